@@ -1,0 +1,61 @@
+"""pycolmap, imported once and safely, and the one edge at which its errors become ours."""
+
+import contextlib
+import zlib  # before pycolmap, whose own deflate symbols otherwise break every later use of zlib in this process
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotYet
+
+import pycolmap
+
+from sfm_app.errors import BackendError, SfmError
+
+__all__ = ["backend", "interruptible", "pycolmap", "show_log", "versions"]
+
+zlib.crc32(b"")  # the import above is there for its side effect
+pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+
+
+def show_log(level: int) -> None:
+    """Let COLMAP speak on stderr: 0 not at all, 1 warnings, 2 everything."""
+    levels = (pycolmap.logging.Level.FATAL, pycolmap.logging.Level.WARNING, pycolmap.logging.Level.INFO)
+    pycolmap.logging.minloglevel = levels[min(level, 2)].value
+    pycolmap.logging.alsologtostderr = level > 0
+
+
+def versions() -> dict[str, str]:
+    """What the manifest notes about COLMAP."""
+    return {"pycolmap": pycolmap.__version__, "colmap": pycolmap.COLMAP_version.split(" ")[-1]}
+
+
+@contextlib.contextmanager
+def backend(doing: str) -> Iterator[None]:
+    """Turn whatever COLMAP raises into a BackendError that says what was being done."""
+    try:
+        yield
+    except (SfmError, OSError):
+        raise
+    except Exception as err:
+        reason = str(err).strip().splitlines()
+        raise BackendError(
+            f"COLMAP failed while {doing}: {reason[-1] if reason else type(err).__name__}",
+            hint="run again with -v to see what COLMAP says",
+        ) from err
+
+
+def interruptible(call: Callable[["pycolmap.CancellationToken"], None], poll: Callable[[], None]) -> None:
+    """Run a long COLMAP call in a thread, so that Ctrl-C stops it and `poll` can show how far it is."""
+    token = pycolmap.CancellationToken()
+    with ThreadPoolExecutor(1, thread_name_prefix="colmap") as thread:
+        future = thread.submit(call, token)
+        try:
+            while True:
+                try:
+                    return future.result(timeout=0.5)
+                except NotYet:
+                    if future.done():
+                        raise
+                    poll()
+        except KeyboardInterrupt:
+            token.cancel()
+            raise

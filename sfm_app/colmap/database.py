@@ -1,0 +1,104 @@
+"""COLMAP's SQLite database: photos and cameras in, keypoints and matches out, our epipolar geometries and K back in."""
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, PairId, Photo, PhotoSet
+
+CAMERA_MODEL = "OPENCV"
+"""fx, fy, cx, cy, k1, k2, p1, p2: the smallest of COLMAP's models that holds a camera matrix with two focals and a lens."""
+
+FOCAL_GUESS = 1.2
+"""COLMAP's own guess where nothing is known: focal length over the longer side."""
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """The database, closed whatever happens."""
+    database = pycolmap.Database.open(path)
+    try:
+        yield database
+    finally:
+        database.close()
+
+
+def create_database(path: Path, photo_dir: Path, photos: PhotoSet) -> None:
+    """Enter photos and cameras in a fixed order.
+
+    Feature extraction would do it too, but numbers photos as its threads finish with them: not twice the same.
+    """
+    with opened(path):
+        pass
+    for members in photos.groups.values():
+        options = pycolmap.ImageReaderOptions()
+        options.camera_model = CAMERA_MODEL
+        options.camera_params = ",".join(str(value) for value in _guess(members[0]))
+        names = [photo.name for photo in members]
+        pycolmap.import_images(path, photo_dir, pycolmap.CameraMode.SINGLE, names, options)
+
+
+def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
+    """Keypoints and raw matches of every photo in the database."""
+    by_name = {photo.name: photo for photo in photos.photos}
+    with opened(path) as database:
+        images, keypoints = {}, {}
+        for entry in sorted(database.read_all_images(), key=lambda entry: entry.image_id):
+            photo = by_name[entry.name]
+            images[entry.image_id] = MatchedImage(
+                entry.image_id, photo.name, photo.group, photo.width, photo.height, photo.exif_focal_px
+            )
+            found = database.read_keypoints(entry.image_id)
+            keypoints[entry.image_id] = np.asarray(found, np.float64).reshape(len(found), -1)[:, :2].copy()
+        pair_ids, rows = database.read_all_matches()
+    matches = {_pair(pair_id): np.asarray(row, np.uint32) for pair_id, row in zip(pair_ids, rows, strict=True)}
+    return MatchGraph(images, keypoints, dict(sorted(matches.items())))
+
+
+def write_epipolar_fits(path: Path, matches: MatchGraph, fits: Mapping[PairId, EpipolarFit]) -> None:
+    """Replace all two-view geometries by ours."""
+    with opened(path) as database, pycolmap.DatabaseTransaction(database):
+        database.clear_two_view_geometries()
+        for pair, fit in fits.items():
+            database.write_two_view_geometry(*pair, _two_view_geometry(fit, matches.matches[pair]))
+
+
+def write_calibrations(path: Path, matches: MatchGraph, cameras: Mapping[str, Calibration]) -> None:
+    """Give every camera its K; a K that the photos determine counts as prior knowledge, a guess does not."""
+    groups = {image.id: image.group for image in matches.images.values()}
+    with opened(path) as database, pycolmap.DatabaseTransaction(database):
+        for entry in database.read_all_images():
+            calibration = cameras[groups[entry.image_id]]
+            camera = database.read_camera(entry.camera_id)
+            camera.params = camera_params(calibration.K)
+            camera.has_prior_focal_length = calibration.identifiable
+            database.update_camera(camera)
+
+
+def camera_params(K: NDArray[np.float64]) -> list[float]:
+    """Parameters of `CAMERA_MODEL` for a camera matrix without distortion."""
+    return [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), 0.0, 0.0, 0.0, 0.0]
+
+
+def _guess(photo: Photo) -> list[float]:
+    focal = FOCAL_GUESS * max(photo.width, photo.height)
+    return [focal, focal, photo.width / 2, photo.height / 2, 0.0, 0.0, 0.0, 0.0]
+
+
+def _pair(pair_id: int) -> PairId:
+    first, second = pycolmap.pair_id_to_image_pair(pair_id)
+    return int(first), int(second)
+
+
+def _two_view_geometry(fit: EpipolarFit, matches: NDArray[np.uint32]) -> Any:
+    geometry = pycolmap.TwoViewGeometry()
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    geometry.config = kinds.PLANAR_OR_PANORAMIC if fit.degeneracy else kinds.UNCALIBRATED
+    geometry.F = fit.F
+    geometry.inlier_matches = np.ascontiguousarray(matches[fit.inliers])
+    return geometry

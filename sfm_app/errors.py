@@ -1,0 +1,63 @@
+"""Every error that the program raises on purpose.
+
+::
+
+    SfmError                    anything below                                   exit 1
+    ├── ConfigError             a setting is unknown, mistyped or out of range   exit 2
+    ├── InputError              photos or files are missing or unreadable        exit 3
+    ├── ReconstructionError     the photos do not support a reconstruction       exit 4
+    ├── BackendError            COLMAP failed; its own error is the cause        exit 5
+    └── PluginError             a plug-in is broken or clashes with another      exit 6
+"""
+
+from typing import ClassVar
+
+
+class SfmError(Exception):
+    """What went wrong, in one line, and what the user can do about it.
+
+    Args:
+        message: one line.
+        hint: what to do, one line; may be empty.
+    """
+
+    exit_code: ClassVar[int] = 1
+
+    def __init__(self, message: str, hint: str = "") -> None:
+        # Both go to the base class, so that the error survives pickling between worker processes.
+        super().__init__(message, hint)
+        self.message = message
+        self.hint = hint
+
+    def __str__(self) -> str:
+        return self.message
+
+
+class ConfigError(SfmError):
+    """A setting is unknown, mistyped or out of range."""
+
+    exit_code = 2
+
+
+class InputError(SfmError):
+    """Photos or files are missing or unreadable, or the output cannot be written."""
+
+    exit_code = 3
+
+
+class ReconstructionError(SfmError):
+    """The photos do not support a reconstruction."""
+
+    exit_code = 4
+
+
+class BackendError(SfmError):
+    """COLMAP failed."""
+
+    exit_code = 5
+
+
+class PluginError(SfmError):
+    """A plug-in is broken, unknown or clashes with another."""
+
+    exit_code = 6

@@ -1,0 +1,23 @@
+"""Loading Open3D: slowly imported, talkative, and in need of a library that bare Linux machines lack."""
+
+import ctypes
+import functools
+import importlib
+from typing import Any
+
+import libusb_package
+
+
+@functools.cache
+def load_open3d() -> Any:
+    """Import Open3D, quiet, with the libusb that its wheel expects on the system.
+
+    Call it inside the functions that need Open3D: the import takes more than a second.
+    """
+    # Open3D links to libusb-1.0.so.0; once a library of that name is in the process, the linker looks no further.
+    library = libusb_package.get_library_path()
+    if library is not None:
+        ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)
+    open3d = importlib.import_module("open3d")
+    open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
+    return open3d

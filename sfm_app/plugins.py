@@ -1,0 +1,171 @@
+"""Plug-ins: typed hooks, and one registry that the built-ins enter through the same door.
+
+A plug-in is an installed package with an entry point in the group ``sfm_app``; its module holds functions marked with
+`hookimpl` that are named as in `Hooks`.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType, ModuleType
+from typing import Protocol, TypeVar
+
+import numpy as np
+import pluggy
+from numpy.typing import NDArray
+
+from sfm_app.errors import ConfigError, PluginError
+from sfm_app.meshing import EXPORTERS
+from sfm_app.ransac import ESTIMATORS
+from sfm_app.selfcal import CALIBRATORS
+from sfm_app.settings import CalibrationSettings, EpipolarSettings
+from sfm_app.types import Calibration, EpipolarFit, Rejected
+
+GROUP = "sfm_app"
+hookspec = pluggy.HookspecMarker(GROUP)
+hookimpl = pluggy.HookimplMarker(GROUP)
+
+FloatArray = NDArray[np.float64]
+
+
+class FitFundamental(Protocol):
+    """Estimates one fundamental matrix; x1, x2 are finite (N, 2) pixels; the same seed gives the same result."""
+
+    def __call__(
+        self, x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int
+    ) -> EpipolarFit | Rejected: ...
+
+
+class Calibrate(Protocol):
+    """Estimates one camera matrix from (P, 3, 3) fundamental matrices of pairs that share it.
+
+    `weights` (P,) > 0 say how far each F is trusted; `size` is (width, height) in pixels. Never raises on data: what is
+    not determined comes back with ``identifiable=False`` and a reason.
+    """
+
+    def __call__(
+        self, Fs: FloatArray, weights: FloatArray, size: tuple[int, int], options: CalibrationSettings, seed: int
+    ) -> Calibration: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Estimator:
+    """A named way to estimate fundamental matrices."""
+
+    name: str
+    fit: FitFundamental
+    summary: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrator:
+    """A named way to get from fundamental matrices to the camera matrix."""
+
+    name: str
+    calibrate: Calibrate
+    summary: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Exporter:
+    """A file format for the finished mesh: `write` gets vertices (V, 3), faces (T, 3), colours (V, 3) and gives the file."""
+
+    name: str
+    """The file's suffix without dot."""
+    write: Callable[[FloatArray, NDArray[np.int64], NDArray[np.uint8]], bytes]
+    summary: str = ""
+
+
+class Hooks:
+    """What a plug-in may define, all optional."""
+
+    @hookspec
+    def sfm_estimators(self) -> Iterable[Estimator]:  # type: ignore[empty-body]
+        """Estimators of fundamental matrices."""
+
+    @hookspec
+    def sfm_calibrators(self) -> Iterable[Calibrator]:  # type: ignore[empty-body]
+        """Calibrators."""
+
+    @hookspec
+    def sfm_exporters(self) -> Iterable[Exporter]:  # type: ignore[empty-body]
+        """Mesh file formats."""
+
+
+class BuiltIns:
+    """What ships with the program, registered like any other plug-in."""
+
+    @hookimpl
+    def sfm_estimators(self) -> Iterable[Estimator]:
+        return [Estimator(name, fit, summary) for name, (fit, summary) in ESTIMATORS.items()]
+
+    @hookimpl
+    def sfm_calibrators(self) -> Iterable[Calibrator]:
+        return [Calibrator(name, calibrate, summary) for name, (calibrate, summary) in CALIBRATORS.items()]
+
+    @hookimpl
+    def sfm_exporters(self) -> Iterable[Exporter]:
+        return [Exporter(name, write, summary) for name, (write, summary) in EXPORTERS.items()]
+
+
+@dataclass(frozen=True, slots=True)
+class Plugins:
+    """Everything that can be chosen by name."""
+
+    estimators: Mapping[str, Estimator]
+    calibrators: Mapping[str, Calibrator]
+    exporters: Mapping[str, Exporter]
+
+    def estimator(self, name: str) -> Estimator:
+        """The estimator of that name; ConfigError names the known ones."""
+        return _named(self.estimators, name, "estimator")
+
+    def calibrator(self, name: str) -> Calibrator:
+        """The calibrator of that name; ConfigError names the known ones."""
+        return _named(self.calibrators, name, "calibrator")
+
+
+def load_plugins(modules: Sequence[ModuleType | object] = (), *, installed: bool = True) -> Plugins:
+    """Register the built-ins, the given modules and, unless told otherwise, every installed plug-in.
+
+    Raises:
+        PluginError: a hook is misspelt, a plug-in does not import, or two things share a name.
+    """
+    manager = pluggy.PluginManager(GROUP)
+    manager.add_hookspecs(Hooks)
+    try:
+        for module in (BuiltIns(), *modules):
+            manager.register(module)
+        if installed:
+            manager.load_setuptools_entrypoints(GROUP)
+        manager.check_pending()
+    except Exception as err:  # whatever a foreign module raises on import
+        raise PluginError(f"a plug-in does not load: {err}", hint="update or uninstall it; hooks: sfm_app.plugins.Hooks") from err
+    return Plugins(
+        estimators=_by_name(manager.hook.sfm_estimators()),
+        calibrators=_by_name(manager.hook.sfm_calibrators()),
+        exporters=_by_name(manager.hook.sfm_exporters()),
+    )
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+Part = TypeVar("Part", bound=_Named)
+
+
+def _by_name(results: Iterable[Iterable[Part]]) -> Mapping[str, Part]:
+    # pluggy calls the last registered first; reversed, the built-ins lead every listing
+    found: dict[str, Part] = {}
+    for part in (part for parts in reversed(list(results)) for part in parts):
+        if part.name in found:
+            raise PluginError(f"two plug-ins offer '{part.name}'", hint="uninstall one of them")
+        found[part.name] = part
+    return MappingProxyType(found)
+
+
+def _named(parts: Mapping[str, Part], name: str, kind: str) -> Part:
+    if name not in parts:
+        raise ConfigError(f"no {kind} is named '{name}'", hint=f"known: {', '.join(parts)}")
+    return parts[name]

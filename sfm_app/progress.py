@@ -1,0 +1,45 @@
+"""How long work tells the outside where it stands, without knowing what shows it."""
+
+from collections.abc import Iterable, Iterator
+from typing import Protocol, TypeVar
+
+Item = TypeVar("Item")
+
+
+class Progress(Protocol):
+    """What a display of progress has to offer; the command line has one on stderr, a library call none."""
+
+    def stage(self, name: str, note: str = "") -> None:
+        """A stage begins (note empty) or was skipped, with the reason as note."""
+
+    def start(self, label: str, total: int) -> None:
+        """Work of `total` steps begins."""
+
+    def advance(self, steps: int = 1) -> None:
+        """That many more steps are done."""
+
+    def finish(self) -> None:
+        """The work begun last is over."""
+
+
+class Silent:
+    """Shows nothing."""
+
+    def stage(self, name: str, note: str = "") -> None: ...
+
+    def start(self, label: str, total: int) -> None: ...
+
+    def advance(self, steps: int = 1) -> None: ...
+
+    def finish(self) -> None: ...
+
+
+def track(progress: Progress, items: Iterable[Item], label: str, total: int) -> Iterator[Item]:
+    """Yield the items and count each one once it has been dealt with."""
+    progress.start(label, total)
+    try:
+        for item in items:
+            yield item
+            progress.advance()
+    finally:
+        progress.finish()

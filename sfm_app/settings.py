@@ -1,0 +1,184 @@
+"""Every option of the program: typed, with unit, range and one line of help; TOML in and out.
+
+A setting comes, in rising order, from its default, from the quality preset, from the TOML file, from a flag.
+"""
+
+import difflib
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from sfm_app.errors import ConfigError
+
+Quality = Literal["draft", "normal", "high"]
+
+
+class Section(BaseModel):
+    """One table of the settings file: frozen, and it refuses what it does not know."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class PhotoSettings(Section):
+    """Which photos are used and which of them share a camera."""
+
+    cameras: Literal["auto", "single", "each"] = Field(
+        "auto", description="auto: same size and same EXIF camera share one; single: all share one; each: none share"
+    )
+    min_side_px: int = Field(64, ge=16, le=4096, description="photos with a shorter side are left out, in pixels")
+
+
+class MatchSettings(Section):
+    """COLMAP's features and matches."""
+
+    max_image_size_px: int = Field(1600, ge=128, le=16384, description="longer side at which features are found, in pixels")
+    max_features: int = Field(8192, ge=100, le=100000, description="most features per photo")
+    max_ratio: float = Field(0.8, gt=0, le=1, description="nearest over second nearest descriptor distance; 1 switches it off")
+
+
+class EpipolarSettings(Section):
+    """Fundamental matrices, one per pair of photos."""
+
+    estimator: str = Field("lev-ransac", description="name of the estimator (see `sfm-app plugins`)")
+    max_error_px: float = Field(1.5, gt=0, le=100, description="inlier threshold on the Sampson distance, in pixels")
+    confidence: float = Field(0.9999, gt=0, lt=1, description="wanted probability that one sample is free of outliers")
+    max_trials: int = Field(20000, ge=1, le=10_000_000, description="most minimal samples per pair")
+    min_inliers: int = Field(16, ge=8, le=10000, description="a pair with fewer inliers is rejected")
+
+
+class CalibrationSettings(Section):
+    """The camera matrix from the fundamental matrices."""
+
+    calibrator: str = Field("zero-curves", description="name of the calibrator (see `sfm-app plugins`)")
+    samples: int = Field(100, ge=10, le=10000, description="samples along one zero curve")
+    centre_sigma: float = Field(
+        0.15, gt=0, le=10, description="soft prior: standard deviation of the optical centre about the middle, in widths"
+    )
+
+
+class SceneSettings(Section):
+    """Poses, sparse points and bundle adjustment."""
+
+    seed_pairs: int = Field(5, ge=1, le=100, description="most seed pairs that are tried")
+    min_seed_angle_deg: float = Field(2.0, gt=0, le=90, description="least median triangulation angle of a seed pair, in degrees")
+    min_points: int = Field(30, ge=6, le=10000, description="a model with fewer points counts as failed")
+
+
+class DepthSettings(Section):
+    """Depth maps on CPU."""
+
+    max_image_size_px: int = Field(1000, ge=64, le=16384, description="longer side of the depth maps, in pixels")
+    neighbours: int = Field(4, ge=1, le=20, description="photos that each photo is matched with")
+    consistency: float = Field(0.01, gt=0, le=1, description="largest relative depth difference between photos that agree")
+    min_agreeing: int = Field(2, ge=1, le=20, description="other photos that have to agree with a depth")
+
+
+class MeshSettings(Section):
+    """The surface through the depth maps."""
+
+    poisson_depth: int = Field(10, ge=5, le=14, description="depth of the Poisson octree")
+    trim: float = Field(6.0, ge=0, le=20, description="surface with less support than this is cut off; 0 keeps a closed surface")
+    min_island: float = Field(0.01, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped")
+
+
+class Settings(Section):
+    """All settings of a run."""
+
+    seed: int = Field(0, ge=0, lt=2**32, description="same seed, same result")
+    workers: int = Field(0, ge=0, le=1024, description="parallel workers; 0: one per core")
+    quality: Quality = Field("normal", description="preset for image sizes and mesh resolution")
+    photos: PhotoSettings = PhotoSettings()
+    matching: MatchSettings = MatchSettings()
+    epipolar: EpipolarSettings = EpipolarSettings()
+    calibration: CalibrationSettings = CalibrationSettings()
+    scene: SceneSettings = SceneSettings()
+    depth: DepthSettings = DepthSettings()
+    mesh: MeshSettings = MeshSettings()
+
+    @classmethod
+    def from_mapping(cls, values: Mapping[str, Any], where: str = "settings") -> "Settings":
+        """Check nested values on top of the preset they name.
+
+        Raises:
+            ConfigError: a key is unknown, or a value has the wrong type or lies out of range; names all of them.
+        """
+        preset = QUALITY_PRESETS.get(str(values.get("quality", "normal")), {})
+        try:
+            return cls.model_validate(merged(preset, values))
+        except ValidationError as err:
+            problems = [_problem(dict(e)) for e in err.errors()]
+            raise ConfigError(
+                f"{where}: " + "; ".join(text for text, _ in problems),
+                hint=next((hint for _, hint in problems if hint), "`sfm-app config` prints every setting"),
+            ) from None
+
+    @classmethod
+    def from_toml(cls, path: Path, overrides: Mapping[str, Any] | None = None) -> "Settings":
+        """Read a settings file and lay `overrides` (nested, from flags) over it."""
+        return cls.from_mapping(merged(read_toml(path), overrides or {}), where=str(path))
+
+    def to_toml(self) -> str:
+        """Every setting with its help as a comment; `from_toml` reads it back."""
+        return "\n".join(_toml_lines(self)) + "\n"
+
+
+QUALITY_PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {
+        "matching": {"max_image_size_px": 1000, "max_features": 4096},
+        "depth": {"max_image_size_px": 640, "neighbours": 3},
+        "mesh": {"poisson_depth": 9},
+    },
+    "normal": {},
+    "high": {
+        "matching": {"max_image_size_px": 3200, "max_features": 16384},
+        "depth": {"max_image_size_px": 2000, "neighbours": 6},
+        "mesh": {"poisson_depth": 11},
+    },
+}
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file, or say what is wrong with it."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as err:
+        raise ConfigError(f"cannot read {path}: {err.strerror}") from err
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
+        raise ConfigError(f"{path} is not a TOML file: {err}", hint="`sfm-app config` prints a valid one") from err
+
+
+def merged(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
+    """Nested mappings laid over each other; `high` wins."""
+    result = dict(low)
+    for key, value in high.items():
+        below = result.get(key)
+        result[key] = merged(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+    return result
+
+
+def _problem(error: dict[str, Any]) -> tuple[str, str]:
+    *table, key = [str(part) for part in error["loc"]] or ["settings"]
+    name = ".".join((*table, key))
+    if error["type"] != "extra_forbidden":
+        return f"'{name}': {error['msg'].lower()}, got {error['input']!r}", ""
+    section: type[BaseModel] = Settings
+    for part in table:
+        section = section.model_fields[part].annotation or Settings
+    close = difflib.get_close_matches(key, section.model_fields, n=1)
+    return f"unknown setting '{name}'", f"did you mean '{'.'.join((*table, close[0]))}'?" if close else ""
+
+
+def _toml_lines(section: BaseModel, table: str = "") -> Iterator[str]:
+    fields = type(section).model_fields
+    tables = [name for name in fields if isinstance(getattr(section, name), BaseModel)]
+    if table:
+        yield f"\n# {(section.__doc__ or '').strip()}\n[{table}]"
+    for name, info in fields.items():
+        if name not in tables:
+            value = getattr(section, name)
+            yield f"# {info.description}\n{name} = {f'"{value}"' if isinstance(value, str) else value}"
+    for name in tables:
+        yield from _toml_lines(getattr(section, name), name)

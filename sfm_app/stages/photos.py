@@ -1,0 +1,164 @@
+"""photos: folder -> PhotoSet."""
+
+import json
+import os
+import shutil
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from sfm_app.context import RunContext
+from sfm_app.errors import InputError
+from sfm_app.settings import PhotoSettings
+from sfm_app.types import Photo, PhotoSet, UnusablePhoto
+
+FORMATS = ("JPEG", "PNG")
+"""What is read so far."""
+
+EXIF_MAKE, EXIF_MODEL, EXIF_ORIENTATION, EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
+EXIF_FOCAL_MM, EXIF_FOCAL_35MM = 0x920A, 0xA405
+FULL_FRAME_WIDTH_MM = 36.0
+
+
+def read_photos(folder: Path, run: RunContext) -> PhotoSet:
+    """Look at every file of the folder and lay the usable photos out for COLMAP.
+
+    Raises:
+        InputError: the folder is missing, or fewer than two photos are usable.
+    """
+    names = list_files(folder, exclude=run.workspace.root)
+    found = run.map(partial(read_photo, folder, options=run.settings.photos), names, "photos")
+    photos = [photo for photo in found if isinstance(photo, Photo)]
+    unusable = tuple(photo for photo in found if isinstance(photo, UnusablePhoto))
+    reasons = Counter(photo.reason for photo in unusable)
+    if len(photos) < 2:
+        raise InputError(_too_few(folder, len(photos), reasons), hint="two photos of one place are the least; 10 to 50 work best")
+    photo_set = PhotoSet(folder, tuple(_grouped(photos, run.settings.photos.cameras)), unusable)
+    lay_out(photo_set, run)
+    save_photo_set(photo_set, run)
+    run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
+    return photo_set
+
+
+def list_files(folder: Path, exclude: Path) -> list[str]:
+    """Names of all files below the folder, sorted, without hidden ones and without the output folder.
+
+    Raises:
+        InputError: there is no such folder, or it cannot be read.
+    """
+    if not folder.exists():
+        raise InputError(f"no such folder: {folder}", hint="name the folder that holds the photos")
+    if not folder.is_dir():
+        raise InputError(f"not a folder: {folder}", hint="name the folder that holds the photos, not a photo")
+    try:
+        os.listdir(folder)
+    except OSError as err:
+        raise InputError(f"cannot read {folder}: {err.strerror}") from err
+    return sorted(path.relative_to(folder).as_posix() for path in _walk(folder, exclude.resolve()))
+
+
+def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Photo | UnusablePhoto:
+    """Decode one file as far as needed to know that it is a whole photo, and what camera took it."""
+    try:
+        with Image.open(folder / name, formats=FORMATS) as image:
+            image.load()
+            return _described(name, image, options)
+    except UnidentifiedImageError:
+        return UnusablePhoto(name, "not a JPEG or PNG photo")
+    except Image.DecompressionBombError:
+        return UnusablePhoto(name, "too many pixels")
+    except (OSError, SyntaxError, ValueError) as err:
+        reason = "truncated or damaged" if not isinstance(err, PermissionError) else "not readable: permission denied"
+        return UnusablePhoto(name, reason)
+
+
+def lay_out(photos: PhotoSet, run: RunContext) -> None:
+    """Fill the workspace's photo folder: links to what COLMAP can read, upright 8-bit copies of the rest."""
+    target = run.workspace.photos
+    shutil.rmtree(target, ignore_errors=True)
+    for photo in photos.photos:
+        place = target / photo.name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        if photo.needs_copy:
+            with Image.open(photos.folder / photo.name) as image:
+                save_options = {"quality": 95} if image.format == "JPEG" else {}
+                _eight_bit(ImageOps.exif_transpose(image)).save(place, image.format, **save_options)
+        else:
+            _link(photos.folder / photo.name, place)
+
+
+def save_photo_set(photos: PhotoSet, run: RunContext) -> None:
+    """Write photos.json."""
+    with run.workspace.replacing(run.workspace.photo_set) as path:
+        path.write_text(json.dumps({**asdict(photos), "folder": str(photos.folder)}, indent=1) + "\n", encoding="utf-8")
+
+
+def load_photo_set(run: RunContext) -> PhotoSet:
+    """Read photos.json back."""
+    values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
+    photos = tuple(Photo(**photo) for photo in values["photos"])
+    return PhotoSet(Path(values["folder"]), photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]))
+
+
+def _walk(folder: Path, exclude: Path) -> Iterator[Path]:
+    for place, folders, files in os.walk(folder):
+        folders[:] = [n for n in folders if not n.startswith(".") and (Path(place) / n).resolve() != exclude]
+        yield from (Path(place) / name for name in files if not name.startswith("."))
+
+
+def _described(name: str, image: Image.Image, options: PhotoSettings) -> Photo | UnusablePhoto:
+    exif = image.getexif()
+    turned = exif.get(EXIF_ORIENTATION, 1) in (5, 6, 7, 8)
+    width, height = image.size[::-1] if turned else image.size
+    if min(width, height) < options.min_side_px:
+        return UnusablePhoto(name, f"smaller than {options.min_side_px} px")
+    details = exif.get_ifd(EXIF_IFD)
+    camera = [str(exif.get(tag, "")).strip("\0 ") for tag in (EXIF_MAKE, EXIF_MODEL)] + [str(details.get(EXIF_FOCAL_MM, ""))]
+    return Photo(
+        name=name,
+        width=width,
+        height=height,
+        group=" ".join([f"{width}x{height}", *filter(None, camera)]),
+        exif_focal_px=_exif_focal_px(details.get(EXIF_FOCAL_35MM), max(width, height)),
+        needs_copy=exif.get(EXIF_ORIENTATION, 1) not in (0, 1) or image.mode not in ("RGB", "L"),
+    )
+
+
+def _exif_focal_px(focal_35mm: object, longer_side: int) -> float | None:
+    try:
+        focal = float(focal_35mm) * longer_side / FULL_FRAME_WIDTH_MM  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return focal if 0.1 * longer_side < focal < 50 * longer_side else None
+
+
+def _grouped(photos: list[Photo], cameras: str) -> Iterator[Photo]:
+    for photo in photos:
+        size = f"{photo.width}x{photo.height}"  # COLMAP's cameras have one size: even `single` keeps sizes apart
+        yield replace(photo, group={"auto": photo.group, "single": size, "each": f"{size} {photo.name}"}[cameras])
+
+
+def _too_few(folder: Path, usable: int, reasons: Counter[str]) -> str:
+    seen = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
+    number = "no usable photo" if usable == 0 else "only one usable photo"
+    return f"{number} in {folder}: " + (seen or ("the folder is empty" if usable == 0 else "nothing else is there"))
+
+
+def _eight_bit(image: Image.Image) -> Image.Image:
+    if image.mode in ("I;16", "I;16B", "I;16L", "I"):
+        return image.point([value / 256 for value in range(65536)], "L") if image.mode != "I" else image.point(lambda v: v / 256).convert("L")
+    if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
+        white = Image.new("RGBA", image.size, "white")
+        return Image.alpha_composite(white, image.convert("RGBA")).convert("RGB")
+    return image if image.mode in ("RGB", "L") else image.convert("RGB")
+
+
+def _link(source: Path, place: Path) -> None:
+    try:
+        place.symlink_to(source.resolve())
+    except OSError:  # Windows without the right to link, some network drives
+        shutil.copyfile(source, place)

@@ -1,0 +1,33 @@
+"""The products that stages hand on: frozen, picklable, numpy only.
+
+Conventions, said once:
+
+- Pixels: the centre of the top-left pixel is (0.5, 0.5), as in COLMAP. x runs right, y down.
+- ``x2' F x1 = 0``: a fundamental matrix maps points of view 1 to epipolar lines of view 2.
+- ``cam_from_world`` maps world points into the camera frame: x right, y down, z forward.
+- Units stand in names: ``_px``, ``_deg``.
+"""
+
+from sfm_app.types.calibration import Calibration, Intrinsics
+from sfm_app.types.epipolar import EpipolarFit, Rejected, ViewGraph
+from sfm_app.types.matches import MatchedImage, MatchGraph, PairId
+from sfm_app.types.photos import Photo, PhotoSet, UnusablePhoto
+from sfm_app.types.scene import CameraModel, Scene
+from sfm_app.types.surface import Surface
+
+__all__ = [
+    "Calibration",
+    "CameraModel",
+    "EpipolarFit",
+    "Intrinsics",
+    "MatchGraph",
+    "MatchedImage",
+    "PairId",
+    "Photo",
+    "PhotoSet",
+    "Rejected",
+    "Scene",
+    "Surface",
+    "UnusablePhoto",
+    "ViewGraph",
+]

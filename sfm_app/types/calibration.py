@@ -1,0 +1,66 @@
+"""Camera matrices and what supports them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """One camera matrix with its evidence."""
+
+    K: NDArray[np.float64]
+    """(3, 3) camera matrix in pixels, zero skew: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."""
+    width: int
+    height: int
+    method: str
+    """Calibrator, or where a guess came from ("exif", "guess")."""
+    identifiable: bool
+    """False when the fundamental matrices do not determine K; K is then a guess."""
+    reason: str = ""
+    """Why K is not identifiable; empty when it is."""
+    spread: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviations in pixels ("fx", "fy", "cx", "cy") where the calibrator estimates them."""
+    evidence: Mapping[str, float] = field(default_factory=dict)
+    """Named figures that support K: pairs used, support at the peak, ..."""
+
+    @property
+    def focal_px(self) -> float:
+        """Geometric mean of fx and fy."""
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        plain = {field.name: getattr(self, field.name) for field in fields(self)}
+        return plain | {"K": self.K.tolist(), "spread": dict(self.spread), "evidence": dict(self.evidence)}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "Calibration":
+        """Back from `to_dict`."""
+        return cls(**{**values, "K": np.array(values["K"], np.float64)})
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """One calibration per camera group."""
+
+    cameras: Mapping[str, Calibration]
+    """By camera group; the first entry has the most photos."""
+
+    @property
+    def main(self) -> Calibration:
+        """The camera that took the most photos."""
+        return next(iter(self.cameras.values()))
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """(3, 3) camera matrix of the camera that took the most photos."""
+        return self.main.K
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether the photos determine the main camera's K."""
+        return self.main.identifiable

@@ -1,0 +1,38 @@
+"""Keypoints and raw, unverified matches."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+PairId = tuple[int, int]
+"""(image id 1, image id 2) with id1 < id2, ids as in COLMAP's database."""
+
+
+@dataclass(frozen=True, slots=True)
+class MatchedImage:
+    """One photo as the match graph knows it."""
+
+    id: int
+    name: str
+    group: str
+    width: int
+    height: int
+    exif_focal_px: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MatchGraph:
+    """Photos as nodes, raw matches as edges."""
+
+    images: Mapping[int, MatchedImage]
+    keypoints: Mapping[int, NDArray[np.float64]]
+    """Per image id: (N, 2) pixels."""
+    matches: Mapping[PairId, NDArray[np.uint32]]
+    """Per pair: (M, 2) keypoint indices in image 1 and image 2."""
+
+    def points(self, pair: PairId) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The matched points of one pair: x1, x2, each (M, 2) pixels."""
+        rows = self.matches[pair]
+        return self.keypoints[pair[0]][rows[:, 0]], self.keypoints[pair[1]][rows[:, 1]]

@@ -1,0 +1,47 @@
+"""What a folder of photos holds."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True, slots=True)
+class Photo:
+    """One usable photo."""
+
+    name: str
+    """Path inside the folder, with forward slashes."""
+    width: int
+    """Upright width in pixels, after EXIF orientation."""
+    height: int
+    """Upright height in pixels."""
+    group: str
+    """Photos of one group share one camera."""
+    exif_focal_px: float | None = None
+    """Focal length that EXIF claims, in pixels of this photo; a hint, never trusted."""
+    needs_copy: bool = False
+    """True where COLMAP cannot read the file as it is (orientation, palette, 16 bit): it then works on an upright 8-bit copy."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnusablePhoto:
+    """One file that was left out, and why."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class PhotoSet:
+    """All usable photos of a folder, and every file that is not."""
+
+    folder: Path
+    photos: tuple[Photo, ...]
+    unusable: tuple[UnusablePhoto, ...] = ()
+
+    @property
+    def groups(self) -> dict[str, tuple[Photo, ...]]:
+        """Photos by camera group, in order of first appearance."""
+        found: dict[str, list[Photo]] = {}
+        for photo in self.photos:
+            found.setdefault(photo.group, []).append(photo)
+        return {name: tuple(members) for name, members in found.items()}

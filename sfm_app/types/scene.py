@@ -1,0 +1,37 @@
+"""The sparse reconstruction as the rest of the program sees it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraModel:
+    """One camera after bundle adjustment."""
+
+    model: str
+    """COLMAP's name of the camera model, such as OPENCV."""
+    params: tuple[float, ...]
+    """COLMAP's parameters of that model."""
+    K: NDArray[np.float64]
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """A COLMAP model on disk and what the summary says about it."""
+
+    model_dir: Path
+    registered: tuple[str, ...]
+    """Names of the photos that have a pose."""
+    unregistered: Mapping[str, str]
+    """Names of the photos without a pose, with the reason."""
+    cameras: Mapping[str, CameraModel]
+    """By camera group."""
+    points: int
+    observations: int
+    mean_reprojection_px: float

@@ -1,0 +1,155 @@
+"""The output folder: what lies in it, what of it is up to date, and the manifest that says so."""
+
+import contextlib
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sfm_app.errors import InputError
+
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True, slots=True)
+class StageRecord:
+    """What the manifest says about one finished stage."""
+
+    fingerprint: str
+    """Hash of everything that the stage's result depends on."""
+    seconds: float
+    counts: Mapping[str, Any] = field(default_factory=dict)
+    files: Mapping[str, int] = field(default_factory=dict)
+    """What the stage wrote, with the size in bytes (-1 for a folder)."""
+
+
+class Workspace:
+    """One output folder."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    @property
+    def photos(self) -> Path:
+        """Upright photos that COLMAP can read: links where the file is fine, copies where not."""
+        return self.root / "photos"
+
+    @property
+    def database(self) -> Path:
+        return self.root / "database.db"
+
+    @property
+    def photo_set(self) -> Path:
+        return self.root / "photos.json"
+
+    @property
+    def view_graph(self) -> Path:
+        return self.root / "view_graph.npz"
+
+    @property
+    def calibration(self) -> Path:
+        return self.root / "calibration.json"
+
+    @property
+    def sparse(self) -> Path:
+        return self.root / "sparse"
+
+    @property
+    def dense(self) -> Path:
+        return self.root / "dense"
+
+    @property
+    def surface(self) -> Path:
+        return self.dense / "surface.npz"
+
+    @property
+    def log(self) -> Path:
+        return self.root / "log.txt"
+
+    def create(self) -> None:
+        """Make the folder and prove that it can be written to.
+
+        Raises:
+            InputError: it cannot.
+        """
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=self.root):
+                pass
+        except OSError as err:
+            raise InputError(
+                f"cannot write to {self.root}: {err.strerror}", hint="name another output folder with -o"
+            ) from err
+
+    def manifest(self) -> dict[str, Any]:
+        """The manifest as written last; empty when there is none or it cannot be read (then everything is redone)."""
+        try:
+            found = json.loads((self.root / MANIFEST).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    def record(self, stage: str) -> StageRecord | None:
+        """The record of a finished stage, if the manifest has a sound one."""
+        entry = self.manifest().get("stages", {}).get(stage)
+        try:
+            return StageRecord(**entry)
+        except TypeError:
+            return None
+
+    def is_current(self, stage: str, fingerprint: str) -> bool:
+        """Whether the stage was finished with these inputs and its files are still as it left them."""
+        record = self.record(stage)
+        return (
+            record is not None
+            and record.fingerprint == fingerprint
+            and all(_size(self.root / name) == size for name, size in record.files.items())
+        )
+
+    def forget(self, stages: tuple[str, ...]) -> None:
+        """Take stages out of the manifest before their files are touched, so that it is never ahead of the files."""
+        manifest = self.manifest()
+        known = manifest.get("stages", {})
+        if any(known.pop(stage, None) for stage in stages):
+            self.write_manifest(manifest)
+
+    def finish(self, stage: str, record: StageRecord, head: Mapping[str, Any]) -> None:
+        """Enter a finished stage; `head` (settings, versions, ...) replaces the rest of the manifest."""
+        stages = self.manifest().get("stages", {}) | {stage: asdict(record)}
+        self.write_manifest({**head, "stages": stages})
+
+    def write_manifest(self, manifest: Mapping[str, Any]) -> None:
+        """Replace the manifest as a whole."""
+        with self.replacing(self.root / MANIFEST) as path:
+            path.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+
+    @contextlib.contextmanager
+    def replacing(self, target: Path) -> Iterator[Path]:
+        """A path beside `target` to write to; it takes the target's place when the block ends without an error."""
+        target.parent.mkdir(parents=True, exist_ok=True)
+        beside = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
+        try:
+            yield beside
+            beside.replace(target)
+        finally:
+            beside.unlink(missing_ok=True)
+
+    def sizes(self, files: tuple[str, ...]) -> dict[str, int]:
+        """Sizes of what a stage wrote, as its record holds them."""
+        return {name: _size(self.root / name) for name in files}
+
+
+def fingerprint(*parts: Any) -> str:
+    """Hash of JSON-able parts, independent of the order of keys."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _size(path: Path) -> int | None:
+    if path.is_dir():
+        return -1
+    return path.stat().st_size if path.exists() else None
