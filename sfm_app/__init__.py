@@ -1,1 +1,36 @@
-"""sfm_app."""
+"""A folder of photos about which nothing is known becomes a 3D model.
+
+    run = sfm_app.reconstruct("photos/", "out/")
+    cal = sfm_app.calibrate_photos("photos/")
+    fit = sfm_app.estimate_fundamental(x1, x2)
+    cal = sfm_app.calibrate_fundamentals(Fs, (width, height))
+"""
+
+from importlib.metadata import version
+
+from sfm_app.api import Run, calibrate_fundamentals, calibrate_photos, estimate_fundamental, reconstruct
+from sfm_app.errors import BackendError, ConfigError, InputError, PluginError, ReconstructionError, SfmError
+from sfm_app.settings import Settings
+from sfm_app.types import Calibration, EpipolarFit, Intrinsics, Rejected
+
+__version__ = version("sfm-app")
+
+__all__ = [
+    "BackendError",
+    "Calibration",
+    "ConfigError",
+    "EpipolarFit",
+    "InputError",
+    "Intrinsics",
+    "PluginError",
+    "ReconstructionError",
+    "Rejected",
+    "Run",
+    "Settings",
+    "SfmError",
+    "__version__",
+    "calibrate_fundamentals",
+    "calibrate_photos",
+    "estimate_fundamental",
+    "reconstruct",
+]

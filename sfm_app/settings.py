@@ -4,6 +4,7 @@ A setting comes, in rising order, from its default, from the quality preset, fro
 """
 
 import difflib
+import json
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -178,7 +179,6 @@ def _toml_lines(section: BaseModel, table: str = "") -> Iterator[str]:
         yield f"\n# {(section.__doc__ or '').strip()}\n[{table}]"
     for name, info in fields.items():
         if name not in tables:
-            value = getattr(section, name)
-            yield f"# {info.description}\n{name} = {f'"{value}"' if isinstance(value, str) else value}"
+            yield f"# {info.description}\n{name} = {json.dumps(getattr(section, name))}"
     for name in tables:
         yield from _toml_lines(getattr(section, name), name)

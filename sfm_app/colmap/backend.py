@@ -10,7 +10,7 @@ import pycolmap
 
 from sfm_app.errors import BackendError, SfmError
 
-__all__ = ["backend", "interruptible", "pycolmap", "show_log", "versions"]
+__all__ = ["backend", "has_cuda", "interruptible", "pycolmap", "show_log", "versions"]
 
 zlib.crc32(b"")  # the import above is there for its side effect
 pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
@@ -21,6 +21,11 @@ def show_log(level: int) -> None:
     levels = (pycolmap.logging.Level.FATAL, pycolmap.logging.Level.WARNING, pycolmap.logging.Level.INFO)
     pycolmap.logging.minloglevel = levels[min(level, 2)].value
     pycolmap.logging.alsologtostderr = level > 0
+
+
+def has_cuda() -> bool:
+    """Whether this pycolmap can use a GPU."""
+    return bool(pycolmap.has_cuda)
 
 
 def versions() -> dict[str, str]:

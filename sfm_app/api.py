@@ -1,0 +1,152 @@
+"""The public functions: a whole run, a calibration, and each of the two estimators alone."""
+
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from sfm_app.context import RunContext
+from sfm_app.parallel import make_executor, worker_count
+from sfm_app.pipeline import run_stages
+from sfm_app.plugins import load_plugins
+from sfm_app.progress import Progress, Silent
+from sfm_app.ransac import check_points
+from sfm_app.settings import Settings
+from sfm_app.types import Calibration, EpipolarFit, Intrinsics, Rejected, Scene
+from sfm_app.workspace import Workspace
+
+PathLike = str | os.PathLike[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What a finished run leaves behind."""
+
+    out: Path
+    calibration: Intrinsics | None
+    """K per camera group as found before bundle adjustment; None when the run stopped earlier."""
+    scene: Scene | None
+    """The sparse reconstruction with the refined cameras; None when the run stopped earlier."""
+    model_dir: Path | None
+    """COLMAP's sparse model."""
+    mesh_path: Path | None
+    """model.glb; model.ply lies beside it."""
+    manifest: dict[str, Any]
+    """manifest.json as it stands now."""
+
+
+def reconstruct(
+    photos: PathLike, out: PathLike, settings: Settings | None = None, *,
+    first: str = "", last: str = "files", progress: Progress | None = None,
+) -> Run:  # fmt: skip
+    """Turn a folder of photos into a mesh: OUT/model.ply and OUT/model.glb.
+
+    What lies in `out` already and is up to date is not done again.
+
+    Args:
+        photos: folder with JPEG or PNG photos of one place; nothing about the camera needs to be known.
+        out: output folder; made if it is not there.
+        settings: defaults where None.
+        first: do everything from this stage on again.
+        last: stop after this stage.
+        progress: shown progress; none by default.
+
+    Raises:
+        SfmError: see `sfm_app.errors`; carries what went wrong and what to do.
+    """
+    with opened_run(Path(out), settings or Settings(), progress) as run:
+        products = run_stages(Path(photos), run, first, last)
+        done = run.workspace.manifest().get("stages", {})
+        scene = products("scene") if "scene" in done else None
+        return Run(
+            out=run.workspace.root,
+            calibration=products("intrinsics") if "intrinsics" in done else None,
+            scene=scene,
+            model_dir=scene.model_dir if scene else None,
+            mesh_path=products("files")[-1] if "files" in done else None,
+            manifest=run.workspace.manifest(),
+        )
+
+
+def calibrate_photos(
+    photos: PathLike, settings: Settings | None = None, *, out: PathLike | None = None, progress: Progress | None = None
+) -> Intrinsics:
+    """Find the camera matrix of a folder of photos, without reconstructing the scene.
+
+    Args:
+        photos: folder with photos.
+        settings: defaults where None.
+        out: keeps features and matches there for a later run; a temporary folder where None.
+        progress: shown progress; none by default.
+
+    Raises:
+        SfmError: see `sfm_app.errors`.
+    """
+    with tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch:
+        with opened_run(Path(out or scratch), settings or Settings(), progress) as run:
+            found: Intrinsics = run_stages(Path(photos), run, last="intrinsics")("intrinsics")
+    return found
+
+
+def estimate_fundamental(
+    x1: ArrayLike, x2: ArrayLike, method: str = "lev-ransac", seed: int = 0, settings: Settings | None = None
+) -> EpipolarFit | Rejected:
+    """Estimate the fundamental matrix of one pair of photos from matches, many of which may be wrong.
+
+    Args:
+        x1: (N, 2) pixels in photo 1.
+        x2: (N, 2) pixels in photo 2, row by row the partners of x1.
+        method: name of an estimator; `sfm-app plugins` lists them.
+        seed: same seed, same result.
+        settings: the table `epipolar` holds the threshold and the limits.
+
+    Returns:
+        EpipolarFit, or Rejected (falsy) with the reason when no geometry is supported by the matches.
+
+    Raises:
+        ValueError: shapes differ or values are not finite.
+        ConfigError: no estimator has that name.
+    """
+    options = (settings or Settings()).epipolar
+    return load_plugins().estimator(method).fit(*check_points(x1, x2), options, seed)
+
+
+def calibrate_fundamentals(
+    Fs: ArrayLike | Sequence[ArrayLike], size: tuple[int, int], method: str = "zero-curves", *,
+    weights: ArrayLike | None = None, seed: int = 0, settings: Settings | None = None,
+) -> Calibration:  # fmt: skip
+    """Find the camera matrix that a set of fundamental matrices has in common.
+
+    Args:
+        Fs: (P, 3, 3) fundamental matrices in pixels, of pairs taken with one camera.
+        size: (width, height) of the photos in pixels.
+        method: name of a calibrator; `sfm-app plugins` lists them.
+        weights: (P,) > 0, how far each matrix is trusted; equal where None.
+        seed: same seed, same result.
+        settings: the table `calibration` holds the limits.
+
+    Raises:
+        ValueError: shapes are wrong or values are not finite.
+        ConfigError: no calibrator has that name.
+    """
+    matrices = np.asarray(Fs, np.float64)
+    trust = np.ones(len(matrices)) if weights is None else np.asarray(weights, np.float64)
+    options = (settings or Settings()).calibration
+    return load_plugins().calibrator(method).calibrate(matrices, trust, size, options, seed)
+
+
+@contextmanager
+def opened_run(out: Path, settings: Settings, progress: Progress | None) -> Iterator[RunContext]:
+    """A run with its workers, which end with it."""
+    plugins = load_plugins()
+    plugins.estimator(settings.epipolar.estimator)  # unknown names are refused before any work is done
+    plugins.calibrator(settings.calibration.calibrator)
+    workers = worker_count(settings.workers)
+    with make_executor(workers) as executor:
+        yield RunContext(settings, Workspace(out), plugins, executor, workers, progress or Silent())

@@ -1,0 +1,155 @@
+"""What a person sees: progress on stderr, results on stdout."""
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import Progress as Bars
+
+from sfm_app.api import Run
+from sfm_app.types import Calibration, Intrinsics
+
+STAGE_TITLES = {
+    "photos": "reading photos",
+    "match_graph": "finding and matching features",
+    "view_graph": "fundamental matrices",
+    "intrinsics": "camera matrix",
+    "scene": "camera poses and points",
+    "depth_maps": "depth maps",
+    "mesh": "surface",
+    "files": "files",
+}
+
+
+class Terminal:
+    """Progress on stderr: bars on a terminal, one line per stage otherwise, nothing when quiet."""
+
+    def __init__(self, *, quiet: bool) -> None:
+        self.console = Console(stderr=True, quiet=quiet, highlight=False)
+        self.bars = Bars(
+            TextColumn("  {task.description:18}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn(),
+            console=self.console, transient=True, disable=quiet or not self.console.is_terminal,
+        )  # fmt: skip
+        self.task: TaskID | None = None
+
+    def stage(self, name: str, note: str = "") -> None:
+        self.console.print(f"{STAGE_TITLES.get(name, name)}{f' [dim]({escape(note)})[/dim]' if note else ''}")
+
+    def start(self, label: str, total: int) -> None:
+        self.task = self.bars.add_task(escape(label), total=total)
+        self.bars.start()
+
+    def advance(self, steps: int = 1) -> None:
+        if self.task is not None:
+            self.bars.advance(self.task, steps)
+
+    def finish(self) -> None:
+        if self.task is not None:
+            self.bars.stop()
+            self.bars.remove_task(self.task)
+            self.task = None
+
+
+def print_json(value: Any) -> None:
+    """One JSON document on stdout."""
+    sys.stdout.write(json.dumps(value, indent=1) + "\n")
+
+
+def print_lines(lines: list[str]) -> None:
+    """Lines on stdout."""
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+def run_summary(run: Run) -> dict[str, Any]:
+    """The figures of a run, plain, for --json."""
+    stages = run.manifest.get("stages", {})
+    counts = {name: stage["counts"] for name, stage in stages.items()}
+    photos = counts.get("photos", {})
+    summary: dict[str, Any] = {
+        "out": str(run.out),
+        "photos": {"usable": photos.get("usable"), "unusable": photos.get("unusable", {})},
+        "pairs": {key: counts.get("view_graph", {}).get(key) for key in ("kept", "rejected")},
+        "calibration": intrinsics_summary(run.calibration) if run.calibration else None,
+        "seconds": {name: stage["seconds"] for name, stage in stages.items()},
+    }
+    if run.scene:
+        summary["scene"] = {
+            "registered": len(run.scene.registered),
+            "of": len(run.scene.registered) + len(run.scene.unregistered),
+            "unregistered": dict(run.scene.unregistered),
+            "points": run.scene.points,
+            "mean_reprojection_px": round(run.scene.mean_reprojection_px, 3),
+            "cameras": {
+                name: {"K": camera.K.round(3).tolist(), "model": camera.model, "params": list(camera.params)}
+                for name, camera in run.scene.cameras.items()
+            },
+        }
+    if run.mesh_path:
+        summary["mesh"] = {"triangles": counts["mesh"].get("triangles"), "files": [str(p) for p in model_files(run)]}
+    return summary
+
+
+def run_lines(run: Run) -> list[str]:
+    """The figures of a run, for people."""
+    summary = run_summary(run)
+    lines = [f"photos      {summary['photos']['usable']} usable"]
+    lines += [f"            left out: {name}: {reason}" for name, reason in summary["photos"]["unusable"].items()]
+    if summary["pairs"]["kept"] is not None:
+        rejected = ", ".join(f"{count} {reason}" for reason, count in summary["pairs"]["rejected"].items())
+        lines.append(f"pairs       {summary['pairs']['kept']} show the same scene" + (f"; rejected: {rejected}" if rejected else ""))
+    if run.calibration:
+        lines += intrinsics_lines(run.calibration)
+    if run.scene:
+        scene = summary["scene"]
+        lines.append(
+            f"scene       {scene['registered']} of {scene['of']} photos placed, {scene['points']} points, "
+            f"mean reprojection error {scene['mean_reprojection_px']} px"
+        )
+        lines += [f"            no place for {name}: {reason}" for name, reason in scene["unregistered"].items()]
+        lines += [f"            camera refined: {_k_text(camera.K)}" for camera in run.scene.cameras.values()]
+    if run.mesh_path:
+        lines.append(f"mesh        {summary['mesh']['triangles']} triangles")
+        lines += [f"            {path}" for path in summary["mesh"]["files"]]
+    seconds = summary["seconds"]
+    lines.append("seconds     " + ", ".join(f"{name} {value:.1f}" for name, value in seconds.items()) + f"; all {sum(seconds.values()):.1f}")
+    return lines
+
+
+def intrinsics_summary(intrinsics: Intrinsics) -> dict[str, Any]:
+    """Calibrations, plain, for --json."""
+    return {name: camera.to_dict() for name, camera in intrinsics.cameras.items()}
+
+
+def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
+    """Calibrations, for people."""
+    many = len(intrinsics.cameras) > 1
+    lines = []
+    for name, camera in intrinsics.cameras.items():
+        lines.append(f"camera      {f'{name}: ' if many else ''}{_k_text(camera.K)}{_spread_text(camera)}")
+        if not camera.identifiable:
+            source = {"exif": "EXIF's claim", "guess": "a guess"}.get(camera.method, camera.method)
+            lines.append(f"            these photos do not determine it ({camera.reason}): {source}")
+    return lines
+
+
+def model_files(run: Run) -> list[Path]:
+    """The mesh in all its formats."""
+    return sorted(run.out.glob("model.*"))
+
+
+def table(rows: Mapping[str, str], width: int = 24) -> list[str]:
+    """Two columns."""
+    return [f"{name:{width}} {text}" for name, text in rows.items()]
+
+
+def _k_text(K: Any) -> str:
+    return f"fx {K[0, 0]:.1f}  fy {K[1, 1]:.1f}  cx {K[0, 2]:.1f}  cy {K[1, 2]:.1f} px"
+
+
+def _spread_text(camera: Calibration) -> str:
+    return "  (+- " + ", ".join(f"{name} {value:.1f}" for name, value in camera.spread.items()) + ")" if camera.spread else ""

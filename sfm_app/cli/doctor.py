@@ -1,0 +1,53 @@
+"""What this machine has and lacks."""
+
+import platform
+import shutil
+from pathlib import Path
+
+from sfm_app.colmap.backend import has_cuda
+from sfm_app.errors import SfmError
+from sfm_app.meshing.open3d import load_open3d
+from sfm_app.parallel import worker_count
+from sfm_app.pipeline import versions
+from sfm_app.plugins import load_plugins
+
+GIGABYTE = 2**30
+ENOUGH_DISK = 2 * GIGABYTE
+
+
+def examine() -> dict[str, str]:
+    """One line per thing looked at."""
+    disk = shutil.disk_usage(Path.cwd()).free
+    return {
+        "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
+        "cores": str(worker_count(0)),
+        "memory": _memory(),
+        "free disk here": f"{disk / GIGABYTE:.0f} GB" + ("" if disk > ENOUGH_DISK else ": little; dense stereo needs about 2 GB"),
+        **versions(),
+        "COLMAP with CUDA": "yes" if has_cuda() else "no: depth maps are made on the CPU",
+        "ray casting (Open3D)": _open3d(),
+        "plug-ins": _plugins(),
+    }
+
+
+def _memory() -> str:
+    try:
+        lines = dict(line.split(":") for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines())
+        return f"{int(lines['MemAvailable'].split()[0]) / 2**20:.0f} GB free"
+    except (OSError, KeyError, ValueError):
+        return "unknown on this system"
+
+
+def _open3d() -> str:
+    try:
+        return f"works, {load_open3d().__version__}"
+    except (ImportError, OSError) as err:
+        return f"does not load: {err}"
+
+
+def _plugins() -> str:
+    try:
+        found = load_plugins()
+    except SfmError as err:
+        return f"broken: {err}"
+    return f"{len(found.estimators)} estimators, {len(found.calibrators)} calibrators, {len(found.exporters)} formats"

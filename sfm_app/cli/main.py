@@ -1,0 +1,125 @@
+"""The commands."""
+
+import logging
+import sys
+import traceback
+from pathlib import Path
+from typing import Any
+
+import click
+
+from sfm_app import __version__
+from sfm_app.api import calibrate_photos, reconstruct
+from sfm_app.cli.display import (
+    Terminal,
+    intrinsics_lines,
+    intrinsics_summary,
+    print_json,
+    print_lines,
+    run_lines,
+    run_summary,
+    table,
+)
+from sfm_app.cli.doctor import examine
+from sfm_app.cli.options import output_options, settings_from, settings_options
+from sfm_app.demo import demo_lines, run_demo
+from sfm_app.errors import SfmError
+from sfm_app.pipeline import NAMES
+from sfm_app.plugins import load_plugins
+
+INTERRUPTED = 130
+
+
+class Commands(click.Group):
+    """Turns errors into one line and an exit code, in one place."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except SfmError as err:
+            fail(str(err), err.hint, err.exit_code)
+        except KeyboardInterrupt:
+            fail("interrupted", "the same command continues where this one stopped", INTERRUPTED)
+        except (click.ClickException, click.exceptions.Exit, click.Abort):
+            raise
+        except Exception as err:  # a bug: the user gets one line, the traceback goes where a report can take it from
+            logging.getLogger("sfm_app").debug("%s", traceback.format_exc())
+            fail(f"unexpected {type(err).__name__}: {err}", "this is a bug; log.txt in the output folder has the details", 1)
+
+
+def fail(message: str, hint: str, code: int) -> None:
+    """Say what went wrong and what to do about it, and end."""
+    click.echo(f"error: {message}" + (f"\nhint: {hint}" if hint else ""), err=True)
+    sys.exit(code)
+
+
+@click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="sfm-app")
+def main() -> None:
+    """Turn a folder of photos about which nothing is known into a 3D model."""
+
+
+@main.command()
+@click.argument("photos", type=click.Path(path_type=Path))
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="Output folder.  [default: PHOTOS-model beside PHOTOS]")
+@click.option("--from", "first", type=click.Choice(NAMES), default=None, help="Do everything from this stage on again.")
+@click.option("--until", "last", type=click.Choice(NAMES), default="files", help="Stop after this stage.")
+@settings_options
+@output_options
+def run(photos: Path, out: Path | None, first: str | None, last: str, as_json: bool, quiet: bool, **flags: Any) -> None:
+    """Reconstruct PHOTOS: camera, poses and a mesh as OUT/model.ply and OUT/model.glb.
+
+    What lies in OUT and is up to date is not done again: an interrupted run goes on where it stopped.
+    """
+    settings = settings_from(flags)
+    out = out or photos.resolve().with_name(f"{photos.resolve().name}-model")
+    done = reconstruct(photos, out, settings, first=first or "", last=last, progress=Terminal(quiet=quiet))
+    print_json(run_summary(done)) if as_json else print_lines(run_lines(done))
+
+
+@main.command()
+@click.argument("photos", type=click.Path(path_type=Path))
+@click.option("-o", "--out", type=click.Path(path_type=Path), help="Keep features and matches in this folder.")
+@settings_options
+@output_options
+def calibrate(photos: Path, out: Path | None, as_json: bool, quiet: bool, **flags: Any) -> None:
+    """Find the camera matrix of PHOTOS, without reconstructing the scene."""
+    found = calibrate_photos(photos, settings_from(flags), out=out, progress=Terminal(quiet=quiet))
+    print_json(intrinsics_summary(found)) if as_json else print_lines(intrinsics_lines(found))
+
+
+@main.command()
+@click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Where.")
+@settings_options
+@output_options
+def demo(out: Path, as_json: bool, quiet: bool, **flags: Any) -> None:
+    """Render photos of a known scene, reconstruct them and say how close it came."""
+    result = run_demo(out, settings_from(flags), Terminal(quiet=quiet))
+    print_json(result.to_dict()) if as_json else print_lines(demo_lines(result))
+
+
+@main.command()
+@output_options
+def doctor(as_json: bool, quiet: bool) -> None:
+    """Say what this machine has and lacks."""
+    found = examine()
+    print_json(found) if as_json else print_lines(table(found))
+
+
+@main.command()
+@settings_options
+def config(**flags: Any) -> None:
+    """Print all settings as TOML, with what the other options change."""
+    print_lines([settings_from(flags).to_toml().rstrip()])
+
+
+@main.command()
+def plugins() -> None:
+    """List estimators, calibrators and file formats."""
+    found = load_plugins()
+    for title, parts in (
+        ("estimators", found.estimators),
+        ("calibrators", found.calibrators),
+        ("exporters", found.exporters),
+    ):
+        print_lines([f"{title}:", *(f"  {line}" for line in table({p.name: p.summary for p in parts.values()}))])

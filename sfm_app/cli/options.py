@@ -1,0 +1,64 @@
+"""Options that several commands share, and how they become settings."""
+
+import tomllib
+from collections.abc import Callable, Mapping
+from functools import reduce
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import click
+
+from sfm_app.colmap.backend import show_log
+from sfm_app.errors import ConfigError
+from sfm_app.settings import Quality, Settings, merged
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+def settings_options(command: Command) -> Command:
+    """--config, --seed, --workers, --quality, --estimator, --calibrator, --set, -v."""
+    options = (
+        click.option("--config", type=click.Path(path_type=Path), help="Settings file (TOML); `sfm-app config` prints one."),
+        click.option("--seed", type=int, help="Same seed, same result.  [default: 0]"),
+        click.option("--workers", type=int, help="Parallel workers.  [default: one per core]"),
+        click.option("--quality", type=click.Choice(get_args(Quality)), help="Preset of sizes.  [default: normal]"),
+        click.option("--estimator", help="Estimator of fundamental matrices.  [default: lev-ransac]"),
+        click.option("--calibrator", help="Calibrator.  [default: zero-curves]"),
+        click.option("--set", "assignments", multiple=True, metavar="TABLE.KEY=VALUE", help="Any other setting."),
+        click.option("-v", "--verbose", count=True, help="Show what COLMAP says; -vv shows all of it."),
+    )
+    return reduce(lambda wrapped, option: option(wrapped), reversed(options), command)
+
+
+def output_options(command: Command) -> Command:
+    """--json and -q."""
+    command = click.option("-q", "--quiet", is_flag=True, help="No progress.")(command)
+    return click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")(command)
+
+
+def settings_from(flags: Mapping[str, Any]) -> Settings:
+    """Settings from the shared options; flags win over the file."""
+    show_log(flags["verbose"])
+    overrides: dict[str, Any] = {key: flags[key] for key in ("seed", "workers", "quality") if flags[key] is not None}
+    for key, table in (("estimator", "epipolar"), ("calibrator", "calibration")):
+        if flags[key] is not None:
+            overrides = merged(overrides, {table: {key: flags[key]}})
+    for assignment in flags["assignments"]:
+        overrides = merged(overrides, _assigned(assignment))
+    if flags["config"] is not None:
+        return Settings.from_toml(flags["config"], overrides)
+    return Settings.from_mapping(overrides, where="command line")
+
+
+def _assigned(text: str) -> dict[str, Any]:
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise ConfigError(f"--set {text}: no '=' in it", hint="write --set depth.neighbours=6")
+    try:
+        return tomllib.loads(f"{name}={value}")
+    except tomllib.TOMLDecodeError:
+        pass
+    try:
+        return tomllib.loads(f'{name}="{value}"')  # a word without quotes
+    except tomllib.TOMLDecodeError as err:
+        raise ConfigError(f"--set {text}: not TOML: {err}", hint="write --set depth.neighbours=6") from None

@@ -1,0 +1,84 @@
+"""COLMAP's sparse model: built from our two-view seed, turned upright, and read for the summary."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.database import opened
+from sfm_app.geometry.seed import TwoViewSeed
+from sfm_app.types import CameraModel, PairId, Scene
+
+
+def model_from_seed(database: Path, pair: PairId, matches: NDArray[np.uint32], seed: TwoViewSeed) -> Any:
+    """A reconstruction of two photos with our pose and our points.
+
+    Args:
+        database: holds photos, keypoints and two-view geometries.
+        pair: ids of the two photos.
+        matches: (N, 2) keypoint indices, one row per point of the seed.
+        seed: pose and points; only its usable points enter.
+    """
+    with opened(database) as db:
+        cache = pycolmap.DatabaseCache.create(db, pycolmap.DatabaseCacheOptions())
+    model = pycolmap.Reconstruction()
+    model.load(cache)
+    for image_id, R, t in ((pair[0], np.eye(3), np.zeros(3)), (pair[1], seed.R, seed.t)):
+        image = model.images[image_id]
+        frame = model.frames[image.frame_id]
+        frame.set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
+        model.register_frame(frame.frame_id)
+    for index in np.flatnonzero(seed.usable):
+        track = pycolmap.Track()
+        track.add_element(pair[0], int(matches[index, 0]))
+        track.add_element(pair[1], int(matches[index, 1]))
+        model.add_point3D(seed.points[index], track, np.zeros(3, np.uint8))
+    return model
+
+
+def turn_upright(model: Any) -> None:
+    """Put the model into the frame that glTF viewers expect: y up, seen from +z, centred, of size about 1.
+
+    Photographers hold cameras level on average, so up is the mean of the photos' up directions.
+    """
+    poses = [image.cam_from_world().matrix()[:, :3] for image in model.images.values() if image.has_pose]
+    up = _unit(-np.mean([R[1] for R in poses], axis=0), np.array([0.0, -1.0, 0.0]))
+    forward = np.mean([R[2] for R in poses], axis=0)
+    sideways = forward - (forward @ up) * up
+    towards = _unit(-sideways, np.cross(up, [1.0, 0.0, 0.0]) + np.cross(up, [0.0, 0.0, 1.0]) * 1e-3)
+    turn = np.stack([np.cross(up, towards), up, towards])
+    points = np.array([point.xyz for point in model.points3D.values()])
+    centre = np.median(points, axis=0)
+    scale = 1.0 / max(float(np.percentile(np.linalg.norm(points - centre, axis=1), 80)), 1e-12)
+    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(turn), -scale * turn @ centre))
+
+
+def read_scene(model_dir: Path, groups: Mapping[str, str], unregistered: Mapping[str, str]) -> Scene:
+    """What the rest of the program needs to know about a model on disk; `groups` gives the camera group by photo."""
+    model = pycolmap.Reconstruction(model_dir)
+    posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.image_id)
+    cameras = {groups[image.name]: _camera(model.cameras[image.camera_id]) for image in posed}
+    return Scene(
+        model_dir=model_dir,
+        registered=tuple(image.name for image in posed),
+        unregistered=dict(unregistered),
+        cameras=cameras,
+        points=model.num_points3D(),
+        observations=model.compute_num_observations(),
+        mean_reprojection_px=float(model.compute_mean_reprojection_error()),
+    )
+
+
+def _camera(camera: Any) -> CameraModel:
+    K = np.asarray(camera.calibration_matrix(), np.float64)
+    params = tuple(float(value) for value in camera.params)
+    return CameraModel(camera.model.name, params, K, camera.width, camera.height)
+
+
+def _unit(vector: NDArray[np.float64], otherwise: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The vector with length 1; where it vanishes (photos from all sides), the other one."""
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 1e-3 else otherwise / np.linalg.norm(otherwise)

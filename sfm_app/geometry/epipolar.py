@@ -1,0 +1,160 @@
+"""The epipolar geometry of two views: distances, the 8-point algorithm, and what follows from F.
+
+``x2' F x1 = 0`` throughout. Points are (N, 2) pixels. Hartley and Zisserman, Multiple View Geometry, 2nd edition (HZ);
+thesis section 4.2.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+
+def homogeneous(x: ArrayLike) -> FloatArray:
+    """(N, 2) points as (N, 3) with a last coordinate of 1; ValueError for any other shape."""
+    points = np.asarray(x, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ValueError(f"points must have shape (N, 2), got {points.shape}")
+    return np.column_stack([points, np.ones(len(points))])
+
+
+def sampson_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
+    """First-order distance of each match to the epipolar constraint (HZ 11.9 and thesis 4.2, before squaring)::
+
+        |x2' F x1| / sqrt((F x1)_1^2 + (F x1)_2^2 + (F' x2)_1^2 + (F' x2)_2^2)
+
+    Args:
+        F: (3, 3), any scale.
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
+
+    Returns:
+        (N,) distances in pixels, >= 0; inf where both epipolar lines vanish.
+
+    Raises:
+        ValueError: the shapes are not as above.
+    """
+    algebraic, line1, line2 = _constraint(F, x1, x2)
+    squared = (line1[:, :2] ** 2).sum(axis=1) + (line2[:, :2] ** 2).sum(axis=1)
+    return _ratio(np.abs(algebraic), np.sqrt(squared))
+
+
+def symmetric_epipolar_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
+    """Root mean square of a match's distances to its two epipolar lines (HZ 11.10).
+
+    Args and errors as in `sampson_distance`.
+
+    Returns:
+        (N,) distances in pixels, >= 0; inf where an epipolar line vanishes.
+    """
+    algebraic, line1, line2 = _constraint(F, x1, x2)
+    to1 = _ratio(np.abs(algebraic), np.hypot(line1[:, 0], line1[:, 1]))
+    to2 = _ratio(np.abs(algebraic), np.hypot(line2[:, 0], line2[:, 1]))
+    return np.sqrt((to1**2 + to2**2) / 2)
+
+
+def hartley_normalisation(x: ArrayLike) -> FloatArray:
+    """The (3, 3) similarity that puts the centroid at 0 and the mean distance from it at sqrt(2).
+
+    Raises:
+        ValueError: no points, or all of them coincide.
+    """
+    points = homogeneous(x)[:, :2]
+    if not len(points):
+        raise ValueError("no points to normalise")
+    centre = points.mean(axis=0)
+    spread = float(np.hypot(*(points - centre).T).mean())
+    if not spread > 1e-9 * max(1.0, float(np.abs(centre).max())):
+        raise ValueError("all points coincide")
+    scale = np.sqrt(2) / spread
+    return np.array([[scale, 0, -scale * centre[0]], [0, scale, -scale * centre[1]], [0, 0, 1]])
+
+
+def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) -> FloatArray:
+    """Normalised 8-point algorithm (thesis 4.3.2): algebraic least squares, then the nearest matrix of rank 2.
+
+    Args:
+        x1: (N, 2) pixels, N >= 8.
+        x2: (N, 2) pixels, the partners.
+        weights: (N,) >= 0, how much each squared algebraic error counts; all 1 when left out.
+
+    Returns:
+        (3, 3), rank 2, Frobenius norm 1. With matches that do not determine F (all on one plane), one of the solutions.
+
+    Raises:
+        ValueError: wrong shapes, fewer than 8 matches, or all points of a view coincide.
+    """
+    h1, h2 = _pair(x1, x2)
+    if len(h1) < 8:
+        raise ValueError(f"the 8-point algorithm needs 8 matches, got {len(h1)}")
+    T1, T2 = hartley_normalisation(h1[:, :2]), hartley_normalisation(h2[:, :2])
+    h1, h2 = h1 @ T1.T, h2 @ T2.T
+    design = (h2[:, :, None] * h1[:, None, :]).reshape(-1, 9)
+    if weights is not None:
+        design *= np.sqrt(np.asarray(weights, dtype=np.float64))[:, None]
+    F = np.linalg.svd(design, full_matrices=True)[2][8].reshape(3, 3)
+    return unit_norm(T2.T @ nearest_rank_two(F) @ T1)
+
+
+def nearest_rank_two(F: ArrayLike) -> FloatArray:
+    """The matrix of rank 2 that is nearest to F in the Frobenius norm (thesis 4.2)."""
+    U, s, Vt = np.linalg.svd(np.asarray(F, dtype=np.float64))
+    rank_two: FloatArray = (U[:, :2] * s[:2]) @ Vt[:2]
+    return rank_two
+
+
+def unit_norm(F: ArrayLike) -> FloatArray:
+    """F with Frobenius norm 1 and its entry of largest magnitude positive.
+
+    Raises:
+        ValueError: F is zero or not finite.
+    """
+    matrix = np.asarray(F, dtype=np.float64)
+    norm = float(np.linalg.norm(matrix))
+    if not (np.isfinite(norm) and norm > 0):
+        raise ValueError("F is zero or not finite")
+    largest = matrix.flat[int(np.argmax(np.abs(matrix)))]
+    return matrix / (norm if largest > 0 else -norm)
+
+
+def epipoles(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Homogeneous unit vectors e1, e2 with F e1 = 0 and F' e2 = 0: each camera centre seen by the other."""
+    U, _, Vt = np.linalg.svd(np.asarray(F, dtype=np.float64))
+    return Vt[2], U[:, 2]
+
+
+def cross_matrix(v: ArrayLike) -> FloatArray:
+    """The (3, 3) matrix [v]x with [v]x w = v x w."""
+    a, b, c = np.asarray(v, dtype=np.float64)
+    return np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
+
+
+def fundamental_from_pose(K1: ArrayLike, K2: ArrayLike, R: ArrayLike, t: ArrayLike) -> FloatArray:
+    """F of two cameras with x1 ~ K1 X and x2 ~ K2 (R X + t) (HZ 9.12), Frobenius norm 1.
+
+    Raises:
+        ValueError: t is zero: without a baseline there is no epipolar geometry.
+    """
+    K1, K2, R = (np.asarray(m, dtype=np.float64) for m in (K1, K2, R))
+    return unit_norm(np.linalg.inv(K2).T @ cross_matrix(t) @ R @ np.linalg.inv(K1))
+
+
+def _pair(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    h1, h2 = homogeneous(x1), homogeneous(x2)
+    if len(h1) != len(h2):
+        raise ValueError(f"x1 and x2 must pair up, got {len(h1)} and {len(h2)} points")
+    return h1, h2
+
+
+def _constraint(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Algebraic error x2' F x1 and the epipolar lines in view 1 and view 2."""
+    matrix = np.asarray(F, dtype=np.float64)
+    if matrix.shape != (3, 3):
+        raise ValueError(f"F must have shape (3, 3), got {matrix.shape}")
+    h1, h2 = _pair(x1, x2)
+    line1, line2 = h2 @ matrix, h1 @ matrix.T
+    return (h2 * line2).sum(axis=1), line1, line2
+
+
+def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
+    return np.divide(above, below, out=np.full(len(above), np.inf), where=below > 0)

@@ -1,0 +1,61 @@
+"""Two-view reconstructions that a mapping can start from."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.essential import essential_from_fundamental, relative_pose
+from sfm_app.geometry.triangulation import triangulation_angle_deg
+
+Array = NDArray[np.float64]
+
+GOOD_ANGLE_DEG = 12.0
+"""From here on a wider angle no longer makes a better seed: depth is well determined, and matches get rarer."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TwoViewSeed:
+    """Pose of view 2 from view 1, and the points both see, in the frame of view 1 (baseline 1)."""
+
+    R: Array
+    t: Array
+    points: Array
+    """(N, 3), one per inlier, in the order given."""
+    usable: NDArray[np.bool_]
+    """(N,) before both cameras, and seen under an angle that fixes its depth."""
+    angle_deg: float
+    """Median triangulation angle of the points before both cameras."""
+    in_front: float
+    """Share of the inliers that lie before both cameras, 0 to 1."""
+
+    @property
+    def score(self) -> float:
+        """What makes a good start: many points, under a wide angle, all on the right side.
+
+        Wrong poses put points behind a camera, so that share counts strongly.
+        """
+        return float(np.count_nonzero(self.usable) * min(self.angle_deg / GOOD_ANGLE_DEG, 1.0) * self.in_front**4)
+
+
+def two_view_seed(F: Array, K1: Array, K2: Array, x1: Array, x2: Array) -> TwoViewSeed:
+    """Decompose F with known camera matrices and triangulate all its inliers.
+
+    Args:
+        F: (3, 3) fundamental matrix, x2' F x1 = 0.
+        K1: (3, 3) camera matrix of view 1.
+        K2: (3, 3) camera matrix of view 2.
+        x1: (N, 2) inliers in pixels.
+        x2: (N, 2) partners.
+    """
+    E = essential_from_fundamental(F, K1, K2)
+    R, t, X, in_front = relative_pose(E, _normalised(K1, x1), _normalised(K2, x2))
+    angles = triangulation_angle_deg(X, np.zeros(3), -R.T @ t)
+    angle = float(np.median(angles[in_front])) if in_front.any() else 0.0
+    usable = in_front & (angles > min(1.0, angle / 4))
+    return TwoViewSeed(R, t, X, usable, angle, float(in_front.mean()) if len(x1) else 0.0)
+
+
+def _normalised(K: Array, x: Array) -> Array:
+    result: Array = np.linalg.solve(K, np.column_stack([x, np.ones(len(x))]).T).T[:, :2]
+    return result

@@ -1,0 +1,195 @@
+"""The stages in order: the program's table of contents, and the loop that runs them."""
+
+import hashlib
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from sfm_app.colmap.backend import versions as colmap_versions
+from sfm_app.context import RunContext
+from sfm_app.errors import ConfigError, SfmError
+from sfm_app.parallel import ordered_map
+from sfm_app.stages.depth_maps import make_depth_maps
+from sfm_app.stages.files import load_files, write_files
+from sfm_app.stages.intrinsics import calibrate, load_intrinsics
+from sfm_app.stages.match_graph import load_match_graph, match_photos
+from sfm_app.stages.mesh import load_surface, make_mesh
+from sfm_app.stages.photos import list_files, load_photo_set, read_photos
+from sfm_app.stages.scene import load_scene, reconstruct_scene
+from sfm_app.stages.view_graph import build_view_graph, load_view_graph
+from sfm_app.workspace import StageRecord, fingerprint
+
+logger = logging.getLogger("sfm_app")
+
+Products = Callable[[str], Any]
+"""Gives the product of an earlier stage by its name, loading it when that stage was skipped."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One step from photos to mesh."""
+
+    name: str
+    takes: tuple[str, ...]
+    """Stages whose products it needs."""
+    settings: tuple[str, ...]
+    """Tables of the settings that its result depends on."""
+    files: tuple[str, ...]
+    """What it leaves in the output folder."""
+    make: Callable[[Products, RunContext], Any]
+    load: Callable[[Products, RunContext], Any]
+
+
+STAGES = (
+    Stage(
+        "photos", (), ("photos",), ("photos.json", "photos"),
+        make=lambda products, run: read_photos(products("folder"), run),
+        load=lambda products, run: load_photo_set(run),
+    ),
+    Stage(
+        "match_graph", ("photos",), ("matching",), ("database.db",),
+        make=lambda products, run: match_photos(products("photos"), run),
+        load=lambda products, run: load_match_graph(products("photos"), run),
+    ),
+    Stage(
+        "view_graph", ("match_graph",), ("epipolar", "seed"), ("view_graph.npz",),
+        make=lambda products, run: build_view_graph(products("match_graph"), run),
+        load=lambda products, run: load_view_graph(run),
+    ),
+    Stage(
+        "intrinsics", ("match_graph", "view_graph"), ("calibration", "seed"), ("calibration.json",),
+        make=lambda products, run: calibrate(products("match_graph"), products("view_graph"), run),
+        load=lambda products, run: load_intrinsics(run),
+    ),
+    Stage(
+        "scene", ("photos", "match_graph", "view_graph", "intrinsics"), ("scene", "seed"), ("sparse",),
+        make=lambda products, run: reconstruct_scene(
+            products("match_graph"), products("view_graph"), products("intrinsics"), run
+        ),
+        load=lambda products, run: load_scene(products("photos"), run),
+    ),
+    Stage(
+        "depth_maps", ("scene",), ("depth",), ("dense",),
+        make=lambda products, run: make_depth_maps(
+            products("scene"), run.workspace.photos, run.workspace.dense, run.settings.depth, run
+        ),
+        load=lambda products, run: run.workspace.dense,
+    ),
+    Stage(
+        "mesh", ("depth_maps",), ("mesh",), ("dense/surface.npz",),
+        make=lambda products, run: make_mesh(products("depth_maps"), run.settings.mesh, run),
+        load=lambda products, run: load_surface(run.workspace.dense),
+    ),
+    Stage(
+        "files", ("mesh",), (), ("model.ply", "model.glb"),
+        make=lambda products, run: write_files(products("mesh"), run),
+        load=lambda products, run: load_files(run),
+    ),
+)  # fmt: skip
+
+NAMES = tuple(stage.name for stage in STAGES)
+
+
+def run_stages(folder: Path, run: RunContext, first: str = "", last: str = "files") -> Products:
+    """Run what is not up to date, up to stage `last`; everything from stage `first` on is done again.
+
+    Raises:
+        SfmError: see errors.py; what was finished before stays valid.
+    """
+    for name in filter(None, (first, last)):
+        if name not in NAMES:
+            raise ConfigError(f"no stage is named '{name}'", hint=f"stages: {', '.join(NAMES)}")
+    found: dict[str, Any] = {"folder": folder}
+    prints: dict[str, str] = {"folder": folder_fingerprint(folder, run)}
+    run.workspace.create()
+    redo = False
+
+    def products(name: str) -> Any:
+        if name not in found:
+            stage = STAGES[NAMES.index(name)]
+            found[name] = stage.load(products, run)
+        return found[name]
+
+    with logged(run):
+        for stage in STAGES[: NAMES.index(last) + 1]:
+            prints[stage.name] = stage_fingerprint(stage, prints, run)
+            redo = redo or stage.name == first or not run.workspace.is_current(stage.name, prints[stage.name])
+            if not redo:
+                run.progress.stage(stage.name, "up to date")
+                continue
+            run.workspace.forget(NAMES[NAMES.index(stage.name) :])
+            found[stage.name] = make(stage, products, prints[stage.name], run)
+    return products
+
+
+def make(stage: Stage, products: Products, print_of_inputs: str, run: RunContext) -> Any:
+    """Run one stage and enter it in the manifest."""
+    run.progress.stage(stage.name)
+    run.counts = {}
+    start = time.perf_counter()
+    try:
+        product = stage.make(products, run)
+    except SfmError as err:
+        logger.info("%s stopped: %s; counted so far: %s", stage.name, err, run.counts)
+        raise
+    seconds = round(time.perf_counter() - start, 2)
+    record = StageRecord(print_of_inputs, seconds, run.counts, run.workspace.sizes(stage.files))
+    run.workspace.finish(stage.name, record, manifest_head(run))
+    logger.info("%s took %.2f s", stage.name, seconds)
+    return product
+
+
+def folder_fingerprint(folder: Path, run: RunContext) -> str:
+    """Hash of the names and bytes of all files in the photo folder."""
+    names = list_files(folder, exclude=run.workspace.root)
+
+    def digest(name: str) -> str:
+        try:
+            with (folder / name).open("rb") as file:
+                return hashlib.file_digest(file, "blake2b").hexdigest()
+        except OSError:
+            return "unreadable"
+
+    return fingerprint(
+        str(folder.resolve()), names, list(ordered_map(run.executor, digest, names, ahead=4 * run.workers))
+    )
+
+
+def stage_fingerprint(stage: Stage, prints: Mapping[str, str], run: RunContext) -> str:
+    """Hash of everything that a stage's result depends on: its inputs, its settings, the versions."""
+    settings = run.settings.model_dump()
+    inputs = [prints[name] for name in stage.takes or ("folder",)]
+    return fingerprint(stage.name, versions(), {name: settings[name] for name in stage.settings}, inputs)
+
+
+def manifest_head(run: RunContext) -> dict[str, Any]:
+    """What the manifest says besides the stages."""
+    return {"program": "sfm-app", "versions": versions(), "settings": run.settings.model_dump()}
+
+
+def versions() -> dict[str, str]:
+    """Versions of what computes the result."""
+    parts = ("sfm-app", "numpy", "numba", "opencv-contrib-python-headless", "open3d")
+    return {name: version(name) for name in parts} | colmap_versions()
+
+
+@contextmanager
+def logged(run: RunContext) -> Iterator[None]:
+    """Keep a log in the output folder, with the traceback of whatever ends the run."""
+    handler = logging.FileHandler(run.workspace.log, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    except BaseException:
+        logger.exception("the run ended here")
+        raise
+    finally:
+        logger.removeHandler(handler)
+        handler.close()

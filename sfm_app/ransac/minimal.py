@@ -1,0 +1,138 @@
+"""Fundamental matrices through seven matches (thesis 4.3.1; Hartley and Zisserman, section 11.1.2)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.ransac.sampling import SAMPLE_SIZE
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MOST_MODELS = 3
+_RANK_TOLERANCE = 1e-9
+
+
+@kernel
+def seven_point(points: FloatArray, sample: IntArray, models: FloatArray) -> int:
+    """All real F with det F = 0 through seven matches.
+
+    The seven constraints leave F = A + z B; det(A + z B) = 0 is a cubic in z with one or three real roots.
+
+    Args:
+        points: (N, 4) x1, y1, x2, y2, of magnitude about 1.
+        sample: (7,) rows of `points`.
+        models: (3, 9) filled with the solutions, row by row, each of norm 1.
+
+    Returns:
+        How many solutions there are, 0 to 3; 0 where the constraints depend on each other (repeated or coplanar points).
+    """
+    basis = np.empty((2, 9))
+    if not _null_space(points, sample, basis):
+        return 0
+    a, b = basis[0], basis[1]
+    c0, c1, c2, c3 = _det(a), _mixed_det(a, b), _mixed_det(b, a), _det(b)
+    if abs(c3) < abs(c0):  # the larger end leads, so that no root runs off to infinity
+        a, b = b, a
+        c0, c1, c2, c3 = c3, c2, c1, c0
+    roots = np.empty(3)
+    count = real_cubic_roots(c0, c1, c2, c3, roots)
+    for k in range(count):
+        z = roots[k]
+        norm = np.sqrt(1.0 + z * z)  # a and b are orthonormal
+        for j in range(9):
+            models[k, j] = (a[j] + z * b[j]) / norm
+    return count
+
+
+@kernel
+def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArray) -> int:
+    """Real roots of c0 + c1 z + c2 z^2 + c3 z^3 into `roots` (3,); 1 or 3 of them, or 0 if c3 is 0."""
+    if c3 == 0.0:
+        return 0
+    a, b, c = c2 / c3, c1 / c3, c0 / c3
+    p, q = b - a * a / 3.0, (2.0 * a * a / 27.0 - b / 3.0) * a + c  # t^3 + p t + q = 0 with z = t - a / 3
+    discriminant = q * q / 4.0 + p * p * p / 27.0
+    count = 1
+    if discriminant < 0.0:
+        radius = 2.0 * np.sqrt(-p / 3.0)
+        angle = np.arccos(min(1.0, max(-1.0, 3.0 * q / (p * radius)))) / 3.0
+        for k in range(3):
+            roots[k] = radius * np.cos(angle - 2.0 * np.pi * k / 3.0) - a / 3.0
+        count = 3
+    else:
+        # of the two equivalent cube roots, the one without cancellation
+        u = np.cbrt(-q / 2.0 - np.sqrt(discriminant)) if q > 0.0 else np.cbrt(-q / 2.0 + np.sqrt(discriminant))
+        roots[0] = u - p / (3.0 * u) - a / 3.0 if u != 0.0 else -a / 3.0
+    for k in range(count):  # Newton takes off the rounding of the closed form
+        for _ in range(2):
+            z = roots[k]
+            slope = (3.0 * z + 2.0 * a) * z + b
+            if slope != 0.0:
+                roots[k] = z - (((z + a) * z + b) * z + c) / slope
+    return count
+
+
+@kernel
+def _null_space(points: FloatArray, sample: IntArray, basis: FloatArray) -> bool:
+    """Two orthonormal vectors perpendicular to the seven rows of the design matrix, by Householder reflections.
+
+    False where the rows depend on each other.
+    """
+    columns = np.empty((SAMPLE_SIZE, 9))  # each row becomes, from its diagonal on, the reflection that zeroes it
+    for k in range(SAMPLE_SIZE):
+        x1, y1, x2, y2 = points[sample[k]]
+        columns[k] = (x2 * x1, x2 * y1, x2, y2 * x1, y2 * y1, y2, x1, y1, 1.0)
+    for k in range(SAMPLE_SIZE):
+        before, left = 0.0, 0.0
+        for j in range(9):
+            before += columns[k, j] ** 2
+            if j >= k:
+                left += columns[k, j] ** 2
+        if left <= _RANK_TOLERANCE**2 * before:
+            return False
+        pivot = columns[k, k]
+        columns[k, k] = pivot + np.sqrt(left) if pivot >= 0 else pivot - np.sqrt(left)
+        length = np.sqrt(2.0 * (left + abs(pivot) * np.sqrt(left)))
+        for j in range(k, 9):
+            columns[k, j] /= length
+        for row in range(k + 1, SAMPLE_SIZE):
+            _reflect(columns[k], k, columns[row])
+    for n in range(2):
+        basis[n] = 0.0
+        basis[n, SAMPLE_SIZE + n] = 1.0
+        for k in range(SAMPLE_SIZE - 1, -1, -1):
+            _reflect(columns[k], k, basis[n])
+    return True
+
+
+@kernel
+def _reflect(unit: FloatArray, start: int, vector: FloatArray) -> None:
+    dot = 0.0
+    for j in range(start, 9):
+        dot += unit[j] * vector[j]
+    for j in range(start, 9):
+        vector[j] -= 2.0 * dot * unit[j]
+
+
+@kernel
+def _det(m: FloatArray) -> float:
+    return (
+        m[0] * (m[4] * m[8] - m[5] * m[7]) - m[1] * (m[3] * m[8] - m[5] * m[6]) + m[2] * (m[3] * m[7] - m[4] * m[6])
+    )
+
+
+@kernel
+def _mixed_det(m: FloatArray, n: FloatArray) -> float:
+    """The part of det(m + z n) that is linear in z: the cofactors of m times the entries of n."""
+    return (
+        n[0] * (m[4] * m[8] - m[5] * m[7])
+        - n[1] * (m[3] * m[8] - m[5] * m[6])
+        + n[2] * (m[3] * m[7] - m[4] * m[6])
+        - n[3] * (m[1] * m[8] - m[2] * m[7])
+        + n[4] * (m[0] * m[8] - m[2] * m[6])
+        - n[5] * (m[0] * m[7] - m[1] * m[6])
+        + n[6] * (m[1] * m[5] - m[2] * m[4])
+        - n[7] * (m[0] * m[5] - m[2] * m[3])
+        + n[8] * (m[0] * m[4] - m[1] * m[3])
+    )

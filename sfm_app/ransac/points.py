@@ -1,0 +1,82 @@
+"""Matched points on their way in: checked, freed of duplicates, shuffled, and scaled to numbers near 1."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sfm_app.geometry.epipolar import unit_norm
+
+FloatArray = NDArray[np.float64]
+
+
+def check_points(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Matched points as contiguous float64 arrays.
+
+    Args:
+        x1: (N, 2) pixels, any real number type; N may be 0.
+        x2: (N, 2) pixels, row by row the partners of x1.
+
+    Returns:
+        Two (N, 2) arrays.
+
+    Raises:
+        ValueError: not (N, 2), not of equal length, not real numbers, or not finite.
+    """
+    checked = [_check(x, name) for x, name in ((x1, "x1"), (x2, "x2"))]
+    if len(checked[0]) != len(checked[1]):
+        raise ValueError(f"x1 and x2 must pair up row by row, got {len(checked[0])} and {len(checked[1])} points")
+    return checked[0], checked[1]
+
+
+def _check(x: ArrayLike, name: str) -> FloatArray:
+    points = np.asarray(x)
+    if points.ndim != 2 or points.shape[1] != 2:
+        raise ValueError(f"{name} must have shape (N, 2), got {points.shape}")
+    if points.dtype.kind not in "iuf":
+        raise ValueError(f"{name} must hold real numbers, got {points.dtype}")
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    if not np.isfinite(points).all():
+        raise ValueError(f"{name} holds {np.count_nonzero(~np.isfinite(points).all(axis=1))} points that are not finite")
+    return points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Matches:
+    """The distinct matches of a pair as the estimators see them."""
+
+    points: FloatArray
+    """(M, 4) x1, y1, x2, y2 in random order; each view centred, both divided by `unit_px`."""
+    rows: NDArray[np.intp]
+    """(N,) for each match as given, its row in `points`."""
+    unit_px: float
+    """Pixels per unit of `points`. One scale for both views, so that a Sampson distance stays one, only in other units."""
+    centre1: FloatArray
+    centre2: FloatArray
+
+    def to_pixels(self, F: FloatArray) -> FloatArray:
+        """F of `points` as F of pixels, Frobenius norm 1."""
+        return unit_norm(self._transform(self.centre2).T @ F @ self._transform(self.centre1))
+
+    def _transform(self, centre: FloatArray) -> FloatArray:
+        return np.array([[1, 0, -centre[0]], [0, 1, -centre[1]], [0, 0, self.unit_px]]) / self.unit_px
+
+
+def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
+    """Drop repeated matches, shuffle and scale.
+
+    SIFT gives a keypoint once per orientation, so that one match may come several times. Repeats would count as support
+    and make samples degenerate. The random order lets a scorer stop early: its first points are a fair sample.
+    """
+    stacked = np.hstack([x1, x2])
+    # One key per match: a projection on incommensurable numbers is equal for equal rows and sorts faster than rows do.
+    keys = stacked[:, 0] + stacked[:, 1] * np.sqrt(2) + stacked[:, 2] * np.sqrt(3) + stacked[:, 3] * np.sqrt(5)
+    _, first, rows = np.unique(keys, return_index=True, return_inverse=True)
+    order = np.random.default_rng(seed).permutation(len(first))
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    centre = stacked.mean(axis=0) if len(stacked) else np.zeros(4)
+    points = np.ascontiguousarray(stacked[first[order]] - centre)
+    unit_px = float(np.sqrt((points**2).mean())) if len(points) else 1.0
+    unit_px = unit_px if unit_px > 0 else 1.0
+    return Matches(points / unit_px, place[rows], unit_px, centre[:2], centre[2:])

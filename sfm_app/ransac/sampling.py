@@ -1,0 +1,93 @@
+"""Random minimal samples, uniform or by weight, from a generator whose state is passed around.
+
+The generator is splitmix64 (Steele, Lea and Flood 2014): 64 bits of state, one multiplication chain per number. Its state
+is an argument, so that pairs run in parallel threads and still repeat to the last bit.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+RandomState = NDArray[np.uint64]
+
+SAMPLE_SIZE = 7
+
+_STEP = np.uint64(0x9E3779B97F4A7C15)
+_MIX1 = np.uint64(0xBF58476D1CE4E5B9)
+_MIX2 = np.uint64(0x94D049BB133111EB)
+_S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
+_TO_UNIT = 2.0**-53
+_MOST_REDRAWS = 100
+
+
+def random_state(seed: int) -> RandomState:
+    """(1,) state of the generator for any integer seed."""
+    return np.array([seed % 2**64], dtype=np.uint64)
+
+
+@kernel
+def uniform(state: RandomState) -> float:
+    """The next number in [0, 1)."""
+    state[0] += _STEP
+    z = state[0]
+    z = (z ^ (z >> _S30)) * _MIX1
+    z = (z ^ (z >> _S27)) * _MIX2
+    return float((z ^ (z >> _S31)) >> _S11) * _TO_UNIT
+
+
+@kernel
+def draw_uniform(state: RandomState, count: int, sample: IntArray) -> None:
+    """Fill `sample` with distinct indices below `count`, which is at least its length."""
+    for k in range(sample.shape[0]):
+        fresh = False
+        while not fresh:
+            sample[k] = int(uniform(state) * count)
+            fresh = _is_fresh(sample, k)
+
+
+@kernel
+def draw_weighted(state: RandomState, cumulative: FloatArray, sample: IntArray) -> bool:
+    """Fill `sample` with distinct indices, each draw proportional to the weights of those that are left.
+
+    Drawing again when an index is already in the sample is the same as drawing from the others. False when that does not
+    end, because fewer points than the sample needs hold nearly all the weight.
+
+    Args:
+        state: generator.
+        cumulative: (N,) running sum of weights >= 0, the last one > 0.
+        sample: (m,) filled with indices.
+    """
+    total = cumulative[-1]
+    redraws = 0
+    for k in range(sample.shape[0]):
+        fresh = False
+        while not fresh:
+            sample[k] = _first_above(cumulative, uniform(state) * total)
+            fresh = _is_fresh(sample, k)
+            redraws += not fresh
+            if redraws > _MOST_REDRAWS:
+                return False
+    return True
+
+
+@kernel
+def _is_fresh(sample: IntArray, last: int) -> bool:
+    for k in range(last):
+        if sample[k] == sample[last]:
+            return False
+    return True
+
+
+@kernel
+def _first_above(cumulative: FloatArray, target: float) -> int:
+    low, high = 0, cumulative.shape[0] - 1
+    while low < high:
+        middle = (low + high) // 2
+        if cumulative[middle] > target:
+            high = middle
+        else:
+            low = middle + 1
+    return low

@@ -1,0 +1,89 @@
+"""Fundamental matrices as every calibrator wants them: checked, of rank 2, in image units."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+
+FULL_WEIGHT_INLIERS = 300
+"""A pair with this many inliers or more counts fully."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """P fundamental matrices in coordinates where the image is about one unit wide, and their parts that E = K'FK needs."""
+
+    F: FloatArray
+    """(P, 3, 3), rank 2, Frobenius norm 1."""
+    e1: FloatArray
+    """(P, 3) unit epipoles of view 1: F e1 = 0."""
+    e2: FloatArray
+    """(P, 3) unit epipoles of view 2: F' e2 = 0."""
+    product: FloatArray
+    """(P,) products of the two non-zero singular values of F."""
+    weights: FloatArray
+    """(P,) how far each F is trusted, > 0."""
+
+    def __len__(self) -> int:
+        return len(self.F)
+
+
+def pair_weights(inlier_counts: ArrayLike) -> FloatArray:
+    """How far fundamental matrices with that many inliers are trusted: min(1, n / 300)."""
+    counts = np.asarray(inlier_counts, dtype=np.float64)
+    return np.minimum(1.0, counts / FULL_WEIGHT_INLIERS)
+
+
+def prepare(
+    Fs: ArrayLike, weights: ArrayLike, size: tuple[int, int], *, unit_px: float, origin_px: tuple[float, float]
+) -> Pairs:
+    """Check what a calibrator was given and express it in units of `unit_px` from `origin_px`.
+
+    Pairs of weight 0 are left out.
+
+    Args:
+        Fs: (P, 3, 3) in pixels, any scale; P may be 0.
+        weights: (P,), >= 0.
+        size: (width, height) in pixels.
+        unit_px: length that becomes 1, in pixels.
+        origin_px: pixel that becomes (0, 0).
+
+    Raises:
+        ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size is not positive.
+    """
+    raw, trust = _checked(Fs, weights, size)
+    to_pixels = np.array([[unit_px, 0.0, origin_px[0]], [0.0, unit_px, origin_px[1]], [0.0, 0.0, 1.0]])
+    # scaled first, so that neither 1e-200 nor 1e200 over- or underflows in the products
+    scaled = raw / np.max(np.abs(raw), axis=(1, 2), keepdims=True)
+    U, s, Vt = np.linalg.svd(to_pixels.T @ scaled @ to_pixels)
+    s = s[:, :2] / np.linalg.norm(s[:, :2], axis=1, keepdims=True)
+    return Pairs(
+        F=np.ascontiguousarray((U[:, :, :2] * s[:, None, :]) @ Vt[:, :2, :]),
+        e1=np.ascontiguousarray(Vt[:, 2, :]),
+        e2=np.ascontiguousarray(U[:, :, 2]),
+        product=s[:, 0] * s[:, 1],
+        weights=trust,
+    )
+
+
+def _checked(Fs: ArrayLike, weights: ArrayLike, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    raw = np.asarray(Fs, dtype=np.float64)
+    trust = np.asarray(weights, dtype=np.float64)
+    if raw.size == 0:
+        raw = raw.reshape(0, 3, 3)
+    if raw.ndim != 3 or raw.shape[1:] != (3, 3):
+        raise ValueError(f"fundamental matrices must have shape (P, 3, 3), not {raw.shape}")
+    if trust.shape != (len(raw),):
+        raise ValueError(f"weights must have shape ({len(raw)},), one per fundamental matrix, not {trust.shape}")
+    if not np.all(np.isfinite(raw)):
+        raise ValueError("fundamental matrices must be finite, found NaN or infinity")
+    if not np.all(np.isfinite(trust) & (trust >= 0)):
+        raise ValueError("weights must be finite and >= 0")
+    if np.any(np.all(raw == 0, axis=(1, 2))):
+        raise ValueError("a fundamental matrix is zero")
+    if len(size) != 2 or not all(np.isfinite(side) and side > 0 for side in size):
+        raise ValueError(f"size must be (width, height) in pixels, both > 0, not {size}")
+    used = trust > 0
+    return raw[used], trust[used]

@@ -1,0 +1,65 @@
+"""intrinsics: ViewGraph -> Intrinsics."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_app.colmap.backend import backend
+from sfm_app.colmap.database import FOCAL_GUESS, write_calibrations
+from sfm_app.context import RunContext
+from sfm_app.selfcal import pair_weights
+from sfm_app.types import Calibration, Intrinsics, MatchedImage, MatchGraph, ViewGraph
+
+
+def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
+    """Find K of every camera group from the pairs that lie within it; what is not identifiable falls back to a guess."""
+    groups: dict[str, list[MatchedImage]] = {}
+    for image in matches.images.values():
+        groups.setdefault(image.group, []).append(image)
+    by_size = sorted(groups, key=lambda name: (-len(groups[name]), name))
+    cameras = {name: calibrate_group(groups[name], views, run) for name in by_size}
+    intrinsics = Intrinsics(cameras)
+    run.record(
+        cameras={name: _summary(camera) for name, camera in cameras.items()},
+        identifiable=sum(camera.identifiable for camera in cameras.values()),
+    )
+    with run.workspace.replacing(run.workspace.calibration) as path:
+        values = {name: camera.to_dict() for name, camera in cameras.items()}
+        path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+    with backend("writing calibrations"):
+        write_calibrations(run.workspace.database, matches, cameras)
+    return intrinsics
+
+
+def calibrate_group(images: list[MatchedImage], views: ViewGraph, run: RunContext) -> Calibration:
+    """K of the photos of one camera."""
+    ids = {image.id for image in images}
+    fits = [fit for pair, fit in views.fits.items() if ids.issuperset(pair) and not fit.degeneracy]
+    options = run.settings.calibration
+    calibrator = run.plugins.calibrator(options.calibrator)
+    Fs = np.array([fit.F for fit in fits], np.float64).reshape(-1, 3, 3)
+    weights = pair_weights(np.array([fit.inlier_count for fit in fits], np.int64))
+    size = (images[0].width, images[0].height)
+    found = calibrator.calibrate(Fs, weights, size, options, run.seed)
+    return found if found.identifiable else fall_back(found, images)
+
+
+def fall_back(found: Calibration, images: list[MatchedImage]) -> Calibration:
+    """The K that mapping starts from when the photos do not determine it: EXIF's claim, else the usual guess."""
+    claims = [image.exif_focal_px for image in images if image.exif_focal_px]
+    focal = float(np.median(claims)) if claims else FOCAL_GUESS * max(found.width, found.height)
+    K = np.array([[focal, 0.0, found.width / 2], [0.0, focal, found.height / 2], [0.0, 0.0, 1.0]])
+    return replace(found, K=K, method="exif" if claims else "guess", spread={})
+
+
+def load_intrinsics(run: RunContext) -> Intrinsics:
+    """Read calibration.json back."""
+    values = json.loads(run.workspace.calibration.read_text(encoding="utf-8"))
+    return Intrinsics({name: Calibration.from_dict(camera) for name, camera in values.items()})
+
+
+def _summary(camera: Calibration) -> dict[str, object]:
+    fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
+    plain = {name: round(float(value), 3) for name, value in (("fx", fx), ("fy", fy), ("cx", cx), ("cy", cy))}
+    return plain | {"method": camera.method, "identifiable": camera.identifiable, "reason": camera.reason}

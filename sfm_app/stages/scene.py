@@ -1,0 +1,183 @@
+"""scene: ViewGraph and Intrinsics -> Scene."""
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sfm_app.colmap.backend import backend
+from sfm_app.colmap.bundle import adjust
+from sfm_app.colmap.mapping import PhotoCounter, continue_mapping
+from sfm_app.colmap.model import model_from_seed, read_scene, turn_upright
+from sfm_app.context import RunContext
+from sfm_app.errors import ReconstructionError
+from sfm_app.geometry.seed import TwoViewSeed, two_view_seed
+from sfm_app.types import EpipolarFit, Intrinsics, MatchGraph, PairId, PhotoSet, Scene, ViewGraph
+
+RANKED_PAIRS = 60
+"""Pairs with most inliers that are looked at as seeds."""
+
+ENOUGH = 0.9
+"""A model with this share of the photos that hang together with its seed ends the search for a better seed."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A pair of photos that mapping may start from."""
+
+    pair: PairId
+    fit: EpipolarFit
+    seed: TwoViewSeed
+
+
+def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
+    """Start mapping from our own pose and points of the best pair; when it fails, from the next best.
+
+    Raises:
+        ReconstructionError: no seed grows into a model; says what was seen.
+    """
+    candidates = rank_seeds(matches, views, intrinsics, run)
+    tried: list[str] = []
+    best: Any = None
+    for candidate in candidates[: run.settings.scene.seed_pairs]:
+        model = grow(candidate, matches, run)
+        found = model.num_reg_images() if model else 0
+        tried.append(f"{_names(candidate.pair, matches)}: {found} photos")
+        if found and (best is None or found > best.num_reg_images()):
+            best = model
+        if found >= ENOUGH * len(connected(candidate.pair, views)):
+            break
+    if best is None:
+        raise ReconstructionError(nothing_found(views, candidates, tried), hint=HINT)
+    with backend("adjusting the bundle"):
+        best, deviations = adjust(best, run.workspace.database)
+        turn_upright(best)
+    write_model(best, run)
+    scene = read_scene(run.workspace.sparse, groups(matches), left_out(best, matches, views))
+    run.record(
+        registered=len(scene.registered),
+        of=len(matches.images),
+        unregistered=dict(scene.unregistered),
+        points=scene.points,
+        observations=scene.observations,
+        mean_reprojection_px=round(scene.mean_reprojection_px, 4),
+        cameras={name: {"model": camera.model, "params": camera.params} for name, camera in scene.cameras.items()},
+        deviations_px_for_1_px_noise={name: round(value, 4) for name, value in deviations.items()},
+        seeds_tried=tried,
+    )
+    return scene
+
+
+HINT = "photos that overlap more, from places a step or two apart (turning on the spot is not enough), may help"
+
+
+def rank_seeds(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> list[Candidate]:
+    """Pairs that can start a mapping, best first: many points, wide angle, not planar, not a mere rotation."""
+
+    def examine(pair: PairId) -> Candidate:
+        fit = views.fits[pair]
+        K1, K2 = (intrinsics.cameras[matches.images[key].group].K for key in pair)
+        x1, x2 = (x[fit.inliers] for x in matches.points(pair))
+        return Candidate(pair, fit, two_view_seed(fit.F, K1, K2, x1, x2))
+
+    firm = [pair for pair, fit in views.fits.items() if not fit.degeneracy] or list(views.fits)
+    firm.sort(key=lambda pair: (-views.fits[pair].inlier_count, pair))
+    found = run.map(examine, firm[:RANKED_PAIRS], "seed pairs")
+    least = run.settings.scene.min_seed_angle_deg
+    wide = [candidate for candidate in found if candidate.seed.angle_deg >= least and candidate.seed.usable.sum() >= 8]
+    return sorted(wide, key=lambda candidate: (-candidate.seed.score, candidate.pair))
+
+
+def grow(candidate: Candidate, matches: MatchGraph, run: RunContext) -> Any | None:
+    """Map on from one seed; None when the model stays without enough points."""
+    place = run.workspace
+    with backend("mapping photos"):
+        rows = matches.matches[candidate.pair][candidate.fit.inliers]
+        start = model_from_seed(place.database, candidate.pair, rows, candidate.seed)
+        counter = PhotoCounter(run.progress, len(matches.images))
+        try:
+            scratch = place.root / ".mapping"
+            model = continue_mapping(place.database, place.photos, start, scratch, run.seed, counter)
+        finally:
+            run.progress.finish()
+    enough = model is not None and model.num_points3D() >= run.settings.scene.min_points and model.num_reg_images() > 1
+    return model if enough else None
+
+
+def connected(pair: PairId, views: ViewGraph) -> set[int]:
+    """Ids of all photos that hang together with a pair through accepted pairs."""
+    reached = set(pair)
+    while True:
+        more = {key for edge in views.fits for key in edge if not reached.isdisjoint(edge)} - reached
+        if not more:
+            return reached
+        reached |= more
+
+
+def left_out(model: Any, matches: MatchGraph, views: ViewGraph) -> dict[str, str]:
+    """Why each photo without a pose has none."""
+    posed = {image.image_id for image in model.images.values() if image.has_pose}
+    return {
+        image.name: _reason(image.id, posed, views) for image in matches.images.values() if image.id not in posed
+    }
+
+
+def write_model(model: Any, run: RunContext) -> None:
+    """Put the model into OUT/sparse as a whole."""
+    target = run.workspace.sparse
+    beside = target.with_name(".sparse")
+    shutil.rmtree(beside, ignore_errors=True)
+    beside.mkdir()
+    with backend("writing the sparse model"):
+        model.write(beside)
+    shutil.rmtree(target, ignore_errors=True)
+    beside.rename(target)
+
+
+def load_scene(photos: PhotoSet, run: RunContext) -> Scene:
+    """Read the model back; why photos were left out stands in the manifest."""
+    record = run.workspace.record("scene")
+    with backend("reading the sparse model"):
+        unregistered = record.counts.get("unregistered", {}) if record else {}
+        return read_scene(run.workspace.sparse, {photo.name: photo.group for photo in photos.photos}, unregistered)
+
+
+def groups(matches: MatchGraph) -> dict[str, str]:
+    """Camera group by photo."""
+    return {image.name: image.group for image in matches.images.values()}
+
+
+def nothing_found(views: ViewGraph, candidates: list[Candidate], tried: list[str]) -> str:
+    """What was seen, in one line."""
+    inliers = sorted(fit.inlier_count for fit in views.fits.values())
+    degenerate = sum(bool(fit.degeneracy) for fit in views.fits.values())
+    parts = [
+        f"{len(views.fits)} pairs with {inliers[0]} to {inliers[-1]} inliers",
+        f"{degenerate} of them planar or without parallax" if degenerate else "",
+        *(f"{count} pairs rejected: {reason}" for reason, count in views.reasons.items()),
+        "" if candidates else "no pair has parallax enough to start from",
+        "; ".join(tried),
+    ]
+    return "no pair of photos grows into a model: " + ", ".join(filter(None, parts))
+
+
+def _names(pair: PairId, matches: MatchGraph) -> str:
+    return " + ".join(matches.images[key].name for key in pair)
+
+
+def _reason(image_id: int, posed: set[int], views: ViewGraph) -> str:
+    edges = list(_edges(image_id, views))
+    to_posed = [count for other, count in edges if other in posed]
+    if to_posed:
+        return f"could not be placed: at most {max(to_posed)} inliers with a photo that was"
+    if edges:
+        return "shares inliers only with photos that have no place either"
+    return "shares no scene with any other photo"
+
+
+def _edges(image_id: int, views: ViewGraph) -> Iterator[tuple[int, int]]:
+    for pair, fit in views.fits.items():
+        if image_id in pair:
+            yield pair[pair[0] == image_id], int(np.count_nonzero(fit.inliers))

@@ -1,0 +1,175 @@
+"""Cameras and the paths that a photographer walks with them."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.errors import ConfigError
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """What stays the same from photo to photo."""
+
+    K: FloatArray
+    """(3, 3) camera matrix in pixels, zero skew."""
+    width: int
+    height: int
+    division_lambda: float = 0.0
+    """Radial distortion, x_u = x_d / (1 + lambda r^2) about the optical centre with r in image widths; < 0: barrel."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """One camera and where it stood."""
+
+    camera: Camera
+    cam_from_world: Mapping[str, FloatArray]
+    """By photo name: (3, 4) [R | t]."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArcOptions:
+    """A walk around the front of a scene, hand-held: no two photos share distance, height, aim or roll.
+
+    A circle around the point that all photos look at leaves the focal length undetermined (an orbit), so each of
+    them varies.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    photos: int = 12
+    """>= 2."""
+    sweep_deg: float = 80.0
+    """Angle of the arc, in degrees, (0, 360]."""
+    distance: tuple[float, float] = (4.2, 6.2)
+    """Range of the distance to the middle, in scene units, > 0."""
+    height: tuple[float, float] = (0.7, 2.6)
+    """Range of the height above the ground, in scene units."""
+    aim: tuple[float, float, float] = (0.0, 1.15, -0.2)
+    """What the photos look at, before it is varied."""
+    aim_spread: float = 0.45
+    """Largest offset of the aim in each direction, in scene units, >= 0."""
+    roll_deg: float = 14.0
+    """Largest roll either way, in degrees, [0, 180]."""
+
+    def __post_init__(self) -> None:
+        checks = {
+            "photos": self.photos >= 2,
+            "sweep_deg": 0 < self.sweep_deg <= 360,
+            "distance": 0 < self.distance[0] <= self.distance[1] < math.inf,
+            "height": self.height[0] <= self.height[1],
+            "aim_spread": 0 <= self.aim_spread < math.inf,
+            "roll_deg": 0 <= self.roll_deg <= 180,
+        }
+        wrong = [name for name, holds in checks.items() if not holds]
+        if wrong:
+            raise ConfigError(f"synthetic cameras: out of range: {', '.join(wrong)}")
+
+
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:
+    """(3, 3) camera matrix without skew, in pixels."""
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def make_camera(
+    width: int,
+    height: int,
+    focal_widths: float = 1.05,
+    centre: tuple[float, float] = (0.53, 0.48),
+    aspect: float = 1.0,
+) -> Camera:
+    """A camera about which a guess goes wrong: its optical centre is not the middle of the photo.
+
+    Args:
+        width: pixels, >= 16.
+        height: pixels, >= 16.
+        focal_widths: fx as a share of the width, > 0.
+        centre: optical centre as shares of width and height.
+        aspect: fy / fx, > 0.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+    if min(width, height) < 16 or not (0 < focal_widths < math.inf and 0 < aspect < math.inf):
+        raise ConfigError("synthetic camera: size, focal_widths or aspect is out of range")
+    fx = focal_widths * width
+    return Camera(camera_matrix(fx, fx * aspect, centre[0] * width, centre[1] * height), width, height)
+
+
+def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Views:
+    """Hand-held photos along an arc in front of the scene (towards +z, y up), named view_00.jpg and so on."""
+    options = options or ArcOptions()
+    rng = np.random.default_rng([seed, 11])
+    count = options.photos
+    # stratified, so that few photos already spread over the whole range
+    azimuth = np.radians(options.sweep_deg) * (np.arange(count) / (count - 1) - 0.5)
+    distance = _spread(options.distance, count, rng)
+    height = _spread(options.height, count, rng)
+    roll_deg = _spread((-options.roll_deg, options.roll_deg), count, rng)
+    aims = np.array(options.aim) + rng.uniform(-1.0, 1.0, (count, 3)) * options.aim_spread
+    centres = np.column_stack([distance * np.sin(azimuth), height, distance * np.cos(azimuth)])
+    poses = [look_at(centre, aim, roll) for centre, aim, roll in zip(centres, aims, roll_deg, strict=True)]
+    return Views(camera, {f"view_{k:02d}.jpg": pose for k, pose in enumerate(poses)})
+
+
+def look_at(centre: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> FloatArray:
+    """(3, 4) cam_from_world of a camera at `centre` (3,) that looks at `aim` (3,), world y up.
+
+    Raises:
+        ValueError: the camera looks straight up or down, so that its roll is undefined.
+    """
+    forward = _unit(np.asarray(aim, dtype=np.float64) - centre)
+    right = np.cross(forward, [0.0, 1.0, 0.0])
+    if np.linalg.norm(right) < 1e-9:
+        raise ValueError("a camera that looks straight up or down has no roll")
+    right = _unit(right)
+    R = axis_rotation(np.array([0.0, 0.0, 1.0]), roll_deg) @ np.stack([right, np.cross(forward, right), forward])
+    return np.column_stack([R, -R @ centre])
+
+
+def camera_centre(cam_from_world: FloatArray) -> FloatArray:
+    """(3,) position in the world of a camera with the (3, 4) pose [R | t]."""
+    return np.asarray(-cam_from_world[:, :3].T @ cam_from_world[:, 3])
+
+
+def axis_rotation(axis: FloatArray, angle_deg: float) -> FloatArray:
+    """(3, 3) rotation about a unit axis (3,), right-handed (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = math.radians(angle_deg)
+    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross)
+
+
+def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> FloatArray:
+    """Directions of view in the camera frame, row by row.
+
+    Args:
+        camera: its lens distortion is undone.
+        offset_px: where in each pixel the ray goes through; (0.5, 0.5) is the centre.
+
+    Returns:
+        (height * width, 3), z = 1.
+    """
+    x, y = np.meshgrid(np.arange(camera.width) + offset_px[0], np.arange(camera.height) + offset_px[1])
+    x = (x.ravel() - camera.K[0, 2]) / camera.K[0, 0]
+    y = (y.ravel() - camera.K[1, 2]) / camera.K[1, 1]
+    # r is counted in pixels over the width, so with fy != fx it is the distance in the image, not in the world
+    r2 = ((x * camera.K[0, 0]) ** 2 + (y * camera.K[1, 1]) ** 2) / camera.width**2
+    stretch = 1.0 / (1.0 + camera.division_lambda * r2)
+    return np.column_stack([x * stretch, y * stretch, np.ones(x.size)])
+
+
+def _spread(limits: tuple[float, float], count: int, rng: np.random.Generator) -> FloatArray:
+    steps = (rng.permutation(count) + rng.uniform(0.2, 0.8, count)) / count
+    return np.asarray(limits[0] + (limits[1] - limits[0]) * steps)
+
+
+def _unit(v: FloatArray) -> FloatArray:
+    return np.asarray(v / np.linalg.norm(v))

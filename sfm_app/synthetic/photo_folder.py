@@ -1,0 +1,196 @@
+"""Rendered photo folders with known truth."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sfm_app.errors import ConfigError, InputError
+from sfm_app.progress import Progress, Silent, track
+from sfm_app.synthetic.cameras import Views, camera_centre
+from sfm_app.synthetic.render import GAMMA, prepare, render_scene
+from sfm_app.synthetic.scenes import SyntheticScene
+
+FloatArray = NDArray[np.float64]
+TRUTH_FILE, SURFACE_FILE = "truth.json", "surface.ply"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotoOptions:
+    """From a perfect image to a photo.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    supersampling: int = 2
+    """Rays per pixel in x and in y, 1..8."""
+    blur_px: float = 0.5
+    """Standard deviation of the Gaussian blur, in pixels, >= 0."""
+    noise: float = 1.5
+    """Standard deviation of the sensor noise, in grey levels of 255, >= 0."""
+    quality: int = 92
+    """JPEG quality, 1..95."""
+    seed: int = 0
+    """Same seed, same noise."""
+
+    def __post_init__(self) -> None:
+        checks = {
+            "supersampling": 1 <= self.supersampling <= 8,
+            "blur_px": 0 <= self.blur_px <= 100,
+            "noise": 0 <= self.noise <= 100,
+            "quality": 1 <= self.quality <= 95,
+            "seed": self.seed >= 0,
+        }
+        wrong = [name for name, holds in checks.items() if not holds]
+        if wrong:
+            raise ConfigError(f"synthetic photos: out of range: {', '.join(wrong)}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """Everything that is true about a rendered photo folder."""
+
+    K: FloatArray
+    """(3, 3) camera matrix in pixels."""
+    width: int
+    height: int
+    cam_from_world: Mapping[str, FloatArray]
+    """By photo name: (3, 4) [R | t]."""
+    vertices: FloatArray
+    """(V, 3) of the surface, y up."""
+    faces: NDArray[np.int64]
+    """(T, 3) vertex indices."""
+    division_lambda: float = 0.0
+    """Radial distortion as in `Camera`."""
+
+    @property
+    def centres(self) -> dict[str, FloatArray]:
+        """Camera centre (3,) in the world by photo name."""
+        return {name: camera_centre(pose) for name, pose in self.cam_from_world.items()}
+
+
+def write_photo_folder(
+    folder: Path,
+    scene: SyntheticScene,
+    views: Views,
+    options: PhotoOptions | None = None,
+    progress: Progress | None = None,
+) -> Truth:
+    """Render one JPEG without EXIF per view into `folder`, which is made where it is missing.
+
+    The truth is not written: it belongs outside the photo folder, see `save_truth`.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    options = options or PhotoOptions()
+    prepared = prepare(scene)
+    camera = views.camera
+    poses = list(enumerate(views.cam_from_world.items()))
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for k, (name, pose) in track(progress or Silent(), poses, "rendering photos", len(poses)):
+            image = render_scene(prepared, camera, pose, options.supersampling)
+            photo = develop(image, options, np.random.default_rng([options.seed, k, 255]))
+            Image.fromarray(photo).save(folder / name, format="JPEG", quality=options.quality)
+    except OSError as err:
+        raise InputError(f"cannot write photos to {folder}: {err}", hint="choose another folder") from err
+    return Truth(
+        K=camera.K,
+        width=camera.width,
+        height=camera.height,
+        cam_from_world=MappingProxyType(dict(views.cam_from_world)),
+        vertices=scene.vertices,
+        faces=scene.faces,
+        division_lambda=camera.division_lambda,
+    )
+
+
+def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Blur, gamma and sensor noise: linear RGB (height, width, 3) to 8 bits."""
+    if options.blur_px > 0:
+        image = np.asarray(cv2.GaussianBlur(image, (0, 0), options.blur_px), dtype=np.float64)
+    levels = 255.0 * np.clip(image, 0.0, 1.0) ** (1.0 / GAMMA)
+    levels += rng.normal(scale=options.noise, size=levels.shape)
+    return np.round(np.clip(levels, 0.0, 255.0)).astype(np.uint8)
+
+
+def save_truth(truth: Truth, folder: Path) -> None:
+    """Write truth.json (cameras: x ~ K (R X + t)) and surface.ply into `folder`, which must not be the photo folder."""
+    K = truth.K.tolist()
+    images = [
+        {
+            "file": name,
+            "width": truth.width,
+            "height": truth.height,
+            "K": K,
+            "R": pose[:, :3].tolist(),
+            "t": pose[:, 3].tolist(),
+        }
+        for name, pose in truth.cam_from_world.items()
+    ]
+    text = {
+        "convention": "x ~ K (R X + t); world to camera; x right, y down, z forward; pixel centres at +0.5",
+        "division_lambda": truth.division_lambda,
+        "images": images,
+    }
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / TRUTH_FILE).write_text(json.dumps(text, indent=1), encoding="utf-8")
+        (folder / SURFACE_FILE).write_bytes(_ply(truth.vertices, truth.faces))
+    except OSError as err:
+        raise InputError(f"cannot write the truth to {folder}: {err}", hint="choose another folder") from err
+
+
+def load_truth(folder: Path) -> Truth:
+    """Read what `save_truth` wrote.
+
+    Raises:
+        InputError: the files are missing or not as `save_truth` writes them.
+    """
+    try:
+        text: dict[str, Any] = json.loads((folder / TRUTH_FILE).read_text(encoding="utf-8"))
+        images = text["images"]
+        vertices, faces = _from_ply((folder / SURFACE_FILE).read_bytes())
+        return Truth(
+            K=np.array(images[0]["K"], dtype=np.float64),
+            width=int(images[0]["width"]),
+            height=int(images[0]["height"]),
+            cam_from_world=MappingProxyType({i["file"]: np.column_stack([i["R"], i["t"]]) for i in images}),
+            vertices=vertices,
+            faces=faces,
+            division_lambda=float(text["division_lambda"]),
+        )
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as err:
+        raise InputError(f"no truth in {folder}: {err}", hint="it holds truth.json and surface.ply") from err
+
+
+_FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
+
+
+def _ply(vertices: FloatArray, faces: NDArray[np.int64]) -> bytes:
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(vertices)}\nproperty double x\nproperty double y\nproperty double z\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = np.empty(len(faces), dtype=_FACE)
+    rows["count"], rows["corners"] = 3, faces
+    return header.encode("ascii") + vertices.astype("<f8").tobytes() + rows.tobytes()
+
+
+def _from_ply(data: bytes) -> tuple[FloatArray, NDArray[np.int64]]:
+    end = data.index(b"end_header\n") + len(b"end_header\n")
+    lines = data[:end].decode("ascii").splitlines()
+    counts = [int(line.split()[2]) for line in lines if line.startswith("element")]
+    vertices = np.frombuffer(data, "<f8", 3 * counts[0], end).reshape(-1, 3)
+    faces = np.frombuffer(data, _FACE, counts[1], end + vertices.nbytes)["corners"]
+    return vertices.copy(), faces.astype(np.int64)

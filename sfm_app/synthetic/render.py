@@ -1,0 +1,199 @@
+"""Rendering by ray casting: a synthetic scene to a photo, a finished mesh to a picture."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.meshing.open3d import load_open3d
+from sfm_app.synthetic.cameras import Camera, camera_centre, pixel_rays
+from sfm_app.synthetic.scenes import SyntheticScene
+from sfm_app.synthetic.textures import mixture
+from sfm_app.types import Surface
+
+FloatArray = NDArray[np.float64]
+NO_HIT = 0xFFFFFFFF
+GAMMA = 2.2
+# linear RGB
+SUNLIGHT = np.array([1.0, 0.93, 0.82])
+SKYLIGHT = np.array([0.82, 0.92, 1.0])
+ZENITH = np.array([0.20, 0.38, 0.72])
+HORIZON = np.array([0.66, 0.76, 0.86])
+AMBIENT_RAYS = 24
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedScene:
+    """A scene ready for many photos: ray-casting structure and the tables that the shading reads."""
+
+    rays: Any
+    """Open3D RaycastingScene."""
+    faces: NDArray[np.int64]
+    vertex_table: FloatArray
+    """(V, 7): normal, texture coordinates, and the share of the sky that is not hidden (ambient occlusion)."""
+    face_material: NDArray[np.int64]
+    materials: FloatArray
+    lights: FloatArray
+    """(5, 3): direction to the sun, sun and sky colours, zenith and horizon colours."""
+
+
+def prepare(scene: SyntheticScene) -> PreparedScene:
+    """Build the tables of a scene once for all its photos."""
+    vertices, faces = scene.vertices, scene.faces
+    shapes = [body.shape for body in scene.bodies]
+    normals = np.concatenate([shape.normals for shape in shapes])
+    caster = ray_caster(vertices, faces)
+    openness = _openness(caster, vertices, normals)
+    sun = np.array(scene.to_light) / np.linalg.norm(scene.to_light)
+    texture = np.concatenate([shape.texture for shape in shapes])
+    return PreparedScene(
+        rays=caster,
+        faces=faces,
+        vertex_table=np.column_stack([normals, texture, openness]),
+        face_material=np.repeat(np.arange(len(shapes)), [len(shape.faces) for shape in shapes]),
+        materials=np.stack([body.material.row() for body in scene.bodies]),
+        lights=np.stack([sun, SUNLIGHT * scene.sun, SKYLIGHT * scene.sky, ZENITH, HORIZON]),
+    )
+
+
+def render_scene(scene: PreparedScene, camera: Camera, cam_from_world: FloatArray, supersampling: int = 2) -> FloatArray:
+    """What the camera sees before blur, noise and gamma.
+
+    Args:
+        scene: from `prepare`.
+        camera: intrinsics, size and distortion.
+        cam_from_world: (3, 4) pose.
+        supersampling: rays per pixel in x and in y, >= 1; each has its shadow.
+
+    Returns:
+        (height, width, 3) linear RGB, about 0..1.
+    """
+    R = cam_from_world[:, :3]
+    centre = camera_centre(cam_from_world)
+    total = np.zeros((camera.height * camera.width, 3))
+    offsets = (np.arange(supersampling) + 0.5) / supersampling
+    for dy in offsets:
+        for dx in offsets:
+            directions = pixel_rays(camera, (float(dx), float(dy))) @ R
+            hits = cast(scene.rays, centre, directions)
+            lit = _lit(scene, centre, directions, hits["t_hit"])
+            # t_hit counts in z depth, since the rays have z = 1: the size of a pixel is depth / f
+            pixel = np.where(np.isfinite(hits["t_hit"]), hits["t_hit"], 1.0) / camera.K[0, 0]
+            shade(
+                (directions, hits["primitive_ids"], hits["primitive_uvs"], pixel, lit),
+                (scene.faces, scene.vertex_table, scene.face_material, scene.materials, scene.lights),
+                total,
+            )
+    return (total / supersampling**2).reshape(camera.height, camera.width, 3)
+
+
+def render_mesh(
+    surface: Surface, camera: Camera, cam_from_world: FloatArray, background: tuple[int, int, int] = (255, 255, 255)
+) -> NDArray[np.uint8]:
+    """A picture of a coloured mesh, with the colours as they are, from both sides, without light.
+
+    Args:
+        surface: vertices in the frame of `cam_from_world`.
+        camera: intrinsics, size and distortion.
+        cam_from_world: (3, 4) pose.
+        background: RGB where nothing is hit.
+
+    Returns:
+        (height, width, 3) RGB.
+    """
+    picture = np.tile(np.array(background, dtype=np.float64), (camera.height * camera.width, 1))
+    if len(surface.faces):
+        directions = pixel_rays(camera) @ cam_from_world[:, :3]
+        caster = ray_caster(surface.vertices, surface.faces)
+        hits = cast(caster, camera_centre(cam_from_world), directions)
+        hit = np.isfinite(hits["t_hit"])
+        uv = hits["primitive_uvs"][hit].astype(np.float64)
+        weights = np.column_stack([1.0 - uv.sum(axis=1), uv])
+        corners = surface.faces[hits["primitive_ids"][hit]]
+        picture[hit] = np.einsum("nk,nkc->nc", weights, surface.colors[corners].astype(np.float64))
+    return np.round(np.clip(picture, 0, 255)).astype(np.uint8).reshape(camera.height, camera.width, 3)
+
+
+def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
+    """Open3D's RaycastingScene of one mesh; it works in single precision."""
+    open3d = load_open3d()
+    caster = open3d.t.geometry.RaycastingScene()
+    tensor = open3d.core.Tensor
+    caster.add_triangles(tensor(vertices.astype(np.float32)), tensor(faces.astype(np.uint32)))
+    return caster
+
+
+def cast(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, NDArray[Any]]:
+    """First hits of rays from `origin`, (3,) or (N, 3), along `directions` (N, 3): t_hit (inf: none), primitive ids, uvs."""
+    rays = np.empty((len(directions), 6), dtype=np.float32)
+    rays[:, :3] = origin
+    rays[:, 3:] = directions
+    found = caster.cast_rays(load_open3d().core.Tensor(rays))
+    return {key: found[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs")}
+
+
+def _lit(scene: PreparedScene, centre: FloatArray, directions: FloatArray, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Whether the sun reaches each hit; also true where nothing was hit."""
+    hit = np.flatnonzero(np.isfinite(depth))
+    rays = np.empty((len(hit), 6), dtype=np.float32)
+    # a step towards the sun keeps the surface from shadowing itself
+    rays[:, :3] = centre + directions[hit] * depth[hit, None] + 4e-3 * scene.lights[0]
+    rays[:, 3:] = scene.lights[0]
+    lit = np.ones(len(depth), dtype=np.bool_)
+    lit[hit] = ~scene.rays.test_occlusions(load_open3d().core.Tensor(rays)).numpy()
+    return lit
+
+
+def _openness(caster: Any, vertices: FloatArray, normals: FloatArray) -> FloatArray:
+    """Share of cosine-distributed rays (Fibonacci spiral) that leave a vertex without hitting anything near."""
+    k = np.arange(AMBIENT_RAYS) + 0.5
+    radius = np.sqrt(k / AMBIENT_RAYS)
+    angle = k * np.pi * (3.0 - np.sqrt(5.0))
+    helper = np.where(np.abs(normals[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    u = np.cross(normals, helper)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    v = np.cross(normals, u)
+    free = np.zeros(len(vertices))
+    for r, a in zip(radius, angle, strict=True):
+        direction = r * np.cos(a) * u + r * np.sin(a) * v + np.sqrt(1.0 - r * r) * normals
+        distance = cast(caster, vertices + 1e-2 * normals, direction)["t_hit"].astype(np.float64)
+        free += np.clip(distance / 1.5, 0.0, 1.0)  # what is 1.5 units away no longer darkens
+    return free / AMBIENT_RAYS
+
+
+@kernel
+def shade(hits: Any, tables: Any, total: NDArray[np.float64]) -> None:
+    """Add the colour of every ray to `total` (N, 3), linear RGB.
+
+    `hits`: directions (N, 3), primitive ids (N,), barycentric uv (N, 2), pixel size at the hit (N,), in sunlight (N,).
+    `tables`: faces, vertex table, material per face, materials and lights of `PreparedScene`.
+    """
+    directions, ids, uvs, pixel, lit = hits
+    faces, vertex_table, face_material, materials, lights = tables
+    at = np.empty(7)
+    for i in range(len(ids)):
+        if ids[i] == NO_HIT:
+            d = directions[i]
+            up = min(1.0, max(0.0, 2.5 * d[1] / np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])))
+            for c in range(3):
+                total[i, c] += lights[4, c] + (lights[3, c] - lights[4, c]) * np.sqrt(up)
+            continue
+        face = ids[i]
+        u, v = uvs[i, 0], uvs[i, 1]
+        for k in range(7):
+            at[k] = (
+                (1.0 - u - v) * vertex_table[faces[face, 0], k]
+                + u * vertex_table[faces[face, 1], k]
+                + v * vertex_table[faces[face, 2], k]
+            )
+        row = materials[face_material[face]]
+        second, joint, bright = mixture(row, (at[3], at[4], at[5]), (at[0], at[1], at[2]), pixel[i])
+        facing = at[0] * lights[0, 0] + at[1] * lights[0, 1] + at[2] * lights[0, 2]
+        sun = max(0.0, facing) if lit[i] else 0.0
+        sky = at[6] * (0.65 + 0.35 * at[1])
+        for c in range(3):
+            color = row[4 + c] + second * (row[7 + c] - row[4 + c])
+            color += joint * (row[10 + c] - color)
+            total[i, c] += color * bright * (sun * lights[1, c] + sky * lights[2, c])

@@ -1,0 +1,139 @@
+"""Triangle meshes of simple bodies, y up, counter-clockwise seen from outside."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.synthetic.cameras import axis_rotation
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shape:
+    """Triangles with normals for shading and the coordinates at which their texture is read."""
+
+    vertices: FloatArray
+    """(V, 3)."""
+    faces: IndexArray
+    """(T, 3) vertex indices."""
+    normals: FloatArray
+    """(V, 3) unit normals; vertices are doubled along sharp edges."""
+    texture: FloatArray
+    """(V, 3): where the body was before it was put into the scene, so that its texture moves with it."""
+
+    def moved(self, to: tuple[float, float, float], turn_deg: float = 0.0, tilt_deg: float = 0.0) -> "Shape":
+        """Tilt about x, then turn about y (right-handed, degrees), then move."""
+        R = axis_rotation(np.array([0.0, 1.0, 0.0]), turn_deg) @ axis_rotation(np.array([1.0, 0.0, 0.0]), tilt_deg)
+        return Shape(self.vertices @ R.T + to, self.faces, self.normals @ R.T, self.texture)
+
+
+def box(width: float, height: float, depth: float, spacing: float = 0.15) -> Shape:
+    """A box centred in x and z that stands on y = 0, its sides cut into squares of about `spacing`."""
+    size = np.array([width, height, depth])
+    parts = []
+    for axis in range(3):
+        # u x v = axis keeps the triangles counter-clockwise
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        grid = [np.linspace(-0.5, 0.5, 1 + max(1, round(size[k] / spacing))) * size[k] for k in (u, v)]
+        side, faces = _grid(*grid)
+        for sign in (1.0, -1.0):
+            vertices = np.empty((len(side), 3))
+            vertices[:, axis] = 0.5 * sign * size[axis]
+            vertices[:, u], vertices[:, v] = side[:, 0], side[:, 1]
+            parts.append((vertices, faces if sign > 0 else faces[:, ::-1]))
+    return _joined([(vertices + [0.0, height / 2, 0.0], faces) for vertices, faces in parts])
+
+
+def revolved(
+    profile: FloatArray, segments: int = 64, span_deg: float = 360.0, sharp: bool = False, flutes: tuple[int, float] = (0, 0.0)
+) -> Shape:
+    """A profile turned about the y axis.
+
+    Args:
+        profile: (P, 2) radius and height; outside lies to the right of the way from the first to the last point
+            seen with the height up, so a vase runs from its foot to its lip and on down the inside.
+        segments: steps around the axis.
+        span_deg: how far around, in degrees; less than 360 leaves the ends open.
+        sharp: whether the points of the profile are edges.
+        flutes: number of grooves around the axis, and their depth as a share of the radius.
+    """
+    strips = [profile[k : k + 2] for k in range(len(profile) - 1)] if sharp else [profile]
+    return _joined([_turned(strip, segments, span_deg, flutes) for strip in strips])
+
+
+def torus(radius: float, tube: float, span_deg: float = 360.0) -> Shape:
+    """A ring of round section about the y axis, centred at the origin."""
+    angle = np.linspace(0.0, 2.0 * math.pi, 25)
+    section = np.column_stack([radius + tube * np.cos(angle), tube * np.sin(angle)])
+    return revolved(section, segments=max(8, round(span_deg / 5.0)), span_deg=span_deg)
+
+
+def arch(radius: float, thickness: float, depth: float) -> Shape:
+    """Half a ring of square section standing on y = 0 across x, its back at z = 0."""
+    inner, outer = radius, radius + thickness
+    section = np.array([[inner, 0.0], [outer, 0.0], [outer, depth], [inner, depth], [inner, 0.0]])
+    lying = revolved(section, segments=40, span_deg=180.0, sharp=True)
+    # the ring lies on the ground in the half z <= 0; standing it up brings its height to +z
+    R = axis_rotation(np.array([1.0, 0.0, 0.0]), 90.0)
+    vertices = lying.vertices @ R.T
+    return Shape(vertices, lying.faces, lying.normals @ R.T, vertices)
+
+
+def ball(radius: float, bumps: float = 0.0, seed: int = 0) -> Shape:
+    """A sphere around the origin; `bumps` is the depth of random dents as a share of the radius."""
+    angle = np.linspace(-0.5, 0.5, 49) * math.pi
+    round_ball = _turned(np.column_stack([np.cos(angle), np.sin(angle)]), 96, 360.0, (0, 0.0))
+    rng = np.random.default_rng([seed, 7])
+    waves = rng.normal(size=(24, 3)) * np.linspace(2.0, 9.0, 24)[:, None]
+    dents = np.cos(round_ball[0] @ waves.T + rng.uniform(0.0, 2.0 * math.pi, 24)).sum(axis=1) / math.sqrt(12.0)
+    return _joined([(round_ball[0] * radius * (1.0 + bumps * dents[:, None]), round_ball[1])])
+
+
+def ground(x: tuple[float, float], z: tuple[float, float], unevenness: float, spacing: float = 0.1) -> Shape:
+    """An uneven floor around y = 0, its heights within about +-unevenness."""
+    xs, zs = (np.linspace(a, b, 1 + max(1, round((b - a) / spacing))) for a, b in (x, z))
+    grid, faces = _grid(zs, xs)
+    height = np.sin(1.3 * grid[:, 1] + 0.7) * np.sin(1.7 * grid[:, 0] + 2.1) + 0.5 * np.sin(3.1 * grid.sum(axis=1))
+    return _joined([(np.column_stack([grid[:, 1], unevenness * height, grid[:, 0]]), faces)])
+
+
+def _turned(
+    profile: FloatArray, segments: int, span_deg: float, flutes: tuple[int, float]
+) -> tuple[FloatArray, IndexArray]:
+    closed = span_deg >= 360.0
+    count = segments if closed else segments + 1
+    angle = np.radians(span_deg) * np.arange(count) / segments
+    radius = profile[None, :, 0] * (1.0 - flutes[1] * np.abs(np.sin(0.5 * flutes[0] * angle))[:, None])
+    height = np.broadcast_to(profile[None, :, 1], radius.shape)
+    # turning from +x towards -z is right-handed about +y
+    vertices = np.stack([radius * np.cos(angle)[:, None], height, -radius * np.sin(angle)[:, None]], axis=-1)
+    ring = np.arange(segments)[:, None] * len(profile) + np.arange(len(profile) - 1)
+    step = (ring + len(profile)) % (count * len(profile))
+    faces = np.concatenate([np.stack([ring, step, step + 1], -1), np.stack([ring, step + 1, ring + 1], -1)])
+    return vertices.reshape(-1, 3), faces.reshape(-1, 3)
+
+
+def _grid(a: FloatArray, b: FloatArray) -> tuple[FloatArray, IndexArray]:
+    points = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
+    corner = (np.arange(len(a) - 1)[:, None] * len(b) + np.arange(len(b) - 1)).ravel()
+    right, up = corner + len(b), corner + 1
+    return points, np.concatenate([np.stack([corner, right, right + 1], -1), np.stack([corner, right + 1, up], -1)])
+
+
+def _joined(parts: list[tuple[FloatArray, IndexArray]]) -> Shape:
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    vertices = np.concatenate([vertices for vertices, _ in parts])
+    faces = np.concatenate([faces + start for (_, faces), start in zip(parts, starts[:-1], strict=True)])
+    corners = vertices[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    kept = np.linalg.norm(cross, axis=1) > 1e-12  # the poles of a turned profile
+    normals = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(normals, faces[kept, k], cross[kept])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.divide(normals, length, out=np.tile([0.0, 1.0, 0.0], (len(normals), 1)), where=length > 0)
+    return Shape(vertices, faces[kept], normals, vertices)
