@@ -41,6 +41,8 @@ class Recipe:
     """End when the priors have converged (thesis 4.18)."""
     improve: Refine | None = None
     """Local optimisation of every new best model."""
+    oriented: bool = False
+    """Drop models that put a sampled point behind a camera before they are scored."""
     bail_out: bool = False
     """Leave hopeless hypotheses before all matches are scored."""
 
@@ -70,7 +72,7 @@ def search(matches: Matches, options: EpipolarSettings, seed: int, recipe: Recip
         guided = 0.0 if recipe.validity is None or best is None else recipe.guided_share
         left = math.ceil(limit) - trials
         drawn, found = next_better(
-            points, np.cumsum(priors), guided, recipe.score, threshold, lowest, least, left, state, model
+            points, np.cumsum(priors), guided, recipe.score, threshold, lowest, least, left, state, recipe.oriented, model
         )
         trials += drawn
         if not found < lowest:

@@ -46,6 +46,34 @@ def seven_point(points: FloatArray, sample: IntArray, models: FloatArray) -> int
 
 
 @kernel
+def is_oriented(points: FloatArray, sample: IntArray, f: FloatArray) -> bool:
+    """Whether the sampled matches can all lie in front of both cameras of f (Chum, Werner and Matas 2004).
+
+    For such points e2 x x2 and F x1, the same line up to scale, point the same way for all matches or opposite for all.
+    Wrong models rarely pass, and need not be scored.
+    """
+    largest = -1.0  # e2 is perpendicular to the columns of F: the most stable cross product of two of them
+    e2 = np.empty(3)
+    for skipped in range(3):
+        j, k = (skipped + 1) % 3, (skipped + 2) % 3
+        x = f[3 + j] * f[6 + k] - f[6 + j] * f[3 + k]
+        y = f[6 + j] * f[k] - f[j] * f[6 + k]
+        z = f[j] * f[3 + k] - f[3 + j] * f[k]
+        if x * x + y * y + z * z > largest:
+            largest = x * x + y * y + z * z
+            e2[0], e2[1], e2[2] = x, y, z
+    positive = 0
+    for n in range(SAMPLE_SIZE):
+        x1, y1, x2, y2 = points[sample[n]]
+        ax, ay, az = f[0] * x1 + f[1] * y1 + f[2], f[3] * x1 + f[4] * y1 + f[5], f[6] * x1 + f[7] * y1 + f[8]
+        side = (e2[1] - e2[2] * y2) * ax + (e2[2] * x2 - e2[0]) * ay + (e2[0] * y2 - e2[1] * x2) * az
+        positive += side > 0.0
+        if positive != 0 and positive != n + 1:
+            return False
+    return True
+
+
+@kernel
 def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArray) -> int:
     """Real roots of c0 + c1 z + c2 z^2 + c3 z^3 into `roots` (3,); 1 or 3 of them, or 0 if c3 is 0."""
     if c3 == 0.0:

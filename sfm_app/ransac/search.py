@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.ransac.minimal import MOST_MODELS, seven_point
+from sfm_app.ransac.minimal import MOST_MODELS, is_oriented, seven_point
 from sfm_app.ransac.sampling import SAMPLE_SIZE, RandomState, draw_uniform, draw_weighted, uniform
 from sfm_app.ransac.scoring import penalty
 
@@ -23,6 +23,7 @@ def next_better(
     least_inliers: IntArray,
     limit: int,
     state: RandomState,
+    oriented: bool,
     best: FloatArray,
 ) -> tuple[int, float]:
     """Draw samples until one of its models has a smaller penalty than `to_beat`.
@@ -37,6 +38,7 @@ def next_better(
         least_inliers: from `bail_out_table`; empty for no bail-out.
         limit: most samples.
         state: random generator.
+        oriented: drop models that put a sampled point behind a camera.
         best: (9,) set to the better model.
 
     Returns:
@@ -50,6 +52,8 @@ def next_better(
             draw_uniform(state, points.shape[0], sample)
         score = to_beat
         for k in range(seven_point(points, sample, models)):
+            if oriented and not is_oriented(points, sample, models[k]):
+                continue
             found = penalty(points, models[k], kind, threshold, score, least_inliers)
             if found < score:
                 score = found

@@ -9,6 +9,7 @@ from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
 
 from sfm_app.context import RunContext
@@ -149,8 +150,8 @@ def _too_few(folder: Path, usable: int, reasons: Counter[str]) -> str:
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:
-    if image.mode in ("I;16", "I;16B", "I;16L", "I"):
-        return image.point([value / 256 for value in range(65536)], "L") if image.mode != "I" else image.point(lambda v: v / 256).convert("L")
+    if image.mode.startswith("I"):  # 16 bit per pixel
+        return Image.fromarray((np.asarray(image).astype(np.uint32) >> 8).clip(0, 255).astype(np.uint8))
     if image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info:
         white = Image.new("RGBA", image.size, "white")
         return Image.alpha_composite(white, image.convert("RGBA")).convert("RGB")

@@ -48,13 +48,13 @@ class ArcOptions:
     """>= 2."""
     sweep_deg: float = 80.0
     """Angle of the arc, in degrees, (0, 360]."""
-    distance: tuple[float, float] = (4.2, 6.2)
+    distance: tuple[float, float] = (4.6, 6.6)
     """Range of the distance to the middle, in scene units, > 0."""
     height: tuple[float, float] = (0.7, 2.6)
     """Range of the height above the ground, in scene units."""
-    aim: tuple[float, float, float] = (0.0, 1.15, -0.2)
+    aim: tuple[float, float, float] = (0.0, 1.3, -0.2)
     """What the photos look at, before it is varied."""
-    aim_spread: float = 0.45
+    aim_spread: float = 0.4
     """Largest offset of the aim in each direction, in scene units, >= 0."""
     roll_deg: float = 14.0
     """Largest roll either way, in degrees, [0, 180]."""

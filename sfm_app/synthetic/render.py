@@ -58,7 +58,9 @@ def prepare(scene: SyntheticScene) -> PreparedScene:
     )
 
 
-def render_scene(scene: PreparedScene, camera: Camera, cam_from_world: FloatArray, supersampling: int = 2) -> FloatArray:
+def render_scene(
+    scene: PreparedScene, camera: Camera, cam_from_world: FloatArray, supersampling: int = 2
+) -> FloatArray:
     """What the camera sees before blur, noise and gamma.
 
     Args:
@@ -78,7 +80,7 @@ def render_scene(scene: PreparedScene, camera: Camera, cam_from_world: FloatArra
         for dx in offsets:
             directions = pixel_rays(camera, (float(dx), float(dy))) @ R
             hits = cast(scene.rays, centre, directions)
-            lit = _lit(scene, centre, directions, hits["t_hit"])
+            lit = _lit(scene, centre, directions, hits)
             # t_hit counts in z depth, since the rays have z = 1: the size of a pixel is depth / f
             pixel = np.where(np.isfinite(hits["t_hit"]), hits["t_hit"], 1.0) / camera.K[0, 0]
             shade(
@@ -126,24 +128,27 @@ def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
 
 
 def cast(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, NDArray[Any]]:
-    """First hits of rays from `origin`, (3,) or (N, 3), along `directions` (N, 3): t_hit (inf: none), primitive ids, uvs."""
+    """First hits of rays from `origin`, (3,) or (N, 3), along `directions` (N, 3), by Open3D's names; t_hit is inf for none."""
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3] = origin
     rays[:, 3:] = directions
     found = caster.cast_rays(load_open3d().core.Tensor(rays))
-    return {key: found[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs")}
+    return {key: found[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs", "primitive_normals")}
 
 
-def _lit(scene: PreparedScene, centre: FloatArray, directions: FloatArray, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Whether the sun reaches each hit; also true where nothing was hit."""
-    hit = np.flatnonzero(np.isfinite(depth))
-    rays = np.empty((len(hit), 6), dtype=np.float32)
+def _lit(
+    scene: PreparedScene, centre: FloatArray, directions: FloatArray, hits: dict[str, NDArray[Any]]
+) -> NDArray[np.bool_]:
+    """Whether the sun reaches each hit; only asked where the surface faces the sun."""
+    sun = scene.lights[0]
+    lit = hits["primitive_normals"] @ sun.astype(np.float32) > 0
+    asked = np.flatnonzero(lit)
+    rays = np.empty((len(asked), 6), dtype=np.float32)
     # a step towards the sun keeps the surface from shadowing itself
-    rays[:, :3] = centre + directions[hit] * depth[hit, None] + 4e-3 * scene.lights[0]
-    rays[:, 3:] = scene.lights[0]
-    lit = np.ones(len(depth), dtype=np.bool_)
-    lit[hit] = ~scene.rays.test_occlusions(load_open3d().core.Tensor(rays)).numpy()
-    return lit
+    rays[:, :3] = centre + directions[asked] * hits["t_hit"][asked, None] + 4e-3 * sun
+    rays[:, 3:] = sun
+    lit[asked] = ~scene.rays.test_occlusions(load_open3d().core.Tensor(rays)).numpy()
+    return np.asarray(lit)
 
 
 def _openness(caster: Any, vertices: FloatArray, normals: FloatArray) -> FloatArray:

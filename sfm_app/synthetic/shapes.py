@@ -49,7 +49,11 @@ def box(width: float, height: float, depth: float, spacing: float = 0.15) -> Sha
 
 
 def revolved(
-    profile: FloatArray, segments: int = 64, span_deg: float = 360.0, sharp: bool = False, flutes: tuple[int, float] = (0, 0.0)
+    profile: FloatArray,
+    segments: int = 64,
+    span_deg: float = 360.0,
+    sharp: bool = False,
+    flutes: tuple[int, float] = (0, 0.0),
 ) -> Shape:
     """A profile turned about the y axis.
 

@@ -152,11 +152,11 @@ def mixture(
     kind, scale, contrast, seed = int(row[0]), row[1], row[2], int(row[3])
     fine = octaves(p, 0.4 * scale, 0.72, footprint, seed + 20)
     broad = octaves(p, 3.0 * scale, 0.5, max(footprint, 0.7 * scale), seed + 40)
-    bright = 1.0 + contrast * (0.9 * fine + 0.35 * broad)
+    bright = 1.0 + contrast * (1.7 * fine + 0.4 * broad)
     second, joint = 0.0, 0.0
     if kind == 0:  # stone: stains and dark pores
         second = ramp(broad + 0.6 * fine, -0.3, 0.9)
-        joint = 0.7 * ramp(octaves(p, 0.12 * scale, 0.5, footprint, seed + 60), 0.35, 0.6)
+        joint = 0.8 * ramp(octaves(p, 0.09 * scale, 0.75, footprint, seed + 60), 0.3, 0.55)
     elif kind == 1 or kind == 2:  # bricks stand on walls, slabs lie on the ground
         along = p[0] if abs(n[2]) >= abs(n[0]) else p[2]
         wobble = 0.06 * value_noise(3.0 * p[0] / scale, 3.0 * p[1] / scale, 3.0 * p[2] / scale, seed)
@@ -191,7 +191,7 @@ def mixture(
             border, name = cells(p[1] / scale, p[2] / scale, seed)
         else:
             border, name = cells(p[0] / scale, p[1] / scale, seed)
-        second, joint = name, 1.0 - ramp(border, 0.02, 0.22)
+        second, joint = name, 1.0 - ramp(border, 0.0, 0.14)
         bright *= 0.7 + 0.6 * ((5.0 * name) % 1.0)
     else:  # stripes around the y axis, worn off in places
         turn = (math.atan2(p[2], p[0]) / (2.0 * math.pi) + 0.5) * 8.0

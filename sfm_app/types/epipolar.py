@@ -75,11 +75,11 @@ class ViewGraph:
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "ViewGraph":
         """Back from `to_arrays`."""
-        cuts = np.cumsum(arrays["match_counts"])[:-1]
+        cuts = np.cumsum(arrays["match_counts"])
         columns = (
             arrays["F"],
-            np.split(arrays["inliers"], cuts),
-            np.split(arrays["priors"], cuts),
+            np.split(arrays["inliers"], cuts)[:-1],
+            np.split(arrays["priors"], cuts)[:-1],
             arrays["trials"].tolist(),
             arrays["rms_px"].tolist(),
             arrays["degeneracy"].tolist(),

@@ -1,0 +1,103 @@
+"""Which depths other photos confirm."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.stereo.view import DepthArray, FloatArray, View
+
+
+def merge_hypotheses(
+    depths: NDArray[np.float32], parallaxes: NDArray[np.float32], tolerance: float
+) -> tuple[DepthArray, NDArray[np.uint8]]:
+    """One depth per pixel from those that the neighbours gave.
+
+    The depth with the heaviest company within the tolerance wins; the company is averaged. A depth weighs the square of
+    its parallax, which is inversely proportional to its variance.
+
+    Args:
+        depths: (N, H, W), 0 where a neighbour gave none.
+        parallaxes: (N, H, W) in pixels.
+        tolerance: largest relative difference of depths that agree.
+
+    Returns:
+        (H, W) depth, 0 where no neighbour gave any, and (H, W) how many neighbours agree with it.
+    """
+    depth = np.zeros(depths.shape[1:], np.float32)
+    support = np.zeros(depths.shape[1:], np.uint8)
+    _merge(depths, parallaxes, tolerance, depth, support)
+    return depth, support
+
+
+@kernel
+def _merge(
+    depths: NDArray[np.float32],
+    parallaxes: NDArray[np.float32],
+    tolerance: float,
+    depth: DepthArray,
+    support: NDArray[np.uint8],
+) -> None:
+    count, height, width = depths.shape
+    for row in range(height):
+        for col in range(width):
+            heaviest = 0.0
+            for i in range(count):
+                z = depths[i, row, col]
+                if z <= 0:
+                    continue
+                weight, mean, members = 0.0, 0.0, 0
+                for j in range(count):
+                    other = depths[j, row, col]
+                    if other > 0 and abs(other - z) <= tolerance * z:
+                        w = parallaxes[j, row, col] ** 2
+                        weight += w
+                        mean += w / other  # noise of disparities is noise of inverse depths
+                        members += 1
+                if weight > heaviest:
+                    heaviest = weight
+                    depth[row, col] = weight / mean
+                    support[row, col] = members
+
+
+def count_agreeing(
+    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
+) -> NDArray[np.uint8]:
+    """How many other depth maps confirm each depth of a view, (H, W).
+
+    A map confirms a depth when the point, seen from there, has a depth within the relative tolerance of the map's.
+    """
+    agreeing = np.zeros(depth.shape, np.uint8)
+    K_inv = np.linalg.inv(view.K)
+    for other, other_depth in others:
+        relative = other.R @ view.R.T
+        P = other.K @ np.column_stack([relative @ K_inv, other.t - relative @ view.t])
+        _count(depth, other_depth, P, tolerance, view.sample_px, agreeing)
+    return agreeing
+
+
+@kernel
+def _count(
+    depth: DepthArray,
+    other_depth: DepthArray,
+    P: FloatArray,
+    tolerance: float,
+    sample_px: float,
+    agreeing: NDArray[np.uint8],
+) -> None:
+    height, width = other_depth.shape
+    for row in range(depth.shape[0]):
+        for col in range(depth.shape[1]):
+            z = depth[row, col]
+            if z <= 0:
+                continue
+            x, y = col + sample_px, row + sample_px
+            w = z * (P[2, 0] * x + P[2, 1] * y + P[2, 2]) + P[2, 3]
+            if w <= 0:
+                continue
+            u = (z * (P[0, 0] * x + P[0, 1] * y + P[0, 2]) + P[0, 3]) / w
+            v = (z * (P[1, 0] * x + P[1, 1] * y + P[1, 2]) + P[1, 3]) / w
+            j, i = int(np.floor(u - sample_px + 0.5)), int(np.floor(v - sample_px + 0.5))
+            if 0 <= i < height and 0 <= j < width and abs(other_depth[i, j] - w) <= tolerance * w:
+                agreeing[row, col] += 1

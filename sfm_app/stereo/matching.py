@@ -1,0 +1,107 @@
+"""Disparities of rectified photos, and the depths they stand for."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.stereo.rectify import Rectification
+from sfm_app.stereo.view import DepthArray, FloatArray, GreyImage, View
+
+BLOCK_PX = 5
+NO_DISPARITY = -1.0
+
+
+def disparities(left: GreyImage, right: GreyImage, count: int) -> NDArray[np.float32]:
+    """Semi-global matching (Hirschmueller, PAMI 2008; OpenCV's block variant) in [0, count), to sub-pixels.
+
+    Returns:
+        (H, W) disparity of the left image in pixels; -1 where left and right disagree by more than a pixel, where a second
+        disparity is nearly as good, and on small specks.
+    """
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=count,
+        blockSize=BLOCK_PX,
+        P1=8 * BLOCK_PX**2,
+        P2=32 * BLOCK_PX**2,
+        disp12MaxDiff=1,
+        preFilterCap=31,
+        uniquenessRatio=5,
+        speckleWindowSize=100,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM,
+    )
+    sixteenths = matcher.compute(left, right)
+    return np.where(sixteenths < 0, NO_DISPARITY, sixteenths / 16.0).astype(np.float32)
+
+
+def depths_from_disparities(
+    disparity: NDArray[np.float32], rectification: Rectification, reference: View, neighbour: View
+) -> tuple[DepthArray, DepthArray]:
+    """Bring a rectified disparity map back into the reference.
+
+    Returns:
+        (H, W) depth of the reference's pixels, 0 where unknown or not seen by the neighbour, and (H, W) the parallax
+        focal * baseline / depth in pixels, to which the relative accuracy of the depth is proportional.
+    """
+    K_inv = np.linalg.inv(reference.K)
+    to_rectified = rectification.rotation @ reference.R.T @ K_inv
+    # x of the neighbour = M x z + m for the pixel x of the reference at depth z
+    M = neighbour.K @ neighbour.R @ reference.R.T @ K_inv
+    m = neighbour.K @ (neighbour.t - neighbour.R @ reference.R.T @ reference.t)
+    focal_baseline = rectification.focal_px * rectification.baseline
+    size = np.array([reference.height, reference.width, neighbour.height, neighbour.width])
+    depth = np.zeros((reference.height, reference.width), np.float32)
+    parallax = np.zeros_like(depth)
+    constants = np.array([focal_baseline, rectification.offset_px, reference.sample_px])
+    _lift(disparity, rectification.left, to_rectified, np.column_stack([M, m]), constants, size, depth, parallax)
+    return depth, parallax
+
+
+@kernel
+def _lift(
+    disparity: NDArray[np.float32],
+    H: FloatArray,
+    to_rectified: FloatArray,
+    P: FloatArray,
+    constants: FloatArray,
+    size: NDArray[np.int64],
+    depth: DepthArray,
+    parallax: DepthArray,
+) -> None:
+    focal_baseline, offset, sample = constants
+    for row in range(size[0]):
+        for col in range(size[1]):
+            x, y = col + sample, row + sample
+            w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
+            u = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / w - 0.5
+            v = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / w - 0.5
+            d = _interpolated(disparity, u, v)
+            if d < 0 or d + offset <= 0:
+                continue
+            z = focal_baseline / (d + offset) / (to_rectified[2, 0] * x + to_rectified[2, 1] * y + to_rectified[2, 2])
+            p2 = z * (P[2, 0] * x + P[2, 1] * y + P[2, 2]) + P[2, 3]
+            if p2 <= 0 or z <= 0:
+                continue
+            p0 = (z * (P[0, 0] * x + P[0, 1] * y + P[0, 2]) + P[0, 3]) / p2
+            p1 = (z * (P[1, 0] * x + P[1, 1] * y + P[1, 2]) + P[1, 3]) / p2
+            # beyond the neighbour's border the matcher only guesses from what is beside
+            if 2 < p0 < size[3] - 2 and 2 < p1 < size[2] - 2:
+                depth[row, col] = z
+                parallax[row, col] = d + offset
+
+
+@kernel
+def _interpolated(disparity: NDArray[np.float32], u: float, v: float) -> float:
+    """Bilinear where the surface is continuous, else the nearest value; -1 where there is none."""
+    height, width = disparity.shape
+    i, j = int(np.floor(v)), int(np.floor(u))
+    if i < 0 or j < 0 or i + 1 >= height or j + 1 >= width:
+        return -1.0
+    a, b, c, d = disparity[i, j], disparity[i, j + 1], disparity[i + 1, j], disparity[i + 1, j + 1]
+    lowest, highest = min(a, b, c, d), max(a, b, c, d)
+    fu, fv = u - j, v - i
+    if lowest >= 0 and highest - lowest < 1.5:
+        return float((1 - fv) * ((1 - fu) * a + fu * b) + fv * ((1 - fu) * c + fu * d))
+    return float(disparity[i + (fv >= 0.5), j + (fu >= 0.5)])

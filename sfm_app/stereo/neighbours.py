@@ -1,0 +1,61 @@
+"""Which other photos a photo is matched with."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.stereo.view import FloatArray, View
+
+MIN_SHARED_POINTS = 5
+BEST_ANGLE_DEG = 8.0
+"""Smaller angles give inexact depths, larger ones images that look different."""
+
+
+def rank_neighbours(views: Sequence[View], count: int) -> list[list[int]]:
+    """For every view the indices of the views that serve it best, best first, at most `count`.
+
+    Greedy coverage: the next neighbour is the one that adds most to the sparse points of the view. A point adds its weight
+    (triangulation angle, difference in scale), halved for each time that it is covered already, so that the choice spreads
+    over the photo instead of crowding on one side.
+    """
+    return [_rank(view, views, count) for view in views]
+
+
+def _rank(view: View, views: Sequence[View], count: int) -> list[int]:
+    weights: dict[int, FloatArray] = {}
+    for index, other in enumerate(views):
+        if other is view:
+            continue
+        shared = np.isin(view.point_ids, other.point_ids, assume_unique=True)
+        if np.count_nonzero(shared) >= MIN_SHARED_POINTS:
+            weights[index] = np.where(shared, point_weights(view, other, view.points), 0.0)
+    value, chosen = np.ones(len(view.point_ids)), list[int]()
+    while weights and len(chosen) < count:
+        # ties go to the lower index, so that the choice never depends on the order of a dictionary
+        best = max(weights, key=lambda index: (float(weights[index] @ value), -index))
+        weight = weights.pop(best)
+        if weight @ value <= 0:
+            break
+        chosen.append(best)
+        value *= 1.0 - 0.5 * weight
+    return chosen
+
+
+def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
+    """(N,) in [0, 1]: how well world points (N, 3) can be matched between two views, from their angle and scale."""
+    angle_deg = triangulation_angles_deg(view.center, other.center, points)
+    spread_deg = np.where(angle_deg < BEST_ANGLE_DEG, BEST_ANGLE_DEG / 3, 1.25 * BEST_ANGLE_DEG)
+    weight = np.exp(-0.5 * ((angle_deg - BEST_ANGLE_DEG) / spread_deg) ** 2)
+    depth, other_depth = points @ view.R[2] + view.t[2], points @ other.R[2] + other.t[2]
+    in_front = (depth > 0) & (other_depth > 0)
+    scale = np.divide(view.K[0, 0] * other_depth, other.K[0, 0] * depth, out=np.ones_like(depth), where=in_front)
+    return np.asarray(np.where(in_front, weight * np.minimum(scale, 1 / scale), 0.0))
+
+
+def triangulation_angles_deg(center1: FloatArray, center2: FloatArray, points: FloatArray) -> NDArray[np.float64]:
+    """(N,) angles in degrees under which points (N, 3) see two centres (3,)."""
+    ray1, ray2 = points - center1, points - center2
+    # atan2 keeps small angles exact, where arccos of a rounded cosine does not
+    sine = np.linalg.norm(np.cross(ray1, ray2), axis=1)
+    return np.asarray(np.degrees(np.arctan2(sine, np.sum(ray1 * ray2, axis=1))))

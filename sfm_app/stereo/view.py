@@ -1,0 +1,56 @@
+"""What stereo knows about a photo besides its pixels."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+DepthArray = NDArray[np.float32]
+"""(H, W) depth along the optical axis in scene units, 0 where unknown."""
+GreyImage = NDArray[np.uint8]
+"""(H, W)."""
+
+
+def _no_ids() -> NDArray[np.int64]:
+    return np.empty(0, np.int64)
+
+
+def _no_points() -> FloatArray:
+    return np.empty((0, 3))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """A posed photo without distortion: x ~ K (R X + t), pixel centres at +0.5."""
+
+    name: str
+    K: FloatArray
+    """(3, 3) camera matrix in pixels; rows and columns may have different focal lengths, skew is allowed."""
+    R: FloatArray
+    """(3, 3) rotation of cam_from_world."""
+    t: FloatArray
+    """(3,) translation of cam_from_world."""
+    width: int
+    height: int
+    point_ids: NDArray[np.int64] = field(default_factory=_no_ids)
+    """(M,) ids of the sparse points that this photo observes, ascending."""
+    points: FloatArray = field(default_factory=_no_points)
+    """(M, 3) those points in the world."""
+    sample_px: float = 0.5
+    """Where inside its pixel a depth is taken, in x and y: 0.5 is the pixel's centre, 0 its top-left corner."""
+
+    @property
+    def center(self) -> FloatArray:
+        """(3,) centre of projection in the world."""
+        return np.asarray(-self.R.T @ self.t)
+
+    @property
+    def depths(self) -> FloatArray:
+        """(M,) depths of the sparse points."""
+        return np.asarray(self.points @ self.R[2] + self.t[2])
+
+    @property
+    def projection(self) -> FloatArray:
+        """(3, 4) projection matrix K [R | t]."""
+        return self.K @ np.column_stack([self.R, self.t])

@@ -1,0 +1,188 @@
+"""How close a reconstruction came to the truth of a rendered photo folder."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.meshing.open3d import load_open3d
+from sfm_app.synthetic.cameras import Camera, camera_centre, pixel_rays
+from sfm_app.synthetic.photo_folder import Truth
+from sfm_app.synthetic.render import cast, ray_caster
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+# Rays per photo, along its longer side, that find out which part of the true surface was seen.
+SEEN_RAYS = 96
+MAX_TRIPLES = 500
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Similarity:
+    """x -> scale R x + t."""
+
+    scale: float
+    R: FloatArray
+    """(3, 3) rotation."""
+    t: FloatArray
+    """(3,)."""
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Move points (N, 3)."""
+        return np.asarray(self.scale * points @ self.R.T + self.t)
+
+
+def focal_error_percent(K: FloatArray, truth: Truth) -> float:
+    """e_focal of thesis section 5.5.3: mean error of fx and fy in percent of the truth."""
+    return float(50.0 * sum(abs(K[i, i] / truth.K[i, i] - 1.0) for i in (0, 1)))
+
+
+def centre_error_percent(K: FloatArray, truth: Truth) -> float:
+    """e_OC of thesis section 5.5.3: mean error of the optical centre's x and y in percent of the truth."""
+    return float(50.0 * sum(abs(K[i, 2] / truth.K[i, 2] - 1.0) for i in (0, 1)))
+
+
+def surface_error(
+    vertices: FloatArray,
+    faces: IndexArray,
+    centres: Mapping[str, FloatArray],
+    truth: Truth,
+    samples: int = 20_000,
+) -> float:
+    """Median distance of a reconstructed surface to the true one, as a share of the scene's size.
+
+    The reconstruction is moved onto the truth by the similarity between the camera centres. The scene's size is the
+    diagonal of the bounding box of the true surface that the photos see. The median says nothing about what is
+    missing: see `surface_coverage`.
+
+    Args:
+        vertices: (V, 3) in the reconstruction's frame.
+        faces: (T, 3) vertex indices.
+        centres: camera centre (3,) by photo name in the frame of `vertices`; at least 3 photos of the truth.
+        truth: of the photo folder.
+        samples: points drawn evenly from the surface (fixed seed).
+
+    Raises:
+        ValueError: fewer than 3 common photos, their centres lie on a line, or the surface has no area.
+    """
+    aligned = align_centres(centres, truth)(vertices)
+    points = sample_surface(aligned, faces, samples)
+    return float(np.median(_distances(points, truth.vertices, truth.faces)) / scene_size(truth))
+
+
+def surface_coverage(
+    vertices: FloatArray,
+    faces: IndexArray,
+    centres: Mapping[str, FloatArray],
+    truth: Truth,
+    tolerance: float = 0.01,
+) -> float:
+    """Share of what the photos see of the true surface that has reconstructed surface within `tolerance` scene sizes.
+
+    Weighted as the photos see it: evenly over their pixels. Arguments and errors as for `surface_error`.
+    """
+    aligned = align_centres(centres, truth)(vertices)
+    if not _area(aligned, faces).sum() > 0:
+        raise ValueError("the surface has no area")
+    return float(np.mean(_distances(seen_points(truth), aligned, faces) <= tolerance * scene_size(truth)))
+
+
+def scene_size(truth: Truth) -> float:
+    """Diagonal of the bounding box of the true surface that the photos see, in scene units."""
+    return float(np.linalg.norm(np.ptp(seen_points(truth), axis=0)))
+
+
+def seen_points(truth: Truth) -> FloatArray:
+    """(N, 3) points where an even grid of rays through all photos meets the true surface."""
+    shrink = SEEN_RAYS / max(truth.width, truth.height)
+    K = np.diag([shrink, shrink, 1.0]) @ truth.K
+    camera = Camera(K, round(truth.width * shrink), round(truth.height * shrink), truth.division_lambda)
+    rays = pixel_rays(camera)
+    caster = ray_caster(truth.vertices, truth.faces)
+    found = []
+    for pose in truth.cam_from_world.values():
+        directions = rays @ pose[:, :3]
+        depth = cast(caster, camera_centre(pose), directions)["t_hit"].astype(np.float64)
+        hit = np.isfinite(depth)
+        found.append(camera_centre(pose) + directions[hit] * depth[hit, None])
+    return np.concatenate(found)
+
+
+def align_centres(centres: Mapping[str, FloatArray], truth: Truth) -> Similarity:
+    """The similarity that takes found camera centres to the true ones, not led astray by wrong photos.
+
+    Least median of squares over triples of photos, then Umeyama on the photos that agree with the best triple
+    (Rousseeuw 1984; the threshold is 2.5 robust standard deviations).
+
+    Raises:
+        ValueError: fewer than 3 common photos, or all centres lie on a line.
+    """
+    names = sorted(set(centres) & set(truth.cam_from_world))
+    if len(names) < 3:
+        raise ValueError(f"{len(names)} of the found camera centres are known; 3 are needed")
+    a = np.array([centres[name] for name in names], dtype=np.float64)
+    b = np.array([truth.centres[name] for name in names])
+    triples = np.array(list(combinations(range(len(names)), 3)))
+    if len(triples) > MAX_TRIPLES:
+        triples = np.random.default_rng(0).permutation(triples)[:MAX_TRIPLES]
+    best, residual = np.inf, np.zeros(len(names))
+    for triple in triples:
+        if _on_a_line(a[triple]) or _on_a_line(b[triple]):
+            continue
+        distance = np.linalg.norm(umeyama(a[triple], b[triple])(a) - b, axis=1)
+        # of n photos 3 fit by construction, so the median has to look beyond them
+        score = float(np.sort(distance)[min(len(names) - 1, len(names) // 2 + 1)])
+        if score < best:
+            best, residual = score, distance
+    if not np.isfinite(best):
+        raise ValueError("the camera centres lie on a line and fix no rotation")
+    agreeing = residual <= max(2.5 * 1.4826 * best, np.sort(residual)[2])
+    return umeyama(a[agreeing], b[agreeing])
+
+
+def umeyama(a: FloatArray, b: FloatArray) -> Similarity:
+    """The similarity that takes points a (N, 3) to b (N, 3) with least squared error (Umeyama 1991); N >= 3."""
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    u, s, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    R = (u * signs) @ vt
+    scale = float((s * signs).sum() / ((a - mean_a) ** 2).sum())
+    return Similarity(scale, R, mean_b - scale * R @ mean_a)
+
+
+def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0) -> FloatArray:
+    """(count, 3) points spread evenly over the triangles.
+
+    Raises:
+        ValueError: the surface has no area.
+    """
+    area = _area(vertices, faces)
+    if not area.sum() > 0:
+        raise ValueError("the surface has no area")
+    rng = np.random.default_rng(seed)
+    corners = vertices[faces[rng.choice(len(faces), count, p=area / area.sum())]]
+    u, v = rng.uniform(size=(2, count, 1))
+    # folding the unit square onto the triangle keeps the points even
+    outside = u + v > 1.0
+    u, v = np.where(outside, 1.0 - u, u), np.where(outside, 1.0 - v, v)
+    return np.asarray(corners[:, 0] * (1.0 - u - v) + corners[:, 1] * u + corners[:, 2] * v)
+
+
+def _distances(points: FloatArray, vertices: FloatArray, faces: IndexArray) -> FloatArray:
+    queries = load_open3d().core.Tensor(points.astype(np.float32))
+    return np.asarray(ray_caster(vertices, faces).compute_distance(queries).numpy(), dtype=np.float64)
+
+
+def _area(vertices: FloatArray, faces: IndexArray) -> FloatArray:
+    corners = vertices[faces]
+    return np.asarray(
+        0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    )
+
+
+def _on_a_line(points: FloatArray) -> bool:
+    s = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(s[1] <= 1e-6 * s[0])

@@ -1,0 +1,157 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sfm_app.context import RunContext
+from sfm_app.errors import InputError
+from sfm_app.parallel import make_executor
+from sfm_app.plugins import load_plugins
+from sfm_app.settings import Settings
+from sfm_app.stages.photos import load_photo_set, read_photos
+from sfm_app.workspace import Workspace
+
+PIXELS = np.random.default_rng(0).integers(0, 255, (96, 128, 3), np.uint8)
+PIXELS[:48] //= 3  # the upper half is dark, so that turning shows
+
+
+@pytest.fixture
+def run(tmp_path):
+    workspace = Workspace(tmp_path / "out")
+    workspace.create()
+    with make_executor(2) as executor:
+        yield RunContext(Settings(), workspace, load_plugins(installed=False), executor, 2)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    place = tmp_path / "photos"
+    place.mkdir()
+    for name in ("a.jpg", "b.png"):
+        Image.fromarray(PIXELS).save(place / name)
+    return place
+
+
+def reasons(photo_set):
+    return {photo.name: photo.reason for photo in photo_set.unusable}
+
+
+def test_every_file_is_used_or_has_a_reason(folder, run):
+    (folder / "notes.txt").write_text("no photo")
+    (folder / "empty.jpg").write_bytes(b"")
+    (folder / "cut.jpg").write_bytes((folder / "a.jpg").read_bytes()[:2000])
+    Image.fromarray(PIXELS[:40, :40]).save(folder / "tiny.png")
+    (folder / ".hidden.jpg").write_bytes(b"x")
+    (folder / "sub dir").mkdir()
+    Image.fromarray(PIXELS).save(folder / "sub dir" / "ü b.jpg")
+
+    found = read_photos(folder, run)
+
+    assert [photo.name for photo in found.photos] == ["a.jpg", "b.png", "sub dir/ü b.jpg"]
+    assert reasons(found) == {
+        "notes.txt": "not a JPEG or PNG photo",
+        "empty.jpg": "not a JPEG or PNG photo",
+        "cut.jpg": "truncated or damaged",
+        "tiny.png": "smaller than 64 px",
+    }
+    assert load_photo_set(run) == found
+    assert np.array_equal(np.asarray(Image.open(run.workspace.photos / "b.png")), PIXELS)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_exif_orientation_is_applied_to_what_colmap_sees(folder, run, orientation):
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(PIXELS).save(folder / "turned.png", exif=exif)
+
+    photo = next(photo for photo in read_photos(folder, run).photos if photo.name == "turned.png")
+    seen = Image.open(run.workspace.photos / "turned.png")
+    seen.load()
+
+    assert (photo.width, photo.height) == seen.size == ((96, 128) if orientation >= 5 else (128, 96))
+    assert seen.getexif().get(0x0112, 1) == 1
+    assert photo.needs_copy == (orientation != 1)
+    expected = {3: PIXELS[::-1, ::-1], 6: np.rot90(PIXELS, -1), 8: np.rot90(PIXELS, 1)}.get(orientation)
+    if expected is not None:
+        assert np.array_equal(np.asarray(seen), expected)
+
+
+@pytest.mark.parametrize("mode", ["RGBA", "P", "LA", "I;16", "1", "CMYK"])
+def test_odd_pixel_formats_become_eight_bit(folder, run, mode):
+    image = Image.fromarray(PIXELS)
+    if mode == "I;16":
+        image = Image.fromarray(PIXELS[..., 0].astype(np.uint16) * 256)
+    else:
+        image = image.convert(mode)
+    name = "odd.jpg" if mode == "CMYK" else "odd.png"
+    image.save(folder / name)
+
+    read_photos(folder, run)
+    seen = Image.open(run.workspace.photos / name)
+    seen.load()
+
+    assert seen.mode in ("RGB", "L")
+    dark, bright = np.asarray(seen.convert("L"))[:48].mean(), np.asarray(seen.convert("L"))[48:].mean()
+    assert bright > 2 * dark > 10
+
+
+def test_photos_of_one_size_share_a_camera_unless_exif_tells_them_apart(folder, run):
+    Image.fromarray(PIXELS[:, :100]).save(folder / "c.jpg")
+    exif = Image.Exif()
+    exif[0x0110] = "Box Brownie"
+    Image.fromarray(PIXELS).save(folder / "d.jpg", exif=exif)
+
+    groups = read_photos(folder, run).groups
+
+    assert [[photo.name for photo in members] for members in groups.values()] == [["a.jpg", "b.png"], ["c.jpg"], ["d.jpg"]]
+
+
+def test_exif_focal_is_read_as_a_hint_in_pixels(folder, run):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769)[0xA405] = 27
+    Image.fromarray(PIXELS).save(folder / "e.jpg", exif=exif)
+
+    photo = next(photo for photo in read_photos(folder, run).photos if photo.name == "e.jpg")
+
+    assert photo.exif_focal_px == pytest.approx(27 / 36 * 128)
+
+
+def test_the_output_folder_inside_the_photos_is_not_read(folder, tmp_path):
+    workspace = Workspace(folder / "out")
+    workspace.create()
+    Image.fromarray(PIXELS).save(folder / "out" / "model.png")
+    with make_executor(1) as executor:
+        found = read_photos(folder, RunContext(Settings(), workspace, load_plugins(installed=False), executor, 1))
+
+    assert [photo.name for photo in found.photos] == ["a.jpg", "b.png"]
+
+
+@pytest.mark.parametrize(
+    ("names", "says"),
+    [
+        ((), "no usable photo in .*: the folder is empty"),
+        (("notes.txt", "more.txt"), "no usable photo in .*: 2 not a JPEG or PNG photo"),
+        (("one.jpg",), "only one usable photo"),
+    ],
+)
+def test_too_few_photos(tmp_path, run, names, says):
+    folder = tmp_path / "few"
+    folder.mkdir()
+    for name in names:
+        if name.endswith(".jpg"):
+            Image.fromarray(PIXELS).save(folder / name)
+        else:
+            (folder / name).write_text("text")
+
+    with pytest.raises(InputError, match=says):
+        read_photos(folder, run)
+
+
+def test_a_missing_folder_or_a_file(tmp_path, run):
+    with pytest.raises(InputError, match="no such folder"):
+        read_photos(tmp_path / "nowhere", run)
+    path = Path(tmp_path / "file.jpg")
+    path.write_bytes(b"x")
+    with pytest.raises(InputError, match="not a folder"):
+        read_photos(path, run)

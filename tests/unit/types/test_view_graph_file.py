@@ -1,0 +1,50 @@
+import io
+
+import numpy as np
+
+from sfm_app.types import Calibration, EpipolarFit, Rejected, ViewGraph
+
+
+def fit(n, degeneracy=""):
+    rng = np.random.default_rng(n)
+    return EpipolarFit(rng.normal(size=(3, 3)), rng.random(n) < 0.5, rng.random(n), n, 0.5, degeneracy)
+
+
+def through_file(graph):
+    file = io.BytesIO()
+    np.savez_compressed(file, **graph.to_arrays())
+    file.seek(0)
+    with np.load(file, allow_pickle=False) as arrays:
+        return ViewGraph.from_arrays(dict(arrays)), file.getvalue()
+
+
+def test_a_view_graph_survives_its_file():
+    graph = ViewGraph({(1, 2): fit(5), (1, 7): fit(9, "planar")}, {(2, 7): Rejected("too few inliers")})
+
+    back, data = through_file(graph)
+
+    assert list(back.fits) == [(1, 2), (1, 7)]
+    assert back.rejected == graph.rejected
+    for pair, one in graph.fits.items():
+        other = back.fits[pair]
+        assert np.array_equal(one.F, other.F) and np.array_equal(one.inliers, other.inliers)
+        assert np.array_equal(one.priors, other.priors)
+        assert (one.trials, one.rms_px, one.degeneracy) == (other.trials, other.rms_px, other.degeneracy)
+    assert through_file(graph)[1] == data
+
+
+def test_an_empty_view_graph_survives_too():
+    back, _ = through_file(ViewGraph({}, {(1, 2): Rejected("x"), (1, 3): Rejected("x"), (2, 3): Rejected("y")}))
+
+    assert not back.fits
+    assert back.reasons == {"x": 2, "y": 1}
+
+
+def test_a_calibration_survives_json():
+    one = Calibration(np.diag([5.0, 6, 1]), 640, 480, "zero-curves", True, spread={"fx": 1.5}, evidence={"pairs": 3})
+
+    back = Calibration.from_dict(one.to_dict())
+
+    assert np.array_equal(back.K, one.K)
+    assert (back.spread, back.evidence, back.identifiable) == ({"fx": 1.5}, {"pairs": 3}, True)
+    assert back.focal_px == np.sqrt(30)
