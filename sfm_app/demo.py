@@ -1,3 +1,154 @@
-"""placeholder"""
-def run_demo(*a): ...
-def demo_lines(*a): ...
+"""A rendered photo folder with a known camera and a known surface, reconstructed and compared with the truth."""
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sfm_app.api import Run, reconstruct
+from sfm_app.errors import InputError
+from sfm_app.progress import Progress
+from sfm_app.settings import Settings
+from sfm_app.stages.mesh import load_surface
+from sfm_app.synthetic.cameras import Camera, arc, camera_centre, make_camera
+from sfm_app.synthetic.compare import centre_error_percent, focal_error_percent, surface_coverage, surface_error
+from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth, write_photo_folder
+from sfm_app.synthetic.render import render_mesh
+from sfm_app.synthetic.scenes import build_scene
+from sfm_app.types import Scene, Surface
+from sfm_app.workspace import Workspace
+
+SIZE = (960, 640)
+ASIDE = 0.35
+"""How far the second view of the picture stands beside a photo's place, as a share of its distance to the scene."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoResult:
+    """How close the reconstruction of the demo scene came."""
+
+    photos: int
+    registered: int
+    true_K: list[list[float]]
+    found_K: list[list[float]]
+    """From the photos alone, before bundle adjustment."""
+    refined_K: list[list[float]]
+    focal_error_percent: float
+    refined_focal_error_percent: float
+    centre_error_percent: float
+    refined_centre_error_percent: float
+    surface_error_percent: float
+    """Median distance of the mesh to the true surface, in percent of the scene's size."""
+    surface_coverage_percent: float
+    """Share of what the photos see that the mesh covers within 1 % of the scene's size."""
+    triangles: int
+    seconds_rendering: float
+    seconds_reconstruction: float
+    files: list[str]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return asdict(self)
+
+
+def run_demo(out: Path, settings: Settings, progress: Progress) -> DemoResult:
+    """Render OUT/photos, reconstruct them into OUT/model, compare, and draw OUT/model.png.
+
+    Raises:
+        SfmError: see `sfm_app.errors`.
+    """
+    start = time.perf_counter()
+    progress.stage("rendering photos of a scene with a known camera")
+    truth = render_photos(out, progress)
+    rendered = time.perf_counter()
+    run = reconstruct(out / "photos", out / "model", settings, progress=progress)
+    done = time.perf_counter()
+    if run.scene is None or run.calibration is None:
+        raise InputError("the demo's reconstruction is incomplete", hint=f"remove {out} and try again")
+    surface = load_surface(Workspace(run.out).dense)
+    draw(surface, run.scene, out)
+    return compared(run, run.scene, surface, truth, (rendered - start, done - rendered), out)
+
+
+def render_photos(out: Path, progress: Progress) -> Truth:
+    """The photo folder and its truth beside it; kept when they are there already."""
+    views = arc(make_camera(*SIZE))
+    names = set(views.cam_from_world)
+    if (out / "truth.json").exists() and {path.name for path in (out / "photos").glob("*.jpg")} == names:
+        return load_truth(out)
+    truth = write_photo_folder(out / "photos", build_scene(), views, progress=progress)
+    save_truth(truth, out)
+    return truth
+
+
+def compared(
+    run: Run, scene: Scene, surface: Surface, truth: Truth, seconds: tuple[float, float], out: Path
+) -> DemoResult:
+    """Set what was found beside what is true."""
+    refined = next(iter(scene.cameras.values())).K
+    found = run.calibration.K if run.calibration else refined
+    centres = {name: camera_centre(pose) for name, pose in scene.cam_from_world.items()}
+    error = surface_error(surface.vertices, surface.faces, centres, truth)
+    coverage = surface_coverage(surface.vertices, surface.faces, centres, truth)
+    return DemoResult(
+        photos=len(truth.cam_from_world),
+        registered=len(scene.registered),
+        true_K=truth.K.tolist(),
+        found_K=found.tolist(),
+        refined_K=refined.tolist(),
+        focal_error_percent=round(focal_error_percent(found, truth), 3),
+        refined_focal_error_percent=round(focal_error_percent(refined, truth), 3),
+        centre_error_percent=round(centre_error_percent(found, truth), 3),
+        refined_centre_error_percent=round(centre_error_percent(refined, truth), 3),
+        surface_error_percent=round(100 * error, 3),
+        surface_coverage_percent=round(100 * coverage, 1),
+        triangles=len(surface.faces),
+        seconds_rendering=round(seconds[0], 1),
+        seconds_reconstruction=round(seconds[1], 1),
+        files=[str(path) for path in (*sorted(run.out.glob("model.*")), out / "model.png")],
+    )
+
+
+def draw(surface: Surface, scene: Scene, out: Path) -> None:
+    """OUT/model.png: a photo, the mesh from where it was taken, and the mesh from beside it."""
+    names = sorted(scene.cam_from_world)
+    name = names[len(names) // 2]
+    model = next(iter(scene.cameras.values()))
+    camera = Camera(model.K, model.width, model.height)
+    pose = scene.cam_from_world[name]
+    photo = np.asarray(Image.open(out / "photos" / name).convert("RGB"))
+    mesh_views = [render_mesh(surface, camera, view) for view in (pose, stepped_aside(pose, surface))]
+    Image.fromarray(np.concatenate([photo, *mesh_views], axis=1)).save(out / "model.png")
+
+
+def stepped_aside(pose: NDArray[np.float64], surface: Surface) -> NDArray[np.float64]:
+    """The pose of somebody who took a step to the right of a camera."""
+    depth = float(np.median(surface.vertices @ pose[2, :3] + pose[2, 3]))
+    moved = pose.copy()
+    moved[0, 3] -= ASIDE * depth
+    return moved
+
+
+def demo_lines(result: DemoResult) -> list[str]:
+    """The result for people."""
+    return [
+        f"true camera     {k_text(result.true_K)}",
+        f"found           {k_text(result.found_K)}   focal {result.focal_error_percent} % off, "
+        f"centre {result.centre_error_percent} % off, from the photos alone",
+        f"refined         {k_text(result.refined_K)}   focal {result.refined_focal_error_percent} % off, "
+        f"centre {result.refined_centre_error_percent} % off, after bundle adjustment",
+        f"photos placed   {result.registered} of {result.photos}",
+        f"mesh            {result.triangles} triangles; half of it lies within {result.surface_error_percent} % of the "
+        f"scene's size of the true surface; covers {result.surface_coverage_percent} % of what the photos see",
+        f"seconds         {result.seconds_reconstruction} reconstruction, {result.seconds_rendering} rendering the photos",
+        *(f"                {path}" for path in result.files),
+    ]
+
+
+def k_text(K: list[list[float]]) -> str:
+    """A camera matrix in one line."""
+    return f"fx {K[0][0]:8.2f}  fy {K[1][1]:8.2f}  cx {K[0][2]:7.2f}  cy {K[1][2]:7.2f}"

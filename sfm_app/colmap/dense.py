@@ -112,7 +112,8 @@ def fuse(dense_dir: Path, names: list[str], min_views: int) -> int:
 def poisson(dense_dir: Path, depth: int, trim: float) -> Surface:
     """Poisson's surface (Kazhdan and Hoppe, ACM TOG 2013) through `fused.ply`, with its colours."""
     options = pycolmap.PoissonMeshingOptions()
-    options.depth, options.trim = depth, trim
+    # More than one thread: other triangles in every run, and slower wherever the cores are shared.
+    options.depth, options.trim, options.num_threads = depth, trim, 1
     path = dense_dir / "poisson.ply"
     with backend("finding the surface"):
         pycolmap.poisson_meshing(dense_dir / "fused.ply", path, options=options)

@@ -63,7 +63,7 @@ def read_scene(model_dir: Path, groups: Mapping[str, str], unregistered: Mapping
     cameras = {groups[image.name]: _camera(model.cameras[image.camera_id]) for image in posed}
     return Scene(
         model_dir=model_dir,
-        registered=tuple(image.name for image in posed),
+        cam_from_world={image.name: np.asarray(image.cam_from_world().matrix(), np.float64) for image in posed},
         unregistered=dict(unregistered),
         cameras=cameras,
         points=model.num_points3D(),

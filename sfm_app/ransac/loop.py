@@ -39,6 +39,8 @@ class Recipe:
     """Share of the samples that are drawn by the priors."""
     stop_on_convergence: bool = False
     """End when the priors have converged (thesis 4.18)."""
+    patience: int | None = None
+    """End after this many samples without a better model."""
     improve: Refine | None = None
     """Local optimisation of every new best model."""
     oriented: bool = False
@@ -71,6 +73,8 @@ def search(matches: Matches, options: EpipolarSettings, seed: int, recipe: Recip
     while trials < limit:
         guided = 0.0 if recipe.validity is None or best is None else recipe.guided_share
         left = math.ceil(limit) - trials
+        if recipe.patience is not None and best is not None:
+            left = min(left, recipe.patience)
         drawn, found = next_better(
             points, np.cumsum(priors), guided, recipe.score, threshold, lowest, least, left, state, recipe.oriented, model
         )

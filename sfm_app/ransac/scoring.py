@@ -45,6 +45,15 @@ def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
 
 
 @kernel
+def _penalty(kind: int, squared: float, limit: float) -> float:
+    if kind == RANSAC:
+        return 0.0 if squared < limit else 1.0
+    if kind == MSAC:
+        return squared
+    return float(np.sqrt(squared))
+
+
+@kernel
 def penalty(
     points: FloatArray, f: FloatArray, kind: int, threshold: float, to_beat: float, least_inliers: IntArray
 ) -> float:
@@ -59,7 +68,7 @@ def penalty(
         least_inliers: from `bail_out_table`; empty for no such test.
     """
     limit = threshold * threshold
-    worst = 1.0 if kind == RANSAC else (limit if kind == MSAC else threshold)
+    worst = _penalty(kind, limit, limit)
     total, inliers, block = 0.0, 0, 0
     start, count = 0, points.shape[0]
     while start < count:
@@ -68,7 +77,7 @@ def penalty(
             squared = squared_sampson(f, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
             if squared <= limit:
                 inliers += 1
-                total += 0.0 if kind == RANSAC else (squared if kind == MSAC else np.sqrt(squared))
+                total += _penalty(kind, squared, limit)
             else:
                 total += worst
         if total >= to_beat or (block < least_inliers.shape[0] and inliers < least_inliers[block]):

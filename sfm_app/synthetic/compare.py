@@ -120,11 +120,12 @@ def align_centres(centres: Mapping[str, FloatArray], truth: Truth) -> Similarity
     Raises:
         ValueError: fewer than 3 common photos, or all centres lie on a line.
     """
-    names = sorted(set(centres) & set(truth.cam_from_world))
+    true_centres = truth.centres
+    names = sorted(set(centres) & set(true_centres))
     if len(names) < 3:
         raise ValueError(f"{len(names)} of the found camera centres are known; 3 are needed")
     a = np.array([centres[name] for name in names], dtype=np.float64)
-    b = np.array([truth.centres[name] for name in names])
+    b = np.array([true_centres[name] for name in names])
     triples = np.array(list(combinations(range(len(names)), 3)))
     if len(triples) > MAX_TRIPLES:
         triples = np.random.default_rng(0).permutation(triples)[:MAX_TRIPLES]

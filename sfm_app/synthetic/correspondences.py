@@ -36,7 +36,7 @@ class PairOptions:
     sigma_px: float = 1.0
     """Standard deviation of the Gaussian noise on every coordinate, in pixels, >= 0."""
     outlier_range_px: float = 256.0
-    """Outliers are off by a uniform value in [-range, range] in x and in y, in pixels, > 0; the thesis names no range."""
+    """Outliers are off by a uniform value in [-range, range] in x and in y, in pixels, > 0; our choice."""
     width: int = 512
     height: int = 512
     focal_px: float = 700.0

@@ -4,7 +4,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import cv2
@@ -14,9 +13,9 @@ from PIL import Image
 
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.progress import Progress, Silent, track
+from sfm_app.synthetic.bodies import SyntheticScene
 from sfm_app.synthetic.cameras import Views, camera_centre
 from sfm_app.synthetic.render import GAMMA, prepare, render_scene
-from sfm_app.synthetic.scenes import SyntheticScene
 
 FloatArray = NDArray[np.float64]
 TRUTH_FILE, SURFACE_FILE = "truth.json", "surface.ply"
@@ -107,7 +106,7 @@ def write_photo_folder(
         K=camera.K,
         width=camera.width,
         height=camera.height,
-        cam_from_world=MappingProxyType(dict(views.cam_from_world)),
+        cam_from_world=dict(views.cam_from_world),
         vertices=scene.vertices,
         faces=scene.faces,
         division_lambda=camera.division_lambda,
@@ -164,7 +163,7 @@ def load_truth(folder: Path) -> Truth:
             K=np.array(images[0]["K"], dtype=np.float64),
             width=int(images[0]["width"]),
             height=int(images[0]["height"]),
-            cam_from_world=MappingProxyType({i["file"]: np.column_stack([i["R"], i["t"]]) for i in images}),
+            cam_from_world={i["file"]: np.column_stack([i["R"], i["t"]]) for i in images},
             vertices=vertices,
             faces=faces,
             division_lambda=float(text["division_lambda"]),

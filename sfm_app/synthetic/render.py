@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.meshing.open3d import load_open3d
+from sfm_app.synthetic.bodies import SyntheticScene
 from sfm_app.synthetic.cameras import Camera, camera_centre, pixel_rays
-from sfm_app.synthetic.scenes import SyntheticScene
 from sfm_app.synthetic.textures import mixture
 from sfm_app.types import Surface
 
@@ -53,7 +53,7 @@ def prepare(scene: SyntheticScene) -> PreparedScene:
         faces=faces,
         vertex_table=np.column_stack([normals, texture, openness]),
         face_material=np.repeat(np.arange(len(shapes)), [len(shape.faces) for shape in shapes]),
-        materials=np.stack([body.material.row() for body in scene.bodies]),
+        materials=np.stack([body.material.row(100 * k) for k, body in enumerate(scene.bodies)]),
         lights=np.stack([sun, SUNLIGHT * scene.sun, SKYLIGHT * scene.sky, ZENITH, HORIZON]),
     )
 
@@ -128,7 +128,7 @@ def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
 
 
 def cast(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, NDArray[Any]]:
-    """First hits of rays from `origin`, (3,) or (N, 3), along `directions` (N, 3), by Open3D's names; t_hit is inf for none."""
+    """First hits of rays from `origin` (3,) or (N, 3) along `directions` (N, 3), by Open3D's names; t_hit inf: none."""
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3] = origin
     rays[:, 3:] = directions

@@ -25,7 +25,9 @@ class Shape:
     texture: FloatArray
     """(V, 3): where the body was before it was put into the scene, so that its texture moves with it."""
 
-    def moved(self, to: tuple[float, float, float], turn_deg: float = 0.0, tilt_deg: float = 0.0) -> "Shape":
+    def moved(
+        self, to: tuple[float, float, float] = (0.0, 0.0, 0.0), turn_deg: float = 0.0, tilt_deg: float = 0.0
+    ) -> "Shape":
         """Tilt about x, then turn about y (right-handed, degrees), then move."""
         R = axis_rotation(np.array([0.0, 1.0, 0.0]), turn_deg) @ axis_rotation(np.array([1.0, 0.0, 0.0]), tilt_deg)
         return Shape(self.vertices @ R.T + to, self.faces, self.normals @ R.T, self.texture)
@@ -45,7 +47,7 @@ def box(width: float, height: float, depth: float, spacing: float = 0.15) -> Sha
             vertices[:, axis] = 0.5 * sign * size[axis]
             vertices[:, u], vertices[:, v] = side[:, 0], side[:, 1]
             parts.append((vertices, faces if sign > 0 else faces[:, ::-1]))
-    return _joined([(vertices + [0.0, height / 2, 0.0], faces) for vertices, faces in parts])
+    return _joined([(vertices + np.array([0.0, height / 2, 0.0]), faces) for vertices, faces in parts])
 
 
 def revolved(
@@ -87,10 +89,10 @@ def arch(radius: float, thickness: float, depth: float) -> Shape:
     return Shape(vertices, lying.faces, lying.normals @ R.T, vertices)
 
 
-def ball(radius: float, bumps: float = 0.0, seed: int = 0) -> Shape:
+def ball(radius: float, segments: int = 96, bumps: float = 0.0, seed: int = 0) -> Shape:
     """A sphere around the origin; `bumps` is the depth of random dents as a share of the radius."""
-    angle = np.linspace(-0.5, 0.5, 49) * math.pi
-    round_ball = _turned(np.column_stack([np.cos(angle), np.sin(angle)]), 96, 360.0, (0, 0.0))
+    angle = np.linspace(-0.5, 0.5, segments // 2 + 1) * math.pi
+    round_ball = _turned(np.column_stack([np.cos(angle), np.sin(angle)]), segments, 360.0, (0, 0.0))
     rng = np.random.default_rng([seed, 7])
     waves = rng.normal(size=(24, 3)) * np.linspace(2.0, 9.0, 24)[:, None]
     dents = np.cos(round_ball[0] @ waves.T + rng.uniform(0.0, 2.0 * math.pi, 24)).sum(axis=1) / math.sqrt(12.0)

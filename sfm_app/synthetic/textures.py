@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-from numba import float64, uint32
+from numba import uint32
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
@@ -34,12 +34,11 @@ class Material:
     """Size of a brick, slab, leaf or band, in scene units."""
     contrast: float = 0.5
     """Strength of the fine grain, 0..1."""
-    seed: int = 0
 
-    def row(self) -> FloatArray:
+    def row(self, seed: int) -> FloatArray:
         """(13,) numbers for the kernels: pattern, scale, contrast, seed, then three linear RGB colours."""
         colors = [(np.array(c) / 255.0) ** 2.2 for c in (self.base, self.second, self.joint)]
-        return np.concatenate([[PATTERNS.index(self.pattern), self.scale, self.contrast, self.seed], *colors])
+        return np.concatenate([[PATTERNS.index(self.pattern), self.scale, self.contrast, seed], *colors])
 
 
 @kernel
@@ -50,7 +49,7 @@ def lattice(ix: int, iy: int, iz: int, seed: int) -> float:
     h = uint32((h ^ (h >> uint32(15))) * uint32(0x2C1B3C6D))
     h = uint32((h ^ (h >> uint32(12))) * uint32(0x297A2D39))
     h = uint32(h ^ (h >> uint32(15)))
-    return float64(h) * (1.0 / 4294967296.0)
+    return float(h) * (1.0 / 4294967296.0)
 
 
 @kernel
@@ -89,7 +88,7 @@ def octaves(p: tuple[float, float, float], size: float, gain: float, footprint: 
 @kernel
 def cells(a: float, b: float, seed: int) -> tuple[float, float]:
     """Random cells in the plane: distance to the border of the cell, in cells, and a number in [0, 1) that names it."""
-    ia, ib = int(math.floor(a)), int(math.floor(b))
+    ia, ib = math.floor(a), math.floor(b)
     first, second, name = 9.0, 9.0, 0.0
     for i in range(ia - 1, ia + 2):
         for j in range(ib - 1, ib + 2):
@@ -109,8 +108,8 @@ def bricks(a: float, b: float, seed: int) -> tuple[float, float]:
     row = math.floor(b)
     a = 0.5 * a + 0.5 * (row % 2.0)
     column = math.floor(a)
-    border = min(min(a - column, column + 1.0 - a) * 2.0, min(b - row, row + 1.0 - b))
-    return border, lattice(int(column), int(row), 4, seed)
+    border = min(2.0 * (a - column), 2.0 * (column + 1.0 - a), b - row, row + 1.0 - b)
+    return border, lattice(column, row, 4, seed)
 
 
 @kernel
@@ -120,10 +119,26 @@ def ramp(x: float, low: float, high: float) -> float:
 
 
 @kernel
+def tiles(
+    kind: int, p: tuple[float, float, float], n: tuple[float, float, float], scale: float, seed: int
+) -> tuple[float, float]:
+    """Bricks on upright walls (1), slabs on the ground (2), leaves along the axis they face most (6): as `cells`."""
+    if kind == 6:
+        if abs(n[1]) >= max(abs(n[0]), abs(n[2])):
+            return cells(p[0] / scale, p[2] / scale, seed)
+        return cells(p[1] / scale, (p[2] if abs(n[0]) >= abs(n[2]) else p[0]) / scale, seed)
+    wobble = 0.06 * value_noise(3.0 * p[0] / scale, 3.0 * p[1] / scale, 3.0 * p[2] / scale, seed)
+    if kind == 2:
+        return cells(p[0] / scale + wobble, p[2] / scale + wobble, seed)
+    along = p[0] if abs(n[2]) >= abs(n[0]) else p[2]
+    return bricks(along / scale + wobble, p[1] / scale + wobble, seed)
+
+
+@kernel
 def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
     """Greek pottery: share of the second colour (glaze), share of the thin lines; bands by height, figures by angle."""
     band = p[1] / scale
-    row = int(math.floor(band))
+    row = math.floor(band)
     inside = band - row
     turn = (math.atan2(p[2], p[0]) / (2.0 * math.pi) + 0.5) * 24.0
     line = 1.0 - ramp(min(inside, 1.0 - inside), 0.03, 0.06)
@@ -134,7 +149,7 @@ def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
     if kind == 1:  # zigzag
         return ramp(abs(2.0 * part - 1.0) - inside, -0.05, 0.05), line
     if kind == 2:  # rays and dots of uneven size
-        reach = 0.22 + 0.2 * lattice(int(math.floor(turn)), row, 5, 17)
+        reach = 0.22 + 0.2 * lattice(math.floor(turn), row, 5, 17)
         return 1.0 - ramp(math.hypot(part - 0.5, inside - 0.5) - reach, -0.04, 0.04), line
     steps = math.floor(4.0 * part)  # meander
     wall = (steps == 0.0) or (steps == 2.0 and inside > 0.3) or (inside > 0.75 and steps < 3.0)
@@ -153,48 +168,35 @@ def mixture(
     fine = octaves(p, 0.4 * scale, 0.72, footprint, seed + 20)
     broad = octaves(p, 3.0 * scale, 0.5, max(footprint, 0.7 * scale), seed + 40)
     bright = 1.0 + contrast * (1.7 * fine + 0.4 * broad)
-    second, joint = 0.0, 0.0
     if kind == 0:  # stone: stains and dark pores
         second = ramp(broad + 0.6 * fine, -0.3, 0.9)
         joint = 0.8 * ramp(octaves(p, 0.09 * scale, 0.75, footprint, seed + 60), 0.3, 0.55)
-    elif kind == 1 or kind == 2:  # bricks stand on walls, slabs lie on the ground
-        along = p[0] if abs(n[2]) >= abs(n[0]) else p[2]
-        wobble = 0.06 * value_noise(3.0 * p[0] / scale, 3.0 * p[1] / scale, 3.0 * p[2] / scale, seed)
-        if kind == 1:
-            border, name = bricks(along / scale + wobble, p[1] / scale + wobble, seed)
-        else:
-            border, name = cells(p[0] / scale + wobble, p[2] / scale + wobble, seed)
+    elif kind <= 2:
+        border, name = tiles(kind, p, n, scale, seed)
         blur = footprint / scale
         joint = 1.0 - ramp(border, 0.04 - 0.5 * blur, 0.06 + 0.5 * blur)
-        second = min(1.0, max(0.0, name + 0.4 * fine))
+        second = name + 0.4 * fine
         bright *= 0.8 + 0.4 * ((7.0 * name) % 1.0)
     elif kind == 3:
         second, joint = ceramic(p, scale)
-        second = min(1.0, max(0.0, second * (1.0 - 0.25 * ramp(fine, 0.1, 0.5))))
-    elif kind == 4:  # wood: rings about the z axis, bent by noise
+        second *= 1.0 - 0.25 * ramp(fine, 0.1, 0.5)
+    elif kind == 4:  # wood: rings about the z axis, bent by noise; planks by height
         r = math.hypot(p[0] + 0.3 * scale * broad, p[1] - 2.0 * scale) / scale
         rings = 6.0 * r + 1.5 * octaves((p[0], p[1], 0.2 * p[2]), 0.5 * scale, 0.6, footprint, seed)
         second = 0.5 + 0.5 * math.sin(2.0 * math.pi * rings) + 0.3 * fine
-        plank = p[1] / scale * 2.0
-        edge = min(plank - math.floor(plank), math.floor(plank) + 1.0 - plank)
-        joint = 1.0 - ramp(edge, 0.02, 0.05)
-        bright *= 0.8 + 0.4 * lattice(int(math.floor(plank)), 3, 0, seed)
-        second = min(1.0, max(0.0, second))
+        plank = 2.0 * p[1] / scale
+        joint = 1.0 - ramp(min(plank - math.floor(plank), math.floor(plank) + 1.0 - plank), 0.02, 0.05)
+        bright *= 0.8 + 0.4 * lattice(math.floor(plank), 3, 0, seed)
     elif kind == 5:  # marble: thin veins where bent planes cross the body
         wave = (p[0] + 0.7 * p[1] + 0.4 * p[2]) / scale + 2.2 * octaves(p, scale, 0.6, footprint, seed)
         second = (1.0 - abs(math.sin(math.pi * wave))) ** 3
         joint = 0.5 * ramp(octaves(p, 0.5 * scale, 0.6, footprint, seed + 80), 0.3, 0.7)
-    elif kind == 6:  # leaves: cells seen along the axis that the surface faces most
-        if abs(n[1]) >= max(abs(n[0]), abs(n[2])):
-            border, name = cells(p[0] / scale, p[2] / scale, seed)
-        elif abs(n[0]) >= abs(n[2]):
-            border, name = cells(p[1] / scale, p[2] / scale, seed)
-        else:
-            border, name = cells(p[0] / scale, p[1] / scale, seed)
+    elif kind == 6:
+        border, name = tiles(kind, p, n, scale, seed)
         second, joint = name, 1.0 - ramp(border, 0.0, 0.14)
         bright *= 0.7 + 0.6 * ((5.0 * name) % 1.0)
     else:  # stripes around the y axis, worn off in places
         turn = (math.atan2(p[2], p[0]) / (2.0 * math.pi) + 0.5) * 8.0
-        second = float64(int(math.floor(turn)) % 2)
+        second = float(math.floor(turn) % 2)
         joint = 0.8 * ramp(broad + fine, 0.25, 0.5)
-    return second, joint, max(0.15, bright)
+    return min(1.0, max(0.0, second)), joint, max(0.15, bright)

@@ -26,8 +26,8 @@ class Scene:
     """A COLMAP model on disk and what the summary says about it."""
 
     model_dir: Path
-    registered: tuple[str, ...]
-    """Names of the photos that have a pose."""
+    cam_from_world: Mapping[str, NDArray[np.float64]]
+    """By name of a photo that has a pose: (3, 4) [R | t]."""
     unregistered: Mapping[str, str]
     """Names of the photos without a pose, with the reason."""
     cameras: Mapping[str, CameraModel]
@@ -35,3 +35,8 @@ class Scene:
     points: int
     observations: int
     mean_reprojection_px: float
+
+    @property
+    def registered(self) -> tuple[str, ...]:
+        """Names of the photos that have a pose."""
+        return tuple(self.cam_from_world)

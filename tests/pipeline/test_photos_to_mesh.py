@@ -1,0 +1,127 @@
+"""Rendered photos end to end: the command a user types, on a scene whose camera and surface are known."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from click.testing import CliRunner
+
+import sfm_app
+from sfm_app.cli import main
+from sfm_app.pipeline import NAMES
+from sfm_app.settings import Settings
+from sfm_app.synthetic.cameras import camera_centre
+from sfm_app.synthetic.compare import centre_error_percent, focal_error_percent, surface_error
+
+DRAFT = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 480}})
+
+
+@pytest.fixture(scope="module")
+def finished(rendered, tmp_path_factory):
+    photos, truth = rendered
+    out = tmp_path_factory.mktemp("finished") / "out"
+    return sfm_app.reconstruct(photos, out, DRAFT), truth
+
+
+def test_camera_is_found(finished):
+    run, truth = finished
+    refined = next(iter(run.scene.cameras.values())).K
+
+    assert run.calibration.identifiable
+    assert focal_error_percent(run.calibration.K, truth) < 2.0
+    assert centre_error_percent(run.calibration.K, truth) < 4.0
+    assert focal_error_percent(refined, truth) < 1.0
+
+
+def test_every_photo_has_a_place(finished):
+    run, truth = finished
+
+    assert set(run.scene.registered) == set(truth.cam_from_world)
+    assert 0.05 < run.scene.mean_reprojection_px < 1.0
+
+
+def test_mesh_lies_on_the_true_surface(finished):
+    run, truth = finished
+    mesh = trimesh.load(run.out / "model.ply", process=False)
+    centres = {name: camera_centre(pose) for name, pose in run.scene.cam_from_world.items()}
+
+    error = surface_error(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64), centres, truth)
+
+    assert len(mesh.faces) > 5000
+    assert error < 0.01
+
+
+def test_glb_loads_upright_and_coloured(finished):
+    run, _ = finished
+    mesh = trimesh.load(run.mesh_path, force="mesh", process=False)
+
+    assert run.mesh_path.name == "model.glb"
+    assert mesh.visual.kind == "vertex"
+    assert np.std(mesh.visual.vertex_colors[:, :3], axis=0).min() > 10
+    up = np.mean([-pose[1, :3] for pose in run.scene.cam_from_world.values()], axis=0)
+    assert up[1] / np.linalg.norm(up) > 0.99
+
+
+def test_manifest_accounts_for_every_stage(finished):
+    run, _ = finished
+
+    assert tuple(run.manifest["stages"]) == NAMES
+    assert run.manifest["stages"]["scene"]["counts"]["registered"] == len(run.scene.registered)
+    assert run.manifest["settings"]["quality"] == "draft"
+
+
+def test_a_second_run_does_nothing(finished, rendered):
+    run, _ = finished
+    stamps = {path: path.stat().st_mtime_ns for path in run.out.rglob("*") if path.is_file() and path.name != "log.txt"}
+
+    again = sfm_app.reconstruct(rendered[0], run.out, DRAFT)
+
+    assert again.manifest == run.manifest
+    assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
+
+
+def test_a_changed_setting_redoes_only_what_it_touches(finished, rendered, tmp_path):
+    run, _ = finished
+    before = {name: stage["fingerprint"] for name, stage in run.manifest["stages"].items()}
+    changed = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 480}, "mesh": {"trim": 5.5}})
+
+    after = sfm_app.reconstruct(rendered[0], run.out, changed).manifest["stages"]
+
+    assert [name for name in NAMES if after[name]["fingerprint"] != before[name]] == ["mesh", "files"]
+    sfm_app.reconstruct(rendered[0], run.out, DRAFT)
+
+
+def test_one_worker_and_two_give_the_same_bytes(rendered, tmp_path):
+    outs = []
+    for workers in (1, 2):
+        out = tmp_path / str(workers)
+        settings = Settings.from_mapping({"quality": "draft", "workers": workers, "seed": 5})
+        sfm_app.reconstruct(rendered[0], out, settings, last="intrinsics")
+        outs.append(out)
+
+    for name in ("view_graph.npz", "calibration.json"):
+        assert (outs[0] / name).read_bytes() == (outs[1] / name).read_bytes()
+
+
+def test_calibrate_prints_json(rendered):
+    photos, truth = rendered
+
+    result = CliRunner().invoke(main, ["calibrate", str(photos), "--json", "-q", "--quality", "draft"])
+
+    assert result.exit_code == 0, result.stderr
+    (camera,) = json.loads(result.stdout).values()
+    assert camera["identifiable"] is True
+    assert focal_error_percent(np.array(camera["K"]), truth) < 2.0
+
+
+def test_the_literal_methods_are_one_flag_away(rendered, tmp_path):
+    photos, _ = rendered
+    flags = ["--estimator", "lev-ransac-thesis", "--calibrator", "zero-curves-thesis", "--until", "scene", "--json", "-q"]
+
+    result = CliRunner().invoke(main, ["run", str(photos), "-o", str(tmp_path / "out"), "--quality", "draft", *flags])
+
+    assert result.exit_code == 0, result.stderr
+    summary = json.loads(result.stdout)
+    assert summary["scene"]["registered"] >= 5
+    assert not (tmp_path / "out" / "dense").exists()

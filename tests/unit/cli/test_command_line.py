@@ -1,0 +1,148 @@
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from click.testing import CliRunner
+from PIL import Image
+
+from sfm_app.cli import main
+from sfm_app.settings import Settings
+
+
+def call(*arguments):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def photo(path, size=(128, 96)):
+    Image.effect_noise(size, 60).convert("RGB").save(path)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    place = tmp_path / "photos"
+    place.mkdir()
+    return place
+
+
+def make_empty(folder): ...
+
+
+def make_text_files(folder):
+    for name in ("a.txt", "b.md"):
+        (folder / name).write_text("not a photo")
+
+
+def make_one_photo(folder):
+    photo(folder / "a.jpg")
+
+
+def make_truncated(folder):
+    for name in ("a.jpg", "b.jpg"):
+        photo(folder / name)
+        (folder / name).write_bytes((folder / name).read_bytes()[:1000])
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (make_empty, "the folder is empty"),
+        (make_text_files, "2 not a JPEG or PNG photo"),
+        (make_one_photo, "only one usable photo"),
+        (make_truncated, "2 truncated or damaged"),
+    ],
+)
+def test_unusable_folders_end_with_one_line_and_exit_code_3(folder, tmp_path, make, says):
+    make(folder)
+
+    result = call("run", folder, "-o", tmp_path / "out", "-q")
+
+    assert result.exit_code == 3
+    assert says in result.stderr
+    error, hint = result.stderr.strip().splitlines()
+    assert error.startswith("error: ") and hint.startswith("hint: ")
+    assert result.stdout == ""
+
+
+def test_missing_paths_end_with_exit_code_3(tmp_path):
+    result = call("run", tmp_path / "nowhere", "-o", tmp_path / "out", "-q")
+
+    assert (result.exit_code, "no such folder" in result.stderr) == (3, True)
+
+
+def test_an_output_folder_that_cannot_be_made_ends_with_exit_code_3(folder, tmp_path):
+    for name in ("a.jpg", "b.jpg"):
+        photo(folder / name)
+    (tmp_path / "file").write_text("in the way")
+
+    result = call("run", folder, "-o", tmp_path / "file" / "out", "-q")
+
+    assert (result.exit_code, "cannot write to" in result.stderr) == (3, True)
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
+def test_a_read_only_output_folder_ends_with_exit_code_3(folder, tmp_path):
+    for name in ("a.jpg", "b.jpg"):
+        photo(folder / name)
+    out = tmp_path / "locked"
+    out.mkdir(mode=0o500)
+
+    result = call("run", folder, "-o", out, "-q")
+
+    assert (result.exit_code, "cannot write to" in result.stderr) == (3, True)
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (("--estimator", "lev"), "no estimator is named 'lev'"),
+        (("--calibrator", "zero"), "no calibrator is named 'zero'"),
+        (("--set", "epipolar.max_eror_px=2"), "unknown setting 'epipolar.max_eror_px'"),
+        (("--set", "epipolar.max_error_px"), "no '=' in it"),
+        (("--set", "epipolar.max_error_px=-1"), "greater than 0"),
+        (("--workers", "-2"), "'workers'"),
+        (("--config", "nowhere.toml"), "cannot read nowhere.toml"),
+        (("--from", "nowhere"), "nowhere"),
+        (("--quality", "best"), "best"),
+    ],
+)
+def test_wrong_settings_end_with_exit_code_2_before_any_work(folder, tmp_path, flags, says):
+    result = call("run", folder, "-o", tmp_path / "out", *flags)
+
+    assert result.exit_code == 2
+    assert says in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_photos_of_different_places_end_with_exit_code_4(unrelated, tmp_path):
+    result = call("run", unrelated, "-o", tmp_path / "out", "-q")
+
+    assert result.exit_code == 4, result.stderr
+    assert len(result.stderr.strip().splitlines()) == 2
+    assert "Traceback" not in result.output
+
+
+def test_config_prints_toml_that_loads(tmp_path):
+    result = call("config", "--quality", "high", "--set", "mesh.trim=3", "--estimator", "msac")
+    path = tmp_path / "run.toml"
+    path.write_text(result.stdout, encoding="utf-8")
+
+    loaded = Settings.from_toml(path)
+    assert (loaded.quality, loaded.mesh.trim, loaded.epipolar.estimator) == ("high", 3.0, "msac")
+    assert loaded.depth.max_image_size_px == Settings.from_mapping({"quality": "high"}).depth.max_image_size_px
+
+
+def test_plugins_and_doctor_answer():
+    listing = call("plugins").stdout
+    found = json.loads(call("doctor", "--json").stdout)
+
+    assert "lev-ransac-thesis" in listing and "zero-curves-thesis" in listing and "glb" in listing
+    assert found["ray casting (Open3D)"].startswith("works")
+    assert "pycolmap" in found
+
+
+def test_the_module_runs_as_a_program():
+    done = subprocess.run([sys.executable, "-m", "sfm_app", "--version"], capture_output=True, text=True, check=True)
+
+    assert done.stdout.startswith("sfm-app, version ")
