@@ -6,40 +6,39 @@ from typing import Any
 import numpy as np
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.database import opened
+from sfm_app.colmap.database import SQUARE_PIXELS, TWO_FOCALS, camera_params, opened
 
-DETERMINED = 0.01
-"""An optical centre counts as determined when its standard deviation is below this share of the image's longer side."""
+LADDER = ((TWO_FOCALS, True), (SQUARE_PIXELS, True), (TWO_FOCALS, False), (SQUARE_PIXELS, False))
+"""Camera model and whether its optical centre is free, from the most to the least that is left to the photos."""
 
-ROUNDS = 2
-"""Adjust, drop what does not fit, adjust again."""
+FOCAL_DETERMINED, CENTRE_DETERMINED = 0.002, 0.003
+"""Largest standard deviations that count as determined: of a focal, as a share of it; of the centre, in longer sides."""
 
 MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
 """COLMAP's own limits for a point: largest reprojection error, least angle between its rays."""
 
 
 def adjust(model: Any, database: Path) -> tuple[Any, dict[str, float]]:
-    """Refine poses, points, focals and distortion; the optical centre too where the photos determine it.
+    """Refine poses, points and cameras; of the cameras as much as the photos determine.
 
-    Freeing a centre that they do not determine makes narrow views worse, so its covariance is asked first.
+    Freeing what they do not determine makes narrow views and small sets worse, so the covariance is asked first, going
+    down the ladder until it agrees. Observations that fit badly are then dropped, and the same is refined again.
 
     Returns:
-        The refined model, and the standard deviations in pixels of fx, fy, cx, cy of the camera with most photos for
-        measurements that are off by 1 px.
+        The refined model, and the standard deviations in pixels of fx, fy, cx, cy of the camera with most photos, as
+        far as they were free.
     """
-    with opened(database) as db:
-        cache = pycolmap.DatabaseCache.create(db, pycolmap.DatabaseCacheOptions())
-    deviations: dict[str, float] = {}
-    for _ in range(ROUNDS):
+    for camera_model, centre in LADDER:
+        if camera_model == SQUARE_PIXELS and not _square(model):
+            continue
         freed = pycolmap.Reconstruction(model)
-        deviations = _solve(freed, centre=True)
-        if _centre_determined(freed, deviations):
-            model = freed
-        else:
-            deviations = _solve(model, centre=False)
-        observations = pycolmap.ObservationManager(model, cache.correspondence_graph)
-        observations.filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
-    return model, deviations
+        for camera in freed.cameras.values():
+            _become(camera, camera_model)
+        deviations = _solve(freed, centre=centre)
+        if _determined(freed, deviations) or (camera_model, centre) == LADDER[-1]:
+            break
+    _drop_misfits(freed, database)
+    return freed, _solve(freed, centre=centre)
 
 
 def _solve(model: Any, *, centre: bool) -> dict[str, float]:
@@ -56,22 +55,47 @@ def _solve(model: Any, *, centre: bool) -> dict[str, float]:
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     adjuster.solve()
+    model.update_point_3d_errors()
     settings = pycolmap.BACovarianceOptions()
     settings.params = pycolmap.BACovarianceOptionsParams.ALL
     covariance = pycolmap.estimate_ba_covariance(settings, model, adjuster)
-    other = covariance.get_other_params_cov(_main_camera(model).params) if covariance else None
-    if other is None:
+    camera = main_camera(model)
+    found = covariance.get_other_params_cov(camera.params) if covariance else None
+    if found is None:
         return {}
-    names = ("fx", "fy", "cx", "cy") if centre else ("fx", "fy")
-    return dict(zip(names, np.sqrt(np.diag(other)).tolist(), strict=False))
+    # COLMAP's covariance is that of measurements off by 1 px
+    deviations = np.sqrt(np.diag(found)) * model.compute_mean_reprojection_error()
+    focals = ("fx", "fy") if len(camera.focal_length_idxs()) == 2 else ("f",)
+    return dict(zip((*focals, "cx", "cy") if centre else focals, deviations.tolist(), strict=False))
 
 
-def _centre_determined(model: Any, deviations: dict[str, float]) -> bool:
-    camera = _main_camera(model)
-    limit = DETERMINED * max(camera.width, camera.height)
-    return max(deviations.get("cx", np.inf), deviations.get("cy", np.inf)) < limit
+def _determined(model: Any, deviations: dict[str, float]) -> bool:
+    camera = main_camera(model)
+    limits = {"f": FOCAL_DETERMINED * camera.mean_focal_length(), "c": CENTRE_DETERMINED * max(camera.width, camera.height)}
+    return bool(deviations) and all(value < limits[name[0]] for name, value in deviations.items())
 
 
-def _main_camera(model: Any) -> Any:
+def _drop_misfits(model: Any, database: Path) -> None:
+    options = pycolmap.DatabaseCacheOptions()
+    options.image_names = {model.images[image_id].name for image_id in model.reg_image_ids()}
+    with opened(database) as db:
+        cache = pycolmap.DatabaseCache.create(db, options)
+    pycolmap.ObservationManager(model, cache.correspondence_graph).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
+
+
+def _become(camera: Any, camera_model: str) -> None:
+    """Change the camera model in place; both models share the first radial term."""
+    if camera.model.name != camera_model:
+        K, radial = camera.calibration_matrix(), float(camera.params[camera.extra_params_idxs()[0]])
+        camera.model = getattr(pycolmap.CameraModelId, camera_model)
+        camera.params = camera_params(K, camera_model, radial)
+
+
+def _square(model: Any) -> bool:
+    return all(camera.model.name == SQUARE_PIXELS for camera in model.cameras.values())
+
+
+def main_camera(model: Any) -> Any:
+    """The camera that took most of the photos that have a pose."""
     used = [model.images[image_id].camera_id for image_id in model.reg_image_ids()]
     return model.cameras[max(set(used), key=lambda camera_id: (used.count(camera_id), -camera_id))]

@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, PairId, Photo, PhotoSet
 
-CAMERA_MODEL = "OPENCV"
-"""fx, fy, cx, cy, k1, k2, p1, p2: the smallest of COLMAP's models that holds a camera matrix with two focals and a lens."""
+SQUARE_PIXELS = "SIMPLE_RADIAL"
+"""f, cx, cy, k: what is mapped with where K has one focal; a second radial term runs wild on the first few photos."""
+
+TWO_FOCALS = "OPENCV"
+"""fx, fy, cx, cy, k1, k2, p1, p2: COLMAP's smallest model that holds a camera matrix with two focals and a lens."""
 
 FOCAL_GUESS = 1.2
 """COLMAP's own guess where nothing is known: focal length over the longer side."""
@@ -37,8 +40,8 @@ def create_database(path: Path, photo_dir: Path, photos: PhotoSet) -> None:
         pass
     for members in photos.groups.values():
         options = pycolmap.ImageReaderOptions()
-        options.camera_model = CAMERA_MODEL
-        options.camera_params = ",".join(str(value) for value in _guess(members[0]))
+        options.camera_model = SQUARE_PIXELS
+        options.camera_params = ",".join(str(value) for value in camera_params(_guess(members[0]), SQUARE_PIXELS))
         names = [photo.name for photo in members]
         pycolmap.import_images(path, photo_dir, pycolmap.CameraMode.SINGLE, names, options)
 
@@ -75,19 +78,26 @@ def write_calibrations(path: Path, matches: MatchGraph, cameras: Mapping[str, Ca
         for entry in database.read_all_images():
             calibration = cameras[groups[entry.image_id]]
             camera = database.read_camera(entry.camera_id)
-            camera.params = camera_params(calibration.K)
+            camera_model = SQUARE_PIXELS if calibration.K[0, 0] == calibration.K[1, 1] else TWO_FOCALS
+            camera.model = getattr(pycolmap.CameraModelId, camera_model)
+            camera.params = camera_params(calibration.K, camera_model)
             camera.has_prior_focal_length = calibration.identifiable
             database.update_camera(camera)
 
 
-def camera_params(K: NDArray[np.float64]) -> list[float]:
-    """Parameters of `CAMERA_MODEL` for a camera matrix without distortion."""
-    return [float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), 0.0, 0.0, 0.0, 0.0]
+def camera_params(
+    K: NDArray[np.float64], camera_model: str, radial: float = 0.0
+) -> list[float]:
+    """COLMAP's parameters for a camera matrix and a first radial term."""
+    fx, fy, cx, cy = (float(K[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    if camera_model == SQUARE_PIXELS:
+        return [(fx * fy) ** 0.5, cx, cy, radial]
+    return [fx, fy, cx, cy, radial, 0.0, 0.0, 0.0]
 
 
-def _guess(photo: Photo) -> list[float]:
+def _guess(photo: Photo) -> NDArray[np.float64]:
     focal = FOCAL_GUESS * max(photo.width, photo.height)
-    return [focal, focal, photo.width / 2, photo.height / 2, 0.0, 0.0, 0.0, 0.0]
+    return np.array([[focal, 0.0, photo.width / 2], [0.0, focal, photo.height / 2], [0.0, 0.0, 1.0]])
 
 
 def _pair(pair_id: int) -> PairId:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.colmap.backend import interruptible, pycolmap
+from sfm_app.colmap.database import SQUARE_PIXELS
 from sfm_app.progress import Progress
 
 
@@ -27,6 +28,8 @@ def continue_mapping(
         (scratch / name).mkdir(parents=True)
     start.write(scratch / "start")
     options = mapping_options(seed)
+    # four distortion terms run wild on the first few photos; the last adjustment frees them
+    options.ba_refine_extra_params = all(camera.model.name == SQUARE_PIXELS for camera in start.cameras.values())
     models: dict[int, Any] = {}
 
     def call(token: Any) -> None:

@@ -6,62 +6,92 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from sfm_app.ransac.minimal import MOST_MODELS
 from sfm_app.ransac.sampling import SAMPLE_SIZE
 from sfm_app.ransac.scoring import squared_distances
 
 FloatArray = NDArray[np.float64]
 
-MOST_MODELS_PER_SAMPLE = 3
 MOST_FALSE_ALARMS = 1e-2
-"""A pair is kept when less than this many models of its support are expected in random matches."""
+"""Support counts as real when less than this many models with as much of it are expected in random matches."""
 
 _FRACTIONS = (1.0, 0.5, 0.25)
-"""The support is also judged at these fractions of the threshold: precise inliers are stronger evidence."""
+"""Support is judged at these fractions of the threshold: precise inliers are stronger evidence."""
 _MISMATCHES = 20000
+_MOST = 1e300
 
 
-def expected_false_alarms(points: FloatArray, f: FloatArray, threshold: float) -> float:
-    """How many models with the support of f one expects among random matches of the same points; capped at 1e300.
-
-    Every model through seven of the N matches is a chance: 3 C(N, 7) of them. Each of the other N - 7 matches agrees with
-    one by accident with probability a. So the expectation is 3 C(N, 7) P(Binomial(N - 7, a) >= k - 7) for k inliers. The
-    probability a is measured, not modelled: it is the share of deliberate mismatches (a point of view 1 with the partner of
-    another one) that agree with f. It thus knows the extent of the photos, where their points cluster, and the epipoles.
+def false_alarms_of(distances: FloatArray, wrong: FloatArray, threshold: float) -> float:
+    """How many models with as much support are expected among random matches of the same points.
 
     Args:
-        points: (N, 4) distinct matches in random order.
-        f: (9,) model.
+        distances: (N,) of the matches to the model.
+        wrong: (M,) of mismatches, from `mismatch_distances`.
         threshold: largest distance of an inlier.
     """
-    count = len(points)
-    if count <= SAMPLE_SIZE:
-        return 1e300
-    squared, wrong = squared_distances(points, f), squared_distances(mismatches(points), f)
-    tests = math.log(MOST_MODELS_PER_SAMPLE * len(_FRACTIONS)) + _log_choose(count, SAMPLE_SIZE)
-    lowest = math.inf
+    tried = []
     for fraction in _FRACTIONS:
-        limit = (fraction * threshold) ** 2
-        chance = (np.count_nonzero(wrong <= limit) + 1.0) / (len(wrong) + 2.0)
-        agreeing = int(np.count_nonzero(squared <= limit)) - SAMPLE_SIZE
-        lowest = min(lowest, tests + log_binomial_tail(count - SAMPLE_SIZE, agreeing, chance))
-    return math.exp(min(lowest, 690.0))
+        inliers = int(np.count_nonzero(distances <= fraction * threshold))
+        chance = accidental_share(wrong, fraction * threshold)
+        tried.append(false_alarms(len(distances), inliers, SAMPLE_SIZE, chance))
+    return min(_MOST, len(_FRACTIONS) * MOST_MODELS * min(tried))
 
 
-def mismatches(points: FloatArray) -> FloatArray:
-    """(M, 4) pairs of points that do not belong together: each point of view 1 with the partners of some others."""
-    shifts = min(len(points) - 1, max(1, _MISMATCHES // len(points)))
-    return np.vstack([np.hstack([points[:, :2], np.roll(points[:, 2:], s, axis=0)]) for s in range(1, shifts + 1)])
+def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> float:
+    """Expected number of minimal samples whose model has so many inliers, if every match is wrong.
+
+    Each of the C(count, s) samples agrees with itself, and with each of the other matches by accident, so that the
+    expectation is C(count, s) P(Binomial(count - s, chance) >= inliers - s).
+
+    Args:
+        count: all matches.
+        inliers: those that agree with the model.
+        sample_size: s, the matches that determine a model.
+        chance: probability that a wrong match agrees with a model, in (0, 1).
+
+    Returns:
+        The number, at most 1e300.
+    """
+    if inliers <= sample_size:
+        return _MOST
+    logarithm = _log_choose(count, sample_size) + log_binomial_tail(count - sample_size, inliers - sample_size, chance)
+    return min(_MOST, math.exp(min(logarithm, 700.0)))
+
+
+def mismatch_distances(points: FloatArray, f: FloatArray) -> FloatArray:
+    """(M,) Sampson distances of deliberate mismatches: each point of view 1 with the partners of some others.
+
+    Args:
+        points: (N, 4) distinct matches in random order, N >= 2.
+        f: (9,) model.
+    """
+    count = len(points)
+    shifts = min(count - 1, max(1, _MISMATCHES // count))
+    squared = [squared_distances(_shifted(points, k), f) for k in range(1, shifts + 1)]
+    return np.sqrt(np.concatenate(squared))
+
+
+def accidental_share(wrong: FloatArray, threshold: float) -> float:
+    """Probability that a wrong match agrees with a model, in (0, 1), from its distances to mismatches.
+
+    Measured, not modelled: it knows the extent of the photos, where their points cluster, and where the epipoles are.
+    """
+    return (int(np.count_nonzero(wrong <= threshold)) + 1.0) / (len(wrong) + 2.0)
+
+
+def _shifted(points: FloatArray, by: int) -> FloatArray:
+    return np.hstack([points[:, :2], np.roll(points[:, 2:], by, axis=0)])
 
 
 def log_binomial_tail(count: int, least: int, chance: float) -> float:
-    """log P(Binomial(count, chance) >= least)."""
+    """log P(Binomial(count, chance) >= least), for a chance in (0, 1)."""
     if least <= 0:
         return 0.0
     if least > count:
         return -math.inf
     k = np.arange(least, count + 1)
-    logs = gammaln(count + 1) - gammaln(k + 1) - gammaln(count - k + 1) + k * math.log(chance)
-    logs += (count - k) * math.log1p(-chance)
+    logs = gammaln(count + 1) - gammaln(k + 1) - gammaln(count - k + 1)
+    logs += k * math.log(chance) + (count - k) * math.log1p(-chance)
     top = float(logs.max())
     return min(0.0, top + math.log(float(np.exp(logs - top).sum())))
 

@@ -1,23 +1,26 @@
 """Regression diagnostics of the fundamental matrix (thesis 3.3.4 and 4.7.2): leverages, Cook's distances, priors.
 
-F is the unit vector f with A f = 0, where row i of the design matrix A is x2 (x) x1. Near a given f the unit vector moves in
-the eight directions perpendicular to it, so that this is a regression with p = 8 parameters, and the hat matrix is that of A
-restricted to them. With all nine directions the ninth would divide by what is zero but for the noise.
+F is the unit vector f with A f = 0, where row i of the design matrix A is x2 (x) x1. Near a given f the unit vector
+moves in the eight directions perpendicular to it, so that this is a regression with p = 8 parameters, and the hat
+matrix is that of A restricted to them. With all nine directions the ninth would divide by what is zero but for the noise.
 
-Leverage and Cook's distance do not change when each view is shifted and scaled, because this maps the rows of A linearly:
-one well-scaled frame (`points.Matches`) gives what Hartley's normalisation gives.
+Leverage and Cook's distance do not change when each view is shifted and scaled, because this maps the rows of A
+linearly: one well-scaled frame (`points.Matches`) gives what Hartley's normalisation gives.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
+from sfm_app.ransac.minimal import design_row
 from sfm_app.ransac.scoring import squared_distances
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 PARAMETERS = 8
+_LEAST_VARIANCE = 1e-24
+"""Of residuals in units of the points' spread: perfect matches are left with the rounding of their coordinates."""
 _MAD_TO_SIGMA = 1.4826
 """Median absolute deviation to standard deviation, for a Gaussian."""
 
@@ -29,7 +32,7 @@ def weighted_gram(points: FloatArray, weights: FloatArray) -> FloatArray:
     row = np.empty(9)
     for i in range(points.shape[0]):
         if weights[i] > 0.0:
-            _design_row(points[i], row)
+            design_row(points[i], row)
             for j in range(9):
                 for k in range(j + 1):
                     gram[j, k] += weights[i] * row[j] * row[k]
@@ -45,7 +48,7 @@ def _quadratic_forms(points: FloatArray, whitening: FloatArray) -> FloatArray:
     forms = np.zeros(points.shape[0])
     row = np.empty(9)
     for i in range(points.shape[0]):
-        _design_row(points[i], row)
+        design_row(points[i], row)
         for k in range(whitening.shape[1]):
             dot = 0.0
             for j in range(9):
@@ -54,17 +57,11 @@ def _quadratic_forms(points: FloatArray, whitening: FloatArray) -> FloatArray:
     return forms
 
 
-@kernel
-def _design_row(point: FloatArray, row: FloatArray) -> None:
-    x1, y1, x2, y2 = point
-    row[:] = (x2 * x1, x2 * y1, x2, y2 * x1, y2 * y1, y2, x1, y1, 1.0)
-
-
 def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArray:
     """Leverage h_ii of every match in a regression on the fitted ones plus itself (thesis 3.11).
 
-    For a fitted match that is the diagonal of the hat matrix. For any other the textbook formula would exceed 1; what counts
-    is how much it would pull if it were fitted as well, which is g / (1 + g) with g = a_i' (A_in' A_in)^-1 a_i.
+    For a fitted match that is the diagonal of the hat matrix. For any other the textbook formula would exceed 1; what
+    counts is how much it would pull if it were fitted as well, which is g / (1 + g) with g = a_i' (A_in' A_in)^-1 a_i.
 
     Args:
         points: (N, 4) matches, of magnitude about 1.
@@ -77,7 +74,9 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
     tangent = np.linalg.svd(f.reshape(1, 9))[2][1:].T
     gram = tangent.T @ weighted_gram(points, fitted.astype(np.float64)) @ tangent
     values, vectors = np.linalg.eigh(gram)
-    floor = max(float(values[-1]), np.finfo(float).tiny) * 1e-14  # a direction without support: any match there has leverage 1
+    floor = (
+        max(float(values[-1]), np.finfo(float).tiny) * 1e-14
+    )  # a direction without support: any match there has leverage 1
     forms = _quadratic_forms(points, np.ascontiguousarray(tangent @ (vectors / np.sqrt(np.maximum(values, floor)))))
     return np.where(fitted, np.minimum(forms, 1.0), forms / (1.0 + forms))
 
@@ -93,7 +92,7 @@ def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: B
     inside = residuals[fitted]
     freedom = max(len(inside) - PARAMETERS, 1)
     variance = float(((inside - inside.mean()) ** 2).sum()) / freedom if len(inside) else 0.0
-    return residuals / np.sqrt(np.maximum(variance * (1.0 - leverage), np.finfo(float).tiny))
+    return residuals / np.sqrt(np.maximum(variance, _LEAST_VARIANCE) * np.maximum(1.0 - leverage, np.finfo(float).eps))
 
 
 def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
@@ -105,7 +104,8 @@ def priors(distances: FloatArray, sigma: float) -> FloatArray:
     """p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels in the sampling)."""
     if not sigma > 0:
         return (distances <= distances.min(initial=np.inf)).astype(np.float64)
-    exponents = (distances / sigma) ** 2 / 2
+    with np.errstate(over="ignore"):  # far outliers: exp(-inf) = 0
+        exponents = (distances / sigma) ** 2 / 2
     return np.exp(exponents.min(initial=np.inf) - exponents)
 
 

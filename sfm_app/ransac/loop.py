@@ -76,7 +76,17 @@ def search(matches: Matches, options: EpipolarSettings, seed: int, recipe: Recip
         if recipe.patience is not None and best is not None:
             left = min(left, recipe.patience)
         drawn, found = next_better(
-            points, np.cumsum(priors), guided, recipe.score, threshold, lowest, least, left, state, recipe.oriented, model
+            points,
+            np.cumsum(priors),
+            guided,
+            recipe.score,
+            threshold,
+            lowest,
+            least,
+            left,
+            state,
+            recipe.oriented,
+            model,
         )
         trials += drawn
         if not found < lowest:

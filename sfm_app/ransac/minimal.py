@@ -14,6 +14,16 @@ _RANK_TOLERANCE = 1e-9
 
 
 @kernel
+def design_row(point: FloatArray, row: FloatArray) -> None:
+    """x2 (x) x1 into `row` (9,): the coefficients of the entries of F, by rows, in x2' F x1 = 0."""
+    for i in range(3):
+        from2 = point[2 + i] if i < 2 else 1.0
+        row[3 * i] = from2 * point[0]
+        row[3 * i + 1] = from2 * point[1]
+        row[3 * i + 2] = from2
+
+
+@kernel
 def seven_point(points: FloatArray, sample: IntArray, models: FloatArray) -> int:
     """All real F with det F = 0 through seven matches.
 
@@ -64,7 +74,7 @@ def is_oriented(points: FloatArray, sample: IntArray, f: FloatArray) -> bool:
             e2[0], e2[1], e2[2] = x, y, z
     positive = 0
     for n in range(SAMPLE_SIZE):
-        x1, y1, x2, y2 = points[sample[n]]
+        x1, y1, x2, y2 = points[sample[n], 0], points[sample[n], 1], points[sample[n], 2], points[sample[n], 3]
         ax, ay, az = f[0] * x1 + f[1] * y1 + f[2], f[3] * x1 + f[4] * y1 + f[5], f[6] * x1 + f[7] * y1 + f[8]
         side = (e2[1] - e2[2] * y2) * ax + (e2[2] * x2 - e2[0]) * ay + (e2[0] * y2 - e2[1] * x2) * az
         positive += side > 0.0
@@ -109,8 +119,7 @@ def _null_space(points: FloatArray, sample: IntArray, basis: FloatArray) -> bool
     """
     columns = np.empty((SAMPLE_SIZE, 9))  # each row becomes, from its diagonal on, the reflection that zeroes it
     for k in range(SAMPLE_SIZE):
-        x1, y1, x2, y2 = points[sample[k]]
-        columns[k] = (x2 * x1, x2 * y1, x2, y2 * x1, y2 * y1, y2, x1, y1, 1.0)
+        design_row(points[sample[k]], columns[k])
     for k in range(SAMPLE_SIZE):
         before, left = 0.0, 0.0
         for j in range(9):
@@ -145,9 +154,7 @@ def _reflect(unit: FloatArray, start: int, vector: FloatArray) -> None:
 
 @kernel
 def _det(m: FloatArray) -> float:
-    return (
-        m[0] * (m[4] * m[8] - m[5] * m[7]) - m[1] * (m[3] * m[8] - m[5] * m[6]) + m[2] * (m[3] * m[7] - m[4] * m[6])
-    )
+    return m[0] * (m[4] * m[8] - m[5] * m[7]) - m[1] * (m[3] * m[8] - m[5] * m[6]) + m[2] * (m[3] * m[7] - m[4] * m[6])
 
 
 @kernel

@@ -37,7 +37,9 @@ def _check(x: ArrayLike, name: str) -> FloatArray:
         raise ValueError(f"{name} must hold real numbers, got {points.dtype}")
     points = np.ascontiguousarray(points, dtype=np.float64)
     if not np.isfinite(points).all():
-        raise ValueError(f"{name} holds {np.count_nonzero(~np.isfinite(points).all(axis=1))} points that are not finite")
+        raise ValueError(
+            f"{name} holds {np.count_nonzero(~np.isfinite(points).all(axis=1))} points that are not finite"
+        )
     return points
 
 
@@ -51,12 +53,12 @@ class Matches:
     """(N,) for each match as given, its row in `points`."""
     unit_px: float
     """Pixels per unit of `points`. One scale for both views, so that a Sampson distance stays one, only in other units."""
-    centre1: FloatArray
-    centre2: FloatArray
+    centre: FloatArray
+    """(4,) pixels x1, y1, x2, y2 of the origin of `points`."""
 
     def to_pixels(self, F: FloatArray) -> FloatArray:
         """F of `points` as F of pixels, Frobenius norm 1."""
-        return unit_norm(self._transform(self.centre2).T @ F @ self._transform(self.centre1))
+        return unit_norm(self._transform(self.centre[2:]).T @ F @ self._transform(self.centre[:2]))
 
     def _transform(self, centre: FloatArray) -> FloatArray:
         return np.array([[1, 0, -centre[0]], [0, 1, -centre[1]], [0, 0, self.unit_px]]) / self.unit_px
@@ -79,4 +81,4 @@ def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
     points = np.ascontiguousarray(stacked[first[order]] - centre)
     unit_px = float(np.sqrt((points**2).mean())) if len(points) else 1.0
     unit_px = unit_px if unit_px > 0 else 1.0
-    return Matches(points / unit_px, place[rows], unit_px, centre[:2], centre[2:])
+    return Matches(points / unit_px, place[rows], unit_px, centre)

@@ -1,7 +1,7 @@
 """Non-linear refinement of F on the Sampson distance, over its seven degrees of freedom.
 
-F = U diag(1, s, 0) V' with rotations U and V: three parameters each and s, rank 2 at every step and no spare scale (Bartoli
-and Sturm 2004). U turns to U exp([a]x), V to V exp([b]x). Levenberg-Marquardt with iteratively reweighted residuals::
+F = U diag(1, s, 0) V' with rotations U and V: three parameters each and s, rank 2 at every step and no spare scale
+(Bartoli and Sturm 2004). U turns to U exp([a]x), V to V exp([b]x). Levenberg-Marquardt with iteratively reweighted residuals::
 
     cost = sum_i c^2 log(1 + min(r_i, cutoff)^2 / c^2)          (c = inf: least squares)
 """
@@ -16,7 +16,7 @@ from sfm_app.ransac.scoring import squared_sampson
 FloatArray = NDArray[np.float64]
 
 _SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e12
-_ENOUGH = 1e-10
+_ENOUGH = 1e-9
 """Relative decrease of the cost under which the search ends."""
 
 
@@ -66,9 +66,10 @@ def _levenberg_marquardt(
     basis, step = np.empty((7, 9)), np.empty(7)
     normal, right = np.empty((7, 7)), np.empty(7)
     f = _compose(U, s, V)
-    cost = _normal_equations(points, f, cutoff, softness, gram, gradient)
+    cost = new_cost = _cost(points, f, cutoff, softness)
     damping = 1e-4
     for _ in range(most_steps):
+        _normal_equations(points, f, cutoff, softness, gram, gradient)
         _tangent(U, s, V, basis)
         _project(gram, gradient, basis, normal, right)
         improved = False
@@ -85,7 +86,6 @@ def _levenberg_marquardt(
         U, V, s, f, cost = U_new, V_new, s_new, new, new_cost
         if done:
             break
-        _normal_equations(points, f, cutoff, softness, gram, gradient)
     return f.reshape(3, 3)
 
 
@@ -130,14 +130,14 @@ def _cost(points: FloatArray, f: FloatArray, cutoff: float, softness: float) -> 
 @kernel
 def _normal_equations(
     points: FloatArray, f: FloatArray, cutoff: float, softness: float, gram: FloatArray, gradient: FloatArray
-) -> float:
-    """Weighted J'J and J'r over the nine entries of F; gives the cost."""
+) -> None:
+    """Weighted J'J and J'r over the nine entries of F."""
     limit = cutoff * cutoff
     gram[:] = 0.0
     gradient[:] = 0.0
     row = np.empty(9)
     for i in range(points.shape[0]):
-        x1, y1, x2, y2 = points[i]
+        x1, y1, x2, y2 = points[i, 0], points[i, 1], points[i, 2], points[i, 3]
         ax, ay, az = f[0] * x1 + f[1] * y1 + f[2], f[3] * x1 + f[4] * y1 + f[5], f[6] * x1 + f[7] * y1 + f[8]
         bx, by = f[0] * x2 + f[3] * y2 + f[6], f[1] * x2 + f[4] * y2 + f[7]
         algebraic, squared_norm = x2 * ax + y2 * ay + az, ax * ax + ay * ay + bx * bx + by * by
@@ -165,7 +165,6 @@ def _normal_equations(
     for j in range(9):
         for k in range(j):
             gram[k, j] = gram[j, k]
-    return _cost(points, f, cutoff, softness)
 
 
 @kernel
@@ -224,7 +223,7 @@ def _turned(R: FloatArray, w: FloatArray) -> FloatArray:
     turned = np.empty((3, 3))
     for i in range(3):
         # row r of R times exp([w]x) = r - a (w x r) + b w x (w x r), because r [w]x = -(w x r)
-        x, y, z = R[i]
+        x, y, z = R[i, 0], R[i, 1], R[i, 2]
         cx, cy, cz = w[1] * z - w[2] * y, w[2] * x - w[0] * z, w[0] * y - w[1] * x
         turned[i, 0] = x - a * cx + b * (w[1] * cz - w[2] * cy)
         turned[i, 1] = y - a * cy + b * (w[2] * cx - w[0] * cz)

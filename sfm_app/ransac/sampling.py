@@ -1,7 +1,7 @@
 """Random minimal samples, uniform or by weight, from a generator whose state is passed around.
 
-The generator is splitmix64 (Steele, Lea and Flood 2014): 64 bits of state, one multiplication chain per number. Its state
-is an argument, so that pairs run in parallel threads and still repeat to the last bit.
+The generator is splitmix64 (Steele, Lea and Flood 2014): 64 bits of state, one multiplication chain per number. Its
+state is an argument, so that pairs run in parallel threads and still repeat to the last bit.
 """
 
 import numpy as np
@@ -52,8 +52,8 @@ def draw_uniform(state: RandomState, count: int, sample: IntArray) -> None:
 def draw_weighted(state: RandomState, cumulative: FloatArray, sample: IntArray) -> bool:
     """Fill `sample` with distinct indices, each draw proportional to the weights of those that are left.
 
-    Drawing again when an index is already in the sample is the same as drawing from the others. False when that does not
-    end, because fewer points than the sample needs hold nearly all the weight.
+    Drawing again when an index is already in the sample is the same as drawing from the others. False when that does
+    not end, because fewer points than the sample needs hold nearly all the weight.
 
     Args:
         state: generator.

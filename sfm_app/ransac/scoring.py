@@ -1,7 +1,7 @@
 """How well a fundamental matrix explains all matches: penalties on the Sampson distance, with early exits (thesis 4.4.1).
 
-A penalty is to be made small. Early exit by the bail-out test (Capel 2005; thesis 4.4.4): the matches come in random order,
-so that after a few blocks it is clear that a hypothesis cannot beat the best one.
+A penalty is to be made small. Early exit by the bail-out test (Capel 2005; thesis 4.4.4): the matches come in random
+order, so that after a few blocks it is clear that a hypothesis cannot beat the best one.
 """
 
 import numpy as np
@@ -90,8 +90,8 @@ def penalty(
 def bail_out_table(count: int, inlier_share: float) -> IntArray:
     """How many inliers a hypothesis must show after each block to be worth finishing.
 
-    A hypothesis as good as the best one has a share `inlier_share` of inliers; in the first m of N matches their number is
-    hypergeometric, and falls short of the figures given here about once in a thousand times.
+    A hypothesis as good as the best one has a share `inlier_share` of inliers; in the first m of N matches their
+    number is hypergeometric, and falls short of the figures given here about once in a thousand times.
 
     Returns:
         (blocks,) counts.

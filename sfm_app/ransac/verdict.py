@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfm_app.geometry.epipolar import sampson_distance
-from sfm_app.ransac.chance import MOST_FALSE_ALARMS, expected_false_alarms
+from sfm_app.ransac.chance import MOST_FALSE_ALARMS, false_alarms_of, mismatch_distances
 from sfm_app.ransac.degeneracy import find_degeneracy
 from sfm_app.ransac.leverage import prior_validity
 from sfm_app.ransac.loop import Recipe, search
@@ -59,19 +59,21 @@ def _judge(
 ) -> EpipolarFit | Rejected:
     points, threshold = matches.points, options.max_error_px / matches.unit_px
     f = np.ascontiguousarray(F / np.linalg.norm(F)).reshape(9)
-    inside = squared_distances(points, f) <= threshold * threshold
-    if np.count_nonzero(inside) < options.min_inliers:
+    distances = np.sqrt(squared_distances(points, f))
+    inliers = distances <= threshold
+    if np.count_nonzero(inliers) < options.min_inliers:
         return Rejected(TOO_FEW_INLIERS)
-    if expected_false_alarms(points, f, threshold) > MOST_FALSE_ALARMS:
+    wrong = mismatch_distances(points, f)
+    if false_alarms_of(distances, wrong, threshold) > MOST_FALSE_ALARMS:
         return Rejected(CHANCE)
     F_px = matches.to_pixels(F)
-    distance = sampson_distance(F_px, x1, x2)
-    inliers = distance <= options.max_error_px
+    errors_px = sampson_distance(F_px, x1, x2)
+    accepted = errors_px <= options.max_error_px
     return EpipolarFit(
         F=F_px,
-        inliers=inliers,
+        inliers=accepted,
         priors=prior_validity(points, f, threshold, sigma_from_inliers=True)[matches.rows],
         trials=trials,
-        rms_px=math.sqrt(float(np.mean(distance[inliers] ** 2))),
-        degeneracy=find_degeneracy(points, f, threshold),
+        rms_px=math.sqrt(float(np.mean(errors_px[accepted] ** 2))),
+        degeneracy=find_degeneracy(points, F, inliers, wrong, threshold, matches.centre / matches.unit_px),
     )

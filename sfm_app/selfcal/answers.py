@@ -8,7 +8,8 @@ from sfm_app.selfcal.inputs import FloatArray
 from sfm_app.types import Calibration
 
 GUESSED_FOCAL = 1.2
-"""Focal of a camera about which nothing is known, in units of the longer side (COLMAP's default as well)."""
+"""Focal of a camera about which nothing is known, in units of the longer side; COLMAP guesses the same."""
+GUESS = "guess"
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:
@@ -16,16 +17,9 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
-def guessed(size: tuple[int, int], method: str, reason: str, evidence: Mapping[str, float]) -> Calibration:
+def guessed(size: tuple[int, int], reason: str, evidence: Mapping[str, float]) -> Calibration:
     """The answer where the pairs do not determine K: a focal of 1.2 longer sides, the centre in the middle."""
     width, height = size
     focal_px = GUESSED_FOCAL * max(size)
-    return Calibration(
-        K=camera_matrix(focal_px, focal_px, width / 2, height / 2),
-        width=width,
-        height=height,
-        method=method,
-        identifiable=False,
-        reason=reason,
-        evidence=dict(evidence),
-    )
+    K = camera_matrix(focal_px, focal_px, width / 2, height / 2)
+    return Calibration(K, width, height, GUESS, identifiable=False, reason=reason, evidence=dict(evidence))

@@ -1,4 +1,4 @@
-"""The highest peak of the joint consensus: a coarse grid over K, then a local search from its best cells."""
+"""The highest peak of the joint consensus: a coarse grid over K, then local searches from its best cells."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,14 +9,14 @@ from sfm_app.selfcal.inputs import FloatArray
 from sfm_app.selfcal.joint import Consensus
 
 FOCAL_RANGE = (0.3, 5.0)
-"""Focals that are tried, in units of the longer side: a fisheye's 120 degrees to a telephoto's 11."""
+"""Focals that are tried, in units of the longer side: 118 to 11 degrees of view."""
 FOCALS = 29
 """Focals on the grid, each 10 % above the one before."""
 CENTRE_REACH = 0.4
 """Centres are tried up to this far from the middle, in units of the longer side."""
 CENTRE_STEP = 0.08
 SIGMAS = (0.05, 0.02)
-"""Widths of the consensus, in units of r: the first finds the peak, the second refines it."""
+"""Widths of the consensus, in units of r: with the first a peak is found, with the second it is refined and compared."""
 MOST_STARTS = 4
 
 
@@ -26,7 +26,7 @@ class Peak(NamedTuple):
     theta: FloatArray
     """(4,) log f, u, v, log a."""
     value: float
-    """Support plus log-prior at the last of `SIGMAS`."""
+    """Support plus log-prior there, at the sigma it was climbed with last."""
 
 
 class Profile(NamedTuple):
@@ -50,11 +50,11 @@ def scan(consensus: Consensus, log_aspects: Sequence[float]) -> Profile:
     return Profile(thetas[rows, best], values[rows, best])
 
 
-def highest_peak(consensus: Consensus, profile: Profile, free: Sequence[int]) -> Peak:
-    """Climb from the best local maxima of the profile, and keep the highest end."""
+def peaks(consensus: Consensus, profile: Profile, free: Sequence[int]) -> list[Peak]:
+    """Where the best local maxima of the profile lead to, highest first."""
     padded = np.concatenate([[-np.inf], profile.values, [-np.inf]])
     is_top = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
     tops = np.flatnonzero(is_top)
     starts = tops[np.argsort(-profile.values[tops], kind="stable")][:MOST_STARTS]
     ends = [Peak(*consensus.climb(profile.thetas[start], free, SIGMAS)) for start in starts]
-    return max(ends, key=lambda peak: peak.value)
+    return sorted(ends, key=lambda peak: -peak.value)

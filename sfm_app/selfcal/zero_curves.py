@@ -1,27 +1,145 @@
-"""Zero Curves as the product uses it: the consensus of thesis (5.33) over all of K at once, and what supports it."""
+"""Zero Curves as the product uses it: the consensus of thesis (5.33) over all of K at once, and an honest verdict on it.
+
+Beyond the thesis: the centre is sought together with the focal (cropped photos), fy/fx is freed only where that is
+clearly better (squeezed photos), and an answer that the pairs do not determine is not given.
+"""
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from sfm_app.selfcal.answers import camera_matrix, guessed
+from sfm_app.selfcal.evidence import best_rival, deviation, effective_count, own_sigma, resampled, spread_px, votes
 from sfm_app.selfcal.inputs import FloatArray, prepare
-from sfm_app.selfcal.joint import CENTRE_U, CENTRE_V, LOG_FOCAL, Consensus
-from sfm_app.selfcal.search import highest_peak, scan
+from sfm_app.selfcal.joint import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, Consensus
+from sfm_app.selfcal.search import FOCAL_RANGE, SIGMAS, Peak, Profile, peaks, scan
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration
 
 METHOD = "zero-curves"
+SQUARE_PIXELS = (LOG_FOCAL, CENTRE_U, CENTRE_V)
+ANY_PIXELS = (*SQUARE_PIXELS, LOG_ASPECT)
+LOG_ASPECTS = tuple(np.linspace(-0.6, 0.6, 9))
+"""log fy/fx on the grid: 0.55 to 1.8."""
+ASPECT_GAIN = float(np.log(50))
+"""Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square."""
+ASPECT_DEVIATIONS = 3.0
+"""fy/fx must differ from 1 by this many of its own standard deviations."""
+MIN_PAIRS = 3
+"""Each F gives two constraints; below three pairs nothing is left to contradict a wrong K."""
+MIN_AGREEING = 2.25
+"""Effective number of pairs that must agree; three parameters satisfy one and a half pairs whatever these say."""
+MIN_SUPPORT = 0.12
+"""Share of the votes that K must win; pairs without any common K give up to 0.06."""
+MIN_LEAD = 0.5
+"""Votes by which K must lead every other focal."""
+MIN_LEAD_SHARE = 0.03
+"""The same as a share of the votes for K: many pairs that hardly tell one focal from another do not add up to knowledge."""
+MAX_LOG_FOCAL_SPREAD = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Answer:
+    """A peak with everything that the verdict needs."""
+
+    theta: FloatArray
+    free: tuple[int, ...]
+    sigma: float
+    lead: float
+    votes: FloatArray
+    resampled: FloatArray
+
+    def deviation(self, index: int) -> float:
+        """Standard deviation of one entry of theta."""
+        return deviation(self.resampled[:, index], effective_count(self.votes), len(self.free))
 
 
 def calibrate(
     Fs: FloatArray, weights: FloatArray, size: tuple[int, int], options: CalibrationSettings, seed: int
 ) -> Calibration:
+    """Find the K that most pairs agree on.
+
+    Args:
+        Fs: (P, 3, 3) in pixels.
+        weights: (P,), >= 0; see `selfcal.pair_weights`.
+        size: (width, height) in pixels.
+        options: `centre_sigma` of the prior on the optical centre.
+        seed: of the resampling behind `spread`.
+
+    Returns:
+        K with ``identifiable=True``, or a guess and the reason why the pairs do not determine K.
+
+    Raises:
+        ValueError: malformed input, see `selfcal.inputs.prepare`.
+    """
     width, height = size
-    unit = max(size)
-    pairs = prepare(Fs, weights, size, unit_px=unit, origin_px=(width / 2, height / 2))
-    if len(pairs) < 3:
-        return guessed(size, METHOD, f"too few pairs: {len(pairs)}, 3 are needed", {"pairs": float(len(pairs))})
-    consensus = Consensus(pairs, options.centre_sigma * width / unit)
-    peak = highest_peak(consensus, scan(consensus, (0.0,)), (LOG_FOCAL, CENTRE_U, CENTRE_V))
-    f = np.exp(peak.theta[0]) * unit
-    K = camera_matrix(f, f, width / 2 + unit * peak.theta[1], height / 2 + unit * peak.theta[2])
-    return Calibration(K, width, height, METHOD, identifiable=True, evidence={"pairs": float(len(pairs))})
+    unit_px = float(max(size))
+    pairs = prepare(Fs, weights, size, unit_px=unit_px, origin_px=(width / 2, height / 2))
+    evidence = {"pairs": float(len(pairs))}
+    if len(pairs) < MIN_PAIRS:
+        return guessed(size, f"{len(pairs)} usable pairs, {MIN_PAIRS} are needed", evidence)
+    consensus = Consensus(pairs, options.centre_sigma * width / unit_px)
+    answer, gain = _found(consensus, seed)
+    mass = float(np.sum(answer.votes))
+    evidence |= {
+        "support": mass / float(np.sum(pairs.weights)),
+        "agreeing_pairs": effective_count(answer.votes),
+        "lead": answer.lead,
+        "lead_share": answer.lead / mass if mass > 0 else 0.0,
+        "sigma": answer.sigma,
+        "aspect_gain": gain,
+        "log_focal_spread": answer.deviation(LOG_FOCAL),
+    }
+    reason = _objection(answer.theta, evidence, (0.5 * width / unit_px, 0.5 * height / unit_px))
+    if reason:
+        return guessed(size, reason, evidence)
+    f, a = np.exp(answer.theta[LOG_FOCAL]) * unit_px, np.exp(0.5 * answer.theta[LOG_ASPECT])
+    centre = unit_px * answer.theta[CENTRE_U : CENTRE_V + 1] + np.array([width, height]) / 2
+    K = camera_matrix(f / a, f * a, centre[0], centre[1])
+    spread = spread_px(answer.resampled, unit_px, effective_count(answer.votes), len(answer.free))
+    return Calibration(K, width, height, METHOD, identifiable=True, spread=spread, evidence=evidence)
+
+
+def _found(consensus: Consensus, seed: int) -> tuple[_Answer, float]:
+    """The answer with square pixels, or, where the pairs clearly ask for it, with any; and what freeing fy/fx gains."""
+    profile = scan(consensus, (0.0,))
+    square = peaks(consensus, profile, SQUARE_PIXELS)
+    free_profile = scan(consensus, LOG_ASPECTS)
+    free = peaks(consensus, free_profile, ANY_PIXELS)
+    # both are measured with the width that suits the freer one, or a wrong square answer would choose a lenient width
+    sigma = own_sigma(consensus, free[0].theta)
+    theta, value = consensus.climb(free[0].theta, ANY_PIXELS, (sigma,))
+    gain = value - consensus.climb(square[0].theta, SQUARE_PIXELS, (sigma,))[1]
+    if gain >= ASPECT_GAIN:
+        answer = _examined(consensus, free, free_profile, ANY_PIXELS, seed)
+        if abs(answer.theta[LOG_ASPECT]) >= ASPECT_DEVIATIONS * answer.deviation(LOG_ASPECT):
+            return answer, gain
+    return _examined(consensus, square, profile, SQUARE_PIXELS, seed), gain
+
+
+def _examined(consensus: Consensus, found: list[Peak], profile: Profile, free: tuple[int, ...], seed: int) -> _Answer:
+    """Refine the highest peak to the width that its own pairs ask for, and collect what speaks for it."""
+    best = found[0]
+    sigma = own_sigma(consensus, best.theta)
+    theta, _ = consensus.climb(best.theta, free, (sigma,))
+    value = float(consensus.at(theta[None, :], SIGMAS[-1])[0])
+    lead = value - best_rival(consensus, Peak(theta, value), profile, found[1:], free)
+    return _Answer(theta, free, sigma, lead, votes(consensus, theta), resampled(consensus, theta, free, sigma, seed))
+
+
+def _objection(theta: FloatArray, evidence: dict[str, float], half_size: tuple[float, float]) -> str:
+    """Why K is not determined, or nothing."""
+    focal = float(np.exp(theta[LOG_FOCAL]))
+    low, high = FOCAL_RANGE
+    agreeing, support = evidence["agreeing_pairs"], evidence["support"]
+    if agreeing < MIN_AGREEING or support < MIN_SUPPORT:
+        return f"the pairs do not agree on a camera: {100 * support:.0f} % of the votes, worth {agreeing:.1f} pairs"
+    if evidence["lead"] < MIN_LEAD or evidence["lead_share"] < MIN_LEAD_SHARE:
+        return "the pairs fit other focals as well (too little rotation, parallel axes, or an orbit)"
+    if not low * 1.02 < focal < high / 1.02:
+        return f"the focal runs to the end of the range, {focal:.2f} longer sides"
+    if abs(theta[CENTRE_U]) > half_size[0] or abs(theta[CENTRE_V]) > half_size[1]:
+        return "the optical centre runs out of the photo"
+    if evidence["log_focal_spread"] > MAX_LOG_FOCAL_SPREAD:
+        return f"the focal is uncertain by {100 * evidence['log_focal_spread']:.0f} %"
+    return ""

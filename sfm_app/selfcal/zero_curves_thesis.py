@@ -45,14 +45,14 @@ def calibrate(
     evidence["focal_curves"] = float(len(curves))
     focal = meeting_point(curves, FOCAL_RANGE, SIGMA_SHARE * FOCAL_RANGE)
     if focal is None:
-        return guessed(size, METHOD, f"{len(curves)} of {len(pairs)} pairs have a usable focal curve, 2 are needed", evidence)
+        return guessed(size, f"{len(curves)} of {len(pairs)} pairs have a usable focal curve, 2 are needed", evidence)
     evidence["focal_support"] = focal.support
 
     curves = usable(centre_curves(pairs, sweep, (fx[focal.sample], focal.value)), tall)
     evidence["centre_curves"] = float(len(curves))
     centre = meeting_point(curves, tall, SIGMA_SHARE * tall)
     if centre is None:
-        return guessed(size, METHOD, f"{len(curves)} of {len(pairs)} pairs have a usable centre curve, 2 are needed", evidence)
+        return guessed(size, f"{len(curves)} of {len(pairs)} pairs have a usable centre curve, 2 are needed", evidence)
     evidence["centre_support"] = centre.support
     K = camera_matrix(fx[focal.sample] * width, focal.value * width, sweep[centre.sample] * width, centre.value * width)
     return Calibration(K, width, height, METHOD, identifiable=True, evidence=evidence)

@@ -64,7 +64,7 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         observations=scene.observations,
         mean_reprojection_px=round(scene.mean_reprojection_px, 4),
         cameras={name: {"model": camera.model, "params": camera.params} for name, camera in scene.cameras.items()},
-        deviations_px_for_1_px_noise={name: round(value, 4) for name, value in deviations.items()},
+        deviations_px={name: round(value, 4) for name, value in deviations.items()},
         seeds_tried=tried,
     )
     return scene

@@ -1,0 +1,92 @@
+"""What speaks for a peak of the joint consensus: how many pairs, against which rivals, how stable."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sfm_app.selfcal.inputs import FloatArray
+from sfm_app.selfcal.joint import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, Consensus
+from sfm_app.selfcal.search import SIGMAS, Peak, Profile
+
+OWN_SIGMA_RANGE = (0.005, 0.02)
+"""The last width of the consensus follows the data within these bounds, in units of r."""
+OWN_SIGMA_FACTOR = 1.5
+"""In medians of r: half of the agreeing pairs then speak with more than half their weight."""
+RIVAL_RATIO = 1.25
+"""A K with a focal this many times longer or shorter is another answer."""
+RESAMPLES = 25
+STABLE_SIGMA = 0.01
+"""Resampled fits use at least this width: below it they snap to single pairs."""
+
+
+def own_sigma(consensus: Consensus, theta: FloatArray) -> float:
+    """The width that fits the scatter of the agreeing pairs: 1.5 times the weighted median of their r."""
+    r = consensus.ratios(theta)
+    agreeing = r < SIGMAS[0]
+    if not np.any(agreeing):
+        return OWN_SIGMA_RANGE[1]
+    order = np.argsort(r[agreeing], kind="stable")
+    mass = np.cumsum(consensus.pairs.weights[agreeing][order])
+    median = r[agreeing][order][np.searchsorted(mass, 0.5 * mass[-1])]
+    return float(np.clip(OWN_SIGMA_FACTOR * median, *OWN_SIGMA_RANGE))
+
+
+def votes(consensus: Consensus, theta: FloatArray, sigma: float = SIGMAS[-1]) -> FloatArray:
+    """(P,) what each pair gives to K: w_i exp(-r_i / sigma)."""
+    return np.asarray(consensus.pairs.weights * np.exp(-consensus.ratios(theta) / sigma))
+
+
+def effective_count(votes: FloatArray) -> float:
+    """How many equal votes weigh the same (Kish's effective sample size); 0 where nobody votes."""
+    total, squares = float(np.sum(votes)), float(np.sum(votes**2))
+    return total * total / squares if squares > 0 else 0.0
+
+
+def best_rival(consensus: Consensus, best: Peak, profile: Profile, others: Sequence[Peak], free: Sequence[int]) -> float:
+    """The highest value, at the last of `SIGMAS`, that another focal reaches with everything else adapted to it.
+
+    Tried are both focals `RIVAL_RATIO` away, from the centre of the peak and from the best cell of the grid there, and the
+    other peaks beyond them. Where the consensus does not depend on the focal (orbits, parallel axes) this equals the peak.
+    """
+    shift = np.log(RIVAL_RATIO)
+    adapted = [index for index in free if index != LOG_FOCAL]
+    values = [peak.value for peak in others if abs(peak.theta[LOG_FOCAL] - best.theta[LOG_FOCAL]) >= shift]
+    for log_focal in best.theta[LOG_FOCAL] + np.array([-shift, shift]):
+        cell = profile.thetas[np.argmin(np.abs(profile.thetas[:, LOG_FOCAL] - log_focal))]
+        for start in (best.theta.copy(), cell.copy()):
+            start[LOG_FOCAL] = log_focal
+            values.append(consensus.climb(start, adapted, SIGMAS)[1])
+    return max(values)
+
+
+def resampled(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigma: float, seed: int) -> FloatArray:
+    """(RESAMPLES, 4) the peak under randomly reweighted pairs: the Bayesian bootstrap (Rubin 1981).
+
+    Weights instead of draws, because three pairs drawn with replacement are often one pair three times.
+    """
+    rng = np.random.default_rng(seed)
+    weights = consensus.pairs.weights
+    found = []
+    for _ in range(RESAMPLES):
+        drawn = weights * rng.exponential(size=len(weights))
+        again = consensus.weighted(drawn * (np.sum(weights) / np.sum(drawn)))
+        found.append(again.climb(theta, free, (max(sigma, STABLE_SIGMA),))[0])
+    return np.array(found)
+
+
+def deviation(values: FloatArray, count: float, parameters: int) -> float:
+    """Standard deviation over resampled peaks of something that `count` effective pairs say about `parameters` unknowns.
+
+    A pair gives two constraints. With three pairs and three unknowns half of the scatter has gone into the fit, and the
+    resampled peaks scatter too little by the same share: the usual correction for degrees of freedom.
+    """
+    spare = max(count - 0.5 * parameters, 0.5)
+    return float(np.std(values, ddof=1) * np.sqrt(max(count, 1.0) / spare))
+
+
+def spread_px(thetas: FloatArray, unit_px: float, count: float, parameters: int) -> dict[str, float]:
+    """Standard deviations of fx, fy, cx, cy, in pixels; see `deviation`."""
+    focal, half = np.exp(thetas[:, LOG_FOCAL]) * unit_px, np.exp(0.5 * thetas[:, LOG_ASPECT])
+    columns = {"fx": focal / half, "fy": focal * half}
+    columns |= {"cx": thetas[:, CENTRE_U] * unit_px, "cy": thetas[:, CENTRE_V] * unit_px}
+    return {name: deviation(column, count, parameters) for name, column in columns.items()}

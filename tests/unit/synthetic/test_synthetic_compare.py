@@ -1,0 +1,150 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfm_app.synthetic.cameras import axis_rotation, make_camera
+from sfm_app.synthetic.compare import (
+    Similarity,
+    align_centres,
+    centre_error_percent,
+    focal_error_percent,
+    sample_surface,
+    scene_size,
+    seen_points,
+    surface_coverage,
+    surface_error,
+    umeyama,
+)
+from sfm_app.synthetic.photo_folder import Truth
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def random_similarity(rng):
+    axis = rng.normal(size=3)
+    R = axis_rotation(axis / np.linalg.norm(axis), rng.uniform(-180, 180))
+    return Similarity(float(np.exp(rng.uniform(-3, 3))), R, rng.normal(size=3) * 10)
+
+
+def moved(truth, similarity):
+    """The truth as a reconstruction would have it: in a frame of its own."""
+    centres = {name: similarity(c[None])[0] for name, c in truth.centres.items()}
+    return similarity(truth.vertices), truth.faces, centres
+
+
+@pytest.fixture(scope="module")
+def plane_truth(photos):
+    """A square of side 4 in the ground plane, seen by the four views."""
+    vertices = np.array([[-2.0, 0, -2], [-2, 0, 2], [2, 0, 2], [2, 0, -2]])
+    return replace(photos[1], vertices=vertices, faces=np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def test_errors_of_K_are_those_of_the_thesis(photos):
+    truth = photos[1]
+    K = truth.K.copy()
+    assert focal_error_percent(K, truth) == centre_error_percent(K, truth) == 0.0
+    K[0, 0] *= 1.02
+    K[1, 1] *= 0.96
+    K[0, 2] *= 0.9
+    assert focal_error_percent(K, truth) == pytest.approx(3.0)
+    assert centre_error_percent(K, truth) == pytest.approx(5.0)
+
+
+@given(seed=SEEDS, flat=st.booleans())
+@settings(deadline=None)
+def test_umeyama_finds_the_similarity(seed, flat):
+    rng = np.random.default_rng(seed)
+    true = random_similarity(rng)
+    a = rng.normal(size=(8, 3)) * [1.0, 1.0, 0.0 if flat else 1.0]
+
+    found = umeyama(a, true(a))
+
+    assert found.scale == pytest.approx(true.scale)
+    assert np.allclose(found.R, true.R, atol=1e-6) and np.linalg.det(found.R) > 0
+    assert np.allclose(found(a), true(a), atol=1e-6 * true.scale)
+
+
+@pytest.mark.parametrize("wrong", [0, 3])
+def test_wrong_photos_do_not_spoil_the_alignment(wrong):
+    rng = np.random.default_rng(5)
+    true = random_similarity(rng)
+    found = rng.normal(size=(12, 3))
+    right = true(found)
+    names = [f"{k}.jpg" for k in range(12)]
+    poses = {name: np.column_stack([np.eye(3), -c]) for name, c in zip(names, right, strict=True)}
+    truth = Truth(make_camera(96, 64).K, 96, 64, poses, np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    noisy = found + rng.normal(scale=1e-3, size=found.shape)
+    noisy[:wrong] += rng.normal(size=(wrong, 3)) * 3
+
+    similarity = align_centres(dict(zip(names, noisy, strict=True)), truth)
+
+    error = np.linalg.norm(similarity(noisy[wrong:]) - right[wrong:], axis=1) / true.scale
+    assert 2e-4 < np.sqrt(np.mean(error**2)) < 4e-3, "what is left is the noise"
+
+
+def test_alignment_needs_three_known_photos_off_a_line(photos):
+    truth = photos[1]
+    two = dict(list(truth.centres.items())[:2]) | {"stranger.jpg": np.zeros(3)}
+    with pytest.raises(ValueError, match="2 of the found camera centres"):
+        align_centres(two, truth)
+    on_a_line = {name: np.array([float(k), 0.0, 0.0]) for k, name in enumerate(truth.centres)}
+    with pytest.raises(ValueError, match="on a line"):
+        align_centres(on_a_line, truth)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_truth_in_another_frame_has_no_error(photos, seed):
+    vertices, faces, centres = moved(photos[1], random_similarity(np.random.default_rng(seed)))
+    assert surface_error(vertices, faces, centres, photos[1]) < 1e-5
+    assert surface_coverage(vertices, faces, centres, photos[1]) == 1.0
+
+
+@pytest.mark.parametrize("offset", [0.01, 0.1])
+def test_the_error_is_the_distance_over_the_scene_size(plane_truth, offset):
+    raised = plane_truth.vertices + np.array([0.0, offset, 0.0])
+    error = surface_error(raised, plane_truth.faces, plane_truth.centres, plane_truth)
+    assert error == pytest.approx(offset / scene_size(plane_truth), rel=1e-3)
+    assert surface_coverage(raised, plane_truth.faces, plane_truth.centres, plane_truth, tolerance=error * 1.01) == 1.0
+    assert surface_coverage(raised, plane_truth.faces, plane_truth.centres, plane_truth, tolerance=error * 0.99) == 0.0
+
+
+def test_coverage_tells_half_a_surface_from_a_whole_one(plane_truth):
+    half = plane_truth.faces[:1]
+    assert surface_error(plane_truth.vertices, half, plane_truth.centres, plane_truth) < 1e-6
+    assert 0.3 < surface_coverage(plane_truth.vertices, half, plane_truth.centres, plane_truth, tolerance=1e-4) < 0.7
+
+
+def test_the_scene_is_what_the_photos_see(photos, plane_truth):
+    truth = photos[1]
+    hidden = np.array([[50.0, 0, 50], [51, 0, 50], [50, 0, 51]])
+    behind = replace(
+        truth,
+        vertices=np.concatenate([truth.vertices, hidden]),
+        faces=np.concatenate([truth.faces, np.array([[0, 1, 2]]) + len(truth.vertices)]),
+    )
+    assert scene_size(behind) == scene_size(truth)
+    assert 4.0 < scene_size(plane_truth) <= 32**0.5 + 1e-3
+    assert np.abs(seen_points(plane_truth)[:, 1]).max() < 1e-5
+
+
+def test_samples_spread_evenly_over_the_triangles():
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [3, 0, 0], [0, 3, 0]])
+    faces = np.array([[0, 1, 2], [0, 3, 4]])  # areas 1/2 and 9/2
+    points = sample_surface(vertices, faces, 20_000)
+    inner = points.sum(axis=1) <= 1.0
+    # all of the small triangle's share, and a ninth of the big one's
+    assert inner.mean() == pytest.approx(0.1 + 0.9 / 9, abs=0.01)
+    assert np.all(points >= 0) and points.sum(axis=1).max() <= 3 and not points[:, 2].any()
+    assert np.allclose(points[~inner].mean(axis=0)[0], points[~inner].mean(axis=0)[1], atol=0.03)
+
+
+def test_a_surface_without_area_is_refused(photos):
+    truth = photos[1]
+    nothing = np.zeros((0, 3), dtype=np.int64)
+    with pytest.raises(ValueError, match="no area"):
+        surface_error(truth.vertices, nothing, truth.centres, truth)
+    with pytest.raises(ValueError, match="no area"):
+        surface_coverage(truth.vertices, nothing, truth.centres, truth)

@@ -1,0 +1,119 @@
+import json
+import pickle
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sfm_app.errors import ConfigError, InputError
+from sfm_app.synthetic.photo_folder import PhotoOptions, develop, load_truth, save_truth, write_photo_folder
+
+
+class Counter:
+    def __init__(self):
+        self.seen = []
+
+    def stage(self, name, note=""): ...
+
+    def start(self, label, total):
+        self.seen.append((label, total))
+
+    def advance(self, steps=1):
+        self.seen.append(steps)
+
+    def finish(self):
+        self.seen.append("done")
+
+
+def test_the_folder_holds_photos_and_nothing_else(photos):
+    folder, truth = photos
+
+    assert sorted(path.name for path in folder.iterdir()) == sorted(truth.cam_from_world)
+    for path in folder.iterdir():
+        with Image.open(path) as image:
+            assert image.format == "JPEG" and image.size == (truth.width, truth.height) == (120, 80)
+            assert not image.getexif() and "exif" not in image.info
+            assert np.asarray(image).std() > 20, "there is something to see"
+
+
+def test_the_same_seed_gives_the_same_bytes(photos, still_life, four_views, tmp_path):
+    folder, _ = photos
+    progress = Counter()
+    write_photo_folder(tmp_path / "again", still_life, four_views, PhotoOptions(seed=3), progress)
+    write_photo_folder(tmp_path / "other", still_life, four_views, PhotoOptions(seed=4))
+
+    for path in folder.iterdir():
+        assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes()
+        assert (tmp_path / "other" / path.name).read_bytes() != path.read_bytes()
+    assert progress.seen == [("rendering photos", 4), 1, 1, 1, 1, "done"]
+
+
+def test_truth_survives_the_disk_and_pickling(photos, tmp_path):
+    _, truth = photos
+    save_truth(truth, tmp_path / "truth")
+    for copy in (load_truth(tmp_path / "truth"), pickle.loads(pickle.dumps(truth))):  # noqa: S301
+        assert np.array_equal(copy.K, truth.K)
+        assert (copy.width, copy.height, copy.division_lambda) == (truth.width, truth.height, 0.0)
+        assert list(copy.cam_from_world) == list(truth.cam_from_world)
+        assert all(np.array_equal(copy.cam_from_world[name], pose) for name, pose in truth.cam_from_world.items())
+        assert np.array_equal(copy.vertices, truth.vertices) and np.array_equal(copy.faces, truth.faces)
+
+
+def test_truth_file_says_x_is_K_RX_plus_t(photos, tmp_path):
+    _, truth = photos
+    save_truth(truth, tmp_path)
+    first = json.loads((tmp_path / "truth.json").read_text())["images"][0]
+    X = np.array([0.1, 1.3, 0.2])
+    h = np.array(first["K"]) @ (np.array(first["R"]) @ X + np.array(first["t"]))
+
+    assert first["file"] == "view_00.jpg" and (first["width"], first["height"]) == (120, 80)
+    assert h[2] > 0 and 0 < h[0] / h[2] < 120 and 0 < h[1] / h[2] < 80, "the ball is in the photo"
+    assert np.allclose(truth.centres["view_00.jpg"], -np.array(first["R"]).T @ first["t"])
+
+
+def test_noise_is_the_injected_noise():
+    grey = np.full((200, 200, 3), 0.2)
+    for noise in (0.8, 3.0):
+        levels = develop(grey, PhotoOptions(noise=noise, blur_px=1.0), np.random.default_rng(0)).astype(float)
+        # rounding to grey levels adds 1/12
+        assert levels.std() == pytest.approx(np.hypot(noise, np.sqrt(1 / 12)), rel=0.02)
+        assert levels.mean() == pytest.approx(255 * 0.2 ** (1 / 2.2), abs=0.1)
+
+
+def test_blur_spreads_an_edge_as_far_as_asked():
+    edge = np.zeros((40, 80, 3))
+    edge[:, 40:] = 1.0
+    rng = np.random.default_rng(0)
+    linear = [
+        (develop(edge, PhotoOptions(noise=0.0, blur_px=blur), rng)[20, :, 0] / 255.0) ** 2.2 for blur in (0.0, 0.5, 2.0)
+    ]
+    weights = [np.diff(profile) for profile in linear]
+    spread = [np.sqrt((w * (np.arange(79) - 39) ** 2).sum() / w.sum()) for w in weights]
+    assert spread[0] == 0.0 and 0.4 < spread[1] < 0.6 and 1.8 < spread[2] < 2.2
+
+
+def test_wrong_options_are_named():
+    with pytest.raises(ConfigError, match="supersampling, quality"):
+        PhotoOptions(supersampling=0, quality=100)
+
+
+def test_a_file_in_place_of_the_folder_is_an_input_error(still_life, four_views, photos, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(InputError, match="cannot write photos"):
+        write_photo_folder(blocked, still_life, four_views)
+    with pytest.raises(InputError, match="cannot write the truth"):
+        save_truth(photos[1], blocked)
+
+
+@pytest.mark.parametrize("damage", ["missing", "truncated", "no json"])
+def test_damaged_truth_is_an_input_error(photos, tmp_path, damage):
+    save_truth(photos[1], tmp_path)
+    if damage == "missing":
+        (tmp_path / "surface.ply").unlink()
+    elif damage == "truncated":
+        (tmp_path / "surface.ply").write_bytes((tmp_path / "surface.ply").read_bytes()[:-100])
+    else:
+        (tmp_path / "truth.json").write_text("{")
+    with pytest.raises(InputError, match="no truth in"):
+        load_truth(tmp_path)

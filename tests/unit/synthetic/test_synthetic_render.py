@@ -1,0 +1,119 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm_app.synthetic.bodies import Body, SyntheticScene
+from sfm_app.synthetic.cameras import Camera, camera_centre, look_at, make_camera, pixel_rays
+from sfm_app.synthetic.render import cast, prepare, ray_caster, render_mesh, render_scene
+from sfm_app.synthetic.shapes import box
+from sfm_app.synthetic.textures import Material
+from sfm_app.types import Surface
+
+
+@pytest.fixture(scope="module")
+def prepared(still_life):
+    return prepare(still_life)
+
+
+def test_two_views_show_the_same_surface_in_the_right_pixels(prepared, still_life, four_views):
+    """What view 1 shows at a pixel, view 2 shows where the truth projects it to: half a pixel off would be noticed."""
+    camera = make_camera(240, 160)
+    poses = list(four_views.cam_from_world.values())[1:3]
+    first, second = (render_scene(prepared, camera, pose, supersampling=3) for pose in poses)
+    directions = pixel_rays(camera) @ poses[0][:, :3]
+    caster = ray_caster(still_life.vertices, still_life.faces)
+    hits = cast(caster, camera_centre(poses[0]), directions)
+    hit = np.isfinite(hits["t_hit"])
+    points = camera_centre(poses[0]) + directions[hit] * hits["t_hit"][hit, None]
+    h = (points @ poses[1][:, :3].T + poses[1][:, 3]) @ camera.K.T
+    x2 = h[:, :2] / h[:, 2:] - 0.5  # to array indices, pixel centres being at +0.5
+
+    def mismatch(dx, dy):
+        shifted = x2 + np.array([dx, dy])
+        at = np.floor(shifted).astype(int)
+        inside = ((at >= 2) & (at < [camera.width - 3, camera.height - 3])).all(axis=1)
+        rest = (shifted - at)[inside]
+        (u, v), (i, j) = rest.T[..., None], at[inside].T
+        low = second[j, i] * (1 - u) + second[j, i + 1] * u
+        high = second[j + 1, i] * (1 - u) + second[j + 1, i + 1] * u
+        return np.median(np.abs(low * (1 - v) + high * v - first.reshape(-1, 3)[hit][inside]))
+
+    best = mismatch(0.0, 0.0)
+    assert 0 < best < 0.03
+    assert all(mismatch(dx, dy) > 1.2 * best for dx, dy in [(0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)])
+
+
+def test_a_pixel_is_seen_through_its_centre():
+    """A wall whose edges lie at x = 10.25 and 30.75, y = 4.25 and 15.75 pixels covers whole pixels by their centres."""
+    white = Material(pattern="stone", base=(230, 230, 230), second=(230, 230, 230), joint=(230, 230, 230))
+    wall = box(20.5, 11.5, 1.0, spacing=50.0).moved((-4.5, -15.75 + 15.0, -20.5))
+    scene = prepare(SyntheticScene("wall", (Body(wall, white),), to_light=(0.0, 0.0, 1.0)))
+    camera = Camera(np.array([[20.0, 0, 25.0], [0, 20.0, 15.0], [0, 0, 1]]), 50, 30)
+    pose = look_at(np.zeros(3), np.array([0.0, 0.0, -1.0]))  # the front of the wall is 20 units away
+
+    image = render_scene(scene, camera, pose, supersampling=1)
+
+    rows, columns = np.nonzero(image[..., 0] > image[..., 2])  # sunlight is warm, the sky is blue
+    assert (columns.min(), columns.max(), rows.min(), rows.max()) == (10, 30, 4, 15)
+    assert len(rows) == 21 * 12
+
+
+def test_the_sun_casts_a_shadow_away_from_it(prepared, still_life):
+    sun = np.array(still_life.to_light)
+    ball = np.array([0.0, 1.3, 0.0])
+    shaded = ball - sun * ball[1] / sun[1]  # where the shadow of the ball's middle falls
+    above = look_at(np.array([0.0, 9.0, 0.1]), np.zeros(3))
+    camera = make_camera(150, 150)
+    empty = prepare(replace(still_life, bodies=still_life.bodies[:1]))
+    ratio = (render_scene(prepared, camera, above) / render_scene(empty, camera, above)).mean(axis=2)
+
+    def darkened(point):
+        h = camera.K @ (above[:, :3] @ point + above[:, 3])
+        x, y = (h[:2] / h[2]).astype(int)
+        return ratio[y - 1 : y + 2, x - 1 : x + 2].mean()
+
+    assert 0.15 < darkened(shaded) < 0.45, "the light of the sky is left"
+    assert darkened(shaded * [-2, 1, -2]) == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_sky_is_blue_and_darker_above(prepared):
+    up = look_at(np.array([0.0, 5.0, 0.0]), np.array([0.0, 9.0, 9.0]))
+    sky = render_scene(prepared, make_camera(60, 60), up)
+    assert np.all(sky[..., 2] > sky[..., 0])
+    assert sky[0].mean() < 0.9 * sky[-1].mean()
+
+
+def test_rendering_repeats_to_the_bit(prepared, four_views):
+    pose = next(iter(four_views.cam_from_world.values()))
+    camera = make_camera(60, 40)
+    assert render_scene(prepared, camera, pose).tobytes() == render_scene(prepared, camera, pose).tobytes()
+
+
+def test_distortion_moves_the_rim_but_not_the_centre(prepared, four_views):
+    pose = next(iter(four_views.cam_from_world.values()))
+    plain = make_camera(120, 80, centre=(0.5, 0.5))
+    barrel = Camera(plain.K, 120, 80, division_lambda=-0.4)
+    difference = np.abs(render_scene(prepared, plain, pose) - render_scene(prepared, barrel, pose)).mean(axis=2)
+    assert difference[38:42, 58:62].mean() < 0.3 * difference[:, :10].mean()
+
+
+def test_a_mesh_is_drawn_with_its_colours_where_it_is():
+    camera = Camera(np.array([[10.0, 0, 10.0], [0, 10.0, 5.0], [0, 0, 1]]), 20, 10)
+    # a square over the right half of the picture, red to blue downwards, one unit in front
+    vertices = np.array([[0.0, -0.5, 1.0], [1.0, -0.5, 1.0], [1.0, 0.5, 1.0], [0.0, 0.5, 1.0]])
+    colors = np.array([[250, 0, 0], [250, 0, 0], [0, 0, 250], [0, 0, 250]], dtype=np.uint8)
+    surface = Surface(vertices, np.array([[0, 1, 2], [0, 2, 3]]), colors)
+
+    image = render_mesh(surface, camera, np.eye(3, 4), background=(1, 2, 3))
+
+    assert image.shape == (10, 20, 3) and image.dtype == np.uint8
+    assert np.all(image[:, :10] == [1, 2, 3])
+    share = (np.arange(10) + 0.5) / 10
+    assert np.allclose(image[:, 10:, 0], np.round(250 * (1 - share))[:, None], atol=1)
+    assert np.allclose(image[:, 10:, 2], np.round(250 * share)[:, None], atol=1)
+
+
+def test_an_empty_mesh_is_background():
+    empty = Surface(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3), dtype=np.uint8))
+    assert np.all(render_mesh(empty, make_camera(20, 16), np.eye(3, 4)) == 255)
