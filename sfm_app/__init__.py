@@ -1,9 +1,9 @@
 """A folder of photos about which nothing is known becomes a 3D model.
 
-    run = sfm_app.reconstruct("photos/", "out/")
-    cal = sfm_app.calibrate_photos("photos/")
-    fit = sfm_app.estimate_fundamental(x1, x2)
-    cal = sfm_app.calibrate_fundamentals(Fs, (width, height))
+run = sfm_app.reconstruct("photos/", "out/")
+cal = sfm_app.calibrate_photos("photos/")
+fit = sfm_app.estimate_fundamental(x1, x2)
+cal = sfm_app.calibrate_fundamentals(Fs, (width, height))
 """
 
 from importlib.metadata import version

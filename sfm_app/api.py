@@ -88,9 +88,11 @@ def calibrate_photos(
     Raises:
         SfmError: see `sfm_app.errors`.
     """
-    with tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch:
-        with opened_run(Path(out or scratch), settings or Settings(), progress) as run:
-            found: Intrinsics = run_stages(Path(photos), run, last="intrinsics")("intrinsics")
+    with (
+        tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch,
+        opened_run(Path(out or scratch), settings or Settings(), progress) as run,
+    ):
+        found: Intrinsics = run_stages(Path(photos), run, last="intrinsics")("intrinsics")
     return found
 
 

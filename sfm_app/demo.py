@@ -144,7 +144,7 @@ def demo_lines(result: DemoResult) -> list[str]:
         f"photos placed   {result.registered} of {result.photos}",
         f"mesh            {result.triangles} triangles; half of it lies within {result.surface_error_percent} % of the "
         f"scene's size of the true surface; covers {result.surface_coverage_percent} % of what the photos see",
-        f"seconds         {result.seconds_reconstruction} reconstruction, {result.seconds_rendering} rendering the photos",
+        f"seconds         {result.seconds_reconstruction} reconstruction, {result.seconds_rendering} rendering",
         *(f"                {path}" for path in result.files),
     ]
 

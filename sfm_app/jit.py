@@ -1,7 +1,7 @@
 """The one place that says how numeric kernels become machine code.
 
-Kernels release the GIL, so pairs run in parallel threads, and their machine code is cached beside the source, so only the
-first run on a machine compiles.
+Kernels release the GIL, so pairs run in parallel threads, and their machine code is cached beside the source, so
+only the first run on a machine compiles.
 """
 
 from collections.abc import Callable

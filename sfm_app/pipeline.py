@@ -49,7 +49,7 @@ STAGES = (
     Stage(
         "photos", (), ("photos",), ("photos.json", "photos"),
         make=lambda products, run: read_photos(products("folder"), run),
-        load=lambda products, run: load_photo_set(run),
+        load=lambda _, run: load_photo_set(run),
     ),
     Stage(
         "match_graph", ("photos",), ("matching",), ("database.db",),
@@ -59,12 +59,12 @@ STAGES = (
     Stage(
         "view_graph", ("match_graph",), ("epipolar", "seed"), ("view_graph.npz",),
         make=lambda products, run: build_view_graph(products("match_graph"), run),
-        load=lambda products, run: load_view_graph(run),
+        load=lambda _, run: load_view_graph(run),
     ),
     Stage(
         "intrinsics", ("match_graph", "view_graph"), ("calibration", "seed"), ("calibration.json",),
         make=lambda products, run: calibrate(products("match_graph"), products("view_graph"), run),
-        load=lambda products, run: load_intrinsics(run),
+        load=lambda _, run: load_intrinsics(run),
     ),
     Stage(
         "scene", ("photos", "match_graph", "view_graph", "intrinsics"), ("scene", "seed"), ("sparse",),
@@ -78,17 +78,17 @@ STAGES = (
         make=lambda products, run: make_depth_maps(
             products("scene"), run.workspace.photos, run.workspace.dense, run.settings.depth, run
         ),
-        load=lambda products, run: run.workspace.dense,
+        load=lambda _, run: run.workspace.dense,
     ),
     Stage(
         "mesh", ("depth_maps",), ("mesh",), ("dense/surface.npz",),
         make=lambda products, run: make_mesh(products("depth_maps"), run.settings.mesh, run),
-        load=lambda products, run: load_surface(run.workspace.dense),
+        load=lambda _, run: load_surface(run.workspace.dense),
     ),
     Stage(
         "files", ("mesh",), (), ("model.ply", "model.glb"),
         make=lambda products, run: write_files(products("mesh"), run),
-        load=lambda products, run: load_files(run),
+        load=lambda _, run: load_files(run),
     ),
 )  # fmt: skip
 

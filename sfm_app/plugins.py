@@ -31,7 +31,7 @@ class FitFundamental(Protocol):
     """Estimates one fundamental matrix; x1, x2 are finite (N, 2) pixels; the same seed gives the same result."""
 
     def __call__(
-        self, x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int
+        self, x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int, /
     ) -> EpipolarFit | Rejected: ...
 
 
@@ -43,7 +43,7 @@ class Calibrate(Protocol):
     """
 
     def __call__(
-        self, Fs: FloatArray, weights: FloatArray, size: tuple[int, int], options: CalibrationSettings, seed: int
+        self, Fs: FloatArray, weights: FloatArray, size: tuple[int, int], options: CalibrationSettings, seed: int, /
     ) -> Calibration: ...
 
 
@@ -67,7 +67,7 @@ class Calibrator:
 
 @dataclass(frozen=True, slots=True)
 class Exporter:
-    """A file format for the finished mesh: `write` gets vertices (V, 3), faces (T, 3), colours (V, 3) and gives the file."""
+    """A file format for the mesh: `write` makes bytes of vertices (V, 3), faces (T, 3) and colours (V, 3)."""
 
     name: str
     """The file's suffix without dot."""
@@ -139,7 +139,9 @@ def load_plugins(modules: Sequence[ModuleType | object] = (), *, installed: bool
             manager.load_setuptools_entrypoints(GROUP)
         manager.check_pending()
     except Exception as err:  # whatever a foreign module raises on import
-        raise PluginError(f"a plug-in does not load: {err}", hint="update or uninstall it; hooks: sfm_app.plugins.Hooks") from err
+        raise PluginError(
+            f"a plug-in does not load: {err}", hint="update or uninstall it; hooks: sfm_app.plugins.Hooks"
+        ) from err
     return Plugins(
         estimators=_by_name(manager.hook.sfm_estimators()),
         calibrators=_by_name(manager.hook.sfm_calibrators()),

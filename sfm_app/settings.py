@@ -35,9 +35,13 @@ class PhotoSettings(Section):
 class MatchSettings(Section):
     """COLMAP's features and matches."""
 
-    max_image_size_px: int = Field(1600, ge=128, le=16384, description="longer side at which features are found, in pixels")
+    max_image_size_px: int = Field(
+        1600, ge=128, le=16384, description="longer side at which features are found, in pixels"
+    )
     max_features: int = Field(8192, ge=100, le=100000, description="most features per photo")
-    max_ratio: float = Field(0.8, gt=0, le=1, description="nearest over second nearest descriptor distance; 1 switches it off")
+    max_ratio: float = Field(
+        0.8, gt=0, le=1, description="nearest over second nearest descriptor distance; 1 switches it off"
+    )
 
 
 class EpipolarSettings(Section):
@@ -56,7 +60,10 @@ class CalibrationSettings(Section):
     calibrator: str = Field("zero-curves", description="name of the calibrator (see `sfm-app plugins`)")
     samples: int = Field(100, ge=10, le=10000, description="samples along one zero curve")
     centre_sigma: float = Field(
-        0.15, gt=0, le=10, description="soft prior: standard deviation of the optical centre about the middle, in widths"
+        0.15,
+        gt=0,
+        le=10,
+        description="soft prior: standard deviation of the optical centre about the middle, in widths",
     )
 
 
@@ -64,7 +71,9 @@ class SceneSettings(Section):
     """Poses, sparse points and bundle adjustment."""
 
     seed_pairs: int = Field(5, ge=1, le=100, description="most seed pairs that are tried")
-    min_seed_angle_deg: float = Field(2.0, gt=0, le=90, description="least median triangulation angle of a seed pair, in degrees")
+    min_seed_angle_deg: float = Field(
+        2.0, gt=0, le=90, description="least median triangulation angle of a seed pair, in degrees"
+    )
     min_points: int = Field(30, ge=6, le=10000, description="a model with fewer points counts as failed")
 
 
@@ -73,7 +82,9 @@ class DepthSettings(Section):
 
     max_image_size_px: int = Field(1000, ge=64, le=16384, description="longer side of the depth maps, in pixels")
     neighbours: int = Field(4, ge=1, le=20, description="photos that each photo is matched with")
-    consistency: float = Field(0.01, gt=0, le=1, description="largest relative depth difference between photos that agree")
+    consistency: float = Field(
+        0.01, gt=0, le=1, description="largest relative depth difference between photos that agree"
+    )
     min_agreeing: int = Field(2, ge=1, le=20, description="other photos that have to agree with a depth")
 
 
@@ -81,8 +92,12 @@ class MeshSettings(Section):
     """The surface through the depth maps."""
 
     poisson_depth: int = Field(10, ge=5, le=14, description="depth of the Poisson octree")
-    trim: float = Field(6.0, ge=0, le=20, description="surface with less support than this is cut off; 0 keeps a closed surface")
-    min_island: float = Field(0.01, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped")
+    trim: float = Field(
+        6.0, ge=0, le=20, description="surface with less support than this is cut off; 0 keeps a closed surface"
+    )
+    min_island: float = Field(
+        0.01, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
+    )
 
 
 class Settings(Section):
@@ -165,9 +180,9 @@ def _problem(error: dict[str, Any]) -> tuple[str, str]:
     name = ".".join((*table, key))
     if error["type"] != "extra_forbidden":
         return f"'{name}': {error['msg'].lower()}, got {error['input']!r}", ""
-    section: type[BaseModel] = Settings
+    section: Any = Settings
     for part in table:
-        section = section.model_fields[part].annotation or Settings
+        section = section.model_fields[part].annotation
     close = difflib.get_close_matches(key, section.model_fields, n=1)
     return f"unknown setting '{name}'", f"did you mean '{'.'.join((*table, close[0]))}'?" if close else ""
 

@@ -13,6 +13,7 @@ from typing import Any
 from sfm_app.errors import InputError
 
 MANIFEST = "manifest.json"
+DATABASE = "database.db"
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +25,7 @@ class StageRecord:
     seconds: float
     counts: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, int] = field(default_factory=dict)
-    """What the stage wrote, with the size in bytes (-1 for a folder)."""
+    """What the stage wrote, with the size in bytes; -1 for what later stages add to (folders, the database)."""
 
 
 class Workspace:
@@ -40,7 +41,7 @@ class Workspace:
 
     @property
     def database(self) -> Path:
-        return self.root / "database.db"
+        return self.root / DATABASE
 
     @property
     def photo_set(self) -> Path:
@@ -140,7 +141,8 @@ class Workspace:
 
     def sizes(self, files: tuple[str, ...]) -> dict[str, int]:
         """Sizes of what a stage wrote, as its record holds them."""
-        return {name: _size(self.root / name) for name in files}
+        found = {name: _size(self.root / name) for name in files}
+        return {name: size for name, size in found.items() if size is not None}
 
 
 def fingerprint(*parts: Any) -> str:
@@ -150,6 +152,6 @@ def fingerprint(*parts: Any) -> str:
 
 
 def _size(path: Path) -> int | None:
-    if path.is_dir():
-        return -1
-    return path.stat().st_size if path.exists() else None
+    if not path.exists():
+        return None
+    return -1 if path.is_dir() or path.name == DATABASE else path.stat().st_size

@@ -26,7 +26,9 @@ def unrelated(tmp_path_factory) -> Path:
     place = tmp_path_factory.mktemp("unrelated")
     for seed in (1, 2):
         rng = np.random.default_rng(seed)
-        coarse = Image.fromarray(rng.integers(0, 255, (40, 60, 3), np.uint8)).resize((480, 320), Image.Resampling.BICUBIC)
+        coarse = Image.fromarray(rng.integers(0, 255, (40, 60, 3), np.uint8)).resize(
+            (480, 320), Image.Resampling.BICUBIC
+        )
         fine = rng.normal(0, 12, (320, 480, 3))
         Image.fromarray(np.clip(np.asarray(coarse) + fine, 0, 255).astype(np.uint8)).save(place / f"{seed}.jpg")
     return place

@@ -100,7 +100,11 @@ def main() -> None:
                 seconds = time.perf_counter() - start
             rows.append({"photos": name, "method": label, **scored(found, args.data / name / "cameras.json", seconds)})
             print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
-    machine = {"machine": platform.machine(), "cores": len(os.sched_getaffinity(0)), "python": platform.python_version()}
+    machine = {
+        "machine": platform.machine(),
+        "cores": len(os.sched_getaffinity(0)),
+        "python": platform.python_version(),
+    }
     document = {"machine": machine, "versions": versions(), "rows": rows}
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / f"{args.name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

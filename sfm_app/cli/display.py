@@ -38,7 +38,9 @@ class Terminal:
         self.task: TaskID | None = None
 
     def stage(self, name: str, note: str = "") -> None:
-        self.console.print(f"{STAGE_TITLES.get(name, name)}{f' [dim]({escape(note)})[/dim]' if note else ''}")
+        steps = list(STAGE_TITLES)
+        number = f"{steps.index(name) + 1}/{len(steps)} " if name in steps else ""
+        self.console.print(f"{number}{STAGE_TITLES.get(name, name)}{f' [dim]({escape(note)})[/dim]' if note else ''}")
 
     def start(self, label: str, total: int) -> None:
         self.task = self.bars.add_task(escape(label), total=total)
@@ -101,7 +103,10 @@ def run_lines(run: Run) -> list[str]:
     lines += [f"            left out: {name}: {reason}" for name, reason in summary["photos"]["unusable"].items()]
     if summary["pairs"]["kept"] is not None:
         rejected = ", ".join(f"{count} {reason}" for reason, count in summary["pairs"]["rejected"].items())
-        lines.append(f"pairs       {summary['pairs']['kept']} show the same scene" + (f"; rejected: {rejected}" if rejected else ""))
+        lines.append(
+            f"pairs       {summary['pairs']['kept']} show the same scene"
+            + (f"; rejected: {rejected}" if rejected else "")
+        )
     if run.calibration:
         lines += intrinsics_lines(run.calibration)
     if run.scene:
@@ -116,7 +121,11 @@ def run_lines(run: Run) -> list[str]:
         lines.append(f"mesh        {summary['mesh']['triangles']} triangles")
         lines += [f"            {path}" for path in summary["mesh"]["files"]]
     seconds = summary["seconds"]
-    lines.append("seconds     " + ", ".join(f"{name} {value:.1f}" for name, value in seconds.items()) + f"; all {sum(seconds.values()):.1f}")
+    lines.append(
+        "seconds     "
+        + ", ".join(f"{name} {value:.1f}" for name, value in seconds.items())
+        + f"; all {sum(seconds.values()):.1f}"
+    )
     return lines
 
 
@@ -152,4 +161,8 @@ def _k_text(K: Any) -> str:
 
 
 def _spread_text(camera: Calibration) -> str:
-    return "  (+- " + ", ".join(f"{name} {value:.1f}" for name, value in camera.spread.items()) + ")" if camera.spread else ""
+    return (
+        "  (+- " + ", ".join(f"{name} {value:.1f}" for name, value in camera.spread.items()) + ")"
+        if camera.spread
+        else ""
+    )

@@ -22,7 +22,8 @@ def examine() -> dict[str, str]:
         "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
         "cores": str(worker_count(0)),
         "memory": _memory(),
-        "free disk here": f"{disk / GIGABYTE:.0f} GB" + ("" if disk > ENOUGH_DISK else ": little; dense stereo needs about 2 GB"),
+        "free disk here": f"{disk / GIGABYTE:.0f} GB"
+        + ("" if disk > ENOUGH_DISK else ": little; dense stereo needs about 2 GB"),
         **versions(),
         "COLMAP with CUDA": "yes" if has_cuda() else "no: depth maps are made on the CPU",
         "ray casting (Open3D)": _open3d(),

@@ -44,7 +44,11 @@ class Commands(click.Group):
             raise
         except Exception as err:  # a bug: the user gets one line, the traceback goes where a report can take it from
             logging.getLogger("sfm_app").debug("%s", traceback.format_exc())
-            fail(f"unexpected {type(err).__name__}: {err}", "this is a bug; log.txt in the output folder has the details", 1)
+            fail(
+                f"unexpected {type(err).__name__}: {err}",
+                "this is a bug; log.txt in the output folder has the details",
+                1,
+            )
 
 
 def fail(message: str, hint: str, code: int) -> None:
@@ -61,7 +65,9 @@ def main() -> None:
 
 @main.command()
 @click.argument("photos", type=click.Path(path_type=Path))
-@click.option("-o", "--out", type=click.Path(path_type=Path), help="Output folder.  [default: PHOTOS-model beside PHOTOS]")
+@click.option(
+    "-o", "--out", type=click.Path(path_type=Path), help="Output folder.  [default: PHOTOS-model beside PHOTOS]"
+)
 @click.option("--from", "first", type=click.Choice(NAMES), default=None, help="Do everything from this stage on again.")
 @click.option("--until", "last", type=click.Choice(NAMES), default="files", help="Stop after this stage.")
 @settings_options
@@ -99,8 +105,8 @@ def demo(out: Path, as_json: bool, quiet: bool, **flags: Any) -> None:
 
 
 @main.command()
-@output_options
-def doctor(as_json: bool, quiet: bool) -> None:
+@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+def doctor(as_json: bool) -> None:
     """Say what this machine has and lacks."""
     found = examine()
     print_json(found) if as_json else print_lines(table(found))

@@ -18,7 +18,9 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 def settings_options(command: Command) -> Command:
     """--config, --seed, --workers, --quality, --estimator, --calibrator, --set, -v."""
     options = (
-        click.option("--config", type=click.Path(path_type=Path), help="Settings file (TOML); `sfm-app config` prints one."),
+        click.option(
+            "--config", type=click.Path(path_type=Path), help="Settings file (TOML); `sfm-app config` prints one."
+        ),
         click.option("--seed", type=int, help="Same seed, same result.  [default: 0]"),
         click.option("--workers", type=int, help="Parallel workers.  [default: one per core]"),
         click.option("--quality", type=click.Choice(get_args(Quality)), help="Preset of sizes.  [default: normal]"),

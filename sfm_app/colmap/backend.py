@@ -5,12 +5,13 @@ import zlib  # before pycolmap, whose own deflate symbols otherwise break every 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
+from typing import Any
 
 import pycolmap
 
 from sfm_app.errors import BackendError, SfmError
 
-__all__ = ["backend", "has_cuda", "interruptible", "pycolmap", "show_log", "versions"]
+__all__ = ["backend", "has_cuda", "interruptible", "plain", "pycolmap", "show_log", "versions"]
 
 zlib.crc32(b"")  # the import above is there for its side effect
 pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
@@ -64,3 +65,14 @@ def interruptible(call: Callable[["pycolmap.CancellationToken"], None], poll: Ca
         except KeyboardInterrupt:
             token.cancel()
             raise
+
+
+def plain(options: dict[str, Any]) -> dict[str, Any]:
+    """COLMAP's options as JSON can hold them: the manifest records all that are in force."""
+    return {str(key): _plain(value) for key, value in options.items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return plain(value)
+    return value if isinstance(value, bool | int | float | str) else str(value)

@@ -12,7 +12,7 @@ LADDER = ((TWO_FOCALS, True), (SQUARE_PIXELS, True), (TWO_FOCALS, False), (SQUAR
 """Camera model and whether its optical centre is free, from the most to the least that is left to the photos."""
 
 FOCAL_DETERMINED, CENTRE_DETERMINED = 0.002, 0.003
-"""Largest standard deviations that count as determined: of a focal, as a share of it; of the centre, in longer sides."""
+"""Largest standard deviation that counts as determined: of a focal as a share of it, of the centre in longer sides."""
 
 MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
 """COLMAP's own limits for a point: largest reprojection error, least angle between its rays."""
@@ -71,7 +71,10 @@ def _solve(model: Any, *, centre: bool) -> dict[str, float]:
 
 def _determined(model: Any, deviations: dict[str, float]) -> bool:
     camera = main_camera(model)
-    limits = {"f": FOCAL_DETERMINED * camera.mean_focal_length(), "c": CENTRE_DETERMINED * max(camera.width, camera.height)}
+    limits = {
+        "f": FOCAL_DETERMINED * camera.mean_focal_length(),
+        "c": CENTRE_DETERMINED * max(camera.width, camera.height),
+    }
     return bool(deviations) and all(value < limits[name[0]] for name, value in deviations.items())
 
 

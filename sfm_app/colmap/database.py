@@ -85,9 +85,7 @@ def write_calibrations(path: Path, matches: MatchGraph, cameras: Mapping[str, Ca
             database.update_camera(camera)
 
 
-def camera_params(
-    K: NDArray[np.float64], camera_model: str, radial: float = 0.0
-) -> list[float]:
+def camera_params(K: NDArray[np.float64], camera_model: str, radial: float = 0.0) -> list[float]:
     """COLMAP's parameters for a camera matrix and a first radial term."""
     fx, fy, cx, cy = (float(K[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
     if camera_model == SQUARE_PIXELS:

@@ -27,9 +27,7 @@ def undistort(model_dir: Path, photo_dir: Path, dense_dir: Path, max_side_px: in
     options.max_image_size = max_side_px
     dense_dir.mkdir(parents=True, exist_ok=True)
     with backend("undistorting photos"):
-        pycolmap.undistort_images(
-            dense_dir, model_dir, photo_dir, undistort_options=options, jpeg_quality=JPEG_QUALITY
-        )
+        pycolmap.undistort_images(dense_dir, model_dir, photo_dir, undistort_options=options, jpeg_quality=JPEG_QUALITY)
 
 
 def read_views(dense_dir: Path) -> list[View]:

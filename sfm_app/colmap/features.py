@@ -6,7 +6,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from sfm_app.colmap.backend import interruptible, pycolmap
+from sfm_app.colmap.backend import interruptible, plain, pycolmap
 from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
 
@@ -28,7 +28,7 @@ def extract_features(
         )  # fmt: skip
 
     _counted(call, database, "keypoints", "features", len(names), progress)
-    return _plain(extraction.todict())
+    return plain(extraction.todict())
 
 
 def match_exhaustively(
@@ -48,7 +48,7 @@ def match_exhaustively(
 
     total = sum(1 for _ in combinations(range(photos), 2))
     _counted(call, database, "matches", "matching", total, progress)
-    return _plain(matching.todict())
+    return plain(matching.todict())
 
 
 def _counted(call: Any, database: Path, table: str, label: str, total: int, progress: Progress) -> None:
@@ -75,14 +75,8 @@ def _row_count(database: Path, table: str) -> int:
     try:
         connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=0.1)
         try:
-            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])  # noqa: S608: our own names
+            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])  # noqa: S608
         finally:
             connection.close()
     except sqlite3.Error:
         return 0
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    return value if isinstance(value, bool | int | float | str) else str(value)

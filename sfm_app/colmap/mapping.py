@@ -35,9 +35,14 @@ def continue_mapping(
     def call(token: Any) -> None:
         models.update(
             pycolmap.incremental_mapping(
-                database, photo_dir, scratch / "found", options,
-                input_path=scratch / "start", next_image_callback=tick, cancellation_token=token,
-            )  # fmt: skip
+                database,
+                photo_dir,
+                scratch / "found",
+                options,
+                input_path=scratch / "start",
+                next_image_callback=tick,
+                cancellation_token=token,
+            )
         )
 
     interruptible(call, lambda: None)

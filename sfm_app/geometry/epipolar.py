@@ -157,4 +157,4 @@ def _constraint(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray,
 
 
 def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
-    return np.divide(above, below, out=np.full(len(above), np.inf), where=below > 0)
+    return np.asarray(np.divide(above, below, out=np.full(len(above), np.inf), where=below > 0))

@@ -11,8 +11,8 @@ Array = NDArray[np.float64]
 def essential_from_fundamental(F: Array, K1: Array, K2: Array) -> Array:
     """The essential matrix nearest to K2' F K1 (thesis Eq. 5.7; Eq. 2.30 inverts K by misprint).
 
-    Noise leaves K2' F K1 with unequal singular values; the nearest essential matrix in the Frobenius norm has their mean
-    twice and a zero (Hartley & Zisserman, 2nd ed., section 11.7.3).
+    Noise leaves K2' F K1 with unequal singular values; the nearest essential matrix in the Frobenius norm has their
+    mean twice and a zero (Hartley & Zisserman, 2nd ed., section 11.7.3). Its scale is then set to 1.
 
     Args:
         F: (3, 3), any scale, x2' F x1 = 0 in pixels.
@@ -23,7 +23,8 @@ def essential_from_fundamental(F: Array, K1: Array, K2: Array) -> Array:
         (3, 3) with singular values (1, 1, 0).
     """
     U, _, Vt = np.linalg.svd(K2.T @ F @ K1)
-    return U @ np.diag([1.0, 1.0, 0.0]) @ Vt
+    nearest: Array = U @ np.diag([1.0, 1.0, 0.0]) @ Vt
+    return nearest
 
 
 def decompose_essential(E: Array) -> list[tuple[Array, Array]]:

@@ -57,5 +57,4 @@ def two_view_seed(F: Array, K1: Array, K2: Array, x1: Array, x2: Array) -> TwoVi
 
 
 def _normalised(K: Array, x: Array) -> Array:
-    result: Array = np.linalg.solve(K, np.column_stack([x, np.ones(len(x))]).T).T[:, :2]
-    return result
+    return np.asarray(np.linalg.solve(K, np.column_stack([x, np.ones(len(x))]).T).T[:, :2], np.float64)

@@ -1,7 +1,8 @@
 """Matches that do not determine F: all on one plane, or taken without moving the camera.
 
 Where one homography H explains the matches, every F = [e]x H does, for any epipole e: the estimator then picks the e
-that catches the most accidental inliers. What tells a real epipole is matches off the plane, more of them than accident gives.
+that catches the most accidental inliers. What tells a real epipole is matches off the plane, more of them than accident
+gives.
 """
 
 import numpy as np
@@ -16,7 +17,7 @@ BoolArray = NDArray[np.bool_]
 _SAMPLES = 64
 _SAMPLE_SIZE, _PARALLAX_SAMPLE = 3, 2
 _LEAST_AREA = 1e-6
-_MOST_SCORED = 500
+_MOST_SCORED = 300
 _PARALLAX = 2.0
 """A match is off the plane when H misses it by more than this many thresholds."""
 _FOCALS = np.geomspace(0.4, 6.0, 60)
@@ -54,7 +55,7 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
     """The homography of the plane that holds the most matches, among those compatible with F.
 
     They are H = A - e2 v' with A = [e2]x F and v' x1 = b for every match on the plane, where
-    b = (x2 x A x1)'(x2 x e2) / |x2 x e2|^2 (Hartley and Zisserman, Result 13.6): a linear regression with three parameters.
+    b = (x2 x A x1)'(x2 x e2) / |x2 x e2|^2 (Hartley and Zisserman, Result 13.6): a linear regression, three parameters.
 
     Args:
         points: (N, 4) inliers of F in random order, N >= 3.
@@ -69,7 +70,6 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
     x1, x2 = _homogeneous(points[:, :2]), _homogeneous(points[:, 2:])
     towards = np.cross(x2, e2)
     b = (np.cross(x2, x1 @ A.T) * towards).sum(axis=1) / np.maximum((towards**2).sum(axis=1), np.finfo(float).tiny)
-    some = points[:_MOST_SCORED]
     planes = _sampled_planes(x1, b)
     # H x1 = A x1 - e2 (v' x1): for all sampled planes at once
     mapped, depth = (x1 @ A.T)[:_MOST_SCORED], planes @ x1[:_MOST_SCORED].T

@@ -36,7 +36,7 @@ def optimise_locally(points: FloatArray, F: FloatArray, threshold: float) -> Flo
 
 
 def refit_to_all(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Robust fit to all matches, first within twice the threshold, then within it at the scale of the inliers' own noise."""
+    """Robust fit to all matches: within twice the threshold, then within it at the scale of the inliers' own noise."""
     wide = refine_sampson(points, F, cutoff=_WIDE * threshold, scale=threshold / 3)
     distances = np.sqrt(squared_distances(points, np.ascontiguousarray(wide).reshape(9)))
     sigma = max(mad_sigma(distances[distances <= threshold]), _LEAST_SIGMA * threshold)

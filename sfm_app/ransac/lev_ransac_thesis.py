@@ -17,7 +17,7 @@ FloatArray = NDArray[np.float64]
 
 
 def refit_to_inliers(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """8-point algorithm, then non-linear least squares on the Sampson distance, both on the inliers of F (thesis 4.3)."""
+    """8-point algorithm, then least squares on the Sampson distance, both on the inliers of F (thesis 4.3)."""
     inliers = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
     if np.count_nonzero(inliers) < 8:
         return F

@@ -2,10 +2,11 @@
 
 F is the unit vector f with A f = 0, where row i of the design matrix A is x2 (x) x1. Near a given f the unit vector
 moves in the eight directions perpendicular to it, so that this is a regression with p = 8 parameters, and the hat
-matrix is that of A restricted to them. With all nine directions the ninth would divide by what is zero but for the noise.
+matrix is that of A restricted to them. With all nine directions the ninth would divide by what is zero but for the
+noise.
 
 Leverage and Cook's distance do not change when each view is shifted and scaled, because this maps the rows of A
-linearly: one well-scaled frame (`points.Matches`) gives what Hartley's normalisation gives.
+linearly (and A f is small): one well-scaled frame (`points.Matches`) gives what Hartley's normalisation gives.
 """
 
 import numpy as np
@@ -74,9 +75,8 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
     tangent = np.linalg.svd(f.reshape(1, 9))[2][1:].T
     gram = tangent.T @ weighted_gram(points, fitted.astype(np.float64)) @ tangent
     values, vectors = np.linalg.eigh(gram)
-    floor = (
-        max(float(values[-1]), np.finfo(float).tiny) * 1e-14
-    )  # a direction without support: any match there has leverage 1
+    # a direction without support: whatever lies in it has leverage 1
+    floor = max(float(values[-1]), np.finfo(float).tiny) * 1e-14
     forms = _quadratic_forms(points, np.ascontiguousarray(tangent @ (vectors / np.sqrt(np.maximum(values, floor)))))
     return np.where(fitted, np.minimum(forms, 1.0), forms / (1.0 + forms))
 
@@ -92,21 +92,22 @@ def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: B
     inside = residuals[fitted]
     freedom = max(len(inside) - PARAMETERS, 1)
     variance = float(((inside - inside.mean()) ** 2).sum()) / freedom if len(inside) else 0.0
-    return residuals / np.sqrt(np.maximum(variance, _LEAST_VARIANCE) * np.maximum(1.0 - leverage, np.finfo(float).eps))
+    free = np.maximum(1.0 - leverage, np.finfo(float).eps)
+    return np.asarray(residuals / np.sqrt(max(variance, _LEAST_VARIANCE) * free))
 
 
 def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
-    """How far the fit would move without each match (thesis 3.16 and 4.17, where the square of d_i is missing in print)."""
-    return studentised**2 / PARAMETERS * leverage / np.maximum(1.0 - leverage, np.finfo(float).eps)
+    """How far the fit would move without each match (thesis 3.16 and 4.17; the square of d_i is missing in print)."""
+    return np.asarray(studentised**2 / PARAMETERS * leverage / np.maximum(1.0 - leverage, np.finfo(float).eps))
 
 
 def priors(distances: FloatArray, sigma: float) -> FloatArray:
-    """p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels in the sampling)."""
+    """p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels)."""
     if not sigma > 0:
-        return (distances <= distances.min(initial=np.inf)).astype(np.float64)
+        return np.asarray(distances <= distances.min(initial=np.inf), dtype=np.float64)
     with np.errstate(over="ignore"):  # far outliers: exp(-inf) = 0
         exponents = (distances / sigma) ** 2 / 2
-    return np.exp(exponents.min(initial=np.inf) - exponents)
+    return np.asarray(np.exp(exponents.min(initial=np.inf) - exponents))
 
 
 def mad_sigma(distances: FloatArray) -> float:

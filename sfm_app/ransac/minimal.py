@@ -35,7 +35,7 @@ def seven_point(points: FloatArray, sample: IntArray, models: FloatArray) -> int
         models: (3, 9) filled with the solutions, row by row, each of norm 1.
 
     Returns:
-        How many solutions there are, 0 to 3; 0 where the constraints depend on each other (repeated or coplanar points).
+        Number of solutions, 0 to 3; 0 where the constraints depend on each other (points repeated or coplanar).
     """
     basis = np.empty((2, 9))
     if not _null_space(points, sample, basis):
@@ -154,13 +154,13 @@ def _reflect(unit: FloatArray, start: int, vector: FloatArray) -> None:
 
 @kernel
 def _det(m: FloatArray) -> float:
-    return m[0] * (m[4] * m[8] - m[5] * m[7]) - m[1] * (m[3] * m[8] - m[5] * m[6]) + m[2] * (m[3] * m[7] - m[4] * m[6])
+    return _mixed_det(m, m) / 3.0
 
 
 @kernel
 def _mixed_det(m: FloatArray, n: FloatArray) -> float:
     """The part of det(m + z n) that is linear in z: the cofactors of m times the entries of n."""
-    return (
+    return float(
         n[0] * (m[4] * m[8] - m[5] * m[7])
         - n[1] * (m[3] * m[8] - m[5] * m[6])
         + n[2] * (m[3] * m[7] - m[4] * m[6])

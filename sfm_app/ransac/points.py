@@ -52,7 +52,7 @@ class Matches:
     rows: NDArray[np.intp]
     """(N,) for each match as given, its row in `points`."""
     unit_px: float
-    """Pixels per unit of `points`. One scale for both views, so that a Sampson distance stays one, only in other units."""
+    """Pixels per unit of `points`; one scale for both views, so that a Sampson distance stays one."""
     centre: FloatArray
     """(4,) pixels x1, y1, x2, y2 of the origin of `points`."""
 

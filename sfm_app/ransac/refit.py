@@ -1,7 +1,7 @@
 """Non-linear refinement of F on the Sampson distance, over its seven degrees of freedom.
 
 F = U diag(1, s, 0) V' with rotations U and V: three parameters each and s, rank 2 at every step and no spare scale
-(Bartoli and Sturm 2004). U turns to U exp([a]x), V to V exp([b]x). Levenberg-Marquardt with iteratively reweighted residuals::
+(Bartoli and Sturm 2004). U turns to U exp([a]x), V to V exp([b]x). Levenberg-Marquardt with reweighted residuals::
 
     cost = sum_i c^2 log(1 + min(r_i, cutoff)^2 / c^2)          (c = inf: least squares)
 """

@@ -75,10 +75,10 @@ def draw_weighted(state: RandomState, cumulative: FloatArray, sample: IntArray) 
 
 @kernel
 def _is_fresh(sample: IntArray, last: int) -> bool:
+    equal = 0
     for k in range(last):
-        if sample[k] == sample[last]:
-            return False
-    return True
+        equal += sample[k] == sample[last]
+    return equal == 0
 
 
 @kernel

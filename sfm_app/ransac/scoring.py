@@ -1,4 +1,4 @@
-"""How well a fundamental matrix explains all matches: penalties on the Sampson distance, with early exits (thesis 4.4.1).
+"""How well F explains all matches: penalties on the Sampson distance, with early exits (thesis 4.4.1).
 
 A penalty is to be made small. Early exit by the bail-out test (Capel 2005; thesis 4.4.4): the matches come in random
 order, so that after a few blocks it is clear that a hypothesis cannot beat the best one.

@@ -12,7 +12,7 @@ CONVERGED = 0.05
 
 
 def trials_needed(inlier_share: float, confidence: float, sample_size: int = SAMPLE_SIZE) -> float:
-    """Samples after which one without outliers was drawn with the wanted probability (thesis 3.19); inf for no inliers."""
+    """Samples that hold one without outliers with the wanted probability (thesis 3.19); inf for no inliers."""
     clean = inlier_share**sample_size
     if clean >= 1:
         return 1.0

@@ -12,6 +12,10 @@ OWN_SIGMA_RANGE = (0.005, 0.02)
 """The last width of the consensus follows the data within these bounds, in units of r."""
 OWN_SIGMA_FACTOR = 1.5
 """In medians of r: half of the agreeing pairs then speak with more than half their weight."""
+MIN_AGREEING = 2.25
+"""Effective number of pairs that must agree; three parameters satisfy one and a half pairs whatever these say."""
+MIN_SUPPORT = 0.12
+"""Share of the votes that K must win; many pairs without any common K give up to 0.06."""
 RIVAL_RATIO = 1.25
 """A K with a focal this many times longer or shorter is another answer."""
 RESAMPLES = 25
@@ -31,7 +35,7 @@ def own_sigma(consensus: Consensus, theta: FloatArray) -> float:
     return float(np.clip(OWN_SIGMA_FACTOR * median, *OWN_SIGMA_RANGE))
 
 
-def votes(consensus: Consensus, theta: FloatArray, sigma: float = SIGMAS[-1]) -> FloatArray:
+def votes(consensus: Consensus, theta: FloatArray, sigma: float) -> FloatArray:
     """(P,) what each pair gives to K: w_i exp(-r_i / sigma)."""
     return np.asarray(consensus.pairs.weights * np.exp(-consensus.ratios(theta) / sigma))
 
@@ -40,6 +44,14 @@ def effective_count(votes: FloatArray) -> float:
     """How many equal votes weigh the same (Kish's effective sample size); 0 where nobody votes."""
     total, squares = float(np.sum(votes)), float(np.sum(votes**2))
     return total * total / squares if squares > 0 else 0.0
+
+
+def disagreement(given: FloatArray, weights: FloatArray) -> str:
+    """Why votes (P,) out of `weights` (P,) do not make a camera, or nothing."""
+    count, support = effective_count(given), float(np.sum(given) / np.sum(weights))
+    if count >= MIN_AGREEING and support >= MIN_SUPPORT:
+        return ""
+    return f"the pairs do not agree on a camera: {100 * support:.0f} % of the votes, worth {count:.1f} pairs"
 
 
 def best_rival(consensus: Consensus, best: Peak, profile: Profile, others: Sequence[Peak], free: Sequence[int]) -> float:

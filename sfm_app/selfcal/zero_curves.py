@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_app.selfcal.answers import camera_matrix, guessed
-from sfm_app.selfcal.evidence import best_rival, deviation, effective_count, own_sigma, resampled, spread_px, votes
+from sfm_app.selfcal.evidence import best_rival, deviation, disagreement, effective_count, own_sigma, resampled, spread_px, votes
 from sfm_app.selfcal.inputs import FloatArray, prepare
 from sfm_app.selfcal.joint import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, Consensus
 from sfm_app.selfcal.search import FOCAL_RANGE, SIGMAS, Peak, Profile, peaks, scan
@@ -27,10 +27,6 @@ ASPECT_DEVIATIONS = 3.0
 """fy/fx must differ from 1 by this many of its own standard deviations."""
 MIN_PAIRS = 3
 """Each F gives two constraints; below three pairs nothing is left to contradict a wrong K."""
-MIN_AGREEING = 2.25
-"""Effective number of pairs that must agree; three parameters satisfy one and a half pairs whatever these say."""
-MIN_SUPPORT = 0.12
-"""Share of the votes that K must win; pairs without any common K give up to 0.06."""
 MIN_LEAD = 0.5
 """Votes by which K must lead every other focal."""
 MIN_LEAD_SHARE = 0.03
@@ -90,7 +86,9 @@ def calibrate(
         "aspect_gain": gain,
         "log_focal_spread": answer.deviation(LOG_FOCAL),
     }
-    reason = _objection(answer.theta, evidence, (0.5 * width / unit_px, 0.5 * height / unit_px))
+    reason = disagreement(answer.votes, pairs.weights) or _objection(
+        answer.theta, evidence, (0.5 * width / unit_px, 0.5 * height / unit_px)
+    )
     if reason:
         return guessed(size, reason, evidence)
     f, a = np.exp(answer.theta[LOG_FOCAL]) * unit_px, np.exp(0.5 * answer.theta[LOG_ASPECT])
@@ -124,16 +122,13 @@ def _examined(consensus: Consensus, found: list[Peak], profile: Profile, free: t
     theta, _ = consensus.climb(best.theta, free, (sigma,))
     value = float(consensus.at(theta[None, :], SIGMAS[-1])[0])
     lead = value - best_rival(consensus, Peak(theta, value), profile, found[1:], free)
-    return _Answer(theta, free, sigma, lead, votes(consensus, theta), resampled(consensus, theta, free, sigma, seed))
+    return _Answer(theta, free, sigma, lead, votes(consensus, theta, SIGMAS[-1]), resampled(consensus, theta, free, sigma, seed))
 
 
 def _objection(theta: FloatArray, evidence: dict[str, float], half_size: tuple[float, float]) -> str:
     """Why K is not determined, or nothing."""
     focal = float(np.exp(theta[LOG_FOCAL]))
     low, high = FOCAL_RANGE
-    agreeing, support = evidence["agreeing_pairs"], evidence["support"]
-    if agreeing < MIN_AGREEING or support < MIN_SUPPORT:
-        return f"the pairs do not agree on a camera: {100 * support:.0f} % of the votes, worth {agreeing:.1f} pairs"
     if evidence["lead"] < MIN_LEAD or evidence["lead_share"] < MIN_LEAD_SHARE:
         return "the pairs fit other focals as well (too little rotation, parallel axes, or an orbit)"
     if not low * 1.02 < focal < high / 1.02:

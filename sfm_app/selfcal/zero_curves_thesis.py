@@ -1,11 +1,19 @@
-"""Algorithm 4 of the thesis to the letter: zero curves in (fx, fy), their meeting point, then the same in (u, v)."""
+"""Algorithm 4 of the thesis to the letter: zero curves in (fx, fy), their meeting point, then the same in (u, v).
+
+Only the verdict is not the thesis's: whatever comes out counts as known only where the pairs satisfy the constraint there.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from sfm_app.selfcal.answers import camera_matrix, guessed
 from sfm_app.selfcal.consensus import meeting_point
 from sfm_app.selfcal.curves import centre_curves, focal_curves, usable
-from sfm_app.selfcal.inputs import FloatArray, prepare
+from sfm_app.selfcal.evidence import disagreement, votes
+from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
+from sfm_app.selfcal.joint import Consensus
+from sfm_app.selfcal.search import SIGMAS
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration
 
@@ -16,19 +24,31 @@ SIGMA_SHARE = 0.1
 """sigma of rho, as a share of the range that is searched (thesis 5.8.4)."""
 
 
+class Found(NamedTuple):
+    """What Algorithm 4 returns, in image widths from the top left corner."""
+
+    fx: float
+    fy: float
+    u: float
+    v: float
+
+
 def calibrate(
     Fs: FloatArray, weights: FloatArray, size: tuple[int, int], options: CalibrationSettings, seed: int
 ) -> Calibration:
     """Find K where the zero curves of all pairs meet (thesis Algorithm 4).
 
-    The thesis gives every pair the same say, so weights only tell which pairs take part (> 0). Nothing is drawn at random.
+    The thesis gives every pair the same say, so weights only tell which pairs take part (> 0), and count in the verdict.
 
     Args:
         Fs: (P, 3, 3) in pixels.
         weights: (P,), >= 0.
         size: (width, height) in pixels.
         options: `samples` along each curve.
-        seed: unused.
+        seed: unused, nothing is drawn at random.
+
+    Returns:
+        K with ``identifiable=True``, or a guess and the reason; `evidence` then still has what Algorithm 4 answered, in pixels.
 
     Raises:
         ValueError: malformed input, see `selfcal.inputs.prepare`.
@@ -36,23 +56,40 @@ def calibrate(
     del seed
     width, height = size
     pairs = prepare(Fs, weights, size, unit_px=width, origin_px=(0.0, 0.0))
-    tall = height / width
-    sweep = np.arange(1, options.samples + 1) / options.samples
     evidence = {"pairs": float(len(pairs))}
+    found = algorithm_4(pairs, height / width, options.samples, evidence)
+    if isinstance(found, str):
+        return guessed(size, found, evidence)
+    fx, fy, cx, cy = (width * value for value in found)
+    evidence |= {"fx_px": fx, "fy_px": fy, "cx_px": cx, "cy_px": cy}
+    theta = np.array([0.5 * np.log(found.fx * found.fy), found.u, found.v, np.log(found.fy / found.fx)])
+    given = votes(Consensus(pairs, np.inf), theta, SIGMAS[0])
+    evidence["support"] = float(np.sum(given) / np.sum(pairs.weights))
+    reason = disagreement(given, pairs.weights)
+    if reason:
+        return guessed(size, reason, evidence)
+    K = camera_matrix(fx, fy, cx, cy)
+    return Calibration(K, width, height, METHOD, identifiable=True, evidence=evidence)
 
+
+def algorithm_4(pairs: Pairs, tall: float, samples: int, evidence: dict[str, float]) -> Found | str:
+    """The algorithm itself, for an image of width 1 and height `tall`; the reason where too few curves are usable.
+
+    Fills `evidence` with the number of curves and their support at the meeting points.
+    """
+    sweep = np.arange(1, samples + 1) / samples
     fx = FOCAL_RANGE * sweep
     curves = usable(focal_curves(pairs, fx, (0.5, 0.5 * tall)), FOCAL_RANGE)
     evidence["focal_curves"] = float(len(curves))
     focal = meeting_point(curves, FOCAL_RANGE, SIGMA_SHARE * FOCAL_RANGE)
     if focal is None:
-        return guessed(size, f"{len(curves)} of {len(pairs)} pairs have a usable focal curve, 2 are needed", evidence)
+        return f"{len(curves)} of {len(pairs)} pairs have a usable focal curve, 2 are needed"
     evidence["focal_support"] = focal.support
 
     curves = usable(centre_curves(pairs, sweep, (fx[focal.sample], focal.value)), tall)
     evidence["centre_curves"] = float(len(curves))
     centre = meeting_point(curves, tall, SIGMA_SHARE * tall)
     if centre is None:
-        return guessed(size, f"{len(curves)} of {len(pairs)} pairs have a usable centre curve, 2 are needed", evidence)
+        return f"{len(curves)} of {len(pairs)} pairs have a usable centre curve, 2 are needed"
     evidence["centre_support"] = centre.support
-    K = camera_matrix(fx[focal.sample] * width, focal.value * width, sweep[centre.sample] * width, centre.value * width)
-    return Calibration(K, width, height, METHOD, identifiable=True, evidence=evidence)
+    return Found(float(fx[focal.sample]), focal.value, float(sweep[centre.sample]), centre.value)

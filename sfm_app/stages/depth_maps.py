@@ -38,12 +38,12 @@ def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: Dep
         match = partial(match_view, views=views, ranked=ranked, dense_dir=dense_dir, options=options)
         matched = run.map(match, range(len(views)), "matching depths")
     usable = [found is None for found in matched]
-    confirm = partial(
-        confirm_view, views=views, ranked=ranked, usable=usable, dense_dir=dense_dir, options=options
-    )
+    confirm = partial(confirm_view, views=views, ranked=ranked, usable=usable, dense_dir=dense_dir, options=options)
     confirmed = run.map(confirm, [index for index in range(len(views)) if usable[index]], "confirming depths")
     coverage = {name: found for name, found in confirmed if isinstance(found, float)}
-    rejected = [found.reason for found in matched if found] + [f.reason for _, f in confirmed if isinstance(f, Rejected)]
+    rejected = [found.reason for found in matched if found] + [
+        f.reason for _, f in confirmed if isinstance(f, Rejected)
+    ]
     run.record(depth_maps=len(coverage), rejected=dict(Counter(rejected)), coverage=coverage)
     if not coverage:
         raise ReconstructionError(

@@ -13,7 +13,7 @@ from sfm_app.types import Calibration, Intrinsics, MatchedImage, MatchGraph, Vie
 
 
 def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
-    """Find K of every camera group from the pairs that lie within it; what is not identifiable falls back to a guess."""
+    """Find K of every camera group from the pairs within it; what is not identifiable falls back to a guess."""
     groups: dict[str, list[MatchedImage]] = {}
     for image in matches.images.values():
         groups.setdefault(image.group, []).append(image)

@@ -31,9 +31,10 @@ def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
         colmap={"extraction": extraction, "matching": matching},
     )
     if not graph.matches:
+        features = [len(points) for points in graph.keypoints.values()]
         raise ReconstructionError(
             f"no two of {len(names)} photos have anything in common "
-            f"({min(map(len, graph.keypoints.values()))} to {max(map(len, graph.keypoints.values()))} features per photo)",
+            f"({min(features)} to {max(features)} features per photo)",
             hint="take photos that overlap by more than half and show texture",
         )
     return graph

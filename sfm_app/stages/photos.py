@@ -37,7 +37,9 @@ def read_photos(folder: Path, run: RunContext) -> PhotoSet:
     unusable = tuple(photo for photo in found if isinstance(photo, UnusablePhoto))
     reasons = Counter(photo.reason for photo in unusable)
     if len(photos) < 2:
-        raise InputError(_too_few(folder, len(photos), reasons), hint="two photos of one place are the least; 10 to 50 work best")
+        raise InputError(
+            _too_few(folder, len(photos), reasons), hint="two photos of one place are the least; 10 to 50 work best"
+        )
     photo_set = PhotoSet(folder, tuple(_grouped(photos, run.settings.photos.cameras)), unusable)
     lay_out(photo_set, run)
     save_photo_set(photo_set, run)
@@ -56,7 +58,7 @@ def list_files(folder: Path, exclude: Path) -> list[str]:
     if not folder.is_dir():
         raise InputError(f"not a folder: {folder}", hint="name the folder that holds the photos, not a photo")
     try:
-        os.listdir(folder)
+        next(folder.iterdir(), None)
     except OSError as err:
         raise InputError(f"cannot read {folder}: {err.strerror}") from err
     return sorted(path.relative_to(folder).as_posix() for path in _walk(folder, exclude.resolve()))
@@ -118,7 +120,9 @@ def _described(name: str, image: Image.Image, options: PhotoSettings) -> Photo |
     if min(width, height) < options.min_side_px:
         return UnusablePhoto(name, f"smaller than {options.min_side_px} px")
     details = exif.get_ifd(EXIF_IFD)
-    camera = [str(exif.get(tag, "")).strip("\0 ") for tag in (EXIF_MAKE, EXIF_MODEL)] + [str(details.get(EXIF_FOCAL_MM, ""))]
+    camera = [str(exif.get(tag, "")).strip("\0 ") for tag in (EXIF_MAKE, EXIF_MODEL)] + [
+        str(details.get(EXIF_FOCAL_MM, ""))
+    ]
     return Photo(
         name=name,
         width=width,

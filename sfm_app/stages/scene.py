@@ -22,6 +22,9 @@ RANKED_PAIRS = 60
 ENOUGH = 0.9
 """A model with this share of the photos that hang together with its seed ends the search for a better seed."""
 
+CONFIRMED = 0.5
+"""So does this share when two seeds agree on how many photos can be placed."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
@@ -39,16 +42,7 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         ReconstructionError: no seed grows into a model; says what was seen.
     """
     candidates = rank_seeds(matches, views, intrinsics, run)
-    tried: list[str] = []
-    best: Any = None
-    for candidate in candidates[: run.settings.scene.seed_pairs]:
-        model = grow(candidate, matches, run)
-        found = model.num_reg_images() if model else 0
-        tried.append(f"{_names(candidate.pair, matches)}: {found} photos")
-        if found and (best is None or found > best.num_reg_images()):
-            best = model
-        if found >= ENOUGH * len(connected(candidate.pair, views)):
-            break
+    best, tried = best_model(candidates, matches, views, run)
     if best is None:
         raise ReconstructionError(nothing_found(views, candidates, tried), hint=HINT)
     with backend("adjusting the bundle"):
@@ -90,6 +84,25 @@ def rank_seeds(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, ru
     return sorted(wide, key=lambda candidate: (-candidate.seed.score, candidate.pair))
 
 
+def best_model(
+    candidates: list[Candidate], matches: MatchGraph, views: ViewGraph, run: RunContext
+) -> tuple[Any | None, list[str]]:
+    """The model with most photos that the best seeds grow into, and what each of them gave."""
+    tried: list[str] = []
+    best, most = None, 0
+    for candidate in candidates[: run.settings.scene.seed_pairs]:
+        model = grow(candidate, matches, run)
+        found = model.num_reg_images() if model else 0
+        tried.append(f"{_names(candidate.pair, matches)}: {found} photos")
+        reachable = len(connected(candidate.pair, views))
+        agreed = found == most and found >= CONFIRMED * reachable
+        if found > most:
+            best, most = model, found
+        if agreed or found >= ENOUGH * reachable:
+            break
+    return best, tried
+
+
 def grow(candidate: Candidate, matches: MatchGraph, run: RunContext) -> Any | None:
     """Map on from one seed; None when the model stays without enough points."""
     place = run.workspace
@@ -119,9 +132,7 @@ def connected(pair: PairId, views: ViewGraph) -> set[int]:
 def left_out(model: Any, matches: MatchGraph, views: ViewGraph) -> dict[str, str]:
     """Why each photo without a pose has none."""
     posed = {image.image_id for image in model.images.values() if image.has_pose}
-    return {
-        image.name: _reason(image.id, posed, views) for image in matches.images.values() if image.id not in posed
-    }
+    return {image.name: _reason(image.id, posed, views) for image in matches.images.values() if image.id not in posed}
 
 
 def write_model(model: Any, run: RunContext) -> None:

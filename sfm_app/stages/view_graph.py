@@ -40,7 +40,7 @@ def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
             hint="take photos of one place that overlap by more than half",
         )
     with run.workspace.replacing(run.workspace.view_graph) as path:
-        np.savez_compressed(path, **graph.to_arrays())
+        np.savez_compressed(path, allow_pickle=False, **graph.to_arrays())
     with backend("writing epipolar geometries"):
         write_epipolar_fits(run.workspace.database, matches, graph.fits)
     return graph

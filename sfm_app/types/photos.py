@@ -19,7 +19,7 @@ class Photo:
     exif_focal_px: float | None = None
     """Focal length that EXIF claims, in pixels of this photo; a hint, never trusted."""
     needs_copy: bool = False
-    """True where COLMAP cannot read the file as it is (orientation, palette, 16 bit): it then works on an upright 8-bit copy."""
+    """True where COLMAP cannot read the file as it is (orientation, palette, 16 bit)."""
 
 
 @dataclass(frozen=True, slots=True)

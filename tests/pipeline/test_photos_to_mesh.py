@@ -117,7 +117,16 @@ def test_calibrate_prints_json(rendered):
 
 def test_the_literal_methods_are_one_flag_away(rendered, tmp_path):
     photos, _ = rendered
-    flags = ["--estimator", "lev-ransac-thesis", "--calibrator", "zero-curves-thesis", "--until", "scene", "--json", "-q"]
+    flags = [
+        "--estimator",
+        "lev-ransac-thesis",
+        "--calibrator",
+        "zero-curves-thesis",
+        "--until",
+        "scene",
+        "--json",
+        "-q",
+    ]
 
     result = CliRunner().invoke(main, ["run", str(photos), "-o", str(tmp_path / "out"), "--quality", "draft", *flags])
 

@@ -19,7 +19,7 @@ def test_results_keep_the_order_of_the_items(workers):
 def test_no_more_than_ahead_items_are_under_way():
     begun = []
     with make_executor(2) as executor:
-        results = ordered_map(executor, lambda item: begun.append(item), range(100), ahead=4)
+        results = ordered_map(executor, begun.append, range(100), ahead=4)
         next(results)
 
         assert len(begun) <= 4

@@ -8,8 +8,7 @@ from sfm_app.types import Rejected
 
 
 def plugin(**functions):
-    module = types.SimpleNamespace(**functions)
-    return module
+    return types.SimpleNamespace(**functions)
 
 
 def never(x1, x2, options, seed):

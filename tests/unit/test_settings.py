@@ -1,4 +1,5 @@
 import pickle
+from itertools import pairwise
 
 import pytest
 
@@ -18,7 +19,7 @@ def test_toml_round_trip(tmp_path):
 def test_every_setting_has_help_in_the_toml():
     lines = Settings().to_toml().splitlines()
 
-    for above, line in zip(lines, lines[1:], strict=False):
+    for above, line in pairwise(lines):
         if "=" in line and not line.startswith("#"):
             assert above.startswith("# ") and len(above) > 10, line
 
@@ -27,7 +28,11 @@ def test_every_setting_has_help_in_the_toml():
     ("values", "says", "hint"),
     [
         ({"sede": 1}, "unknown setting 'sede'", "did you mean 'seed'?"),
-        ({"epipolar": {"max_eror_px": 1}}, "unknown setting 'epipolar.max_eror_px'", "did you mean 'epipolar.max_error_px'?"),
+        (
+            {"epipolar": {"max_eror_px": 1}},
+            "unknown setting 'epipolar.max_eror_px'",
+            "did you mean 'epipolar.max_error_px'?",
+        ),
         ({"epipolar": {"confidence": 1.5}}, "'epipolar.confidence'", "sfm-app config"),
         ({"epipolar": {"max_error_px": float("nan")}}, "'epipolar.max_error_px'", "sfm-app config"),
         ({"depth": 3}, "'depth'", "sfm-app config"),
@@ -52,7 +57,9 @@ def test_presets_are_valid_and_explicit_values_win():
     for name in QUALITY_PRESETS:
         assert Settings.from_mapping({"quality": name}).quality == name
     assert Settings.from_mapping({"quality": "draft"}).depth.max_image_size_px == 640
-    assert Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 700}}).depth.max_image_size_px == 700
+    assert (
+        Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 700}}).depth.max_image_size_px == 700
+    )
 
 
 def test_a_file_that_is_not_toml_is_named(tmp_path):

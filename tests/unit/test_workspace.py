@@ -78,3 +78,13 @@ def test_a_file_in_place_of_the_folder_is_an_input_error(tmp_path):
 def test_fingerprints_ignore_order_of_keys_only():
     assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
     assert fingerprint([1, 2]) != fingerprint([2, 1])
+
+
+def test_the_database_may_grow_but_not_vanish(place):
+    (place.root / "database.db").write_text("1234")
+    finish(place, files=("database.db",))
+    (place.root / "database.db").write_text("123456")
+
+    assert place.is_current("photos", "abc")
+    (place.root / "database.db").unlink()
+    assert not place.is_current("photos", "abc")

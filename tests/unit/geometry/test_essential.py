@@ -77,7 +77,9 @@ def test_triangulation_of_parallel_rays_is_infinite_not_wrong():
 
 
 def test_triangulation_angle_of_a_right_angle():
-    assert triangulation_angle_deg(np.array([[0.5, 0, 0.5]]), np.zeros(3), np.array([1.0, 0, 0]))[0] == pytest.approx(90)
+    assert triangulation_angle_deg(np.array([[0.5, 0, 0.5]]), np.zeros(3), np.array([1.0, 0, 0]))[0] == pytest.approx(
+        90
+    )
 
 
 def test_a_good_pair_makes_a_better_seed_than_a_narrow_or_a_contradictory_one():
@@ -85,7 +87,7 @@ def test_a_good_pair_makes_a_better_seed_than_a_narrow_or_a_contradictory_one():
 
     def seed(t, flip=0):
         t = np.array(t)
-        X, x1, x2 = scene(1, np.eye(3), t)
+        _, x1, x2 = scene(1, np.eye(3), t)
         F = np.linalg.inv(K).T @ cross(t) @ np.linalg.inv(K)
         a, b = (np.column_stack([x, np.ones(len(x))]) @ K.T for x in (x1, x2))
         a, b = a[:, :2], b[:, :2]

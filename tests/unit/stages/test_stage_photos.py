@@ -79,11 +79,8 @@ def test_exif_orientation_is_applied_to_what_colmap_sees(folder, run, orientatio
 
 @pytest.mark.parametrize("mode", ["RGBA", "P", "LA", "I;16", "1", "CMYK"])
 def test_odd_pixel_formats_become_eight_bit(folder, run, mode):
-    image = Image.fromarray(PIXELS)
-    if mode == "I;16":
-        image = Image.fromarray(PIXELS[..., 0].astype(np.uint16) * 256)
-    else:
-        image = image.convert(mode)
+    deep = Image.fromarray(PIXELS[..., 0].astype(np.uint16) * 256)
+    image = deep if mode == "I;16" else Image.fromarray(PIXELS).convert(mode)
     name = "odd.jpg" if mode == "CMYK" else "odd.png"
     image.save(folder / name)
 
@@ -104,7 +101,11 @@ def test_photos_of_one_size_share_a_camera_unless_exif_tells_them_apart(folder, 
 
     groups = read_photos(folder, run).groups
 
-    assert [[photo.name for photo in members] for members in groups.values()] == [["a.jpg", "b.png"], ["c.jpg"], ["d.jpg"]]
+    assert [[photo.name for photo in members] for members in groups.values()] == [
+        ["a.jpg", "b.png"],
+        ["c.jpg"],
+        ["d.jpg"],
+    ]
 
 
 def test_exif_focal_is_read_as_a_hint_in_pixels(folder, run):

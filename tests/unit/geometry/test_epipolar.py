@@ -1,0 +1,182 @@
+"""Epipolar distances, the 8-point algorithm and what follows from F."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfm_app.geometry.epipolar import (
+    cross_matrix,
+    eight_point,
+    epipoles,
+    fundamental_from_pose,
+    hartley_normalisation,
+    homogeneous,
+    nearest_rank_two,
+    sampson_distance,
+    symmetric_epipolar_distance,
+    unit_norm,
+)
+from sfm_app.synthetic.correspondences import PairOptions, make_pair
+
+SEEDS = st.integers(0, 2**31)
+
+
+def same_up_to_sign(F, G):
+    return min(np.abs(F - G).max(), np.abs(F + G).max())
+
+
+def test_distances_by_hand():
+    # epipolar lines y = const: F of a pure shift along x; the match is 3 px off
+    F = cross_matrix([1, 0, 0])
+    x1, x2 = [[10.0, 20.0]], [[40.0, 23.0]]
+
+    assert sampson_distance(F, x1, x2) == pytest.approx([3 / np.sqrt(2)])
+    assert symmetric_epipolar_distance(F, x1, x2) == pytest.approx([3])
+
+
+@given(seed=SEEDS, scale=st.floats(-1e6, 1e6).filter(lambda s: abs(s) > 1e-6))
+def test_sampson_distance_ignores_the_scale_and_the_order_of_the_views(seed, scale):
+    rng = np.random.default_rng(seed)
+    F, x1, x2 = rng.normal(size=(3, 3)), rng.uniform(0, 10, (5, 2)), rng.uniform(0, 10, (5, 2))
+
+    expected = sampson_distance(F, x1, x2)
+
+    assert (expected > 0).all()
+    np.testing.assert_allclose(sampson_distance(scale * F, x1, x2), expected, rtol=1e-6)
+    np.testing.assert_allclose(sampson_distance(F.T, x2, x1), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sampson_distance_is_the_distance_to_the_nearest_exact_match(seed):
+    pair = make_pair(PairOptions(points=20, sigma_px=0.5), seed)
+    distance = sampson_distance(pair.F, pair.x1, pair.x2)
+    gradient = np.empty((20, 4))  # of the algebraic error over (x1, x2), by central differences
+    for k in range(4):
+        step = np.eye(4)[k] * 1e-3
+        ahead, behind = (
+            np.einsum("ni,ij,nj->n", homogeneous(pair.x2 + s * step[2:]), pair.F, homogeneous(pair.x1 + s * step[:2]))
+            for s in (1, -1)
+        )
+        gradient[:, k] = (ahead - behind) / 2e-3
+    algebraic = np.einsum("ni,ij,nj->n", homogeneous(pair.x2), pair.F, homogeneous(pair.x1))
+
+    np.testing.assert_allclose(distance, np.abs(algebraic) / np.linalg.norm(gradient, axis=1), rtol=1e-6)
+    assert 0.2 < np.sqrt(np.mean(distance**2)) < 0.8
+
+
+def test_vanishing_lines_are_infinitely_far():
+    assert sampson_distance(np.zeros((3, 3)), [[1, 2]], [[3, 4]]) == [np.inf]
+    assert symmetric_epipolar_distance(np.zeros((3, 3)), [[1, 2]], [[3, 4]]) == [np.inf]
+
+
+@pytest.mark.parametrize("function", [sampson_distance, symmetric_epipolar_distance])
+@pytest.mark.parametrize(
+    ("F", "x1", "x2", "message"),
+    [
+        (np.eye(2), [[1, 2]], [[1, 2]], r"F must have shape \(3, 3\)"),
+        (np.eye(3), [1, 2], [[1, 2]], r"shape \(N, 2\)"),
+        (np.eye(3), [[1, 2]], [[1, 2], [3, 4]], "pair up"),
+    ],
+)
+def test_wrong_shapes_are_refused(function, F, x1, x2, message):
+    with pytest.raises(ValueError, match=message):
+        function(F, x1, x2)
+
+
+@given(seed=SEEDS, shift=st.floats(-1e4, 1e4), scale=st.floats(1e-3, 1e3))
+def test_hartley_normalisation_centres_and_scales(seed, shift, scale):
+    x = np.random.default_rng(seed).normal(size=(30, 2)) * scale + shift
+
+    y = homogeneous(x) @ hartley_normalisation(x).T
+
+    assert np.abs(y[:, :2].mean(axis=0)).max() < 1e-6
+    assert np.hypot(y[:, 0], y[:, 1]).mean() == pytest.approx(np.sqrt(2))
+
+
+@pytest.mark.parametrize("x", [np.empty((0, 2)), np.full((5, 2), 1e5)])
+def test_points_without_extent_cannot_be_normalised(x):
+    with pytest.raises(ValueError, match=r"no points|coincide"):
+        hartley_normalisation(x)
+
+
+@settings(max_examples=25)
+@given(seed=st.integers(0, 10_000))
+def test_eight_point_finds_the_exact_matrix(seed):
+    pair = make_pair(PairOptions(points=30), seed)
+
+    F = eight_point(pair.exact_x1, pair.exact_x2)
+
+    assert sampson_distance(F, pair.exact_x1, pair.exact_x2).max() < 1e-6
+    assert abs(np.linalg.det(F)) < 1e-12
+    assert np.linalg.norm(F) == pytest.approx(1)
+
+
+def test_eight_point_on_eight_matches():
+    pair = make_pair(PairOptions(points=8), 1)
+    F = eight_point(pair.exact_x1, pair.exact_x2)
+    assert same_up_to_sign(F, unit_norm(pair.F)) < 1e-6
+
+
+def test_eight_point_follows_its_weights():
+    pair = make_pair(PairOptions(points=100, outliers=0.3), 2)
+
+    weighted = eight_point(pair.x1, pair.x2, weights=pair.is_inlier)
+    blind = eight_point(pair.x1, pair.x2)
+
+    good = pair.x1[pair.is_inlier], pair.x2[pair.is_inlier]
+    assert np.median(sampson_distance(weighted, *good)) < 2
+    assert np.median(sampson_distance(blind, *good)) > 4
+
+
+def test_eight_point_needs_eight():
+    with pytest.raises(ValueError, match="needs 8 matches, got 7"):
+        eight_point(np.random.default_rng(0).normal(size=(7, 2)), np.ones((7, 2)))
+
+
+@given(seed=SEEDS)
+def test_no_rank_two_matrix_is_nearer(seed):
+    rng = np.random.default_rng(seed)
+    F = rng.normal(size=(3, 3))
+
+    G = nearest_rank_two(F)
+    other = nearest_rank_two(G + 0.1 * rng.normal(size=(3, 3)))
+
+    assert np.linalg.svd(G, compute_uv=False)[2] < 1e-12
+    assert np.linalg.norm(F - G) == pytest.approx(np.linalg.svd(F, compute_uv=False)[2])
+    assert np.linalg.norm(F - other) >= np.linalg.norm(F - G) - 1e-12
+
+
+@given(seed=SEEDS, scale=st.floats(-1e6, 1e6).filter(lambda s: abs(s) > 1e-6))
+def test_unit_norm_forgets_scale_and_sign(seed, scale):
+    F = np.random.default_rng(seed).normal(size=(3, 3))
+
+    G = unit_norm(scale * F)
+
+    np.testing.assert_allclose(G, unit_norm(F), rtol=1e-9)
+    assert np.linalg.norm(G) == pytest.approx(1)
+    assert G.flat[np.argmax(np.abs(G))] > 0
+
+
+@pytest.mark.parametrize("F", [np.zeros((3, 3)), np.full((3, 3), np.nan), np.full((3, 3), np.inf)])
+def test_unit_norm_refuses_what_has_none(F):
+    with pytest.raises(ValueError, match="zero or not finite"):
+        unit_norm(F)
+
+
+def test_pose_gives_the_matrix_of_the_synthetic_pair():
+    pair = make_pair(PairOptions(points=20), 3)
+
+    F = fundamental_from_pose(pair.K1, pair.K2, pair.R, pair.t)
+
+    assert same_up_to_sign(F, pair.F) < 1e-12
+    e1, e2 = epipoles(F)
+    assert np.abs(F @ e1).max() < 1e-12
+    assert np.abs(F.T @ e2).max() < 1e-12
+    centre1_in_2 = pair.K2 @ pair.t
+    assert np.abs(np.cross(e2, centre1_in_2 / np.linalg.norm(centre1_in_2))).max() < 1e-9
+
+
+def test_pose_without_baseline_has_none():
+    with pytest.raises(ValueError, match="zero"):
+        fundamental_from_pose(np.eye(3), np.eye(3), np.eye(3), np.zeros(3))

@@ -1,0 +1,102 @@
+"""The 7-point solver: every solution is one, and the true one is among them."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfm_app.ransac.minimal import design_row, is_oriented, real_cubic_roots, seven_point
+from sfm_app.ransac.points import prepare
+from sfm_app.synthetic.correspondences import PairOptions, make_pair
+
+ROOTS = st.floats(-10, 10)
+
+
+def exact_sample(seed):
+    pair = make_pair(PairOptions(points=8), seed)
+    m = prepare(pair.exact_x1[:7], pair.exact_x2[:7], seed)
+    return pair, m
+
+
+def solve(points, sample=np.arange(7)):
+    models = np.zeros((3, 9))
+    count = seven_point(points, sample, models)
+    return models[:count]
+
+
+@settings(max_examples=200)
+@given(seed=st.integers(0, 100_000))
+def test_solutions_pass_through_the_sample_and_hold_the_truth(seed):
+    pair, m = exact_sample(seed)
+
+    models = solve(m.points)
+
+    assert len(models) in (1, 3)
+    row = np.empty(9)
+    for f in models:
+        assert np.linalg.norm(f) == pytest.approx(1, abs=1e-9)
+        assert abs(np.linalg.det(f.reshape(3, 3))) < 1e-9
+        for point in m.points:
+            design_row(point, row)
+            assert abs(row @ f) < 1e-8
+    true = pair.F / np.linalg.norm(pair.F) * np.sign(pair.F.flat[np.argmax(np.abs(pair.F))])
+    errors = [np.abs(m.to_pixels(f.reshape(3, 3)) - true).max() for f in models]
+    assert min(errors) < 1e-4
+
+
+def test_design_row_is_the_constraint():
+    rng = np.random.default_rng(0)
+    point, F, row = rng.normal(size=4), rng.normal(size=(3, 3)), np.empty(9)
+    design_row(point, row)
+    assert row @ F.reshape(9) == pytest.approx(np.append(point[2:], 1) @ F @ np.append(point[:2], 1))
+
+
+@pytest.mark.parametrize("case", ["repeated", "coplanar", "collinear"])
+def test_dependent_samples_have_no_solution(case):
+    rng = np.random.default_rng(4)
+    points = rng.normal(size=(7, 4))
+    if case == "repeated":
+        points[6] = points[2]
+    if case == "coplanar":
+        h = np.column_stack([points[:, :2], np.ones(7)]) @ np.array([[1, 0.1, 0], [0.2, 0.9, 0.3], [0.1, 0.05, 1]]).T
+        points[:, 2:] = h[:, :2] / h[:, 2:]
+    if case == "collinear":
+        points[:, 1], points[:, 3] = points[:, 0], 0.5 * points[:, 2]
+    assert len(solve(points)) == 0
+
+
+@given(a=ROOTS, b=ROOTS, c=ROOTS, lead=st.floats(0.1, 10))
+def test_three_real_roots_are_found(a, b, c, lead):
+    p = lead * np.poly([a, b, c])[::-1]
+    roots = np.empty(3)
+
+    count = real_cubic_roots(*p, roots)
+
+    # close roots are ill-conditioned, so what counts is that the polynomial vanishes there
+    assert count in (1, 3)
+    assert np.abs(np.polyval(p[::-1], roots[:count])).max() < 1e-9 * lead * (1 + np.abs([a, b, c]).max()) ** 3
+    if min(abs(a - b), abs(b - c), abs(c - a)) > 0.1:
+        assert count == 3
+        np.testing.assert_allclose(np.sort(roots), np.sort([a, b, c]), atol=1e-6)
+
+
+@given(a=ROOTS, real=ROOTS, imaginary=st.floats(0.1, 10))
+def test_one_real_root_is_found(a, real, imaginary):
+    p = np.poly([a, real + 1j * imaginary, real - 1j * imaginary]).real[::-1]
+    roots = np.empty(3)
+    assert real_cubic_roots(*p, roots) == 1
+    assert roots[0] == pytest.approx(a, abs=1e-6)
+
+
+def test_a_quadratic_is_no_cubic():
+    assert real_cubic_roots(1.0, 2.0, 3.0, 0.0, np.empty(3)) == 0
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_real_cameras_are_oriented_and_a_point_behind_is_not(seed):
+    pair, m = exact_sample(seed)
+    e = np.linalg.svd(pair.F)[0][:, 2]
+    T = m.to_pixels  # noqa: F841 - the frame of `points` is what is tested
+    f = solve(m.points)
+    true = min(f, key=lambda g: np.abs(m.to_pixels(g.reshape(3, 3)) - pair.F / np.linalg.norm(pair.F)).max())
+    assert is_oriented(m.points, np.arange(7), true) or np.abs(e).min() < 1e-6
