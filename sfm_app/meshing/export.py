@@ -41,8 +41,8 @@ def write_glb(vertices: Vertices, faces: Faces, colors: Colors) -> bytes:
         ReconstructionError: the mesh has no triangles.
     """
     mesh = _mesh(vertices, faces)
-    # glTF multiplies COLOR_0 into the light as it is, so it has to be linear, while photos are sRGB. Floats, because eight
-    # linear bits show steps in the shadows. trimesh itself writes only eight: the colours travel as an attribute of our own.
+    # glTF multiplies COLOR_0 into the light as it is, so it has to be linear, while photos are sRGB. Floats, because
+    # eight linear bits show steps in the shadows; trimesh writes only eight, so the colours travel as our own attribute.
     mesh.vertex_attributes["_COLOR_0"] = srgb_to_linear(colors)
     return bytes(
         trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=True, tree_postprocessor=_finish_gltf)

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaln
 
+from sfm_app.jit import kernel
 from sfm_app.ransac.minimal import MOST_MODELS
 from sfm_app.ransac.sampling import SAMPLE_SIZE
-from sfm_app.ransac.scoring import squared_distances
+from sfm_app.ransac.scoring import squared_distances, squared_sampson
 
 FloatArray = NDArray[np.float64]
 
@@ -35,6 +36,18 @@ def false_alarms_of(distances: FloatArray, wrong: FloatArray, threshold: float) 
         chance = accidental_share(wrong, fraction * threshold)
         tried.append(false_alarms(len(distances), inliers, SAMPLE_SIZE, chance))
     return min(_MOST, len(_FRACTIONS) * MOST_MODELS * min(tried))
+
+
+def is_credible(points: FloatArray, f: FloatArray, threshold: float) -> bool:
+    """Whether the support of f is more than luck.
+
+    Args:
+        points: (N, 4) distinct matches in random order, N >= 2.
+        f: (9,) model.
+        threshold: largest distance of an inlier.
+    """
+    distances, wrong = np.sqrt(squared_distances(points, f)), mismatch_distances(points, f)
+    return false_alarms_of(distances, wrong, threshold) <= MOST_FALSE_ALARMS
 
 
 def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> float:
@@ -65,10 +78,19 @@ def mismatch_distances(points: FloatArray, f: FloatArray) -> FloatArray:
         points: (N, 4) distinct matches in random order, N >= 2.
         f: (9,) model.
     """
-    count = len(points)
-    shifts = min(count - 1, max(1, _MISMATCHES // count))
-    squared = [squared_distances(_shifted(points, k), f) for k in range(1, shifts + 1)]
-    return np.sqrt(np.concatenate(squared))
+    shifts = min(len(points) - 1, max(1, _MISMATCHES // len(points)))
+    return np.sqrt(_squared_mismatches(points, f, shifts))
+
+
+@kernel
+def _squared_mismatches(points: FloatArray, f: FloatArray, shifts: int) -> FloatArray:
+    count = points.shape[0]
+    squared = np.empty(shifts * count)
+    for shift in range(shifts):
+        for i in range(count):
+            j = (i + shift + 1) % count
+            squared[shift * count + i] = squared_sampson(f, points[i, 0], points[i, 1], points[j, 2], points[j, 3])
+    return squared
 
 
 def accidental_share(wrong: FloatArray, threshold: float) -> float:
@@ -77,10 +99,6 @@ def accidental_share(wrong: FloatArray, threshold: float) -> float:
     Measured, not modelled: it knows the extent of the photos, where their points cluster, and where the epipoles are.
     """
     return (int(np.count_nonzero(wrong <= threshold)) + 1.0) / (len(wrong) + 2.0)
-
-
-def _shifted(points: FloatArray, by: int) -> FloatArray:
-    return np.hstack([points[:, :2], np.roll(points[:, 2:], by, axis=0)])
 
 
 def log_binomial_tail(count: int, least: int, chance: float) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.ransac.chance import is_credible
 from sfm_app.ransac.points import Matches
 from sfm_app.ransac.sampling import SAMPLE_SIZE, random_state
 from sfm_app.ransac.scoring import bail_out_table, penalty, squared_distances
@@ -40,7 +41,7 @@ class Recipe:
     stop_on_convergence: bool = False
     """End when the priors have converged (thesis 4.18)."""
     patience: int | None = None
-    """End after this many samples without a better model."""
+    """End after this many samples without a better model, unless the best one may be luck."""
     improve: Refine | None = None
     """Local optimisation of every new best model."""
     oriented: bool = False
@@ -69,33 +70,20 @@ def search(matches: Matches, options: EpipolarSettings, seed: int, recipe: Recip
         return None
     state, model, best = random_state(seed), np.empty(9), None
     priors, lowest, least = np.ones(count), math.inf, NO_TABLE
-    trials, limit = 0, float(options.max_trials)
+    trials, limit = 0, options.max_trials
     while trials < limit:
-        guided = 0.0 if recipe.validity is None or best is None else recipe.guided_share
-        left = math.ceil(limit) - trials
-        if recipe.patience is not None and best is not None:
-            left = min(left, recipe.patience)
-        drawn, found = next_better(
-            points,
-            np.cumsum(priors),
-            guided,
-            recipe.score,
-            threshold,
-            lowest,
-            least,
-            left,
-            state,
-            recipe.oriented,
-            model,
-        )
+        guided = recipe.guided_share if recipe.validity is not None and best is not None else 0.0
+        left = limit - trials if recipe.patience is None else min(limit - trials, recipe.patience)
+        rules = (guided, recipe.oriented, recipe.score)
+        drawn, found = next_better(points, np.cumsum(priors), rules, threshold, lowest, least, left, state, model)
         trials += drawn
         if not found < lowest:
-            break
-        best, lowest = model.copy(), found
-        if recipe.improve is not None:
-            best, lowest = _improved(points, best, lowest, threshold, recipe)
+            if trials < limit and best is not None and is_credible(points, best, threshold):
+                break
+            continue
+        best, lowest = _improved(points, model.copy(), found, threshold, recipe)
         share = float(np.mean(squared_distances(points, best) <= threshold * threshold))
-        limit = min(limit, trials_needed(share, options.confidence))
+        limit = math.ceil(min(limit, trials_needed(share, options.confidence)))
         least = bail_out_table(count, share) if recipe.bail_out else NO_TABLE
         if recipe.validity is not None:
             before, priors = priors, recipe.validity(points, best, threshold)

@@ -105,9 +105,10 @@ def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArr
     for k in range(count):  # Newton takes off the rounding of the closed form
         for _ in range(2):
             z = roots[k]
-            slope = (3.0 * z + 2.0 * a) * z + b
-            if slope != 0.0:
-                roots[k] = z - (((z + a) * z + b) * z + c) / slope
+            value, slope = ((z + a) * z + b) * z + c, (3.0 * z + 2.0 * a) * z + b
+            better = z - value / slope if slope != 0.0 else z
+            if abs(((better + a) * better + b) * better + c) < abs(value):  # not so beside a multiple root
+                roots[k] = better
     return count
 
 

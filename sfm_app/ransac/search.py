@@ -16,14 +16,12 @@ IntArray = NDArray[np.int64]
 def next_better(
     points: FloatArray,
     cumulative: FloatArray,
-    guided_share: float,
-    kind: int,
+    rules: tuple[float, bool, int],
     threshold: float,
     to_beat: float,
     least_inliers: IntArray,
     limit: int,
     state: RandomState,
-    oriented: bool,
     best: FloatArray,
 ) -> tuple[int, float]:
     """Draw samples until one of its models has a smaller penalty than `to_beat`.
@@ -31,19 +29,19 @@ def next_better(
     Args:
         points: (N, 4) matches in random order, N >= 7.
         cumulative: (N,) running sum of the priors p(v_i).
-        guided_share: share of the samples that are drawn by the priors; the others are uniform.
-        kind: which penalty, see `scoring`.
+        rules: share of the samples that are drawn by the priors, the others being uniform; whether models that put a
+            sampled point behind a camera are dropped; which penalty, see `scoring`.
         threshold: largest distance of an inlier.
         to_beat: best penalty so far.
         least_inliers: from `bail_out_table`; empty for no bail-out.
         limit: most samples.
         state: random generator.
-        oriented: drop models that put a sampled point behind a camera.
         best: (9,) set to the better model.
 
     Returns:
         Number of samples drawn, and the smaller penalty; `to_beat` itself if there was none.
     """
+    guided_share, oriented, kind = rules
     sample = np.empty(SAMPLE_SIZE, dtype=np.int64)
     models = np.empty((MOST_MODELS, 9))
     for trial in range(1, limit + 1):

@@ -1,17 +1,17 @@
-"""The Huang-Faugeras constraint on one fundamental matrix: E = K'FK has two equal singular values (thesis 5.2.4, 5.8.2).
+"""The Huang-Faugeras constraint on one F: E = K'FK has two equal singular values (thesis 5.2.4, 5.8.2).
 
 F has rank 2, so E has singular values s1 >= s2 and 0, and everything follows from two numbers without an SVD::
 
     a = tr(EE') = s1^2 + s2^2        the sum of the squared entries of E
     p = (s1 s2)^2                    the sum of the squared 2x2 minors of E
 
-The minors of F form the matrix q e2 e1' (epipoles e1, e2 of unit length, q the product of F's singular values), those of a
+The minors of F form the matrix q e2 e1' (unit epipoles e1, e2, and q the product of F's singular values), those of a
 product are the products of the minors, and the minors of K come from adj(K). Hence::
 
     p = q^2 |adj(K) e2|^2 |adj(K) e1|^2
 
-Thesis (5.25) is then  2 tr((EE')^2) - tr(EE')^2 = (s1^2 - s2^2)^2 = a^2 - 4p. It is never negative: with noise its zeros are
-isolated points, and the thesis's "zero curve" is the real part of a pair of complex roots.
+Thesis (5.25) is then  2 tr((EE')^2) - tr(EE')^2 = (s1^2 - s2^2)^2 = a^2 - 4p. It is never negative: with noise its
+zeros are isolated points, and the thesis's "zero curve" is the real part of a pair of complex roots.
 """
 
 import numpy as np
@@ -87,7 +87,12 @@ def centre_polynomials(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) 
     fixed = x * x * F[..., 0, 0] ** 2 + x * y * (F[..., 0, 1] ** 2 + F[..., 1, 0] ** 2) + y * y * F[..., 1, 1] ** 2
     zero = np.zeros_like(g33)
     a = _pad(_stack(fixed + zero), 5)
-    for factor, low, slope in ((x, g13, F[..., 0, 1]), (x, g31, F[..., 1, 0]), (y, g23, F[..., 1, 1]), (y, g32, F[..., 1, 1])):
+    for factor, low, slope in (
+        (x, g13, F[..., 0, 1]),
+        (x, g31, F[..., 1, 0]),
+        (y, g23, F[..., 1, 1]),
+        (y, g32, F[..., 1, 1]),
+    ):
         line = _stack(low, slope + zero)
         a += factor * _pad(_times(line, line), 5)
     corner = _stack(g33, g23 + g32, F[..., 1, 1] + zero)

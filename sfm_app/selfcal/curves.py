@@ -44,23 +44,29 @@ def focal_curves(pairs: Pairs, fx: FloatArray, centre: tuple[float, float]) -> F
     """
     coefficients = focal_polynomials(pairs, fx, centre)
     # the quartic is in fy^2: a negative fy^2 becomes an fy without real part, which the choice of the root passes over
-    return np.stack([_chosen(np.sqrt(companion_roots(row))) for row in coefficients]) if len(pairs) else np.empty((0, len(fx)))
+    curves = np.empty(coefficients.shape[:2])
+    for curve, row in zip(curves, coefficients, strict=True):
+        curve[:] = _chosen(np.sqrt(companion_roots(row)))
+    return curves
 
 
 def centre_curves(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
     """Z^oc of thesis (5.30): v at every swept u; as `focal_curves`."""
     coefficients = centre_polynomials(pairs, u, focal)
-    return np.stack([_chosen(companion_roots(row)) for row in coefficients]) if len(pairs) else np.empty((0, len(u)))
+    curves = np.empty(coefficients.shape[:2])
+    for curve, row in zip(curves, coefficients, strict=True):
+        curve[:] = _chosen(companion_roots(row))
+    return curves
 
 
 def degeneracy(curves: FloatArray, upper: float) -> FloatArray:
     """Thesis (5.35): per curve, the share of its samples that lie out of (0, upper)."""
-    return np.mean((curves <= ROOT_IS_ZERO) | (curves >= upper), axis=1)
+    return np.asarray(np.mean((curves <= ROOT_IS_ZERO) | (curves >= upper), axis=1))
 
 
 def usable(curves: FloatArray, upper: float) -> FloatArray:
     """The curves that are not degenerate."""
-    return curves[degeneracy(curves, upper) <= MAX_OUT_OF_RANGE] if len(curves) else curves
+    return curves[degeneracy(curves, upper) <= MAX_OUT_OF_RANGE]
 
 
 def _chosen(roots: NDArray[np.complex128]) -> FloatArray:

@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_app.selfcal.inputs import FloatArray
 from sfm_app.selfcal.joint import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, Consensus
-from sfm_app.selfcal.search import SIGMAS, Peak, Profile
+from sfm_app.selfcal.search import SIGMAS, Profile
 
 OWN_SIGMA_RANGE = (0.005, 0.02)
 """The last width of the consensus follows the data within these bounds, in units of r."""
@@ -18,6 +18,10 @@ MIN_SUPPORT = 0.12
 """Share of the votes that K must win; many pairs without any common K give up to 0.06."""
 RIVAL_RATIO = 1.25
 """A K with a focal this many times longer or shorter is another answer."""
+MIN_LEAD = 0.5
+"""Votes by which K must lead every other focal."""
+MIN_LEAD_SHARE = 0.03
+"""The same as a share of the votes for K: many pairs that hardly tell focals apart do not add up to knowledge."""
 RESAMPLES = 25
 STABLE_SIGMA = 0.01
 """Resampled fits use at least this width: below it they snap to single pairs."""
@@ -54,20 +58,34 @@ def disagreement(given: FloatArray, weights: FloatArray) -> str:
     return f"the pairs do not agree on a camera: {100 * support:.0f} % of the votes, worth {count:.1f} pairs"
 
 
-def best_rival(consensus: Consensus, best: Peak, profile: Profile, others: Sequence[Peak], free: Sequence[int]) -> float:
-    """The highest value, at the last of `SIGMAS`, that another focal reaches with everything else adapted to it.
+def indecision(lead: float, given: FloatArray) -> str:
+    """Why a lead over the best rival is not enough beside the votes (P,) for K, or nothing."""
+    if lead >= max(MIN_LEAD, MIN_LEAD_SHARE * float(np.sum(given))):
+        return ""
+    return "the pairs fit other focals as well or better (too little rotation, parallel axes, or an orbit)"
 
-    Tried are both focals `RIVAL_RATIO` away, from the centre of the peak and from the best cell of the grid there, and the
-    other peaks beyond them. Where the consensus does not depend on the focal (orbits, parallel axes) this equals the peak.
+
+def best_rival(
+    consensus: Consensus,
+    theta: FloatArray,
+    free: Sequence[int],
+    sigmas: Sequence[float],
+    profile: Profile | None = None,
+) -> float:
+    """The highest value, at the last sigma, of a focal `RIVAL_RATIO` away with everything else adapted to it.
+
+    It is climbed to from `theta` and, where a profile is given, from the best cell of the grid for that focal. Where
+    the consensus does not depend on the focal (orbits, parallel axes) it equals the value at theta.
     """
-    shift = np.log(RIVAL_RATIO)
     adapted = [index for index in free if index != LOG_FOCAL]
-    values = [peak.value for peak in others if abs(peak.theta[LOG_FOCAL] - best.theta[LOG_FOCAL]) >= shift]
-    for log_focal in best.theta[LOG_FOCAL] + np.array([-shift, shift]):
-        cell = profile.thetas[np.argmin(np.abs(profile.thetas[:, LOG_FOCAL] - log_focal))]
-        for start in (best.theta.copy(), cell.copy()):
+    values = []
+    for log_focal in theta[LOG_FOCAL] + np.log(RIVAL_RATIO) * np.array([-1.0, 1.0]):
+        starts = [theta.copy()]
+        if profile is not None:
+            starts.append(profile.thetas[np.argmin(np.abs(profile.thetas[:, LOG_FOCAL] - log_focal))].copy())
+        for start in starts:
             start[LOG_FOCAL] = log_focal
-            values.append(consensus.climb(start, adapted, SIGMAS)[1])
+            values.append(consensus.climb(start, adapted, sigmas)[1])
     return max(values)
 
 
@@ -87,7 +105,7 @@ def resampled(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigm
 
 
 def deviation(values: FloatArray, count: float, parameters: int) -> float:
-    """Standard deviation over resampled peaks of something that `count` effective pairs say about `parameters` unknowns.
+    """Standard deviation over resampled peaks of what `count` effective pairs say about one of `parameters` unknowns.
 
     A pair gives two constraints. With three pairs and three unknowns half of the scatter has gone into the fit, and the
     resampled peaks scatter too little by the same share: the usual correction for degrees of freedom.

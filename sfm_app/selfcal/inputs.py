@@ -13,7 +13,7 @@ FULL_WEIGHT_INLIERS = 300
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """P fundamental matrices in coordinates where the image is about one unit wide, and their parts that E = K'FK needs."""
+    """P fundamental matrices in image units, with the parts of them that E = K'FK needs."""
 
     F: FloatArray
     """(P, 3, 3), rank 2, Frobenius norm 1."""
@@ -51,7 +51,8 @@ def prepare(
         origin_px: pixel that becomes (0, 0).
 
     Raises:
-        ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size is not positive.
+        ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size is not
+            positive.
     """
     raw, trust = _checked(Fs, weights, size)
     to_pixels = np.array([[unit_px, 0.0, origin_px[0]], [0.0, unit_px, origin_px[1]], [0.0, 0.0, 1.0]])

@@ -1,8 +1,8 @@
 """The consensus of all pairs over all of K at once.
 
-Thesis (5.33) seeks the point where most zero curves meet, in one plane of K at a time. Here the same is asked of the whole of
-K: at the parameters ``theta = (log f, u, v, log a)``, with f = sqrt(fx fy) and a = fy / fx, how many pairs satisfy the
-constraint? Each pair speaks with at most its weight, so outliers do not pull::
+Thesis (5.33) seeks the point where most zero curves meet, in one plane of K at a time. Here the same is asked of the
+whole of K: at the parameters ``theta = (log f, u, v, log a)``, with f = sqrt(fx fy) and a = fy / fx, how many pairs
+satisfy the constraint? Each pair speaks with at most its weight, so outliers do not pull::
 
     support(theta) = sum_i w_i exp(-r_i(theta) / sigma),      r = (s1 - s2) / (s1 + s2) of E_i = K'F_iK
 
@@ -25,7 +25,7 @@ LOG_FOCAL, CENTRE_U, CENTRE_V, LOG_ASPECT = range(4)
 FIRST_STEPS = np.array([0.05, 0.03, 0.03, 0.05])
 """First steps of the local search along theta."""
 RESTARTS = 2
-"""Runs of the local search, each from the end of the one before with steps a tenth as long: a simplex can stall on a ridge."""
+"""Runs of the local search, each from the end of the last with a tenth of its steps: a simplex can stall on a ridge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,7 +44,7 @@ class Consensus:
         """(N,) supports plus log-priors at the rows of `thetas` (N, 4)."""
         p = self.pairs
         prior = -0.5 * np.sum(thetas[:, CENTRE_U : CENTRE_V + 1] ** 2, axis=1) / self.centre_sigma**2
-        return supports(p.F, p.e1, p.e2, p.product, p.weights, thetas, sigma) + prior
+        return np.asarray(supports(p.F, p.e1, p.e2, p.product, p.weights, thetas, sigma) + prior)
 
     def ratios(self, theta: FloatArray) -> FloatArray:
         """(P,) r_i at theta."""
@@ -52,7 +52,9 @@ class Consensus:
         return ratios(p.F, p.e1, p.e2, p.product, theta)
 
     def climb(self, start: FloatArray, free: Sequence[int], sigmas: Sequence[float]) -> tuple[FloatArray, float]:
-        """The local maximum reached from `start` by moving the entries `free` of theta, through falling sigmas (Nelder-Mead).
+        """The local maximum reached from `start` by moving the entries `free` of theta, through falling sigmas.
+
+        Nelder-Mead, because the consensus has a cusp wherever a pair is satisfied exactly.
 
         Returns:
             theta (4,) and the value there, at the last sigma.
@@ -92,7 +94,13 @@ def ratios(F: FloatArray, e1: FloatArray, e2: FloatArray, product: FloatArray, t
 
 @kernel
 def supports(
-    F: FloatArray, e1: FloatArray, e2: FloatArray, product: FloatArray, weights: FloatArray, thetas: FloatArray, sigma: float
+    F: FloatArray,
+    e1: FloatArray,
+    e2: FloatArray,
+    product: FloatArray,
+    weights: FloatArray,
+    thetas: FloatArray,
+    sigma: float,
 ) -> FloatArray:
     """(N,) sum_i w_i exp(-r_i / sigma) at the rows of `thetas` (N, 4)."""
     found = np.zeros(len(thetas))

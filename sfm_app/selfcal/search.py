@@ -16,7 +16,7 @@ CENTRE_REACH = 0.4
 """Centres are tried up to this far from the middle, in units of the longer side."""
 CENTRE_STEP = 0.08
 SIGMAS = (0.05, 0.02)
-"""Widths of the consensus, in units of r: with the first a peak is found, with the second it is refined and compared."""
+"""Widths of the consensus, in units of r: the first finds a peak, the second refines it and compares it with others."""
 MOST_STARTS = 4
 
 
@@ -40,9 +40,9 @@ class Profile(NamedTuple):
 
 def scan(consensus: Consensus, log_aspects: Sequence[float]) -> Profile:
     """Look at every cell of the grid."""
-    focals = np.linspace(*np.log(FOCAL_RANGE), FOCALS)
+    focals = np.geomspace(*FOCAL_RANGE, FOCALS)
     centres = np.arange(-CENTRE_REACH, CENTRE_REACH + CENTRE_STEP / 2, CENTRE_STEP)
-    cells = np.meshgrid(focals, centres, centres, np.asarray(log_aspects), indexing="ij")
+    cells = np.meshgrid(np.log(focals), centres, centres, np.asarray(log_aspects), indexing="ij")
     thetas = np.stack(cells, axis=-1).reshape(FOCALS, -1, 4)
     values = consensus.at(thetas.reshape(-1, 4), SIGMAS[0]).reshape(FOCALS, -1)
     best = np.argmax(values, axis=1)

@@ -1,4 +1,4 @@
-"""Zero Curves as the product uses it: the consensus of thesis (5.33) over all of K at once, and an honest verdict on it.
+"""Zero Curves as the product uses it: the consensus of thesis (5.33) over all of K at once, and a verdict on it.
 
 Beyond the thesis: the centre is sought together with the focal (cropped photos), fy/fx is freed only where that is
 clearly better (squeezed photos), and an answer that the pairs do not determine is not given.
@@ -9,7 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_app.selfcal.answers import camera_matrix, guessed
-from sfm_app.selfcal.evidence import best_rival, deviation, disagreement, effective_count, own_sigma, resampled, spread_px, votes
+from sfm_app.selfcal.evidence import (
+    RIVAL_RATIO,
+    best_rival,
+    deviation,
+    disagreement,
+    effective_count,
+    indecision,
+    own_sigma,
+    resampled,
+    spread_px,
+    votes,
+)
 from sfm_app.selfcal.inputs import FloatArray, prepare
 from sfm_app.selfcal.joint import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, Consensus
 from sfm_app.selfcal.search import FOCAL_RANGE, SIGMAS, Peak, Profile, peaks, scan
@@ -27,11 +38,10 @@ ASPECT_DEVIATIONS = 3.0
 """fy/fx must differ from 1 by this many of its own standard deviations."""
 MIN_PAIRS = 3
 """Each F gives two constraints; below three pairs nothing is left to contradict a wrong K."""
-MIN_LEAD = 0.5
-"""Votes by which K must lead every other focal."""
-MIN_LEAD_SHARE = 0.03
-"""The same as a share of the votes for K: many pairs that hardly tell one focal from another do not add up to knowledge."""
 MAX_LOG_FOCAL_SPREAD = 0.1
+"""Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess."""
+EDGE = 1.02
+"""A focal within this factor of an end of the range has run there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,8 +96,10 @@ def calibrate(
         "aspect_gain": gain,
         "log_focal_spread": answer.deviation(LOG_FOCAL),
     }
-    reason = disagreement(answer.votes, pairs.weights) or _objection(
-        answer.theta, evidence, (0.5 * width / unit_px, 0.5 * height / unit_px)
+    reason = (
+        disagreement(answer.votes, pairs.weights)
+        or indecision(answer.lead, answer.votes)
+        or _objection(answer, (0.5 * width / unit_px, 0.5 * height / unit_px))
     )
     if reason:
         return guessed(size, reason, evidence)
@@ -105,9 +117,9 @@ def _found(consensus: Consensus, seed: int) -> tuple[_Answer, float]:
     free_profile = scan(consensus, LOG_ASPECTS)
     free = peaks(consensus, free_profile, ANY_PIXELS)
     # both are measured with the width that suits the freer one, or a wrong square answer would choose a lenient width
-    sigma = own_sigma(consensus, free[0].theta)
-    theta, value = consensus.climb(free[0].theta, ANY_PIXELS, (sigma,))
-    gain = value - consensus.climb(square[0].theta, SQUARE_PIXELS, (sigma,))[1]
+    sigmas = (own_sigma(consensus, free[0].theta),)
+    theta, value = consensus.climb(square[0].theta, SQUARE_PIXELS, sigmas)
+    gain = max(consensus.climb(start, ANY_PIXELS, sigmas)[1] for start in (theta, free[0].theta)) - value
     if gain >= ASPECT_GAIN:
         answer = _examined(consensus, free, free_profile, ANY_PIXELS, seed)
         if abs(answer.theta[LOG_ASPECT]) >= ASPECT_DEVIATIONS * answer.deviation(LOG_ASPECT):
@@ -121,20 +133,21 @@ def _examined(consensus: Consensus, found: list[Peak], profile: Profile, free: t
     sigma = own_sigma(consensus, best.theta)
     theta, _ = consensus.climb(best.theta, free, (sigma,))
     value = float(consensus.at(theta[None, :], SIGMAS[-1])[0])
-    lead = value - best_rival(consensus, Peak(theta, value), profile, found[1:], free)
-    return _Answer(theta, free, sigma, lead, votes(consensus, theta, SIGMAS[-1]), resampled(consensus, theta, free, sigma, seed))
+    far = [peak.value for peak in found[1:] if abs(peak.theta[LOG_FOCAL] - theta[LOG_FOCAL]) > np.log(RIVAL_RATIO)]
+    lead = value - max([best_rival(consensus, theta, free, SIGMAS, profile), *far])
+    return _Answer(
+        theta, free, sigma, lead, votes(consensus, theta, SIGMAS[-1]), resampled(consensus, theta, free, sigma, seed)
+    )
 
 
-def _objection(theta: FloatArray, evidence: dict[str, float], half_size: tuple[float, float]) -> str:
-    """Why K is not determined, or nothing."""
-    focal = float(np.exp(theta[LOG_FOCAL]))
-    low, high = FOCAL_RANGE
-    if evidence["lead"] < MIN_LEAD or evidence["lead_share"] < MIN_LEAD_SHARE:
-        return "the pairs fit other focals as well (too little rotation, parallel axes, or an orbit)"
-    if not low * 1.02 < focal < high / 1.02:
+def _objection(answer: _Answer, half_size: tuple[float, float]) -> str:
+    """Why an answer that the pairs agree on is not to be trusted, or nothing."""
+    focal, (low, high) = float(np.exp(answer.theta[LOG_FOCAL])), FOCAL_RANGE
+    if not low * EDGE < focal < high / EDGE:
         return f"the focal runs to the end of the range, {focal:.2f} longer sides"
-    if abs(theta[CENTRE_U]) > half_size[0] or abs(theta[CENTRE_V]) > half_size[1]:
+    if np.any(np.abs(answer.theta[CENTRE_U : CENTRE_V + 1]) > half_size):
         return "the optical centre runs out of the photo"
-    if evidence["log_focal_spread"] > MAX_LOG_FOCAL_SPREAD:
-        return f"the focal is uncertain by {100 * evidence['log_focal_spread']:.0f} %"
+    uncertainty = answer.deviation(LOG_FOCAL)
+    if uncertainty > MAX_LOG_FOCAL_SPREAD:
+        return f"the focal is uncertain by {100 * uncertainty:.0f} %"
     return ""

@@ -1,6 +1,7 @@
 """Algorithm 4 of the thesis to the letter: zero curves in (fx, fy), their meeting point, then the same in (u, v).
 
-Only the verdict is not the thesis's: whatever comes out counts as known only where the pairs satisfy the constraint there.
+Only the verdict is not the thesis's: what comes out counts as known where the pairs satisfy the constraint there, and
+do not satisfy it as well at other focals.
 """
 
 from typing import NamedTuple
@@ -10,7 +11,7 @@ import numpy as np
 from sfm_app.selfcal.answers import camera_matrix, guessed
 from sfm_app.selfcal.consensus import meeting_point
 from sfm_app.selfcal.curves import centre_curves, focal_curves, usable
-from sfm_app.selfcal.evidence import disagreement, votes
+from sfm_app.selfcal.evidence import best_rival, disagreement, indecision, votes
 from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
 from sfm_app.selfcal.joint import Consensus
 from sfm_app.selfcal.search import SIGMAS
@@ -38,7 +39,7 @@ def calibrate(
 ) -> Calibration:
     """Find K where the zero curves of all pairs meet (thesis Algorithm 4).
 
-    The thesis gives every pair the same say, so weights only tell which pairs take part (> 0), and count in the verdict.
+    The thesis gives every pair the same say: weights tell which pairs take part (> 0), and count in the verdict only.
 
     Args:
         Fs: (P, 3, 3) in pixels.
@@ -48,7 +49,8 @@ def calibrate(
         seed: unused, nothing is drawn at random.
 
     Returns:
-        K with ``identifiable=True``, or a guess and the reason; `evidence` then still has what Algorithm 4 answered, in pixels.
+        K with ``identifiable=True``, or a guess and the reason. `evidence` has what Algorithm 4 answered in both cases,
+        as fx_px, fy_px, cx_px and cy_px.
 
     Raises:
         ValueError: malformed input, see `selfcal.inputs.prepare`.
@@ -63,9 +65,12 @@ def calibrate(
     fx, fy, cx, cy = (width * value for value in found)
     evidence |= {"fx_px": fx, "fy_px": fy, "cx_px": cx, "cy_px": cy}
     theta = np.array([0.5 * np.log(found.fx * found.fy), found.u, found.v, np.log(found.fy / found.fx)])
-    given = votes(Consensus(pairs, np.inf), theta, SIGMAS[0])
-    evidence["support"] = float(np.sum(given) / np.sum(pairs.weights))
-    reason = disagreement(given, pairs.weights)
+    # the wider sigma: a sample of a curve is no maximum, and must not be held against the last per cent
+    consensus, sigmas = Consensus(pairs, np.inf), SIGMAS[:1]
+    given = votes(consensus, theta, sigmas[-1])
+    lead = float(np.sum(given)) - best_rival(consensus, theta, range(4), sigmas)
+    evidence |= {"support": float(np.sum(given) / np.sum(pairs.weights)), "lead": lead}
+    reason = disagreement(given, pairs.weights) or indecision(lead, given)
     if reason:
         return guessed(size, reason, evidence)
     K = camera_matrix(fx, fy, cx, cy)

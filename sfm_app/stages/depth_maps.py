@@ -13,8 +13,10 @@ from sfm_app.colmap.dense import fuse, read_depth, read_grey, read_views, undist
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.settings import DepthSettings
-from sfm_app.stereo import DepthMap, View, confirm_depths, match_depths, rank_neighbours
+from sfm_app.stereo import DepthMap, View, confirm_depths, match_depths, rank_neighbours, region
 from sfm_app.types import Rejected, Scene
+
+HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
 CONFIRMING = 2
 """A depth map is checked against this many times as many photos as it was made from."""
@@ -48,10 +50,13 @@ def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: Dep
     if not coverage:
         raise ReconstructionError(
             f"none of {len(views)} photos gets a depth map: {_most_common(rejected)}",
-            hint="take photos a step apart, from the side rather than forward, with two thirds of the view in common",
+            hint=HINT,
         )
-    points = fuse(dense_dir, list(coverage), 1 + min(options.min_agreeing, len(coverage) - 1))
+    fusable = [view for view in views if view.name in coverage]
+    points = fuse(dense_dir, fusable, 1 + min(options.min_agreeing, len(fusable) - 1), region(views))
     run.record(fused_points=points)
+    if not points:
+        raise ReconstructionError("the depth maps do not agree on any point", hint=HINT)
     return dense_dir
 
 

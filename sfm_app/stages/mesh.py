@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_app.colmap.dense import poisson
+from sfm_app.colmap.dense import poisson, read_fused
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
+from sfm_app.meshing import drop_islands, octree_depth, trim_unsupported
 from sfm_app.settings import MeshSettings
 from sfm_app.types import Surface
 
@@ -20,8 +21,14 @@ def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surfac
         ReconstructionError: nothing is left.
         BackendError: COLMAP failed.
     """
-    surface = poisson(dense_dir, options.poisson_depth, options.trim)
-    run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
+    points, normals = read_fused(dense_dir)
+    depth = octree_depth(points, options.poisson_depth)
+    raw = poisson(dense_dir, depth, options.trim)
+    trimmed = trim_unsupported(raw, points, normals) if options.trim else raw
+    surface = drop_islands(trimmed, options.min_island)
+    run.record(
+        poisson_depth=depth, raw_triangles=len(raw.faces), vertices=len(surface.vertices), triangles=len(surface.faces)
+    )
     if not len(surface.faces):
         raise ReconstructionError("no surface is left after cleaning", hint="take more photos with more overlap")
     with run.workspace.replacing(dense_dir / SURFACE) as path:

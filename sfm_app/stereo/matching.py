@@ -8,7 +8,7 @@ from sfm_app.jit import kernel
 from sfm_app.stereo.rectify import Rectification
 from sfm_app.stereo.view import DepthArray, FloatArray, GreyImage, View
 
-BLOCK_PX = 5
+BLOCK_PX = 3
 NO_DISPARITY = -1.0
 
 
@@ -26,8 +26,8 @@ def disparities(left: GreyImage, right: GreyImage, count: int) -> NDArray[np.flo
         P1=8 * BLOCK_PX**2,
         P2=32 * BLOCK_PX**2,
         disp12MaxDiff=1,
-        preFilterCap=31,
-        uniquenessRatio=5,
+        preFilterCap=63,
+        uniquenessRatio=10,
         speckleWindowSize=100,
         speckleRange=2,
         mode=cv2.STEREO_SGBM_MODE_SGBM,

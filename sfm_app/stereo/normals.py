@@ -6,10 +6,13 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.stereo.view import DepthArray, FloatArray, View
 
-RADIUS_PX = 3
+SIGMA_PX = 2.5
+"""How fast the weight of a neighbouring pixel falls off: smaller keeps more detail, larger more noise out of the normals."""
+RADIUS_PX = 5
 MAX_STEP = 0.02
 """Relative depth difference beyond which a pixel belongs to another surface."""
-MIN_PIXELS = 8
+MIN_WEIGHT = 0.25
+"""Least share of the window that has to be filled."""
 
 
 def fit_planes(view: View, depth: DepthArray) -> tuple[NDArray[np.float32], DepthArray]:
@@ -23,16 +26,24 @@ def fit_planes(view: View, depth: DepthArray) -> tuple[NDArray[np.float32], Dept
     """
     normals = np.zeros((*depth.shape, 3), np.float32)
     planes = np.zeros_like(depth)
+    steps = np.arange(-RADIUS_PX, RADIUS_PX + 1)
+    profile = np.exp(-0.5 * (steps / SIGMA_PX) ** 2)
     K_inv = np.asarray(np.linalg.inv(view.K), np.float64)
-    _fit(depth, K_inv, view.sample_px, normals, planes)
+    _fit(depth, K_inv, view.sample_px, np.outer(profile, profile), normals, planes)
     return normals, planes
 
 
 @kernel
 def _fit(
-    depth: DepthArray, K_inv: FloatArray, sample_px: float, normals: NDArray[np.float32], planes: DepthArray
+    depth: DepthArray,
+    K_inv: FloatArray,
+    sample_px: float,
+    window: FloatArray,
+    normals: NDArray[np.float32],
+    planes: DepthArray,
 ) -> None:
     height, width = depth.shape
+    least = MIN_WEIGHT * np.sum(window)
     for row in range(height):
         for col in range(width):
             z = depth[row, col]
@@ -46,16 +57,17 @@ def _fit(
                     if other <= 0 or abs(other - z) > MAX_STEP * z:
                         continue
                     du, dv, inverse = float(j - col), float(i - row), 1.0 / other
-                    n += 1
-                    su += du
-                    sv += dv
-                    suu += du * du
-                    suv += du * dv
-                    svv += dv * dv
-                    q += inverse
-                    qu += du * inverse
-                    qv += dv * inverse
-            if n < MIN_PIXELS:
+                    weight = window[i - row + RADIUS_PX, j - col + RADIUS_PX]
+                    n += weight
+                    su += weight * du
+                    sv += weight * dv
+                    suu += weight * du * du
+                    suv += weight * du * dv
+                    svv += weight * dv * dv
+                    q += weight * inverse
+                    qu += weight * du * inverse
+                    qv += weight * dv * inverse
+            if n < least:
                 continue
             suu, suv, svv = suu - su * su / n, suv - su * sv / n, svv - sv * sv / n
             qu, qv = qu - su * q / n, qv - sv * q / n

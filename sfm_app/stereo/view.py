@@ -1,5 +1,6 @@
 """What stereo knows about a photo besides its pixels."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -54,3 +55,10 @@ class View:
     def projection(self) -> FloatArray:
         """(3, 4) projection matrix K [R | t]."""
         return self.K @ np.column_stack([self.R, self.t])
+
+
+def region(views: Sequence[View], margin: float = 0.2) -> FloatArray:
+    """Box (2, 3) around the sparse points: lowest and highest coordinates, without the strays, widened by a share."""
+    points = np.concatenate([view.points for view in views])
+    low, high = np.percentile(points, [1, 99], axis=0)
+    return np.stack([low - margin * (high - low).max(), high + margin * (high - low).max()])

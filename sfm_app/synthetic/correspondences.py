@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import ConfigError
+from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.synthetic.cameras import axis_rotation, camera_matrix
 
 FloatArray = NDArray[np.float64]
@@ -214,13 +215,6 @@ def make_tracks(options: TrackOptions, seed: int) -> Tracks:
     raise ConfigError("no random cameras see the same points", hint="lower max_rotation_deg or max_shift")
 
 
-def fundamental_from_cameras(K1: FloatArray, K2: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
-    """(3, 3) fundamental matrix K2^-T [t]x R K1^-1 of Frobenius norm 1; R, t: cam2_from_cam1, t not zero."""
-    cross = np.array([[0.0, -t[2], t[1]], [t[2], 0.0, -t[0]], [-t[1], t[0], 0.0]])
-    F = np.linalg.inv(K2).T @ cross @ R @ np.linalg.inv(K1)
-    return np.asarray(F / np.linalg.norm(F))
-
-
 def random_rotation(rng: np.random.Generator, max_angle_deg: float) -> FloatArray:
     """(3, 3) rotation about a uniformly random axis by a uniformly random angle up to the given one."""
     return axis_rotation(_direction(rng), rng.uniform(0.0, max_angle_deg))
@@ -269,7 +263,7 @@ def _two_views(
     is_inlier[rng.permutation(count)[: round(share * count)]] = False
     x2 = noisy[j].copy()
     x2[~is_inlier] += rng.uniform(-reach, reach, (np.count_nonzero(~is_inlier), 2))
-    F = fundamental_from_cameras(Ks[i], Ks[j], R, t)
+    F = fundamental_from_pose(Ks[i], Ks[j], R, t)
     return TwoViews(noisy[i].copy(), x2, is_inlier, F, Ks[i], Ks[j], R, t, exact[i], exact[j])
 
 

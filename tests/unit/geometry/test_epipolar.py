@@ -100,7 +100,7 @@ def test_points_without_extent_cannot_be_normalised(x):
         hartley_normalisation(x)
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10_000))
 def test_eight_point_finds_the_exact_matrix(seed):
     pair = make_pair(PairOptions(points=30), seed)

@@ -51,6 +51,13 @@ def test_the_pose_is_a_rotation_and_a_baseline_within_the_options(seed):
     assert 0.05 <= np.linalg.norm(pair.t) <= 0.5
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_points_behind_a_camera_are_not_matches(seed):
+    # cameras far apart and turned anywhere: many points project into image 2 from behind
+    wide = PairOptions(points=100, max_rotation_deg=180.0, max_baseline=3.0)
+    assert depths(make_pair(wide, seed)).min() > 0
+
+
 @pytest.mark.parametrize("sigma_px", [0.3, 1.0, 2.0])
 def test_noise_is_the_injected_noise(sigma_px):
     pair = make_pair(PairOptions(sigma_px=sigma_px, outliers=0.25), seed=4)

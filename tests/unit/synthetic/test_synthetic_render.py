@@ -84,6 +84,16 @@ def test_the_sky_is_blue_and_darker_above(prepared):
     assert sky[0].mean() < 0.9 * sky[-1].mean()
 
 
+def test_bodies_of_one_material_have_their_own_stains():
+    white = Material(pattern="stone", base=(200, 200, 200), second=(100, 100, 100))
+    twins = tuple(Body(box(1.0, 1.0, 1.0).moved((x, 0.0, 0.0)), white) for x in (-0.5, 0.5))
+    pose = look_at(np.array([0.0, 0.5, 9.0]), np.array([0.0, 0.5, 0.0]))
+    camera = make_camera(200, 100, focal_widths=3.0, centre=(0.5, 0.5))
+    image = render_scene(prepare(SyntheticScene("twins", twins, to_light=(0.0, 0.0, 1.0))), camera, pose)[..., 1]
+    left, right = image[30:70, 30:60], image[30:70, 101:131]  # one unit is 71 pixels
+    assert left.std() > 0.01 and abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 0.5
+
+
 def test_rendering_repeats_to_the_bit(prepared, four_views):
     pose = next(iter(four_views.cam_from_world.values()))
     camera = make_camera(60, 40)

@@ -1,0 +1,79 @@
+"""Zero curves of thesis 5.8.3."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfm_app.selfcal.curves import centre_curves, companion_roots, degeneracy, focal_curves, usable
+from sfm_app.selfcal.inputs import prepare
+
+
+def in_widths(made):
+    return prepare(made.Fs, made.weights, made.size, unit_px=made.size[0], origin_px=(0.0, 0.0))
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.floats(-3, 3), min_size=4, max_size=8), st.floats(0.01, 100))
+def test_companion_roots_are_roots(roots, lead):
+    coefficients = lead * np.poly(roots)[::-1]
+    found = companion_roots(coefficients[None])[0]
+    assert found.shape == (len(roots),)
+    # roots of high multiplicity are ill-conditioned, the polynomial built from what was found is not
+    np.testing.assert_allclose(np.poly(found)[::-1], np.poly(roots)[::-1], atol=1e-6 * np.abs(np.poly(roots)).max())
+
+
+def test_missing_powers_become_far_roots():
+    found = companion_roots(np.array([[6.0, -5.0, 1.0, 0.0, 0.0]]))[0]
+    near = np.sort(found[np.abs(found) < 1e3].real)
+    np.testing.assert_allclose(near, [2, 3], rtol=1e-6)
+    assert np.sum(np.abs(found) > 1e3) == 2
+
+
+def test_a_vanishing_polynomial_collapses_to_zero():
+    found = companion_roots(np.array([[0.0, 0, 0, 0, 0], [1, 0, 0, 0, 1]]))
+    assert np.all(found[0] == 0)
+    np.testing.assert_allclose(np.abs(found[1]), 1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_exact_curves_run_through_the_true_camera(views, seed):
+    made = views(4, seed, noise=0.0, focal=900, aspect=1.15)
+    pairs, K = in_widths(made), made.K / 1000
+
+    fy = focal_curves(pairs, K[0, 0] * np.array([0.5, 1.0, 1.5]), (K[0, 2], K[1, 2]))
+    v = centre_curves(pairs, K[0, 2] * np.array([0.5, 1.0, 1.5]), (K[0, 0], K[1, 1]))
+
+    np.testing.assert_allclose(fy[:, 1], K[1, 1], rtol=1e-4)
+    np.testing.assert_allclose(v[:, 1], K[1, 2], rtol=1e-4)
+    assert np.ptp(fy[:, 0]) > 1e-3  # away from it the pairs differ
+    assert np.ptp(v[:, 0]) > 1e-3
+
+
+def test_noisy_curves_pass_close_by(views):
+    made = views(5, noise=1e-3)
+    pairs, K = in_widths(made), made.K / 1000
+    fy = focal_curves(pairs, np.array([K[0, 0]]), (K[0, 2], K[1, 2]))[:, 0]
+    assert 1e-5 < np.median(np.abs(fy - K[1, 1])) < 0.03
+
+
+@pytest.mark.parametrize("motion", ["translation", "level"])
+def test_degenerate_motions_lose_their_curves(views, motion):
+    # level cameras say nothing about fy: the whole constraint scales with it
+    pairs = in_widths(views(4, noise=0.0, motion=getattr(views, motion)))
+    curves = focal_curves(pairs, np.linspace(0.03, 3, 50), (0.5, 0.375))
+    assert np.all(degeneracy(curves, 3.0) > 0.5)
+    assert len(usable(curves, 3.0)) == 0
+
+
+def test_degeneracy_is_the_share_out_of_range():
+    curves = np.array([[1.0, 2, 3, 4], [0, 0, 1, 2], [-1, 0, 5, 1], [1, 1, 1, 1]])
+    np.testing.assert_array_equal(degeneracy(curves, 3.0), [0.5, 0.5, 0.75, 0])
+    np.testing.assert_array_equal(usable(curves, 3.0), curves[[0, 1, 3]])
+
+
+def test_no_pairs_no_curves():
+    pairs = prepare(np.empty((0, 3, 3)), [], (4, 3), unit_px=4.0, origin_px=(0.0, 0.0))
+    assert focal_curves(pairs, np.ones(7), (0.5, 0.4)).shape == (0, 7)
+    assert centre_curves(pairs, np.ones(7), (1.0, 1.0)).shape == (0, 7)
+    assert len(usable(np.empty((0, 7)), 3.0)) == 0

@@ -1,0 +1,166 @@
+"""The production calibrator on cameras that are cropped, squeezed, narrow, few, mixed or undetermined."""
+
+import numpy as np
+import pytest
+
+from sfm_app.selfcal import pair_weights
+from sfm_app.selfcal.zero_curves import METHOD, calibrate
+from sfm_app.settings import CalibrationSettings
+
+OPTIONS = CalibrationSettings()
+
+
+def run(made, seed=0, weights=None):
+    return calibrate(made.Fs, made.weights if weights is None else weights, made.size, OPTIONS, seed)
+
+
+def errors(found, K, size):
+    """Largest relative focal error, and largest error of the centre in longer sides."""
+    focal = np.abs(np.diag(found.K)[:2] / np.diag(K)[:2] - 1).max()
+    return focal, np.abs(found.K[:2, 2] - K[:2, 2]).max() / max(size)
+
+
+CAMERAS = {
+    "plain": {},
+    "wide": {"focal": 450},
+    "narrow": {"focal": 2700, "noise": 2e-4},
+    "cropped": {"centre": (720, 260)},
+    "portrait": {"size": (750, 1000)},
+    "squeezed": {"aspect": 0.75},
+    "stretched and cropped": {"aspect": 1.25, "centre": (400, 450)},
+    "level": {"motion": "level", "noise": 3e-4},
+}
+
+
+@pytest.mark.parametrize("camera", CAMERAS)
+@pytest.mark.parametrize("seed", range(2))
+def test_finds_the_camera(views, camera, seed):
+    knobs = dict(CAMERAS[camera])
+    if "motion" in knobs:
+        knobs["motion"] = getattr(views, knobs["motion"])
+    made = views(7, seed, **knobs)
+
+    found = run(made)
+
+    assert found.identifiable, found.reason
+    assert found.method == METHOD
+    focal, centre = errors(found, made.K, made.size)
+    assert 0 < focal < 0.02
+    assert 0 < centre < 0.02
+    assert found.evidence["agreeing_pairs"] > 15
+
+
+@pytest.mark.parametrize("knobs", [{}, {"focal": 2700}, {"centre": (720, 260)}])
+def test_pixels_stay_square_unless_the_pairs_clearly_say_otherwise(views, knobs):
+    for seed in range(3):
+        found = run(views(6, seed, **knobs))
+        assert found.K[0, 0] == found.K[1, 1]
+        assert found.evidence["aspect_gain"] < 3.9
+
+
+def test_freeing_the_aspect_is_what_the_pairs_ask_for(views):
+    found = run(views(6, aspect=0.75))
+    assert found.K[1, 1] / found.K[0, 0] == pytest.approx(0.75, rel=0.02)
+    assert 4 < found.evidence["aspect_gain"] < 15
+
+
+@pytest.mark.parametrize("count", [3, 5])
+def test_spread_is_the_size_of_the_error(views, count):
+    scores = []
+    for seed in range(12):
+        made = views(count, seed, noise=2e-3)
+        found = run(made, seed)
+        if found.identifiable:
+            scores.append((found.K[0, 0] - made.K[0, 0]) / found.spread["fx"])
+    assert len(scores) >= 8
+    assert 0.2 < np.median(np.abs(scores)) < 1.8
+    assert np.quantile(np.abs(scores), 0.8) < 4
+
+
+def test_wrong_pairs_are_outvoted(views, random_fundamentals):
+    made = views(6)
+    Fs = made.Fs.copy()
+    Fs[:6] = random_fundamentals(6)
+    found = calibrate(Fs, made.weights, made.size, OPTIONS, 0)
+    assert found.identifiable
+    assert max(errors(found, made.K, made.size)) < 0.03
+    assert 7 < found.evidence["agreeing_pairs"] < 11
+
+
+def test_a_zoomed_photo_is_outvoted(views):
+    made, zoomed = views(5, noise=3e-4), views(5, noise=3e-4, focal=1500)
+    Fs = made.Fs.copy()
+    with_photo_0 = [0, 1, 2, 3]
+    # photo 0 was taken at 1.5 times the focal: its pixels are those of the others, 1.5 times further from the centre
+    zoom = made.K @ np.linalg.inv(zoomed.K)
+    Fs[with_photo_0] = made.Fs[with_photo_0] @ zoom
+    found = calibrate(Fs, made.weights, made.size, OPTIONS, 0)
+    assert found.identifiable
+    assert max(errors(found, made.K, made.size)) < 0.05
+
+
+def test_weights_decide_between_two_cameras(views):
+    one, other = views(5, 1, noise=3e-4), views(5, 2, noise=3e-4, focal=2000)
+    Fs = np.concatenate([one.Fs, other.Fs])
+    for weights, focal in (([1.0] * 10 + [0.2] * 10, 1000), ([0.2] * 10 + [1.0] * 10, 2000)):
+        found = calibrate(Fs, np.array(weights), one.size, OPTIONS, 0)
+        assert found.K[0, 0] == pytest.approx(focal, rel=0.05)
+
+
+@pytest.mark.parametrize("motion", ["orbit", "translation"])
+@pytest.mark.parametrize("noise", [0.0, 3e-4, 3e-3])
+@pytest.mark.parametrize("count", [3, 7])
+def test_motions_that_do_not_determine_the_focal(views, motion, noise, count):
+    found = run(views(count, motion=getattr(views, motion), noise=noise))
+    assert not found.identifiable
+    assert found.reason
+    assert found.method == "guess"
+    np.testing.assert_array_equal(found.K, [[1200, 0, 500], [0, 1200, 375], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("count", [3, 10, 45])
+def test_matrices_without_a_camera(random_fundamentals, count):
+    for seed in range(4):
+        found = calibrate(random_fundamentals(count, seed), np.ones(count), (1000, 750), OPTIONS, 0)
+        assert not found.identifiable
+        assert "do not agree" in found.reason
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_pairs(views, count):
+    made = views(3)
+    found = calibrate(made.Fs[:count], made.weights[:count], made.size, OPTIONS, 0)
+    assert not found.identifiable
+    assert found.reason == f"{count} usable pairs, 3 are needed"
+    assert found.evidence == {"pairs": count}
+
+
+def test_one_pair_repeated_is_one_pair(views):
+    for seed in range(4):
+        made = views(2, seed)
+        found = calibrate(np.repeat(made.Fs, 10, axis=0), np.ones(10), made.size, OPTIONS, 0)
+        assert not found.identifiable
+
+
+def test_the_prior_holds_the_centre_of_few_pairs(views):
+    made = views(3, 1, noise=4e-3)
+    offsets = []
+    for sigma in (0.01, 1.0):
+        options = OPTIONS.model_copy(update={"centre_sigma": sigma})
+        found = calibrate(made.Fs, made.weights, made.size, options, 0)
+        offsets.append(np.linalg.norm(found.K[:2, 2] - [500, 375]))
+    assert offsets[0] < 20
+    assert offsets[0] <= offsets[1]
+
+
+def test_seed_changes_the_spread_only(views):
+    made = views(5)
+    first, second = run(made, 1), run(made, 2)
+    np.testing.assert_array_equal(first.K, second.K)
+    assert first.spread != second.spread
+    assert first.spread["fx"] == pytest.approx(second.spread["fx"], rel=1.0)
+
+
+def test_inlier_counts_make_weights(views):
+    made = views(5)
+    assert run(made, weights=pair_weights(np.full(10, 200))).identifiable
