@@ -87,8 +87,9 @@ def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
     """Write the confirmed depths and the normals of a view, as COLMAP's fusion expects them."""
     write_depth(dense_dir, view, maps.depth, "geometric")
     with backend(f"writing the normal map of {view.name}"):
-        normals = pycolmap.NormalMap.from_array(np.ascontiguousarray(maps.normals))
-        normals.write(_map_path(dense_dir, "normal_maps", view, "geometric"))
+        # pycolmap takes (H, W, 3) but stores the bytes as they come, where COLMAP keeps x, y and z in planes.
+        planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
+        pycolmap.NormalMap.from_array(planes).write(_map_path(dense_dir, "normal_maps", view, "geometric"))
 
 
 def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind) -> Path:

@@ -25,24 +25,26 @@ VANISHED = 1e-12
 
 
 @kernel
-def singular_value_ratio(
-    F: FloatArray, e1: FloatArray, e2: FloatArray, product: float, fx: float, fy: float, u: float, v: float
-) -> float:
+def singular_value_ratio(pair: FloatArray, fx: float, fy: float, u: float, v: float) -> float:
     """r = (s1 - s2) / (s1 + s2) of E = K'FK, in [0, 1]; 0 where K satisfies the constraint.
 
     Unlike thesis (5.8) it is bounded, symmetric in the two views, and free of the scale of F.
+
+    Args:
+        pair: (16,) a row of `Pairs.packed`.
     """
-    g13 = F[0, 0] * u + F[0, 1] * v + F[0, 2]
-    g23 = F[1, 0] * u + F[1, 1] * v + F[1, 2]
-    g31 = F[0, 0] * u + F[1, 0] * v + F[2, 0]
-    g32 = F[0, 1] * u + F[1, 1] * v + F[2, 1]
-    g33 = u * g13 + v * g23 + F[2, 0] * u + F[2, 1] * v + F[2, 2]
+    f11, f12, f13 = pair[0], pair[1], pair[2]
+    f21, f22, f23 = pair[3], pair[4], pair[5]
+    f31, f32, f33 = pair[6], pair[7], pair[8]
+    g13, g23 = f11 * u + f12 * v + f13, f21 * u + f22 * v + f23
+    g31, g32 = f11 * u + f21 * v + f31, f12 * u + f22 * v + f32
+    g33 = f31 * u + f32 * v + f33 + u * g13 + v * g23
     x, y = fx * fx, fy * fy
-    a = x * x * F[0, 0] ** 2 + x * y * (F[0, 1] ** 2 + F[1, 0] ** 2) + y * y * F[1, 1] ** 2
+    a = x * x * f11 * f11 + x * y * (f12 * f12 + f21 * f21) + y * y * f22 * f22
     a += x * (g13 * g13 + g31 * g31) + y * (g23 * g23 + g32 * g32) + g33 * g33
-    n1 = y * (e1[0] - u * e1[2]) ** 2 + x * (e1[1] - v * e1[2]) ** 2 + x * y * e1[2] ** 2
-    n2 = y * (e2[0] - u * e2[2]) ** 2 + x * (e2[1] - v * e2[2]) ** 2 + x * y * e2[2] ** 2
-    twice = 2.0 * product * np.sqrt(n1 * n2)
+    n1 = y * (pair[9] - u * pair[11]) ** 2 + x * (pair[10] - v * pair[11]) ** 2 + x * y * pair[11] ** 2
+    n2 = y * (pair[12] - u * pair[14]) ** 2 + x * (pair[13] - v * pair[14]) ** 2 + x * y * pair[14] ** 2
+    twice = 2.0 * pair[15] * np.sqrt(n1 * n2)
     if not a + twice > 0.0:
         return 1.0
     # (s1 - s2)^2 / (s1 + s2)^2; rounding may push the numerator below zero

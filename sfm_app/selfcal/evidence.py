@@ -34,14 +34,14 @@ def own_sigma(consensus: Consensus, theta: FloatArray) -> float:
     if not np.any(agreeing):
         return OWN_SIGMA_RANGE[1]
     order = np.argsort(r[agreeing], kind="stable")
-    mass = np.cumsum(consensus.pairs.weights[agreeing][order])
+    mass = np.cumsum(consensus.weights[agreeing][order])
     median = r[agreeing][order][np.searchsorted(mass, 0.5 * mass[-1])]
     return float(np.clip(OWN_SIGMA_FACTOR * median, *OWN_SIGMA_RANGE))
 
 
 def votes(consensus: Consensus, theta: FloatArray, sigma: float) -> FloatArray:
     """(P,) what each pair gives to K: w_i exp(-r_i / sigma)."""
-    return np.asarray(consensus.pairs.weights * np.exp(-consensus.ratios(theta) / sigma))
+    return np.asarray(consensus.weights * np.exp(-consensus.ratios(theta) / sigma))
 
 
 def effective_count(votes: FloatArray) -> float:
@@ -95,7 +95,7 @@ def resampled(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigm
     Weights instead of draws, because three pairs drawn with replacement are often one pair three times.
     """
     rng = np.random.default_rng(seed)
-    weights = consensus.pairs.weights
+    weights = consensus.weights
     found = []
     for _ in range(RESAMPLES):
         drawn = weights * rng.exponential(size=len(weights))

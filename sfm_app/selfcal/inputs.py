@@ -29,6 +29,11 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.F)
 
+    @property
+    def packed(self) -> FloatArray:
+        """(P, 16) F by rows, e1, e2 and product side by side, for kernels."""
+        return np.column_stack([self.F.reshape(-1, 9), self.e1, self.e2, self.product])
+
 
 def pair_weights(inlier_counts: ArrayLike) -> FloatArray:
     """How far fundamental matrices with that many inliers are trusted: min(1, n / 300)."""
@@ -41,7 +46,7 @@ def prepare(
 ) -> Pairs:
     """Check what a calibrator was given and express it in units of `unit_px` from `origin_px`.
 
-    Pairs of weight 0 are left out.
+    Pairs of weight 0 are left out, and so is an F that repeats another, in either direction: it is no further evidence.
 
     Args:
         Fs: (P, 3, 3) in pixels, any scale; P may be 0.
@@ -58,12 +63,14 @@ def prepare(
     to_pixels = np.array([[unit_px, 0.0, origin_px[0]], [0.0, unit_px, origin_px[1]], [0.0, 0.0, 1.0]])
     # scaled first, so that neither 1e-200 nor 1e200 over- or underflows in the products
     scaled = raw / np.max(np.abs(raw), axis=(1, 2), keepdims=True)
+    distinct = _distinct(scaled)
+    scaled, trust = scaled[distinct], trust[distinct]
     U, s, Vt = np.linalg.svd(to_pixels.T @ scaled @ to_pixels)
     s = s[:, :2] / np.linalg.norm(s[:, :2], axis=1, keepdims=True)
     return Pairs(
-        F=np.ascontiguousarray((U[:, :, :2] * s[:, None, :]) @ Vt[:, :2, :]),
-        e1=np.ascontiguousarray(Vt[:, 2, :]),
-        e2=np.ascontiguousarray(U[:, :, 2]),
+        F=(U[:, :, :2] * s[:, None, :]) @ Vt[:, :2, :],
+        e1=Vt[:, 2, :],
+        e2=U[:, :, 2],
         product=s[:, 0] * s[:, 1],
         weights=trust,
     )
@@ -88,3 +95,12 @@ def _checked(Fs: ArrayLike, weights: ArrayLike, size: tuple[int, int]) -> tuple[
         raise ValueError(f"size must be (width, height) in pixels, both > 0, not {size}")
     used = trust > 0
     return raw[used], trust[used]
+
+
+def _distinct(scaled: FloatArray) -> NDArray[np.int64]:
+    """Indices of the first of all matrices that agree to 9 digits up to sign and transposition."""
+    seen: dict[bytes, int] = {}
+    for index, F in enumerate(scaled):
+        keys = [(np.round(sign * G, 9) + 0.0).tobytes() for sign in (1, -1) for G in (F, F.T)]
+        seen.setdefault(min(keys), index)
+    return np.array(sorted(seen.values()), dtype=np.int64)

@@ -11,10 +11,8 @@ fades where they are many.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import minimize
 
 from sfm_app.jit import kernel
 from sfm_app.selfcal.constraints import singular_value_ratio
@@ -24,88 +22,151 @@ LOG_FOCAL, CENTRE_U, CENTRE_V, LOG_ASPECT = range(4)
 """Places in theta."""
 FIRST_STEPS = np.array([0.05, 0.03, 0.03, 0.05])
 """First steps of the local search along theta."""
-RESTARTS = 2
-"""Runs of the local search, each from the end of the last with a tenth of its steps: a simplex can stall on a ridge."""
+FINISHED_STEP, FINISHED_VALUE = 1e-5, 1e-6
+"""A simplex of this extent in theta and in value has arrived."""
+MOST_STEPS = 300
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Consensus:
-    """The function that the right K maximises."""
+    """The function that the right K maximises.
 
-    pairs: Pairs
-    centre_sigma: float
-    """Standard deviation of the prior on (u, v) about (0, 0), in units of the pairs."""
+    Args:
+        pairs: what votes.
+        centre_sigma: standard deviation of the prior on (u, v) about (0, 0), in units of the pairs; may be inf.
+        weights: (P,) to use instead of those of the pairs.
+    """
+
+    def __init__(self, pairs: Pairs, centre_sigma: float, weights: FloatArray | None = None) -> None:
+        self.pairs = pairs
+        self.centre_sigma = centre_sigma
+        self.weights = pairs.weights if weights is None else weights
+        self._packed = pairs.packed
 
     def weighted(self, weights: FloatArray) -> "Consensus":
         """The same pairs with other weights (P,)."""
-        return replace(self, pairs=replace(self.pairs, weights=weights))
+        return Consensus(self.pairs, self.centre_sigma, weights)
 
     def at(self, thetas: FloatArray, sigma: float) -> FloatArray:
         """(N,) supports plus log-priors at the rows of `thetas` (N, 4)."""
-        p = self.pairs
-        prior = -0.5 * np.sum(thetas[:, CENTRE_U : CENTRE_V + 1] ** 2, axis=1) / self.centre_sigma**2
-        return np.asarray(supports(p.F, p.e1, p.e2, p.product, p.weights, thetas, sigma) + prior)
+        return np.asarray(_values(self._packed, self.weights, self.centre_sigma, thetas, sigma))
 
     def ratios(self, theta: FloatArray) -> FloatArray:
         """(P,) r_i at theta."""
-        p = self.pairs
-        return ratios(p.F, p.e1, p.e2, p.product, theta)
+        return np.asarray(_ratios(self._packed, theta))
 
     def climb(self, start: FloatArray, free: Sequence[int], sigmas: Sequence[float]) -> tuple[FloatArray, float]:
         """The local maximum reached from `start` by moving the entries `free` of theta, through falling sigmas.
 
-        Nelder-Mead, because the consensus has a cusp wherever a pair is satisfied exactly.
+        Nelder-Mead, because the consensus has a cusp wherever a pair is satisfied exactly. For every sigma it runs a
+        second time, from the end of the first with a tenth of its steps: a simplex can stall on a ridge.
 
         Returns:
             theta (4,) and the value there, at the last sigma.
         """
-        indices = list(free)
-        theta = start.copy()
-        value = 0.0
+        theta, value = start.copy(), 0.0
         for sigma in sigmas:
-
-            def loss(moved: FloatArray, sigma: float = sigma) -> float:
-                trial = theta.copy()
-                trial[indices] = moved
-                return -float(self.at(trial[None, :], sigma)[0])
-
-            for shrink in 0.1 ** np.arange(RESTARTS):
-                simplex = theta[indices] + np.vstack([np.zeros(len(indices)), np.diag(shrink * FIRST_STEPS[indices])])
-                found = minimize(
-                    loss,
-                    theta[indices],
-                    method="Nelder-Mead",
-                    options={"initial_simplex": simplex, "xatol": 1e-5, "fatol": 1e-6, "maxiter": 300, "maxfev": 600},
-                )
-                theta[indices] = found.x
-                value = -float(found.fun)
+            for steps in (FIRST_STEPS, 0.1 * FIRST_STEPS):
+                simplex = np.tile(theta, (len(free) + 1, 1))
+                for row, index in enumerate(free):
+                    simplex[row + 1, index] += steps[index]
+                theta, value = _climbed(self._packed, self.weights, self.centre_sigma, simplex, sigma)
         return theta, value
 
 
 @kernel
-def ratios(F: FloatArray, e1: FloatArray, e2: FloatArray, product: FloatArray, theta: FloatArray) -> FloatArray:
-    """(P,) r_i at theta = (log f, u, v, log a)."""
+def _ratios(packed: FloatArray, theta: FloatArray) -> FloatArray:
     fx, fy = np.exp(theta[0] - 0.5 * theta[3]), np.exp(theta[0] + 0.5 * theta[3])
-    r = np.empty(len(F))
-    for i in range(len(F)):
-        r[i] = singular_value_ratio(F[i], e1[i], e2[i], product[i], fx, fy, theta[1], theta[2])
+    r = np.empty(len(packed))
+    for i in range(len(packed)):
+        r[i] = singular_value_ratio(packed[i], fx, fy, theta[1], theta[2])
     return r
 
 
 @kernel
-def supports(
-    F: FloatArray,
-    e1: FloatArray,
-    e2: FloatArray,
-    product: FloatArray,
-    weights: FloatArray,
-    thetas: FloatArray,
-    sigma: float,
+def _value(packed: FloatArray, weights: FloatArray, centre_sigma: float, theta: FloatArray, sigma: float) -> float:
+    """sum_i w_i exp(-r_i / sigma) plus the log-prior of the centre."""
+    fx, fy = np.exp(theta[0] - 0.5 * theta[3]), np.exp(theta[0] + 0.5 * theta[3])
+    value = -0.5 * (theta[1] ** 2 + theta[2] ** 2) / centre_sigma**2
+    for i in range(len(packed)):
+        value += weights[i] * np.exp(-singular_value_ratio(packed[i], fx, fy, theta[1], theta[2]) / sigma)
+    return float(value)
+
+
+@kernel
+def _values(
+    packed: FloatArray, weights: FloatArray, centre_sigma: float, thetas: FloatArray, sigma: float
 ) -> FloatArray:
-    """(N,) sum_i w_i exp(-r_i / sigma) at the rows of `thetas` (N, 4)."""
-    found = np.zeros(len(thetas))
+    values = np.empty(len(thetas))
     for k in range(len(thetas)):
-        r = ratios(F, e1, e2, product, thetas[k])
-        for i in range(len(r)):
-            found[k] += weights[i] * np.exp(-r[i] / sigma)
-    return found
+        values[k] = _value(packed, weights, centre_sigma, thetas[k], sigma)
+    return values
+
+
+@kernel
+def _climbed(
+    packed: FloatArray, weights: FloatArray, centre_sigma: float, simplex: FloatArray, sigma: float
+) -> tuple[FloatArray, float]:
+    """Nelder and Mead (1965) upwards from a simplex (n + 1, 4), with their coefficients 1, 2, 1/2, 1/2."""
+    count = len(simplex)
+    values = _values(packed, weights, centre_sigma, simplex, sigma)
+    for _ in range(MOST_STEPS):
+        _sort(simplex, values)
+        if values[0] - values[-1] <= FINISHED_VALUE and _extent(simplex) <= FINISHED_STEP:
+            break
+        worst = values[-1]
+        trial = _moved(simplex, 1.0)
+        value = _value(packed, weights, centre_sigma, trial, sigma)
+        if value > values[0]:
+            further = _moved(simplex, 2.0)
+            better = _value(packed, weights, centre_sigma, further, sigma)
+            if better > value:
+                trial, value = further, better
+        elif value <= values[-2]:
+            floor = max(value, worst)
+            trial = _moved(simplex, 0.5 if value > worst else -0.5)
+            value = _value(packed, weights, centre_sigma, trial, sigma)
+            if value <= floor:
+                for k in range(1, count):
+                    simplex[k] = 0.5 * (simplex[0] + simplex[k])
+                    values[k] = _value(packed, weights, centre_sigma, simplex[k], sigma)
+                continue
+        simplex[-1] = trial
+        values[-1] = value
+    _sort(simplex, values)
+    return simplex[0].copy(), float(values[0])
+
+
+@kernel
+def _sort(simplex: FloatArray, values: FloatArray) -> None:
+    """Highest first, in place; equal values keep their order. Loops compile in a tenth of the time of argsort."""
+    for k in range(1, len(values)):
+        row, value = simplex[k].copy(), values[k]
+        i = k
+        while i > 0 and values[i - 1] < value:
+            simplex[i] = simplex[i - 1]
+            values[i] = values[i - 1]
+            i -= 1
+        simplex[i] = row
+        values[i] = value
+
+
+@kernel
+def _moved(simplex: FloatArray, factor: float) -> FloatArray:
+    """The last corner mirrored at the middle of the others, `factor` times as far behind it as it was before it."""
+    trial = np.empty(4)
+    for column in range(4):
+        middle = 0.0
+        for k in range(len(simplex) - 1):
+            middle += simplex[k, column]
+        middle /= len(simplex) - 1
+        trial[column] = middle + factor * (middle - simplex[-1, column])
+    return trial
+
+
+@kernel
+def _extent(simplex: FloatArray) -> float:
+    extent = 0.0
+    for k in range(1, len(simplex)):
+        for column in range(4):
+            extent = max(extent, abs(simplex[k, column] - simplex[0, column]))
+    return extent

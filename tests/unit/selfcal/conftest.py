@@ -71,7 +71,7 @@ def fundamental(K, first, second, noise):
 def views():
     """Makes `Views`: count, seed, noise, motion, and the camera."""
 
-    def make(  # noqa: PLR0913 - a scene has that many knobs
+    def make(
         count=6, seed=0, *, noise=1e-3, motion=free_motion, focal=1000.0, aspect=1.0, centre=None, size=(1000, 750)
     ):
         rng = np.random.default_rng(seed)

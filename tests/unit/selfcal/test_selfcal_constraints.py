@@ -27,7 +27,7 @@ def thesis_5_25(E):
 
 
 def ratio(pairs, i, *camera):
-    return singular_value_ratio(pairs.F[i], pairs.e1[i], pairs.e2[i], pairs.product[i], *camera)
+    return singular_value_ratio(pairs.packed[i], *camera)
 
 
 @settings(max_examples=60, deadline=None)

@@ -1,0 +1,186 @@
+"""One set of tests for every registered calibrator, ours and any plug-in's."""
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sfm_app.plugins import load_plugins
+from sfm_app.settings import CalibrationSettings
+from sfm_app.types import Calibration
+
+CALIBRATORS = load_plugins().calibrators
+OPTIONS = CalibrationSettings()
+SIZE = (1000, 750)
+K = np.array([[1100.0, 0, 510], [0, 1100, 370], [0, 0, 1]])
+GUESS = np.array([[1200.0, 0, 500], [0, 1200, 375], [0, 0, 1]])
+
+
+def fundamentals(count, seed, *, noise=3e-4, motion="free"):
+    """(P, 3, 3) for all pairs of `count` cameras of matrix K; `noise` is that of the entries of E."""
+    rng = np.random.default_rng(seed)
+    turns = rng.uniform(-0.6, 0.6, (count, 3)) if motion == "free" else np.zeros((count, 3))
+    centres = rng.normal(size=(count, 3))
+    if motion == "orbit":
+        turns[:, 1] = 0.25 * np.arange(count)
+        centres = np.stack([-np.sin(turns[:, 1]), np.zeros(count), -np.cos(turns[:, 1])], axis=1)
+    rotations = Rotation.from_rotvec(turns).as_matrix().transpose(0, 2, 1)
+    inverse, found = np.linalg.inv(K), []
+    for i, j in combinations(range(count), 2):
+        t = rotations[j] @ (centres[i] - centres[j])
+        E = np.cross(np.eye(3), t / np.linalg.norm(t)).T @ rotations[j] @ rotations[i].T
+        found.append(inverse.T @ (E + rng.normal(0, noise, (3, 3))) @ inverse)
+    return np.array(found)
+
+
+def random_fundamentals(count, seed):
+    scale = np.diag([1e-3, 1e-3, 1.0])
+    return scale @ np.random.default_rng(seed).normal(size=(count, 3, 3)) @ scale
+
+
+UNDETERMINED = {
+    "no pairs": np.empty((0, 3, 3)),
+    "one pair": fundamentals(2, 0),
+    "one pair, ten times": np.repeat(fundamentals(2, 0), 10, axis=0),
+    "pure translation, exact": fundamentals(6, 0, noise=0.0, motion="translation"),
+    "pure translation, noisy": fundamentals(6, 1, motion="translation"),
+    "orbit, exact": fundamentals(6, 0, noise=0.0, motion="orbit"),
+    "orbit, noisy": fundamentals(6, 1, motion="orbit"),
+    "no camera, few pairs": random_fundamentals(4, 0),
+    "no camera, many pairs": random_fundamentals(60, 1),
+    "rank one": np.ones((5, 3, 3)) + np.eye(3)[0] * np.arange(5)[:, None, None],
+    "the identity": np.tile(np.eye(3), (4, 1, 1)) + np.arange(4)[:, None, None] * np.diag([1.0, 2, 3]),
+}
+
+
+@pytest.fixture(params=CALIBRATORS)
+def calibrate(request):
+    return CALIBRATORS[request.param].calibrate
+
+
+def run(calibrate, Fs, seed=0, weights=None, size=SIZE):
+    return calibrate(Fs, np.ones(len(Fs)) if weights is None else weights, size, OPTIONS, seed)
+
+
+def is_well_formed(found):
+    assert isinstance(found, Calibration)
+    assert (found.K.shape, found.K.dtype) == ((3, 3), np.float64)
+    assert np.all(np.isfinite(found.K))
+    assert found.K[0, 0] > 0
+    assert found.K[1, 1] > 0
+    np.testing.assert_array_equal(found.K[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
+    assert (found.width, found.height) == SIZE
+    assert found.identifiable == (found.reason == "")
+    assert found.method in (*CALIBRATORS, "guess")
+    assert set(found.spread) <= {"fx", "fy", "cx", "cy"}
+    assert all(np.isfinite(value) and value >= 0 for value in found.spread.values())
+    assert all(isinstance(value, float) and np.isfinite(value) for value in found.evidence.values())
+    return True
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_finds_the_camera(calibrate, seed):
+    found = run(calibrate, fundamentals(6, seed))
+
+    assert is_well_formed(found)
+    assert found.identifiable, found.reason
+    error = np.abs(found.K - K)
+    assert 0 < error[[0, 1], [0, 1]].max() < 0.05 * 1100
+    assert 0 < error[:2, 2].max() < 0.05 * 1000
+    assert 0 < found.evidence["support"] <= 1
+
+
+def test_some_wrong_pairs_do_no_harm(calibrate):
+    Fs = fundamentals(6, 0)
+    Fs[[2, 9]] = random_fundamentals(2, 0)
+    found = run(calibrate, Fs)
+    assert found.identifiable, found.reason
+    np.testing.assert_allclose(found.K, K, rtol=0.06, atol=50)
+
+
+@pytest.mark.parametrize("case", UNDETERMINED)
+def test_what_is_not_determined_is_a_guess_with_a_reason(calibrate, case):
+    found = run(calibrate, UNDETERMINED[case])
+    assert is_well_formed(found)
+    assert not found.identifiable
+    assert 0 < len(found.reason) < 120
+    assert found.method == "guess"
+    np.testing.assert_array_equal(found.K, GUESS)
+
+
+def test_three_pairs_give_an_answer_or_a_reason(calibrate):
+    for seed in range(6):
+        found = run(calibrate, fundamentals(3, seed))
+        assert is_well_formed(found)
+        if found.identifiable:
+            np.testing.assert_allclose(np.diag(found.K)[:2], 1100, rtol=0.15)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_matrices_and_weights_that_are_not_finite_are_refused(calibrate, bad):
+    Fs, weights = fundamentals(4, 0), np.ones(6)
+    Fs[2, 0, 1] = weights[3] = bad
+    with pytest.raises(ValueError, match="finite"):
+        run(calibrate, Fs)
+    with pytest.raises(ValueError, match="finite"):
+        run(calibrate, fundamentals(4, 0), weights=weights)
+
+
+@pytest.mark.parametrize(
+    ("Fs", "weights", "size"),
+    [
+        (K, np.ones(1), SIZE),
+        (np.ones((4, 3, 4)), np.ones(4), SIZE),
+        (np.zeros((4, 3, 3)), np.ones(4), SIZE),
+        (random_fundamentals(4, 0), np.ones(3), SIZE),
+        (random_fundamentals(4, 0), np.ones((4, 1)), SIZE),
+        (random_fundamentals(4, 0), -np.ones(4), SIZE),
+        (random_fundamentals(4, 0), np.ones(4), (0, 750)),
+    ],
+)
+def test_malformed_input_is_refused(calibrate, Fs, weights, size):
+    with pytest.raises(ValueError, match=r"shape|zero|weights|size"):
+        calibrate(Fs, weights, size, OPTIONS, 0)
+
+
+def test_scale_sign_order_and_direction_do_not_matter(calibrate):
+    Fs = fundamentals(6, 2)
+    expected = run(calibrate, Fs).K
+    scales = np.random.default_rng(0).uniform(1, 1e6, 15) * np.where(np.arange(15) % 2, 1, -1)
+    for same in (Fs * scales[:, None, None], Fs[::-1], Fs.transpose(0, 2, 1)):
+        np.testing.assert_allclose(run(calibrate, same).K, expected, rtol=2e-3)
+
+
+def test_pairs_without_weight_do_not_count(calibrate):
+    Fs = np.concatenate([fundamentals(6, 3), random_fundamentals(5, 3)])
+    weights = np.concatenate([np.full(15, 0.8), np.zeros(5)])
+    np.testing.assert_array_equal(
+        run(calibrate, Fs, weights=weights).K, run(calibrate, Fs[:15], weights=weights[:15]).K
+    )
+
+
+def test_input_is_left_alone(calibrate):
+    Fs, weights = fundamentals(4, 0), np.linspace(0.1, 1, 6)
+    before = Fs.copy(), weights.copy()
+    run(calibrate, Fs, weights=weights)
+    np.testing.assert_array_equal(Fs, before[0])
+    np.testing.assert_array_equal(weights, before[1])
+
+
+def test_products_cross_process_borders(calibrate):
+    for Fs in (fundamentals(5, 1), UNDETERMINED["one pair"]):
+        found = run(calibrate, Fs)
+        copy = pickle.loads(pickle.dumps(found))  # noqa: S301 - our own bytes
+        np.testing.assert_array_equal(copy.K, found.K)
+        assert (copy.identifiable, copy.reason, copy.evidence) == (found.identifiable, found.reason, found.evidence)
+    assert pickle.loads(pickle.dumps(calibrate)) is calibrate  # noqa: S301
+
+
+def test_ten_runs_in_threads_give_the_same_bytes(calibrate):
+    Fs = fundamentals(5, 4)
+    with ThreadPoolExecutor(4) as pool:
+        runs = list(pool.map(lambda _: pickle.dumps(run(calibrate, Fs, seed=3)), range(10)))
+    assert len(set(runs)) == 1
