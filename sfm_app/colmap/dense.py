@@ -15,7 +15,7 @@ from sfm_app.types import Surface
 
 FUSED = "fused.ply"
 JPEG_QUALITY = 98
-MAX_NORMAL_ERROR_DEG = 60.0
+MAX_NORMAL_ERROR_DEG = 25.0
 Kind = Literal["photometric", "geometric"]
 """COLMAP's names for a depth map before and after the check against the other photos."""
 
@@ -111,7 +111,7 @@ def fuse(dense_dir: Path, views: Sequence[View], min_views: int, box: NDArray[np
     (dense_dir / "stereo" / "fusion.cfg").write_text(config, encoding="utf-8")
     options = pycolmap.StereoFusionOptions()
     options.min_num_pixels = min_views
-    # The depths have been checked already; normals from disparities are too noisy for COLMAP's 10 degrees.
+    # The depths have been checked already; normals from disparities are noisier than those of COLMAP's PatchMatch.
     options.max_normal_error = MAX_NORMAL_ERROR_DEG
     options.bounding_box = (box[0].astype(np.float32), box[1].astype(np.float32))
     options.num_threads = 1  # with more, the points depend on which thread comes first

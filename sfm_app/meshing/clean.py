@@ -18,13 +18,13 @@ MAX_SPREAD = 4.0
 
 
 def octree_depth(points: NDArray[np.float64], most: int) -> int:
-    """The depth at which Poisson's finest cell is about as wide as the points (N, 3) lie apart, at most `most`.
+    """The depth at which Poisson's finest cell is one to two spacings of the points (N, 3) wide, at most `most`.
 
     Finer cells would only model the noise, at four times the triangles per level.
     """
     if len(points) <= NEIGHBOURS:
         return most
-    return int(np.clip(np.ceil(np.log2(np.ptp(points, axis=0).max() / np.median(_spacing(points)))), 1, most))
+    return int(np.clip(np.floor(np.log2(np.ptp(points, axis=0).max() / np.median(_spacing(points)))), 1, most))
 
 
 def trim_unsupported(surface: Surface, points: NDArray[np.float64], normals: NDArray[np.float64]) -> Surface:
@@ -60,7 +60,7 @@ def vertex_normals(surface: Surface) -> NDArray[np.float64]:
 
 def _spacing(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Per point the distance at which a sheet of points has `NEIGHBOURS` others, as the width of one point's share."""
-    distance = cKDTree(points).query(points, k=[NEIGHBOURS + 1])[0][:, 0]
+    distance = np.asarray(cKDTree(points).query(points, k=[NEIGHBOURS + 1])[0])[:, 0]
     return np.asarray(distance * np.sqrt(np.pi / (NEIGHBOURS + 1)))
 
 

@@ -42,7 +42,7 @@ def write_glb(vertices: Vertices, faces: Faces, colors: Colors) -> bytes:
     """
     mesh = _mesh(vertices, faces)
     # glTF multiplies COLOR_0 into the light as it is, so it has to be linear, while photos are sRGB. Floats, because
-    # eight linear bits show steps in the shadows; trimesh writes only eight, so the colours travel as our own attribute.
+    # eight linear bits show steps in the shadows; trimesh writes only eight, so they travel as an attribute.
     mesh.vertex_attributes["_COLOR_0"] = srgb_to_linear(colors)
     return bytes(
         trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=True, tree_postprocessor=_finish_gltf)

@@ -34,8 +34,6 @@ LOG_ASPECTS = tuple(np.linspace(-0.6, 0.6, 9))
 """log fy/fx on the grid: 0.55 to 1.8."""
 ASPECT_GAIN = float(np.log(50))
 """Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square."""
-ASPECT_DEVIATIONS = 3.0
-"""fy/fx must differ from 1 by this many of its own standard deviations."""
 MIN_PAIRS = 3
 """Each F gives two constraints; below three pairs nothing is left to contradict a wrong K."""
 MAX_LOG_FOCAL_SPREAD = 0.1
@@ -121,9 +119,7 @@ def _found(consensus: Consensus, seed: int) -> tuple[_Answer, float]:
     theta, value = consensus.climb(square[0].theta, SQUARE_PIXELS, sigmas)
     gain = max(consensus.climb(start, ANY_PIXELS, sigmas)[1] for start in (theta, free[0].theta)) - value
     if gain >= ASPECT_GAIN:
-        answer = _examined(consensus, free, free_profile, ANY_PIXELS, seed)
-        if abs(answer.theta[LOG_ASPECT]) >= ASPECT_DEVIATIONS * answer.deviation(LOG_ASPECT):
-            return answer, gain
+        return _examined(consensus, free, free_profile, ANY_PIXELS, seed), gain
     return _examined(consensus, square, profile, SQUARE_PIXELS, seed), gain
 
 

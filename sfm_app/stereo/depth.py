@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses
-from sfm_app.stereo.matching import depths_from_disparities, disparities
+from sfm_app.stereo.matching import depths_from_disparities, disparities, has_texture
 from sfm_app.stereo.normals import fit_planes
 from sfm_app.stereo.rectify import rectify
 from sfm_app.stereo.view import DepthArray, GreyImage, View
@@ -52,7 +52,7 @@ def match_depths(
     if not found:
         return Rejected(reason)
     depth, _ = merge_hypotheses(np.stack([d for d, _ in found]), np.stack([p for _, p in found]), tolerance)
-    return depth
+    return np.where(has_texture(image), depth, np.float32(0))
 
 
 def confirm_depths(

@@ -10,14 +10,17 @@ from sfm_app.stereo.view import DepthArray, FloatArray, GreyImage, View
 
 BLOCK_PX = 3
 NO_DISPARITY = -1.0
+FLAT_WINDOW_PX = 9
+FLAT_RANGE = 4
+"""Grey levels; a window with less between its darkest and brightest pixel holds nothing that could be matched."""
 
 
 def disparities(left: GreyImage, right: GreyImage, count: int) -> NDArray[np.float32]:
     """Semi-global matching (Hirschmueller, PAMI 2008; OpenCV's block variant) in [0, count), to sub-pixels.
 
     Returns:
-        (H, W) disparity of the left image in pixels; -1 where left and right disagree by more than a pixel, where a second
-        disparity is nearly as good, and on small specks.
+        (H, W) disparity of the left image in pixels; -1 where left and right disagree by more than a pixel, where a
+        second disparity is nearly as good, and on small specks.
     """
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
@@ -34,6 +37,12 @@ def disparities(left: GreyImage, right: GreyImage, count: int) -> NDArray[np.flo
     )
     sixteenths = matcher.compute(left, right)
     return np.where(sixteenths < 0, NO_DISPARITY, sixteenths / 16.0).astype(np.float32)
+
+
+def has_texture(image: GreyImage) -> NDArray[np.bool_]:
+    """(H, W) where there is something to match; in skies the matcher only spreads what is beside."""
+    window = np.ones((FLAT_WINDOW_PX, FLAT_WINDOW_PX), np.uint8)
+    return np.asarray(cv2.subtract(cv2.dilate(image, window), cv2.erode(image, window)) >= FLAT_RANGE)
 
 
 def depths_from_disparities(

@@ -15,9 +15,9 @@ BEST_ANGLE_DEG = 8.0
 def rank_neighbours(views: Sequence[View], count: int) -> list[list[int]]:
     """For every view the indices of the views that serve it best, best first, at most `count`.
 
-    Greedy coverage: the next neighbour is the one that adds most to the sparse points of the view. A point adds its weight
-    (triangulation angle, difference in scale), halved for each time that it is covered already, so that the choice spreads
-    over the photo instead of crowding on one side.
+    Greedy coverage: the next neighbour is the one that adds most to the sparse points of the view. A point adds its
+    weight (triangulation angle, difference in scale), up to halved for each time that it is covered already, so that
+    the choice spreads over the photo instead of crowding on one side.
     """
     return [_rank(view, views, count) for view in views]
 

@@ -1,4 +1,7 @@
-"""Two posed photos turned so that matches lie in the same row (Fusiello, Trucco, Verri, MVA 2000), on a canvas made to measure."""
+"""Two posed photos turned so that matches lie in the same row, on a canvas made to measure.
+
+Fusiello, Trucco, Verri: A compact algorithm for rectification of stereo pairs. Machine Vision and Applications 2000.
+"""
 
 from dataclasses import dataclass
 
@@ -100,7 +103,7 @@ def _rectified_rotation(reference: View, neighbour: View) -> FloatArray | Reject
 
 
 def _bounds(H: FloatArray, view: View) -> FloatArray | None:
-    """Lowest and highest x and y, (2, 2), that the photo's border takes; None where it reaches 70 degrees off the axis."""
+    """Lowest and highest x and y, (2, 2), of the photo's border; None where it is 70 degrees off the axis."""
     w, h = float(view.width), float(view.height)
     corners = np.array([[0, 0, 1], [w, 0, 1], [w, h, 1], [0, h, 1]]) @ H.T
     corners /= np.linalg.norm(corners, axis=1, keepdims=True)
@@ -111,7 +114,7 @@ def _bounds(H: FloatArray, view: View) -> FloatArray | None:
 
 
 def _disparity_range(disparities: FloatArray) -> tuple[float, float]:
-    """Largest and smallest disparity, per focal length, that the surface may have; sparse points rarely reach its ends."""
+    """Largest and smallest disparity, per focal length, of the surface; sparse points rarely reach its ends."""
     low, high = np.percentile(disparities, [1, 99])
     margin = 0.15 * (high - low) + 0.02 * high
     return float(high + margin), float(max(low - margin, 0.25 * low))
@@ -125,7 +128,7 @@ def _canvas(left: FloatArray, right: FloatArray, near: float, far: float) -> tup
 
 
 def _focal_px(H: FloatArray, view: View) -> float:
-    """The focal length at which the middle of the photo keeps its resolution: a homography scales areas by det(H) / z^3."""
+    """Focal length at which the middle of the photo keeps its size: a homography scales areas by det(H) / z^3."""
     z = H[2] @ [view.width / 2, view.height / 2, 1]
     return float(np.sqrt(z**3 / np.linalg.det(H)))
 

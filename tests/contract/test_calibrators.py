@@ -45,6 +45,7 @@ UNDETERMINED = {
     "no pairs": np.empty((0, 3, 3)),
     "one pair": fundamentals(2, 0),
     "one pair, ten times": np.repeat(fundamentals(2, 0), 10, axis=0),
+    "one pair, to and fro": np.concatenate([fundamentals(2, 0), -2 * fundamentals(2, 0).transpose(0, 2, 1)] * 3),
     "pure translation, exact": fundamentals(6, 0, noise=0.0, motion="translation"),
     "pure translation, noisy": fundamentals(6, 1, motion="translation"),
     "orbit, exact": fundamentals(6, 0, noise=0.0, motion="orbit"),

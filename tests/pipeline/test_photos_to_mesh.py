@@ -1,6 +1,10 @@
 """Rendered photos end to end: the command a user types, on a scene whose camera and surface are known."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
@@ -135,3 +139,18 @@ def test_the_literal_methods_are_one_flag_away(rendered, tmp_path):
     summary = json.loads(result.stdout)
     assert summary["scene"]["registered"] >= 5
     assert not (tmp_path / "out" / "dense").exists()
+
+
+def test_an_interrupted_run_says_so_and_goes_on(rendered, tmp_path):
+    command = [sys.executable, "-m", "sfm_app", "run", str(rendered[0]), "-o", str(tmp_path / "out"), "-q"]
+    command += ["--quality", "draft", "--until", "intrinsics"]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        while not (tmp_path / "out" / "database.db").exists() and process.poll() is None:
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+
+    assert (process.returncode, said.splitlines()[0]) == (130, "error: interrupted")
+    assert "Traceback" not in said
+    assert subprocess.run(command, capture_output=True, check=False).returncode == 0
+    assert (tmp_path / "out" / "calibration.json").exists()

@@ -54,6 +54,14 @@ def test_pairs_without_weight_are_left_out(views):
     assert len(pairs) == 2
 
 
+def test_repeated_matrices_count_once(views):
+    made = views(3)
+    Fs = np.concatenate([made.Fs, -3 * made.Fs, made.Fs.transpose(0, 2, 1), 1e9 * made.Fs])
+    pairs = prepare(Fs, np.arange(1.0, 13), made.size, **FRAME)
+    np.testing.assert_array_equal(pairs.weights, [1, 2, 3])
+    assert len(prepare(made.Fs + 1e-6 * np.abs(made.Fs).max(), made.weights, made.size, **FRAME)) == 3
+
+
 def test_no_pairs_are_fine():
     assert len(prepare([], [], (4, 3), **FRAME)) == 0
 

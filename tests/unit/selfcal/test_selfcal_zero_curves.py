@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal import pair_weights
+from sfm_app.selfcal import pair_weights, zero_curves
 from sfm_app.selfcal.zero_curves import METHOD, calibrate
 from sfm_app.settings import CalibrationSettings
 
@@ -52,7 +52,7 @@ def test_finds_the_camera(views, camera, seed):
 
 @pytest.mark.parametrize("knobs", [{}, {"focal": 2700}, {"centre": (720, 260)}])
 def test_pixels_stay_square_unless_the_pairs_clearly_say_otherwise(views, knobs):
-    for seed in range(3):
+    for seed in range(12):
         found = run(views(6, seed, **knobs))
         assert found.K[0, 0] == found.K[1, 1]
         assert found.evidence["aspect_gain"] < 3.9
@@ -151,6 +151,32 @@ def test_the_prior_holds_the_centre_of_few_pairs(views):
         offsets.append(np.linalg.norm(found.K[:2, 2] - [500, 375]))
     assert offsets[0] < 20
     assert offsets[0] <= offsets[1]
+
+
+def test_the_prior_is_measured_in_widths(views):
+    made = views(3, 1, noise=4e-3)
+    swap = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])
+    lying = calibrate(made.Fs, made.weights, (1000, 750), OPTIONS.model_copy(update={"centre_sigma": 0.06}), 0)
+    standing = calibrate(
+        swap @ made.Fs @ swap, made.weights, (750, 1000), OPTIONS.model_copy(update={"centre_sigma": 0.08}), 0
+    )
+    assert lying.identifiable
+    np.testing.assert_allclose(swap @ standing.K @ swap, lying.K, rtol=1e-3)
+
+
+def test_what_the_pairs_agree_on_can_still_be_wrong():
+    def objection(theta, scatter=0.001):
+        thetas = np.array(theta) + scatter * np.linspace(-1, 1, 25)[:, None]
+        answer = zero_curves._Answer(np.array(theta), (0, 1, 2), 0.01, 5.0, np.ones(10), thetas)
+        return zero_curves._objection(answer, (0.5, 0.375))
+
+    assert objection([0.0, 0.49, -0.37, 0.0]) == ""
+    assert objection([0.0, 0.0, 0.0, 0.0], scatter=0.1) == ""
+    assert "uncertain by 1" in objection([0.0, 0.0, 0.0, 0.0], scatter=0.2)
+    assert "end of the range" in objection([np.log(0.3), 0.0, 0.0, 0.0])
+    assert "end of the range" in objection([np.log(5.1), 0.0, 0.0, 0.0])
+    assert "centre" in objection([0.0, 0.51, 0.0, 0.0])
+    assert "centre" in objection([0.0, 0.0, -0.38, 0.0])
 
 
 def test_seed_changes_the_spread_only(views):
