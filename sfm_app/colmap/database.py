@@ -9,16 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, PairId, Photo, PhotoSet
+from sfm_app.geometry.camera import guessed_camera_matrix
+from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, PairId, PhotoSet
 
 SQUARE_PIXELS = "SIMPLE_RADIAL"
 """f, cx, cy, k: what is mapped with where K has one focal; a second radial term runs wild on the first few photos."""
 
 TWO_FOCALS = "OPENCV"
 """fx, fy, cx, cy, k1, k2, p1, p2: COLMAP's smallest model that holds a camera matrix with two focals and a lens."""
-
-FOCAL_GUESS = 1.2
-"""COLMAP's own guess where nothing is known: focal length over the longer side."""
 
 
 @contextlib.contextmanager
@@ -39,9 +37,10 @@ def create_database(path: Path, photo_dir: Path, photos: PhotoSet) -> None:
     with opened(path):
         pass
     for members in photos.groups.values():
+        K = guessed_camera_matrix((members[0].width, members[0].height))
         options = pycolmap.ImageReaderOptions()
         options.camera_model = SQUARE_PIXELS
-        options.camera_params = ",".join(str(value) for value in camera_params(_guess(members[0]), SQUARE_PIXELS))
+        options.camera_params = ",".join(str(value) for value in camera_params(K, SQUARE_PIXELS))
         names = [photo.name for photo in members]
         pycolmap.import_images(path, photo_dir, pycolmap.CameraMode.SINGLE, names, options)
 
@@ -91,11 +90,6 @@ def camera_params(K: NDArray[np.float64], camera_model: str, radial: float = 0.0
     if camera_model == SQUARE_PIXELS:
         return [(fx * fy) ** 0.5, cx, cy, radial]
     return [fx, fy, cx, cy, radial, 0.0, 0.0, 0.0]
-
-
-def _guess(photo: Photo) -> NDArray[np.float64]:
-    focal = FOCAL_GUESS * max(photo.width, photo.height)
-    return np.array([[focal, 0.0, photo.width / 2], [0.0, focal, photo.height / 2], [0.0, 0.0, 1.0]])
 
 
 def _pair(pair_id: int) -> PairId:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_app.selfcal.answers import camera_matrix, guessed
+from sfm_app.geometry.camera import camera_matrix
+from sfm_app.selfcal.answers import guessed
 from sfm_app.selfcal.evidence import (
     RIVAL_RATIO,
     best_rival,

@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_app.selfcal.answers import camera_matrix, guessed
+from sfm_app.geometry.camera import camera_matrix
+from sfm_app.selfcal.answers import guessed
 from sfm_app.selfcal.consensus import meeting_point
 from sfm_app.selfcal.curves import centre_curves, focal_curves, usable
 from sfm_app.selfcal.evidence import best_rival, disagreement, indecision, votes

@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.database import FOCAL_GUESS, write_calibrations
+from sfm_app.colmap.database import write_calibrations
 from sfm_app.context import RunContext
+from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.selfcal import pair_weights
 from sfm_app.types import Calibration, Intrinsics, MatchedImage, MatchGraph, ViewGraph
 
@@ -48,8 +49,7 @@ def calibrate_group(images: list[MatchedImage], views: ViewGraph, run: RunContex
 def fall_back(found: Calibration, images: list[MatchedImage]) -> Calibration:
     """The K that mapping starts from when the photos do not determine it: EXIF's claim, else the usual guess."""
     claims = [image.exif_focal_px for image in images if image.exif_focal_px]
-    focal = float(np.median(claims)) if claims else FOCAL_GUESS * max(found.width, found.height)
-    K = np.array([[focal, 0.0, found.width / 2], [0.0, focal, found.height / 2], [0.0, 0.0, 1.0]])
+    K = guessed_camera_matrix((found.width, found.height), float(np.median(claims)) if claims else None)
     return replace(found, K=K, method="exif" if claims else "guess", spread={})
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import ConfigError
+from sfm_app.geometry.camera import camera_matrix
 
 FloatArray = NDArray[np.float64]
 
@@ -71,11 +72,6 @@ class ArcOptions:
         wrong = [name for name, holds in checks.items() if not holds]
         if wrong:
             raise ConfigError(f"synthetic cameras: out of range: {', '.join(wrong)}")
-
-
-def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> FloatArray:
-    """(3, 3) camera matrix without skew, in pixels."""
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def make_camera(

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import ConfigError
+from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import fundamental_from_pose
-from sfm_app.synthetic.cameras import axis_rotation, camera_matrix
+from sfm_app.synthetic.cameras import axis_rotation
 
 FloatArray = NDArray[np.float64]
 Poses = tuple[FloatArray, FloatArray]

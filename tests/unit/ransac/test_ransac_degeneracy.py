@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from sfm_app.geometry.camera import camera_matrix
 from sfm_app.ransac import ESTIMATORS
 from sfm_app.settings import EpipolarSettings
-from sfm_app.synthetic.cameras import axis_rotation, camera_matrix
+from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 from sfm_app.types import EpipolarFit
 
