@@ -1,0 +1,106 @@
+"""Cameras and models that COLMAP synthesises, through our side of it."""
+
+import numpy as np
+import pytest
+
+from sfm_app.colmap.backend import backend, plain, pycolmap
+from sfm_app.colmap.bundle import adjust, main_camera
+from sfm_app.colmap.database import SQUARE_PIXELS, TWO_FOCALS, camera_params
+from sfm_app.colmap.model import turn_upright
+from sfm_app.errors import BackendError, ConfigError
+
+WIDTH, HEIGHT = 1000, 800
+
+
+def synthetic(tmp_path, true_params, noise_px=0.3, photos=8):
+    """A COLMAP model with known camera, and its database."""
+    pycolmap.set_random_seed(1)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, photos
+    options.num_points3D = 400
+    options.camera_width, options.camera_height = WIDTH, HEIGHT
+    options.camera_model_id = pycolmap.CameraModelId.OPENCV
+    options.camera_params = true_params
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        model = pycolmap.synthesize_dataset(options, database)
+        noise = pycolmap.SyntheticNoiseOptions()
+        noise.point2D_stddev = noise_px
+        pycolmap.synthesize_noise(noise, model, database)
+    return model, tmp_path / "database.db"
+
+
+@pytest.mark.parametrize("radial", [0.0, -0.08])
+def test_the_last_adjustment_finds_focal_centre_and_lens(tmp_path, radial):
+    true = [900.0, 900.0, 530.0, 380.0, radial, 0.0, 0.0, 0.0]
+    model, database = synthetic(tmp_path, true)
+    for camera in model.cameras.values():  # as mapping leaves it: one focal, a centre that is off
+        camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+        camera.params = [880.0, 500.0, 400.0, radial]
+
+    found, deviations = adjust(model, database)
+    K = main_camera(found).calibration_matrix()
+
+    assert K[0, 0] == pytest.approx(900, rel=0.003)
+    assert K[1, 1] == pytest.approx(900, rel=0.003)
+    assert np.hypot(K[0, 2] - 530, K[1, 2] - 380) < 6
+    assert abs(K[0, 2] - 530) < 4 * deviations["cx"] and abs(K[1, 2] - 380) < 4 * deviations["cy"]
+    assert main_camera(found).model.name == TWO_FOCALS
+    assert main_camera(found).params[4] == pytest.approx(radial, abs=0.04)
+    assert 0.01 < deviations["cx"] < 3
+    assert 0.2 < found.compute_mean_reprojection_error() < 0.6
+
+
+def test_a_centre_that_two_photos_do_not_determine_stays(tmp_path):
+    model, database = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], noise_px=1.0, photos=2)
+    for camera in model.cameras.values():
+        camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+        camera.params = [900.0, 500.0, 400.0, 0.0]
+
+    found, deviations = adjust(model, database)
+    K = main_camera(found).calibration_matrix()
+
+    assert (K[0, 2], K[1, 2]) == (500.0, 400.0)
+    assert "cx" not in deviations
+
+
+def test_a_model_is_turned_upright_centred_and_scaled(tmp_path):
+    model, _ = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0])
+    error = model.compute_mean_reprojection_error()
+    turned = pycolmap.Rotation3d(np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]))
+    model.transform(pycolmap.Sim3d(7.0, turned, np.array([30.0, -5, 2])))
+
+    turn_upright(model)
+    points = np.array([point.xyz for point in model.points3D.values()])
+    poses = [image.cam_from_world().matrix()[:, :3] for image in model.images.values()]
+    up = np.mean([-R[1] for R in poses], axis=0)
+
+    assert np.allclose(np.median(points, axis=0), 0, atol=0.1)
+    assert np.percentile(np.linalg.norm(points, axis=1), 80) == pytest.approx(1, abs=0.05)
+    if np.linalg.norm(up) > 1e-3:
+        assert up[1] / np.linalg.norm(up) == pytest.approx(1, abs=1e-6)
+    assert model.compute_mean_reprojection_error() == pytest.approx(error, rel=1e-4)
+
+
+def test_camera_parameters_of_both_models():
+    K = np.array([[800.0, 0, 310], [0, 1250.0, 240], [0, 0, 1]])
+
+    assert camera_params(K, TWO_FOCALS, -0.1) == [800, 1250, 310, 240, -0.1, 0, 0, 0]
+    assert camera_params(K, SQUARE_PIXELS) == [1000, 310, 240, 0]
+
+
+def test_what_colmap_raises_becomes_one_of_ours():
+    with (
+        pytest.raises(BackendError, match="COLMAP failed while reading: .*cannot find it") as caught,
+        backend("reading"),
+    ):
+        raise ValueError("[reconstruction.cc:1] cannot find it\n")
+    assert isinstance(caught.value.__cause__, ValueError)
+    with pytest.raises(ConfigError), backend("reading"):
+        raise ConfigError("ours stays ours")
+
+
+def test_options_become_plain_values():
+    options = plain(pycolmap.FeatureMatchingOptions().todict())
+
+    assert options["sift"]["max_ratio"] == 0.8
+    assert isinstance(options["type"], str)
