@@ -91,9 +91,12 @@ class DepthSettings(Section):
 class MeshSettings(Section):
     """The surface through the depth maps."""
 
-    poisson_depth: int = Field(10, ge=5, le=14, description="depth of the Poisson octree")
+    poisson_depth: int = Field(10, ge=5, le=14, description="greatest depth of the Poisson octree")
     trim: float = Field(
-        6.0, ge=0, le=20, description="surface with less support than this is cut off; 0 keeps a closed surface"
+        6.0,
+        ge=0,
+        le=20,
+        description="surface in cells coarser than this depth of the octree is cut off; 0 keeps a closed surface",
     )
     min_island: float = Field(
         0.01, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"

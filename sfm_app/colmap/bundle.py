@@ -14,6 +14,9 @@ LADDER = ((TWO_FOCALS, True), (SQUARE_PIXELS, True), (TWO_FOCALS, False), (SQUAR
 FOCAL_DETERMINED, CENTRE_DETERMINED = 0.002, 0.003
 """Largest standard deviation that counts as determined: of a focal as a share of it, of the centre in longer sides."""
 
+PHOTOS_FOR_CENTRE = 5
+"""With fewer photos, what the camera model does not hold (a lens, a zoom) moves the centre more than the noise does."""
+
 MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
 """COLMAP's own limits for a point: largest reprojection error, least angle between its rays."""
 
@@ -28,8 +31,9 @@ def adjust(model: Any, database: Path) -> tuple[Any, dict[str, float]]:
         The refined model, and the standard deviations in pixels of fx, fy, cx, cy of the camera with most photos, as
         far as they were free.
     """
+    few = model.num_reg_images() < PHOTOS_FOR_CENTRE
     for camera_model, centre in LADDER:
-        if camera_model == SQUARE_PIXELS and not _square(model):
+        if (camera_model == SQUARE_PIXELS and not _square(model)) or (centre and few):
             continue
         freed = pycolmap.Reconstruction(model)
         for camera in freed.cameras.values():

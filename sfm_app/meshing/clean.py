@@ -11,6 +11,8 @@ from sfm_app.types import Surface
 NEIGHBOURS = 6
 REACH = 6.0
 """How far, in spacings of the points, the surface may go beyond them: it closes small holes but spans no gaps."""
+MIN_CELL = 0.8
+"""Least width of Poisson's cells in spacings of the points."""
 MIN_COSINE = 0.1
 """Least cosine between the surface and the measured point nearest to it."""
 MAX_SPREAD = 4.0
@@ -18,13 +20,14 @@ MAX_SPREAD = 4.0
 
 
 def octree_depth(points: NDArray[np.float64], most: int) -> int:
-    """The depth at which Poisson's finest cell is one to two spacings of the points (N, 3) wide, at most `most`.
+    """Greatest depth, at most `most`, whose finest cell in Poisson's octree still holds a point or so of (N, 3).
 
     Finer cells would only model the noise, at four times the triangles per level.
     """
     if len(points) <= NEIGHBOURS:
         return most
-    return int(np.clip(np.floor(np.log2(np.ptp(points, axis=0).max() / np.median(_spacing(points)))), 1, most))
+    cell = MIN_CELL * np.median(_spacing(points))
+    return int(np.clip(np.floor(np.log2(np.ptp(points, axis=0).max() / cell)), 1, most))
 
 
 def trim_unsupported(surface: Surface, points: NDArray[np.float64], normals: NDArray[np.float64]) -> Surface:

@@ -37,6 +37,10 @@ ASPECT_GAIN = float(np.log(50))
 """Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square."""
 MIN_PAIRS = 3
 """Each F gives two constraints; below three pairs nothing is left to contradict a wrong K."""
+FEW_PAIRS = 3
+"""So many pairs fit almost any centre: it is then held where photos that nobody cropped have it."""
+UNCROPPED_SIGMA = 0.02
+"""Standard deviation of the centre of such photos about the middle, in widths."""
 MAX_LOG_FOCAL_SPREAD = 0.1
 """Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess."""
 EDGE = 1.02
@@ -83,7 +87,8 @@ def calibrate(
     evidence = {"pairs": float(len(pairs))}
     if len(pairs) < MIN_PAIRS:
         return guessed(size, f"{len(pairs)} usable pairs, {MIN_PAIRS} are needed", evidence)
-    consensus = Consensus(pairs, options.centre_sigma * width / unit_px)
+    centre_sigma = options.centre_sigma if len(pairs) > FEW_PAIRS else min(options.centre_sigma, UNCROPPED_SIGMA)
+    consensus = Consensus(pairs, centre_sigma * width / unit_px)
     answer, gain = _found(consensus, seed)
     mass = float(np.sum(answer.votes))
     evidence |= {

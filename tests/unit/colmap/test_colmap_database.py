@@ -37,7 +37,7 @@ def stored(tmp_path):
 
 
 def test_photos_are_numbered_by_name_and_share_cameras_by_group(stored):
-    path, photos, keypoints, matches = stored
+    path, photos, keypoints, _ = stored
 
     graph = read_match_graph(path, photos)
 

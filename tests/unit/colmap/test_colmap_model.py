@@ -90,7 +90,7 @@ def test_camera_parameters_of_both_models():
 
 def test_what_colmap_raises_becomes_one_of_ours():
     with (
-        pytest.raises(BackendError, match="COLMAP failed while reading: .*cannot find it") as caught,
+        pytest.raises(BackendError, match=r"COLMAP failed while reading: .*cannot find it") as caught,
         backend("reading"),
     ):
         raise ValueError("[reconstruction.cc:1] cannot find it\n")

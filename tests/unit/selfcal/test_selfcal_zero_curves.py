@@ -142,8 +142,15 @@ def test_one_pair_repeated_is_one_pair(views):
         assert not found.identifiable
 
 
-def test_the_prior_holds_the_centre_of_few_pairs(views):
+def test_three_pairs_leave_the_centre_near_the_middle(views):
     made = views(3, 1, noise=4e-3)
+    found = calibrate(made.Fs, made.weights, made.size, OPTIONS.model_copy(update={"centre_sigma": 1.0}), 0)
+
+    assert 0 < np.linalg.norm(found.K[:2, 2] - [500, 375]) < 60
+
+
+def test_the_prior_holds_the_centre_of_few_pairs(views):
+    made = views(4, 1, noise=4e-3)
     offsets = []
     for sigma in (0.01, 1.0):
         options = OPTIONS.model_copy(update={"centre_sigma": sigma})
@@ -154,7 +161,7 @@ def test_the_prior_holds_the_centre_of_few_pairs(views):
 
 
 def test_the_prior_is_measured_in_widths(views):
-    made = views(3, 1, noise=4e-3)
+    made = views(4, 1, noise=4e-3)
     swap = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])
     lying = calibrate(made.Fs, made.weights, (1000, 750), OPTIONS.model_copy(update={"centre_sigma": 0.06}), 0)
     standing = calibrate(

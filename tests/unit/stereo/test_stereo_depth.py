@@ -36,8 +36,8 @@ def test_confirmed_depths_lie_on_the_plane(plane, views, matched):
     error = np.abs(found.depth / plane.depth(views[1]) - 1)[known]
     assert found.coverage == pytest.approx(np.mean(known))
     assert 0.8 < found.coverage <= 1
-    assert 1e-5 < np.median(error) < 1e-3
-    assert np.percentile(error, 99) < 0.01
+    assert 2e-4 < np.median(error) < 3e-3  # a disparity of 28 px, known to 0.05 px
+    assert np.percentile(error, 99) < 0.02
     cosine = -(found.normals[known] @ plane.normal)
     assert np.degrees(np.arccos(np.median(cosine))) < 6
     np.testing.assert_allclose(np.linalg.norm(found.normals[known], axis=1), 1, rtol=1e-5)

@@ -1,0 +1,103 @@
+"""The dense workspace: what we write is what COLMAP's fusion understands."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.dense import fuse, poisson, read_depth, read_fused, read_grey, read_views, undistort, write_maps
+from sfm_app.errors import BackendError
+from sfm_app.stereo import DepthMap
+
+NORMAL = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
+DISTANCE = 5.0
+BOX = np.array([[-50.0] * 3, [50.0] * 3])
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    """Three undistorted views of the plane NORMAL'X = DISTANCE, with its true maps."""
+    place = tmp_path_factory.mktemp("dense")
+    (place / "photos").mkdir()
+    (place / "sparse").mkdir()
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="PINHOLE", width=120, height=90, params=[110, 105, 63, 41])
+    )
+    for index, x in enumerate((-0.4, 0.0, 0.4), start=1):
+        name = f"{index}.png"
+        cv2.imwrite(str(place / "photos" / name), np.full((90, 120, 3), (40 * index, 100, 200), np.uint8))
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.eye(3)), np.array([-x, 0.1 * x, 0]))
+        image = pycolmap.Image(image_id=index, name=name, camera_id=1)
+        model.add_image_with_trivial_frame(image, pose)
+    at = np.random.default_rng(0).uniform(-1.2, 1.2, (60, 2))
+    points = np.column_stack([at, (DISTANCE - at @ NORMAL[:2]) / NORMAL[2]])
+    for image in model.images.values():
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(image.project_point(xyz)) for xyz in points])
+    for index, xyz in enumerate(points):
+        track = pycolmap.Track()
+        for image_id in (1, 2, 3):
+            track.add_element(image_id, index)
+        model.add_point3D(xyz, track, np.zeros(3, np.uint8))
+    model.write(place / "sparse")
+    undistort(place / "sparse", place / "photos", place / "dense", 1000)
+    views = read_views(place / "dense")
+    for view in views:
+        y, x = np.mgrid[: view.height, : view.width] + view.sample_px
+        rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(view.K).T @ view.R
+        depth = ((DISTANCE - NORMAL @ view.center) / (rays @ NORMAL)).astype(np.float32)
+        normals = np.broadcast_to((-view.R @ NORMAL).astype(np.float32), (*depth.shape, 3))
+        write_maps(place / "dense", view, DepthMap(depth, normals))
+    return place / "dense", views
+
+
+def test_views_are_those_of_the_model(workspace):
+    dense, views = workspace
+
+    assert [view.name for view in views] == ["1.png", "2.png", "3.png"]
+    np.testing.assert_allclose(views[0].center, [-0.4, 0.04, 0], atol=1e-12)
+    np.testing.assert_allclose(views[0].K, [[110, 0, 63], [0, 105, 41], [0, 0, 1]])
+    assert read_grey(dense, views[0]).shape == (90, 120)
+    assert all(np.all(np.diff(view.point_ids) > 0) for view in views)
+    np.testing.assert_allclose(views[1].points @ NORMAL, DISTANCE, atol=1e-9)
+
+
+def test_fused_points_lie_on_the_plane_and_face_the_cameras(workspace):
+    dense, views = workspace
+
+    count = fuse(dense, views, 3, BOX)
+    points, normals = read_fused(dense)
+
+    assert count == len(points)
+    assert 1000 < count < 120 * 90
+    assert abs(np.median(points @ NORMAL) - DISTANCE) < 4e-4  # depths taken half a pixel aside would make it 2e-3
+    assert np.max(np.abs(points @ NORMAL - DISTANCE)) < 0.02
+    # with the three planes of the normal map in the wrong order this is 1
+    np.testing.assert_allclose(normals, np.broadcast_to(-NORMAL, normals.shape), atol=1e-3)
+
+
+def test_the_box_cuts_the_points(workspace):
+    dense, views = workspace
+
+    fuse(dense, views, 2, np.array([[0.0, -50, -50], [50, 50, 50]]))
+    assert read_fused(dense)[0][:, 0].min() >= 0
+
+
+def test_the_surface_has_the_shape_and_the_colours_of_the_points(workspace):
+    dense, views = workspace
+    fuse(dense, views, 3, BOX)
+
+    surface = poisson(dense, 6, 4.0)
+
+    inside = np.all(np.abs(surface.vertices[:, :2]) < 1, axis=1)
+    assert np.count_nonzero(inside) > 100
+    assert np.percentile(np.abs(surface.vertices[inside] @ NORMAL - DISTANCE), 90) < 0.02
+    assert np.all(np.abs(np.median(surface.colors[inside], axis=0) - [200, 100, 80]) <= 45)
+    assert not (dense / "poisson.ply").exists()
+
+
+def test_missing_inputs_are_backend_errors(tmp_path, workspace):
+    with pytest.raises(BackendError, match="undistorting photos"):
+        undistort(tmp_path / "none", tmp_path, tmp_path / "dense", 100)
+    with pytest.raises(BackendError, match=r"depth map of 1\.png"):
+        read_depth(tmp_path, workspace[1][0], "geometric")
