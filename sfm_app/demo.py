@@ -23,8 +23,8 @@ from sfm_app.types import Scene, Surface
 from sfm_app.workspace import Workspace
 
 SIZE = (960, 640)
-ASIDE = 0.35
-"""How far the second view of the picture stands beside a photo's place, as a share of its distance to the scene."""
+ASIDE_DEG = -30.0
+"""How far the last view of the picture is turned away from the photo's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,16 +121,18 @@ def draw(surface: Surface, scene: Scene, out: Path) -> None:
     camera = Camera(model.K, model.width, model.height)
     pose = scene.cam_from_world[name]
     photo = np.asarray(Image.open(out / "photos" / name).convert("RGB"))
-    mesh_views = [render_mesh(surface, camera, view) for view in (pose, stepped_aside(pose, surface))]
+    mesh_views = [render_mesh(surface, camera, view) for view in (pose, walked_around(pose, surface, ASIDE_DEG))]
     Image.fromarray(np.concatenate([photo, *mesh_views], axis=1)).save(out / "model.png")
 
 
-def stepped_aside(pose: NDArray[np.float64], surface: Surface) -> NDArray[np.float64]:
-    """The pose of somebody who took a step to the right of a camera."""
-    depth = float(np.median(surface.vertices @ pose[2, :3] + pose[2, 3]))
-    moved = pose.copy()
-    moved[0, 3] -= ASIDE * depth
-    return moved
+def walked_around(pose: NDArray[np.float64], surface: Surface, angle_deg: float) -> NDArray[np.float64]:
+    """The pose of somebody who walked around what a camera looks at, in a frame with y up."""
+    R, t = pose[:, :3], pose[:, 3]
+    depth = float(np.median(surface.vertices @ R[2] + t[2]))
+    middle = R.T @ (np.array([0.0, 0.0, depth]) - t)
+    cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    turned = R @ np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+    return np.column_stack([turned, R @ middle + t - turned @ middle])
 
 
 def demo_lines(result: DemoResult) -> list[str]:
