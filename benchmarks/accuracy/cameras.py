@@ -2,6 +2,7 @@
 """Camera poses of `sfm-app` beside those of stock pycolmap, on the same photos in the same run.
 
     python benchmarks/accuracy/cameras.py DATA --sets fountain-P11 castle-P19
+    python benchmarks/accuracy/cameras.py DATA --sets fountain-P11 --crop 460,200 --name cameras-cropped
 
 Stock is pycolmap's default except one shared camera and the same image size cap.
 """
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image, ImageOps
 from score import area_under_recall, focal_error_percent, load_truth, pose_errors_deg
 
 import sfm_app
@@ -62,6 +64,16 @@ def stock(photos: Path, out: Path) -> dict[str, Any]:
     }
 
 
+def cropped(photos: Path, out: Path, left: int, top: int) -> Path:
+    """Copies without EXIF that lack columns at the left and rows at the top: the optical centre moves."""
+    out.mkdir()
+    for path in sorted(photos.iterdir()):
+        with Image.open(path) as image:
+            upright = ImageOps.exif_transpose(image).convert("RGB")
+        upright.crop((left, top, *upright.size)).save(out / f"{path.stem}.jpg", quality=92)
+    return out
+
+
 def scored(found: dict[str, Any], truth_path: Path, seconds: float) -> dict[str, Any]:
     """Plain figures of one method on one set."""
     row: dict[str, Any] = {"registered": len(found["poses"]), "points": found["points"], "seconds": round(seconds, 1)}
@@ -89,14 +101,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path)
     parser.add_argument("--sets", nargs="+", required=True)
+    parser.add_argument(
+        "--crop", type=lambda text: [int(value) for value in text.split(",")], help="LEFT,TOP in pixels"
+    )
     parser.add_argument("--name", default="cameras", help="name of the result files")
     args = parser.parse_args()
     rows = []
     for name in args.sets:
         for label, method in (("sfm-app", ours), ("pycolmap", stock)):
             with tempfile.TemporaryDirectory() as scratch:
+                photos = args.data / name / "images"
+                photos = cropped(photos, Path(scratch) / "photos", *args.crop) if args.crop else photos
                 start = time.perf_counter()
-                found = method(args.data / name / "images", Path(scratch) / "out")
+                found = method(photos, Path(scratch) / "out")
                 seconds = time.perf_counter() - start
             rows.append({"photos": name, "method": label, **scored(found, args.data / name / "cameras.json", seconds)})
             print(json.dumps(rows[-1]), file=sys.stderr, flush=True)

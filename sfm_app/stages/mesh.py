@@ -13,6 +13,9 @@ from sfm_app.types import Surface
 
 SURFACE = "surface.npz"
 
+KEPT_LEVELS = 2
+"""Poisson's trimming leaves at least the surface in this many of its finest levels: few points make a coarse octree."""
+
 
 def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surface:
     """Span a surface over the fused points, cut off what they do not support, and keep it beside them.
@@ -23,7 +26,7 @@ def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surfac
     """
     points, normals = read_fused(dense_dir)
     depth = octree_depth(points, options.poisson_depth)
-    raw = poisson(dense_dir, depth, options.trim)
+    raw = poisson(dense_dir, depth, min(options.trim, depth - KEPT_LEVELS))
     trimmed = trim_unsupported(raw, points, normals) if options.trim else raw
     surface = drop_islands(trimmed, options.min_island)
     run.record(
