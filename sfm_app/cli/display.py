@@ -116,7 +116,9 @@ def run_lines(run: Run) -> list[str]:
             f"mean reprojection error {scene['mean_reprojection_px']} px"
         )
         lines += [f"            no place for {name}: {reason}" for name, reason in scene["unregistered"].items()]
-        lines += [f"            camera refined: {_k_text(camera.K)}" for camera in run.scene.cameras.values()]
+        many = len(run.scene.cameras) > 1
+        for name, camera in run.scene.cameras.items():
+            lines.append(f"            camera {f'{name} ' if many else ''}refined: {_k_text(camera.K)}")
     if run.mesh_path:
         lines.append(f"mesh        {summary['mesh']['triangles']} triangles")
         lines += [f"            {path}" for path in summary["mesh"]["files"]]

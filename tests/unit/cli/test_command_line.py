@@ -146,3 +146,27 @@ def test_the_module_runs_as_a_program():
     done = subprocess.run([sys.executable, "-m", "sfm_app", "--version"], capture_output=True, text=True, check=True)
 
     assert done.stdout.startswith("sfm-app, version ")
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "says"),
+    [
+        (
+            OSError(28, "No space left on device", "out/dense/fused.ply"),
+            3,
+            "No space left on device: out/dense/fused.ply",
+        ),
+        (ZeroDivisionError("by accident"), 1, "unexpected ZeroDivisionError: by accident"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_whatever_happens_ends_with_one_line(monkeypatch, folder, error, code, says):
+    def broken(*_, **__):
+        raise error
+
+    monkeypatch.setattr("sfm_app.cli.commands.reconstruct", broken)
+    result = call("run", folder, "-q")
+
+    assert result.exit_code == code
+    assert result.stderr.startswith(f"error: {says}")
+    assert len(result.stderr.strip().splitlines()) == 2

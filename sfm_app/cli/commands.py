@@ -1,8 +1,6 @@
 """The commands."""
 
-import logging
 import sys
-import traceback
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +40,10 @@ class Commands(click.Group):
             fail("interrupted", "the same command continues where this one stopped", INTERRUPTED)
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise
-        except Exception as err:  # a bug: the user gets one line, the traceback goes where a report can take it from
-            logging.getLogger("sfm_app").debug("%s", traceback.format_exc())
-            fail(
-                f"unexpected {type(err).__name__}: {err}",
-                "this is a bug; log.txt in the output folder has the details",
-                1,
-            )
+        except OSError as err:  # a full disk, a folder that went away
+            fail(f"{err.strerror or err}: {err.filename or 'a file of this run'}", "what was finished stays valid", 3)
+        except Exception as err:  # a bug: the user gets one line, log.txt has the traceback
+            fail(f"unexpected {type(err).__name__}: {err}", "this is a bug; please report it with OUT/log.txt", 1)
 
 
 def fail(message: str, hint: str, code: int) -> None:
@@ -72,15 +67,15 @@ def main() -> None:
 @click.option("--until", "last", type=click.Choice(NAMES), default="files", help="Stop after this stage.")
 @settings_options
 @output_options
-def run(photos: Path, out: Path | None, first: str | None, last: str, as_json: bool, quiet: bool, **flags: Any) -> None:
+def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: Any) -> None:
     """Reconstruct PHOTOS: camera, poses and a mesh as OUT/model.ply and OUT/model.glb.
 
     What lies in OUT and is up to date is not done again: an interrupted run goes on where it stopped.
     """
     settings = settings_from(flags)
     out = out or photos.resolve().with_name(f"{photos.resolve().name}-model")
-    done = reconstruct(photos, out, settings, first=first or "", last=last, progress=Terminal(quiet=quiet))
-    print_json(run_summary(done)) if as_json else print_lines(run_lines(done))
+    done = reconstruct(photos, out, settings, first=first or "", last=last, progress=Terminal(quiet=flags["quiet"]))
+    print_json(run_summary(done)) if flags["as_json"] else print_lines(run_lines(done))
 
 
 @main.command()
@@ -88,20 +83,20 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, as_json: b
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Keep features and matches in this folder.")
 @settings_options
 @output_options
-def calibrate(photos: Path, out: Path | None, as_json: bool, quiet: bool, **flags: Any) -> None:
+def calibrate(photos: Path, out: Path | None, **flags: Any) -> None:
     """Find the camera matrix of PHOTOS, without reconstructing the scene."""
-    found = calibrate_photos(photos, settings_from(flags), out=out, progress=Terminal(quiet=quiet))
-    print_json(intrinsics_summary(found)) if as_json else print_lines(intrinsics_lines(found))
+    found = calibrate_photos(photos, settings_from(flags), out=out, progress=Terminal(quiet=flags["quiet"]))
+    print_json(intrinsics_summary(found)) if flags["as_json"] else print_lines(intrinsics_lines(found))
 
 
 @main.command()
 @click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Where.")
 @settings_options
 @output_options
-def demo(out: Path, as_json: bool, quiet: bool, **flags: Any) -> None:
+def demo(out: Path, **flags: Any) -> None:
     """Render photos of a known scene, reconstruct them and say how close it came."""
-    result = run_demo(out, settings_from(flags), Terminal(quiet=quiet))
-    print_json(result.to_dict()) if as_json else print_lines(demo_lines(result))
+    result = run_demo(out, settings_from(flags), Terminal(quiet=flags["quiet"]))
+    print_json(result.to_dict()) if flags["as_json"] else print_lines(demo_lines(result))
 
 
 @main.command()
