@@ -8,6 +8,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from sfm_app.errors import ReconstructionError
+from sfm_app.meshing.clean import vertex_normals
+from sfm_app.types import Surface
 
 Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -59,7 +61,10 @@ def srgb_to_linear(colors: Colors) -> NDArray[np.float32]:
 def _mesh(vertices: Vertices, faces: Faces) -> trimesh.Trimesh:
     if len(faces) == 0:
         raise ReconstructionError("the mesh has no triangles", hint="take more photos with more overlap")
-    return trimesh.Trimesh(vertices, faces, process=False)
+    normals = vertex_normals(Surface(vertices, faces, np.zeros((len(vertices), 3), np.uint8)))
+    # triangles without area leave a corner without a normal; glTF wants length 1 everywhere
+    normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 1.0, 0.0)
+    return trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
 
 
 def _finish_gltf(tree: dict[str, Any]) -> None:

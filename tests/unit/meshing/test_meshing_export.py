@@ -93,3 +93,14 @@ def test_srgb_curve_is_the_standard_one():
     assert light[255] == 1
     assert np.all(np.diff(light) > 0)
     np.testing.assert_allclose(light[[10, 128, 188]], [0.003035, 0.215861, 0.502886], atol=1e-6)
+
+
+def test_a_triangle_without_area_still_has_unit_normals():
+    vertices = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, -1], [5, 5, 5]])
+    faces = np.array([[0, 1, 2], [3, 3, 3]])
+
+    data = EXPORTERS["ply"][0](vertices, faces, np.full((4, 3), 128, np.uint8))
+    raw = trimesh.load(io.BytesIO(data), file_type="ply", process=False).metadata["_ply_raw"]["vertex"]["data"]
+
+    np.testing.assert_allclose(raw["nx"] ** 2 + raw["ny"] ** 2 + raw["nz"] ** 2, 1, atol=1e-6)
+    np.testing.assert_allclose(raw["ny"], 1, atol=1e-6)
