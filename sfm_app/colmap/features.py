@@ -1,12 +1,12 @@
 """COLMAP's SIFT features and raw matches, on CPU, without its geometric verification."""
 
-import sqlite3
-from collections.abc import Sequence
-from itertools import combinations
+import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from sfm_app.colmap.backend import interruptible, plain, pycolmap
+from sfm_app.colmap.database import opened
 from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
 
@@ -27,7 +27,10 @@ def extract_features(
             device=pycolmap.Device.cpu, cancellation_token=token,
         )  # fmt: skip
 
-    _counted(call, database, "keypoints", "features", len(names), progress)
+    def done(reader: Any) -> int:
+        return sum(reader.exists_keypoints(image_id) for image_id in range(1, len(names) + 1))
+
+    _counted(call, database, done, ("features", len(names)), progress)
     return plain(extraction.todict())
 
 
@@ -46,37 +49,35 @@ def match_exhaustively(
             database, matching_options=matching, device=pycolmap.Device.cpu, cancellation_token=token
         )
 
-    total = sum(1 for _ in combinations(range(photos), 2))
-    _counted(call, database, "matches", "matching", total, progress)
+    def done(reader: Any) -> int:
+        return int(reader.num_matched_image_pairs())
+
+    _counted(call, database, done, ("matching", math.comb(photos, 2)), progress)
     return plain(matching.todict())
 
 
-def _counted(call: Any, database: Path, table: str, label: str, total: int, progress: Progress) -> None:
-    """Run a COLMAP call and show how many rows it has added to a table."""
-    progress.start(label, total)
+def _counted(
+    call: Callable[[Any], None],
+    database: Path,
+    done: Callable[[Any], int],
+    work: tuple[str, int],
+    progress: Progress,
+) -> None:
+    """Run a COLMAP call and show how far it is, as read from the database.
+
+    The reader is COLMAP's own SQLite, opened once before the call: a second SQLite in the process (Python's) would drop
+    the locks of the first whenever it closes the file, and COLMAP aborts.
+    """
+    progress.start(*work)
     seen = 0
-
-    def poll() -> None:
-        nonlocal seen
-        rows = _row_count(database, table)
-        if rows > seen:
-            progress.advance(rows - seen)
-            seen = rows
-
     try:
-        interruptible(call, poll)
-        poll()
+        with opened(database) as reader:
+
+            def poll() -> None:
+                nonlocal seen
+                before, seen = seen, done(reader)
+                progress.advance(seen - before)
+
+            interruptible(call, poll)
     finally:
         progress.finish()
-
-
-def _row_count(database: Path, table: str) -> int:
-    """Rows so far, read beside COLMAP's own connection; 0 while it holds the lock."""
-    try:
-        connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=0.1)
-        try:
-            return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])  # noqa: S608
-        finally:
-            connection.close()
-    except sqlite3.Error:
-        return 0
