@@ -153,9 +153,10 @@ def model_files(run: Run) -> list[Path]:
     return sorted(run.out.glob("model.*"))
 
 
-def table(rows: Mapping[str, str], width: int = 24) -> list[str]:
+def table(rows: Mapping[str, str]) -> list[str]:
     """Two columns."""
-    return [f"{name:{width}} {text}" for name, text in rows.items()]
+    width = max(map(len, rows), default=0)
+    return [f"{name:{width}}  {text}" for name, text in rows.items()]
 
 
 def _k_text(K: Any) -> str:
