@@ -14,5 +14,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def kernel(function: Function) -> Function:
     """Compile a function with numba: nogil, cached on disk, IEEE arithmetic (same seed, same bytes)."""
-    compiled: Function = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    try:
+        compiled: Function = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
+    except RuntimeError:  # no folder to cache in can be written: compile anew in every process
+        compiled = numba.njit(nogil=True, error_model="numpy")(function)
     return compiled

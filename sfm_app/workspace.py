@@ -64,10 +64,6 @@ class Workspace:
         return self.root / "dense"
 
     @property
-    def surface(self) -> Path:
-        return self.dense / "surface.npz"
-
-    @property
     def log(self) -> Path:
         return self.root / "log.txt"
 
