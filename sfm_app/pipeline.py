@@ -141,6 +141,7 @@ def make(stage: Stage, products: Products, print_of_inputs: str, run: RunContext
     record = StageRecord(print_of_inputs, seconds, run.counts, run.workspace.sizes(stage.files))
     run.workspace.finish(stage.name, record, manifest_head(run))
     logger.info("%s took %.2f s", stage.name, seconds)
+    run.progress.stage_done(seconds)
     return product
 
 

@@ -12,6 +12,9 @@ class Progress(Protocol):
     def stage(self, name: str, note: str = "") -> None:
         """A stage begins (note empty) or was skipped, with the reason as note."""
 
+    def stage_done(self, seconds: float) -> None:
+        """The stage that began last is over, after so long."""
+
     def start(self, label: str, total: int) -> None:
         """Work of `total` steps begins."""
 
@@ -26,6 +29,8 @@ class Silent:
     """Shows nothing."""
 
     def stage(self, name: str, note: str = "") -> None: ...
+
+    def stage_done(self, seconds: float) -> None: ...
 
     def start(self, label: str, total: int) -> None: ...
 

@@ -42,6 +42,9 @@ class Terminal:
         number = f"{steps.index(name) + 1}/{len(steps)} " if name in steps else ""
         self.console.print(f"{number}{STAGE_TITLES.get(name, name)}{f' [dim]({escape(note)})[/dim]' if note else ''}")
 
+    def stage_done(self, seconds: float) -> None:
+        self.console.print(f"    [dim]{seconds:.1f} s[/dim]")
+
     def start(self, label: str, total: int) -> None:
         self.task = self.bars.add_task(escape(label), total=total)
         self.bars.start()
