@@ -1,8 +1,11 @@
 """Robust estimation of fundamental matrices (thesis, chapter 4).
 
-An estimator is a `loop.Recipe`: a way to sample, to score, to stop and to refit. `loop.search` runs it,
-`verdict.estimate` judges what it found. From the sample to the answer: `points`, `sampling`, `minimal`, `scoring`,
-`search`, `leverage`, `stopping`, `refit`, `chance`, `degeneracy`.
+An estimator is a `loop.Recipe`: what it samples, solves, scores and verifies with, when it stops, how it refits.
+`loop.search` runs it, `verdict.estimate` judges what it found. `lev_ransac` is the one that the program uses,
+`recipes` has the others.
+
+From the sample to the answer: `points`, `sampling`, `minimal`, `verification`, `sprt`, `scoring`, `mixture`, `search`,
+`leverage`, `residuals`, `stopping`, `loop`, `refit`, `chance`, `degeneracy`.
 """
 
 from collections.abc import Callable
@@ -11,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.ransac.lev_ransac import fit_lev_ransac
-from sfm_app.ransac.lev_ransac_thesis import fit_lev_ransac_thesis, fit_msac
 from sfm_app.ransac.points import check_points
+from sfm_app.ransac.recipes import RECIPES, classical
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 
@@ -21,8 +24,7 @@ FitFundamentalLike = Callable[[FloatArray, FloatArray, EpipolarSettings, int], E
 
 ESTIMATORS: dict[str, tuple[FitFundamentalLike, str]] = {
     "lev-ransac": (fit_lev_ransac, "samples guided by Cook's distances, local optimisation, robust refit; the default"),
-    "lev-ransac-thesis": (fit_lev_ransac_thesis, "Algorithm 1 of the thesis to the letter"),
-    "msac": (fit_msac, "uniform samples, truncated squared error"),
+    **{name: (classical(name), about) for name, (_, about) in RECIPES.items()},
 }
 """Name, way to fit, and one line about it."""
 

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 from sfm_app.ransac.leverage import mad_sigma, prior_validity
 from sfm_app.ransac.loop import Recipe
 from sfm_app.ransac.refit import fit_eight_point, refine_sampson
-from sfm_app.ransac.scoring import MSAC, squared_distances
+from sfm_app.ransac.scoring import msac, squared_distances
 from sfm_app.ransac.verdict import estimate
+from sfm_app.ransac.verification import BailOut
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 
@@ -44,13 +45,13 @@ def refit_to_all(points: FloatArray, F: FloatArray, threshold: float) -> FloatAr
 
 
 PRODUCTION = Recipe(
-    score=MSAC,
+    score=msac,
     validity=partial(prior_validity, sigma_from_inliers=True),
     guided_share=0.5,
+    verifier=BailOut,
     patience=2000,
     oriented=True,
     improve=optimise_locally,
-    bail_out=True,
     finish=refit_to_all,
 )
 

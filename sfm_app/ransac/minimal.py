@@ -1,4 +1,4 @@
-"""Fundamental matrices through seven matches (thesis 4.3.1; Hartley and Zisserman, section 11.1.2)."""
+"""Fundamental matrices through seven or eight matches (thesis 4.3.1 and 4.4.2; Hartley and Zisserman, chapter 11)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ IntArray = NDArray[np.int64]
 
 MOST_MODELS = 3
 _RANK_TOLERANCE = 1e-9
+_SQUARINGS = 6
 
 
 @kernel
@@ -24,14 +25,15 @@ def design_row(point: FloatArray, row: FloatArray) -> None:
 
 
 @kernel
-def seven_point(points: FloatArray, sample: IntArray, models: FloatArray) -> int:
-    """All real F with det F = 0 through seven matches.
+def models_through(points: FloatArray, sample: IntArray, models: FloatArray) -> int:
+    """F from a minimal sample: all those through seven matches, or the linear one through eight.
 
-    The seven constraints leave F = A + z B; det(A + z B) = 0 is a cubic in z with one or three real roots.
+    Seven constraints leave F = a + z b; one more settles z: det F = 0, a cubic with one or three real roots, or an
+    eighth match. The linear model is then moved to the nearest one of rank 2, and with noise misses its own sample.
 
     Args:
         points: (N, 4) x1, y1, x2, y2, of magnitude about 1.
-        sample: (7,) rows of `points`.
+        sample: (7,) or (8,) rows of `points`.
         models: (3, 9) filled with the solutions, row by row, each of norm 1.
 
     Returns:
@@ -40,6 +42,14 @@ def seven_point(points: FloatArray, sample: IntArray, models: FloatArray) -> int
     basis = np.empty((2, 9))
     if not _null_space(points, sample, basis):
         return 0
+    if sample.shape[0] > SAMPLE_SIZE:
+        return _through_eighth(points[sample[SAMPLE_SIZE]], basis, models[0])
+    return _of_rank_two(basis, models)
+
+
+@kernel
+def _of_rank_two(basis: FloatArray, models: FloatArray) -> int:
+    """Those of the pencil a + z b whose determinant vanishes."""
     a, b = basis[0], basis[1]
     c0, c1, c2, c3 = _det(a), _mixed_det(a, b), _mixed_det(b, a), _det(b)
     if abs(c3) < abs(c0):  # the larger end leads, so that no root runs off to infinity
@@ -53,6 +63,69 @@ def seven_point(points: FloatArray, sample: IntArray, models: FloatArray) -> int
         for j in range(9):
             models[k, j] = (a[j] + z * b[j]) / norm
     return count
+
+
+@kernel
+def _through_eighth(point: FloatArray, basis: FloatArray, model: FloatArray) -> int:
+    """The one of the pencil that meets `point` (4,), less what stands in the way of rank 2: F - F v v'."""
+    row, v = np.empty(9), np.empty(3)
+    design_row(point, row)
+    a, b = 0.0, 0.0
+    for j in range(9):
+        a += basis[0, j] * row[j]
+        b += basis[1, j] * row[j]
+    for j in range(9):
+        model[j] = b * basis[0, j] - a * basis[1, j]
+    if not _weakest_direction(model, v):
+        return 0
+    squared = 0.0
+    for i in range(0, 9, 3):
+        dot = model[i] * v[0] + model[i + 1] * v[1] + model[i + 2] * v[2]
+        for j in range(3):
+            model[i + j] -= dot * v[j]
+            squared += model[i + j] ** 2
+    for j in range(9):
+        model[j] /= np.sqrt(squared)
+    return 1
+
+
+@kernel
+def _weakest_direction(f: FloatArray, v: FloatArray) -> bool:
+    """The right singular vector of F's smallest singular value into v (3,); False for a rank below 2.
+
+    The cofactors C of F have the same singular vectors with the values s2 s3, s1 s3, s1 s2, so that the vector wanted
+    leads in C'C, and the more so each time that is squared.
+    """
+    cofactors, gram, square = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        a, b = 3 * ((i + 1) % 3), 3 * ((i + 2) % 3)
+        for j in range(3):
+            c, d = (j + 1) % 3, (j + 2) % 3
+            cofactors[j, i] = f[a + c] * f[b + d] - f[a + d] * f[b + c]
+    for i in range(3):
+        for j in range(3):
+            gram[i, j] = _dot3(cofactors[i], cofactors[j])
+    for _ in range(_SQUARINGS):
+        trace = gram[0, 0] + gram[1, 1] + gram[2, 2]
+        if not trace > 0.0:
+            return False
+        for i in range(3):
+            for j in range(3):
+                square[i, j] = _dot3(gram[i], gram[j]) / (trace * trace)
+        gram, square = square, gram
+    largest = 0
+    for i in range(1, 3):
+        if gram[i, i] > gram[largest, largest]:
+            largest = i
+    norm = np.sqrt(_dot3(gram[largest], gram[largest]))
+    for i in range(3):
+        v[i] = gram[largest, i] / norm
+    return True
+
+
+@kernel
+def _dot3(a: FloatArray, b: FloatArray) -> float:
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 @kernel
@@ -73,7 +146,7 @@ def is_oriented(points: FloatArray, sample: IntArray, f: FloatArray) -> bool:
             largest = x * x + y * y + z * z
             e2[0], e2[1], e2[2] = x, y, z
     positive = 0
-    for n in range(SAMPLE_SIZE):
+    for n in range(sample.shape[0]):
         x1, y1, x2, y2 = points[sample[n], 0], points[sample[n], 1], points[sample[n], 2], points[sample[n], 3]
         ax, ay, az = f[0] * x1 + f[1] * y1 + f[2], f[3] * x1 + f[4] * y1 + f[5], f[6] * x1 + f[7] * y1 + f[8]
         side = (e2[1] - e2[2] * y2) * ax + (e2[2] * x2 - e2[0]) * ay + (e2[0] * y2 - e2[1] * x2) * az
@@ -114,7 +187,7 @@ def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArr
 
 @kernel
 def _null_space(points: FloatArray, sample: IntArray, basis: FloatArray) -> bool:
-    """Two orthonormal vectors perpendicular to the seven rows of the design matrix, by Householder reflections.
+    """Two orthonormal vectors perpendicular to the first seven design rows of the sample, by Householder reflections.
 
     False where the rows depend on each other.
     """

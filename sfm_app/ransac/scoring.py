@@ -1,28 +1,59 @@
 """How well F explains all matches: penalties on the Sampson distance, with early exits (thesis 4.4.1).
 
-A penalty is to be made small. Early exit by the bail-out test (Capel 2005; thesis 4.4.4): the matches come in random
-order, so that after a few blocks it is clear that a hypothesis cannot beat the best one.
+A penalty is to be made small. A score is a function (points, threshold, best model or None) -> `Measure`, asked
+again at every new best model; only that of MLESAC changes during the search.
 """
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
+from sfm_app.ransac.verification import BLOCK, Gate
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
-RANSAC = 0
-"""Penalty 1 beyond the threshold, else 0 (thesis 3.20, 4.4)."""
-MSAC = 1
-"""The squared distance, at most the squared threshold (Torr and Zisserman 2000)."""
-MSAC_LINEAR = 2
-"""The distance, at most the threshold (thesis 4.5 as printed)."""
+RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS = range(5)
 
-BLOCK = 32
-"""Matches between two looks at whether to go on."""
 
-_BAIL_OUT_SIGMAS = 3.0
+class Measure(NamedTuple):
+    """A penalty as the inner loop counts it."""
+
+    kind: int
+    limit: float
+    """Largest squared distance of an inlier."""
+    reach: float
+    """Squared distance beyond which every match costs `worst`."""
+    worst: float
+    precision: float = 0.0
+    """MLESAC: 1 / (2 sigma^2)."""
+    odds: float = 0.0
+    """MLESAC: density of the outliers over that of the inliers at distance 0."""
+
+
+Score = Callable[[FloatArray, float, FloatArray | None], Measure]
+
+
+def ransac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Measure:
+    """1 for every match beyond the threshold, else 0 (thesis 3.20, 4.4)."""
+    return Measure(RANSAC, threshold * threshold, threshold * threshold, 1.0)
+
+
+def msac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Measure:
+    """The squared distance, at most the squared threshold (Torr and Zisserman 2000)."""
+    return Measure(MSAC, threshold * threshold, threshold * threshold, threshold * threshold)
+
+
+def msac_linear(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Measure:
+    """The distance, at most the threshold (thesis 4.5 as printed)."""
+    return Measure(MSAC_LINEAR, threshold * threshold, threshold * threshold, threshold)
+
+
+def lmeds(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Measure:
+    """The median of the squared distances (Rousseeuw 1984; thesis 4.4.1); the threshold only counts inliers."""
+    return Measure(LMEDS, threshold * threshold, np.inf, np.inf)
 
 
 @kernel
@@ -45,58 +76,85 @@ def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
 
 
 @kernel
-def _penalty(kind: int, squared: float, limit: float) -> float:
-    if kind == RANSAC:
-        return 0.0 if squared < limit else 1.0
-    if kind == MSAC:
+def _cost(measure: Measure, squared: float) -> float:
+    if measure.kind == MSAC:
         return squared
-    return float(np.sqrt(squared))
+    if measure.kind == RANSAC:
+        return 0.0
+    if measure.kind == MSAC_LINEAR:
+        return float(np.sqrt(squared))
+    return float(np.log((1.0 + measure.odds) / (np.exp(-measure.precision * squared) + measure.odds)))
 
 
 @kernel
-def penalty(
-    points: FloatArray, f: FloatArray, kind: int, threshold: float, to_beat: float, least_inliers: IntArray
-) -> float:
-    """Sum of the penalties of all matches, or inf as soon as f has no prospect of staying below `to_beat`.
+def penalty(points: FloatArray, f: FloatArray, measure: Measure, to_beat: float, gate: Gate) -> float:
+    """Penalty of all matches, or inf as soon as f cannot stay below `to_beat` or is turned away at the gate.
 
     Args:
         points: (N, 4), in random order.
         f: (9,) entries of F.
-        kind: RANSAC, MSAC or MSAC_LINEAR.
-        threshold: largest distance of an inlier.
+        measure: which penalty. The gate is open for the median: it is counted another way.
         to_beat: best penalty so far; inf for a full count.
-        least_inliers: from `bail_out_table`; empty for no such test.
+        gate: how many inliers f must show on the way.
     """
-    limit = threshold * threshold
-    worst = _penalty(kind, limit, limit)
+    if measure.kind == LMEDS:
+        return _median_of_squares(points, f, to_beat)
+    least_inliers, limit, reach = gate.least_inliers, measure.limit, measure.reach
     total, inliers, block = 0.0, 0, 0
-    start, count = 0, points.shape[0]
-    while start < count:
-        stop = min(start + BLOCK, count)
-        for i in range(start, stop):
+    done, count = 0, points.shape[0]
+    while done < count:
+        gated = block < least_inliers.shape[0]
+        stop = min(done + (gate.stride if gated else BLOCK), count)
+        for i in range(done, stop):
             squared = squared_sampson(f, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
-            if squared <= limit:
-                inliers += 1
-                total += _penalty(kind, squared, limit)
+            if squared <= reach:
+                inliers += squared <= limit
+                total += _cost(measure, squared)
             else:
-                total += worst
-        if total >= to_beat or (block < least_inliers.shape[0] and inliers < least_inliers[block]):
+                total += measure.worst
+        if gated and inliers < least_inliers[block]:
+            gate.rejected[0] += stop
+            gate.rejected[1] += inliers
             return np.inf
-        start = stop
+        if total >= to_beat:
+            return np.inf
+        done = stop
         block += 1
     return total
 
 
-def bail_out_table(count: int, inlier_share: float) -> IntArray:
-    """How many inliers a hypothesis must show after each block to be worth finishing.
+@kernel
+def _median_of_squares(points: FloatArray, f: FloatArray, to_beat: float) -> float:
+    """The (N // 2 + 1)th smallest squared distance, or inf once too many matches lie too far for it to be smaller."""
+    count = points.shape[0]
+    squared = np.empty(count)
+    may_miss = count - count // 2 - 1
+    for i in range(count):
+        squared[i] = squared_sampson(f, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
+        may_miss -= squared[i] >= to_beat
+        if may_miss < 0:
+            return np.inf
+    return select(squared, count // 2)
 
-    A hypothesis as good as the best one has a share `inlier_share` of inliers; in the first m of N matches their
-    number is hypergeometric, and falls short of the figures given here about once in a thousand times.
 
-    Returns:
-        (blocks,) counts.
-    """
-    seen = np.arange(BLOCK, count, BLOCK, dtype=np.float64)
-    mean = seen * inlier_share
-    deviation = np.sqrt(mean * (1 - inlier_share) * (count - seen) / max(count - 1, 1))
-    return np.maximum(np.floor(mean - _BAIL_OUT_SIGMAS * deviation), 0).astype(np.int64)
+@kernel
+def select(values: FloatArray, rank: int) -> float:
+    """The value that sorting would put at `rank`, by Hoare's quickselect; reorders `values`."""
+    low, high = 0, values.shape[0] - 1
+    while low < high:
+        pivot, i, j = values[(low + high) // 2], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        if rank <= j:
+            high = j
+        elif rank >= i:
+            low = i
+        else:
+            return float(values[rank])
+    return float(values[rank])

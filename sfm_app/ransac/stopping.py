@@ -5,18 +5,24 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.ransac.sampling import SAMPLE_SIZE
-
 CONVERGED = 0.05
 """G of the thesis: priors that changed less than this, in sum, have converged."""
 
 
-def trials_needed(inlier_share: float, confidence: float, sample_size: int = SAMPLE_SIZE) -> float:
-    """Samples that hold one without outliers with the wanted probability (thesis 3.19); inf for no inliers."""
-    clean = inlier_share**sample_size
-    if clean >= 1:
+def trials_needed(success: float, confidence: float, log_missed: float = 0.0) -> float:
+    """Samples of which at least one succeeds with the wanted probability (thesis 3.19); inf if none can.
+
+    Args:
+        success: probability of one sample to be clean, share^m, and to pass the test of its models.
+        confidence: wanted probability, in (0, 1).
+        log_missed: logarithm of the probability that all samples drawn before failed; they are not counted again.
+    """
+    left = math.log1p(-confidence) - log_missed
+    if left >= 0:
+        return 0.0
+    if success >= 1:
         return 1.0
-    return math.log1p(-confidence) / math.log1p(-clean) if clean > 0 else math.inf
+    return left / math.log1p(-success) if success > 0 else math.inf
 
 
 def have_converged(before: NDArray[np.float64], after: NDArray[np.float64], limit: float = CONVERGED) -> bool:

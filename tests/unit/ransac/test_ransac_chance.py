@@ -63,7 +63,8 @@ def test_random_matches_are_rejected(name, count):
         rng = np.random.default_rng([count, seed])
         fit = ESTIMATORS[name][0](*(rng.uniform(size=(2, count, 2)) * size), OPTIONS, seed)
         assert isinstance(fit, Rejected), fit.inlier_count
-        assert fit.reason == "inliers no better than chance"
+        # the median looks at no threshold: what it finds may have no inliers to speak of
+        assert fit.reason in ("inliers no better than chance", *["too few inliers"] * (name == "lmeds"))
 
 
 @pytest.mark.parametrize(("true", "false"), [(20, 0), (20, 10), (25, 25), (30, 60), (60, 140)])

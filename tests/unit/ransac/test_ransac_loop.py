@@ -8,8 +8,9 @@ import pytest
 from sfm_app.ransac.loop import Recipe, search
 from sfm_app.ransac.points import prepare
 from sfm_app.ransac.sampling import random_state
-from sfm_app.ransac.scoring import MSAC, squared_distances
-from sfm_app.ransac.search import next_better
+from sfm_app.ransac.scoring import msac, squared_distances
+from sfm_app.ransac.search import Rules, next_better
+from sfm_app.ransac.verification import OPEN
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
@@ -19,8 +20,7 @@ def always(value):
     return lambda *_: value
 
 
-NO_TABLE = np.zeros(0, dtype=np.int64)
-PLAIN = Recipe(score=MSAC, finish=lambda _points, F, _threshold: F)
+PLAIN = Recipe(score=msac, finish=lambda _points, F, _threshold: F)
 
 
 def scene(outliers=0.3, seed=0, points=300):
@@ -104,7 +104,15 @@ def test_local_optimisation_is_kept_only_if_better():
 def test_next_better_leaves_the_best_alone_when_nothing_is_better():
     m, best = scene(), np.full(9, 7.0)
     drawn, score = next_better(
-        m.points, np.cumsum(np.ones(300)), (0.0, False, MSAC), 0.01, 1e-12, NO_TABLE, 25, random_state(0), best
+        m.points,
+        np.cumsum(np.ones(300)),
+        Rules(7, False, 0.0),
+        msac(m.points, 0.01, None),
+        OPEN,
+        1e-12,
+        25,
+        random_state(0),
+        best,
     )
     assert (drawn, score) == (25, 1e-12)
     assert (best == 7).all()

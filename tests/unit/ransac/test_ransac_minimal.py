@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.ransac.minimal import design_row, is_oriented, real_cubic_roots, seven_point
+from sfm_app.ransac.minimal import design_row, is_oriented, models_through, real_cubic_roots
 from sfm_app.ransac.points import prepare
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
@@ -21,7 +21,7 @@ def exact_sample(seed):
 
 def solve(points):
     models = np.zeros((3, 9))
-    count = seven_point(points, np.arange(7), models)
+    count = models_through(points, np.arange(7), models)
     return models[:count]
 
 

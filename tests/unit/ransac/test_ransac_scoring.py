@@ -5,17 +5,17 @@ import pytest
 
 from sfm_app.geometry.epipolar import cross_matrix, sampson_distance
 from sfm_app.ransac.scoring import (
-    BLOCK,
-    MSAC,
-    MSAC_LINEAR,
-    RANSAC,
-    bail_out_table,
+    lmeds,
+    msac,
+    msac_linear,
     penalty,
+    ransac,
+    select,
     squared_distances,
     squared_sampson,
 )
+from sfm_app.ransac.verification import BLOCK, OPEN, gate
 
-NO_TABLE = np.zeros(0, dtype=np.int64)
 SHIFT = cross_matrix([1.0, 0, 0]).reshape(9)
 
 
@@ -36,44 +36,59 @@ def test_distances_agree_with_the_reference():
 
 
 @pytest.mark.parametrize(
-    ("kind", "expected"),
-    [(RANSAC, 0 + 0 + 1 + 1), (MSAC, 0 + 0.25 + 4 + 4), (MSAC_LINEAR, 0 + 0.5 + 2 + 2)],
+    ("score", "expected"),
+    [(ransac, 0 + 0 + 1 + 1), (msac, 0 + 0.25 + 4 + 4), (msac_linear, 0 + 0.5 + 2 + 2), (lmeds, 2.5**2)],
 )
-def test_penalties_by_hand(kind, expected):
+def test_penalties_by_hand(score, expected):
     points = matches_off_by(0, 0.5, 2.5, 100)
-    assert penalty(points, SHIFT, kind, 2.0, np.inf, NO_TABLE) == pytest.approx(expected)
+    assert penalty(points, SHIFT, score(points, 2.0, None), np.inf, OPEN) == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("kind", [RANSAC, MSAC, MSAC_LINEAR])
-def test_a_score_that_cannot_win_is_left(kind):
+@pytest.mark.parametrize("score", [ransac, msac, msac_linear, lmeds])
+def test_a_score_that_cannot_win_is_left(score):
     points = matches_off_by(*np.linspace(0, 4, 1000))
-    full = penalty(points, SHIFT, kind, 2.0, np.inf, NO_TABLE)
+    measure = score(points, 2.0, None)
+    full = penalty(points, SHIFT, measure, np.inf, OPEN)
 
-    assert penalty(points, SHIFT, kind, 2.0, full * 1.001, NO_TABLE) == full
-    assert penalty(points, SHIFT, kind, 2.0, full, NO_TABLE) == np.inf
+    assert penalty(points, SHIFT, measure, full * 1.001, OPEN) == full
+    assert penalty(points, SHIFT, measure, full, OPEN) == np.inf
 
 
-def test_bail_out_leaves_when_inliers_are_missing():
+def test_a_match_at_the_threshold_is_an_inlier():
+    on, beyond = matches_off_by(0.0), matches_off_by(2.0)
+    at_two = np.sqrt(squared_distances(beyond, SHIFT)[0])
+    assert penalty(on, SHIFT, ransac(on, 0.0, None), np.inf, OPEN) == 0
+    assert penalty(beyond, SHIFT, ransac(beyond, at_two * (1 + 1e-9), None), np.inf, OPEN) == 0
+    assert penalty(beyond, SHIFT, ransac(beyond, at_two * (1 - 1e-9), None), np.inf, OPEN) == 1
+
+
+def test_the_gate_turns_away_what_lacks_inliers_and_keeps_books():
     points = matches_off_by(*[9.0] * BLOCK, *[0.0] * 10 * BLOCK)
-    assert penalty(points, SHIFT, MSAC, 2.0, np.inf, np.array([0])) < np.inf
-    assert penalty(points, SHIFT, MSAC, 2.0, np.inf, np.array([1])) == np.inf
+    measure = msac(points, 2.0, None)
+    lenient, strict = (gate(np.array([least]), BLOCK, random_start=False) for least in (0, 1))
+
+    assert penalty(points, SHIFT, measure, np.inf, lenient) == 4 * BLOCK
+    assert penalty(points, SHIFT, measure, np.inf, strict) == np.inf
+    assert lenient.rejected.tolist() == [0, 0]
+    assert strict.rejected.tolist() == [BLOCK, 0]
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_bail_out_rarely_drops_an_equal_model_and_mostly_a_bad_one(share):
-    rng, count = np.random.default_rng(1), 2000
-    table = bail_out_table(count, share)
+def test_a_gate_asks_after_its_own_stride():
+    points = matches_off_by(0, 0, 9, 0, 0, 0)
+    measure = msac(points, 2.0, None)
+    for least, passes in [
+        ([1, 2, 2], True),
+        ([1, 2, 3], False),
+        ([1, 2, 2, 3, 4, 5], True),
+        ([0, 0, 0, 0, 0, 6], False),
+    ]:
+        turned = penalty(points, SHIFT, measure, np.inf, gate(np.array(least), 1, random_start=False))
+        assert (turned < np.inf) == passes
 
-    def survives(real_share):
-        inlier = rng.permutation(count) < round(real_share * count)
-        seen = np.cumsum(inlier)[BLOCK - 1 : -1 : BLOCK][: len(table)]
-        return (seen >= table).all()
 
-    assert np.mean([survives(share) for _ in range(300)]) > 0.97
-    assert np.mean([survives(share / 2) for _ in range(300)]) < 0.1
-
-
-def test_bail_out_table_of_few_matches_is_empty():
-    assert len(bail_out_table(BLOCK, 0.5)) == 0
-    assert bail_out_table(1, 1.0).tolist() == []
-    assert bail_out_table(4 * BLOCK, 1.0).tolist() == [BLOCK, 2 * BLOCK, 3 * BLOCK]
+@pytest.mark.parametrize("count", [1, 2, 9, 10, 1001])
+def test_quickselect_agrees_with_sorting(count):
+    rng = np.random.default_rng(count)
+    for values in (rng.normal(size=count), rng.integers(0, 3, count).astype(float)):
+        for rank in {0, count // 2, count - 1}:
+            assert select(values.copy(), rank) == np.sort(values)[rank]
