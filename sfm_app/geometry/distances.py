@@ -119,8 +119,9 @@ def _shortest_moves(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
     below = slope + np.copysign(root, slope)
     extra = np.divide(-2.0 * rest, below, out=np.zeros_like(rest), where=below != 0)
     np.put_along_axis(z, weakest, np.take_along_axis(z, weakest, axis=1) + extra[:, None], axis=1)
-    z[(s[0] == 0) & ~g.any(axis=1)] = np.inf
-    return np.asarray(z @ axes)
+    z = z @ axes
+    z[(s[0] == 0) & ~g.any(axis=1)] = np.inf  # q is constant
+    return np.asarray(z)
 
 
 def _multiplier(c: FloatArray, g: FloatArray, d: FloatArray, a: float) -> FloatArray:

@@ -2,7 +2,7 @@
 
 An estimator is a `loop.Recipe`: a way to sample, to score, to stop and to refit. `loop.search` runs it,
 `verdict.estimate` judges what it found. From the sample to the answer: `points`, `sampling`, `minimal`, `scoring`,
-`search`, `leverage`, `stopping`, `refit`, `chance`, `degeneracy`.
+`search`, `leverage`, `stopping`, `refit`, `reprojection`, `refits`, `chance`, `degeneracy`.
 """
 
 from collections.abc import Callable

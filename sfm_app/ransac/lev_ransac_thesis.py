@@ -7,31 +7,21 @@ from numpy.typing import NDArray
 
 from sfm_app.ransac.leverage import prior_validity
 from sfm_app.ransac.loop import Recipe
-from sfm_app.ransac.refit import fit_eight_point, refine_sampson
-from sfm_app.ransac.scoring import MSAC, MSAC_LINEAR, squared_distances
+from sfm_app.ransac.refits import refit_sampson
+from sfm_app.ransac.scoring import MSAC, MSAC_LINEAR
 from sfm_app.ransac.verdict import estimate
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 
 FloatArray = NDArray[np.float64]
 
-
-def refit_to_inliers(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """8-point algorithm, then least squares on the Sampson distance, both on the inliers of F (thesis 4.3)."""
-    inliers = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
-    if np.count_nonzero(inliers) < 8:
-        return F
-    chosen = points[inliers]
-    return refine_sampson(chosen, fit_eight_point(chosen, np.ones(len(chosen))), cutoff=np.inf)
-
-
 THESIS = Recipe(
     score=MSAC_LINEAR,
     validity=partial(prior_validity, sigma_from_inliers=False),
     stop_on_convergence=True,
-    finish=refit_to_inliers,
+    finish=refit_sampson,
 )
-UNIFORM = Recipe(score=MSAC, finish=refit_to_inliers)
+UNIFORM = Recipe(score=MSAC, finish=refit_sampson)
 
 
 def fit_lev_ransac_thesis(

@@ -122,3 +122,23 @@ def test_pose_gives_the_matrix_of_the_synthetic_pair():
 def test_pose_without_baseline_has_none():
     with pytest.raises(ValueError, match="zero"):
         fundamental_from_pose(np.eye(3), np.eye(3), np.eye(3), np.zeros(3))
+
+
+@pytest.mark.parametrize("scale", [1.0, -40.0])
+def test_canonical_cameras_have_the_matrix_they_come_from(scale):
+    rng = np.random.default_rng(0)
+    F = unit_norm(nearest_rank_two(rng.normal(size=(3, 3))))
+
+    P1, P2 = canonical_cameras(scale * F)
+
+    np.testing.assert_array_equal(P1, np.eye(3, 4))
+    assert same_up_to_sign(unit_norm(cross_matrix(P2[:, 3]) @ P2[:, :3]), F) < 1e-12
+    X = rng.normal(size=(20, 4))
+    assert np.abs(np.einsum("ni,ij,nj->n", X @ P2.T, F, X @ P1.T)).max() < 1e-12
+    s = np.linalg.svd(F, compute_uv=False)
+    np.testing.assert_allclose(np.linalg.svd(P2[:, :3], compute_uv=False), [s[0], np.sqrt(s[0] * s[1]), s[1]])
+
+
+def test_canonical_cameras_of_nothing_do_not_exist():
+    with pytest.raises(ValueError, match="zero or not finite"):
+        canonical_cameras(np.zeros((3, 3)))
