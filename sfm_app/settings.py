@@ -52,6 +52,10 @@ class EpipolarSettings(Section):
     confidence: float = Field(0.9999, gt=0, lt=1, description="wanted probability that one sample is free of outliers")
     max_trials: int = Field(20000, ge=1, le=10_000_000, description="most minimal samples per pair")
     min_inliers: int = Field(16, ge=8, le=10000, description="a pair with fewer inliers is rejected")
+    refit: Literal["auto", "eight-point", "sampson", "reprojection"] = Field(
+        "auto",
+        description="distance that one more fit to the inliers makes small; auto: the estimator's own fit is the last",
+    )
 
 
 class CalibrationSettings(Section):

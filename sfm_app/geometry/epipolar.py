@@ -1,7 +1,6 @@
-"""The epipolar geometry of two views: distances, the 8-point algorithm, and what follows from F.
+"""The epipolar geometry of two views: the 8-point algorithm, and what follows from F.
 
-``x2' F x1 = 0`` throughout. Points are (N, 2) pixels. Hartley and Zisserman, Multiple View Geometry, 2nd edition (HZ);
-thesis section 4.2.
+``x2' F x1 = 0`` throughout. Points are (N, 2) pixels. Hartley and Zisserman, Multiple View Geometry, 2nd edition (HZ).
 """
 
 import numpy as np
@@ -18,39 +17,12 @@ def homogeneous(x: ArrayLike) -> FloatArray:
     return np.column_stack([points, np.ones(len(points))])
 
 
-def sampson_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
-    """First-order distance of each match to the epipolar constraint (HZ 11.9 and thesis 4.2, before squaring)::
-
-        |x2' F x1| / sqrt((F x1)_1^2 + (F x1)_2^2 + (F' x2)_1^2 + (F' x2)_2^2)
-
-    Args:
-        F: (3, 3), any scale.
-        x1: (N, 2) pixels.
-        x2: (N, 2) pixels, row by row the partners of x1.
-
-    Returns:
-        (N,) distances in pixels, >= 0; inf where both epipolar lines vanish.
-
-    Raises:
-        ValueError: the shapes are not as above.
-    """
-    algebraic, line1, line2 = _constraint(F, x1, x2)
-    squared = (line1[:, :2] ** 2).sum(axis=1) + (line2[:, :2] ** 2).sum(axis=1)
-    return _ratio(np.abs(algebraic), np.sqrt(squared))
-
-
-def symmetric_epipolar_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
-    """Root mean square of a match's distances to its two epipolar lines (HZ 11.10).
-
-    Args and errors as in `sampson_distance`.
-
-    Returns:
-        (N,) distances in pixels, >= 0; inf where an epipolar line vanishes.
-    """
-    algebraic, line1, line2 = _constraint(F, x1, x2)
-    to1 = _ratio(np.abs(algebraic), np.hypot(line1[:, 0], line1[:, 1]))
-    to2 = _ratio(np.abs(algebraic), np.hypot(line2[:, 0], line2[:, 1]))
-    return np.sqrt((to1**2 + to2**2) / 2)
+def homogeneous_pair(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Both views of N matches as (N, 3); ValueError for other shapes, and where the rows do not pair up."""
+    h1, h2 = homogeneous(x1), homogeneous(x2)
+    if len(h1) != len(h2):
+        raise ValueError(f"x1 and x2 must pair up, got {len(h1)} and {len(h2)} points")
+    return h1, h2
 
 
 def hartley_normalisation(x: ArrayLike) -> FloatArray:
@@ -84,7 +56,7 @@ def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) 
     Raises:
         ValueError: wrong shapes, fewer than 8 matches, or all points of a view coincide.
     """
-    h1, h2 = _pair(x1, x2)
+    h1, h2 = homogeneous_pair(x1, x2)
     if len(h1) < 8:
         raise ValueError(f"the 8-point algorithm needs 8 matches, got {len(h1)}")
     T1, T2 = hartley_normalisation(h1[:, :2]), hartley_normalisation(h2[:, :2])
@@ -123,6 +95,29 @@ def epipoles(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
     return Vt[2], U[:, 2]
 
 
+def canonical_cameras(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Two cameras with this F, P1 = [I|0] and P2 = [[e2]x F + e2 v' | e2] (thesis 2.34 with lambda = 1, HZ 9.10).
+
+    v is free: it says which plane of the scene lies at infinity. With F of norm 1, singular values s1 >= s2, and
+    v = sqrt(s1 s2) e1 the left 3 x 3 of P2 has the singular values s1, sqrt(s1 s2), s2: invertible, and as well
+    conditioned as F lets it be. With pixels s1 / s2 is large; give F of centred points with coordinates near 1.
+
+    Args:
+        F: (3, 3), rank 2, any scale.
+
+    Returns:
+        P1, P2, both (3, 4), x1 ~ P1 X and x2 ~ P2 X.
+
+    Raises:
+        ValueError: F is zero or not finite.
+    """
+    F = unit_norm(F)
+    e1, e2 = epipoles(F)
+    s = np.linalg.svd(F, compute_uv=False)
+    M = cross_matrix(e2) @ F + np.outer(e2, np.sqrt(s[0] * s[1]) * e1)
+    return np.eye(3, 4), np.column_stack([M, e2])
+
+
 def cross_matrix(v: ArrayLike) -> FloatArray:
     """The (3, 3) matrix [v]x with [v]x w = v x w."""
     a, b, c = np.asarray(v, dtype=np.float64)
@@ -137,24 +132,3 @@ def fundamental_from_pose(K1: ArrayLike, K2: ArrayLike, R: ArrayLike, t: ArrayLi
     """
     K1, K2, R = (np.asarray(m, dtype=np.float64) for m in (K1, K2, R))
     return unit_norm(np.linalg.inv(K2).T @ cross_matrix(t) @ R @ np.linalg.inv(K1))
-
-
-def _pair(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    h1, h2 = homogeneous(x1), homogeneous(x2)
-    if len(h1) != len(h2):
-        raise ValueError(f"x1 and x2 must pair up, got {len(h1)} and {len(h2)} points")
-    return h1, h2
-
-
-def _constraint(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Algebraic error x2' F x1 and the epipolar lines in view 1 and view 2."""
-    matrix = np.asarray(F, dtype=np.float64)
-    if matrix.shape != (3, 3):
-        raise ValueError(f"F must have shape (3, 3), got {matrix.shape}")
-    h1, h2 = _pair(x1, x2)
-    line1, line2 = h2 @ matrix, h1 @ matrix.T
-    return (h2 * line2).sum(axis=1), line1, line2
-
-
-def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
-    return np.asarray(np.divide(above, below, out=np.full(len(above), np.inf), where=below > 0))

@@ -5,7 +5,7 @@ An estimator is a `loop.Recipe`: what it samples, solves, scores and verifies wi
 `recipes` has the others.
 
 From the sample to the answer: `points`, `sampling`, `minimal`, `verification`, `sprt`, `scoring`, `mixture`, `search`,
-`leverage`, `residuals`, `stopping`, `loop`, `refit`, `chance`, `degeneracy`.
+`leverage`, `residuals`, `stopping`, `loop`, `refit`, `reprojection`, `refits`, `chance`, `degeneracy`.
 """
 
 from collections.abc import Callable

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sfm_app.ransac.leverage import prior_validity
 from sfm_app.ransac.loop import Recipe
 from sfm_app.ransac.mixture import mlesac
-from sfm_app.ransac.refit import fit_eight_point, refine_sampson
+from sfm_app.ransac.refits import refit_sampson
 from sfm_app.ransac.residuals import residual_validity
 from sfm_app.ransac.scoring import lmeds, msac, msac_linear, ransac, squared_distances
 from sfm_app.ransac.sprt import Sprt
@@ -30,19 +30,10 @@ FloatArray = NDArray[np.float64]
 _LMEDS_SIGMAS = 2.5
 
 
-def refit_to_inliers(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """8-point algorithm, then least squares on the Sampson distance, both on the inliers of F (thesis 4.3)."""
-    inliers = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
-    if np.count_nonzero(inliers) < 8:
-        return F
-    chosen = points[inliers]
-    return refine_sampson(chosen, fit_eight_point(chosen, np.ones(len(chosen))), cutoff=np.inf)
-
-
 def refit_to_median(points: FloatArray, F: FloatArray, _threshold: float) -> FloatArray:
     """The same on the matches within 2.5 robust standard deviations: LMedS knows the scale by itself."""
     squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
-    return refit_to_inliers(points, F, _LMEDS_SIGMAS * median_sigma(squared))
+    return refit_sampson(points, F, _LMEDS_SIGMAS * median_sigma(squared))
 
 
 def median_sigma(squared: FloatArray) -> float:
@@ -53,7 +44,7 @@ def median_sigma(squared: FloatArray) -> float:
     return 1.4826 * (1 + 5 / max(len(squared) - 7, 1)) * math.sqrt(float(np.median(squared)))
 
 
-RANSAC = Recipe(score=ransac, finish=refit_to_inliers)
+RANSAC = Recipe(score=ransac, finish=refit_sampson)
 LEV_RANSAC = replace(
     RANSAC,
     score=msac_linear,

@@ -5,12 +5,13 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfm_app.geometry.epipolar import sampson_distance
+from sfm_app.geometry.distances import sampson_distance
 from sfm_app.ransac.chance import MOST_FALSE_ALARMS, false_alarms_of, mismatch_distances
 from sfm_app.ransac.degeneracy import find_degeneracy
 from sfm_app.ransac.leverage import prior_validity
 from sfm_app.ransac.loop import Recipe, search
 from sfm_app.ransac.points import Matches, check_points, prepare
+from sfm_app.ransac.refits import last_fit
 from sfm_app.ransac.scoring import squared_distances
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
@@ -48,7 +49,7 @@ def estimate(
     if found is None:
         return Rejected(NO_MODEL)
     threshold = options.max_error_px / matches.unit_px
-    F = recipe.finish(matches.points, found.F, threshold)
+    F = last_fit(options.refit, recipe.finish)(matches.points, found.F, threshold)
     if not np.isfinite(F).all():
         return Rejected(NO_MODEL)
     return _judge(first, second, matches, F, found.trials, options)

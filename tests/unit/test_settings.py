@@ -35,6 +35,7 @@ def test_every_setting_has_help_in_the_toml():
         ),
         ({"epipolar": {"confidence": 1.5}}, "'epipolar.confidence'", "sfm-app config"),
         ({"epipolar": {"max_error_px": float("nan")}}, "'epipolar.max_error_px'", "sfm-app config"),
+        ({"epipolar": {"refit": "none"}}, "'epipolar.refit'", "sfm-app config"),
         ({"depth": 3}, "'depth'", "sfm-app config"),
         ({"quality": "best"}, "'quality'", "sfm-app config"),
     ],

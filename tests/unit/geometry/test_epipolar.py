@@ -1,11 +1,13 @@
-"""Epipolar distances, the 8-point algorithm and what follows from F."""
+"""The 8-point algorithm and what follows from F."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import (
+    canonical_cameras,
     cross_matrix,
     eight_point,
     epipoles,
@@ -13,8 +15,6 @@ from sfm_app.geometry.epipolar import (
     hartley_normalisation,
     homogeneous,
     nearest_rank_two,
-    sampson_distance,
-    symmetric_epipolar_distance,
     unit_norm,
 )
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
@@ -24,64 +24,6 @@ SEEDS = st.integers(0, 2**31)
 
 def same_up_to_sign(F, G):
     return min(np.abs(F - G).max(), np.abs(F + G).max())
-
-
-def test_distances_by_hand():
-    # epipolar lines y = const: F of a pure shift along x; the match is 3 px off
-    F = cross_matrix([1, 0, 0])
-    x1, x2 = [[10.0, 20.0]], [[40.0, 23.0]]
-
-    assert sampson_distance(F, x1, x2) == pytest.approx([3 / np.sqrt(2)])
-    assert symmetric_epipolar_distance(F, x1, x2) == pytest.approx([3])
-
-
-@given(seed=SEEDS, scale=st.floats(-1e6, 1e6).filter(lambda s: abs(s) > 1e-6))
-def test_sampson_distance_ignores_the_scale_and_the_order_of_the_views(seed, scale):
-    rng = np.random.default_rng(seed)
-    F, x1, x2 = rng.normal(size=(3, 3)), rng.uniform(0, 10, (5, 2)), rng.uniform(0, 10, (5, 2))
-
-    expected = sampson_distance(F, x1, x2)
-
-    assert (expected > 0).all()
-    np.testing.assert_allclose(sampson_distance(scale * F, x1, x2), expected, rtol=1e-6)
-    np.testing.assert_allclose(sampson_distance(F.T, x2, x1), expected, rtol=1e-9)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_sampson_distance_is_the_distance_to_the_nearest_exact_match(seed):
-    pair = make_pair(PairOptions(points=20, sigma_px=0.5), seed)
-    distance = sampson_distance(pair.F, pair.x1, pair.x2)
-    gradient = np.empty((20, 4))  # of the algebraic error over (x1, x2), by central differences
-    for k in range(4):
-        step = np.eye(4)[k] * 1e-3
-        ahead, behind = (
-            np.einsum("ni,ij,nj->n", homogeneous(pair.x2 + s * step[2:]), pair.F, homogeneous(pair.x1 + s * step[:2]))
-            for s in (1, -1)
-        )
-        gradient[:, k] = (ahead - behind) / 2e-3
-    algebraic = np.einsum("ni,ij,nj->n", homogeneous(pair.x2), pair.F, homogeneous(pair.x1))
-
-    np.testing.assert_allclose(distance, np.abs(algebraic) / np.linalg.norm(gradient, axis=1), rtol=1e-6)
-    assert 0.2 < np.sqrt(np.mean(distance**2)) < 0.8
-
-
-def test_vanishing_lines_are_infinitely_far():
-    assert sampson_distance(np.zeros((3, 3)), [[1, 2]], [[3, 4]]) == [np.inf]
-    assert symmetric_epipolar_distance(np.zeros((3, 3)), [[1, 2]], [[3, 4]]) == [np.inf]
-
-
-@pytest.mark.parametrize("function", [sampson_distance, symmetric_epipolar_distance])
-@pytest.mark.parametrize(
-    ("F", "x1", "x2", "message"),
-    [
-        (np.eye(2), [[1, 2]], [[1, 2]], r"F must have shape \(3, 3\)"),
-        (np.eye(3), [1, 2], [[1, 2]], r"shape \(N, 2\)"),
-        (np.eye(3), [[1, 2]], [[1, 2], [3, 4]], "pair up"),
-    ],
-)
-def test_wrong_shapes_are_refused(function, F, x1, x2, message):
-    with pytest.raises(ValueError, match=message):
-        function(F, x1, x2)
 
 
 @given(seed=SEEDS, shift=st.floats(-1e4, 1e4), scale=st.floats(1e-3, 1e3))
@@ -180,3 +122,23 @@ def test_pose_gives_the_matrix_of_the_synthetic_pair():
 def test_pose_without_baseline_has_none():
     with pytest.raises(ValueError, match="zero"):
         fundamental_from_pose(np.eye(3), np.eye(3), np.eye(3), np.zeros(3))
+
+
+@pytest.mark.parametrize("scale", [1.0, -40.0])
+def test_canonical_cameras_have_the_matrix_they_come_from(scale):
+    rng = np.random.default_rng(0)
+    F = unit_norm(nearest_rank_two(rng.normal(size=(3, 3))))
+
+    P1, P2 = canonical_cameras(scale * F)
+
+    np.testing.assert_array_equal(P1, np.eye(3, 4))
+    assert same_up_to_sign(unit_norm(cross_matrix(P2[:, 3]) @ P2[:, :3]), F) < 1e-12
+    X = rng.normal(size=(20, 4))
+    assert np.abs(np.einsum("ni,ij,nj->n", X @ P2.T, F, X @ P1.T)).max() < 1e-12
+    s = np.linalg.svd(F, compute_uv=False)
+    np.testing.assert_allclose(np.linalg.svd(P2[:, :3], compute_uv=False), [s[0], np.sqrt(s[0] * s[1]), s[1]])
+
+
+def test_canonical_cameras_of_nothing_do_not_exist():
+    with pytest.raises(ValueError, match="zero or not finite"):
+        canonical_cameras(np.zeros((3, 3)))

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.geometry.epipolar import sampson_distance
+from sfm_app.geometry.distances import sampson_distance
 from sfm_app.ransac.points import check_points, prepare
 from sfm_app.ransac.scoring import squared_distances
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.epipolar import sampson_distance
+from sfm_app.geometry.distances import sampson_distance
 from sfm_app.ransac.points import prepare
 from sfm_app.ransac.refit import fit_eight_point, refine_sampson
 from sfm_app.ransac.scoring import squared_distances

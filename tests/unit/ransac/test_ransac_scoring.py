@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.epipolar import cross_matrix, sampson_distance
+from sfm_app.geometry.distances import sampson_distance
+from sfm_app.geometry.epipolar import cross_matrix
 from sfm_app.ransac.scoring import (
     lmeds,
     msac,

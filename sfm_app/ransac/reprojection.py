@@ -1,0 +1,97 @@
+"""The Gold Standard refit: F of the projective reconstruction with least reprojection error (thesis 4.3, HZ 11.4.1)::
+
+    cost = sum_i c^2 log(1 + r_i^2 / c^2)          (c = inf: least squares)
+
+with r_i the reprojection distance of match i, hence already the least over its point X_i. Bundle adjustment of two
+views has twelve camera parameters and three per point, but of the twelve only the seven of F count (2.34: v and lambda
+are free), and the Schur complement of a point at its best place leaves one equation of its match: r_i, with the
+derivative x2 x1' / |gradient of x2' F x1| over F, both taken at the nearest exact match. So this is Levenberg-Marquardt
+over F alone, and the points follow exactly. It needs no depth: points at infinity are points like all others, and those
+near an epipole, where depth is undetermined, do not hold back the rest. Time and memory grow with the matches.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.distances import nearest_exact_matches
+from sfm_app.geometry.epipolar import homogeneous, nearest_rank_two, unit_norm
+
+FloatArray = NDArray[np.float64]
+
+_SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e12
+_ENOUGH = 1e-9
+"""Relative decrease of the cost under which the search ends."""
+_FLOOR = 1e-12
+"""Least curvature, relative to the largest: some matches leave a direction of F free."""
+
+
+def refine_reprojection(
+    points: FloatArray, F: FloatArray, *, scale: float = np.inf, most_steps: int = 20
+) -> FloatArray:
+    """Move F to a local minimum of the cost above.
+
+    Args:
+        points: (N, 4) inliers, of magnitude about 1.
+        F: (3, 3) start.
+        scale: Cauchy scale c, in the units of `points`; inf for plain least squares.
+        most_steps: most Levenberg-Marquardt steps.
+
+    Returns:
+        (3, 3), rank 2, Frobenius norm 1.
+
+    Raises:
+        ValueError: F is zero or not finite.
+    """
+    softness = 1.0 / (scale * scale)
+    F = unit_norm(nearest_rank_two(unit_norm(F)))
+    moves = _moves(points, F)
+    cost, damping = _cost(moves, softness), 1e-4
+    for _ in range(most_steps):
+        basis = _tangent(F)
+        normal, right = _normal_equations(points, F, moves, softness, basis)
+        curvature, improved, before = np.maximum(np.diag(normal), _FLOOR * np.diag(normal).max()), False, cost
+        while not improved and 0 < before < np.inf and damping < _LARGEST_DAMPING:
+            step = np.linalg.solve(normal + damping * np.diag(curvature), right)
+            trial = unit_norm(nearest_rank_two(F + (step @ basis).reshape(3, 3)))
+            moves = _moves(points, trial)
+            cost = _cost(moves, softness)
+            improved = cost < before
+            damping = max(damping * 0.1, _SMALLEST_DAMPING) if improved else damping * 10.0
+        if not improved:
+            break
+        F = trial
+        if before - cost <= _ENOUGH * before:
+            break
+    return F
+
+
+def _moves(points: FloatArray, F: FloatArray) -> FloatArray:
+    """(N, 4) from every match to the nearest exact one, where its best point reprojects."""
+    return np.hstack(nearest_exact_matches(F, points[:, :2], points[:, 2:])) - points
+
+
+def _cost(moves: FloatArray, softness: float) -> float:
+    squared = (moves**2).sum(axis=1)
+    return float((np.log1p(softness * squared) / softness if softness > 0 else squared).sum())
+
+
+def _tangent(F: FloatArray) -> FloatArray:
+    """(7, 9) orthonormal directions in which F, of norm 1, stays of rank 2 and of norm 1 to first order."""
+    U, _, Vt = np.linalg.svd(F)
+    basis: FloatArray = np.linalg.svd(np.stack([np.outer(U[:, 2], Vt[2]).ravel(), F.ravel()]))[2][2:]
+    return basis
+
+
+def _normal_equations(
+    points: FloatArray, F: FloatArray, moves: FloatArray, softness: float, basis: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted J'J (7, 7) and -J'r (7,) over the directions of `basis`, the points eliminated."""
+    exact1, exact2 = homogeneous(points[:, :2] + moves[:, :2]), homogeneous(points[:, 2:] + moves[:, 2:])
+    gradient = np.hstack([(exact2 @ F)[:, :2], (exact1 @ F.T)[:, :2]])
+    length = np.linalg.norm(gradient, axis=1)
+    inverse = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)  # both on the epipoles: no direction
+    residuals = -(moves * gradient).sum(axis=1) * inverse
+    rows = (exact2[:, :, None] * exact1[:, None, :]).reshape(-1, 9) * inverse[:, None]
+    jacobian = np.einsum("nk,jk->nj", rows, basis)  # einsum sums in one thread, in one order
+    weighted = jacobian / (1.0 + softness * (moves**2).sum(axis=1))[:, None]
+    return np.einsum("nj,nk->jk", weighted, jacobian), -np.einsum("nj,n->j", weighted, residuals)
