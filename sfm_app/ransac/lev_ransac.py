@@ -1,14 +1,20 @@
-"""LEV-RANSAC as the program uses it: Algorithm 1 with what today's estimators have learnt since."""
+"""LEV-RANSAC as the program uses it: Algorithm 1 with what today's estimators have learnt since.
+
+One kind of cost goes through all of it, r^2 / (r^2 + c^2), which has no threshold to fall off: at a coarse scale c for
+the models of samples, which are noisy, and at a fine one for models that were optimised on all matches nearby. Fine
+scales tell the true geometry from one that lies on repeated structure or on a single plane.
+"""
 
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.ransac.leverage import mad_sigma, prior_validity
+from sfm_app.ransac.leverage import prior_validity
 from sfm_app.ransac.loop import Recipe
-from sfm_app.ransac.refit import fit_eight_point, refine_sampson
-from sfm_app.ransac.scoring import msac, squared_distances
+from sfm_app.ransac.parallax import with_another_epipole
+from sfm_app.ransac.refit import fit_eight_point, refine_mixture, refine_sampson
+from sfm_app.ransac.scoring import geman_mcclure, squared_distances
 from sfm_app.ransac.verdict import estimate
 from sfm_app.ransac.verification import BailOut
 from sfm_app.settings import EpipolarSettings
@@ -16,42 +22,43 @@ from sfm_app.types import EpipolarFit, Rejected
 
 FloatArray = NDArray[np.float64]
 
+COARSE, FINE = 0.25, 0.1
+"""Scales c in thresholds."""
 _WIDE = 2.0
-_LOCAL_MATCHES, _LOCAL_STEPS = 1000, 5
-_CAUCHY = 1.5
-"""Scale of the last robust fit, in standard deviations of the inliers."""
-_LEAST_SIGMA = 0.02
-"""In thresholds: matches that are nearly perfect must not shut out all others."""
+_LOCAL_MATCHES, _LOCAL_STEPS, _ENOUGH = 500, (5, 3), 1e-3
+_REACH, _FINAL_STEPS = 3.0, 12
 
 
 def optimise_locally(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """8-point fit to the matches within twice the threshold, then a few robust Sampson steps; on a random thousand.
+    """8-point fit to the matches within twice the threshold, then Sampson steps, coarse and fine; on the first 500.
 
     A model through seven noisy matches misses many true ones by more than the threshold; from the wider set it reaches
     them (Chum, Matas and Kittler 2003).
     """
-    some = points[:_LOCAL_MATCHES]
+    some = np.asfortranarray(points[:_LOCAL_MATCHES])
     near = squared_distances(some, np.ascontiguousarray(F).reshape(9)) <= (_WIDE * threshold) ** 2
-    start = fit_eight_point(some, near.astype(np.float64)) if np.count_nonzero(near) >= 8 else F
-    return refine_sampson(some, start, cutoff=_WIDE * threshold, scale=threshold / 2, most_steps=_LOCAL_STEPS)
+    F = fit_eight_point(some, near.astype(np.float64)) if np.count_nonzero(near) >= 8 else F
+    for scale, steps in zip((COARSE, FINE), _LOCAL_STEPS, strict=True):
+        F = refine_sampson(some, F, scale=scale * threshold, most_steps=steps, enough=_ENOUGH)
+    return F
 
 
 def refit_to_all(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Robust fit to all matches: within twice the threshold, then within it at the scale of the inliers' own noise."""
-    wide = refine_sampson(points, F, cutoff=_WIDE * threshold, scale=threshold / 3)
-    distances = np.sqrt(squared_distances(points, np.ascontiguousarray(wide).reshape(9)))
-    sigma = max(mad_sigma(distances[distances <= threshold]), _LEAST_SIGMA * threshold)
-    return refine_sampson(points, wide, cutoff=threshold, scale=_CAUCHY * sigma)
+    """Maximum likelihood on all matches within three thresholds, whose noise it measures."""
+    return refine_mixture(points, F, threshold=threshold, reach=_REACH, most_steps=_FINAL_STEPS)
 
 
 PRODUCTION = Recipe(
-    score=msac,
+    score=partial(geman_mcclure, scale=COARSE),
+    fine_score=partial(geman_mcclure, scale=FINE),
     validity=partial(prior_validity, sigma_from_inliers=True),
     guided_share=0.5,
     verifier=BailOut,
+    least_trials=300,
     patience=2000,
     oriented=True,
     improve=optimise_locally,
+    recover=with_another_epipole,
     finish=refit_to_all,
 )
 

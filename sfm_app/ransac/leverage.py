@@ -12,8 +12,7 @@ linearly (and A f is small): one well-scaled frame (`points.Matches`) gives what
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.jit import kernel
-from sfm_app.ransac.minimal import design_row
+from sfm_app.ransac.design import quadratic_forms, weighted_gram
 from sfm_app.ransac.scoring import squared_distances
 
 FloatArray = NDArray[np.float64]
@@ -24,38 +23,6 @@ _LEAST_VARIANCE = 1e-24
 """Of residuals in units of the points' spread: perfect matches are left with the rounding of their coordinates."""
 _MAD_TO_SIGMA = 1.4826
 """Median absolute deviation to standard deviation, for a Gaussian."""
-
-
-@kernel
-def weighted_gram(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """(9, 9) matrix A' W A of the design matrix of the matches (N, 4), with weights (N,) >= 0."""
-    gram = np.zeros((9, 9))
-    row = np.empty(9)
-    for i in range(points.shape[0]):
-        if weights[i] > 0.0:
-            design_row(points[i], row)
-            for j in range(9):
-                for k in range(j + 1):
-                    gram[j, k] += weights[i] * row[j] * row[k]
-    for j in range(9):
-        for k in range(j):
-            gram[k, j] = gram[j, k]
-    return gram
-
-
-@kernel
-def _quadratic_forms(points: FloatArray, whitening: FloatArray) -> FloatArray:
-    """(N,) squared lengths of the design rows after `whitening` (9, 8)."""
-    forms = np.zeros(points.shape[0])
-    row = np.empty(9)
-    for i in range(points.shape[0]):
-        design_row(points[i], row)
-        for k in range(whitening.shape[1]):
-            dot = 0.0
-            for j in range(9):
-                dot += row[j] * whitening[j, k]
-            forms[i] += dot * dot
-    return forms
 
 
 def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArray:
@@ -77,7 +44,7 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
     values, vectors = np.linalg.eigh(gram)
     # a direction without support: whatever lies in it has leverage 1
     floor = max(float(values[-1]), np.finfo(float).tiny) * 1e-14
-    forms = _quadratic_forms(points, np.ascontiguousarray(tangent @ (vectors / np.sqrt(np.maximum(values, floor)))))
+    forms = quadratic_forms(points, np.ascontiguousarray(tangent @ (vectors / np.sqrt(np.maximum(values, floor)))))
     return np.where(fitted, np.minimum(forms, 1.0), forms / (1.0 + forms))
 
 

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
+from sfm_app.ransac.design import design_row
 from sfm_app.ransac.sampling import SAMPLE_SIZE
 
 FloatArray = NDArray[np.float64]
@@ -12,16 +13,6 @@ IntArray = NDArray[np.int64]
 MOST_MODELS = 3
 _RANK_TOLERANCE = 1e-9
 _SQUARINGS = 6
-
-
-@kernel
-def design_row(point: FloatArray, row: FloatArray) -> None:
-    """x2 (x) x1 into `row` (9,): the coefficients of the entries of F, by rows, in x2' F x1 = 0."""
-    for i in range(3):
-        from2 = point[2 + i] if i < 2 else 1.0
-        row[3 * i] = from2 * point[0]
-        row[3 * i + 1] = from2 * point[1]
-        row[3 * i + 2] = from2
 
 
 @kernel

@@ -48,7 +48,10 @@ class Matches:
     """The distinct matches of a pair as the estimators see them."""
 
     points: FloatArray
-    """(M, 4) x1, y1, x2, y2 in random order; each view centred, both divided by `unit_px`."""
+    """(M, 4) x1, y1, x2, y2 in random order; each view centred, both divided by `unit_px`.
+
+    In Fortran order: kernels run along the matches, and a column on end in memory lets them take several at once.
+    """
     rows: NDArray[np.intp]
     """(N,) for each match as given, its row in `points`."""
     unit_px: float
@@ -73,12 +76,16 @@ def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
     stacked = np.hstack([x1, x2])
     # One key per match: a projection on incommensurable numbers is equal for equal rows and sorts faster than rows do.
     keys = stacked[:, 0] + stacked[:, 1] * np.sqrt(2) + stacked[:, 2] * np.sqrt(3) + stacked[:, 3] * np.sqrt(5)
-    _, first, rows = np.unique(keys, return_index=True, return_inverse=True)
+    ranked = np.argsort(keys, kind="stable")
+    is_new = np.diff(keys[ranked], prepend=-np.inf) > 0
+    first = ranked[is_new]
     order = np.random.default_rng(seed).permutation(len(first))
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
+    rows = np.empty_like(ranked)
+    rows[ranked] = place[np.cumsum(is_new) - 1]
     centre = stacked.mean(axis=0) if len(stacked) else np.zeros(4)
-    points = np.ascontiguousarray(stacked[first[order]] - centre)
+    points = stacked[first[order]] - centre
     unit_px = float(np.sqrt((points**2).mean())) if len(points) else 1.0
     unit_px = unit_px if unit_px > 0 else 1.0
-    return Matches(points / unit_px, place[rows], unit_px, centre)
+    return Matches(np.asfortranarray(points / unit_px), rows, unit_px, centre)

@@ -1,45 +1,77 @@
 """Non-linear refinement of F on the Sampson distance, over its seven degrees of freedom.
 
 F = U diag(1, s, 0) V' with rotations U and V: three parameters each and s, rank 2 at every step and no spare scale
-(Bartoli and Sturm 2004). U turns to U exp([a]x), V to V exp([b]x). Levenberg-Marquardt with reweighted residuals::
+(Bartoli and Sturm 2004). U turns to U exp([a]x), V to V exp([b]x).
 
-    cost = sum_i c^2 log(1 + min(r_i, cutoff)^2 / c^2)          (c = inf: least squares)
+All fits are reweighted least squares: weigh the matches by their distances, take one Levenberg-Marquardt step that
+lowers sum_i w_i r_i^2, weigh again. For a cost that is a concave function of r^2, as all robust ones are, such a step
+lowers the cost itself as well.
 """
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.jit import kernel
-from sfm_app.ransac.leverage import weighted_gram
-from sfm_app.ransac.scoring import squared_sampson
+from sfm_app.jit import kernel, summing_kernel
+from sfm_app.ransac.design import LANES, add_products, gather, mirror, weighted_gram
+from sfm_app.ransac.scoring import distances_of_block, squared_distances
 
 FloatArray = NDArray[np.float64]
 
-_SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e12
+_FIRST_DAMPING, _SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-12, 1e12
 _ENOUGH = 1e-9
 """Relative decrease of the cost under which the search ends."""
+_ENOUGH_LIKELIHOOD = 1e-6
+_NEGLIGIBLE = 1e-3
+"""Weight below which a match is left out of a step."""
+_LEAST_SIGMA = 0.02
+"""In thresholds: matches that are nearly perfect must not shut out all others."""
+_MOST_SHARE = 0.999
+_MAD_TO_SIGMA = 1.4826
 
 
 def refine_sampson(
-    points: FloatArray, F: FloatArray, *, cutoff: float, scale: float = np.inf, most_steps: int = 20
+    points: FloatArray, F: FloatArray, *, scale: float = np.inf, most_steps: int = 20, enough: float = _ENOUGH
 ) -> FloatArray:
-    """Move F to a local minimum of the robust cost above.
+    """Move F towards a minimum of sum_i r_i^2 / (1 + r_i^2 / c^2) (Geman and McClure 1987).
 
     Args:
         points: (N, 4) matches.
         F: (3, 3) start.
-        cutoff: matches farther away than this do not pull.
-        scale: Cauchy scale c, in the units of `points`; inf for plain least squares within the cutoff.
+        scale: c, in the units of `points`; inf for least squares.
         most_steps: most Levenberg-Marquardt steps.
+        enough: relative decrease of the cost under which to stop.
 
     Returns:
         (3, 3), rank 2, its largest singular value 1.
     """
-    U, s, Vt = np.linalg.svd(F)
-    U, V = np.ascontiguousarray(U), np.ascontiguousarray(Vt.T)
-    U[:, 2] *= np.sign(np.linalg.det(U))  # the third columns meet the singular value 0: their sign is free
-    V[:, 2] *= np.sign(np.linalg.det(V))
-    return _levenberg_marquardt(points, U, s[1] / s[0], V, cutoff, 1.0 / (scale * scale), most_steps)
+    law = np.array([scale**-2, 0.0, 0.0, 0.0])
+    return _reweighted(points, *_factors(F), law, most_steps, enough)
+
+
+def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach: float, most_steps: int) -> FloatArray:
+    """Maximum likelihood of F, the inliers' sigma and their share, by expectation maximisation (thesis 3.5 and 4.6).
+
+    Among the matches within `reach` thresholds, distances of inliers are those of a Gaussian about 0, all others are
+    spread evenly. The weight of a match is the probability that it is an inlier. sigma is at most one threshold.
+
+    Args:
+        points: (N, 4) matches.
+        F: (3, 3) start, near enough for its inliers to tell sigma.
+        threshold: largest distance of an inlier.
+        reach: thresholds within which matches count, > 1.
+        most_steps: most steps.
+
+    Returns:
+        (3, 3), rank 2, its largest singular value 1.
+    """
+    U, s, V = _factors(F)
+    squared = squared_distances(points, _compose(U, s, V))
+    inside = squared[squared <= threshold * threshold]
+    sigma = _MAD_TO_SIGMA * math.sqrt(float(np.median(inside))) if len(inside) else threshold
+    law = np.array([0.0, (reach * threshold) ** 2, threshold**2, min(sigma, threshold) ** 2])
+    return _reweighted(points, U, s, V, law, most_steps, _ENOUGH_LIKELIHOOD)
 
 
 def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
@@ -58,35 +90,136 @@ def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
     return rank_two
 
 
+def _factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+    """Rotations U and V and the number s of F ~ U diag(1, s, 0) V'."""
+    U, s, Vt = np.linalg.svd(F)
+    U, V = np.ascontiguousarray(U), np.ascontiguousarray(Vt.T)
+    U[:, 2] *= np.sign(np.linalg.det(U))  # the third columns meet the singular value 0: their sign is free
+    V[:, 2] *= np.sign(np.linalg.det(V))
+    return U, float(s[1] / s[0]), V
+
+
 @kernel
-def _levenberg_marquardt(
-    points: FloatArray, U: FloatArray, s: float, V: FloatArray, cutoff: float, softness: float, most_steps: int
+def _reweighted(
+    points: FloatArray, U: FloatArray, s: float, V: FloatArray, law: FloatArray, most_steps: int, enough: float
 ) -> FloatArray:
-    gram, gradient = np.empty((9, 9)), np.empty(9)
-    basis, step = np.empty((7, 9)), np.empty(7)
-    normal, right = np.empty((7, 7)), np.empty(7)
+    """The loop of all fits; `law` says how matches are weighed: 1 / c^2, 0, 0, 0 for a robust cost, or else 0, the
+    squares of the reach, of the largest sigma and of the first sigma for a mixture.
+    """
+    count = points.shape[0]
+    weights, squared, trial = np.empty(count), np.empty(count), np.empty(count)
+    normal, right, step = np.empty((7, 7)), np.empty(7), np.empty(7)
     f = _compose(U, s, V)
-    cost = new_cost = _cost(points, f, cutoff, softness)
-    damping = 1e-4
-    for _ in range(most_steps):
-        _normal_equations(points, f, cutoff, softness, gram, gradient)
-        _tangent(U, s, V, basis)
-        _project(gram, gradient, basis, normal, right)
+    distances_of_block(points, f, 0, squared)
+    damping, mixture, share = _FIRST_DAMPING, law[1] > 0.0, 0.9
+    variance = law[3]
+    for n in range(most_steps):
+        if mixture:
+            variance, share = _weigh_by_mixture(squared, law, variance, share, 6 if n == 0 else 1, weights)
+        else:
+            _weigh_robustly(squared, law[0], weights)
+        cost = new_cost = _weighted_sum(squared, weights)
+        _normal_equations(points, f, weights, U, s, V, normal, right)
         improved = False
         while not improved and damping < _LARGEST_DAMPING:
             if _solve(normal, right, damping, step):
                 U_new, V_new, s_new = _turned(U, step[0:3]), _turned(V, step[3:6]), s + step[6]
                 new = _compose(U_new, s_new, V_new)
-                new_cost = _cost(points, new, cutoff, softness)
+                distances_of_block(points, new, 0, trial)
+                new_cost = _weighted_sum(trial, weights)
                 improved = new_cost < cost
             damping = max(damping * 0.1, _SMALLEST_DAMPING) if improved else damping * 10.0
         if not improved:
             break
-        done = cost - new_cost <= _ENOUGH * cost
-        U, V, s, f, cost = U_new, V_new, s_new, new, new_cost
-        if done:
+        U, V, s, f = U_new, V_new, s_new, new
+        squared, trial = trial, squared
+        if cost - new_cost <= enough * cost:
             break
     return f.reshape(3, 3)
+
+
+@kernel
+def _weigh_robustly(squared: FloatArray, softness: float, weights: FloatArray) -> None:
+    """d/d(r^2) of r^2 / (1 + softness r^2)."""
+    for i in range(squared.shape[0]):
+        root = 1.0 / (1.0 + softness * squared[i])
+        weights[i] = root * root if root * root > _NEGLIGIBLE else 0.0
+
+
+@kernel
+def _weigh_by_mixture(
+    squared: FloatArray, law: FloatArray, variance: float, share: float, rounds: int, weights: FloatArray
+) -> tuple[float, float]:
+    """Probability of each match to be an inlier; the inliers' variance and share that follow from these."""
+    reach, largest = law[1], law[2]
+    for _ in range(rounds):
+        inlier, outlier = share * np.sqrt(2.0 / (np.pi * variance)), (1.0 - share) / np.sqrt(reach)
+        near, total, moment = 0, 0.0, 0.0
+        for i in range(squared.shape[0]):
+            weights[i] = 0.0
+            if squared[i] < reach:
+                near += 1
+                density = inlier * np.exp(-squared[i] / (2.0 * variance))
+                weight = density / (density + outlier)
+                total += weight
+                moment += weight * squared[i]
+                weights[i] = weight if weight > _NEGLIGIBLE else 0.0
+        variance = moment / max(total - 7.0, 1.0)  # seven parameters of F are fitted to the same matches
+        variance = min(max(variance, _LEAST_SIGMA * _LEAST_SIGMA * largest), largest)
+        share = min(max(total / max(near, 1), 1.0 - _MOST_SHARE), _MOST_SHARE)
+    return variance, share
+
+
+@summing_kernel
+def _weighted_sum(squared: FloatArray, weights: FloatArray) -> float:
+    total = 0.0
+    for i in range(squared.shape[0]):
+        total += weights[i] * squared[i] if weights[i] > 0.0 else 0.0
+    return total
+
+
+@kernel
+def _normal_equations(
+    points: FloatArray, f: FloatArray, weights: FloatArray, U: FloatArray, s: float, V: FloatArray,
+    normal: FloatArray, right: FloatArray,
+) -> None:  # fmt: skip
+    """Weighted J'J and -J'r over the seven parameters."""
+    gram, block, rows = np.zeros((10, 10)), np.empty((5, LANES)), np.empty((10, LANES))
+    start = 0
+    while start < points.shape[0]:
+        count, start = gather(points, weights, start, block)
+        _derivatives(block, count, f, rows)
+        add_products(rows, count, gram)
+    mirror(gram)
+    basis = np.empty((7, 9))
+    _tangent(U, s, V, basis)
+    _project(gram, basis, normal, right)
+
+
+@kernel
+def _derivatives(block: FloatArray, count: int, f: FloatArray, rows: FloatArray) -> None:
+    """dr / dF (9 rows) and r (the last row) of the matches of a block, times sqrt(weight).
+
+    r = n / g with n = x2' F x1 and g the norm of its gradient: dr = dn / g - r dg / g.
+    """
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
+    for n in range(count):
+        x1, y1, x2, y2 = block[0, n], block[1, n], block[2, n], block[3, n]
+        ax, ay, az = f0 * x1 + f1 * y1 + f2, f3 * x1 + f4 * y1 + f5, f6 * x1 + f7 * y1 + f8
+        bx, by = f0 * x2 + f3 * y2 + f6, f1 * x2 + f4 * y2 + f7
+        inverse = 1.0 / np.sqrt(ax * ax + ay * ay + bx * bx + by * by)
+        residual = (x2 * ax + y2 * ay + az) * inverse
+        shrink, scale = residual * inverse, inverse * block[4, n]
+        rows[0, n] = (x2 * x1 - shrink * (ax * x1 + bx * x2)) * scale
+        rows[1, n] = (x2 * y1 - shrink * (ax * y1 + by * x2)) * scale
+        rows[2, n] = (x2 - shrink * ax) * scale
+        rows[3, n] = (y2 * x1 - shrink * (ay * x1 + bx * y2)) * scale
+        rows[4, n] = (y2 * y1 - shrink * (ay * y1 + by * y2)) * scale
+        rows[5, n] = (y2 - shrink * ay) * scale
+        rows[6, n] = (x1 - shrink * bx) * scale
+        rows[7, n] = (y1 - shrink * by) * scale
+        rows[8, n] = scale
+        rows[9, n] = residual * block[4, n]
 
 
 @kernel
@@ -114,67 +247,13 @@ def _tangent(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
 
 
 @kernel
-def _cost(points: FloatArray, f: FloatArray, cutoff: float, softness: float) -> float:
-    limit = cutoff * cutoff
-    worst = np.log1p(softness * limit) / softness if softness > 0.0 else limit
-    total = 0.0
-    for i in range(points.shape[0]):
-        squared = squared_sampson(f, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
-        if squared < limit:
-            total += np.log1p(softness * squared) / softness if softness > 0.0 else squared
-        else:
-            total += worst
-    return total
-
-
-@kernel
-def _normal_equations(
-    points: FloatArray, f: FloatArray, cutoff: float, softness: float, gram: FloatArray, gradient: FloatArray
-) -> None:
-    """Weighted J'J and J'r over the nine entries of F."""
-    limit = cutoff * cutoff
-    gram[:] = 0.0
-    gradient[:] = 0.0
-    row = np.empty(9)
-    for i in range(points.shape[0]):
-        x1, y1, x2, y2 = points[i, 0], points[i, 1], points[i, 2], points[i, 3]
-        ax, ay, az = f[0] * x1 + f[1] * y1 + f[2], f[3] * x1 + f[4] * y1 + f[5], f[6] * x1 + f[7] * y1 + f[8]
-        bx, by = f[0] * x2 + f[3] * y2 + f[6], f[1] * x2 + f[4] * y2 + f[7]
-        algebraic, squared_norm = x2 * ax + y2 * ay + az, ax * ax + ay * ay + bx * bx + by * by
-        if not algebraic * algebraic < limit * squared_norm:
-            continue
-        inverse = 1.0 / np.sqrt(squared_norm)
-        residual = algebraic * inverse
-        weight = 1.0 / (1.0 + softness * residual * residual)
-        # r = n / g with n = x2' F x1 and g the norm: dr = dn / g - r dg / g
-        shrink = residual * inverse
-        row[0] = (x2 * x1 - shrink * (ax * x1 + bx * x2)) * inverse
-        row[1] = (x2 * y1 - shrink * (ax * y1 + by * x2)) * inverse
-        row[2] = (x2 - shrink * ax) * inverse
-        row[3] = (y2 * x1 - shrink * (ay * x1 + bx * y2)) * inverse
-        row[4] = (y2 * y1 - shrink * (ay * y1 + by * y2)) * inverse
-        row[5] = (y2 - shrink * ay) * inverse
-        row[6] = (x1 - shrink * bx) * inverse
-        row[7] = (y1 - shrink * by) * inverse
-        row[8] = inverse
-        for j in range(9):
-            weighted = weight * row[j]
-            gradient[j] += weighted * residual
-            for k in range(j + 1):
-                gram[j, k] += weighted * row[k]
-    for j in range(9):
-        for k in range(j):
-            gram[k, j] = gram[j, k]
-
-
-@kernel
-def _project(gram: FloatArray, gradient: FloatArray, basis: FloatArray, normal: FloatArray, right: FloatArray) -> None:
-    """Normal equations over the seven parameters from those over the nine entries."""
+def _project(gram: FloatArray, basis: FloatArray, normal: FloatArray, right: FloatArray) -> None:
+    """Normal equations over the seven parameters from those over the nine entries, whose gradient is the last row."""
     part = np.empty(9)
     for p in range(7):
         right[p] = 0.0
         for j in range(9):
-            right[p] -= basis[p, j] * gradient[j]
+            right[p] -= basis[p, j] * gram[9, j]
             part[j] = 0.0
             for k in range(9):
                 part[j] += gram[j, k] * basis[p, k]

@@ -27,7 +27,7 @@ def refit_eight_point(points: FloatArray, F: FloatArray, threshold: float) -> Fl
 def refit_sampson(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
     """Least squares on the Sampson distance (thesis 4.2)."""
     inliers = _inliers(points, F, threshold)
-    return refine_sampson(inliers, refit_eight_point(points, F, threshold), cutoff=np.inf) if len(inliers) >= 8 else F
+    return refine_sampson(inliers, refit_eight_point(points, F, threshold)) if len(inliers) >= 8 else F
 
 
 def refit_reprojection(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:

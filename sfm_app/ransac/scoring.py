@@ -15,7 +15,7 @@ from sfm_app.ransac.verification import BLOCK, Gate
 
 FloatArray = NDArray[np.float64]
 
-RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS = range(5)
+RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS, GEMAN_MCCLURE = range(6)
 
 
 class Measure(NamedTuple):
@@ -28,7 +28,7 @@ class Measure(NamedTuple):
     """Squared distance beyond which every match costs `worst`."""
     worst: float
     precision: float = 0.0
-    """MLESAC: 1 / (2 sigma^2)."""
+    """MLESAC: 1 / (2 sigma^2). Geman-McClure: 1 / c^2."""
     odds: float = 0.0
     """MLESAC: density of the outliers over that of the inliers at distance 0."""
 
@@ -56,6 +56,11 @@ def lmeds(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Me
     return Measure(LMEDS, threshold * threshold, np.inf, np.inf)
 
 
+def geman_mcclure(_points: FloatArray, threshold: float, _best: FloatArray | None, *, scale: float) -> Measure:
+    """r^2 / (r^2 + c^2), c being `scale` thresholds: no edge, and close matches count most (Geman and McClure 1987)."""
+    return Measure(GEMAN_MCCLURE, threshold * threshold, np.inf, 1.0, (scale * threshold) ** -2)
+
+
 @kernel
 def squared_sampson(f: FloatArray, x1: float, y1: float, x2: float, y2: float) -> float:
     """Squared Sampson distance (thesis 4.2) of one match to f, the nine entries of F by rows."""
@@ -70,9 +75,21 @@ def squared_sampson(f: FloatArray, x1: float, y1: float, x2: float, y2: float) -
 def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
     """(N,) squared Sampson distances of all matches (N, 4)."""
     squared = np.empty(points.shape[0])
-    for i in range(points.shape[0]):
-        squared[i] = squared_sampson(f, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
+    distances_of_block(points, f, 0, squared)
     return squared
+
+
+@kernel
+def distances_of_block(points: FloatArray, f: FloatArray, start: int, squared: FloatArray) -> None:
+    """The squared Sampson distances of as many matches as `squared` has room for, from row `start` on."""
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
+    for i in range(squared.shape[0]):  # spelt out: several matches at once in the lanes of the processor
+        x1, y1, x2, y2 = points[start + i, 0], points[start + i, 1], points[start + i, 2], points[start + i, 3]
+        ax, ay, az = f0 * x1 + f1 * y1 + f2, f3 * x1 + f4 * y1 + f5, f6 * x1 + f7 * y1 + f8
+        bx, by = f0 * x2 + f3 * y2 + f6, f1 * x2 + f4 * y2 + f7
+        algebraic = x2 * ax + y2 * ay + az
+        gradient = ax * ax + ay * ay + bx * bx + by * by
+        squared[i] = algebraic * algebraic / gradient if gradient > 0.0 else np.inf
 
 
 @kernel
@@ -87,11 +104,12 @@ def _cost(measure: Measure, squared: float) -> float:
 
 
 @kernel
-def penalty(points: FloatArray, f: FloatArray, measure: Measure, to_beat: float, gate: Gate) -> float:
+def penalty(points: FloatArray, start: int, f: FloatArray, measure: Measure, to_beat: float, gate: Gate) -> float:
     """Penalty of all matches, or inf as soon as f cannot stay below `to_beat` or is turned away at the gate.
 
     Args:
-        points: (N, 4), in random order.
+        points: (N, 4), in random order; (2 N, 4), the matches twice over, for a gate with a random start.
+        start: the match to begin with.
         f: (9,) entries of F.
         measure: which penalty. The gate is open for the median: it is counted another way.
         to_beat: best penalty so far; inf for a full count.
@@ -99,28 +117,44 @@ def penalty(points: FloatArray, f: FloatArray, measure: Measure, to_beat: float,
     """
     if measure.kind == LMEDS:
         return _median_of_squares(points, f, to_beat)
-    least_inliers, limit, reach = gate.least_inliers, measure.limit, measure.reach
+    least_inliers = gate.least_inliers
     total, inliers, block = 0.0, 0, 0
-    done, count = 0, points.shape[0]
+    squared = np.empty(max(gate.stride, BLOCK))
+    done, count = 0, points.shape[0] // 2 if gate.random_start else points.shape[0]
     while done < count:
         gated = block < least_inliers.shape[0]
-        stop = min(done + (gate.stride if gated else BLOCK), count)
-        for i in range(done, stop):
-            squared = squared_sampson(f, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
-            if squared <= reach:
-                inliers += squared <= limit
-                total += _cost(measure, squared)
-            else:
-                total += measure.worst
+        size = min(gate.stride if gated else BLOCK, count - done)
+        distances_of_block(points, f, start + done, squared[:size])
+        more, cost = _add_up(squared[:size], measure)
+        inliers += more
+        total += cost
+        done += size
         if gated and inliers < least_inliers[block]:
-            gate.rejected[0] += stop
+            gate.rejected[0] += done
             gate.rejected[1] += inliers
             return np.inf
         if total >= to_beat:
             return np.inf
-        done = stop
         block += 1
     return total
+
+
+@kernel
+def _add_up(squared: FloatArray, measure: Measure) -> tuple[int, float]:
+    """Inliers among the given matches, and the sum of their penalties."""
+    total, inliers = 0.0, 0
+    if measure.kind == GEMAN_MCCLURE:
+        for i in range(squared.shape[0]):
+            inliers += squared[i] <= measure.limit
+            total += 1.0 - 1.0 / (1.0 + measure.precision * squared[i])
+        return inliers, total
+    for i in range(squared.shape[0]):
+        if squared[i] <= measure.reach:
+            inliers += squared[i] <= measure.limit
+            total += _cost(measure, squared[i])
+        else:
+            total += measure.worst
+    return inliers, total
 
 
 @kernel

@@ -66,7 +66,7 @@ def next_better(
             if rules.oriented and not is_oriented(points, sample, models[k]):
                 continue
             start = int(uniform(state) * count) if gate.random_start else 0
-            found = penalty(points[start : start + count], models[k], measure, score, gate)
+            found = penalty(points, start, models[k], measure, score, gate)
             if found < score:
                 score = found
                 best[:] = models[k]

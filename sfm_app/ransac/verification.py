@@ -19,7 +19,7 @@ from sfm_app.ransac.stopping import trials_needed
 
 IntArray = NDArray[np.int64]
 
-BLOCK = 32
+BLOCK = 64
 """Matches between two looks at whether to go on, where no test asks for more."""
 
 _BAIL_OUT_SIGMAS = 3.0

@@ -1,0 +1,106 @@
+"""The plane that holds most of a model's inliers, and the matches off it.
+
+Where one homography H explains the matches, every F = [e]x H does, for any epipole e: the estimator then picks the e
+that catches the most accidental inliers. What tells a real epipole is matches off the plane.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.epipolar import cross_matrix, epipoles
+from sfm_app.jit import kernel
+from sfm_app.ransac.sampling import RandomState, random_state, uniform
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_SAMPLES, _SAMPLE_SIZE = 64, 3
+_LEAST_AREA = 1e-3
+_MOST_SCORED = 300
+
+
+def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+    """The homography of the plane that holds the most matches, among those compatible with F.
+
+    They are H = A - e2 v' with A = [e2]x F and v' x1 = b for every match on the plane, where
+    b = (x2 x A x1)'(x2 x e2) / |x2 x e2|^2 (Hartley and Zisserman, Result 13.6): a linear regression, three parameters.
+    Its noise goes as 1 / |x2 x e2|, so each match weighs by its distance from the epipole.
+
+    Args:
+        points: (N, 4) inliers of F in random order, N >= 3.
+        F: (3, 3).
+        threshold: largest distance of a match to the plane.
+
+    Returns:
+        (3, 3), x2 ~ H x1.
+    """
+    e2 = epipoles(F)[1]
+    A = cross_matrix(e2) @ F
+    x1, x2 = homogeneous(points[:, :2]), homogeneous(points[:, 2:])
+    towards = np.cross(x2, e2)
+    length = np.sqrt((towards**2).sum(axis=1))
+    b = (np.cross(x2, x1 @ A.T) * towards).sum(axis=1) / np.maximum(length**2, np.finfo(float).tiny)
+    best = _sampled_plane(points[:_MOST_SCORED], b, A, e2, 2 * threshold * threshold, random_state(len(points)))
+    on_plane = transfer_distance(A - np.outer(e2, best), points) <= threshold
+    if np.count_nonzero(on_plane) >= _SAMPLE_SIZE:
+        near = length[on_plane]
+        best = np.linalg.lstsq(x1[on_plane] * near[:, None], b[on_plane] * near, rcond=None)[0]
+    return A - np.outer(e2, best)
+
+
+@kernel
+def _sampled_plane(
+    points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatArray, limit: float, state: RandomState
+) -> FloatArray:
+    """The v through three matches, v' x1 = b, whose H maps most matches to within sqrt(limit) of their partners."""
+    count, most = points.shape[0], -1
+    best, corner, v = np.zeros(3), np.empty(3, dtype=np.int64), np.empty(3)
+    mapped = np.empty((3, count))
+    for i in range(count):
+        for r in range(3):
+            mapped[r, i] = A[r, 0] * points[i, 0] + A[r, 1] * points[i, 1] + A[r, 2]
+    for _ in range(_SAMPLES):
+        for k in range(3):
+            corner[k] = int(uniform(state) * count)
+        p, q, r = corner[0], corner[1], corner[2]
+        x, y = points[q, 0] - points[p, 0], points[q, 1] - points[p, 1]
+        z, w = points[r, 0] - points[p, 0], points[r, 1] - points[p, 1]
+        area = x * w - z * y
+        if not abs(area) > _LEAST_AREA:
+            continue
+        v[0] = ((b[q] - b[p]) * w - (b[r] - b[p]) * y) / area
+        v[1] = (x * (b[r] - b[p]) - z * (b[q] - b[p])) / area
+        v[2] = b[p] - v[0] * points[p, 0] - v[1] * points[p, 1]
+        on_plane = 0
+        for i in range(count):
+            along = v[0] * points[i, 0] + v[1] * points[i, 1] + v[2]
+            depth = mapped[2, i] - e2[2] * along
+            dx = mapped[0, i] - e2[0] * along - points[i, 2] * depth
+            dy = mapped[1, i] - e2[1] * along - points[i, 3] * depth
+            on_plane += dx * dx + dy * dy <= limit * depth * depth
+        if on_plane > most:
+            most = on_plane
+            best[:] = v
+    return best
+
+
+def transfer_distance(H: FloatArray, points: FloatArray) -> FloatArray:
+    """(N,) |x2 - H x1| / sqrt(2): about the distance of the match (x1, x2) in 4D to those that fit H exactly."""
+    return np.sqrt(_squared_transfer(points, H))
+
+
+@kernel
+def _squared_transfer(points: FloatArray, H: FloatArray) -> FloatArray:
+    squared = np.empty(points.shape[0])
+    for i in range(points.shape[0]):
+        x, y = points[i, 0], points[i, 1]
+        depth = H[2, 0] * x + H[2, 1] * y + H[2, 2]
+        dx = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / depth - points[i, 2]
+        dy = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / depth - points[i, 3]
+        squared[i] = (dx * dx + dy * dy) / 2.0 if depth != 0.0 else np.inf
+    return squared
+
+
+def homogeneous(x: FloatArray) -> FloatArray:
+    """(N, 2) as (N, 3)."""
+    return np.column_stack([x, np.ones(len(x))])
