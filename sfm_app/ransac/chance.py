@@ -4,12 +4,10 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
 
-from sfm_app.jit import kernel
 from sfm_app.ransac.minimal import MOST_MODELS
 from sfm_app.ransac.sampling import SAMPLE_SIZE
-from sfm_app.ransac.scoring import squared_distances, squared_sampson
+from sfm_app.ransac.scoring import squared_distances
 
 FloatArray = NDArray[np.float64]
 
@@ -18,23 +16,23 @@ MOST_FALSE_ALARMS = 1e-2
 
 _FRACTIONS = (1.0, 0.5, 0.25)
 """Support is judged at these fractions of the threshold: precise inliers are stronger evidence."""
-_MISMATCHES = 20000
+_MISMATCHES = 8000
 _MOST = 1e300
 
 
-def false_alarms_of(distances: FloatArray, wrong: FloatArray, threshold: float) -> float:
+def false_alarms_of(squared: FloatArray, wrong: FloatArray, threshold: float) -> float:
     """How many models with as much support are expected among random matches of the same points.
 
     Args:
-        distances: (N,) of the matches to the model.
-        wrong: (M,) of mismatches, from `mismatch_distances`.
+        squared: (N,) squared distances of the matches to the model.
+        wrong: (M,) those of mismatches, from `squared_mismatches`.
         threshold: largest distance of an inlier.
     """
     tried = []
     for fraction in _FRACTIONS:
-        inliers = int(np.count_nonzero(distances <= fraction * threshold))
+        inliers = int(np.count_nonzero(squared <= (fraction * threshold) ** 2))
         chance = accidental_share(wrong, fraction * threshold)
-        tried.append(false_alarms(len(distances), inliers, SAMPLE_SIZE, chance))
+        tried.append(false_alarms(len(squared), inliers, SAMPLE_SIZE, chance))
     return min(_MOST, len(_FRACTIONS) * MOST_MODELS * min(tried))
 
 
@@ -46,8 +44,8 @@ def is_credible(points: FloatArray, f: FloatArray, threshold: float) -> bool:
         f: (9,) model.
         threshold: largest distance of an inlier.
     """
-    distances, wrong = np.sqrt(squared_distances(points, f)), mismatch_distances(points, f)
-    return false_alarms_of(distances, wrong, threshold) <= MOST_FALSE_ALARMS
+    wrong = squared_mismatches(points, f)
+    return false_alarms_of(squared_distances(points, f), wrong, threshold) <= MOST_FALSE_ALARMS
 
 
 def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> float:
@@ -63,7 +61,7 @@ def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> f
         chance: probability that a wrong match agrees with a model, in (0, 1).
 
     Returns:
-        The number, at most 1e300.
+        An upper bound of the number, at most 1e300.
     """
     if inliers <= sample_size:
         return _MOST
@@ -71,47 +69,41 @@ def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> f
     return min(_MOST, math.exp(min(logarithm, 700.0)))
 
 
-def mismatch_distances(points: FloatArray, f: FloatArray) -> FloatArray:
-    """(M,) Sampson distances of deliberate mismatches: each point of view 1 with the partners of some others.
+def squared_mismatches(points: FloatArray, f: FloatArray) -> FloatArray:
+    """(M,) squared Sampson distances of deliberate mismatches: points of view 1 with the partners of some others.
 
     Args:
         points: (N, 4) distinct matches in random order, N >= 2.
         f: (9,) model.
     """
     shifts = min(len(points) - 1, max(1, _MISMATCHES // len(points)))
-    return np.sqrt(_squared_mismatches(points, f, shifts))
-
-
-@kernel
-def _squared_mismatches(points: FloatArray, f: FloatArray, shifts: int) -> FloatArray:
-    count = points.shape[0]
-    squared = np.empty(shifts * count)
+    mismatched = points.copy(order="F")
+    wrong = np.empty((shifts, len(points)))
     for shift in range(shifts):
-        for i in range(count):
-            j = (i + shift + 1) % count
-            squared[shift * count + i] = squared_sampson(f, points[i, 0], points[i, 1], points[j, 2], points[j, 3])
-    return squared
+        mismatched[:, 2:] = np.roll(points[:, 2:], -1 - shift, axis=0)
+        wrong[shift] = squared_distances(mismatched, f)
+    return wrong.ravel()
 
 
 def accidental_share(wrong: FloatArray, threshold: float) -> float:
-    """Probability that a wrong match agrees with a model, in (0, 1), from its distances to mismatches.
+    """Probability that a wrong match agrees with a model, in (0, 1), from the squared distances of mismatches.
 
     Measured, not modelled: it knows the extent of the photos, where their points cluster, and where the epipoles are.
     """
-    return (int(np.count_nonzero(wrong <= threshold)) + 1.0) / (len(wrong) + 2.0)
+    return (int(np.count_nonzero(wrong <= threshold * threshold)) + 1.0) / (len(wrong) + 2.0)
 
 
 def log_binomial_tail(count: int, least: int, chance: float) -> float:
-    """log P(Binomial(count, chance) >= least), for a chance in (0, 1)."""
-    if least <= 0:
+    """Upper bound of log P(Binomial(count, chance) >= least), for a chance in (0, 1) (Chernoff 1952)."""
+    share = least / count
+    if share <= chance:
         return 0.0
-    if least > count:
+    if share > 1:
         return -math.inf
-    k = np.arange(least, count + 1)
-    logs = gammaln(count + 1) - gammaln(k + 1) - gammaln(count - k + 1)
-    logs += k * math.log(chance) + (count - k) * math.log1p(-chance)
-    top = float(logs.max())
-    return min(0.0, top + math.log(float(np.exp(logs - top).sum())))
+    divergence = share * math.log(share / chance)
+    if share < 1:
+        divergence += (1 - share) * math.log((1 - share) / (1 - chance))
+    return -count * divergence
 
 
 def _log_choose(n: int, k: int) -> float:

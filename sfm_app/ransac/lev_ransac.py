@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sfm_app.ransac.leverage import prior_validity
 from sfm_app.ransac.loop import Recipe
 from sfm_app.ransac.parallax import with_another_epipole
-from sfm_app.ransac.refit import fit_eight_point, refine_mixture, refine_sampson
+from sfm_app.ransac.refit import fit_algebraic, refine_mixture, refine_sampson
 from sfm_app.ransac.scoring import geman_mcclure, squared_distances
 from sfm_app.ransac.verdict import estimate
 from sfm_app.ransac.verification import BailOut
@@ -37,7 +37,7 @@ def optimise_locally(points: FloatArray, F: FloatArray, threshold: float) -> Flo
     """
     some = np.asfortranarray(points[:_LOCAL_MATCHES])
     near = squared_distances(some, np.ascontiguousarray(F).reshape(9)) <= (_WIDE * threshold) ** 2
-    F = fit_eight_point(some, near.astype(np.float64)) if np.count_nonzero(near) >= 8 else F
+    F = fit_algebraic(some, near.astype(np.float64)) if np.count_nonzero(near) >= 8 else F
     for scale, steps in zip((COARSE, FINE), _LOCAL_STEPS, strict=True):
         F = refine_sampson(some, F, scale=scale * threshold, most_steps=steps, enough=_ENOUGH)
     return F

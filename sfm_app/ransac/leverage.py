@@ -12,8 +12,10 @@ linearly (and A f is small): one well-scaled frame (`points.Matches`) gives what
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.jit import kernel
 from sfm_app.ransac.design import quadratic_forms, weighted_gram
-from sfm_app.ransac.scoring import squared_distances
+from sfm_app.ransac.eigen import symmetric_eigen
+from sfm_app.ransac.scoring import select, squared_distances
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -21,10 +23,15 @@ BoolArray = NDArray[np.bool_]
 PARAMETERS = 8
 _LEAST_VARIANCE = 1e-24
 """Of residuals in units of the points' spread: perfect matches are left with the rounding of their coordinates."""
+_LEAST_FREEDOM = 2.0**-52
+"""Of 1 - h."""
+_LEAST_SUPPORT = 1e-14
+"""Of a direction, over that of the best supported one."""
 _MAD_TO_SIGMA = 1.4826
 """Median absolute deviation to standard deviation, for a Gaussian."""
 
 
+@kernel
 def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArray:
     """Leverage h_ii of every match in a regression on the fitted ones plus itself (thesis 3.11).
 
@@ -39,15 +46,31 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
     Returns:
         (N,) in [0, 1].
     """
-    tangent = np.linalg.svd(f.reshape(1, 9))[2][1:].T
-    gram = tangent.T @ weighted_gram(points, fitted.astype(np.float64)) @ tangent
-    values, vectors = np.linalg.eigh(gram)
+    tangent = _perpendicular(f)
+    within = tangent.T @ (weighted_gram(points, fitted.astype(np.float64)) @ tangent)
+    values, vectors = np.empty(PARAMETERS), np.empty((PARAMETERS, PARAMETERS))
+    symmetric_eigen(within, values, vectors)
     # a direction without support: whatever lies in it has leverage 1
-    floor = max(float(values[-1]), np.finfo(float).tiny) * 1e-14
-    forms = quadratic_forms(points, np.ascontiguousarray(tangent @ (vectors / np.sqrt(np.maximum(values, floor)))))
-    return np.where(fitted, np.minimum(forms, 1.0), forms / (1.0 + forms))
+    floor = max(values[-1], 2.0**-1000) * _LEAST_SUPPORT
+    forms = quadratic_forms(points, tangent @ (vectors / np.sqrt(np.maximum(values, floor))))
+    for i in range(forms.shape[0]):
+        forms[i] = min(forms[i], 1.0) if fitted[i] else 1.0 / (1.0 + 1.0 / forms[i])
+    return forms
 
 
+@kernel
+def _perpendicular(f: FloatArray) -> FloatArray:
+    """(9, 8) orthonormal directions perpendicular to a unit vector: what a reflection of f to an axis makes of the others."""
+    last = f[8] + 1.0 if f[8] >= 0.0 else f[8] - 1.0
+    basis = np.zeros((9, PARAMETERS))
+    for k in range(PARAMETERS):
+        basis[k, k] = 1.0
+        for j in range(9):
+            basis[j, k] -= (f[j] if j < 8 else last) * f[k] / abs(last)
+    return basis
+
+
+@kernel
 def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: BoolArray) -> FloatArray:
     """Residuals over their standard deviation (thesis 3.14 and 3.15, the variance taken from the fitted matches).
 
@@ -57,29 +80,37 @@ def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: B
         fitted: (N,) the matches that the model rests on.
     """
     inside = residuals[fitted]
-    freedom = max(len(inside) - PARAMETERS, 1)
-    variance = float(((inside - inside.mean()) ** 2).sum()) / freedom if len(inside) else 0.0
-    free = np.maximum(1.0 - leverage, np.finfo(float).eps)
-    return np.asarray(residuals / np.sqrt(max(variance, _LEAST_VARIANCE) * free))
+    variance = 0.0
+    if inside.shape[0] > 0:
+        variance = ((inside - inside.mean()) ** 2).sum() / max(inside.shape[0] - PARAMETERS, 1)
+    return residuals / np.sqrt(max(variance, _LEAST_VARIANCE) * np.maximum(1.0 - leverage, _LEAST_FREEDOM))
 
 
+@kernel
 def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
     """How far the fit would move without each match (thesis 3.16 and 4.17; the square of d_i is missing in print)."""
-    return np.asarray(studentised**2 / PARAMETERS * leverage / np.maximum(1.0 - leverage, np.finfo(float).eps))
+    return studentised**2 / PARAMETERS * leverage / np.maximum(1.0 - leverage, _LEAST_FREEDOM)
 
 
+@kernel
 def priors(distances: FloatArray, sigma: float) -> FloatArray:
     """p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels)."""
-    if not sigma > 0:
-        return np.asarray(distances <= distances.min(initial=np.inf), dtype=np.float64)
-    with np.errstate(over="ignore"):  # far outliers: exp(-inf) = 0
-        exponents = (distances / sigma) ** 2 / 2
-    return np.asarray(np.exp(exponents.min(initial=np.inf) - exponents))
+    probable = np.empty(distances.shape[0])
+    least = distances.min() if distances.shape[0] else 0.0
+    for i in range(distances.shape[0]):
+        if sigma > 0.0:
+            # less the smallest exponent, which makes the largest value 1; far outliers: exp(-inf) = 0
+            probable[i] = np.exp(-(distances[i] - least) / sigma * ((distances[i] + least) / sigma) / 2.0)
+        else:
+            probable[i] = 1.0 if distances[i] <= least else 0.0
+    return probable
 
 
+@kernel
 def mad_sigma(distances: FloatArray) -> float:
     """Standard deviation about zero from the median absolute deviation (thesis 4.7.3)."""
-    return _MAD_TO_SIGMA * float(np.median(np.abs(distances))) if len(distances) else 0.0
+    count = distances.shape[0]
+    return _MAD_TO_SIGMA * select(np.abs(distances), count // 2) if count else 0.0
 
 
 def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma_from_inliers: bool) -> FloatArray:
@@ -91,6 +122,11 @@ def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma
         threshold: largest distance of an inlier; the inliers are the fitted matches.
         sigma_from_inliers: take sigma from the inliers' Cook's distances; otherwise from all, as in the thesis.
     """
+    return _validity(points, f, threshold, sigma_from_inliers)
+
+
+@kernel
+def _validity(points: FloatArray, f: FloatArray, threshold: float, sigma_from_inliers: bool) -> FloatArray:
     squared = squared_distances(points, f)
     fitted = squared <= threshold * threshold
     leverage = leverages(points, f, fitted)

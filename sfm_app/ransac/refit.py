@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel, summing_kernel
 from sfm_app.ransac.design import LANES, add_products, gather, mirror, weighted_gram
+from sfm_app.ransac.eigen import symmetric_eigen
 from sfm_app.ransac.scoring import distances_of_block, squared_distances
 
 FloatArray = NDArray[np.float64]
@@ -84,19 +85,48 @@ def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
     Returns:
         (3, 3), rank 2.
     """
-    _, vectors = np.linalg.eigh(weighted_gram(points, weights))
-    U, s, Vt = np.linalg.svd(vectors[:, 0].reshape(3, 3))
-    rank_two: FloatArray = (U[:, :2] * s[:2]) @ Vt[:2]
-    return rank_two
+    U, s, V = _factors(fit_algebraic(points, weights))
+    return _compose(U, s, V).reshape(3, 3)
 
 
+@kernel
+def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """The first half of `fit_eight_point`: (3, 3) of norm 1 with the least algebraic error, of any rank."""
+    values, vectors = np.empty(9), np.empty((9, 9))
+    symmetric_eigen(weighted_gram(points, weights), values, vectors)
+    return vectors[:, 0].copy().reshape(3, 3)
+
+
+@kernel
 def _factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
-    """Rotations U and V and the number s of F ~ U diag(1, s, 0) V'."""
-    U, s, Vt = np.linalg.svd(F)
-    U, V = np.ascontiguousarray(U), np.ascontiguousarray(Vt.T)
-    U[:, 2] *= np.sign(np.linalg.det(U))  # the third columns meet the singular value 0: their sign is free
-    V[:, 2] *= np.sign(np.linalg.det(V))
-    return U, float(s[1] / s[0]), V
+    """Rotations U and V and the number s of the nearest rank 2 matrix U diag(1, s, 0) V', up to its scale."""
+    gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                gram[i, j] += F[k, i] * F[k, j]
+    symmetric_eigen(gram, values, vectors)
+    U, V = np.empty((3, 3)), np.empty((3, 3))
+    for k in range(2):
+        V[:, k] = vectors[:, 2 - k]
+        for i in range(3):
+            U[i, k] = F[i, 0] * V[0, k] + F[i, 1] * V[1, k] + F[i, 2] * V[2, k]
+    first = np.sqrt((U[:, 0] ** 2).sum())
+    U[:, 0] /= first
+    U[:, 1] -= (U[:, 0] * U[:, 1]).sum() * U[:, 0]  # what rounding left where s is small
+    second = np.sqrt((U[:, 1] ** 2).sum())
+    if second > 1e-12 * first:
+        U[:, 1] /= second
+    else:  # rank 1: any direction will do
+        least = np.argmin(np.abs(U[:, 0]))
+        U[:, 1] = -U[least, 0] * U[:, 0]
+        U[least, 1] += 1.0
+        U[:, 1] /= np.sqrt((U[:, 1] ** 2).sum())
+    for R in (U, V):  # the third columns meet the singular value 0: they make rotations of both
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            R[i, 2] = R[j, 0] * R[k, 1] - R[k, 0] * R[j, 1]
+    return U, second / first, V
 
 
 @kernel
