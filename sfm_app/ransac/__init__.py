@@ -1,8 +1,9 @@
 """Robust estimation of fundamental matrices (thesis, chapter 4).
 
 An estimator is a `loop.Recipe`: a way to sample, to score, to stop and to refit. `loop.search` runs it,
-`verdict.estimate` judges what it found. From the sample to the answer: `points`, `sampling`, `minimal`, `scoring`,
-`search`, `leverage`, `stopping`, `refit`, `chance`, `degeneracy`.
+`verdict.estimate` judges what it found; `verdict.estimate_with` does the same for the searches of other libraries. From
+the sample to the answer: `points`, `sampling`, `minimal`, `scoring`, `search`, `leverage`, `stopping`, `refit`,
+`chance`, `degeneracy`.
 """
 
 from collections.abc import Callable
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from sfm_app.ransac.lev_ransac import fit_lev_ransac
 from sfm_app.ransac.lev_ransac_thesis import fit_lev_ransac_thesis, fit_msac
 from sfm_app.ransac.points import check_points
+from sfm_app.ransac.verdict import estimate_with, judge
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 
@@ -26,4 +28,4 @@ ESTIMATORS: dict[str, tuple[FitFundamentalLike, str]] = {
 }
 """Name, way to fit, and one line about it."""
 
-__all__ = ["ESTIMATORS", "FitFundamentalLike", "check_points"]
+__all__ = ["ESTIMATORS", "FitFundamentalLike", "check_points", "estimate_with", "judge"]
