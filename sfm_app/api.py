@@ -13,7 +13,6 @@ from numpy.typing import ArrayLike
 
 from sfm_app.context import RunContext
 from sfm_app.parallel import make_executor, worker_count
-from sfm_app.pipeline import run_stages
 from sfm_app.plugins import load_plugins
 from sfm_app.progress import Progress, Silent
 from sfm_app.ransac import check_points
@@ -60,6 +59,8 @@ def reconstruct(
     Raises:
         SfmError: see `sfm_app.errors`; carries what went wrong and what to do.
     """
+    from sfm_app.pipeline import run_stages  # loads COLMAP, which an estimator alone can do without
+
     with opened_run(Path(out), settings or Settings(), progress) as run:
         products = run_stages(Path(photos), run, first, last)
         done = run.workspace.manifest().get("stages", {})
@@ -88,6 +89,8 @@ def calibrate_photos(
     Raises:
         SfmError: see `sfm_app.errors`.
     """
+    from sfm_app.pipeline import run_stages  # as above
+
     with (
         tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch,
         opened_run(Path(out or scratch), settings or Settings(), progress) as run,

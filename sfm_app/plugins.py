@@ -6,6 +6,7 @@ A plug-in is an installed package with an entry point in the group ``sfm_app``; 
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from types import MappingProxyType, ModuleType
 from typing import Protocol, TypeVar
 
@@ -127,9 +128,22 @@ class Plugins:
 def load_plugins(modules: Sequence[ModuleType | object] = (), *, installed: bool = True) -> Plugins:
     """Register the built-ins, the given modules and, unless told otherwise, every installed plug-in.
 
+    Without arguments the answer is found once per process: the search through all installed packages takes
+    milliseconds, an estimator's work on an easy pair does not. `installed_plugins.cache_clear()` makes it look again.
+
     Raises:
         PluginError: a hook is misspelt, a plug-in does not import, or two things share a name.
     """
+    return installed_plugins() if installed and not modules else _load(modules, installed)
+
+
+@cache
+def installed_plugins() -> Plugins:
+    """The built-ins and every installed plug-in, as they were at the first call; errors as in `load_plugins`."""
+    return _load((), installed=True)
+
+
+def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
     manager = pluggy.PluginManager(GROUP)
     manager.add_hookspecs(Hooks)
     try:

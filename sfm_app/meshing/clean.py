@@ -1,10 +1,10 @@
-"""Cutting away what a closed surface invents where nothing was measured."""
+"""Cutting away what a closed surface invents where nothing was measured.
+
+SciPy is imported where it is used: a program that only estimates fundamental matrices starts without it.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from sfm_app.types import Surface
 
@@ -41,6 +41,8 @@ def trim_unsupported(surface: Surface, points: NDArray[np.float64], normals: NDA
         points: (N, 3) measured points.
         normals: (N, 3) their unit normals.
     """
+    from scipy.spatial import cKDTree
+
     if len(points) <= NEIGHBOURS or not len(surface.faces):
         return select_faces(surface, np.zeros(len(surface.faces), bool))
     spacing = _spacing(points)
@@ -63,12 +65,17 @@ def vertex_normals(surface: Surface) -> NDArray[np.float64]:
 
 def _spacing(points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Per point the distance at which a sheet of points has `NEIGHBOURS` others, as the width of one point's share."""
+    from scipy.spatial import cKDTree
+
     distance = np.asarray(cKDTree(points).query(points, k=[NEIGHBOURS + 1])[0])[:, 0]
     return np.asarray(distance * np.sqrt(np.pi / (NEIGHBOURS + 1)))
 
 
 def drop_islands(surface: Surface, min_share: float) -> Surface:
     """Drop connected parts that have less than a share in [0, 1] of all triangles."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     if not len(surface.faces):
         return surface
     a, b, c = surface.faces.T

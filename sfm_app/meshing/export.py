@@ -1,15 +1,20 @@
-"""Mesh files. Every writer takes vertices (V, 3), faces (T, 3), sRGB colours (V, 3) and gives the file's bytes."""
+"""Mesh files. Every writer takes vertices (V, 3), faces (T, 3), sRGB colours (V, 3) and gives the file's bytes.
+
+trimesh is imported where it is used: it takes longer to load than everything that a calibration needs.
+"""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from sfm_app.errors import ReconstructionError
 from sfm_app.meshing.clean import vertex_normals
 from sfm_app.types import Surface
+
+if TYPE_CHECKING:
+    from trimesh import Trimesh
 
 Vertices = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -29,9 +34,11 @@ def write_ply(vertices: Vertices, faces: Faces, colors: Colors) -> bytes:
     Raises:
         ReconstructionError: the mesh has no triangles.
     """
+    from trimesh.exchange.ply import export_ply
+
     mesh = _mesh(vertices, faces)
     mesh.visual.vertex_colors = colors
-    return bytes(trimesh.exchange.ply.export_ply(mesh, vertex_normal=True))
+    return bytes(export_ply(mesh, vertex_normal=True))
 
 
 def write_glb(vertices: Vertices, faces: Faces, colors: Colors) -> bytes:
@@ -42,13 +49,14 @@ def write_glb(vertices: Vertices, faces: Faces, colors: Colors) -> bytes:
     Raises:
         ReconstructionError: the mesh has no triangles.
     """
+    from trimesh import Scene
+    from trimesh.exchange.gltf import export_glb
+
     mesh = _mesh(vertices, faces)
     # glTF multiplies COLOR_0 into the light as it is, so it has to be linear, while photos are sRGB. Floats, because
     # eight linear bits show steps in the shadows; trimesh writes only eight, so they travel as an attribute.
     mesh.vertex_attributes["_COLOR_0"] = srgb_to_linear(colors)
-    return bytes(
-        trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh), include_normals=True, tree_postprocessor=_finish_gltf)
-    )
+    return bytes(export_glb(Scene(mesh), include_normals=True, tree_postprocessor=_finish_gltf))
 
 
 def srgb_to_linear(colors: Colors) -> NDArray[np.float32]:
@@ -58,13 +66,15 @@ def srgb_to_linear(colors: Colors) -> NDArray[np.float32]:
     return light.astype(np.float32)[colors]
 
 
-def _mesh(vertices: Vertices, faces: Faces) -> trimesh.Trimesh:
+def _mesh(vertices: Vertices, faces: Faces) -> "Trimesh":
+    from trimesh import Trimesh
+
     if len(faces) == 0:
         raise ReconstructionError("the mesh has no triangles", hint="take more photos with more overlap")
     normals = vertex_normals(Surface(vertices, faces, np.zeros((len(vertices), 3), np.uint8)))
     # triangles without area leave a corner without a normal; glTF wants length 1 everywhere
     normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 1.0, 0.0)
-    return trimesh.Trimesh(vertices, faces, vertex_normals=normals, process=False)
+    return Trimesh(vertices, faces, vertex_normals=normals, process=False)
 
 
 def _finish_gltf(tree: dict[str, Any]) -> None:

@@ -1,11 +1,12 @@
 """Robust estimation of fundamental matrices (thesis, chapter 4).
 
 An estimator is a `loop.Recipe`: what it samples, solves, scores and verifies with, when it stops, how it refits.
-`loop.search` runs it, `verdict.estimate` judges what it found. `lev_ransac` is the one that the program uses,
-`recipes` has the others.
+`loop.search` runs it, `verdict.estimate` judges what it found, and `verdict.estimate_with` does the same for the searches
+of other libraries. `lev_ransac` is the estimator that the program uses, `recipes` has the others.
 
 From the sample to the answer: `points`, `sampling`, `minimal`, `verification`, `sprt`, `scoring`, `mixture`, `search`,
-`leverage`, `residuals`, `stopping`, `loop`, `refit`, `reprojection`, `refits`, `chance`, `degeneracy`.
+`leverage`, `residuals`, `stopping`, `loop`, `planes`, `parallax`, `refit`, `reprojection`, `refits`, `chance`,
+`degeneracy`; below them `design` and `eigen`.
 """
 
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from sfm_app.ransac.lev_ransac import fit_lev_ransac
 from sfm_app.ransac.points import check_points
 from sfm_app.ransac.recipes import RECIPES, classical
+from sfm_app.ransac.verdict import estimate_with, judge
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 
@@ -28,4 +30,4 @@ ESTIMATORS: dict[str, tuple[FitFundamentalLike, str]] = {
 }
 """Name, way to fit, and one line about it."""
 
-__all__ = ["ESTIMATORS", "FitFundamentalLike", "check_points"]
+__all__ = ["ESTIMATORS", "FitFundamentalLike", "check_points", "estimate_with", "judge"]

@@ -30,7 +30,7 @@ def find_degeneracy(
         points: (N, 4) matches in random order.
         F: (3, 3) the model.
         inliers: (N,) at least 3 of them.
-        wrong: (M,) distances of mismatches to F, from `chance.mismatch_distances`.
+        wrong: (M,) squared distances of mismatches to F, from `chance.squared_mismatches`.
         threshold: largest distance of an inlier.
         centres: (4,) the origin of `points` in a frame that both views share, in the same units.
 

@@ -13,15 +13,15 @@ from sfm_app.ransac.sampling import SAMPLE_SIZE, RandomState, random_state
 from sfm_app.ransac.scoring import Measure, Score, penalty, squared_distances
 from sfm_app.ransac.search import Rules, next_better
 from sfm_app.ransac.stopping import have_converged
-from sfm_app.ransac.verification import OPEN, FullVerification, Verifier
+from sfm_app.ransac.verification import OPEN, FullVerification, Gate, Verifier
 from sfm_app.settings import EpipolarSettings
 
 FloatArray = NDArray[np.float64]
 
 Refine = Callable[[FloatArray, FloatArray, float], FloatArray]
 """(points, F, threshold) -> a better F."""
-Recover = Callable[[FloatArray, FloatArray, float, Measure, RandomState], FloatArray | None]
-"""(points, F, threshold, measure, random generator) -> another F that the samples may have missed, or None."""
+Recover = Callable[[FloatArray, FloatArray, float, Measure, Gate, RandomState], FloatArray | None]
+"""(points, F, threshold, measure, gate, random generator) -> another F that the samples may have missed, or None."""
 Validity = Callable[[FloatArray, FloatArray, float], FloatArray]
 """(points, f, threshold) -> p(v_i), (N,) >= 0, at least one of them > 0."""
 
@@ -104,7 +104,8 @@ def search(matches: Matches, options: EpipolarSettings, seed: int, recipe: Recip
                 break
             idle = 0
     if best.is_known and recipe.recover is not None:
-        best.meets_another(recipe.recover(points, best.f.reshape(3, 3), threshold, best.measure, state))
+        gate = OPEN if test.gate.random_start else test.gate
+        best.meets_another(recipe.recover(points, best.f.reshape(3, 3), threshold, best.measure, gate, state))
     return Hypothesis(best.f.reshape(3, 3), trials) if best.is_known else None
 
 

@@ -11,7 +11,7 @@ from sfm_app.jit import kernel
 from sfm_app.ransac.planes import dominant_homography, transfer_distance
 from sfm_app.ransac.sampling import RandomState, uniform
 from sfm_app.ransac.scoring import Measure, penalty, squared_distances
-from sfm_app.ransac.verification import OPEN, Gate
+from sfm_app.ransac.verification import Gate
 
 FloatArray = NDArray[np.float64]
 
@@ -23,7 +23,7 @@ _MOST_INLIERS = 300
 
 
 def with_another_epipole(
-    points: FloatArray, F: FloatArray, threshold: float, measure: Measure, state: RandomState
+    points: FloatArray, F: FloatArray, threshold: float, measure: Measure, gate: Gate, state: RandomState
 ) -> FloatArray | None:
     """The best model that shares the dominant plane of F's inliers; None without a plane and two matches off it.
 
@@ -32,6 +32,7 @@ def with_another_epipole(
         F: (3, 3).
         threshold: largest distance of an inlier.
         measure: the penalty.
+        gate: the test that a model has to pass; not one with a random start.
         state: random generator.
     """
     inliers = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
@@ -43,7 +44,7 @@ def with_another_epipole(
     if len(off_plane) < 2:
         return None
     best = np.empty(9)
-    found = _best_epipole(points, H, off_plane, measure, OPEN, state, best)
+    found = _best_epipole(points, H, off_plane, measure, gate, state, best)
     return best.reshape(3, 3) if np.isfinite(found) else None
 
 

@@ -1,12 +1,14 @@
 """From the best model of a search to the answer: a fit with its evidence, or a rejection with its reason."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sfm_app.geometry.distances import sampson_distance
-from sfm_app.ransac.chance import MOST_FALSE_ALARMS, false_alarms_of, mismatch_distances
+from sfm_app.geometry.epipolar import nearest_rank_two
+from sfm_app.ransac.chance import MOST_FALSE_ALARMS, false_alarms_of, squared_mismatches
 from sfm_app.ransac.degeneracy import find_degeneracy
 from sfm_app.ransac.leverage import prior_validity
 from sfm_app.ransac.loop import Recipe, search
@@ -17,6 +19,8 @@ from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 
 FloatArray = NDArray[np.float64]
+Find = Callable[[FloatArray, FloatArray, EpipolarSettings, int], tuple[ArrayLike, int] | None]
+"""(x1, x2, options, seed) -> F and how many samples were drawn, or None: a search from outside, for `estimate_with`."""
 
 TOO_FEW_MATCHES = "too few matches"
 NO_MODEL = "no model found"
@@ -55,17 +59,88 @@ def estimate(
     return _judge(first, second, matches, F, found.trials, options)
 
 
+def estimate_with(
+    find: Find, x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int
+) -> EpipolarFit | Rejected:
+    """Hold an estimator from outside to what the built-in ones promise: the way to write a plug-in.
+
+    Args:
+        find: gets the distinct matches, at least `options.min_inliers`, as contiguous (M, 2) pixels about the middle of
+            each view, in an order that depends on the seed. Its F may have any scale; it is brought to rank 2, and its
+            inliers, priors, degeneracy and chance are worked out as for any other. It should not raise on data.
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
+        options: as in `estimate`.
+        seed: same seed, same bytes, as far as `find` keeps to it.
+
+    Raises:
+        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+    """
+    first, second = check_points(x1, x2)
+    matches = prepare(first, second, seed)
+    if len(matches.points) < options.min_inliers:
+        return Rejected(TOO_FEW_MATCHES)
+    px1, px2 = (np.ascontiguousarray(side) * matches.unit_px for side in np.hsplit(matches.points, 2))
+    found = find(px1, px2, options, seed)
+    if found is None:
+        return Rejected(NO_MODEL)
+    F, trials = found
+    return _judge_any(first, second, matches, _in_frame(F, matches.unit_px, np.zeros(4)), trials, options)
+
+
+def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> EpipolarFit | Rejected:
+    """What matches say about a fundamental matrix, wherever it comes from.
+
+    Args:
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
+        F: (3, 3) of any scale, x2' F x1 = 0 in pixels.
+        options: threshold and fewest inliers.
+
+    Returns:
+        The fit, its `trials` 1, or why F is not to be trusted.
+
+    Raises:
+        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+    """
+    first, second = check_points(x1, x2)
+    matches = prepare(first, second, seed=0)
+    if len(matches.points) < options.min_inliers:
+        return Rejected(TOO_FEW_MATCHES)
+    return _judge_any(first, second, matches, _in_frame(F, matches.unit_px, matches.centre), 1, options)
+
+
+def _in_frame(F: ArrayLike, unit_px: float, centre: FloatArray) -> FloatArray:
+    """F of pixels as F of points that are centred and in units; the inverse of `Matches.to_pixels`."""
+    pixels = np.asarray(F, dtype=np.float64)
+    if pixels.shape != (3, 3):
+        raise ValueError(f"F must have shape (3, 3), got {pixels.shape}")
+    to1, to2 = (np.array([[unit_px, 0, x], [0, unit_px, y], [0, 0, 1]]) for x, y in (centre[:2], centre[2:]))
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is rejected
+        return np.asarray(to2.T @ pixels @ to1)
+
+
+def _judge_any(
+    x1: FloatArray, x2: FloatArray, matches: Matches, F: FloatArray, trials: int, options: EpipolarSettings
+) -> EpipolarFit | Rejected:
+    """`_judge` for an F that need not be finite, of rank 2 or of a sensible scale."""
+    largest = np.abs(F).max()
+    if not (np.isfinite(largest) and largest > 0) or np.linalg.matrix_rank(F / largest) < 2:
+        return Rejected(NO_MODEL)
+    return _judge(x1, x2, matches, nearest_rank_two(F / largest), trials, options)
+
+
 def _judge(
     x1: FloatArray, x2: FloatArray, matches: Matches, F: FloatArray, trials: int, options: EpipolarSettings
 ) -> EpipolarFit | Rejected:
     points, threshold = matches.points, options.max_error_px / matches.unit_px
     f = np.ascontiguousarray(F / np.linalg.norm(F)).reshape(9)
-    distances = np.sqrt(squared_distances(points, f))
-    inliers = distances <= threshold
+    squared = squared_distances(points, f)
+    inliers = squared <= threshold * threshold
     if np.count_nonzero(inliers) < options.min_inliers:
         return Rejected(TOO_FEW_INLIERS)
-    wrong = mismatch_distances(points, f)
-    if false_alarms_of(distances, wrong, threshold) > MOST_FALSE_ALARMS:
+    wrong = squared_mismatches(points, f)
+    if false_alarms_of(squared, wrong, threshold) > MOST_FALSE_ALARMS:
         return Rejected(CHANCE)
     F_px = matches.to_pixels(F)
     errors_px = sampson_distance(F_px, x1, x2)

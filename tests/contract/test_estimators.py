@@ -1,7 +1,10 @@
 """One set of tests for every registered estimator, ours and any plug-in's."""
 
+import itertools
 import pickle
+import re
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,10 +12,12 @@ import pytest
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import EpipolarSettings
-from sfm_app.synthetic.correspondences import PairOptions, make_pair
+from sfm_app.synthetic.correspondences import PairOptions, make_pair, random_rotation
 from sfm_app.types import EpipolarFit, Rejected
 
 ESTIMATORS = load_plugins().estimators
+UNREFINED = {"opencv-ransac"}
+"""They return the F of seven matches: twice the noise, and some true matches beyond the threshold."""
 SCENE = {"points": 400, "sigma_px": 0.5, "width": 1024, "height": 768, "focal_px": 900.0}
 OPTIONS = EpipolarSettings(max_error_px=2.0, max_trials=2000)
 RNG = np.random.default_rng(5)
@@ -35,8 +40,41 @@ DEGENERATE = {
 
 
 @pytest.fixture(params=ESTIMATORS)
-def fit(request):
-    return ESTIMATORS[request.param].fit
+def name(request):
+    return request.param
+
+
+@pytest.fixture
+def fit(name):
+    return ESTIMATORS[name].fit
+
+
+@pytest.fixture
+def accuracy_px(name):
+    """How far exact matches may lie from F, by their median, on an easy pair."""
+    return 0.8 if name in UNREFINED else 0.4
+
+
+def options(**values):
+    return OPTIONS.model_copy(update=values)
+
+
+def mapped(H, x):
+    h = np.column_stack([x, np.ones(len(x))]) @ H.T
+    return h[:, :2] / h[:, 2:]
+
+
+def homography_pair(kind, seed, sigma_px):
+    """400 matches that one homography explains: of a camera that only turned, or of a plane."""
+    rng = np.random.default_rng([seed, 77])
+    K = np.array([[900.0, 0, 512], [0, 900, 384], [0, 0, 1]])
+    x1 = rng.uniform((0, 0), (1024, 768), (4000, 2))
+    while True:
+        R, t, n = random_rotation(rng, 30.0), rng.normal(0, 0.4, 3), rng.normal((0, 0, -1), 0.4)
+        x2 = mapped(K @ (R if kind == "rotation" else R - np.outer(t, n)) @ np.linalg.inv(K), x1)
+        seen = np.flatnonzero(((x2 > 0) & (x2 < (1024, 768))).all(axis=1))[:400]
+        if len(seen) == 400:
+            return x1[seen] + rng.normal(0, sigma_px, (400, 2)), x2[seen] + rng.normal(0, sigma_px, (400, 2))
 
 
 def is_well_formed(found, count):
@@ -55,16 +93,17 @@ def is_well_formed(found, count):
 
 @pytest.mark.parametrize("outliers", [0.0, 0.3])
 @pytest.mark.parametrize("seed", range(4))
-def test_finds_the_truth_and_the_injected_noise(fit, outliers, seed):
+def test_finds_the_truth_and_the_injected_noise(name, fit, accuracy_px, outliers, seed):
     pair = make_pair(PairOptions(outliers=outliers, **SCENE), seed)
 
     found = fit(pair.x1, pair.x2, OPTIONS, seed)
 
     assert is_well_formed(found, 400)
     noise = np.sqrt(np.mean(sampson_distance(found.F, pair.x1, pair.x2)[pair.is_inlier] ** 2))
-    assert 0.40 < noise < 0.65
-    assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < 0.4
-    assert found.inliers[pair.is_inlier].mean() > 0.95
+    rough = name in UNREFINED
+    assert 0.40 < noise < (1.3 if rough else 0.65)
+    assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < accuracy_px
+    assert found.inliers[pair.is_inlier].mean() > (0.85 if rough else 0.95)
     assert found.inliers[~pair.is_inlier].sum() < 0.1 * 400
     assert found.degeneracy == ""
 
@@ -83,6 +122,9 @@ def test_evidence_is_that_of_the_returned_matrix(fit):
 @pytest.mark.parametrize("case", DEGENERATE)
 def test_matches_without_geometry_are_rejected_with_a_reason(fit, case):
     found = fit(*DEGENERATE[case], OPTIONS, 0)
+    if case == "on a line in both views" and found:  # they do support an F, one of many
+        assert found.degeneracy == "planar"
+        return
     assert isinstance(found, Rejected), found
     assert found.reason
     assert len(found.reason) < 60
@@ -98,10 +140,21 @@ def test_points_that_are_not_finite_are_refused(fit, bad):
         fit(CLOUD, x, OPTIONS, 0)
 
 
-@pytest.mark.parametrize(("x1", "x2"), [(CLOUD[:, 0], CLOUD), (CLOUD, np.ones((100, 3))), (CLOUD, CLOUD[:50])])
-def test_wrong_shapes_are_refused(fit, x1, x2):
-    with pytest.raises(ValueError, match=r"shape|pair up"):
-        fit(x1, x2, OPTIONS, 0)
+@pytest.mark.parametrize(
+    "bad", [CLOUD[:, 0], CLOUD.T, np.ones((100, 3)), CLOUD[:50], CLOUD[..., None], [[1.0, 2.0], [3.0]] * 50, 3.0, None]
+)
+def test_wrong_shapes_are_refused(fit, bad):
+    for x1, x2 in ((bad, CLOUD), (CLOUD, bad)):
+        with pytest.raises(ValueError, match=r"shape|pair up"):
+            fit(x1, x2, OPTIONS, 0)
+
+
+@pytest.mark.parametrize("kind", [bool, complex, object, str, "datetime64[s]"])
+def test_what_are_no_real_numbers_is_refused(fit, kind):
+    bad = np.zeros((100, 2), kind)
+    for x1, x2 in ((bad, CLOUD), (CLOUD, bad)):
+        with pytest.raises(ValueError, match="real numbers"):
+            fit(x1, x2, OPTIONS, 0)
 
 
 @pytest.mark.parametrize("count", [8, 16, 20])
@@ -125,13 +178,21 @@ def test_layout_and_type_of_the_arrays_do_not_matter(fit):
 
     padded = np.zeros((800, 3))
     padded[::2, :2] = x1
-    views = [
-        (x1.astype(np.int32), x2.astype(np.int64)),
-        (np.asfortranarray(x1), np.asfortranarray(x2)),
-        (padded[::2, :2], x2),
-    ]
-    for a, b in views:
-        assert pickle.dumps(fit(a, b, OPTIONS, 0)) == expected
+    backwards = np.ascontiguousarray(x1[::-1])[::-1]
+    locked = x1.copy()
+    locked.flags.writeable = False
+    views = {
+        "integers": (x1.astype(np.int32), x2.astype(np.int64)),
+        "small floats": (x1.astype(np.float32), x2.astype(np.float16)),
+        "other byte order": (x1.astype(">f8"), x2.astype(">i4")),
+        "Fortran order": (np.asfortranarray(x1), np.asfortranarray(x2)),
+        "strided": (padded[::2, :2], x2),
+        "reversed": (backwards, x2),
+        "read-only": (locked, x2),
+        "lists": (x1.tolist(), x2.tolist()),
+    }
+    for view, (a, b) in views.items():
+        assert pickle.dumps(fit(a, b, OPTIONS, 0)) == expected, view
 
 
 def test_input_is_left_alone(fit):
@@ -159,7 +220,183 @@ def test_ten_runs_in_threads_give_the_same_bytes(fit):
     assert len(set(runs)) == 1
 
 
-def test_repeated_matches_are_no_evidence(fit):
-    x = RNG.uniform(0, 1000, (12, 4))
-    found = fit(np.repeat(x[:, :2], 20, axis=0), np.repeat(x[:, 2:], 20, axis=0), OPTIONS, 0)
+def test_a_repeated_match_counts_once_and_gets_one_verdict(fit):
+    pair = make_pair(PairOptions(outliers=0.3, **SCENE), 3)
+    once = fit(pair.x1, pair.x2, OPTIONS, 0)
+
+    thrice = fit(np.tile(pair.x1, (3, 1)), np.tile(pair.x2, (3, 1)), OPTIONS, 0)
+
+    np.testing.assert_array_equal(thrice.inliers, np.tile(thrice.inliers[:400], 3))
+    np.testing.assert_array_equal(thrice.priors, np.tile(thrice.priors[:400], 3))
+    assert np.mean(thrice.inliers[:400] == once.inliers) > 0.9
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_twenty_noisy_matches_are_enough(name, fit, seed):
+    pair = make_pair(PairOptions(**{**SCENE, "points": 20}), seed)
+
+    found = fit(pair.x1, pair.x2, OPTIONS, 0)
+
+    if name != "lev-ransac" and not found:  # what the others may miss, ours does not
+        return
+    assert is_well_formed(found, 20)
+    assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < 1.0
+
+
+def test_ten_thousand_matches(fit, accuracy_px):
+    pair = make_pair(PairOptions(outliers=0.3, **{**SCENE, "points": 10_000}), 3)
+
+    found = fit(pair.x1, pair.x2, OPTIONS, 0)
+
+    assert is_well_formed(found, 10_000)
+    assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < accuracy_px
+    assert found.inliers[pair.is_inlier].mean() > 0.9
+    assert found.inliers[~pair.is_inlier].mean() < 0.05
+
+
+def peak_bytes():
+    """Most memory that this process ever held since `clear_refs` was last written, of any library."""
+    return 1024 * int(re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text()).group(1))
+
+
+@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux can reset its count of peak memory")
+def test_memory_is_linear_in_the_matches(fit):
+    few, many = (make_pair(PairOptions(outliers=0.1, **{**SCENE, "points": count}), 0) for count in (100, 20_000))
+    fit(few.x1, few.x2, options(max_trials=100), 0)  # loads and compiles
+    Path("/proc/self/clear_refs").write_text("5")
+    before = peak_bytes()
+
+    assert fit(many.x1, many.x2, options(max_trials=100), 0)
+
+    # one byte per pair of matches would be 400 MB
+    assert peak_bytes() - before < 20_000 * 5000
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.3])
+def test_exact_matches_give_the_exact_answer(fit, outliers):
+    pair = make_pair(PairOptions(outliers=outliers, **{**SCENE, "sigma_px": 0.0}), 3)
+
+    found = fit(pair.x1, pair.x2, OPTIONS, 0)
+
+    assert is_well_formed(found, 400)
+    assert found.inliers[pair.is_inlier].all()
+    assert (
+        sampson_distance(found.F, pair.x1, pair.x2)[pair.is_inlier].max() < 1e-2
+    )  # OpenCV computes in single precision
+
+
+def test_coordinates_a_million_pixels_away(fit, accuracy_px):
+    pair = make_pair(PairOptions(outliers=0.3, **SCENE), 3)
+
+    found = fit(pair.x1 + 1e6, pair.x2 - 1e6, OPTIONS, 0)
+
+    assert is_well_formed(found, 400)
+    error = np.median(sampson_distance(found.F, pair.exact_x1 + 1e6, pair.exact_x2 - 1e6))
+    assert 0 < error < accuracy_px
+    assert found.inliers[pair.is_inlier].mean() > 0.85
+
+
+@pytest.mark.parametrize("scale", [0.1, 10.0])
+def test_tiny_and_huge_images(fit, scale):
+    pair = make_pair(PairOptions(outliers=0.3, **SCENE), 3)
+
+    found = fit(pair.x1 * scale, pair.x2 * scale, options(max_error_px=2.0 * scale), 0)
+
+    assert is_well_formed(found, 400)
+    assert found.inliers[pair.is_inlier].mean() > 0.85
+    assert found.inliers[~pair.is_inlier].mean() < 0.1
+
+
+def test_one_match_far_away_is_an_outlier(fit):
+    pair = make_pair(PairOptions(outliers=0.1, **SCENE), 3)
+    pair.x1[0], pair.x2[1] = (1e5, 0.0), (0.0, -1e5)
+
+    found = fit(pair.x1, pair.x2, OPTIONS, 0)
+
+    assert found.inliers[2:][pair.is_inlier[2:]].mean() > 0.85
+    assert not found.inliers[:2].any()
+
+
+def test_exchanged_views_give_the_transpose(name, fit, accuracy_px):
+    pair = make_pair(PairOptions(outliers=0.2, **SCENE), 3)
+
+    there, back = fit(pair.x1, pair.x2, OPTIONS, 0), fit(pair.x2, pair.x1, OPTIONS, 0)
+
+    assert np.mean(there.inliers == back.inliers) > (0.85 if name in UNREFINED else 0.98)
+    assert np.median(sampson_distance(back.F.T, pair.exact_x1, pair.exact_x2)) < accuracy_px
+
+
+@pytest.mark.parametrize("move", [(0.0, 0.0), (5.0, 3.0)])
+def test_equal_views_are_no_epipolar_geometry(fit, move):
+    found = fit(CLOUD, CLOUD + move, OPTIONS, 0)
+    assert isinstance(found, Rejected) or found.degeneracy == "rotation"
+
+
+@pytest.mark.parametrize("sigma_px", [0.0, 0.5])
+@pytest.mark.parametrize("kind", ["rotation", "planar"])
+@pytest.mark.parametrize("seed", range(5, 8))
+def test_matches_of_one_homography_are_flagged(fit, kind, sigma_px, seed):
+    found = fit(*homography_pair(kind, seed, sigma_px), OPTIONS, seed)
+    assert found.degeneracy == kind if found else sigma_px == 0
+
+
+def test_a_plane_among_outliers_is_flagged(fit):
+    x1, x2 = homography_pair("planar", 5, 0.5)
+    x2[:120] += np.random.default_rng(0).uniform(-256, 256, (120, 2))
+    assert fit(x1, x2, OPTIONS, 0).degeneracy == "planar"
+
+
+@pytest.mark.parametrize("values", [{}, {"min_inliers": 8, "max_error_px": 50.0}, {"min_inliers": 8, "max_trials": 1}])
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_is_rejected(fit, values, seed):
+    rng = np.random.default_rng([seed, 300])
+    found = fit(rng.uniform(0, 1000, (300, 2)), rng.uniform(0, 1000, (300, 2)), options(**values), seed)
     assert isinstance(found, Rejected)
+
+
+EDGES = {
+    "min_inliers": (8, 10_000),
+    "max_trials": (1, 10),
+    "confidence": (0.5, 0.999999),
+    "max_error_px": (0.1, 50.0),
+}
+
+
+@pytest.mark.parametrize("edge", [(key, value) for key, values in EDGES.items() for value in values], ids=str)
+def test_options_at_their_edges(fit, accuracy_px, edge):
+    pair = make_pair(PairOptions(outliers=0.3, **SCENE), 3)
+    changed = options(**dict([edge]))
+
+    found = fit(pair.x1, pair.x2, changed, 0)
+
+    if edge[0] == "confidence" or edge == ("min_inliers", 8):
+        assert isinstance(found, EpipolarFit)
+    if found:
+        assert is_well_formed(found, 400)
+        assert found.inlier_count >= changed.min_inliers
+        assert found.trials <= changed.max_trials
+        assert found.rms_px <= changed.max_error_px
+        error = np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2))
+        assert error < max(5 * accuracy_px, 0.2 * changed.max_error_px)
+
+
+def awkward_matches(rng):
+    """Few matches, rounded, repeated, partly on lines, partly of one homography: what falls out of small photos."""
+    count, step = int(rng.integers(0, 60)), float(rng.choice([1e-6, 1.0, 50.0, 400.0]))
+    x1 = np.rint(rng.uniform(0, 1000, (count, 2)) / step) * step
+    x2 = np.rint((x1 + rng.normal(0, rng.choice([0.0, 1.0, 300.0]), (count, 2))) / step) * step
+    same = rng.random(count) < rng.choice([0.0, 0.5, 0.95])
+    x1[same, 1] = x1[same, 0] * rng.choice([0.0, 1.0])
+    x2[rng.random(count) < rng.choice([0.0, 0.5])] = 0.0
+    return x1, x2
+
+
+def test_awkward_matches_give_a_sound_answer_or_a_reason(fit):
+    for seed, least in itertools.product(range(40), (8, 16)):
+        x1, x2 = awkward_matches(np.random.default_rng([seed, 60]))
+        found = fit(x1, x2, options(min_inliers=least, max_trials=100), seed)
+        if found:
+            assert is_well_formed(found, len(x1)), seed
+            assert found.inlier_count >= least
+        else:
+            assert found.reason, seed

@@ -1,9 +1,11 @@
+import sys
 import types
+from importlib import metadata
 
 import pytest
 
 from sfm_app.errors import ConfigError, PluginError
-from sfm_app.plugins import Estimator, hookimpl, load_plugins
+from sfm_app.plugins import Estimator, hookimpl, installed_plugins, load_plugins
 from sfm_app.types import Rejected
 
 
@@ -53,3 +55,42 @@ def test_a_misspelt_hook_is_refused():
 
     with pytest.raises(PluginError, match="sfm_estimator"):
         load_plugins([plugin(sfm_estimator=sfm_estimator)], installed=False)
+
+
+@pytest.fixture
+def installed(monkeypatch):
+    """A package that comes and goes, and how often anybody looked for it."""
+    looked = []
+    module = types.ModuleType("test_plugins_never")
+    module.sfm_estimators = sfm_estimators
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    package = types.SimpleNamespace(entry_points=[metadata.EntryPoint("never", module.__name__, "sfm_app")])
+    monkeypatch.setattr(metadata, "distributions", lambda: looked.append(1) or [package])
+    installed_plugins.cache_clear()
+    yield looked
+    installed_plugins.cache_clear()
+
+
+def test_installed_packages_are_searched_once_per_process(installed):
+    assert load_plugins() is load_plugins()
+    assert load_plugins().estimator("never").fit is never
+    assert len(installed) == 1
+
+    installed_plugins.cache_clear()
+    assert "never" in load_plugins().estimators
+    assert len(installed) == 2
+
+
+def test_given_modules_and_no_installed_ones_are_not_kept(installed):
+    extra = plugin()
+
+    assert "never" not in load_plugins(installed=False).estimators
+    assert load_plugins([extra]) is not load_plugins([extra])
+    assert "never" in load_plugins([extra]).estimators
+
+
+def test_a_plugin_that_does_not_import_is_named_every_time(installed, monkeypatch):
+    monkeypatch.setitem(sys.modules, "test_plugins_never", None)
+    for _ in range(2):
+        with pytest.raises(PluginError, match="test_plugins_never"):
+            load_plugins()

@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -16,3 +19,13 @@ def test_an_estimator_refuses_bad_input_clearly():
         sfm_app.estimate_fundamental(np.zeros((9, 2)), np.full((9, 2), np.nan))
     with pytest.raises(sfm_app.ConfigError, match="no calibrator is named 'kruppa5'"):
         sfm_app.calibrate_fundamentals(np.eye(3)[None], (640, 480), method="kruppa5")
+
+
+def test_the_import_leaves_out_what_an_estimator_does_not_need():
+    heavy = {"cv2", "open3d", "pycolmap", "trimesh", "scipy.optimize", "scipy.sparse", "scipy.spatial", "rich"}
+    lists = "import sys, sfm_app; print(*sys.modules)"
+
+    done = subprocess.run([sys.executable, "-c", lists], capture_output=True, text=True, check=True)
+
+    assert "sfm_app.ransac.verdict" in done.stdout.split()
+    assert heavy.isdisjoint(done.stdout.split())
