@@ -1,0 +1,60 @@
+"""Curves for the result pages."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+STYLE = {
+    "axes.grid": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "figure.constrained_layout.use": True,
+    "figure.dpi": 110,
+    "font.size": 9,
+    "grid.alpha": 0.3,
+    "legend.fontsize": 8,
+    "legend.frameon": False,
+    "lines.linewidth": 1.4,
+    "lines.markersize": 4,
+}
+MARKERS = "osD^vP*Xhd<>"
+
+
+def pyplot() -> Any:
+    """matplotlib without a display, in our style; it is imported only where a figure is drawn."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise SystemExit("matplotlib is missing: pip install -e '.[bench]'") from None
+    matplotlib.use("Agg")
+    matplotlib.rcParams.update(STYLE)
+    from matplotlib import pyplot as plt
+
+    return plt
+
+
+def curves(axes: Any, x: Sequence[float], lines: Mapping[str, Sequence[float]], heavy: Sequence[str] = ()) -> None:
+    """One line with markers per name; those in `heavy` are drawn bolder."""
+    for n, (name, y) in enumerate(lines.items()):
+        width = 2.4 if name in heavy else 1.2
+        axes.plot(x, y, label=name, color=f"C{n % 10}", marker=MARKERS[n % len(MARKERS)], linewidth=width)
+
+
+def label(axes: Any, x: str, y: str, title: str = "", *, log: bool = False) -> None:
+    """Names of the axes; figures on a logarithmic axis are written out, not as powers."""
+    axes.set(xlabel=x, ylabel=y, title=title)
+    if log:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+
+
+def legend_beside(figure: Any, axes: Any) -> None:
+    """One legend to the right of all plots of a figure."""
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside right center")
+
+
+def save(figure: Any, folder: Path, name: str) -> None:
+    """NAME.png."""
+    folder.mkdir(parents=True, exist_ok=True)
+    figure.savefig(folder / f"{name}.png", metadata={"Software": None})
+    pyplot().close(figure)
