@@ -41,11 +41,13 @@ def curves(axes: Any, x: Sequence[float], lines: Mapping[str, Sequence[float]], 
 
 
 def label(axes: Any, x: str, y: str, title: str = "", *, log: bool = False) -> None:
-    """Names of the axes; figures on a logarithmic axis are written out, not as powers."""
+    """Names of the axes; on a logarithmic axis figures near 1 are written out, not as powers."""
     axes.set(xlabel=x, ylabel=y, title=title)
     if log:
         axes.set_yscale("log")
-        axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        low, high = axes.get_ylim()
+        if low > 1e-4 and high < 1e5:
+            axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
 
 
 def legend_beside(figure: Any, axes: Any) -> None:

@@ -51,6 +51,9 @@ def score_real(pairs: Sequence[RealPair], methods: Mapping[str, Method], seed: i
         row: Row = {"method": name}
         row |= {f"AUC@{limit}": round(area_under_recall(errors[name], limit), 4) for limit in POSE_LIMITS_DEG}
         row |= {"rms px": _finite(np.median(rms)), "no F": sum(a.F is None for a in tries), **timing(tries)}
+        for photos in dict.fromkeys(pair.photos for pair in pairs):
+            of_set = errors[name][[pair.photos == photos for pair in pairs]]
+            row[f"{photos} AUC@10"] = round(area_under_recall(of_set, 10), 4)
         rows.append(row)
     _set_in_relation(rows, "ms total")
     return rows, errors
@@ -64,7 +67,7 @@ def run_real(task: str, files: list[Path], methods: Mapping[str, Method], args: 
     shares = np.array([pair.is_true.mean() for pair in pairs])
     counts = np.array([len(pair.x1) for pair in pairs])
     data = {
-        "sets": {path.stem: sum(pair.name.startswith(f"{path.stem} ") for pair in pairs) for path in files},
+        "sets": {path.stem: sum(pair.photos == path.stem for pair in pairs) for path in files},
         "pairs": len(pairs),
         "true inlier share": [round(float(value), 3) for value in np.quantile(shares, (0, 0.5, 1))],
         "matches": [int(value) for value in np.quantile(counts, (0, 0.5, 1))],
@@ -77,7 +80,12 @@ def run_real(task: str, files: list[Path], methods: Mapping[str, Method], args: 
         "rms px: median over the pairs of the RMS Sampson distance of the true inliers (within "
         f"{TRUE_PX:g} px of the truth)."
     )
-    _publish(task, about, data, rows, args, {"": table(rows)})
+    by_set = [column for column in rows[0] if column.endswith(" AUC@10")]
+    tables = {
+        "All pairs": table(rows, [column for column in rows[0] if column not in by_set]),
+        "AUC@10 by photo set": table(rows, ["method", *by_set]),
+    }
+    _publish(task, about, data, rows, args, tables)
     plt = pyplot()
     figure, axes = plt.subplots(figsize=(7.5, 3.6))
     recall = np.arange(1, len(pairs) + 1) / len(pairs)
@@ -159,7 +167,7 @@ def _publish(
     options = {"threshold px": THRESHOLD_PX, "confidence": CONFIDENCE, "most trials": MAX_TRIALS, "seed": args.seed}
     found = document(f"fundamental {task}", about, options, data, rows)
     limits = f"Threshold {THRESHOLD_PX} px, confidence {CONFIDENCE}, at most {MAX_TRIALS} samples, one thread, one run."
-    body = "\n".join(f"### {title}\n\n{text}" if title else text for title, text in tables.items())
+    body = "\n".join(f"## {title}\n\n{text}" for title, text in tables.items())
     page = f"# {_title(task)}\n\n{about} {limits}\n\n{body}"
     write(args.results, _name(task, args), found, page)
     print(page)
@@ -179,10 +187,10 @@ def _name(task: str, args: argparse.Namespace) -> str:
 
 
 def _set_in_relation(rows: list[Row], column: str) -> None:
+    """Every time over that of the baseline, where that was measured."""
     times = {row["method"]: row[column] for row in rows}
-    if BASELINE in times:
-        for row in rows:
-            row["time : MAGSAC++"] = round(row[column] / times[BASELINE], 3)
+    for row in rows if BASELINE in times else []:
+        row["time : MAGSAC++"] = round(row[column] / times[BASELINE], 3)
 
 
 def _finite(value: float) -> float | None:

@@ -1,5 +1,6 @@
 """The estimators that are compared: ours by name through the public API, and the rivals as they come."""
 
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,8 +23,10 @@ RIVALS = ("OpenCV RANSAC", BASELINE, "PoseLib", "pycolmap LO-RANSAC")
 
 
 def our_estimators(names: Sequence[str], options: EpipolarSettings) -> dict[str, Method]:
-    """Estimators of sfm_app by name; unknown names are left out, so that the result says what was there."""
+    """Estimators of sfm_app by name; unknown names are left out with a note, so that older states can be measured."""
     known = load_plugins().estimators
+    if missing := [name for name in names if name not in known]:
+        print(f"left out, no such estimator: {', '.join(missing)}", file=sys.stderr)
     return {name: _ours(name, options) for name in names if name in known}
 
 

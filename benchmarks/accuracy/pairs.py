@@ -31,6 +31,8 @@ _FIELDS = ("x1", "x2", "F", "K1", "K2", "R", "t")
 class RealPair:
     """Matches of two photos, and the truth."""
 
+    photos: str
+    """Name of the photo set."""
     name: str
     x1: FloatArray
     x2: FloatArray
@@ -59,7 +61,7 @@ def load_pairs(files: list[Path], limit: int | None = None) -> list[RealPair]:
         with np.load(path) as data:
             names = sorted({key.rsplit("/", 1)[0] for key in data.files})
             read = (
-                RealPair(f"{path.stem} {name}", *(data[f"{name}/{field}"].astype(np.float64) for field in _FIELDS))
+                RealPair(path.stem, name, *(data[f"{name}/{field}"].astype(np.float64) for field in _FIELDS))
                 for name in names
             )
             usable = [pair for pair in read if pair.is_usable]

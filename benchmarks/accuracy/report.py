@@ -7,6 +7,7 @@ The document:
      "rows": [{"method": str, column: str, number or null, ...}, ...]}
 """
 
+import csv
 import json
 import os
 import platform
@@ -74,6 +75,14 @@ def write(folder: Path, name: str, found: Row, page: str) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.json").write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     (folder / f"{name}.md").write_text(page, encoding="utf-8")
+
+
+def write_csv(folder: Path, name: str, rows: Sequence[Row]) -> None:
+    """NAME.csv."""
+    with (folder / f"{name}.csv").open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def table(rows: Sequence[Row], columns: Sequence[str] | None = None) -> str:

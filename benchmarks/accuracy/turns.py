@@ -60,7 +60,7 @@ def is_usable(F: FloatArray | None) -> bool:
 
 
 def timing(attempts: Sequence[Attempt]) -> dict[str, float | None]:
-    """Milliseconds, and the median number of samples where the method tells."""
+    """Milliseconds, and the mean number of samples where the method tells."""
     ms = np.array([attempt.ms for attempt in attempts])
     trials = [attempt.trials for attempt in attempts if attempt.trials is not None]
     return {
@@ -68,5 +68,5 @@ def timing(attempts: Sequence[Attempt]) -> dict[str, float | None]:
         "ms mean": round(float(ms.mean()), 2),
         "ms p90": round(float(np.percentile(ms, 90)), 2),
         "ms total": round(float(ms.sum()), 1),
-        "trials median": float(np.median(trials)) if trials else None,
+        "trials mean": round(float(np.mean(trials)), 1) if trials else None,
     }
