@@ -15,7 +15,7 @@ STYLE = {
     "legend.fontsize": 8,
     "legend.frameon": False,
     "lines.linewidth": 1.4,
-    "lines.markersize": 4,
+    "lines.markersize": 5,
 }
 MARKERS = "osD^vP*Xhd<>"
 
@@ -34,10 +34,10 @@ def pyplot() -> Any:
 
 
 def curves(axes: Any, x: Sequence[float], lines: Mapping[str, Sequence[float]], heavy: Sequence[str] = ()) -> None:
-    """One line with markers per name; those in `heavy` are drawn bolder."""
+    """One line per name, bolder for those in `heavy`; markers shrink from line to line, so that none hides another."""
     for n, (name, y) in enumerate(lines.items()):
-        width = 2.4 if name in heavy else 1.2
-        axes.plot(x, y, label=name, color=f"C{n % 10}", marker=MARKERS[n % len(MARKERS)], linewidth=width)
+        style, width = MARKERS[n % len(MARKERS)] + "-", 2.4 if name in heavy else 1.2
+        axes.plot(x, y, style, label=name, color=f"C{n % 10}", linewidth=width, markersize=max(7.0 - 0.7 * n, 3.0))
 
 
 def label(axes: Any, x: str, y: str, title: str = "", *, log: bool = False) -> None:
@@ -47,7 +47,9 @@ def label(axes: Any, x: str, y: str, title: str = "", *, log: bool = False) -> N
         axes.set_yscale("log")
         low, high = axes.get_ylim()
         if low > 1e-4 and high < 1e5:
+            labelled = "25" if high / low < 100 else ""
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+            axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in labelled else "")
 
 
 def legend_beside(figure: Any, axes: Any) -> None:
