@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 from turns import Method
 
 from sfm_app.ransac.lev_ransac import PRODUCTION
-from sfm_app.ransac.lev_ransac_thesis import refit_to_inliers
 from sfm_app.ransac.leverage import prior_validity
 from sfm_app.ransac.loop import Recipe
+from sfm_app.ransac.recipes import refit_to_inliers
 from sfm_app.ransac.verdict import estimate
+from sfm_app.ransac.verification import FullVerification
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit
 
@@ -26,7 +27,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "stops by Eq. 3.19 only": {"patience": None},
     "no orientation test": {"oriented": False},
     "no local optimisation": {"improve": None},
-    "no bail-out": {"bail_out": False},
+    "no bail-out": {"verifier": FullVerification},
     "least squares on the inliers last": {"finish": refit_to_inliers},
 }
 """Name of what is missing, and the fields of the recipe that say so."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.ransac.leverage import cook_distances, leverages, mad_sigma, priors, studentised_residuals
-from sfm_app.ransac.minimal import MOST_MODELS, seven_point
+from sfm_app.ransac.minimal import MOST_MODELS, models_through
 from sfm_app.ransac.points import Matches, prepare
 from sfm_app.ransac.refit import fit_eight_point, refine_sampson
 from sfm_app.ransac.sampling import SAMPLE_SIZE, RandomState, draw_uniform, draw_weighted, random_state
@@ -54,7 +54,7 @@ def trace(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int, 
         cook = cook_distances(studentised_residuals(residuals, leverage, fitted), leverage)
         validity = priors(cook, mad_sigma(cook))
         cumulative = np.cumsum(validity) if guided else cumulative
-        limit = min(limit, trials_needed(float(fitted.mean()), options.confidence))
+        limit = min(limit, trials_needed(float(fitted.mean()) ** SAMPLE_SIZE, options.confidence))
         yield BestModel(trial, *_as_given(matches, residuals * matches.unit_px, cook, validity))
 
 
@@ -88,7 +88,7 @@ def _candidates(points: FloatArray, state: RandomState, cumulative: FloatArray) 
     sample, models = np.empty(SAMPLE_SIZE, np.int64), np.empty((MOST_MODELS, 9))
     if not (len(cumulative) and draw_weighted(state, cumulative, sample)):
         draw_uniform(state, len(points), sample)
-    return [models[k].copy() for k in range(seven_point(points, sample, models))]
+    return [models[k].copy() for k in range(models_through(points, sample, models))]
 
 
 def _as_given(matches: Matches, *values: FloatArray) -> Iterator[FloatArray]:
