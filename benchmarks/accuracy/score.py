@@ -1,4 +1,4 @@
-"""Camera poses against the truth."""
+"""Camera poses and fundamental matrices against the truth."""
 
 import json
 from collections.abc import Mapping
@@ -8,10 +8,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.epipolar import sampson_distance
+from sfm_app.geometry.essential import decompose_essential, essential_from_fundamental
+
 Pose = NDArray[np.float64]
 
 LOST_DEG = 180.0
-"""Error of a pair with a photo that has no pose."""
+"""Error of a pair with a photo that has no pose, and of a pair without F."""
+CAP_PX = 5.0
+"""A fundamental matrix that is farther off than this has failed; as a capped error it counts as this much."""
 
 
 def load_truth(path: Path) -> dict[str, tuple[NDArray[np.float64], Pose]]:
@@ -28,12 +33,43 @@ def pose_errors_deg(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> NDA
     errors = []
     for a, b in combinations(sorted(truth), 2):
         if a in found and b in found:
-            (R, t), (S, u) = _relative(found[a], found[b]), _relative(truth[a], truth[b])
-            cosines = ((np.trace(R.T @ S) - 1) / 2, t @ u / (np.linalg.norm(t) * np.linalg.norm(u)))
-            errors.append(max(np.degrees(np.arccos(np.clip(cosines, -1, 1)))))
+            errors.append(_angle_deg(_relative(found[a], found[b]), _relative(truth[a], truth[b])))
         else:
             errors.append(LOST_DEG)
     return np.array(errors)
+
+
+def fundamental_pose_error_deg(
+    F: NDArray[np.float64] | None, cameras: tuple[NDArray[np.float64], NDArray[np.float64]], R: Pose, t: Pose
+) -> float:
+    """The larger of the errors of rotation and of translation direction in F, decomposed with the true K1 and K2.
+
+    Of the four poses in F the best one counts; `LOST_DEG` without F.
+    """
+    if F is None:
+        return LOST_DEG
+    poses = decompose_essential(essential_from_fundamental(F, *cameras))
+    return min(_angle_deg(pose, (R, t)) for pose in poses)
+
+
+def rms_sampson_px(F: NDArray[np.float64] | None, x1: NDArray[np.float64], x2: NDArray[np.float64]) -> float:
+    """Root mean square Sampson distance of matches to F; inf without F."""
+    return float("inf") if F is None else float(np.sqrt(np.mean(sampson_distance(F, x1, x2) ** 2)))
+
+
+def mean_sampson_px(F: NDArray[np.float64] | None, x1: NDArray[np.float64], x2: NDArray[np.float64]) -> float:
+    """Mean Sampson distance of matches to F; inf without F."""
+    return float("inf") if F is None else float(np.mean(sampson_distance(F, x1, x2)))
+
+
+def summary_px(errors_px: NDArray[np.float64]) -> dict[str, float | int]:
+    """Mean of the answers that did not fail, mean of all with failures at `CAP_PX`, and how many failed."""
+    good = errors_px <= CAP_PX
+    return {
+        "mean px": round(float(errors_px[good].mean()), 4) if good.any() else CAP_PX,
+        "capped mean px": round(float(np.minimum(errors_px, CAP_PX).mean()), 4),
+        "failures": int(np.count_nonzero(~good)),
+    }
 
 
 def area_under_recall(errors_deg: NDArray[np.float64], limit_deg: float) -> float:
@@ -48,6 +84,12 @@ def area_under_recall(errors_deg: NDArray[np.float64], limit_deg: float) -> floa
 def focal_error_percent(found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
     """e_focal of the thesis: mean error of fx and fy."""
     return float(50 * (abs(found[0, 0] / truth[0, 0] - 1) + abs(found[1, 1] / truth[1, 1] - 1)))
+
+
+def _angle_deg(a: tuple[Pose, Pose], b: tuple[Pose, Pose]) -> float:
+    (R, t), (S, u) = a, b
+    cosines = ((np.trace(R.T @ S) - 1) / 2, t @ u / (np.linalg.norm(t) * np.linalg.norm(u)))
+    return float(max(np.degrees(np.arccos(np.clip(cosines, -1, 1)))))
 
 
 def _relative(a: Pose, b: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

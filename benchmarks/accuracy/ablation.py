@@ -1,0 +1,47 @@
+"""`lev-ransac` with one part switched off at a time: what each part is worth."""
+
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from turns import Method
+
+from sfm_app.ransac.lev_ransac import PRODUCTION
+from sfm_app.ransac.leverage import prior_validity
+from sfm_app.ransac.loop import Recipe
+from sfm_app.ransac.recipes import refit_to_inliers
+from sfm_app.ransac.verdict import estimate
+from sfm_app.ransac.verification import FullVerification
+from sfm_app.settings import EpipolarSettings
+from sfm_app.types import EpipolarFit
+
+FloatArray = NDArray[np.float64]
+
+WHOLE = "lev-ransac"
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "uniform samples": {"validity": None},
+    "all samples by the priors": {"guided_share": 1.0},
+    "sigma from all matches": {"validity": partial(prior_validity, sigma_from_inliers=False)},
+    "stops by Eq. 3.19 only": {"patience": None},
+    "no orientation test": {"oriented": False},
+    "no local optimisation": {"improve": None},
+    "no bail-out": {"verifier": FullVerification},
+    "least squares on the inliers last": {"finish": refit_to_inliers},
+}
+"""Name of what is missing, and the fields of the recipe that say so."""
+
+
+def ablated(options: EpipolarSettings) -> dict[str, Method]:
+    """The whole estimator, and one for every row of `ABLATIONS`, all called in the same way."""
+    recipes = {WHOLE: PRODUCTION} | {name: replace(PRODUCTION, **fields) for name, fields in ABLATIONS.items()}
+    return {name: _fit_with(recipe, options) for name, recipe in recipes.items()}
+
+
+def _fit_with(recipe: Recipe, options: EpipolarSettings) -> Method:
+    def fit(x1: FloatArray, x2: FloatArray, seed: int) -> tuple[FloatArray | None, int | None]:
+        found = estimate(x1, x2, options, seed, recipe)
+        return (found.F, found.trials) if isinstance(found, EpipolarFit) else (None, None)
+
+    return fit
