@@ -11,7 +11,7 @@ from turns import Method
 from sfm_app.ransac.lev_ransac import PRODUCTION
 from sfm_app.ransac.leverage import prior_validity
 from sfm_app.ransac.loop import Recipe
-from sfm_app.ransac.recipes import refit_to_inliers
+from sfm_app.ransac.refits import refit_sampson
 from sfm_app.ransac.verdict import estimate
 from sfm_app.ransac.verification import FullVerification
 from sfm_app.settings import EpipolarSettings
@@ -28,7 +28,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "no orientation test": {"oriented": False},
     "no local optimisation": {"improve": None},
     "no bail-out": {"verifier": FullVerification},
-    "least squares on the inliers last": {"finish": refit_to_inliers},
+    "least squares on the inliers last": {"finish": refit_sampson},
 }
 """Name of what is missing, and the fields of the recipe that say so."""
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from score import load_truth
 
 from sfm_app.api import opened_run
-from sfm_app.geometry.epipolar import fundamental_from_pose, sampson_distance
+from sfm_app.geometry.distances import sampson_distance
+from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.pipeline import run_stages
 from sfm_app.settings import Settings
 

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import ConfigError
-from sfm_app.geometry.epipolar import fundamental_from_pose, sampson_distance
+from sfm_app.geometry.distances import sampson_distance
+from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.synthetic.correspondences import FAR, MAX_SETUPS, NEAR, PairOptions, TwoViews, make_pair, random_rotation
 
 FloatArray = NDArray[np.float64]

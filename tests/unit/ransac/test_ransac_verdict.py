@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.epipolar import sampson_distance, unit_norm
+from sfm_app.geometry.distances import sampson_distance
+from sfm_app.geometry.epipolar import unit_norm
 from sfm_app.ransac import estimate_with, judge
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair

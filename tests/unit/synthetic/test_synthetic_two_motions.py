@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfm_app.errors import ConfigError
-from sfm_app.geometry.epipolar import sampson_distance
+from sfm_app.geometry.distances import sampson_distance
 from sfm_app.synthetic.correspondences import PairOptions
 from sfm_app.synthetic.two_motions import LEAST_DEPARTURE_PX, make_two_motions
 
