@@ -5,9 +5,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.jit import kernel
 from sfm_app.ransac.minimal import MOST_MODELS
 from sfm_app.ransac.sampling import SAMPLE_SIZE
-from sfm_app.ransac.scoring import squared_distances
+from sfm_app.ransac.scoring import distances_of_block, squared_distances
 
 FloatArray = NDArray[np.float64]
 
@@ -76,13 +77,20 @@ def squared_mismatches(points: FloatArray, f: FloatArray) -> FloatArray:
         points: (N, 4) distinct matches in random order, N >= 2.
         f: (9,) model.
     """
-    shifts = min(len(points) - 1, max(1, _MISMATCHES // len(points)))
-    mismatched = points.copy(order="F")
-    wrong = np.empty((shifts, len(points)))
+    return _shifted(points, f, min(len(points) - 1, max(1, _MISMATCHES // len(points))))
+
+
+@kernel
+def _shifted(points: FloatArray, f: FloatArray, shifts: int) -> FloatArray:
+    count = points.shape[0]
+    wrong, mismatched = np.empty(shifts * count), np.empty((4, count)).T
+    mismatched[:, :2] = points[:, :2]
     for shift in range(shifts):
-        mismatched[:, 2:] = np.roll(points[:, 2:], -1 - shift, axis=0)
-        wrong[shift] = squared_distances(mismatched, f)
-    return wrong.ravel()
+        for i in range(count):
+            partner = (i + shift + 1) % count
+            mismatched[i, 2], mismatched[i, 3] = points[partner, 2], points[partner, 3]
+        distances_of_block(mismatched, f, 0, wrong[shift * count : (shift + 1) * count])
+    return wrong
 
 
 def accidental_share(wrong: FloatArray, threshold: float) -> float:

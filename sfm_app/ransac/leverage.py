@@ -60,7 +60,7 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
 
 @kernel
 def _perpendicular(f: FloatArray) -> FloatArray:
-    """(9, 8) orthonormal directions perpendicular to a unit vector: a reflection takes it to one axis, them to the others."""
+    """(9, 8) orthonormal directions perpendicular to a unit vector: a reflection takes it and them to the axes."""
     last = f[8] + 1.0 if f[8] >= 0.0 else f[8] - 1.0
     basis = np.zeros((9, PARAMETERS))
     for k in range(PARAMETERS):

@@ -7,18 +7,21 @@ that catches the most accidental inliers. What tells a real epipole is matches o
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.epipolar import cross_matrix, epipoles
 from sfm_app.jit import kernel
-from sfm_app.ransac.sampling import RandomState, random_state, uniform
+from sfm_app.ransac.eigen import symmetric_eigen
+from sfm_app.ransac.refit import factors
+from sfm_app.ransac.sampling import uniform
 
 FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _SAMPLES, _SAMPLE_SIZE = 64, 3
 _LEAST_AREA = 1e-3
 _MOST_SCORED = 300
+_LEAST_SUPPORT = 1e-12
+"""Smallest over largest eigenvalue of the regression for a plane."""
 
 
+@kernel
 def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
     """The homography of the plane that holds the most matches, among those compatible with F.
 
@@ -34,26 +37,64 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
     Returns:
         (3, 3), x2 ~ H x1.
     """
-    e2 = epipoles(F)[1]
-    A = cross_matrix(e2) @ F
-    x1, x2 = homogeneous(points[:, :2]), homogeneous(points[:, 2:])
-    towards = np.cross(x2, e2)
-    length = np.sqrt((towards**2).sum(axis=1))
-    b = (np.cross(x2, x1 @ A.T) * towards).sum(axis=1) / np.maximum(length**2, np.finfo(float).tiny)
-    best = _sampled_plane(points[:_MOST_SCORED], b, A, e2, 2 * threshold * threshold, random_state(len(points)))
-    on_plane = transfer_distance(A - np.outer(e2, best), points) <= threshold
-    if np.count_nonzero(on_plane) >= _SAMPLE_SIZE:
-        near = length[on_plane]
-        best = np.linalg.lstsq(x1[on_plane] * near[:, None], b[on_plane] * near, rcond=None)[0]
-    return A - np.outer(e2, best)
+    e2 = factors(F)[0][:, 2].copy()
+    A = np.empty((3, 3))
+    for k in range(3):
+        A[0, k] = e2[1] * F[2, k] - e2[2] * F[1, k]
+        A[1, k] = e2[2] * F[0, k] - e2[0] * F[2, k]
+        A[2, k] = e2[0] * F[1, k] - e2[1] * F[0, k]
+    b, weights = _plane_equations(points, A, e2)
+    best = _sampled_plane(points[:_MOST_SCORED], b, A, e2, 2.0 * threshold * threshold)
+    H = A - np.outer(e2, best)
+    squared = _squared_transfer(points, H)
+    for i in range(points.shape[0]):
+        weights[i] = weights[i] if squared[i] <= threshold * threshold else 0.0
+    if np.count_nonzero(weights) >= _SAMPLE_SIZE and _fit_plane(points, b, weights, best):
+        H = A - np.outer(e2, best)
+    return H
 
 
 @kernel
-def _sampled_plane(
-    points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatArray, limit: float, state: RandomState
-) -> FloatArray:
+def _plane_equations(points: FloatArray, A: FloatArray, e2: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """b of every match, and |x2 x e2|^2, the weight of its equation v' x1 = b."""
+    b, weights = np.empty(points.shape[0]), np.empty(points.shape[0])
+    for i in range(points.shape[0]):
+        x1, y1, x2, y2 = points[i, 0], points[i, 1], points[i, 2], points[i, 3]
+        px, py = A[0, 0] * x1 + A[0, 1] * y1 + A[0, 2], A[1, 0] * x1 + A[1, 1] * y1 + A[1, 2]
+        pz = A[2, 0] * x1 + A[2, 1] * y1 + A[2, 2]
+        tx, ty, tz = y2 * e2[2] - e2[1], e2[0] - x2 * e2[2], x2 * e2[1] - y2 * e2[0]
+        weights[i] = tx * tx + ty * ty + tz * tz
+        along = (y2 * pz - py) * tx + (px - x2 * pz) * ty + (x2 * py - y2 * px) * tz
+        b[i] = along / max(weights[i], 1e-300)
+    return b, weights
+
+
+@kernel
+def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray, plane: FloatArray) -> bool:
+    """Weighted least squares of v' x1 = b into `plane` (3,); False, and nothing changed, for points on one line."""
+    gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    right, row = np.zeros(3), np.ones(3)
+    for i in range(points.shape[0]):
+        row[0], row[1] = points[i, 0], points[i, 1]
+        for j in range(3):
+            right[j] += weights[i] * row[j] * b[i]
+            for k in range(3):
+                gram[j, k] += weights[i] * row[j] * row[k]
+    symmetric_eigen(gram, values, vectors)
+    if not values[0] > _LEAST_SUPPORT * values[2]:
+        return False
+    plane[:] = 0.0
+    for n in range(3):
+        along = (vectors[:, n] * right).sum() / values[n]
+        for j in range(3):
+            plane[j] += along * vectors[j, n]
+    return True
+
+
+@kernel
+def _sampled_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatArray, limit: float) -> FloatArray:
     """The v through three matches, v' x1 = b, whose H maps most matches to within sqrt(limit) of their partners."""
-    count, most = points.shape[0], -1
+    count, most, state = points.shape[0], -1, np.array([points.shape[0]], dtype=np.uint64)
     best, corner, v = np.zeros(3), np.empty(3, dtype=np.int64), np.empty(3)
     mapped = np.empty((3, count))
     for i in range(count):
@@ -99,8 +140,3 @@ def _squared_transfer(points: FloatArray, H: FloatArray) -> FloatArray:
         dy = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / depth - points[i, 3]
         squared[i] = (dx * dx + dy * dy) / 2.0 if depth != 0.0 else np.inf
     return squared
-
-
-def homogeneous(x: FloatArray) -> FloatArray:
-    """(N, 2) as (N, 3)."""
-    return np.column_stack([x, np.ones(len(x))])

@@ -48,7 +48,7 @@ def refine_sampson(
         (3, 3), rank 2, its largest singular value 1.
     """
     law = np.array([scale**-2, 0.0, 0.0, 0.0])
-    return _reweighted(points, *_factors(F), law, most_steps, enough)
+    return _reweighted(points, *factors(F), law, most_steps, enough)
 
 
 def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach: float, most_steps: int) -> FloatArray:
@@ -67,7 +67,7 @@ def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach
     Returns:
         (3, 3), rank 2, its largest singular value 1.
     """
-    U, s, V = _factors(F)
+    U, s, V = factors(F)
     squared = squared_distances(points, _compose(U, s, V))
     inside = squared[squared <= threshold * threshold]
     sigma = _MAD_TO_SIGMA * math.sqrt(float(np.median(inside))) if len(inside) else threshold
@@ -85,7 +85,7 @@ def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
     Returns:
         (3, 3), rank 2.
     """
-    U, s, V = _factors(fit_algebraic(points, weights))
+    U, s, V = factors(fit_algebraic(points, weights))
     return _compose(U, s, V).reshape(3, 3)
 
 
@@ -98,7 +98,7 @@ def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 @kernel
-def _factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
     """Rotations U and V and the number s of the nearest rank 2 matrix U diag(1, s, 0) V', up to its scale."""
     gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
     for i in range(3):
