@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sfm_app.ransac.chance import is_credible
 from sfm_app.ransac.points import Matches
 from sfm_app.ransac.sampling import SAMPLE_SIZE, random_state
-from sfm_app.ransac.scoring import Measure, Score, penalty, squared_distances
+from sfm_app.ransac.scoring import Score, penalty, squared_distances
 from sfm_app.ransac.search import Rules, next_better
 from sfm_app.ransac.stopping import have_converged
 from sfm_app.ransac.verification import OPEN, FullVerification, Verifier
@@ -64,73 +64,99 @@ class Hypothesis:
 
 
 def search(matches: Matches, options: EpipolarSettings, seed: int, recipe: Recipe) -> Hypothesis | None:
-    """Draw samples, by the priors, until one of the stopping rules holds (thesis, Algorithm 1).
-
-    The algorithm starts with Q* = 0 in print; as a penalty that is to fall it has to start at infinity.
-    """
-    points, threshold = matches.points, options.max_error_px / matches.unit_px
-    count = len(points)
-    if count < recipe.sample_size:
+    """Draw samples, by the priors, until one of the stopping rules holds (thesis, Algorithm 1)."""
+    if len(matches.points) < recipe.sample_size:
         return None
-    test, measure = recipe.verifier(count, recipe.sample_size), recipe.score(points, threshold, None)
-    state, model, best, lowest = random_state(seed), np.empty(9), None, math.inf
-    priors, guided = np.ones(count), 0.0
-    circle = np.vstack([points, points]) if test.gate.random_start else points
-    share = recipe.assumed_share or 0.0
-    patience = recipe.patience or options.max_trials
-    trials, idle, limit = 0, 0, _trials_allowed(test, share, options)
-    while trials < limit:
-        left = min(limit - trials, patience - idle, test.review)
-        rules = Rules(recipe.sample_size, recipe.oriented, guided)
-        drawn, found = next_better(circle, np.cumsum(priors), rules, measure, test.gate, lowest, left, state, model)
-        trials, idle = trials + drawn, idle + drawn
-        test.learn(drawn)
-        if not found < lowest:
-            limit = _trials_allowed(test, share, options)
-            if idle >= patience and trials < limit:
-                if best is not None and is_credible(points, best, threshold):
-                    break
-                idle = 0
-            continue
-        best, lowest = _improved(points, model.copy(), found, threshold, recipe, measure)
-        measure, lowest = _measured_anew(points, best, lowest, threshold, recipe, measure)
-        idle = 0
-        seen = float(np.mean(squared_distances(points, best) <= threshold * threshold))
-        share = recipe.assumed_share or max(share, seen)
-        test.expect(seen)
-        limit = _trials_allowed(test, share, options)
-        if recipe.validity is not None and trials >= recipe.guided_after * limit:
-            before, priors, guided = priors, recipe.validity(points, best, threshold), recipe.guided_share
-            if recipe.stop_on_convergence and have_converged(before, priors):
+    return _Search(matches, options, seed, recipe).run()
+
+
+class _Search:
+    """Algorithm 1 at work: the best model so far, and what follows from it for the samples to come."""
+
+    best: FloatArray | None
+    """(9,), and its penalty `lowest`."""
+    share: float
+    """Of inliers, in the best model that was ever seen or as assumed."""
+    limit: int
+    """Samples, by 3.19 and the settings."""
+    first_priors: int
+    """Samples before the priors are first estimated."""
+
+    def __init__(self, matches: Matches, options: EpipolarSettings, seed: int, recipe: Recipe) -> None:
+        self.points, self.threshold = matches.points, options.max_error_px / matches.unit_px
+        self.options, self.recipe = options, recipe
+        self.test = recipe.verifier(len(self.points), recipe.sample_size)
+        self.measure = recipe.score(self.points, self.threshold, None)
+        # in print Q* starts at 0; as a penalty that is to fall it has to start at infinity
+        self.best, self.lowest, self.share = None, math.inf, recipe.assumed_share or 0.0
+        self.priors, self.guided_share = np.ones(len(self.points)), 0.0
+        self.cumulative = np.cumsum(self.priors)
+        self.state, self.model = random_state(seed), np.empty(9)
+        self.circle = np.vstack([self.points] * 2) if self.test.gate.random_start else self.points
+        self.trials = self.idle = 0
+        self._look_ahead()
+
+    def run(self) -> Hypothesis | None:
+        """Go on until the samples are used up, the priors have converged, or patience has run out."""
+        while self.trials < self.limit:
+            better = self._draw()
+            if self._guide(better):
                 break
-    return None if best is None else Hypothesis(best.reshape(3, 3), trials)
+            if self.idle == self.recipe.patience:
+                if self.best is not None and is_credible(self.points, self.best, self.threshold):
+                    break
+                self.idle = 0
+        return None if self.best is None else Hypothesis(self.best.reshape(3, 3), self.trials)
 
+    def _draw(self) -> bool:
+        """Samples until one is better, which is then adopted, or until something else has to be decided."""
+        left = min(self.limit - self.trials, self.test.review)
+        if self.recipe.patience is not None:
+            left = min(left, self.recipe.patience - self.idle)
+        if self.trials < self.first_priors:
+            left = min(left, self.first_priors - self.trials)
+        rules = Rules(self.recipe.sample_size, self.recipe.oriented, self.guided_share)
+        parts = rules, self.measure, self.test.gate
+        drawn, found = next_better(self.circle, self.cumulative, *parts, self.lowest, left, self.state, self.model)
+        self.trials += drawn
+        self.idle += drawn
+        self.test.learn(drawn)
+        better = found < self.lowest
+        if better:
+            self._adopt(self.model.copy(), found)
+        self._look_ahead()
+        return better
 
-def _trials_allowed(test: Verifier, share: float, options: EpipolarSettings) -> int:
-    return math.ceil(min(options.max_trials, test.trials_needed(share, options.confidence)))
+    def _adopt(self, model: FloatArray, found: float) -> None:
+        """A better model, perhaps improved further; the measure and the test are made anew for it."""
+        points, threshold, recipe = self.points, self.threshold, self.recipe
+        self.best, self.lowest, self.idle = model, found, 0
+        if recipe.improve is not None:
+            refined = np.ascontiguousarray(recipe.improve(points, model.reshape(3, 3), threshold)).reshape(9)
+            refined /= np.linalg.norm(refined)
+            score = penalty(points, refined, self.measure, math.inf, OPEN)
+            if score < found:
+                self.best, self.lowest = refined, score
+        measure = recipe.score(points, threshold, self.best)
+        if measure != self.measure:
+            # MLESAC's function changes with the best model; the thesis names the flaw of comparing across the change
+            self.measure, self.lowest = measure, penalty(points, self.best, measure, math.inf, OPEN)
+        share = float(np.mean(squared_distances(points, self.best) <= threshold * threshold))
+        self.share = recipe.assumed_share or max(self.share, share)
+        self.test.expect(share)
 
+    def _look_ahead(self) -> None:
+        needed = self.test.trials_needed(self.share, self.options.confidence)
+        self.limit = math.ceil(min(self.options.max_trials, needed))
+        self.first_priors = math.ceil(self.recipe.guided_after * self.limit)
 
-def _improved(
-    points: FloatArray, best: FloatArray, lowest: float, threshold: float, recipe: Recipe, measure: Measure
-) -> tuple[FloatArray, float]:
-    """The locally optimised model if its penalty is smaller, else the one it started from."""
-    if recipe.improve is None:
-        return best, lowest
-    refined = np.ascontiguousarray(recipe.improve(points, best.reshape(3, 3), threshold)).reshape(9)
-    refined /= np.linalg.norm(refined)
-    score = penalty(points, refined, measure, math.inf, OPEN)
-    return (refined, score) if score < lowest else (best, lowest)
-
-
-def _measured_anew(
-    points: FloatArray, best: FloatArray, lowest: float, threshold: float, recipe: Recipe, measure: Measure
-) -> tuple[Measure, float]:
-    """The measure after a new best model, and that model's penalty by it.
-
-    MLESAC's changes with every best model. A penalty of before would be compared with those of another function, a
-    flaw that the thesis names (4.4.1).
-    """
-    renewed = recipe.score(points, threshold, best)
-    if renewed == measure:
-        return measure, lowest
-    return renewed, penalty(points, best, renewed, math.inf, OPEN)
+    def _guide(self, better: bool) -> bool:
+        """Priors from a new best model; whether they say that the search is over."""
+        recipe = self.recipe
+        if recipe.validity is None or self.best is None or self.trials < self.first_priors:
+            return False
+        if not better and self.guided_share > 0:
+            return False
+        before, self.priors = self.priors, recipe.validity(self.points, self.best, self.threshold)
+        self.cumulative, self.guided_share = np.cumsum(self.priors), recipe.guided_share
+        return recipe.stop_on_convergence and have_converged(before, self.priors)

@@ -7,6 +7,7 @@ with a probability of at most 1/A.
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,31 +57,31 @@ class SequentialTest:
         """Least probability that a good model passes whose true share of inliers is this one: 1 - A^-h."""
         if math.isinf(self.log_threshold):
             return 1.0
-        return -math.expm1(-self.log_threshold * self._exponent(share))
+        return -math.expm1(-self.log_threshold * _exponent(*self._steps(), min(share, _MOST_EPSILON)))
 
     def _steps(self) -> tuple[float, float]:
         """What an inlier and an outlier add to the logarithm of the ratio."""
         return math.log(self.delta / self.epsilon), math.log((1 - self.delta) / (1 - self.epsilon))
 
-    def _exponent(self, share: float) -> float:
-        """The h > 0 with E[ratio^h] = 1 for matches of which `share` are inliers; 1 for the share of the design.
 
-        0 if the ratio does not fall on average: such a model is sure to be rejected in the end.
-        """
-        share = min(share, _MOST_EPSILON)
-        hit, miss = self._steps()
-        if share * hit + (1 - share) * miss >= 0:
-            return 0.0
-        low, high = 0.0, 1.0
-        while share * math.exp(high * hit) + (1 - share) * math.exp(high * miss) < 1:
-            low, high = high, 2 * high
-        for _ in range(60):
-            middle = (low + high) / 2
-            if share * math.exp(middle * hit) + (1 - share) * math.exp(middle * miss) < 1:
-                low = middle
-            else:
-                high = middle
-        return low
+@lru_cache(maxsize=1024)  # asked over and over for the same share
+def _exponent(hit: float, miss: float, share: float) -> float:
+    """The h > 0 with E[ratio^h] = 1 for matches of which `share` are inliers; 1 for the share of the design.
+
+    0 if the ratio does not fall on average: such a model is sure to be rejected in the end.
+    """
+    if share * hit + (1 - share) * miss >= 0:
+        return 0.0
+    low, high = 0.0, 1.0
+    while share * math.exp(high * hit) + (1 - share) * math.exp(high * miss) < 1:
+        low, high = high, 2 * high
+    for _ in range(60):
+        middle = (low + high) / 2
+        if share * math.exp(middle * hit) + (1 - share) * math.exp(middle * miss) < 1:
+            low = middle
+        else:
+            high = middle
+    return low
 
 
 def design(epsilon: float, delta: float, sample_size: int) -> SequentialTest:
