@@ -20,7 +20,7 @@ IntArray = NDArray[np.int64]
 FIRST_EPSILON, FIRST_DELTA = 0.1, 0.01
 """Before anything is known: few inliers, and a thin band of accidental ones around the epipolar lines."""
 MODEL_COST = {7: 160.0, 8: 160.0}
-"""t_M: time for a sample and its models over the time to check one match, by sample size; measured."""
+"""t_M: time for a sample and its models over the time to check one match, by sample size; measured (1.1 us, 7 ns)."""
 MODELS_PER_SAMPLE = {7: 2.45, 8: 1.0}
 """m_S, by sample size; measured."""
 
@@ -138,6 +138,7 @@ class Sprt:
         clean = share**self._sample_size
         missed, drawn = 0.0, 0  # log-probability that all samples so far were unclean, or clean but rejected
         for test, trials in self._past:
+            # a share of 1 would make past samples certain successes
             missed += trials * math.log1p(-min(clean * test.pass_rate(share), _MOST_EPSILON))
             drawn += trials
         return drawn + trials_needed(clean * self._test.pass_rate(share), confidence, missed)

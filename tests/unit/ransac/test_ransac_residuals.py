@@ -33,7 +33,13 @@ def test_units_do_not_matter_and_order_is_kept():
 
 @pytest.mark.parametrize(
     ("residuals", "expected"),
-    [([0, 0, 0, 1], [1, 1, 1, 0]), ([2, 2, 2], [1, 1, 1]), ([1, 1, np.inf], [1, 1, 1]), ([1, 9, np.inf], None)],
+    [
+        ([0, 0, 0, 1], [1, 1, 1, 0]),
+        ([2, 2, 2], [1, 1, 1]),
+        ([1, 1, np.inf], [1, 1, 1]),
+        ([1, np.inf, np.inf], [1, 0, 0]),
+        ([1, 9, np.inf], None),
+    ],
 )
 def test_residuals_that_tell_little_still_give_priors(residuals, expected):
     valid = validity_of(np.array(residuals, dtype=float))
