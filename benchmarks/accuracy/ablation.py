@@ -10,7 +10,7 @@ from turns import Method
 
 from sfm_app.ransac.lev_ransac import PRODUCTION
 from sfm_app.ransac.leverage import prior_validity
-from sfm_app.ransac.loop import Recipe
+from sfm_app.ransac.recipe import Recipe
 from sfm_app.ransac.refits import refit_sampson
 from sfm_app.ransac.verdict import estimate
 from sfm_app.ransac.verification import FullVerification

@@ -1,11 +1,11 @@
 """Robust estimation of fundamental matrices (thesis, chapter 4).
 
-An estimator is a `loop.Recipe`: what it samples, solves, scores and verifies with, when it stops, how it refits.
+An estimator is a `recipe.Recipe`: what it samples, solves, scores and verifies with, when it stops, how it refits.
 `loop.search` runs it, `verdict.estimate` judges what it found, and `verdict.estimate_with` what other libraries find.
 `lev_ransac` is the estimator that the program uses, `recipes` has the others.
 
 From the sample to the answer: `points`, `sampling`, `minimal`, `verification`, `sprt`, `scoring`, `mixture`, `search`,
-`leverage`, `residuals`, `stopping`, `loop`, `planes`, `parallax`, `refit`, `reprojection`, `refits`, `chance`,
+`leverage`, `residuals`, `stopping`, `best`, `loop`, `planes`, `parallax`, `refit`, `reprojection`, `refits`, `chance`,
 `degeneracy`; below them `design` and `eigen`.
 """
 

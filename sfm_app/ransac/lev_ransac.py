@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.ransac.leverage import prior_validity
-from sfm_app.ransac.loop import Recipe
 from sfm_app.ransac.parallax import with_another_epipole
+from sfm_app.ransac.recipe import Recipe
 from sfm_app.ransac.refit import fit_algebraic, refine_mixture, refine_sampson
 from sfm_app.ransac.scoring import geman_mcclure, squared_distances
 from sfm_app.ransac.verdict import estimate

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.ransac.leverage import prior_validity
-from sfm_app.ransac.loop import Recipe
 from sfm_app.ransac.mixture import mlesac
+from sfm_app.ransac.recipe import Recipe
 from sfm_app.ransac.refits import refit_sampson
 from sfm_app.ransac.residuals import residual_validity
 from sfm_app.ransac.scoring import lmeds, msac, msac_linear, ransac, squared_distances
@@ -54,8 +54,14 @@ LEV_RANSAC = replace(
 
 RECIPES: Mapping[str, tuple[Recipe, str]] = {
     "lev-ransac-thesis": (LEV_RANSAC, "Algorithm 1 of the thesis to the letter"),
-    "lev-ransac-sprt": (replace(LEV_RANSAC, verifier=Sprt), "the same with Wald's sequential test of hypotheses"),
-    "lev-ransac-tdd": (replace(LEV_RANSAC, verifier=RandomisedTdd), "the same with the T(1,1) test of hypotheses"),
+    "lev-ransac-sprt": (
+        replace(LEV_RANSAC, verifier=Sprt),
+        "lev-ransac-thesis with Wald's sequential test of hypotheses",
+    ),
+    "lev-ransac-tdd": (
+        replace(LEV_RANSAC, verifier=RandomisedTdd),
+        "lev-ransac-thesis with the T(1,1) test of hypotheses",
+    ),
     "res-ransac": (
         replace(RANSAC, score=mlesac, validity=residual_validity, guided_after=0.1),
         "MLESAC with samples guided by the residuals of the best model",
@@ -63,8 +69,8 @@ RECIPES: Mapping[str, tuple[Recipe, str]] = {
     "mlesac": (replace(RANSAC, score=mlesac), "likelihood of Gaussian inliers and uniform outliers"),
     "msac": (replace(RANSAC, score=msac), "uniform samples, truncated squared error"),
     "ransac": (RANSAC, "uniform samples, number of outliers"),
-    "ransac-sprt": (replace(RANSAC, verifier=Sprt), "the same with Wald's sequential test of hypotheses"),
-    "ransac-tdd": (replace(RANSAC, verifier=RandomisedTdd), "the same with the T(1,1) test of hypotheses"),
+    "ransac-sprt": (replace(RANSAC, verifier=Sprt), "ransac with Wald's sequential test of hypotheses"),
+    "ransac-tdd": (replace(RANSAC, verifier=RandomisedTdd), "ransac with the T(1,1) test of hypotheses"),
     "lmeds": (
         replace(RANSAC, score=lmeds, assumed_share=0.5, finish=refit_to_median),
         "least median of squares, for up to half outliers",

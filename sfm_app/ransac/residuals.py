@@ -30,11 +30,11 @@ def validity_of(residuals: FloatArray) -> FloatArray:
         residuals: (N,) distances >= 0.
 
     Returns:
-        (N,) in [0, 1), or all 1 where the residuals tell nothing because one bin holds them all.
+        (N,) in [0, 1], at least one of them > 0; all 1 where one bin holds all residuals, which then tell nothing.
     """
     width = float(np.median(residuals)) / BINS
-    if not width > 0:
-        return np.asarray(residuals <= 0, dtype=np.float64)
+    if not 0 < width < np.inf:  # half of the matches are met exactly, or infinitely far away
+        return np.asarray(residuals <= residuals.min(), dtype=np.float64)
     bins = np.minimum(np.ceil(residuals / width) - 1, BINS - 1).astype(np.int64).clip(min=0)  # Q_l < r <= Q_l+1
     middles = (np.arange(BINS) + 0.5) * width
     finite = residuals[np.isfinite(residuals)]

@@ -7,6 +7,7 @@ with a probability of at most 1/A.
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ IntArray = NDArray[np.int64]
 FIRST_EPSILON, FIRST_DELTA = 0.1, 0.01
 """Before anything is known: few inliers, and a thin band of accidental ones around the epipolar lines."""
 MODEL_COST = {7: 160.0, 8: 160.0}
-"""t_M: time for a sample and its models over the time to check one match, by sample size; measured."""
+"""t_M: time for a sample and its models over the time to check one match, by sample size; measured (1.1 us, 7 ns)."""
 MODELS_PER_SAMPLE = {7: 2.45, 8: 1.0}
 """m_S, by sample size; measured."""
 
@@ -56,31 +57,31 @@ class SequentialTest:
         """Least probability that a good model passes whose true share of inliers is this one: 1 - A^-h."""
         if math.isinf(self.log_threshold):
             return 1.0
-        return -math.expm1(-self.log_threshold * self._exponent(share))
+        return -math.expm1(-self.log_threshold * _exponent(*self._steps(), min(share, _MOST_EPSILON)))
 
     def _steps(self) -> tuple[float, float]:
         """What an inlier and an outlier add to the logarithm of the ratio."""
         return math.log(self.delta / self.epsilon), math.log((1 - self.delta) / (1 - self.epsilon))
 
-    def _exponent(self, share: float) -> float:
-        """The h > 0 with E[ratio^h] = 1 for matches of which `share` are inliers; 1 for the share of the design.
 
-        0 if the ratio does not fall on average: such a model is sure to be rejected in the end.
-        """
-        share = min(share, _MOST_EPSILON)
-        hit, miss = self._steps()
-        if share * hit + (1 - share) * miss >= 0:
-            return 0.0
-        low, high = 0.0, 1.0
-        while share * math.exp(high * hit) + (1 - share) * math.exp(high * miss) < 1:
-            low, high = high, 2 * high
-        for _ in range(60):
-            middle = (low + high) / 2
-            if share * math.exp(middle * hit) + (1 - share) * math.exp(middle * miss) < 1:
-                low = middle
-            else:
-                high = middle
-        return low
+@lru_cache(maxsize=1024)  # asked over and over for the same share
+def _exponent(hit: float, miss: float, share: float) -> float:
+    """The h > 0 with E[ratio^h] = 1 for matches of which `share` are inliers; 1 for the share of the design.
+
+    0 if the ratio does not fall on average: such a model is sure to be rejected in the end.
+    """
+    if share * hit + (1 - share) * miss >= 0:
+        return 0.0
+    low, high = 0.0, 1.0
+    while share * math.exp(high * hit) + (1 - share) * math.exp(high * miss) < 1:
+        low, high = high, 2 * high
+    for _ in range(60):
+        middle = (low + high) / 2
+        if share * math.exp(middle * hit) + (1 - share) * math.exp(middle * miss) < 1:
+            low = middle
+        else:
+            high = middle
+    return low
 
 
 def design(epsilon: float, delta: float, sample_size: int) -> SequentialTest:
@@ -137,6 +138,7 @@ class Sprt:
         clean = share**self._sample_size
         missed, drawn = 0.0, 0  # log-probability that all samples so far were unclean, or clean but rejected
         for test, trials in self._past:
+            # a share of 1 would make past samples certain successes
             missed += trials * math.log1p(-min(clean * test.pass_rate(share), _MOST_EPSILON))
             drawn += trials
         return drawn + trials_needed(clean * self._test.pass_rate(share), confidence, missed)

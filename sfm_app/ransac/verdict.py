@@ -11,8 +11,9 @@ from sfm_app.geometry.epipolar import nearest_rank_two
 from sfm_app.ransac.chance import MOST_FALSE_ALARMS, false_alarms_of, squared_mismatches
 from sfm_app.ransac.degeneracy import find_degeneracy
 from sfm_app.ransac.leverage import prior_validity
-from sfm_app.ransac.loop import Recipe, search
+from sfm_app.ransac.loop import search
 from sfm_app.ransac.points import Matches, check_points, prepare
+from sfm_app.ransac.recipe import Recipe
 from sfm_app.ransac.refits import last_fit
 from sfm_app.ransac.scoring import squared_distances
 from sfm_app.settings import EpipolarSettings

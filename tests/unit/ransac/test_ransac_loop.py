@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.ransac.loop import Recipe, search
+import sfm_app.ransac.loop as loop
+from sfm_app.ransac.loop import search
+from sfm_app.ransac.mixture import mlesac
 from sfm_app.ransac.points import prepare
+from sfm_app.ransac.recipe import Recipe
 from sfm_app.ransac.sampling import random_state
 from sfm_app.ransac.scoring import msac, squared_distances
 from sfm_app.ransac.search import Rules, next_better
-from sfm_app.ransac.verification import OPEN
+from sfm_app.ransac.verification import OPEN, FullVerification, RandomisedTdd
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
@@ -116,3 +119,125 @@ def test_next_better_leaves_the_best_alone_when_nothing_is_better():
     )
     assert (drawn, score) == (25, 1e-12)
     assert (best == 7).all()
+
+
+class Script:
+    """In place of the inner loop: draws all it may, but after the given trials has a model of the given penalty."""
+
+    def __init__(self, model, *better):
+        self.model, self.better, self.trials, self.calls = model, list(better), 0, []
+
+    def __call__(self, _points, _cumulative, rules, _measure, _gate, to_beat, limit, _state, best):
+        self.calls.append((limit, rules.guided_share, to_beat))
+        if self.better and self.better[0][0] <= self.trials + limit:
+            at, score = self.better.pop(0)
+            drawn, self.trials = at - self.trials, at
+            best[:] = self.model
+            return drawn, score
+        self.trials += limit
+        return limit, to_beat
+
+
+@pytest.fixture
+def scripted(monkeypatch):
+    """Run a recipe on a scene whose true model the script hands out."""
+    pair = make_pair(PairOptions(points=300, outliers=0.5, sigma_px=0.1), 0)
+    m = prepare(pair.x1, pair.x2, 0)
+    truth = search(m, options(), 0, PLAIN).F.reshape(9)
+
+    def run(recipe, *better, model=truth, **values):
+        script = Script(model, *better)
+        monkeypatch.setattr(loop, "next_better", script)
+        return search(m, options(**values), 0, recipe), script.calls
+
+    return run
+
+
+def test_a_search_ends_when_319_says_so(scripted):
+    found, calls = scripted(PLAIN, (10, 1.0))
+    seen = np.log(1 - options().confidence) / np.log1p(-(0.5**7))
+    assert found.trials == pytest.approx(seen, rel=0.25)  # a few outliers lie on their lines
+    assert [c[0] for c in calls] == [20000, found.trials - 10]
+
+
+def test_assumed_shares_fix_the_trials(scripted):
+    fixed = replace(PLAIN, assumed_share=0.5)
+    assert scripted(fixed, (10, 1.0))[0].trials == 1175
+    assert scripted(fixed, (10, 1.0), max_trials=100)[0].trials == 100
+    assert scripted(replace(fixed, sample_size=8), (10, 1.0))[0].trials == 2354
+
+
+def test_patience_is_counted_from_the_last_better_model(scripted):
+    found, calls = scripted(replace(PLAIN, patience=50), (30, 2.0), (70, 1.0))
+    assert found.trials == 120
+    assert [c[0] for c in calls] == [50, 50, 50]
+
+
+def test_patience_without_a_credible_model_starts_again(scripted):
+    nothing, calls = scripted(replace(PLAIN, patience=50), max_trials=170)
+    assert nothing is None
+    assert [c[0] for c in calls] == [50, 50, 50, 20]
+    luck = np.ones(9) / 3
+    assert scripted(replace(PLAIN, patience=50), (1, 1.0), model=luck, max_trials=170)[0].trials == 170
+
+
+def test_first_priors_come_at_their_share_of_the_trials(scripted):
+    seen = []
+
+    def validity(_points, best, _threshold):
+        seen.append(best.copy())
+        return np.ones(300)
+
+    recipe = replace(PLAIN, assumed_share=0.5, validity=validity, guided_after=0.1)
+    _, calls = scripted(recipe, (10, 3.0), (60, 2.0), (200, 1.0), (300, 0.5))
+
+    # a tenth of 1175 is 118: until then no priors, then those of the best model, then those of every new one
+    assert [(c[0], c[1]) for c in calls] == [(118, 0), (108, 0), (58, 0), (1057, 1), (975, 1), (875, 1)]
+    assert len(seen) == 3
+    _, calls = scripted(recipe, (400, 3.0))
+    assert [(c[0], c[1]) for c in calls] == [(118, 0), (1057, 0), (775, 1)]
+
+
+def test_a_renewed_measure_scores_the_best_model_anew(scripted):
+    # the script says 1e6; what the next models have to beat is counted with the share of inliers that the best one has
+    _, calls = scripted(replace(PLAIN, score=mlesac, assumed_share=0.5), (10, 1e6))
+    assert calls[0][2] == np.inf
+    assert 500 < calls[1][2] < 1200
+
+
+def test_tests_are_reviewed_and_told_of_every_trial_and_model(scripted):
+    told = []
+
+    class Nosy(FullVerification):
+        review = 40
+
+        def learn(self, trials):
+            told.append(trials)
+
+        def expect(self, share):
+            told.append(round(share, 1))
+
+    scripted(replace(PLAIN, verifier=Nosy), (50, 1.0), max_trials=100)
+    assert told == [40, 10, 0.5, 40, 10]
+
+
+def test_an_outlier_in_front_does_not_spoil_a_randomised_test():
+    pair = make_pair(PairOptions(points=300, outliers=0.3, sigma_px=0.1), 2)
+    m = prepare(pair.x1, pair.x2, 0)
+    inlier = np.empty(300, dtype=bool)
+    inlier[m.rows] = pair.is_inlier
+    spoilt = replace(m, points=np.ascontiguousarray(m.points[np.argsort(inlier)]))  # all outliers come first
+
+    found = search(spoilt, options(), 0, replace(PLAIN, verifier=RandomisedTdd))
+
+    near = squared_distances(spoilt.points, found.F.reshape(9)) < (3 / m.unit_px) ** 2
+    assert near[np.sort(inlier)].mean() > 0.9
+
+
+def test_samples_of_eight_find_the_truth_too():
+    m = scene(0.3)
+    seven, eight = (search(m, options(), 0, replace(PLAIN, sample_size=n)) for n in (7, 8))
+    near = [np.mean(squared_distances(m.points, h.F.reshape(9)) < (3 / m.unit_px) ** 2) for h in (seven, eight)]
+    assert min(near) > 0.5
+    assert eight.trials > seven.trials
+    assert search(replace(m, points=m.points[:7].copy()), options(), 0, replace(PLAIN, sample_size=8)) is None

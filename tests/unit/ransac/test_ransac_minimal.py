@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.geometry.epipolar import cross_matrix
+from sfm_app.geometry.epipolar import cross_matrix, nearest_rank_two
 from sfm_app.ransac.minimal import design_row, is_oriented, models_through, real_cubic_roots
 from sfm_app.ransac.points import prepare
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
@@ -108,3 +108,37 @@ def test_real_cameras_are_oriented_and_a_point_behind_is_not():
         f = (cross_matrix(t) @ R).reshape(9)
         assert is_oriented(points, np.arange(7), f) == (front.all() or not front.any())
         assert is_oriented(points, np.arange(7), -f) == (front.all() or not front.any())
+
+
+def test_eight_exact_matches_give_the_one_model():
+    pair = make_pair(PairOptions(points=40, sigma_px=0), 3)
+    m, models = prepare(pair.x1, pair.x2, 0), np.empty((3, 9))
+    for start in range(0, 32, 8):
+        assert models_through(m.points, np.arange(start, start + 8), models) == 1
+        F = m.to_pixels(models[0].reshape(3, 3))
+        np.testing.assert_allclose(F, pair.F * np.sign((F * pair.F).sum()), atol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_eight_noisy_matches_give_the_nearest_matrix_of_rank_two(seed):
+    points, models = np.random.default_rng(seed).normal(size=(8, 4)), np.empty((3, 9))
+    design = np.empty((8, 9))
+    for k in range(8):
+        design_row(points[k], design[k])
+    linear = np.linalg.svd(design)[2][8].reshape(3, 3)
+    expected = nearest_rank_two(linear)
+
+    assert models_through(points, np.arange(8), models) == 1
+
+    F = models[0].reshape(3, 3)
+    assert np.linalg.norm(F) == pytest.approx(1)
+    assert np.linalg.svd(F, compute_uv=False)[2] < 1e-14
+    weakest = np.linalg.svd(linear, compute_uv=False)
+    # two singular values that are nearly equal: either direction will do
+    sharp = weakest[2] < 0.8 * weakest[1]
+    np.testing.assert_allclose(abs((F * expected).sum()) / np.linalg.norm(expected), 1, atol=1e-12 if sharp else 0.05)
+
+
+def test_eight_points_in_general_but_repeated_give_nothing():
+    points = np.random.default_rng(0).normal(size=(4, 4)).repeat(2, axis=0)
+    assert models_through(points, np.arange(8), np.empty((3, 9))) == 0

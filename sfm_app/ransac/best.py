@@ -1,0 +1,73 @@
+"""The best model of a search, and what the next one has to beat."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.ransac.recipe import Recipe
+from sfm_app.ransac.scoring import penalty, squared_distances
+from sfm_app.ransac.verification import OPEN
+
+FloatArray = NDArray[np.float64]
+
+
+class Best:
+    """The best model so far.
+
+    Algorithm 1 starts with Q* = 0 in print; as a penalty that is to fall it has to start at infinity.
+    """
+
+    f: FloatArray
+    """(9,) entries of F, norm 1."""
+    to_beat: float
+    """Penalty that the model of a sample has to stay below."""
+
+    def __init__(self, points: FloatArray, threshold: float, recipe: Recipe) -> None:
+        self._points, self._threshold, self._recipe = points, threshold, recipe
+        self.measure = recipe.score(points, threshold, None)
+        self._fine = None if recipe.fine_score is None else recipe.fine_score(points, threshold, None)
+        self.f, self.to_beat, self._lowest = np.zeros(9), math.inf, math.inf
+
+    def __bool__(self) -> bool:
+        """Whether there is one yet."""
+        return self._lowest < math.inf
+
+    def inlier_share(self) -> float:
+        """Of all matches, those within the threshold."""
+        return float(np.mean(squared_distances(self._points, self.f) <= self._threshold**2))
+
+    def meets(self, model: FloatArray, found: float) -> bool:
+        """The best model of a sample so far, f (9,), with its penalty; whether the best model has changed."""
+        if self._fine is not None:
+            self.to_beat = found
+            return self.challenged_by(model.reshape(3, 3))
+        self.f, self._lowest = model, found
+        if self._recipe.improve is not None:
+            improved = self._improved(model.reshape(3, 3))
+            score = penalty(self._points, 0, improved, self.measure, math.inf, OPEN)
+            if score < found:
+                self.f, self._lowest = improved, score
+        self._measure_anew()
+        self.to_beat = self._lowest
+        return True
+
+    def challenged_by(self, F: FloatArray) -> bool:
+        """Whether F (3, 3), locally optimised, is the best model by the finer penalty."""
+        improved = self._improved(F)
+        score = penalty(self._points, 0, improved, self._fine or self.measure, self._lowest, OPEN)
+        if score < self._lowest:
+            self.f, self._lowest = improved, score
+            return True
+        return False
+
+    def _improved(self, F: FloatArray) -> FloatArray:
+        if self._recipe.improve is not None:
+            F = self._recipe.improve(self._points, F, self._threshold)
+        return np.asarray(np.ascontiguousarray(F).reshape(9) / np.linalg.norm(F))
+
+    def _measure_anew(self) -> None:
+        """MLESAC's function changes with the best model; the thesis names the flaw of comparing across the change."""
+        renewed = self._recipe.score(self._points, self._threshold, self.f)
+        if renewed != self.measure:
+            self.measure, self._lowest = renewed, penalty(self._points, 0, self.f, renewed, math.inf, OPEN)
