@@ -27,6 +27,8 @@ _LEAST_FREEDOM = 2.0**-52
 """Of 1 - h."""
 _LEAST_SUPPORT = 1e-14
 """Of a direction, over that of the best supported one."""
+_FAR = 700.0
+"""Exponent from which the exponential is 0 for all purposes."""
 _MAD_TO_SIGMA = 1.4826
 """Median absolute deviation to standard deviation, for a Gaussian."""
 
@@ -99,8 +101,9 @@ def priors(distances: FloatArray, sigma: float) -> FloatArray:
     least = distances.min() if distances.shape[0] else 0.0
     for i in range(distances.shape[0]):
         if sigma > 0.0:
-            # less the smallest exponent, which makes the largest value 1; far outliers: exp(-inf) = 0
-            probable[i] = np.exp(-(distances[i] - least) / sigma * ((distances[i] + least) / sigma) / 2.0)
+            # less the smallest exponent, which makes the largest value 1
+            exponent = (distances[i] - least) / sigma * ((distances[i] + least) / sigma) / 2.0
+            probable[i] = np.exp(-exponent) if exponent < _FAR else 0.0
         else:
             probable[i] = 1.0 if distances[i] <= least else 0.0
     return probable

@@ -178,43 +178,68 @@ def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArr
 
 @kernel
 def _null_space(points: FloatArray, sample: IntArray, basis: FloatArray) -> bool:
-    """Two orthonormal vectors perpendicular to the first seven design rows of the sample, by Householder reflections.
+    """Two orthonormal vectors perpendicular to the first seven design rows of the sample, by elimination.
 
-    False where the rows depend on each other.
+    Complete pivoting makes it as exact as reflections would be, in half the time. False where the rows depend on each
+    other.
     """
-    columns = np.empty((SAMPLE_SIZE, 9))  # each row becomes, from its diagonal on, the reflection that zeroes it
+    rows, place = np.empty((SAMPLE_SIZE, 9)), np.arange(9)
     for k in range(SAMPLE_SIZE):
-        design_row(points[sample[k]], columns[k])
+        design_row(points[sample[k]], rows[k])
+    largest = 0.0
     for k in range(SAMPLE_SIZE):
-        before, left = 0.0, 0.0
-        for j in range(9):
-            before += columns[k, j] ** 2
-            if j >= k:
-                left += columns[k, j] ** 2
-        if left <= _RANK_TOLERANCE**2 * before:
+        pivot = _bring_pivot(rows, place, k)
+        largest = max(largest, pivot)
+        if not pivot > _RANK_TOLERANCE * largest:
             return False
-        pivot = columns[k, k]
-        columns[k, k] = pivot + np.sqrt(left) if pivot >= 0 else pivot - np.sqrt(left)
-        length = np.sqrt(2.0 * (left + abs(pivot) * np.sqrt(left)))
-        for j in range(k, 9):
-            columns[k, j] /= length
-        for row in range(k + 1, SAMPLE_SIZE):
-            _reflect(columns[k], k, columns[row])
+        for j in range(k + 1, 9):
+            rows[k, j] /= rows[k, k]
+        for i in range(k + 1, SAMPLE_SIZE):
+            for j in range(k + 1, 9):
+                rows[i, j] -= rows[i, k] * rows[k, j]
     for n in range(2):
-        basis[n] = 0.0
-        basis[n, SAMPLE_SIZE + n] = 1.0
+        for j in range(9):
+            basis[n, j] = 1.0 if j == place[SAMPLE_SIZE + n] else 0.0
         for k in range(SAMPLE_SIZE - 1, -1, -1):
-            _reflect(columns[k], k, basis[n])
+            behind = rows[k, SAMPLE_SIZE + n]
+            for j in range(k + 1, SAMPLE_SIZE):
+                behind += rows[k, j] * basis[n, place[j]]
+            basis[n, place[k]] = -behind
+    _orthonormalise(basis[0], basis[1])
     return True
 
 
 @kernel
-def _reflect(unit: FloatArray, start: int, vector: FloatArray) -> None:
-    dot = 0.0
-    for j in range(start, 9):
-        dot += unit[j] * vector[j]
-    for j in range(start, 9):
-        vector[j] -= 2.0 * dot * unit[j]
+def _bring_pivot(rows: FloatArray, place: IntArray, k: int) -> float:
+    """Swap the largest entry from (k, k) on to that place, and return its magnitude; `place` keeps track of columns."""
+    largest, row, column = -1.0, k, k
+    for i in range(k, SAMPLE_SIZE):
+        for j in range(k, 9):
+            if abs(rows[i, j]) > largest:
+                largest, row, column = abs(rows[i, j]), i, j
+    if row != k:
+        for j in range(k, 9):
+            rows[row, j], rows[k, j] = rows[k, j], rows[row, j]
+    if column != k:
+        place[column], place[k] = place[k], place[column]
+        for i in range(SAMPLE_SIZE):
+            rows[i, column], rows[i, k] = rows[i, k], rows[i, column]
+    return largest
+
+
+@kernel
+def _orthonormalise(a: FloatArray, b: FloatArray) -> None:
+    length, dot, left = 0.0, 0.0, 0.0
+    for j in range(9):
+        length += a[j] * a[j]
+    for j in range(9):
+        a[j] /= np.sqrt(length)
+        dot += a[j] * b[j]
+    for j in range(9):
+        b[j] -= dot * a[j]
+        left += b[j] * b[j]
+    for j in range(9):
+        b[j] /= np.sqrt(left)
 
 
 @kernel
