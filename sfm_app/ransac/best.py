@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sfm_app.ransac.recipe import Recipe
 from sfm_app.ransac.scoring import penalty, squared_distances
-from sfm_app.ransac.verification import OPEN
+from sfm_app.ransac.verification import LENIENCE, OPEN
 
 FloatArray = NDArray[np.float64]
 
@@ -20,14 +20,17 @@ class Best:
 
     f: FloatArray
     """(9,) entries of F, norm 1."""
-    to_beat: float
-    """Penalty that the model of a sample has to stay below."""
+    to_beat: FloatArray
+    """(2,) penalties that models of samples have to stay below: samples of all matches, and of the rest."""
+    samples: FloatArray
+    """(2, 9) the models that hold these penalties."""
 
     def __init__(self, points: FloatArray, threshold: float, recipe: Recipe) -> None:
         self._points, self._threshold, self._recipe = points, threshold, recipe
         self.measure = recipe.score(points, threshold, None)
         self._fine = None if recipe.fine_score is None else recipe.fine_score(points, threshold, None)
-        self.f, self.to_beat, self._lowest = np.zeros(9), math.inf, math.inf
+        self.f, self._lowest = np.zeros(9), math.inf
+        self.to_beat, self.samples = np.full(2, math.inf), np.empty((2, 9))
 
     def __bool__(self) -> bool:
         """Whether there is one yet."""
@@ -37,11 +40,20 @@ class Best:
         """Of all matches, those within the threshold."""
         return float(np.mean(squared_distances(self._points, self.f) <= self._threshold**2))
 
-    def meets(self, model: FloatArray, found: float) -> bool:
-        """The best model of a sample so far, f (9,), with its penalty; whether the best model has changed."""
-        if self._fine is not None:
-            self.to_beat = found
-            return self.challenged_by(model.reshape(3, 3))
+    def meets(self, kind: int) -> bool:
+        """There is a new best sample of that kind (0: all matches, 1: the rest); whether the best model has changed."""
+        if self._fine is None:
+            self._replace(self.samples[kind].copy(), float(self.to_beat[kind]))
+            return True
+        if not self.challenged_by(self.samples[kind].reshape(3, 3)):
+            return False
+        # the rest is another one now
+        count = len(self._points)
+        self.to_beat[1] = count * self.measure.worst - LENIENCE * (count * self.measure.worst - self.to_beat[0])
+        return True
+
+    def _replace(self, model: FloatArray, found: float) -> None:
+        """The model of a sample, or what local optimisation makes of it, is the best model."""
         self.f, self._lowest = model, found
         if self._recipe.improve is not None:
             improved = self._improved(model.reshape(3, 3))
@@ -49,8 +61,7 @@ class Best:
             if score < found:
                 self.f, self._lowest = improved, score
         self._measure_anew()
-        self.to_beat = self._lowest
-        return True
+        self.to_beat[:] = self._lowest
 
     def challenged_by(self, F: FloatArray) -> bool:
         """Whether F (3, 3), locally optimised, is the best model by the finer penalty."""

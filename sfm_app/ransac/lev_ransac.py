@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.ransac.evidence import samples_to_wait
 from sfm_app.ransac.leverage import prior_validity
 from sfm_app.ransac.parallax import with_another_epipole
 from sfm_app.ransac.recipe import Recipe
@@ -53,9 +54,11 @@ PRODUCTION = Recipe(
     fine_score=partial(geman_mcclure, scale=FINE),
     validity=partial(prior_validity, sigma_from_inliers=True),
     guided_share=0.5,
+    rest_share=0.25,
+    batch=32,
     verifier=BailOut,
-    least_trials=300,
-    patience=2000,
+    least_trials=100,
+    patience=samples_to_wait,
     oriented=True,
     improve=optimise_locally,
     recover=with_another_epipole,

@@ -7,16 +7,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.ransac.best import Best
-from sfm_app.ransac.chance import is_credible
 from sfm_app.ransac.points import Matches
 from sfm_app.ransac.recipe import Recipe
 from sfm_app.ransac.sampling import random_state
-from sfm_app.ransac.search import Rules, next_better
+from sfm_app.ransac.scoring import squared_distances
+from sfm_app.ransac.search import Draws, next_better
 from sfm_app.ransac.stopping import have_converged
 from sfm_app.ransac.verification import OPEN
 from sfm_app.settings import EpipolarSettings
 
 FloatArray = NDArray[np.float64]
+
+_EXPLAINED = 2.0
+"""Thresholds within which a match counts as explained by the best model."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,30 +47,30 @@ class _Search:
     """Samples, by 3.19 and the settings."""
     first_priors: int
     """Samples before the priors are first estimated."""
+    patience: float
+    """Idle samples after which the best model is asked for more."""
 
     def __init__(self, matches: Matches, options: EpipolarSettings, seed: int, recipe: Recipe) -> None:
         self.points, self.threshold = matches.points, options.max_error_px / matches.unit_px
         self.options, self.recipe = options, recipe
         self.test = recipe.verifier(len(self.points), recipe.sample_size)
         self.best, self.share = Best(self.points, self.threshold, recipe), recipe.assumed_share or 0.0
-        self.priors, self.guided_share = np.ones(len(self.points)), 0.0
-        self.cumulative = np.cumsum(self.priors)
-        self.state, self.model = random_state(seed), np.empty(9)
+        self.priors, self.state = np.ones(len(self.points)), random_state(seed)
+        no_rest = np.zeros(1)
+        equal = np.cumsum(self.priors)
+        self.draws = Draws(recipe.sample_size, recipe.oriented, recipe.batch, 0.0, equal, 0.0, no_rest)
         twice = self.test.gate.random_start
         self.circle = np.asfortranarray(np.vstack([self.points] * 2)) if twice else self.points
         self.trials = self.idle = 0
+        self.patience = recipe.least_trials if recipe.patience is not None else math.inf
         self._look_ahead()
 
     def run(self) -> Hypothesis | None:
         """Go on until the samples are used up, the priors have converged, or patience has run out."""
         while self.trials < self.limit:
             better = self._draw()
-            if self._guide(better):
+            if self._guide(better) or self._has_waited_enough():
                 break
-            if self.idle == self.recipe.patience:
-                if self.best and is_credible(self.points, self.best.f, self.threshold):
-                    break
-                self.idle = 0
         if not self.best:
             return None
         self._recover()
@@ -75,22 +78,23 @@ class _Search:
 
     def _draw(self) -> bool:
         """Samples until one is better or something else has to be decided; whether there is a new best model."""
-        left = min(self.limit - self.trials, self.test.review)
-        if self.recipe.patience is not None:
-            left = min(left, self.recipe.patience - self.idle)
+        left = min(self.limit - self.trials, self.test.review, self.patience - self.idle)
         if self.trials < self.first_priors:
             left = min(left, self.first_priors - self.trials)
-        best, rules = self.best, Rules(self.recipe.sample_size, self.recipe.oriented, self.guided_share)
-        parts = rules, best.measure, self.test.gate
-        drawn, found = next_better(self.circle, self.cumulative, *parts, best.to_beat, left, self.state, self.model)
+        best, before = self.best, self.best.to_beat.copy()
+        parts = self.draws, best.measure, (self.test.gate, self.test.lenient)
+        drawn = next_better(self.circle, *parts, best.to_beat, int(left), self.state, best.samples)
         self.trials += drawn
         self.idle += drawn
         self.test.learn(drawn)
-        better = found < best.to_beat and best.meets(self.model.copy(), found)
+        changes = [best.meets(kind) for kind in (0, 1) if best.to_beat[kind] < before[kind]]
+        better = any(changes)
         if better:
             seen = best.inlier_share()
             self.idle, self.share = 0, self.recipe.assumed_share or max(self.share, seen)
             self.test.expect(seen)
+            if self.recipe.patience is not None:
+                self.patience = self.recipe.least_trials
         self._look_ahead()
         return better
 
@@ -104,11 +108,29 @@ class _Search:
         recipe = self.recipe
         if recipe.validity is None or not self.best or self.trials < self.first_priors:
             return False
-        if not better and self.guided_share > 0:
+        if not better and self.draws.guided_share > 0:
             return False
         before, self.priors = self.priors, recipe.validity(self.points, self.best.f, self.threshold)
-        self.cumulative, self.guided_share = np.cumsum(self.priors), recipe.guided_share
+        self.draws = self.draws._replace(guided_share=recipe.guided_share, priors=np.cumsum(self.priors))
+        if recipe.rest_share > 0:
+            unexplained = squared_distances(self.points, self.best.f) > (_EXPLAINED * self.threshold) ** 2
+            self.draws = self.draws._replace(
+                rest_share=recipe.rest_share, rest=np.cumsum(unexplained, dtype=np.float64)
+            )
         return recipe.stop_on_convergence and have_converged(before, self.priors)
+
+    def _has_waited_enough(self) -> bool:
+        """Whether the best model has stood for as many samples as its evidence calls for."""
+        if self.recipe.patience is None or self.idle < self.patience:
+            return False
+        if self.best:
+            F = self.best.f.reshape(3, 3)
+            self.patience = math.ceil(
+                min(self.recipe.patience(self.points, F, self.threshold), self.options.max_trials)
+            )
+        else:
+            self.patience += self.recipe.least_trials
+        return self.patience <= self.idle
 
     def _recover(self) -> None:
         if self.recipe.recover is None:

@@ -85,7 +85,7 @@ def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
     rows = np.empty_like(ranked)
     rows[ranked] = place[np.cumsum(is_new) - 1]
     centre = stacked.mean(axis=0) if len(stacked) else np.zeros(4)
-    points = stacked[first[order]] - centre
+    points = stacked.take(first[order], axis=0) - centre
     unit_px = float(np.sqrt((points**2).mean())) if len(points) else 1.0
     unit_px = unit_px if unit_px > 0 else 1.0
     return Matches(np.asfortranarray(points / unit_px), rows, unit_px, centre)

@@ -34,6 +34,10 @@ class Recipe:
     """Priors from a new best model; None samples uniformly throughout."""
     guided_share: float = 1.0
     """Share of the samples that are drawn by the priors."""
+    rest_share: float = 0.0
+    """Share of the samples that are drawn from what the best model leaves unexplained, once there are priors."""
+    batch: int = 1
+    """Samples between two looks at whether one of them was better."""
     guided_after: float = 0.0
     """Share of the trials before the first priors."""
     verifier: Callable[[int, int], Verifier] = FullVerification
@@ -41,11 +45,11 @@ class Recipe:
     assumed_share: float | None = None
     """Inliers that the number of trials is made for (3.19); None: those of the best model."""
     least_trials: int = 0
-    """Samples that are drawn even if fewer would do by 3.19."""
+    """Samples that are drawn even if fewer would do by 3.19, and before `patience` is asked."""
     stop_on_convergence: bool = False
     """End when the priors have converged (thesis 4.18)."""
-    patience: int | None = None
-    """End after this many samples without a better model, unless the best one may be luck."""
+    patience: Callable[[FloatArray, FloatArray, float], float] | None = None
+    """(points, F, threshold) -> samples without a better model that end the search (see `evidence`)."""
     improve: Refine | None = None
     """Local optimisation of every new best model of a sample."""
     fine_score: Score | None = None

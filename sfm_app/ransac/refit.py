@@ -23,7 +23,7 @@ FloatArray = NDArray[np.float64]
 _FIRST_DAMPING, _SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-12, 1e12
 _ENOUGH = 1e-9
 """Relative decrease of the cost under which the search ends."""
-_ENOUGH_LIKELIHOOD = 1e-6
+_ENOUGH_LIKELIHOOD = 1e-4
 _NEGLIGIBLE = 1e-3
 """Weight below which a match is left out of a step."""
 _LEAST_SIGMA = 0.02

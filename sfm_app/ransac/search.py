@@ -14,62 +14,79 @@ from sfm_app.ransac.verification import Gate
 FloatArray = NDArray[np.float64]
 
 
-class Rules(NamedTuple):
+class Draws(NamedTuple):
     """How hypotheses are made."""
 
     sample_size: int
     """7 or 8, see `minimal`."""
     oriented: bool
     """Whether models that put a sampled point behind a camera are dropped."""
+    batch: int
+    """Samples between two looks at whether one of them was better."""
     guided_share: float
-    """Share of the samples that are drawn by the priors, the others being uniform."""
+    """Share of the samples that are drawn by the priors."""
+    priors: FloatArray
+    """(N,) running sum of the priors p(v_i)."""
+    rest_share: float
+    """Share of those that are drawn from the rest: what the best model leaves unexplained. The others are uniform."""
+    rest: FloatArray
+    """(N,) running count of the matches in the rest."""
 
 
 @kernel
 def next_better(
     points: FloatArray,
-    cumulative: FloatArray,
-    rules: Rules,
+    draws: Draws,
     measure: Measure,
-    gate: Gate,
-    to_beat: float,
+    gates: tuple[Gate, Gate],
+    to_beat: FloatArray,
     limit: int,
     state: RandomState,
     best: FloatArray,
-) -> tuple[int, float]:
-    """Draw samples until one of its models has a smaller penalty than `to_beat`.
+) -> int:
+    """Draw samples until one of its models has a smaller penalty than the best of its kind.
+
+    Samples of the rest are a kind of their own. A second motion, or what a wrong model took for outliers, would never
+    be found in competition with samples that the priors have made nearly perfect.
 
     Args:
         points: (N, 4) matches in random order, N >= the sample size; twice over, (2 N, 4), for a gate with a random
             start, so that any N rows on end are all of them.
-        cumulative: (N,) running sum of the priors p(v_i).
-        rules: how samples are drawn and models made.
+        draws: how samples are drawn and models made.
         measure: the penalty.
-        gate: the test that a model has to pass.
-        to_beat: best penalty so far.
+        gates: the tests that a model has to pass, of a sample of all matches and of one of the rest.
+        to_beat: (2,) smallest penalty so far of samples of all matches, and of the rest; lowered.
         limit: most samples.
         state: random generator.
-        best: (9,) set to the better model.
+        best: (2, 9) set to the better models.
 
     Returns:
-        Number of samples drawn, and the smaller penalty; `to_beat` itself if there was none.
+        Number of samples drawn.
     """
-    share, count = rules.guided_share, cumulative.shape[0]
-    sample = np.empty(rules.sample_size, dtype=np.int64)
+    guided, count = draws.guided_share, draws.priors.shape[0]
+    guided_or_rest = guided + draws.rest_share if draws.rest[-1] >= draws.sample_size else guided
+    sample = np.empty(draws.sample_size, dtype=np.int64)
     models = np.empty((MOST_MODELS, 9))
+    better = False
     for trial in range(1, limit + 1):
-        guided = share > 0.0 and (share >= 1.0 or uniform(state) < share)
-        if not (guided and draw_weighted(state, cumulative, sample)):
+        lot = uniform(state) if 0.0 < guided < 1.0 else 0.0
+        kind, drawn = 0, False
+        if lot < guided:
+            drawn = draw_weighted(state, draws.priors, sample)
+        elif lot < guided_or_rest:
+            drawn = draw_weighted(state, draws.rest, sample)
+            kind = 1 if drawn else 0
+        if not drawn:
             draw_uniform(state, count, sample)
-        score = to_beat
+        gate = gates[kind]
         for k in range(models_through(points, sample, models)):
-            if rules.oriented and not is_oriented(points, sample, models[k]):
+            if draws.oriented and not is_oriented(points, sample, models[k]):
                 continue
             start = int(uniform(state) * count) if gate.random_start else 0
-            found = penalty(points, start, models[k], measure, score, gate)
-            if found < score:
-                score = found
-                best[:] = models[k]
-        if score < to_beat:
-            return trial, score
-    return limit, to_beat
+            found = penalty(points, start, models[k], measure, to_beat[kind], gate)
+            if found < to_beat[kind]:
+                to_beat[kind], better = found, True
+                best[kind] = models[k]
+        if better and trial % draws.batch == 0:
+            return trial
+    return limit

@@ -114,7 +114,7 @@ class Sprt:
 
     def _begin(self, epsilon: float, delta: float) -> None:
         self._test, self._trials = design(epsilon, delta, self._sample_size), 0
-        self.gate = Gate(self._test.least_inliers(self._count), 1, True, self._rejected)
+        self.gate = self.lenient = Gate(self._test.least_inliers(self._count), 1, True, self._rejected)
 
     def _renew(self, epsilon: float) -> None:
         self._past.append((self._test, self._trials))

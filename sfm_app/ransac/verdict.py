@@ -6,7 +6,6 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import nearest_rank_two
 from sfm_app.ransac.chance import MOST_FALSE_ALARMS, false_alarms_of, squared_mismatches
 from sfm_app.ransac.degeneracy import find_degeneracy
@@ -144,13 +143,13 @@ def _judge(
     if false_alarms_of(squared, wrong, threshold) > MOST_FALSE_ALARMS:
         return Rejected(CHANCE)
     F_px = matches.to_pixels(F)
-    errors_px = sampson_distance(F_px, x1, x2)
-    accepted = errors_px <= options.max_error_px
+    squared_px = squared_distances(np.asfortranarray(np.hstack([x1, x2])), F_px.reshape(9))
+    accepted = squared_px <= options.max_error_px**2
     return EpipolarFit(
         F=F_px,
         inliers=accepted,
         priors=prior_validity(points, f, threshold, sigma_from_inliers=True)[matches.rows],
         trials=trials,
-        rms_px=math.sqrt(float(np.mean(errors_px[accepted] ** 2))),
+        rms_px=math.sqrt(float(squared_px[accepted].mean())),
         degeneracy=find_degeneracy(points, F, inliers, wrong, threshold, matches.centre / matches.unit_px),
     )

@@ -22,6 +22,8 @@ IntArray = NDArray[np.int64]
 BLOCK = 64
 """Matches between two looks at whether to go on, where no test asks for more."""
 
+LENIENCE = 0.5
+"""Support that a model of the rest must have, over that of the best sample, to be looked at."""
 _BAIL_OUT_SIGMAS = 3.0
 
 
@@ -49,6 +51,8 @@ class Verifier(Protocol):
     """A test, what it learns during a search, and the trials that its mistakes cost."""
 
     gate: Gate
+    lenient: Gate
+    """For models of the rest: what the best model leaves unexplained."""
     review: int
     """Most trials between two calls of `learn`."""
 
@@ -69,7 +73,7 @@ class FullVerification:
 
     def __init__(self, count: int, sample_size: int) -> None:
         self.count, self.sample_size = count, sample_size
-        self.gate = OPEN
+        self.gate = self.lenient = OPEN
 
     def learn(self, trials: int) -> None: ...
 
@@ -83,7 +87,9 @@ class BailOut(FullVerification):
     """Leave a hypothesis that falls behind the best one (Capel 2005), seen on the matches in their random order."""
 
     def expect(self, share: float) -> None:
-        self.gate = gate(bail_out_table(self.count, share), BLOCK, random_start=False)
+        least = bail_out_table(self.count, share)
+        self.gate = gate(least, BLOCK, random_start=False)
+        self.lenient = gate((LENIENCE * least).astype(np.int64), BLOCK, random_start=False)
 
 
 class RandomisedTdd(FullVerification):
@@ -96,7 +102,7 @@ class RandomisedTdd(FullVerification):
 
     def __init__(self, count: int, sample_size: int) -> None:
         super().__init__(count, sample_size)
-        self.gate = gate(np.arange(1, self.d + 1), 1, random_start=True)
+        self.gate = self.lenient = gate(np.arange(1, self.d + 1), 1, random_start=True)
 
     def trials_needed(self, share: float, confidence: float) -> float:
         return trials_needed(share ** (self.sample_size + self.d), confidence)
