@@ -30,7 +30,7 @@ class Best:
         self.measure = recipe.score(points, threshold, None)
         self._fine = None if recipe.fine_score is None else recipe.fine_score(points, threshold, None)
         self.f, self._lowest = np.zeros(9), math.inf
-        self.to_beat, self.samples = np.full(2, math.inf), np.empty((2, 9))
+        self.to_beat, self.samples = np.full(2, math.inf), np.zeros((2, 9))
 
     def __bool__(self) -> bool:
         """Whether there is one yet."""

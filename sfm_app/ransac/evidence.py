@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 
 OFF_PLANE = 2.0
 """A match is off the plane when H misses it by more than this many thresholds."""
-_SURE, _MOST = 1000.0, 4000.0
+_SURE, _MOST = 1400.0, 4000.0
 
 
 def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> float:
@@ -22,7 +22,7 @@ def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> floa
     Wrong models live on one plane, or on repeated structure, and have little else for them. The inliers off the
     dominant plane are counted in standard deviations z over what accident gives. Right models of real photos have z
     of 40 to 300, wrong ones mostly less than 40. The patience falls with the square
-    of it, from 4000 for z up to 16.
+    of it, from 4000 for z up to 22.
 
     Args:
         points: (N, 4) distinct matches in random order, N >= 7.

@@ -87,8 +87,8 @@ class _Search:
         self.trials += drawn
         self.idle += drawn
         self.test.learn(drawn)
-        changes = [best.meets(kind) for kind in (0, 1) if best.to_beat[kind] < before[kind]]
-        better = any(changes)
+        improved = np.flatnonzero(best.to_beat < before).tolist()
+        better = any([best.meets(kind) for kind in improved])  # noqa: C419  both kinds are to be met
         if better:
             seen = best.inlier_share()
             self.idle, self.share = 0, self.recipe.assumed_share or max(self.share, seen)
