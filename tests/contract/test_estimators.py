@@ -87,7 +87,7 @@ def is_well_formed(found, count):
     assert found.priors.min() >= 0
     assert found.priors.max() == 1
     assert found.trials >= 1
-    assert found.degeneracy in ("", "planar", "rotation")
+    assert found.degeneracy in ("", "collinear", "planar", "rotation")
     return True
 
 
@@ -123,7 +123,7 @@ def test_evidence_is_that_of_the_returned_matrix(fit):
 def test_matches_without_geometry_are_rejected_with_a_reason(fit, case):
     found = fit(*DEGENERATE[case], OPTIONS, 0)
     if case == "on a line in both views" and found:  # they do support an F, one of many
-        assert found.degeneracy == "planar"
+        assert found.degeneracy == "collinear"
         return
     assert isinstance(found, Rejected), found
     assert found.reason

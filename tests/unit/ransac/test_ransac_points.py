@@ -69,7 +69,7 @@ def test_absurd_matches_and_repeats_do_not_move_the_frame():
     assert len(m.points) == 102
     assert m.unit_px == pytest.approx(plain.unit_px, rel=0.1)
     assert np.abs(m.centre - plain.centre).max() < 0.1 * m.unit_px
-    assert 500 / 3**0.5 == pytest.approx(plain.unit_px, rel=0.1)
+    assert plain.unit_px == pytest.approx(500 / 3**0.5, rel=0.1)
 
 
 @pytest.mark.parametrize("spread", [0, 1, 4])
