@@ -365,7 +365,7 @@ def test_equal_views_are_no_epipolar_geometry(fit, move):
 
 @pytest.mark.parametrize("sigma_px", [0.0, 0.5])
 @pytest.mark.parametrize("kind", ["rotation", "planar"])
-@pytest.mark.parametrize("seed", range(5, 8))
+@pytest.mark.parametrize("seed", range(8))
 def test_matches_of_one_homography_are_flagged(fit, kind, sigma_px, seed):
     found = fit(*homography_pair(kind, seed, sigma_px), OPTIONS, seed)
     assert found.degeneracy == kind if found else sigma_px == 0
