@@ -90,7 +90,8 @@ def off_dominant_line(points: FloatArray, inliers: BoolArray, view: int, width: 
             on_line += abs(a * x[n] + b * y[n] + c) <= width
         if on_line > most:
             most, line[0], line[1], line[2] = on_line, a, b, c
-    return np.abs(line[0] * x + line[1] * y + line[2]) > width
+    off: BoolArray = np.abs(line[0] * x + line[1] * y + line[2]) > width
+    return off
 
 
 def is_rotation(H: FloatArray, points: FloatArray, centres: FloatArray) -> bool:

@@ -5,7 +5,7 @@ import pytest
 
 from sfm_app.ransac.design import LANES, design_row, quadratic_forms, weighted_gram
 
-SIZES = [0, 1, 7, LANES - 1, LANES, LANES + 1, 3 * LANES, 200]
+SIZES = [2, 7, LANES - 1, LANES, LANES + 1, 3 * LANES, 200]
 
 
 def dense(points):

@@ -253,7 +253,7 @@ def test_an_outlier_in_front_does_not_spoil_a_randomised_test():
     m = prepare(pair.x1, pair.x2, 0)
     inlier = np.empty(300, dtype=bool)
     inlier[m.rows] = pair.is_inlier
-    spoilt = replace(m, points=np.ascontiguousarray(m.points[np.argsort(inlier)]))  # all outliers come first
+    spoilt = replace(m, points=np.asfortranarray(m.points[np.argsort(inlier)]))  # all outliers come first
 
     found = search(spoilt, options(), 0, replace(PLAIN, verifier=RandomisedTdd))
 

@@ -120,7 +120,8 @@ def test_a_small_decrease_ends_the_search():
     _, m, _ = scene(4, points=100)
     start = fit_eight_point(m.points, np.ones(100))
     soon, one, late = (
-        refine_sampson(m.points, start, enough=enough, most_steps=steps) for enough, steps in ((1.0, 9), (0, 1), (0, 9))
+        refine_sampson(m.points, start, enough=enough, most_steps=steps)
+        for enough, steps in ((1.0, 9), (0.0, 1), (0.0, 9))
     )
     np.testing.assert_array_equal(soon, one)
     assert cost(m.points, late) < cost(m.points, soon)
@@ -161,7 +162,7 @@ def test_perfect_matches_stay_perfect():
     assert sampson_distance(F, pair.x1, pair.x2)[pair.is_inlier].max() < 1e-3
 
 
-@pytest.mark.parametrize("count", [0, 1, 6, 7, 8])
+@pytest.mark.parametrize("count", [2, 6, 7, 8])
 @pytest.mark.parametrize("threshold", [1e-9, 0.1, 10.0])
 def test_few_matches_leave_a_matrix_of_rank_two(count, threshold):
     rng = np.random.default_rng(count)

@@ -58,7 +58,9 @@ def test_no_neighbour_of_rank_two_is_better(seed, scale):
 @pytest.mark.parametrize("seed", range(5))
 def test_exact_matches_give_the_exact_matrix(seed):
     pair, m, _ = scene(seed, points=60, sigma_px=0)
-    rough = fit_eight_point(m.points + 0.003 * np.random.default_rng(seed).normal(size=(60, 4)), np.ones(60))
+    rough = fit_eight_point(
+        np.asfortranarray(m.points + 0.003 * np.random.default_rng(seed).normal(size=(60, 4))), np.ones(60)
+    )
     assert sampson_distance(m.to_pixels(rough), pair.x1, pair.x2).max() > 0.1
 
     F = m.to_pixels(refine_reprojection(m.points, rough, most_steps=100))
