@@ -1,22 +1,31 @@
-"""Matches that do not determine F: all on one plane, or taken without moving the camera.
+"""Matches that do not determine F: all on one line of a photo, on one plane, or taken without moving the camera.
 
-What tells a real epipole is matches off the dominant plane (see `planes`), more of them than accident gives.
+Matches on a line of one view leave two parameters of F free, on a line of both views four. Any so many other matches
+fix them, mismatches too: what counts is matches off the line, more of them than accident gives. In the same way what
+tells a real epipole is matches off the dominant plane (see `planes`).
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.jit import kernel
 from sfm_app.ransac.chance import MOST_FALSE_ALARMS, accidental_share, false_alarms
 from sfm_app.ransac.planes import dominant_homography, transfer_distance
+from sfm_app.ransac.sampling import uniform
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-_PARALLAX_SAMPLE = 2
-_PARALLAX = 2.0
-"""A match is off the plane when H misses it by more than this many thresholds."""
+_LINE_SAMPLE, _PARALLAX_SAMPLE = 4, 2
+"""Matches that fix what a line, or a plane, leaves free of F."""
+_BAND, _PARALLAX = 2.0, 2.0
+"""A match is off the line, or the plane, when that misses it by more than this many thresholds."""
+_LINES, _MOST_SCORED = 16, 300
+"""A line that matters holds most of the inliers: few samples will find it."""
+_EXTENT = (0.01, 0.99)
+"""Where the points of a view begin and end, a few absurd ones aside."""
 _FOCALS = np.geomspace(0.4, 6.0, 60)
-"""Focal lengths that are tried for a rotation, in sides of the box around all points."""
+"""Focal lengths that are tried for a rotation, in sides of the box around the points."""
 _ROTATION_TOLERANCE = 0.05
 """A rotation stretches nothing; a homography that stretches less than this, for some focal length, counts as one."""
 
@@ -35,22 +44,60 @@ def find_degeneracy(
         centres: (4,) the origin of `points` in a frame that both views share, in the same units.
 
     Returns:
+        "collinear" where all matches lie on one line of a photo, or in one place (but for a few that may be accident),
         "rotation" where the camera only turned, "planar" where all matches lie on one plane (or too close to one to
         tell), "" where F is determined.
     """
+    chance = accidental_share(wrong, threshold)
+    for view in range(2):
+        off_line = off_dominant_line(points, inliers, view, _BAND * threshold)
+        if _may_be_accident(off_line, inliers, _LINE_SAMPLE, chance):
+            return "collinear"
     H = dominant_homography(np.asfortranarray(points[inliers]), F, threshold)
-    off_plane = transfer_distance(H, points) > _PARALLAX * threshold
-    agreeing, chance = int(np.count_nonzero(off_plane & inliers)), accidental_share(wrong, threshold)
-    if false_alarms(int(np.count_nonzero(off_plane)), agreeing, _PARALLAX_SAMPLE, chance) <= MOST_FALSE_ALARMS:
+    if not _may_be_accident(transfer_distance(H, points) > _PARALLAX * threshold, inliers, _PARALLAX_SAMPLE, chance):
         return ""
     return "rotation" if is_rotation(H, points, centres) else "planar"
+
+
+def _may_be_accident(off: BoolArray, inliers: BoolArray, sample_size: int, chance: float) -> bool:
+    """Whether so many of the matches `off` a line or plane would agree with some F if all of these were wrong."""
+    agreeing = int(np.count_nonzero(off & inliers))
+    return false_alarms(int(np.count_nonzero(off)), agreeing, sample_size, chance) > MOST_FALSE_ALARMS
+
+
+@kernel
+def off_dominant_line(points: FloatArray, inliers: BoolArray, view: int, width: float) -> BoolArray:
+    """Which matches lie further than `width` from the line that holds the most inliers of a view.
+
+    Args:
+        points: (N, 4) matches in random order.
+        inliers: (N,) at least one of them.
+        view: 0 or 1.
+        width: in the units of `points`.
+
+    Returns:
+        (N,)
+    """
+    x, y, rows = points[:, 2 * view], points[:, 2 * view + 1], np.flatnonzero(inliers)
+    state, most, line = np.array([rows.shape[0]], dtype=np.uint64), -1, np.zeros(3)
+    for _ in range(_LINES):
+        i, j = rows[int(uniform(state) * rows.shape[0])], rows[int(uniform(state) * rows.shape[0])]
+        a, b = y[i] - y[j], x[j] - x[i]
+        norm = np.sqrt(a * a + b * b)
+        a, b = (a / norm, b / norm) if norm > 0.0 else (1.0, 0.0)  # of two points in one place any line will do
+        c, on_line = -(a * x[i] + b * y[i]), 0
+        for n in rows[:_MOST_SCORED]:
+            on_line += abs(a * x[n] + b * y[n] + c) <= width
+        if on_line > most:
+            most, line[0], line[1], line[2] = on_line, a, b, c
+    off: BoolArray = np.abs(line[0] * x + line[1] * y + line[2]) > width
+    return off
 
 
 def is_rotation(H: FloatArray, points: FloatArray, centres: FloatArray) -> bool:
     """Whether H = K R K^-1 for one focal length and an optical centre in the middle of where both views have points."""
     placed = points + centres
-    both = np.vstack([placed[:, :2], placed[:, 2:]])
-    low, high = both.min(axis=0), both.max(axis=0)
+    low, high = np.quantile(np.vstack([placed[:, :2], placed[:, 2:]]), _EXTENT, axis=0)
     middle, side = (low + high) / 2, float((high - low).max())
     to1, to2 = _shift(middle - centres[:2]), _shift(centres[2:] - middle)
     for focal in _FOCALS * side:

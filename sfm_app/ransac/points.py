@@ -9,6 +9,11 @@ from sfm_app.geometry.epipolar import unit_norm
 
 FloatArray = NDArray[np.float64]
 
+_LARGEST_PX = 1e15
+"""Coordinates beyond this are no pixels: their sixth powers, which a fit needs, could no longer be summed."""
+_MOST, _MOST_TO_RMS = 0.9, 1.56
+"""Share of the coordinates that tell the spread, and the largest of them over the root mean square, if uniform."""
+
 
 def check_points(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Matched points as contiguous float64 arrays.
@@ -21,7 +26,7 @@ def check_points(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
         Two (N, 2) arrays.
 
     Raises:
-        ValueError: not (N, 2), not of equal length, not real numbers, or not finite.
+        ValueError: not (N, 2), not of equal length, not real numbers, not finite, or beyond 1e15 px.
     """
     checked = [_check(x, name) for x, name in ((x1, "x1"), (x2, "x2"))]
     if len(checked[0]) != len(checked[1]):
@@ -40,6 +45,8 @@ def _check(x: ArrayLike, name: str) -> FloatArray:
         raise ValueError(
             f"{name} holds {np.count_nonzero(~np.isfinite(points).all(axis=1))} points that are not finite"
         )
+    if len(points) and np.abs(points).max() > _LARGEST_PX:
+        raise ValueError(f"{name} must lie within {_LARGEST_PX:.0e} px, got {np.abs(points).max():.1e}")
     return points
 
 
@@ -79,13 +86,23 @@ def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
     ranked = np.argsort(keys, kind="stable")
     is_new = np.diff(keys[ranked], prepend=-np.inf) > 0
     first = ranked[is_new]
-    order = np.random.default_rng(seed).permutation(len(first))
+    order = np.random.default_rng(seed % 2**64).permutation(len(first))
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     rows = np.empty_like(ranked)
     rows[ranked] = place[np.cumsum(is_new) - 1]
-    centre = stacked.mean(axis=0) if len(stacked) else np.zeros(4)
-    points = stacked.take(first[order], axis=0) - centre
-    unit_px = float(np.sqrt((points**2).mean())) if len(points) else 1.0
-    unit_px = unit_px if unit_px > 0 else 1.0
-    return Matches(np.asfortranarray(points / unit_px), rows, unit_px, centre)
+    points = np.asfortranarray(stacked.take(first[order], axis=0))
+    centre, unit_px = _frame(points)
+    return Matches((points - centre) / unit_px, rows, unit_px, centre)
+
+
+def _frame(points: FloatArray) -> tuple[FloatArray, float]:
+    """Origin (4,) and unit in which most coordinates are of magnitude 1: a few absurd matches do not move them."""
+    if not len(points):
+        return np.zeros(4), 1.0
+    middle, deviations = len(points) // 2, np.empty_like(points)
+    centre = np.array([np.partition(column, middle)[middle] for column in points.T])
+    np.abs(points - centre, out=deviations)
+    ranked = int(_MOST * (deviations.size - 1))
+    unit_px = float(np.partition(deviations.ravel(order="K"), ranked)[ranked]) / _MOST_TO_RMS
+    return centre, unit_px or float(np.sqrt((deviations**2).mean())) or 1.0

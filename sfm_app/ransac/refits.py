@@ -55,4 +55,5 @@ def last_fit(name: str, own: Refit) -> Refit:
 
 
 def _inliers(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    return points[squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold]
+    chosen = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
+    return np.asfortranarray(points[chosen])

@@ -68,7 +68,7 @@ HINT = "photos that overlap more, from places a step or two apart (turning on th
 
 
 def rank_seeds(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> list[Candidate]:
-    """Pairs that can start a mapping, best first: many points, wide angle, not planar, not a mere rotation."""
+    """Pairs that can start a mapping, best first: many points, wide angle, nothing degenerate."""
 
     def examine(pair: PairId) -> Candidate:
         fit = views.fits[pair]
@@ -166,7 +166,7 @@ def nothing_found(views: ViewGraph, candidates: list[Candidate], tried: list[str
     degenerate = sum(bool(fit.degeneracy) for fit in views.fits.values())
     parts = [
         f"{len(views.fits)} pairs with {inliers[0]} to {inliers[-1]} inliers",
-        f"{degenerate} of them planar or without parallax" if degenerate else "",
+        f"{degenerate} of them planar, on one line, or without parallax" if degenerate else "",
         *(f"{count} pairs rejected: {reason}" for reason, count in views.reasons.items()),
         "" if candidates else "no pair has parallax enough to start from",
         "; ".join(tried),

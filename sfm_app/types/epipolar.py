@@ -26,7 +26,7 @@ class EpipolarFit:
     rms_px: float
     """Root mean square Sampson distance of the inliers."""
     degeneracy: str = ""
-    """Why F is not determined by these matches ("planar", "rotation"); empty when it is."""
+    """Why F is not determined by these matches ("collinear", "planar", "rotation"); empty when it is."""
 
     @property
     def inlier_count(self) -> int:

@@ -87,7 +87,7 @@ def is_well_formed(found, count):
     assert found.priors.min() >= 0
     assert found.priors.max() == 1
     assert found.trials >= 1
-    assert found.degeneracy in ("", "planar", "rotation")
+    assert found.degeneracy in ("", "collinear", "planar", "rotation")
     return True
 
 
@@ -123,7 +123,7 @@ def test_evidence_is_that_of_the_returned_matrix(fit):
 def test_matches_without_geometry_are_rejected_with_a_reason(fit, case):
     found = fit(*DEGENERATE[case], OPTIONS, 0)
     if case == "on a line in both views" and found:  # they do support an F, one of many
-        assert found.degeneracy == "planar"
+        assert found.degeneracy == "collinear"
         return
     assert isinstance(found, Rejected), found
     assert found.reason
@@ -138,6 +138,23 @@ def test_points_that_are_not_finite_are_refused(fit, bad):
         fit(x, CLOUD, OPTIONS, 0)
     with pytest.raises(ValueError, match="not finite"):
         fit(CLOUD, x, OPTIONS, 0)
+
+
+@pytest.mark.parametrize("bad", [1e16, -1e300])
+def test_points_beyond_all_photos_are_refused(fit, bad):
+    x = CLOUD.copy()
+    x[3, 1] = bad
+    for views in ((x, CLOUD), (CLOUD, x)):
+        with pytest.raises(ValueError, match="must lie within"):
+            fit(*views, OPTIONS, 0)
+
+
+def test_any_integer_is_a_seed(fit):
+    pair = make_pair(PairOptions(**SCENE), 3)
+    for seed in (-1, 2**70):
+        assert pickle.dumps(fit(pair.x1, pair.x2, OPTIONS, seed)) == pickle.dumps(
+            fit(pair.x1, pair.x2, OPTIONS, seed % 2**64)
+        )
 
 
 @pytest.mark.parametrize(
@@ -317,6 +334,20 @@ def test_one_match_far_away_is_an_outlier(fit):
     assert not found.inliers[:2].any()
 
 
+def test_absurd_matches_do_not_hide_the_scene():
+    pair = make_pair(PairOptions(outliers=0.3, **SCENE), 3)
+    kept = pair.is_inlier.copy()
+    kept[:3] = False
+    pair.x1[0], pair.x2[1], pair.x1[2] = (1e10, 0.0), (0.0, -1e12), (-1e15, 1e15)
+
+    found = ESTIMATORS["lev-ransac"].fit(pair.x1, pair.x2, OPTIONS, 0)
+
+    assert found.inliers[kept].mean() > 0.97
+    assert not found.inliers[:3].any()
+    assert found.degeneracy == ""
+    assert 0 < np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2)) < 0.2
+
+
 def test_exchanged_views_give_the_transpose(name, fit, accuracy_px):
     pair = make_pair(PairOptions(outliers=0.2, **SCENE), 3)
 
@@ -334,7 +365,7 @@ def test_equal_views_are_no_epipolar_geometry(fit, move):
 
 @pytest.mark.parametrize("sigma_px", [0.0, 0.5])
 @pytest.mark.parametrize("kind", ["rotation", "planar"])
-@pytest.mark.parametrize("seed", range(5, 8))
+@pytest.mark.parametrize("seed", range(8))
 def test_matches_of_one_homography_are_flagged(fit, kind, sigma_px, seed):
     found = fit(*homography_pair(kind, seed, sigma_px), OPTIONS, seed)
     assert found.degeneracy == kind if found else sigma_px == 0
@@ -377,7 +408,9 @@ def test_options_at_their_edges(fit, accuracy_px, edge):
         assert found.trials <= changed.max_trials
         assert found.rms_px <= changed.max_error_px
         error = np.median(sampson_distance(found.F, pair.exact_x1, pair.exact_x2))
-        assert error < max(5 * accuracy_px, 0.2 * changed.max_error_px)
+        # one sample is rarely clean, and what it gives is then only better than chance
+        rough_px = 25.0 if edge == ("max_trials", 1) else 0.2 * changed.max_error_px
+        assert error < max(5 * accuracy_px, rough_px)
 
 
 def awkward_matches(rng):

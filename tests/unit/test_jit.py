@@ -1,9 +1,12 @@
 import numba
+import numpy as np
+import pytest
 
-from sfm_app.jit import kernel
+from sfm_app.jit import kernel, summing_kernel
 
 
-def test_a_kernel_compiles_where_nothing_can_be_cached(monkeypatch):
+@pytest.mark.parametrize("decorator", [kernel, summing_kernel])
+def test_a_kernel_compiles_where_nothing_can_be_cached(monkeypatch, decorator):
     real = numba.njit
 
     def njit(*functions, **options):
@@ -13,8 +16,24 @@ def test_a_kernel_compiles_where_nothing_can_be_cached(monkeypatch):
 
     monkeypatch.setattr(numba, "njit", njit)
 
-    @kernel
+    @decorator
     def twice(x):
         return 2 * x
 
     assert twice(3.5) == 7.0
+
+
+def test_sums_in_lanes_still_know_infinities():
+    @summing_kernel
+    def total(values):
+        found = 0.0
+        for k in range(values.shape[0]):
+            found += values[k]
+        return found
+
+    values = np.random.default_rng(0).normal(size=1001)
+    assert total(values) == pytest.approx(values.sum(), rel=1e-12)
+    values[500] = np.inf
+    assert total(values) == np.inf
+    values[0] = -np.inf
+    assert np.isnan(total(values))

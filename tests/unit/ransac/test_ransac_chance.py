@@ -8,7 +8,7 @@ from scipy.stats import binom
 
 from sfm_app.geometry.epipolar import cross_matrix, eight_point
 from sfm_app.ransac import ESTIMATORS
-from sfm_app.ransac.chance import accidental_share, false_alarms, log_binomial_tail, mismatch_distances
+from sfm_app.ransac.chance import accidental_share, false_alarms, log_binomial_tail, squared_mismatches
 from sfm_app.ransac.points import prepare
 from sfm_app.ransac.scoring import squared_distances
 from sfm_app.settings import EpipolarSettings
@@ -18,14 +18,16 @@ from sfm_app.types import EpipolarFit, Rejected
 OPTIONS = EpipolarSettings(max_trials=3000, min_inliers=8)  # so that only the test of chance stands in the way
 
 
-@pytest.mark.parametrize(
-    ("n", "k", "p"), [(10, 3, 0.2), (200, 20, 0.005), (5000, 100, 0.01), (30, 30, 0.3), (30, 0, 0.1)]
-)
-def test_binomial_tail_agrees_with_scipy(n, k, p):
-    assert log_binomial_tail(n, k, p) == pytest.approx(binom.logsf(k - 1, n, p), rel=1e-9, abs=1e-9)
+@pytest.mark.parametrize(("n", "k", "p"), [(10, 3, 0.2), (200, 20, 0.005), (5000, 100, 0.01), (30, 29, 0.3)])
+def test_binomial_tail_is_bounded_from_above_and_closely(n, k, p):
+    excess = log_binomial_tail(n, k, p) - binom.logsf(k - 1, n, p)
+    # the term at k alone is at least the bound over this (Ash 1965)
+    assert 0 <= excess <= 0.5 * math.log(8 * k * (1 - k / n))
 
 
-def test_more_than_all_is_impossible():
+def test_binomial_tails_at_the_ends():
+    assert log_binomial_tail(30, 30, 0.3) == pytest.approx(30 * math.log(0.3))
+    assert log_binomial_tail(30, 9, 0.3) == log_binomial_tail(30, 0, 0.1) == 0.0
     assert log_binomial_tail(10, 11, 0.5) == -math.inf
 
 
@@ -37,8 +39,8 @@ def test_false_alarms_by_hand():
 
 def test_accidental_share_is_the_area_of_the_band():
     # a shift along x in a square of side 1: |y1 - y2| < w has probability 2 w - w^2
-    points = np.random.default_rng(0).uniform(size=(300, 4))
-    wrong = mismatch_distances(points, cross_matrix([1.0, 0, 0]).reshape(9))
+    points = np.asfortranarray(np.random.default_rng(0).uniform(size=(300, 4)))
+    wrong = squared_mismatches(points, cross_matrix([1.0, 0, 0]).reshape(9))
     width = 0.1
     assert accidental_share(wrong, width / np.sqrt(2)) == pytest.approx(2 * width - width**2, rel=0.1)
     assert 0 < accidental_share(wrong, 0.0) < accidental_share(wrong, 10.0) < 1
@@ -49,22 +51,24 @@ def test_mismatches_never_pair_a_point_with_its_partner():
     m = prepare(pair.x1, pair.x2, 0)
     f = eight_point(m.points[:, :2], m.points[:, 2:]).reshape(9)
 
-    wrong = mismatch_distances(m.points, f)
+    wrong = squared_mismatches(m.points, f)
 
-    assert len(wrong) >= 19_000
-    assert wrong.min() > 100 * np.sqrt(squared_distances(m.points, f).max())
+    assert 7_800 <= len(wrong) <= 8_000
+    assert wrong.min() > 1e4 * squared_distances(m.points, f).max()
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)
 @pytest.mark.parametrize("count", [20, 40, 60, 100, 200])
 def test_random_matches_are_rejected(name, count):
-    size = np.array([1600.0, 1200.0])
+    size, reasons = np.array([1600.0, 1200.0]), []
     for seed in range(8):
         rng = np.random.default_rng([count, seed])
         fit = ESTIMATORS[name][0](*(rng.uniform(size=(2, count, 2)) * size), OPTIONS, seed)
         assert isinstance(fit, Rejected), fit.inlier_count
-        # the median looks at no threshold: what it finds may have no inliers to speak of
-        assert fit.reason in ("inliers no better than chance", *["too few inliers"] * (name == "lmeds"))
+        reasons.append(fit.reason)
+    assert set(reasons) <= {"inliers no better than chance", "too few inliers"}
+    # the median looks at no threshold: what it finds may have no inliers to speak of
+    assert reasons.count("inliers no better than chance") >= 4 or name == "lmeds"
 
 
 @pytest.mark.parametrize(("true", "false"), [(20, 0), (20, 10), (25, 25), (30, 60), (60, 140)])

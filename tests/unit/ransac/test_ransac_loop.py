@@ -167,6 +167,33 @@ def test_assumed_shares_fix_the_trials(scripted):
     assert scripted(replace(fixed, sample_size=8), (10, 1.0))[0].trials == 2354
 
 
+def test_least_trials_are_drawn_even_if_fewer_would_do(scripted):
+    eager = replace(PLAIN, assumed_share=0.9)  # 3.19 asks for 15
+    assert scripted(eager, (3, 1.0))[0].trials == 15
+    found, calls = scripted(replace(eager, least_trials=40), (3, 2.0), (30, 1.0))
+    assert found.trials == 40
+    assert [c[0] for c in calls] == [40, 37, 10]
+    assert scripted(replace(eager, least_trials=40), (3, 1.0), max_trials=25)[0].trials == 25
+    assert scripted(replace(PLAIN, assumed_share=0.5, least_trials=40), (3, 1.0))[0].trials == 1175
+
+
+def test_a_last_attempt_may_beat_the_best_model_and_else_is_dropped(scripted):
+    seen, wrong = [], np.eye(3) / np.sqrt(3)
+
+    def recover(points, F, threshold, measure, gate, state):
+        seen.append((F.copy(), measure, gate))
+        return seen[0][0] if len(seen) == 2 else wrong
+
+    found, _ = scripted(replace(PLAIN, recover=recover), (1, 1e-9), max_trials=10)
+    truth = seen[0][0]
+    np.testing.assert_array_equal(found.F, truth)
+    found, _ = scripted(replace(PLAIN, recover=recover), (1, 290.0), model=wrong.reshape(9), max_trials=10)
+    np.testing.assert_allclose(found.F, truth, atol=1e-15)
+    assert seen[1][2] is OPEN
+    assert scripted(replace(PLAIN, recover=recover), max_trials=10)[0] is None
+    assert len(seen) == 2
+
+
 def test_patience_is_counted_from_the_last_better_model(scripted):
     found, calls = scripted(replace(PLAIN, patience=50), (30, 2.0), (70, 1.0))
     assert found.trials == 120
@@ -226,7 +253,7 @@ def test_an_outlier_in_front_does_not_spoil_a_randomised_test():
     m = prepare(pair.x1, pair.x2, 0)
     inlier = np.empty(300, dtype=bool)
     inlier[m.rows] = pair.is_inlier
-    spoilt = replace(m, points=np.ascontiguousarray(m.points[np.argsort(inlier)]))  # all outliers come first
+    spoilt = replace(m, points=np.asfortranarray(m.points[np.argsort(inlier)]))  # all outliers come first
 
     found = search(spoilt, options(), 0, replace(PLAIN, verifier=RandomisedTdd))
 

@@ -55,7 +55,7 @@ def test_design_row_is_the_constraint():
 @pytest.mark.parametrize("case", ["repeated", "coplanar", "collinear"])
 def test_dependent_samples_have_no_solution(case):
     rng = np.random.default_rng(4)
-    points = rng.normal(size=(7, 4))
+    points = np.asfortranarray(rng.normal(size=(7, 4)))
     if case == "repeated":
         points[6] = points[2]
     if case == "coplanar":
@@ -103,7 +103,7 @@ def test_real_cameras_are_oriented_and_a_point_behind_is_not():
         X2 = np.column_stack([rng.uniform(-1, 1, (7, 2)), np.ones(7)]) * rng.uniform(2, 4, (7, 1))
         t = rng.normal(size=3)
         X1 = (X2 - t) @ R  # X2 = R X1 + t
-        points = np.ascontiguousarray(np.column_stack([X1[:, :2] / X1[:, 2:], X2[:, :2] / X2[:, 2:]]))
+        points = np.asfortranarray(np.column_stack([X1[:, :2] / X1[:, 2:], X2[:, :2] / X2[:, 2:]]))
         front = X1[:, 2] > 0
         f = (cross_matrix(t) @ R).reshape(9)
         assert is_oriented(points, np.arange(7), f) == (front.all() or not front.any())
@@ -121,7 +121,7 @@ def test_eight_exact_matches_give_the_one_model():
 
 @pytest.mark.parametrize("seed", range(20))
 def test_eight_noisy_matches_give_the_nearest_matrix_of_rank_two(seed):
-    points, models = np.random.default_rng(seed).normal(size=(8, 4)), np.empty((3, 9))
+    points, models = np.asfortranarray(np.random.default_rng(seed).normal(size=(8, 4))), np.empty((3, 9))
     design = np.empty((8, 9))
     for k in range(8):
         design_row(points[k], design[k])
@@ -140,5 +140,5 @@ def test_eight_noisy_matches_give_the_nearest_matrix_of_rank_two(seed):
 
 
 def test_eight_points_in_general_but_repeated_give_nothing():
-    points = np.random.default_rng(0).normal(size=(4, 4)).repeat(2, axis=0)
+    points = np.asfortranarray(np.random.default_rng(0).normal(size=(4, 4)).repeat(2, axis=0))
     assert models_through(points, np.arange(8), np.empty((3, 9))) == 0

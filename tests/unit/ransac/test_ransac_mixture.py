@@ -36,7 +36,7 @@ def test_shares_stay_possible():
 def test_penalty_is_the_log_likelihood_less_its_peak(best):
     rng = np.random.default_rng(2)
     y = np.concatenate([rng.normal(scale=SIGMA, size=200), rng.uniform(-50, 50, 300)])
-    points = np.column_stack([rng.uniform(0, 100, (500, 2)), rng.uniform(0, 100, 500), np.zeros(500)])
+    points = np.asfortranarray(rng.uniform(0, 100, (500, 4)))
     points[:, 3] = points[:, 1] + y * np.sqrt(2)
     r, w = np.sqrt(squared_distances(points, SHIFT)), window(points)
     gamma = 0.5 if best is None else inlier_share(r**2, SIGMA, w)
@@ -45,7 +45,7 @@ def test_penalty_is_the_log_likelihood_less_its_peak(best):
         inlier = np.exp(-(r**2) / (2 * SIGMA**2)) / (SIGMA * math.sqrt(2 * math.pi))
         return np.log(gamma * inlier + (1 - gamma) / w)
 
-    found = penalty(points, SHIFT, mlesac(points, SIGMAS * SIGMA, best), np.inf, OPEN)
+    found = penalty(points, 0, SHIFT, mlesac(points, SIGMAS * SIGMA, best), np.inf, OPEN)
 
     assert found == pytest.approx(float((log_p(np.zeros(500)) - log_p(r)).sum()), rel=1e-9)
     assert best is None or 0.35 < gamma < 0.45

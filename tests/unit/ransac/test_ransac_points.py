@@ -18,6 +18,8 @@ from sfm_app.ransac.scoring import squared_distances
         ([[1.0, 2.0]], np.empty((0, 2)), "row by row, got 1 and 0"),
         ([[np.nan, 2.0]], [[1.0, 2.0]], "x1 holds 1 points that are not finite"),
         ([[1.0, 2.0]], [[np.inf, 2.0]], "x2 holds 1 points that are not finite"),
+        ([[1.1e15, 2.0]], [[1.0, 2.0]], r"x1 must lie within 1e\+15 px, got 1.1e\+15"),
+        ([[1.0, 2.0]], [[2.0, -1e300]], r"x2 must lie within 1e\+15 px, got 1.0e\+300"),
         ([["a", "b"]], [[1.0, 2.0]], "x1 must hold real numbers"),
         ([[1j, 2.0]], [[1.0, 2.0]], "x1 must hold real numbers"),
     ],
@@ -54,7 +56,29 @@ def test_repeats_leave_and_rows_find_the_way_back(seed, repeats):
 
     assert m.points.shape == (20, 4)
     np.testing.assert_allclose(m.points[m.rows] * m.unit_px + m.centre, x, atol=1e-9)
-    assert np.sqrt((m.points**2).mean()) == pytest.approx(1)
+    assert 0.7 < np.sqrt((m.points**2).mean()) < 1.4
+    np.testing.assert_allclose(np.mean(m.points < 0, axis=0), 0.5)
+    assert m.points.flags.f_contiguous
+
+
+def test_absurd_matches_and_repeats_do_not_move_the_frame():
+    x = np.random.default_rng(0).uniform(0, 1000, (100, 4))
+    plain = prepare(x[:, :2], x[:, 2:], 0)
+    absurd = np.vstack([x, np.tile(x[:1], (50, 1)), [[1e10, 5, -1e12, 0], [1e15, 1e15, 1e15, 1e15]]])
+    m = prepare(absurd[:, :2], absurd[:, 2:], 0)
+    assert len(m.points) == 102
+    assert m.unit_px == pytest.approx(plain.unit_px, rel=0.1)
+    assert np.abs(m.centre - plain.centre).max() < 0.1 * m.unit_px
+    assert plain.unit_px == pytest.approx(500 / 3**0.5, rel=0.1)
+
+
+@pytest.mark.parametrize("spread", [0, 1, 4])
+def test_any_extent_has_a_unit(spread):
+    x = np.full((20, 4), 7.0)
+    x[:spread, 0] += 100 * np.arange(1, spread + 1)
+    m = prepare(x[:, :2], x[:, 2:], 0)
+    assert m.points.shape == (spread + 1, 4)
+    assert m.unit_px == 1 if spread == 0 else 10 < m.unit_px < 300
 
 
 def test_matches_that_share_one_point_stay_apart():
@@ -74,7 +98,8 @@ def test_distances_are_those_of_pixels():
 
 def test_seed_decides_the_order():
     x = np.random.default_rng(0).uniform(0, 100, (50, 4))
-    first, again, other = (prepare(x[:, :2], x[:, 2:], seed) for seed in (1, 1, 2))
+    first, again, other, negative = (prepare(x[:, :2], x[:, 2:], seed) for seed in (1, 1, 2, -1))
 
     np.testing.assert_array_equal(first.points, again.points)
     assert not np.array_equal(first.points, other.points)
+    assert not np.array_equal(first.points, negative.points)

@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
-from sfm_app.geometry.epipolar import sampson_distance
+from sfm_app.geometry.distances import sampson_distance
 from sfm_app.ransac import ESTIMATORS
 from sfm_app.ransac.loop import search
 from sfm_app.ransac.points import prepare

@@ -17,14 +17,14 @@ def matches_of(inlier):
     """Matches of a shift along x, those that are no inliers 9 units off, twice over."""
     count = len(inlier)
     points = np.column_stack([np.arange(count), np.zeros(count), np.arange(count) + 5.0, np.where(inlier, 0.0, 9.0)])
-    return np.vstack([points, points])
+    return np.asfortranarray(np.vstack([points, points]))
 
 
 def passes(gate: Gate, inlier) -> np.ndarray:
     """For every match to begin with, whether the model passes."""
     circle, count = matches_of(inlier), len(inlier)
     measure = msac(circle, 1.0, None)
-    return np.array([penalty(circle[k : k + count], SHIFT, measure, np.inf, gate) < np.inf for k in range(count)])
+    return np.array([penalty(circle, k, SHIFT, measure, np.inf, gate) < np.inf for k in range(count)])
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
