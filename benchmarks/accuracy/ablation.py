@@ -12,6 +12,8 @@ from sfm_app.ransac.lev_ransac import PRODUCTION
 from sfm_app.ransac.leverage import prior_validity
 from sfm_app.ransac.recipe import Recipe
 from sfm_app.ransac.refits import refit_sampson
+from sfm_app.ransac.scoring import msac
+from sfm_app.ransac.sprt import Sprt
 from sfm_app.ransac.verdict import estimate
 from sfm_app.ransac.verification import FullVerification
 from sfm_app.settings import EpipolarSettings
@@ -23,11 +25,18 @@ WHOLE = "lev-ransac"
 ABLATIONS: dict[str, dict[str, Any]] = {
     "uniform samples": {"validity": None},
     "all samples by the priors": {"guided_share": 1.0},
+    "no samples of the rest": {"rest_share": 0.0},
     "sigma from all matches": {"validity": partial(prior_validity, sigma_from_inliers=False)},
-    "stops by Eq. 3.19 only": {"patience": None},
+    "a look after every sample": {"batch": 1},
+    "stops by Eq. 3.19 only": {"patience": None, "least_trials": 0},
+    "2000 idle samples for any evidence": {"patience": lambda *_: 2000.0},
+    "one score, coarse": {"fine_score": None},
+    "one score, truncated squares": {"fine_score": None, "score": msac},
+    "no local optimisation": {"improve": None, "fine_score": None},
+    "no plane and parallax": {"recover": None},
     "no orientation test": {"oriented": False},
-    "no local optimisation": {"improve": None},
     "no bail-out": {"verifier": FullVerification},
+    "SPRT instead of bail-out": {"verifier": Sprt},
     "least squares on the inliers last": {"finish": refit_sampson},
 }
 """Name of what is missing, and the fields of the recipe that say so."""

@@ -13,16 +13,18 @@ FloatArray = NDArray[np.float64]
 
 OFF_PLANE = 2.0
 """A match is off the plane when H misses it by more than this many thresholds."""
-_SURE, _MOST = 1400.0, 4000.0
+_SURE = 1400.0
+"""z of a model that no further sample could shake."""
+_MOST = 4000.0
+_LEAST_INLIERS = 8
 
 
 def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> float:
     """Samples without a better model after which to believe this one.
 
     Wrong models live on one plane, or on repeated structure, and have little else for them. The inliers off the
-    dominant plane are counted in standard deviations z over what accident gives. Right models of real photos have z
-    of 40 to 300, wrong ones mostly less than 40. The patience falls with the square
-    of it, from 4000 for z up to 22.
+    dominant plane are counted in standard deviations z over what accident gives: right models of real photos have z of
+    40 to 300, wrong ones mostly less than 40. The patience is 4000 samples up to z = 22 and falls as 1 / z^2.
 
     Args:
         points: (N, 4) distinct matches in random order, N >= 7.
@@ -34,7 +36,7 @@ def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> floa
     """
     squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
     inliers, wrong = squared <= threshold * threshold, squared_mismatches(points, np.ascontiguousarray(F).reshape(9))
-    if np.count_nonzero(inliers) < 8 or false_alarms_of(squared, wrong, threshold) > MOST_FALSE_ALARMS:
+    if np.count_nonzero(inliers) < _LEAST_INLIERS or false_alarms_of(squared, wrong, threshold) > MOST_FALSE_ALARMS:
         return math.inf
     H = dominant_homography(np.asfortranarray(points[inliers]), F, threshold)
     off_plane = transfer_distance(H, points) > OFF_PLANE * threshold
