@@ -75,7 +75,7 @@ def refits(
             continue
         done += 1
         linear = fit_eight_point(points, inliers.astype(np.float64))
-        nonlinear = refine_sampson(points[inliers], linear, cutoff=np.inf)
+        nonlinear = refine_sampson(points[inliers], linear)
         fits = {"7-point": minimal, "8-point refit": linear, "Sampson refit": nonlinear}
         yield {
             name: float(np.sqrt(squared_distances(points, np.ravel(F))).mean()) * matches.unit_px
