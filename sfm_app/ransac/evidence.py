@@ -15,7 +15,7 @@ OFF_PLANE = 2.0
 """A match is off the plane when H misses it by more than this many thresholds."""
 _SURE = 1400.0
 """z of a model that no further sample could shake."""
-_MOST = 4000.0
+_MOST = 3000.0
 _LEAST_INLIERS = 8
 
 
@@ -24,7 +24,7 @@ def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> floa
 
     Wrong models live on one plane, or on repeated structure, and have little else for them. The inliers off the
     dominant plane are counted in standard deviations z over what accident gives: right models of real photos have z of
-    40 to 300, wrong ones mostly less than 40. The patience is 4000 samples up to z = 22 and falls as 1 / z^2.
+    40 to 300, wrong ones mostly less than 40. The patience is 3000 samples up to z = 26 and falls as 1 / z^2.
 
     Args:
         points: (N, 4) distinct matches in random order, N >= 7.
