@@ -97,7 +97,8 @@ def quadratic_forms(points: FloatArray, whitening: FloatArray) -> FloatArray:
         filled, start = gather(points, ones, start, block)
         design_columns(block, filled, rows)
         for k in range(whitening.shape[1]):
-            dots[:filled] = 0.0
+            for n in range(filled):
+                dots[n] = 0.0
             for j in range(9):
                 factor = whitening[j, k]
                 for n in range(filled):

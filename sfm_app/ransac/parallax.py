@@ -70,12 +70,16 @@ def _best_epipole(
             f[c] = ey * H[2, c] - ez * H[1, c]
             f[3 + c] = ez * H[0, c] - ex * H[2, c]
             f[6 + c] = ex * H[1, c] - ey * H[0, c]
-        norm = np.sqrt((f * f).sum())
-        if not norm > 0.0:
+        squared = 0.0
+        for c in range(9):
+            squared += f[c] * f[c]
+        if not squared > 0.0:
             continue
-        f /= norm
+        for c in range(9):
+            f[c] /= np.sqrt(squared)
         score = penalty(points, 0, f, measure, lowest, gate)
         if score < lowest:
             lowest = score
-            best[:] = f
+            for c in range(9):
+                best[c] = f[c]
     return lowest

@@ -89,12 +89,11 @@ def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
     return _compose(U, s, V).reshape(3, 3)
 
 
-@kernel
 def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
     """The first half of `fit_eight_point`: (3, 3) of norm 1 with the least algebraic error, of any rank."""
     values, vectors = np.empty(9), np.empty((9, 9))
     symmetric_eigen(weighted_gram(points, weights), values, vectors)
-    return vectors[:, 0].copy().reshape(3, 3)
+    return np.ascontiguousarray(vectors[:, 0]).reshape(3, 3)
 
 
 @kernel
@@ -108,25 +107,43 @@ def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
     symmetric_eigen(gram, values, vectors)
     U, V = np.empty((3, 3)), np.empty((3, 3))
     for k in range(2):
-        V[:, k] = vectors[:, 2 - k]
+        for i in range(3):
+            V[i, k] = vectors[i, 2 - k]
         for i in range(3):
             U[i, k] = F[i, 0] * V[0, k] + F[i, 1] * V[1, k] + F[i, 2] * V[2, k]
-    first = np.sqrt((U[:, 0] ** 2).sum())
-    U[:, 0] /= first
-    U[:, 1] -= (U[:, 0] * U[:, 1]).sum() * U[:, 0]  # what rounding left where s is small
-    second = np.sqrt((U[:, 1] ** 2).sum())
-    if second > 1e-12 * first:
-        U[:, 1] /= second
-    else:  # rank 1: any direction will do
-        least = np.argmin(np.abs(U[:, 0]))
-        U[:, 1] = -U[least, 0] * U[:, 0]
-        U[least, 1] += 1.0
-        U[:, 1] /= np.sqrt((U[:, 1] ** 2).sum())
-    for R in (U, V):  # the third columns meet the singular value 0: they make rotations of both
+    first = _normalise(U, 0)
+    _turn_away(U)  # what rounding left where s is small
+    second = _normalise(U, 1)
+    if not second > 1e-12 * first:  # rank 1: any direction will do
+        least = 0
+        for i in range(1, 3):
+            least = i if abs(U[i, 0]) < abs(U[least, 0]) else least
         for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            R[i, 2] = R[j, 0] * R[k, 1] - R[k, 0] * R[j, 1]
+            U[i, 1] = 1.0 if i == least else 0.0
+        _turn_away(U)
+        _normalise(U, 1)
+    for i in range(3):  # the third columns meet the singular value 0: they make rotations of both
+        j, k = (i + 1) % 3, (i + 2) % 3
+        U[i, 2] = U[j, 0] * U[k, 1] - U[k, 0] * U[j, 1]
+        V[i, 2] = V[j, 0] * V[k, 1] - V[k, 0] * V[j, 1]
     return U, second / first, V
+
+
+@kernel
+def _normalise(U: FloatArray, k: int) -> float:
+    """Column k over its length; the length."""
+    length = np.sqrt(U[0, k] * U[0, k] + U[1, k] * U[1, k] + U[2, k] * U[2, k])
+    for i in range(3):
+        U[i, k] /= length
+    return float(length)
+
+
+@kernel
+def _turn_away(U: FloatArray) -> None:
+    """Make the second column perpendicular to the first, a unit vector."""
+    dot = U[0, 0] * U[0, 1] + U[1, 0] * U[1, 1] + U[2, 0] * U[2, 1]
+    for i in range(3):
+        U[i, 1] -= dot * U[i, 0]
 
 
 @kernel
