@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.ransac.planes import dominant_homography, transfer_distance
 from sfm_app.ransac.sampling import RandomState, uniform
-from sfm_app.ransac.scoring import Measure, penalty, squared_distances
+from sfm_app.ransac.scoring import FIRST, Measure, penalty, squared_distances
 from sfm_app.ransac.verification import Gate
 
 FloatArray = NDArray[np.float64]
@@ -77,7 +77,7 @@ def _best_epipole(
             continue
         for c in range(9):
             f[c] /= np.sqrt(squared)
-        score = penalty(points, 0, f, measure, lowest, gate)
+        score = penalty(points, FIRST, f, measure, lowest, gate)
         if score < lowest:
             lowest = score
             for c in range(9):
