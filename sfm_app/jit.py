@@ -26,7 +26,7 @@ def summing_kernel(function: Function) -> Function:
 
 
 def _compiled(function: Function, *, fastmath: bool | set[str]) -> Function:
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
+    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": fastmath, "no_cfunc_wrapper": True}
     try:
         compiled: Function = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder to cache in can be written: compile anew in every process

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.ransac.minimal import MOST_MODELS
 from sfm_app.ransac.sampling import SAMPLE_SIZE
-from sfm_app.ransac.scoring import distances_of_block, squared_distances
+from sfm_app.ransac.scoring import squared_distances, squared_sampson
 
 FloatArray = NDArray[np.float64]
 
@@ -83,13 +83,13 @@ def squared_mismatches(points: FloatArray, f: FloatArray) -> FloatArray:
 @kernel
 def _shifted(points: FloatArray, f: FloatArray, shifts: int) -> FloatArray:
     count = points.shape[0]
-    wrong, mismatched = np.empty(shifts * count), np.empty((4, count)).T
-    mismatched[:, :2] = points[:, :2]
+    wrong = np.empty(shifts * count)
     for shift in range(shifts):
         for i in range(count):
             partner = (i + shift + 1) % count
-            mismatched[i, 2], mismatched[i, 3] = points[partner, 2], points[partner, 3]
-        distances_of_block(mismatched, f, 0, wrong[shift * count : (shift + 1) * count])
+            wrong[shift * count + i] = squared_sampson(
+                f, points[i, 0], points[i, 1], points[partner, 2], points[partner, 3]
+            )
     return wrong
 
 

@@ -65,7 +65,6 @@ def _may_be_accident(off: BoolArray, inliers: BoolArray, sample_size: int, chanc
     return false_alarms(int(np.count_nonzero(off)), agreeing, sample_size, chance) > MOST_FALSE_ALARMS
 
 
-@kernel
 def off_dominant_line(points: FloatArray, inliers: BoolArray, view: int, width: float) -> BoolArray:
     """Which matches lie further than `width` from the line that holds the most inliers of a view.
 
@@ -78,20 +77,27 @@ def off_dominant_line(points: FloatArray, inliers: BoolArray, view: int, width: 
     Returns:
         (N,)
     """
-    x, y, rows = points[:, 2 * view], points[:, 2 * view + 1], np.flatnonzero(inliers)
-    state, most, line = np.array([rows.shape[0]], dtype=np.uint64), -1, np.zeros(3)
+    x, y = points[:, 2 * view], points[:, 2 * view + 1]
+    a, b, c = _dominant_line(x[inliers], y[inliers], width)
+    return np.asarray(np.abs(a * x + b * y + c) > width)
+
+
+@kernel
+def _dominant_line(x: FloatArray, y: FloatArray, width: float) -> tuple[float, float, float]:
+    """The line a x + b y + c = 0, a^2 + b^2 = 1, that passes most of the first points, through two of all."""
+    count, most, best, state = x.shape[0], -1, (1.0, 0.0, 0.0), np.empty(1, dtype=np.uint64)
+    state[0] = count
     for _ in range(_LINES):
-        i, j = rows[int(uniform(state) * rows.shape[0])], rows[int(uniform(state) * rows.shape[0])]
+        i, j = int(uniform(state) * count), int(uniform(state) * count)
         a, b = y[i] - y[j], x[j] - x[i]
         norm = np.sqrt(a * a + b * b)
         a, b = (a / norm, b / norm) if norm > 0.0 else (1.0, 0.0)  # of two points in one place any line will do
         c, on_line = -(a * x[i] + b * y[i]), 0
-        for n in rows[:_MOST_SCORED]:
+        for n in range(min(count, _MOST_SCORED)):
             on_line += abs(a * x[n] + b * y[n] + c) <= width
         if on_line > most:
-            most, line[0], line[1], line[2] = on_line, a, b, c
-    off: BoolArray = np.abs(line[0] * x + line[1] * y + line[2]) > width
-    return off
+            most, best = on_line, (a, b, c)
+    return best
 
 
 def is_rotation(H: FloatArray, points: FloatArray, centres: FloatArray) -> bool:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel, summing_kernel
+from sfm_app.ransac.scoring import FIRST
 
 FloatArray = NDArray[np.float64]
 
@@ -72,17 +73,23 @@ def mirror(gram: FloatArray) -> None:
             gram[k, j] = gram[j, k]
 
 
-@kernel
 def weighted_gram(points: FloatArray, weights: FloatArray) -> FloatArray:
     """(9, 9) matrix A' W A of the matches (N, 4), with weights (N,) >= 0."""
-    gram, block, rows = np.zeros((9, 9)), np.empty((5, LANES)), np.empty((9, LANES))
-    start = 0
+    gram = np.zeros((9, 9))
+    _add_gram(points, weights, gram)
+    return gram
+
+
+@kernel
+def _add_gram(points: FloatArray, weights: FloatArray, gram: FloatArray) -> None:
+    # a size that the compiler does not know: it would spell out all 45 sums
+    block, rows = np.empty((5, LANES)), np.empty((gram.shape[0], LANES))
+    start = FIRST
     while start < points.shape[0]:
         count, start = gather(points, weights, start, block)
         design_columns(block, count, rows)
         add_products(rows, count, gram)
     mirror(gram)
-    return gram
 
 
 @kernel
@@ -91,13 +98,14 @@ def quadratic_forms(points: FloatArray, whitening: FloatArray) -> FloatArray:
     count = points.shape[0]
     forms, ones = np.zeros(count), np.ones(count)
     block, rows, dots = np.empty((5, LANES)), np.empty((9, LANES)), np.empty(LANES)
-    start = 0
+    start = FIRST
     while start < count:
         first = start
         filled, start = gather(points, ones, start, block)
         design_columns(block, filled, rows)
         for k in range(whitening.shape[1]):
-            dots[:filled] = 0.0
+            for n in range(filled):
+                dots[n] = 0.0
             for j in range(9):
                 factor = whitening[j, k]
                 for n in range(filled):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.ransac.design import quadratic_forms, weighted_gram
 from sfm_app.ransac.eigen import symmetric_eigen
-from sfm_app.ransac.scoring import select, squared_distances
+from sfm_app.ransac.scoring import squared_distances
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -33,7 +33,6 @@ _MAD_TO_SIGMA = 1.4826
 """Median absolute deviation to standard deviation, for a Gaussian."""
 
 
-@kernel
 def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArray:
     """Leverage h_ii of every match in a regression on the fitted ones plus itself (thesis 3.11).
 
@@ -49,15 +48,14 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
         (N,) in [0, 1].
     """
     tangent = _perpendicular(f)
-    within = tangent.T @ (weighted_gram(points, fitted.astype(np.float64)) @ tangent)
+    within = tangent.T @ weighted_gram(points, fitted.astype(np.float64)) @ tangent
     values, vectors = np.empty(PARAMETERS), np.empty((PARAMETERS, PARAMETERS))
     symmetric_eigen(within, values, vectors)
     # a direction without support: whatever lies in it has leverage 1
     floor = max(values[-1], 2.0**-1000) * _LEAST_SUPPORT
     forms = quadratic_forms(points, tangent @ (vectors / np.sqrt(np.maximum(values, floor))))
-    for i in range(forms.shape[0]):
-        forms[i] = min(forms[i], 1.0) if fitted[i] else 1.0 / (1.0 + 1.0 / forms[i])
-    return forms
+    with np.errstate(divide="ignore", over="ignore"):
+        return np.where(fitted, np.minimum(forms, 1.0), 1.0 / (1.0 + 1.0 / forms))
 
 
 @kernel
@@ -72,7 +70,6 @@ def _perpendicular(f: FloatArray) -> FloatArray:
     return basis
 
 
-@kernel
 def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: BoolArray) -> FloatArray:
     """Residuals over their standard deviation (thesis 3.14 and 3.15, the variance taken from the fitted matches).
 
@@ -81,39 +78,32 @@ def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: B
         leverage: (N,) from `leverages`.
         fitted: (N,) the matches that the model rests on.
     """
-    inside = residuals[fitted]
-    variance = 0.0
-    if inside.shape[0] > 0:
-        variance = ((inside - inside.mean()) ** 2).sum() / max(inside.shape[0] - PARAMETERS, 1)
+    inside, variance = residuals[fitted], 0.0
+    if len(inside):
+        variance = float(((inside - inside.mean()) ** 2).sum()) / max(len(inside) - PARAMETERS, 1)
     return residuals / np.sqrt(max(variance, _LEAST_VARIANCE) * np.maximum(1.0 - leverage, _LEAST_FREEDOM))
 
 
-@kernel
 def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
     """How far the fit would move without each match (thesis 3.16 and 4.17; the square of d_i is missing in print)."""
     return studentised**2 / PARAMETERS * leverage / np.maximum(1.0 - leverage, _LEAST_FREEDOM)
 
 
-@kernel
 def priors(distances: FloatArray, sigma: float) -> FloatArray:
     """p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels)."""
-    probable = np.empty(distances.shape[0])
-    least = distances.min() if distances.shape[0] else 0.0
-    for i in range(distances.shape[0]):
-        if sigma > 0.0:
-            # less the smallest exponent, which makes the largest value 1
-            exponent = (distances[i] - least) / sigma * ((distances[i] + least) / sigma) / 2.0
-            probable[i] = np.exp(-exponent) if exponent < _FAR else 0.0
-        else:
-            probable[i] = 1.0 if distances[i] <= least else 0.0
-    return probable
+    least = distances.min(initial=np.inf)
+    if not sigma > 0.0:
+        return np.asarray(distances <= least, dtype=np.float64)
+    with np.errstate(over="ignore"):
+        # less the smallest exponent, which makes the largest value 1
+        exponent = (distances - least) / sigma * ((distances + least) / sigma) / 2.0
+    return np.where(exponent < _FAR, np.exp(-np.minimum(exponent, _FAR)), 0.0)
 
 
-@kernel
 def mad_sigma(distances: FloatArray) -> float:
     """Standard deviation about zero from the median absolute deviation (thesis 4.7.3)."""
-    count = distances.shape[0]
-    return _MAD_TO_SIGMA * select(np.abs(distances), count // 2) if count else 0.0
+    count = len(distances)
+    return _MAD_TO_SIGMA * float(np.partition(np.abs(distances), count // 2)[count // 2]) if count else 0.0
 
 
 def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma_from_inliers: bool) -> FloatArray:
@@ -125,11 +115,6 @@ def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma
         threshold: largest distance of an inlier; the inliers are the fitted matches.
         sigma_from_inliers: take sigma from the inliers' Cook's distances; otherwise from all, as in the thesis.
     """
-    return _validity(points, f, threshold, sigma_from_inliers)
-
-
-@kernel
-def _validity(points: FloatArray, f: FloatArray, threshold: float, sigma_from_inliers: bool) -> FloatArray:
     squared = squared_distances(points, f)
     fitted = squared <= threshold * threshold
     leverage = leverages(points, f, fitted)

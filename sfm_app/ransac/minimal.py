@@ -183,7 +183,9 @@ def _null_space(points: FloatArray, sample: IntArray, basis: FloatArray) -> bool
     Complete pivoting makes it as exact as reflections would be, in half the time. False where the rows depend on each
     other.
     """
-    rows, place = np.empty((SAMPLE_SIZE, 9)), np.arange(9)
+    rows, place = np.empty((SAMPLE_SIZE, 9)), np.empty(9, dtype=np.int64)
+    for j in range(9):
+        place[j] = j
     for k in range(SAMPLE_SIZE):
         design_row(points[sample[k]], rows[k])
     largest = 0.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.ransac.planes import dominant_homography, transfer_distance
 from sfm_app.ransac.sampling import RandomState, uniform
-from sfm_app.ransac.scoring import Measure, penalty, squared_distances
+from sfm_app.ransac.scoring import FIRST, Measure, penalty, squared_distances
 from sfm_app.ransac.verification import Gate
 
 FloatArray = NDArray[np.float64]
@@ -70,12 +70,16 @@ def _best_epipole(
             f[c] = ey * H[2, c] - ez * H[1, c]
             f[3 + c] = ez * H[0, c] - ex * H[2, c]
             f[6 + c] = ex * H[1, c] - ey * H[0, c]
-        norm = np.sqrt((f * f).sum())
-        if not norm > 0.0:
+        squared = 0.0
+        for c in range(9):
+            squared += f[c] * f[c]
+        if not squared > 0.0:
             continue
-        f /= norm
-        score = penalty(points, 0, f, measure, lowest, gate)
+        for c in range(9):
+            f[c] /= np.sqrt(squared)
+        score = penalty(points, FIRST, f, measure, lowest, gate)
         if score < lowest:
             lowest = score
-            best[:] = f
+            for c in range(9):
+                best[c] = f[c]
     return lowest

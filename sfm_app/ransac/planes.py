@@ -7,8 +7,8 @@ that catches the most accidental inliers. What tells a real epipole is matches o
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.epipolar import cross_matrix
 from sfm_app.jit import kernel
-from sfm_app.ransac.eigen import symmetric_eigen
 from sfm_app.ransac.refit import factors
 from sfm_app.ransac.sampling import uniform
 
@@ -21,7 +21,6 @@ _LEAST_SUPPORT = 1e-12
 """Smallest over largest eigenvalue of the regression for a plane."""
 
 
-@kernel
 def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
     """The homography of the plane that holds the most matches, among those compatible with F.
 
@@ -37,21 +36,16 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
     Returns:
         (3, 3), x2 ~ H x1.
     """
-    e2 = factors(F)[0][:, 2].copy()
-    A = np.empty((3, 3))
-    for k in range(3):
-        A[0, k] = e2[1] * F[2, k] - e2[2] * F[1, k]
-        A[1, k] = e2[2] * F[0, k] - e2[0] * F[2, k]
-        A[2, k] = e2[0] * F[1, k] - e2[1] * F[0, k]
+    e2 = factors(np.ascontiguousarray(F))[0][:, 2].copy()
+    A = cross_matrix(e2) @ F
     b, weights = _plane_equations(points, A, e2)
-    best = _sampled_plane(points[:_MOST_SCORED], b, A, e2, 2.0 * threshold * threshold)
+    best = _sampled_plane(points, b, A, e2, 2.0 * threshold * threshold)
     H = A - np.outer(e2, best)
-    squared = _squared_transfer(points, H)
-    for i in range(points.shape[0]):
-        weights[i] = weights[i] if squared[i] <= threshold * threshold else 0.0
-    if np.count_nonzero(weights) >= _SAMPLE_SIZE and _fit_plane(points, b, weights, best):
-        H = A - np.outer(e2, best)
-    return H
+    weights[~(_squared_transfer(points, H) <= threshold * threshold)] = 0.0
+    if np.count_nonzero(weights) < _SAMPLE_SIZE:
+        return np.asarray(H)
+    fitted = _fit_plane(points, b, weights)
+    return np.asarray(H if fitted is None else A - np.outer(e2, fitted))
 
 
 @kernel
@@ -69,33 +63,32 @@ def _plane_equations(points: FloatArray, A: FloatArray, e2: FloatArray) -> tuple
     return b, weights
 
 
+def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray) -> FloatArray | None:
+    """Weighted least squares of v' x1 = b: v (3,), or None for points on one line."""
+    gram, right = _regression(points, b, weights)
+    values, vectors = np.linalg.eigh(gram)
+    return vectors @ (vectors.T @ right / values) if values[0] > _LEAST_SUPPORT * values[2] else None
+
+
 @kernel
-def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray, plane: FloatArray) -> bool:
-    """Weighted least squares of v' x1 = b into `plane` (3,); False, and nothing changed, for points on one line."""
-    gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
-    right, row = np.zeros(3), np.ones(3)
+def _regression(points: FloatArray, b: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Weighted normal equations (3, 3) and (3,) of v' x1 = b."""
+    gram, right, row = np.zeros((3, 3)), np.zeros(3), np.ones(3)
     for i in range(points.shape[0]):
         row[0], row[1] = points[i, 0], points[i, 1]
         for j in range(3):
             right[j] += weights[i] * row[j] * b[i]
             for k in range(3):
                 gram[j, k] += weights[i] * row[j] * row[k]
-    symmetric_eigen(gram, values, vectors)
-    if not values[0] > _LEAST_SUPPORT * values[2]:
-        return False
-    plane[:] = 0.0
-    for n in range(3):
-        along = (vectors[:, n] * right).sum() / values[n]
-        for j in range(3):
-            plane[j] += along * vectors[j, n]
-    return True
+    return gram, right
 
 
 @kernel
 def _sampled_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatArray, limit: float) -> FloatArray:
-    """The v through three matches, v' x1 = b, whose H maps most matches to within sqrt(limit) of their partners."""
-    count, most, state = points.shape[0], -1, np.array([points.shape[0]], dtype=np.uint64)
+    """The v through three matches, v' x1 = b, whose H maps most to within sqrt(limit) of their partners; of the first."""
+    count, most, state = min(points.shape[0], _MOST_SCORED), -1, np.empty(1, dtype=np.uint64)
     best, corner, v = np.zeros(3), np.empty(3, dtype=np.int64), np.empty(3)
+    state[0] = count
     mapped = np.empty((3, count))
     for i in range(count):
         for r in range(3):
@@ -121,7 +114,8 @@ def _sampled_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatAr
             on_plane += dx * dx + dy * dy <= limit * depth * depth
         if on_plane > most:
             most = on_plane
-            best[:] = v
+            for k in range(3):
+                best[k] = v[k]
     return best
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel, summing_kernel
 from sfm_app.ransac.design import LANES, add_products, gather, mirror, weighted_gram
 from sfm_app.ransac.eigen import symmetric_eigen
-from sfm_app.ransac.scoring import distances_of_block, squared_distances
+from sfm_app.ransac.scoring import FIRST, distances_of_block, squared_distances
 
 FloatArray = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ def refine_sampson(
         (3, 3), rank 2, its largest singular value 1.
     """
     law = np.array([scale**-2, 0.0, 0.0, 0.0])
-    return _reweighted(points, *factors(F), law, most_steps, enough)
+    return _reweighted(points, *factors(F), law, most_steps, enough, np.empty((10, 10)))
 
 
 def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach: float, most_steps: int) -> FloatArray:
@@ -72,7 +72,7 @@ def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach
     inside = squared[squared <= threshold * threshold]
     sigma = _MAD_TO_SIGMA * math.sqrt(float(np.median(inside))) if len(inside) else threshold
     law = np.array([0.0, (reach * threshold) ** 2, threshold**2, min(sigma, threshold) ** 2])
-    return _reweighted(points, U, s, V, law, most_steps, _ENOUGH_LIKELIHOOD)
+    return _reweighted(points, U, s, V, law, most_steps, _ENOUGH_LIKELIHOOD, np.empty((10, 10)))
 
 
 def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
@@ -89,12 +89,11 @@ def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
     return _compose(U, s, V).reshape(3, 3)
 
 
-@kernel
 def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
     """The first half of `fit_eight_point`: (3, 3) of norm 1 with the least algebraic error, of any rank."""
     values, vectors = np.empty(9), np.empty((9, 9))
     symmetric_eigen(weighted_gram(points, weights), values, vectors)
-    return vectors[:, 0].copy().reshape(3, 3)
+    return np.ascontiguousarray(vectors[:, 0]).reshape(3, 3)
 
 
 @kernel
@@ -108,39 +107,59 @@ def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
     symmetric_eigen(gram, values, vectors)
     U, V = np.empty((3, 3)), np.empty((3, 3))
     for k in range(2):
-        V[:, k] = vectors[:, 2 - k]
+        for i in range(3):
+            V[i, k] = vectors[i, 2 - k]
         for i in range(3):
             U[i, k] = F[i, 0] * V[0, k] + F[i, 1] * V[1, k] + F[i, 2] * V[2, k]
-    first = np.sqrt((U[:, 0] ** 2).sum())
-    U[:, 0] /= first
-    U[:, 1] -= (U[:, 0] * U[:, 1]).sum() * U[:, 0]  # what rounding left where s is small
-    second = np.sqrt((U[:, 1] ** 2).sum())
-    if second > 1e-12 * first:
-        U[:, 1] /= second
-    else:  # rank 1: any direction will do
-        least = np.argmin(np.abs(U[:, 0]))
-        U[:, 1] = -U[least, 0] * U[:, 0]
-        U[least, 1] += 1.0
-        U[:, 1] /= np.sqrt((U[:, 1] ** 2).sum())
-    for R in (U, V):  # the third columns meet the singular value 0: they make rotations of both
+    first = _normalise(U, FIRST)
+    _turn_away(U)  # what rounding left where s is small
+    second = _normalise(U, 1)
+    if not second > 1e-12 * first:  # rank 1: any direction will do
+        least = 0
+        for i in range(1, 3):
+            least = i if abs(U[i, 0]) < abs(U[least, 0]) else least
         for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            R[i, 2] = R[j, 0] * R[k, 1] - R[k, 0] * R[j, 1]
+            U[i, 1] = 1.0 if i == least else 0.0
+        _turn_away(U)
+        _normalise(U, 1)
+    for i in range(3):  # the third columns meet the singular value 0: they make rotations of both
+        j, k = (i + 1) % 3, (i + 2) % 3
+        U[i, 2] = U[j, 0] * U[k, 1] - U[k, 0] * U[j, 1]
+        V[i, 2] = V[j, 0] * V[k, 1] - V[k, 0] * V[j, 1]
     return U, second / first, V
 
 
 @kernel
+def _normalise(U: FloatArray, k: int) -> float:
+    """Column k over its length; the length."""
+    length = np.sqrt(U[0, k] * U[0, k] + U[1, k] * U[1, k] + U[2, k] * U[2, k])
+    for i in range(3):
+        U[i, k] /= length
+    return float(length)
+
+
+@kernel
+def _turn_away(U: FloatArray) -> None:
+    """Make the second column perpendicular to the first, a unit vector."""
+    dot = U[0, 0] * U[0, 1] + U[1, 0] * U[1, 1] + U[2, 0] * U[2, 1]
+    for i in range(3):
+        U[i, 1] -= dot * U[i, 0]
+
+
+@kernel
 def _reweighted(
-    points: FloatArray, U: FloatArray, s: float, V: FloatArray, law: FloatArray, most_steps: int, enough: float
-) -> FloatArray:
+    points: FloatArray, U: FloatArray, s: float, V: FloatArray, law: FloatArray, most_steps: int, enough: float,
+    gram: FloatArray,
+) -> FloatArray:  # fmt: skip
     """The loop of all fits; `law` says how matches are weighed: 1 / c^2, 0, 0, 0 for a robust cost, or else 0, the
-    squares of the reach, of the largest sigma and of the first sigma for a mixture.
+    squares of the reach, of the largest sigma and of the first sigma for a mixture. `gram` (10, 10) is for work: the
+    compiler would spell out all sums of a matrix whose size it knows.
     """
     count = points.shape[0]
     weights, squared, trial = np.empty(count), np.empty(count), np.empty(count)
     normal, right, step = np.empty((7, 7)), np.empty(7), np.empty(7)
     f = _compose(U, s, V)
-    distances_of_block(points, f, 0, squared)
+    distances_of_block(points, f, FIRST, squared)
     damping, mixture, share = _FIRST_DAMPING, law[1] > 0.0, 0.9
     variance = law[3]
     for n in range(most_steps):
@@ -149,13 +168,13 @@ def _reweighted(
         else:
             _weigh_robustly(squared, law[0], weights)
         cost = new_cost = _weighted_sum(squared, weights)
-        _normal_equations(points, f, weights, U, s, V, normal, right)
+        _normal_equations(points, f, weights, U, s, V, gram, normal, right)
         improved = False
         while not improved and damping < _LARGEST_DAMPING:
             if _solve(normal, right, damping, step):
                 U_new, V_new, s_new = _turned(U, step[0:3]), _turned(V, step[3:6]), s + step[6]
                 new = _compose(U_new, s_new, V_new)
-                distances_of_block(points, new, 0, trial)
+                distances_of_block(points, new, FIRST, trial)
                 new_cost = _weighted_sum(trial, weights)
                 improved = new_cost < cost
             damping = max(damping * 0.1, _SMALLEST_DAMPING) if improved else damping * 10.0
@@ -211,11 +230,15 @@ def _weighted_sum(squared: FloatArray, weights: FloatArray) -> float:
 @kernel
 def _normal_equations(
     points: FloatArray, f: FloatArray, weights: FloatArray, U: FloatArray, s: float, V: FloatArray,
-    normal: FloatArray, right: FloatArray,
+    gram: FloatArray, normal: FloatArray, right: FloatArray,
 ) -> None:  # fmt: skip
     """Weighted J'J and -J'r over the seven parameters."""
-    gram, block, rows = np.zeros((10, 10)), np.empty((5, LANES)), np.empty((10, LANES))
-    start = 0
+    size = gram.shape[0]
+    for j in range(size):
+        for k in range(size):
+            gram[j, k] = 0.0
+    block, rows = np.empty((5, LANES)), np.empty((size, LANES))
+    start = FIRST
     while start < points.shape[0]:
         count, start = gather(points, weights, start, block)
         _derivatives(block, count, f, rows)

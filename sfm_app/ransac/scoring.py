@@ -5,7 +5,7 @@ again at every new best model; only that of MLESAC changes during the search.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,9 @@ from sfm_app.jit import kernel
 from sfm_app.ransac.verification import BLOCK, Gate
 
 FloatArray = NDArray[np.float64]
+
+FIRST = cast("int", np.int64(0))
+"""Where blocks begin. A plain 0 is a type of its own to numba, and kernels are compiled for it once more."""
 
 RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS, GEMAN_MCCLURE = range(6)
 
@@ -75,7 +78,7 @@ def squared_sampson(f: FloatArray, x1: float, y1: float, x2: float, y2: float) -
 def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
     """(N,) squared Sampson distances of all matches (N, 4)."""
     squared = np.empty(points.shape[0])
-    distances_of_block(points, f, 0, squared)
+    distances_of_block(points, f, FIRST, squared)
     return squared
 
 

@@ -86,7 +86,8 @@ def next_better(
             found = penalty(points, start, models[k], measure, to_beat[kind], gate)
             if found < to_beat[kind]:
                 to_beat[kind], better = found, True
-                best[kind] = models[k]
+                for j in range(9):
+                    best[kind, j] = models[k, j]
         if better and trial % draws.batch == 0:
             return trial
     return limit

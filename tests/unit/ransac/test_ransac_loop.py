@@ -12,7 +12,7 @@ from sfm_app.ransac.points import prepare
 from sfm_app.ransac.recipe import Recipe
 from sfm_app.ransac.sampling import random_state
 from sfm_app.ransac.scoring import msac, squared_distances
-from sfm_app.ransac.search import Rules, next_better
+from sfm_app.ransac.search import Draws, next_better
 from sfm_app.ransac.verification import OPEN, FullVerification, RandomisedTdd
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
@@ -75,7 +75,7 @@ def test_converged_priors_end_the_search():
 
 def test_patience_ends_the_search():
     m = scene(0.6)
-    limited = search(m, options(), 0, replace(PLAIN, patience=5)).trials
+    limited = search(m, options(), 0, replace(PLAIN, patience=always(5), least_trials=5)).trials
     assert limited < search(m, options(), 0, PLAIN).trials
 
 
@@ -104,21 +104,55 @@ def test_local_optimisation_is_kept_only_if_better():
     assert search(m, options(), 0, misled).F.tobytes() == search(m, options(), 0, PLAIN).F.tobytes()
 
 
+def draw(points, draws, to_beat, best, limit=25, gates=(OPEN, OPEN), seed=0):
+    return next_better(points, draws, msac(points, 0.01, None), gates, to_beat, limit, random_state(seed), best)
+
+
+def blind(count, batch=1):
+    """Uniform samples only."""
+    return Draws(7, False, batch, 0.0, np.cumsum(np.ones(count)), 0.0, np.zeros(1))
+
+
 def test_next_better_leaves_the_best_alone_when_nothing_is_better():
-    m, best = scene(), np.full(9, 7.0)
-    drawn, score = next_better(
-        m.points,
-        np.cumsum(np.ones(300)),
-        Rules(7, False, 0.0),
-        msac(m.points, 0.01, None),
-        OPEN,
-        1e-12,
-        25,
-        random_state(0),
-        best,
-    )
-    assert (drawn, score) == (25, 1e-12)
+    m, best, to_beat = scene(), np.full((2, 9), 7.0), np.full(2, 1e-12)
+    assert draw(m.points, blind(300), to_beat, best) == 25
     assert (best == 7).all()
+    assert (to_beat == 1e-12).all()
+
+
+@pytest.mark.parametrize(("batch", "limit", "drawn"), [(1, 25, 1), (4, 25, 4), (32, 100, 32), (32, 20, 20)])
+def test_a_batch_is_drawn_to_its_end_and_its_best_model_returned(batch, limit, drawn):
+    m, best, to_beat = scene(), np.zeros((2, 9)), np.full(2, np.inf)
+    assert draw(m.points, blind(300, batch), to_beat, best, limit) == drawn
+    one_by_one, lowest, state = np.zeros((2, 9)), np.full(2, np.inf), random_state(0)
+    left = drawn
+    while left:
+        left -= next_better(
+            m.points, blind(300), msac(m.points, 0.01, None), (OPEN, OPEN), lowest, left, state, one_by_one
+        )
+    np.testing.assert_array_equal(best, one_by_one)
+    np.testing.assert_array_equal(to_beat, lowest)
+
+
+def test_samples_of_the_rest_compete_with_each_other_only():
+    pair = make_pair(PairOptions(points=300, outliers=0.5, sigma_px=0.0), 3)
+    points = prepare(pair.x1, pair.x2, 0)
+    rest = np.zeros(300)
+    rest[points.rows[pair.is_inlier]] = 1.0
+    draws = blind(300)._replace(rest_share=1.0, rest=np.cumsum(rest), guided_share=1e-9)
+    best, to_beat = np.zeros((2, 9)), np.array([1e-12, np.inf])  # no sample of all matches can win
+
+    assert draw(points.points, draws, to_beat, best) < 25
+
+    assert (best[0] == 0).all()
+    assert to_beat[0] == 1e-12
+    exact = squared_distances(points.points, best[1])[rest > 0]
+    assert np.median(exact) < 1e-12
+    # fewer matches than a sample are no rest: all samples are of all matches
+    few = draws._replace(rest=np.cumsum(np.arange(300) < 6).astype(np.float64))
+    best, to_beat = np.zeros((2, 9)), np.full(2, np.inf)
+    draw(points.points, few, to_beat, best)
+    assert to_beat[0] < np.inf == to_beat[1]
 
 
 class Script:
@@ -127,15 +161,15 @@ class Script:
     def __init__(self, model, *better):
         self.model, self.better, self.trials, self.calls = model, list(better), 0, []
 
-    def __call__(self, _points, _cumulative, rules, _measure, _gate, to_beat, limit, _state, best):
-        self.calls.append((limit, rules.guided_share, to_beat))
+    def __call__(self, _points, draws, _measure, _gates, to_beat, limit, _state, best):
+        self.calls.append((limit, draws.guided_share, to_beat[0]))
         if self.better and self.better[0][0] <= self.trials + limit:
             at, score = self.better.pop(0)
             drawn, self.trials = at - self.trials, at
-            best[:] = self.model
-            return drawn, score
+            best[0], to_beat[0] = self.model, score
+            return drawn
         self.trials += limit
-        return limit, to_beat
+        return limit
 
 
 @pytest.fixture
@@ -195,17 +229,55 @@ def test_a_last_attempt_may_beat_the_best_model_and_else_is_dropped(scripted):
 
 
 def test_patience_is_counted_from_the_last_better_model(scripted):
-    found, calls = scripted(replace(PLAIN, patience=50), (30, 2.0), (70, 1.0))
+    found, calls = scripted(replace(PLAIN, patience=always(50), least_trials=50), (30, 2.0), (70, 1.0))
     assert found.trials == 120
     assert [c[0] for c in calls] == [50, 50, 50]
 
 
-def test_patience_without_a_credible_model_starts_again(scripted):
-    nothing, calls = scripted(replace(PLAIN, patience=50), max_trials=170)
+def test_patience_without_a_credible_model_goes_on(scripted):
+    waiting = replace(PLAIN, patience=always(50), least_trials=50)
+    nothing, calls = scripted(waiting, max_trials=170)
     assert nothing is None
     assert [c[0] for c in calls] == [50, 50, 50, 20]
+    endless = replace(waiting, patience=always(np.inf))
     luck = np.ones(9) / 3
-    assert scripted(replace(PLAIN, patience=50), (1, 1.0), model=luck, max_trials=170)[0].trials == 170
+    assert scripted(endless, (1, 1.0), model=luck, max_trials=170)[0].trials == 170
+
+
+def test_patience_is_asked_about_the_best_model_after_the_least_trials(scripted):
+    asked = []
+
+    def patience(points, F, threshold):
+        asked.append(F.copy())
+        return 70.0
+
+    recipe = replace(PLAIN, patience=patience, least_trials=50)
+    found, calls = scripted(recipe, (10, 2.0), (100, 1.0))
+    # idle for 50 after the 10th: 20 more; the 100th comes too late
+    assert found.trials == 80
+    assert [c[0] for c in calls] == [50, 50, 20]
+    np.testing.assert_array_equal(asked, [found.F, found.F])
+
+
+@pytest.mark.parametrize(("improved", "met"), [([0], [0]), ([1], [1]), ([0, 1], [0, 1]), ([], [])])
+def test_only_kinds_of_samples_that_improved_are_met(monkeypatch, improved, met):
+    seen, m = [], scene()
+
+    def script(_points, _draws, _measure, _gates, to_beat, limit, _state, best):
+        if not seen:
+            best[improved], to_beat[improved] = np.ones(9) / 3, 1.0
+        return limit
+
+    def meets(best, kind):
+        seen.append(kind)
+        assert best.samples[kind].any()
+        best.to_beat[:] = 0.5  # as a new best model does: the bar of the other kind falls too
+        return True
+
+    monkeypatch.setattr(loop, "next_better", script)
+    monkeypatch.setattr(loop.Best, "meets", meets)
+    search(m, options(max_trials=120), 0, replace(PLAIN, least_trials=50, patience=always(200)))
+    assert seen == met
 
 
 def test_first_priors_come_at_their_share_of_the_trials(scripted):
