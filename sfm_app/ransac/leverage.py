@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.ransac.design import quadratic_forms, weighted_gram
-from sfm_app.ransac.eigen import symmetric_eigen
 from sfm_app.ransac.scoring import squared_distances
 
 FloatArray = NDArray[np.float64]
@@ -49,8 +48,7 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
     """
     tangent = _perpendicular(f)
     within = tangent.T @ weighted_gram(points, fitted.astype(np.float64)) @ tangent
-    values, vectors = np.empty(PARAMETERS), np.empty((PARAMETERS, PARAMETERS))
-    symmetric_eigen(within, values, vectors)
+    values, vectors = np.linalg.eigh(within)
     # a direction without support: whatever lies in it has leverage 1
     floor = max(values[-1], 2.0**-1000) * _LEAST_SUPPORT
     forms = quadratic_forms(points, tangent @ (vectors / np.sqrt(np.maximum(values, floor))))

@@ -85,7 +85,7 @@ def _regression(points: FloatArray, b: FloatArray, weights: FloatArray) -> tuple
 
 @kernel
 def _sampled_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatArray, limit: float) -> FloatArray:
-    """The v through three matches, v' x1 = b, whose H maps most to within sqrt(limit) of their partners; of the first."""
+    """The v through three matches, v' x1 = b, whose H maps most of the first ones to within sqrt(limit)."""
     count, most, state = min(points.shape[0], _MOST_SCORED), -1, np.empty(1, dtype=np.uint64)
     best, corner, v = np.zeros(3), np.empty(3, dtype=np.int64), np.empty(3)
     state[0] = count

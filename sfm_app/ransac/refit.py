@@ -91,8 +91,7 @@ def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
     """The first half of `fit_eight_point`: (3, 3) of norm 1 with the least algebraic error, of any rank."""
-    values, vectors = np.empty(9), np.empty((9, 9))
-    symmetric_eigen(weighted_gram(points, weights), values, vectors)
+    _, vectors = np.linalg.eigh(weighted_gram(points, weights))
     return np.ascontiguousarray(vectors[:, 0]).reshape(3, 3)
 
 
