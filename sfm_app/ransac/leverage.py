@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.ransac.design import quadratic_forms, weighted_gram
-from sfm_app.ransac.scoring import squared_distances
+from sfm_app.ransac.scoring import select, squared_distances
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -52,8 +52,16 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
     # a direction without support: whatever lies in it has leverage 1
     floor = max(values[-1], 2.0**-1000) * _LEAST_SUPPORT
     forms = quadratic_forms(points, tangent @ (vectors / np.sqrt(np.maximum(values, floor))))
-    with np.errstate(divide="ignore", over="ignore"):
-        return np.where(fitted, np.minimum(forms, 1.0), 1.0 / (1.0 + 1.0 / forms))
+    return _of_forms(forms, fitted)
+
+
+@kernel
+def _of_forms(forms: FloatArray, fitted: BoolArray) -> FloatArray:
+    """h for those fitted, g / (1 + g) for the others; without support g may be inf."""
+    leverage = np.empty(forms.shape[0])
+    for i in range(forms.shape[0]):
+        leverage[i] = min(forms[i], 1.0) if fitted[i] else 1.0 / (1.0 + 1.0 / forms[i])
+    return leverage
 
 
 @kernel
@@ -68,6 +76,7 @@ def _perpendicular(f: FloatArray) -> FloatArray:
     return basis
 
 
+@kernel
 def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: BoolArray) -> FloatArray:
     """Residuals over their standard deviation (thesis 3.14 and 3.15, the variance taken from the fitted matches).
 
@@ -76,32 +85,56 @@ def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: B
         leverage: (N,) from `leverages`.
         fitted: (N,) the matches that the model rests on.
     """
-    inside, variance = residuals[fitted], 0.0
-    if len(inside):
-        variance = float(((inside - inside.mean()) ** 2).sum()) / max(len(inside) - PARAMETERS, 1)
-    return residuals / np.sqrt(max(variance, _LEAST_VARIANCE) * np.maximum(1.0 - leverage, _LEAST_FREEDOM))
+    count, total, moment = 0, 0.0, 0.0
+    for i in range(residuals.shape[0]):
+        if fitted[i]:
+            count += 1
+            total += residuals[i]
+    mean = total / max(count, 1)
+    for i in range(residuals.shape[0]):
+        if fitted[i]:
+            moment += (residuals[i] - mean) ** 2
+    variance = max(moment / max(count - PARAMETERS, 1), _LEAST_VARIANCE)
+    studentised = np.empty(residuals.shape[0])
+    for i in range(residuals.shape[0]):
+        studentised[i] = residuals[i] / np.sqrt(variance * max(1.0 - leverage[i], _LEAST_FREEDOM))
+    return studentised
 
 
+@kernel
 def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
     """How far the fit would move without each match (thesis 3.16 and 4.17; the square of d_i is missing in print)."""
-    return studentised**2 / PARAMETERS * leverage / np.maximum(1.0 - leverage, _LEAST_FREEDOM)
+    distances = np.empty(studentised.shape[0])
+    for i in range(studentised.shape[0]):
+        odds = leverage[i] / max(1.0 - leverage[i], _LEAST_FREEDOM)
+        distances[i] = studentised[i] * studentised[i] / PARAMETERS * odds
+    return distances
 
 
+@kernel
 def priors(distances: FloatArray, sigma: float) -> FloatArray:
     """p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels)."""
-    least = distances.min(initial=np.inf)
-    if not sigma > 0.0:
-        return np.asarray(distances <= least, dtype=np.float64)
-    with np.errstate(over="ignore"):
-        # less the smallest exponent, which makes the largest value 1
-        exponent = (distances - least) / sigma * ((distances + least) / sigma) / 2.0
-    return np.where(exponent < _FAR, np.exp(-np.minimum(exponent, _FAR)), 0.0)
+    least, probable = np.inf, np.empty(distances.shape[0])
+    for i in range(distances.shape[0]):
+        least = min(least, distances[i])
+    for i in range(distances.shape[0]):
+        if sigma > 0.0:
+            # less the smallest exponent, which makes the largest value 1
+            exponent = (distances[i] - least) / sigma * ((distances[i] + least) / sigma) / 2.0
+            probable[i] = np.exp(-exponent) if exponent < _FAR else 0.0
+        else:
+            probable[i] = 1.0 if distances[i] <= least else 0.0
+    return probable
 
 
+@kernel
 def mad_sigma(distances: FloatArray) -> float:
     """Standard deviation about zero from the median absolute deviation (thesis 4.7.3)."""
-    count = len(distances)
-    return _MAD_TO_SIGMA * float(np.partition(np.abs(distances), count // 2)[count // 2]) if count else 0.0
+    count = distances.shape[0]
+    deviations = np.empty(count)
+    for i in range(count):
+        deviations[i] = abs(distances[i])
+    return _MAD_TO_SIGMA * select(deviations, count // 2) if count > 0 else 0.0
 
 
 def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma_from_inliers: bool) -> FloatArray:

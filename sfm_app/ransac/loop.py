@@ -61,7 +61,7 @@ class _Search:
         self.draws = Draws(recipe.sample_size, recipe.oriented, recipe.batch, 0.0, equal, 0.0, no_rest)
         twice = self.test.gate.random_start
         self.circle = np.asfortranarray(np.vstack([self.points] * 2)) if twice else self.points
-        self.trials = self.idle = 0
+        self.trials, self.idle, self.has_priors = 0, 0, False
         self.patience = recipe.least_trials if recipe.patience is not None else math.inf
         self._look_ahead()
 
@@ -108,28 +108,27 @@ class _Search:
         recipe = self.recipe
         if recipe.validity is None or not self.best or self.trials < self.first_priors:
             return False
-        if not better and self.draws.guided_share > 0:
+        if not better and self.has_priors:
             return False
+        self.has_priors = True
         before, self.priors = self.priors, recipe.validity(self.points, self.best.f, self.threshold)
         self.draws = self.draws._replace(guided_share=recipe.guided_share, priors=np.cumsum(self.priors))
         if recipe.rest_share > 0:
-            unexplained = squared_distances(self.points, self.best.f) > (_EXPLAINED * self.threshold) ** 2
-            self.draws = self.draws._replace(
-                rest_share=recipe.rest_share, rest=np.cumsum(unexplained, dtype=np.float64)
-            )
+            rest = squared_distances(self.points, self.best.f) > (_EXPLAINED * self.threshold) ** 2
+            self.draws = self.draws._replace(rest_share=recipe.rest_share, rest=np.cumsum(rest, dtype=np.float64))
         return recipe.stop_on_convergence and have_converged(before, self.priors)
 
     def _has_waited_enough(self) -> bool:
         """Whether the best model has stood for as many samples as its evidence calls for."""
         if self.recipe.patience is None or self.idle < self.patience:
             return False
-        if self.best:
-            F = self.best.f.reshape(3, 3)
-            self.patience = math.ceil(
-                min(self.recipe.patience(self.points, F, self.threshold), self.options.max_trials)
-            )
-        else:
+        if not self.best:
             self.patience += self.recipe.least_trials
+            return False
+        wanted = self.recipe.patience(self.points, self.best.f.reshape(3, 3), self.threshold)
+        if math.isinf(wanted):  # what may be luck is no guide
+            self.draws = self.draws._replace(guided_share=0.0, rest_share=0.0)
+        self.patience = math.ceil(min(wanted, self.options.max_trials))
         return self.patience <= self.idle
 
     def _recover(self) -> None:

@@ -7,8 +7,8 @@ that catches the most accidental inliers. What tells a real epipole is matches o
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.epipolar import cross_matrix
 from sfm_app.jit import kernel
+from sfm_app.ransac.eigen import symmetric_eigen
 from sfm_app.ransac.refit import factors
 from sfm_app.ransac.sampling import uniform
 
@@ -21,6 +21,7 @@ _LEAST_SUPPORT = 1e-12
 """Smallest over largest eigenvalue of the regression for a plane."""
 
 
+@kernel
 def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
     """The homography of the plane that holds the most matches, among those compatible with F.
 
@@ -36,16 +37,36 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
     Returns:
         (3, 3), x2 ~ H x1.
     """
-    e2 = factors(np.ascontiguousarray(F))[0][:, 2].copy()
-    A = cross_matrix(e2) @ F
+    U, _, _ = factors(F)
+    e2, A = np.empty(3), np.empty((3, 3))
+    for i in range(3):
+        e2[i] = U[i, 2]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for n in range(3):
+            A[i, n] = e2[j] * F[k, n] - e2[k] * F[j, n]
     b, weights = _plane_equations(points, A, e2)
     best = _sampled_plane(points, b, A, e2, 2.0 * threshold * threshold)
-    H = A - np.outer(e2, best)
-    weights[~(_squared_transfer(points, H) <= threshold * threshold)] = 0.0
-    if np.count_nonzero(weights) < _SAMPLE_SIZE:
-        return np.asarray(H)
-    fitted = _fit_plane(points, b, weights)
-    return np.asarray(H if fitted is None else A - np.outer(e2, fitted))
+    H = _homography(A, e2, best)
+    squared, on_plane = _squared_transfer(points, H), 0
+    for i in range(points.shape[0]):
+        if squared[i] <= threshold * threshold:
+            on_plane += 1
+        else:
+            weights[i] = 0.0
+    if on_plane >= _SAMPLE_SIZE and _fit_plane(points, b, weights, best):
+        H = _homography(A, e2, best)
+    return H
+
+
+@kernel
+def _homography(A: FloatArray, e2: FloatArray, v: FloatArray) -> FloatArray:
+    """A - e2 v'."""
+    H = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            H[i, j] = A[i, j] - e2[i] * v[j]
+    return H
 
 
 @kernel
@@ -63,24 +84,29 @@ def _plane_equations(points: FloatArray, A: FloatArray, e2: FloatArray) -> tuple
     return b, weights
 
 
-def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray) -> FloatArray | None:
-    """Weighted least squares of v' x1 = b: v (3,), or None for points on one line."""
-    gram, right = _regression(points, b, weights)
-    values, vectors = np.linalg.eigh(gram)
-    return vectors @ (vectors.T @ right / values) if values[0] > _LEAST_SUPPORT * values[2] else None
-
-
 @kernel
-def _regression(points: FloatArray, b: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Weighted normal equations (3, 3) and (3,) of v' x1 = b."""
-    gram, right, row = np.zeros((3, 3)), np.zeros(3), np.ones(3)
+def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray, plane: FloatArray) -> bool:
+    """Weighted least squares of v' x1 = b into `plane` (3,); False, and nothing changed, for points on one line."""
+    gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    right, row = np.zeros(3), np.ones(3)
     for i in range(points.shape[0]):
         row[0], row[1] = points[i, 0], points[i, 1]
         for j in range(3):
             right[j] += weights[i] * row[j] * b[i]
             for k in range(3):
                 gram[j, k] += weights[i] * row[j] * row[k]
-    return gram, right
+    symmetric_eigen(gram, values, vectors)
+    if not values[0] > _LEAST_SUPPORT * values[2]:
+        return False
+    for j in range(3):
+        plane[j] = 0.0
+    for n in range(3):
+        along = 0.0
+        for j in range(3):
+            along += vectors[j, n] * right[j]
+        for j in range(3):
+            plane[j] += along / values[n] * vectors[j, n]
+    return True
 
 
 @kernel
