@@ -21,6 +21,10 @@ FIRST = cast("int", np.int64(0))
 RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS, GEMAN_MCCLURE = range(6)
 
 
+_FEW = 16
+"""Matches whose distances are taken at once where the gate looks often."""
+
+
 class Measure(NamedTuple):
     """A penalty as the inner loop counts it."""
 
@@ -97,6 +101,11 @@ def distances_of_block(points: FloatArray, f: FloatArray, start: int, squared: F
 
 @kernel
 def _cost(measure: Measure, squared: float) -> float:
+    """Penalty of one match."""
+    if measure.kind == GEMAN_MCCLURE:
+        return 1.0 - 1.0 / (1.0 + measure.precision * squared)
+    if not squared <= measure.reach:
+        return measure.worst
     if measure.kind == MSAC:
         return squared
     if measure.kind == RANSAC:
@@ -120,43 +129,54 @@ def penalty(points: FloatArray, start: int, f: FloatArray, measure: Measure, to_
     """
     if measure.kind == LMEDS:
         return _median_of_squares(points, f, to_beat)
-    least_inliers = gate.least_inliers
-    total, inliers, block = 0.0, 0, 0
-    squared = np.empty(max(gate.stride, BLOCK))
-    done, count = 0, points.shape[0] // 2 if gate.random_start else points.shape[0]
+    total, inliers, done = 0.0, 0, 0
+    count = points.shape[0] // 2 if gate.random_start else points.shape[0]
+    squared = np.empty(BLOCK)
     while done < count:
-        gated = block < least_inliers.shape[0]
-        size = min(gate.stride if gated else BLOCK, count - done)
+        often = gate.stride < BLOCK and done < gate.stride * gate.least_inliers.shape[0]
+        size = min(_FEW if often else BLOCK, count - done)
         distances_of_block(points, f, start + done, squared[:size])
-        more, cost = _add_up(squared[:size], measure)
-        inliers += more
-        total += cost
-        done += size
-        if gated and inliers < least_inliers[block]:
-            gate.rejected[0] += done
-            gate.rejected[1] += inliers
-            return np.inf
+        if often:  # the gate looks after every few matches, and most models end at the first looks
+            for i in range(size):
+                inliers += squared[i] <= measure.limit
+                total += _cost(measure, squared[i])
+                if not _passes(gate, done + i + 1, inliers):
+                    return np.inf
+        else:
+            more, cost = _add_up(squared[:size], measure)
+            inliers += more
+            total += cost
+            if not _passes(gate, done + size, inliers):
+                return np.inf
         if total >= to_beat:
             return np.inf
-        block += 1
+        done += size
     return total
+
+
+@kernel
+def _passes(gate: Gate, done: int, inliers: int) -> bool:
+    """Whether the gate lets a model go on that has so many inliers among the first matches; it keeps the books."""
+    looks = done // gate.stride
+    if done % gate.stride != 0 or looks > gate.least_inliers.shape[0] or inliers >= gate.least_inliers[looks - 1]:
+        return True
+    gate.rejected[0] += done
+    gate.rejected[1] += inliers
+    return False
 
 
 @kernel
 def _add_up(squared: FloatArray, measure: Measure) -> tuple[int, float]:
     """Inliers among the given matches, and the sum of their penalties."""
     total, inliers = 0.0, 0
-    if measure.kind == GEMAN_MCCLURE:
-        for i in range(squared.shape[0]):
-            inliers += squared[i] <= measure.limit
-            total += 1.0 - 1.0 / (1.0 + measure.precision * squared[i])
-        return inliers, total
     for i in range(squared.shape[0]):
-        if squared[i] <= measure.reach:
-            inliers += squared[i] <= measure.limit
+        inliers += squared[i] <= measure.limit
+    if measure.kind == GEMAN_MCCLURE:  # without a branch inside: several at once
+        for i in range(squared.shape[0]):
+            total += 1.0 - 1.0 / (1.0 + measure.precision * squared[i])
+    else:
+        for i in range(squared.shape[0]):
             total += _cost(measure, squared[i])
-        else:
-            total += measure.worst
     return inliers, total
 
 
