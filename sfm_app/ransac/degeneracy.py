@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.ransac.chance import MOST_FALSE_ALARMS, accidental_share, false_alarms
-from sfm_app.ransac.planes import dominant_homography, transfer_distance
+from sfm_app.ransac.planes import OFF_PLANE, dominant_homography, transfer_distance
 from sfm_app.ransac.sampling import uniform
 
 FloatArray = NDArray[np.float64]
@@ -18,8 +18,8 @@ BoolArray = NDArray[np.bool_]
 
 _LINE_SAMPLE, _PARALLAX_SAMPLE = 4, 2
 """Matches that fix what a line, or a plane, leaves free of F."""
-_BAND, _PARALLAX = 2.0, 2.0
-"""A match is off the line, or the plane, when that misses it by more than this many thresholds."""
+_OFF_LINE = 2.0
+"""A match is off the line when that misses it by more than this many thresholds."""
 _LINES, _MOST_SCORED = 16, 300
 """A line that matters holds most of the inliers: few samples will find it."""
 _EXTENT = (0.01, 0.99)
@@ -50,11 +50,12 @@ def find_degeneracy(
     """
     chance = accidental_share(wrong, threshold)
     for view in range(2):
-        off_line = off_dominant_line(points, inliers, view, _BAND * threshold)
+        off_line = off_dominant_line(points, inliers, view, _OFF_LINE * threshold)
         if _may_be_accident(off_line, inliers, _LINE_SAMPLE, chance):
             return "collinear"
     H = dominant_homography(np.asfortranarray(points[inliers]), F, threshold)
-    if not _may_be_accident(transfer_distance(H, points) > _PARALLAX * threshold, inliers, _PARALLAX_SAMPLE, chance):
+    off_plane = transfer_distance(H, points) > OFF_PLANE * threshold
+    if not _may_be_accident(off_plane, inliers, _PARALLAX_SAMPLE, chance):
         return ""
     return "rotation" if is_rotation(H, points, centres) else "planar"
 

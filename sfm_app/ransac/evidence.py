@@ -6,13 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.ransac.chance import MOST_FALSE_ALARMS, accidental_share, false_alarms_of, squared_mismatches
-from sfm_app.ransac.planes import dominant_homography, transfer_distance
+from sfm_app.ransac.planes import OFF_PLANE, dominant_homography, transfer_distance
 from sfm_app.ransac.scoring import squared_distances
 
 FloatArray = NDArray[np.float64]
 
-OFF_PLANE = 2.0
-"""A match is off the plane when H misses it by more than this many thresholds."""
 _SURE = 1400.0
 """z of a model that no further sample could shake."""
 _MOST = 3000.0

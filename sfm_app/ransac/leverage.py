@@ -28,7 +28,7 @@ _LEAST_SUPPORT = 1e-14
 """Of a direction, over that of the best supported one."""
 _FAR = 700.0
 """Exponent from which the exponential is 0 for all purposes."""
-_MAD_TO_SIGMA = 1.4826
+MAD_TO_SIGMA = 1.4826
 """Median absolute deviation to standard deviation, for a Gaussian."""
 
 
@@ -134,7 +134,7 @@ def mad_sigma(distances: FloatArray) -> float:
     deviations = np.empty(count)
     for i in range(count):
         deviations[i] = abs(distances[i])
-    return _MAD_TO_SIGMA * select(deviations, count // 2) if count > 0 else 0.0
+    return MAD_TO_SIGMA * select(deviations, count // 2) if count > 0 else 0.0
 
 
 def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma_from_inliers: bool) -> FloatArray:

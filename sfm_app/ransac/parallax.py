@@ -8,15 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.ransac.planes import dominant_homography, transfer_distance
+from sfm_app.ransac.planes import OFF_PLANE, dominant_homography, transfer_distance
 from sfm_app.ransac.sampling import RandomState, uniform
 from sfm_app.ransac.scoring import FIRST, Measure, penalty, squared_distances
 from sfm_app.ransac.verification import Gate
 
 FloatArray = NDArray[np.float64]
 
-_OFF_PLANE = 2.0
-"""Distance from the plane, in thresholds, from which a match tells the epipole."""
 _SAMPLES = 100
 _LEAST_INLIERS = 8
 _MOST_INLIERS = 300
@@ -40,7 +38,7 @@ def with_another_epipole(
         return None
     chosen = np.asfortranarray(points[np.flatnonzero(inliers)[:_MOST_INLIERS]])
     H = dominant_homography(chosen, F, threshold)
-    off_plane = np.flatnonzero(transfer_distance(H, points) > _OFF_PLANE * threshold)
+    off_plane = np.flatnonzero(transfer_distance(H, points) > OFF_PLANE * threshold)
     if len(off_plane) < 2:
         return None
     best = np.empty(9)

@@ -14,6 +14,8 @@ from sfm_app.ransac.sampling import uniform
 
 FloatArray = NDArray[np.float64]
 
+OFF_PLANE = 2.0
+"""A match is off the plane when H misses it by more than this many thresholds."""
 _SAMPLES, _SAMPLE_SIZE = 64, 3
 _LEAST_AREA = 1e-3
 _MOST_SCORED = 300

@@ -13,7 +13,7 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.ransac.leverage import prior_validity
+from sfm_app.ransac.leverage import MAD_TO_SIGMA, prior_validity
 from sfm_app.ransac.mixture import mlesac
 from sfm_app.ransac.recipe import Recipe
 from sfm_app.ransac.refits import refit_sampson
@@ -41,7 +41,7 @@ def median_sigma(squared: FloatArray) -> float:
 
     The factor 1 + 5 / (n - p) makes up for the p = 7 matches that a minimal model meets exactly.
     """
-    return 1.4826 * (1 + 5 / max(len(squared) - 7, 1)) * math.sqrt(float(np.median(squared)))
+    return MAD_TO_SIGMA * (1 + 5 / max(len(squared) - 7, 1)) * math.sqrt(float(np.median(squared)))
 
 
 RANSAC = Recipe(score=ransac, finish=refit_sampson)

@@ -8,14 +8,13 @@ lowers sum_i w_i r_i^2, weigh again. For a cost that is a concave function of r^
 lowers the cost itself as well.
 """
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel, summing_kernel
 from sfm_app.ransac.design import LANES, add_products, gather, mirror, weighted_gram
 from sfm_app.ransac.eigen import symmetric_eigen
+from sfm_app.ransac.leverage import mad_sigma
 from sfm_app.ransac.scoring import FIRST, distances_of_block, squared_distances
 
 FloatArray = NDArray[np.float64]
@@ -29,7 +28,6 @@ _NEGLIGIBLE = 1e-3
 _LEAST_SIGMA = 0.02
 """In thresholds: matches that are nearly perfect must not shut out all others."""
 _MOST_SHARE = 0.999
-_MAD_TO_SIGMA = 1.4826
 
 
 def refine_sampson(
@@ -70,7 +68,7 @@ def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach
     U, s, V = factors(F)
     squared = squared_distances(points, _compose(U, s, V))
     inside = squared[squared <= threshold * threshold]
-    sigma = _MAD_TO_SIGMA * math.sqrt(float(np.median(inside))) if len(inside) else threshold
+    sigma = mad_sigma(np.sqrt(inside)) if len(inside) else threshold
     law = np.array([0.0, (reach * threshold) ** 2, threshold**2, min(sigma, threshold) ** 2])
     return _reweighted(points, U, s, V, law, most_steps, _ENOUGH_LIKELIHOOD, np.empty((10, 10)))
 
