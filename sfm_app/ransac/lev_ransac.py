@@ -27,7 +27,7 @@ COARSE, FINE = 0.25, 0.1
 """Scales c in thresholds."""
 _WIDE, _AROUND = 2.0, 4.0
 """Thresholds within which matches take part in the 8-point fit, and in the Sampson steps after it."""
-_LOCAL_MATCHES, _LOCAL_STEPS, _ENOUGH = 500, (5, 3), 1e-3
+_LOCAL_MATCHES, _LOCAL_STEPS, _ENOUGH = 1000, (5, 3), 1e-3
 _REACH, _FINAL_STEPS = 3.0, 12
 
 
