@@ -21,7 +21,7 @@ class Best:
     f: FloatArray
     """(9,) entries of F, norm 1."""
     to_beat: FloatArray
-    """(2,) penalties that models of samples have to stay below: samples of all matches, and of the rest."""
+    """(2,) penalties that models of samples have to stay below, by kind (see `search.next_better`)."""
     samples: FloatArray
     """(2, 9) the models that hold these penalties."""
 
@@ -41,13 +41,13 @@ class Best:
         return float(np.mean(squared_distances(self._points, self.f) <= self._threshold**2))
 
     def meets(self, kind: int) -> bool:
-        """There is a new best sample of that kind (0: all matches, 1: the rest); whether the best model has changed."""
+        """There is a new best sample of that kind; whether the best model has changed."""
         if self._fine is None:
             self._replace(self.samples[kind].copy(), float(self.to_beat[kind]))
             return True
         if not self.challenged_by(self.samples[kind].reshape(3, 3)):
             return False
-        # the rest is another one now
+        # what the others have to come up to is another model now
         count = len(self._points)
         self.to_beat[1] = count * self.measure.worst - LENIENCE * (count * self.measure.worst - self.to_beat[0])
         return True

@@ -14,6 +14,8 @@ FloatArray = NDArray[np.float64]
 _SURE = 1400.0
 """z of a model that no further sample could shake."""
 _MOST = 3000.0
+_LEAST_IN_DOUBT = 250.0
+"""A quarter of them are samples of the rest; a motion that holds two thirds of it is in one of 17 of these."""
 _LEAST_INLIERS = 8
 
 
@@ -22,7 +24,8 @@ def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> floa
 
     Wrong models live on one plane, or on repeated structure, and have little else for them. The inliers off the
     dominant plane are counted in standard deviations z over what accident gives: right models of real photos have z of
-    40 to 300, wrong ones mostly less than 40. The patience is 3000 samples up to z = 26 and falls as 1 / z^2.
+    40 to 300, wrong ones mostly less than 40. The patience is 3000 samples up to z = 26 and falls as 1 / z^2. Where
+    most matches are not explained, another motion may hold them, and has to be given a chance to be sampled.
 
     Args:
         points: (N, 4) distinct matches in random order, N >= 7.
@@ -41,4 +44,5 @@ def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> floa
     count, agreeing = np.count_nonzero(off_plane), np.count_nonzero(off_plane & inliers)
     chance = accidental_share(wrong, threshold)
     z = (agreeing - count * chance) / math.sqrt(count * chance * (1 - chance) + 1)
-    return min((_SURE / max(z, 1.0)) ** 2, _MOST)
+    least = _LEAST_IN_DOUBT if 2 * np.count_nonzero(inliers) < len(points) else 0.0
+    return max(min((_SURE / max(z, 1.0)) ** 2, _MOST), least)

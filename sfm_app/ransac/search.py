@@ -46,16 +46,16 @@ def next_better(
 ) -> int:
     """Draw samples until one of its models has a smaller penalty than the best of its kind.
 
-    Samples of the rest are a kind of their own. A second motion, or what a wrong model took for outliers, would never
-    be found in competition with samples that the priors have made nearly perfect.
+    Samples that owe nothing to the priors are a kind of their own. A second motion, or what a wrong model took for
+    outliers, would never be found in competition with samples that the priors have made nearly perfect.
 
     Args:
         points: (N, 4) matches in random order, N >= the sample size; twice over, (2 N, 4), for a gate with a random
             start, so that any N rows on end are all of them.
         draws: how samples are drawn and models made.
         measure: the penalty.
-        gates: the tests that a model has to pass, of a sample of all matches and of one of the rest.
-        to_beat: (2,) smallest penalty so far of samples of all matches, and of the rest; lowered.
+        gates: the tests that a model has to pass, by the kind of its sample: 0, or 1 for those besides the priors.
+        to_beat: (2,) smallest penalty so far of each kind; lowered.
         limit: most samples.
         state: random generator.
         best: (2, 9) set to the better models.
@@ -73,9 +73,9 @@ def next_better(
         kind, drawn = 0, False
         if lot < guided:
             drawn = draw_weighted(state, draws.priors, sample)
-        elif lot < guided_or_rest:
-            drawn = draw_weighted(state, draws.rest, sample)
-            kind = 1 if drawn else 0
+        elif guided > 0.0:
+            kind = 1
+            drawn = lot < guided_or_rest and draw_weighted(state, draws.rest, sample)
         if not drawn:
             draw_uniform(state, count, sample)
         gate = gates[kind]

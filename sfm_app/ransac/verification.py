@@ -23,7 +23,7 @@ BLOCK = 64
 """Matches between two looks at whether to go on, where no test asks for more."""
 
 LENIENCE = 0.5
-"""Support that a model of the rest must have, over that of the best sample, to be looked at."""
+"""Support that a model besides the priors must have, over that of the best sample, to be looked at."""
 _BAIL_OUT_SIGMAS = 3.0
 
 
@@ -52,7 +52,7 @@ class Verifier(Protocol):
 
     gate: Gate
     lenient: Gate
-    """For models of the rest: what the best model leaves unexplained."""
+    """For models of samples that owe nothing to the priors."""
     review: int
     """Most trials between two calls of `learn`."""
 
