@@ -134,7 +134,7 @@ def test_a_batch_is_drawn_to_its_end_and_its_best_model_returned(batch, limit, d
     np.testing.assert_array_equal(to_beat, lowest)
 
 
-def test_samples_of_the_rest_compete_with_each_other_only():
+def test_samples_besides_the_priors_compete_with_each_other_only():
     pair = make_pair(PairOptions(points=300, outliers=0.5, sigma_px=0.0), 3)
     points = prepare(pair.x1, pair.x2, 0)
     rest = np.zeros(300)
@@ -148,11 +148,12 @@ def test_samples_of_the_rest_compete_with_each_other_only():
     assert to_beat[0] == 1e-12
     exact = squared_distances(points.points, best[1])[rest > 0]
     assert np.median(exact) < 1e-12
-    # fewer matches than a sample are no rest: all samples are of all matches
+    # fewer matches than a sample are no rest: uniform samples take their place, and their kind once there are priors
     few = draws._replace(rest=np.cumsum(np.arange(300) < 6).astype(np.float64))
-    best, to_beat = np.zeros((2, 9)), np.full(2, np.inf)
-    draw(points.points, few, to_beat, best)
-    assert to_beat[0] < np.inf == to_beat[1]
+    for guided_share, kind in ((1e-9, 1), (0.0, 0)):
+        best, to_beat = np.zeros((2, 9)), np.full(2, np.inf)
+        draw(points.points, few._replace(guided_share=guided_share), to_beat, best)
+        assert to_beat[kind] < np.inf == to_beat[1 - kind]
 
 
 class Script:
