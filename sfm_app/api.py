@@ -4,7 +4,7 @@ import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from sfm_app.plugins import load_plugins
 from sfm_app.progress import Progress, Silent
 from sfm_app.ransac import check_points
 from sfm_app.settings import Settings
-from sfm_app.types import Calibration, EpipolarFit, Intrinsics, Rejected, Scene
+from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Intrinsics, Rejected, Scene
 from sfm_app.workspace import Workspace
 
 PathLike = str | os.PathLike[str]
@@ -123,8 +123,9 @@ def estimate_fundamental(
 
 
 def calibrate_fundamentals(
-    Fs: ArrayLike | Sequence[ArrayLike], size: tuple[int, int], method: str = "zero-curves", *,
-    weights: ArrayLike | None = None, seed: int = 0, settings: Settings | None = None,
+    Fs: ArrayLike, size: tuple[int, int], method: str = "zero-curves", *,
+    weights: ArrayLike | None = None, matches: Sequence[ArrayLike] = (), photos: Sequence[tuple[int, int]] = (),
+    seed: int = 0, settings: Settings | None = None,
 ) -> Calibration:  # fmt: skip
     """Find the camera matrix that a set of fundamental matrices has in common.
 
@@ -133,6 +134,9 @@ def calibrate_fundamentals(
         size: (width, height) of the photos in pixels.
         method: name of a calibrator; `sfm-app plugins` lists them.
         weights: (P,) > 0, how far each matrix is trusted; equal where None.
+        matches: per matrix (N, 4) x1, y1, x2, y2 in pixels, the matches it rests on; they show the lens and say how
+            exact each matrix is.
+        photos: per matrix the numbers of its two photos.
         seed: same seed, same result.
         settings: the table `calibration` holds the limits.
 
@@ -140,10 +144,9 @@ def calibrate_fundamentals(
         ValueError: shapes are wrong or values are not finite.
         ConfigError: no calibrator has that name.
     """
-    matrices = np.asarray(Fs, np.float64)
-    trust = np.ones(len(matrices)) if weights is None else np.asarray(weights, np.float64)
-    options = (settings or Settings()).calibration
-    return load_plugins().calibrator(method).calibrate(matrices, trust, size, options, seed)
+    found = [np.asarray(pair, np.float64) for pair in matches]
+    pairs = replace(CameraPairs.of(Fs, size, weights), photos=tuple(photos), inliers=tuple(found))
+    return load_plugins().calibrator(method).calibrate(pairs, (settings or Settings()).calibration, seed)
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from sfm_app.meshing import EXPORTERS
 from sfm_app.ransac import ESTIMATORS
 from sfm_app.selfcal import CALIBRATORS
 from sfm_app.settings import CalibrationSettings, EpipolarSettings
-from sfm_app.types import Calibration, EpipolarFit, Rejected
+from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Rejected
 
 GROUP = "sfm_app"
 hookspec = pluggy.HookspecMarker(GROUP)
@@ -37,15 +37,13 @@ class FitFundamental(Protocol):
 
 
 class Calibrate(Protocol):
-    """Estimates one camera matrix from (P, 3, 3) fundamental matrices of pairs that share it.
+    """Estimates one camera matrix from the fundamental matrices of pairs that share it; same seed, same result.
 
-    `weights` (P,) > 0 say how far each F is trusted; `size` is (width, height) in pixels. Never raises on data: what is
-    not determined comes back with ``identifiable=False`` and a reason.
+    Never raises on data: what is not determined comes back with ``identifiable=False`` and a reason. ValueError on
+    malformed arrays; `sfm_app.selfcal.inputs.prepare` checks them.
     """
 
-    def __call__(
-        self, Fs: FloatArray, weights: FloatArray, size: tuple[int, int], options: CalibrationSettings, seed: int, /
-    ) -> Calibration: ...
+    def __call__(self, pairs: CameraPairs, options: CalibrationSettings, seed: int, /) -> Calibration: ...
 
 
 @dataclass(frozen=True, slots=True)

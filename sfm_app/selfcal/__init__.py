@@ -3,13 +3,13 @@
 from collections.abc import Callable
 
 from sfm_app.selfcal import zero_curves, zero_curves_thesis
-from sfm_app.selfcal.inputs import FloatArray, pair_weights
+from sfm_app.selfcal.inputs import pair_weights
 from sfm_app.settings import CalibrationSettings
-from sfm_app.types import Calibration
+from sfm_app.types import Calibration, CameraPairs
 
 __all__ = ["CALIBRATORS", "CalibrateFunction", "pair_weights"]
 
-CalibrateFunction = Callable[[FloatArray, FloatArray, tuple[int, int], CalibrationSettings, int], Calibration]
+CalibrateFunction = Callable[[CameraPairs, CalibrationSettings, int], Calibration]
 
 CALIBRATORS: dict[str, tuple[CalibrateFunction, str]] = {
     zero_curves.METHOD: (

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sfm_app.types import CameraPairs
+
 FloatArray = NDArray[np.float64]
 
 FULL_WEIGHT_INLIERS = 300
@@ -41,17 +43,13 @@ def pair_weights(inlier_counts: ArrayLike) -> FloatArray:
     return np.minimum(1.0, counts / FULL_WEIGHT_INLIERS)
 
 
-def prepare(
-    Fs: ArrayLike, weights: ArrayLike, size: tuple[int, int], *, unit_px: float, origin_px: tuple[float, float]
-) -> Pairs:
+def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float]) -> Pairs:
     """Check what a calibrator was given and express it in units of `unit_px` from `origin_px`.
 
     Pairs of weight 0 are left out, and so is an F that repeats another, in either direction: it is no further evidence.
 
     Args:
-        Fs: (P, 3, 3) in pixels, any scale; P may be 0.
-        weights: (P,), >= 0.
-        size: (width, height) in pixels.
+        pairs: P may be 0.
         unit_px: length that becomes 1, in pixels.
         origin_px: pixel that becomes (0, 0).
 
@@ -59,7 +57,7 @@ def prepare(
         ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size is not
             positive.
     """
-    raw, trust = _checked(Fs, weights, size)
+    raw, trust = _checked(pairs)
     to_pixels = np.array([[unit_px, 0.0, origin_px[0]], [0.0, unit_px, origin_px[1]], [0.0, 0.0, 1.0]])
     # scaled first, so that neither 1e-200 nor 1e200 over- or underflows in the products
     scaled = raw / np.max(np.abs(raw), axis=(1, 2), keepdims=True)
@@ -76,9 +74,10 @@ def prepare(
     )
 
 
-def _checked(Fs: ArrayLike, weights: ArrayLike, size: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    raw = np.asarray(Fs, dtype=np.float64)
-    trust = np.asarray(weights, dtype=np.float64)
+def _checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray]:
+    raw = np.asarray(pairs.Fs, dtype=np.float64)
+    trust = np.asarray(pairs.weights, dtype=np.float64)
+    size = pairs.size
     if raw.size == 0:
         raw = raw.reshape(0, 3, 3)
     if raw.ndim != 3 or raw.shape[1:] != (3, 3):

@@ -26,7 +26,7 @@ from sfm_app.selfcal.inputs import FloatArray, prepare
 from sfm_app.selfcal.joint import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, Consensus
 from sfm_app.selfcal.search import FOCAL_RANGE, SIGMAS, Peak, Profile, peaks, scan
 from sfm_app.settings import CalibrationSettings
-from sfm_app.types import Calibration
+from sfm_app.types import Calibration, CameraPairs
 
 METHOD = "zero-curves"
 SQUARE_PIXELS = (LOG_FOCAL, CENTRE_U, CENTRE_V)
@@ -63,15 +63,11 @@ class _Answer:
         return deviation(self.resampled[:, index], effective_count(self.votes), len(self.free))
 
 
-def calibrate(
-    Fs: FloatArray, weights: FloatArray, size: tuple[int, int], options: CalibrationSettings, seed: int
-) -> Calibration:
+def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
     """Find the K that most pairs agree on.
 
     Args:
-        Fs: (P, 3, 3) in pixels.
-        weights: (P,), >= 0; see `selfcal.pair_weights`.
-        size: (width, height) in pixels.
+        pairs: for their weights see `selfcal.pair_weights`.
         options: `centre_sigma` of the prior on the optical centre.
         seed: of the resampling behind `spread`.
 
@@ -81,18 +77,18 @@ def calibrate(
     Raises:
         ValueError: malformed input, see `selfcal.inputs.prepare`.
     """
-    width, height = size
+    width, height = size = pairs.size
     unit_px = float(max(size))
-    pairs = prepare(Fs, weights, size, unit_px=unit_px, origin_px=(width / 2, height / 2))
-    evidence = {"pairs": float(len(pairs))}
-    if len(pairs) < MIN_PAIRS:
-        return guessed(size, f"{len(pairs)} usable pairs, {MIN_PAIRS} are needed", evidence)
-    centre_sigma = options.centre_sigma if len(pairs) > FEW_PAIRS else min(options.centre_sigma, UNCROPPED_SIGMA)
-    consensus = Consensus(pairs, centre_sigma * width / unit_px)
+    usable = prepare(pairs, unit_px=unit_px, origin_px=(width / 2, height / 2))
+    evidence = {"pairs": float(len(usable))}
+    if len(usable) < MIN_PAIRS:
+        return guessed(size, f"{len(usable)} usable pairs, {MIN_PAIRS} are needed", evidence)
+    centre_sigma = options.centre_sigma if len(usable) > FEW_PAIRS else min(options.centre_sigma, UNCROPPED_SIGMA)
+    consensus = Consensus(usable, centre_sigma * width / unit_px)
     answer, gain = _found(consensus, seed)
     mass = float(np.sum(answer.votes))
     evidence |= {
-        "support": mass / float(np.sum(pairs.weights)),
+        "support": mass / float(np.sum(usable.weights)),
         "agreeing_pairs": effective_count(answer.votes),
         "lead": answer.lead,
         "lead_share": answer.lead / mass if mass > 0 else 0.0,
@@ -101,7 +97,7 @@ def calibrate(
         "log_focal_spread": answer.deviation(LOG_FOCAL),
     }
     reason = (
-        disagreement(answer.votes, pairs.weights)
+        disagreement(answer.votes, usable.weights)
         or indecision(answer.lead, answer.votes)
         or _objection(answer, (0.5 * width / unit_px, 0.5 * height / unit_px))
     )

@@ -13,11 +13,11 @@ from sfm_app.selfcal.answers import guessed
 from sfm_app.selfcal.consensus import meeting_point
 from sfm_app.selfcal.curves import centre_curves, focal_curves, usable
 from sfm_app.selfcal.evidence import best_rival, disagreement, indecision, votes
-from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
+from sfm_app.selfcal.inputs import Pairs, prepare
 from sfm_app.selfcal.joint import Consensus
 from sfm_app.selfcal.search import SIGMAS
 from sfm_app.settings import CalibrationSettings
-from sfm_app.types import Calibration
+from sfm_app.types import Calibration, CameraPairs
 
 METHOD = "zero-curves-thesis"
 FOCAL_RANGE = 3.0
@@ -35,17 +35,13 @@ class Found(NamedTuple):
     v: float
 
 
-def calibrate(
-    Fs: FloatArray, weights: FloatArray, size: tuple[int, int], options: CalibrationSettings, seed: int
-) -> Calibration:
+def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
     """Find K where the zero curves of all pairs meet (thesis Algorithm 4).
 
     The thesis gives every pair the same say: weights tell which pairs take part (> 0), and count in the verdict only.
 
     Args:
-        Fs: (P, 3, 3) in pixels.
-        weights: (P,), >= 0.
-        size: (width, height) in pixels.
+        pairs: F's and weights.
         options: `samples` along each curve.
         seed: unused, nothing is drawn at random.
 
@@ -57,21 +53,21 @@ def calibrate(
         ValueError: malformed input, see `selfcal.inputs.prepare`.
     """
     del seed
-    width, height = size
-    pairs = prepare(Fs, weights, size, unit_px=width, origin_px=(0.0, 0.0))
-    evidence = {"pairs": float(len(pairs))}
-    found = algorithm_4(pairs, height / width, options.samples, evidence)
+    width, height = size = pairs.size
+    usable = prepare(pairs, unit_px=width, origin_px=(0.0, 0.0))
+    evidence = {"pairs": float(len(usable))}
+    found = algorithm_4(usable, height / width, options.samples, evidence)
     if isinstance(found, str):
         return guessed(size, found, evidence)
     fx, fy, cx, cy = (width * value for value in found)
     evidence |= {"fx_px": fx, "fy_px": fy, "cx_px": cx, "cy_px": cy}
     theta = np.array([0.5 * np.log(found.fx * found.fy), found.u, found.v, np.log(found.fy / found.fx)])
     # the wider sigma: a sample of a curve is no maximum, and must not be held against the last per cent
-    consensus, sigmas = Consensus(pairs, np.inf), SIGMAS[:1]
+    consensus, sigmas = Consensus(usable, np.inf), SIGMAS[:1]
     given = votes(consensus, theta, sigmas[-1])
     lead = float(np.sum(given)) - best_rival(consensus, theta, range(4), sigmas)
-    evidence |= {"support": float(np.sum(given) / np.sum(pairs.weights)), "lead": lead}
-    reason = disagreement(given, pairs.weights) or indecision(lead, given)
+    evidence |= {"support": float(np.sum(given) / np.sum(usable.weights)), "lead": lead}
+    reason = disagreement(given, usable.weights) or indecision(lead, given)
     if reason:
         return guessed(size, reason, evidence)
     K = camera_matrix(fx, fy, cx, cy)

@@ -10,7 +10,7 @@ from sfm_app.colmap.database import write_calibrations
 from sfm_app.context import RunContext
 from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.selfcal import pair_weights
-from sfm_app.types import Calibration, Intrinsics, MatchedImage, MatchGraph, ViewGraph
+from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, ViewGraph
 
 
 def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
@@ -19,7 +19,7 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
     for image in matches.images.values():
         groups.setdefault(image.group, []).append(image)
     by_size = sorted(groups, key=lambda name: (-len(groups[name]), name))
-    cameras = {name: calibrate_group(groups[name], views, run) for name in by_size}
+    cameras = {name: calibrate_group(groups[name], matches, views, run) for name in by_size}
     intrinsics = Intrinsics(cameras)
     run.record(
         cameras={name: _summary(camera) for name, camera in cameras.items()},
@@ -33,16 +33,20 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
     return intrinsics
 
 
-def calibrate_group(images: list[MatchedImage], views: ViewGraph, run: RunContext) -> Calibration:
+def calibrate_group(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph, run: RunContext) -> Calibration:
     """K of the photos of one camera."""
     ids = {image.id for image in images}
-    fits = [fit for pair, fit in views.fits.items() if ids.issuperset(pair) and not fit.degeneracy]
+    fits = {pair: fit for pair, fit in views.fits.items() if ids.issuperset(pair) and not fit.degeneracy}
+    pairs = CameraPairs(
+        Fs=np.array([fit.F for fit in fits.values()], np.float64).reshape(-1, 3, 3),
+        weights=pair_weights(np.array([fit.inlier_count for fit in fits.values()], np.int64)),
+        size=(images[0].width, images[0].height),
+        photos=tuple(fits),
+        inliers=tuple(np.hstack(matches.points(pair))[fit.inliers] for pair, fit in fits.items()),
+        focal_hints_px=tuple(image.exif_focal_px for image in images if image.exif_focal_px),
+    )
     options = run.settings.calibration
-    calibrator = run.plugins.calibrator(options.calibrator)
-    Fs = np.array([fit.F for fit in fits], np.float64).reshape(-1, 3, 3)
-    weights = pair_weights(np.array([fit.inlier_count for fit in fits], np.int64))
-    size = (images[0].width, images[0].height)
-    found = calibrator.calibrate(Fs, weights, size, options, run.seed)
+    found = run.plugins.calibrator(options.calibrator).calibrate(pairs, options, run.seed)
     return found if found.identifiable else fall_back(found, images)
 
 

@@ -9,6 +9,7 @@ Conventions, said once:
 """
 
 from sfm_app.types.calibration import Calibration, Intrinsics
+from sfm_app.types.camera_pairs import CameraPairs
 from sfm_app.types.epipolar import EpipolarFit, Rejected, ViewGraph
 from sfm_app.types.matches import MatchedImage, MatchGraph, PairId
 from sfm_app.types.photos import Photo, PhotoSet, UnusablePhoto
@@ -18,6 +19,7 @@ from sfm_app.types.surface import Surface
 __all__ = [
     "Calibration",
     "CameraModel",
+    "CameraPairs",
     "EpipolarFit",
     "Intrinsics",
     "MatchGraph",

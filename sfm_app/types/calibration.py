@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.types.matches import PairId
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
@@ -22,8 +24,14 @@ class Calibration:
     """False when the fundamental matrices do not determine K; K is then a guess."""
     reason: str = ""
     """Why K is not identifiable; empty when it is."""
+    radial: float = 0.0
+    """k1 of COLMAP's SIMPLE_RADIAL: x_d = x_u (1 + k1 r^2) with r in focal lengths; 0 where no lens was sought."""
     spread: Mapping[str, float] = field(default_factory=dict)
-    """Standard deviations in pixels ("fx", "fy", "cx", "cy") where the calibrator estimates them."""
+    """Standard deviations where the calibrator estimates them: "fx", "fy", "cx", "cy" in pixels, "k1"."""
+    held: tuple[str, ...] = ()
+    """What the photos do not determine and so stays near its prior: "centre", "aspect", "k1"."""
+    key_pairs: tuple[PairId, ...] = ()
+    """Pairs of photos that a reconstruction starts from best, by what they say about K; best first."""
     evidence: Mapping[str, float] = field(default_factory=dict)
     """Named figures that support K: pairs used, support at the peak, ..."""
 
@@ -35,12 +43,16 @@ class Calibration:
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         plain = {field.name: getattr(self, field.name) for field in fields(self)}
-        return plain | {"K": self.K.tolist(), "spread": dict(self.spread), "evidence": dict(self.evidence)}
+        tables = {"K": self.K.tolist(), "spread": dict(self.spread), "evidence": dict(self.evidence)}
+        return plain | tables | {"held": list(self.held), "key_pairs": [list(pair) for pair in self.key_pairs]}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Calibration":
         """Back from `to_dict`."""
-        return cls(**{**values, "K": np.array(values["K"], np.float64)})
+        pairs = tuple((int(first), int(second)) for first, second in values["key_pairs"])
+        return cls(
+            **{**values, "K": np.array(values["K"], np.float64), "held": tuple(values["held"]), "key_pairs": pairs}
+        )
 
 
 @dataclass(frozen=True, slots=True)

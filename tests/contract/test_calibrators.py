@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import CalibrationSettings
-from sfm_app.types import Calibration
+from sfm_app.types import Calibration, CameraPairs
 
 CALIBRATORS = load_plugins().calibrators
 OPTIONS = CalibrationSettings()
@@ -63,7 +63,7 @@ def calibrate(request):
 
 
 def run(calibrate, Fs, seed=0, weights=None, size=SIZE):
-    return calibrate(Fs, np.ones(len(Fs)) if weights is None else weights, size, OPTIONS, seed)
+    return calibrate(CameraPairs.of(Fs, size, weights), OPTIONS, seed)
 
 
 def is_well_formed(found):
@@ -144,7 +144,7 @@ def test_matrices_and_weights_that_are_not_finite_are_refused(calibrate, bad):
 )
 def test_malformed_input_is_refused(calibrate, Fs, weights, size):
     with pytest.raises(ValueError, match=r"shape|zero|weights|size"):
-        calibrate(Fs, weights, size, OPTIONS, 0)
+        calibrate(CameraPairs.of(Fs, size, weights), OPTIONS, 0)
 
 
 def test_scale_sign_order_and_direction_do_not_matter(calibrate):

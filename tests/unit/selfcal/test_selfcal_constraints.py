@@ -7,13 +7,16 @@ from hypothesis import strategies as st
 
 from sfm_app.selfcal.constraints import centre_polynomials, focal_polynomials, singular_value_ratio
 from sfm_app.selfcal.inputs import prepare
+from sfm_app.types import CameraPairs
 
 seeds = st.integers(0, 2**32 - 1)
 
 
 def random_pairs(seed, count=3):
     rng = np.random.default_rng(seed)
-    return prepare(rng.normal(size=(count, 3, 3)), np.ones(count), (1, 1), unit_px=1.0, origin_px=(0.0, 0.0))
+    return prepare(
+        CameraPairs.of(rng.normal(size=(count, 3, 3)), (1, 1), np.ones(count)), unit_px=1.0, origin_px=(0.0, 0.0)
+    )
 
 
 def essential(F, fx, fy, u, v):
@@ -66,7 +69,7 @@ def test_every_swept_sample_has_its_polynomial():
 
 def test_the_true_camera_satisfies_the_constraint(views):
     made = views(4, noise=0.0, focal=900, aspect=1.2, centre=(420, 400))
-    pairs = prepare(made.Fs, made.weights, made.size, unit_px=1000.0, origin_px=(0.0, 0.0))
+    pairs = prepare(CameraPairs.of(made.Fs, made.size, made.weights), unit_px=1000.0, origin_px=(0.0, 0.0))
     K = made.K / 1000
     for i in range(len(pairs)):
         assert ratio(pairs, i, K[0, 0], K[1, 1], K[0, 2], K[1, 2]) < 1e-6
@@ -75,12 +78,14 @@ def test_the_true_camera_satisfies_the_constraint(views):
 
 def test_translation_satisfies_it_with_any_camera(views):
     made = views(3, noise=0.0, motion=views.translation)
-    pairs = prepare(made.Fs, made.weights, made.size, unit_px=1000.0, origin_px=(0.0, 0.0))
+    pairs = prepare(CameraPairs.of(made.Fs, made.size, made.weights), unit_px=1000.0, origin_px=(0.0, 0.0))
     assert ratio(pairs, 0, 0.4, 2.0, 0.9, -0.3) < 1e-6
     assert not np.any(focal_polynomials(pairs, np.array([0.3, 1.0, 3.0]), (0.5, 0.4)))
     assert not np.any(centre_polynomials(pairs, np.array([0.3, 1.0]), (1.0, 1.1)))
 
 
 def test_a_matrix_of_rank_one_is_as_far_from_it_as_can_be():
-    pairs = prepare(np.outer([1, 2, 3], [4, 5, 6])[None], [1.0], (1, 1), unit_px=1.0, origin_px=(0.0, 0.0))
+    pairs = prepare(
+        CameraPairs.of(np.outer([1, 2, 3], [4, 5, 6])[None], (1, 1), [1.0]), unit_px=1.0, origin_px=(0.0, 0.0)
+    )
     assert ratio(pairs, 0, 1.0, 1.0, 0.0, 0.0) == pytest.approx(1)

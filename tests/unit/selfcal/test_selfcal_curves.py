@@ -7,10 +7,11 @@ from hypothesis import strategies as st
 
 from sfm_app.selfcal.curves import centre_curves, companion_roots, degeneracy, focal_curves, usable
 from sfm_app.selfcal.inputs import prepare
+from sfm_app.types import CameraPairs
 
 
 def in_widths(made):
-    return prepare(made.Fs, made.weights, made.size, unit_px=made.size[0], origin_px=(0.0, 0.0))
+    return prepare(CameraPairs.of(made.Fs, made.size, made.weights), unit_px=made.size[0], origin_px=(0.0, 0.0))
 
 
 @settings(max_examples=40, deadline=None)
@@ -73,7 +74,7 @@ def test_degeneracy_is_the_share_out_of_range():
 
 
 def test_no_pairs_no_curves():
-    pairs = prepare(np.empty((0, 3, 3)), [], (4, 3), unit_px=4.0, origin_px=(0.0, 0.0))
+    pairs = prepare(CameraPairs.of(np.empty((0, 3, 3)), (4, 3), []), unit_px=4.0, origin_px=(0.0, 0.0))
     assert focal_curves(pairs, np.ones(7), (0.5, 0.4)).shape == (0, 7)
     assert centre_curves(pairs, np.ones(7), (1.0, 1.0)).shape == (0, 7)
     assert len(usable(np.empty((0, 7)), 3.0)) == 0

@@ -17,6 +17,7 @@ from sfm_app.selfcal.evidence import (
 from sfm_app.selfcal.inputs import prepare
 from sfm_app.selfcal.joint import Consensus
 from sfm_app.selfcal.search import FOCAL_RANGE, FOCALS, SIGMAS, peaks, scan
+from sfm_app.types import CameraPairs
 
 FREE = (0, 1, 2)
 
@@ -26,7 +27,7 @@ def consensus(views):
     def make(**knobs):
         made = views(**knobs)
         frame = {"unit_px": float(made.size[0]), "origin_px": (made.size[0] / 2, made.size[1] / 2)}
-        return Consensus(prepare(made.Fs, made.weights, made.size, **frame), 0.15)
+        return Consensus(prepare(CameraPairs.of(made.Fs, made.size, made.weights), **frame), 0.15)
 
     return make
 

@@ -5,12 +5,13 @@ import pytest
 
 from sfm_app.selfcal.zero_curves_thesis import METHOD, calibrate
 from sfm_app.settings import CalibrationSettings
+from sfm_app.types import CameraPairs
 
 OPTIONS = CalibrationSettings()
 
 
 def run(made, options=OPTIONS, seed=0):
-    return calibrate(made.Fs, made.weights, made.size, options, seed)
+    return calibrate(CameraPairs.of(made.Fs, made.size, made.weights), options, seed)
 
 
 @pytest.mark.parametrize("aspect", [0.8, 1.0, 1.2])
@@ -39,7 +40,7 @@ def test_outlying_curves_are_outvoted(views, random_fundamentals):
     made = views(6, noise=3e-4)
     Fs = made.Fs.copy()
     Fs[:3] = random_fundamentals(3)
-    found = calibrate(Fs, made.weights, made.size, OPTIONS, 0)
+    found = calibrate(CameraPairs.of(Fs, made.size, made.weights), OPTIONS, 0)
     assert found.identifiable
     assert found.K[0, 0] == pytest.approx(1000, rel=0.07)
     assert found.K[1, 1] == pytest.approx(1000, rel=0.07)

@@ -1,0 +1,35 @@
+"""Pairs of photos that one camera took: what a calibrator works from."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sfm_app.types.matches import PairId
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPairs:
+    """Fundamental matrices of pairs with the same camera, and what is known about each.
+
+    Nothing is checked here: a calibrator refuses malformed values with a ValueError, see `selfcal.inputs.prepare`.
+    """
+
+    Fs: NDArray[np.float64]
+    """(P, 3, 3) in pixels, x2' F x1 = 0, any scale."""
+    weights: NDArray[np.float64]
+    """(P,) >= 0, how far each F is trusted."""
+    size: tuple[int, int]
+    """(width, height) of the photos in pixels."""
+    photos: tuple[PairId, ...] = ()
+    """Per pair the ids of its two photos; empty where nobody knows."""
+    inliers: tuple[NDArray[np.float64], ...] = ()
+    """Per pair (N, 4) x1, y1, x2, y2 in pixels: the matches that F rests on; empty where only the F's are known."""
+    focal_hints_px: tuple[float, ...] = field(default=())
+    """Focals that somebody claims (EXIF), in pixels, one per photo that has one. Never trusted."""
+
+    @classmethod
+    def of(cls, Fs: ArrayLike, size: tuple[int, int], weights: ArrayLike | None = None) -> "CameraPairs":
+        """From matrices alone, all trusted alike unless `weights` (P,) says otherwise."""
+        matrices = np.asarray(Fs, np.float64)
+        return cls(matrices, np.ones(len(matrices)) if weights is None else np.asarray(weights, np.float64), size)
