@@ -27,6 +27,8 @@ class Pairs:
     """(P,) products of the two non-zero singular values of F."""
     weights: FloatArray
     """(P,) how far each F is trusted, > 0."""
+    kept: NDArray[np.int64]
+    """(P,) which of the given matrices these are."""
 
     def __len__(self) -> int:
         return len(self.F)
@@ -57,7 +59,7 @@ def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float
         ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size is not
             positive.
     """
-    raw, trust = _checked(pairs)
+    raw, trust, used = _checked(pairs)
     to_pixels = np.array([[unit_px, 0.0, origin_px[0]], [0.0, unit_px, origin_px[1]], [0.0, 0.0, 1.0]])
     # scaled first, so that neither 1e-200 nor 1e200 over- or underflows in the products
     scaled = raw / np.max(np.abs(raw), axis=(1, 2), keepdims=True)
@@ -71,10 +73,11 @@ def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float
         e2=U[:, :, 2],
         product=s[:, 0] * s[:, 1],
         weights=trust,
+        kept=used[distinct],
     )
 
 
-def _checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray]:
+def _checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     raw = np.asarray(pairs.Fs, dtype=np.float64)
     trust = np.asarray(pairs.weights, dtype=np.float64)
     size = pairs.size
@@ -92,8 +95,14 @@ def _checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray]:
         raise ValueError("a fundamental matrix is zero")
     if len(size) != 2 or not all(np.isfinite(side) and side > 0 for side in size):
         raise ValueError(f"size must be (width, height) in pixels, both > 0, not {size}")
-    used = trust > 0
-    return raw[used], trust[used]
+    if pairs.inliers and len(pairs.inliers) != len(raw):
+        raise ValueError(f"inliers of {len(pairs.inliers)} pairs were given for {len(raw)} fundamental matrices")
+    if any(x.ndim != 2 or x.shape[1] != 4 or not np.all(np.isfinite(x)) for x in map(np.asarray, pairs.inliers)):
+        raise ValueError("inliers must have shape (N, 4) per pair and be finite")
+    if pairs.photos and len(pairs.photos) != len(raw):
+        raise ValueError(f"photos of {len(pairs.photos)} pairs were given for {len(raw)} fundamental matrices")
+    used = np.flatnonzero(trust > 0)
+    return raw[used], trust[used], used
 
 
 def _distinct(scaled: FloatArray) -> NDArray[np.int64]:

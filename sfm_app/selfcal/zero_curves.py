@@ -1,75 +1,46 @@
-"""Zero Curves as the product uses it: the consensus of thesis (5.33) over all of K at once, and a verdict on it.
+"""Zero Curves as the product uses it: thesis (5.33) over all of K at once, then the matches themselves, then a verdict.
 
-Beyond the thesis: the centre is sought together with the focal (cropped photos), fy/fx is freed only where that is
-clearly better (squeezed photos), and an answer that the pairs do not determine is not given.
+Beyond the thesis: the centre is sought together with the focal (cropped photos), fy/fx and a lens are freed where the
+photos ask for it, every parameter comes with a standard deviation, and an answer that the pairs do not determine is not
+given. The consensus of the pairs finds the camera from nothing; the adjustment of `refine` makes it exact.
 """
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.selfcal.answers import guessed
-from sfm_app.selfcal.evidence import (
-    RIVAL_RATIO,
-    best_rival,
-    deviation,
-    disagreement,
-    effective_count,
-    indecision,
-    own_sigma,
-    resampled,
-    spread_px,
-    votes,
-)
-from sfm_app.selfcal.inputs import FloatArray, prepare
-from sfm_app.selfcal.joint import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, Consensus
-from sfm_app.selfcal.search import FOCAL_RANGE, SIGMAS, Peak, Profile, peaks, scan
+from sfm_app.selfcal import peak
+from sfm_app.selfcal.adjustment import Matches
+from sfm_app.selfcal.answers import calibration_of, guessed
+from sfm_app.selfcal.evidence import effective_count, spread_px
+from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
+from sfm_app.selfcal.joint import Consensus
+from sfm_app.selfcal.lens import KAPPA, LOG_FOCAL
+from sfm_app.selfcal.priors import CENTRE, LENS, NAMES, USUAL_FOCAL, Usual
+from sfm_app.selfcal.refine import Fit, refined, straight_fundamentals
+from sfm_app.selfcal.uncertainty import covariance, key_pairs, spread_of
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
 METHOD = "zero-curves"
-SQUARE_PIXELS = (LOG_FOCAL, CENTRE_U, CENTRE_V)
-ANY_PIXELS = (*SQUARE_PIXELS, LOG_ASPECT)
-LOG_ASPECTS = tuple(np.linspace(-0.6, 0.6, 9))
-"""log fy/fx on the grid: 0.55 to 1.8."""
-ASPECT_GAIN = float(np.log(50))
-"""Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square."""
 MIN_PAIRS = 3
 """Each F gives two constraints; below three pairs nothing is left to contradict a wrong K."""
 FEW_PAIRS = 3
-"""So many pairs fit almost any centre: it is then held where photos that nobody cropped have it."""
+"""So many pairs fit almost any centre: without their matches it is held where uncropped photos have it."""
 UNCROPPED_SIGMA = 0.02
 """Standard deviation of the centre of such photos about the middle, in widths."""
-MAX_LOG_FOCAL_SPREAD = 0.1
-"""Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess."""
-EDGE = 1.02
-"""A focal within this factor of an end of the range has run there."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Answer:
-    """A peak with everything that the verdict needs."""
-
-    theta: FloatArray
-    free: tuple[int, ...]
-    sigma: float
-    lead: float
-    votes: FloatArray
-    resampled: FloatArray
-
-    def deviation(self, index: int) -> float:
-        """Standard deviation of one entry of theta."""
-        return deviation(self.resampled[:, index], effective_count(self.votes), len(self.free))
+ELSEWHERE = float(np.log(1.1))
+"""A consensus on straightened photos that lies this far in log f from the adjusted camera is tried as a start."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Find the K that most pairs agree on.
+    """Find the K that most pairs agree on, and the lens.
 
     Args:
-        pairs: for their weights see `selfcal.pair_weights`.
+        pairs: for their weights see `selfcal.pair_weights`. Without inliers nothing is known about a lens, and the
+            standard deviations come from resampling the pairs.
         options: `centre_sigma` of the prior on the optical centre.
-        seed: of the resampling behind `spread`.
+        seed: of that resampling.
 
     Returns:
         K with ``identifiable=True``, or a guess and the reason why the pairs do not determine K.
@@ -77,75 +48,107 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
     Raises:
         ValueError: malformed input, see `selfcal.inputs.prepare`.
     """
-    width, height = size = pairs.size
-    unit_px = float(max(size))
-    usable = prepare(pairs, unit_px=unit_px, origin_px=(width / 2, height / 2))
+    usable = _prepared(pairs)
     evidence = {"pairs": float(len(usable))}
     if len(usable) < MIN_PAIRS:
-        return guessed(size, f"{len(usable)} usable pairs, {MIN_PAIRS} are needed", evidence)
+        return guessed(pairs.size, f"{len(usable)} usable pairs, {MIN_PAIRS} are needed", evidence)
+    if pairs.inliers:
+        return _from_matches(pairs, usable, options, evidence)
+    return _from_fundamentals(pairs, usable, options, seed)
+
+
+def _from_fundamentals(pairs: CameraPairs, usable: Pairs, options: CalibrationSettings, seed: int) -> Calibration:
+    """The peak of the consensus, when the matrices are all that is known."""
+    side = float(max(pairs.size))
     centre_sigma = options.centre_sigma if len(usable) > FEW_PAIRS else min(options.centre_sigma, UNCROPPED_SIGMA)
-    consensus = Consensus(usable, centre_sigma * width / unit_px)
-    answer, gain = _found(consensus, seed)
-    mass = float(np.sum(answer.votes))
-    evidence |= {
-        "support": mass / float(np.sum(usable.weights)),
-        "agreeing_pairs": effective_count(answer.votes),
-        "lead": answer.lead,
-        "lead_share": answer.lead / mass if mass > 0 else 0.0,
-        "sigma": answer.sigma,
-        "aspect_gain": gain,
-        "log_focal_spread": answer.deviation(LOG_FOCAL),
-    }
+    consensus = Consensus(usable, centre_sigma * pairs.size[0] / side)
+    answer = peak.found(consensus)
+    scatter = answer.scatter(consensus, seed)
+    log_focal_spread = answer.deviation(scatter[:, LOG_FOCAL])
+    evidence = {"pairs": float(len(usable)), **answer.evidence(usable.weights), "log_focal_spread": log_focal_spread}
+    reason = answer.contradicted(usable.weights) or peak.objection(answer.theta, log_focal_spread, _half(pairs.size))
+    if reason:
+        return guessed(pairs.size, reason, evidence)
+    spread = spread_px(scatter, side, effective_count(answer.votes), len(answer.free))
+    found = calibration_of(np.append(answer.theta, 0.0), pairs.size, METHOD)
+    return replace(found, spread=spread, evidence=evidence)
+
+
+def _from_matches(
+    pairs: CameraPairs, usable: Pairs, options: CalibrationSettings, evidence: dict[str, float]
+) -> Calibration:
+    """The consensus finds where to begin; the matches say the rest; a consensus without the lens has the last word."""
+    side = float(max(pairs.size))
+    sigma = options.centre_sigma * pairs.size[0] / side
+    hint = float(np.median(pairs.focal_hints_px)) / side if pairs.focal_hints_px else np.nan
+    usual = Usual(np.ones(1), np.array([hint]), sigma)
+    matches, Fs = _in_sides(pairs, usable)
+    answer = peak.found(Consensus(usable, sigma))
+    plain = np.array([USUAL_FOCAL, 0.0, 0.0, 0.0])
+    starts = [np.append(theta, 0.0)[None] for theta in (answer.theta, *answer.others[:1], plain)]
+    fit = refined(matches, Fs, starts, usual)
+    judged = usable
+    if fit.free[0, LENS]:
+        judged = _prepared(replace(pairs, Fs=_in_pixels(straight_fundamentals(fit), pairs), weights=usable.weights))
+        answer = peak.found(Consensus(judged, sigma))
+        if abs(answer.theta[LOG_FOCAL] - fit.state.thetas[0, LOG_FOCAL]) > ELSEWHERE:
+            again = np.append(answer.theta, fit.state.thetas[0, KAPPA])
+            fit = refined(matches, Fs, [fit.state.thetas, again[None]], usual)
+    theta, cov = fit.state.thetas[0], covariance(fit, np.ones(1))
+    evidence |= {**answer.evidence(judged.weights), **_figures(fit, side, float(np.sqrt(cov[LOG_FOCAL, LOG_FOCAL])))}
     reason = (
-        disagreement(answer.votes, usable.weights)
-        or indecision(answer.lead, answer.votes)
-        or _objection(answer, (0.5 * width / unit_px, 0.5 * height / unit_px))
+        answer.contradicted(judged.weights)
+        or _split(theta, answer.theta)
+        or peak.objection(theta, evidence["log_focal_spread"], _half(pairs.size))
     )
     if reason:
-        return guessed(size, reason, evidence)
-    f, a = np.exp(answer.theta[LOG_FOCAL]) * unit_px, np.exp(0.5 * answer.theta[LOG_ASPECT])
-    centre = unit_px * answer.theta[CENTRE_U : CENTRE_V + 1] + np.array([width, height]) / 2
-    K = camera_matrix(f / a, f * a, centre[0], centre[1])
-    spread = spread_px(answer.resampled, unit_px, effective_count(answer.votes), len(answer.free))
-    return Calibration(K, width, height, METHOD, identifiable=True, spread=spread, evidence=evidence)
-
-
-def _found(consensus: Consensus, seed: int) -> tuple[_Answer, float]:
-    """The answer with square pixels, or, where the pairs clearly ask for it, with any; and what freeing fy/fx gains."""
-    profile = scan(consensus, (0.0,))
-    square = peaks(consensus, profile, SQUARE_PIXELS)
-    free_profile = scan(consensus, LOG_ASPECTS)
-    free = peaks(consensus, free_profile, ANY_PIXELS)
-    # both are measured with the width that suits the freer one, or a wrong square answer would choose a lenient width
-    sigmas = (own_sigma(consensus, free[0].theta),)
-    theta, value = consensus.climb(square[0].theta, SQUARE_PIXELS, sigmas)
-    gain = max(consensus.climb(start, ANY_PIXELS, sigmas)[1] for start in (theta, free[0].theta)) - value
-    if gain >= ASPECT_GAIN:
-        return _examined(consensus, free, free_profile, ANY_PIXELS, seed), gain
-    return _examined(consensus, square, profile, SQUARE_PIXELS, seed), gain
-
-
-def _examined(consensus: Consensus, found: list[Peak], profile: Profile, free: tuple[int, ...], seed: int) -> _Answer:
-    """Refine the highest peak to the width that its own pairs ask for, and collect what speaks for it."""
-    best = found[0]
-    sigma = own_sigma(consensus, best.theta)
-    theta, _ = consensus.climb(best.theta, free, (sigma,))
-    value = float(consensus.at(theta[None, :], SIGMAS[-1])[0])
-    far = [peak.value for peak in found[1:] if abs(peak.theta[LOG_FOCAL] - theta[LOG_FOCAL]) > np.log(RIVAL_RATIO)]
-    lead = value - max([best_rival(consensus, theta, free, SIGMAS, profile), *far])
-    return _Answer(
-        theta, free, sigma, lead, votes(consensus, theta, SIGMAS[-1]), resampled(consensus, theta, free, sigma, seed)
+        return guessed(pairs.size, reason, evidence)
+    found = calibration_of(theta, pairs.size, METHOD)
+    held = tuple(NAMES[place] for place in range(CENTRE, LENS + 1) if not fit.free[0, place])
+    photos = tuple(pairs.photos[k] for k in usable.kept) if pairs.photos else ()
+    return replace(
+        found, spread=spread_of(theta, cov, side), evidence=evidence, held=held, key_pairs=key_pairs(fit, photos)
     )
 
 
-def _objection(answer: _Answer, half_size: tuple[float, float]) -> str:
-    """Why an answer that the pairs agree on is not to be trusted, or nothing."""
-    focal, (low, high) = float(np.exp(answer.theta[LOG_FOCAL])), FOCAL_RANGE
-    if not low * EDGE < focal < high / EDGE:
-        return f"the focal runs to the end of the range, {focal:.2f} longer sides"
-    if np.any(np.abs(answer.theta[CENTRE_U : CENTRE_V + 1]) > half_size):
-        return "the optical centre runs out of the photo"
-    uncertainty = answer.deviation(LOG_FOCAL)
-    if uncertainty > MAX_LOG_FOCAL_SPREAD:
-        return f"the focal is uncertain by {100 * uncertainty:.0f} %"
-    return ""
+def _prepared(pairs: CameraPairs) -> Pairs:
+    width, height = pairs.size
+    return prepare(pairs, unit_px=float(max(pairs.size)), origin_px=(width / 2, height / 2))
+
+
+def _in_sides(pairs: CameraPairs, usable: Pairs) -> tuple[Matches, FloatArray]:
+    """Inliers and F's of the usable pairs in longer sides about the middle."""
+    side = float(max(pairs.size))
+    middle = np.tile(np.array(pairs.size) / 2, 2)
+    inliers = [(np.asarray(pairs.inliers[k], np.float64) - middle) / side for k in usable.kept]
+    count = len(usable)
+    photos = np.array([pairs.photos[k] for k in usable.kept]) if pairs.photos else np.arange(2 * count).reshape(-1, 2)
+    return Matches(inliers, np.zeros((count, 2), np.int64), photos, side), usable.F
+
+
+def _in_pixels(Fs: FloatArray, pairs: CameraPairs) -> FloatArray:
+    side = float(max(pairs.size))
+    to_sides = np.array([[1 / side, 0, -pairs.size[0] / 2 / side], [0, 1 / side, -pairs.size[1] / 2 / side], [0, 0, 1]])
+    return np.asarray(to_sides.T @ Fs @ to_sides, np.float64)
+
+
+def _figures(fit: Fit, side: float, log_focal_spread: float) -> dict[str, float]:
+    return {
+        "log_focal_spread": log_focal_spread,
+        "noise_px": fit.state.sigma * side,
+        "conflict": fit.state.scale,
+        "weight": float(np.sum(fit.state.weights)),
+        "gain": fit.gain,
+    }
+
+
+def _split(adjusted: FloatArray, agreed: FloatArray) -> str:
+    """Why the matches and the consensus of their F's do not name one camera, or nothing."""
+    ratio = float(np.exp(abs(adjusted[LOG_FOCAL] - agreed[LOG_FOCAL])))
+    if ratio < 1.25:
+        return ""
+    return f"the pairs agree on one focal and their matches on another, {ratio:.1f} times away"
+
+
+def _half(size: tuple[int, int]) -> tuple[float, float]:
+    return 0.5 * size[0] / max(size), 0.5 * size[1] / max(size)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal import pair_weights, zero_curves
+from sfm_app.selfcal import pair_weights
 from sfm_app.selfcal.zero_curves import METHOD, calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import CameraPairs
@@ -170,21 +170,6 @@ def test_the_prior_is_measured_in_widths(views):
     )
     assert lying.identifiable
     np.testing.assert_allclose(swap @ standing.K @ swap, lying.K, rtol=1e-3)
-
-
-def test_what_the_pairs_agree_on_can_still_be_wrong():
-    def objection(theta, scatter=0.001):
-        thetas = np.array(theta) + scatter * np.linspace(-1, 1, 25)[:, None]
-        answer = zero_curves._Answer(np.array(theta), (0, 1, 2), 0.01, 5.0, np.ones(10), thetas)
-        return zero_curves._objection(answer, (0.5, 0.375))
-
-    assert objection([0.0, 0.49, -0.37, 0.0]) == ""
-    assert objection([0.0, 0.0, 0.0, 0.0], scatter=0.1) == ""
-    assert "uncertain by 1" in objection([0.0, 0.0, 0.0, 0.0], scatter=0.2)
-    assert "end of the range" in objection([np.log(0.3), 0.0, 0.0, 0.0])
-    assert "end of the range" in objection([np.log(5.1), 0.0, 0.0, 0.0])
-    assert "centre" in objection([0.0, 0.51, 0.0, 0.0])
-    assert "centre" in objection([0.0, 0.0, -0.38, 0.0])
 
 
 def test_seed_changes_the_spread_only(views):

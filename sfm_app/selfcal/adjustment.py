@@ -1,0 +1,226 @@
+"""Cameras and relative poses of all pairs adjusted to their matches at once: bundle adjustment without points.
+
+Every pair has its own relative pose, which is eliminated (Schur complement): what is left of a pair is what it says
+about the cameras, one Hessian and one gradient. A pair whose matches are right but whose geometry is not (repeated
+facades, another camera, a zoom) pulls at the cameras far harder than its noise allows; it is recognised by that and
+weighs less.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.selfcal.two_view_cost import CAMERA, distances, moved, pair_costs, pair_systems
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+MOST_MATCHES = 1000
+"""Of one pair; more of them are not independent, and would let one pair outvote all others."""
+CONFLICT = 3.0
+"""A pair that would gain this much log-likelihood from cameras of its own is worth a quarter (chi^2 = 6 of 2)."""
+ALONE = np.array([0.3, 0.15, 0.15, 0.2, 0.2])
+"""How far such cameras of its own may lie away: standard deviations of log f, u, v, log a, kappa."""
+LOWER_QUARTILE = 0.288
+"""Of that gain, where two degrees of freedom are noise (chi^2 / 2)."""
+LEAST_SIGMA_PX = 0.1
+FEW_MATCHES = 150
+"""Of one pair, until the cameras have nearly arrived."""
+ROUNDS, LAST_ROUNDS, STEPS = 12, 4, 4
+ARRIVED = 2e-5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """Independent normal priors on the parameters of all cameras."""
+
+    mean: FloatArray
+    """(C, 5)."""
+    precision: FloatArray
+    """(C, 5), 1 / variance, > 0."""
+
+    def cost(self, thetas: FloatArray) -> float:
+        """Negative log-density, without its constant."""
+        return 0.5 * float(np.sum(self.precision * (thetas - self.mean) ** 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Where the adjustment stands."""
+
+    thetas: FloatArray
+    """(C, 5) parameters of the cameras, see `lens`."""
+    poses: FloatArray
+    """(P, 12), see `two_view_cost.essential`."""
+    weights: FloatArray
+    """(P,) in [0, 1]: how well a pair agrees with the others."""
+    sigma: float
+    """Standard deviation of a Sampson distance."""
+    scale: float = 1.0
+    """How many times larger the pairs' disagreement is than their noise explains, >= 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Information:
+    """What each pair says about the cameras once its pose is eliminated."""
+
+    hessians: FloatArray
+    """(P, 10, 10) of camera 1 and camera 2; in the first five rows and columns where both are the same camera."""
+    gradients: FloatArray
+    """(P, 10) negative gradients."""
+    gains: FloatArray
+    """(P,) log-likelihood that a pair would gain from cameras of its own."""
+
+
+class Matches:
+    """Inliers of pairs, laid end to end.
+
+    Args:
+        inliers: per pair (N, 4), about the middle of the photos, in any one unit.
+        cameras: (P, 2) numbers of the cameras, counted from 0.
+        photos: (P, 2) numbers of the photos.
+        unit_px: length of that unit, in pixels.
+        most: of one pair; evenly chosen where there are more.
+    """
+
+    def __init__(
+        self, inliers: Sequence[FloatArray], cameras: IndexArray, photos: IndexArray, unit_px: float,
+        most: int = MOST_MATCHES,
+    ) -> None:  # fmt: skip
+        kept = [evenly(x, most) for x in inliers]
+        self.unit_px = unit_px
+        self.points = np.ascontiguousarray(np.concatenate([*kept, np.empty((0, 4))]))
+        self.ends = np.concatenate([[0], np.cumsum([len(x) for x in kept])]).astype(np.int64)
+        self.cameras = np.ascontiguousarray(cameras, dtype=np.int64)
+        self.photos = np.asarray(photos, dtype=np.int64)
+        self.count = int(self.cameras.max()) + 1 if len(cameras) else 0
+        self.least_sigma = LEAST_SIGMA_PX / unit_px
+
+    def of_pair(self, pair: int) -> FloatArray:
+        """(N, 4) of one pair."""
+        return self.points[self.ends[pair] : self.ends[pair + 1]]
+
+    def thinned(self, most: int) -> "Matches":
+        """The same with at most so many per pair."""
+        inliers = [self.of_pair(pair) for pair in range(len(self.cameras))]
+        return Matches(inliers, self.cameras, self.photos, self.unit_px, most)
+
+    def costs(self, state: State) -> FloatArray:
+        """(P,) robust costs."""
+        return np.asarray(
+            pair_costs(self.points, self.ends, state.thetas, self.cameras, state.poses, state.sigma), np.float64
+        )
+
+    def noise(self, state: State) -> float:
+        """Standard deviation of the distances of the pairs that agree, from their median."""
+        found = np.abs(distances(self.points, self.ends, state.thetas, self.cameras, state.poses))
+        agreeing = np.repeat(state.weights > 0.5, np.diff(self.ends))
+        return max(1.4826 * float(np.median(found[agreeing])) if agreeing.any() else 0.0, self.least_sigma)
+
+    def scattered(self, information: Information, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Sum over the pairs, times `factors` (P,): (5C, 5C) and (5C,) in the parameters of all cameras."""
+        rows = (CAMERA * self.cameras[:, :, None] + np.arange(CAMERA)).reshape(-1, 2 * CAMERA)
+        H, b = np.zeros((CAMERA * self.count,) * 2), np.zeros(CAMERA * self.count)
+        np.add.at(H, (rows[:, :, None], rows[:, None, :]), factors[:, None, None] * information.hessians)
+        np.add.at(b, rows, factors[:, None] * information.gradients)
+        return H, b
+
+
+def evenly(rows: FloatArray, most: int) -> FloatArray:
+    """At most so many rows, evenly chosen."""
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
+
+
+def adjusted(matches: Matches, state: State, prior: Prior) -> State:
+    """`settled` with few matches, then with all."""
+    state = settled(matches.thinned(FEW_MATCHES), state, prior)
+    return settled(matches, state, prior, LAST_ROUNDS)
+
+
+def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) -> State:
+    """Weigh the pairs, minimise, and so on until the cameras stand still."""
+    for _ in range(rounds):
+        before = state.thetas
+        state = _descended(matches, reweighted(matches, state), prior)
+        state = replace(state, sigma=matches.noise(state))
+        if np.max(np.abs(state.thetas - before), initial=0.0) < ARRIVED:
+            break
+    return reweighted(matches, state)
+
+
+def reweighted(matches: Matches, state: State) -> State:
+    """Weigh every pair by what it would gain from cameras of its own."""
+    gains = informed(matches, state).gains
+    scale = max(1.0, float(np.quantile(gains, 0.25)) / LOWER_QUARTILE) if len(gains) else 1.0
+    return replace(state, weights=(1.0 + gains / (CONFLICT * scale)) ** -2, scale=scale)
+
+
+def objective(matches: Matches, state: State, prior: Prior) -> float:
+    """What the right cameras make small: the pairs' disagreement, each with a bounded say, and the prior."""
+    gains = informed(matches, state).gains
+    return float(np.sum(gains / (1.0 + gains / CONFLICT))) + prior.cost(state.thetas)
+
+
+def informed(matches: Matches, state: State) -> Information:
+    """Eliminate the poses."""
+    A, b = pair_systems(matches.points, matches.ends, state.thetas, matches.cameras, state.poses, state.sigma)
+    H, g, _, _ = _reduced(matches, A, b, 1e-9)
+    gains = 0.5 * np.einsum("pi,pi->p", g, np.linalg.solve(H + np.diag(np.tile(ALONE**-2.0, 2)), g[..., None])[..., 0])
+    return Information(H, g, gains)
+
+
+def _reduced(
+    matches: Matches, A: FloatArray, b: FloatArray, damping: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Schur complement of the poses; also what gives their steps: V^-1 W' and V^-1 b_pose."""
+    n = 2 * CAMERA
+    V = A[:, n:, n:].copy()
+    diagonal = np.arange(V.shape[-1])
+    V[:, diagonal, diagonal] += damping * V[:, diagonal, diagonal] + 1e-9
+    back, own = np.split(np.linalg.solve(V, np.concatenate([A[:, n:, :n], b[:, n:, None]], axis=2)), [n], axis=2)
+    H = A[:, :n, :n] - A[:, :n, n:] @ back
+    g = b[:, :n] - (A[:, :n, n:] @ own)[..., 0]
+    same = matches.cameras[:, 0] == matches.cameras[:, 1]
+    fold = np.zeros((n, n))
+    fold[:CAMERA, :CAMERA] = fold[:CAMERA, CAMERA:] = np.eye(CAMERA)
+    H[same], g[same] = fold @ H[same] @ fold.T, g[same] @ fold.T
+    return H, g, back, own[..., 0]
+
+
+def _descended(matches: Matches, state: State, prior: Prior) -> State:
+    """A few steps of Levenberg and Marquardt with the weights as they are."""
+    factors = state.weights / state.scale
+    damping = 1e-4
+    cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
+    for _ in range(STEPS):
+        A, b = pair_systems(matches.points, matches.ends, state.thetas, matches.cameras, state.poses, state.sigma)
+        while True:
+            trial = _stepped(matches, state, prior, (A, b, factors), damping)
+            new = float(factors @ matches.costs(trial)) + prior.cost(trial.thetas)
+            if new <= cost or damping > 1e8:
+                break
+            damping *= 10.0
+        if not new <= cost:
+            break
+        gained, cost, state = cost - new, new, trial
+        damping = max(0.1 * damping, 1e-9)
+        if gained <= 1e-7 * cost:
+            break
+    return state
+
+
+def _stepped(
+    matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray, FloatArray], damping: float
+) -> State:
+    A, b, factors = system
+    reduced, gradients, back, own = _reduced(matches, A, b, damping)
+    H, g = matches.scattered(Information(reduced, gradients, np.empty(0)), factors)
+    H += np.diag(prior.precision.ravel())
+    g += (prior.precision * (prior.mean - state.thetas)).ravel()
+    step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g).reshape(-1, CAMERA)
+    cameras = step[matches.cameras].reshape(-1, 2 * CAMERA)
+    turns = own - (back @ cameras[..., None])[..., 0]
+    poses = np.array([moved(pose, turn) for pose, turn in zip(state.poses, turns, strict=True)]).reshape(-1, 12)
+    return replace(state, thetas=state.thetas + step, poses=poses)

@@ -1,0 +1,66 @@
+"""From pixels to rays through a lens with one radial term.
+
+The lens is COLMAP's SIMPLE_RADIAL: x_d = x_u (1 + k1 r_u^2) about the optical centre, r_u in focal lengths. While the
+focal is sought, the lens is held as kappa = k1 / f^2, with f and lengths in longer sides: how far it moves a point of
+the photo must not depend on the focal that is tried.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+
+FloatArray = NDArray[np.float64]
+
+LOG_FOCAL, CENTRE_U, CENTRE_V, LOG_ASPECT, KAPPA = range(5)
+"""Places in the parameters of a camera: log f with f = sqrt(fx fy), centre from the middle, log fy/fx, kappa."""
+LEAST_SLOPE = 0.2
+"""Where the lens squeezes radii by more than this, points are taken as if it went on evenly: it must not fold."""
+NEWTON_STEPS = 8
+
+
+@kernel
+def camera_of(theta: FloatArray, camera: FloatArray) -> None:
+    """fx, fy, u, v, k1 of the parameters (5,), into `camera` (5,)."""
+    f, half = np.exp(theta[0]), np.exp(0.5 * theta[3])
+    camera[0], camera[1], camera[2], camera[3] = f / half, f * half, theta[1], theta[2]
+    camera[4] = theta[4] * f * f
+
+
+@kernel
+def stretch(radius: float, k1: float) -> tuple[float, float]:
+    """r_u / r_d and d r_u / d r_d at the distorted radius r_d, in focal lengths."""
+    if k1 == 0.0 or radius < 1e-9:
+        return 1.0, 1.0
+    r = radius / (1.0 + k1 * radius * radius) if k1 > 0.0 else radius
+    for _ in range(NEWTON_STEPS):
+        slope = max(1.0 + 3.0 * k1 * r * r, LEAST_SLOPE)
+        step = (r * (1.0 + k1 * r * r) - radius) / slope
+        r -= step
+        if abs(step) < 1e-13:
+            break
+    return r / radius, 1.0 / max(1.0 + 3.0 * k1 * r * r, LEAST_SLOPE)
+
+
+@kernel
+def ray(x: float, y: float, camera: FloatArray, out: FloatArray) -> None:
+    """The point (a, b) of the plane z = 1 that pixel (x, y) sees, into `out` (6,): a, b, da/dx, da/dy, db/dx, db/dy."""
+    a, b = (x - camera[2]) / camera[0], (y - camera[3]) / camera[1]
+    r2 = a * a + b * b
+    along, radial = stretch(np.sqrt(r2), camera[4])
+    bend = (radial - along) / r2 if r2 > 1e-18 else 0.0
+    out[0], out[1] = along * a, along * b
+    out[2], out[3] = (along + bend * a * a) / camera[0], bend * a * b / camera[1]
+    out[4], out[5] = bend * a * b / camera[0], (along + bend * b * b) / camera[1]
+
+
+@kernel
+def straightened(points: FloatArray, theta: FloatArray) -> FloatArray:
+    """(N, 2) where points (N, 2) would lie without the lens, in the units of the points."""
+    camera, out, straight = np.empty(5), np.empty(6), np.empty_like(points)
+    camera_of(theta, camera)
+    for i in range(len(points)):
+        ray(points[i, 0], points[i, 1], camera, out)
+        straight[i, 0] = out[0] * camera[0] + camera[2]
+        straight[i, 1] = out[1] * camera[1] + camera[3]
+    return straight

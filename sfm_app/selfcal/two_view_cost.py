@@ -1,0 +1,182 @@
+"""What the matches of pairs of photos say about their cameras: Sampson distances of E = [t]x R, and derivatives.
+
+A pair has fifteen parameters: five of each camera (`lens`), and the five of its relative pose. The distance of a match
+is Sampson's in pixels of the photo as it is, so that a lens which is undone does not change what a pixel is worth::
+
+    r = C / |dC/d(x1, y1, x2, y2)|,      C = q2' E q1,      q = ray of a pixel
+
+Matches that fit badly are worth less: r^2 / (1 + r^2 / c^2) with c = 3 sigma (Geman and McClure 1987).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.selfcal.lens import camera_of, ray
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+CAMERA, POSE = 5, 5
+"""Parameters of one camera, and of a relative pose: three of rotation, two of direction."""
+PAIR = 2 * CAMERA + POSE
+REACH = 3.0
+"""c, in sigma."""
+_STEP = 1e-6
+
+
+@kernel
+def essential(pose: FloatArray, E: FloatArray) -> None:
+    """[t]x R of a pose (12,): R by rows, then the unit vector t."""
+    x, y, z = pose[9], pose[10], pose[11]
+    for j in range(3):
+        E[0, j] = y * pose[6 + j] - z * pose[3 + j]
+        E[1, j] = z * pose[j] - x * pose[6 + j]
+        E[2, j] = x * pose[3 + j] - y * pose[j]
+
+
+@kernel
+def moved(pose: FloatArray, step: FloatArray) -> FloatArray:
+    """The pose (12,) after a step (5,): R turned by exp([w]x), t along two directions across it."""
+    wx, wy, wz = step[0], step[1], step[2]
+    angle = np.sqrt(wx * wx + wy * wy + wz * wz)
+    sine = np.sin(angle) / angle if angle > 1e-12 else 1.0
+    versine = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-6 else 0.5
+    out = np.empty(12)
+    for j in range(3):
+        a, b, c = pose[j], pose[3 + j], pose[6 + j]
+        dot = wx * a + wy * b + wz * c
+        cosine = 1.0 - versine * angle * angle
+        out[j] = cosine * a + sine * (wy * c - wz * b) + versine * dot * wx
+        out[3 + j] = cosine * b + sine * (wz * a - wx * c) + versine * dot * wy
+        out[6 + j] = cosine * c + sine * (wx * b - wy * a) + versine * dot * wz
+    x, y, z = pose[9], pose[10], pose[11]
+    # two unit vectors across t (Duff et al. 2017)
+    sign = 1.0 if z >= 0.0 else -1.0
+    p = -1.0 / (sign + z)
+    q = x * y * p
+    u, v = step[3], step[4]
+    nx = x + u * (1.0 + sign * x * x * p) + v * q
+    ny = y + u * sign * q + v * (sign + y * y * p)
+    nz = z - u * sign * x - v * y
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    out[9], out[10], out[11] = nx / length, ny / length, nz / length
+    return out
+
+
+@kernel
+def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
+    l0 = E[0, 0] * p[0] + E[0, 1] * p[1] + E[0, 2]
+    l1 = E[1, 0] * p[0] + E[1, 1] * p[1] + E[1, 2]
+    l2 = E[2, 0] * p[0] + E[2, 1] * p[1] + E[2, 2]
+    k0 = E[0, 0] * q[0] + E[1, 0] * q[1] + E[2, 0]
+    k1 = E[0, 1] * q[0] + E[1, 1] * q[1] + E[2, 1]
+    g0, g1 = p[2] * k0 + p[4] * k1, p[3] * k0 + p[5] * k1
+    h0, h1 = q[2] * l0 + q[4] * l1, q[3] * l0 + q[5] * l1
+    return float((q[0] * l0 + q[1] * l1 + l2) / np.sqrt(g0 * g0 + g1 * g1 + h0 * h0 + h1 * h1 + 1e-300))
+
+
+@kernel
+def pair_costs(
+    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
+) -> FloatArray:
+    """(P,) half the sum over the matches of a pair of their robust squared distances, in sigma^2.
+
+    Args:
+        matches: (M, 4) of all pairs, one after the other.
+        ends: (P + 1,) where each pair begins, and the end of the last.
+        thetas: (C, 5) parameters of the cameras.
+        cameras: (P, 2) camera of view 1 and of view 2.
+        poses: (P, 12), see `essential`.
+        sigma: standard deviation of a distance.
+    """
+    E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
+    p, q = np.empty(6), np.empty(6)
+    costs = np.zeros(len(poses))
+    for k in range(len(poses)):
+        essential(poses[k], E)
+        camera_of(thetas[cameras[k, 0]], first)
+        camera_of(thetas[cameras[k, 1]], second)
+        for i in range(ends[k], ends[k + 1]):
+            ray(matches[i, 0], matches[i, 1], first, p)
+            ray(matches[i, 2], matches[i, 3], second, q)
+            r2 = (_distance(p, q, E) / sigma) ** 2
+            costs[k] += 0.5 * r2 / (1.0 + r2 / REACH**2)
+    return costs
+
+
+@kernel
+def distances(
+    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray
+) -> FloatArray:
+    """(M,) Sampson distances with sign, in the units of the matches; arguments as in `pair_costs`."""
+    E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
+    p, q = np.empty(6), np.empty(6)
+    found = np.empty(len(matches))
+    for k in range(len(poses)):
+        essential(poses[k], E)
+        camera_of(thetas[cameras[k, 0]], first)
+        camera_of(thetas[cameras[k, 1]], second)
+        for i in range(ends[k], ends[k + 1]):
+            ray(matches[i, 0], matches[i, 1], first, p)
+            ray(matches[i, 2], matches[i, 3], second, q)
+            found[i] = _distance(p, q, E)
+    return found
+
+
+@kernel
+def pair_systems(
+    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
+) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Newton systems of all pairs in their fifteen parameters: camera 1, camera 2, pose.
+
+    Arguments as in `pair_costs`.
+
+    Returns:
+        (P, 15, 15) approximate Hessians of the costs and (P, 15) their negative gradients.
+    """
+    A, b = np.zeros((len(poses), PAIR, PAIR)), np.zeros((len(poses), PAIR))
+    # index 0 is the point itself, 1 to 5 one parameter moved
+    lenses, Es = np.empty((2, 1 + CAMERA, 5)), np.empty((1 + POSE, 3, 3))
+    rays, J = np.empty((2, 1 + CAMERA, 6)), np.empty(PAIR)
+    step = np.zeros(POSE)
+    for k in range(len(poses)):
+        essential(poses[k], Es[0])
+        for j in range(POSE):
+            step[j] = _STEP
+            essential(moved(poses[k], step), Es[1 + j])
+            step[j] = 0.0
+        for view in range(2):
+            theta = thetas[cameras[k, view]].copy()
+            camera_of(theta, lenses[view, 0])
+            for j in range(CAMERA):
+                kept = theta[j]
+                theta[j] = kept + _STEP
+                camera_of(theta, lenses[view, 1 + j])
+                theta[j] = kept
+        for i in range(ends[k], ends[k + 1]):
+            for view in range(2):
+                for j in range(1 + CAMERA):
+                    ray(matches[i, 2 * view], matches[i, 2 * view + 1], lenses[view, j], rays[view, j])
+            r = _distance(rays[0, 0], rays[1, 0], Es[0]) / sigma
+            for j in range(CAMERA):
+                J[j] = (_distance(rays[0, 1 + j], rays[1, 0], Es[0]) / sigma - r) / _STEP
+                J[CAMERA + j] = (_distance(rays[0, 0], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
+            for j in range(POSE):
+                J[2 * CAMERA + j] = (_distance(rays[0, 0], rays[1, 0], Es[1 + j]) / sigma - r) / _STEP
+            weight = (1.0 + r * r / REACH**2) ** -2
+            _add(A[k], b[k], J, r, weight)
+    for k in range(len(poses)):
+        for i in range(PAIR):
+            for j in range(i):
+                A[k, j, i] = A[k, i, j]
+    return A, b
+
+
+@kernel
+def _add(A: FloatArray, b: FloatArray, J: FloatArray, r: float, weight: float) -> None:
+    for i in range(PAIR):
+        scaled = weight * J[i]
+        b[i] -= scaled * r
+        for j in range(i + 1):
+            A[i, j] += scaled * J[j]

@@ -1,0 +1,70 @@
+"""How far a fit may be trusted: covariances, standard deviations in pixels, and which pairs say most."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.selfcal.adjustment import ALONE, Matches
+from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, KAPPA, LOG_ASPECT, LOG_FOCAL
+from sfm_app.selfcal.priors import spare
+from sfm_app.selfcal.refine import Fit
+from sfm_app.selfcal.two_view_cost import CAMERA
+from sfm_app.types import PairId
+
+FloatArray = NDArray[np.float64]
+
+MODEL_ERROR = np.array([1e-3, 1e-3, 1e-3, 1e-3, 3e-3])
+"""Standard deviations of what no lens model holds: of log f, u, v in longer sides, log a, and k1."""
+AGREES = 0.5
+"""A pair with a smaller weight in the fit is no key pair."""
+
+
+def covariance(fit: Fit, sides: FloatArray) -> FloatArray:
+    """(5C, 5C) covariance of all parameters.
+
+    The inverse Hessian takes all matches as independent. They are not: one keypoint in m photos gives m (m - 1) / 2
+    matches of 2 m - 3 independent errors. The number of matches per keypoint says how much that is worth.
+    """
+    H, _ = fit.system()
+    share = spare(fit.free, float(np.sum(fit.state.weights))) / redundancy(fit.matches)
+    found = np.linalg.inv(share * H + np.diag(fit.prior.precision.ravel()))
+    floor = np.tile(MODEL_ERROR, (len(sides), 1))
+    floor[:, CENTRE_U : CENTRE_V + 1] *= sides[:, None]
+    floor[:, KAPPA] /= np.exp(2.0 * fit.state.thetas[:, LOG_FOCAL])
+    return np.asarray(found + np.diag(floor.ravel() ** 2), np.float64)
+
+
+def redundancy(matches: Matches) -> float:
+    """Matches over independent errors, >= 1."""
+    if len(matches.points) == 0:
+        return 1.0
+    photos = matches.photos.repeat(np.diff(matches.ends), axis=0)
+    keypoints = np.concatenate(
+        [np.column_stack([photos[:, view], matches.points[:, 2 * view : 2 * view + 2]]) for view in range(2)]
+    )
+    per_keypoint = len(keypoints) / len(np.unique(keypoints, axis=0))
+    return max(1.0, 0.5 * per_keypoint * (per_keypoint + 1.0) / (2.0 * per_keypoint - 1.0))
+
+
+def spread_of(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, float]:
+    """Standard deviations of fx, fy, cx, cy in pixels and of k1, from the covariance (5, 5) of one camera."""
+    focal, squared = float(np.exp(theta[LOG_FOCAL])) * unit_px, float(np.exp(2.0 * theta[LOG_FOCAL]))
+    half = float(np.exp(0.5 * theta[LOG_ASPECT]))
+    # rows: how fx, fy, cx, cy, k1 change with log f, u, v, log a, kappa
+    slopes = np.zeros((CAMERA, CAMERA))
+    slopes[0, [LOG_FOCAL, LOG_ASPECT]] = focal / half, -0.5 * focal / half
+    slopes[1, [LOG_FOCAL, LOG_ASPECT]] = focal * half, 0.5 * focal * half
+    slopes[2, CENTRE_U] = slopes[3, CENTRE_V] = unit_px
+    slopes[4, [LOG_FOCAL, KAPPA]] = 2.0 * theta[KAPPA] * squared, squared
+    deviations = np.sqrt(np.diag(slopes @ cov @ slopes.T))
+    return dict(zip(("fx", "fy", "cx", "cy", "k1"), deviations.tolist(), strict=True))
+
+
+def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:
+    """Pairs that agree with the cameras, those that say most about them first: views that differ in more than place."""
+    if not photos:
+        return ()
+    alone = np.tile(ALONE, 2)
+    news = np.linalg.slogdet(np.eye(2 * CAMERA) + alone[:, None] * fit.information.hessians * alone)[1]
+    worth = fit.state.weights * news
+    order = [pair for pair in np.argsort(-worth, kind="stable") if fit.state.weights[pair] >= AGREES]
+    return tuple(photos[pair] for pair in order)
