@@ -37,7 +37,7 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
         As `selfcal.verdict.answered`, which also says what is raised.
     """
     del options
-    return answered(METHOD, pairs, partial(algorithm_2, seed=seed))
+    return answered(METHOD, pairs, partial(algorithm_2, seed=seed), SAMPLE)
 
 
 def algorithm_2(pairs: Pairs, tall: float, evidence: dict[str, float], seed: int) -> Camera:
