@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Self-calibration before bundle adjustment: ours beside COLMAP's view-graph calibration and the thesis's methods.
 
-    python benchmarks/accuracy/selfcal.py --photos DATA --cache CACHE
+    python benchmarks/accuracy/selfcal.py --photos DATA --cache CACHE --rendered 2
     python benchmarks/accuracy/selfcal.py --photos DATA --cache CACHE --varied castle-P19 --sets --each \\
         --variants crop:460,200+scale:0.75,1
     python benchmarks/accuracy/selfcal.py --speed --coverage 500
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from photo_sets import PhotoSet, photo_set, steps
+from rendered_sets import rendered_sets
 from report import RESULTS, Row, document, on_one_thread, table, write, write_csv
 from selfcal_coverage import coverage, summary
 from selfcal_methods import PRODUCTION, adjusted_cameras, every_method, measured, warm_up
@@ -56,14 +57,12 @@ def run_photos(args: argparse.Namespace) -> None:
 
 
 def chosen_sets(args: argparse.Namespace) -> Iterator[PhotoSet]:
-    """The varied sets with their variants, then the others."""
-    changes = [(name, change, "auto") for name in args.varied for change in ("", *args.variants)]
-    for name, change, cameras in [
-        *changes,
-        *((n, "", "auto") for n in args.sets),
-        *((n, "", "each") for n in args.each),
-    ]:
+    """The varied sets with their variants, the others, and what is rendered."""
+    plain = [(name, "", "auto") for name in args.sets] + [(name, "", "each") for name in args.each]
+    varied = [(name, change, "auto") for name in args.varied for change in ("", *args.variants)]
+    for name, change, cameras in [*varied, *plain] if args.photos else []:
         yield photo_set(args.photos, name, change, args.cache, cameras)
+    yield from rendered_sets(args.rendered, args.cache)
 
 
 def calibrated(photos: PhotoSet, args: argparse.Namespace) -> list[Row]:
@@ -145,6 +144,7 @@ def main() -> None:
     parser.add_argument("--variants", nargs="*", default=VARIANTS, help="changes of the photos, see photo_sets.py")
     parser.add_argument("--sets", nargs="*", default=SETS, help="sets that are taken plain")
     parser.add_argument("--each", nargs="*", default=EACH, help="sets in which every photo has its own camera")
+    parser.add_argument("--rendered", type=int, default=0, metavar="N", help="rendered sets, each under so many seeds")
     parser.add_argument("--coverage", type=int, metavar="N", help="so many synthetic calibrations")
     parser.add_argument(
         "--speed", nargs="?", const="castle-P19", metavar="SET", help="times, with --photos also of a set"
@@ -157,15 +157,15 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--name", default="selfcal", help="name of the result files")
     args = parser.parse_args()
-    if not (args.photos or args.coverage or args.speed):
-        parser.error("name at least one of --photos, --coverage, --speed")
-    if args.photos and not args.cache:
-        parser.error("--photos needs --cache")
+    if not (args.photos or args.rendered or args.coverage or args.speed):
+        parser.error("name at least one of --photos, --rendered, --coverage, --speed")
+    if (args.photos or args.rendered) and not args.cache:
+        parser.error("--photos and --rendered need --cache")
     for change in args.variants:
         steps(change)
     on_one_thread()
     warm_up()
-    if args.photos:
+    if args.photos or args.rendered:
         run_photos(args)
     if args.speed:
         run_speed(args)

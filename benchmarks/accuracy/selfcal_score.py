@@ -39,7 +39,8 @@ def row(photos: str, found: Found, truth: Mapping[str, TrueCamera]) -> Row:
 
 
 COLUMNS = (
-    "e_focal %", "centre % of width", "fy/fx %", "k1 error", "sd of f %", "fx sd", "fy sd", "cx sd", "cy sd", "in 3 sd",
+    "e_focal %", "worst e_focal %", "centre % of width", "fy/fx %", "k1 error", "sd of f %",
+    "fx sd", "fy sd", "cx sd", "cy sd", "in 3 sd",
 )  # fmt: skip
 """What needs the truth. "fx sd" is the error of fx in its own standard deviations, and so on."""
 
@@ -64,8 +65,10 @@ def _errors(cameras: Sequence[Calibration], truth: Sequence[TrueCamera]) -> Row:
     both = list(zip(cameras, truth, strict=True))
     stated = [deviations(camera, true.K) for camera, true in both if camera.identifiable]
     stated = [values for values in stated if values]
+    focal = [focal_error_percent(camera.K, true.K) for camera, true in both]
     line: Row = {
-        "e_focal %": _rounded([focal_error_percent(camera.K, true.K) for camera, true in both]),
+        "e_focal %": _rounded(focal),
+        "worst e_focal %": _rounded([max(focal)]) if len({true.K.tobytes() for true in truth}) > 1 else None,
         "centre % of width": _rounded([centre_error_percent(camera, true.K) for camera, true in both]),
         "fy/fx %": _rounded([aspect_error_percent(camera, true.K) for camera, true in both]),
         "k1 error": _rounded([abs(camera.radial - true.k1) for camera, true in both if true.k1 is not None], 4),
