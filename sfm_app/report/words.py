@@ -24,28 +24,28 @@ def field_of_view_deg(camera: Calibration) -> tuple[float, float]:
 def verdict(camera: Calibration) -> str:
     """Whether K is known, and if not, why, and what it is instead."""
     if camera.identifiable:
-        return "The photos tell it."
-    return f"The photos do not tell it ({camera.reason}): this is {SOURCES.get(camera.method, camera.method)}."
+        return "Known: the photos agree on this camera."
+    source = SOURCES.get(camera.method, camera.method)
+    return f"Not known: what follows is {source}, since these photos do not determine the camera: {camera.reason}."
 
 
 def focal_text(camera: Calibration) -> str:
     """Focal length and field of view."""
     across, down = field_of_view_deg(camera)
     focal = f"Focal length {camera.focal_px:.0f} px{_deviation(camera, 'fx')}"
-    fx, fy = camera.K[0, 0], camera.K[1, 1]
-    shape = "" if abs(fy / fx - 1) < 1e-9 else f", pixels {fx / fy:.3f} times as high as wide"
-    return f"{focal}: the camera sees {across:.0f} by {down:.0f} degrees{shape}."
+    tall = camera.K[0, 0] / camera.K[1, 1]
+    shape = "" if abs(tall - 1) < 5e-4 else f"; its pixels are {tall:.3f} times as high as wide"
+    return f"{focal}: the camera sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom{shape}."
 
 
 def centre_text(camera: Calibration) -> str:
     """Where the optical centre lies, from the middle of the photo."""
     right, below = camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2
-    steps = [
-        f"{abs(value):.0f} px{_deviation(camera, name)} {ways[int(value > 0)]}"
-        for value, name, ways in ((right, "cx", ("left", "right")), (below, "cy", ("above", "below")))
-        if abs(value) >= 0.5
-    ]
-    return f"Optical centre {' and '.join(steps)} of the middle." if steps else "Optical centre in the middle."
+    if max(abs(right), abs(below)) < 0.5:
+        return "Optical centre in the middle of the photo."
+    across = f"{abs(right):.0f} px{_deviation(camera, 'cx')} {'right' if right > 0 else 'left'} of"
+    down = f"{abs(below):.0f} px{_deviation(camera, 'cy')} {'below' if below > 0 else 'above'}"
+    return f"Optical centre {across} and {down} the middle of the photo."
 
 
 def lens_text(camera: Calibration) -> str:
