@@ -76,26 +76,34 @@ def reconstruct(
 
 
 def calibrate_photos(
-    photos: PathLike, settings: Settings | None = None, *, out: PathLike | None = None, progress: Progress | None = None
-) -> Intrinsics:
+    photos: PathLike, settings: Settings | None = None, *,
+    out: PathLike | None = None, figure: PathLike | None = None, progress: Progress | None = None,
+) -> Intrinsics:  # fmt: skip
     """Find the camera matrix of a folder of photos, without reconstructing the scene.
 
     Args:
         photos: folder with photos.
         settings: defaults where None.
         out: keeps features and matches there for a later run; a temporary folder where None.
+        figure: PNG, SVG or PDF file in which the pairs' votes and zero curves are drawn; none where None.
         progress: shown progress; none by default.
 
     Raises:
         SfmError: see `sfm_app.errors`.
     """
     from sfm_app.pipeline import run_stages  # as above
+    from sfm_app.report import check_figure, draw_intrinsics
 
+    if figure is not None:
+        check_figure(Path(figure))  # said before minutes of work
     with (
         tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch,
         opened_run(Path(out or scratch), settings or Settings(), progress) as run,
     ):
-        found: Intrinsics = run_stages(Path(photos), run, last="intrinsics")("intrinsics")
+        products = run_stages(Path(photos), run, last="intrinsics")
+        found: Intrinsics = products("intrinsics")
+        if figure is not None:
+            draw_intrinsics(Path(figure), products("match_graph"), products("view_graph"), found)
     return found
 
 

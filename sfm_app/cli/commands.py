@@ -81,11 +81,17 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
 @main.command()
 @click.argument("photos", type=click.Path(path_type=Path))
 @click.option("-o", "--out", type=click.Path(path_type=Path), help="Keep features and matches in this folder.")
+@click.option(
+    "--figure",
+    type=click.Path(path_type=Path),
+    help="Draw what the pairs of photos say into this PNG, SVG or PDF file.",
+)
 @settings_options
 @output_options
-def calibrate(photos: Path, out: Path | None, **flags: Any) -> None:
+def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any) -> None:
     """Find the camera matrix of PHOTOS, without reconstructing the scene."""
-    found = calibrate_photos(photos, settings_from(flags), out=out, progress=Terminal(quiet=flags["quiet"]))
+    progress = Terminal(quiet=flags["quiet"])
+    found = calibrate_photos(photos, settings_from(flags), out=out, figure=figure, progress=progress)
     print_json(intrinsics_summary(found)) if flags["as_json"] else print_lines(intrinsics_lines(found))
 
 

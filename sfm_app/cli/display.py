@@ -4,6 +4,7 @@ import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from rich.console import Console
@@ -12,7 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.progress import Progress as Bars
 
 from sfm_app.api import Run
-from sfm_app.types import Calibration, Intrinsics
+from sfm_app.report import field_of_view_deg, held_text, lens_text
+from sfm_app.types import Intrinsics
 
 STAGE_TITLES = {
     "photos": "reading photos",
@@ -24,6 +26,9 @@ STAGE_TITLES = {
     "mesh": "surface",
     "files": "files",
 }
+
+KEY_PAIRS = 3
+"""So many are named to people; --json has all."""
 
 
 class Terminal:
@@ -136,7 +141,10 @@ def run_lines(run: Run) -> list[str]:
 
 def intrinsics_summary(intrinsics: Intrinsics) -> dict[str, Any]:
     """Calibrations, plain, for --json."""
-    return {name: camera.to_dict() for name, camera in intrinsics.cameras.items()}
+    return {
+        name: {"field_of_view_deg": [round(angle, 2) for angle in field_of_view_deg(camera)], **camera.to_dict()}
+        for name, camera in intrinsics.cameras.items()
+    }
 
 
 def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
@@ -144,10 +152,16 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
     many = len(intrinsics.cameras) > 1
     lines = []
     for name, camera in intrinsics.cameras.items():
-        lines.append(f"camera      {f'{name}: ' if many else ''}{_k_text(camera.K)}{_spread_text(camera)}")
+        lines.append(f"camera      {f'{name}: ' if many else ''}{_k_text(camera.K, camera.spread)}")
         if not camera.identifiable:
             source = {"exif": "EXIF's claim", "guess": "a guess"}.get(camera.method, camera.method)
             lines.append(f"            these photos do not determine it ({camera.reason}): {source}")
+        across, down = field_of_view_deg(camera)
+        lines.append(f"            sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom")
+        lines += [f"            {text}" for text in (lens_text(camera), held_text(camera)) if text]
+        if camera.key_pairs:
+            best = ", ".join(f"{first}-{second}" for first, second in camera.key_pairs[:KEY_PAIRS])
+            lines.append(f"            best pairs of photos to start from: {best} (numbers as in database.db)")
     return lines
 
 
@@ -162,13 +176,9 @@ def table(rows: Mapping[str, str]) -> list[str]:
     return [f"{name:{width}}  {text}" for name, text in rows.items()]
 
 
-def _k_text(K: Any) -> str:
-    return f"fx {K[0, 0]:.1f}  fy {K[1, 1]:.1f}  cx {K[0, 2]:.1f}  cy {K[1, 2]:.1f} px"
-
-
-def _spread_text(camera: Calibration) -> str:
-    return (
-        "  (+- " + ", ".join(f"{name} {value:.1f}" for name, value in camera.spread.items()) + ")"
-        if camera.spread
-        else ""
+def _k_text(K: Any, spread: Mapping[str, float] = MappingProxyType({})) -> str:
+    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    parts = (
+        f"{name} {value:.1f}" + (f" +- {spread[name]:.1f}" if name in spread else "") for name, value in values.items()
     )
+    return "  ".join(parts) + " px"

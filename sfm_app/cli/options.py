@@ -46,13 +46,14 @@ def settings_from(flags: Mapping[str, Any]) -> Settings:
         if flags[key] is not None:
             overrides = merged(overrides, {table: {key: flags[key]}})
     for assignment in flags["assignments"]:
-        overrides = merged(overrides, _assigned(assignment))
+        overrides = merged(overrides, assigned(assignment))
     if flags["config"] is not None:
         return Settings.from_toml(flags["config"], overrides)
     return Settings.from_mapping(overrides, where="command line")
 
 
-def _assigned(text: str) -> dict[str, Any]:
+def assigned(text: str) -> dict[str, Any]:
+    """TABLE.KEY=VALUE as nested settings; ConfigError where it is something else."""
     name, equals, value = text.partition("=")
     if not equals:
         raise ConfigError(f"--set {text}: no '=' in it", hint="write --set depth.neighbours=6")

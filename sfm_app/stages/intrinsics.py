@@ -35,9 +35,17 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
 
 def calibrate_group(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph, run: RunContext) -> Calibration:
     """K of the photos of one camera."""
+    options = run.settings.calibration
+    pairs = camera_pairs(images, matches, views)
+    found = run.plugins.calibrator(options.calibrator).calibrate(pairs, options, run.seed)
+    return found if found.identifiable else fall_back(found, images)
+
+
+def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> CameraPairs:
+    """What a calibrator gets to know about the photos of one camera: all pairs among them that are not degenerate."""
     ids = {image.id for image in images}
     fits = {pair: fit for pair, fit in views.fits.items() if ids.issuperset(pair) and not fit.degeneracy}
-    pairs = CameraPairs(
+    return CameraPairs(
         Fs=np.array([fit.F for fit in fits.values()], np.float64).reshape(-1, 3, 3),
         weights=pair_weights(np.array([fit.inlier_count for fit in fits.values()], np.int64)),
         size=(images[0].width, images[0].height),
@@ -45,9 +53,6 @@ def calibrate_group(images: list[MatchedImage], matches: MatchGraph, views: View
         inliers=tuple(np.hstack(matches.points(pair))[fit.inliers] for pair, fit in fits.items()),
         focal_hints_px=tuple(image.exif_focal_px for image in images if image.exif_focal_px),
     )
-    options = run.settings.calibration
-    found = run.plugins.calibrator(options.calibrator).calibrate(pairs, options, run.seed)
-    return found if found.identifiable else fall_back(found, images)
 
 
 def fall_back(found: Calibration, images: list[MatchedImage]) -> Calibration:

@@ -1,8 +1,8 @@
 """Cameras and the paths that a photographer walks with them."""
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from sfm_app.errors import ConfigError
 from sfm_app.geometry.camera import camera_matrix
 
 FloatArray = NDArray[np.float64]
+NEWTON_STEPS = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,17 +22,36 @@ class Camera:
     """(3, 3) camera matrix in pixels, zero skew."""
     width: int
     height: int
-    division_lambda: float = 0.0
-    """Radial distortion, x_u = x_d / (1 + lambda r^2) about the optical centre with r in image widths; < 0: barrel."""
+    radial: float = 0.0
+    """k1 of COLMAP's SIMPLE_RADIAL and OPENCV: x_d = x_u (1 + k1 r^2) about the optical centre, with
+    x = (X/Z, Y/Z) and r = |x_u|, so that r counts in focal lengths; < 0: barrel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """One camera and where it stood."""
+    """Photos that are to be taken: with which camera and from where."""
 
-    camera: Camera
+    cameras: Mapping[str, Camera]
+    """By photo name; the same names as below."""
     cam_from_world: Mapping[str, FloatArray]
     """By photo name: (3, 4) [R | t]."""
+
+    @classmethod
+    def of(cls, camera: Camera, poses: Sequence[FloatArray]) -> "Views":
+        """One camera at poses (3, 4), the photos named view_00.jpg and so on."""
+        named = {f"view_{k:02d}.jpg": pose for k, pose in enumerate(poses)}
+        return cls(dict.fromkeys(named, camera), named)
+
+    def taken_with(self, camera: Camera, photos: Collection[str]) -> "Views":
+        """The same views, these photos taken with another camera.
+
+        Raises:
+            ConfigError: a photo is not among the views.
+        """
+        strangers = sorted(set(photos) - set(self.cameras))
+        if strangers:
+            raise ConfigError(f"synthetic cameras: no such photo: {', '.join(strangers)}")
+        return replace(self, cameras={**self.cameras, **dict.fromkeys(sorted(photos), camera)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,6 +100,7 @@ def make_camera(
     focal_widths: float = 1.05,
     centre: tuple[float, float] = (0.53, 0.48),
     aspect: float = 1.0,
+    radial: float = 0.0,
 ) -> Camera:
     """A camera about which a guess goes wrong: its optical centre is not the middle of the photo.
 
@@ -89,6 +110,7 @@ def make_camera(
         focal_widths: fx as a share of the width, > 0.
         centre: optical centre as shares of width and height.
         aspect: fy / fx, > 0.
+        radial: k1 as in `Camera`.
 
     Raises:
         ConfigError: a value is out of range.
@@ -96,7 +118,7 @@ def make_camera(
     if min(width, height) < 16 or not (0 < focal_widths < math.inf and 0 < aspect < math.inf):
         raise ConfigError("synthetic camera: size, focal_widths or aspect is out of range")
     fx = focal_widths * width
-    return Camera(camera_matrix(fx, fx * aspect, centre[0] * width, centre[1] * height), width, height)
+    return Camera(camera_matrix(fx, fx * aspect, centre[0] * width, centre[1] * height), width, height, radial)
 
 
 def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Views:
@@ -112,7 +134,38 @@ def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Vie
     aims = np.array(options.aim) + rng.uniform(-1.0, 1.0, (count, 3)) * options.aim_spread
     centres = np.column_stack([distance * np.sin(azimuth), height, distance * np.cos(azimuth)])
     poses = [look_at(centre, aim, roll) for centre, aim, roll in zip(centres, aims, roll_deg, strict=True)]
-    return Views(camera, {f"view_{k:02d}.jpg": pose for k, pose in enumerate(poses)})
+    return Views.of(camera, poses)
+
+
+def orbit(
+    camera: Camera,
+    photos: int = 12,
+    sweep_deg: float = 80.0,
+    distance: float = 5.6,
+    aim: tuple[float, float, float] = (0.0, 1.3, -0.2),
+) -> Views:
+    """Upright photos evenly spread on a level circle, all looking at its centre: they leave the focal undetermined.
+
+    Any two of the optical axes meet at the same distance from both cameras (isosceles), and then one F says nothing
+    about the focal length (Sturm 2001); K is the same for all photos.
+
+    Args:
+        camera: takes all photos.
+        photos: >= 2.
+        sweep_deg: angle of the arc that the photos share out, in degrees, (0, 360].
+        distance: radius of the circle, in scene units, > 0.
+        aim: the circle's centre.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+    if photos < 2 or not (0 < sweep_deg <= 360 and 0 < distance < math.inf):
+        raise ConfigError("synthetic orbit: photos, sweep_deg or distance is out of range")
+    # steps of sweep / photos: with 360 degrees the last photo is not the first again
+    azimuth = np.radians(sweep_deg) * ((np.arange(photos) + 0.5) / photos - 0.5)
+    around = np.column_stack([np.sin(azimuth), np.zeros(photos), np.cos(azimuth)])
+    middle = np.array(aim)
+    return Views.of(camera, [look_at(middle + distance * way, middle) for way in around])
 
 
 def look_at(centre: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> FloatArray:
@@ -147,19 +200,35 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
     """Directions of view in the camera frame, row by row.
 
     Args:
-        camera: its lens distortion is undone.
+        camera: its lens distortion is undone exactly.
         offset_px: where in each pixel the ray goes through; (0.5, 0.5) is the centre.
 
     Returns:
         (height * width, 3), z = 1.
+
+    Raises:
+        ConfigError: the radial distortion folds within the photo, so that a pixel has no one ray.
     """
     x, y = np.meshgrid(np.arange(camera.width) + offset_px[0], np.arange(camera.height) + offset_px[1])
     x = (x.ravel() - camera.K[0, 2]) / camera.K[0, 0]
     y = (y.ravel() - camera.K[1, 2]) / camera.K[1, 1]
-    # r is counted in pixels over the width, so with fy != fx it is the distance in the image, not in the world
-    r2 = ((x * camera.K[0, 0]) ** 2 + (y * camera.K[1, 1]) ** 2) / camera.width**2
-    stretch = 1.0 / (1.0 + camera.division_lambda * r2)
+    stretch = _undistorted_over_distorted(np.hypot(x, y), camera.radial)
     return np.column_stack([x * stretch, y * stretch, np.ones(x.size)])
+
+
+def _undistorted_over_distorted(distorted: FloatArray, k1: float) -> FloatArray:
+    """r / d where r (1 + k1 r^2) = d, on the branch through the centre."""
+    # for k1 < 0 the left side rises up to r^2 = -1 / (3 k1), where it is 2 r / 3, and then falls
+    if k1 < 0 and distorted.max(initial=0.0) >= 2.0 / 3.0 / math.sqrt(-3.0 * k1):
+        raise ConfigError(f"synthetic camera: a radial distortion of {k1:g} folds within the photo")
+    r = distorted.copy()
+    # the cubic bends one way all along, so Newton from d nears the root from one side and cannot overshoot
+    for _ in range(NEWTON_STEPS if k1 != 0 else 0):
+        step = (r * (1.0 + k1 * r * r) - distorted) / (1.0 + 3.0 * k1 * r * r)
+        r -= step
+        if np.all(np.abs(step) <= 2.0 * np.finfo(np.float64).eps * r):
+            break
+    return np.divide(r, distorted, out=np.ones_like(r), where=distorted > 0)
 
 
 def _spread(limits: tuple[float, float], count: int, rng: np.random.Generator) -> FloatArray:

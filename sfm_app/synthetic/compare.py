@@ -35,14 +35,25 @@ class Similarity:
         return np.asarray(self.scale * points @ self.R.T + self.t)
 
 
-def focal_error_percent(K: FloatArray, truth: Truth) -> float:
-    """e_focal of thesis section 5.5.3: mean error of fx and fy in percent of the truth."""
-    return float(50.0 * sum(abs(K[i, i] / truth.K[i, i] - 1.0) for i in (0, 1)))
+def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
+    """e_focal of thesis section 5.5.3: mean error of fx and fy in percent of the truth.
+
+    Args:
+        K: (3, 3) that was found.
+        truth: of the photo folder.
+        photo: whose camera K belongs to; needed where there are several cameras.
+
+    Raises:
+        ValueError: the photos have several cameras and none is named.
+    """
+    true = truth.cameras[photo].K if photo else truth.K
+    return float(50.0 * sum(abs(K[i, i] / true[i, i] - 1.0) for i in (0, 1)))
 
 
-def centre_error_percent(K: FloatArray, truth: Truth) -> float:
-    """e_OC of thesis section 5.5.3: mean error of the optical centre's x and y in percent of the truth."""
-    return float(50.0 * sum(abs(K[i, 2] / truth.K[i, 2] - 1.0) for i in (0, 1)))
+def centre_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
+    """e_OC of thesis section 5.5.3: mean error of the optical centre's x and y in percent of the truth; as above."""
+    true = truth.cameras[photo].K if photo else truth.K
+    return float(50.0 * sum(abs(K[i, 2] / true[i, 2] - 1.0) for i in (0, 1)))
 
 
 def surface_error(
@@ -97,14 +108,10 @@ def scene_size(truth: Truth) -> float:
 
 def seen_points(truth: Truth) -> FloatArray:
     """(N, 3) points where an even grid of rays through all photos meets the true surface."""
-    shrink = SEEN_RAYS / max(truth.width, truth.height)
-    K = np.diag([shrink, shrink, 1.0]) @ truth.K
-    camera = Camera(K, round(truth.width * shrink), round(truth.height * shrink), truth.division_lambda)
-    rays = pixel_rays(camera)
     caster = ray_caster(truth.vertices, truth.faces)
     found = []
-    for pose in truth.cam_from_world.values():
-        directions = rays @ pose[:, :3]
+    for name, pose in truth.cam_from_world.items():
+        directions = pixel_rays(_coarse(truth.cameras[name])) @ pose[:, :3]
         depth = cast(caster, camera_centre(pose), directions)["t_hit"].astype(np.float64)
         hit = np.isfinite(depth)
         found.append(camera_centre(pose) + directions[hit] * depth[hit, None])
@@ -170,6 +177,12 @@ def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: in
     outside = u + v > 1.0
     u, v = np.where(outside, 1.0 - u, u), np.where(outside, 1.0 - v, v)
     return np.asarray(corners[:, 0] * (1.0 - u - v) + corners[:, 1] * u + corners[:, 2] * v)
+
+
+def _coarse(camera: Camera) -> Camera:
+    shrink = SEEN_RAYS / max(camera.width, camera.height)
+    K = np.diag([shrink, shrink, 1.0]) @ camera.K
+    return Camera(K, round(camera.width * shrink), round(camera.height * shrink), camera.radial)
 
 
 def _distances(points: FloatArray, vertices: FloatArray, faces: IndexArray) -> FloatArray:

@@ -216,6 +216,34 @@ def make_tracks(options: TrackOptions, seed: int) -> Tracks:
     raise ConfigError("no random cameras see the same points", hint="lower max_rotation_deg or max_shift")
 
 
+def pair_matches(
+    tracks: Tracks,
+    outliers: Mapping[tuple[int, int], float] | None = None,
+    outlier_range_px: float = 256.0,
+    seed: int = 0,
+) -> Iterator[tuple[tuple[int, int], FloatArray]]:
+    """The matches of every pair of cameras, with outliers in chosen pairs: one set of tracks under several corruptions.
+
+    Args:
+        tracks: their noise is kept; outliers that they hold already are not.
+        outliers: share of wrong matches, in [0, 1), per pair; no pair by default.
+        outlier_range_px: outliers are off by a uniform value in [-range, range] in x and in y in the second view.
+        seed: a pair's outliers depend on the seed and the pair alone.
+
+    Yields:
+        Pair (i, j) in the order of `tracks.pairs`, and (N, 4) x1, y1, x2, y2 in pixels.
+
+    Raises:
+        ConfigError: a share is out of range or a pair is not in the tracks.
+    """
+    shares = outliers or {}
+    _require(outliers=set(shares) <= set(tracks.pairs) and all(0 <= share < 1 for share in shares.values()))
+    for i, j in tracks.pairs:
+        rng = np.random.default_rng([seed, 554, i, j])
+        x2, _ = _with_outliers(tracks.x[j], shares.get((i, j), 0.0), outlier_range_px, rng)
+        yield (i, j), np.column_stack([tracks.x[i], x2])
+
+
 def random_rotation(rng: np.random.Generator, max_angle_deg: float) -> FloatArray:
     """(3, 3) rotation about a uniformly random axis by a uniformly random angle up to the given one."""
     return axis_rotation(_direction(rng), rng.uniform(0.0, max_angle_deg))
@@ -258,14 +286,19 @@ def _two_views(
     Ks, Rs, ts = cameras
     R = Rs[j] @ Rs[i].T
     t = ts[j] - R @ ts[i]
-    count = exact.shape[1]
-    share, reach = wrong
-    is_inlier = np.ones(count, dtype=np.bool_)
-    is_inlier[rng.permutation(count)[: round(share * count)]] = False
-    x2 = noisy[j].copy()
-    x2[~is_inlier] += rng.uniform(-reach, reach, (np.count_nonzero(~is_inlier), 2))
+    x2, is_inlier = _with_outliers(noisy[j], *wrong, rng)
     F = fundamental_from_pose(Ks[i], Ks[j], R, t)
     return TwoViews(noisy[i].copy(), x2, is_inlier, F, Ks[i], Ks[j], R, t, exact[i], exact[j])
+
+
+def _with_outliers(
+    x: FloatArray, share: float, reach_px: float, rng: np.random.Generator
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    is_inlier = np.ones(len(x), dtype=np.bool_)
+    is_inlier[rng.permutation(len(x))[: round(share * len(x))]] = False
+    moved = x.copy()
+    moved[~is_inlier] += rng.uniform(-reach_px, reach_px, (np.count_nonzero(~is_inlier), 2))
+    return moved, is_inlier
 
 
 def _converges(Ks: FloatArray, poses: Poses, size: tuple[int, int], rng: np.random.Generator) -> bool:

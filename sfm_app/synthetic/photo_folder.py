@@ -14,7 +14,7 @@ from PIL import Image
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.progress import Progress, Silent, track
 from sfm_app.synthetic.bodies import SyntheticScene
-from sfm_app.synthetic.cameras import Views, camera_centre
+from sfm_app.synthetic.cameras import Camera, Views, camera_centre
 from sfm_app.synthetic.render import GAMMA, prepare, render_scene
 
 FloatArray = NDArray[np.float64]
@@ -57,18 +57,31 @@ class PhotoOptions:
 class Truth:
     """Everything that is true about a rendered photo folder."""
 
-    K: FloatArray
-    """(3, 3) camera matrix in pixels."""
-    width: int
-    height: int
+    cameras: Mapping[str, Camera]
+    """By photo name."""
     cam_from_world: Mapping[str, FloatArray]
     """By photo name: (3, 4) [R | t]."""
     vertices: FloatArray
     """(V, 3) of the surface, y up."""
     faces: NDArray[np.int64]
     """(T, 3) vertex indices."""
-    division_lambda: float = 0.0
-    """Radial distortion as in `Camera`."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera of all photos.
+
+        Raises:
+            ValueError: there are several.
+        """
+        first, *others = self.cameras.values()
+        if any(_values(camera) != _values(first) for camera in others):
+            raise ValueError("the photos were taken with several cameras")
+        return first
+
+    @property
+    def K(self) -> FloatArray:
+        """(3, 3) camera matrix of all photos in pixels; ValueError as for `camera`."""
+        return self.camera.K
 
     @property
     def centres(self) -> dict[str, FloatArray]:
@@ -92,25 +105,16 @@ def write_photo_folder(
     """
     options = options or PhotoOptions()
     prepared = prepare(scene)
-    camera = views.camera
     poses = list(enumerate(views.cam_from_world.items()))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for k, (name, pose) in track(progress or Silent(), poses, "rendering photos", len(poses)):
-            image = render_scene(prepared, camera, pose, options.supersampling)
+            image = render_scene(prepared, views.cameras[name], pose, options.supersampling)
             photo = develop(image, options, np.random.default_rng([options.seed, k, 255]))
             Image.fromarray(photo).save(folder / name, format="JPEG", quality=options.quality)
     except OSError as err:
         raise InputError(f"cannot write photos to {folder}: {err}", hint="choose another folder") from err
-    return Truth(
-        K=camera.K,
-        width=camera.width,
-        height=camera.height,
-        cam_from_world=dict(views.cam_from_world),
-        vertices=scene.vertices,
-        faces=scene.faces,
-        division_lambda=camera.division_lambda,
-    )
+    return Truth(dict(views.cameras), dict(views.cam_from_world), scene.vertices, scene.faces)
 
 
 def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) -> NDArray[np.uint8]:
@@ -123,22 +127,24 @@ def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) 
 
 
 def save_truth(truth: Truth, folder: Path) -> None:
-    """Write truth.json (cameras: x ~ K (R X + t)) and surface.ply into `folder`, which must not be the photo folder."""
-    K = truth.K.tolist()
-    images = [
-        {
-            "file": name,
-            "width": truth.width,
-            "height": truth.height,
-            "K": K,
-            "R": pose[:, :3].tolist(),
-            "t": pose[:, 3].tolist(),
-        }
-        for name, pose in truth.cam_from_world.items()
-    ]
+    """Write truth.json (x ~ K d(R X + t), d the lens) and surface.ply into `folder`, not into that of the photos."""
+    images = []
+    for name, pose in truth.cam_from_world.items():
+        width, height, K, radial = _values(truth.cameras[name])
+        images.append(
+            {
+                "file": name,
+                "width": width,
+                "height": height,
+                "K": K,
+                "radial": radial,
+                "R": pose[:, :3].tolist(),
+                "t": pose[:, 3].tolist(),
+            }
+        )
     text = {
-        "convention": "x ~ K (R X + t); world to camera; x right, y down, z forward; pixel centres at +0.5",
-        "division_lambda": truth.division_lambda,
+        "convention": "x ~ K d(R X + t); world to camera; x right, y down, z forward; pixel centres at +0.5; "
+        "d(x) = x (1 + radial |x|^2) on x = (X/Z, Y/Z)",
         "images": images,
     }
     try:
@@ -160,16 +166,22 @@ def load_truth(folder: Path) -> Truth:
         images = text["images"]
         vertices, faces = _from_ply((folder / SURFACE_FILE).read_bytes())
         return Truth(
-            K=np.array(images[0]["K"], dtype=np.float64),
-            width=int(images[0]["width"]),
-            height=int(images[0]["height"]),
+            cameras={i["file"]: _camera(i) for i in images},
             cam_from_world={i["file"]: np.column_stack([i["R"], i["t"]]) for i in images},
             vertices=vertices,
             faces=faces,
-            division_lambda=float(text["division_lambda"]),
         )
     except (OSError, ValueError, KeyError, IndexError, TypeError) as err:
         raise InputError(f"no truth in {folder}: {err}", hint="it holds truth.json and surface.ply") from err
+
+
+def _values(camera: Camera) -> tuple[int, int, list[list[float]], float]:
+    return camera.width, camera.height, camera.K.tolist(), camera.radial
+
+
+def _camera(image: Mapping[str, Any]) -> Camera:
+    K = np.array(image["K"], dtype=np.float64)
+    return Camera(K, int(image["width"]), int(image["height"]), float(image["radial"]))
 
 
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])

@@ -170,3 +170,11 @@ def test_whatever_happens_ends_with_one_line(monkeypatch, folder, error, code, s
     assert result.exit_code == code
     assert result.stderr.startswith(f"error: {says}")
     assert len(result.stderr.strip().splitlines()) == 2
+
+
+def test_a_figure_that_cannot_be_written_is_refused_before_any_work(folder, tmp_path):
+    result = call("calibrate", folder, "--figure", tmp_path / "curves.jpg", "-q")
+
+    assert result.exit_code == 2
+    assert "cannot write '.jpg'" in result.stderr
+    assert ".svg" in result.stderr

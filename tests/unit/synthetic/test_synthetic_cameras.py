@@ -1,17 +1,20 @@
+from itertools import combinations
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfm_app.errors import ConfigError
+from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.synthetic.cameras import (
     ArcOptions,
-    Camera,
     arc,
     axis_rotation,
     camera_centre,
     look_at,
     make_camera,
+    orbit,
     pixel_rays,
 )
 
@@ -47,18 +50,42 @@ def test_rotation_is_right_handed():
     assert np.allclose(turned, [0.0, 1.0, 0.0])
 
 
-@given(lam=st.floats(-0.3, 0.3), aspect=st.floats(0.7, 1.4))
+@given(k1=st.floats(-0.35, 0.5), aspect=st.floats(0.8, 1.4), width=st.sampled_from([40, 56]))
 @settings(deadline=None)
-def test_rays_undo_projection_and_distortion(lam, aspect):
-    plain = make_camera(40, 30, aspect=aspect)
-    camera = Camera(plain.K, 40, 30, division_lambda=lam)
-    h = pixel_rays(camera) @ camera.K.T
-    undistorted = h[:, :2] / h[:, 2:] - camera.K[:2, 2]
-    x, y = np.meshgrid(np.arange(40) + 0.5, np.arange(30) + 0.5)
-    pixels = np.column_stack([x.ravel(), y.ravel()]) - camera.K[:2, 2]
+def test_rays_undo_projection_and_distortion(k1, aspect, width):
+    camera = make_camera(width, 30, focal_widths=1.3, aspect=aspect, radial=k1)
+    x, y, z = pixel_rays(camera).T
+    # COLMAP's OPENCV model, which is SIMPLE_RADIAL where fx = fy
+    bent = 1 + k1 * (x * x + y * y)
+    pixels = np.column_stack([x * bent, y * bent, z]) @ camera.K.T
 
-    r2 = (pixels**2).sum(axis=1, keepdims=True) / 40**2
-    assert np.allclose(undistorted * (1 + lam * r2), pixels)
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(30) + 0.5)
+    assert np.allclose(pixels[:, 0], u.ravel(), atol=1e-11) and np.allclose(pixels[:, 1], v.ravel(), atol=1e-11)
+    assert np.all(1 + 3 * k1 * (x * x + y * y) > 0), "the branch through the centre"
+
+
+def test_the_sign_of_k1_is_colmaps():
+    plain, barrel, cushion = (np.abs(pixel_rays(make_camera(40, 30, radial=k1))[0, :2]) for k1 in (0.0, -0.2, 0.2))
+    assert np.all(cushion < plain) and np.all(plain < barrel)
+
+
+def test_the_ray_through_the_optical_centre_is_the_axis():
+    camera = make_camera(16, 16, centre=(0.53125, 0.53125), radial=-0.1)
+    assert pixel_rays(camera)[8 * 16 + 8].tolist() == [0.0, 0.0, 1.0]
+
+
+@given(share=st.floats(0.5, 1.5).filter(lambda share: abs(share - 1) > 1e-6))
+@settings(deadline=None)
+def test_distortion_that_folds_within_the_photo_is_refused(share):
+    plain = make_camera(40, 30, centre=(0.5, 0.5))
+    rim = np.hypot(19.5 / plain.K[0, 0], 14.5 / plain.K[1, 1])  # the outermost pixel centres
+    folds_at_rim = -4.0 / 27.0 / rim**2
+    camera = make_camera(40, 30, centre=(0.5, 0.5), radial=share * folds_at_rim)
+    if share > 1:
+        with pytest.raises(ConfigError, match="folds within the photo"):
+            pixel_rays(camera)
+    else:
+        assert np.all(np.isfinite(pixel_rays(camera)))
 
 
 def test_the_optical_centre_is_not_the_middle():
@@ -67,26 +94,81 @@ def test_the_optical_centre_is_not_the_middle():
     assert K[0, 0] == pytest.approx(1008.0) and K[0, 1] == 0.0
 
 
+def miss_of_axes(views):
+    """(N,) how far each optical axis passes the point that is nearest to all of them."""
+    poses = np.array(list(views.cam_from_world.values()))
+    centres = np.array([camera_centre(pose) for pose in poses])
+    axes = poses[:, 2, :3]
+    away = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    meeting = np.linalg.solve(away.sum(axis=0), np.einsum("nij,nj->i", away, centres))
+    return np.linalg.norm(np.einsum("nij,nj->ni", away, meeting - centres), axis=1)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_an_arc_is_no_orbit(seed):
     options = ArcOptions()
     views = arc(make_camera(96, 64), options, seed)
-    poses = np.array(list(views.cam_from_world.values()))
-    centres = np.array([camera_centre(pose) for pose in poses])
+    centres = np.array([camera_centre(pose) for pose in views.cam_from_world.values()])
     ground_distance = np.hypot(centres[:, 0], centres[:, 2])
 
-    assert list(views.cam_from_world) == [f"view_{k:02d}.jpg" for k in range(12)]
+    assert list(views.cam_from_world) == [f"view_{k:02d}.jpg" for k in range(12)] == list(views.cameras)
     assert options.distance[0] <= ground_distance.min() and ground_distance.max() <= options.distance[1]
     assert np.ptp(ground_distance) > 0.7 * np.ptp(options.distance)
     assert np.ptp(centres[:, 1]) > 0.7 * np.ptp(options.height)
     azimuth = np.degrees(np.arctan2(centres[:, 0], centres[:, 2]))
     assert np.ptp(azimuth) == pytest.approx(options.sweep_deg)
-    # the point nearest to all optical axes: in an orbit every axis goes through it
-    axes = poses[:, 2, :3]
-    away = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    meeting = np.linalg.solve(away.sum(axis=0), np.einsum("nij,nj->i", away, centres))
-    miss = np.linalg.norm(np.einsum("nij,nj->ni", away, meeting - centres), axis=1)
-    assert 0.1 < miss.mean() < 1.0
+    assert 0.1 < miss_of_axes(views).mean() < 1.0
+
+
+@pytest.mark.parametrize(("photos", "sweep_deg"), [(12, 80.0), (8, 360.0)])
+def test_in_an_orbit_all_axes_meet_at_one_distance(photos, sweep_deg):
+    aim = np.array([0.5, 1.0, -0.3])
+    views = orbit(make_camera(96, 64), photos, sweep_deg, distance=4.0, aim=tuple(aim))
+    poses = np.array(list(views.cam_from_world.values()))
+    centres = np.array([camera_centre(pose) for pose in poses])
+
+    assert len(poses) == photos and miss_of_axes(views).max() < 1e-9
+    assert np.allclose(np.linalg.norm(centres - aim, axis=1), 4.0) and np.allclose(centres[:, 1], 1.0)
+    assert np.allclose(poses[:, 1, :3], [0, -1, 0]), "upright"
+    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    assert np.allclose(steps, 8.0 * np.sin(np.radians(sweep_deg / photos / 2)))
+
+
+def test_an_orbit_leaves_the_focal_undetermined():
+    """A wrong focal makes every pair essential as well; on an arc it does not."""
+    K = make_camera(96, 64, centre=(0.5, 0.5)).K
+    wrong = K.copy()
+    wrong[0, 0] *= 1.3
+    wrong[1, 1] *= 1.3
+
+    def ratio(views):
+        poses = list(views.cam_from_world.values())
+        found = []
+        for first, second in combinations(poses[:5], 2):
+            R = second[:, :3] @ first[:, :3].T
+            F = fundamental_from_pose(K, K, R, second[:, 3] - R @ first[:, 3])
+            s = np.linalg.svd(wrong.T @ F @ wrong, compute_uv=False)
+            found.append(s[1] / s[0])
+        return min(found)
+
+    camera = make_camera(96, 64, centre=(0.5, 0.5))
+    assert ratio(orbit(camera)) > 1 - 1e-9 > 0.99 > ratio(arc(camera))
+
+
+def test_photos_can_be_taken_with_another_camera():
+    wide, tele = make_camera(96, 64), make_camera(96, 64, focal_widths=2.0)
+    views = orbit(wide, 4).taken_with(tele, ["view_01.jpg", "view_03.jpg"])
+
+    assert [camera is tele for camera in views.cameras.values()] == [False, True, False, True]
+    assert list(views.cameras) == list(views.cam_from_world)
+    with pytest.raises(ConfigError, match=r"no such photo: view_09\.jpg"):
+        views.taken_with(tele, ["view_09.jpg"])
+
+
+@pytest.mark.parametrize("wrong", [{"photos": 1}, {"sweep_deg": 400.0}, {"distance": 0.0}])
+def test_impossible_orbits_are_refused(wrong):
+    with pytest.raises(ConfigError, match="orbit"):
+        orbit(make_camera(96, 64), **wrong)
 
 
 @pytest.mark.parametrize(

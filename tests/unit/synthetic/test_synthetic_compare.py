@@ -53,6 +53,17 @@ def test_errors_of_K_are_those_of_the_thesis(photos):
     assert centre_error_percent(K, truth) == pytest.approx(5.0)
 
 
+def test_with_several_cameras_K_is_judged_by_its_photo(photos):
+    truth = photos[1]
+    tele = make_camera(120, 80, focal_widths=2.1, centre=(0.5, 0.5))
+    mixed = replace(truth, cameras={**truth.cameras, "view_02.jpg": tele})
+
+    assert focal_error_percent(tele.K, mixed, "view_02.jpg") == centre_error_percent(tele.K, mixed, "view_02.jpg") == 0
+    assert focal_error_percent(tele.K, mixed, "view_00.jpg") == pytest.approx(100.0)
+    with pytest.raises(ValueError, match="several cameras"):
+        focal_error_percent(tele.K, mixed)
+
+
 @given(seed=SEEDS, flat=st.booleans())
 @settings(deadline=None)
 def test_umeyama_finds_the_similarity(seed, flat):
@@ -75,7 +86,7 @@ def test_wrong_photos_do_not_spoil_the_alignment(wrong):
     right = true(found)
     names = [f"{k}.jpg" for k in range(12)]
     poses = {name: np.column_stack([np.eye(3), -c]) for name, c in zip(names, right, strict=True)}
-    truth = Truth(make_camera(96, 64).K, 96, 64, poses, np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
+    truth = Truth(dict.fromkeys(names, make_camera(96, 64)), poses, np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
     noisy = found + rng.normal(scale=1e-3, size=found.shape)
     noisy[:wrong] += rng.normal(size=(wrong, 3)) * 3
 

@@ -1,11 +1,13 @@
 import json
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from sfm_app.errors import ConfigError, InputError
+from sfm_app.synthetic.cameras import Camera, Views, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, develop, load_truth, save_truth, write_photo_folder
 
 
@@ -31,7 +33,7 @@ def test_the_folder_holds_photos_and_nothing_else(photos):
     assert sorted(path.name for path in folder.iterdir()) == sorted(truth.cam_from_world)
     for path in folder.iterdir():
         with Image.open(path) as image:
-            assert image.format == "JPEG" and image.size == (truth.width, truth.height) == (120, 80)
+            assert image.format == "JPEG" and image.size == (truth.camera.width, truth.camera.height) == (120, 80)
             assert not image.getexif() and "exif" not in image.info
             assert np.asarray(image).std() > 20, "there is something to see"
 
@@ -50,10 +52,15 @@ def test_the_same_seed_gives_the_same_bytes(photos, still_life, four_views, tmp_
 
 def test_truth_survives_the_disk_and_pickling(photos, tmp_path):
     _, truth = photos
+    odd = Camera(np.array([[150.0, 0, 61.5], [0, 140.0, 38.25], [0, 0, 1]]), 124, 77, radial=-0.125)
+    truth = replace(truth, cameras=Views(truth.cameras, truth.cam_from_world).taken_with(odd, ["view_02.jpg"]).cameras)
     save_truth(truth, tmp_path / "truth")
     for copy in (load_truth(tmp_path / "truth"), pickle.loads(pickle.dumps(truth))):  # noqa: S301
-        assert np.array_equal(copy.K, truth.K)
-        assert (copy.width, copy.height, copy.division_lambda) == (truth.width, truth.height, 0.0)
+        for name, camera in truth.cameras.items():
+            found = copy.cameras[name]
+            assert np.array_equal(found.K, camera.K)
+            assert (found.width, found.height, found.radial) == (camera.width, camera.height, camera.radial)
+        assert copy.cameras["view_02.jpg"].radial == -0.125 and copy.cameras["view_01.jpg"].radial == 0.0
         assert list(copy.cam_from_world) == list(truth.cam_from_world)
         assert all(np.array_equal(copy.cam_from_world[name], pose) for name, pose in truth.cam_from_world.items())
         assert np.array_equal(copy.vertices, truth.vertices) and np.array_equal(copy.faces, truth.faces)
@@ -69,6 +76,20 @@ def test_truth_file_says_x_is_K_RX_plus_t(photos, tmp_path):
     assert first["file"] == "view_00.jpg" and (first["width"], first["height"]) == (120, 80)
     assert h[2] > 0 and 0 < h[0] / h[2] < 120 and 0 < h[1] / h[2] < 80, "the ball is in the photo"
     assert np.allclose(truth.centres["view_00.jpg"], -np.array(first["R"]).T @ first["t"])
+
+
+def test_every_photo_is_taken_with_its_own_camera(photos, still_life, four_views, tmp_path):
+    folder, truth = photos
+    tele = make_camera(120, 80, focal_widths=1.6)
+    mixed = write_photo_folder(tmp_path, still_life, four_views.taken_with(tele, ["view_01.jpg"]), PhotoOptions(seed=3))
+
+    for name in truth.cam_from_world:
+        same = (tmp_path / name).read_bytes() == (folder / name).read_bytes()
+        assert same == (name != "view_01.jpg")
+        assert (mixed.cameras[name].K[0, 0] == tele.K[0, 0]) == (name == "view_01.jpg")
+    assert np.array_equal(truth.K, truth.camera.K)
+    with pytest.raises(ValueError, match="several cameras"):
+        _ = mixed.K
 
 
 def test_noise_is_the_injected_noise():

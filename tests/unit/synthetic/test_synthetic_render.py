@@ -103,7 +103,7 @@ def test_rendering_repeats_to_the_bit(prepared, four_views):
 def test_distortion_moves_the_rim_but_not_the_centre(prepared, four_views):
     pose = next(iter(four_views.cam_from_world.values()))
     plain = make_camera(120, 80, centre=(0.5, 0.5))
-    barrel = Camera(plain.K, 120, 80, division_lambda=-0.4)
+    barrel = Camera(plain.K, 120, 80, radial=-0.4)
     difference = np.abs(render_scene(prepared, plain, pose) - render_scene(prepared, barrel, pose)).mean(axis=2)
     assert difference[38:42, 58:62].mean() < 0.3 * difference[:, :10].mean()
 

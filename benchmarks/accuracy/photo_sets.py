@@ -1,0 +1,121 @@
+"""Photo sets for calibration: copies that tell nothing about the camera, changed as asked, and what is true of them.
+
+A change is written as steps joined by "+": ``crop:LEFT,TOP`` cuts columns and rows, ``scale:SX,SY`` resizes, and
+``window:LEFT,TOP,WIDTH,HEIGHT`` keeps a part.
+"""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+FORMATS = (".jpg", ".jpeg", ".png")
+STEPS = {"crop": 2, "scale": 2, "window": 4}
+"""Kinds of change, and how many figures each takes."""
+
+Step = tuple[str, tuple[float, ...]]
+
+
+class TrueCamera(NamedTuple):
+    """What took a photo."""
+
+    K: NDArray[np.float64]
+    k1: float | None = None
+    """Of COLMAP's SIMPLE_RADIAL; None where nobody knows."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotoSet:
+    """Photos without EXIF."""
+
+    name: str
+    """Of the set, with the change behind a blank."""
+    folder: Path
+    truth: Mapping[str, TrueCamera]
+    """By photo name without suffix; empty where nobody knows."""
+    cameras: str = "auto"
+    """Which photos share a camera, as in the setting `photos.cameras`."""
+
+
+def steps(text: str) -> list[Step]:
+    """The steps of a change.
+
+    Raises:
+        ValueError: a kind is not known, or has another number of figures.
+    """
+    found = []
+    for part in filter(None, text.split("+")):
+        kind, _, figures = part.partition(":")
+        values = tuple(float(value) for value in figures.split(","))
+        if STEPS.get(kind) != len(values):
+            raise ValueError(f"'{part}' is none of crop:LEFT,TOP scale:SX,SY window:LEFT,TOP,WIDTH,HEIGHT")
+        found.append((kind, values))
+    return found
+
+
+def changed_photo(image: Image.Image, change: Sequence[Step]) -> Image.Image:
+    """The photo after the steps."""
+    for kind, values in change:
+        if kind == "scale":
+            size = round(image.width * values[0]), round(image.height * values[1])
+            image = image.resize(size, Image.Resampling.LANCZOS)
+        else:
+            left, top = (round(value) for value in values[:2])
+            right, bottom = image.size if kind == "crop" else (round(left + values[2]), round(top + values[3]))
+            image = image.crop((left, top, right, bottom))
+    return image
+
+
+def changed_camera(K: NDArray[np.float64], change: Sequence[Step]) -> NDArray[np.float64]:
+    """The camera matrix after the same steps; pixel centres at +0.5, so that resizing multiplies."""
+    K = K.copy()
+    for kind, values in change:
+        if kind == "scale":
+            K[:2] *= np.array(values)[:, None]
+        else:
+            K[:2, 2] -= values[:2]
+    return K
+
+
+def photo_set(data: Path, name: str, change: str, cache: Path, cameras: str = "auto") -> PhotoSet:
+    """A set of DATA after a change; the copies are kept in the cache, and nothing there is written twice.
+
+    Where all photos come from one camera (`cameras` is not "each"), the truth is its median over the photos.
+    """
+    todo = steps(change)
+    title = f"{name} {change}".strip()
+    folder = cache / "photos" / title.translate(str.maketrans(" :,", "_--"))
+    for source in sorted((data / name / "images").iterdir()):
+        target = folder / f"{source.stem}.png"
+        if source.suffix.lower() in FORMATS and not target.exists():
+            save_plain(source, target, todo)
+    truth = dict(_true_cameras(data / name / "cameras.json", todo))
+    if truth and cameras != "each":
+        K = np.median([camera.K for camera in truth.values()], axis=0)
+        truth = {photo: TrueCamera(K, camera.k1) for photo, camera in truth.items()}
+    return PhotoSet(title, folder, truth, cameras)
+
+
+def save_plain(source: Path, target: Path, change: Sequence[Step]) -> None:
+    """Upright, changed, and of the rest the pixels alone: PNG loses none of them, and nobody hands EXIF on."""
+    with Image.open(source) as image:
+        upright = ImageOps.exif_transpose(image).convert("RGB")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = target.with_suffix(".part")
+    pixels = np.asarray(changed_photo(upright, change))
+    Image.fromarray(pixels).save(unfinished, format="PNG", compress_level=1)
+    unfinished.replace(target)
+
+
+def _true_cameras(path: Path, change: Sequence[Step]) -> Iterator[tuple[str, TrueCamera]]:
+    if not path.exists():
+        return
+    square = all(values[0] == values[1] for kind, values in change if kind == "scale")
+    for entry in json.loads(path.read_text(encoding="utf-8"))["images"]:
+        k1 = float(entry["dist"][0]) if square and entry.get("dist") else None
+        yield Path(entry["file"]).stem, TrueCamera(changed_camera(np.array(entry["K"], np.float64), change), k1)

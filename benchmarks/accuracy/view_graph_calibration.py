@@ -1,0 +1,61 @@
+"""COLMAP's view-graph calibration on our fundamental matrices: what zero curves compete with."""
+
+import shutil
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.database import SQUARE_PIXELS, camera_params, opened, write_epipolar_fits
+from sfm_app.geometry.camera import guessed_camera_matrix
+from sfm_app.types import Calibration, MatchGraph, ViewGraph
+
+METHOD = "view-graph calibration"
+
+
+def view_graph_calibration(
+    database: Path, scratch: Path, matches: MatchGraph, views: ViewGraph, seed: int = 0
+) -> tuple[dict[int, Calibration], float]:
+    """Calibrate a copy of the database that starts from 1.2 times the longer side, of which nobody is sure.
+
+    Degenerate pairs stay in it, marked as such, as they do for mapping. Relative poses are not estimated anew: that
+    is no part of the calibration, and would only cost it time.
+
+    Returns:
+        By image id, and the seconds of COLMAP's part alone. A camera that stays at its guess counts as not
+        identifiable: COLMAP itself does not say so.
+    """
+    copy = scratch / "view_graph_calibration.db"
+    shutil.copyfile(database, copy)
+    write_epipolar_fits(copy, matches, views.fits)
+    _forget_cameras(copy)
+    options = pycolmap.ViewGraphCalibrationOptions()
+    options.random_seed, options.reestimate_relative_pose = seed, False
+    start = time.perf_counter()
+    done = pycolmap.calibrate_view_graph(copy, options)
+    seconds = time.perf_counter() - start
+    with opened(copy) as opened_copy:
+        found = {
+            entry.image_id: _answer(opened_copy.read_camera(entry.camera_id), done)
+            for entry in opened_copy.read_all_images()
+        }
+    copy.unlink()
+    return found, seconds
+
+
+def _forget_cameras(path: Path) -> None:
+    with opened(path) as database, pycolmap.DatabaseTransaction(database):
+        for camera in database.read_all_cameras():
+            camera.model = getattr(pycolmap.CameraModelId, SQUARE_PIXELS)
+            camera.params = camera_params(guessed_camera_matrix((camera.width, camera.height)), SQUARE_PIXELS)
+            camera.has_prior_focal_length = False
+            database.update_camera(camera)
+
+
+def _answer(camera: Any, done: bool) -> Calibration:
+    K = np.asarray(camera.calibration_matrix(), np.float64)
+    known = done and camera.has_prior_focal_length  # COLMAP sets it where it accepts what it found
+    reason = "" if known else "kept the guess" if done else "gave up"
+    return Calibration(K, camera.width, camera.height, METHOD, identifiable=known, reason=reason)

@@ -1,0 +1,6 @@
+"""What people look at: figures of what a run found, and the words for them."""
+
+from sfm_app.report.calibration_figure import check_figure, draw_intrinsics
+from sfm_app.report.words import field_of_view_deg, held_text, lens_text
+
+__all__ = ["check_figure", "draw_intrinsics", "field_of_view_deg", "held_text", "lens_text"]

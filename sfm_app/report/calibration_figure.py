@@ -1,0 +1,237 @@
+"""Where the zero curves of all pairs meet, drawn: thesis Figure 5.13, with the votes behind the curves.
+
+One row per camera. Left: the two focals, with the optical centre where it was found; right: the optical centre, with
+the focals as found. Bright is where many pairs agree.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from textwrap import fill
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sfm_app.errors import ConfigError
+from sfm_app.report.words import centre_text, focal_text, held_text, lens_text, verdict
+from sfm_app.selfcal.curves import centre_curves, focal_curves
+from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
+from sfm_app.selfcal.joint import Consensus
+from sfm_app.stages.intrinsics import camera_pairs
+from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchGraph, ViewGraph
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure, SubFigure
+
+SUFFIXES = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+"""Formats, and what is left out of the file so that the same figure gives the same bytes."""
+CELLS = 160
+"""Votes are counted on a grid of this many cells a side."""
+SAMPLES = 400
+"""Samples along each curve: where a curve is steep, few leave it ragged."""
+JUMP = 0.05
+"""A curve that rises by this share of the plane from one sample to the next has changed to another root."""
+SIGMA = 0.05
+"""Width of a vote, in units of r as in `Consensus`: the wider one of the search; the other hardly shows."""
+FOCALS_SHOWN = (0.15, 2.2)
+"""Range of the focals around the one found, as multiples of it."""
+MOST_CAMERAS = 4
+DEVIATIONS = 3.0
+"""Standard deviations that the ellipse covers; in at most 1 % of cases the truth should lie outside."""
+ZOOMED_BELOW = 0.1
+"""An ellipse smaller than this share of the plane is drawn once more, enlarged."""
+MARK, CURVE, GUIDE = "#00e5ff", "white", "#b0b0b0"
+
+
+class Panel(NamedTuple):
+    """One camera to draw."""
+
+    name: str
+    camera: Calibration
+    pairs: CameraPairs
+
+
+class Plane(NamedTuple):
+    """Two of the parameters, in pixels; the others stay where they were found."""
+
+    names: tuple[str, str]
+    title: str
+    labels: tuple[str, str]
+    extent: tuple[float, float, float, float]
+    """Left, right, bottom, top."""
+    found: tuple[float, float]
+    spread: tuple[float, float]
+    """Standard deviations; 0 where none is stated."""
+    curves: Callable[[FloatArray], FloatArray]
+    """(S,) first parameter -> (P, S) second, per pair."""
+
+
+def check_figure(path: Path) -> None:
+    """ConfigError unless the name ends as one of the formats that can be written."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise ConfigError(f"figure {path.name}: cannot write '{path.suffix}'", hint=f"use {', '.join(SUFFIXES)}")
+
+
+def draw_intrinsics(path: Path, matches: MatchGraph, views: ViewGraph, found: Intrinsics) -> None:
+    """`draw_calibration` of every camera of a run."""
+    images = list(matches.images.values())
+    groups = {name: [image for image in images if image.group == name] for name in found.cameras}
+    draw_calibration(path, [Panel(n, c, camera_pairs(groups[n], matches, views)) for n, c in found.cameras.items()])
+
+
+def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
+    """Draw the votes and curves of every camera into a file; the same calibration gives the same bytes.
+
+    Args:
+        path: its suffix names the format, see `check_figure`; the folder is made where it is missing.
+        panels: the first `MOST_CAMERAS` are drawn.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    check_figure(path)
+    shown = panels[:MOST_CAMERAS]
+    with rc_context({"font.size": 9, "svg.hashsalt": "sfm-app"}):
+        figure = Figure(figsize=(12.5, 5.6 * len(shown)), layout="constrained")
+        for part, panel in zip(figure.subfigures(len(shown), 1, squeeze=False)[:, 0], shown, strict=True):
+            many = f"Camera {panel.name}, one of {len(panels)}.\n" if len(panels) > 1 else ""
+            part.suptitle(many + in_words(panel.camera), fontsize=10.5, x=0.02, ha="left")
+            draw_camera(part, panel)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=130, metadata=SUFFIXES[path.suffix.lower()])
+
+
+def in_words(camera: Calibration) -> str:
+    """What was found, a line for each thing."""
+    texts = (verdict(camera), focal_text(camera), centre_text(camera), lens_text(camera), held_text(camera))
+    return "\n".join(fill(text, 150) for text in texts if text).replace("+-", "±")
+
+
+def draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
+    """Both planes of one camera."""
+    camera = panel.camera
+    pairs = prepare(panel.pairs, unit_px=_unit(camera), origin_px=(camera.width / 2, camera.height / 2))
+    left, right = part.subplots(1, 2)
+    for axes, plane in ((left, focal_plane(camera, pairs)), (right, centre_plane(camera, pairs))):
+        draw_plane(axes, plane, camera, pairs)
+    left.axline((0.0, 0.0), slope=1.0, color=GUIDE, linewidth=0.8, linestyle=":")
+    left.annotate(
+        "square pixels", (0.93, 0.93), xycoords="axes fraction", color=GUIDE, rotation=45, ha="right", va="top"
+    )
+    right.plot(camera.width / 2, camera.height / 2, "+", color=GUIDE, markersize=9)
+    part.colorbar(right.images[0], ax=right, label="share of the pairs' votes", shrink=0.8)
+
+
+def focal_plane(camera: Calibration, pairs: Pairs) -> Plane:
+    """fx and fy, with the optical centre where it was found."""
+    unit, (low, high) = _unit(camera), FOCALS_SHOWN
+    (fx, _, cx), (_, fy, cy), _ = camera.K
+    centre = ((cx - camera.width / 2) / unit, (cy - camera.height / 2) / unit)
+    return Plane(
+        names=("fx", "fy"),
+        title=f"Focal length: every line is what one of {len(pairs)} pairs of photos allows",
+        labels=("focal length across, px", "focal length down, px"),
+        extent=(low * fx, high * fx, low * fy, high * fy),
+        found=(fx, fy),
+        spread=(camera.spread.get("fx", 0.0), camera.spread.get("fy", 0.0)),
+        curves=lambda x: unit * focal_curves(pairs, x / unit, centre),
+    )
+
+
+def centre_plane(camera: Calibration, pairs: Pairs) -> Plane:
+    """cx and cy over the whole photo, with the focals as found."""
+    unit, u0, v0 = _unit(camera), camera.width / 2, camera.height / 2
+    focals = (camera.K[0, 0] / unit, camera.K[1, 1] / unit)
+    return Plane(
+        names=("cx", "cy"),
+        title="Optical centre, in the frame of the photo (+ is its middle)",
+        labels=("across the photo, px", "down the photo, px"),
+        extent=(0.0, float(camera.width), float(camera.height), 0.0),
+        found=(camera.K[0, 2], camera.K[1, 2]),
+        spread=(camera.spread.get("cx", 0.0), camera.spread.get("cy", 0.0)),
+        curves=lambda x: unit * centre_curves(pairs, (x - u0) / unit, focals) + v0,
+    )
+
+
+def draw_plane(axes: "Axes", plane: Plane, camera: Calibration, pairs: Pairs) -> None:
+    """Votes, curves and K in one plane."""
+    shades = votes(plane, camera, pairs)
+    axes.imshow(shades, extent=plane.extent, origin="lower", cmap="inferno", vmin=0, vmax=1, interpolation="bilinear")
+    draw_curves(axes, plane, plane.extent, len(pairs))
+    marker, label = ("o", "found") if camera.identifiable else ("X", "a guess")
+    axes.plot(*plane.found, marker, markersize=12, fillstyle="none", color=MARK, markeredgewidth=1.6, label=label)
+    axes.set(title=plane.title, xlabel=plane.labels[0], ylabel=plane.labels[1], aspect="equal")
+    if camera.identifiable and min(plane.spread) > 0:
+        enlarge(axes, plane, camera, len(pairs))
+    axes.legend(loc="lower right", labelcolor=MARK, framealpha=0.6, facecolor="black", edgecolor="none")
+
+
+def draw_curves(axes: "Axes", plane: Plane, extent: tuple[float, float, float, float], pairs: int) -> None:
+    """The part of all curves that lies in `extent`; the more there are, the fainter."""
+    left, right, bottom, top = extent
+    x = _steps(left, right, SAMPLES)
+    y = _unbroken(plane.curves(x), min(bottom, top), max(bottom, top))
+    axes.plot(x, y.T, color=CURVE, linewidth=0.6, alpha=float(np.clip(12.0 / max(pairs, 1), 0.2, 0.8)))
+    axes.set(xlim=(left, right), ylim=(bottom, top))
+
+
+def enlarge(axes: "Axes", plane: Plane, camera: Calibration, pairs: int) -> None:
+    """The ellipse, in a window of its own where it would be too small to see."""
+    from matplotlib.patches import Ellipse
+
+    (x, y), (dx, dy) = plane.found, (DEVIATIONS * value for value in plane.spread)
+    left, right, bottom, top = plane.extent
+    target = axes
+    if max(dx / abs(right - left), dy / abs(top - bottom)) < ZOOMED_BELOW:
+        reach = 2.5 * max(dx, dy)
+        window = (x - reach, x + reach, y - np.sign(top - bottom) * reach, y + np.sign(top - bottom) * reach)
+        target = axes.inset_axes((0.63, 0.63, 0.35, 0.35))
+        target.set_facecolor("#20123a")
+        draw_curves(target, plane, window, pairs)
+        target.tick_params(colors=CURVE, labelsize=7)
+        target.locator_params(nbins=3)
+        axes.indicate_inset_zoom(target, edgecolor=GUIDE)
+    label = f"{DEVIATIONS:.0f} standard deviations"
+    if plane.names[0] == "fx" and camera.K[0, 0] == camera.K[1, 1]:
+        # one focal for both directions: they can be wrong only together
+        target.plot((x - dx, x + dx), (y - dy, y + dy), color=MARK, linewidth=1.8, label=label)
+    else:
+        target.add_patch(Ellipse((x, y), 2 * dx, 2 * dy, fill=False, edgecolor=MARK, linewidth=1.4, label=label))
+    if target is not axes:
+        axes.plot([], [], color=MARK, linewidth=1.6, label=f"{label} (enlarged)")
+
+
+def votes(plane: Plane, camera: Calibration, pairs: Pairs) -> FloatArray:
+    """(CELLS, CELLS) share of the votes at every point of the plane; rows go from its bottom to its top."""
+    left, right, bottom, top = plane.extent
+    grid = [values.ravel() for values in np.meshgrid(_steps(left, right, CELLS), _steps(bottom, top, CELLS))]
+    fixed = {"fx": camera.K[0, 0], "fy": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2]}
+    at = {name: np.full(CELLS * CELLS, value) for name, value in fixed.items()}
+    at |= dict(zip(plane.names, grid, strict=True))
+    unit = _unit(camera)
+    thetas = np.column_stack(
+        [
+            0.5 * np.log(at["fx"] * at["fy"] / unit**2),
+            (at["cx"] - camera.width / 2) / unit,
+            (at["cy"] - camera.height / 2) / unit,
+            np.log(at["fy"] / at["fx"]),
+        ]
+    )
+    support = Consensus(pairs, np.inf).at(thetas, SIGMA)
+    return support.reshape(CELLS, CELLS) / max(float(np.sum(pairs.weights)), 1.0)
+
+
+def _unit(camera: Calibration) -> float:
+    return float(max(camera.width, camera.height))
+
+
+def _steps(start: float, stop: float, count: int) -> FloatArray:
+    return start + (stop - start) * (np.arange(count) + 0.5) / count
+
+
+def _unbroken(curves: FloatArray, low: float, high: float) -> FloatArray:
+    """Curves without what lies outside of the range, and without the jumps from one root to another."""
+    inside = np.where((curves > low) & (curves < high), curves, np.nan)
+    jumps = np.abs(np.diff(inside, axis=1)) > JUMP * (high - low)
+    inside[:, 1:][jumps] = np.nan
+    return inside

@@ -1,0 +1,69 @@
+"""A calibration in words that need no knowledge of cameras."""
+
+import numpy as np
+
+from sfm_app.types import Calibration
+
+SOURCES = {"exif": "what the camera wrote into the files", "guess": "the usual guess"}
+HELD = {
+    "centre": "optical centre near the middle of the photo",
+    "aspect": "square pixels",
+    "k1": "a lens that bends no lines",
+}
+"""What is assumed where the photos do not tell."""
+
+
+def field_of_view_deg(camera: Calibration) -> tuple[float, float]:
+    """How much the camera sees from left to right and from top to bottom, in degrees; the lens is left out."""
+    (fx, _, cx), (_, fy, cy), _ = camera.K
+    across = np.arctan2([cx, camera.width - cx], fx)
+    down = np.arctan2([cy, camera.height - cy], fy)
+    return float(np.degrees(across.sum())), float(np.degrees(down.sum()))
+
+
+def verdict(camera: Calibration) -> str:
+    """Whether K is known, and if not, why, and what it is instead."""
+    if camera.identifiable:
+        return "Known: the photos agree on this camera."
+    source = SOURCES.get(camera.method, camera.method)
+    return f"Not known: what follows is {source}, since these photos do not determine the camera: {camera.reason}."
+
+
+def focal_text(camera: Calibration) -> str:
+    """Focal length and field of view."""
+    across, down = field_of_view_deg(camera)
+    focal = f"Focal length {camera.focal_px:.0f} px{_deviation(camera, 'fx')}"
+    tall = camera.K[0, 0] / camera.K[1, 1]
+    shape = "" if abs(tall - 1) < 5e-4 else f"; its pixels are {tall:.3f} times as high as wide"
+    return f"{focal}: the camera sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom{shape}."
+
+
+def centre_text(camera: Calibration) -> str:
+    """Where the optical centre lies, from the middle of the photo."""
+    right, below = camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2
+    if max(abs(right), abs(below)) < 0.5:
+        return "Optical centre in the middle of the photo."
+    across = f"{abs(right):.0f} px{_deviation(camera, 'cx')} {'right' if right > 0 else 'left'} of"
+    down = f"{abs(below):.0f} px{_deviation(camera, 'cy')} {'below' if below > 0 else 'above'}"
+    return f"Optical centre {across} and {down} the middle of the photo."
+
+
+def lens_text(camera: Calibration) -> str:
+    """The radial term, or nothing where none was found."""
+    if camera.radial == 0.0:
+        return ""
+    shape = "outwards (barrel)" if camera.radial < 0 else "inwards (pincushion)"
+    deviation = f" +- {camera.spread['k1']:.3f}" if "k1" in camera.spread else ""
+    return f"The lens bends lines {shape}, k1 {camera.radial:.3f}{deviation}."
+
+
+def held_text(camera: Calibration) -> str:
+    """What is assumed, or nothing."""
+    if not camera.held or not camera.identifiable:
+        return ""
+    return "Assumed, since the photos do not tell: " + ", ".join(HELD.get(name, name) for name in camera.held) + "."
+
+
+def _deviation(camera: Calibration, name: str) -> str:
+    value = camera.spread.get(name, 0.0)
+    return f" +- {value:.0f}" if value >= 1.5 else f" +- {value:.1f}" if value > 0 else ""

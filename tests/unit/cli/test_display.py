@@ -1,0 +1,46 @@
+import json
+
+import pytest
+
+from sfm_app.cli.display import intrinsics_lines, intrinsics_summary
+from sfm_app.geometry.camera import camera_matrix
+from sfm_app.types import Calibration, Intrinsics
+
+K = camera_matrix(500.0, 510.0, 480.0, 410.0)
+KNOWN = Calibration(
+    K, 1000, 800, "zero-curves", True,
+    radial=-0.05, spread={"fx": 1.25, "fy": 2.0, "cx": 3.0, "cy": 4.0, "k1": 0.01}, held=("aspect",),
+    key_pairs=((1, 2), (2, 3), (3, 4), (4, 5)),
+)  # fmt: skip
+GUESS = Calibration(K, 1000, 800, "guess", False, "an orbit", held=("centre",))
+
+
+def test_every_parameter_stands_beside_its_deviation():
+    first, *others = intrinsics_lines(Intrinsics({"one": KNOWN}))
+
+    assert first == "camera      fx 500.0 +- 1.2  fy 510.0 +- 2.0  cx 480.0 +- 3.0  cy 410.0 +- 4.0 px"
+    assert [line.strip() for line in others] == [
+        "sees 90 degrees from left to right, 76 from top to bottom",
+        "The lens bends lines outwards (barrel), k1 -0.050 +- 0.010.",
+        "Assumed, since the photos do not tell: square pixels.",
+        "best pairs of photos to start from: 1-2, 2-3, 3-4 (numbers as in database.db)",
+    ]
+
+
+def test_a_guess_is_called_one_right_after_its_figures():
+    lines = intrinsics_lines(Intrinsics({"one": GUESS, "two": KNOWN}))
+
+    assert lines[0].startswith("camera      one: fx 500.0  fy 510.0")
+    assert lines[1].strip() == "these photos do not determine it (an orbit): a guess"
+    assert sum(line.startswith("camera ") for line in lines) == 2
+
+
+def test_json_holds_everything_that_is_known_of_a_camera():
+    found = json.loads(json.dumps(intrinsics_summary(Intrinsics({"one": KNOWN}))))["one"]
+
+    assert found["field_of_view_deg"] == pytest.approx([89.95, 76.23], abs=0.3)
+    assert (
+        Calibration.from_dict({k: v for k, v in found.items() if k != "field_of_view_deg"}).to_dict() == KNOWN.to_dict()
+    )
+    assert (found["radial"], found["spread"]["k1"], found["held"]) == (-0.05, 0.01, ["aspect"])
+    assert (found["identifiable"], found["reason"], found["key_pairs"][0]) == (True, "", [1, 2])
