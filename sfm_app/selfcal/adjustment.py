@@ -26,9 +26,7 @@ ALONE = np.array([0.3, 0.15, 0.15, 0.2, 0.2])
 LOWER_QUARTILE = 0.288
 """Of that gain, where two degrees of freedom are noise (chi^2 / 2)."""
 LEAST_SIGMA_PX = 0.1
-FEW_MATCHES = 150
-"""Of one pair, until the cameras have nearly arrived."""
-ROUNDS, LAST_ROUNDS, STEPS = 12, 4, 4
+ROUNDS, STEPS = 12, 4
 ARRIVED = 2e-5
 
 
@@ -98,6 +96,20 @@ class Matches:
         self.count = int(self.cameras.max()) + 1 if len(cameras) else 0
         self.least_sigma = LEAST_SIGMA_PX / unit_px
 
+    @property
+    def redundancy(self) -> float:
+        """Matches over independent errors, >= 1.
+
+        One keypoint in m photos gives m (m - 1) / 2 matches, but 2 m - 3 independent errors. How many matches there are
+        per keypoint says what m is.
+        """
+        if len(self.points) == 0:
+            return 1.0
+        photos = self.photos.repeat(np.diff(self.ends), axis=0)
+        views = [np.column_stack([photos[:, view], self.points[:, 2 * view : 2 * view + 2]]) for view in range(2)]
+        each = 2 * len(self.points) / len(np.unique(np.concatenate(views), axis=0))
+        return max(1.0, 0.5 * each * (each + 1.0) / (2.0 * each - 1.0))
+
     def of_pair(self, pair: int) -> FloatArray:
         """(N, 4) of one pair."""
         return self.points[self.ends[pair] : self.ends[pair + 1]]
@@ -133,12 +145,6 @@ def evenly(rows: FloatArray, most: int) -> FloatArray:
     return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
 
 
-def adjusted(matches: Matches, state: State, prior: Prior) -> State:
-    """`settled` with few matches, then with all."""
-    state = settled(matches.thinned(FEW_MATCHES), state, prior)
-    return settled(matches, state, prior, LAST_ROUNDS)
-
-
 def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) -> State:
     """Weigh the pairs, minimise, and so on until the cameras stand still."""
     for _ in range(rounds):
@@ -155,12 +161,6 @@ def reweighted(matches: Matches, state: State) -> State:
     gains = informed(matches, state).gains
     scale = max(1.0, float(np.quantile(gains, 0.25)) / LOWER_QUARTILE) if len(gains) else 1.0
     return replace(state, weights=(1.0 + gains / (CONFLICT * scale)) ** -2, scale=scale)
-
-
-def objective(matches: Matches, state: State, prior: Prior) -> float:
-    """What the right cameras make small: the pairs' disagreement, each with a bounded say, and the prior."""
-    gains = informed(matches, state).gains
-    return float(np.sum(gains / (1.0 + gains / CONFLICT))) + prior.cost(state.thetas)
 
 
 def informed(matches: Matches, state: State) -> Information:

@@ -30,7 +30,7 @@ HINT_SPREAD = 0.05
 NARROW = {CENTRE: 0.012, ASPECT: 0.002, LENS: 0.005}
 """Standard deviations about the usual value: of the centre in longer sides, of log fy/fx, of k1."""
 WIDE = {CENTRE: 0.15, ASPECT: 0.25, LENS: 0.2}
-FREE_SHARE = {CENTRE: 0.2, ASPECT: 0.02, LENS: 0.5, FOCAL: 0.3}
+FREE_SHARE = {CENTRE: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
 """Share of photo sets in which the wide prior is the right one; for FOCAL, in which a claim is wrong."""
 
 
@@ -68,55 +68,61 @@ class Usual:
         return total
 
 
-def log_evidence(H: FloatArray, b: FloatArray, thetas: FloatArray, prior: Prior) -> float:
-    """Log marginal likelihood, up to a constant, of pairs that say -b'd + d'Hd / 2 about a step d from `thetas`.
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What all pairs together say about a step d of the cameras from `thetas`: -g'd + d'Hd / 2."""
 
-    Args:
-        H: (5C, 5C) Hessian of the negative log-likelihood of the pairs.
-        b: (5C,) its negative gradient.
-        thetas: (C, 5) where both were taken.
-        prior: normal, see `Usual.prior`.
-    """
-    precision = prior.precision.ravel()
-    away = (prior.mean - thetas).ravel()
-    A = H + np.diag(precision)
-    g = b + precision * away
-    least = 0.5 * float(precision @ away**2) - 0.5 * float(g @ np.linalg.solve(A, g))
-    return 0.5 * float(np.sum(np.log(precision))) - 0.5 * float(np.linalg.slogdet(A)[1]) - least
+    thetas: FloatArray
+    """(C, 5) parameters of the cameras."""
+    H: FloatArray
+    """(5C, 5C) Hessian of the negative log-likelihood."""
+    g: FloatArray
+    """(5C,) its negative gradient."""
+    pairs: float
+    """Effective number of pairs behind it."""
+    usual: Usual
 
+    def posterior(self, free: BoolArray) -> tuple[float, FloatArray, FloatArray]:
+        """Log-probability of a choice of freed parameters, up to a constant; mean step and covariance under it."""
+        prior = self.usual.prior(free, self.thetas)
+        precision, away = prior.precision.ravel(), (prior.mean - self.thetas).ravel()
+        share = spare(free, self.pairs)
+        covariance = np.asarray(np.linalg.inv(share * self.H + np.diag(precision)), np.float64)
+        pull = share * self.g + precision * away
+        step = covariance @ pull
+        fit = 0.5 * float(pull @ step) - 0.5 * float(precision @ away**2)
+        volume = 0.5 * float(np.sum(np.log(precision))) + 0.5 * float(np.linalg.slogdet(covariance)[1])
+        return fit + volume + self.usual.log_odds(free), step, covariance
 
-def chosen(
-    H: FloatArray, b: FloatArray, thetas: FloatArray, usual: Usual, free: BoolArray, pairs: float
-) -> tuple[BoolArray, float]:
-    """Which parameters the pairs free, and by how many nats that choice beats leaving all as usual.
+    def choices(self, free: BoolArray, camera: int) -> list[BoolArray]:
+        """All choices for one camera, the others as in `free` (C, 4); those that free less come first."""
+        trials = []
+        for switches in sorted(product((False, True), repeat=free.shape[1]), key=sum):
+            trials.append(free.copy())
+            trials[-1][camera] = switches
+        return trials
 
-    One camera: all sixteen choices. Several: one camera after the other, the rest as they are, until none changes.
+    def best(self, free: BoolArray) -> BoolArray:
+        """The most probable choice: one camera after the other, the rest as they are, until none changes."""
+        while True:
+            before = free
+            for camera in range(len(free)):
+                free = max(self.choices(free, camera), key=lambda trial: self.posterior(trial)[0])
+            if np.array_equal(free, before):
+                return free
 
-    Args:
-        H: as in `log_evidence`.
-        b: as in `log_evidence`.
-        thetas: (C, 5) where both were taken.
-        usual: the priors.
-        free: (C, 4) the choice to begin from.
-        pairs: effective number of pairs behind H.
-    """
-
-    def value(choice: BoolArray) -> float:
-        share = spare(choice, pairs)
-        return log_evidence(share * H, share * b, thetas, usual.prior(choice, thetas)) + usual.log_odds(choice)
-
-    free = free.copy()
-    while True:
-        before = free.copy()
+    def covariance(self, free: BoolArray) -> FloatArray:
+        """(5C, 5C) of the cameras about `thetas`, over all choices: what is nearly free is nearly as uncertain."""
+        total: FloatArray = self.posterior(free)[2]
         for camera in range(len(free)):
-            trials = []
-            for switches in product((False, True), repeat=free.shape[1]):
-                trial = free.copy()
-                trial[camera] = switches
-                trials.append((value(trial), -sum(switches), switches))
-            free[camera] = max(trials)[2]
-        if np.array_equal(free, before):
-            return free, value(free) - value(np.zeros_like(free))
+            block = slice(CAMERA * camera, CAMERA * (camera + 1))
+            found = [self.posterior(trial) for trial in self.choices(free, camera)]
+            odds = np.exp(np.array([value for value, _, _ in found]) - max(value for value, _, _ in found))
+            mixed = np.zeros((CAMERA, CAMERA))
+            for share, (_, step, covariance) in zip(odds / odds.sum(), found, strict=True):
+                mixed += share * (covariance[block, block] + np.outer(step[block], step[block]))
+            total[block, block] = mixed
+        return total
 
 
 def spare(free: BoolArray, pairs: float) -> float:

@@ -9,28 +9,28 @@ from numpy.typing import NDArray
 from sfm_app.geometry.essential import essential_from_fundamental, relative_pose
 from sfm_app.ransac.refit import refine_sampson
 from sfm_app.selfcal.adjustment import (
+    CONFLICT,
     Information,
     Matches,
     Prior,
     State,
-    adjusted,
     evenly,
     informed,
-    objective,
+    reweighted,
     settled,
 )
 from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, straightened
-from sfm_app.selfcal.priors import ASPECT, Usual, chosen
+from sfm_app.selfcal.priors import ASPECT, NAMES, Evidence, Usual
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+FEW_MATCHES, LAST_ROUNDS = 150, 4
+"""Matches of one pair until the cameras have nearly arrived; rounds with all of them after that."""
 POSE_MATCHES = 100
 """Enough to tell which of the four poses of an E is the right one."""
 CHOICES = 3
 """Times the evidence is asked again after an adjustment."""
-NOT_SQUARE = 0.02
-"""A first idea with a larger |log fy/fx| keeps its aspect free from the start."""
 REFIT_REACH = 3.0
 """Scale of the robust refit of an F, in sigma."""
 
@@ -44,21 +44,37 @@ class Fit:
     free: BoolArray
     """(C, 4) which parameters the evidence freed, see `priors`."""
     prior: Prior
-    gain: float
-    """Nats by which that choice beats leaving all as usual."""
+    usual: Usual
 
     @property
     def information(self) -> Information:
-        """What each pair says at the end."""
+        """What each pair says."""
         return informed(self.matches, self.state)
 
-    def system(self) -> tuple[FloatArray, FloatArray]:
-        """(5C, 5C) Hessian and (5C,) negative gradient of what all pairs say, without the prior."""
-        return self.matches.scattered(self.information, self.state.weights / self.state.scale)
+    @property
+    def evidence(self) -> Evidence:
+        """What all pairs say, as if the matches of one keypoint were worth what they are."""
+        trust = self.state.weights / (self.state.scale * self.matches.redundancy)
+        H, g = self.matches.scattered(self.information, trust)
+        return Evidence(self.state.thetas, H, g, float(np.sum(self.state.weights)), self.usual)
+
+    def cost(self, sigma: float, scale: float) -> float:
+        """Negative log-probability by which fits from different starts compete, the pairs' say bounded.
+
+        Args:
+            sigma: of a distance; with its own, larger one a wrong fit would be lenient with itself.
+            scale: of the disagreement; likewise.
+        """
+        state = reweighted(self.matches, replace(self.state, sigma=sigma))
+        gains = informed(self.matches, state).gains / (scale * self.matches.redundancy)
+        H = replace(self, state=state).evidence.H + np.diag(self.prior.precision.ravel())
+        volume = 0.5 * float(np.linalg.slogdet(H)[1] - np.sum(np.log(self.prior.precision)))
+        bounded = float(np.sum(gains / (1.0 + gains / CONFLICT)))
+        return bounded + self.prior.cost(state.thetas) + volume - self.usual.log_odds(self.free)
 
 
 def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], usual: Usual) -> Fit:
-    """The best of the fits that begin at `starts`.
+    """The best of the fits that begin at `starts`, each with the pixels square and not.
 
     Args:
         matches: inliers about the middle of the photos.
@@ -66,25 +82,19 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], usua
         starts: (C, 5) each, first ideas of the cameras.
         usual: what is known before.
     """
-    few = matches.thinned(POSE_MATCHES)
-    begun = [_begun(few, Fs, thetas, usual) for thetas in starts]
-    if len(begun) > 1:
-        # compared with one sigma, or a wrong start would be lenient with itself
-        sigma = min(state.sigma for state, _, _ in begun)
-        costs = [objective(few, replace(state, sigma=sigma), prior) for state, prior, _ in begun]
-        state, prior, free = begun[int(np.argmin(costs))]
-    else:
-        state, prior, free = begun[0]
-    state = adjusted(matches, state, prior)
-    gain = 0.0
+    few = matches.thinned(FEW_MATCHES)
+    begun = [_begun(few, Fs, thetas, usual, square) for thetas in starts for square in (True, False)]
+    sigma, scale = (min(getattr(fit.state, name) for fit in begun) for name in ("sigma", "scale"))
+    fit = replace(min(begun, key=lambda fit: fit.cost(sigma, scale)), matches=matches)
+    fit = replace(fit, state=settled(matches, fit.state, fit.prior, LAST_ROUNDS))
     for _ in range(CHOICES):
-        H, b = matches.scattered(informed(matches, state), state.weights / state.scale)
-        again, gain = chosen(H, b, state.thetas, usual, free, float(np.sum(state.weights)))
-        if np.array_equal(again, free):
+        free = fit.evidence.best(fit.free)
+        if np.array_equal(free, fit.free):
             break
-        free, prior = again, usual.prior(again, state.thetas)
-        state = adjusted(matches, state, prior)
-    return Fit(matches, state, free, prior, gain)
+        prior = usual.prior(free, fit.state.thetas)
+        state = settled(few, fit.state, prior)
+        fit = Fit(matches, settled(matches, state, prior, LAST_ROUNDS), free, prior, usual)
+    return fit
 
 
 def straight_fundamentals(fit: Fit) -> FloatArray:
@@ -107,12 +117,12 @@ def camera_matrix_of(theta: FloatArray) -> FloatArray:
     return np.array([[f / half, 0.0, theta[CENTRE_U]], [0.0, f * half, theta[CENTRE_V]], [0.0, 0.0, 1.0]])
 
 
-def _begun(few: Matches, Fs: FloatArray, thetas: FloatArray, usual: Usual) -> tuple[State, Prior, BoolArray]:
-    free = np.ones((len(thetas), 4), np.bool_)
-    free[:, ASPECT] = np.abs(thetas[:, LOG_ASPECT]) > NOT_SQUARE
+def _begun(few: Matches, Fs: FloatArray, thetas: FloatArray, usual: Usual, square: bool) -> Fit:
+    free = np.ones((len(thetas), len(NAMES)), np.bool_)
+    free[:, ASPECT] = not square
     prior = usual.prior(free, thetas)
     state = State(thetas, _poses(few, Fs, thetas), np.ones(len(Fs)), few.least_sigma)
-    return settled(few, replace(state, sigma=few.noise(state)), prior), prior, free
+    return Fit(few, settled(few, replace(state, sigma=few.noise(state)), prior), free, prior, usual)
 
 
 def _poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatArray:

@@ -3,9 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.selfcal.adjustment import ALONE, Matches
+from sfm_app.selfcal.adjustment import ALONE
 from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, KAPPA, LOG_ASPECT, LOG_FOCAL
-from sfm_app.selfcal.priors import spare
 from sfm_app.selfcal.refine import Fit
 from sfm_app.selfcal.two_view_cost import CAMERA
 from sfm_app.types import PairId
@@ -19,30 +18,12 @@ AGREES = 0.5
 
 
 def covariance(fit: Fit, sides: FloatArray) -> FloatArray:
-    """(5C, 5C) covariance of all parameters.
-
-    The inverse Hessian takes all matches as independent. They are not: one keypoint in m photos gives m (m - 1) / 2
-    matches of 2 m - 3 independent errors. The number of matches per keypoint says how much that is worth.
-    """
-    H, _ = fit.system()
-    share = spare(fit.free, float(np.sum(fit.state.weights))) / redundancy(fit.matches)
-    found = np.linalg.inv(share * H + np.diag(fit.prior.precision.ravel()))
+    """(5C, 5C) covariance of all parameters, over all choices of what is free, with what no model holds added."""
+    found = fit.evidence.covariance(fit.free)
     floor = np.tile(MODEL_ERROR, (len(sides), 1))
     floor[:, CENTRE_U : CENTRE_V + 1] *= sides[:, None]
     floor[:, KAPPA] /= np.exp(2.0 * fit.state.thetas[:, LOG_FOCAL])
     return np.asarray(found + np.diag(floor.ravel() ** 2), np.float64)
-
-
-def redundancy(matches: Matches) -> float:
-    """Matches over independent errors, >= 1."""
-    if len(matches.points) == 0:
-        return 1.0
-    photos = matches.photos.repeat(np.diff(matches.ends), axis=0)
-    keypoints = np.concatenate(
-        [np.column_stack([photos[:, view], matches.points[:, 2 * view : 2 * view + 2]]) for view in range(2)]
-    )
-    per_keypoint = len(keypoints) / len(np.unique(keypoints, axis=0))
-    return max(1.0, 0.5 * per_keypoint * (per_keypoint + 1.0) / (2.0 * per_keypoint - 1.0))
 
 
 def spread_of(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, float]:

@@ -138,7 +138,6 @@ def _figures(fit: Fit, side: float, log_focal_spread: float) -> dict[str, float]
         "noise_px": fit.state.sigma * side,
         "conflict": fit.state.scale,
         "weight": float(np.sum(fit.state.weights)),
-        "gain": fit.gain,
     }
 
 
