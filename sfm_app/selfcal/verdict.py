@@ -31,7 +31,7 @@ class Camera(NamedTuple):
 
     @classmethod
     def initial(cls, tall: float) -> "Camera":
-        """K_init of thesis 5.7.2 for an image of width 1 and height `tall`: focal 1, centre in the middle."""
+        """K_init of thesis 5.7.2 for an image of width 1 and height `tall`: 53 degrees (not 90, as it says) across."""
         return cls(1.0, 1.0, 0.5, 0.5 * tall)
 
     @property
