@@ -81,11 +81,12 @@ class Matches:
         photos: (P, 2) numbers of the photos.
         unit_px: length of that unit, in pixels.
         most: of one pair; evenly chosen where there are more.
+        count: number of cameras.
     """
 
     def __init__(
         self, inliers: Sequence[FloatArray], cameras: IndexArray, photos: IndexArray, unit_px: float,
-        most: int = MOST_MATCHES,
+        most: int = MOST_MATCHES, count: int = 1,
     ) -> None:  # fmt: skip
         kept = [evenly(x, most) for x in inliers]
         self.unit_px = unit_px
@@ -93,7 +94,7 @@ class Matches:
         self.ends = np.concatenate([[0], np.cumsum([len(x) for x in kept])]).astype(np.int64)
         self.cameras = np.ascontiguousarray(cameras, dtype=np.int64)
         self.photos = np.asarray(photos, dtype=np.int64)
-        self.count = int(self.cameras.max()) + 1 if len(cameras) else 0
+        self.count = count
         self.least_sigma = LEAST_SIGMA_PX / unit_px
 
     @property
@@ -117,7 +118,7 @@ class Matches:
     def thinned(self, most: int) -> "Matches":
         """The same with at most so many per pair."""
         inliers = [self.of_pair(pair) for pair in range(len(self.cameras))]
-        return Matches(inliers, self.cameras, self.photos, self.unit_px, most)
+        return Matches(inliers, self.cameras, self.photos, self.unit_px, most, self.count)
 
     def costs(self, state: State) -> FloatArray:
         """(P,) robust costs."""

@@ -18,10 +18,19 @@ def guessed(size: tuple[int, int], reason: str, evidence: Mapping[str, float]) -
     return Calibration(K, *size, GUESS, identifiable=False, reason=reason, evidence=dict(evidence))
 
 
-def calibration_of(theta: NDArray[np.float64], size: tuple[int, int], method: str) -> Calibration:
-    """An answer from the parameters (5,) of `lens`, in longer sides about the middle."""
-    side = float(max(size))
+def calibration_of(
+    theta: NDArray[np.float64], size: tuple[int, int], method: str, unit_px: float | None = None
+) -> Calibration:
+    """An answer from the parameters (5,) of `lens`, about the middle, in units of the longer side unless told."""
+    unit = float(max(size)) if unit_px is None else unit_px
     focal, half = float(np.exp(theta[LOG_FOCAL])), float(np.exp(0.5 * theta[LOG_ASPECT]))
-    cx, cy = side * theta[CENTRE_U] + size[0] / 2, side * theta[CENTRE_V] + size[1] / 2
-    K = camera_matrix(side * focal / half, side * focal * half, float(cx), float(cy))
+    cx, cy = unit * theta[CENTRE_U] + size[0] / 2, unit * theta[CENTRE_V] + size[1] / 2
+    K = camera_matrix(unit * focal / half, unit * focal * half, float(cx), float(cy))
     return Calibration(K, *size, method, identifiable=True, radial=float(theta[KAPPA]) * focal**2)
+
+
+def parameters_of(found: Calibration, unit_px: float) -> NDArray[np.float64]:
+    """Back from `calibration_of`: (5,)."""
+    focal = found.focal_px / unit_px
+    u, v = (found.K[0, 2] - found.width / 2) / unit_px, (found.K[1, 2] - found.height / 2) / unit_px
+    return np.array([np.log(focal), u, v, np.log(found.K[1, 1] / found.K[0, 0]), found.radial / focal**2])

@@ -57,10 +57,12 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True)
 class Intrinsics:
-    """One calibration per camera group."""
+    """One calibration per camera."""
 
     cameras: Mapping[str, Calibration]
-    """By camera group; the first entry has the most photos."""
+    """By name of the camera; the first entry has the most photos."""
+    camera_of: Mapping[str, str] = field(default_factory=dict)
+    """Name of the camera by photo: its camera group, unless the photos of a group turned out to be of several cameras."""
 
     @property
     def main(self) -> Calibration:

@@ -1,0 +1,259 @@
+"""Several cameras in one set of photos: one K each, from the pairs within cameras and between them.
+
+A camera that its own pairs determine is known. The focals of the others are found together, on a grid, as the choice
+that most pairs agree on (max-sum message passing; E = K2'F K1 has two equal singular values for the right two focals),
+and then everything is adjusted to the matches at once.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.selfcal import peak
+from sfm_app.selfcal.adjustment import Matches
+from sfm_app.selfcal.answers import calibration_of, guessed, parameters_of
+from sfm_app.selfcal.evidence import MIN_LEAD, RIVAL_RATIO
+from sfm_app.selfcal.inputs import FloatArray, prepare
+from sfm_app.selfcal.lens import LOG_FOCAL, camera_of
+from sfm_app.selfcal.priors import FOCAL_SPREAD, HINT_SPREAD, NAMES, USUAL_FOCAL, Usual
+from sfm_app.selfcal.refine import Fit, refined, straight_fundamentals
+from sfm_app.selfcal.search import FOCAL_RANGE, SIGMAS
+from sfm_app.selfcal.two_view_cost import CAMERA
+from sfm_app.selfcal.uncertainty import covariance, spread_of
+from sfm_app.types import Calibration, CameraPairs
+
+IndexArray = NDArray[np.int64]
+
+FOCALS = 41
+"""Focals on the grid of a camera, each 7 % above the one before."""
+MESSAGE_ROUNDS, DAMPING = 30, 0.5
+LEAST_PAIRS = 2
+"""Pairs that a camera needs: two constraints find its focal, two more contradict a wrong one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraGroup:
+    """One camera of several."""
+
+    size: tuple[int, int]
+    """(width, height) of its photos in pixels."""
+    known: Calibration | None = None
+    """What its own pairs say, where they determine it."""
+    hint_px: float = np.nan
+    """Claimed focal."""
+
+
+def calibrate_several(
+    cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, method: str
+) -> list[Calibration]:
+    """One calibration per camera, in their order; each is identifiable or a guess with the reason.
+
+    Args:
+        cameras: sizes, and what is known.
+        pairs: all pairs, within and between cameras, with inliers; the size is not used.
+        members: (P, 2) number of the camera that took view 1, view 2.
+        method: name that goes into the answers.
+    """
+    unit = float(max(max(camera.size) for camera in cameras))
+    kept, Fs, matches = _in_units(cameras, pairs, members, unit)
+    members = members[kept]
+    sides = np.array([max(camera.size) / unit for camera in cameras])
+    usual = Usual(sides, np.array([camera.hint_px for camera in cameras]) / unit)
+    weights = pairs.weights[kept]
+    thetas = np.array([_first(camera, side, unit) for camera, side in zip(cameras, sides, strict=True)])
+    unknown = np.array([camera.known is None for camera in cameras])
+    if unknown.any():
+        thetas = _with_focals(thetas, unknown, Tables(Fs, members, weights), usual)
+    fit = refined(matches, Fs, [thetas], usual)
+    cov = covariance(fit, sides)
+    straight = Tables(straight_fundamentals(fit), members, weights)
+    return [_judged(k, camera, fit, cov, straight, unit, method) for k, camera in enumerate(cameras)]
+
+
+class Tables:
+    """How well pairs agree, focal by focal of their two cameras.
+
+    Args:
+        Fs: (P, 3, 3) in one unit about the middle of each photo.
+        members: (P, 2) cameras.
+        weights: (P,).
+    """
+
+    def __init__(self, Fs: FloatArray, members: IndexArray, weights: FloatArray) -> None:
+        ones = CameraPairs.of(Fs, (1, 1), weights)
+        ready = prepare(ones, unit_px=1.0, origin_px=(0.0, 0.0))
+        self.packed, self.members, self.weights = ready.packed, members[ready.kept], ready.weights
+
+    def votes(self, pair: int, first: FloatArray, second: FloatArray, sigma: float) -> FloatArray:
+        """(A, B) w exp(-r / sigma) for cameras (A, 5) of view 1 and (B, 5) of view 2."""
+        return np.asarray(self.weights[pair] * np.exp(-_ratios(self.packed[pair], first, second) / sigma), np.float64)
+
+
+def _in_units(
+    cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, unit: float
+) -> tuple[IndexArray, FloatArray, Matches]:
+    """Usable pairs, their F's and inliers in units about the middle of each photo."""
+    ready = prepare(pairs, unit_px=unit, origin_px=(0.0, 0.0))
+    middles = np.array([camera.size for camera in cameras]) / (2.0 * unit)
+    used = members[ready.kept]
+    moves = np.tile(np.eye(3), (len(cameras), 1, 1))
+    moves[:, :2, 2] = middles
+    Fs = moves[used[:, 1]].transpose(0, 2, 1) @ ready.F @ moves[used[:, 0]]
+    inliers = [
+        np.asarray(pairs.inliers[k], np.float64) / unit - np.concatenate([middles[i], middles[j]])
+        for k, (i, j) in zip(ready.kept, used, strict=True)
+    ]
+    photos = np.array([pairs.photos[k] for k in ready.kept]).reshape(-1, 2)
+    return ready.kept, Fs, Matches(inliers, used, photos, unit, count=len(cameras))
+
+
+def _first(camera: CameraGroup, side: float, unit: float) -> FloatArray:
+    if camera.known is not None:
+        return parameters_of(camera.known, unit)
+    return np.array([USUAL_FOCAL + np.log(side), 0.0, 0.0, 0.0, 0.0])
+
+
+def _with_focals(thetas: FloatArray, unknown: NDArray[np.bool_], tables: Tables, usual: Usual) -> FloatArray:
+    """The unknown focals on which most pairs agree."""
+    grid = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
+    trials = np.repeat(thetas[:, None], FOCALS, axis=1)
+    trials[unknown, :, LOG_FOCAL] = grid + np.log(usual.sides[unknown])[:, None]
+    own = -0.5 * ((trials[..., LOG_FOCAL] - np.log(usual.sides)[:, None] - USUAL_FOCAL) / FOCAL_SPREAD) ** 2
+    hinted = np.isfinite(usual.hints)
+    off = (trials[hinted, :, LOG_FOCAL] - np.log(usual.hints[hinted])[:, None]) / HINT_SPREAD
+    own[hinted] += np.exp(-0.5 * off**2)
+    between: dict[tuple[int, int], FloatArray] = {}
+    for pair, (i, j) in enumerate(tables.members):
+        table = tables.votes(pair, trials[i], trials[j], SIGMAS[0])
+        if i == j:
+            own[i] += np.diag(table)
+        else:
+            key, table = ((i, j), table) if i < j else ((j, i), table.T)
+            between[key] = between.get(key, 0.0) + table
+    places = best_places(own, between)
+    chosen = thetas.copy()
+    chosen[:, LOG_FOCAL] = trials[np.arange(len(thetas)), places, LOG_FOCAL]
+    return chosen
+
+
+def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> IndexArray:
+    """Which place on its grid every camera takes, so that the sum over cameras and over pairs of cameras is large.
+
+    Damped max-sum message passing (Pearl 1988; exact on trees), then one camera after the other while that helps.
+
+    Args:
+        own: (C, G) what each camera gains by itself.
+        between: (G, G) what two cameras i < j gain together, by (i, j).
+    """
+    tables = {(i, j): table for (i, j), table in between.items()} | {(j, i): t.T for (i, j), t in between.items()}
+    messages = {edge: np.zeros(own.shape[1]) for edge in tables}
+    for _ in range(MESSAGE_ROUNDS):
+        belief = own.copy()
+        for (_, to), message in messages.items():
+            belief[to] += message
+        for (source, to), table in tables.items():
+            new = np.max((belief[source] - messages[to, source])[:, None] + table, axis=0)
+            messages[source, to] = DAMPING * messages[source, to] + (1.0 - DAMPING) * (new - np.max(new))
+    belief = own.copy()
+    for (_, to), message in messages.items():
+        belief[to] += message
+    places: IndexArray = np.argmax(belief, axis=1).astype(np.int64)
+    for _ in range(MESSAGE_ROUNDS):
+        before = places.copy()
+        for camera in range(len(places)):
+            value = own[camera].copy()
+            for (source, to), table in tables.items():
+                if to == camera:
+                    value += table[places[source]]
+            places[camera] = int(np.argmax(value))
+        if np.array_equal(places, before):
+            break
+    return places
+
+
+def _judged(
+    index: int, camera: CameraGroup, fit: Fit, cov: FloatArray, straight: Tables, unit: float, method: str
+) -> Calibration:
+    """The answer for one camera, or why its pairs do not give one."""
+    theta = fit.state.thetas[index]
+    block = cov[CAMERA * index : CAMERA * (index + 1), CAMERA * index : CAMERA * (index + 1)]
+    mine = np.flatnonzero((fit.matches.cameras == index).any(axis=1))
+    lead, support = _lead(index, fit.state.thetas, straight)
+    side = max(camera.size) / unit
+    in_sides = theta - np.array([np.log(side), 0.0, 0.0, 0.0, 0.0])
+    in_sides[1:3] /= side
+    spread = float(np.sqrt(block[LOG_FOCAL, LOG_FOCAL]))
+    evidence = {
+        "pairs": float(len(mine)),
+        "support": support,
+        "lead": lead,
+        "log_focal_spread": spread,
+        "noise_px": fit.state.sigma * unit,
+        "weight": float(np.sum(fit.state.weights[mine])),
+    }
+    half = (0.5 * camera.size[0] / max(camera.size), 0.5 * camera.size[1] / max(camera.size))
+    reason = ""
+    if len(mine) < LEAST_PAIRS:
+        reason = f"{len(mine)} usable pairs, {LEAST_PAIRS} are needed"
+    elif camera.known is None and lead < MIN_LEAD:
+        reason = "the pairs fit other focals as well or better"
+    reason = reason or peak.objection(in_sides, spread, half)
+    if reason:
+        return guessed(camera.size, reason, evidence)
+    held = tuple(NAMES[place] for place in range(3) if not fit.free[index, place])
+    found = calibration_of(theta, camera.size, method, unit)
+    return replace(found, spread=spread_of(theta, block, unit), evidence=evidence, held=held)
+
+
+def _lead(index: int, thetas: FloatArray, tables: Tables) -> tuple[float, float]:
+    """Votes by which a camera's focal leads all others, the other cameras as they are; and its share of the votes."""
+    offsets = np.concatenate([[0.0], np.linspace(-1.5, 1.5, 61)])
+    trials = np.repeat(thetas[None, index], len(offsets), axis=0)
+    trials[:, LOG_FOCAL] += offsets
+    total, most = np.zeros(len(offsets)), 0.0
+    for pair, (i, j) in enumerate(tables.members):
+        if index not in (i, j):
+            continue
+        most += tables.weights[pair]
+        if i == j:
+            total += np.diag(tables.votes(pair, trials, trials, SIGMAS[-1]))
+        elif i == index:
+            total += tables.votes(pair, trials, thetas[j][None], SIGMAS[-1])[:, 0]
+        else:
+            total += tables.votes(pair, thetas[i][None], trials, SIGMAS[-1])[0]
+    rivals = total[np.abs(offsets) > np.log(RIVAL_RATIO)]
+    return float(total[0] - np.max(rivals)), float(total[0] / most) if most > 0 else 0.0
+
+
+@kernel
+def _ratios(pair: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+    """(A, B) r = (s1 - s2) / (s1 + s2) of E = K2'F K1, for cameras (A, 5) and (B, 5), lenses aside.
+
+    As `constraints.singular_value_ratio`, with two cameras.
+    """
+    k1, k2, G = np.empty(5), np.empty(5), np.empty((3, 3))
+    found = np.empty((len(first), len(second)))
+    for i in range(len(first)):
+        camera_of(first[i], k1)
+        for row in range(3):
+            a, b, c = pair[3 * row], pair[3 * row + 1], pair[3 * row + 2]
+            G[row, 0], G[row, 1], G[row, 2] = a * k1[0], b * k1[1], a * k1[2] + b * k1[3] + c
+        n1 = _minor(pair[9], pair[10], pair[11], k1)
+        for j in range(len(second)):
+            camera_of(second[j], k2)
+            square = 0.0
+            for column in range(3):
+                p, q = G[0, column], G[1, column]
+                square += (k2[0] * p) ** 2 + (k2[1] * q) ** 2 + (k2[2] * p + k2[3] * q + G[2, column]) ** 2
+            twice = 2.0 * pair[15] * np.sqrt(n1 * _minor(pair[12], pair[13], pair[14], k2))
+            found[i, j] = np.sqrt(max(square - twice, 0.0) / (square + twice)) if square + twice > 0.0 else 1.0
+    return found
+
+
+@kernel
+def _minor(x: float, y: float, w: float, k: FloatArray) -> float:
+    """|adj(K) e|^2."""
+    return float((k[1] * (x - k[2] * w)) ** 2 + (k[0] * (y - k[3] * w)) ** 2 + (k[0] * k[1] * w) ** 2)
