@@ -62,7 +62,7 @@ class Intrinsics:
     cameras: Mapping[str, Calibration]
     """By name of the camera; the first entry has the most photos."""
     camera_of: Mapping[str, str] = field(default_factory=dict)
-    """Name of the camera by photo: its camera group, unless the photos of a group turned out to be of several cameras."""
+    """Name of the camera by photo: its camera group, unless a group turned out to hold photos of several cameras."""
 
     @property
     def main(self) -> Calibration:
