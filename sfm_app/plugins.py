@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sfm_app.errors import ConfigError, PluginError
 from sfm_app.meshing import EXPORTERS
 from sfm_app.ransac import ESTIMATORS
-from sfm_app.selfcal import CALIBRATORS
+from sfm_app.selfcal import CALIBRATORS, SEVERAL_CAMERAS
 from sfm_app.settings import CalibrationSettings, EpipolarSettings
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Rejected
 
@@ -62,6 +62,8 @@ class Calibrator:
     name: str
     calibrate: Calibrate
     summary: str = ""
+    together: bool = False
+    """Whether groups that disagree are split, and pairs between cameras used, by the program's own method."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +101,10 @@ class BuiltIns:
 
     @hookimpl
     def sfm_calibrators(self) -> Iterable[Calibrator]:
-        return [Calibrator(name, calibrate, summary) for name, (calibrate, summary) in CALIBRATORS.items()]
+        return [
+            Calibrator(name, calibrate, summary, together=name == SEVERAL_CAMERAS)
+            for name, (calibrate, summary) in CALIBRATORS.items()
+        ]
 
     @hookimpl
     def sfm_exporters(self) -> Iterable[Exporter]:

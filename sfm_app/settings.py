@@ -63,6 +63,7 @@ class CalibrationSettings(Section):
 
     calibrator: str = Field("zero-curves", description="name of the calibrator (see `sfm-app plugins`)")
     samples: int = Field(100, ge=10, le=10000, description="samples along one zero curve")
+    lens: bool = Field(True, description="look for the radial distortion of the lens")
     centre_sigma: float = Field(
         0.15,
         gt=0,

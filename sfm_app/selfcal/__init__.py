@@ -1,7 +1,5 @@
 """Self-calibration: the camera matrix from fundamental matrices (thesis chapter 5)."""
 
-from collections.abc import Callable
-
 from sfm_app.selfcal import (
     geometric,
     huang_faugeras,
@@ -12,17 +10,14 @@ from sfm_app.selfcal import (
     zero_curves_thesis,
 )
 from sfm_app.selfcal.inputs import pair_weights
-from sfm_app.settings import CalibrationSettings
-from sfm_app.types import Calibration, CameraPairs
+from sfm_app.selfcal.photo_set import CalibrateFunction, Camera, calibrate_photo_set
 
-__all__ = ["CALIBRATORS", "CalibrateFunction", "pair_weights"]
-
-CalibrateFunction = Callable[[CameraPairs, CalibrationSettings, int], Calibration]
+__all__ = ["CALIBRATORS", "SEVERAL_CAMERAS", "CalibrateFunction", "Camera", "calibrate_photo_set", "pair_weights"]
 
 CALIBRATORS: dict[str, tuple[CalibrateFunction, str]] = {
     zero_curves.METHOD: (
         zero_curves.calibrate,
-        "consensus of all pairs over focal, centre and, where the photos show it, fy/fx at once",
+        "consensus of all pairs over all of K, then cameras and lens adjusted to the matches; several cameras",
     ),
     zero_curves_thesis.METHOD: (
         zero_curves_thesis.calibrate,
@@ -50,3 +45,6 @@ CALIBRATORS: dict[str, tuple[CalibrateFunction, str]] = {
     ),
 }
 """Every calibrator by name, with a line about it."""
+
+SEVERAL_CAMERAS = zero_curves.METHOD
+"""The calibrator that also splits groups and uses pairs between cameras."""

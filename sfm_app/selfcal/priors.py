@@ -30,6 +30,8 @@ HINT_SPREAD = 0.05
 NARROW = {CENTRE: 0.012, ASPECT: 0.002, LENS: 0.005}
 """Standard deviations about the usual value: of the centre in longer sides, of log fy/fx, of k1."""
 WIDE = {CENTRE: 0.15, ASPECT: 0.25, LENS: 0.2}
+STRAIGHT = 1e-6
+"""The same of k1 where nobody wants to know about it."""
 FREE_SHARE = {CENTRE: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
 """Share of photo sets in which the wide prior is the right one; for FOCAL, in which a claim is wrong."""
 
@@ -44,6 +46,8 @@ class Usual:
     """(C,) claimed focal in the same units, NaN where nobody claims one."""
     centre_sigma: float = WIDE[CENTRE]
     """Wide prior on the centre, in longer sides."""
+    lens: bool = True
+    """False: every lens is taken as straight."""
 
     def prior(self, free: BoolArray, thetas: FloatArray) -> Prior:
         """The prior when `free` (C, 4) says what is freed; `thetas` (C, 5) turn k1 into kappa."""
@@ -55,7 +59,7 @@ class Usual:
         wide = self.centre_sigma
         deviation[:, CENTRE_U : CENTRE_U + 2] = (np.where(free[:, CENTRE], wide, NARROW[CENTRE]) * self.sides)[:, None]
         deviation[:, LOG_ASPECT] = np.where(free[:, ASPECT], WIDE[ASPECT], NARROW[ASPECT])
-        k1 = np.where(free[:, LENS], WIDE[LENS], NARROW[LENS])
+        k1 = np.where(free[:, LENS], WIDE[LENS], NARROW[LENS]) if self.lens else STRAIGHT
         deviation[:, KAPPA] = k1 / np.exp(2.0 * thetas[:, LOG_FOCAL])
         return Prior(mean, deviation**-2.0)
 

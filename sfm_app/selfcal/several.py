@@ -23,6 +23,7 @@ from sfm_app.selfcal.refine import Fit, refined, straight_fundamentals
 from sfm_app.selfcal.search import FOCAL_RANGE, SIGMAS
 from sfm_app.selfcal.two_view_cost import CAMERA
 from sfm_app.selfcal.uncertainty import covariance, spread_of
+from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
 IndexArray = NDArray[np.int64]
@@ -40,14 +41,16 @@ class CameraGroup:
 
     size: tuple[int, int]
     """(width, height) of its photos in pixels."""
-    known: Calibration | None = None
-    """What its own pairs say, where they determine it."""
+    start: Calibration | None = None
+    """What its own pairs say, or a photo of it."""
+    known: bool = False
+    """Whether its own pairs determine that."""
     hint_px: float = np.nan
     """Claimed focal."""
 
 
 def calibrate_several(
-    cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, method: str
+    cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, options: CalibrationSettings, method: str
 ) -> list[Calibration]:
     """One calibration per camera, in their order; each is identifiable or a guess with the reason.
 
@@ -55,16 +58,18 @@ def calibrate_several(
         cameras: sizes, and what is known.
         pairs: all pairs, within and between cameras, with inliers; the size is not used.
         members: (P, 2) number of the camera that took view 1, view 2.
+        options: whether to look for a lens.
         method: name that goes into the answers.
     """
     unit = float(max(max(camera.size) for camera in cameras))
     kept, Fs, matches = _in_units(cameras, pairs, members, unit)
     members = members[kept]
     sides = np.array([max(camera.size) / unit for camera in cameras])
-    usual = Usual(sides, np.array([camera.hint_px for camera in cameras]) / unit)
+    hints = np.array([camera.hint_px for camera in cameras]) / unit
+    usual = Usual(sides, hints, options.centre_sigma, options.lens)
     weights = pairs.weights[kept]
     thetas = np.array([_first(camera, side, unit) for camera, side in zip(cameras, sides, strict=True)])
-    unknown = np.array([camera.known is None for camera in cameras])
+    unknown = np.array([camera.start is None for camera in cameras])
     if unknown.any():
         thetas = _with_focals(thetas, unknown, Tables(Fs, members, weights), usual)
     fit = refined(matches, Fs, [thetas], usual)
@@ -111,8 +116,8 @@ def _in_units(
 
 
 def _first(camera: CameraGroup, side: float, unit: float) -> FloatArray:
-    if camera.known is not None:
-        return parameters_of(camera.known, unit)
+    if camera.start is not None:
+        return parameters_of(camera.start, unit)
     return np.array([USUAL_FOCAL + np.log(side), 0.0, 0.0, 0.0, 0.0])
 
 
@@ -198,7 +203,7 @@ def _judged(
     reason = ""
     if len(mine) < LEAST_PAIRS:
         reason = f"{len(mine)} usable pairs, {LEAST_PAIRS} are needed"
-    elif camera.known is None and lead < MIN_LEAD:
+    elif not camera.known and lead < MIN_LEAD:
         reason = "the pairs fit other focals as well or better"
     reason = reason or peak.objection(in_sides, spread, half)
     if reason:

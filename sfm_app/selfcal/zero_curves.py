@@ -39,7 +39,7 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
     Args:
         pairs: for their weights see `selfcal.pair_weights`. Without inliers nothing is known about a lens, and the
             standard deviations come from resampling the pairs.
-        options: `centre_sigma` of the prior on the optical centre.
+        options: `centre_sigma` of the prior on the optical centre, and whether to look for a lens.
         seed: of that resampling.
 
     Returns:
@@ -81,7 +81,7 @@ def _from_matches(
     side = float(max(pairs.size))
     sigma = options.centre_sigma * pairs.size[0] / side
     hint = float(np.median(pairs.focal_hints_px)) / side if pairs.focal_hints_px else np.nan
-    usual = Usual(np.ones(1), np.array([hint]), sigma)
+    usual = Usual(np.ones(1), np.array([hint]), sigma, options.lens)
     matches, Fs = _in_sides(pairs, usable)
     answer = peak.found(Consensus(usable, sigma))
     plain = np.array([USUAL_FOCAL, 0.0, 0.0, 0.0])

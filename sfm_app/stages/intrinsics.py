@@ -1,74 +1,65 @@
 """intrinsics: ViewGraph -> Intrinsics."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import write_calibrations
 from sfm_app.context import RunContext
-from sfm_app.geometry.camera import guessed_camera_matrix
-from sfm_app.selfcal import pair_weights
-from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, ViewGraph
+from sfm_app.selfcal import calibrate_photo_set, pair_weights
+from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
 
 
 def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
-    """Find K of every camera group from the pairs within it; what is not identifiable falls back to a guess."""
-    groups: dict[str, list[MatchedImage]] = {}
-    for image in matches.images.values():
-        groups.setdefault(image.group, []).append(image)
-    by_size = sorted(groups, key=lambda name: (-len(groups[name]), name))
-    cameras = {name: calibrate_group(groups[name], matches, views, run) for name in by_size}
-    intrinsics = Intrinsics(cameras)
+    """Find K and lens of every camera, and which photos are whose; what is not identifiable falls back to a guess."""
+    options = run.settings.calibration
+    calibrator = run.plugins.calibrator(options.calibrator)
+    pairs = photo_pairs(list(matches.images.values()), matches, views)
+    cameras = calibrate_photo_set(pairs, calibrator.calibrate, options, run.seed, together=calibrator.together)
+    intrinsics = Intrinsics(
+        cameras={camera.name: camera.found for camera in cameras},
+        camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
+    )
     run.record(
-        cameras={name: _summary(camera) for name, camera in cameras.items()},
-        identifiable=sum(camera.identifiable for camera in cameras.values()),
+        cameras={name: _summary(camera) for name, camera in intrinsics.cameras.items()},
+        photos={camera.name: len(camera.photos) for camera in cameras},
+        identifiable=sum(camera.found.identifiable for camera in cameras),
     )
     with run.workspace.replacing(run.workspace.calibration) as path:
-        values = {name: camera.to_dict() for name, camera in cameras.items()}
-        path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(intrinsics.to_dict(), indent=1) + "\n", encoding="utf-8")
     with backend("writing calibrations"):
-        write_calibrations(run.workspace.database, matches, cameras)
+        write_calibrations(run.workspace.database, matches, intrinsics.cameras)
     return intrinsics
 
 
-def calibrate_group(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph, run: RunContext) -> Calibration:
-    """K of the photos of one camera."""
-    options = run.settings.calibration
-    pairs = camera_pairs(images, matches, views)
-    found = run.plugins.calibrator(options.calibrator).calibrate(pairs, options, run.seed)
-    return found if found.identifiable else fall_back(found, images)
-
-
-def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> CameraPairs:
-    """What a calibrator gets to know about the photos of one camera: all pairs among them that are not degenerate."""
+def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> PhotoPairs:
+    """What is known about all pairs of these photos that are not degenerate."""
     ids = {image.id for image in images}
     fits = {pair: fit for pair, fit in views.fits.items() if ids.issuperset(pair) and not fit.degeneracy}
-    return CameraPairs(
+    return PhotoPairs(
         Fs=np.array([fit.F for fit in fits.values()], np.float64).reshape(-1, 3, 3),
         weights=pair_weights(np.array([fit.inlier_count for fit in fits.values()], np.int64)),
-        size=(images[0].width, images[0].height),
         photos=tuple(fits),
         inliers=tuple(np.hstack(matches.points(pair))[fit.inliers] for pair, fit in fits.items()),
-        focal_hints_px=tuple(image.exif_focal_px for image in images if image.exif_focal_px),
+        sizes={image.id: (image.width, image.height) for image in images},
+        groups={image.id: image.group for image in images},
+        focal_hints_px={image.id: image.exif_focal_px for image in images if image.exif_focal_px},
     )
 
 
-def fall_back(found: Calibration, images: list[MatchedImage]) -> Calibration:
-    """The K that mapping starts from when the photos do not determine it: EXIF's claim, else the usual guess."""
-    claims = [image.exif_focal_px for image in images if image.exif_focal_px]
-    K = guessed_camera_matrix((found.width, found.height), float(np.median(claims)) if claims else None)
-    return replace(found, K=K, method="exif" if claims else "guess", spread={})
+def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> CameraPairs:
+    """What a calibrator gets to know about the photos of one camera."""
+    return photo_pairs(images, matches, views).among([image.id for image in images])
 
 
 def load_intrinsics(run: RunContext) -> Intrinsics:
     """Read calibration.json back."""
-    values = json.loads(run.workspace.calibration.read_text(encoding="utf-8"))
-    return Intrinsics({name: Calibration.from_dict(camera) for name, camera in values.items()})
+    return Intrinsics.from_dict(json.loads(run.workspace.calibration.read_text(encoding="utf-8")))
 
 
 def _summary(camera: Calibration) -> dict[str, object]:
     fx, fy, cx, cy = camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]
     plain = {name: round(float(value), 3) for name, value in (("fx", fx), ("fy", fy), ("cx", cx), ("cy", cy))}
+    plain["k1"] = round(camera.radial, 5)
     return plain | {"method": camera.method, "identifiable": camera.identifiable, "reason": camera.reason}

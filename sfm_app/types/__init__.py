@@ -9,7 +9,7 @@ Conventions, said once:
 """
 
 from sfm_app.types.calibration import Calibration, Intrinsics
-from sfm_app.types.camera_pairs import CameraPairs
+from sfm_app.types.camera_pairs import CameraPairs, PhotoPairs
 from sfm_app.types.epipolar import EpipolarFit, Rejected, ViewGraph
 from sfm_app.types.matches import MatchedImage, MatchGraph, PairId
 from sfm_app.types.photos import Photo, PhotoSet, UnusablePhoto
@@ -26,6 +26,7 @@ __all__ = [
     "MatchedImage",
     "PairId",
     "Photo",
+    "PhotoPairs",
     "PhotoSet",
     "Rejected",
     "Scene",

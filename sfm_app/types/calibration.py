@@ -78,3 +78,14 @@ class Intrinsics:
     def identifiable(self) -> bool:
         """Whether the photos determine the main camera's K."""
         return self.main.identifiable
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        cameras = {name: camera.to_dict() for name, camera in self.cameras.items()}
+        return {"cameras": cameras, "photos": dict(self.camera_of)}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "Intrinsics":
+        """Back from `to_dict`."""
+        cameras = {name: Calibration.from_dict(camera) for name, camera in values["cameras"].items()}
+        return cls(cameras, dict(values["photos"]))

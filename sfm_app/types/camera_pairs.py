@@ -1,5 +1,6 @@
-"""Pairs of photos that one camera took: what a calibrator works from."""
+"""Pairs of photos with what is known about each: what calibrators work from."""
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,3 +34,38 @@ class CameraPairs:
         """From matrices alone, all trusted alike unless `weights` (P,) says otherwise."""
         matrices = np.asarray(Fs, np.float64)
         return cls(matrices, np.ones(len(matrices)) if weights is None else np.asarray(weights, np.float64), size)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotoPairs:
+    """All pairs of a set of photos, which may be of several cameras."""
+
+    Fs: NDArray[np.float64]
+    """(P, 3, 3) in pixels, x2' F x1 = 0, any scale."""
+    weights: NDArray[np.float64]
+    """(P,) >= 0, how far each F is trusted."""
+    photos: tuple[PairId, ...]
+    """Per pair the ids of its two photos."""
+    inliers: tuple[NDArray[np.float64], ...]
+    """Per pair (N, 4) x1, y1, x2, y2 in pixels."""
+    sizes: Mapping[int, tuple[int, int]]
+    """(width, height) in pixels by photo."""
+    groups: Mapping[int, str]
+    """By photo the group that is thought to be one camera."""
+    focal_hints_px: Mapping[int, float] = field(default_factory=dict)
+    """Claimed focal (EXIF) by photo, where there is one."""
+
+    def among(self, members: Collection[int]) -> CameraPairs:
+        """The pairs within photos of one size."""
+        wanted = set(members)
+        kept = [k for k, pair in enumerate(self.photos) if wanted.issuperset(pair)]
+        return CameraPairs(
+            Fs=self.Fs[kept].reshape(-1, 3, 3),
+            weights=self.weights[kept],
+            size=self.sizes[min(wanted)],
+            photos=tuple(self.photos[k] for k in kept),
+            inliers=tuple(self.inliers[k] for k in kept),
+            focal_hints_px=tuple(
+                self.focal_hints_px[photo] for photo in sorted(wanted) if photo in self.focal_hints_px
+            ),
+        )

@@ -1,0 +1,143 @@
+"""A set of photos: which of them are of one camera, and the K of every camera."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm_app.geometry.camera import guessed_camera_matrix
+from sfm_app.ransac.refit import refine_sampson
+from sfm_app.selfcal.answers import calibration_of, guessed, parameters_of
+from sfm_app.selfcal.inputs import FloatArray, prepare
+from sfm_app.selfcal.joint import Consensus
+from sfm_app.selfcal.lens import straightened
+from sfm_app.selfcal.several import CameraGroup, Tables, calibrate_several
+from sfm_app.selfcal.split import peaks_of, separated
+from sfm_app.selfcal.zero_curves import METHOD
+from sfm_app.settings import CalibrationSettings
+from sfm_app.types import Calibration, CameraPairs, PhotoPairs
+
+CalibrateFunction = Callable[[CameraPairs, CalibrationSettings, int], Calibration]
+
+LEAST_TO_SPLIT = 4
+"""Photos of a group below which nobody can say who disagrees with whom."""
+BENT = 0.01
+"""From this |k1| on, photos are straightened before they are asked whether they are of one camera."""
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """One camera of the set."""
+
+    name: str
+    photos: tuple[int, ...]
+    found: Calibration
+
+
+def calibrate_photo_set(
+    pairs: PhotoPairs, calibrate: CalibrateFunction, options: CalibrationSettings, seed: int, *, together: bool
+) -> list[Camera]:
+    """Every camera of a set of photos, the one with most photos first.
+
+    Args:
+        pairs: all pairs that are not degenerate.
+        calibrate: finds one camera from its own pairs.
+        options: handed to it.
+        seed: likewise.
+        together: also split groups whose photos disagree, and use the pairs between cameras.
+    """
+    groups: dict[str, list[int]] = {}
+    for photo, group in pairs.groups.items():
+        groups.setdefault(group, []).append(photo)
+    cameras: list[Camera] = []
+    for name, members in groups.items():
+        camera = Camera(name, tuple(members), calibrate(pairs.among(members), options, seed))
+        cameras += _split(camera, pairs, options) if together else [camera]
+    if together and len(cameras) > 1:
+        cameras = _together(cameras, pairs, options)
+    cameras = [replace(camera, found=_or_guess(camera, pairs)) for camera in cameras]
+    return sorted(cameras, key=lambda camera: (-len(camera.photos), camera.name))
+
+
+def _split(camera: Camera, pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
+    """The camera, or the several that its photos are of."""
+    if len(camera.photos) < LEAST_TO_SPLIT:
+        return [camera]
+    own, found = pairs.among(camera.photos), camera.found
+    side = float(max(own.size))
+    if abs(found.radial) > BENT:
+        own = straight_pairs(own, found)
+    ready = prepare(own, unit_px=side, origin_px=(own.size[0] / 2, own.size[1] / 2))
+    if len(ready) == 0:
+        return [camera]
+    starts = peaks_of(Consensus(ready, options.centre_sigma * own.size[0] / side))
+    if found.identifiable:
+        starts.append(np.append(parameters_of(found, side)[:4], 0.0))
+    tables = Tables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
+    thetas, labels = separated(tables, [own.photos[k] for k in ready.kept], starts)
+    if len(thetas) == 1:
+        return [camera]
+    parts = []
+    for number, theta in enumerate(thetas):
+        photos = tuple(photo for photo in camera.photos if labels.get(photo, 0) == number)
+        theta[4] = found.radial / np.exp(2.0 * theta[0])
+        first = calibration_of(theta, own.size, found.method)
+        parts.append(Camera(camera.name if number == 0 else f"{camera.name} #{number + 1}", photos, first))
+    return parts
+
+
+def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
+    """All cameras from all pairs at once."""
+    number = {photo: k for k, camera in enumerate(cameras) for photo in camera.photos}
+    everything = CameraPairs(pairs.Fs, pairs.weights, (1, 1), pairs.photos, pairs.inliers)
+    members = np.array([[number[first], number[second]] for first, second in pairs.photos]).reshape(-1, 2)
+    asked = [
+        CameraGroup(
+            size=pairs.sizes[camera.photos[0]],
+            start=camera.found if camera.found.identifiable else None,
+            known=camera.found.identifiable and bool(camera.found.evidence),
+            hint_px=_claim(camera, pairs),
+        )
+        for camera in cameras
+    ]
+    answers = calibrate_several(asked, everything, members, options, METHOD)
+    return [
+        replace(camera, found=replace(answer, key_pairs=camera.found.key_pairs))
+        for camera, answer in zip(cameras, answers, strict=True)
+    ]
+
+
+def straight_pairs(pairs: CameraPairs, found: Calibration) -> CameraPairs:
+    """The pairs as they would be without the lens: inliers moved, F's refitted to them."""
+    side, middle = float(max(pairs.size)), np.array(pairs.size) / 2
+    theta = parameters_of(found, side)
+    to_sides = np.array([[1 / side, 0, -middle[0] / side], [0, 1 / side, -middle[1] / side], [0, 0, 1]])
+    back = np.linalg.inv(to_sides)
+    Fs, inliers = np.empty_like(pairs.Fs), []
+    for k, x in enumerate(pairs.inliers):
+        views = [_straight((x[:, i : i + 2] - middle) / side, theta) for i in (0, 2)]
+        points = np.asfortranarray(np.hstack(views))
+        Fs[k] = to_sides.T @ refine_sampson(points, back.T @ pairs.Fs[k] @ back, scale=3.0 / side) @ to_sides
+        inliers.append(points * side + np.tile(middle, 2))
+    return replace(pairs, Fs=Fs, inliers=tuple(inliers))
+
+
+def _straight(points: FloatArray, theta: FloatArray) -> FloatArray:
+    return np.asarray(straightened(np.ascontiguousarray(points), theta), np.float64)
+
+
+def _or_guess(camera: Camera, pairs: PhotoPairs) -> Calibration:
+    """What was found; else the K that mapping starts from: EXIF's claim, or 1.2 x the longer side."""
+    found = camera.found
+    if found.identifiable:
+        return found
+    claim = _claim(camera, pairs)
+    size = pairs.sizes[camera.photos[0]]
+    if not np.isfinite(claim):
+        return guessed(size, found.reason, found.evidence)
+    return replace(found, K=guessed_camera_matrix(size, claim), method="exif", radial=0.0, spread={}, held=())
+
+
+def _claim(camera: Camera, pairs: PhotoPairs) -> float:
+    claims = [pairs.focal_hints_px[photo] for photo in camera.photos if photo in pairs.focal_hints_px]
+    return float(np.median(claims)) if claims else float("nan")
