@@ -8,6 +8,7 @@ weighs less.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +27,8 @@ ALONE = np.array([0.3, 0.15, 0.15, 0.2, 0.2])
 LOWER_QUARTILE = 0.288
 """Of that gain, where two degrees of freedom are noise (chi^2 / 2)."""
 LEAST_SIGMA_PX = 0.1
-ROUNDS, STEPS = 12, 4
+ROUNDS = 25
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e8
 ARRIVED = 2e-5
 
 
@@ -97,7 +99,7 @@ class Matches:
         self.count = count
         self.least_sigma = LEAST_SIGMA_PX / unit_px
 
-    @property
+    @cached_property
     def redundancy(self) -> float:
         """Matches over independent errors, >= 1.
 
@@ -147,29 +149,43 @@ def evenly(rows: FloatArray, most: int) -> FloatArray:
 
 
 def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) -> State:
-    """Weigh the pairs, minimise, and so on until the cameras stand still."""
+    """Weigh the pairs anew and take a step of Levenberg and Marquardt, until the cameras stand still."""
+    damping = FIRST_DAMPING
     for _ in range(rounds):
-        before = state.thetas
-        state = _descended(matches, reweighted(matches, state), prior)
-        state = replace(state, sigma=matches.noise(state))
-        if np.max(np.abs(state.thetas - before), initial=0.0) < ARRIVED:
+        system = _system(matches, state)
+        state = _weighed(matches, state, system)
+        trial, damping = _stepped(matches, state, prior, system, damping)
+        moved_by = np.max(np.abs(trial.thetas - state.thetas), initial=0.0)
+        state = replace(trial, sigma=matches.noise(trial))
+        if moved_by < ARRIVED:
             break
     return reweighted(matches, state)
 
 
 def reweighted(matches: Matches, state: State) -> State:
     """Weigh every pair by what it would gain from cameras of its own."""
-    gains = informed(matches, state).gains
-    scale = max(1.0, float(np.quantile(gains, 0.25)) / LOWER_QUARTILE) if len(gains) else 1.0
-    return replace(state, weights=(1.0 + gains / (CONFLICT * scale)) ** -2, scale=scale)
+    return _weighed(matches, state, _system(matches, state))
 
 
 def informed(matches: Matches, state: State) -> Information:
     """Eliminate the poses."""
-    A, b = pair_systems(matches.points, matches.ends, state.thetas, matches.cameras, state.poses, state.sigma)
-    H, g, _, _ = _reduced(matches, A, b, 1e-9)
+    return _information(matches, _system(matches, state))
+
+
+def _system(matches: Matches, state: State) -> tuple[FloatArray, FloatArray]:
+    return pair_systems(matches.points, matches.ends, state.thetas, matches.cameras, state.poses, state.sigma)
+
+
+def _information(matches: Matches, system: tuple[FloatArray, FloatArray]) -> Information:
+    H, g, _, _ = _reduced(matches, *system, 0.0)
     gains = 0.5 * np.einsum("pi,pi->p", g, np.linalg.solve(H + np.diag(np.tile(ALONE**-2.0, 2)), g[..., None])[..., 0])
     return Information(H, g, gains)
+
+
+def _weighed(matches: Matches, state: State, system: tuple[FloatArray, FloatArray]) -> State:
+    gains = _information(matches, system).gains
+    scale = max(1.0, float(np.quantile(gains, 0.25)) / LOWER_QUARTILE) if len(gains) else 1.0
+    return replace(state, weights=(1.0 + gains / (CONFLICT * scale)) ** -2, scale=scale)
 
 
 def _reduced(
@@ -183,41 +199,28 @@ def _reduced(
     back, own = np.split(np.linalg.solve(V, np.concatenate([A[:, n:, :n], b[:, n:, None]], axis=2)), [n], axis=2)
     H = A[:, :n, :n] - A[:, :n, n:] @ back
     g = b[:, :n] - (A[:, :n, n:] @ own)[..., 0]
-    same = matches.cameras[:, 0] == matches.cameras[:, 1]
-    fold = np.zeros((n, n))
-    fold[:CAMERA, :CAMERA] = fold[:CAMERA, CAMERA:] = np.eye(CAMERA)
-    H[same], g[same] = fold @ H[same] @ fold.T, g[same] @ fold.T
     return H, g, back, own[..., 0]
 
 
-def _descended(matches: Matches, state: State, prior: Prior) -> State:
-    """A few steps of Levenberg and Marquardt with the weights as they are."""
-    factors = state.weights / state.scale
-    damping = 1e-4
-    cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
-    for _ in range(STEPS):
-        A, b = pair_systems(matches.points, matches.ends, state.thetas, matches.cameras, state.poses, state.sigma)
-        while True:
-            trial = _stepped(matches, state, prior, (A, b, factors), damping)
-            new = float(factors @ matches.costs(trial)) + prior.cost(trial.thetas)
-            if new <= cost or damping > 1e8:
-                break
-            damping *= 10.0
-        if not new <= cost:
-            break
-        gained, cost, state = cost - new, new, trial
-        damping = max(0.1 * damping, 1e-9)
-        if gained <= 1e-7 * cost:
-            break
-    return state
-
-
 def _stepped(
-    matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray, FloatArray], damping: float
+    matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
+) -> tuple[State, float]:
+    """One step that lowers the cost, damped as far as that needs, and the damping for the next."""
+    factors = state.weights / state.scale
+    cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
+    while damping < MOST_DAMPING:
+        trial = _tried(matches, state, prior, system, damping)
+        if float(factors @ matches.costs(trial)) + prior.cost(trial.thetas) <= cost:
+            return trial, max(0.1 * damping, LEAST_DAMPING)
+        damping *= 10.0
+    return state, damping
+
+
+def _tried(
+    matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
 ) -> State:
-    A, b, factors = system
-    reduced, gradients, back, own = _reduced(matches, A, b, damping)
-    H, g = matches.scattered(Information(reduced, gradients, np.empty(0)), factors)
+    reduced, gradients, back, own = _reduced(matches, *system, damping)
+    H, g = matches.scattered(Information(reduced, gradients, np.empty(0)), state.weights / state.scale)
     H += np.diag(prior.precision.ravel())
     g += (prior.precision * (prior.mean - state.thetas)).ravel()
     step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g).reshape(-1, CAMERA)

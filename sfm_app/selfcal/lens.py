@@ -28,39 +28,48 @@ def camera_of(theta: FloatArray, camera: FloatArray) -> None:
 
 
 @kernel
-def stretch(radius: float, k1: float) -> tuple[float, float]:
-    """r_u / r_d and d r_u / d r_d at the distorted radius r_d, in focal lengths."""
+def undone(radius: float, k1: float, guess: float) -> float:
+    """r_u of the distorted radius r_d, in focal lengths, by Newton from a guess."""
     if k1 == 0.0 or radius < 1e-9:
-        return 1.0, 1.0
-    r = radius / (1.0 + k1 * radius * radius) if k1 > 0.0 else radius
+        return radius
+    r = guess
     for _ in range(NEWTON_STEPS):
         slope = max(1.0 + 3.0 * k1 * r * r, LEAST_SLOPE)
         step = (r * (1.0 + k1 * r * r) - radius) / slope
         r -= step
         if abs(step) < 1e-13:
             break
-    return r / radius, 1.0 / max(1.0 + 3.0 * k1 * r * r, LEAST_SLOPE)
+    return r
 
 
 @kernel
-def ray(x: float, y: float, camera: FloatArray, out: FloatArray) -> None:
-    """The point (a, b) of the plane z = 1 that pixel (x, y) sees, into `out` (6,): a, b, da/dx, da/dy, db/dx, db/dy."""
+def ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -> None:
+    """The point (a, b) of the plane z = 1 that pixel (x, y) sees, into `out` (7,): a, b, its derivatives, r_u.
+
+    `guess` is r_u of a camera nearby, or negative.
+    """
     a, b = (x - camera[2]) / camera[0], (y - camera[3]) / camera[1]
     r2 = a * a + b * b
-    along, radial = stretch(np.sqrt(r2), camera[4])
+    radius, k1 = np.sqrt(r2), camera[4]
+    if guess < 0.0:
+        guess = radius / (1.0 + k1 * r2) if k1 > 0.0 else radius
+    r = undone(radius, k1, guess)
+    along = r / radius if radius > 1e-9 else 1.0
+    radial = 1.0 / max(1.0 + 3.0 * k1 * r * r, LEAST_SLOPE)
     bend = (radial - along) / r2 if r2 > 1e-18 else 0.0
     out[0], out[1] = along * a, along * b
     out[2], out[3] = (along + bend * a * a) / camera[0], bend * a * b / camera[1]
     out[4], out[5] = bend * a * b / camera[0], (along + bend * b * b) / camera[1]
+    out[6] = r
 
 
 @kernel
 def straightened(points: FloatArray, theta: FloatArray) -> FloatArray:
     """(N, 2) where points (N, 2) would lie without the lens, in the units of the points."""
-    camera, out, straight = np.empty(5), np.empty(6), np.empty_like(points)
+    camera, out, straight = np.empty(5), np.empty(7), np.empty_like(points)
     camera_of(theta, camera)
     for i in range(len(points)):
-        ray(points[i, 0], points[i, 1], camera, out)
+        ray(points[i, 0], points[i, 1], camera, -1.0, out)
         straight[i, 0] = out[0] * camera[0] + camera[2]
         straight[i, 1] = out[1] * camera[1] + camera[3]
     return straight

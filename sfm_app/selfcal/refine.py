@@ -25,9 +25,9 @@ from sfm_app.selfcal.priors import ASPECT, NAMES, Evidence, Usual
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-FEW_MATCHES, LAST_ROUNDS = 150, 4
+FEW_MATCHES, LAST_ROUNDS = 150, 12
 """Matches of one pair until the cameras have nearly arrived; rounds with all of them after that."""
-POSE_MATCHES = 100
+POSE_MATCHES = 30
 """Enough to tell which of the four poses of an E is the right one."""
 CHOICES = 3
 """Times the evidence is asked again after an adjustment."""
@@ -74,7 +74,7 @@ class Fit:
 
 
 def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], usual: Usual) -> Fit:
-    """The best of the fits that begin at `starts`, each with the pixels square and not.
+    """The best of the fits that begin at `starts`, the most likely first, with the pixels square and not.
 
     Args:
         matches: inliers about the middle of the photos.
@@ -83,9 +83,9 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], usua
         usual: what is known before.
     """
     few = matches.thinned(FEW_MATCHES)
-    begun = [_begun(few, Fs, thetas, usual, square) for thetas in starts for square in (True, False)]
-    sigma, scale = (min(getattr(fit.state, name) for fit in begun) for name in ("sigma", "scale"))
-    fit = replace(min(begun, key=lambda fit: fit.cost(sigma, scale)), matches=matches)
+    best = _best([_begun(few, Fs, thetas, usual, square=True) for thetas in starts])
+    others = [_begun(few, Fs, thetas, usual, square=False) for thetas in (best.state.thetas, starts[0])]
+    fit = replace(_best([best, *others]), matches=matches)
     fit = replace(fit, state=settled(matches, fit.state, fit.prior, LAST_ROUNDS))
     for _ in range(CHOICES):
         free = fit.evidence.best(fit.free)
@@ -117,7 +117,12 @@ def camera_matrix_of(theta: FloatArray) -> FloatArray:
     return np.array([[f / half, 0.0, theta[CENTRE_U]], [0.0, f * half, theta[CENTRE_V]], [0.0, 0.0, 1.0]])
 
 
-def _begun(few: Matches, Fs: FloatArray, thetas: FloatArray, usual: Usual, square: bool) -> Fit:
+def _best(fits: Sequence[Fit]) -> Fit:
+    sigma, scale = (min(getattr(fit.state, name) for fit in fits) for name in ("sigma", "scale"))
+    return min(fits, key=lambda fit: fit.cost(sigma, scale))
+
+
+def _begun(few: Matches, Fs: FloatArray, thetas: FloatArray, usual: Usual, *, square: bool) -> Fit:
     free = np.ones((len(thetas), len(NAMES)), np.bool_)
     free[:, ASPECT] = not square
     prior = usual.prior(free, thetas)

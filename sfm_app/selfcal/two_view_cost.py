@@ -91,15 +91,15 @@ def pair_costs(
         sigma: standard deviation of a distance.
     """
     E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
-    p, q = np.empty(6), np.empty(6)
+    p, q = np.empty(7), np.empty(7)
     costs = np.zeros(len(poses))
     for k in range(len(poses)):
         essential(poses[k], E)
         camera_of(thetas[cameras[k, 0]], first)
         camera_of(thetas[cameras[k, 1]], second)
         for i in range(ends[k], ends[k + 1]):
-            ray(matches[i, 0], matches[i, 1], first, p)
-            ray(matches[i, 2], matches[i, 3], second, q)
+            ray(matches[i, 0], matches[i, 1], first, -1.0, p)
+            ray(matches[i, 2], matches[i, 3], second, -1.0, q)
             r2 = (_distance(p, q, E) / sigma) ** 2
             costs[k] += 0.5 * r2 / (1.0 + r2 / REACH**2)
     return costs
@@ -111,15 +111,15 @@ def distances(
 ) -> FloatArray:
     """(M,) Sampson distances with sign, in the units of the matches; arguments as in `pair_costs`."""
     E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
-    p, q = np.empty(6), np.empty(6)
+    p, q = np.empty(7), np.empty(7)
     found = np.empty(len(matches))
     for k in range(len(poses)):
         essential(poses[k], E)
         camera_of(thetas[cameras[k, 0]], first)
         camera_of(thetas[cameras[k, 1]], second)
         for i in range(ends[k], ends[k + 1]):
-            ray(matches[i, 0], matches[i, 1], first, p)
-            ray(matches[i, 2], matches[i, 3], second, q)
+            ray(matches[i, 0], matches[i, 1], first, -1.0, p)
+            ray(matches[i, 2], matches[i, 3], second, -1.0, q)
             found[i] = _distance(p, q, E)
     return found
 
@@ -133,14 +133,17 @@ def pair_systems(
     Arguments as in `pair_costs`.
 
     Returns:
-        (P, 15, 15) approximate Hessians of the costs and (P, 15) their negative gradients.
+        (P, 15, 15) approximate Hessians of the costs and (P, 15) their negative gradients; where both views are of one
+        camera, all that concerns it stands in the first five rows and columns.
     """
     A, b = np.zeros((len(poses), PAIR, PAIR)), np.zeros((len(poses), PAIR))
     # index 0 is the point itself, 1 to 5 one parameter moved
     lenses, Es = np.empty((2, 1 + CAMERA, 5)), np.empty((1 + POSE, 3, 3))
-    rays, J = np.empty((2, 1 + CAMERA, 6)), np.empty(PAIR)
+    rays, J = np.empty((2, 1 + CAMERA, 7)), np.empty(PAIR)
     step = np.zeros(POSE)
     for k in range(len(poses)):
+        shared = cameras[k, 0] == cameras[k, 1]
+        J[:] = 0.0
         essential(poses[k], Es[0])
         for j in range(POSE):
             step[j] = _STEP
@@ -156,12 +159,17 @@ def pair_systems(
                 theta[j] = kept
         for i in range(ends[k], ends[k + 1]):
             for view in range(2):
+                x, y, guess = matches[i, 2 * view], matches[i, 2 * view + 1], -1.0
                 for j in range(1 + CAMERA):
-                    ray(matches[i, 2 * view], matches[i, 2 * view + 1], lenses[view, j], rays[view, j])
+                    ray(x, y, lenses[view, j], guess, rays[view, j])
+                    guess = rays[view, 0, 6]
             r = _distance(rays[0, 0], rays[1, 0], Es[0]) / sigma
             for j in range(CAMERA):
-                J[j] = (_distance(rays[0, 1 + j], rays[1, 0], Es[0]) / sigma - r) / _STEP
-                J[CAMERA + j] = (_distance(rays[0, 0], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
+                if shared:
+                    J[j] = (_distance(rays[0, 1 + j], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
+                else:
+                    J[j] = (_distance(rays[0, 1 + j], rays[1, 0], Es[0]) / sigma - r) / _STEP
+                    J[CAMERA + j] = (_distance(rays[0, 0], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
             for j in range(POSE):
                 J[2 * CAMERA + j] = (_distance(rays[0, 0], rays[1, 0], Es[1 + j]) / sigma - r) / _STEP
             weight = (1.0 + r * r / REACH**2) ** -2
