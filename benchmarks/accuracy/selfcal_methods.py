@@ -20,6 +20,8 @@ from sfm_app.types import Calibration, CameraPairs, MatchedImage, MatchGraph, Vi
 from sfm_app.types.scene import CameraModel
 
 PRODUCTION = "zero-curves"
+WITHOUT_MATCHES = f"{PRODUCTION} without matches"
+"""From the fundamental matrices alone: what the consensus says by itself, which knows no lens."""
 ANSWER = ("fx_px", "fy_px", "cx_px", "cy_px")
 """Evidence in which a literal method leaves its own answer, whatever our verdict on it."""
 
@@ -79,15 +81,17 @@ def production(subject: Measured, overrides: Mapping[str, object] | None = None,
 
 def literal(subject: Measured, method: str) -> Found:
     """A calibrator alone on the pairs within each camera; its own answer counts even where our verdict on it is no."""
-    calibrator = load_plugins().calibrator(method)
+    calibrator = load_plugins().calibrator(PRODUCTION if method == WITHOUT_MATCHES else method)
     cameras, seconds, pairs = {}, 0.0, 0
     for images in subject.groups:
         of_camera = camera_pairs(images, subject.matches, subject.views)
+        if method == WITHOUT_MATCHES:
+            of_camera = replace(of_camera, inliers=())
         start = time.perf_counter()
         found = calibrator.calibrate(of_camera, subject.settings.calibration, subject.settings.seed)
         seconds += time.perf_counter() - start
         pairs += len(of_camera.Fs)
-        if method != PRODUCTION and all(name in found.evidence for name in ANSWER):
+        if method != WITHOUT_MATCHES and all(name in found.evidence for name in ANSWER):
             found = replace(found, K=camera_matrix(*(found.evidence[name] for name in ANSWER)))
         cameras |= {Path(image.name).stem: found for image in images}
     return Found(method, cameras, seconds, pairs)
@@ -109,9 +113,8 @@ def every_method(
     for label, overrides in others.items():
         yield production(subject, overrides, f"{PRODUCTION}, {label}")
     yield colmap(subject)
-    for method in methods:
-        if method != PRODUCTION:
-            yield literal(subject, method)
+    for method in (WITHOUT_MATCHES, *(name for name in methods if name != PRODUCTION)):
+        yield literal(subject, method)
 
 
 def adjusted_cameras(subject: Measured) -> dict[str, TrueCamera]:
