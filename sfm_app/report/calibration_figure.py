@@ -190,8 +190,8 @@ def enlarge(axes: "Axes", plane: Plane, camera: Calibration) -> None:
         target.locator_params(nbins=3)
         axes.indicate_inset_zoom(target, edgecolor=GUIDE)
     label = f"{DEVIATIONS:.0f} standard deviations"
-    if plane.names[0] == "fx" and camera.K[0, 0] == camera.K[1, 1]:
-        # one focal for both directions: they can be wrong only together
+    if plane.names[0] == "fx" and ("aspect" in camera.held or camera.K[0, 0] == camera.K[1, 1]):
+        # pixels are taken to be square: fx and fy can be wrong only together
         target.plot((x - dx, x + dx), (y - dy, y + dy), color=MARK, linewidth=1.8, label=label)
     else:
         target.add_patch(Ellipse((x, y), 2 * dx, 2 * dy, fill=False, edgecolor=MARK, linewidth=1.4, label=label))
