@@ -16,7 +16,7 @@ from sfm_app.pipeline import run_stages
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings, merged
 from sfm_app.stages.intrinsics import camera_pairs
-from sfm_app.types import Calibration, CameraPairs, MatchedImage, MatchGraph, ViewGraph
+from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, ViewGraph
 from sfm_app.types.scene import CameraModel
 
 PRODUCTION = "zero-curves"
@@ -75,8 +75,13 @@ def production(subject: Measured, overrides: Mapping[str, object] | None = None,
     with opened_run(subject.out, settings, None) as run:
         found = run_stages(subject.photos.folder, run, first="intrinsics", last="intrinsics")("intrinsics")
         seconds = run.workspace.manifest()["stages"]["intrinsics"]["seconds"]
-    cameras = {Path(image.name).stem: found.cameras[image.group] for image in subject.matches.images.values()}
+    cameras = {Path(image.name).stem: camera_of(image, found) for image in subject.matches.images.values()}
     return Found(label, cameras, seconds, len(subject.views.fits))
+
+
+def camera_of(image: MatchedImage, found: Intrinsics) -> Calibration:
+    """The camera that the program takes to have made a photo."""
+    return found.cameras[image.group]
 
 
 def literal(subject: Measured, method: str) -> Found:

@@ -57,7 +57,7 @@ def synthetic_pairs(cameras: int, seed: int = 0) -> CameraPairs:
 def _curves(pairs: CameraPairs) -> Row:
     width, height = pairs.size
     usable = prepare(pairs, unit_px=width, origin_px=(0.0, 0.0))
-    seconds = _seconds(lambda: algorithm_4(usable, height / width, SAMPLES, {}))
+    seconds = _seconds(lambda: algorithm_4(usable, height / width, samples=SAMPLES, evidence={}))
     return _row(f"zero-curves-thesis: all curves of {SAMPLES} samples and their meeting points", len(usable), seconds)
 
 

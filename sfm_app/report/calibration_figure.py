@@ -74,10 +74,11 @@ def check_figure(path: Path) -> None:
 
 
 def draw_intrinsics(path: Path, matches: MatchGraph, views: ViewGraph, found: Intrinsics) -> None:
-    """`draw_calibration` of every camera of a run."""
+    """`draw_calibration` of the cameras of a run, those with most pairs of their own first."""
     images = list(matches.images.values())
     groups = {name: [image for image in images if image.group == name] for name in found.cameras}
-    draw_calibration(path, [Panel(n, c, camera_pairs(groups[n], matches, views)) for n, c in found.cameras.items()])
+    panels = [Panel(n, c, camera_pairs(groups[n], matches, views)) for n, c in found.cameras.items() if groups[n]]
+    draw_calibration(path, sorted(panels, key=lambda panel: -len(panel.pairs.Fs)))
 
 
 def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
@@ -127,7 +128,9 @@ def focal_plane(camera: Calibration, pairs: Pairs) -> Plane:
     centre = ((cx - camera.width / 2) / unit, (cy - camera.height / 2) / unit)
     return Plane(
         names=("fx", "fy"),
-        title=f"Focal length: every line is what one of {len(pairs)} pairs of photos allows",
+        title=f"Focal length: every line is what one of {len(pairs)} pairs of photos allows"
+        if len(pairs)
+        else "Focal length: no pair of photos is from this camera alone",
         labels=("focal length across, px", "focal length down, px"),
         extent=(low * fx, high * fx, low * fy, high * fy),
         found=(fx, fy),
