@@ -16,6 +16,7 @@ from sfm_app.pipeline import run_stages
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings, merged
 from sfm_app.stages.intrinsics import camera_pairs
+from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, ViewGraph
 from sfm_app.types.scene import CameraModel
 
@@ -139,7 +140,8 @@ def _first_radial_term(camera: CameraModel) -> float:
 
 def warm_up() -> None:
     """Compile the kernels: one call of every calibrator, unmeasured."""
-    rng = np.random.default_rng(0)
-    pairs = CameraPairs.of(rng.normal(size=(6, 3, 3)), (640, 480))
+    tracks = make_tracks(TrackOptions(cameras=4), seed=0)
+    inliers = tuple(np.hstack([view.x1, view.x2]) for view in tracks.pairs.values())
+    pairs = CameraPairs(tracks.F, np.ones(len(tracks.F)), tracks.size, tuple(tracks.pairs), inliers)
     for calibrator in load_plugins().calibrators.values():
         calibrator.calibrate(pairs, Settings().calibration, 0)
