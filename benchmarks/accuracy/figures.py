@@ -22,10 +22,8 @@ MARKERS = "osD^vP*Xhd<>"
 
 def pyplot() -> Any:
     """matplotlib without a display, in our style; it is imported only where a figure is drawn."""
-    try:
-        import matplotlib
-    except ImportError:
-        raise SystemExit("matplotlib is missing: pip install -e '.[bench]'") from None
+    import matplotlib
+
     matplotlib.use("Agg")
     matplotlib.rcParams.update(STYLE)
     from matplotlib import pyplot as plt

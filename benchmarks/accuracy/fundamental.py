@@ -217,7 +217,6 @@ def main() -> None:
     if args.ratio and not args.cache:
         parser.error("--ratio needs --cache")
     on_one_thread()
-    pyplot()  # said before hours of work
     options = EpipolarSettings(max_error_px=THRESHOLD_PX, confidence=CONFIDENCE, max_trials=MAX_TRIALS)
 
     methods = (ablated(options) if args.ablation else our_estimators(args.methods, options)) | rivals(

@@ -43,7 +43,7 @@ ABOUT_COVERAGE = (
     "Synthetic photos of random cameras, every pair with noise and 20 % wrong matches, fundamental matrices from our "
     "own estimator. Shares of the answered trials in which the truth lies within 1 and 3 stated standard deviations."
 )
-ABOUT_SPEED = "Medians of five calls in one process on one thread, compiled before."
+ABOUT_SPEED = "Medians of up to five calls in one process on one thread, compiled before."
 
 
 def run_photos(args: argparse.Namespace) -> None:

@@ -16,10 +16,13 @@ from sfm_app.pipeline import run_stages
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings, merged
 from sfm_app.stages.intrinsics import camera_pairs
-from sfm_app.types import Calibration, CameraPairs, MatchedImage, MatchGraph, ViewGraph
+from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
+from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, ViewGraph
 from sfm_app.types.scene import CameraModel
 
 PRODUCTION = "zero-curves"
+WITHOUT_MATCHES = f"{PRODUCTION} without matches"
+"""From the fundamental matrices alone: what the consensus says by itself, which knows no lens."""
 ANSWER = ("fx_px", "fy_px", "cx_px", "cy_px")
 """Evidence in which a literal method leaves its own answer, whatever our verdict on it."""
 
@@ -73,21 +76,28 @@ def production(subject: Measured, overrides: Mapping[str, object] | None = None,
     with opened_run(subject.out, settings, None) as run:
         found = run_stages(subject.photos.folder, run, first="intrinsics", last="intrinsics")("intrinsics")
         seconds = run.workspace.manifest()["stages"]["intrinsics"]["seconds"]
-    cameras = {Path(image.name).stem: found.cameras[image.group] for image in subject.matches.images.values()}
+    cameras = {Path(image.name).stem: camera_of(image, found) for image in subject.matches.images.values()}
     return Found(label, cameras, seconds, len(subject.views.fits))
+
+
+def camera_of(image: MatchedImage, found: Intrinsics) -> Calibration:
+    """The camera that the program takes to have made a photo."""
+    return found.cameras[image.group]
 
 
 def literal(subject: Measured, method: str) -> Found:
     """A calibrator alone on the pairs within each camera; its own answer counts even where our verdict on it is no."""
-    calibrator = load_plugins().calibrator(method)
+    calibrator = load_plugins().calibrator(PRODUCTION if method == WITHOUT_MATCHES else method)
     cameras, seconds, pairs = {}, 0.0, 0
     for images in subject.groups:
         of_camera = camera_pairs(images, subject.matches, subject.views)
+        if method == WITHOUT_MATCHES:
+            of_camera = replace(of_camera, inliers=())
         start = time.perf_counter()
         found = calibrator.calibrate(of_camera, subject.settings.calibration, subject.settings.seed)
         seconds += time.perf_counter() - start
         pairs += len(of_camera.Fs)
-        if method != PRODUCTION and all(name in found.evidence for name in ANSWER):
+        if method != WITHOUT_MATCHES and all(name in found.evidence for name in ANSWER):
             found = replace(found, K=camera_matrix(*(found.evidence[name] for name in ANSWER)))
         cameras |= {Path(image.name).stem: found for image in images}
     return Found(method, cameras, seconds, pairs)
@@ -109,9 +119,8 @@ def every_method(
     for label, overrides in others.items():
         yield production(subject, overrides, f"{PRODUCTION}, {label}")
     yield colmap(subject)
-    for method in methods:
-        if method != PRODUCTION:
-            yield literal(subject, method)
+    for method in (WITHOUT_MATCHES, *(name for name in methods if name != PRODUCTION)):
+        yield literal(subject, method)
 
 
 def adjusted_cameras(subject: Measured) -> dict[str, TrueCamera]:
@@ -131,7 +140,8 @@ def _first_radial_term(camera: CameraModel) -> float:
 
 def warm_up() -> None:
     """Compile the kernels: one call of every calibrator, unmeasured."""
-    rng = np.random.default_rng(0)
-    pairs = CameraPairs.of(rng.normal(size=(6, 3, 3)), (640, 480))
+    tracks = make_tracks(TrackOptions(cameras=4), seed=0)
+    inliers = tuple(np.hstack([view.x1, view.x2]) for view in tracks.pairs.values())
+    pairs = CameraPairs(tracks.F, np.ones(len(tracks.F)), tracks.size, tuple(tracks.pairs), inliers)
     for calibrator in load_plugins().calibrators.values():
         calibrator.calibrate(pairs, Settings().calibration, 0)

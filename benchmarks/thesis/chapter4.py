@@ -176,7 +176,6 @@ def main() -> None:
     parser.add_argument("--results", type=Path, default=RESULTS)
     args = parser.parse_args()
     on_one_thread()
-    pyplot()  # said before hours of work
     tests, most, levels = (3, 10_000, QUICK_LEVELS) if args.quick else (args.tests, args.max_trials, LEVELS)
     options = EpipolarSettings(max_error_px=THRESHOLD_PX, confidence=CONFIDENCE, max_trials=most)
     args.results.mkdir(parents=True, exist_ok=True)

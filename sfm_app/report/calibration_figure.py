@@ -29,6 +29,7 @@ CELLS = 160
 """Votes are counted on a grid of this many cells a side."""
 SAMPLES = 400
 """Samples along each curve: where a curve is steep, few leave it ragged."""
+ENLARGED_SAMPLES = 60
 JUMP = 0.05
 """A curve that rises by this share of the plane from one sample to the next has changed to another root."""
 SIGMA = 0.05
@@ -73,10 +74,11 @@ def check_figure(path: Path) -> None:
 
 
 def draw_intrinsics(path: Path, matches: MatchGraph, views: ViewGraph, found: Intrinsics) -> None:
-    """`draw_calibration` of every camera of a run."""
+    """`draw_calibration` of the cameras of a run, those with most pairs of their own first."""
     images = list(matches.images.values())
     groups = {name: [image for image in images if image.group == name] for name in found.cameras}
-    draw_calibration(path, [Panel(n, c, camera_pairs(groups[n], matches, views)) for n, c in found.cameras.items()])
+    panels = [Panel(n, c, camera_pairs(groups[n], matches, views)) for n, c in found.cameras.items() if groups[n]]
+    draw_calibration(path, sorted(panels, key=lambda panel: -len(panel.pairs.Fs)))
 
 
 def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
@@ -112,13 +114,10 @@ def draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
     camera = panel.camera
     pairs = prepare(panel.pairs, unit_px=_unit(camera), origin_px=(camera.width / 2, camera.height / 2))
     left, right = part.subplots(1, 2)
+    left.axline((0.0, 0.0), slope=1.0, color=GUIDE, linewidth=0.8, linestyle=":", label="square pixels")
+    right.plot(camera.width / 2, camera.height / 2, "+", color=GUIDE, markersize=9, label="middle of the photo")
     for axes, plane in ((left, focal_plane(camera, pairs)), (right, centre_plane(camera, pairs))):
         draw_plane(axes, plane, camera, pairs)
-    left.axline((0.0, 0.0), slope=1.0, color=GUIDE, linewidth=0.8, linestyle=":")
-    left.annotate(
-        "square pixels", (0.93, 0.93), xycoords="axes fraction", color=GUIDE, rotation=45, ha="right", va="top"
-    )
-    right.plot(camera.width / 2, camera.height / 2, "+", color=GUIDE, markersize=9)
     part.colorbar(right.images[0], ax=right, label="share of the pairs' votes", shrink=0.8)
 
 
@@ -129,7 +128,9 @@ def focal_plane(camera: Calibration, pairs: Pairs) -> Plane:
     centre = ((cx - camera.width / 2) / unit, (cy - camera.height / 2) / unit)
     return Plane(
         names=("fx", "fy"),
-        title=f"Focal length: every line is what one of {len(pairs)} pairs of photos allows",
+        title=f"Focal length: every line is what one of {len(pairs)} pairs of photos allows"
+        if len(pairs)
+        else "Focal length: no pair of photos is from this camera alone",
         labels=("focal length across, px", "focal length down, px"),
         extent=(low * fx, high * fx, low * fy, high * fy),
         found=(fx, fy),
@@ -144,7 +145,7 @@ def centre_plane(camera: Calibration, pairs: Pairs) -> Plane:
     focals = (camera.K[0, 0] / unit, camera.K[1, 1] / unit)
     return Plane(
         names=("cx", "cy"),
-        title="Optical centre, in the frame of the photo (+ is its middle)",
+        title="Optical centre, in the frame of the photo",
         labels=("across the photo, px", "down the photo, px"),
         extent=(0.0, float(camera.width), float(camera.height), 0.0),
         found=(camera.K[0, 2], camera.K[1, 2]),
@@ -157,25 +158,25 @@ def draw_plane(axes: "Axes", plane: Plane, camera: Calibration, pairs: Pairs) ->
     """Votes, curves and K in one plane."""
     shades = votes(plane, camera, pairs)
     axes.imshow(shades, extent=plane.extent, origin="lower", cmap="inferno", vmin=0, vmax=1, interpolation="bilinear")
-    draw_curves(axes, plane, plane.extent, len(pairs))
+    draw_curves(axes, plane, plane.extent, SAMPLES)
     marker, label = ("o", "found") if camera.identifiable else ("X", "a guess")
     axes.plot(*plane.found, marker, markersize=12, fillstyle="none", color=MARK, markeredgewidth=1.6, label=label)
     axes.set(title=plane.title, xlabel=plane.labels[0], ylabel=plane.labels[1], aspect="equal")
     if camera.identifiable and min(plane.spread) > 0:
-        enlarge(axes, plane, camera, len(pairs))
-    axes.legend(loc="lower right", labelcolor=MARK, framealpha=0.6, facecolor="black", edgecolor="none")
+        enlarge(axes, plane, camera)
+    axes.legend(loc="lower right", labelcolor=CURVE, framealpha=0.6, facecolor="black", edgecolor="none")
 
 
-def draw_curves(axes: "Axes", plane: Plane, extent: tuple[float, float, float, float], pairs: int) -> None:
+def draw_curves(axes: "Axes", plane: Plane, extent: tuple[float, float, float, float], samples: int) -> None:
     """The part of all curves that lies in `extent`; the more there are, the fainter."""
     left, right, bottom, top = extent
-    x = _steps(left, right, SAMPLES)
+    x = _steps(left, right, samples)
     y = _unbroken(plane.curves(x), min(bottom, top), max(bottom, top))
-    axes.plot(x, y.T, color=CURVE, linewidth=0.6, alpha=float(np.clip(12.0 / max(pairs, 1), 0.2, 0.8)))
+    axes.plot(x, y.T, color=CURVE, linewidth=0.6, alpha=float(np.clip(12.0 / max(len(y), 1), 0.2, 0.8)))
     axes.set(xlim=(left, right), ylim=(bottom, top))
 
 
-def enlarge(axes: "Axes", plane: Plane, camera: Calibration, pairs: int) -> None:
+def enlarge(axes: "Axes", plane: Plane, camera: Calibration) -> None:
     """The ellipse, in a window of its own where it would be too small to see."""
     from matplotlib.patches import Ellipse
 
@@ -187,13 +188,13 @@ def enlarge(axes: "Axes", plane: Plane, camera: Calibration, pairs: int) -> None
         window = (x - reach, x + reach, y - np.sign(top - bottom) * reach, y + np.sign(top - bottom) * reach)
         target = axes.inset_axes((0.63, 0.63, 0.35, 0.35))
         target.set_facecolor("#20123a")
-        draw_curves(target, plane, window, pairs)
+        draw_curves(target, plane, window, ENLARGED_SAMPLES)
         target.tick_params(colors=CURVE, labelsize=7)
         target.locator_params(nbins=3)
         axes.indicate_inset_zoom(target, edgecolor=GUIDE)
     label = f"{DEVIATIONS:.0f} standard deviations"
-    if plane.names[0] == "fx" and camera.K[0, 0] == camera.K[1, 1]:
-        # one focal for both directions: they can be wrong only together
+    if plane.names[0] == "fx" and ("aspect" in camera.held or camera.K[0, 0] == camera.K[1, 1]):
+        # pixels are taken to be square: fx and fy can be wrong only together
         target.plot((x - dx, x + dx), (y - dy, y + dy), color=MARK, linewidth=1.8, label=label)
     else:
         target.add_patch(Ellipse((x, y), 2 * dx, 2 * dy, fill=False, edgecolor=MARK, linewidth=1.4, label=label))

@@ -10,7 +10,7 @@ HELD = {
     "aspect": "square pixels",
     "k1": "a lens that bends no lines",
 }
-"""What is assumed where the photos do not tell."""
+"""What is usual, by what the photos do not determine."""
 
 
 def field_of_view_deg(camera: Calibration) -> tuple[float, float]:
@@ -34,7 +34,9 @@ def focal_text(camera: Calibration) -> str:
     across, down = field_of_view_deg(camera)
     focal = f"Focal length {camera.focal_px:.0f} px{_deviation(camera, 'fx')}"
     tall = camera.K[0, 0] / camera.K[1, 1]
-    shape = "" if abs(tall - 1) < 5e-4 else f"; its pixels are {tall:.3f} times as high as wide"
+    shape = (
+        "" if "aspect" in camera.held or abs(tall - 1) < 5e-4 else f"; its pixels are {tall:.3f} times as high as wide"
+    )
     return f"{focal}: the camera sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom{shape}."
 
 
@@ -49,8 +51,8 @@ def centre_text(camera: Calibration) -> str:
 
 
 def lens_text(camera: Calibration) -> str:
-    """The radial term, or nothing where none was found."""
-    if camera.radial == 0.0:
+    """The radial term, or nothing where none was found for certain."""
+    if camera.radial == 0.0 or "k1" in camera.held:
         return ""
     shape = "outwards (barrel)" if camera.radial < 0 else "inwards (pincushion)"
     deviation = f" +- {camera.spread['k1']:.3f}" if "k1" in camera.spread else ""
@@ -58,10 +60,10 @@ def lens_text(camera: Calibration) -> str:
 
 
 def held_text(camera: Calibration) -> str:
-    """What is assumed, or nothing."""
+    """What is taken to be as usual, or nothing."""
     if not camera.held or not camera.identifiable:
         return ""
-    return "Assumed, since the photos do not tell: " + ", ".join(HELD.get(name, name) for name in camera.held) + "."
+    return "Taken to be as usual, as far as the photos allow: " + ", ".join(HELD.get(n, n) for n in camera.held) + "."
 
 
 def _deviation(camera: Calibration, name: str) -> str:

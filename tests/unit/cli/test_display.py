@@ -22,7 +22,7 @@ def test_every_parameter_stands_beside_its_deviation():
     assert [line.strip() for line in others] == [
         "sees 90 degrees from left to right, 76 from top to bottom",
         "The lens bends lines outwards (barrel), k1 -0.050 +- 0.010.",
-        "Assumed, since the photos do not tell: square pixels.",
+        "Taken to be as usual, as far as the photos allow: square pixels.",
         "best pairs of photos to start from: 1-2, 2-3, 3-4 (numbers as in database.db)",
     ]
 

@@ -23,6 +23,7 @@ def test_the_focal_says_how_sure_it_is_and_how_wide_it_sees():
         "Focal length 500 px +- 2: the camera sees 90 degrees from left to right, 77 from top to bottom."
     )
     assert "pixels are 1.250 times as high as wide" in focal_text(camera(fx=625.0))
+    assert "pixels" not in focal_text(camera(fx=501.0, held=("aspect",)))
 
 
 @pytest.mark.parametrize(
@@ -51,3 +52,4 @@ def test_a_lens_and_what_is_held_are_told_only_where_there_is_something_to_tell(
     assert lens_text(bent) == "The lens bends lines outwards (barrel), k1 -0.120 +- 0.004."
     assert held_text(bent).endswith("optical centre near the middle of the photo, square pixels.")
     assert held_text(camera(held=("centre",), identifiable=False)) == ""
+    assert lens_text(camera(radial=-0.003, held=("k1",))) == ""
