@@ -1,21 +1,11 @@
-"""Algorithm 4 of the thesis to the letter: zero curves in (fx, fy), their meeting point, then the same in (u, v).
-
-Only the verdict is not the thesis's: what comes out counts as known where the pairs satisfy the constraint there, and
-do not satisfy it as well at other focals.
-"""
-
-from typing import NamedTuple
+"""Algorithm 4 of the thesis to the letter: zero curves in (fx, fy), their meeting point, then the same in (u, v)."""
 
 import numpy as np
 
-from sfm_app.geometry.camera import camera_matrix
-from sfm_app.selfcal.answers import guessed
 from sfm_app.selfcal.consensus import meeting_point
 from sfm_app.selfcal.curves import centre_curves, focal_curves, usable
-from sfm_app.selfcal.evidence import best_rival, disagreement, indecision, votes
-from sfm_app.selfcal.inputs import Pairs, prepare
-from sfm_app.selfcal.joint import Consensus
-from sfm_app.selfcal.search import SIGMAS
+from sfm_app.selfcal.inputs import Pairs
+from sfm_app.selfcal.verdict import Camera, answered
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
@@ -24,15 +14,6 @@ FOCAL_RANGE = 3.0
 """Focals are sought up to this many image widths (thesis 5.29)."""
 SIGMA_SHARE = 0.1
 """sigma of rho, as a share of the range that is searched (thesis 5.8.4)."""
-
-
-class Found(NamedTuple):
-    """What Algorithm 4 returns, in image widths from the top left corner."""
-
-    fx: float
-    fy: float
-    u: float
-    v: float
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
@@ -46,35 +27,13 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
         seed: unused, nothing is drawn at random.
 
     Returns:
-        K with ``identifiable=True``, or a guess and the reason. `evidence` has what Algorithm 4 answered in both cases,
-        as fx_px, fy_px, cx_px and cy_px.
-
-    Raises:
-        ValueError: malformed input, see `selfcal.inputs.prepare`.
+        As `selfcal.verdict.answered`, which also says what is raised.
     """
     del seed
-    width, height = size = pairs.size
-    usable = prepare(pairs, unit_px=width, origin_px=(0.0, 0.0))
-    evidence = {"pairs": float(len(usable))}
-    found = algorithm_4(usable, height / width, options.samples, evidence)
-    if isinstance(found, str):
-        return guessed(size, found, evidence)
-    fx, fy, cx, cy = (width * value for value in found)
-    evidence |= {"fx_px": fx, "fy_px": fy, "cx_px": cx, "cy_px": cy}
-    theta = np.array([0.5 * np.log(found.fx * found.fy), found.u, found.v, np.log(found.fy / found.fx)])
-    # the wider sigma: a sample of a curve is no maximum, and must not be held against the last per cent
-    consensus, sigmas = Consensus(usable, np.inf), SIGMAS[:1]
-    given = votes(consensus, theta, sigmas[-1])
-    lead = float(np.sum(given)) - best_rival(consensus, theta, range(4), sigmas)
-    evidence |= {"support": float(np.sum(given) / np.sum(usable.weights)), "lead": lead}
-    reason = disagreement(given, usable.weights) or indecision(lead, given)
-    if reason:
-        return guessed(size, reason, evidence)
-    K = camera_matrix(fx, fy, cx, cy)
-    return Calibration(K, width, height, METHOD, identifiable=True, evidence=evidence)
+    return answered(METHOD, pairs, lambda *given: algorithm_4(given[0], given[1], options.samples, given[2]))
 
 
-def algorithm_4(pairs: Pairs, tall: float, samples: int, evidence: dict[str, float]) -> Found | str:
+def algorithm_4(pairs: Pairs, tall: float, samples: int, evidence: dict[str, float]) -> Camera | str:
     """The algorithm itself, for an image of width 1 and height `tall`; the reason where too few curves are usable.
 
     Fills `evidence` with the number of curves and their support at the meeting points.
@@ -94,4 +53,4 @@ def algorithm_4(pairs: Pairs, tall: float, samples: int, evidence: dict[str, flo
     if centre is None:
         return f"{len(curves)} of {len(pairs)} pairs have a usable centre curve, 2 are needed"
     evidence["centre_support"] = centre.support
-    return Found(float(fx[focal.sample]), focal.value, float(sweep[centre.sample]), centre.value)
+    return Camera(float(fx[focal.sample]), focal.value, float(sweep[centre.sample]), centre.value)

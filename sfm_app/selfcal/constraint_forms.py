@@ -1,0 +1,134 @@
+"""The forms of the Huang-Faugeras constraint (thesis 5.2.4, 5.2.5, 5.8.2): E = K'FK has two equal singular values.
+
+Every form here is divided by the power of |E| that makes it free of the scale of F. With singular values s1 >= s2 >= 0
+and 0 of E, and d = (s1^2 - s2^2) / (s1^2 + s2^2)::
+
+    Frobenius form (5.9)     d
+    polynomial (5.25)        d^2
+    Trivedi (5.11)           three values whose sum is d^2
+
+so that on matrices of rank 2 all vanish together with (5.8), (s1 - s2) / s2. `Halves` gives what least squares needs
+and none of these is: smooth equations that change sign at the solution, two for every pair.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_app.selfcal.inputs import FloatArray, Pairs
+
+_TINY = float(np.finfo(np.float64).tiny)
+LEAST_COMPLEMENT = 1e-6
+"""(5.8) divides by s2; 1 - r is held above this, so that a matrix of rank 1 gets a large number, not infinity."""
+
+
+def essential(F: FloatArray, K: FloatArray) -> FloatArray:
+    """(..., 3, 3) E = K'FK (thesis 5.7)."""
+    return np.asarray(K.T @ F @ K)
+
+
+def huang_faugeras(E: FloatArray) -> FloatArray:
+    """(...,) the terms (s1 - s2) / s2 of thesis (5.8) for E (..., 3, 3); inf for rank 1."""
+    s = np.linalg.svd(E, compute_uv=False)
+    return np.divide(s[..., 0] - s[..., 1], s[..., 1], out=np.full(s.shape[:-1], np.inf), where=s[..., 1] > 0)
+
+
+def frobenius_form(E: FloatArray) -> FloatArray:
+    """(...,) |2 EE'E - tr(EE') E| / |E|^3 of thesis (5.9), in Frobenius norms."""
+    S = E @ np.swapaxes(E, -1, -2)
+    trace = np.trace(S, axis1=-2, axis2=-1)
+    return np.asarray(np.linalg.norm(2 * S @ E - trace[..., None, None] * E, axis=(-2, -1)) / trace**1.5)
+
+
+def polynomial_form(E: FloatArray) -> FloatArray:
+    """(...,) 2 tr((EE')^2) / tr(EE')^2 - 1 of thesis (5.25)."""
+    S = E @ np.swapaxes(E, -1, -2)
+    return np.asarray(2 * np.sum(S * S, axis=(-2, -1)) / np.trace(S, axis1=-2, axis2=-1) ** 2 - 1.0)
+
+
+def trivedi(E: FloatArray) -> FloatArray:
+    """(..., 3) the terms 4 S_ij^2 - (tr S - 2 S_ii)(tr S - 2 S_jj) of thesis (5.11), over tr(S)^2, with S = EE'.
+
+    For ij = 12, 13, 23: with i = j, which (5.11) does not exclude, the term is tr S (4 S_ii - tr S), and vanishes for
+    no particular camera.
+    """
+    S = E @ np.swapaxes(E, -1, -2)
+    trace = np.trace(S, axis1=-2, axis2=-1)[..., None]
+    diagonal = np.diagonal(S, axis1=-2, axis2=-1)
+    i, j = [0, 0, 1], [1, 2, 2]
+    return np.asarray((4 * S[..., i, j] ** 2 - (trace - 2 * diagonal[..., i]) * (trace - 2 * diagonal[..., j])) / trace**2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Halves:
+    """F = U S V' by its two non-zero singular values: what E is made of once the epipoles are left out.
+
+    K'U and K'V span what E maps to and from. With their Gram matrices A = U'KK'U = L L' and B = V'KK'V = N N', the
+    singular values of E are those of the 2 x 2 matrix M = L'S N, and the Kruppa equations are relations of A, S and B.
+    """
+
+    U: FloatArray
+    """(..., 2, 3) rows u1, u2."""
+    V: FloatArray
+    """(..., 2, 3) rows v1, v2."""
+    s: FloatArray
+    """(..., 2) singular values, falling."""
+
+    @classmethod
+    def of(cls, pairs: Pairs) -> "Halves":
+        """(P, ...) of all pairs."""
+        U, s, Vt = np.linalg.svd(pairs.F)
+        return cls(np.swapaxes(U, 1, 2)[:, :2], Vt[:, :2], s[:, :2])
+
+    def __getitem__(self, rows: object) -> "Halves":
+        """Some of them, as numpy indexing."""
+        return Halves(self.U[rows], self.V[rows], self.s[rows])  # type: ignore[index]
+
+    def grams(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """(..., 3), (..., 3) entries 11, 12, 22 of A and B for cameras (..., 4) of fx, fy, u, v."""
+        return _gram(self.U, cameras), _gram(self.V, cameras)
+
+
+def equations(halves: Halves, cameras: FloatArray) -> FloatArray:
+    """Two smooth equations for every pair whose norm is r = (s1 - s2) / (s1 + s2) of E.
+
+    A 2 x 2 matrix is the sum of a similarity (a, -d; d, a) and a reflected one (b, c; c, -b); its singular values are
+    the sum and the difference of their sizes. M has a positive determinant, so the similarity is the larger one, and
+    the equations are (b, c) / |(a, d)|.
+
+    Args:
+        cameras: (..., 4) fx, fy, u, v; its leading axes broadcast with those of `halves`.
+
+    Returns:
+        (..., 2).
+    """
+    A, B = halves.grams(cameras)
+    l11, l21, l22 = _cholesky(A)
+    n11, n21, n22 = _cholesky(B)
+    s1, s2 = halves.s[..., 0], halves.s[..., 1]
+    m11, m12 = s1 * l11 * n11 + s2 * l21 * n21, s2 * l21 * n22
+    m21, m22 = s2 * l22 * n21, s2 * l22 * n22
+    size = np.hypot(m11 + m22, m21 - m12) + _TINY
+    return np.stack([(m11 - m22) / size, (m12 + m21) / size], axis=-1)
+
+
+def huang_faugeras_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
+    """(..., 2) as `equations`, lengthened so that the norm is (s1 - s2) / s2 = 2 r / (1 - r), the term of (5.8)."""
+    g = equations(halves, cameras)
+    r = np.linalg.norm(g, axis=-1, keepdims=True)
+    return np.asarray(2 * g / np.maximum(1.0 - r, LEAST_COMPLEMENT))
+
+
+def _gram(basis: FloatArray, cameras: FloatArray) -> FloatArray:
+    fx, fy, u, v = (cameras[..., column, None] for column in range(4))
+    x, y = fx * basis[..., 0], fy * basis[..., 1]
+    z = u * basis[..., 0] + v * basis[..., 1] + basis[..., 2]
+    squares = x * x + y * y + z * z
+    mixed = x[..., 0] * x[..., 1] + y[..., 0] * y[..., 1] + z[..., 0] * z[..., 1]
+    return np.stack([squares[..., 0], mixed, squares[..., 1]], axis=-1)
+
+
+def _cholesky(gram: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    first = np.sqrt(gram[..., 0]) + _TINY
+    below = gram[..., 1] / first
+    return first, below, np.sqrt(np.maximum(gram[..., 2] - below**2, 0.0))
