@@ -1,4 +1,4 @@
-"""The point where most zero curves meet (thesis 5.8.4)."""
+"""The point where most zero curves meet, or the points, where several cameras took the photos (thesis 5.8.4)."""
 
 from typing import NamedTuple
 
@@ -6,6 +6,11 @@ import numpy as np
 
 from sfm_app.jit import kernel
 from sfm_app.selfcal.inputs import FloatArray
+
+SEPARATION = 1.25
+"""Peaks whose focals sqrt(fx fy) differ by a smaller factor are one."""
+LEAST_SHARE = 0.5
+"""A peak has at least this share of the highest one's support; what curves meet in by chance has less."""
 
 
 class Meeting(NamedTuple):
@@ -34,13 +39,47 @@ def meeting_point(curves: FloatArray, upper: float, sigma: float) -> Meeting | N
     """
     if len(curves) < 2:
         return None
-    scores = _scores(np.ascontiguousarray(curves), sigma)
-    scores[(curves <= 0) | (curves >= upper)] = -1.0
-    best = int(np.argmax(scores))
-    k, j = divmod(best, curves.shape[1])
-    if scores[k, j] < 0:
-        return None
-    return Meeting(j, float(curves[k, j]), float(scores[k, j]) / (len(curves) - 1))
+    supports = _supports(curves, (0.0, upper), sigma)
+    k, j = divmod(int(np.argmax(supports)), curves.shape[1])
+    return Meeting(j, float(curves[k, j]), float(supports[k, j])) if supports[k, j] >= 0 else None
+
+
+def meeting_points(curves: FloatArray, sweep: FloatArray, limits: tuple[float, float], sigma: float) -> list[Meeting]:
+    """All well-separated peaks of the support along the sweep: the cameras in a set of several (Figure 5.15).
+
+    A peak is higher than its neighbours along the sweep, `SEPARATION` away from higher peaks, and has `LEAST_SHARE` of
+    the highest one's support.
+
+    Args:
+        curves: (C, S) focal curves fy that are not degenerate.
+        sweep: (S,) fx, rising.
+        limits: only fx and fy between them are answers; near 0 all curves bunch up, so 0 is no good lower limit.
+        sigma: as in `meeting_point`, but small beside the distance between the cameras' focals.
+
+    Returns:
+        By falling support; empty where there are fewer than two curves.
+    """
+    if len(curves) < 2:
+        return []
+    supports = _supports(curves, limits, sigma)
+    supports[:, (sweep <= limits[0]) | (sweep >= limits[1])] = -1.0
+    best = np.argmax(supports, axis=0)
+    profile, values = (table[best, np.arange(len(sweep))] for table in (supports, curves))
+    is_top = np.concatenate([[False], (profile[1:-1] > profile[:-2]) & (profile[1:-1] >= profile[2:]), [False]])
+    tops = sorted(np.flatnonzero(is_top & (profile > 0)), key=lambda j: (-profile[j], j))
+    found: list[Meeting] = []
+    for j in tops:
+        focals = [sweep[other.sample] * other.value for other in found]
+        far = all(abs(np.log(sweep[j] * values[j] / focal)) >= 2 * np.log(SEPARATION) for focal in focals)
+        if far and profile[j] >= LEAST_SHARE * profile[tops[0]]:
+            found.append(Meeting(int(j), float(values[j]), float(profile[j])))
+    return found
+
+
+def _supports(curves: FloatArray, limits: tuple[float, float], sigma: float) -> FloatArray:
+    """(C, S) mean of rho over the other curves; -1 where the value is not between the limits."""
+    scores = _scores(np.ascontiguousarray(curves), sigma) / (len(curves) - 1)
+    return np.where((curves > limits[0]) & (curves < limits[1]), scores, -1.0)
 
 
 @kernel

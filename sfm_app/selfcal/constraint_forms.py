@@ -14,6 +14,7 @@ and none of these is: smooth equations that change sign at the solution, two for
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfm_app.selfcal.inputs import FloatArray, Pairs
 
@@ -30,7 +31,8 @@ def essential(F: FloatArray, K: FloatArray) -> FloatArray:
 def huang_faugeras(E: FloatArray) -> FloatArray:
     """(...,) the terms (s1 - s2) / s2 of thesis (5.8) for E (..., 3, 3); inf for rank 1."""
     s = np.linalg.svd(E, compute_uv=False)
-    return np.divide(s[..., 0] - s[..., 1], s[..., 1], out=np.full(s.shape[:-1], np.inf), where=s[..., 1] > 0)
+    infinite = np.full(s.shape[:-1], np.inf)
+    return np.asarray(np.divide(s[..., 0] - s[..., 1], s[..., 1], out=infinite, where=s[..., 1] > 0))
 
 
 def frobenius_form(E: FloatArray) -> FloatArray:
@@ -54,9 +56,9 @@ def trivedi(E: FloatArray) -> FloatArray:
     """
     S = E @ np.swapaxes(E, -1, -2)
     trace = np.trace(S, axis1=-2, axis2=-1)[..., None]
-    diagonal = np.diagonal(S, axis1=-2, axis2=-1)
+    rest = trace - 2 * np.diagonal(S, axis1=-2, axis2=-1)
     i, j = [0, 0, 1], [1, 2, 2]
-    return np.asarray((4 * S[..., i, j] ** 2 - (trace - 2 * diagonal[..., i]) * (trace - 2 * diagonal[..., j])) / trace**2)
+    return np.asarray((4 * S[..., i, j] ** 2 - rest[..., i] * rest[..., j]) / trace**2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,9 +82,9 @@ class Halves:
         U, s, Vt = np.linalg.svd(pairs.F)
         return cls(np.swapaxes(U, 1, 2)[:, :2], Vt[:, :2], s[:, :2])
 
-    def __getitem__(self, rows: object) -> "Halves":
-        """Some of them, as numpy indexing."""
-        return Halves(self.U[rows], self.V[rows], self.s[rows])  # type: ignore[index]
+    def __getitem__(self, rows: NDArray[np.int64] | None) -> "Halves":
+        """Some of them, as numpy indexes; None adds an axis in front."""
+        return Halves(self.U[rows], self.V[rows], self.s[rows])
 
     def grams(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
         """(..., 3), (..., 3) entries 11, 12, 22 of A and B for cameras (..., 4) of fx, fy, u, v."""

@@ -45,7 +45,7 @@ def _found(pairs: Pairs, tall: float, evidence: dict[str, float]) -> Camera:
 def kruppa_ratios(halves: Halves, cameras: FloatArray) -> FloatArray:
     """(..., 3) the ratios a^2 B11 / A22, -ab B12 / A12, b^2 B22 / A11: equal for the right camera; NaN for 0 / 0."""
     left, right = _sides(halves, cameras)
-    return np.divide(left, right, out=np.full(left.shape, np.nan), where=right != 0)
+    return np.asarray(np.divide(left, right, out=np.full(left.shape, np.nan), where=right != 0))
 
 
 def kruppa_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
@@ -83,16 +83,19 @@ def focals_of(pairs: Pairs, centre: tuple[float, float]) -> FloatArray:
     centred = _centred(pairs, centre)
     linear, quadratic = _focal_polynomials(centred)
     squares = np.full((len(pairs), 3), np.nan)
-    slope = np.sum(linear[:, :, 1] ** 2, axis=1)
-    determined = np.max(np.abs(linear), axis=(1, 2)) > VANISHED
-    np.divide(-np.sum(linear[:, :, 0] * linear[:, :, 1], axis=1), slope, out=squares[:, 0], where=determined & (slope > 0))
+    slopes = linear[:, :, 1]
+    known = np.max(np.abs(slopes), axis=1) > VANISHED
+    squares[known, 0] = -np.sum(linear[:, :, 0] * slopes, axis=1)[known] / np.sum(slopes**2, axis=1)[known]
     for row, coefficients in zip(squares, quadratic, strict=True):
-        if np.max(np.abs(coefficients)) > VANISHED:
-            roots = np.polynomial.polynomial.polyroots(np.trim_zeros(coefficients, "b"))
+        size = np.max(np.abs(coefficients))
+        if size > VANISHED:
+            # what is lost in rounding would only add a root far out
+            kept = np.where(np.abs(coefficients) > VANISHED * size, coefficients, 0.0)
+            roots = np.polynomial.polynomial.polyroots(np.trim_zeros(kept, "b"))
             row[1 : 1 + len(roots)] = np.where(np.isreal(roots), roots.real, np.nan)
     focals = np.sqrt(np.where(squares > 0, squares, np.nan))
-    cameras = np.stack([focals, focals, np.zeros_like(focals), np.zeros_like(focals)], axis=-1)
-    errors = np.linalg.norm(kruppa_equations(centred[:, None], cameras), axis=-1)
+    cameras = np.stack([focals, focals, np.zeros_like(focals), np.zeros_like(focals)])
+    errors = np.linalg.norm([kruppa_equations(centred, column.T) for column in np.moveaxis(cameras, 2, 0)], axis=-1).T
     best = np.argmin(np.where(np.isfinite(errors), errors, np.inf), axis=1)
     return np.asarray(focals[np.arange(len(pairs)), best])
 

@@ -1,9 +1,11 @@
 """Least squares over (fx, fy, u, v): what all methods of the thesis but Zero Curves rest on (5.6, 5.7)."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sfm_app.selfcal.constraint_forms import Halves, huang_faugeras_equations
 from sfm_app.selfcal.inputs import FloatArray, Pairs
@@ -30,9 +32,7 @@ class Minima(NamedTuple):
     """(B,) weighted sums of squares there."""
 
 
-def fitted(
-    pairs: Pairs, start: Camera, weights: FloatArray, equations: Equations = huang_faugeras_equations
-) -> Camera:
+def fitted(pairs: Pairs, start: Camera, weights: FloatArray, equations: Equations = huang_faugeras_equations) -> Camera:
     """The local minimum of sum_i w_i |equations_i|^2 / sum_i w_i that is reached from `start`, over all pairs."""
     found = minima(Halves.of(pairs)[None], weights[None], np.array([start]), equations)
     return Camera(*(float(value) for value in found.cameras[0]))
@@ -52,23 +52,21 @@ def minima(
     """
     scale = np.sqrt(weights / np.sum(weights, axis=1, keepdims=True))[..., None]
 
-    def residuals(thetas: FloatArray, rows: FloatArray | slice) -> FloatArray:
+    def residuals(thetas: FloatArray, rows: NDArray[np.int64]) -> FloatArray:
         values = scale[rows] * equations(halves[rows], _cameras(thetas)[:, None])
         return np.asarray(values.reshape(len(thetas), -1))
 
     thetas = np.column_stack([np.log(starts[:, :2]), starts[:, 2:]])
-    sums = np.sum(residuals(thetas, slice(None)) ** 2, axis=1)
-    damping = np.full(len(thetas), FIRST_DAMPING)
     searching = np.arange(len(thetas))
+    sums = np.sum(residuals(thetas, searching) ** 2, axis=1)
+    damping = np.full(len(thetas), FIRST_DAMPING)
     for _ in range(MOST_STEPS):
-        here = thetas[searching]
-        trial = here + _step(lambda moved, rows=searching: residuals(moved, rows), here, damping[searching])
-        values = np.sum(residuals(trial, searching) ** 2, axis=1)
-        before = sums[searching]
-        better = values < before
-        thetas[searching[better]], sums[searching[better]] = trial[better], values[better]
+        trial = thetas[searching] + _step(partial(residuals, rows=searching), thetas[searching], damping[searching])
+        before, after = sums[searching], np.sum(residuals(trial, searching) ** 2, axis=1)
+        better = after < before
+        thetas[searching[better]], sums[searching[better]] = trial[better], after[better]
         damping[searching] = np.clip(damping[searching] * np.where(better, 0.1, 10.0), *DAMPING_RANGE)
-        arrived = np.where(better, before - values <= FINISHED * before, damping[searching] == DAMPING_RANGE[1])
+        arrived = np.where(better, before - after <= FINISHED * before, damping[searching] == DAMPING_RANGE[1])
         searching = searching[~arrived]
         if not len(searching):
             break
@@ -83,9 +81,10 @@ def _step(residuals: Callable[[FloatArray], FloatArray], thetas: FloatArray, dam
     normal = np.swapaxes(J, 1, 2) @ J
     gradient = np.einsum("bmk,bm->bk", J, here)
     diagonal = np.einsum("bkk->bk", normal)
-    # where no equation depends on a parameter, it stays
-    lifted = damping[:, None] * diagonal + np.finfo(np.float64).eps * (1.0 + np.max(diagonal, axis=1, keepdims=True))
-    steps = np.linalg.solve(normal + lifted[:, :, None] * np.eye(4), -gradient[..., None])[..., 0]
+    # lifted a little even where no equation depends on a parameter, which then stays
+    least = np.finfo(np.float64).eps * (1.0 + np.max(diagonal, axis=1, keepdims=True))
+    lifted = normal + (damping[:, None] * diagonal + least)[:, :, None] * np.eye(4)
+    steps = np.linalg.solve(lifted, -gradient[..., None])[..., 0]
     return np.asarray(np.clip(steps, -LONGEST_STEP, LONGEST_STEP))
 
 

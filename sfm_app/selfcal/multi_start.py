@@ -1,11 +1,12 @@
 """Algorithm 2 of the thesis: least squares on random triples of pairs, from random cameras (5.6)."""
 
+from functools import partial
 from math import ceil, comb, log
 
 import numpy as np
 
-from sfm_app.selfcal.constraint_forms import Halves, huang_faugeras_equations
-from sfm_app.selfcal.inputs import FloatArray, Pairs
+from sfm_app.selfcal.constraint_forms import Halves
+from sfm_app.selfcal.inputs import Pairs
 from sfm_app.selfcal.kruppa import focals_of
 from sfm_app.selfcal.minimise import minima
 from sfm_app.selfcal.verdict import Camera, answered
@@ -36,7 +37,7 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
         As `selfcal.verdict.answered`, which also says what is raised.
     """
     del options
-    return answered(METHOD, pairs, lambda *given: algorithm_2(*given, seed))
+    return answered(METHOD, pairs, partial(algorithm_2, seed=seed))
 
 
 def algorithm_2(pairs: Pairs, tall: float, evidence: dict[str, float], seed: int) -> Camera:

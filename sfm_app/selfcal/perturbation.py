@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sfm_app.selfcal.inputs import FloatArray, Pairs
 from sfm_app.selfcal.constraint_forms import essential
+from sfm_app.selfcal.inputs import FloatArray, Pairs
 from sfm_app.selfcal.minimise import fitted
 from sfm_app.selfcal.verdict import Camera, answered
 from sfm_app.settings import CalibrationSettings

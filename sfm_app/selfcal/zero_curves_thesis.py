@@ -1,5 +1,7 @@
 """Algorithm 4 of the thesis to the letter: zero curves in (fx, fy), their meeting point, then the same in (u, v)."""
 
+from functools import partial
+
 import numpy as np
 
 from sfm_app.selfcal.consensus import meeting_point
@@ -30,10 +32,10 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
         As `selfcal.verdict.answered`, which also says what is raised.
     """
     del seed
-    return answered(METHOD, pairs, lambda *given: algorithm_4(given[0], given[1], options.samples, given[2]))
+    return answered(METHOD, pairs, partial(algorithm_4, samples=options.samples))
 
 
-def algorithm_4(pairs: Pairs, tall: float, samples: int, evidence: dict[str, float]) -> Camera | str:
+def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: int) -> Camera | str:
     """The algorithm itself, for an image of width 1 and height `tall`; the reason where too few curves are usable.
 
     Fills `evidence` with the number of curves and their support at the meeting points.
