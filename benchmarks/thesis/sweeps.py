@@ -83,7 +83,7 @@ def sweep(lab: Lab, number: str) -> Drawn:
         rows = found[plot.part]
         levels = sorted({row["x"] for row in rows})
         lines = {name: [value(rows, name, level, plot.column) for level in levels] for name in _methods(rows)}
-        curves(axis, levels, lines, [PRODUCTION] if PRODUCTION in lines else [plot.methods[0]])
+        curves(axis, levels, lines, [PRODUCTION] if PRODUCTION in lines else [plot.methods[0]], ALL)
         label(axis, plot.axis, TITLES[plot.column], plot.title, log=True)
     legend_beside(figure, np.ravel(axes)[0])
     rows = [{"part": part, **row} for part, several in found.items() for row in several]
