@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from fits import Fits, FloatArray
+from panels import rounded
 from report import Row
 from setups import Trial
 
@@ -110,11 +111,11 @@ def contest(experiment: Experiment, tests: dict[str, int], seed: int, pool: Exec
 def summary(method: str, x: float, tries: Sequence[Attempt]) -> Row:
     """Mean and median errors over the answers, and how many there are."""
     answers = [(attempt.K, attempt.true_K) for attempt in tries if attempt.K is not None]
-    row: Row = {"method": method, "x": x, "tests": len(tries), "answered": len(answers) / max(len(tries), 1)}
+    row: Row = {"method": method, "x": rounded(x), "tests": len(tries), "answered": len(answers) / max(len(tries), 1)}
     for title, error in (("e_focal", e_focal), ("e_OC", e_centre)):
         errors = [min(error(K, true_K), CAP_PERCENT) for K, true_K in answers]
-        row[title] = float(np.mean(errors)) if errors else None
-        row[f"{title} median"] = float(np.median(errors)) if errors else None
+        row[title] = rounded(float(np.mean(errors))) if errors else None
+        row[f"{title} median"] = rounded(float(np.median(errors))) if errors else None
     for name, entry in (("fx", (0, 0)), ("fy", (1, 1)), ("cx", (0, 2)), ("cy", (1, 2))):
-        row[name] = float(np.median([K[entry] for K, _ in answers])) if answers else None
-    return row | {"ms": float(np.median([attempt.ms for attempt in tries])) if tries else None}
+        row[name] = rounded(float(np.median([K[entry] for K, _ in answers]))) if answers else None
+    return row | {"ms": rounded(float(np.median([attempt.ms for attempt in tries])), 4) if tries else None}

@@ -43,9 +43,9 @@ def draw(panels: Sequence[Panel], x: str, y: str, *, log: bool = False, columns:
 
 
 def rows_of(panels: Sequence[Panel]) -> list[Row]:
-    """One row per point of every line."""
+    """One row per point of every line, to six digits."""
     return [
-        {"panel": panel.title, "line": name, "x": float(x), "y": float(y)}
+        {"panel": panel.title, "line": name, "x": rounded(x), "y": rounded(y)}
         for panel in panels
         for name, values in panel.lines.items()
         for x, y in zip(panel.x, values, strict=True)
@@ -55,3 +55,8 @@ def rows_of(panels: Sequence[Panel]) -> list[Row]:
 def lowest(panel: Panel, line: str) -> float:
     """The x of the lowest point of a line."""
     return float(panel.x[int(np.nanargmin(panel.lines[line]))])
+
+
+def rounded(value: float, digits: int = 6) -> float:
+    """As many significant digits as anyone will read."""
+    return float(f"{value:.{digits}g}")

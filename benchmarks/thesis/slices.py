@@ -6,7 +6,7 @@ from contests import FloatArray
 from figures import label, pyplot
 from fits import Fit, fit_to_all, robust_fits
 from lab import Drawn, Lab
-from panels import Panel, draw, lowest, rows_of
+from panels import Panel, draw, lowest, rounded, rows_of
 from sequences import ImageSequence
 from setups import NOISE_PX
 
@@ -114,7 +114,9 @@ def surfaces(lab: Lab) -> Drawn:
         axis.grid(False)
         figure.colorbar(shown, ax=axis, label="log10 of the objective (5.8)")
         rows += [
-            {"panel": name, "fx": f, "cx": u, "y": values[i, j]} for i, u in enumerate(cx) for j, f in enumerate(fx)
+            {"panel": name, "fx": rounded(f), "cx": rounded(u), "y": rounded(values[i, j])}
+            for i, u in enumerate(cx)
+            for j, f in enumerate(fx)
         ]
     lab.keep("5.4", figure, rows)
     return Drawn(note="Valbonne, which the thesis shows beside the Corridor, is not at hand.")
@@ -194,7 +196,7 @@ def _forms(sequence: ImageSequence, seed: int | None = None) -> FloatArray:
         noise = np.random.default_rng([seed, 55]).normal(scale=F_NOISE, size=pairs.F.shape)
         pairs = prepare(CameraPairs.of(pairs.F + noise, (1, 1)), unit_px=1.0, origin_px=(0.0, 0.0))
     cameras = np.array([[scale * K[0, 0], scale * K[1, 1], K[0, 2], K[1, 2]] for scale in SCALES])
-    halves = Halves.of(pairs)[:, None]
+    halves = Halves.of(pairs.F)[np.arange(len(pairs))[:, None]]
     ratios = kruppa_ratios(halves, cameras)
     unlike = np.sum((ratios - np.roll(ratios, 1, axis=-1)) ** 2, axis=-1)
     sines = np.linalg.norm(kruppa_equations(halves, cameras), axis=-1)
