@@ -10,7 +10,7 @@ from sfm_app.selfcal.inputs import FloatArray
 SEPARATION = 1.25
 """Peaks whose focals sqrt(fx fy) differ by a smaller factor are one."""
 LEAST_SHARE = 0.5
-"""A peak has at least this share of the highest one's support; what curves meet in by chance has less."""
+"""A peak has at least this share of the highest one's support; what curves meet in by chance mostly has less."""
 
 
 class Meeting(NamedTuple):
@@ -66,14 +66,13 @@ def meeting_points(curves: FloatArray, sweep: FloatArray, limits: tuple[float, f
     best = np.argmax(supports, axis=0)
     profile, values = (table[best, np.arange(len(sweep))] for table in (supports, curves))
     is_top = np.concatenate([[False], (profile[1:-1] > profile[:-2]) & (profile[1:-1] >= profile[2:]), [False]])
-    tops = sorted(np.flatnonzero(is_top & (profile > 0)), key=lambda j: (-profile[j], j))
-    found: list[Meeting] = []
-    for j in tops:
-        focals = [sweep[other.sample] * other.value for other in found]
-        far = all(abs(np.log(sweep[j] * values[j] / focal)) >= 2 * np.log(SEPARATION) for focal in focals)
-        if far and profile[j] >= LEAST_SHARE * profile[tops[0]]:
-            found.append(Meeting(int(j), float(values[j]), float(profile[j])))
-    return found
+    tops = np.flatnonzero(is_top & (profile >= LEAST_SHARE * np.max(profile)) & (profile > 0))
+    log_focals = 0.5 * np.log(sweep * np.where(profile > 0, values, 1.0))
+    kept: list[int] = []
+    for j in tops[np.argsort(-profile[tops], kind="stable")]:
+        if np.all(np.abs(log_focals[j] - log_focals[kept]) >= np.log(SEPARATION)):
+            kept.append(int(j))
+    return [Meeting(j, float(values[j]), float(profile[j])) for j in kept]
 
 
 def _supports(curves: FloatArray, limits: tuple[float, float], sigma: float) -> FloatArray:

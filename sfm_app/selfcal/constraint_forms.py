@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.selfcal.inputs import FloatArray, Pairs
+from sfm_app.selfcal.inputs import FloatArray
 
 _TINY = float(np.finfo(np.float64).tiny)
 LEAST_COMPLEMENT = 1e-6
@@ -77,13 +77,14 @@ class Halves:
     """(..., 2) singular values, falling."""
 
     @classmethod
-    def of(cls, pairs: Pairs) -> "Halves":
-        """(P, ...) of all pairs."""
-        U, s, Vt = np.linalg.svd(pairs.F)
-        return cls(np.swapaxes(U, 1, 2)[:, :2], Vt[:, :2], s[:, :2])
+    def of(cls, F: FloatArray) -> "Halves":
+        """(P, ...) of matrices (P, 3, 3) of rank 2, brought to Frobenius norm 1."""
+        U, s, Vt = np.linalg.svd(F)
+        s = s[:, :2] / np.linalg.norm(s[:, :2], axis=1, keepdims=True)
+        return cls(np.swapaxes(U, 1, 2)[:, :2], Vt[:, :2], s)
 
-    def __getitem__(self, rows: NDArray[np.int64] | None) -> "Halves":
-        """Some of them, as numpy indexes; None adds an axis in front."""
+    def __getitem__(self, rows: NDArray[np.int64]) -> "Halves":
+        """Those of the given indices, which may have any shape."""
         return Halves(self.U[rows], self.V[rows], self.s[rows])
 
     def grams(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:

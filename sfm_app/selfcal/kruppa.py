@@ -26,7 +26,13 @@ VANISHED = 1e-9
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
     """Least squares over the Kruppa equations of all pairs, from the median of their focal-only solutions.
 
-    Args and returns as in `selfcal.huang_faugeras.calibrate`.
+    Args:
+        pairs: F's and weights.
+        options: unused.
+        seed: unused, nothing is drawn at random.
+
+    Returns:
+        As `selfcal.verdict.answered`, which also says what is raised.
     """
     del options, seed
     return answered(METHOD, pairs, _found)
@@ -80,31 +86,36 @@ def focals_of(pairs: Pairs, centre: tuple[float, float]) -> FloatArray:
     Returns:
         (P,) in the units of the pairs; NaN where the equations hold for any focal, or for none.
     """
-    centred = _centred(pairs, centre)
+    to_centre = np.array([[1.0, 0.0, centre[0]], [0.0, 1.0, centre[1]], [0.0, 0.0, 1.0]])
+    centred = Halves.of(to_centre.T @ pairs.F @ to_centre)
     linear, quadratic = _focal_polynomials(centred)
-    squares = np.full((len(pairs), 3), np.nan)
-    slopes = linear[:, :, 1]
+    squares = np.column_stack([_common_root(linear), *_roots(quadratic).T])
+    focals = np.sqrt(np.where(squares > 0, squares, np.nan))
+    cameras = np.stack([focals, focals, np.zeros_like(focals), np.zeros_like(focals)], axis=-1)
+    rows = np.arange(len(pairs))
+    errors = np.linalg.norm(kruppa_equations(centred[rows[:, None]], cameras), axis=-1)
+    return np.asarray(focals[rows, np.argmin(np.where(np.isfinite(errors), errors, np.inf), axis=1)])
+
+
+def _common_root(linear: FloatArray) -> FloatArray:
+    """(P,) least-squares roots of two lines each; NaN where both slopes vanish."""
+    slopes, roots = linear[:, :, 1], np.full(len(linear), np.nan)
     known = np.max(np.abs(slopes), axis=1) > VANISHED
-    squares[known, 0] = -np.sum(linear[:, :, 0] * slopes, axis=1)[known] / np.sum(slopes**2, axis=1)[known]
-    for row, coefficients in zip(squares, quadratic, strict=True):
+    roots[known] = -np.sum(linear[:, :, 0] * slopes, axis=1)[known] / np.sum(slopes**2, axis=1)[known]
+    return roots
+
+
+def _roots(quadratic: FloatArray) -> FloatArray:
+    """(P, 2) real roots, NaN where there are fewer or the polynomial vanishes."""
+    found = np.full((len(quadratic), 2), np.nan)
+    for row, coefficients in zip(found, quadratic, strict=True):
         size = np.max(np.abs(coefficients))
         if size > VANISHED:
             # what is lost in rounding would only add a root far out
             kept = np.where(np.abs(coefficients) > VANISHED * size, coefficients, 0.0)
             roots = np.polynomial.polynomial.polyroots(np.trim_zeros(kept, "b"))
-            row[1 : 1 + len(roots)] = np.where(np.isreal(roots), roots.real, np.nan)
-    focals = np.sqrt(np.where(squares > 0, squares, np.nan))
-    cameras = np.stack([focals, focals, np.zeros_like(focals), np.zeros_like(focals)])
-    errors = np.linalg.norm([kruppa_equations(centred, column.T) for column in np.moveaxis(cameras, 2, 0)], axis=-1).T
-    best = np.argmin(np.where(np.isfinite(errors), errors, np.inf), axis=1)
-    return np.asarray(focals[np.arange(len(pairs)), best])
-
-
-def _centred(pairs: Pairs, centre: tuple[float, float]) -> Halves:
-    to_centre = np.array([[1.0, 0.0, centre[0]], [0.0, 1.0, centre[1]], [0.0, 0.0, 1.0]])
-    U, s, Vt = np.linalg.svd(to_centre.T @ pairs.F @ to_centre)
-    s = s / np.linalg.norm(s, axis=1, keepdims=True)
-    return Halves(np.swapaxes(U, 1, 2)[:, :2], Vt[:, :2], s[:, :2])
+            row[: len(roots)] = np.where(np.isreal(roots), roots.real, np.nan)
+    return found
 
 
 def _focal_polynomials(halves: Halves) -> tuple[FloatArray, FloatArray]:

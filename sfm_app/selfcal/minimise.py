@@ -34,7 +34,7 @@ class Minima(NamedTuple):
 
 def fitted(pairs: Pairs, start: Camera, weights: FloatArray, equations: Equations = huang_faugeras_equations) -> Camera:
     """The local minimum of sum_i w_i |equations_i|^2 / sum_i w_i that is reached from `start`, over all pairs."""
-    found = minima(Halves.of(pairs)[None], weights[None], np.array([start]), equations)
+    found = minima(Halves.of(pairs.F)[np.arange(len(pairs))[None]], weights[None], np.array([start]), equations)
     return Camera(*(float(value) for value in found.cameras[0]))
 
 

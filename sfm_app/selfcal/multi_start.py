@@ -37,11 +37,14 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
         As `selfcal.verdict.answered`, which also says what is raised.
     """
     del options
-    return answered(METHOD, pairs, partial(algorithm_2, seed=seed))
+    return answered(METHOD, pairs, partial(algorithm_2, seed=seed), SAMPLE)
 
 
 def algorithm_2(pairs: Pairs, tall: float, evidence: dict[str, float], seed: int) -> Camera:
-    """The algorithm itself, for an image of width 1 and height `tall`; `evidence` gets the distribution and MaxIter."""
+    """The algorithm itself, for an image of width 1 and height `tall`; `evidence` gets the distribution and MaxIter.
+
+    Residual(s) is that of the triple: the thesis writes that other pairs play no part, and that this costs accuracy.
+    """
     rng = np.random.default_rng(seed)
     count = number_of_starts(len(pairs))
     mean, deviation = focal_distribution(pairs, tall)
@@ -50,14 +53,17 @@ def algorithm_2(pairs: Pairs, tall: float, evidence: dict[str, float], seed: int
     centre = rng.normal([0.5, 0.5 * tall], [1 / 6, tall / 6], (count, 2))
     starts = np.column_stack([focal, focal, centre])
     # sorted by a property that neither scale nor direction nor place changes: the order of the pairs has no effect
-    halves = Halves.of(pairs)[np.argsort(pairs.product, kind="stable")]
+    halves = Halves.of(pairs.F)[np.argsort(pairs.product, kind="stable")]
     triples = np.argsort(rng.random((count, len(pairs))), axis=1)[:, :SAMPLE]
     found = minima(halves[triples], np.ones(triples.shape), starts)
     return Camera(*(float(value) for value in found.cameras[np.argmin(found.sums)]))
 
 
 def number_of_starts(pairs: int) -> int:
-    """MaxIter of thesis 5.6.3: any one triple of the pairs is drawn with a probability of 0.95."""
+    """MaxIter of thesis 5.6.3: any one triple of the pairs is drawn with a probability of 0.95.
+
+    N in its formula counts fundamental matrices ("every arrangement of three"), not frames as N in (5.14) does.
+    """
     triples = comb(pairs, SAMPLE)
     return 1 if triples == 1 else min(MOST_STARTS, ceil(log(1 - CONFIDENCE) / log(1 - 1 / triples)))
 

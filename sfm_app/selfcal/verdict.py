@@ -31,7 +31,7 @@ class Camera(NamedTuple):
 
     @classmethod
     def initial(cls, tall: float) -> "Camera":
-        """K_init of thesis 5.7.2 for an image of width 1 and height `tall`: focal 1, centre in the middle."""
+        """K_init of thesis 5.7.2 for an image of width 1 and height `tall`: 53 degrees (not 90, as it says) across."""
         return cls(1.0, 1.0, 0.5, 0.5 * tall)
 
     @property
@@ -44,8 +44,15 @@ Find = Callable[[Pairs, float, dict[str, float]], Camera | str]
 """A method: pairs in image widths, height over width, and a table for its figures; K, or why there is none."""
 
 
-def answered(method: str, pairs: CameraPairs, find: Find) -> Calibration:
+def answered(method: str, pairs: CameraPairs, find: Find, sample: int = 0) -> Calibration:
     """Run a method and judge what it finds.
+
+    Args:
+        method: its name.
+        pairs: what it works from.
+        find: what it does.
+        sample: pairs that it picks out and fits alone. They agree with the answer whatever that is worth, so that the
+            others must.
 
     Returns:
         K with ``identifiable=True``, or a guess and the reason. `evidence` has what the method answered in both cases,
@@ -64,13 +71,13 @@ def answered(method: str, pairs: CameraPairs, find: Find) -> Calibration:
         return guessed(size, found, evidence)
     in_px = [float(width * value) for value in found]
     evidence |= dict(zip(("fx_px", "fy_px", "cx_px", "cy_px"), in_px, strict=True))
-    reason = _objection(found, usable, evidence)
+    reason = _objection(found, usable, sample, evidence)
     if reason:
         return guessed(size, reason, evidence)
     return Calibration(camera_matrix(*in_px), width, height, method, identifiable=True, evidence=evidence)
 
 
-def _objection(found: Camera, pairs: Pairs, evidence: dict[str, float]) -> str:
+def _objection(found: Camera, pairs: Pairs, sample: int, evidence: dict[str, float]) -> str:
     """Why the answer is not to be trusted, or nothing; adds support and lead to the evidence."""
     theta = np.array([0.5 * np.log(found.fx * found.fy), found.u, found.v, np.log(found.fy / found.fx)])
     # the wider sigma: these answers are no maxima of the consensus, and must not be held against the last per cent
@@ -78,4 +85,7 @@ def _objection(found: Camera, pairs: Pairs, evidence: dict[str, float]) -> str:
     given = votes(consensus, theta, sigmas[-1])
     lead = float(np.sum(given)) - best_rival(consensus, theta, range(4), sigmas)
     evidence |= {"support": float(np.sum(given) / np.sum(pairs.weights)), "lead": lead}
-    return disagreement(given, pairs.weights) or indecision(lead, given)
+    if len(pairs) <= sample:
+        return f"{sample} pairs were fitted, and no others are there to confirm it"
+    others = np.argsort(given, kind="stable")[: len(pairs) - sample]
+    return disagreement(given[others], pairs.weights[others]) or indecision(lead, given)

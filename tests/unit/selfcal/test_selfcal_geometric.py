@@ -62,12 +62,18 @@ def test_pairs_that_do_not_take_part_get_no_weight():
     assert np.sum(weights) == pytest.approx(8)
 
 
-def test_exact_matches_count_alike(views):
+def test_exact_matches_count_alike():
+    tracks = make_tracks(TrackOptions(sigma_px=0.0), 0)
+    inliers = tuple(np.hstack([pair.x1, pair.x2]) for pair in tracks.pairs.values())
+    pairs = replace(CameraPairs.of(tracks.F, tracks.size), inliers=inliers)
+    np.testing.assert_allclose(geometric.residual_weights(pairs), np.ones(10), rtol=1e-12)
+
+
+def test_without_any_match_there_is_no_answer(views):
     made = views(3, noise=0.0)
-    nothing = np.zeros((0, 4))
-    pairs = replace(CameraPairs.of(made.Fs, made.size), inliers=(nothing, nothing, nothing))
+    pairs = replace(CameraPairs.of(made.Fs, made.size), inliers=(np.zeros((0, 4)),) * 3)
     np.testing.assert_array_equal(geometric.residual_weights(pairs), np.zeros(3))
-    assert not geometric.calibrate(pairs, OPTIONS, 0).identifiable
+    assert "0 usable pairs" in geometric.calibrate(pairs, OPTIONS, 0).reason
 
 
 def test_matches_for_other_pairs_are_refused(views):

@@ -29,7 +29,7 @@ def test_exact_pairs_lead_to_the_exact_camera(views, count):
 def test_it_stops_where_scipy_does(views):
     made = views(6, seed=2, noise=5e-3)
     pairs, weights = in_widths(made), np.linspace(0.1, 1, 15)
-    halves = Halves.of(pairs)
+    halves = Halves.of(pairs.F)
 
     def residuals(camera):
         return (np.sqrt(weights)[:, None] * huang_faugeras_equations(halves, camera)).ravel()
@@ -57,7 +57,7 @@ def test_a_pair_of_weight_zero_does_not_count(views, random_fundamentals):
 
 def test_searches_side_by_side_are_as_if_alone(views):
     pairs = in_widths(views(5, noise=2e-3))
-    halves, rng = Halves.of(pairs), np.random.default_rng(0)
+    halves, rng = Halves.of(pairs.F), np.random.default_rng(0)
     triples = np.array([[0, 1, 2], [3, 5, 9], [2, 4, 8], [1, 6, 7]])
     starts = np.column_stack([rng.uniform(0.5, 2, (4, 2)), rng.uniform(0.3, 0.6, (4, 2))])
     together = minima(halves[triples], np.ones((4, 3)), starts)
@@ -77,7 +77,7 @@ def test_it_never_ends_above_its_start(views, random_fundamentals):
     pairs = prepare(CameraPairs.of(Fs, (1000, 750)), unit_px=1000.0, origin_px=(0.0, 0.0))
     start = Camera.initial(0.75)
     end = fitted(pairs, start, np.ones(12))
-    sums = [np.sum(huang_faugeras_equations(Halves.of(pairs), np.array(camera)) ** 2) for camera in (start, end)]
+    sums = [np.sum(huang_faugeras_equations(Halves.of(pairs.F), np.array(camera)) ** 2) for camera in (start, end)]
     assert sums[1] < sums[0]
     assert np.all(np.isfinite(end))
     assert min(end[:2]) > 0

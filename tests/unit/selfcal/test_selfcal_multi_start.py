@@ -58,6 +58,20 @@ def test_three_wrong_pairs_of_ten_do_no_harm(views, random_fundamentals):
     assert found.evidence["starts"] == 358
 
 
+def test_three_pairs_that_happen_to_agree_are_no_camera(random_fundamentals):
+    for seed in range(5):
+        found = run(random_fundamentals(15, seed))
+        assert not found.identifiable
+        assert found.evidence["lead"] > -1
+
+
+def test_the_three_pairs_of_three_photos_have_an_answer_but_no_confirmation(views):
+    found = run(views(3, noise=1e-4).Fs)
+    assert found.evidence["starts"] == 1
+    assert "no others" in found.reason
+    assert found.evidence["fx_px"] == pytest.approx(1000, rel=0.1)
+
+
 def test_the_seed_decides(views):
     made = views(5, noise=2e-3)
     np.testing.assert_array_equal(run(made.Fs, seed=1).K, run(made.Fs, seed=1).K)

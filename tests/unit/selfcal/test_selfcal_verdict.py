@@ -42,6 +42,14 @@ def test_any_camera_that_parallel_axes_fit_is_undecided(views):
     assert "other focals" in found.reason
 
 
+@pytest.mark.parametrize(("sample", "known"), [(0, True), (3, False), (10, False), (12, False)])
+def test_pairs_that_were_fitted_do_not_speak_for_the_answer(views, random_fundamentals, sample, known):
+    Fs = np.concatenate([views(3).Fs, random_fundamentals(7)])
+    found = answered("mine", CameraPairs.of(Fs, (1000, 750)), lambda *_: Camera(1.0, 1.0, 0.5, 0.375), sample)
+    assert found.identifiable == known
+    assert 0.2 < found.evidence["support"] < 0.4
+
+
 def test_a_method_may_have_no_answer(views):
     found = judged(views(4), "no curve")
     assert (found.identifiable, found.reason, found.method) == (False, "no curve", "guess")
