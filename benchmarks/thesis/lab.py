@@ -1,6 +1,6 @@
 """What the figures of chapter 5 draw from: data, experiments that several of them share, a folder for the results."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from functools import partial
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from claims import Claim
-from contests import MULTI_START, Experiment, contest
+from contests import Experiment, contest
 from figures import save
 from report import Row, write_csv
 from sequences import CORNERS, ImageSequence, corner_sequence, photo_sequence
@@ -39,8 +39,8 @@ class Lab:
     """Seeds per level of a figure."""
     runs: int
     """Seeds per sequence of the tables."""
-    slow_tests: int
-    """The same for a method that takes far longer than the others."""
+    most: Mapping[str, int]
+    """At most so many of both for methods that take far longer than the others."""
     seed: int
     pool: Executor
     _sequences: dict[str, ImageSequence] = field(default_factory=dict)
@@ -58,10 +58,18 @@ class Lab:
         title = f"{experiment.__name__} {sequence}".strip()
         if title not in self._contests:
             count = self.tests if tests is None else tests
-            each = {name: min(count, self.slow_tests) if name == MULTI_START else count for name in self.methods}
+            each = {name: min(count, self.most.get(name, count)) for name in self.methods}
             bound: Experiment = partial(experiment, self.sequence(sequence)) if sequence else experiment
             self._contests[title] = contest(bound, each, self.seed, self.pool, title)
         return self._contests[title]
+
+    @property
+    def fewer(self) -> str:
+        """The methods that have fewer tests or runs, for people."""
+        most = max(self.tests, self.runs)
+        return (
+            ", ".join(f"at most {count} of `{name}`" for name, count in self.most.items() if count < most) or "of all"
+        )
 
     def keep(self, number: str, figure: Any, rows: Sequence[Row]) -> None:
         """Write the PNG and the CSV of a figure."""

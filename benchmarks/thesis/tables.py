@@ -58,11 +58,11 @@ def real_sequences(lab: Lab) -> Drawn:
         "Table 5.2: K in px, medians": cameras(rows, truths),
     }
     parts = [f"### {title}\n\n{table(lines)}" for title, lines in shown.items()]
-    return Drawn(claims(rows), rows, _NOTE.format(runs=lab.runs, slow=lab.slow_tests), "\n".join(parts))
+    return Drawn(claims(rows), rows, _NOTE.format(runs=lab.runs, fewer=lab.fewer), "\n".join(parts))
 
 
 _NOTE = (
-    "{runs} runs a sequence, {slow} of `multi-start`, each with its own seed for LEV-RANSAC and the calibrator. "
+    "{runs} runs a sequence ({fewer}), each with its own seed for LEV-RANSAC and the calibrator. "
     "VGG sequences: the corners and matches that come with them (the thesis matched SIFT), all pairs of views that "
     "share 20 corners. Photos: SIFT matches of `sfm-app`. Pairs that LEV-RANSAC rejects or calls degenerate take no "
     "part. Truth is the K of the first view, as in Table 5.2; in the Corridor the true K's drift over its 11 views, by "

@@ -10,9 +10,10 @@ import setups
 import sweep_claims
 import tables
 from bounds import full_bound, gap, reduced_bound
-from chapter5 import IN_ORDER, PARTS
+from chapter5 import IN_ORDER, MOST, PARTS, most_of
 from contests import CAP_PERCENT, NON_ROBUST, PRODUCTION, Attempt, answer_of, contest, e_centre, e_focal, summary
 from fits import Fit, fit_to_all, robust_fits, with_outlying
+from lab import Lab
 from panels import Panel, lowest, rows_of
 from sequences import ImageSequence, camera_matrix_of, corner_sequence, fundamental_of
 from setups import Trial
@@ -259,3 +260,16 @@ def test_support_is_highest_where_curves_meet():
 def test_every_figure_of_the_issue_is_drawn():
     asked = {f"5.{n}" for n in (1, 2, 3, 5, 6, 9, 10, 11, 12, *range(14, 23))} | {"5.7-5.8", "tables"}
     assert asked <= set(PARTS) == set(IN_ORDER) and IN_ORDER[0] == "5.1" and IN_ORDER[-1] == "tables"
+
+
+def test_slow_methods_have_fewer_tests(tmp_path, tracks, monkeypatch):
+    monkeypatch.setattr(setups, "two_levels", partial(two_levels, tracks=tracks), raising=False)
+    setups.two_levels.__name__ = "two_levels"
+    with ThreadPoolExecutor(1) as pool:
+        lab = Lab(tmp_path, tmp_path, tmp_path, [NON_ROBUST, "kruppa"], 2, 1, {"kruppa": 1}, 0, pool)
+        rows = lab.contest(setups.two_levels)
+        assert lab.contest(setups.two_levels) is rows, "an experiment is run once"
+
+    assert {row["method"]: row["tests"] for row in rows} == {NON_ROBUST: 2, "kruppa": 1}
+    assert lab.fewer == "at most 1 of `kruppa`"
+    assert most_of("kruppa=3") == ("kruppa", 3) and dict(MOST).keys() <= set(contests.METHODS)
