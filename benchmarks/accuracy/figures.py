@@ -31,9 +31,20 @@ def pyplot() -> Any:
     return plt
 
 
-def curves(axes: Any, x: Sequence[float], lines: Mapping[str, Sequence[float]], heavy: Sequence[str] = ()) -> None:
-    """One line per name, bolder for those in `heavy`; markers shrink from line to line, so that none hides another."""
-    for n, (name, y) in enumerate(lines.items()):
+def curves(
+    axes: Any,
+    x: Sequence[float],
+    lines: Mapping[str, Sequence[float]],
+    heavy: Sequence[str] = (),
+    order: Sequence[str] = (),
+) -> None:
+    """One line per name, bolder for those in `heavy`; markers shrink from line to line, so that none hides another.
+
+    Names in `order` keep their colour and marker from figure to figure, whichever of them are drawn.
+    """
+    places = {name: n for n, name in enumerate(dict.fromkeys([*order, *lines]))}
+    for name, y in lines.items():
+        n = places[name]
         style, width = MARKERS[n % len(MARKERS)] + "-", 2.4 if name in heavy else 1.2
         axes.plot(x, y, style, label=name, color=f"C{n % 10}", linewidth=width, markersize=max(7.0 - 0.7 * n, 3.0))
 

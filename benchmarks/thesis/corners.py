@@ -13,7 +13,7 @@ def load_corners(folder: Path, first: int, second: int) -> tuple[FloatArray, Flo
     """The matches of two views of a sequence.
 
     Args:
-        folder: holds 001.corners, 002.corners, ... and nview-corners: per 3D point and view the number of the corner,
+        folder: holds one *.corners file per view and *nview-corners: per 3D point and view the number of the corner,
             or * where the point is not seen.
         first: number of view 1, counted from 1.
         second: number of view 2.
@@ -21,10 +21,11 @@ def load_corners(folder: Path, first: int, second: int) -> tuple[FloatArray, Flo
     Returns:
         x1, x2: (N, 2) pixels.
     """
-    table = [line.split() for line in (folder / "nview-corners").read_text(encoding="utf-8").splitlines()]
+    files, (listed,) = sorted(folder.glob("*.corners")), folder.glob("*nview-corners")
+    table = [line.split() for line in listed.read_text(encoding="utf-8").splitlines()]
     seen = [(row[first - 1], row[second - 1]) for row in table if "*" not in (row[first - 1], row[second - 1])]
-    rows = np.array(seen, dtype=np.int64)
-    corners = [np.loadtxt(folder / f"{view:03d}.corners") for view in (first, second)]
+    rows = np.array(seen, dtype=np.int64).reshape(-1, 2)
+    corners = [np.loadtxt(files[view - 1]) for view in (first, second)]
     return corners[0][rows[:, 0]], corners[1][rows[:, 1]]
 
 
