@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sfm_app.errors import ConfigError
+from sfm_app.report.straight import without_lens
 from sfm_app.report.words import centre_text, focal_text, held_text, lens_text, verdict
 from sfm_app.selfcal.curves import centre_curves, focal_curves
 from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
@@ -112,7 +113,8 @@ def in_words(camera: Calibration) -> str:
 def draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
     """Both planes of one camera."""
     camera = panel.camera
-    pairs = prepare(panel.pairs, unit_px=_unit(camera), origin_px=(camera.width / 2, camera.height / 2))
+    straight = without_lens(panel.pairs, camera)
+    pairs = prepare(straight, unit_px=_unit(camera), origin_px=(camera.width / 2, camera.height / 2))
     left, right = part.subplots(1, 2)
     left.axline((0.0, 0.0), slope=1.0, color=GUIDE, linewidth=0.8, linestyle=":", label="square pixels")
     right.plot(camera.width / 2, camera.height / 2, "+", color=GUIDE, markersize=9, label="middle of the photo")

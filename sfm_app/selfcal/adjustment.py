@@ -177,7 +177,7 @@ def _system(matches: Matches, state: State) -> tuple[FloatArray, FloatArray]:
 
 
 def _information(matches: Matches, system: tuple[FloatArray, FloatArray]) -> Information:
-    H, g, _, _ = _reduced(matches, *system, 0.0)
+    H, g, _, _ = _reduced(*system, 0.0)
     gains = 0.5 * np.einsum("pi,pi->p", g, np.linalg.solve(H + np.diag(np.tile(ALONE**-2.0, 2)), g[..., None])[..., 0])
     return Information(H, g, gains)
 
@@ -188,9 +188,7 @@ def _weighed(matches: Matches, state: State, system: tuple[FloatArray, FloatArra
     return replace(state, weights=(1.0 + gains / (CONFLICT * scale)) ** -2, scale=scale)
 
 
-def _reduced(
-    matches: Matches, A: FloatArray, b: FloatArray, damping: float
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _reduced(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Schur complement of the poses; also what gives their steps: V^-1 W' and V^-1 b_pose."""
     n = 2 * CAMERA
     V = A[:, n:, n:].copy()
@@ -219,7 +217,7 @@ def _stepped(
 def _tried(
     matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
 ) -> State:
-    reduced, gradients, back, own = _reduced(matches, *system, damping)
+    reduced, gradients, back, own = _reduced(*system, damping)
     H, g = matches.scattered(Information(reduced, gradients, np.empty(0)), state.weights / state.scale)
     H += np.diag(prior.precision.ravel())
     g += (prior.precision * (prior.mean - state.thetas)).ravel()
