@@ -153,7 +153,7 @@ def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) 
     damping = FIRST_DAMPING
     for _ in range(rounds):
         system = _system(matches, state)
-        state = _weighed(matches, state, system)
+        state = _weighed(state, system)
         trial, damping = _stepped(matches, state, prior, system, damping)
         moved_by = np.max(np.abs(trial.thetas - state.thetas), initial=0.0)
         state = replace(trial, sigma=matches.noise(trial))
@@ -164,26 +164,26 @@ def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) 
 
 def reweighted(matches: Matches, state: State) -> State:
     """Weigh every pair by what it would gain from cameras of its own."""
-    return _weighed(matches, state, _system(matches, state))
+    return _weighed(state, _system(matches, state))
 
 
 def informed(matches: Matches, state: State) -> Information:
     """Eliminate the poses."""
-    return _information(matches, _system(matches, state))
+    return _information(_system(matches, state))
 
 
 def _system(matches: Matches, state: State) -> tuple[FloatArray, FloatArray]:
     return pair_systems(matches.points, matches.ends, state.thetas, matches.cameras, state.poses, state.sigma)
 
 
-def _information(matches: Matches, system: tuple[FloatArray, FloatArray]) -> Information:
+def _information(system: tuple[FloatArray, FloatArray]) -> Information:
     H, g, _, _ = _reduced(*system, 0.0)
     gains = 0.5 * np.einsum("pi,pi->p", g, np.linalg.solve(H + np.diag(np.tile(ALONE**-2.0, 2)), g[..., None])[..., 0])
     return Information(H, g, gains)
 
 
-def _weighed(matches: Matches, state: State, system: tuple[FloatArray, FloatArray]) -> State:
-    gains = _information(matches, system).gains
+def _weighed(state: State, system: tuple[FloatArray, FloatArray]) -> State:
+    gains = _information(system).gains
     scale = max(1.0, float(np.quantile(gains, 0.25)) / LOWER_QUARTILE) if len(gains) else 1.0
     return replace(state, weights=(1.0 + gains / (CONFLICT * scale)) ** -2, scale=scale)
 

@@ -6,13 +6,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_app.geometry.camera import guessed_camera_matrix
-from sfm_app.ransac.refit import refine_sampson
 from sfm_app.selfcal.answers import calibration_of, guessed, parameters_of
-from sfm_app.selfcal.inputs import FloatArray, prepare
+from sfm_app.selfcal.inputs import prepare
 from sfm_app.selfcal.joint import Consensus
-from sfm_app.selfcal.lens import straightened
 from sfm_app.selfcal.several import CameraGroup, Tables, calibrate_several
 from sfm_app.selfcal.split import peaks_of, separated
+from sfm_app.selfcal.straight import without_lens
 from sfm_app.selfcal.zero_curves import METHOD
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs, PhotoPairs
@@ -66,7 +65,7 @@ def _split(camera: Camera, pairs: PhotoPairs, options: CalibrationSettings) -> l
     own, found = pairs.among(camera.photos), camera.found
     side = float(max(own.size))
     if abs(found.radial) > BENT:
-        own = straight_pairs(own, found)
+        own = without_lens(own, found)
     ready = prepare(own, unit_px=side, origin_px=(own.size[0] / 2, own.size[1] / 2))
     if len(ready) == 0:
         return [camera]
@@ -105,25 +104,6 @@ def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: Calibration
         replace(camera, found=replace(answer, key_pairs=camera.found.key_pairs))
         for camera, answer in zip(cameras, answers, strict=True)
     ]
-
-
-def straight_pairs(pairs: CameraPairs, found: Calibration) -> CameraPairs:
-    """The pairs as they would be without the lens: inliers moved, F's refitted to them."""
-    side, middle = float(max(pairs.size)), np.array(pairs.size) / 2
-    theta = parameters_of(found, side)
-    to_sides = np.array([[1 / side, 0, -middle[0] / side], [0, 1 / side, -middle[1] / side], [0, 0, 1]])
-    back = np.linalg.inv(to_sides)
-    Fs, inliers = np.empty_like(pairs.Fs), []
-    for k, x in enumerate(pairs.inliers):
-        views = [_straight((x[:, i : i + 2] - middle) / side, theta) for i in (0, 2)]
-        points = np.asfortranarray(np.hstack(views))
-        Fs[k] = to_sides.T @ refine_sampson(points, back.T @ pairs.Fs[k] @ back, scale=3.0 / side) @ to_sides
-        inliers.append(points * side + np.tile(middle, 2))
-    return replace(pairs, Fs=Fs, inliers=tuple(inliers))
-
-
-def _straight(points: FloatArray, theta: FloatArray) -> FloatArray:
-    return np.asarray(straightened(np.ascontiguousarray(points), theta), np.float64)
 
 
 def _or_guess(camera: Camera, pairs: PhotoPairs) -> Calibration:

@@ -19,8 +19,9 @@ from sfm_app.selfcal.adjustment import (
     reweighted,
     settled,
 )
-from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, straightened
+from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL
 from sfm_app.selfcal.priors import ASPECT, NAMES, Evidence, Usual
+from sfm_app.selfcal.straight import straight_points
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -103,7 +104,7 @@ def straight_fundamentals(fit: Fit) -> FloatArray:
     found = np.empty((len(cameras), 3, 3))
     for pair, (first, second) in enumerate(cameras):
         x = fit.matches.of_pair(pair)
-        views = (_straight(x[:, :2], thetas[first]), _straight(x[:, 2:], thetas[second]))
+        views = (straight_points(x[:, :2], thetas[first]), straight_points(x[:, 2:], thetas[second]))
         inverses = [np.linalg.inv(camera_matrix_of(thetas[camera])) for camera in (first, second)]
         E = _essential(fit.state.poses[pair])
         start = inverses[1].T @ E @ inverses[0]
@@ -136,7 +137,7 @@ def _poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatArray:
         K1, K2 = camera_matrix_of(thetas[first]), camera_matrix_of(thetas[second])
         x = evenly(few.of_pair(pair), POSE_MATCHES)
         rays = [
-            (_straight(points, thetas[camera]) - K[:2, 2]) / K[[0, 1], [0, 1]]
+            (straight_points(points, thetas[camera]) - K[:2, 2]) / K[[0, 1], [0, 1]]
             for points, camera, K in ((x[:, :2], first, K1), (x[:, 2:], second, K2))
         ]
         R, t, _, _ = relative_pose(essential_from_fundamental(Fs[pair], K1, K2), *rays)
@@ -147,7 +148,3 @@ def _poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatArray:
 def _essential(pose: FloatArray) -> FloatArray:
     R, t = pose[:9].reshape(3, 3), pose[9:]
     return np.asarray(np.cross(t, R, axisb=0, axisc=0), np.float64)
-
-
-def _straight(points: FloatArray, theta: FloatArray) -> FloatArray:
-    return np.asarray(straightened(np.ascontiguousarray(points), theta), np.float64)

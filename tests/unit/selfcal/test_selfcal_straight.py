@@ -1,7 +1,7 @@
 import numpy as np
 
 from sfm_app.geometry.distances import sampson_distance
-from sfm_app.report.straight import without_lens
+from sfm_app.selfcal.straight import without_lens
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration, CameraPairs
 
