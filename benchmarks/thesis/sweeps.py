@@ -69,7 +69,7 @@ FIGURES = {
         Plot("5.22b", "clean_frames", "frames", ALL, "ms"),
     ),
 }
-TIMED_TESTS = 9
+TIMED_TESTS = 5
 """Seeds of Figure 5.22b."""
 
 
