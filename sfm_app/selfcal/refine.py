@@ -26,8 +26,10 @@ from sfm_app.selfcal.straight import straight_points
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-FEW_MATCHES, LAST_ROUNDS = 150, 12
-"""Matches of one pair until the cameras have nearly arrived; rounds with all of them after that."""
+FEW_MATCHES = 100
+"""Of one pair, until the cameras have nearly arrived."""
+FIRST_ROUNDS, LAST_ROUNDS = 8, 12
+"""Before starts are compared, and with all matches."""
 POSE_MATCHES = 30
 """Enough to tell which of the four poses of an E is the right one."""
 CHOICES = 3
@@ -86,8 +88,9 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], usua
     few = matches.thinned(FEW_MATCHES)
     best = _best([_begun(few, Fs, thetas, usual, square=True) for thetas in starts])
     others = [_begun(few, Fs, thetas, usual, square=False) for thetas in (best.state.thetas, starts[0])]
-    fit = replace(_best([best, *others]), matches=matches)
-    fit = replace(fit, state=settled(matches, fit.state, fit.prior, LAST_ROUNDS))
+    fit = _best([best, *others])
+    state = settled(few, fit.state, fit.prior)
+    fit = replace(fit, matches=matches, state=settled(matches, state, fit.prior, LAST_ROUNDS))
     for _ in range(CHOICES):
         free = fit.evidence.best(fit.free)
         if np.array_equal(free, fit.free):
@@ -128,7 +131,8 @@ def _begun(few: Matches, Fs: FloatArray, thetas: FloatArray, usual: Usual, *, sq
     free[:, ASPECT] = not square
     prior = usual.prior(free, thetas)
     state = State(thetas, _poses(few, Fs, thetas), np.ones(len(Fs)), few.least_sigma)
-    return Fit(few, settled(few, replace(state, sigma=few.noise(state)), prior), free, prior, usual)
+    state = settled(few, replace(state, sigma=few.noise(state)), prior, FIRST_ROUNDS)
+    return Fit(few, state, free, prior, usual)
 
 
 def _poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatArray:
