@@ -29,7 +29,7 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
         values = {name: camera.to_dict() for name, camera in cameras.items()}
         path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
     with backend("writing calibrations"):
-        write_calibrations(run.workspace.database, matches, cameras)
+        write_calibrations(run.workspace.database, matches, intrinsics)
     return intrinsics
 
 
