@@ -71,7 +71,7 @@ STAGES = (
         make=lambda products, run: reconstruct_scene(
             products("match_graph"), products("view_graph"), products("intrinsics"), run
         ),
-        load=lambda products, run: load_scene(products("photos"), run),
+        load=lambda products, run: load_scene(products("photos"), products("intrinsics"), run),
     ),
     Stage(
         "depth_maps", ("scene",), ("depth",), ("dense",),

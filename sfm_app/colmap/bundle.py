@@ -1,5 +1,7 @@
 """The last bundle adjustment: everything that the photos determine is set free."""
 
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,28 +27,46 @@ def adjust(model: Any, database: Path) -> tuple[Any, dict[str, float]]:
     """Refine poses, points and cameras; of the cameras as much as the photos determine.
 
     Freeing what they do not determine makes narrow views and small sets worse, so the covariance is asked first, going
-    down the ladder until it agrees. Observations that fit badly are then dropped, and the same is refined again.
+    down the ladder until it agrees. The camera with most photos decides; of the others, those that the step asks too
+    much of (a single photo with another zoom) stay as mapping left them. Observations that fit badly are then dropped,
+    and the same is refined again.
 
     Returns:
         The refined model, and the standard deviations in pixels of fx, fy, cx, cy of the camera with most photos, as
         far as they were free.
     """
-    few = model.num_reg_images() < PHOTOS_FOR_CENTRE
+    few, main = model.num_reg_images() < PHOTOS_FOR_CENTRE, main_camera(model)
     for camera_model, centre in LADDER:
-        if (camera_model == SQUARE_PIXELS and not _square(model)) or (centre and few):
+        if (camera_model == SQUARE_PIXELS and main.model.name != SQUARE_PIXELS) or (centre and few):
             continue
         freed = pycolmap.Reconstruction(model)
         for camera in freed.cameras.values():
-            _become(camera, camera_model)
+            if camera.model.name == SQUARE_PIXELS:
+                _become(camera, camera_model)
         deviations = _solve(freed, centre=centre)
-        if _determined(freed, deviations) or (camera_model, centre) == LADDER[-1]:
+        if _determined(main_camera(freed), deviations):
             break
+    _step_back(freed, model, deviations, centre=centre)
     _drop_misfits(freed, database)
-    return freed, _solve(freed, centre=centre)
+    return freed, _solve(freed, centre=centre).get(main.camera_id, {})
 
 
-def _solve(model: Any, *, centre: bool) -> dict[str, float]:
-    """Adjust the model in place; standard deviations of its main camera's parameters, empty where they are infinite."""
+def _step_back(freed: Any, model: Any, deviations: Mapping[int, Mapping[str, float]], *, centre: bool) -> None:
+    """Give cameras that were set too free their former model, all but the one that decides."""
+    weak = [
+        camera
+        for camera in freed.cameras.values()
+        if camera.model.name != model.cameras[camera.camera_id].model.name and not _determined(camera, deviations)
+    ]
+    for camera in weak:
+        former = model.cameras[camera.camera_id]
+        camera.model, camera.params = former.model, former.params
+    if weak:
+        _solve(freed, centre=centre)
+
+
+def _solve(model: Any, *, centre: bool) -> dict[int, dict[str, float]]:
+    """Adjust the model in place; standard deviations of its cameras' parameters, for those where they are finite."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_principal_point = centre
@@ -63,23 +83,26 @@ def _solve(model: Any, *, centre: bool) -> dict[str, float]:
     settings = pycolmap.BACovarianceOptions()
     settings.params = pycolmap.BACovarianceOptionsParams.ALL
     covariance = pycolmap.estimate_ba_covariance(settings, model, adjuster)
-    camera = main_camera(model)
-    found = covariance.get_other_params_cov(camera.params) if covariance else None
-    if found is None:
-        return {}
-    # COLMAP's covariance is that of measurements off by 1 px
-    deviations = np.sqrt(np.diag(found)) * model.compute_mean_reprojection_error()
-    focals = ("fx", "fy") if len(camera.focal_length_idxs()) == 2 else ("f",)
-    return dict(zip((*focals, "cx", "cy") if centre else focals, deviations.tolist(), strict=False))
+    noise = model.compute_mean_reprojection_error()
+    found = {}
+    for camera_id in _used_cameras(model):
+        camera = model.cameras[camera_id]
+        spread = covariance.get_other_params_cov(camera.params) if covariance else None
+        if spread is not None:
+            focals = ("fx", "fy") if len(camera.focal_length_idxs()) == 2 else ("f",)
+            # COLMAP's covariance is that of measurements off by 1 px
+            values = (np.sqrt(np.diag(spread)) * noise).tolist()
+            found[camera_id] = dict(zip((*focals, "cx", "cy") if centre else focals, values, strict=False))
+    return found
 
 
-def _determined(model: Any, deviations: dict[str, float]) -> bool:
-    camera = main_camera(model)
+def _determined(camera: Any, deviations: Mapping[int, Mapping[str, float]]) -> bool:
+    found = deviations.get(camera.camera_id, {})
     limits = {
         "f": FOCAL_DETERMINED * camera.mean_focal_length(),
         "c": CENTRE_DETERMINED * max(camera.width, camera.height),
     }
-    return bool(deviations) and all(value < limits[name[0]] for name, value in deviations.items())
+    return bool(found) and all(value < limits[name[0]] for name, value in found.items())
 
 
 def _drop_misfits(model: Any, database: Path) -> None:
@@ -98,11 +121,12 @@ def _become(camera: Any, camera_model: str) -> None:
         camera.params = camera_params(K, camera_model, radial)
 
 
-def _square(model: Any) -> bool:
-    return all(camera.model.name == SQUARE_PIXELS for camera in model.cameras.values())
-
-
 def main_camera(model: Any) -> Any:
     """The camera that took most of the photos that have a pose."""
-    used = [model.images[image_id].camera_id for image_id in model.reg_image_ids()]
-    return model.cameras[max(set(used), key=lambda camera_id: (used.count(camera_id), -camera_id))]
+    used = _used_cameras(model)
+    return model.cameras[max(used, key=lambda camera_id: (used[camera_id], -camera_id))]
+
+
+def _used_cameras(model: Any) -> Counter[int]:
+    """How many photos with a pose each camera took, by its id."""
+    return Counter(model.images[image_id].camera_id for image_id in model.reg_image_ids())

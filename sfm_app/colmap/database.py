@@ -1,6 +1,7 @@
 """COLMAP's SQLite database: photos and cameras in, keypoints and matches out, our epipolar geometries and K back in."""
 
 import contextlib
+import sqlite3
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,16 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.geometry.camera import guessed_camera_matrix
-from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, PairId, PhotoSet
+from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchedImage, MatchGraph, PairId, PhotoSet
 
 SQUARE_PIXELS = "SIMPLE_RADIAL"
 """f, cx, cy, k: what is mapped with where K has one focal; a second radial term runs wild on the first few photos."""
 
 TWO_FOCALS = "OPENCV"
 """fx, fy, cx, cy, k1, k2, p1, p2: COLMAP's smallest model that holds a camera matrix with two focals and a lens."""
+
+SQUARE_WITHIN = 1e-3
+"""fy/fx of square pixels: calibrators leave it this near to 1 where the photos do not ask for more."""
 
 
 @contextlib.contextmanager
@@ -70,18 +74,55 @@ def write_epipolar_fits(path: Path, matches: MatchGraph, fits: Mapping[PairId, E
             database.write_two_view_geometry(*pair, _two_view_geometry(fit, matches.matches[pair]))
 
 
-def write_calibrations(path: Path, matches: MatchGraph, cameras: Mapping[str, Calibration]) -> None:
-    """Give every camera its K; a K that the photos determine counts as prior knowledge, a guess does not."""
-    groups = {image.id: image.group for image in matches.images.values()}
+def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) -> None:
+    """Replace all cameras by ours, each with its K and lens, and give every photo its camera.
+
+    Cameras are numbered by their first photo, whatever the database held before. A K that the photos determine counts
+    as prior knowledge, a guess does not.
+    """
+    used = {image.id: intrinsics.name_of(image) for image in matches.images.values()}
+    ids = {name: number for number, name in enumerate(dict.fromkeys(used[key] for key in sorted(used)), start=1)}
     with opened(path) as database, pycolmap.DatabaseTransaction(database):
-        for entry in database.read_all_images():
-            calibration = cameras[groups[entry.image_id]]
-            camera = database.read_camera(entry.camera_id)
-            camera_model = SQUARE_PIXELS if calibration.K[0, 0] == calibration.K[1, 1] else TWO_FOCALS
-            camera.model = getattr(pycolmap.CameraModelId, camera_model)
-            camera.params = camera_params(calibration.K, camera_model)
-            camera.has_prior_focal_length = calibration.identifiable
-            database.update_camera(camera)
+        database.clear_frames()
+        database.clear_rigs()
+        for name, camera_id in ids.items():
+            _write_camera(database, camera_id, intrinsics.cameras[name])
+        for image in database.read_all_images():
+            image.camera_id = ids[used[image.image_id]]
+            database.update_image(image)
+            frame = pycolmap.Frame(frame_id=image.image_id, rig_id=image.camera_id)
+            frame.add_data_id(image.data_id)
+            database.write_frame(frame, use_frame_id=True)
+    # pycolmap can only clear all cameras at once, and only while no image refers to one
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.execute("DELETE FROM cameras WHERE camera_id > ?", (len(ids),))
+
+
+def _write_camera(database: Any, camera_id: int, calibration: Calibration) -> None:
+    """A camera, new or in the place of another, and the rig of one sensor that COLMAP wants around it."""
+    name = camera_model(calibration)
+    camera = pycolmap.Camera(
+        camera_id=camera_id,
+        model=getattr(pycolmap.CameraModelId, name),
+        width=calibration.width,
+        height=calibration.height,
+        params=camera_params(calibration.K, name, calibration.radial),
+        has_prior_focal_length=calibration.identifiable,
+    )
+    if database.exists_camera(camera_id):
+        database.update_camera(camera)
+    else:
+        database.write_camera(camera, use_camera_id=True)
+    rig = pycolmap.Rig(rig_id=camera_id)
+    rig.add_ref_sensor(camera.sensor_id)
+    database.write_rig(rig, use_rig_id=True)
+
+
+def camera_model(calibration: Calibration) -> str:
+    """COLMAP's name of the smallest camera model that holds what is known."""
+    K = calibration.K
+    square = "aspect" in calibration.held or abs(K[1, 1] / K[0, 0] - 1.0) < SQUARE_WITHIN
+    return SQUARE_PIXELS if square else TWO_FOCALS
 
 
 def camera_params(K: NDArray[np.float64], camera_model: str, radial: float = 0.0) -> list[float]:

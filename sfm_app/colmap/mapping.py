@@ -28,8 +28,7 @@ def continue_mapping(
         (scratch / name).mkdir(parents=True)
     start.write(scratch / "start")
     options = mapping_options(seed)
-    # four distortion terms run wild on the first few photos; the last adjustment frees them
-    options.ba_refine_extra_params = all(camera.model.name == SQUARE_PIXELS for camera in start.cameras.values())
+    options.ba_refine_extra_params = all(_lens_to_be_found(camera) for camera in start.cameras.values())
     models: dict[int, Any] = {}
 
     def call(token: Any) -> None:
@@ -48,6 +47,14 @@ def continue_mapping(
     interruptible(call, lambda: None)
     shutil.rmtree(scratch, ignore_errors=True)
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+
+
+def _lens_to_be_found(camera: Any) -> bool:
+    """Whether mapping is to seek the lens: a known one stays until the last adjustment, which frees it.
+
+    On the first few photos even one distortion term moves more than the noise does, and four run wild.
+    """
+    return camera.model.name == SQUARE_PIXELS and camera.params[camera.extra_params_idxs()[0]] == 0.0
 
 
 def mapping_options(seed: int) -> Any:

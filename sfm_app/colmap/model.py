@@ -56,11 +56,11 @@ def turn_upright(model: Any) -> None:
     model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(turn), -scale * turn @ centre))
 
 
-def read_scene(model_dir: Path, groups: Mapping[str, str], unregistered: Mapping[str, str]) -> Scene:
-    """What the rest of the program needs to know about a model on disk; `groups` gives the camera group by photo."""
+def read_scene(model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str]) -> Scene:
+    """What the rest of the program needs to know about a model on disk; `names` gives the camera by photo."""
     model = pycolmap.Reconstruction(model_dir)
     posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.image_id)
-    cameras = {groups[image.name]: _camera(model.cameras[image.camera_id]) for image in posed}
+    cameras = {names[image.name]: _camera(model.cameras[image.camera_id]) for image in posed}
     return Scene(
         model_dir=model_dir,
         cam_from_world={image.name: np.asarray(image.cam_from_world().matrix(), np.float64) for image in posed},

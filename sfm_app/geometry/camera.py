@@ -6,6 +6,9 @@ from numpy.typing import NDArray
 GUESSED_FOCAL = 1.2
 """Focal of a camera about which nothing is known, in units of the longer side; COLMAP guesses the same."""
 
+NEWTON_STEPS, LEAST_SLOPE = 10, 0.2
+"""Of the search for a ray through a lens; the slope that it divides by is 0 where the lens folds."""
+
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
     """(3, 3) camera matrix without skew, in the unit of its arguments."""
@@ -21,3 +24,26 @@ def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) 
     """
     focal = GUESSED_FOCAL * max(size) if focal_px is None else focal_px
     return camera_matrix(focal, focal, size[0] / 2, size[1] / 2)
+
+
+def rays(x: NDArray[np.float64], K: NDArray[np.float64], radial: float = 0.0) -> NDArray[np.float64]:
+    """(N, 2) points of the plane z = 1 that pixels see through a lens x_d = x_u (1 + radial r_u^2).
+
+    Newton's search from the distorted radius. A barrel lens folds where r (1 + radial r^2) stops growing with r; what
+    lies beyond is taken to lie there.
+
+    Args:
+        x: (N, 2) pixels.
+        K: (3, 3) camera matrix without skew.
+        radial: k1 of COLMAP's SIMPLE_RADIAL.
+    """
+    distorted = (x - K[:2, 2]) / np.diag(K)[:2]
+    if radial == 0.0:
+        return np.asarray(distorted, np.float64)
+    radius = np.hypot(distorted[:, 0], distorted[:, 1])
+    fold = (-3.0 * radial) ** -0.5 if radial < 0.0 else np.inf
+    r = np.minimum(radius / (1.0 + max(radial, 0.0) * radius**2), fold)
+    for _ in range(NEWTON_STEPS):
+        slope = np.maximum(1.0 + 3.0 * radial * r * r, LEAST_SLOPE)
+        r = np.minimum(r - (r * (1.0 + radial * r * r) - radius) / slope, fold)
+    return np.asarray(distorted * np.divide(r, radius, out=np.ones_like(r), where=radius > 0)[:, None], np.float64)

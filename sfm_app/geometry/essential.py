@@ -11,9 +11,6 @@ Array = NDArray[np.float64]
 def essential_from_fundamental(F: Array, K1: Array, K2: Array) -> Array:
     """The essential matrix nearest to K2' F K1 (thesis Eq. 5.7; Eq. 2.30 inverts K by misprint).
 
-    Noise leaves K2' F K1 with unequal singular values; the nearest essential matrix in the Frobenius norm has their
-    mean twice and a zero (Hartley & Zisserman, 2nd ed., section 11.7.3). Its scale is then set to 1.
-
     Args:
         F: (3, 3), any scale, x2' F x1 = 0 in pixels.
         K1: (3, 3) camera matrix of view 1.
@@ -22,7 +19,16 @@ def essential_from_fundamental(F: Array, K1: Array, K2: Array) -> Array:
     Returns:
         (3, 3) with singular values (1, 1, 0).
     """
-    U, _, Vt = np.linalg.svd(K2.T @ F @ K1)
+    return nearest_essential(K2.T @ F @ K1)
+
+
+def nearest_essential(E: Array) -> Array:
+    """The essential matrix nearest to E (3, 3), with singular values (1, 1, 0).
+
+    Noise leaves E with unequal singular values; the nearest essential matrix in the Frobenius norm has their mean twice
+    and a zero (Hartley & Zisserman, 2nd ed., section 11.7.3). Its scale is then set to 1.
+    """
+    U, _, Vt = np.linalg.svd(E)
     nearest: Array = U @ np.diag([1.0, 1.0, 0.0]) @ Vt
     return nearest
 

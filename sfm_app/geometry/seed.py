@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.essential import essential_from_fundamental, relative_pose
+from sfm_app.geometry.essential import nearest_essential, relative_pose
 from sfm_app.geometry.triangulation import triangulation_angle_deg
 
 Array = NDArray[np.float64]
@@ -38,23 +38,16 @@ class TwoViewSeed:
         return float(np.count_nonzero(self.usable) * min(self.angle_deg / GOOD_ANGLE_DEG, 1.0) * self.in_front**4)
 
 
-def two_view_seed(F: Array, K1: Array, K2: Array, x1: Array, x2: Array) -> TwoViewSeed:
-    """Decompose F with known camera matrices and triangulate all its inliers.
+def two_view_seed(E: Array, x1: Array, x2: Array) -> TwoViewSeed:
+    """Decompose E and triangulate all its inliers.
 
     Args:
-        F: (3, 3) fundamental matrix, x2' F x1 = 0.
-        K1: (3, 3) camera matrix of view 1.
-        K2: (3, 3) camera matrix of view 2.
-        x1: (N, 2) inliers in pixels.
+        E: (3, 3) with x2' E x1 = 0; the essential matrix nearest to it counts.
+        x1: (N, 2) inliers as points of the plane z = 1, see `geometry.camera.rays`.
         x2: (N, 2) partners.
     """
-    E = essential_from_fundamental(F, K1, K2)
-    R, t, X, in_front = relative_pose(E, _normalised(K1, x1), _normalised(K2, x2))
+    R, t, X, in_front = relative_pose(nearest_essential(E), x1, x2)
     angles = triangulation_angle_deg(X, np.zeros(3), -R.T @ t)
     angle = float(np.median(angles[in_front])) if in_front.any() else 0.0
     usable = in_front & (angles > min(1.0, angle / 4))
     return TwoViewSeed(R, t, X, usable, angle, float(in_front.mean()) if len(x1) else 0.0)
-
-
-def _normalised(K: Array, x: Array) -> Array:
-    return np.asarray(np.linalg.solve(K, np.column_stack([x, np.ones(len(x))]).T).T[:, :2], np.float64)

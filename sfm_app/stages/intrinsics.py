@@ -29,7 +29,7 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
     with run.workspace.replacing(run.workspace.calibration) as path:
         path.write_text(json.dumps(intrinsics.to_dict(), indent=1) + "\n", encoding="utf-8")
     with backend("writing calibrations"):
-        write_calibrations(run.workspace.database, matches, intrinsics.cameras)
+        write_calibrations(run.workspace.database, matches, intrinsics)
     return intrinsics
 
 

@@ -1,7 +1,7 @@
 """scene: ViewGraph and Intrinsics -> Scene."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,14 +13,20 @@ from sfm_app.colmap.mapping import PhotoCounter, continue_mapping
 from sfm_app.colmap.model import model_from_seed, read_scene, turn_upright
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
+from sfm_app.geometry.camera import rays
+from sfm_app.geometry.epipolar import eight_point
 from sfm_app.geometry.seed import TwoViewSeed, two_view_seed
-from sfm_app.types import EpipolarFit, Intrinsics, MatchGraph, PairId, PhotoSet, Scene, ViewGraph
+from sfm_app.ransac.refit import refine_sampson
+from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchGraph, PairId, PhotoSet, Scene, ViewGraph
 
 RANKED_PAIRS = 60
 """Pairs with most inliers that are looked at as seeds."""
 
 ENOUGH = 0.9
 """A model with this share of the photos that hang together with its seed ends the search for a better seed."""
+
+DISSENT = 0.1
+"""What counts of a seed whose pair contradicts the camera matrix that other pairs agree on."""
 
 CONFIRMED = 0.5
 """So does this share when two seeds agree on how many photos can be placed."""
@@ -33,6 +39,8 @@ class Candidate:
     pair: PairId
     fit: EpipolarFit
     seed: TwoViewSeed
+    score: float
+    """What the seed promises, times how well the pair agrees with K."""
 
 
 def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
@@ -49,7 +57,8 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         best, deviations = adjust(best, run.workspace.database)
         turn_upright(best)
     write_model(best, run)
-    scene = read_scene(run.workspace.sparse, groups(matches), left_out(best, matches, views))
+    names = {image.name: intrinsics.name_of(image) for image in matches.images.values()}
+    scene = read_scene(run.workspace.sparse, names, left_out(best, matches, views))
     run.record(
         registered=len(scene.registered),
         of=len(matches.images),
@@ -68,20 +77,38 @@ HINT = "photos that overlap more, from places a step or two apart (turning on th
 
 
 def rank_seeds(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> list[Candidate]:
-    """Pairs that can start a mapping, best first: many points, wide angle, nothing degenerate."""
+    """Pairs that can start a mapping, best first: many points, wide angle, nothing degenerate, in accord with K."""
 
     def examine(pair: PairId) -> Candidate:
-        fit = views.fits[pair]
-        K1, K2 = (intrinsics.cameras[matches.images[key].group].K for key in pair)
-        x1, x2 = (x[fit.inliers] for x in matches.points(pair))
-        return Candidate(pair, fit, two_view_seed(fit.F, K1, K2, x1, x2))
+        cameras = [intrinsics.camera(matches.images[key]) for key in pair]
+        seed = seed_of(matches, views.fits[pair], pair, cameras)
+        return Candidate(pair, views.fits[pair], seed, seed.score * agreement(pair, cameras))
 
     firm = [pair for pair, fit in views.fits.items() if not fit.degeneracy] or list(views.fits)
     firm.sort(key=lambda pair: (-views.fits[pair].inlier_count, pair))
     found = run.map(examine, firm[:RANKED_PAIRS], "seed pairs")
     least = run.settings.scene.min_seed_angle_deg
     wide = [candidate for candidate in found if candidate.seed.angle_deg >= least and candidate.seed.usable.sum() >= 8]
-    return sorted(wide, key=lambda candidate: (-candidate.seed.score, candidate.pair))
+    return sorted(wide, key=lambda candidate: (-candidate.score, candidate.pair))
+
+
+def seed_of(matches: MatchGraph, fit: EpipolarFit, pair: PairId, cameras: Sequence[Calibration]) -> TwoViewSeed:
+    """Pose and points of a pair; where there is a lens, from its inliers as they were without it."""
+    first, second = cameras
+    x1, x2 = (
+        rays(x[fit.inliers], camera.K, camera.radial) for x, camera in zip(matches.points(pair), cameras, strict=True)
+    )
+    E = second.K.T @ fit.F @ first.K
+    if first.radial or second.radial:
+        E = refine_sampson(np.asfortranarray(np.hstack([x1, x2])), eight_point(x1, x2))
+    return two_view_seed(E, x1, x2)
+
+
+def agreement(pair: PairId, cameras: Sequence[Calibration]) -> float:
+    """1 for a pair that agrees with the camera its consensus found, little for one that does not."""
+    first, second = cameras
+    unknown = first is not second or not first.key_pairs
+    return 1.0 if unknown or pair in first.key_pairs else DISSENT
 
 
 def best_model(
@@ -147,17 +174,13 @@ def write_model(model: Any, run: RunContext) -> None:
     beside.rename(target)
 
 
-def load_scene(photos: PhotoSet, run: RunContext) -> Scene:
+def load_scene(photos: PhotoSet, intrinsics: Intrinsics, run: RunContext) -> Scene:
     """Read the model back; why photos were left out stands in the manifest."""
     record = run.workspace.record("scene")
+    names = {photo.name: intrinsics.name_of(photo) for photo in photos.photos}
     with backend("reading the sparse model"):
         unregistered = record.counts.get("unregistered", {}) if record else {}
-        return read_scene(run.workspace.sparse, {photo.name: photo.group for photo in photos.photos}, unregistered)
-
-
-def groups(matches: MatchGraph) -> dict[str, str]:
-    """Camera group by photo."""
-    return {image.name: image.group for image in matches.images.values()}
+        return read_scene(run.workspace.sparse, names, unregistered)
 
 
 def nothing_found(views: ViewGraph, candidates: list[Candidate], tried: list[str]) -> str:

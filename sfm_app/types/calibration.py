@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.types.matches import PairId
+from sfm_app.types.matches import MatchedImage, PairId
+from sfm_app.types.photos import Photo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +64,14 @@ class Intrinsics:
     """By name of the camera; the first entry has the most photos."""
     camera_of: Mapping[str, str] = field(default_factory=dict)
     """Name of the camera by photo: its camera group, unless a group turned out to hold photos of several cameras."""
+
+    def name_of(self, photo: Photo | MatchedImage) -> str:
+        """Name of the camera that took a photo."""
+        return self.camera_of.get(photo.name, photo.group)
+
+    def camera(self, photo: Photo | MatchedImage) -> Calibration:
+        """The camera that took a photo."""
+        return self.cameras[self.name_of(photo)]
 
     @property
     def main(self) -> Calibration:

@@ -31,7 +31,7 @@ class Scene:
     unregistered: Mapping[str, str]
     """Names of the photos without a pose, with the reason."""
     cameras: Mapping[str, CameraModel]
-    """By camera group."""
+    """By name, as in `Intrinsics`."""
     points: int
     observations: int
     mean_reprojection_px: float

@@ -1,3 +1,7 @@
+import collections
+import contextlib
+import sqlite3
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -5,13 +9,16 @@ from PIL import Image
 from sfm_app.colmap.database import (
     SQUARE_PIXELS,
     TWO_FOCALS,
+    camera_model,
     create_database,
     opened,
     read_match_graph,
     write_calibrations,
     write_epipolar_fits,
 )
-from sfm_app.types import Calibration, EpipolarFit, Photo, PhotoSet
+from sfm_app.colmap.model import model_from_seed
+from sfm_app.geometry.seed import TwoViewSeed
+from sfm_app.types import Calibration, EpipolarFit, Intrinsics, Photo, PhotoSet
 
 NAMES = ("b.png", "a.png", "c.png")
 
@@ -66,16 +73,116 @@ def test_fits_replace_the_two_view_geometries(stored):
     assert np.array_equal(geometry.inlier_matches, matches[:9])
 
 
+def calibration(f=130.0, aspect=1.0, **others):
+    K = np.array([[f, 0, 66], [0, f * aspect, 41], [0, 0, 1]])
+    return Calibration(K, 120, 90, "zero-curves", **{"identifiable": True, **others})
+
+
+TWO = Calibration(np.array([[120.0, 0, 50], [0, 90, 50], [0, 0, 1]]), 100, 100, "guess", False, "no pairs")
+
+
+def cameras_of(path):
+    """What COLMAP reads: the camera of each photo, and what the database holds besides."""
+    with opened(path) as database:
+        used = [database.read_image(image_id).camera_id for image_id in (1, 2, 3)]
+        return [database.read_camera(camera_id) for camera_id in used]
+
+
+def rows_of(path):
+    """Everything in the database by table, but for the numbers it would give out next."""
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        found = collections.defaultdict(list)
+        for line in database.iterdump():
+            if line.startswith("INSERT INTO "):
+                found[line.split('"')[1]].append(line)
+        return {table: rows for table, rows in found.items() if table != "sqlite_sequence"}
+
+
 def test_only_a_k_that_is_known_counts_as_prior_knowledge(stored):
     path, photos, _, _ = stored
-    graph = read_match_graph(path, photos)
-    square = Calibration(np.array([[130.0, 0, 66], [0, 130, 41], [0, 0, 1]]), 120, 90, "zero-curves", True)
-    guess = Calibration(np.array([[120.0, 0, 50], [0, 90, 50], [0, 0, 1]]), 100, 100, "guess", False, "no pairs")
 
-    write_calibrations(path, graph, {"one": square, "two": guess})
+    write_calibrations(path, read_match_graph(path, photos), Intrinsics({"one": calibration(), "two": TWO}))
 
-    with opened(path) as database:
-        one, two = (database.read_camera(database.read_image(image_id).camera_id) for image_id in (1, 3))
+    one, same, two = cameras_of(path)
     assert (one.model.name, list(one.params), one.has_prior_focal_length) == (SQUARE_PIXELS, [130, 66, 41, 0], True)
+    assert one.camera_id == same.camera_id
     assert (two.model.name, two.has_prior_focal_length) == (TWO_FOCALS, False)
     assert list(two.params) == [120, 90, 50, 50, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("found", "model"),
+    [
+        (calibration(aspect=1.02, held=("aspect",)), SQUARE_PIXELS),
+        (calibration(aspect=1.0009), SQUARE_PIXELS),
+        (calibration(aspect=1.0011, held=("centre",)), TWO_FOCALS),
+        (calibration(aspect=1 / 1.0012), TWO_FOCALS),
+    ],
+)
+def test_pixels_are_square_where_the_photos_ask_for_nothing_else(found, model):
+    assert camera_model(found) == model
+
+
+@pytest.mark.parametrize(("aspect", "place"), [(1.0, 3), (0.75, 4)])
+def test_the_lens_is_handed_on(stored, aspect, place):
+    path, photos, _, _ = stored
+    found = calibration(aspect=aspect, radial=-0.2)
+
+    write_calibrations(path, read_match_graph(path, photos), Intrinsics({"one": found, "two": TWO}))
+
+    camera = cameras_of(path)[0]
+    assert camera.params[place] == -0.2 and not np.any(camera.params[place + 1 :])
+    assert camera.mean_focal_length() == pytest.approx(np.mean([130, 130 * aspect]))
+
+
+def test_a_group_can_be_of_several_cameras_and_of_one_again(stored, tmp_path):
+    path, photos, _, _ = stored
+    graph = read_match_graph(path, photos)
+    whole = Intrinsics({"one": calibration(), "two": TWO})
+    split = Intrinsics(
+        {"two": TWO, "one #2": calibration(99.0), "one": calibration()}, {"a.png": "one", "b.png": "one #2"}
+    )
+    write_calibrations(path, graph, whole)
+    before = rows_of(path)
+
+    write_calibrations(path, graph, split)
+    focals = [camera.params[0] for camera in cameras_of(path)]
+    apart = rows_of(path)
+    write_calibrations(path, graph, split)
+
+    assert focals == [130, 99, 120]
+    assert [camera.camera_id for camera in cameras_of(path)] == [1, 2, 3]  # by first photo, whatever the order of names
+    assert rows_of(path) == apart
+    assert len(apart["cameras"]) == len(apart["rigs"]) == len(apart["frames"]) == 3
+    write_calibrations(path, graph, whole)
+    assert rows_of(path) == before
+    assert len(before["cameras"]) == len(before["rigs"]) == 2 and len(before["frames"]) == 3
+
+
+def test_cameras_are_those_of_a_fresh_database(stored):
+    path, photos, _, _ = stored
+    fresh = rows_of(path)
+
+    write_calibrations(path, read_match_graph(path, photos), Intrinsics({"two": TWO, "one": calibration()}))
+
+    found = rows_of(path)
+    assert set(found) == set(fresh)
+    assert [table for table in found if found[table] != fresh[table]] == ["cameras"]
+
+
+def test_a_seed_of_photos_of_two_cameras_becomes_a_model(stored):
+    path, photos, _, matches = stored
+    graph = read_match_graph(path, photos)
+    cameras = {"one": calibration(), "one #2": calibration(99.0), "two": TWO}
+    write_calibrations(path, graph, Intrinsics(cameras, {"b.png": "one #2"}))
+    write_epipolar_fits(path, graph, {(1, 2): EpipolarFit(np.eye(3), np.ones(12, bool), np.ones(12), 5, 0.3)})
+    X = np.random.default_rng(1).uniform([-1, -1, 4], [1, 1, 6], (12, 3))
+    seed = TwoViewSeed(np.eye(3), np.array([-1.0, 0, 0]), X, np.ones(12, bool), 10.0, 1.0)
+
+    model = model_from_seed(path, (1, 2), matches, seed)
+
+    posed = {image.image_id: image for image in model.images.values() if image.has_pose}
+    assert sorted(posed) == [1, 2]
+    assert [model.cameras[posed[key].camera_id].params[0] for key in (1, 2)] == [130, 99]
+    assert np.allclose(posed[2].cam_from_world().translation, [-1, 0, 0])
+    assert model.num_points3D() == 12

@@ -8,15 +8,16 @@ from sfm_app.colmap.bundle import adjust, main_camera
 from sfm_app.colmap.database import SQUARE_PIXELS, TWO_FOCALS, camera_params
 from sfm_app.colmap.model import turn_upright
 from sfm_app.errors import BackendError, ConfigError
+from sfm_app.geometry.camera import camera_matrix
 
 WIDTH, HEIGHT = 1000, 800
 
 
-def synthetic(tmp_path, true_params, noise_px=0.3, photos=8):
-    """A COLMAP model with known camera, and its database."""
+def synthetic(tmp_path, true_params, noise_px=0.3, photos=8, cameras=1):
+    """A COLMAP model with known cameras, so many photos of each, and its database."""
     pycolmap.set_random_seed(1)
     options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, photos
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = cameras, 1, photos
     options.num_points3D = 400
     options.camera_width, options.camera_height = WIDTH, HEIGHT
     options.camera_model_id = pycolmap.CameraModelId.OPENCV
@@ -61,6 +62,37 @@ def test_a_centre_that_two_photos_do_not_determine_stays(tmp_path):
 
     assert (K[0, 2], K[1, 2]) == (500.0, 400.0)
     assert "cx" not in deviations
+
+
+def test_the_camera_with_most_photos_does_not_free_one_of_a_single_photo(tmp_path):
+    model, database = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=5, cameras=2)
+    lone, *others = sorted(image_id for image_id in model.reg_image_ids() if model.images[image_id].camera_id == 2)
+    for image_id in others:
+        model.deregister_frame(model.images[image_id].frame_id)
+    model.tear_down()
+    for camera in model.cameras.values():
+        camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+        camera.params = [890.0, 500.0, 400.0, 0.0]
+
+    found, _ = adjust(model, database)
+
+    assert main_camera(found).camera_id == 1 and found.images[lone].has_pose
+    assert [found.cameras[key].model.name for key in (1, 2)] == [TWO_FOCALS, SQUARE_PIXELS]
+    for key, tolerance in ((1, 0.003), (2, 0.01)):
+        assert found.cameras[key].mean_focal_length() == pytest.approx(900, rel=tolerance)
+
+
+def test_a_camera_with_two_focals_keeps_them_beside_one_with_square_pixels(tmp_path):
+    model, database = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=2, cameras=2)
+    for camera in model.cameras.values():
+        camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL if camera.camera_id == 1 else pycolmap.CameraModelId.OPENCV
+        camera.params = camera_params(camera_matrix(890, 890, 500, 400), camera.model.name)
+
+    found, deviations = adjust(model, database)
+
+    assert found.cameras[2].model.name == TWO_FOCALS
+    assert found.cameras[1].mean_focal_length() == pytest.approx(900, rel=0.01)
+    assert set(deviations) <= {"f", "fx", "fy"}
 
 
 def test_a_model_is_turned_upright_centred_and_scaled(tmp_path):

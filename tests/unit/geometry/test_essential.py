@@ -83,16 +83,11 @@ def test_triangulation_angle_of_a_right_angle():
 
 
 def test_a_good_pair_makes_a_better_seed_than_a_narrow_or_a_contradictory_one():
-    K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
-
     def seed(t, flip=0):
         t = np.array(t)
         _, x1, x2 = scene(1, np.eye(3), t)
-        F = np.linalg.inv(K).T @ cross(t) @ np.linalg.inv(K)
-        a, b = (np.column_stack([x, np.ones(len(x))]) @ K.T for x in (x1, x2))
-        a, b = a[:, :2], b[:, :2]
-        a[:flip], b[:flip] = b[:flip].copy(), a[:flip].copy()  # swapped matches lie behind the cameras
-        return two_view_seed(F, K, K, a, b)
+        x1[:flip], x2[:flip] = x2[:flip].copy(), x1[:flip].copy()  # swapped matches lie behind the cameras
+        return two_view_seed(3.0 * cross(t), x1, x2)
 
     wide, narrow, contradictory = seed([-1.0, 0, 0]), seed([-0.05, 0, 0]), seed([-1.0, 0, 0], flip=20)
 
