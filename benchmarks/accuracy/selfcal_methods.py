@@ -82,7 +82,7 @@ def production(subject: Measured, overrides: Mapping[str, object] | None = None,
 
 def camera_of(image: MatchedImage, found: Intrinsics) -> Calibration:
     """The camera that the program takes to have made a photo."""
-    return found.cameras[image.group]
+    return found.camera(image)
 
 
 def literal(subject: Measured, method: str) -> Found:

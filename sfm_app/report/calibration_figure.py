@@ -77,7 +77,7 @@ def check_figure(path: Path) -> None:
 def draw_intrinsics(path: Path, matches: MatchGraph, views: ViewGraph, found: Intrinsics) -> None:
     """`draw_calibration` of the cameras of a run, those with most pairs of their own first."""
     images = list(matches.images.values())
-    groups = {name: [image for image in images if image.group == name] for name in found.cameras}
+    groups = {name: [image for image in images if found.name_of(image) == name] for name in found.cameras}
     panels = [Panel(n, c, camera_pairs(groups[n], matches, views)) for n, c in found.cameras.items() if groups[n]]
     draw_calibration(path, sorted(panels, key=lambda panel: -len(panel.pairs.Fs)))
 

@@ -16,6 +16,7 @@ from sfm_app.selfcal.evidence import effective_count, spread_px
 from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
 from sfm_app.selfcal.joint import Consensus
 from sfm_app.selfcal.lens import KAPPA, LOG_FOCAL
+from sfm_app.selfcal.motion import open_focal
 from sfm_app.selfcal.priors import CENTRE, LENS, NAMES, USUAL_FOCAL, Usual
 from sfm_app.selfcal.refine import Fit, refined, straight_fundamentals
 from sfm_app.selfcal.uncertainty import covariance, key_pairs, spread_of
@@ -96,8 +97,9 @@ def _from_matches(
             fit = refined(matches, Fs, [fit.state.thetas, again[None]], usual)
     theta, cov = fit.state.thetas[0], covariance(fit, np.ones(1))
     evidence |= {**answer.evidence(judged.weights), **_figures(fit, side, float(np.sqrt(cov[LOG_FOCAL, LOG_FOCAL])))}
+    undecided = answer.contradicted(judged.weights)
     reason = (
-        answer.contradicted(judged.weights)
+        (undecided and (open_focal(fit) or undecided))
         or _split(theta, answer.theta)
         or peak.objection(theta, evidence["log_focal_spread"], _half(pairs.size))
     )

@@ -1,13 +1,15 @@
 """intrinsics: ViewGraph -> Intrinsics."""
 
 import json
+from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import write_calibrations
 from sfm_app.context import RunContext
-from sfm_app.selfcal import calibrate_photo_set, pair_weights
+from sfm_app.selfcal import Camera, calibrate_photo_set, pair_weights
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
 
 
@@ -18,7 +20,7 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
     pairs = photo_pairs(list(matches.images.values()), matches, views)
     cameras = calibrate_photo_set(pairs, calibrator.calibrate, options, run.seed, together=calibrator.together)
     intrinsics = Intrinsics(
-        cameras={camera.name: camera.found for camera in cameras},
+        cameras={camera.name: explained(camera, views) for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
     )
     run.record(
@@ -31,6 +33,16 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
     with backend("writing calibrations"):
         write_calibrations(run.workspace.database, matches, intrinsics)
     return intrinsics
+
+
+def explained(camera: Camera, views: ViewGraph) -> Calibration:
+    """What was found; where that is nothing, with the pairs that could not be asked."""
+    members = set(camera.photos)
+    kinds = Counter(fit.degeneracy for pair, fit in views.fits.items() if fit.degeneracy and members.issuperset(pair))
+    if camera.found.identifiable or not kinds:
+        return camera.found
+    left_out = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
+    return replace(camera.found, reason=f"{camera.found.reason}; pairs that show no camera: {left_out}")
 
 
 def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> PhotoPairs:
