@@ -104,11 +104,13 @@ def main() -> None:
     parser.add_argument(
         "--crop", type=lambda text: [int(value) for value in text.split(",")], help="LEFT,TOP in pixels"
     )
+    parser.add_argument("--ours-only", action="store_true", help="without stock pycolmap")
     parser.add_argument("--name", default="cameras", help="name of the result files")
     args = parser.parse_args()
+    methods = {"sfm-app": ours} if args.ours_only else {"sfm-app": ours, "pycolmap": stock}
     rows = []
     for name in args.sets:
-        for label, method in (("sfm-app", ours), ("pycolmap", stock)):
+        for label, method in methods.items():
             with tempfile.TemporaryDirectory() as scratch:
                 photos = args.data / name / "images"
                 photos = cropped(photos, Path(scratch) / "photos", *args.crop) if args.crop else photos

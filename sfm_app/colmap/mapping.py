@@ -54,7 +54,7 @@ def _lens_to_be_found(camera: Any) -> bool:
 
     On the first few photos even one distortion term moves more than the noise does, and four run wild.
     """
-    return camera.model.name == SQUARE_PIXELS and camera.params[camera.extra_params_idxs()[0]] == 0.0
+    return bool(camera.model.name == SQUARE_PIXELS and camera.params[camera.extra_params_idxs()[0]] == 0.0)
 
 
 def mapping_options(seed: int) -> Any:
