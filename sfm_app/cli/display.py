@@ -141,10 +141,14 @@ def run_lines(run: Run) -> list[str]:
 
 def intrinsics_summary(intrinsics: Intrinsics) -> dict[str, Any]:
     """Calibrations, plain, for --json."""
-    return {
+    names = intrinsics.photos
+    cameras = {
         name: {"field_of_view_deg": [round(angle, 2) for angle in field_of_view_deg(camera)], **camera.to_dict()}
         for name, camera in intrinsics.cameras.items()
     }
+    for camera in cameras.values():
+        camera["key_pairs"] = [[names.get(key, str(key)) for key in pair] for pair in camera["key_pairs"]]
+    return cameras
 
 
 def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
@@ -160,8 +164,9 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
         lines.append(f"            sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom")
         lines += [f"            {text}" for text in (lens_text(camera), held_text(camera)) if text]
         if camera.key_pairs:
-            best = ", ".join(f"{first}-{second}" for first, second in camera.key_pairs[:KEY_PAIRS])
-            lines.append(f"            best pairs of photos to start from: {best} (numbers as in database.db)")
+            named = [[intrinsics.photos.get(key, str(key)) for key in pair] for pair in camera.key_pairs[:KEY_PAIRS]]
+            best = ", ".join(f"{first} + {second}" for first, second in named)
+            lines.append(f"            best pairs of photos to start from: {best}")
     return lines
 
 

@@ -22,6 +22,7 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
     intrinsics = Intrinsics(
         cameras={camera.name: explained(camera, views) for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
+        photos={image.id: image.name for image in matches.images.values()},
     )
     run.record(
         cameras={name: _summary(camera) for name, camera in intrinsics.cameras.items()},

@@ -64,6 +64,8 @@ class Intrinsics:
     """By name of the camera; the first entry has the most photos."""
     camera_of: Mapping[str, str] = field(default_factory=dict)
     """Name of the camera by photo: its camera group, unless a group turned out to hold photos of several cameras."""
+    photos: Mapping[int, str] = field(default_factory=dict)
+    """Name of the photo by the id that pairs use."""
 
     def name_of(self, photo: Photo | MatchedImage) -> str:
         """Name of the camera that took a photo."""
@@ -91,10 +93,11 @@ class Intrinsics:
     def to_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
         cameras = {name: camera.to_dict() for name, camera in self.cameras.items()}
-        return {"cameras": cameras, "photos": dict(self.camera_of)}
+        photos = {str(key): name for key, name in self.photos.items()}
+        return {"cameras": cameras, "camera_of": dict(self.camera_of), "photos": photos}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Intrinsics":
         """Back from `to_dict`."""
         cameras = {name: Calibration.from_dict(camera) for name, camera in values["cameras"].items()}
-        return cls(cameras, dict(values["photos"]))
+        return cls(cameras, dict(values["camera_of"]), {int(key): name for key, name in values["photos"].items()})

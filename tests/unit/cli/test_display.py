@@ -16,14 +16,14 @@ GUESS = Calibration(K, 1000, 800, "guess", False, "an orbit", held=("centre",))
 
 
 def test_every_parameter_stands_beside_its_deviation():
-    first, *others = intrinsics_lines(Intrinsics({"one": KNOWN}))
+    first, *others = intrinsics_lines(Intrinsics({"one": KNOWN}, photos={1: "a.jpg", 2: "b.jpg", 3: "c.jpg"}))
 
     assert first == "camera      fx 500.0 +- 1.2  fy 510.0 +- 2.0  cx 480.0 +- 3.0  cy 410.0 +- 4.0 px"
     assert [line.strip() for line in others] == [
         "sees 90 degrees from left to right, 76 from top to bottom",
         "The lens bends lines outwards (barrel), k1 -0.050 +- 0.010.",
         "Taken to be as usual, as far as the photos allow: square pixels.",
-        "best pairs of photos to start from: 1-2, 2-3, 3-4 (numbers as in database.db)",
+        "best pairs of photos to start from: a.jpg + b.jpg, b.jpg + c.jpg, c.jpg + 4",
     ]
 
 
@@ -39,8 +39,9 @@ def test_json_holds_everything_that_is_known_of_a_camera():
     found = json.loads(json.dumps(intrinsics_summary(Intrinsics({"one": KNOWN}))))["one"]
 
     assert found["field_of_view_deg"] == pytest.approx([89.95, 76.23], abs=0.3)
-    assert (
-        Calibration.from_dict({k: v for k, v in found.items() if k != "field_of_view_deg"}).to_dict() == KNOWN.to_dict()
-    )
+    beside = ("field_of_view_deg", "key_pairs")
+    assert {k: v for k, v in found.items() if k not in beside} == {
+        k: v for k, v in KNOWN.to_dict().items() if k not in beside
+    }
     assert (found["radial"], found["spread"]["k1"], found["held"]) == (-0.05, 0.01, ["aspect"])
-    assert (found["identifiable"], found["reason"], found["key_pairs"][0]) == (True, "", [1, 2])
+    assert (found["identifiable"], found["reason"], found["key_pairs"][0]) == (True, "", ["1", "2"])
