@@ -28,6 +28,7 @@ STAGE_TITLES = {
 }
 
 KEY_PAIRS = 3
+PHOTOS = 4
 """So many are named to people; --json has all."""
 
 
@@ -157,6 +158,10 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
     lines = []
     for name, camera in intrinsics.cameras.items():
         lines.append(f"camera      {f'{name}: ' if many else ''}{_k_text(camera.K, camera.spread)}")
+        mine = [photo for photo, of in intrinsics.camera_of.items() if of == name]
+        if many and mine:
+            more = f" and {len(mine) - PHOTOS} more" if len(mine) > PHOTOS else ""
+            lines.append(f"            took {', '.join(mine[:PHOTOS])}{more}")
         if not camera.identifiable:
             source = {"exif": "EXIF's claim", "guess": "a guess"}.get(camera.method, camera.method)
             lines.append(f"            these photos do not determine it ({camera.reason}): {source}")

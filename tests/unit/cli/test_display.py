@@ -35,6 +35,14 @@ def test_a_guess_is_called_one_right_after_its_figures():
     assert sum(line.startswith("camera ") for line in lines) == 2
 
 
+def test_of_several_cameras_each_names_its_photos():
+    took = {**{f"{key}.jpg": "one" for key in range(6)}, "z.jpg": "one #2"}
+    lines = [line.strip() for line in intrinsics_lines(Intrinsics({"one": KNOWN, "one #2": KNOWN}, took))]
+
+    assert "took 0.jpg, 1.jpg, 2.jpg, 3.jpg and 2 more" in lines
+    assert "took z.jpg" in lines
+
+
 def test_json_holds_everything_that_is_known_of_a_camera():
     found = json.loads(json.dumps(intrinsics_summary(Intrinsics({"one": KNOWN}))))["one"]
 
