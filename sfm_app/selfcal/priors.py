@@ -30,6 +30,8 @@ HINT_SPREAD = 0.05
 NARROW = {CENTRE: 0.012, ASPECT: 0.002, LENS: 0.005}
 """Standard deviations about the usual value: of the centre in longer sides, of log fy/fx, of k1."""
 WIDE = {CENTRE: 0.15, ASPECT: 0.25, LENS: 0.2}
+LEAST_SPARE = 0.25
+"""Share of the constraints that must be left to contradict the cameras, or nothing more is freed."""
 STRAIGHT = 1e-6
 """The same of k1 where nobody wants to know about it."""
 FREE_SHARE = {CENTRE: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
@@ -99,11 +101,16 @@ class Evidence:
         return fit + volume + self.usual.log_odds(free), step, covariance
 
     def choices(self, free: BoolArray, camera: int) -> list[BoolArray]:
-        """All choices for one camera, the others as in `free` (C, 4); those that free less come first."""
-        trials = []
+        """All choices for one camera, the others as in `free` (C, 4); those that free less come first.
+
+        What would leave hardly a constraint to contradict it is no choice: three pairs fit almost any centre.
+        """
+        trials: list[BoolArray] = []
         for switches in sorted(product((False, True), repeat=free.shape[1]), key=sum):
-            trials.append(free.copy())
-            trials[-1][camera] = switches
+            trial = free.copy()
+            trial[camera] = switches
+            if not trials or spare(trial, self.pairs) >= LEAST_SPARE:
+                trials.append(trial)
         return trials
 
     def best(self, free: BoolArray) -> BoolArray:
