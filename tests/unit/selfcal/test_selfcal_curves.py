@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from sfm_app.selfcal.curves import centre_curves, companion_roots, degeneracy, focal_curves, usable
+from sfm_app.selfcal.constraints import centre_polynomials, focal_polynomials
+from sfm_app.selfcal.curves import centre_curves, degeneracy, focal_curves, usable
 from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.roots import companion_roots
 from sfm_app.types import CameraPairs
 
 
@@ -14,27 +14,27 @@ def in_widths(made):
     return prepare(CameraPairs.of(made.Fs, made.size, made.weights), unit_px=made.size[0], origin_px=(0.0, 0.0))
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.lists(st.floats(-3, 3), min_size=4, max_size=8), st.floats(0.01, 100))
-def test_companion_roots_are_roots(roots, lead):
-    coefficients = lead * np.poly(roots)[::-1]
-    found = companion_roots(coefficients[None])[0]
-    assert found.shape == (len(roots),)
-    # roots of high multiplicity are ill-conditioned, the polynomial built from what was found is not
-    np.testing.assert_allclose(np.poly(found)[::-1], np.poly(roots)[::-1], atol=1e-6 * np.abs(np.poly(roots)).max())
+def thesis_curve(roots):
+    """The thesis's choice, root by root."""
+    curve = np.zeros(roots.shape[:2])
+    for at in np.ndindex(curve.shape):
+        real = [root for root in roots[at] if abs(root.real) > 1e-9]
+        curve[at] = min(real, key=lambda root: abs(root.imag)).real if real else 0.0
+    return curve
 
 
-def test_missing_powers_become_far_roots():
-    found = companion_roots(np.array([[6.0, -5.0, 1.0, 0.0, 0.0]]))[0]
-    near = np.sort(found[np.abs(found) < 1e3].real)
-    np.testing.assert_allclose(near, [2, 3], rtol=1e-6)
-    assert np.sum(np.abs(found) > 1e3) == 2
+@pytest.mark.parametrize("noise", [1e-3, 0.1])
+def test_curves_are_those_of_the_companion_matrices(views, noise):
+    pairs, sweep = in_widths(views(6, noise=noise)), np.linspace(0.01, 1, 100)
 
+    fy = focal_curves(pairs, 3 * sweep, (0.5, 0.375))
+    v = centre_curves(pairs, sweep, (1.0, 1.1))
 
-def test_a_vanishing_polynomial_collapses_to_zero():
-    found = companion_roots(np.array([[0.0, 0, 0, 0, 0], [1, 0, 0, 0, 1]]))
-    assert np.all(found[0] == 0)
-    np.testing.assert_allclose(np.abs(found[1]), 1)
+    quartics, octics = focal_polynomials(pairs, 3 * sweep, (0.5, 0.375)), centre_polynomials(pairs, sweep, (1.0, 1.1))
+    np.testing.assert_allclose(fy, thesis_curve(np.sqrt(companion_roots(quartics))), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(v, thesis_curve(companion_roots(octics)), rtol=1e-9, atol=1e-12)
+    assert np.ptp(fy) > 0.5
+    assert np.ptp(v) > 0.5
 
 
 @pytest.mark.parametrize("seed", range(5))
