@@ -20,7 +20,10 @@ def focal_curves(pairs: Pairs, fx: FloatArray, centre: tuple[float, float]) -> F
     """
     coefficients = focal_polynomials(pairs, fx, centre)
     # the quartic is in fy^2: a negative fy^2 becomes an fy without real part, which the choice of the root passes over
-    return _chosen(np.sqrt(swept_roots(coefficients)))
+    roots = np.sqrt(swept_roots(coefficients))
+    # the imaginary part is to be "approximately zero": roots in which it prevails form tails near fy = 0 on which all
+    # curves agree, whatever the camera
+    return _chosen(np.where(np.abs(roots.imag) <= np.abs(roots.real), roots, 0.0))
 
 
 def centre_curves(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
@@ -39,13 +42,8 @@ def usable(curves: FloatArray, upper: float) -> FloatArray:
 
 
 def _chosen(roots: ComplexArray) -> FloatArray:
-    """Per sample the real part of the root with non-zero real part and the smallest imaginary part.
-
-    It must be "approximately zero": where it exceeds the real part there is no root. Such roots form tails near zero on
-    which all curves agree, whatever the camera.
-    """
-    size, imaginary = np.abs(roots.real), np.abs(roots.imag)
-    imaginary = np.where((size > ROOT_IS_ZERO) & (imaginary <= size), imaginary, np.inf)
+    """Per sample the real part of the root with non-zero real part and the smallest imaginary part."""
+    imaginary = np.where(np.abs(roots.real) > ROOT_IS_ZERO, np.abs(roots.imag), np.inf)
     best = np.argmin(imaginary, axis=-1)[..., None]
     value = np.take_along_axis(roots.real, best, axis=-1)[..., 0]
     found = np.isfinite(np.take_along_axis(imaginary, best, axis=-1)[..., 0])
