@@ -19,7 +19,7 @@ SQUARE_PIXELS = "SIMPLE_RADIAL"
 TWO_FOCALS = "OPENCV"
 """fx, fy, cx, cy, k1, k2, p1, p2: COLMAP's smallest model that holds a camera matrix with two focals and a lens."""
 
-SQUARE_WITHIN = 1e-3
+SQUARE_WITHIN = 0.005
 """fy/fx of square pixels: calibrators leave it this near to 1 where the photos do not ask for more."""
 
 

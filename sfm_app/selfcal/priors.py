@@ -30,6 +30,12 @@ HINT_SPREAD = 0.05
 NARROW = {CENTRE: 0.012, ASPECT: 0.002, LENS: 0.005}
 """Standard deviations about the usual value: of the centre in longer sides, of log fy/fx, of k1."""
 WIDE = {CENTRE: 0.15, ASPECT: 0.25, LENS: 0.2}
+COLUMNS = {CENTRE: [CENTRE_U, CENTRE_U + 1], ASPECT: [LOG_ASPECT], LENS: [KAPPA]}
+"""Places in the parameters of a camera."""
+UNDETERMINED = 0.5
+"""A parameter whose narrow prior the pairs do not make narrower than this stays at its usual value."""
+STAYS = 1e-3
+"""What then becomes of that prior's deviation."""
 LEAST_SPARE = 0.25
 """Share of the constraints that must be left to contradict the cameras, or nothing more is freed."""
 STRAIGHT = 1e-6
@@ -51,8 +57,11 @@ class Usual:
     lens: bool = True
     """False: every lens is taken as straight."""
 
-    def prior(self, free: BoolArray, thetas: FloatArray) -> Prior:
-        """The prior when `free` (C, 4) says what is freed; `thetas` (C, 5) turn k1 into kappa."""
+    def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
+        """The prior when `free` (C, 4) says what is freed and `held` (C, 4) what stays at its usual value.
+
+        `thetas` (C, 5) turn k1 into kappa.
+        """
         mean, deviation = np.zeros((len(self.sides), CAMERA)), np.empty((len(self.sides), CAMERA))
         hinted = ~free[:, FOCAL] & np.isfinite(self.hints)
         with np.errstate(invalid="ignore"):
@@ -63,6 +72,10 @@ class Usual:
         deviation[:, LOG_ASPECT] = np.where(free[:, ASPECT], WIDE[ASPECT], NARROW[ASPECT])
         k1 = np.where(free[:, LENS], WIDE[LENS], NARROW[LENS]) if self.lens else STRAIGHT
         deviation[:, KAPPA] = k1 / np.exp(2.0 * thetas[:, LOG_FOCAL])
+        if held is not None:
+            for place, columns in COLUMNS.items():
+                for column in columns:
+                    deviation[held[:, place], column] *= STAYS
         return Prior(mean, deviation**-2.0)
 
     def log_odds(self, free: BoolArray) -> float:
@@ -121,6 +134,15 @@ class Evidence:
                 free = max(self.choices(free, camera), key=lambda trial: self.posterior(trial)[0])
             if np.array_equal(free, before):
                 return free
+
+    def undetermined(self, free: BoolArray) -> BoolArray:
+        """(C, 4) what is not freed and about which the pairs say hardly more than the prior."""
+        before = self.usual.prior(free, self.thetas).precision ** -0.5
+        after = np.sqrt(np.diag(self.posterior(free)[2])).reshape(before.shape)
+        found = np.zeros_like(free)
+        for place, columns in COLUMNS.items():
+            found[:, place] = ~free[:, place] & np.any(after[:, columns] > UNDETERMINED * before[:, columns], axis=1)
+        return found
 
     def covariance(self, free: BoolArray) -> FloatArray:
         """(5C, 5C) of the cameras about `thetas`, over all choices: what is nearly free is nearly as uncertain."""

@@ -48,6 +48,12 @@ class Fit:
     """(C, 4) which parameters the evidence freed, see `priors`."""
     prior: Prior
     usual: Usual
+    held: BoolArray | None = None
+    """(C, 4) what stays at its usual value, because the pairs do not determine it."""
+
+    def names_held(self, camera: int) -> tuple[str, ...]:
+        """The same by name, for one camera."""
+        return tuple(name for place, name in enumerate(NAMES) if self.held is not None and self.held[camera, place])
 
     @property
     def information(self) -> Information:
@@ -98,7 +104,9 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], usua
         prior = usual.prior(free, fit.state.thetas)
         state = settled(few, fit.state, prior)
         fit = Fit(matches, settled(matches, state, prior, LAST_ROUNDS), free, prior, usual)
-    return fit
+    held = fit.evidence.undetermined(fit.free)
+    prior = usual.prior(fit.free, fit.state.thetas, held)
+    return replace(fit, prior=prior, held=held, state=settled(matches, fit.state, prior, LAST_ROUNDS))
 
 
 def straight_fundamentals(fit: Fit) -> FloatArray:

@@ -18,7 +18,7 @@ from sfm_app.selfcal.answers import calibration_of, guessed, parameters_of
 from sfm_app.selfcal.evidence import MIN_LEAD, RIVAL_RATIO
 from sfm_app.selfcal.inputs import FloatArray, prepare
 from sfm_app.selfcal.lens import LOG_FOCAL, camera_of
-from sfm_app.selfcal.priors import FOCAL_SPREAD, HINT_SPREAD, NAMES, USUAL_FOCAL, Usual
+from sfm_app.selfcal.priors import FOCAL_SPREAD, HINT_SPREAD, USUAL_FOCAL, Usual
 from sfm_app.selfcal.refine import Fit, refined, straight_fundamentals
 from sfm_app.selfcal.search import FOCAL_RANGE, SIGMAS
 from sfm_app.selfcal.two_view_cost import CAMERA
@@ -208,9 +208,8 @@ def _judged(
     reason = reason or peak.objection(in_sides, spread, half)
     if reason:
         return guessed(camera.size, reason, evidence)
-    held = tuple(NAMES[place] for place in range(3) if not fit.free[index, place])
     found = calibration_of(theta, camera.size, method, unit)
-    return replace(found, spread=spread_of(theta, block, unit), evidence=evidence, held=held)
+    return replace(found, spread=spread_of(theta, block, unit), evidence=evidence, held=fit.names_held(index))
 
 
 def _lead(index: int, thetas: FloatArray, tables: Tables) -> tuple[float, float]:

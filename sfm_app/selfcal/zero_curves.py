@@ -17,7 +17,7 @@ from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
 from sfm_app.selfcal.joint import Consensus
 from sfm_app.selfcal.lens import KAPPA, LOG_FOCAL
 from sfm_app.selfcal.motion import open_focal
-from sfm_app.selfcal.priors import CENTRE, LENS, NAMES, USUAL_FOCAL, Usual
+from sfm_app.selfcal.priors import LENS, USUAL_FOCAL, Usual
 from sfm_app.selfcal.refine import Fit, refined, straight_fundamentals
 from sfm_app.selfcal.uncertainty import covariance, key_pairs, spread_of
 from sfm_app.settings import CalibrationSettings
@@ -106,10 +106,13 @@ def _from_matches(
     if reason:
         return guessed(pairs.size, reason, evidence)
     found = calibration_of(theta, pairs.size, METHOD)
-    held = tuple(NAMES[place] for place in range(CENTRE, LENS + 1) if not fit.free[0, place])
     photos = tuple(pairs.photos[k] for k in usable.kept) if pairs.photos else ()
     return replace(
-        found, spread=spread_of(theta, cov, side), evidence=evidence, held=held, key_pairs=key_pairs(fit, photos)
+        found,
+        spread=spread_of(theta, cov, side),
+        evidence=evidence,
+        held=fit.names_held(0),
+        key_pairs=key_pairs(fit, photos),
     )
 
 
