@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.selfcal.two_view_cost import CAMERA, distances, moved, pair_costs, pair_systems
+from sfm_app.selfcal.two_view_cost import CAMERA, POSE, distances, moved, pair_costs, pair_systems
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -78,7 +78,7 @@ class Matches:
     """Inliers of pairs, laid end to end.
 
     Args:
-        inliers: per pair (N, 4), about the middle of the photos, in any one unit.
+        inliers: per pair (N, 4), about the middle of the photos, in longer sides of the largest.
         cameras: (P, 2) numbers of the cameras, counted from 0.
         photos: (P, 2) numbers of the photos.
         unit_px: length of that unit, in pixels.
@@ -90,7 +90,8 @@ class Matches:
         self, inliers: Sequence[FloatArray], cameras: IndexArray, photos: IndexArray, unit_px: float,
         most: int = MOST_MATCHES, count: int = 1,
     ) -> None:  # fmt: skip
-        kept = [evenly(x, most) for x in inliers]
+        # what lies outside of the photos is no match, and would overflow
+        kept = [evenly(x[np.all(np.abs(x) <= 1.0, axis=1)], most) for x in inliers]
         self.unit_px = unit_px
         self.points = np.ascontiguousarray(np.concatenate([*kept, np.empty((0, 4))]))
         self.ends = np.concatenate([[0], np.cumsum([len(x) for x in kept])]).astype(np.int64)
@@ -129,9 +130,14 @@ class Matches:
         )
 
     def noise(self, state: State) -> float:
-        """Standard deviation of the distances of the pairs that agree, from their median."""
+        """Standard deviation of the distances of the pairs that agree, from their median.
+
+        A pose takes five of a pair's degrees of freedom: the distances of few matches are smaller than their errors.
+        """
+        counts = np.diff(self.ends)
         found = np.abs(distances(self.points, self.ends, state.thetas, self.cameras, state.poses))
-        agreeing = np.repeat(state.weights > 0.5, np.diff(self.ends))
+        found *= np.repeat(np.sqrt(counts / np.maximum(counts - POSE, 1)), counts)
+        agreeing = np.repeat(state.weights > 0.5, counts)
         return max(1.4826 * float(np.median(found[agreeing])) if agreeing.any() else 0.0, self.least_sigma)
 
     def scattered(self, information: Information, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -193,7 +199,9 @@ def _reduced(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, 
     n = 2 * CAMERA
     V = A[:, n:, n:].copy()
     diagonal = np.arange(V.shape[-1])
-    V[:, diagonal, diagonal] += damping * V[:, diagonal, diagonal] + 1e-9
+    # few or degenerate matches leave a pose open: what is added must count beside the largest entry
+    least = 1e-9 + 1e-12 * np.max(V[:, diagonal, diagonal], axis=1, keepdims=True)
+    V[:, diagonal, diagonal] += damping * V[:, diagonal, diagonal] + least
     back, own = np.split(np.linalg.solve(V, np.concatenate([A[:, n:, :n], b[:, n:, None]], axis=2)), [n], axis=2)
     H = A[:, :n, :n] - A[:, :n, n:] @ back
     g = b[:, :n] - (A[:, :n, n:] @ own)[..., 0]

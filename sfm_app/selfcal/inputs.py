@@ -56,8 +56,8 @@ def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float
         origin_px: pixel that becomes (0, 0).
 
     Raises:
-        ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size is not
-            positive.
+        ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size or a
+            claimed focal is not positive.
     """
     raw, trust, used = _checked(pairs)
     to_pixels = np.array([[unit_px, 0.0, origin_px[0]], [0.0, unit_px, origin_px[1]], [0.0, 0.0, 1.0]])
@@ -99,6 +99,8 @@ def _checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.int
         raise ValueError(f"inliers of {len(pairs.inliers)} pairs were given for {len(raw)} fundamental matrices")
     if any(x.ndim != 2 or x.shape[1] != 4 or not np.all(np.isfinite(x)) for x in map(np.asarray, pairs.inliers)):
         raise ValueError("inliers must have shape (N, 4) per pair and be finite")
+    if not all(np.isfinite(focal) and focal > 0 for focal in pairs.focal_hints_px):
+        raise ValueError("claimed focals must be finite and > 0")
     if pairs.photos and len(pairs.photos) != len(raw):
         raise ValueError(f"photos of {len(pairs.photos)} pairs were given for {len(raw)} fundamental matrices")
     used = np.flatnonzero(trust > 0)

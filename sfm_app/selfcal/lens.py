@@ -15,8 +15,9 @@ FloatArray = NDArray[np.float64]
 LOG_FOCAL, CENTRE_U, CENTRE_V, LOG_ASPECT, KAPPA = range(5)
 """Places in the parameters of a camera: log f with f = sqrt(fx fy), centre from the middle, log fy/fx, kappa."""
 LEAST_SLOPE = 0.2
-"""Where the lens squeezes radii by more than this, points are taken as if it went on evenly: it must not fold."""
-NEWTON_STEPS = 8
+"""Once the lens squeezes radii by this much it goes on evenly: it must not fold."""
+NEWTON_STEPS = 20
+"""Most; three or four are enough but for the strongest pincushions."""
 
 
 @kernel
@@ -32,6 +33,11 @@ def undone(radius: float, k1: float, guess: float) -> float:
     """r_u of the distorted radius r_d, in focal lengths, by Newton from a guess."""
     if k1 == 0.0 or radius < 1e-9:
         return radius
+    if k1 < 0.0:
+        last = np.sqrt((LEAST_SLOPE - 1.0) / (3.0 * k1))
+        beyond = radius - last * (1.0 + k1 * last * last)
+        if beyond >= 0.0:
+            return float(last + beyond / LEAST_SLOPE)
     r = guess
     for _ in range(NEWTON_STEPS):
         slope = max(1.0 + 3.0 * k1 * r * r, LEAST_SLOPE)

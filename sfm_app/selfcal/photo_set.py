@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import count
 
 import numpy as np
 
@@ -77,11 +78,13 @@ def _split(camera: Camera, pairs: PhotoPairs, options: CalibrationSettings) -> l
     if len(thetas) == 1:
         return [camera]
     parts = []
+    taken = set(pairs.groups.values())
+    names = (name for number in count(2) if (name := f"{camera.name} #{number}") not in taken)
     for number, theta in enumerate(thetas):
         photos = tuple(photo for photo in camera.photos if labels.get(photo, 0) == number)
         theta[4] = found.radial / np.exp(2.0 * theta[0])
         first = calibration_of(theta, own.size, found.method)
-        parts.append(Camera(camera.name if number == 0 else f"{camera.name} #{number + 1}", photos, first))
+        parts.append(Camera(camera.name if number == 0 else next(names), photos, first))
     return parts
 
 

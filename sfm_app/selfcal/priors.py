@@ -83,7 +83,8 @@ class Usual:
         total = 0.0
         for place, share in FREE_SHARE.items():
             counts = np.isfinite(self.hints) if place == FOCAL else np.ones(len(self.sides), np.bool_)
-            total += float(np.sum(np.log(np.where(free[counts, place], share, 1.0 - share))))
+            freed = share if place != LENS or self.lens else STRAIGHT
+            total += float(np.sum(np.log(np.where(free[counts, place], freed, 1.0 - freed))))
         return total
 
 

@@ -147,7 +147,8 @@ def _with_focals(thetas: FloatArray, unknown: NDArray[np.bool_], tables: Tables,
 def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> IndexArray:
     """Which place on its grid every camera takes, so that the sum over cameras and over pairs of cameras is large.
 
-    Damped max-sum message passing (Pearl 1988; exact on trees), then one camera after the other while that helps.
+    Damped max-sum message passing (Pearl 1988; exact on trees), then one camera after the other while that helps; the
+    same from what each camera wants by itself, which loops of messages do not always outdo.
 
     Args:
         own: (C, G) what each camera gains by itself.
@@ -165,7 +166,13 @@ def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> 
     belief = own.copy()
     for (_, to), message in messages.items():
         belief[to] += message
-    places: IndexArray = np.argmax(belief, axis=1).astype(np.int64)
+    ends = [_one_by_one(np.argmax(start, axis=1), own, tables) for start in (belief, own)]
+    return max(ends, key=lambda places: _gain(places, own, between))
+
+
+def _one_by_one(places: IndexArray, own: FloatArray, tables: dict[tuple[int, int], FloatArray]) -> IndexArray:
+    """Every camera in turn takes its best place, the others as they are, until none changes."""
+    places = places.astype(np.int64)
     for _ in range(MESSAGE_ROUNDS):
         before = places.copy()
         for camera in range(len(places)):
@@ -177,6 +184,11 @@ def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> 
         if np.array_equal(places, before):
             break
     return places
+
+
+def _gain(places: IndexArray, own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> float:
+    shared = sum(float(table[places[i], places[j]]) for (i, j), table in between.items())
+    return float(np.sum(own[np.arange(len(places)), places])) + shared
 
 
 def _judged(

@@ -1,12 +1,18 @@
-"""Fundamental matrices of cameras with known K."""
+"""Fundamental matrices, and matches, of cameras with known K."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+
+from sfm_app.geometry.epipolar import eight_point
+from sfm_app.ransac.refit import refine_sampson
+from sfm_app.selfcal import pair_weights
+from sfm_app.types import CameraPairs, PhotoPairs
 
 
 @dataclass(frozen=True)
@@ -93,4 +99,90 @@ def random_fundamentals():
         scale = np.diag([1e-3, 1e-3, 1.0])
         return scale @ np.random.default_rng(seed).normal(size=(count, 3, 3)) @ scale
 
+    return make
+
+
+@dataclass(frozen=True)
+class Shots:
+    """Photos of random points: what a calibrator gets, and the cameras."""
+
+    pairs: CameraPairs
+    Ks: NDArray[np.float64]
+    sizes: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+
+    def as_set(self, groups, hints=None):
+        """`PhotoPairs` with the group of every photo."""
+        p = self.pairs
+        return PhotoPairs(p.Fs, p.weights, p.photos, p.inliers, self.sizes, dict(enumerate(groups)), hints or {})
+
+
+def parallel(rng, count):
+    """Cameras with parallel axes in front of the scene."""
+    return [(np.eye(3), np.array([0, 0, -5.0]) + C) for C in rng.uniform(-0.8, 0.8, (count, 3))]
+
+
+def turning(rng, count):
+    """Cameras that hardly move from one place."""
+    centres = np.array([0, 0, -5.0]) + rng.normal(0, 0.02, (count, 3))
+    return [(_looking(C, rng.normal(0, 0.5, 3), rng.normal(0, 0.2)), C) for C in centres]
+
+
+def onward(rng, count):
+    """Cameras that go straight ahead."""
+    centres = np.array([0, 0, -5.0]) + np.linspace(-1, 1, count)[:, None] * [0.05, 0.02, 1]
+    return [(Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix(), C) for C in centres]
+
+
+def _photo(X, pose, K, k1):
+    """(N, 2) pixels without noise, and (N,) what lies before the camera."""
+    R, C = pose
+    seen = (X - C) @ R.T
+    rays = seen[:, :2] / np.where(seen[:, 2:] > 0.1, seen[:, 2:], 1.0)
+    rays = rays * (1 + k1 * np.sum(rays**2, axis=1, keepdims=True))
+    return rays * [K[0, 0], K[1, 1]] + K[:2, 2], seen[:, 2] > 0.1
+
+
+def _shots(motion, seed, points, Ks, sizes, k1, noise_px):
+    rng = np.random.default_rng([seed, 7])
+    poses, X = motion(rng, len(Ks)), rng.uniform(-1.6, 1.6, (points, 3))
+    photos = []
+    for pose, K, size in zip(poses, Ks, sizes, strict=True):
+        x, before = _photo(X, pose, K, k1)
+        x = x + noise_px * rng.normal(size=x.shape)
+        photos.append((x, before & np.all((x >= 0) & (x <= size), axis=1)))
+    Fs, ids, inliers = [], [], []
+    for i, j in combinations(range(len(Ks)), 2):
+        both = photos[i][1] & photos[j][1]
+        if np.count_nonzero(both) >= 16:
+            x = np.hstack([photos[i][0][both], photos[j][0][both]])
+            unit = np.diag([1e-3, 1e-3, 1.0])
+            start = np.linalg.inv(unit) @ eight_point(x[:, :2], x[:, 2:]) @ np.linalg.inv(unit)
+            Fs.append(unit @ refine_sampson(np.asfortranarray(x * 1e-3), start, scale=3e-3) @ unit)
+            ids.append((i, j))
+            inliers.append(x)
+    return np.array(Fs).reshape(-1, 3, 3), tuple(ids), tuple(inliers)
+
+
+@pytest.fixture(scope="session")
+def shots():
+    """Makes `Shots`: number of photos, seed, motion, lens, noise; focals and sizes may differ from photo to photo."""
+
+    def make(
+        count=6, seed=0, *, motion=free_motion, focal=1000.0, aspect=1.0, centre=(0.5, 0.5), size=(1000, 750), k1=0.0,
+        noise_px=0.5, points=250, hints=(),
+    ):  # fmt: skip
+        focals = np.broadcast_to(focal, count)
+        sizes = [size] * count if isinstance(size[0], int) else list(size)
+        root = np.sqrt(aspect)
+        Ks = np.array(
+            [[[f / root, 0, w * centre[0]], [0, f * root, h * centre[1]], [0, 0, 1]]
+             for f, (w, h) in zip(focals, sizes, strict=True)]
+        )  # fmt: skip
+        Fs, ids, inliers = _shots(motion, seed, points, Ks, sizes, k1, noise_px)
+        weights = pair_weights([len(x) for x in inliers])
+        pairs = CameraPairs(Fs, weights, sizes[0], ids, inliers, tuple(hints))
+        return Shots(pairs, Ks, dict(enumerate(sizes)))
+
+    make.free, make.orbit, make.level = free_motion, orbit, level
+    make.parallel, make.turning, make.onward = parallel, turning, onward
     return make

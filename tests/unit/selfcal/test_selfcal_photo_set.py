@@ -1,0 +1,126 @@
+"""Whole sets of photos: groups, splits, claims, and what is left where nothing is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm_app.selfcal import calibrate_photo_set
+from sfm_app.selfcal.answers import guessed
+from sfm_app.selfcal.zero_curves import calibrate
+from sfm_app.settings import CalibrationSettings
+from sfm_app.types import PhotoPairs
+
+OPTIONS = CalibrationSettings()
+NO_PAIRS = PhotoPairs(np.empty((0, 3, 3)), np.empty(0), (), (), {}, {})
+
+
+def cameras_of(pairs, together=True):
+    return calibrate_photo_set(pairs, calibrate, OPTIONS, 0, together=together)
+
+
+def unknown(pairs, options, seed):
+    return guessed(pairs.size, "an orbit", {})
+
+
+def alone(count, size=(1000, 750), hints=None):
+    """Photos of one group without any pair."""
+    return replace(
+        NO_PAIRS, sizes=dict.fromkeys(range(count), size), groups=dict.fromkeys(range(count), "one"),
+        focal_hints_px=hints or {},
+    )  # fmt: skip
+
+
+def test_no_photos_are_no_cameras():
+    assert cameras_of(NO_PAIRS) == []
+
+
+@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("count", [1, 5])
+def test_photos_without_pairs_have_the_usual_guess(count, together):
+    (camera,) = cameras_of(alone(count), together)
+    assert (camera.name, camera.photos) == ("one", tuple(range(count)))
+    assert (camera.found.method, camera.found.identifiable) == ("guess", False)
+    assert camera.found.reason == "0 usable pairs, 3 are needed"
+    assert camera.found.focal_px == pytest.approx(1200)
+
+
+@pytest.mark.parametrize("together", [True, False])
+def test_a_claim_comes_before_a_guess(together):
+    (camera,) = cameras_of(alone(4, hints={1: 900.0, 2: 910.0, 3: 5000.0}), together)
+    assert (camera.found.method, camera.found.focal_px) == ("exif", pytest.approx(910))
+    assert (camera.found.identifiable, camera.found.radial, camera.found.spread) == (False, 0.0, {})
+
+
+def test_what_the_pairs_determine_comes_before_a_wrong_claim(shots):
+    made = shots(6, 1)
+    (camera,) = cameras_of(made.as_set(["one"] * 6, dict.fromkeys(range(6), 3000.0)))
+    assert camera.found.identifiable
+    assert 0 < abs(camera.found.K[0, 0] - 1000) < 3 * camera.found.spread["fx"] < 30
+    assert 0.1 < camera.found.evidence["support"] <= 1
+
+
+def test_a_group_of_two_cameras_is_split(shots):
+    focals = [1000.0] * 4 + [1500.0] * 4
+    made = shots(8, 2, focal=focals)
+    found = cameras_of(made.as_set(["zoom"] * 8))
+    assert sorted(camera.name for camera in found) == ["zoom", "zoom #2"]
+    assert sorted(camera.photos for camera in found) == [(0, 1, 2, 3), (4, 5, 6, 7)]
+    for camera in found:
+        assert camera.found.identifiable, camera.found.reason
+        assert 0 < abs(camera.found.K[0, 0] / focals[camera.photos[0]] - 1) < 0.01
+
+
+def test_without_together_groups_stay_what_they_are(shots):
+    made = shots(8, 2, focal=[1000.0] * 4 + [1500.0] * 4)
+    (camera,) = cameras_of(made.as_set(["zoom"] * 8), together=False)
+    assert camera.photos == tuple(range(8))
+
+
+def test_pairs_between_cameras_help_a_small_group(shots):
+    sizes = [(1000, 750)] * 5 + [(800, 600)] * 2
+    made = shots(7, 3, focal=[1000.0] * 5 + [950.0] * 2, size=sizes)
+    pairs = made.as_set(["big"] * 5 + ["small"] * 2)
+
+    alone_, together = cameras_of(pairs, together=False), cameras_of(pairs)
+
+    assert [camera.name for camera in together] == ["big", "small"]
+    assert [camera.photos for camera in together] == [(0, 1, 2, 3, 4), (5, 6)]
+    assert not alone_[1].found.identifiable
+    small = together[1].found
+    assert small.identifiable, small.reason
+    assert (small.width, small.height) == (800, 600)
+    assert 0 < abs(small.K[0, 0] / 950 - 1) < 0.03
+    assert 0 < abs(small.K[0, 0] - 950) < 3 * small.spread["fx"]
+
+
+def test_a_group_without_pairs_beside_one_with(shots):
+    made = shots(5, 4)
+    pairs = made.as_set(["seen"] * 5)
+    pairs = replace(
+        pairs, sizes={**pairs.sizes, 5: (400, 300), 6: (400, 300)}, groups={**pairs.groups, 5: "lost", 6: "lost"},
+        focal_hints_px={6: 333.0},
+    )  # fmt: skip
+    seen, lost = cameras_of(pairs)
+    assert seen.found.identifiable
+    assert (lost.found.method, lost.found.focal_px, lost.photos) == ("exif", pytest.approx(333), (5, 6))
+    assert "0 usable pairs" in lost.found.reason
+
+
+def test_cameras_with_most_photos_come_first():
+    pairs = replace(
+        NO_PAIRS,
+        sizes={1: (64, 64), 2: (640, 480), 3: (640, 480), 4: (64, 64)},
+        groups={1: "b", 2: "two", 3: "two", 4: "a"},
+    )
+    assert [camera.name for camera in calibrate_photo_set(pairs, unknown, OPTIONS, 0, together=False)] == [
+        "two", "a", "b",
+    ]  # fmt: skip
+
+
+def test_every_photo_has_one_camera_and_every_camera_one_name(shots):
+    made = shots(8, 5, focal=[1000.0] * 4 + [1500.0] * 4)
+    for groups in (["one"] * 8, ["one"] * 7 + ["one #2"]):
+        found = cameras_of(made.as_set(groups))
+        assert sorted(photo for camera in found for photo in camera.photos) == list(range(8))
+        assert len({camera.name for camera in found}) == len(found)
