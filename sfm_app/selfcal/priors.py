@@ -137,12 +137,14 @@ class Evidence:
                 return free
 
     def undetermined(self, free: BoolArray) -> BoolArray:
-        """(C, 4) what is not freed and about which the pairs say hardly more than the prior."""
-        before = self.usual.prior(free, self.thetas).precision ** -0.5
+        """(C, 4) what is not freed, about which the pairs say hardly more than the prior, and nothing against it."""
+        prior = self.usual.prior(free, self.thetas)
+        before = prior.precision**-0.5
         after = np.sqrt(np.diag(self.posterior(free)[2])).reshape(before.shape)
+        vague, near = after > UNDETERMINED * before, np.abs(self.thetas - prior.mean) < after
         found = np.zeros_like(free)
         for place, columns in COLUMNS.items():
-            found[:, place] = ~free[:, place] & np.any(after[:, columns] > UNDETERMINED * before[:, columns], axis=1)
+            found[:, place] = ~free[:, place] & vague[:, columns].any(axis=1) & near[:, columns].all(axis=1)
         return found
 
     def covariance(self, free: BoolArray) -> FloatArray:
