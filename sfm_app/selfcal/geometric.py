@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_app.geometry.distances import sampson_distance
-from sfm_app.selfcal.inputs import FloatArray, Pairs
+from sfm_app.selfcal.inputs import FloatArray, Pairs, checked
 from sfm_app.selfcal.minimise import fitted
 from sfm_app.selfcal.verdict import Camera, answered
 from sfm_app.settings import CalibrationSettings
@@ -37,10 +37,9 @@ def residual_weights(pairs: CameraPairs) -> FloatArray:
     Pairs of weight 0 keep it; a pair without inliers, or with infinite distances, gets it.
 
     Raises:
-        ValueError: there are not as many sets of inliers as pairs, or a shape is wrong.
+        ValueError: malformed input, see `selfcal.inputs.prepare`.
     """
-    if not len(pairs.inliers) == len(pairs.Fs) == len(pairs.weights):
-        raise ValueError(f"{len(pairs.inliers)} sets of inliers and {len(pairs.weights)} weights for {len(pairs.Fs)} F")
+    checked(pairs)
     residuals = [
         float(np.mean(sampson_distance(F, matches[:, :2], matches[:, 2:]))) if len(matches) else np.inf
         for F, matches in zip(pairs.Fs, pairs.inliers, strict=True)

@@ -59,7 +59,7 @@ def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float
         ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size or a
             claimed focal is not positive.
     """
-    raw, trust, used = _checked(pairs)
+    raw, trust, used = checked(pairs)
     to_pixels = np.array([[unit_px, 0.0, origin_px[0]], [0.0, unit_px, origin_px[1]], [0.0, 0.0, 1.0]])
     # scaled first, so that neither 1e-200 nor 1e200 over- or underflows in the products
     scaled = raw / np.max(np.abs(raw), axis=(1, 2), keepdims=True)
@@ -77,7 +77,12 @@ def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float
     )
 
 
-def _checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+def checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    """Matrices (Q, 3, 3) and weights (Q,) of the pairs with a weight, and which of the given these are.
+
+    Raises:
+        ValueError: as `prepare`.
+    """
     raw = np.asarray(pairs.Fs, dtype=np.float64)
     trust = np.asarray(pairs.weights, dtype=np.float64)
     size = pairs.size

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import count
+from itertools import chain, count
 
 import numpy as np
 
@@ -21,6 +21,8 @@ CalibrateFunction = Callable[[CameraPairs, CalibrationSettings, int], Calibratio
 
 LEAST_TO_SPLIT = 4
 """Photos of a group below which nobody can say who disagrees with whom."""
+ALIKE = 0.03
+"""Parts of a group whose log f differ by less are one camera."""
 BENT = 0.01
 """From this |k1| on, photos are straightened before they are asked whether they are of one camera."""
 
@@ -49,14 +51,35 @@ def calibrate_photo_set(
     groups: dict[str, list[int]] = {}
     for photo, group in pairs.groups.items():
         groups.setdefault(group, []).append(photo)
-    cameras: list[Camera] = []
-    for name, members in groups.items():
-        camera = Camera(name, tuple(members), calibrate(pairs.among(members), options, seed))
-        cameras += _split(camera, pairs, options) if together else [camera]
-    if together and len(cameras) > 1:
-        cameras = _together(cameras, pairs, options)
+    cameras = [
+        Camera(name, tuple(members), calibrate(pairs.among(members), options, seed)) for name, members in groups.items()
+    ]
+    if together:
+        cameras = _of_all_pairs(cameras, pairs, options)
     cameras = [replace(camera, found=_or_guess(camera, pairs)) for camera in cameras]
     return sorted(cameras, key=lambda camera: (-len(camera.photos), camera.name))
+
+
+def _of_all_pairs(whole: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
+    """Groups split where their photos disagree, and all cameras from all pairs.
+
+    Parts of a group that turn out to have the same focal were one camera after all.
+    """
+    parts = [_split(camera, pairs, options) for camera in whole]
+    found = _together(list(chain.from_iterable(parts)), pairs, options)
+    focals = {camera.name: camera.found.focal_px for camera in found}
+    kept = [
+        [camera] if _alike([focals[part.name] for part in split]) else split
+        for camera, split in zip(whole, parts, strict=True)
+    ]
+    if sum(map(len, kept)) == len(found):
+        return found
+    return _together(list(chain.from_iterable(kept)), pairs, options)
+
+
+def _alike(focals: Sequence[float]) -> bool:
+    """Whether two of them are the same."""
+    return bool(np.any(np.diff(np.sort(np.log(focals))) < ALIKE))
 
 
 def _split(camera: Camera, pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
@@ -89,7 +112,9 @@ def _split(camera: Camera, pairs: PhotoPairs, options: CalibrationSettings) -> l
 
 
 def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
-    """All cameras from all pairs at once."""
+    """All cameras from all pairs at once; one camera is what its own pairs say."""
+    if len(cameras) == 1:
+        return list(cameras)
     number = {photo: k for k, camera in enumerate(cameras) for photo in camera.photos}
     everything = CameraPairs(pairs.Fs, pairs.weights, (1, 1), pairs.photos, pairs.inliers)
     members = np.array([[number[first], number[second]] for first, second in pairs.photos]).reshape(-1, 2)
@@ -103,10 +128,7 @@ def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: Calibration
         for camera in cameras
     ]
     answers = calibrate_several(asked, everything, members, options, METHOD)
-    return [
-        replace(camera, found=replace(answer, key_pairs=camera.found.key_pairs))
-        for camera, answer in zip(cameras, answers, strict=True)
-    ]
+    return [replace(camera, found=answer) for camera, answer in zip(cameras, answers, strict=True)]
 
 
 def _or_guess(camera: Camera, pairs: PhotoPairs) -> Calibration:

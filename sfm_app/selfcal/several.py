@@ -22,7 +22,7 @@ from sfm_app.selfcal.priors import FOCAL_SPREAD, HINT_SPREAD, USUAL_FOCAL, Usual
 from sfm_app.selfcal.refine import Fit, refined, straight_fundamentals
 from sfm_app.selfcal.search import FOCAL_RANGE, SIGMAS
 from sfm_app.selfcal.two_view_cost import CAMERA
-from sfm_app.selfcal.uncertainty import covariance, spread_of
+from sfm_app.selfcal.uncertainty import covariance, key_pairs, spread_of
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
@@ -75,7 +75,15 @@ def calibrate_several(
     fit = refined(matches, Fs, [thetas], usual)
     cov = covariance(fit, sides)
     straight = Tables(straight_fundamentals(fit), members, weights)
-    return [_judged(k, camera, fit, cov, straight, unit, method) for k, camera in enumerate(cameras)]
+    best = key_pairs(fit, tuple(pairs.photos[k] for k in kept))
+    of = {pairs.photos[k]: (int(first), int(second)) for k, (first, second) in zip(kept, members, strict=True)}
+    return [
+        replace(
+            _judged(k, camera, fit, cov, straight, unit, method),
+            key_pairs=tuple(pair for pair in best if of[pair] == (k, k)),
+        )
+        for k, camera in enumerate(cameras)
+    ]
 
 
 class Tables:

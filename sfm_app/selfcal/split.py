@@ -23,10 +23,10 @@ FAIR_SHARE = 0.5
 """Share of its votes that a photo must get to belong to a peak, or to name a focal."""
 OTHER_FOCAL = 0.05
 """A difference in log f from which on it is another camera."""
-CLEARLY = 1.0
-"""Votes by which another focal must beat that of the peak, for one photo."""
-LEAST_GAIN = 2.0
-"""Votes that all photos together must win by several cameras."""
+CLEARLY = 0.25
+"""Share of a photo's votes by which another focal must beat that of the peak."""
+LEAST_GAIN = 0.25
+"""The same of the photos of all other cameras together, for a split to be worth it."""
 REACH, TRIALS = 1.1, 111
 """Focals that a photo is asked about: up to three times longer or shorter."""
 MOST_PEAKS = 4
@@ -60,7 +60,7 @@ def separated(
     gain = pairs.total(cameras, labels) - max(
         pairs.total(cameras, dict.fromkeys(everyone, k)) for k in range(len(cameras))
     )
-    if gain < LEAST_GAIN:
+    if gain <= LEAST_GAIN * pairs.at_stake({photo for photo, label in labels.items() if label != 0}):
         return one, dict.fromkeys(everyone, 0)
     used = sorted(set(labels.values()))
     return cameras[used], {photo: used.index(label) for photo, label in labels.items()}
@@ -113,7 +113,7 @@ class _Pairs:
                 continue
             most += self.tables.weights[k]
         best = int(np.argmax(votes))
-        clear = votes[best] - votes[TRIALS // 2] >= CLEARLY and votes[best] >= FAIR_SHARE * most
+        clear = votes[best] - votes[TRIALS // 2] > CLEARLY * most and votes[best] >= FAIR_SHARE * most
         return [float(steps[best])] if clear and abs(steps[best]) > OTHER_FOCAL else []
 
     def labelled(self, cameras: FloatArray, everyone: Sequence[int], core: set[int]) -> dict[int, int]:
@@ -132,6 +132,11 @@ class _Pairs:
             if labels == before:
                 break
         return labels
+
+    def at_stake(self, asked: set[int]) -> float:
+        """Most votes that the pairs of some photos can give."""
+        touched = [bool(asked.intersection(pair)) for pair in self.photos]
+        return float(np.sum(self.tables.weights[touched]))
 
     def total(self, cameras: FloatArray, labels: dict[int, int]) -> float:
         """Votes of all pairs."""

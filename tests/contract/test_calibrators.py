@@ -2,6 +2,8 @@
 
 import pickle
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import cache
 from itertools import combinations
 
 import numpy as np
@@ -9,7 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_app.plugins import load_plugins
+from sfm_app.selfcal import pair_weights
 from sfm_app.settings import CalibrationSettings
+from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration, CameraPairs
 
 CALIBRATORS = load_plugins().calibrators
@@ -79,7 +83,9 @@ def is_well_formed(found):
     assert (found.width, found.height) == SIZE
     assert found.identifiable == (found.reason == "")
     assert found.method in (*CALIBRATORS, "guess")
-    assert set(found.spread) <= {"fx", "fy", "cx", "cy"}
+    assert np.isfinite(found.radial)
+    assert set(found.spread) <= {"fx", "fy", "cx", "cy", "k1"}
+    assert set(found.held) <= {"centre", "aspect", "k1"}
     assert all(np.isfinite(value) and value >= 0 for value in found.spread.values())
     assert all(isinstance(value, float) and np.isfinite(value) for value in found.evidence.values())
     return True
@@ -192,3 +198,117 @@ def test_ten_runs_in_threads_give_the_same_bytes(calibrate):
     with ThreadPoolExecutor(4) as pool:
         runs = list(pool.map(lambda _: pickle.dumps(run(calibrate, Fs, seed=3)), range(10)))
     assert len(set(runs)) == 1
+
+
+TRACKS = TrackOptions(
+    points=150, sigma_px=0.5, width=1000, height=750, focal_px=(1100, 1100), aspect=(1, 1), centre_offset=0.0
+)
+
+
+@cache
+def matched(seed):
+    """Pairs with their matches, of a camera with focal 1100 and the centre in the middle."""
+    tracks, rng, Fs = make_tracks(TRACKS, seed), np.random.default_rng(seed), []
+    for view in tracks.pairs.values():
+        E = view.K.T @ view.F @ view.K
+        inverse = np.linalg.inv(view.K)
+        Fs.append(inverse.T @ (E / np.linalg.norm(E) + rng.normal(0, 2e-4, (3, 3))) @ inverse)
+    inliers = tuple(np.hstack([view.x1, view.x2]) for view in tracks.pairs.values())
+    return CameraPairs(np.array(Fs), np.ones(len(Fs)), SIZE, tuple(tracks.pairs), inliers)
+
+
+def each(pairs, change):
+    """The same pairs with other inliers."""
+    return replace(pairs, inliers=tuple(change(x) for x in pairs.inliers))
+
+
+def first(pairs, change):
+    return replace(pairs, inliers=(change(pairs.inliers[0]), *pairs.inliers[1:]))
+
+
+HOSTILE = {
+    "seven inliers": lambda p: replace(each(p, lambda x: x[:7]), weights=pair_weights([7] * len(p.Fs))),
+    "one inlier": lambda p: each(p, lambda x: x[:1]),
+    "no inliers": lambda p: each(p, lambda x: x[:0]),
+    "one pair without": lambda p: first(p, lambda x: x[:0]),
+    "one pair with": lambda p: replace(p, inliers=(p.inliers[0], *(x[:0] for x in p.inliers[1:]))),
+    "identical points": lambda p: each(p, lambda x: np.repeat(x[:1], 20, axis=0)),
+    "all in the middle": lambda p: each(p, lambda x: 0 * x + [500, 375, 500, 375]),
+    "on one line": lambda p: each(p, lambda x: x[:, [0, 0, 2, 2]]),
+    "on a vertical line": lambda p: each(p, lambda x: x * [0, 1, 0, 1] + [500, 0, 500, 0]),
+    "nothing moved": lambda p: each(p, lambda x: x[:, [0, 1, 0, 1]]),
+    "huge": lambda p: each(p, lambda x: x * 1e6),
+    "one huge": lambda p: first(p, lambda x: np.vstack([x, [[1e12, -1e12, 1e12, 5.0]]])),
+    "tiny": lambda p: each(p, lambda x: x * 1e-200),
+    "mirrored": lambda p: each(p, lambda x: -x),
+    "integers": lambda p: each(p, lambda x: np.round(x).astype(np.int64)),
+    "16 bit": lambda p: each(p, lambda x: np.round(x).astype(np.int16)),
+    "single precision": lambda p: each(p, lambda x: x.astype(np.float32)),
+    "strided": lambda p: each(p, lambda x: np.repeat(x, 2, axis=0)[::2]),
+    "of other pairs": lambda p: replace(p, inliers=p.inliers[3:] + p.inliers[:3]),
+    "matches of noise": lambda p: each(p, lambda x: np.random.default_rng(0).uniform(0, 700, x.shape)),
+    "matrices of noise": lambda p: replace(p, Fs=random_fundamentals(len(p.Fs), 0)),
+    "rank one": lambda p: replace(p, Fs=np.tile(UNDETERMINED["rank one"], (2, 1, 1))),
+    "photos unknown": lambda p: replace(p, photos=()),
+    "hardly trusted": lambda p: replace(p, weights=np.full(len(p.Fs), 1e-200)),
+    "absurd claims": lambda p: replace(p, focal_hints_px=(1e-12, 1e12, 1e12)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_finds_the_camera_with_matches(calibrate, seed):
+    found = calibrate(matched(seed), OPTIONS, 0)
+    assert is_well_formed(found)
+    assert found.identifiable, found.reason
+    error = np.abs(found.K - [[1100, 0, 500], [0, 1100, 375], [0, 0, 1]])
+    assert 0 < error[[0, 1], [0, 1]].max() < 0.05 * 1100
+    assert 0 < error[:2, 2].max() < 50
+    assert set(found.key_pairs) <= set(matched(seed).photos)
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_matches_never_raise(calibrate, case):
+    found = calibrate(HOSTILE[case](matched(1)), OPTIONS, 0)
+    assert is_well_formed(found)
+    if found.identifiable:
+        np.testing.assert_allclose(np.diag(found.K)[:2], 1100, rtol=0.08)
+
+
+@pytest.mark.parametrize("change", [
+    lambda p: replace(p, inliers=p.inliers[:-1]),
+    lambda p: first(p, lambda x: x[:, :3]),
+    lambda p: first(p, lambda x: x[0]),
+    lambda p: first(p, lambda x: x * np.nan),
+    lambda p: first(p, lambda x: x * np.inf),
+    lambda p: replace(p, focal_hints_px=(1000.0, np.nan)),
+    lambda p: replace(p, focal_hints_px=(-5.0,)),
+    lambda p: replace(p, focal_hints_px=(0.0,)),
+    lambda p: replace(p, photos=p.photos[1:]),
+])  # fmt: skip
+def test_malformed_matches_and_claims_are_refused(calibrate, change):
+    with pytest.raises(ValueError, match=r"inliers|focals|photos|finite"):
+        calibrate(change(matched(1)), OPTIONS, 0)
+
+
+def test_matches_are_left_alone_and_answers_repeat(calibrate):
+    pairs = matched(2)
+    before = pairs.Fs.copy(), [x.copy() for x in pairs.inliers]
+    with ThreadPoolExecutor(2) as pool:
+        runs = list(pool.map(lambda _: pickle.dumps(calibrate(pairs, OPTIONS, 3)), range(4)))
+    assert len(set(runs)) == 1
+    np.testing.assert_array_equal(pairs.Fs, before[0])
+    np.testing.assert_array_equal(pairs.inliers, before[1])
+    found, copy = calibrate(pairs, OPTIONS, 3), pickle.loads(runs[0])  # noqa: S301 - our own bytes
+    assert (copy.K.tobytes(), copy.spread, copy.key_pairs) == (found.K.tobytes(), found.spread, found.key_pairs)
+
+
+def test_order_and_direction_of_pairs_with_matches_do_not_matter(calibrate):
+    pairs = matched(3)
+    expected = calibrate(pairs, OPTIONS, 0).K
+    back = replace(
+        each(pairs, lambda x: x[:, [2, 3, 0, 1]]),
+        Fs=pairs.Fs.transpose(0, 2, 1), photos=tuple((j, i) for i, j in pairs.photos),
+    )  # fmt: skip
+    turned = replace(pairs, Fs=pairs.Fs[::-1], photos=pairs.photos[::-1], inliers=pairs.inliers[::-1])
+    for same in (back, turned):
+        np.testing.assert_allclose(calibrate(same, OPTIONS, 0).K, expected, rtol=2e-3, atol=0.5)

@@ -79,5 +79,5 @@ def test_without_any_match_there_is_no_answer(views):
 def test_matches_for_other_pairs_are_refused(views):
     made = views(3)
     pairs = replace(CameraPairs.of(made.Fs, made.size), inliers=(np.zeros((5, 4)),))
-    with pytest.raises(ValueError, match="1 sets of inliers"):
+    with pytest.raises(ValueError, match="inliers of 1 pairs"):
         geometric.calibrate(pairs, OPTIONS, 0)

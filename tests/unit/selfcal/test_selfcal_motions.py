@@ -18,9 +18,9 @@ def off(found, made, k1):
 
 
 @pytest.mark.parametrize("motion", ["orbit", "parallel", "onward"])
-@pytest.mark.parametrize(("k1", "count"), [(0.0, 4), (-0.1, 6)])
+@pytest.mark.parametrize(("k1", "count"), [(0.0, 4), (-0.1, 5)])
 def test_what_matches_do_not_determine_is_not_given(shots, motion, k1, count):
-    for seed in range(2):
+    for seed in range(1 if k1 else 3):
         made = shots(count, seed, motion=getattr(shots, motion), k1=k1, points=120)
         found = calibrate(made.pairs, OPTIONS, seed)
         assert not found.identifiable
@@ -29,15 +29,15 @@ def test_what_matches_do_not_determine_is_not_given(shots, motion, k1, count):
 
 
 @pytest.mark.parametrize("motion", ["level", "turning"])
-@pytest.mark.parametrize(("k1", "count"), [(0.0, 4), (-0.1, 6)])
+@pytest.mark.parametrize(("k1", "count"), [(0.0, 4), (-0.1, 5)])
 def test_what_matches_hardly_determine_is_not_overstated(shots, motion, k1, count):
-    for seed in range(2):
+    for seed in range(1 if k1 else 3):
         made = shots(count, seed, motion=getattr(shots, motion), k1=k1, points=120)
         assert off(calibrate(made.pairs, OPTIONS, seed), made, k1) < 3
 
 
 def test_a_camera_that_only_turns_on_the_spot_gives_no_wrong_answer(shots):
     # no baseline: every F is one of many that fit
-    for seed in range(3):
+    for seed in range(2):
         made = shots(5, seed, motion=lambda rng, n: [(R, np.array([0, 0, -5.0])) for R, _ in shots.turning(rng, n)])
         assert off(calibrate(made.pairs, OPTIONS, seed), made, 0.0) < 3

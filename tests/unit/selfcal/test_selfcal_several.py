@@ -21,10 +21,8 @@ def answers(made, members, cameras=None, options=OPTIONS):
 
 
 def score(found, K):
-    names = ("fx", "fy", "cx", "cy")
-    return max(
-        abs(found.K[at] - K[at]) / found.spread[name] for name, at in zip(names, [(0, 0), (1, 1), (0, 2), (1, 2)])
-    )
+    places = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
+    return max(abs(found.K[at] - K[at]) / found.spread[name] for name, at in places.items())
 
 
 def test_two_cameras_of_different_size_and_focal(shots):

@@ -1,7 +1,6 @@
 """Standard deviations against the scatter of repeated photos."""
 
 import numpy as np
-import pytest
 
 from sfm_app.selfcal.adjustment import Matches
 from sfm_app.selfcal.answers import calibration_of, parameters_of
@@ -21,7 +20,7 @@ def fitted(pairs):
 
 
 def test_standard_deviations_are_those_of_repeated_photos(shots):
-    # the same photos again and again would share their geometry: these are 32 sets, each with its own standard deviation
+    # 32 sets, each judged by the standard deviations it comes with
     scores = []
     for seed in range(32):
         made = shots(5, 40 + seed, k1=-0.1, centre=(0.56, 0.46), points=90, noise_px=1.0)
@@ -53,10 +52,9 @@ def test_parameters_survive_the_answer():
         np.testing.assert_allclose(parameters_of(calibration_of(theta, (1000, 750), "mine", unit), unit), theta)
 
 
-@pytest.mark.parametrize("points", [60, 250])
-def test_more_matches_say_more(shots, points):
+def test_more_matches_say_more(shots):
     spreads = []
-    for count in (points, 4 * points):
+    for count in (60, 240):
         fit = fitted(shots(5, 1, points=count).pairs)
         spreads.append(np.sqrt(covariance(fit, np.ones(1))[0, 0] - 1e-6))
     assert 1.4 < spreads[0] / spreads[1] < 3

@@ -1,0 +1,32 @@
+import json
+
+import numpy as np
+
+from sfm_app.types import Calibration, Intrinsics
+
+FOUND = Calibration(
+    np.array([[900.5, 0, 501.25], [0, 901.5, 373.0], [0, 0, 1]]), 1000, 750, "zero-curves", True, radial=-0.0625,
+    spread={"fx": 3.5, "k1": 0.01}, held=("aspect",), key_pairs=((1, 4), (2, 7)), evidence={"pairs": 12.0},
+)  # fmt: skip
+UNKNOWN = Calibration(np.diag([1200.0, 1200.0, 1.0]), 1000, 750, "exif", False, "an orbit")
+
+
+def test_every_field_of_a_calibration_survives():
+    for one in (FOUND, UNKNOWN):
+        back = Calibration.from_dict(json.loads(json.dumps(one.to_dict())))
+        np.testing.assert_array_equal(back.K, one.K)
+        for name in one.__slots__:
+            assert name == "K" or getattr(back, name) == getattr(one, name)
+            assert type(getattr(back, name)) is type(getattr(one, name))
+
+
+def test_cameras_keep_their_order_names_and_photos():
+    taken = {"b.jpg": "zoom", "a.jpg": "zoom #2"}
+    one = Intrinsics({"zoom": FOUND, "zoom #2": UNKNOWN}, taken)
+
+    back = Intrinsics.from_dict(json.loads(json.dumps(one.to_dict())))
+
+    assert list(back.cameras) == ["zoom", "zoom #2"]
+    assert back.camera_of == taken
+    assert (back.main.method, back.identifiable) == ("zero-curves", True)
+    np.testing.assert_array_equal(back.K, FOUND.K)
