@@ -113,7 +113,7 @@ def _split(camera: Camera, pairs: PhotoPairs, options: CalibrationSettings) -> l
 
 def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
     """All cameras from all pairs at once; one camera is what its own pairs say."""
-    if len(cameras) == 1:
+    if len(cameras) <= 1:
         return list(cameras)
     number = {photo: k for k, camera in enumerate(cameras) for photo in camera.photos}
     everything = CameraPairs(pairs.Fs, pairs.weights, (1, 1), pairs.photos, pairs.inliers)

@@ -22,6 +22,8 @@ CAMERA, POSE = 5, 5
 PAIR = 2 * CAMERA + POSE
 REACH = 3.0
 """c, in sigma."""
+HOPELESS = 1e60
+"""Squared distances in sigma^2, or derivatives, above this are no numbers any more."""
 _STEP = 1e-6
 
 
@@ -101,7 +103,7 @@ def pair_costs(
             ray(matches[i, 0], matches[i, 1], first, -1.0, p)
             ray(matches[i, 2], matches[i, 3], second, -1.0, q)
             r2 = (_distance(p, q, E) / sigma) ** 2
-            costs[k] += 0.5 * r2 / (1.0 + r2 / REACH**2)
+            costs[k] += 0.5 * r2 / (1.0 + r2 / REACH**2) if r2 < HOPELESS else 0.5 * REACH**2
     return costs
 
 
@@ -172,8 +174,12 @@ def pair_systems(
                     J[CAMERA + j] = (_distance(rays[0, 0], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
             for j in range(POSE):
                 J[2 * CAMERA + j] = (_distance(rays[0, 0], rays[1, 0], Es[1 + j]) / sigma - r) / _STEP
-            weight = (1.0 + r * r / REACH**2) ** -2
-            _add(A[k], b[k], J, r, weight)
+            # at an epipole the distance has no gradient to be divided by
+            total = r * r
+            for j in range(PAIR):
+                total += abs(J[j])
+            if total < HOPELESS:
+                _add(A[k], b[k], J, r, (1.0 + r * r / REACH**2) ** -2)
     for k in range(len(poses)):
         for i in range(PAIR):
             for j in range(i):
