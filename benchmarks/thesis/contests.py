@@ -18,6 +18,8 @@ from sfm_app.selfcal import pair_weights
 from sfm_app.types import Calibration
 
 PRODUCTION = "zero-curves"
+WITHOUT_LENS = "zero-curves without a lens"
+"""The same with `calibration.lens = false`: the camera model of the truth that comes with the VGG sequences."""
 ZERO_CURVES, MULTI_START, PERTURBATION = "zero-curves-thesis", "multi-start", "perturbation"
 GEOMETRIC, NON_ROBUST, KRUPPA = "geometric", "huang-faugeras", "kruppa"
 METHODS = (PRODUCTION, ZERO_CURVES, MULTI_START, PERTURBATION, GEOMETRIC, NON_ROBUST, KRUPPA)
@@ -40,14 +42,16 @@ class Attempt(NamedTuple):
 
 def ask(method: str, fits: Fits, size: tuple[int, int], seed: int) -> Calibration:
     """A calibrator by its name, with all that is known about the pairs."""
+    lens = method != WITHOUT_LENS
     return sfm_app.calibrate_fundamentals(
         np.array([fit.F for fit in fits.values()]).reshape(-1, 3, 3),
         size,
-        method,
+        method if lens else PRODUCTION,
         weights=pair_weights([len(fit.matches) for fit in fits.values()]),
         matches=[fit.matches for fit in fits.values()],
         photos=list(fits),
         seed=seed,
+        settings=sfm_app.Settings.from_mapping({"calibration": {"lens": lens}}),
     )
 
 
@@ -56,7 +60,7 @@ def answer_of(method: str, found: Calibration) -> FloatArray | None:
     if found.identifiable:
         return found.K
     told = [found.evidence.get(name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")]
-    if method == PRODUCTION or None in told:
+    if method in (PRODUCTION, WITHOUT_LENS) or None in told:
         return None
     fx, fy, cx, cy = told
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

@@ -53,12 +53,19 @@ class Lab:
             self._sequences[name] = found
         return self._sequences[name]
 
-    def contest(self, experiment: Callable[..., Any], sequence: str = "", tests: int | None = None) -> list[Row]:
-        """The rows of an experiment of `setups`; each is run once."""
+    def contest(
+        self,
+        experiment: Callable[..., Any],
+        sequence: str = "",
+        tests: int | None = None,
+        also: Mapping[str, str] | None = None,
+    ) -> list[Row]:
+        """The rows of an experiment of `setups`; each is run once. `also`: further methods, tested as often as others."""
         title = f"{experiment.__name__} {sequence}".strip()
         if title not in self._contests:
             count = self.tests if tests is None else tests
             each = {name: min(count, self.most.get(name, count)) for name in self.methods}
+            each |= {name: each[like] for name, like in (also or {}).items() if like in each}
             bound: Experiment = partial(experiment, self.sequence(sequence)) if sequence else experiment
             self._contests[title] = contest(bound, each, self.seed, self.pool, title)
         return self._contests[title]
