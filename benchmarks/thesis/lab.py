@@ -60,7 +60,7 @@ class Lab:
         tests: int | None = None,
         also: Mapping[str, str] | None = None,
     ) -> list[Row]:
-        """The rows of an experiment of `setups`; each is run once. `also`: further methods, tested as often as others."""
+        """The rows of an experiment of `setups`; each is run once. `also`: more methods, tested as often as others."""
         title = f"{experiment.__name__} {sequence}".strip()
         if title not in self._contests:
             count = self.tests if tests is None else tests

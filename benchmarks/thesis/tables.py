@@ -69,8 +69,8 @@ _NOTE = (
     "5 % in the focal and by 32 % in the centre. Means are over the runs with an answer; `answered` is their share. A "
     "method of the thesis always answers, unless too few curves are left; `zero-curves` may say that the photos do not "
     "determine K. The K's that come with the VGG sequences were fitted without a lens; `zero-curves` finds one "
-    "(k1 -0.05 to -0.10) and then a shorter focal, as does COLMAP's bundle adjustment on the photos of Merton I (k1 -0.07, "
-    "f 1092). `zero-curves without a lens` has the camera model of that truth."
+    "(k1 -0.05 to -0.10) and then a shorter focal, as does COLMAP's bundle adjustment on the photos of Merton I (k1 "
+    "-0.07, f 1092). `zero-curves without a lens` has the camera model of that truth."
 )
 
 
