@@ -90,7 +90,8 @@ def _from_matches(
     fit = refined(matches, Fs, starts, usual)
     judged = usable
     if fit.free[0, LENS]:
-        judged = _prepared(replace(pairs, Fs=_in_pixels(straight_fundamentals(fit), pairs), weights=usable.weights))
+        straight = _in_pixels(straight_fundamentals(fit), pairs)
+        judged = _prepared(CameraPairs(straight, usable.weights, pairs.size))
         answer = peak.found(Consensus(judged, sigma))
         if abs(answer.theta[LOG_FOCAL] - fit.state.thetas[0, LOG_FOCAL]) > ELSEWHERE:
             again = np.append(answer.theta, fit.state.thetas[0, KAPPA])

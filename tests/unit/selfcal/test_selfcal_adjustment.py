@@ -195,3 +195,14 @@ def test_tracks_through_many_photos_repeat_their_errors(views, redundancy):
     photos = np.array([(i, j) for i in range(views) for j in range(i + 1, views)])
     matches = Matches([np.hstack([x[i], x[j]]) for i, j in photos], 0 * photos, photos, SIDE)
     assert matches.redundancy == pytest.approx(redundancy)
+
+
+def test_pairs_without_weight_are_no_trouble_to_a_lens(shots):
+    # the consensus without the lens is asked about fewer pairs than there are inliers of
+    made = shots(5, 2, k1=-0.15)
+    weights = made.pairs.weights.copy()
+    weights[3] = 0.0
+    found = calibrate(replace(made.pairs, weights=weights), OPTIONS, 0)
+
+    assert found.identifiable, found.reason
+    assert 0 < abs(found.radial + 0.15) < 0.02
