@@ -9,6 +9,7 @@ contradict it.
 
 from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,19 @@ class Usual:
         return total
 
 
+class Alternative(NamedTuple):
+    """One choice for one camera."""
+
+    free: BoolArray
+    """(C, 4) of all cameras."""
+    value: float
+    """Log-probability, up to a constant."""
+    step: FloatArray
+    """(5,) mean step of this camera."""
+    covariance: FloatArray
+    """(5, 5) of this camera."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
     """What all pairs together say about a step d of the cameras from `thetas`: -g'd + d'Hd / 2."""
@@ -132,7 +146,9 @@ class Evidence:
         while True:
             before = free
             for camera in range(len(free)):
-                free = max(self.choices(free, camera), key=lambda trial: self.posterior(trial)[0])
+                _, step, covariance = self.posterior(free)
+                found = self.alternatives(free, camera, step, covariance)
+                free = max(found, key=lambda alternative: alternative.value).free
             if np.array_equal(free, before):
                 return free
 
@@ -149,16 +165,42 @@ class Evidence:
 
     def covariance(self, free: BoolArray) -> FloatArray:
         """(5C, 5C) of the cameras about `thetas`, over all choices: what is nearly free is nearly as uncertain."""
-        total: FloatArray = self.posterior(free)[2]
+        _, step, covariance = self.posterior(free)
+        total = covariance.copy()
         for camera in range(len(free)):
+            found = self.alternatives(free, camera, step, covariance)
+            odds = np.exp(np.array([one.value for one in found]) - max(one.value for one in found))
             block = slice(CAMERA * camera, CAMERA * (camera + 1))
-            found = [self.posterior(trial) for trial in self.choices(free, camera)]
-            odds = np.exp(np.array([value for value, _, _ in found]) - max(value for value, _, _ in found))
-            mixed = np.zeros((CAMERA, CAMERA))
-            for share, (_, step, covariance) in zip(odds / odds.sum(), found, strict=True):
-                mixed += share * (covariance[block, block] + np.outer(step[block], step[block]))
-            total[block, block] = mixed
+            total[block, block] = sum(
+                share * (one.covariance + np.outer(one.step, one.step))
+                for share, one in zip(odds / odds.sum(), found, strict=True)
+            )
         return total
+
+    def alternatives(
+        self, free: BoolArray, camera: int, step: FloatArray, covariance: FloatArray
+    ) -> list["Alternative"]:
+        """All choices for one camera, the others as in `free`, whose posterior has this mean step and covariance.
+
+        What the pairs and the other cameras say about this one is its marginal posterior without its prior: five
+        parameters, whatever the number of cameras.
+        """
+        block = slice(CAMERA * camera, CAMERA * (camera + 1))
+        prior, share = self.usual.prior(free, self.thetas), spare(free, self.pairs)
+        own = np.linalg.inv(covariance[block, block])
+        H = own - np.diag(prior.precision[camera])
+        g = own @ step[block] - prior.precision[camera] * (prior.mean - self.thetas)[camera]
+        found = []
+        for trial in self.choices(free, camera):
+            other = self.usual.prior(trial, self.thetas)
+            precision, away = other.precision[camera], (other.mean - self.thetas)[camera]
+            scale = spare(trial, self.pairs) / share
+            mine = np.asarray(np.linalg.inv(scale * H + np.diag(precision)), np.float64)
+            pull = scale * g + precision * away
+            value = 0.5 * float(pull @ mine @ pull) - 0.5 * float(precision @ away**2) + self.usual.log_odds(trial)
+            value += 0.5 * float(np.sum(np.log(precision))) + 0.5 * float(np.linalg.slogdet(mine)[1])
+            found.append(Alternative(trial, value, mine @ pull, mine))
+        return found
 
 
 def spare(free: BoolArray, pairs: float) -> float:
