@@ -62,7 +62,7 @@ STAGES = (
         load=lambda _, run: load_view_graph(run),
     ),
     Stage(
-        "intrinsics", ("match_graph", "view_graph"), ("calibration", "seed"), ("calibration.json",),
+        "intrinsics", ("match_graph", "view_graph"), ("calibration", "photos", "seed"), ("calibration.json",),
         make=lambda products, run: calibrate(products("match_graph"), products("view_graph"), run),
         load=lambda _, run: load_intrinsics(run),
     ),

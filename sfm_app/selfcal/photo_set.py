@@ -37,8 +37,9 @@ class Camera:
 
 
 def calibrate_photo_set(
-    pairs: PhotoPairs, calibrate: CalibrateFunction, options: CalibrationSettings, seed: int, *, together: bool
-) -> list[Camera]:
+    pairs: PhotoPairs, calibrate: CalibrateFunction, options: CalibrationSettings, seed: int, *,
+    together: bool, split: bool = True,
+) -> list[Camera]:  # fmt: skip
     """Every camera of a set of photos, the one with most photos first.
 
     Args:
@@ -46,7 +47,8 @@ def calibrate_photo_set(
         calibrate: finds one camera from its own pairs.
         options: handed to it.
         seed: likewise.
-        together: also split groups whose photos disagree, and use the pairs between cameras.
+        together: also use the pairs between cameras.
+        split: then also split groups whose photos disagree.
     """
     groups: dict[str, list[int]] = {}
     for photo, group in pairs.groups.items():
@@ -55,7 +57,7 @@ def calibrate_photo_set(
         Camera(name, tuple(members), calibrate(pairs.among(members), options, seed)) for name, members in groups.items()
     ]
     if together:
-        cameras = _of_all_pairs(cameras, pairs, options)
+        cameras = _of_all_pairs(cameras, pairs, options) if split else _together(cameras, pairs, options)
     cameras = [replace(camera, found=_or_guess(camera, pairs)) for camera in cameras]
     return sorted(cameras, key=lambda camera: (-len(camera.photos), camera.name))
 

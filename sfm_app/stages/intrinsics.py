@@ -18,7 +18,11 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
     options = run.settings.calibration
     calibrator = run.plugins.calibrator(options.calibrator)
     pairs = photo_pairs(list(matches.images.values()), matches, views)
-    cameras = calibrate_photo_set(pairs, calibrator.calibrate, options, run.seed, together=calibrator.together)
+    # a group that the user made is not split
+    split = run.settings.photos.cameras == "auto"
+    cameras = calibrate_photo_set(
+        pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split
+    )
     intrinsics = Intrinsics(
         cameras={camera.name: explained(camera, views) for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},

@@ -123,3 +123,17 @@ def test_every_photo_has_one_camera_and_every_camera_one_name(shots):
     found = cameras_of(made.as_set(["one"] * 7 + ["one #2"]))
     assert sorted(photo for camera in found for photo in camera.photos) == list(range(8))
     assert sorted(camera.name for camera in found) == ["one", "one #2", "one #3"]
+
+
+def test_a_group_that_the_user_made_is_not_split(shots):
+    made = shots(8, 1, focal=[1000.0] * 4 + [1500.0] * 4, points=250)
+    ids = sorted({photo for pair in made.pairs.photos for photo in pair})
+    pairs = PhotoPairs(
+        made.pairs.Fs, made.pairs.weights, made.pairs.photos, made.pairs.inliers,
+        dict.fromkeys(ids, made.pairs.size), dict.fromkeys(ids, "one"),
+    )  # fmt: skip
+    by_split = {
+        split: calibrate_photo_set(pairs, calibrate, OPTIONS, 0, together=True, split=split) for split in (True, False)
+    }
+    assert [len(camera.photos) for camera in by_split[True]] == [4, 4]
+    assert [len(camera.photos) for camera in by_split[False]] == [8]
