@@ -141,11 +141,17 @@ def test_the_literal_methods_are_one_flag_away(rendered, tmp_path):
     assert not (tmp_path / "out" / "dense").exists()
 
 
+def heed_interrupts():
+    """Shells start background jobs with SIGINT ignored, and children inherit that."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_an_interrupted_run_says_so_and_goes_on(rendered, tmp_path):
     command = [sys.executable, "-m", "sfm_app", "run", str(rendered[0]), "-o", str(tmp_path / "out"), "-q"]
     command += ["--quality", "draft"]
     # a run to the end: what is asked of it must not be done before the signal comes, however busy the machine is
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "preexec_fn": heed_interrupts}
+    with subprocess.Popen(command, **options) as process:
         while not (tmp_path / "out" / "database.db").exists() and process.poll() is None:
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)
