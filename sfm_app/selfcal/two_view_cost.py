@@ -79,10 +79,10 @@ def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
 
 
 @kernel
-def pair_costs(
-    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
+def distances(
+    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray
 ) -> FloatArray:
-    """(P,) half the sum over the matches of a pair of their robust squared distances, in sigma^2.
+    """(M,) Sampson distances with sign, in the units of the matches.
 
     Args:
         matches: (M, 4) of all pairs, one after the other.
@@ -90,28 +90,7 @@ def pair_costs(
         thetas: (C, 5) parameters of the cameras.
         cameras: (P, 2) camera of view 1 and of view 2.
         poses: (P, 12), see `essential`.
-        sigma: standard deviation of a distance.
     """
-    E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
-    p, q = np.empty(7), np.empty(7)
-    costs = np.zeros(len(poses))
-    for k in range(len(poses)):
-        essential(poses[k], E)
-        camera_of(thetas[cameras[k, 0]], first)
-        camera_of(thetas[cameras[k, 1]], second)
-        for i in range(ends[k], ends[k + 1]):
-            ray(matches[i, 0], matches[i, 1], first, -1.0, p)
-            ray(matches[i, 2], matches[i, 3], second, -1.0, q)
-            r2 = (_distance(p, q, E) / sigma) ** 2
-            costs[k] += 0.5 * r2 / (1.0 + r2 / REACH**2) if r2 < HOPELESS else 0.5 * REACH**2
-    return costs
-
-
-@kernel
-def distances(
-    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray
-) -> FloatArray:
-    """(M,) Sampson distances with sign, in the units of the matches; arguments as in `pair_costs`."""
     E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
     p, q = np.empty(7), np.empty(7)
     found = np.empty(len(matches))
@@ -127,12 +106,29 @@ def distances(
 
 
 @kernel
+def pair_costs(
+    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
+) -> FloatArray:
+    """(P,) half the sum over the matches of a pair of their robust squared distances, in sigma^2.
+
+    Arguments as in `distances`; sigma is the standard deviation of one.
+    """
+    found = distances(matches, ends, thetas, cameras, poses)
+    costs = np.zeros(len(poses))
+    for k in range(len(poses)):
+        for i in range(ends[k], ends[k + 1]):
+            r2 = (found[i] / sigma) ** 2
+            costs[k] += 0.5 * r2 / (1.0 + r2 / REACH**2) if r2 < HOPELESS else 0.5 * REACH**2
+    return costs
+
+
+@kernel
 def pair_systems(
     matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
 ) -> tuple[FloatArray, FloatArray]:
     """Gauss-Newton systems of all pairs in their fifteen parameters: camera 1, camera 2, pose.
 
-    Arguments as in `pair_costs`.
+    Arguments as in `distances`; sigma is the standard deviation of one.
 
     Returns:
         (P, 15, 15) approximate Hessians of the costs and (P, 15) their negative gradients; where both views are of one
