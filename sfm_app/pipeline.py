@@ -67,7 +67,7 @@ STAGES = (
         load=lambda _, run: load_intrinsics(run),
     ),
     Stage(
-        "scene", ("photos", "match_graph", "view_graph", "intrinsics"), ("scene", "seed"), ("sparse",),
+        "scene", ("photos", "match_graph", "view_graph", "intrinsics"), ("scene", "epipolar", "seed"), ("sparse",),
         make=lambda products, run: reconstruct_scene(
             products("match_graph"), products("view_graph"), products("intrinsics"), run
         ),

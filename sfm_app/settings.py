@@ -75,6 +75,10 @@ class CalibrationSettings(Section):
 class SceneSettings(Section):
     """Poses, sparse points and bundle adjustment."""
 
+    mapper: Literal["auto", "incremental", "global"] = Field(
+        "auto",
+        description="incremental: photo after photo from a seed; global: all at once; auto: the one that explains more",
+    )
     seed_pairs: int = Field(5, ge=1, le=100, description="most seed pairs that are tried")
     min_seed_angle_deg: float = Field(
         2.0, gt=0, le=90, description="least median triangulation angle of a seed pair, in degrees"

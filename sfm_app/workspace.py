@@ -60,6 +60,11 @@ class Workspace:
         return self.root / "sparse"
 
     @property
+    def other_models(self) -> Path:
+        """COLMAP models of photos that do not hang together with the main one, numbered from 1."""
+        return self.root / "other_models"
+
+    @property
     def dense(self) -> Path:
         return self.root / "dense"
 

@@ -11,13 +11,32 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.geometry.camera import guessed_camera_matrix
-from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchedImage, MatchGraph, PairId, PhotoSet
+from sfm_app.geometry.epipolar import cross_matrix
+from sfm_app.types import (
+    Calibration,
+    EpipolarFit,
+    Intrinsics,
+    MatchedImage,
+    MatchGraph,
+    PairId,
+    PhotoSet,
+    PoseGraph,
+    RelativePose,
+)  # fmt: skip
 
 SQUARE_PIXELS = "SIMPLE_RADIAL"
 """f, cx, cy, k: what is mapped with where K has one focal; a second radial term runs wild on the first few photos."""
 
 TWO_FOCALS = "OPENCV"
 """fx, fy, cx, cy, k1, k2, p1, p2: COLMAP's smallest model that holds a camera matrix with two focals and a lens."""
+
+KINDS = {
+    "calibrated": "CALIBRATED",
+    "uncalibrated": "UNCALIBRATED",
+    "planar": "PLANAR",
+    "rotation": "PANORAMIC",
+}
+"""COLMAP's names for the kinds of relative poses."""
 
 SQUARE_WITHIN = 0.005
 """fy/fx of square pixels: calibrators leave it this near to 1 where the photos do not ask for more."""
@@ -59,8 +78,8 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
             images[entry.image_id] = MatchedImage(
                 entry.image_id, photo.name, photo.group, photo.width, photo.height, photo.exif_focal_px
             )
-            found = database.read_keypoints(entry.image_id)
-            keypoints[entry.image_id] = np.asarray(found, np.float64).reshape(len(found), -1)[:, :2].copy()
+            found = np.asarray(database.read_keypoints(entry.image_id), np.float64)
+            keypoints[entry.image_id] = found[:, :2].copy() if len(found) else np.empty((0, 2))
         pair_ids, rows = database.read_all_matches()
     matches = {_pair(pair_id): np.asarray(row, np.uint32) for pair_id, row in zip(pair_ids, rows, strict=True)}
     return MatchGraph(images, keypoints, dict(sorted(matches.items())))
@@ -72,6 +91,14 @@ def write_epipolar_fits(path: Path, matches: MatchGraph, fits: Mapping[PairId, E
         database.clear_two_view_geometries()
         for pair, fit in fits.items():
             database.write_two_view_geometry(*pair, _two_view_geometry(fit, matches.matches[pair]))
+
+
+def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
+    """Replace all two-view geometries by our relative poses, with the essential matrices they stand for."""
+    with opened(path) as database, pycolmap.DatabaseTransaction(database):
+        database.clear_two_view_geometries()
+        for pair, pose in graph.poses.items():
+            database.write_two_view_geometry(*pair, _posed_geometry(pose, matches.matches[pair]))
 
 
 def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) -> None:
@@ -144,4 +171,14 @@ def _two_view_geometry(fit: EpipolarFit, matches: NDArray[np.uint32]) -> Any:
     geometry.config = kinds.PLANAR_OR_PANORAMIC if fit.degeneracy else kinds.UNCALIBRATED
     geometry.F = fit.F
     geometry.inlier_matches = np.ascontiguousarray(matches[fit.inliers])
+    return geometry
+
+
+def _posed_geometry(pose: RelativePose, matches: NDArray[np.uint32]) -> Any:
+    geometry = pycolmap.TwoViewGeometry()
+    geometry.config = getattr(pycolmap.TwoViewGeometryConfiguration, KINDS[pose.kind])
+    geometry.E = cross_matrix(pose.t) @ pose.R
+    geometry.cam2_from_cam1 = pycolmap.Rigid3d(pycolmap.Rotation3d(pose.R), pose.t)
+    geometry.tri_angle = float(np.radians(pose.angle_deg))
+    geometry.inlier_matches = np.ascontiguousarray(matches[pose.inliers])
     return geometry

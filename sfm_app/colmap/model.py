@@ -1,6 +1,7 @@
 """COLMAP's sparse model: built from our two-view seed, turned upright, and read for the summary."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,59 @@ def model_from_seed(database: Path, pair: PairId, matches: NDArray[np.uint32], s
     return model
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedView:
+    """A photo with a place, and what its keypoints see."""
+
+    R: NDArray[np.float64]
+    """(3, 3) rotation from the world."""
+    t: NDArray[np.float64]
+    """(3,)"""
+    rays: NDArray[np.float64]
+    """(N, 2) keypoints on the plane z = 1."""
+    focals: NDArray[np.float64]
+    """(2,) fx, fy in pixels."""
+
+
+def placed_views(model: Any, keypoints: Mapping[int, NDArray[np.float64]]) -> dict[int, PlacedView]:
+    """All photos of a model that have a pose, by id."""
+    found = {}
+    for image in _posed(model):
+        camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
+        rays = np.asarray(camera.cam_from_img(keypoints[image.image_id]), np.float64).reshape(-1, 2)
+        focals = np.diag(camera.calibration_matrix())[:2].copy()
+        found[image.image_id] = PlacedView(pose[:, :3].copy(), pose[:, 3].copy(), rays, focals)
+    return found
+
+
+def photos_of(model: Any) -> list[int]:
+    """Ids of the photos of a model that have a pose, in order."""
+    return [image.image_id for image in _posed(model)]
+
+
+def cameras_of(model: Any) -> dict[int, tuple[NDArray[np.float64], float]]:
+    """By photo with a pose: K (3, 3) and the first radial term of its camera."""
+    found = {}
+    for image in _posed(model):
+        camera = model.cameras[image.camera_id]
+        radial = float(camera.params[camera.extra_params_idxs()[0]])
+        found[image.image_id] = np.asarray(camera.calibration_matrix(), np.float64), radial
+    return found
+
+
+def part_of(model: Any, photos: Sequence[int]) -> Any:
+    """A copy of a model with these photos only, and the points that at least two of them see."""
+    part, members = pycolmap.Reconstruction(model), set(photos)
+    for image in _posed(model):
+        if image.image_id not in members:
+            part.deregister_frame(image.frame_id)
+    return part
+
+
+def _posed(model: Any) -> list[Any]:
+    return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.image_id)
+
+
 def turn_upright(model: Any) -> None:
     """Put the model into the frame that glTF viewers expect: y up, seen from +z, centred, of size about 1.
 
@@ -59,7 +113,7 @@ def turn_upright(model: Any) -> None:
 def read_scene(model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str]) -> Scene:
     """What the rest of the program needs to know about a model on disk; `names` gives the camera by photo."""
     model = pycolmap.Reconstruction(model_dir)
-    posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.image_id)
+    posed = _posed(model)
     cameras = {names[image.name]: _camera(model.cameras[image.camera_id]) for image in posed}
     return Scene(
         model_dir=model_dir,

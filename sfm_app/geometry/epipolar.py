@@ -64,7 +64,8 @@ def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) 
     design = (h2[:, :, None] * h1[:, None, :]).reshape(-1, 9)
     if weights is not None:
         design *= np.sqrt(np.asarray(weights, dtype=np.float64))[:, None]
-    F = np.linalg.svd(design, full_matrices=True)[2][8].reshape(3, 3)
+    # all of V is wanted, but not all of U, which is as large as the number of matches squared
+    F = np.linalg.svd(design, full_matrices=len(design) < 9)[2][8].reshape(3, 3)
     return unit_norm(T2.T @ nearest_rank_two(F) @ T1)
 
 

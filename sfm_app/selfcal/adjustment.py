@@ -13,7 +13,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.selfcal.two_view_cost import CAMERA, POSE, distances, moved, pair_costs, pair_systems
+from sfm_app.geometry.pose_steps import POSE, moved
+from sfm_app.selfcal.two_view_cost import CAMERA, distances, pair_costs, pair_systems
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -53,7 +54,7 @@ class State:
     thetas: FloatArray
     """(C, 5) parameters of the cameras, see `lens`."""
     poses: FloatArray
-    """(P, 12), see `two_view_cost.essential`."""
+    """(P, 12), see `pose_steps.essential`."""
     weights: FloatArray
     """(P,) in [0, 1]: how well a pair agrees with the others."""
     sigma: float

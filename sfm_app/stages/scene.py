@@ -1,173 +1,87 @@
 """scene: ViewGraph and Intrinsics -> Scene."""
 
 import shutil
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.bundle import adjust
-from sfm_app.colmap.mapping import PhotoCounter, continue_mapping
-from sfm_app.colmap.model import model_from_seed, read_scene, turn_upright
+from sfm_app.colmap.model import photos_of, read_scene, turn_upright
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
-from sfm_app.geometry.camera import rays
-from sfm_app.geometry.epipolar import eight_point
-from sfm_app.geometry.seed import TwoViewSeed, two_view_seed
-from sfm_app.ransac.refit import refine_sampson
-from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchGraph, PairId, PhotoSet, Scene, ViewGraph
-
-RANKED_PAIRS = 60
-"""Pairs with most inliers that are looked at as seeds."""
-
-ENOUGH = 0.9
-"""A model with this share of the photos that hang together with its seed ends the search for a better seed."""
-
-DISSENT = 0.1
-"""What counts of a seed whose pair contradicts the camera matrix that other pairs agree on."""
-
-CONFIRMED = 0.5
-"""So does this share when two seeds agree on how many photos can be placed."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
-    """A pair of photos that mapping may start from."""
-
-    pair: PairId
-    fit: EpipolarFit
-    seed: TwoViewSeed
-    score: float
-    """What the seed promises, times how well the pair agrees with K."""
-
-
-def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
-    """Start mapping from our own pose and points of the best pair; when it fails, from the next best.
-
-    Raises:
-        ReconstructionError: no seed grows into a model; says what was seen.
-    """
-    candidates = rank_seeds(matches, views, intrinsics, run)
-    best, tried = best_model(candidates, matches, views, run)
-    if best is None:
-        raise ReconstructionError(nothing_found(views, candidates, tried), hint=HINT)
-    with backend("adjusting the bundle"):
-        best, deviations = adjust(best, run.workspace.database)
-        turn_upright(best)
-    write_model(best, run)
-    names = {image.name: intrinsics.name_of(image) for image in matches.images.values()}
-    scene = read_scene(run.workspace.sparse, names, left_out(best, matches, views))
-    run.record(
-        registered=len(scene.registered),
-        of=len(matches.images),
-        unregistered=dict(scene.unregistered),
-        points=scene.points,
-        observations=scene.observations,
-        mean_reprojection_px=round(scene.mean_reprojection_px, 4),
-        cameras={name: {"model": camera.model, "params": camera.params} for name, camera in scene.cameras.items()},
-        deviations_px={name: round(value, 4) for name, value in deviations.items()},
-        seeds_tried=tried,
-    )
-    return scene
-
+from sfm_app.reconstruction import Outcome, reconstruct
+from sfm_app.reconstruction.left_out import left_out, names_of, nothing_found
+from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
 
 HINT = "photos that overlap more, from places a step or two apart (turning on the spot is not enough), may help"
 
 
-def rank_seeds(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> list[Candidate]:
-    """Pairs that can start a mapping, best first: many points, wide angle, nothing degenerate, in accord with K."""
+def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
+    """Map the photos and adjust everything; the largest model goes on, the others are kept beside it.
 
-    def examine(pair: PairId) -> Candidate:
-        cameras = [intrinsics.camera(matches.images[key]) for key in pair]
-        seed = seed_of(matches, views.fits[pair], pair, cameras)
-        return Candidate(pair, views.fits[pair], seed, seed.score * agreement(pair, cameras))
-
-    firm = [pair for pair, fit in views.fits.items() if not fit.degeneracy] or list(views.fits)
-    firm.sort(key=lambda pair: (-views.fits[pair].inlier_count, pair))
-    found = run.map(examine, firm[:RANKED_PAIRS], "seed pairs")
-    least = run.settings.scene.min_seed_angle_deg
-    wide = [candidate for candidate in found if candidate.seed.angle_deg >= least and candidate.seed.usable.sum() >= 8]
-    return sorted(wide, key=lambda candidate: (-candidate.score, candidate.pair))
-
-
-def seed_of(matches: MatchGraph, fit: EpipolarFit, pair: PairId, cameras: Sequence[Calibration]) -> TwoViewSeed:
-    """Pose and points of a pair; where there is a lens, from its inliers as they were without it."""
-    first, second = cameras
-    x1, x2 = (
-        rays(x[fit.inliers], camera.K, camera.radial) for x, camera in zip(matches.points(pair), cameras, strict=True)
+    Raises:
+        ReconstructionError: no pair of photos grows into a model; says what was seen.
+    """
+    outcome = reconstruct(matches, views, intrinsics, run)
+    if not outcome.models:
+        raise ReconstructionError(nothing_found(views, outcome.graph, outcome.tried), hint=HINT)
+    with backend("adjusting the bundle"):
+        adjusted = [adjust(attempt.model, run.workspace.database) for attempt in outcome.models]
+        for model, _ in adjusted:
+            turn_upright(model)
+    models = [model for model, _ in adjusted]
+    write_models(models, run)
+    members = [photos_of(model) for model in models]
+    reasons = left_out(set(members[0]), members[1:], matches, views, outcome.graph)
+    names = {image.name: intrinsics.name_of(image) for image in matches.images.values()}
+    scene = read_scene(run.workspace.sparse, names, reasons)
+    run.record(
+        registered=len(scene.registered),
+        of=len(matches.images),
+        unregistered=dict(scene.unregistered),
+        other_models=[names_of(photos, matches) for photos in members[1:]],
+        points=scene.points,
+        observations=scene.observations,
+        mean_reprojection_px=round(scene.mean_reprojection_px, 4),
+        cameras={name: {"model": camera.model, "params": camera.params} for name, camera in scene.cameras.items()},
+        deviations_px={name: round(value, 4) for name, value in adjusted[0][1].items()},
+        **how_it_was_made(outcome),
     )
-    E = second.K.T @ fit.F @ first.K
-    if first.radial or second.radial:
-        E = refine_sampson(np.asfortranarray(np.hstack([x1, x2])), eight_point(x1, x2))
-    return two_view_seed(E, x1, x2)
+    return scene
 
 
-def agreement(pair: PairId, cameras: Sequence[Calibration]) -> float:
-    """1 for a pair that agrees with the camera its consensus found, little for one that does not."""
-    first, second = cameras
-    unknown = first is not second or not first.key_pairs
-    return 1.0 if unknown or pair in first.key_pairs else DISSENT
+def how_it_was_made(outcome: Outcome) -> dict[str, Any]:
+    """What the manifest says about relative poses and mapping."""
+    poses, main = outcome.graph.poses.values(), outcome.models[0]
+    dropped = list(outcome.graph.dropped.values())
+    kinds = [pose.kind for pose in poses]
+    return {
+        "mapper": main.mapper,
+        "tried": list(outcome.tried),
+        "passes": outcome.passes,
+        "explained_matches": sum(pair.matches for pair in main.explained.values()),
+        "contradicted_matches": sum(pair.contradicted for pair in main.explained.values()),
+        "cut_apart": list(outcome.cuts),
+        "pairs": {kind: kinds.count(kind) for kind in sorted(set(kinds))}
+        | {"found with the help of others": sum(pose.guided for pose in poses)},
+        "pairs_dropped": {reason: dropped.count(reason) for reason in sorted(set(dropped))},
+    }
 
 
-def best_model(
-    candidates: list[Candidate], matches: MatchGraph, views: ViewGraph, run: RunContext
-) -> tuple[Any | None, list[str]]:
-    """The model with most photos that the best seeds grow into, and what each of them gave."""
-    tried: list[str] = []
-    best, most = None, 0
-    for candidate in candidates[: run.settings.scene.seed_pairs]:
-        model = grow(candidate, matches, run)
-        found = model.num_reg_images() if model else 0
-        tried.append(f"{_names(candidate.pair, matches)}: {found} photos")
-        reachable = len(connected(candidate.pair, views))
-        agreed = found == most and found >= CONFIRMED * reachable
-        if found > most:
-            best, most = model, found
-        if agreed or found >= ENOUGH * reachable:
-            break
-    return best, tried
-
-
-def grow(candidate: Candidate, matches: MatchGraph, run: RunContext) -> Any | None:
-    """Map on from one seed; None when the model stays without enough points."""
+def write_models(models: list[Any], run: RunContext) -> None:
+    """Put the main model into OUT/sparse and the others into OUT/other_models/1, 2, ..., each as a whole."""
     place = run.workspace
-    with backend("mapping photos"):
-        rows = matches.matches[candidate.pair][candidate.fit.inliers]
-        start = model_from_seed(place.database, candidate.pair, rows, candidate.seed)
-        counter = PhotoCounter(run.progress, len(matches.images))
-        try:
-            scratch = place.root / ".mapping"
-            model = continue_mapping(place.database, place.photos, start, scratch, run.seed, counter)
-        finally:
-            run.progress.finish()
-    enough = model is not None and model.num_points3D() >= run.settings.scene.min_points and model.num_reg_images() > 1
-    return model if enough else None
+    shutil.rmtree(place.other_models, ignore_errors=True)
+    for number, model in enumerate(models[1:], start=1):
+        write_model(model, place.other_models / str(number))
+    write_model(models[0], place.sparse)
 
 
-def connected(pair: PairId, views: ViewGraph) -> set[int]:
-    """Ids of all photos that hang together with a pair through accepted pairs."""
-    reached = set(pair)
-    while True:
-        more = {key for edge in views.fits for key in edge if not reached.isdisjoint(edge)} - reached
-        if not more:
-            return reached
-        reached |= more
-
-
-def left_out(model: Any, matches: MatchGraph, views: ViewGraph) -> dict[str, str]:
-    """Why each photo without a pose has none."""
-    posed = {image.image_id for image in model.images.values() if image.has_pose}
-    return {image.name: _reason(image.id, posed, views) for image in matches.images.values() if image.id not in posed}
-
-
-def write_model(model: Any, run: RunContext) -> None:
-    """Put the model into OUT/sparse as a whole."""
-    target = run.workspace.sparse
-    beside = target.with_name(".sparse")
+def write_model(model: Any, target: Path) -> None:
+    """Put a model into a folder as a whole."""
+    beside = target.with_name(f".{target.name}")
     shutil.rmtree(beside, ignore_errors=True)
-    beside.mkdir()
+    beside.mkdir(parents=True)
     with backend("writing the sparse model"):
         model.write(beside)
     shutil.rmtree(target, ignore_errors=True)
@@ -181,37 +95,3 @@ def load_scene(photos: PhotoSet, intrinsics: Intrinsics, run: RunContext) -> Sce
     with backend("reading the sparse model"):
         unregistered = record.counts.get("unregistered", {}) if record else {}
         return read_scene(run.workspace.sparse, names, unregistered)
-
-
-def nothing_found(views: ViewGraph, candidates: list[Candidate], tried: list[str]) -> str:
-    """What was seen, in one line."""
-    inliers = sorted(fit.inlier_count for fit in views.fits.values())
-    degenerate = sum(bool(fit.degeneracy) for fit in views.fits.values())
-    parts = [
-        f"{len(views.fits)} pairs with {inliers[0]} to {inliers[-1]} inliers",
-        f"{degenerate} of them planar, on one line, or without parallax" if degenerate else "",
-        *(f"{count} pairs rejected: {reason}" for reason, count in views.reasons.items()),
-        "" if candidates else "no pair has parallax enough to start from",
-        "; ".join(tried),
-    ]
-    return "no pair of photos grows into a model: " + ", ".join(filter(None, parts))
-
-
-def _names(pair: PairId, matches: MatchGraph) -> str:
-    return " + ".join(matches.images[key].name for key in pair)
-
-
-def _reason(image_id: int, posed: set[int], views: ViewGraph) -> str:
-    edges = list(_edges(image_id, views))
-    to_posed = [count for other, count in edges if other in posed]
-    if to_posed:
-        return f"could not be placed: at most {max(to_posed)} inliers with a photo that was"
-    if edges:
-        return "shares inliers only with photos that have no place either"
-    return "shares no scene with any other photo"
-
-
-def _edges(image_id: int, views: ViewGraph) -> Iterator[tuple[int, int]]:
-    for pair, fit in views.fits.items():
-        if image_id in pair:
-            yield pair[pair[0] == image_id], int(np.count_nonzero(fit.inliers))

@@ -13,6 +13,7 @@ from sfm_app.types.camera_pairs import CameraPairs, PhotoPairs
 from sfm_app.types.epipolar import EpipolarFit, Rejected, ViewGraph
 from sfm_app.types.matches import MatchedImage, MatchGraph, PairId
 from sfm_app.types.photos import Photo, PhotoSet, UnusablePhoto
+from sfm_app.types.pose_graph import PoseGraph, RelativePose
 from sfm_app.types.scene import CameraModel, Scene
 from sfm_app.types.surface import Surface
 
@@ -28,7 +29,9 @@ __all__ = [
     "Photo",
     "PhotoPairs",
     "PhotoSet",
+    "PoseGraph",
     "Rejected",
+    "RelativePose",
     "Scene",
     "Surface",
     "UnusablePhoto",

@@ -6,8 +6,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from sfm_app.geometry.distances import sampson_distance
+from sfm_app.geometry.pose_steps import essential, moved
 from sfm_app.selfcal.lens import straightened
-from sfm_app.selfcal.two_view_cost import REACH, distances, essential, moved, pair_costs, pair_systems
+from sfm_app.selfcal.two_view_cost import REACH, distances, pair_costs, pair_systems
 
 SIGMA = 2e-3
 THETAS = np.array([[0.1, 0.02, -0.03, 0.05, -0.08], [0.3, -0.04, 0.01, -0.1, 0.05]])

@@ -1,0 +1,118 @@
+"""The pose graph: relative poses of pairs that agree with each other."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.posegraph.guided import guided_pose
+from sfm_app.posegraph.pair_pose import Pair, estimated
+from sfm_app.posegraph.rotations import average_rotations
+from sfm_app.types import EpipolarFit, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
+
+FloatArray = NDArray[np.float64]
+Map = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
+"""Results of a function in the order of its arguments, computed in parallel; the text labels a progress bar."""
+
+LEAST_IN_FRONT = 0.75
+"""A pair with a smaller share of its inliers before both cameras has a wrong pose, or matches that are."""
+LEAST_AGREEMENT_DEG = 5.0
+"""A pair may be this far from the rotations of its photos, or four times as far as most are, which is more where
+cameras are guesses."""
+SPREADS = 4.0
+ENOUGH = 100.0
+"""From so many inliers on, more of them make a pair hardly more believable."""
+CONTRADICTS, BEHIND, TOO_FEW = "contradicts other pairs", "points behind a camera", "too few matches fit the cameras"
+
+
+@dataclass(frozen=True, slots=True)
+class PoseGraphOptions:
+    """How pairs are judged."""
+
+    max_error_px: float
+    """Largest Sampson distance of an inlier."""
+    min_inliers: int
+    """A pair with fewer is dropped."""
+    seed: int
+    """Of the run."""
+
+
+def build_pose_graph(
+    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, options: PoseGraphOptions, run_map: Map
+) -> PoseGraph:
+    """Relative poses of all pairs, without those that contradict the others, with those that the others bear out.
+
+    Args:
+        matches: keypoints and raw matches.
+        views: fundamental matrices.
+        intrinsics: cameras.
+        options: see there.
+        run_map: computes pairs in parallel.
+    """
+
+    def pair_of(pair: PairId) -> Pair:
+        cameras = [intrinsics.camera(matches.images[photo]) for photo in pair]
+        return Pair(matches.points(pair), cameras, options.max_error_px)
+
+    def from_fit(item: tuple[PairId, EpipolarFit]) -> RelativePose | None:
+        return estimated(pair_of(item[0]), item[1])
+
+    found = dict(zip(views.fits, run_map(from_fit, list(views.fits.items()), "relative poses"), strict=True))
+    poses, dropped = _plausible(found, options.min_inliers)
+    rotations, angles = averaged(poses)
+    limit = max(LEAST_AGREEMENT_DEG, SPREADS * float(np.median(list(angles.values()) or [0.0])))
+    for pair in [pair for pair, angle in angles.items() if angle > limit]:
+        dropped[pair] = CONTRADICTS
+        del poses[pair]
+
+    def again(pair: PairId) -> RelativePose | None:
+        seed = int(np.random.SeedSequence([options.seed, *pair]).generate_state(1)[0])
+        known = pair_of(pair)
+        R = rotations[pair[1]] @ rotations[pair[0]].T
+        return guided_pose(known, R, options.min_inliers, seed) if known.trusted else None
+
+    group = {photo: number for number, photos in enumerate(_groups(poses)) for photo in photos}
+    left = [pair for pair in matches.matches if pair not in poses and group.get(pair[0], -1) == group.get(pair[1], -2)]
+    for pair, pose in zip(left, run_map(again, left, "pairs again"), strict=True):
+        if pose is not None:
+            poses[pair] = pose
+            dropped.pop(pair, None)
+    poses = dict(sorted(poses.items()))
+    return PoseGraph(poses, dropped, averaged(poses)[0], _groups(poses))
+
+
+def averaged(poses: Mapping[PairId, RelativePose]) -> tuple[dict[int, FloatArray], dict[PairId, float]]:
+    """Rotations of photos, and how far pairs are from them, with pairs counting by their inliers."""
+    weights = {pair: pose.inlier_count / (1.0 + pose.inlier_count / ENOUGH) for pair, pose in poses.items()}
+    return average_rotations({pair: pose.R for pair, pose in poses.items()}, weights)
+
+
+def connected(pairs: Iterable[PairId]) -> list[set[int]]:
+    """Photos that hang together through pairs."""
+    groups: list[set[int]] = []
+    for pair in pairs:
+        joined = set(pair).union(*(group for group in groups if not group.isdisjoint(pair)))
+        groups = [*(group for group in groups if group.isdisjoint(pair)), joined]
+    return groups
+
+
+def _plausible(
+    found: Mapping[PairId, RelativePose | None], min_inliers: int
+) -> tuple[dict[PairId, RelativePose], dict[PairId, str]]:
+    poses, dropped = {}, {}
+    for pair, pose in found.items():
+        if pose is None or pose.inlier_count < min_inliers:
+            dropped[pair] = TOO_FEW
+        elif pose.in_front < LEAST_IN_FRONT and pose.kind != "rotation":
+            dropped[pair] = BEHIND
+        else:
+            poses[pair] = pose
+    return poses, dropped
+
+
+def _groups(poses: Mapping[PairId, RelativePose]) -> tuple[tuple[int, ...], ...]:
+    groups = [tuple(sorted(group)) for group in connected(poses)]
+    inliers = {group: sum(p.inlier_count for pair, p in poses.items() if pair[0] in group) for group in groups}
+    return tuple(sorted(groups, key=lambda group: (-len(group), -inliers[group], group)))

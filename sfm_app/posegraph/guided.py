@@ -1,0 +1,67 @@
+"""Matches looked at again with what the other pairs know: the rotation is given, only the direction is sought.
+
+F of few matches on a facade catches whatever lies right by accident. With the rotation known from loops of other pairs
+two matches fix the direction, and what agrees then is the scene.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sfm_app.posegraph.pair_pose import Pair, in_front
+from sfm_app.posegraph.refine import pose_distances, refined
+from sfm_app.types import RelativePose
+
+FloatArray = NDArray[np.float64]
+
+SAMPLES = 200
+NEAR = 3.0
+"""While the rotation is that of others, matches count within this many thresholds."""
+LEAST_IN_FRONT, MOST_TURN_DEG = 0.95, 2.0
+"""A pose found so is believed when that much of it lies before both cameras and it kept the rotation it was given."""
+
+
+def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> RelativePose | None:
+    """The pose of a pair whose rotation is known; None where its matches do not bear it out.
+
+    Args:
+        pair: matches and cameras.
+        R: (3, 3) rotation of view 2 from view 1, as all other pairs have it.
+        min_inliers: a pose with fewer is none.
+        seed: of the sampling.
+    """
+    if len(pair.rays) < min_inliers:
+        return None
+    t = sampled_direction(pair, R, np.random.default_rng(seed))
+    if t is None:
+        return None
+    near = pose_distances(pair.rays, pair.focals, R, t) <= NEAR * pair.max_error_px
+    if np.count_nonzero(near) < min_inliers:
+        return None
+    turned, t = refined(pair.rays[near], pair.focals, R, t)
+    inliers = pair.inliers(turned, t)
+    found = pair.pose(turned, t, inliers, guided=True)
+    turn_deg = float(np.degrees(Rotation.from_matrix(R.T @ turned).magnitude()))
+    firm = found.inlier_count >= min_inliers and found.in_front >= LEAST_IN_FRONT and turn_deg <= MOST_TURN_DEG
+    return found if firm and found.kind != "rotation" else None
+
+
+def sampled_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> FloatArray | None:
+    """(3,) direction of translation that most matches agree with, R given: the best of many through two matches."""
+    h1 = np.column_stack([pair.rays[:, :2], np.ones(len(pair.rays))]) @ R.T
+    h2 = np.column_stack([pair.rays[:, 2:], np.ones(len(pair.rays))])
+    normals = np.cross(h1, h2)
+    picks = rng.integers(len(normals), size=(SAMPLES, 2))
+    found = np.cross(normals[picks[:, 0]], normals[picks[:, 1]])
+    lengths = np.linalg.norm(found, axis=1)
+    best, lowest = None, np.inf
+    for t in found[lengths > 1e-12] / lengths[lengths > 1e-12, None]:
+        distances = pose_distances(pair.rays, pair.focals, R, t) / pair.max_error_px
+        cost = float(np.sum(distances**2 / (1.0 + distances**2)))
+        if cost < lowest:
+            best, lowest = np.asarray(t, np.float64), cost
+    if best is None:
+        return None
+    # t and -t have the same epipolar lines
+    front, behind = (np.count_nonzero(in_front(pair.rays, R, sign * best)) for sign in (1.0, -1.0))
+    return best if front >= behind else -best

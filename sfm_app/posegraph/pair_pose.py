@@ -1,0 +1,144 @@
+"""One pair of photos: from F and two cameras to a relative pose, and what kind of pair it is."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.camera import rays
+from sfm_app.geometry.epipolar import cross_matrix, eight_point
+from sfm_app.geometry.essential import decompose_essential, nearest_essential
+from sfm_app.posegraph.refine import pose_distances, refined
+from sfm_app.ransac.planes import OFF_PLANE, dominant_homography, transfer_distance
+from sfm_app.types import Calibration, EpipolarFit, RelativePose
+
+FloatArray = NDArray[np.float64]
+
+MANY = 0.95
+"""A pair is planar, or a rotation, when this share of its inliers says so."""
+SAMPLE = 200
+"""Points that choose among the four poses of an essential matrix."""
+LEAST = 8
+"""Inliers, below which a pair says nothing about its pose."""
+ROTATION_ROUNDS = 10
+
+
+class Pair:
+    """The matches of a pair, seen through its cameras.
+
+    Args:
+        points: x1, x2, each (M, 2) pixels: all matches of the pair.
+        cameras: of photo 1 and photo 2.
+        max_error_px: largest Sampson distance of an inlier.
+    """
+
+    def __init__(
+        self, points: tuple[FloatArray, FloatArray], cameras: Sequence[Calibration], max_error_px: float
+    ) -> None:
+        self.cameras = tuple(cameras)
+        self.rays = np.hstack([rays(x, c.K, c.radial) for x, c in zip(points, cameras, strict=True)])
+        self.focals = np.concatenate([np.diag(camera.K)[:2] for camera in cameras])
+        self.max_error_px = max_error_px
+        self.trusted = all(camera.identifiable or camera.method == "exif" for camera in cameras)
+
+    def start(self, fit: EpipolarFit) -> tuple[FloatArray, FloatArray]:
+        """R and t as F and the cameras have them."""
+        first, second = self.cameras
+        inliers = self.rays[fit.inliers]
+        E = second.K.T @ fit.F @ first.K
+        if first.radial or second.radial:  # F knows no lens
+            E = eight_point(inliers[:, :2], inliers[:, 2:])
+        chosen = inliers[np.linspace(0, len(inliers) - 1, min(len(inliers), SAMPLE)).astype(np.int64)]
+        poses = decompose_essential(nearest_essential(E))
+        return max(poses, key=lambda pose: int(np.count_nonzero(in_front(chosen, *pose))))
+
+    def pose(self, R: FloatArray, t: FloatArray, inliers: NDArray[np.bool_], *, guided: bool = False) -> RelativePose:
+        """A pose with what its inliers say about it."""
+        used = self.rays[inliers]
+        front = in_front(used, R, t)
+        angles = ray_angles_deg(used[front], R)
+        return RelativePose(
+            R, t, inliers,
+            angle_deg=float(np.median(angles)) if len(angles) else 0.0,
+            in_front=float(front.mean()) if len(used) else 0.0,
+            kind=self.kind(used, R, t) if self.trusted else "uncalibrated",
+            guided=guided,
+        )  # fmt: skip
+
+    def inliers(self, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
+        """(M,) which matches lie within the threshold of a pose."""
+        return pose_distances(self.rays, self.focals, R, t) <= self.max_error_px
+
+    def kind(self, used: FloatArray, R: FloatArray, t: FloatArray) -> str:
+        """What the inliers of a pose are of: see `RelativePose.kind`."""
+        unit = float(self.focals.mean())
+        if np.mean(turn_distances(used, self.focals, R) <= OFF_PLANE * self.max_error_px) >= MANY:
+            return "rotation"
+        H = dominant_homography(np.asfortranarray(used), cross_matrix(t) @ R, self.max_error_px / unit)
+        off_plane = transfer_distance(H, used) > OFF_PLANE * self.max_error_px / unit
+        return "planar" if np.mean(off_plane) <= 1.0 - MANY else "calibrated"
+
+
+def estimated(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
+    """The relative pose behind a fundamental matrix; None where too few matches agree with any.
+
+    Where a camera is a guess, E is wrong by as much as the guess, and the inliers of F stay what they are.
+    """
+    R, t = pair.start(fit)
+    if not pair.trusted:
+        return pair.pose(R, t, fit.inliers)
+    R, t = refined(pair.rays[fit.inliers], pair.focals, R, t)
+    inliers = pair.inliers(R, t)
+    return pair.pose(R, t, inliers) if np.count_nonzero(inliers) >= LEAST else None
+
+
+def depths(used: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """(N,) depths along the rays of view 1 and view 2 of the points where they pass each other closest.
+
+    Args:
+        used: (N, 4) points of the plane z = 1, view 1 and view 2.
+        R: (3, 3) rotation of view 2 from view 1.
+        t: (3,) translation.
+    """
+    h1, h2 = _homogeneous(used[:, :2]) @ R.T, _homogeneous(used[:, 2:])
+    # least squares of d1 h1 + t = d2 h2
+    a, b, c = (h1 * h1).sum(1), (h1 * h2).sum(1), (h2 * h2).sum(1)
+    p, q = h1 @ t, h2 @ t
+    determinant = np.maximum(a * c - b * b, 1e-300)
+    return (b * q - c * p) / determinant, (a * q - b * p) / determinant
+
+
+def in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
+    """(N,) which points lie before both cameras; arguments as in `depths`."""
+    first, second = depths(used, R, t)
+    return (first > 0) & (second > 0)
+
+
+def ray_angles_deg(used: FloatArray, R: FloatArray) -> FloatArray:
+    """(N,) degrees between the two rays of each match: the triangulation angles, where t fits."""
+    h1, h2 = _homogeneous(used[:, :2]) @ R.T, _homogeneous(used[:, 2:])
+    sine = np.linalg.norm(np.cross(h1, h2), axis=1)
+    return np.asarray(np.degrees(np.arctan2(sine, (h1 * h2).sum(axis=1))), np.float64)
+
+
+def turn_distances(used: FloatArray, focals: FloatArray, R: FloatArray) -> FloatArray:
+    """(N,) pixels in view 2 between matches and what the rotation nearest to R that explains most of them predicts.
+
+    Rays are turned onto their partners (Kabsch), those that fit counting most.
+    """
+    h1, h2 = (_unit(_homogeneous(used[:, view : view + 2])) for view in (0, 2))
+    focal = float(focals.mean())
+    for _ in range(ROTATION_ROUNDS):
+        distances = focal * np.linalg.norm(h1 @ R.T - h2, axis=1)
+        weights = 1.0 / (1.0 + distances**2)
+        U, _, Vt = np.linalg.svd(np.einsum("ni,nj->ij", h2 * weights[:, None], h1))
+        R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return np.asarray(focal * np.linalg.norm(h1 @ R.T - h2, axis=1), np.float64)
+
+
+def _homogeneous(x: FloatArray) -> FloatArray:
+    return np.column_stack([x, np.ones(len(x))])
+
+
+def _unit(h: FloatArray) -> FloatArray:
+    return np.asarray(h / np.linalg.norm(h, axis=1, keepdims=True), np.float64)

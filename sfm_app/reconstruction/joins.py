@@ -1,0 +1,41 @@
+"""Parts of a model that hang together only against the evidence.
+
+Facades that look alike join places that are apart. Such a join rests on few matches and leaves many others
+unexplained: those of pairs that see the places as they are.
+"""
+
+from collections.abc import Iterable, Mapping
+
+from sfm_app.reconstruction.support import Explained
+from sfm_app.types import PairId
+
+LEAST_MATCHES = 16
+"""Matches, below which a pair holds nothing together."""
+
+
+def sound_parts(explained: Mapping[PairId, Explained], photos: Iterable[int]) -> list[tuple[int, ...]]:
+    """Photos in parts that more matches join than contradict, largest part first.
+
+    Pairs are taken strongest first; two parts become one when the matches between them that the model explains
+    outnumber the inliers of fundamental matrices between them that it does not.
+    """
+    part = {photo: frozenset([photo]) for photo in photos}
+    worth = {pair: found.matches - found.contradicted for pair, found in explained.items()}
+    for pair in sorted(worth, key=lambda pair: (-worth[pair], pair)):
+        first, second = part[pair[0]], part[pair[1]]
+        if first == second or worth[pair] < LEAST_MATCHES:
+            continue
+        between = sum(value for (a, b), value in worth.items() if _apart(a, b, first, second) and _counts(value))
+        if between > 0:
+            for photo in first | second:
+                part[photo] = first | second
+    parts = {tuple(sorted(members)) for members in part.values()}
+    return sorted(parts, key=lambda members: (-len(members), members))
+
+
+def _apart(a: int, b: int, first: frozenset[int], second: frozenset[int]) -> bool:
+    return (a in first and b in second) or (b in first and a in second)
+
+
+def _counts(worth: int) -> bool:
+    return abs(worth) >= LEAST_MATCHES

@@ -1,0 +1,67 @@
+"""Why photos have no place, and why there is no model at all."""
+
+from collections.abc import Iterator, Sequence
+
+from sfm_app.types import MatchGraph, PoseGraph, ViewGraph
+
+
+def left_out(
+    posed: set[int], others: Sequence[Sequence[int]], matches: MatchGraph, views: ViewGraph, graph: PoseGraph
+) -> dict[str, str]:
+    """The reason for every photo that the main model does not hold, by name.
+
+    Args:
+        posed: photos of the main model.
+        others: photos of the other models.
+        matches: all photos.
+        views: fundamental matrices.
+        graph: relative poses that agree with each other.
+    """
+    reasons = {}
+    for photo, image in matches.images.items():
+        if photo not in posed:
+            model = next((model for model in others if photo in model), None)
+            reasons[image.name] = (
+                f"belongs to another model, of {len(model)} photos" if model else _reason(photo, posed, views, graph)
+            )
+    return reasons
+
+
+def nothing_found(views: ViewGraph, graph: PoseGraph, tried: Sequence[str]) -> str:
+    """What was seen, in one line."""
+    inliers = sorted(fit.inlier_count for fit in views.fits.values())
+    degenerate = sum(bool(fit.degeneracy) for fit in views.fits.values())
+    turned = sum(pose.kind == "rotation" for pose in graph.poses.values())
+    parts = [
+        f"{len(views.fits)} pairs with {inliers[0]} to {inliers[-1]} inliers",
+        f"{degenerate} of them planar, on one line, or without parallax" if degenerate else "",
+        *(f"{count} pairs rejected: {reason}" for reason, count in views.reasons.items()),
+        f"{turned} pairs between which the camera only turned" if turned else "",
+        "" if tried else "no pair has parallax enough to start from",
+        "; ".join(tried),
+    ]
+    return "no pair of photos grows into a model: " + ", ".join(filter(None, parts))
+
+
+def _reason(photo: int, posed: set[int], views: ViewGraph, graph: PoseGraph) -> str:
+    edges = dict(_edges(photo, views))
+    to_posed = {other: count for other, count in edges.items() if other in posed}
+    if to_posed:
+        nearest = max(to_posed, key=lambda other: (to_posed[other], -other))
+        contradiction = graph.dropped.get((min(photo, nearest), max(photo, nearest)))
+        because = f", but that pair {contradiction}" if contradiction else ""
+        return f"could not be placed: {to_posed[nearest]} inliers with the nearest photo that was{because}"
+    return (
+        "shares inliers only with photos that have no place either" if edges else "shares no scene with any other photo"
+    )
+
+
+def _edges(photo: int, views: ViewGraph) -> Iterator[tuple[int, int]]:
+    for pair, fit in views.fits.items():
+        if photo in pair:
+            yield pair[pair[0] == photo], fit.inlier_count
+
+
+def names_of(photos: Sequence[int], matches: MatchGraph) -> list[str]:
+    """Names of photos."""
+    return [matches.images[photo].name for photo in photos]

@@ -1,0 +1,125 @@
+"""Map every group of photos; learn cameras from the model, and map again where that may help."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm_app.colmap.backend import backend
+from sfm_app.colmap.database import write_calibrations, write_pose_graph
+from sfm_app.colmap.model import cameras_of, part_of, photos_of
+from sfm_app.context import RunContext
+from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
+from sfm_app.reconstruction.attempts import Attempt, Group, attempts, better
+from sfm_app.reconstruction.joins import sound_parts
+from sfm_app.reconstruction.left_out import names_of
+from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
+
+LEARNED_FROM = 3
+"""Photos: fewer do not teach a camera, and in fewer no other group is mapped beside the main one."""
+MOVED = 0.01
+"""A focal that mapping moved by more than this share is worth a second look at the pairs."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """Models of all groups, before the last adjustment."""
+
+    models: tuple[Attempt, ...]
+    """The main one first."""
+    graph: PoseGraph
+    intrinsics: Intrinsics
+    """As the mapping had them."""
+    tried: tuple[str, ...]
+    """Every attempt, for people."""
+    cuts: tuple[str, ...] = ()
+    """What was taken apart because matches contradict the join."""
+    passes: int = 1
+
+    @property
+    def support(self) -> float:
+        """Of the main model; 0 without one."""
+        return self.models[0].support if self.models else 0.0
+
+
+def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:
+    """Models of all photos that hang together; none where no pair grows into one.
+
+    Where cameras were guesses, or photos of the main group stayed out, the cameras that mapping found are taken for a
+    second pass: with them, relative poses are right that were not before. The better of both passes counts.
+    """
+    first = _pass(matches, views, intrinsics, run)
+    if not first.models:
+        return first
+    learned = learned_intrinsics(first.models[0], intrinsics, matches)
+    if learned is None:
+        return first
+    second = replace(_pass(matches, views, learned, run), passes=2)
+    if second.support > first.support:
+        return second
+    _enter(first.graph, intrinsics, matches, run)
+    return first
+
+
+def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGraph) -> Intrinsics | None:
+    """The cameras as a model has them; None where that is no news."""
+    if model.photos < LEARNED_FROM:
+        return None
+    cameras, news = dict(intrinsics.cameras), False
+    with backend("reading cameras"):
+        found = cameras_of(model.model)
+    for photo, (K, radial) in found.items():
+        name = intrinsics.name_of(matches.images[photo])
+        before = intrinsics.cameras[name]
+        after = replace(before, K=K, radial=radial, identifiable=True, reason="", method="mapping")
+        news = news or not before.identifiable or _far(before, after)
+        cameras[name] = after
+    return replace(intrinsics, cameras=cameras) if news else None
+
+
+def _far(before: Calibration, after: Calibration) -> bool:
+    return abs(float(np.log(after.focal_px / before.focal_px))) > MOVED
+
+
+def _pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:
+    epipolar = run.settings.epipolar
+    options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
+    graph = build_pose_graph(matches, views, intrinsics, options, run.map)
+    _enter(graph, intrinsics, matches, run)
+    models: list[Attempt] = []
+    tried: list[str] = []
+    cuts: list[str] = []
+    for number, photos in enumerate(graph.groups):
+        if number and len(photos) < LEARNED_FROM:
+            continue
+        found = attempts(Group(photos, matches, views, graph, intrinsics), run)
+        tried += [attempt.note for attempt in found]
+        best = better(found)
+        if best is not None:
+            parts = taken_apart(best)
+            models += parts
+            cuts += [", ".join(names_of(sorted(photos_of(part.model)), matches)) for part in parts if len(parts) > 1]
+    models.sort(key=lambda attempt: (-attempt.photos, -attempt.support))
+    return Outcome(tuple(models), graph, intrinsics, tuple(tried), tuple(cuts))
+
+
+def taken_apart(attempt: Attempt) -> list[Attempt]:
+    """A model as it is, or the parts of it that more matches join than contradict; lonely photos are left out."""
+    parts = sound_parts(attempt.explained, photos_of(attempt.model))
+    if len(parts) == 1:
+        return [attempt]
+    kept = [part for number, part in enumerate(parts) if len(part) >= (2 if number == 0 else LEARNED_FROM)]
+    with backend("taking a model apart"):
+        return [_part(attempt, part) for part in kept]
+
+
+def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
+    members = set(photos)
+    explained = {pair: found for pair, found in attempt.explained.items() if members.issuperset(pair)}
+    return replace(attempt, model=part_of(attempt.model, photos), explained=explained)
+
+
+def _enter(graph: PoseGraph, intrinsics: Intrinsics, matches: MatchGraph, run: RunContext) -> None:
+    with backend("writing relative poses"):
+        write_calibrations(run.workspace.database, matches, intrinsics)
+        write_pose_graph(run.workspace.database, matches, graph)

@@ -1,0 +1,54 @@
+"""Relative poses of pairs of photos, and how they hang together."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.types.matches import PairId
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativePose:
+    """Pose of view 2 from view 1, with its evidence."""
+
+    R: FloatArray
+    """(3, 3) rotation."""
+    t: FloatArray
+    """(3,) direction of the translation, length 1."""
+    inliers: NDArray[np.bool_]
+    """(M,) per match of the pair: within the threshold of this pose."""
+    angle_deg: float
+    """Median triangulation angle of the inliers before both cameras."""
+    in_front: float
+    """Share of the inliers before both cameras, 0 to 1."""
+    kind: str = "calibrated"
+    """"calibrated", "uncalibrated" (a camera is a guess: the inliers are those of F), "planar" (all inliers on one
+    plane), "rotation" (they show no parallax, so that t means nothing)."""
+    guided: bool = False
+    """Found only with the help of other pairs."""
+
+    @property
+    def inlier_count(self) -> int:
+        """How many matches agree with the pose."""
+        return int(np.count_nonzero(self.inliers))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseGraph:
+    """Pairs whose relative poses agree with each other, and what happened to the others."""
+
+    poses: Mapping[PairId, RelativePose]
+    dropped: Mapping[PairId, str]
+    """Pairs with an epipolar geometry that were left out, with the reason."""
+    rotations: Mapping[int, FloatArray]
+    """By photo: (3, 3) rotation from the world; every group of photos has a world of its own."""
+    groups: tuple[tuple[int, ...], ...]
+    """Photos that hang together, the group with the most inliers first."""
+
+    def group_of(self, photo: int) -> tuple[int, ...]:
+        """All photos that hang together with this one; empty where none does."""
+        return next((group for group in self.groups if photo in group), ())
