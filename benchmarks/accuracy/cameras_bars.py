@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from cameras_methods import INCREMENTAL
+from cameras_run import INCREMENTAL
 from report import Row
 
 

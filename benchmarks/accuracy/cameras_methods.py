@@ -1,11 +1,6 @@
-"""Photos to cameras by one method in a process of its own: by the program, or by pycolmap as it comes.
-
-Run as a script it is that process: ``cameras_methods.py METHOD PHOTOS OUT JSON``.
-"""
+"""The ways from photos to cameras, and how one of them is run: in a process of its own, see cameras_run.py."""
 
 import json
-import re
-import resource
 import shutil
 import subprocess
 import sys
@@ -15,14 +10,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cameras_run
+from cameras_run import GLOBAL, INCREMENTAL, OURS, RESULT
 from photo_sets import PhotoSet
 from report import Row
 
-OURS = "sfm-app"
-INCREMENTAL, GLOBAL = "incremental", "global"
+from sfm_app.settings import MatchSettings, merged
+
 STOCK = (INCREMENTAL, GLOBAL)
-RESULT = "benchmark.json"
-"""In OUT: what the process says about itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,75 +47,14 @@ def run(method: Method, photos: PhotoSet, out: Path) -> Row:
     """Run a method from nothing into OUT; seconds of its steps, peak memory, and why it failed where it did."""
     shutil.rmtree(out, ignore_errors=True)
     out.parent.mkdir(parents=True, exist_ok=True)
-    options = {"cameras": photos.cameras, "settings": method.settings}
-    command = [sys.executable, __file__, method.kind, str(photos.folder), str(out), json.dumps(options)]
+    settings = merged({"photos": {"cameras": photos.cameras}}, method.settings)
+    cap = MatchSettings(**settings.get("matching", {})).max_image_size_px
+    options = {"settings": settings, "cameras": photos.cameras, "max_image_size_px": cap}
+    command = [sys.executable, cameras_run.__file__, method.kind, str(photos.folder), str(out), json.dumps(options)]
     start = time.perf_counter()
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     said = {"wall seconds": round(time.perf_counter() - start, 2)}
     if (out / RESULT).exists():
         return said | json.loads((out / RESULT).read_text(encoding="utf-8"))
     last = done.stderr.strip().splitlines()[-1:] or ["no word"]
-    return said | {"failed": f"exit code {done.returncode}: {last[0]}", "seconds": {}}
-
-
-def ours(photos: Path, out: Path, options: Mapping[str, Any]) -> Row:
-    """The program until the cameras stand; its seconds are those of the manifest."""
-    import sfm_app
-    from sfm_app.settings import merged
-
-    settings = sfm_app.Settings.from_mapping(merged({"photos": {"cameras": options["cameras"]}}, options["settings"]))
-    failed, manifest = "", out / "manifest.json"
-    try:
-        sfm_app.reconstruct(photos, out, settings, last="scene")
-    except sfm_app.SfmError as error:
-        failed = str(error)
-    stages = json.loads(manifest.read_text(encoding="utf-8"))["stages"] if manifest.exists() else {}
-    return {"failed": failed, "seconds": {name: stage["seconds"] for name, stage in stages.items()}}
-
-
-def stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) -> Row:
-    """pycolmap's defaults but for a seed, the program's cap on the image size, and one camera where there is one."""
-    from sfm_app.colmap.backend import pycolmap
-    from sfm_app.settings import MatchSettings
-
-    out.mkdir()
-    pycolmap.set_random_seed(0)
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.max_image_size = MatchSettings().max_image_size_px
-    mode = pycolmap.CameraMode.AUTO if options["cameras"] == "each" else pycolmap.CameraMode.SINGLE
-    database, sparse = out / "database.db", out / "sparse"
-    steps = {
-        "features": lambda: pycolmap.extract_features(
-            database, photos, camera_mode=mode, extraction_options=extraction
-        ),
-        "match_and_verify": lambda: pycolmap.match_exhaustive(database),
-    }
-    if mapper == GLOBAL:
-        steps["calibrate"] = lambda: pycolmap.calibrate_view_graph(database)
-        steps["map"] = lambda: pycolmap.global_mapping(database, photos, sparse)
-    else:
-        steps["map"] = lambda: pycolmap.incremental_mapping(database, photos, sparse)
-    seconds = {}
-    for name, step in steps.items():
-        start = time.perf_counter()
-        step()
-        seconds[name] = round(time.perf_counter() - start, 2)
-    return {"failed": "", "seconds": seconds}
-
-
-def peak_mb() -> int:
-    """Most memory that this process has held; the kernel's other count starts with what the parent held."""
-    status = Path("/proc/self/status")
-    found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text()) if status.exists() else None
-    return (int(found[1]) if found else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) // 1024
-
-
-def main() -> None:
-    kind, photos, out, text = sys.argv[1:]
-    options = json.loads(text)
-    found = ours(Path(photos), Path(out), options) if kind == OURS else stock(Path(photos), Path(out), options, kind)
-    (Path(out) / RESULT).write_text(json.dumps(found | {"peak MB": peak_mb()}), encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()
+    return said | {"failed": f"exit code {done.returncode}: {last[0]}", "seconds": {}, "peak MB": None}

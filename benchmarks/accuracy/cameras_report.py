@@ -6,7 +6,8 @@ from statistics import median
 
 import numpy as np
 from cameras_bars import BARS, verdict
-from cameras_methods import INCREMENTAL, STOCK
+from cameras_methods import STOCK
+from cameras_run import INCREMENTAL
 from cameras_score import FILES
 from figures import pyplot, save
 from report import Row, table
