@@ -112,14 +112,17 @@ def draw(rows: Sequence[Row], folder: Path, name: str) -> None:
         for number, method in enumerate(methods):
             of_set = {row["photos"]: row[column] for row in known if row["method"] == method}
             places = np.arange(len(sets)) + (number - (len(methods) - 1) / 2) * height
-            axes.barh(places, [of_set.get(photos, 0.0) for photos in sets], height, label=method)
+            bars = axes.barh(places, [of_set.get(photos, 0.0) for photos in sets], height, label=method)
+            axes.bar_label(bars, fmt=" %.2f", fontsize=6)
+        axes.vlines([], [], [], "k", label="bar to meet")
         for place, bound in _bounds(sets, column):
-            axes.plot([bound, bound], [place - 0.45, place + 0.45], "k", linewidth=1.5)
-        axes.set(xlabel=f"{column}, higher is better", xlim=(0, 1))
+            axes.vlines(bound, place - 0.45, place + 0.45, "k")
+        axes.set(xlabel=f"{column}, higher is better", xlim=(0, 1.05))
+        axes.margins(y=0.01)
         axes.grid(visible=False, axis="y")
     panels[0].set_yticks(range(len(sets)), [photos.replace(" ", "\n") for photos in sets])
     panels[0].invert_yaxis()
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(methods))
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=len(methods) + 1)
     save(figure, folder, name)
 
 
