@@ -1,134 +1,146 @@
 #!/usr/bin/env python3
-"""Camera poses of `sfm-app` beside those of stock pycolmap, on the same photos in the same run.
+"""Cameras of `sfm-app` beside those of stock pycolmap: the same pixels, the same run, nobody sees EXIF.
 
-    python benchmarks/accuracy/cameras.py DATA --sets fountain-P11 castle-P19
-    python benchmarks/accuracy/cameras.py DATA --sets fountain-P11 --crop 460,200 --name cameras-cropped
+    python benchmarks/accuracy/cameras.py DATA --cache CACHE --repeat 3 --twice
+    python benchmarks/accuracy/cameras.py DATA --cache CACHE --sets merton1 "castle-P19 crop:300,100" --ours-only
+    python benchmarks/accuracy/cameras.py DATA --cache CACHE --also scene.min_seed_angle_deg=4
 
-Stock is pycolmap's default except one shared camera and the same image size cap.
+Stock is pycolmap's default, incremental and global, but for one shared camera, a seed, and our cap on the image size.
 """
 
 import argparse
 import json
-import os
-import platform
 import sys
 import tempfile
-import time
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image, ImageOps
-from score import area_under_recall, focal_error_percent, load_truth, pose_errors_deg
+from cameras_bars import BARS
+from cameras_methods import STOCK, Method, methods, run, taking_turns
+from cameras_report import draw, medians, page
+from cameras_run import OURS
+from cameras_score import (
+    accuracy,
+    before_adjustment,
+    hashes,
+    read_models,
+    stated_deviations,
+    times,
+    true_photos,
+)
+from photo_sets import PhotoSet, photo_set, steps
+from report import RESULTS, Row, document, write
 
-import sfm_app
-from sfm_app.colmap.backend import pycolmap
-from sfm_app.pipeline import versions
+from sfm_app.cli.options import assigned
+from sfm_app.settings import merged
 
-RESULTS = Path(__file__).parents[1] / "results"
-
-
-def ours(photos: Path, out: Path) -> dict[str, Any]:
-    """Until the scene stands."""
-    run = sfm_app.reconstruct(photos, out, last="scene")
-    camera = next(iter(run.scene.cameras.values()))
-    return {
-        "poses": {Path(name).stem: pose for name, pose in run.scene.cam_from_world.items()},
-        "K_before": run.calibration.K if run.calibration.identifiable else None,
-        "K": camera.K,
-        "points": run.scene.points,
-        "reprojection_px": run.scene.mean_reprojection_px,
-    }
-
-
-def stock(photos: Path, out: Path) -> dict[str, Any]:
-    """pycolmap's incremental mapping."""
-    out.mkdir(parents=True)
-    pycolmap.set_random_seed(0)
-    options = pycolmap.FeatureExtractionOptions()
-    options.max_image_size = sfm_app.Settings().matching.max_image_size_px
-    database = out / "database.db"
-    pycolmap.extract_features(database, photos, camera_mode=pycolmap.CameraMode.SINGLE, extraction_options=options)
-    pycolmap.match_exhaustive(database)
-    models = pycolmap.incremental_mapping(database, photos, out)
-    if not models:
-        return {"poses": {}, "K_before": None, "K": None, "points": 0, "reprojection_px": None}
-    best = max(models.values(), key=lambda model: model.num_reg_images())
-    posed = [image for image in best.images.values() if image.has_pose]
-    return {
-        "poses": {Path(image.name).stem: image.cam_from_world().matrix() for image in posed},
-        "K_before": None,
-        "K": best.cameras[posed[0].camera_id].calibration_matrix(),
-        "points": best.num_points3D(),
-        "reprojection_px": best.compute_mean_reprojection_error(),
-    }
+EACH = ("reichstag10",)
+ALSO: tuple[str, ...] = ()
+"""Settings under which the program runs once more unless --also names others."""
+FEW = 6
+"""Sets with fewer photos do not need all kernels."""
+ABOUT = (
+    "The same pixels for all: photos saved anew as PNG, upright, without EXIF. Every run in a process of its own, "
+    "methods taking turns, kernels compiled before; medians over the repetitions. e_focal, e_OC: mean errors of fx and "
+    "fy, and of cx and cy (thesis 5.5.3); e_OC_w: distance of the optical centres as a share of the unchanged photo's "
+    "width; centre rms: of camera centres after a similarity, in percent of their mean distance from their mean; AUC: "
+    "area under the recall of the larger of rotation and translation error over all pairs of photos, 180 degrees for a "
+    "pair with a photo left out; every photo is compared with its own K. AUC@5 of each model: over its own photos, "
+    "where there are several. Seconds: from the photos to the final cameras; COLMAP verifies pairs while matching, we "
+    "after it; / incremental: total over that of stock incremental in the same repetition. sd: stated standard "
+    "deviation after bundle adjustment; fx in sd: error of fx in them; in 3 sd: whether all errors are. bar met: see "
+    "benchmarks/accuracy/cameras_bars.py."
+)
 
 
-def cropped(photos: Path, out: Path, left: int, top: int) -> Path:
-    """Copies without EXIF that lack columns at the left and rows at the top: the optical centre moves."""
-    out.mkdir()
-    for path in sorted(photos.iterdir()):
-        with Image.open(path) as image:
-            upright = ImageOps.exif_transpose(image).convert("RGB")
-        upright.crop((left, top, *upright.size)).save(out / f"{path.stem}.jpg", quality=92)
-    return out
+def chosen_sets(args: argparse.Namespace, cache: Path) -> Iterator[tuple[PhotoSet, str]]:
+    """Each set with the name of its data; the change stands behind a blank."""
+    for title in args.sets:
+        name, _, change = title.partition(" ")
+        yield photo_set(args.data, name, change, cache, "each" if name in args.each else "auto"), name
 
 
-def scored(found: dict[str, Any], truth_path: Path, seconds: float) -> dict[str, Any]:
-    """Plain figures of one method on one set."""
-    row: dict[str, Any] = {"registered": len(found["poses"]), "points": found["points"], "seconds": round(seconds, 1)}
-    if found["reprojection_px"] is not None:
-        row["reprojection_px"] = round(found["reprojection_px"], 3)
-    if truth_path.exists():
-        truth = load_truth(truth_path)
-        errors = pose_errors_deg(found["poses"], {name: pose for name, (_, pose) in truth.items()})
-        row |= {f"AUC@{limit}": round(area_under_recall(errors, limit), 3) for limit in (1, 5)}
-        true_K = np.median([K for K, _ in truth.values()], axis=0)
-        for key, name in (("K_before", "focal error before BA %"), ("K", "focal error %")):
-            row[name] = None if found[key] is None else round(focal_error_percent(found[key], true_K), 2)
+def warm_up(sets: Sequence[PhotoSet], these: Sequence[Method], out: Path) -> None:
+    """Compile the kernels: one unmeasured run on the smallest set of every kind that is no special case."""
+    by_size = sorted(sets, key=lambda photos: (_count(photos) < FEW, _bytes(photos)), reverse=True)
+    smallest = {photos.cameras: photos for photos in by_size}
+    for photos in smallest.values():
+        for method in these:
+            if method.kind == OURS:
+                run(method, photos, out)
+
+
+def measure(photos: PhotoSet, truth_file: Path, method: Method, out: Path) -> Row:
+    """One method, once, on one set."""
+    said = run(method, photos, out)
+    truth = true_photos(truth_file, steps(photos.name.partition(" ")[2]))
+    models = read_models(out)
+    row = {"photos": photos.name, "method": method.name, "failed": said["failed"]}
+    row |= accuracy(models, truth, _count(photos)) | times(said["seconds"], complete=not said["failed"])
+    row |= {name: said[name] for name in ("wall seconds", "peak MB")}
+    if method.kind == OURS:
+        row |= before_adjustment(out, truth) | hashes(out)
+        row |= stated_deviations(out, models[0], truth) if models else {}
     return row
 
 
-def markdown(rows: list[dict[str, Any]]) -> str:
-    """The rows as a table."""
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
-    lines += ["| " + " | ".join(str(row.get(column, "")) for column in columns) + " |" for row in rows]
-    return "\n".join(lines) + "\n"
+def all_runs(args: argparse.Namespace, these: Sequence[Method], cache: Path) -> Iterator[Row]:
+    """Every set, every repetition, every method."""
+    sets = list(chosen_sets(args, cache))
+    warm_up([photos for photos, _ in sets], these, cache / "cameras" / "warm-up")
+    for photos, name in sets:
+        for repetition in range(max(args.repeat, 1 + args.twice)):
+            for method in taking_turns(these, repetition):
+                if method.kind in STOCK and repetition >= args.repeat:
+                    continue
+                out = cache / "cameras" / photos.folder.name / method.name.replace(" ", "_")
+                row = measure(photos, args.data / name / "cameras.json", method, out)
+                print(json.dumps(row), file=sys.stderr, flush=True)
+                yield row | {"repetition": repetition}
+
+
+def overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Settings by what was typed; several at once are joined by blanks."""
+    found = {}
+    for text in texts:
+        settings: dict[str, Any] = {}
+        for assignment in text.split():
+            settings = merged(settings, assigned(assignment))
+        found[text] = settings
+    return found
+
+
+def _count(photos: PhotoSet) -> int:
+    return len(list(photos.folder.glob("*.png")))
+
+
+def _bytes(photos: PhotoSet) -> int:
+    return sum(path.stat().st_size for path in photos.folder.glob("*.png"))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--sets", nargs="+", required=True)
-    parser.add_argument(
-        "--crop", type=lambda text: [int(value) for value in text.split(",")], help="LEFT,TOP in pixels"
-    )
+    parser.add_argument("data", type=Path, help="folder with NAME/images and NAME/cameras.json")
+    parser.add_argument("--cache", type=Path, help="keeps copies of photos and the last run of every method")
+    parser.add_argument("--sets", nargs="+", default=list(BARS), metavar="SET", help='"NAME" or "NAME CHANGE"')
+    parser.add_argument("--each", nargs="*", default=EACH, help="sets in which every photo has its own camera")
     parser.add_argument("--ours-only", action="store_true", help="without stock pycolmap")
+    parser.add_argument("--also", nargs="*", default=ALSO, metavar="TABLE.KEY=VALUE", help="ours under this, too")
+    parser.add_argument("--repeat", type=int, default=1, metavar="N", help="runs of every method")
+    parser.add_argument("--twice", action="store_true", help="ours at least twice: are the bytes the same?")
+    parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--name", default="cameras", help="name of the result files")
     args = parser.parse_args()
-    methods = {"sfm-app": ours} if args.ours_only else {"sfm-app": ours, "pycolmap": stock}
-    rows = []
-    for name in args.sets:
-        for label, method in methods.items():
-            with tempfile.TemporaryDirectory() as scratch:
-                photos = args.data / name / "images"
-                photos = cropped(photos, Path(scratch) / "photos", *args.crop) if args.crop else photos
-                start = time.perf_counter()
-                found = method(photos, Path(scratch) / "out")
-                seconds = time.perf_counter() - start
-            rows.append({"photos": name, "method": label, **scored(found, args.data / name / "cameras.json", seconds)})
-            print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
-    machine = {
-        "machine": platform.machine(),
-        "cores": len(os.sched_getaffinity(0)),
-        "python": platform.python_version(),
-    }
-    document = {"machine": machine, "versions": versions(), "rows": rows}
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / f"{args.name}.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    (RESULTS / f"{args.name}.md").write_text(markdown(rows), encoding="utf-8")
-    print(markdown(rows))
+    these = methods(overrides(args.also), ours_only=args.ours_only)
+    with tempfile.TemporaryDirectory(prefix="cameras-") as scratch:
+        runs = list(all_runs(args, these, args.cache or Path(scratch)))
+    rows = medians(runs)
+    options = {"methods": [method.name for method in these], "repeat": args.repeat, "each": list(args.each)}
+    found = document("cameras", ABOUT, options, {"sets": list(args.sets), "medians": rows}, runs)
+    write(args.results, args.name, found, page(ABOUT, rows))
+    draw(rows, args.results, args.name)
+    print(page(ABOUT, rows))
 
 
 if __name__ == "__main__":

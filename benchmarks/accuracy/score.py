@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.essential import decompose_essential, essential_from_fundamental
+from sfm_app.synthetic.compare import umeyama
 
 Pose = NDArray[np.float64]
 
@@ -84,6 +85,33 @@ def area_under_recall(errors_deg: NDArray[np.float64], limit_deg: float) -> floa
 def focal_error_percent(found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
     """e_focal of the thesis: mean error of fx and fy."""
     return float(50 * (abs(found[0, 0] / truth[0, 0] - 1) + abs(found[1, 1] / truth[1, 1] - 1)))
+
+
+def centre_error_percent(found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
+    """e_OC of the thesis: mean error of cx and cy, in percent of the true ones."""
+    return float(50 * (abs(found[0, 2] / truth[0, 2] - 1) + abs(found[1, 2] / truth[1, 2] - 1)))
+
+
+def centre_shift_percent(found: NDArray[np.float64], truth: NDArray[np.float64], width: float) -> float:
+    """Distance of the optical centres as a share of a width, which does not depend on where the centre lies."""
+    return float(100 * np.linalg.norm(found[:2, 2] - truth[:2, 2]) / width)
+
+
+def position_rms_percent(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> float | None:
+    """How far the cameras stand from their true places after a similarity; None with fewer than three.
+
+    In percent of the mean distance of the true places from their mean. Photos without a pose are left out.
+    """
+    common = sorted(set(found) & set(truth))
+    if len(common) < 3:
+        return None
+    ours, true = (np.array([_position(poses[name]) for name in common]) for poses in (found, truth))
+    distances = np.linalg.norm(umeyama(ours, true)(ours) - true, axis=1)
+    return float(100 * np.sqrt(np.mean(distances**2)) / np.linalg.norm(true - true.mean(0), axis=1).mean())
+
+
+def _position(pose: Pose) -> NDArray[np.float64]:
+    return -pose[:, :3].T @ pose[:, 3]
 
 
 def _angle_deg(a: tuple[Pose, Pose], b: tuple[Pose, Pose]) -> float:

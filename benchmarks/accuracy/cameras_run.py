@@ -1,0 +1,83 @@
+#!/usr/bin/env python3
+"""Photos to cameras by one method: ``cameras_run.py METHOD PHOTOS OUT JSON``, a process of its own for each.
+
+Nothing is imported but what the method itself needs, so that memory and times are its own.
+"""
+
+import json
+import re
+import resource
+import sys
+import time
+import zlib  # before pycolmap, see CONTRIBUTING.md
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+OURS = "sfm-app"
+INCREMENTAL, GLOBAL = "incremental", "global"
+RESULT = "benchmark.json"
+"""In OUT: what the process says about itself."""
+
+
+def ours(photos: Path, out: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The program until the cameras stand; its seconds are those of the manifest."""
+    import sfm_app
+
+    failed, manifest = "", out / "manifest.json"
+    try:
+        sfm_app.reconstruct(photos, out, sfm_app.Settings.from_mapping(options["settings"]), last="scene")
+    except sfm_app.SfmError as error:
+        failed = str(error)
+    stages = json.loads(manifest.read_text(encoding="utf-8"))["stages"] if manifest.exists() else {}
+    return {"failed": failed, "seconds": {name: stage["seconds"] for name, stage in stages.items()}}
+
+
+def stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) -> dict[str, Any]:
+    """pycolmap's defaults but for a seed, a cap on the image size, and one camera for all photos where that is so."""
+    import pycolmap
+
+    zlib.crc32(b"")  # the import above is there for its side effect
+    out.mkdir()
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.set_random_seed(0)
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size = options["max_image_size_px"]
+    mode = pycolmap.CameraMode.AUTO if options["cameras"] == "each" else pycolmap.CameraMode.SINGLE
+    database, sparse, seconds = out / "database.db", out / "sparse", {}
+    start = time.perf_counter()
+
+    def lap(step: str) -> None:
+        nonlocal start
+        seconds[step], start = round(time.perf_counter() - start, 2), time.perf_counter()
+
+    pycolmap.extract_features(database, photos, camera_mode=mode, extraction_options=extraction)
+    lap("features")
+    pycolmap.match_exhaustive(database)
+    lap("match_and_verify")
+    if mapper == GLOBAL:
+        pycolmap.calibrate_view_graph(database)
+        lap("calibrate")
+        pycolmap.global_mapping(database, photos, sparse)
+    else:
+        pycolmap.incremental_mapping(database, photos, sparse)
+    lap("map")
+    return {"failed": "", "seconds": seconds}
+
+
+def peak_mb() -> int:
+    """Most memory that this process has held; the kernel's other count starts with what the parent held."""
+    status = Path("/proc/self/status")
+    found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text()) if status.exists() else None
+    return (int(found[1]) if found else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) // 1024
+
+
+def main() -> None:
+    kind, photos, out, text = sys.argv[1:]
+    options = json.loads(text)
+    found = ours(Path(photos), Path(out), options) if kind == OURS else stock(Path(photos), Path(out), options, kind)
+    (Path(out) / RESULT).write_text(json.dumps(found | {"peak MB": peak_mb()}), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
