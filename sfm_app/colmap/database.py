@@ -57,7 +57,7 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
         for entry in sorted(database.read_all_images(), key=lambda entry: entry.image_id):
             photo = by_name[entry.name]
             images[entry.image_id] = MatchedImage(
-                entry.image_id, photo.name, photo.group, photo.width, photo.height, photo.exif_focal_px
+                entry.image_id, photo.name, photo.group, photo.width, photo.height, photo.exif_focal_px, photo.gps
             )
             found = database.read_keypoints(entry.image_id)
             keypoints[entry.image_id] = np.asarray(found, np.float64).reshape(len(found), -1)[:, :2].copy()

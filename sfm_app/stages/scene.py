@@ -10,13 +10,14 @@ import numpy as np
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.mapping import PhotoCounter, continue_mapping
-from sfm_app.colmap.model import model_from_seed, read_scene, turn_upright
+from sfm_app.colmap.model import model_from_seed, read_scene
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.camera import rays
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.geometry.seed import TwoViewSeed, two_view_seed
 from sfm_app.ransac.refit import refine_sampson
+from sfm_app.stages.orientation import orient
 from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchGraph, PairId, PhotoSet, Scene, ViewGraph
 
 RANKED_PAIRS = 60
@@ -55,7 +56,7 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         raise ReconstructionError(nothing_found(views, candidates, tried), hint=HINT)
     with backend("adjusting the bundle"):
         best, deviations = adjust(best, run.workspace.database)
-        turn_upright(best)
+    orientation = orient(best, matches, run)
     write_model(best, run)
     names = {image.name: intrinsics.name_of(image) for image in matches.images.values()}
     scene = read_scene(run.workspace.sparse, names, left_out(best, matches, views))
@@ -69,6 +70,7 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         cameras={name: {"model": camera.model, "params": camera.params} for name, camera in scene.cameras.items()},
         deviations_px={name: round(value, 4) for name, value in deviations.items()},
         seeds_tried=tried,
+        orientation=orientation,
     )
     return scene
 
