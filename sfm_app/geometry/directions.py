@@ -21,6 +21,11 @@ def axis_angle_deg(first: ArrayLike, second: ArrayLike) -> FloatArray:
     return np.asarray(np.degrees(np.arctan2(sine, np.abs((a * b).sum(axis=-1)))))
 
 
+def along(vectors: FloatArray, axis: FloatArray) -> FloatArray:
+    """Components (N,) of vectors (N, 3) along an axis (3,); not by BLAS, whose digits depend on its threads."""
+    return np.asarray(np.einsum("ni,i->n", vectors, axis))
+
+
 def across(vector: ArrayLike, axis: FloatArray) -> FloatArray:
     """What of vectors (..., 3) is at right angles to a unit axis (3,)."""
     values = np.asarray(vector, np.float64)

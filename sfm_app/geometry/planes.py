@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.directions import axis_angle_deg, least_direction, unit
+from sfm_app.geometry.directions import along, axis_angle_deg, least_direction, unit
 
 FloatArray = NDArray[np.float64]
 
@@ -53,7 +53,7 @@ def dominant_plane(points: FloatArray, axis: FloatArray, between_deg: tuple[floa
         normal = unit(np.cross(b - a, c - a))
         if not normal.any() or not between_deg[0] <= axis_angle_deg(normal, axis) <= between_deg[1]:
             continue
-        near = np.abs((cloud - a) @ normal) < reach
+        near = np.abs(along(cloud - a, normal)) < reach
         if np.count_nonzero(near) > most:
             best, most = near, float(np.count_nonzero(near))
     return None if best is None else _fitted(cloud[best], axis, float(best.mean()))
@@ -61,7 +61,7 @@ def dominant_plane(points: FloatArray, axis: FloatArray, between_deg: tuple[floa
 
 def _fitted(points: FloatArray, axis: FloatArray, share: float) -> Plane:
     spread = points - points.mean(axis=0)
-    scatter = spread.T @ spread
+    scatter = np.einsum("ni,nj->ij", spread, spread)
     small, middle, _ = np.linalg.eigvalsh(scatter)
     deviation = np.degrees(np.arctan2(np.sqrt(small / len(points)), np.sqrt(max(middle, 1e-30))))
     return Plane(least_direction(scatter, axis), share, float(deviation))

@@ -30,6 +30,9 @@ ODD_ONE = 1.0
 VOICES = 8
 """Photos of one walk are no independent witnesses: more than so many count as so many."""
 
+FIELD = 0.6
+"""Tangent of half the field of view of a common camera."""
+
 STEPS = 20
 
 
@@ -47,28 +50,29 @@ class Roll:
     """Standard deviation of `up` in its worst direction, as the spread of roll and pitch has it."""
 
 
-def up_from_roll(rotations: FloatArray, centres: FloatArray, near: FloatArray | None = None) -> Roll:
+def up_from_roll(rotations: FloatArray, centres: FloatArray, points: FloatArray | None = None) -> Roll:
     """The direction for which the cameras are held most nearly level, and most nearly along the ground.
 
     Roll alone does not tell portrait photos of a wall from landscape photos of the same wall lying on its side, so
-    three weaker signs join in: people look about horizontally, they walk rather than climb, and what is low in a photo
-    is near, being ground. Of the directions that the photos propose the best is refined by weighted least squares.
+    two weaker signs join in: people look about horizontally, and they walk rather than climb. Which way photos on their
+    side were turned is seen from the ground: what is low is near. Of the directions that the photos propose the best is
+    refined by weighted least squares.
 
     Args:
         rotations: (N, 3, 3) cam_from_world, N >= 1; camera axes x right, y down, z forward.
         centres: (N, 3) camera centres.
-        near: (N, 3) per camera the direction in the world, within the photo, towards which things are nearer, of
-            length 0 (no tendency) to 1; left out where unknown.
+        points: (P, 3) of the scene; left out where unknown.
     """
-    nearer = np.zeros((len(rotations), 3)) if near is None else near
     best, least = (-unit(rotations[0, 1]), 0, ROLLS_DEG[0]), np.inf
     for turn, proposals in enumerate(_proposals(rotations)):
         for proposal, roll_deg in product(proposals, ROLLS_DEG):
             for up in (proposal, _refined(proposal, rotations, roll_deg)):
-                cost = _cost(up, turn, rotations, roll_deg) + _cost_of_place(up, rotations, centres, nearer)
+                cost = _cost(up, turn, rotations, roll_deg) + _climbing(up, centres)
                 if cost < least - 1e-9:
                     best, least = (up, turn, roll_deg), cost
     up, turn, roll_deg = best
+    if turn % 2 and points is not None and nearer(up, rotations, centres, points) > 0:
+        up, turn = -up, (turn + 2) % 4
     return Roll(up, 90 * turn, *_uncertainty(up, rotations, roll_deg))
 
 
@@ -103,12 +107,28 @@ def _cost(up: FloatArray, turn: int, rotations: FloatArray, roll_deg: float) -> 
     return float(min(len(rotations), VOICES) * per_photo.mean() + TURNED[turn])
 
 
-def _cost_of_place(up: FloatArray, rotations: FloatArray, centres: FloatArray, near: FloatArray) -> float:
-    """What the weaker signs say: people who climb, and things that are near overhead."""
+def _climbing(up: FloatArray, centres: FloatArray) -> float:
+    """-log likelihood of how much of the cameras' spread is height."""
     spread = centres - centres.mean(axis=0)
     total = float((spread**2).sum())
-    climbing = 0.5 * float(((spread @ up) ** 2).sum()) / total if total > 0 else 0.0
-    return min(len(rotations), VOICES) * (climbing + float((near @ up).mean()))
+    return min(len(centres), VOICES) * 0.5 * float(((spread @ up) ** 2).sum()) / total if total > 0 else 0.0
+
+
+def nearer(up: FloatArray, rotations: FloatArray, centres: FloatArray, points: FloatArray) -> float:
+    """Mean over the photos of the correlation of nearness with height in the photo: > 0 where things overhead are near.
+
+    Of each camera's points those within `FIELD` of its axis count, seen or hidden.
+    """
+    found = []
+    for R, centre in zip(rotations, centres, strict=True):
+        local = (points - centre) @ R.T
+        local = local[local[:, 2] > 0]
+        x = local[:, :2] / local[:, 2:]
+        kept = np.abs(x).max(axis=1, initial=0.0) < FIELD
+        height, nearness = x[kept] @ (R @ up)[:2], -np.log(local[kept, 2])
+        if np.count_nonzero(kept) > 2 and height.std() > 0 and nearness.std() > 0:
+            found.append(float(np.corrcoef(height, nearness)[0, 1]))
+    return float(np.mean(found)) if found else 0.0
 
 
 def _refined(up: FloatArray, rotations: FloatArray, roll_deg: float) -> FloatArray:

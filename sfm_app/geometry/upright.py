@@ -60,7 +60,7 @@ def up_direction(rotations: FloatArray, centres: FloatArray, points: FloatArray,
         points: (P, 3) of the scene.
         segments: lines in the photos; may be empty.
     """
-    roll = up_from_roll(rotations, centres)
+    roll = up_from_roll(rotations, centres, points)
     lines = vanishing_near(roll.up, segments)
     if lines is not None:
         level = level_direction(lines.direction, segments)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.directions import axis_angle_deg, basis_across, least_direction, unit
+from sfm_app.geometry.directions import along, axis_angle_deg, basis_across, least_direction, unit
 
 FloatArray = NDArray[np.float64]
 
@@ -97,9 +97,9 @@ def joined(parts: list[Segments]) -> Segments:
 
 def misses_deg(direction: FloatArray, segments: Segments) -> FloatArray:
     """(N,) angle in the photo between each segment and the line from its middle to the vanishing point; [0, 90]."""
-    sine = np.abs(segments.normals @ direction)
-    along = np.linalg.norm(np.cross(segments.middles, direction), axis=1)
-    return np.asarray(np.degrees(np.arcsin(np.clip(sine / np.maximum(along, 1e-9), 0.0, 1.0))), np.float64)
+    sine = np.abs(along(segments.normals, direction))
+    away = np.linalg.norm(np.cross(segments.middles, direction), axis=1)
+    return np.asarray(np.degrees(np.arcsin(np.clip(sine / np.maximum(away, 1e-9), 0.0, 1.0))), np.float64)
 
 
 def vanishing_near(start: FloatArray, segments: Segments) -> Vanishing | None:
@@ -125,7 +125,9 @@ def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
 
     Segments on the horizon fit all horizontal directions, and vertical ones are no witnesses: both stay out.
     """
-    apart = (np.abs(segments.normals @ up) < np.cos(np.radians(APART_DEG))) & (misses_deg(up, segments) > APART_DEG / 2)
+    apart = (np.abs(along(segments.normals, up)) < np.cos(np.radians(APART_DEG))) & (
+        misses_deg(up, segments) > APART_DEG / 2
+    )
     level = segments.take(apart)
     if len(level) < LEAST_SEGMENTS:
         return None
@@ -174,8 +176,8 @@ def _rotation_equations(frame: FloatArray, segments: Segments, width_deg: float)
     """Per photo (P, 3, 3) and (P, 3): normal equations of the rotation vector."""
     misses = np.array([misses_deg(axis, segments) for axis in frame])
     axes = frame[np.argmin(misses, axis=0)]
-    along = np.maximum(np.linalg.norm(np.cross(segments.middles, axes), axis=1), LEAST_SINE)
-    weights = segments.lengths * np.exp(-0.5 * (misses.min(axis=0) / width_deg) ** 2) / along**2
+    away = np.maximum(np.linalg.norm(np.cross(segments.middles, axes), axis=1), LEAST_SINE)
+    weights = segments.lengths * np.exp(-0.5 * (misses.min(axis=0) / width_deg) ** 2) / away**2
     J, r = np.cross(axes, segments.normals), -(segments.normals * axes).sum(axis=1)
     return (
         _per_photo(segments, weights[:, None, None] * J[:, :, None] * J[:, None]),
@@ -212,8 +214,8 @@ def _support(direction: FloatArray, segments: Segments, width_deg: float) -> flo
 
 def _matrices(direction: FloatArray, segments: Segments, width_deg: float) -> FloatArray:
     """(P, 3, 3) per photo the sum of n n' of its segments, weighted for least squares of the misses."""
-    along = np.maximum(np.linalg.norm(np.cross(segments.middles, direction), axis=1), LEAST_SINE)
-    weights = segments.lengths * np.exp(-0.5 * (misses_deg(direction, segments) / width_deg) ** 2) / along**2
+    away = np.maximum(np.linalg.norm(np.cross(segments.middles, direction), axis=1), LEAST_SINE)
+    weights = segments.lengths * np.exp(-0.5 * (misses_deg(direction, segments) / width_deg) ** 2) / away**2
     n = segments.normals
     return _per_photo(segments, weights[:, None, None] * n[:, :, None] * n[:, None])
 

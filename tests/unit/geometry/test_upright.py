@@ -73,14 +73,14 @@ def test_single_photos_that_are_turned_or_wild_are_outvoted(build_house):
     assert error_deg(mean / np.linalg.norm(mean), scene.up) > 10
 
 
-def test_what_is_near_is_down(build_house):
-    scene = build_house([roll + 90 for roll in HAND_HELD], sweep_deg=90.0)
-    down = np.tile(-0.5 * scene.up, (len(HAND_HELD), 1))
+@pytest.mark.parametrize("turn_deg", [90, -90])
+def test_what_is_near_is_down(build_house, turn_deg):
+    scene = build_house([roll + turn_deg for roll in HAND_HELD], sweep_deg=90.0)
+    floor = np.random.default_rng(3).uniform([-4, 0, -4], [4, 0, 4], (300, 3)) @ scene.turned.T
 
-    found = [up_from_roll(scene.rotations, scene.centres, sign * down).up for sign in (1, -1)]
-
-    assert error_deg(found[0], scene.up) < 8
-    assert error_deg(found[1], -scene.up) < 8
+    for ground, up in ((floor, scene.up), (floor + 4.0 * scene.up, -scene.up)):
+        points = np.concatenate([scene.points, ground])
+        assert error_deg(up_from_roll(scene.rotations, scene.centres, points).up, up) < 8
 
 
 def test_cameras_that_nobody_held_level_stand_on_the_ground(build_house):
