@@ -125,10 +125,8 @@ def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
 
     Segments on the horizon fit all horizontal directions, and vertical ones are no witnesses: both stay out.
     """
-    apart = (np.abs(along(segments.normals, up)) < np.cos(np.radians(APART_DEG))) & (
-        misses_deg(up, segments) > APART_DEG / 2
-    )
-    level = segments.take(apart)
+    on_horizon = np.abs(along(segments.normals, up)) > np.cos(np.radians(APART_DEG))
+    level = segments.take(~on_horizon & (misses_deg(up, segments) > APART_DEG / 2))
     if len(level) < LEAST_SEGMENTS:
         return None
     e1, e2 = basis_across(up)

@@ -73,7 +73,11 @@ def lines_of(model: Any, posed: list[int], matches: MatchGraph, run: RunContext)
 
 def photo_segments(path: Path) -> FloatArray:
     """Line segments (N, 4) of a photo in its pixels; none where OpenCV cannot read it."""
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    try:
+        data = np.fromfile(path, np.uint8)  # OpenCV does not open names beyond ASCII on every system
+    except OSError:
+        data = np.zeros(0, np.uint8)
+    grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     return np.zeros((0, 4)) if grey is None else line_segments(np.asarray(grey, np.uint8))
 
 

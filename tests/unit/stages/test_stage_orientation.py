@@ -7,7 +7,7 @@ import pytest
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.model import posed_photos
-from sfm_app.geometry.georeference import position_at
+from sfm_app.geometry.georeference import enu_m, position_at
 from sfm_app.stages.orientation import orient, photo_segments
 from sfm_app.synthetic.cameras import arc, make_camera
 from sfm_app.types import GpsPosition, MatchedImage, MatchGraph
@@ -88,6 +88,12 @@ def test_with_gps_the_model_is_in_metres_and_knows_its_place(tmp_path):
     assert 0 <= place["heading_deg"] < 360
     turned_deg = (place["heading_deg"] - HEADING_DEG + 180) % 360 - 180
     assert abs(turned_deg) < 30, "the front may be turned to the viewer, not further"
+    h = np.radians(place["heading_deg"])
+    origin = GpsPosition(place["latitude_deg"], place["longitude_deg"], place["altitude_m"])
+    for key, pose in posed_photos(model)[0].items():
+        x, y, z = -pose[:, :3].T @ pose[:, 3]
+        enu = np.array([x * np.cos(h) - z * np.sin(h), -x * np.sin(h) - z * np.cos(h), y])
+        assert enu == pytest.approx(enu_m([matches.images[key].gps], origin)[0], abs=4), "up is only that of roll"
 
 
 def test_a_photo_that_is_gone_has_no_lines(tmp_path):
