@@ -76,7 +76,7 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
         for entry in sorted(database.read_all_images(), key=lambda entry: entry.image_id):
             photo = by_name[entry.name]
             images[entry.image_id] = MatchedImage(
-                entry.image_id, photo.name, photo.group, photo.width, photo.height, photo.exif_focal_px
+                entry.image_id, photo.name, photo.group, photo.width, photo.height, photo.exif_focal_px, photo.gps
             )
             found = np.asarray(database.read_keypoints(entry.image_id), np.float64)
             keypoints[entry.image_id] = found[:, :2].copy() if len(found) else np.empty((0, 2))

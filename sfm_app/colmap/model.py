@@ -1,4 +1,4 @@
-"""COLMAP's sparse model: built from our two-view seed, turned upright, and read for the summary."""
+"""COLMAP's sparse model: built from our two-view seed, moved to another frame, and read for the summary."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import opened
 from sfm_app.geometry.seed import TwoViewSeed
+from sfm_app.geometry.similarity import Similarity
 from sfm_app.types import CameraModel, PairId, Scene
 
 
@@ -93,21 +94,30 @@ def _posed(model: Any) -> list[Any]:
     return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.image_id)
 
 
-def turn_upright(model: Any) -> None:
-    """Put the model into the frame that glTF viewers expect: y up, seen from +z, centred, of size about 1.
+def posed_photos(model: Any) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.float64]]:
+    """(3, 4) cam_from_world by id of the photos that have a pose, in order of ids, and the points (P, 3)."""
+    poses = {image.image_id: np.asarray(image.cam_from_world().matrix(), np.float64) for image in _posed(model)}
+    points = np.array([model.points3D[key].xyz for key in sorted(model.points3D)]).reshape(-1, 3)
+    return poses, points
 
-    Photographers hold cameras level on average, so up is the mean of the photos' up directions.
-    """
-    poses = [image.cam_from_world().matrix()[:, :3] for image in model.images.values() if image.has_pose]
-    up = _unit(-np.mean([R[1] for R in poses], axis=0), np.array([0.0, -1.0, 0.0]))
-    forward = np.mean([R[2] for R in poses], axis=0)
-    sideways = forward - (forward @ up) * up
-    towards = _unit(-sideways, np.cross(up, [1.0, 0.0, 0.0]) + np.cross(up, [0.0, 0.0, 1.0]) * 1e-3)
-    turn = np.stack([np.cross(up, towards), up, towards])
-    points = np.array([point.xyz for point in model.points3D.values()])
-    centre = np.median(points, axis=0)
-    scale = 1.0 / max(float(np.percentile(np.linalg.norm(points - centre, axis=1), 80)), 1e-12)
-    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(turn), -scale * turn @ centre))
+
+def viewing_rays(model: Any, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Directions (N, 3) in the world, of any length, that pixels (N, 2) of a photo see."""
+    image = model.images[image_id]
+    plane = np.asarray(model.cameras[image.camera_id].cam_from_img(x), np.float64).reshape(-1, 2)
+    R = image.cam_from_world().matrix()[:, :3]
+    return np.asarray(np.column_stack([plane, np.ones(len(plane))]) @ R)
+
+
+def focal_px(model: Any, image_id: int) -> float:
+    """Focal length of the camera that took a photo, in pixels."""
+    return float(model.cameras[model.images[image_id].camera_id].mean_focal_length())
+
+
+def move(model: Any, similarity: Similarity) -> None:
+    """Put the model into another frame."""
+    rotation = pycolmap.Rotation3d(similarity.R)
+    model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.t))
 
 
 def read_scene(model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str]) -> Scene:
@@ -130,9 +140,3 @@ def _camera(camera: Any) -> CameraModel:
     K = np.asarray(camera.calibration_matrix(), np.float64)
     params = tuple(float(value) for value in camera.params)
     return CameraModel(camera.model.name, params, K, camera.width, camera.height)
-
-
-def _unit(vector: NDArray[np.float64], otherwise: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The vector with length 1; where it vanishes (photos from all sides), the other one."""
-    length = float(np.linalg.norm(vector))
-    return vector / length if length > 1e-3 else otherwise / np.linalg.norm(otherwise)

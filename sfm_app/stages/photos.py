@@ -4,10 +4,11 @@ import json
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageOps, UnidentifiedImageError
@@ -15,13 +16,18 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 from sfm_app.context import RunContext
 from sfm_app.errors import InputError
 from sfm_app.settings import PhotoSettings
-from sfm_app.types import Photo, PhotoSet, UnusablePhoto
+from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
 
 FORMATS = ("JPEG", "PNG")
 """What is read so far."""
 
 EXIF_MAKE, EXIF_MODEL, EXIF_ORIENTATION, EXIF_IFD = 0x010F, 0x0110, 0x0112, 0x8769
 EXIF_FOCAL_MM, EXIF_FOCAL_35MM = 0x920A, 0xA405
+EXIF_GPS_IFD = 0x8825
+GPS_LATITUDE_REF, GPS_LATITUDE, GPS_LONGITUDE_REF, GPS_LONGITUDE, GPS_ALTITUDE_REF, GPS_ALTITUDE = range(1, 7)
+LOWEST_M, HIGHEST_M = -1000.0, 20_000.0
+"""Altitudes that a photo may be taken at."""
+
 FULL_FRAME_WIDTH_MM = 36.0
 
 
@@ -44,6 +50,7 @@ def read_photos(folder: Path, run: RunContext) -> PhotoSet:
     lay_out(photo_set, run)
     save_photo_set(photo_set, run)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
+    run.record(gps=sum(photo.gps is not None for photo in photos))
     return photo_set
 
 
@@ -103,8 +110,13 @@ def save_photo_set(photos: PhotoSet, run: RunContext) -> None:
 def load_photo_set(run: RunContext) -> PhotoSet:
     """Read photos.json back."""
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
-    photos = tuple(Photo(**photo) for photo in values["photos"])
+    photos = tuple(_photo(entry) for entry in values["photos"])
     return PhotoSet(Path(values["folder"]), photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]))
+
+
+def _photo(entry: Mapping[str, Any]) -> Photo:
+    gps = entry.get("gps")
+    return Photo(**{**entry, "gps": GpsPosition(**gps) if gps else None})
 
 
 def _walk(folder: Path, exclude: Path) -> Iterator[Path]:
@@ -130,7 +142,43 @@ def _described(name: str, image: Image.Image, options: PhotoSettings) -> Photo |
         group=" ".join([f"{width}x{height}", *filter(None, camera)]),
         exif_focal_px=_exif_focal_px(details.get(EXIF_FOCAL_35MM), max(width, height)),
         needs_copy=exif.get(EXIF_ORIENTATION, 1) not in (0, 1) or image.mode not in ("RGB", "L"),
+        gps=gps_position(exif.get_ifd(EXIF_GPS_IFD)),
     )
+
+
+def gps_position(entries: Mapping[int, Any]) -> GpsPosition | None:
+    """The position in EXIF's table of GPS entries; None where it is missing or cannot be true.
+
+    Cameras without a fix write zeros: latitude and longitude 0 is open sea, and counts as missing.
+    """
+    latitude = _degrees(entries.get(GPS_LATITUDE), entries.get(GPS_LATITUDE_REF), "NS", 90.0)
+    longitude = _degrees(entries.get(GPS_LONGITUDE), entries.get(GPS_LONGITUDE_REF), "EW", 180.0)
+    if latitude is None or longitude is None or latitude == longitude == 0.0:
+        return None
+    return GpsPosition(latitude, longitude, _altitude_m(entries.get(GPS_ALTITUDE), entries.get(GPS_ALTITUDE_REF)))
+
+
+def _degrees(parts: Any, reference: Any, sides: str, largest: float) -> float | None:
+    """Signed degrees from EXIF's degrees, minutes and seconds and the letter of the side."""
+    try:
+        degrees, minutes, seconds = (float(part) for part in parts)
+        side = sides.index(str(reference).strip("\0 ").upper()[:1] or "?")
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    if not (degrees >= 0 and 0 <= minutes <= 60 and 0 <= seconds <= 60):
+        return None
+    value = degrees + minutes / 60 + seconds / 3600
+    return (-value if side else value) if value <= largest else None
+
+
+def _altitude_m(altitude: Any, reference: Any) -> float | None:
+    try:
+        value = float(altitude)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    below = reference in (1, b"\x01")
+    value = -value if below else value
+    return value if LOWEST_M <= value <= HIGHEST_M else None
 
 
 def _exif_focal_px(focal_35mm: object, longer_side: int) -> float | None:

@@ -6,11 +6,12 @@ from typing import Any
 
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.bundle import adjust
-from sfm_app.colmap.model import photos_of, read_scene, turn_upright
+from sfm_app.colmap.model import photos_of, read_scene
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.reconstruction import Outcome, reconstruct
 from sfm_app.reconstruction.left_out import left_out, names_of, nothing_found
+from sfm_app.reconstruction.orientation import orient
 from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
 
 HINT = "photos that overlap more, from places a step or two apart (turning on the spot is not enough), may help"
@@ -27,9 +28,8 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         raise ReconstructionError(nothing_found(views, outcome.graph, outcome.tried), hint=HINT)
     with backend("adjusting the bundle"):
         adjusted = [adjust(attempt.model, run.workspace.database) for attempt in outcome.models]
-        for model, _ in adjusted:
-            turn_upright(model)
     models = [model for model, _ in adjusted]
+    orientations = [orient(model, matches, run) for model in models]
     write_models(models, run)
     members = [photos_of(model) for model in models]
     reasons = left_out(set(members[0]), members[1:], matches, views, outcome.graph)
@@ -45,6 +45,7 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         mean_reprojection_px=round(scene.mean_reprojection_px, 4),
         cameras={name: {"model": camera.model, "params": camera.params} for name, camera in scene.cameras.items()},
         deviations_px={name: round(value, 4) for name, value in adjusted[0][1].items()},
+        orientation=orientations[0],
         **how_it_was_made(outcome),
     )
     return scene

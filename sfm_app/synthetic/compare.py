@@ -1,12 +1,11 @@
 """How close a reconstruction came to the truth of a rendered photo folder."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.similarity import Similarity, robust_similarity
 from sfm_app.meshing.open3d import load_open3d
 from sfm_app.synthetic.cameras import Camera, camera_centre, pixel_rays
 from sfm_app.synthetic.photo_folder import Truth
@@ -17,22 +16,6 @@ IndexArray = NDArray[np.int64]
 
 # Rays per photo, along its longer side, that find out which part of the true surface was seen.
 SEEN_RAYS = 96
-MAX_TRIPLES = 500
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Similarity:
-    """x -> scale R x + t."""
-
-    scale: float
-    R: FloatArray
-    """(3, 3) rotation."""
-    t: FloatArray
-    """(3,)."""
-
-    def __call__(self, points: FloatArray) -> FloatArray:
-        """Move points (N, 3)."""
-        return np.asarray(self.scale * points @ self.R.T + self.t)
 
 
 def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
@@ -121,9 +104,6 @@ def seen_points(truth: Truth) -> FloatArray:
 def align_centres(centres: Mapping[str, FloatArray], truth: Truth) -> Similarity:
     """The similarity that takes found camera centres to the true ones, not led astray by wrong photos.
 
-    Least median of squares over triples of photos, then Umeyama on the photos that agree with the best triple
-    (Rousseeuw 1984; the threshold is 2.5 robust standard deviations).
-
     Raises:
         ValueError: fewer than 3 common photos, or all centres lie on a line.
     """
@@ -133,32 +113,7 @@ def align_centres(centres: Mapping[str, FloatArray], truth: Truth) -> Similarity
         raise ValueError(f"{len(names)} of the found camera centres are known; 3 are needed")
     a = np.array([centres[name] for name in names], dtype=np.float64)
     b = np.array([true_centres[name] for name in names])
-    triples = np.array(list(combinations(range(len(names)), 3)))
-    if len(triples) > MAX_TRIPLES:
-        triples = np.random.default_rng(0).permutation(triples)[:MAX_TRIPLES]
-    best, residual = np.inf, np.zeros(len(names))
-    for triple in triples:
-        if _on_a_line(a[triple]) or _on_a_line(b[triple]):
-            continue
-        distance = np.linalg.norm(umeyama(a[triple], b[triple])(a) - b, axis=1)
-        # of n photos 3 fit by construction, so the median has to look beyond them
-        score = float(np.sort(distance)[min(len(names) - 1, len(names) // 2 + 1)])
-        if score < best:
-            best, residual = score, distance
-    if not np.isfinite(best):
-        raise ValueError("the camera centres lie on a line and fix no rotation")
-    agreeing = residual <= max(2.5 * 1.4826 * best, np.sort(residual)[2])
-    return umeyama(a[agreeing], b[agreeing])
-
-
-def umeyama(a: FloatArray, b: FloatArray) -> Similarity:
-    """The similarity that takes points a (N, 3) to b (N, 3) with least squared error (Umeyama 1991); N >= 3."""
-    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
-    u, s, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    R = (u * signs) @ vt
-    scale = float((s * signs).sum() / ((a - mean_a) ** 2).sum())
-    return Similarity(scale, R, mean_b - scale * R @ mean_a)
+    return robust_similarity(a, b)
 
 
 def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0) -> FloatArray:
@@ -195,8 +150,3 @@ def _area(vertices: FloatArray, faces: IndexArray) -> FloatArray:
     return np.asarray(
         0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     )
-
-
-def _on_a_line(points: FloatArray) -> bool:
-    s = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(s[1] <= 1e-6 * s[0])

@@ -12,7 +12,7 @@ from sfm_app.types.calibration import Calibration, Intrinsics
 from sfm_app.types.camera_pairs import CameraPairs, PhotoPairs
 from sfm_app.types.epipolar import EpipolarFit, Rejected, ViewGraph
 from sfm_app.types.matches import MatchedImage, MatchGraph, PairId
-from sfm_app.types.photos import Photo, PhotoSet, UnusablePhoto
+from sfm_app.types.photos import GpsPosition, Photo, PhotoSet, UnusablePhoto
 from sfm_app.types.pose_graph import PoseGraph, RelativePose
 from sfm_app.types.scene import CameraModel, Scene
 from sfm_app.types.surface import Surface
@@ -22,6 +22,7 @@ __all__ = [
     "CameraModel",
     "CameraPairs",
     "EpipolarFit",
+    "GpsPosition",
     "Intrinsics",
     "MatchGraph",
     "MatchedImage",

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.types.photos import GpsPosition
+
 PairId = tuple[int, int]
 """(image id 1, image id 2) with id1 < id2, ids as in COLMAP's database."""
 
@@ -20,6 +22,7 @@ class MatchedImage:
     width: int
     height: int
     exif_focal_px: float | None = None
+    gps: GpsPosition | None = None
 
 
 @dataclass(frozen=True, slots=True)

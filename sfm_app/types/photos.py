@@ -5,6 +5,18 @@ from pathlib import Path
 
 
 @dataclass(frozen=True, slots=True)
+class GpsPosition:
+    """Where a photo claims to be taken (WGS84)."""
+
+    latitude_deg: float
+    """North of the equator, [-90, 90]."""
+    longitude_deg: float
+    """East of Greenwich, [-180, 180]."""
+    altitude_m: float | None = None
+    """Above sea level; None where unknown."""
+
+
+@dataclass(frozen=True, slots=True)
 class Photo:
     """One usable photo."""
 
@@ -20,6 +32,8 @@ class Photo:
     """Focal length that EXIF claims, in pixels of this photo; a hint, never trusted."""
     needs_copy: bool = False
     """True where COLMAP cannot read the file as it is (orientation, palette, 16 bit)."""
+    gps: GpsPosition | None = None
+    """Where EXIF claims it was taken; a hint, never trusted."""
 
 
 @dataclass(frozen=True, slots=True)

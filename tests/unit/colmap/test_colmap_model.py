@@ -6,9 +6,10 @@ import pytest
 from sfm_app.colmap.backend import backend, plain, pycolmap
 from sfm_app.colmap.bundle import adjust, main_camera
 from sfm_app.colmap.database import SQUARE_PIXELS, TWO_FOCALS, camera_params
-from sfm_app.colmap.model import turn_upright
+from sfm_app.colmap.model import focal_px, move, posed_photos, viewing_rays
 from sfm_app.errors import BackendError, ConfigError
 from sfm_app.geometry.camera import camera_matrix
+from sfm_app.geometry.similarity import Similarity
 
 WIDTH, HEIGHT = 1000, 800
 
@@ -95,22 +96,35 @@ def test_a_camera_with_two_focals_keeps_them_beside_one_with_square_pixels(tmp_p
     assert set(deviations) <= {"f", "fx", "fy"}
 
 
-def test_a_model_is_turned_upright_centred_and_scaled(tmp_path):
+def test_a_model_moves_as_a_whole(tmp_path):
     model, _ = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0])
     error = model.compute_mean_reprojection_error()
-    turned = pycolmap.Rotation3d(np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]))
-    model.transform(pycolmap.Sim3d(7.0, turned, np.array([30.0, -5, 2])))
+    poses, points = posed_photos(model)
+    similarity = Similarity(7.0, np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([30.0, -5, 2]))
 
-    turn_upright(model)
-    points = np.array([point.xyz for point in model.points3D.values()])
-    poses = [image.cam_from_world().matrix()[:, :3] for image in model.images.values()]
-    up = np.mean([-R[1] for R in poses], axis=0)
+    move(model, similarity)
+    moved_poses, moved_points = posed_photos(model)
 
-    assert np.allclose(np.median(points, axis=0), 0, atol=0.1)
-    assert np.percentile(np.linalg.norm(points, axis=1), 80) == pytest.approx(1, abs=0.05)
-    if np.linalg.norm(up) > 1e-3:
-        assert up[1] / np.linalg.norm(up) == pytest.approx(1, abs=1e-6)
+    assert list(moved_poses) == list(poses) == sorted(model.images)
+    assert np.allclose(moved_points, similarity(points))
+    for key, pose in poses.items():
+        assert np.allclose(moved_poses[key][:, :3], pose[:, :3] @ similarity.R.T)
     assert model.compute_mean_reprojection_error() == pytest.approx(error, rel=1e-4)
+
+
+def test_rays_of_a_lens_meet_the_points_that_the_photo_shows(tmp_path):
+    model, _ = synthetic(tmp_path, [900.0, 900.0, 530.0, 380.0, -0.08, 0.0, 0.0, 0.0])
+    poses, _ = posed_photos(model)
+    key = min(poses)
+    seen = [point for point in model.images[key].points2D if point.has_point3D()]
+    centre = -poses[key][:, :3].T @ poses[key][:, 3]
+    truth = np.array([model.points3D[point.point3D_id].xyz for point in seen]) - centre
+
+    rays = viewing_rays(model, key, np.array([point.xy for point in seen]))
+    sine = np.linalg.norm(np.cross(rays, truth), axis=1) / np.linalg.norm(rays, axis=1) / np.linalg.norm(truth, axis=1)
+
+    assert 0.1 < np.sqrt(np.mean((sine * focal_px(model, key)) ** 2)) < 0.8, "the noise of 0.3 px"
+    assert ((rays * truth).sum(axis=1) > 0).all()
 
 
 def test_camera_parameters_of_both_models():

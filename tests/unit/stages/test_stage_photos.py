@@ -3,6 +3,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from sfm_app.context import RunContext
 from sfm_app.errors import InputError
@@ -116,6 +117,69 @@ def test_exif_focal_is_read_as_a_hint_in_pixels(folder, run):
     photo = next(photo for photo in read_photos(folder, run).photos if photo.name == "e.jpg")
 
     assert photo.exif_focal_px == pytest.approx(27 / 36 * 128)
+
+
+def with_gps(folder, **entries):
+    """A photo whose EXIF has these GPS entries on top of sound ones; None takes one away."""
+    tags = {"lat_ref": 1, "lat": 2, "lon_ref": 3, "lon": 4, "alt_ref": 5, "alt": 6}
+    sound = {
+        "lat_ref": "S",
+        "lat": (33.0, 51.0, 24.5),
+        "lon_ref": "E",
+        "lon": (151.0, 12.0, 54.25),
+        "alt_ref": b"\x00",
+        "alt": 7.5,
+    }
+    exif = Image.Exif()
+    exif.get_ifd(0x8825).update({tags[name]: value for name, value in (sound | entries).items() if value is not None})
+    Image.fromarray(PIXELS).save(folder / "where.jpg", exif=exif)
+
+
+def read_gps(folder, run):
+    found = read_photos(folder, run)
+    assert load_photo_set(run) == found
+    return next(photo.gps for photo in found.photos if photo.name == "where.jpg")
+
+
+def test_gps_is_read_as_a_hint(folder, run):
+    with_gps(folder)
+
+    gps = read_gps(folder, run)
+
+    assert gps.latitude_deg == pytest.approx(-(33 + 51 / 60 + 24.5 / 3600), abs=1e-6)
+    assert gps.longitude_deg == pytest.approx(151 + 12 / 60 + 54.25 / 3600, abs=1e-6)
+    assert gps.altitude_m == pytest.approx(7.5)
+    assert run.counts["gps"] == 1
+
+
+@pytest.mark.parametrize(
+    ("entries", "altitude_m"),
+    [({"alt": None}, None), ({"alt_ref": b"\x01"}, -7.5), ({"alt": 90_000.0}, None), ({"alt_ref": None}, 7.5)],
+)
+def test_altitude_is_optional(folder, run, entries, altitude_m):
+    with_gps(folder, **entries)
+
+    assert read_gps(folder, run).altitude_m == altitude_m
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        {"lat": None},
+        {"lon_ref": None},
+        {"lat_ref": "X"},
+        {"lat": (91.0, 0.0, 0.0)},
+        {"lon": (180.0, 30.0, 0.0)},
+        {"lat": (33.0, 75.0, 0.0)},
+        {"lat": (33.0, 51.0)},
+        {"lat": (IFDRational(33, 0), 51.0, 0.0)},
+        {"lat": (0.0, 0.0, 0.0), "lon": (0.0, 0.0, 0.0)},
+    ],
+)
+def test_a_position_that_cannot_be_true_is_none(folder, run, entries):
+    with_gps(folder, **entries)
+
+    assert read_gps(folder, run) is None
 
 
 def test_the_output_folder_inside_the_photos_is_not_read(folder, tmp_path):

@@ -2,12 +2,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sfm_app.geometry.similarity import Similarity
 from sfm_app.synthetic.cameras import axis_rotation, make_camera
 from sfm_app.synthetic.compare import (
-    Similarity,
     align_centres,
     centre_error_percent,
     focal_error_percent,
@@ -16,7 +15,6 @@ from sfm_app.synthetic.compare import (
     seen_points,
     surface_coverage,
     surface_error,
-    umeyama,
 )
 from sfm_app.synthetic.photo_folder import Truth
 
@@ -62,20 +60,6 @@ def test_with_several_cameras_K_is_judged_by_its_photo(photos):
     assert focal_error_percent(tele.K, mixed, "view_00.jpg") == pytest.approx(100.0)
     with pytest.raises(ValueError, match="several cameras"):
         focal_error_percent(tele.K, mixed)
-
-
-@given(seed=SEEDS, flat=st.booleans())
-@settings(deadline=None)
-def test_umeyama_finds_the_similarity(seed, flat):
-    rng = np.random.default_rng(seed)
-    true = random_similarity(rng)
-    a = rng.normal(size=(8, 3)) * [1.0, 1.0, 0.0 if flat else 1.0]
-
-    found = umeyama(a, true(a))
-
-    assert found.scale == pytest.approx(true.scale)
-    assert np.allclose(found.R, true.R, atol=1e-6) and np.linalg.det(found.R) > 0
-    assert np.allclose(found(a), true(a), atol=1e-6 * true.scale)
 
 
 @pytest.mark.parametrize("wrong", [0, 3])

@@ -1,0 +1,164 @@
+"""Which way is up, from how photographers hold cameras.
+
+They hold them level: the x axes of the cameras are horizontal, and up is the direction most nearly at right angles to
+all of them. Some turn the camera by 90 degrees, for one photo or for all, and the file does not always say so; some do
+not hold it level at all.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.directions import least_direction, unit
+
+FloatArray = NDArray[np.float64]
+
+ROLLS_DEG, PITCH_DEG = (4.0, 12.0, 30.0), 20.0
+"""Standard deviations, sideways of careful, careless and wild photographers, and along the view of all."""
+
+MOST = 4.5
+"""What one photo at most counts against a direction: three standard deviations, so that wild photos are outvoted."""
+
+TURNED = (0.0, 3.0, 8.0, 3.0)
+"""Evidence, as -log of odds, that it takes to believe that all photos are turned by 0, 90, 180, 270 degrees."""
+
+ODD_ONE = 1.0
+"""The same for one photo that is turned otherwise than the others."""
+
+VOICES = 8
+"""Photos of one walk are no independent witnesses: more than so many count as so many."""
+
+FIELD = 0.6
+"""Tangent of half the field of view of a common camera."""
+
+STEPS = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Roll:
+    """What the cameras say about up."""
+
+    up: FloatArray
+    """(3,) unit vector in the world."""
+    turn_deg: int
+    """By how much most photos are turned clockwise against the upright: 0, 90, 180 or 270."""
+    spread_deg: float
+    """Robust standard deviation of the cameras' roll; large where nobody held them level."""
+    deviation_deg: float
+    """Standard deviation of `up` in its worst direction, as the spread of roll and pitch has it."""
+
+
+def up_from_roll(rotations: FloatArray, centres: FloatArray, points: FloatArray | None = None) -> Roll:
+    """The direction for which the cameras are held most nearly level, and most nearly along the ground.
+
+    Roll alone does not tell portrait photos of a wall from landscape photos of the same wall lying on its side, so
+    two weaker signs join in: people look about horizontally, and they walk rather than climb. Which way photos on their
+    side were turned is seen from the ground: what is low is near. Of the directions that the photos propose the best is
+    refined by weighted least squares.
+
+    Args:
+        rotations: (N, 3, 3) cam_from_world, N >= 1; camera axes x right, y down, z forward.
+        centres: (N, 3) camera centres.
+        points: (P, 3) of the scene; left out where unknown.
+    """
+    best, least = (-unit(rotations[0, 1]), 0, ROLLS_DEG[0]), np.inf
+    for turn, proposals in enumerate(_proposals(rotations)):
+        for proposal, roll_deg in product(proposals, ROLLS_DEG):
+            for up in (proposal, _refined(proposal, rotations, roll_deg)):
+                cost = _cost(up, turn, rotations, roll_deg) + _climbing(up, centres)
+                if cost < least - 1e-9:
+                    best, least = (up, turn, roll_deg), cost
+    up, turn, roll_deg = best
+    if turn % 2 and points is not None and nearer(up, rotations, centres, points) > 0:
+        up, turn = -up, (turn + 2) % 4
+    return Roll(up, 90 * turn, *_uncertainty(up, rotations, roll_deg))
+
+
+def _up_axes(rotations: FloatArray) -> FloatArray:
+    """(4, N, 3) what is up in each photo if it is turned by 0, 90, 180, 270 degrees clockwise."""
+    x, y = rotations[:, 0], rotations[:, 1]
+    return np.stack([-y, -x, y, x])
+
+
+def _proposals(rotations: FloatArray) -> list[FloatArray]:
+    """Per turn of the set the mean of its photos' up directions, and some of them alone."""
+    axes = _up_axes(rotations)
+    chosen = np.unique(np.linspace(0, len(rotations) - 1, 12).astype(int))
+    return [
+        np.concatenate([mean[None], ups[chosen]]) if np.linalg.norm(mean := unit(ups.mean(axis=0))) else ups[chosen]
+        for ups in axes
+    ]
+
+
+def _tilts(up: FloatArray, rotations: FloatArray) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
+    """Per photo its turn (0 to 3) and the sines of roll and pitch against `up`."""
+    turns = np.argmax(_up_axes(rotations) @ up, axis=0)
+    level = np.where((turns % 2 == 0)[:, None], rotations[:, 0], rotations[:, 1])
+    return turns, level @ up, rotations[:, 2] @ up
+
+
+def _cost(up: FloatArray, turn: int, rotations: FloatArray, roll_deg: float) -> float:
+    """-log likelihood of the poses if the set as a whole is turned by `turn` quarters."""
+    turns, roll, pitch = _tilts(up, rotations)
+    tilts = [np.minimum(_squares(sine, deg), MOST) for sine, deg in ((roll, roll_deg), (pitch, PITCH_DEG))]
+    per_photo = sum(tilts) + ODD_ONE * (turns != turn) + np.log(roll_deg)
+    return float(min(len(rotations), VOICES) * per_photo.mean() + TURNED[turn])
+
+
+def _climbing(up: FloatArray, centres: FloatArray) -> float:
+    """-log likelihood of how much of the cameras' spread is height."""
+    spread = centres - centres.mean(axis=0)
+    total = float((spread**2).sum())
+    return min(len(centres), VOICES) * 0.5 * float(((spread @ up) ** 2).sum()) / total if total > 0 else 0.0
+
+
+def nearer(up: FloatArray, rotations: FloatArray, centres: FloatArray, points: FloatArray) -> float:
+    """Mean over the photos of the correlation of nearness with height in the photo: > 0 where things overhead are near.
+
+    Of each camera's points those within `FIELD` of its axis count, seen or hidden.
+    """
+    found = []
+    for R, centre in zip(rotations, centres, strict=True):
+        local = (points - centre) @ R.T
+        local = local[local[:, 2] > 0]
+        x = local[:, :2] / local[:, 2:]
+        kept = np.abs(x).max(axis=1, initial=0.0) < FIELD
+        height, nearness = x[kept] @ (R @ up)[:2], -np.log(local[kept, 2])
+        if np.count_nonzero(kept) > 2 and height.std() > 0 and nearness.std() > 0:
+            found.append(float(np.corrcoef(height, nearness)[0, 1]))
+    return float(np.mean(found)) if found else 0.0
+
+
+def _refined(up: FloatArray, rotations: FloatArray, roll_deg: float) -> FloatArray:
+    """Least squares of roll and pitch with Welsch's weights on each photo, from `up` on."""
+    for _ in range(STEPS):
+        before = up
+        up = least_direction(_normal_matrix(up, rotations, roll_deg), up)
+        if float(np.abs(up - before).max()) < 1e-12:
+            break
+    return up
+
+
+def _normal_matrix(up: FloatArray, rotations: FloatArray, roll_deg: float) -> FloatArray:
+    """(3, 3) information about up: sum of the axes' a a' that should be level, over their variances."""
+    turns, roll, pitch = _tilts(up, rotations)
+    level = np.where((turns % 2 == 0)[:, None], rotations[:, 0], rotations[:, 1])
+    matrix = np.zeros((3, 3))
+    for axes, sine, deg in ((level, roll, roll_deg), (rotations[:, 2], pitch, PITCH_DEG)):
+        weights = np.exp(-_squares(sine, deg) / MOST) / np.radians(deg) ** 2
+        matrix += np.einsum("n,ni,nj->ij", weights, axes, axes)
+    return matrix
+
+
+def _uncertainty(up: FloatArray, rotations: FloatArray, roll_deg: float) -> tuple[float, float]:
+    """Robust spread of the roll in degrees, and the standard deviation of `up`."""
+    _, roll, _ = _tilts(up, rotations)
+    spread = float(1.4826 * np.median(np.degrees(np.abs(np.arcsin(np.clip(roll, -1.0, 1.0))))))
+    information = np.linalg.eigvalsh(_normal_matrix(up, rotations, roll_deg))[1]  # of the less certain of two tilts
+    return spread, float(np.degrees(1.0 / np.sqrt(max(information, 1e-12))))
+
+
+def _squares(sine: FloatArray, deg: float) -> FloatArray:
+    return np.asarray(0.5 * (np.degrees(np.arcsin(np.clip(sine, -1.0, 1.0))) / deg) ** 2)

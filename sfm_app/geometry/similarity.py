@@ -1,0 +1,77 @@
+"""Similarities between two sets of points in space: scale, rotation, translation."""
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+MAX_TRIPLES = 500
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Similarity:
+    """x -> scale R x + t."""
+
+    scale: float
+    R: FloatArray
+    """(3, 3) rotation."""
+    t: FloatArray
+    """(3,)."""
+
+    def __call__(self, points: FloatArray) -> FloatArray:
+        """Move points (N, 3)."""
+        return np.asarray(self.scale * points @ self.R.T + self.t)
+
+    def after(self, first: "Similarity") -> "Similarity":
+        """The similarity that does `first`, then this one."""
+        return Similarity(self.scale * first.scale, self.R @ first.R, self.scale * self.R @ first.t + self.t)
+
+    def inverse(self) -> "Similarity":
+        """The similarity that undoes this one."""
+        return Similarity(1.0 / self.scale, self.R.T, -self.R.T @ self.t / self.scale)
+
+
+def umeyama(a: FloatArray, b: FloatArray) -> Similarity:
+    """The similarity that takes points a (N, 3) to b (N, 3) with least squared error (Umeyama 1991); N >= 3."""
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    u, s, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    R = (u * signs) @ vt
+    scale = float((s * signs).sum() / ((a - mean_a) ** 2).sum())
+    return Similarity(scale, R, mean_b - scale * R @ mean_a)
+
+
+def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
+    """The similarity that takes most of the points a (N, 3) to b (N, 3), not led astray by wrong ones.
+
+    Least median of squares over triples, then Umeyama on the points that agree with the best triple (Rousseeuw 1984;
+    the threshold is 2.5 robust standard deviations).
+
+    Raises:
+        ValueError: fewer than 3 points, or all lie on a line.
+    """
+    count = len(a)
+    triples = np.array(list(combinations(range(count), 3)), np.intp).reshape(-1, 3)
+    if len(triples) > MAX_TRIPLES:
+        triples = np.random.default_rng(0).permutation(triples)[:MAX_TRIPLES]
+    best, residual = np.inf, np.zeros(count)
+    for triple in triples:
+        if _on_a_line(a[triple]) or _on_a_line(b[triple]):
+            continue
+        distance = np.linalg.norm(umeyama(a[triple], b[triple])(a) - b, axis=1)
+        # of n points 3 fit by construction, so the median has to look beyond them
+        score = float(np.sort(distance)[min(count - 1, count // 2 + 1)])
+        if score < best:
+            best, residual = score, distance
+    if not np.isfinite(best):
+        raise ValueError("fewer than 3 points, or all on a line: they fix no rotation")
+    agreeing = residual <= max(2.5 * 1.4826 * best, np.sort(residual)[2])
+    return umeyama(a[agreeing], b[agreeing])
+
+
+def _on_a_line(points: FloatArray) -> bool:
+    s = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(s[1] <= 1e-6 * s[0])

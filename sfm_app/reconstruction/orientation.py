@@ -1,0 +1,116 @@
+"""How the finished scene is put before the viewer: upright, centred, and in metres where GPS says how large it is."""
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.colmap.backend import backend
+from sfm_app.colmap.model import focal_px, move, posed_photos, viewing_rays
+from sfm_app.context import RunContext
+from sfm_app.geometry.georeference import Georeference, NoGeoreference, georeference, position_at
+from sfm_app.geometry.segments import line_segments
+from sfm_app.geometry.similarity import Similarity
+from sfm_app.geometry.upright import LINES, Upright, facing, up_direction, viewer_frame
+from sfm_app.geometry.vanishing import Segments, joined, segment_planes
+from sfm_app.types import MatchGraph
+
+logger = logging.getLogger("sfm_app")
+
+FloatArray = NDArray[np.float64]
+
+LINE_PHOTOS = 16
+"""Photos that lines are sought in, spread over the set."""
+
+
+def orient(model: Any, matches: MatchGraph, run: RunContext) -> dict[str, Any]:
+    """Move the model into the frame of glTF viewers: y up, seen from +z, centred, of size about 1 or in metres.
+
+    Args:
+        model: COLMAP's model; changed in place.
+        matches: knows the photos' names and GPS positions.
+        run: where the photos lie.
+
+    Returns:
+        How it was done, for the manifest.
+    """
+    with backend("reading the model"):
+        poses, points = posed_photos(model)
+    segments = lines_of(model, list(poses), matches, run)
+    matrices = np.array(list(poses.values()))
+    R, centres = matrices[:, :, :3], -np.einsum("nij,ni->nj", matrices[:, :, :3], matrices[:, :, 3])
+    upright = up_direction(R, centres, points, segments)
+    positions = [matches.images[key].gps for key in poses]
+    gps = georeference(centres, positions, upright.up, up_is_sure=upright.found_by == LINES)
+    metres = None
+    if isinstance(gps, Georeference):
+        metres = gps.enu_from_world.scale
+        if gps.up_deviation_deg is not None:
+            upright = upright.turned_to(gps.enu_from_world.R[2], gps.up_deviation_deg)
+    towards, front = facing(upright, R, points)
+    viewer = viewer_frame(upright.up, towards, points, metres)
+    with backend("turning the model upright"):
+        move(model, viewer)
+    entry = how_it_stands(upright, front) | where_it_stands(viewer, gps)
+    logger.info("orientation: %s", entry)
+    return entry
+
+
+def lines_of(model: Any, posed: list[int], matches: MatchGraph, run: RunContext) -> Segments:
+    """Line segments, in the world, of some of the photos that have a pose."""
+    chosen = [posed[k] for k in np.unique(np.linspace(0, len(posed) - 1, LINE_PHOTOS).astype(int))]
+    files = [run.workspace.photos / matches.images[key].name for key in chosen]
+    found = run.map(photo_segments, files, "lines in the photos")
+    with backend("looking along lines in the photos"):
+        return joined([_in_world(model, key, lines) for key, lines in zip(chosen, found, strict=True)])
+
+
+def photo_segments(path: Path) -> FloatArray:
+    """Line segments (N, 4) of a photo in its pixels; none where OpenCV cannot read it."""
+    try:
+        data = np.fromfile(path, np.uint8)  # OpenCV does not open names beyond ASCII on every system
+    except OSError:
+        data = np.zeros(0, np.uint8)
+    grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+    return np.zeros((0, 4)) if grey is None else line_segments(np.asarray(grey, np.uint8))
+
+
+def _in_world(model: Any, image_id: int, lines: FloatArray) -> Segments:
+    first, second = (viewing_rays(model, image_id, lines[:, ends]) for ends in (slice(0, 2), slice(2, 4)))
+    return segment_planes(first, second, image_id, focal_px(model, image_id))
+
+
+def how_it_stands(upright: Upright, front: str) -> dict[str, Any]:
+    """Up and front, for the manifest."""
+    return {
+        "up": upright.found_by,
+        "up_deviation_deg": round(upright.deviation_deg, 3),
+        "off_camera_roll_deg": round(upright.off_roll_deg, 2),
+        "camera_roll_spread_deg": round(upright.roll.spread_deg, 2),
+        "photos_turned_deg": upright.roll.turn_deg,
+        "front": front,
+    }
+
+
+def where_it_stands(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Any]:
+    """Unit and place of the model that `viewer` has moved, for the manifest."""
+    if isinstance(gps, NoGeoreference):
+        return {"unit": "about the size of the scene", "gps": f"not used: {gps.reason}"}
+    enu_from_model = gps.enu_from_world.after(viewer.inverse())
+    origin = position_at(enu_from_model.t, gps.origin)
+    east, north, _ = -enu_from_model.R[:, 2]
+    return {
+        "unit": "metre",
+        "gps": f"{gps.photos} of {gps.of} positions agree",
+        "georeference": {
+            "latitude_deg": round(origin.latitude_deg, 8),
+            "longitude_deg": round(origin.longitude_deg, 8),
+            "altitude_m": None if origin.altitude_m is None else round(origin.altitude_m, 2),
+            "heading_deg": round(float(np.degrees(np.arctan2(east, north))) % 360.0, 3),
+            "scale_deviation_percent": round(100 * gps.scale_deviation, 2),
+            "residual_m": round(gps.rms_m, 2),
+        },
+    }

@@ -1,0 +1,53 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from sfm_app.geometry.similarity import Similarity, robust_similarity, umeyama
+
+
+def random_similarity(rng):
+    R = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+    return Similarity(float(np.exp(rng.uniform(-3, 3))), R, rng.normal(size=3) * 10)
+
+
+@given(seed=st.integers(0, 2**32 - 1), flat=st.booleans())
+@settings(deadline=None)
+def test_umeyama_finds_the_similarity(seed, flat):
+    rng = np.random.default_rng(seed)
+    true = random_similarity(rng)
+    a = rng.normal(size=(8, 3)) * [1.0, 1.0, 0.0 if flat else 1.0]
+
+    found = umeyama(a, true(a))
+
+    assert found.scale == pytest.approx(true.scale)
+    assert np.allclose(found.R, true.R, atol=1e-6) and np.linalg.det(found.R) > 0
+    assert np.allclose(found(a), true(a), atol=1e-6 * true.scale)
+
+
+def test_similarities_combine_and_undo():
+    rng = np.random.default_rng(1)
+    first, second, x = random_similarity(rng), random_similarity(rng), rng.normal(size=(5, 3))
+
+    assert np.allclose(second.after(first)(x), second(first(x)))
+    assert np.allclose(first.inverse()(first(x)), x)
+
+
+def test_wrong_points_do_not_spoil_the_robust_fit():
+    rng = np.random.default_rng(2)
+    true, a = random_similarity(rng), rng.normal(size=(12, 3))
+    b = true(a + rng.normal(scale=1e-3, size=a.shape))
+    b[:4] += true.scale * rng.normal(size=(4, 3))
+
+    robust, plain = robust_similarity(a, b), umeyama(a, b)
+    errors = [np.abs(fit(a[4:]) - b[4:]).mean() / true.scale for fit in (robust, plain)]
+
+    assert 3e-4 < errors[0] < 3e-3 < 3e-2 < errors[1]
+
+
+def test_points_that_fix_no_rotation():
+    line = np.arange(5.0)[:, None] * [1.0, 2.0, 3.0]
+    for few in (line, line[:2]):
+        with pytest.raises(ValueError, match="fix no rotation"):
+            robust_similarity(few, few)

@@ -1,0 +1,105 @@
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.model import posed_photos
+from sfm_app.geometry.georeference import enu_m, position_at
+from sfm_app.reconstruction.orientation import orient, photo_segments
+from sfm_app.synthetic.cameras import arc, make_camera
+from sfm_app.types import GpsPosition, MatchedImage, MatchGraph
+from sfm_app.workspace import Workspace
+
+METRES = 8.0
+"""Per unit of the synthetic scene."""
+
+HEADING_DEG = 70.0
+"""Compass direction that its -z has."""
+
+
+def model_of(views):
+    """A COLMAP model with these views, moved to another frame, and a cloud of points a quarter as deep as wide."""
+    model = pycolmap.Reconstruction()
+    for key, (name, pose) in enumerate(views.cam_from_world.items(), start=1):
+        camera = views.cameras[name]
+        params = [*np.diag(camera.K)[:2], *camera.K[:2, 2], 0, 0, 0, 0]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=key, model="OPENCV", width=camera.width, height=camera.height, params=params)
+        )
+        image = pycolmap.Image(name=name, camera_id=key, image_id=key)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:, :3]), pose[:, 3]))
+    for xyz in np.random.default_rng(0).uniform([-2, 0, -0.5], [2, 2, 0.5], (300, 3)):
+        model.add_point3D(xyz, pycolmap.Track(), np.zeros(3, np.uint8))
+    model.transform(pycolmap.Sim3d(0.3, pycolmap.Rotation3d(np.array([0.3, -0.5, 0.1, 0.8])), np.array([1.0, 2, 3])))
+    return model
+
+
+def scene(tmp_path, positions):
+    views = arc(make_camera(480, 320))
+    images = {
+        key: MatchedImage(key, name, "one", 480, 320, gps=gps)
+        for key, (name, gps) in enumerate(zip(views.cam_from_world, positions(views), strict=True), start=1)
+    }
+    run = SimpleNamespace(workspace=Workspace(tmp_path), map=lambda function, items, _: [function(i) for i in items])
+    return views, model_of(views), MatchGraph(images, {}, {}), run
+
+
+def true_positions(views):
+    """Where the cameras are if the synthetic scene stands in Vienna, and looks towards `HEADING_DEG`."""
+    turn = np.radians(HEADING_DEG)
+    ahead, right = np.array([np.sin(turn), np.cos(turn), 0.0]), np.array([np.cos(turn), -np.sin(turn), 0.0])
+    axes = np.stack([right, [0, 0, 1.0], -ahead])
+    centres = [-pose[:, :3].T @ pose[:, 3] for pose in views.cam_from_world.values()]
+    return [position_at(METRES * centre @ axes, GpsPosition(48.2, 16.37, 170.0)) for centre in centres]
+
+
+def test_without_gps_the_model_has_size_one_and_stands_upright(tmp_path):
+    views, model, matches, run = scene(tmp_path, lambda views: [None] * len(views.cam_from_world))
+
+    entry = orient(model, matches, run)
+    poses, points = posed_photos(model)
+
+    assert entry["up"] == "camera roll" and entry["gps"] == "not used: the photos have no positions"
+    assert np.allclose(np.median(points, axis=0), 0, atol=0.1)
+    assert np.percentile(np.linalg.norm(points, axis=1), 80) == pytest.approx(1, abs=1e-6)
+    ups = [poses[key][:, :3].T @ pose[:, :3] @ [0, 1, 0] for key, pose in enumerate(views.cam_from_world.values(), 1)]
+    assert np.allclose(ups, ups[0], atol=1e-6)
+    assert ups[0][1] > np.cos(np.radians(12))
+    assert np.mean([pose[2, 2] for pose in poses.values()]) < -0.8, "photos look from the viewer's side"
+
+
+def test_with_gps_the_model_is_in_metres_and_knows_its_place(tmp_path):
+    _, model, matches, run = scene(tmp_path, true_positions)
+    shape = posed_photos(model)[1]
+
+    entry = orient(model, matches, run)
+    points = posed_photos(model)[1]
+
+    assert entry["unit"] == "metre" and entry["gps"] == "12 of 12 positions agree"
+    assert np.ptp(points, axis=0).max() / np.linalg.norm(np.ptp(shape, axis=0)) > 5
+    extent = np.linalg.norm(points - np.median(points, axis=0), axis=1).max()
+    assert extent == pytest.approx(METRES * np.hypot(2, np.hypot(1, 0.5)), rel=0.1)
+    place = entry["georeference"]
+    assert (place["latitude_deg"], place["longitude_deg"]) == pytest.approx((48.2, 16.37), abs=3e-5)
+    assert place["altitude_m"] == pytest.approx(170 + METRES, abs=3)
+    assert 0 <= place["heading_deg"] < 360
+    turned_deg = (place["heading_deg"] - HEADING_DEG + 180) % 360 - 180
+    assert abs(turned_deg) < 30, "the front may be turned to the viewer, not further"
+    h = np.radians(place["heading_deg"])
+    origin = GpsPosition(place["latitude_deg"], place["longitude_deg"], place["altitude_m"])
+    for key, pose in posed_photos(model)[0].items():
+        x, y, z = -pose[:, :3].T @ pose[:, 3]
+        enu = np.array([x * np.cos(h) - z * np.sin(h), -x * np.sin(h) - z * np.cos(h), y])
+        assert enu == pytest.approx(enu_m([matches.images[key].gps], origin)[0], abs=4), "up is only that of roll"
+
+
+def test_a_photo_that_is_gone_has_no_lines(tmp_path):
+    picture = np.zeros((200, 300), np.uint8)
+    picture[:, 150:] = 200
+    cv2.imwrite(str(tmp_path / "a.png"), picture)
+
+    assert photo_segments(tmp_path / "a.png") == pytest.approx(np.array([[150, 0, 150, 200]]), abs=2)
+    assert photo_segments(Path(tmp_path / "b.png")).shape == (0, 4)
