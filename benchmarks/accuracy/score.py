@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.essential import decompose_essential, essential_from_fundamental
-from sfm_app.synthetic.compare import umeyama
+from sfm_app.geometry.similarity import umeyama
 
 Pose = NDArray[np.float64]
 

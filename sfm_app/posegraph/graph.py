@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sfm_app.posegraph.guided import guided_pose
 from sfm_app.posegraph.pair_pose import Pair, estimated
-from sfm_app.posegraph.rotations import average_rotations
+from sfm_app.posegraph.rotations import agreeing_loops, average_rotations
 from sfm_app.types import EpipolarFit, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
 
 FloatArray = NDArray[np.float64]
@@ -24,7 +24,10 @@ cameras are guesses."""
 SPREADS = 4.0
 ENOUGH = 100.0
 """From so many inliers on, more of them make a pair hardly more believable."""
+WEAK = 2.0
+"""A pair with fewer than so many times the least inliers needs a loop of other pairs to bear it out."""
 CONTRADICTS, BEHIND, TOO_FEW = "contradicts other pairs", "points behind a camera", "too few matches fit the cameras"
+UNCONFIRMED = "few matches, and no other pair bears it out"
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +83,9 @@ def build_pose_graph(
             poses[pair] = pose
             dropped.pop(pair, None)
     poses = dict(sorted(poses.items()))
+    for pair in unconfirmed(poses, WEAK * options.min_inliers):
+        dropped[pair] = UNCONFIRMED
+        del poses[pair]
     return PoseGraph(poses, dropped, averaged(poses)[0], _groups(poses))
 
 
@@ -87,6 +93,22 @@ def averaged(poses: Mapping[PairId, RelativePose]) -> tuple[dict[int, FloatArray
     """Rotations of photos, and how far pairs are from them, with pairs counting by their inliers."""
     weights = {pair: pose.inlier_count / (1.0 + pose.inlier_count / ENOUGH) for pair, pose in poses.items()}
     return average_rotations({pair: pose.R for pair, pose in poses.items()}, weights)
+
+
+def unconfirmed(poses: Mapping[PairId, RelativePose], firm: float) -> list[PairId]:
+    """Pairs with fewer than `firm` inliers that no loop of three photos bears out.
+
+    With these a place that only looks like another is joined to it, and no other pair is there to contradict.
+    """
+    photos = sorted({photo for pair in poses for photo in pair})
+    edges = np.searchsorted(photos, np.array(list(poses), np.int64).reshape(-1, 2))
+    loops, agree = agreeing_loops(edges, np.array([pose.R for pose in poses.values()]).reshape(-1, 3, 3))
+    borne_out = set(loops[agree].ravel().tolist())
+    return (
+        [pair for k, (pair, pose) in enumerate(poses.items()) if pose.inlier_count < firm and k not in borne_out]
+        if len(poses) > 1
+        else []
+    )
 
 
 def connected(pairs: Iterable[PairId]) -> list[set[int]]:

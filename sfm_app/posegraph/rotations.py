@@ -65,16 +65,11 @@ def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) ->
     """(E,) in (0, 1]: which share of the loops of three through each pair agrees; 1 where there is no loop.
 
     Args:
-        edges: (E, 2) numbers of photos.
+        edges: (E, 2) numbers of photos, the smaller first.
         turns: (E, 3, 3) rotation of photo 2 from photo 1.
         strengths: (E,) weights; a loop weighs as much as the weaker of the two other pairs in it.
     """
-    loops = np.array(list(_loops(edges.tolist())), np.int64).reshape(-1, 3)
-    if not len(loops):
-        return np.ones(len(edges))
-    first, second, across = turns[loops[:, 0]], turns[loops[:, 1]], turns[loops[:, 2]]
-    around = np.einsum("nji,njk,nkl->nil", across, second, first)
-    agree = np.degrees(Rotation.from_matrix(around).magnitude()) < LOOP_DEG
+    loops, agree = agreeing_loops(edges, turns)
     found = np.zeros((2, len(edges)))
     for one, others in ((0, (1, 2)), (1, (0, 2)), (2, (0, 1))):
         weight = np.minimum(*(strengths[loops[:, other]] for other in others))
@@ -84,9 +79,19 @@ def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) ->
     return np.asarray((found[0] + least) / (found[1] + least), np.float64)
 
 
+def agreeing_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArray[np.bool_]]:
+    """(L, 3) numbers of the edges of every loop of three photos, and (L,) whether their rotations agree."""
+    loops = np.array(list(_loops(edges.tolist())), np.int64).reshape(-1, 3)
+    if not len(loops):
+        return loops, np.zeros(0, np.bool_)
+    first, second, across = turns[loops[:, 0]], turns[loops[:, 1]], turns[loops[:, 2]]
+    around = np.einsum("nji,njk,nkl->nil", across, second, first)
+    return loops, np.degrees(Rotation.from_matrix(around).magnitude()) < LOOP_DEG
+
+
 def _loops(edges: Sequence[Sequence[int]]) -> Iterator[tuple[int, int, int]]:
     """Numbers of the edges a-b, b-c and a-c of every three photos a < b < c that all meet."""
-    number = {(min(edge), max(edge)): k for k, edge in enumerate(edges)}
+    number = {(a, b): k for k, (a, b) in enumerate(edges)}
     after: dict[int, list[int]] = {}
     for a, b in number:
         after.setdefault(a, []).append(b)

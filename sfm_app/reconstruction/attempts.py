@@ -77,6 +77,9 @@ def attempts(group: Group, run: RunContext) -> list[Attempt]:
         if _settled(found, len(group.photos)):
             break
         found += _judged(group, [maker], run)
+    best = better(found)
+    if best is not None and best.mapper == "global" and best.photos < len(group.photos):
+        found += _judged(group, [_from_model(best.model, run)], run)
     return found
 
 
@@ -136,13 +139,20 @@ def _all_at_once(group: Group, run: RunContext) -> tuple[str, str, Maker]:
 
 
 def _from_seed(group: Group, candidate: Candidate, run: RunContext) -> tuple[str, str, Maker]:
-    place = run.workspace
-
     def make(token: Any) -> Any:
         rows = group.matches.matches[candidate.pair][candidate.pose.inliers]
         seed = seed_of(group.matches, candidate, group.intrinsics)
-        start = model_from_seed(place.database, candidate.pair, rows, seed)
-        scratch = place.root / ".mapping"
-        return map_incrementally(place.database, place.photos, start, scratch, run.seed, run.progress.advance, token)
+        return _grown(model_from_seed(run.workspace.database, candidate.pair, rows, seed), run, token)
 
     return "incremental", f"from {' + '.join(names_of(candidate.pair, group.matches))}", make
+
+
+def _from_model(model: Any, run: RunContext) -> tuple[str, str, Maker]:
+    """Photos that the global mapper left out may fit into what it made."""
+    return "incremental", "what was left out, photo by photo", lambda token: _grown(model, run, token)
+
+
+def _grown(start: Any, run: RunContext, token: Any) -> Any:
+    place = run.workspace
+    scratch = place.root / ".mapping"
+    return map_incrementally(place.database, place.photos, start, scratch, run.seed, run.progress.advance, token)
