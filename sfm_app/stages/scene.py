@@ -1,14 +1,15 @@
 """scene: ViewGraph and Intrinsics -> Scene."""
 
+import json
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.bundle import adjust
+from sfm_app.colmap.bundle import Adjusted, adjust
 from sfm_app.colmap.mapping import PhotoCounter, continue_mapping
 from sfm_app.colmap.model import model_from_seed, read_scene, turn_upright
 from sfm_app.context import RunContext
@@ -54,11 +55,13 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
     if best is None:
         raise ReconstructionError(nothing_found(views, candidates, tried), hint=HINT)
     with backend("adjusting the bundle"):
-        best, deviations = adjust(best, run.workspace.database)
+        adjusted = adjust(best, run.workspace.database)
+        best = adjusted.model
         turn_upright(best)
     write_model(best, run)
     names = {image.name: intrinsics.name_of(image) for image in matches.images.values()}
-    scene = read_scene(run.workspace.sparse, names, left_out(best, matches, views))
+    scene = read_scene(run.workspace.sparse, names, left_out(best, matches, views), refined_by_name(adjusted, names))
+    write_refined(scene, run)
     run.record(
         registered=len(scene.registered),
         of=len(matches.images),
@@ -66,8 +69,7 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         points=scene.points,
         observations=scene.observations,
         mean_reprojection_px=round(scene.mean_reprojection_px, 4),
-        cameras={name: {"model": camera.model, "params": camera.params} for name, camera in scene.cameras.items()},
-        deviations_px={name: round(value, 4) for name, value in deviations.items()},
+        cameras={name: camera.to_dict() for name, camera in scene.cameras.items()},
         seeds_tried=tried,
     )
     return scene
@@ -174,13 +176,31 @@ def write_model(model: Any, run: RunContext) -> None:
     beside.rename(target)
 
 
+def refined_by_name(adjusted: Adjusted, names: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """What is known about the refined cameras besides COLMAP's model, by name of the camera."""
+    cameras = {names[image.name]: image.camera_id for image in adjusted.model.images.values() if image.has_pose}
+    return {
+        name: {"deviations": adjusted.deviations[camera_id], "determined": adjusted.determined[camera_id]}
+        for name, camera_id in cameras.items()
+    }
+
+
+def write_refined(scene: Scene, run: RunContext) -> None:
+    """Enter the refined cameras into calibration.json, beside what was found before."""
+    path = run.workspace.calibration
+    known = json.loads(path.read_text(encoding="utf-8"))
+    known["refined"] = {name: camera.to_dict() for name, camera in scene.cameras.items()}
+    with run.workspace.replacing(path) as beside:
+        beside.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+
+
 def load_scene(photos: PhotoSet, intrinsics: Intrinsics, run: RunContext) -> Scene:
     """Read the model back; why photos were left out stands in the manifest."""
     record = run.workspace.record("scene")
     names = {photo.name: intrinsics.name_of(photo) for photo in photos.photos}
     with backend("reading the sparse model"):
-        unregistered = record.counts.get("unregistered", {}) if record else {}
-        return read_scene(run.workspace.sparse, names, unregistered)
+        counts = record.counts if record else {}
+        return read_scene(run.workspace.sparse, names, counts.get("unregistered", {}), counts.get("cameras", {}))
 
 
 def nothing_found(views: ViewGraph, candidates: list[Candidate], tried: list[str]) -> str:

@@ -1,0 +1,209 @@
+"""What a whole bundle of photos says about its cameras, and how much of that is believed.
+
+As for pairs (`priors`): each part of a camera has a narrow prior about its usual value and a wide one, and is freed
+where the evidence for the wide one (the marginal likelihood, by Laplace's approximation) outweighs how rare such
+cameras are. Freed or not, the prior stays in the estimate: what the photos do not determine stays where it usually is.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.bundle import CAMERA, CX, CY, FX, FY, K1, K2, P1, P2, Reduced
+from sfm_app.selfcal.priors import ASPECT, CENTRE, FREE_SHARE, LENS, NARROW, WIDE
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+LOG_FOCAL, LOG_ASPECT = FX, FY
+"""What stands in place of fx and fy: log sqrt(fx fy) and log fy/fx."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Parameters of a camera that are freed together."""
+
+    name: str
+    places: tuple[int, ...]
+    narrow: float
+    """Standard deviation about the usual value; the centre's in longer sides."""
+    wide: float
+    share: float
+    """Share of cameras for which the wide prior is the right one."""
+    stays: bool
+    """Whether it stays as it is where the photos do not determine it; else it is drawn to its usual value. Mapping
+    knows centre and aspect from the calibration, but finds a lens with nothing to hold it."""
+
+
+PARTS = (
+    Part("centre", (CX, CY), NARROW[CENTRE], WIDE[CENTRE], FREE_SHARE[CENTRE], True),
+    Part("aspect", (LOG_ASPECT,), NARROW[ASPECT], WIDE[ASPECT], FREE_SHARE[ASPECT], True),
+    Part("k1", (K1,), NARROW[LENS], WIDE[LENS], FREE_SHARE[LENS], False),
+    Part("k2", (K2,), 0.01, 0.2, 0.3, False),
+    Part("p1 p2", (P1, P2), 0.0002, 0.002, 0.05, True),
+)
+FOCAL_SPREAD = 0.7
+"""Prior standard deviation of log f about what mapping found: none to speak of."""
+UNDETERMINED = 0.5
+"""A part whose prior the photos do not make narrower than this stays as it is: freeing it adds more than it removes."""
+MISFIT = 4.0
+"""Errors of cameras, in what independent noise in the observations explains: lenses are not quite of the model's form,
+neighbouring observations err alike. Measured on photos with known cameras."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Usual:
+    """What is believed about the cameras before the bundle is asked, one row each."""
+
+    centres: FloatArray
+    """(C, 2) where the centre usually is, in pixels: the middle of the photo."""
+    sides: FloatArray
+    """(C,) longer side in pixels."""
+    asked: BoolArray
+    """(C, 5) whether the photos are asked about a part, in the order of PARTS; else it stays as it is."""
+
+    def precision(self, free: BoolArray) -> FloatArray:
+        """(C, 8) of the prior when `free` (C, 5) says what has the wide one."""
+        deviation = np.full((len(free), CAMERA), FOCAL_SPREAD)
+        for k, part in enumerate(PARTS):
+            unit = self.sides if part.name == "centre" else np.ones(len(free))
+            sigma = np.where(free[:, k], part.wide, part.narrow) * unit
+            deviation[:, list(part.places)] = sigma[:, None]
+        return np.asarray(deviation**-2.0, np.float64)
+
+    def away(self, params: FloatArray) -> FloatArray:
+        """(C, 8) from the cameras to their usual values; none for the focal, nor for what the photos are not asked."""
+        away = np.zeros_like(params)
+        away[:, [CX, CY]] = self.centres - params[:, [CX, CY]]
+        away[:, LOG_ASPECT] = np.log(params[:, FX] / params[:, FY])
+        away[:, [K1, K2, P1, P2]] = -params[:, [K1, K2, P1, P2]]
+        return np.where(spread(self.asked), away, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Where the cameras are most probably."""
+
+    params: FloatArray
+    """(C, 8) as in `Bundle`."""
+    deviations: FloatArray
+    """(C, 8) their standard deviations."""
+    free: BoolArray
+    """(C, 5) the parts that have the wide prior, in the order of PARTS."""
+    determined: BoolArray
+    """(C, 5) the parts about which the photos say more than the prior."""
+    step: float
+    """The largest change of a parameter, in standard deviations."""
+
+
+def estimate(params: FloatArray, reduced: Reduced, usual: Usual) -> Estimate:
+    """The most probable cameras, with the most probable choice of freed parts; undetermined parts stay.
+
+    The deviations are those of all parts, about the value that was chosen, even where that is the present one.
+    """
+    T = _by_logarithms(params)
+    weight = (MISFIT * reduced.noise_px) ** -2.0
+    H, g = weight * T.T @ reduced.H @ T, weight * T.T @ reduced.g
+    away = usual.away(params)
+    free = _choose(H, g, away, usual)
+    precision = usual.precision(free)
+    soft, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
+    determined = usual.asked & _determined(covariance, precision)
+    changing = spread(determined | (usual.asked & ~np.array([part.stays for part in PARTS])))
+    step, own = _posterior(H, g, precision, away, changing)
+    off = T @ (soft - step)
+    deviations = np.sqrt(np.diag(T @ covariance @ T.T) + off**2).reshape(params.shape)
+    largest = float(np.max(np.abs(step[changing.ravel()]) / np.sqrt(np.diag(own)[changing.ravel()])))
+    return Estimate(_moved(params, step.reshape(params.shape)), deviations, free & determined, determined, largest)
+
+
+def spread(parts: BoolArray) -> BoolArray:
+    """(C, 8) the parameters of some parts (C, 5), and of the focal."""
+    chosen = np.ones((len(parts), CAMERA), np.bool_)
+    for k, part in enumerate(PARTS):
+        chosen[:, list(part.places)] = parts[:, [k]]
+    return chosen
+
+
+def _posterior(
+    H: FloatArray, g: FloatArray, precision: FloatArray, away: FloatArray, changing: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean step (8C,) and covariance (8C, 8C) of what is changing (C, 8); 0 elsewhere."""
+    places = np.flatnonzero(changing)
+    step, covariance = np.zeros(len(g)), np.zeros_like(H)
+    block = np.ix_(places, places)
+    covariance[block] = np.linalg.inv((H + np.diag(precision.ravel()))[block])
+    step[places] = covariance[block] @ (g + (precision * away).ravel())[places]
+    return step, covariance
+
+
+def _determined(covariance: FloatArray, precision: FloatArray) -> BoolArray:
+    """(C, 5) as in `Estimate`."""
+    narrower = np.sqrt(np.diag(covariance)).reshape(precision.shape) < UNDETERMINED * precision**-0.5
+    return np.stack([narrower[:, list(part.places)].all(axis=1) for part in PARTS], axis=1)
+
+
+def _choose(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual) -> BoolArray:
+    """The most probable choice (C, 5): one camera after the other, the rest as they are, until none changes."""
+    free = np.zeros((len(away), len(PARTS)), np.bool_)
+    for _ in range(len(away) + 1):
+        before = free.copy()
+        for camera in range(len(away)):
+            own_H, own_g = _marginal(H, g, away, usual.precision(free), camera)
+            free[camera] = _best(own_H, own_g, away[camera], usual, camera)
+        if len(away) == 1 or np.array_equal(free, before):
+            break
+    return free
+
+
+def _marginal(
+    H: FloatArray, g: FloatArray, away: FloatArray, precision: FloatArray, camera: int
+) -> tuple[FloatArray, FloatArray]:
+    """What photos and the other cameras' priors say about one camera: its H (8, 8) and g (8,)."""
+    own = np.arange(CAMERA * camera, CAMERA * (camera + 1))
+    rest = np.setdiff1d(np.arange(len(g)), own)
+    if not len(rest):
+        return H, g
+    others = H[np.ix_(rest, rest)] + np.diag(precision.ravel()[rest])
+    pull = g[rest] + precision.ravel()[rest] * away.ravel()[rest]
+    give = np.linalg.solve(others, np.column_stack([H[np.ix_(rest, own)], pull]))
+    across = H[np.ix_(own, rest)]
+    return H[np.ix_(own, own)] - across @ give[:, :-1], g[own] - across @ give[:, -1]
+
+
+def _best(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual, camera: int) -> BoolArray:
+    """The most probable choice (5,) for one camera; of equals the one that frees less."""
+    best, most = np.zeros(len(PARTS), np.bool_), -np.inf
+    for switches in sorted(product((False, True), repeat=len(PARTS)), key=sum):
+        trial = np.array(switches)
+        if np.any(trial & ~usual.asked[camera]):
+            continue
+        alone = Usual(usual.centres[[camera]], usual.sides[[camera]], usual.asked[[camera]])
+        precision = alone.precision(trial[None])[0]
+        covariance = np.linalg.inv(H + np.diag(precision))
+        pull = g + precision * away
+        value = 0.5 * float(pull @ covariance @ pull - precision @ away**2)
+        value += 0.5 * float(np.sum(np.log(precision)) + np.linalg.slogdet(covariance)[1])
+        value += sum(np.log(part.share if on else 1.0 - part.share) for part, on in zip(PARTS, trial, strict=True))
+        if value > most + 1e-9:
+            best, most = trial, value
+    return best
+
+
+def _by_logarithms(params: FloatArray) -> FloatArray:
+    """(8C, 8C) derivatives of the parameters by those with log f and log fy/fx in place of fx and fy."""
+    T = np.eye(params.size)
+    for camera, values in enumerate(params):
+        x, y = CAMERA * camera + FX, CAMERA * camera + FY
+        T[x, [x, y]] = values[FX], -0.5 * values[FX]
+        T[y, [x, y]] = values[FY], 0.5 * values[FY]
+    return T
+
+
+def _moved(params: FloatArray, step: FloatArray) -> FloatArray:
+    moved = params + step
+    moved[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
+    moved[:, FY] = params[:, FY] * np.exp(step[:, LOG_FOCAL] + 0.5 * step[:, LOG_ASPECT])
+    return moved
