@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import TWO_FOCALS, camera_params, opened
-from sfm_app.geometry.bundle import Bundle, reduce
+from sfm_app.geometry.bundle import POSE, Bundle, Reduced, cost, moved, reduce
 from sfm_app.selfcal.lens_evidence import PARTS, Estimate, Usual, estimate
 
 PHOTOS_TO_ASK = 5
@@ -22,9 +22,12 @@ LOSS_SCALE_PX = 1.0
 MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
 """COLMAP's own limits for a point: largest reprojection error, least angle between its rays."""
 
-ROUNDS, CHANGED, STEP = 5, 0.0005, 0.1
+ROUNDS, CHANGED, STEP = 6, 0.0005, 0.2
 """At most so many rounds; fewer when less than this share of the observations changes, and no camera by more than this
 share of its standard deviation."""
+
+FAR = 1.0
+"""Beyond so many standard deviations a linear step does not arrive, and COLMAP's solver settles poses and points."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,24 +44,24 @@ class Adjusted:
 def adjust(model: Any, database: Path) -> Adjusted:
     """Refine cameras, poses, points and tracks in turn; of the cameras as much as the photos determine.
 
-    COLMAP's solver adjusts poses and points with the cameras held. What the bundle then says about the cameras, poses
-    and points giving way, is weighed against what cameras usually are; the cameras make that step, and all starts
-    again.
+    What the bundle says about the cameras, poses and points giving way, is weighed against what cameras usually are.
+    The cameras make that step, poses and points follow (COLMAP's solver helps where the way is long), tracks are
+    completed and cleaned, and all starts again.
     """
     model = pycolmap.Reconstruction(model)
     for camera in model.cameras.values():
         _generalise(camera)
     graph = _correspondences(model, database)
     for _ in range(ROUNDS):
-        solve(model)
-        changed = improve_tracks(model, graph)
         ids, bundle = read_bundle(model)
-        found = estimate(bundle.params, reduce(bundle, LOSS_SCALE_PX), usual_cameras(model, ids))
-        for camera_id, params in zip(ids, found.params, strict=True):
-            model.cameras[camera_id].params = params
+        reduced = reduce(bundle, LOSS_SCALE_PX)
+        found = estimate(bundle.params, reduced, usual_cameras(model, ids))
+        write_bundle(model, ids, best_step(bundle, reduced, found))
+        if found.step > FAR:
+            solve(model)
+        changed = improve_tracks(model, graph)
         if found.step < STEP and changed < CHANGED * len(bundle.x):
             break
-    solve(model)
     model.update_point_3d_errors()
     return Adjusted(model, *_summary(ids, found))
 
@@ -70,7 +73,7 @@ def solve(model: Any) -> None:
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.loss_function_scale = LOSS_SCALE_PX
     options.ceres.solver_options.max_num_iterations = 50
-    options.ceres.solver_options.function_tolerance = 1e-6
+    options.ceres.solver_options.function_tolerance = 1e-5
     options.ceres.solver_options.num_threads = 1
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
@@ -114,6 +117,24 @@ def read_bundle(model: Any) -> tuple[list[int], Bundle]:
         point=np.array([rows[keypoint.point3D_id] for one in seen for keypoint in one]),
         x=np.array([keypoint.xy for one in seen for keypoint in one]),
     )
+
+
+def best_step(bundle: Bundle, reduced: Reduced, found: Estimate) -> Bundle:
+    """The bundle with the estimated cameras; poses and points follow, where that is no worse than if they stayed."""
+    nowhere = np.zeros((len(bundle.R), POSE)), np.zeros_like(bundle.X)
+    steps = (reduced.follow(found.params - bundle.params), nowhere)
+    return min((moved(bundle, found.params, *step) for step in steps), key=lambda one: cost(one, LOSS_SCALE_PX))
+
+
+def write_bundle(model: Any, ids: list[int], bundle: Bundle) -> None:
+    """Put arrays in the order of `read_bundle` into the model."""
+    for camera_id, params in zip(ids, bundle.params, strict=True):
+        model.cameras[camera_id].params = params
+    for image_id, R, t in zip(sorted(model.reg_image_ids()), bundle.R, bundle.t, strict=True):
+        image = model.images[image_id]
+        model.frames[image.frame_id].set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
+    for point, xyz in zip(sorted(model.points3D), bundle.X, strict=True):
+        model.points3D[point].xyz = xyz
 
 
 def usual_cameras(model: Any, ids: list[int]) -> Usual:

@@ -1,10 +1,11 @@
 """What all observations of a model together say about its cameras, with poses and points eliminated."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
 
@@ -47,7 +48,21 @@ class Reduced:
     g: FloatArray
     """(8C,)"""
     noise_px: float
-    """Standard deviation of a coordinate, from what the parameters leave over."""
+    """Standard deviation of a coordinate, from what the best linear step leaves over."""
+    pose_step: FloatArray
+    """(6I,) best change of the poses when the cameras stay."""
+    pose_give: FloatArray
+    """(6I, 8C) how much less they change per change of the cameras."""
+    point_step: FloatArray
+    """(3P,) best change of the points when all else stays."""
+    point_give: sparse.csr_array
+    """(3P, 6I + 8C) how much less they change per change of poses and cameras."""
+
+    def follow(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Changes of poses (I, 6) and points (P, 3) that go best with a change of the cameras (C, 8)."""
+        poses = self.pose_step - np.einsum("ij,j->i", self.pose_give, cameras.ravel())
+        points = self.point_step - self.point_give @ np.concatenate([poses, cameras.ravel()])
+        return poses.reshape(-1, POSE), points.reshape(-1, 3)
 
 
 def project(bundle: Bundle) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -97,7 +112,8 @@ def reduce(bundle: Bundle, scale_px: float) -> Reduced:
     root = (1.0 + np.einsum("ni,ni->n", r, r) / scale_px**2) ** -0.25
     r, by_point = r * root[:, None], by_point * root[:, None, None]
     by_view = np.concatenate([by_pose, by_camera], 2) * root[:, None, None]
-    by_point = _orthonormal(by_point, bundle.point, len(bundle.X))
+    whiten = _whiten(by_point, bundle.point, len(bundle.X))
+    by_point = np.einsum("nki,nji->nkj", by_point, whiten[bundle.point])
     poses, cameras = POSE * len(bundle.R), CAMERA * len(bundle.params)
     columns = np.hstack(
         [
@@ -116,19 +132,50 @@ def reduce(bundle: Bundle, scale_px: float) -> Reduced:
     give = np.linalg.solve(S[np.ix_(free, free)], np.column_stack([S[free][:, poses:], gradient[free]]))
     H = S[poses:, poses:] - S[poses:][:, free] @ give[:, :-1]
     g = gradient[poses:] - S[poses:][:, free] @ give[:, -1]
+    H = 0.5 * (H + H.T)
+    explained = np.sum(along**2) + np.sum(gradient[free] * give[:, -1]) + np.sum(g * np.linalg.solve(H, g))
     spare = max(len(flat) - 3 * len(bundle.X) - len(free) - cameras, 1)
-    return Reduced(0.5 * (H + H.T), g, float(np.sqrt(np.sum(flat * flat) / spare)))
+    pose_step, pose_give = np.zeros(poses), np.zeros((poses, cameras))
+    pose_step[free], pose_give[free] = give[:, -1], give[:, :-1]
+    unwhiten = _block_diagonal(whiten.transpose(0, 2, 1))
+    return Reduced(
+        H=H,
+        g=g,
+        noise_px=float(np.sqrt(max(np.sum(flat**2) - explained, 0.0) / spare)),
+        pose_step=pose_step,
+        pose_give=pose_give,
+        point_step=unwhiten @ along,
+        point_give=unwhiten @ A,
+    )
 
 
-def _orthonormal(by_point: FloatArray, point: NDArray[np.int64], points: int) -> FloatArray:
-    """Derivatives by another basis of every point's space, such that they are orthonormal over its observations."""
+def moved(bundle: Bundle, params: FloatArray, poses: FloatArray, points: FloatArray) -> Bundle:
+    """The bundle with other cameras (C, 8), and with changed poses (I, 6) and points (P, 3)."""
+    R = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ bundle.R
+    return replace(bundle, params=params, R=R, t=bundle.t + poses[:, 3:], X=bundle.X + points)
+
+
+def cost(bundle: Bundle, scale_px: float) -> float:
+    """Half the sum of the loss of `reduce`."""
+    r = bundle.x - project(bundle)[0]
+    return float(scale_px**2 * np.sum(np.sqrt(1.0 + np.einsum("ni,ni->n", r, r) / scale_px**2) - 1.0))
+
+
+def _whiten(by_point: FloatArray, point: NDArray[np.int64], points: int) -> FloatArray:
+    """(P, 3, 3) W such that the derivatives by W^-T X are orthonormal over the observations of a point."""
     H = np.zeros((points, 3, 3))
     products = np.einsum("nki,nkj->nij", by_point, by_point)
     for i in range(3):
         for j in range(3):
             H[:, i, j] = np.bincount(point, products[:, i, j], points)
-    whiten = np.linalg.inv(np.linalg.cholesky(H))[point]
-    return np.asarray(np.einsum("nki,nji->nkj", by_point, whiten), np.float64)
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(H)), np.float64)
+
+
+def _block_diagonal(blocks: FloatArray) -> sparse.csr_array:
+    """(3P, 3P) from (P, 3, 3)."""
+    P = len(blocks)
+    columns = np.repeat(3 * np.arange(P)[:, None] + np.arange(3), 3, axis=0)
+    return sparse.csr_array((blocks.ravel(), columns.ravel(), 3 * np.arange(3 * P + 1)), shape=(3 * P, 3 * P))
 
 
 def _gauge(bundle: Bundle) -> NDArray[np.int64]:
