@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
+from sfm_app.geometry.positive import solve_positive
+
 FloatArray = NDArray[np.float64]
 
 FX, FY, CX, CY, K1, K2, P1, P2 = range(8)
@@ -129,11 +131,13 @@ def reduce(bundle: Bundle, scale_px: float) -> Reduced:
     along = Jp.T @ flat
     gradient = J.T @ flat - A.T @ along
     free = _gauge(bundle)
-    give = np.linalg.solve(S[np.ix_(free, free)], np.column_stack([S[free][:, poses:], gradient[free]]))
-    H = S[poses:, poses:] - S[poses:][:, free] @ give[:, :-1]
-    g = gradient[poses:] - S[poses:][:, free] @ give[:, -1]
+    give = solve_positive(S[np.ix_(free, free)], np.column_stack([S[free][:, poses:], gradient[free]]))
+    across = np.einsum("ij,jk->ik", S[poses:][:, free], give)
+    H, g = S[poses:, poses:] - across[:, :-1], gradient[poses:] - across[:, -1]
     H = 0.5 * (H + H.T)
-    explained = np.sum(along**2) + np.sum(gradient[free] * give[:, -1]) + np.sum(g * np.linalg.solve(H, g))
+    explained = (
+        np.sum(along**2) + np.sum(gradient[free] * give[:, -1]) + np.sum(g * solve_positive(H, g[:, None])[:, 0])
+    )
     spare = max(len(flat) - 3 * len(bundle.X) - len(free) - cameras, 1)
     pose_step, pose_give = np.zeros(poses), np.zeros((poses, cameras))
     pose_step[free], pose_give[free] = give[:, -1], give[:, :-1]

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.bundle import CAMERA, CX, CY, FX, FY, K1, K2, P1, P2, Reduced
+from sfm_app.geometry.positive import inverse_of_positive
 from sfm_app.selfcal.priors import ASPECT, CENTRE, FREE_SHARE, LENS, NARROW, WIDE
 
 FloatArray = NDArray[np.float64]
@@ -48,6 +49,8 @@ FOCAL_SPREAD = 0.7
 """Prior standard deviation of log f about what mapping found: none to speak of."""
 UNDETERMINED = 0.5
 """A part whose prior the photos do not make narrower than this stays as it is: freeing it adds more than it removes."""
+SWEEPS = 5
+"""At most so many times all cameras are asked which of their parts are free."""
 MISFIT = 4.0
 """Errors of cameras, in what independent noise in the observations explains: lenses are not quite of the model's form,
 neighbouring observations err alike. Measured on photos with known cameras."""
@@ -105,7 +108,7 @@ def estimate(params: FloatArray, reduced: Reduced, usual: Usual) -> Estimate:
     """
     T = _by_logarithms(params)
     weight = (MISFIT * reduced.noise_px) ** -2.0
-    H, g = weight * T.T @ reduced.H @ T, weight * T.T @ reduced.g
+    H, g = weight * np.einsum("ki,kl,lj->ij", T, reduced.H, T), weight * np.einsum("ki,k->i", T, reduced.g)
     away = usual.away(params)
     free = _choose(H, g, away, usual)
     precision = usual.precision(free)
@@ -134,8 +137,8 @@ def _posterior(
     places = np.flatnonzero(changing)
     step, covariance = np.zeros(len(g)), np.zeros_like(H)
     block = np.ix_(places, places)
-    covariance[block] = np.linalg.inv((H + np.diag(precision.ravel()))[block])
-    step[places] = covariance[block] @ (g + (precision * away).ravel())[places]
+    covariance[block] = inverse_of_positive((H + np.diag(precision.ravel()))[block])
+    step[places] = np.einsum("ij,j->i", covariance[block], (g + (precision * away).ravel())[places])
     return step, covariance
 
 
@@ -146,50 +149,37 @@ def _determined(covariance: FloatArray, precision: FloatArray) -> BoolArray:
 
 
 def _choose(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual) -> BoolArray:
-    """The most probable choice (C, 5): one camera after the other, the rest as they are, until none changes."""
-    free = np.zeros((len(away), len(PARTS)), np.bool_)
-    for _ in range(len(away) + 1):
-        before = free.copy()
-        for camera in range(len(away)):
-            own_H, own_g = _marginal(H, g, away, usual.precision(free), camera)
+    """The most probable choice (C, 5) for each camera, the others as they were in the sweep before, until none changes.
+
+    What the photos and the other cameras say about one camera is its marginal posterior without its own prior.
+    """
+    free, everything = np.zeros((len(away), len(PARTS)), np.bool_), np.ones_like(away, np.bool_)
+    for _ in range(SWEEPS):
+        before, precision = free, usual.precision(free)
+        step, covariance = _posterior(H, g, precision, away, everything)
+        free = np.empty_like(before)
+        for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
+            marginal = np.linalg.inv(covariance[np.ix_(own, own)])
+            own_H = marginal - np.diag(precision[camera])
+            own_g = marginal @ step[own] - precision[camera] * away[camera]
             free[camera] = _best(own_H, own_g, away[camera], usual, camera)
-        if len(away) == 1 or np.array_equal(free, before):
+        if np.array_equal(free, before):
             break
     return free
 
 
-def _marginal(
-    H: FloatArray, g: FloatArray, away: FloatArray, precision: FloatArray, camera: int
-) -> tuple[FloatArray, FloatArray]:
-    """What photos and the other cameras' priors say about one camera: its H (8, 8) and g (8,)."""
-    own = np.arange(CAMERA * camera, CAMERA * (camera + 1))
-    rest = np.setdiff1d(np.arange(len(g)), own)
-    if not len(rest):
-        return H, g
-    others = H[np.ix_(rest, rest)] + np.diag(precision.ravel()[rest])
-    pull = g[rest] + precision.ravel()[rest] * away.ravel()[rest]
-    give = np.linalg.solve(others, np.column_stack([H[np.ix_(rest, own)], pull]))
-    across = H[np.ix_(own, rest)]
-    return H[np.ix_(own, own)] - across @ give[:, :-1], g[own] - across @ give[:, -1]
-
-
 def _best(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual, camera: int) -> BoolArray:
     """The most probable choice (5,) for one camera; of equals the one that frees less."""
-    best, most = np.zeros(len(PARTS), np.bool_), -np.inf
-    for switches in sorted(product((False, True), repeat=len(PARTS)), key=sum):
-        trial = np.array(switches)
-        if np.any(trial & ~usual.asked[camera]):
-            continue
-        alone = Usual(usual.centres[[camera]], usual.sides[[camera]], usual.asked[[camera]])
-        precision = alone.precision(trial[None])[0]
-        covariance = np.linalg.inv(H + np.diag(precision))
-        pull = g + precision * away
-        value = 0.5 * float(pull @ covariance @ pull - precision @ away**2)
-        value += 0.5 * float(np.sum(np.log(precision)) + np.linalg.slogdet(covariance)[1])
-        value += sum(np.log(part.share if on else 1.0 - part.share) for part, on in zip(PARTS, trial, strict=True))
-        if value > most + 1e-9:
-            best, most = trial, value
-    return best
+    trials = np.array(sorted(product((False, True), repeat=len(PARTS)), key=sum))
+    trials = trials[~np.any(trials & ~usual.asked[camera], axis=1)]
+    precision = Usual(usual.centres, np.full(len(trials), usual.sides[camera]), trials).precision(trials)
+    covariance = np.linalg.inv(H + precision[:, :, None] * np.eye(CAMERA))
+    pull = g + precision * away
+    share = np.array([part.share for part in PARTS])
+    value = 0.5 * np.einsum("ti,tij,tj->t", pull, covariance, pull) - 0.5 * np.sum(precision * away**2, axis=1)
+    value += 0.5 * np.sum(np.log(precision), axis=1) + 0.5 * np.linalg.slogdet(covariance)[1]
+    value += np.sum(np.log(np.where(trials, share, 1.0 - share)), axis=1)
+    return np.asarray(trials[np.argmax(value)], np.bool_)
 
 
 def _by_logarithms(params: FloatArray) -> FloatArray:
