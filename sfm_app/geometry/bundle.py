@@ -135,9 +135,8 @@ def reduce(bundle: Bundle, scale_px: float) -> Reduced:
     across = np.einsum("ij,jk->ik", S[poses:][:, free], give)
     H, g = S[poses:, poses:] - across[:, :-1], gradient[poses:] - across[:, -1]
     H = 0.5 * (H + H.T)
-    explained = (
-        np.sum(along**2) + np.sum(gradient[free] * give[:, -1]) + np.sum(g * solve_positive(H, g[:, None])[:, 0])
-    )
+    step = solve_positive(H, g[:, None])[:, 0]
+    explained = np.sum(along**2) + np.sum(gradient[free] * give[:, -1]) + np.sum(g * step)
     spare = max(len(flat) - 3 * len(bundle.X) - len(free) - cameras, 1)
     pose_step, pose_give = np.zeros(poses), np.zeros((poses, cameras))
     pose_step[free], pose_give[free] = give[:, -1], give[:, :-1]

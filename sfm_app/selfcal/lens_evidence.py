@@ -108,7 +108,7 @@ def estimate(params: FloatArray, reduced: Reduced, usual: Usual) -> Estimate:
     """
     T = _by_logarithms(params)
     weight = (MISFIT * reduced.noise_px) ** -2.0
-    H, g = weight * np.einsum("ki,kl,lj->ij", T, reduced.H, T), weight * np.einsum("ki,k->i", T, reduced.g)
+    H, g = weight * _product(T.T, _product(reduced.H, T)), weight * _product(T.T, reduced.g)
     away = usual.away(params)
     free = _choose(H, g, away, usual)
     precision = usual.precision(free)
@@ -116,8 +116,8 @@ def estimate(params: FloatArray, reduced: Reduced, usual: Usual) -> Estimate:
     determined = usual.asked & _determined(covariance, precision)
     changing = spread(determined | (usual.asked & ~np.array([part.stays for part in PARTS])))
     step, own = _posterior(H, g, precision, away, changing)
-    off = T @ (soft - step)
-    deviations = np.sqrt(np.diag(T @ covariance @ T.T) + off**2).reshape(params.shape)
+    variances = np.sum(_product(T, covariance) * T, axis=1) + _product(T, soft - step) ** 2
+    deviations = np.sqrt(variances).reshape(params.shape)
     largest = float(np.max(np.abs(step[changing.ravel()]) / np.sqrt(np.diag(own)[changing.ravel()])))
     return Estimate(_moved(params, step.reshape(params.shape)), deviations, free & determined, determined, largest)
 
@@ -138,7 +138,7 @@ def _posterior(
     step, covariance = np.zeros(len(g)), np.zeros_like(H)
     block = np.ix_(places, places)
     covariance[block] = inverse_of_positive((H + np.diag(precision.ravel()))[block])
-    step[places] = np.einsum("ij,j->i", covariance[block], (g + (precision * away).ravel())[places])
+    step[places] = _product(covariance[block], (g + (precision * away).ravel())[places])
     return step, covariance
 
 
@@ -159,7 +159,7 @@ def _choose(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual) -> Boo
         step, covariance = _posterior(H, g, precision, away, everything)
         free = np.empty_like(before)
         for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
-            marginal = np.linalg.inv(covariance[np.ix_(own, own)])
+            marginal = np.asarray(np.linalg.inv(covariance[np.ix_(own, own)]), np.float64)
             own_H = marginal - np.diag(precision[camera])
             own_g = marginal @ step[own] - precision[camera] * away[camera]
             free[camera] = _best(own_H, own_g, away[camera], usual, camera)
@@ -190,6 +190,11 @@ def _by_logarithms(params: FloatArray) -> FloatArray:
         T[x, [x, y]] = values[FX], -0.5 * values[FX]
         T[y, [x, y]] = values[FY], 0.5 * values[FY]
     return T
+
+
+def _product(A: FloatArray, B: FloatArray) -> FloatArray:
+    """A B without BLAS, whose sums depend on its threads."""
+    return np.asarray(np.einsum("ij,j...->i...", A, B), np.float64)
 
 
 def _moved(params: FloatArray, step: FloatArray) -> FloatArray:
