@@ -49,6 +49,8 @@ FOCAL_SPREAD = 0.7
 """Prior standard deviation of log f about what mapping found: none to speak of."""
 UNDETERMINED = 0.5
 """A part whose prior the photos do not make narrower than this stays as it is: freeing it adds more than it removes."""
+FEW = 2.0
+"""So much further off are cameras of few photos, whose misfit does not average out."""
 SWEEPS = 5
 """At most so many times all cameras are asked which of their parts are free."""
 MISFIT = 4.0
@@ -117,7 +119,7 @@ def estimate(params: FloatArray, reduced: Reduced, usual: Usual) -> Estimate:
     changing = spread(determined | (usual.asked & ~np.array([part.stays for part in PARTS])))
     step, own = _posterior(H, g, precision, away, changing)
     variances = np.sum(_product(T, covariance) * T, axis=1) + _product(T, soft - step) ** 2
-    deviations = np.sqrt(variances).reshape(params.shape)
+    deviations = np.sqrt(variances).reshape(params.shape) * np.where(usual.asked.all(axis=1), 1.0, FEW)[:, None]
     largest = float(np.max(np.abs(step[changing.ravel()]) / np.sqrt(np.diag(own)[changing.ravel()])))
     return Estimate(_moved(params, step.reshape(params.shape)), deviations, free & determined, determined, largest)
 
