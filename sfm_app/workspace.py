@@ -14,6 +14,9 @@ from sfm_app.errors import InputError
 
 MANIFEST = "manifest.json"
 DATABASE = "database.db"
+CALIBRATION = "calibration.json"
+SHARED = (DATABASE, CALIBRATION)
+"""Files that later stages add to."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +28,7 @@ class StageRecord:
     seconds: float
     counts: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, int] = field(default_factory=dict)
-    """What the stage wrote, with the size in bytes; -1 for what later stages add to (folders, the database)."""
+    """What the stage wrote, with the size in bytes; -1 for what later stages add to (folders, SHARED)."""
 
 
 class Workspace:
@@ -53,7 +56,7 @@ class Workspace:
 
     @property
     def calibration(self) -> Path:
-        return self.root / "calibration.json"
+        return self.root / CALIBRATION
 
     @property
     def sparse(self) -> Path:
@@ -155,4 +158,4 @@ def fingerprint(*parts: Any) -> str:
 def _size(path: Path) -> int | None:
     if not path.exists():
         return None
-    return -1 if path.is_dir() or path.name == DATABASE else path.stat().st_size
+    return -1 if path.is_dir() or path.name in SHARED else path.stat().st_size

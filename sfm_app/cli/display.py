@@ -96,7 +96,7 @@ def run_summary(run: Run) -> dict[str, Any]:
             "points": run.scene.points,
             "mean_reprojection_px": round(run.scene.mean_reprojection_px, 3),
             "cameras": {
-                name: {"K": camera.K.round(3).tolist(), "model": camera.model, "params": list(camera.params)}
+                name: {**camera.to_dict(), "K": camera.K.round(3).tolist()}
                 for name, camera in run.scene.cameras.items()
             },
         }
@@ -127,7 +127,9 @@ def run_lines(run: Run) -> list[str]:
         lines += [f"            no place for {name}: {reason}" for name, reason in scene["unregistered"].items()]
         many = len(run.scene.cameras) > 1
         for name, camera in run.scene.cameras.items():
-            lines.append(f"            camera {f'{name} ' if many else ''}refined: {_k_text(camera.K)}")
+            lines.append(
+                f"            camera {f'{name} ' if many else ''}refined: {_k_text(camera.K, camera.deviations)}"
+            )
     if run.mesh_path:
         lines.append(f"mesh        {summary['mesh']['triangles']} triangles")
         lines += [f"            {path}" for path in summary["mesh"]["files"]]

@@ -1,132 +1,179 @@
-"""The last bundle adjustment: everything that the photos determine is set free."""
+"""The last adjustment: cameras, poses, points and tracks, until nothing changes."""
 
 from collections import Counter
-from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.database import SQUARE_PIXELS, TWO_FOCALS, camera_params, opened
+from sfm_app.colmap.database import TWO_FOCALS, camera_params, opened
+from sfm_app.geometry.bundle import POSE, Bundle, Reduced, cost, moved, reduce
+from sfm_app.selfcal.lens_evidence import PARTS, Estimate, Usual, estimate
 
-LADDER = ((TWO_FOCALS, True), (SQUARE_PIXELS, True), (TWO_FOCALS, False), (SQUARE_PIXELS, False))
-"""Camera model and whether its optical centre is free, from the most to the least that is left to the photos."""
+PHOTOS_TO_ASK = 5
+"""With fewer photos, what the camera model does not hold (a lens, a zoom) moves a camera more than the noise does; only
+its focal and k1 are then sought."""
 
-FOCAL_DETERMINED, CENTRE_DETERMINED = 0.002, 0.003
-"""Largest standard deviation that counts as determined: of a focal as a share of it, of the centre in longer sides."""
-
-PHOTOS_FOR_CENTRE = 5
-"""With fewer photos, what the camera model does not hold (a lens, a zoom) moves the centre more than the noise does."""
+LOSS_SCALE_PX = 0.5
+"""Of COLMAP's SOFT_L1: some twice the noise of SIFT keypoints. Poses are better than with 1, COLMAP's own."""
 
 MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
 """COLMAP's own limits for a point: largest reprojection error, least angle between its rays."""
 
+ROUNDS, CHANGED, STEP = 6, 0.0005, 0.2
+"""At most so many rounds; fewer when less than this share of the observations changes, and no camera by more than this
+share of its standard deviation."""
 
-def adjust(model: Any, database: Path) -> tuple[Any, dict[str, float]]:
-    """Refine poses, points and cameras; of the cameras as much as the photos determine.
+FAR = 1.0
+"""Beyond so many standard deviations a linear step does not arrive, and COLMAP's solver settles poses and points."""
 
-    Freeing what they do not determine makes narrow views and small sets worse, so the covariance is asked first, going
-    down the ladder until it agrees. The camera with most photos decides; of the others, those that the step asks too
-    much of (a single photo with another zoom) stay as mapping left them. Observations that fit badly are then dropped,
-    and the same is refined again.
 
-    Returns:
-        The refined model, and the standard deviations in pixels of fx, fy, cx, cy of the camera with most photos, as
-        far as they were free.
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjusted:
+    """The refined model and how far its cameras can be trusted."""
+
+    model: Any
+    deviations: dict[int, dict[str, float]]
+    """By camera id, as in `CameraModel`."""
+    determined: dict[int, tuple[str, ...]]
+    """By camera id, as in `CameraModel`."""
+
+
+def adjust(model: Any, database: Path) -> Adjusted:
+    """Refine cameras, poses, points and tracks in turn; of the cameras as much as the photos determine.
+
+    What the bundle says about the cameras, poses and points giving way, is weighed against what cameras usually are.
+    The cameras make that step, poses and points follow (COLMAP's solver helps where the way is long), tracks are
+    completed and cleaned, and all starts again.
     """
-    few, main = model.num_reg_images() < PHOTOS_FOR_CENTRE, main_camera(model)
-    for camera_model, centre in LADDER:
-        if (camera_model == SQUARE_PIXELS and main.model.name != SQUARE_PIXELS) or (centre and few):
-            continue
-        freed = pycolmap.Reconstruction(model)
-        for camera in freed.cameras.values():
-            if camera.model.name == SQUARE_PIXELS:
-                _become(camera, camera_model)
-        deviations = _solve(freed, centre=centre)
-        if _determined(main_camera(freed), deviations):
+    model = pycolmap.Reconstruction(model)
+    for camera in model.cameras.values():
+        _generalise(camera)
+    graph = _correspondences(model, database)
+    for _ in range(ROUNDS):
+        ids, bundle = read_bundle(model)
+        reduced = reduce(bundle, LOSS_SCALE_PX)
+        found = estimate(bundle.params, reduced, usual_cameras(model, ids))
+        write_bundle(model, ids, best_step(bundle, reduced, found))
+        if found.step > FAR:
+            solve(model)
+        changed = improve_tracks(model, graph)
+        if found.step < STEP and changed < CHANGED * len(bundle.x):
             break
-    _step_back(freed, model, deviations, centre=centre)
-    _drop_misfits(freed, database)
-    return freed, _solve(freed, centre=centre).get(main.camera_id, {})
+    model.update_point_3d_errors()
+    return Adjusted(model, *_summary(ids, found))
 
 
-def _step_back(freed: Any, model: Any, deviations: Mapping[int, Mapping[str, float]], *, centre: bool) -> None:
-    """Give cameras that were set too free their former model, all but the one that decides."""
-    weak = [
-        camera
-        for camera in freed.cameras.values()
-        if camera.model.name != model.cameras[camera.camera_id].model.name and not _determined(camera, deviations)
-    ]
-    for camera in weak:
-        former = model.cameras[camera.camera_id]
-        camera.model, camera.params = former.model, former.params
-    if weak:
-        _solve(freed, centre=centre)
-
-
-def _solve(model: Any, *, centre: bool) -> dict[int, dict[str, float]]:
-    """Adjust the model in place; standard deviations of its cameras' parameters, for those where they are finite."""
+def solve(model: Any) -> None:
+    """Adjust poses and points in place, with one thread: sums over threads come in any order."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
-    options.refine_principal_point = centre
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = LOSS_SCALE_PX
     options.ceres.solver_options.max_num_iterations = 50
-    options.ceres.solver_options.function_tolerance = 1e-6
+    options.ceres.solver_options.function_tolerance = 1e-5
+    options.ceres.solver_options.num_threads = 1
     config = pycolmap.BundleAdjustmentConfig()
-    for image_id in model.reg_image_ids():
+    for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
+    for camera_id in used_cameras(model):
+        config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
-    adjuster.solve()
-    model.update_point_3d_errors()
-    settings = pycolmap.BACovarianceOptions()
-    settings.params = pycolmap.BACovarianceOptionsParams.ALL
-    covariance = pycolmap.estimate_ba_covariance(settings, model, adjuster)
-    noise = model.compute_mean_reprojection_error()
-    found = {}
-    for camera_id in _used_cameras(model):
-        camera = model.cameras[camera_id]
-        spread = covariance.get_other_params_cov(camera.params) if covariance else None
-        if spread is not None:
-            focals = ("fx", "fy") if len(camera.focal_length_idxs()) == 2 else ("f",)
-            # COLMAP's covariance is that of measurements off by 1 px
-            values = (np.sqrt(np.diag(spread)) * noise).tolist()
-            found[camera_id] = dict(zip((*focals, "cx", "cy") if centre else focals, values, strict=False))
-    return found
+    pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve()
 
 
-def _determined(camera: Any, deviations: Mapping[int, Mapping[str, float]]) -> bool:
-    found = deviations.get(camera.camera_id, {})
-    limits = {
-        "f": FOCAL_DETERMINED * camera.mean_focal_length(),
-        "c": CENTRE_DETERMINED * max(camera.width, camera.height),
-    }
-    return bool(found) and all(value < limits[name[0]] for name, value in found.items())
+def improve_tracks(model: Any, graph: Any) -> int:
+    """Continue, merge and triangulate tracks, then drop what does not fit; how many observations that changed.
+
+    What is added only to be dropped again does not count: near the limits that never ends.
+    """
+    before = model.compute_num_observations()
+    observations = pycolmap.ObservationManager(model, graph)
+    triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
+    options = pycolmap.IncrementalTriangulatorOptions()
+    triangulator.complete_all_tracks(options)
+    triangulator.merge_all_tracks(options)
+    triangulator.retriangulate(options)
+    observations.filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
+    return abs(int(model.compute_num_observations() - before))
 
 
-def _drop_misfits(model: Any, database: Path) -> None:
+def read_bundle(model: Any) -> tuple[list[int], Bundle]:
+    """The ids of the cameras in use, and the model as arrays."""
+    images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
+    ids, points = sorted(used_cameras(model)), sorted(model.points3D)
+    rows = {point: row for row, point in enumerate(points)}
+    seen = [image.get_observation_points2D() for image in images]
+    poses = np.array([image.cam_from_world().matrix() for image in images])
+    return ids, Bundle(
+        params=np.array([model.cameras[camera_id].params for camera_id in ids]),
+        camera=np.array([ids.index(image.camera_id) for image in images]),
+        R=poses[:, :, :3],
+        t=poses[:, :, 3],
+        X=np.array([model.points3D[point].xyz for point in points]),
+        photo=np.repeat(np.arange(len(images)), [len(one) for one in seen]),
+        point=np.array([rows[keypoint.point3D_id] for one in seen for keypoint in one]),
+        x=np.array([keypoint.xy for one in seen for keypoint in one]),
+    )
+
+
+def best_step(bundle: Bundle, reduced: Reduced, found: Estimate) -> Bundle:
+    """The bundle with the estimated cameras; poses and points follow, where that is no worse than if they stayed."""
+    nowhere = np.zeros((len(bundle.R), POSE)), np.zeros_like(bundle.X)
+    steps = (reduced.follow(found.params - bundle.params), nowhere)
+    return min((moved(bundle, found.params, *step) for step in steps), key=lambda one: cost(one, LOSS_SCALE_PX))
+
+
+def write_bundle(model: Any, ids: list[int], bundle: Bundle) -> None:
+    """Put arrays in the order of `read_bundle` into the model."""
+    for camera_id, params in zip(ids, bundle.params, strict=True):
+        model.cameras[camera_id].params = params
+    for image_id, R, t in zip(sorted(model.reg_image_ids()), bundle.R, bundle.t, strict=True):
+        image = model.images[image_id]
+        model.frames[image.frame_id].set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
+    for point, xyz in zip(sorted(model.points3D), bundle.X, strict=True):
+        model.points3D[point].xyz = xyz
+
+
+def usual_cameras(model: Any, ids: list[int]) -> Usual:
+    """What is believed about cameras before the bundle is asked."""
+    used = used_cameras(model)
+    sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
+    many = np.array([used[camera_id] >= PHOTOS_TO_ASK for camera_id in ids])
+    asked = many[:, None] | np.array([part.name == "k1" for part in PARTS])
+    return Usual(sizes / 2, sizes.max(axis=1), asked)
+
+
+def used_cameras(model: Any) -> Counter[int]:
+    """How many photos with a pose each camera took, by its id."""
+    return Counter(model.images[image_id].camera_id for image_id in sorted(model.reg_image_ids()))
+
+
+def _generalise(camera: Any) -> None:
+    """Change the camera in place to the model that holds all that may be freed; both share the first radial term."""
+    if camera.model.name != TWO_FOCALS:
+        K, radial = camera.calibration_matrix(), float(camera.params[camera.extra_params_idxs()[0]])
+        camera.model = getattr(pycolmap.CameraModelId, TWO_FOCALS)
+        camera.params = camera_params(K, TWO_FOCALS, radial)
+
+
+def _correspondences(model: Any, database: Path) -> Any:
     options = pycolmap.DatabaseCacheOptions()
     options.image_names = {model.images[image_id].name for image_id in model.reg_image_ids()}
     with opened(database) as db:
-        cache = pycolmap.DatabaseCache.create(db, options)
-    pycolmap.ObservationManager(model, cache.correspondence_graph).filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
+        return pycolmap.DatabaseCache.create(db, options).correspondence_graph
 
 
-def _become(camera: Any, camera_model: str) -> None:
-    """Change the camera model in place; both models share the first radial term."""
-    if camera.model.name != camera_model:
-        K, radial = camera.calibration_matrix(), float(camera.params[camera.extra_params_idxs()[0]])
-        camera.model = getattr(pycolmap.CameraModelId, camera_model)
-        camera.params = camera_params(K, camera_model, radial)
-
-
-def main_camera(model: Any) -> Any:
-    """The camera that took most of the photos that have a pose."""
-    used = _used_cameras(model)
-    return model.cameras[max(used, key=lambda camera_id: (used[camera_id], -camera_id))]
-
-
-def _used_cameras(model: Any) -> Counter[int]:
-    """How many photos with a pose each camera took, by its id."""
-    return Counter(model.images[image_id].camera_id for image_id in model.reg_image_ids())
+def _summary(ids: list[int], found: Estimate) -> tuple[dict[int, dict[str, float]], dict[int, tuple[str, ...]]]:
+    names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    deviations = {
+        camera_id: dict(zip(names, map(float, values), strict=True))
+        for camera_id, values in zip(ids, found.deviations, strict=True)
+    }
+    determined = {
+        camera_id: tuple(part.name for part, on in zip(PARTS, row, strict=True) if on)
+        for camera_id, row in zip(ids, found.determined, strict=True)
+    }
+    return deviations, determined

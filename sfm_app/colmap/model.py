@@ -120,23 +120,33 @@ def move(model: Any, similarity: Similarity) -> None:
     model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.t))
 
 
-def read_scene(model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str]) -> Scene:
-    """What the rest of the program needs to know about a model on disk; `names` gives the camera by photo."""
+def read_scene(
+    model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str], refined: Mapping[str, Mapping[str, Any]]
+) -> Scene:
+    """What the rest of the program needs to know about a model on disk.
+
+    Args:
+        model_dir: COLMAP's model.
+        names: the camera by photo.
+        unregistered: why photos have no pose, by photo.
+        refined: "deviations" and "determined" of `CameraModel`, by camera; others are left without.
+    """
     model = pycolmap.Reconstruction(model_dir)
     posed = _posed(model)
-    cameras = {names[image.name]: _camera(model.cameras[image.camera_id]) for image in posed}
+    ids = {names[image.name]: image.camera_id for image in posed}
     return Scene(
         model_dir=model_dir,
         cam_from_world={image.name: np.asarray(image.cam_from_world().matrix(), np.float64) for image in posed},
         unregistered=dict(unregistered),
-        cameras=cameras,
+        cameras={name: _camera(model.cameras[key], refined.get(name, {})) for name, key in ids.items()},
         points=model.num_points3D(),
         observations=model.compute_num_observations(),
         mean_reprojection_px=float(model.compute_mean_reprojection_error()),
     )
 
 
-def _camera(camera: Any) -> CameraModel:
+def _camera(camera: Any, refined: Mapping[str, Any]) -> CameraModel:
     K = np.asarray(camera.calibration_matrix(), np.float64)
     params = tuple(float(value) for value in camera.params)
-    return CameraModel(camera.model.name, params, K, camera.width, camera.height)
+    deviations, determined = dict(refined.get("deviations", {})), tuple(refined.get("determined", ()))
+    return CameraModel(camera.model.name, params, K, camera.width, camera.height, deviations, determined)

@@ -1,11 +1,13 @@
 """scene: ViewGraph and Intrinsics -> Scene."""
 
+import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.bundle import adjust
+from sfm_app.colmap.bundle import Adjusted, adjust
 from sfm_app.colmap.model import photos_of, read_scene
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
@@ -28,13 +30,14 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         raise ReconstructionError(nothing_found(views, outcome.graph, outcome.tried), hint=HINT)
     with backend("adjusting the bundle"):
         adjusted = [adjust(attempt.model, run.workspace.database) for attempt in outcome.models]
-    models = [model for model, _ in adjusted]
+    models = [found.model for found in adjusted]
     orientations = [orient(model, matches, run) for model in models]
     write_models(models, run)
     members = [photos_of(model) for model in models]
     reasons = left_out(set(members[0]), members[1:], matches, views, outcome.graph)
     names = {image.name: intrinsics.name_of(image) for image in matches.images.values()}
-    scene = read_scene(run.workspace.sparse, names, reasons)
+    scene = read_scene(run.workspace.sparse, names, reasons, refined_by_name(adjusted[0], names))
+    write_refined(scene, run)
     run.record(
         registered=len(scene.registered),
         of=len(matches.images),
@@ -43,8 +46,7 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         points=scene.points,
         observations=scene.observations,
         mean_reprojection_px=round(scene.mean_reprojection_px, 4),
-        cameras={name: {"model": camera.model, "params": camera.params} for name, camera in scene.cameras.items()},
-        deviations_px={name: round(value, 4) for name, value in adjusted[0][1].items()},
+        cameras={name: camera.to_dict() for name, camera in scene.cameras.items()},
         orientation=orientations[0],
         **how_it_was_made(outcome),
     )
@@ -89,10 +91,28 @@ def write_model(model: Any, target: Path) -> None:
     beside.rename(target)
 
 
+def refined_by_name(adjusted: Adjusted, names: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """What is known about the refined cameras besides COLMAP's model, by name of the camera."""
+    cameras = {names[image.name]: image.camera_id for image in adjusted.model.images.values() if image.has_pose}
+    return {
+        name: {"deviations": adjusted.deviations[camera_id], "determined": adjusted.determined[camera_id]}
+        for name, camera_id in cameras.items()
+    }
+
+
+def write_refined(scene: Scene, run: RunContext) -> None:
+    """Enter the refined cameras into calibration.json, beside what was found before."""
+    path = run.workspace.calibration
+    known = json.loads(path.read_text(encoding="utf-8"))
+    known["refined"] = {name: camera.to_dict() for name, camera in scene.cameras.items()}
+    with run.workspace.replacing(path) as beside:
+        beside.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+
+
 def load_scene(photos: PhotoSet, intrinsics: Intrinsics, run: RunContext) -> Scene:
     """Read the model back; why photos were left out stands in the manifest."""
     record = run.workspace.record("scene")
     names = {photo.name: intrinsics.name_of(photo) for photo in photos.photos}
     with backend("reading the sparse model"):
-        unregistered = record.counts.get("unregistered", {}) if record else {}
-        return read_scene(run.workspace.sparse, names, unregistered)
+        counts = record.counts if record else {}
+        return read_scene(run.workspace.sparse, names, counts.get("unregistered", {}), counts.get("cameras", {}))

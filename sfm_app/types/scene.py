@@ -1,8 +1,9 @@
 """The sparse reconstruction as the rest of the program sees it."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,15 @@ class CameraModel:
     K: NDArray[np.float64]
     width: int
     height: int
+    deviations: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviations: "fx", "fy", "cx", "cy" in pixels, "k1", "k2", "p1", "p2"."""
+    determined: tuple[str, ...] = ()
+    """What the photos determine besides the focal: "centre", "aspect", "k1", ...; the rest stayed as it was."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        plain = {field.name: getattr(self, field.name) for field in fields(self)}
+        return plain | {"K": self.K.tolist(), "params": list(self.params), "determined": list(self.determined)}
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,9 +2,10 @@ import json
 
 import pytest
 
-from sfm_app.cli.display import intrinsics_lines, intrinsics_summary
+from sfm_app.api import Run
+from sfm_app.cli.display import intrinsics_lines, intrinsics_summary, run_lines, run_summary
 from sfm_app.geometry.camera import camera_matrix
-from sfm_app.types import Calibration, Intrinsics
+from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
 
 K = camera_matrix(500.0, 510.0, 480.0, 410.0)
 KNOWN = Calibration(
@@ -53,3 +54,18 @@ def test_json_holds_everything_that_is_known_of_a_camera():
     }
     assert (found["radial"], found["spread"]["k1"], found["held"]) == (-0.05, 0.01, ["aspect"])
     assert (found["identifiable"], found["reason"], found["key_pairs"][0]) == (True, "", ["1", "2"])
+
+
+def test_refined_cameras_stand_with_their_deviations(tmp_path):
+    deviations = {"fx": 0.75, "fy": 1.5, "cx": 2.0, "cy": 2.5, "k1": 0.01}
+    camera = CameraModel("OPENCV", (500.0, 510.0, 480.0, 410.0, -0.05, 0, 0, 0), K, 1000, 800, deviations, ("centre",))
+    scene = Scene(tmp_path, {}, {}, {"one": camera}, 10, 20, 0.3)
+    run = Run(tmp_path, None, scene, None, None, {})
+
+    assert any(
+        line.strip() == "camera refined: fx 500.0 +- 0.8  fy 510.0 +- 1.5  cx 480.0 +- 2.0  cy 410.0 +- 2.5 px"
+        for line in run_lines(run)
+    )
+    found = json.loads(json.dumps(run_summary(run)))["scene"]["cameras"]["one"]
+    assert found["deviations"] == deviations and found["determined"] == ["centre"]
+    assert found["K"] == K.tolist() and found["params"][4] == -0.05

@@ -4,11 +4,9 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import backend, plain, pycolmap
-from sfm_app.colmap.bundle import adjust, main_camera
 from sfm_app.colmap.database import SQUARE_PIXELS, TWO_FOCALS, camera_params
 from sfm_app.colmap.model import focal_px, move, posed_photos, viewing_rays
 from sfm_app.errors import BackendError, ConfigError
-from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.similarity import Similarity
 
 WIDTH, HEIGHT = 1000, 800
@@ -29,71 +27,6 @@ def synthetic(tmp_path, true_params, noise_px=0.3, photos=8, cameras=1):
         noise.point2D_stddev = noise_px
         pycolmap.synthesize_noise(noise, model, database)
     return model, tmp_path / "database.db"
-
-
-@pytest.mark.parametrize("radial", [0.0, -0.08])
-def test_the_last_adjustment_finds_focal_centre_and_lens(tmp_path, radial):
-    true = [900.0, 900.0, 530.0, 380.0, radial, 0.0, 0.0, 0.0]
-    model, database = synthetic(tmp_path, true)
-    for camera in model.cameras.values():  # as mapping leaves it: one focal, a centre that is off
-        camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
-        camera.params = [880.0, 500.0, 400.0, radial]
-
-    found, deviations = adjust(model, database)
-    K = main_camera(found).calibration_matrix()
-
-    assert K[0, 0] == pytest.approx(900, rel=0.003)
-    assert K[1, 1] == pytest.approx(900, rel=0.003)
-    assert np.hypot(K[0, 2] - 530, K[1, 2] - 380) < 6
-    assert abs(K[0, 2] - 530) < 4 * deviations["cx"] and abs(K[1, 2] - 380) < 4 * deviations["cy"]
-    assert main_camera(found).model.name == TWO_FOCALS
-    assert main_camera(found).params[4] == pytest.approx(radial, abs=0.04)
-    assert 0.01 < deviations["cx"] < 3
-    assert 0.2 < found.compute_mean_reprojection_error() < 0.6
-
-
-def test_a_centre_that_two_photos_do_not_determine_stays(tmp_path):
-    model, database = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], noise_px=1.0, photos=2)
-    for camera in model.cameras.values():
-        camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
-        camera.params = [900.0, 500.0, 400.0, 0.0]
-
-    found, deviations = adjust(model, database)
-    K = main_camera(found).calibration_matrix()
-
-    assert (K[0, 2], K[1, 2]) == (500.0, 400.0)
-    assert "cx" not in deviations
-
-
-def test_the_camera_with_most_photos_does_not_free_one_of_a_single_photo(tmp_path):
-    model, database = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=5, cameras=2)
-    lone, *others = sorted(image_id for image_id in model.reg_image_ids() if model.images[image_id].camera_id == 2)
-    for image_id in others:
-        model.deregister_frame(model.images[image_id].frame_id)
-    model.tear_down()
-    for camera in model.cameras.values():
-        camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
-        camera.params = [890.0, 500.0, 400.0, 0.0]
-
-    found, _ = adjust(model, database)
-
-    assert main_camera(found).camera_id == 1 and found.images[lone].has_pose
-    assert [found.cameras[key].model.name for key in (1, 2)] == [TWO_FOCALS, SQUARE_PIXELS]
-    for key, tolerance in ((1, 0.003), (2, 0.01)):
-        assert found.cameras[key].mean_focal_length() == pytest.approx(900, rel=tolerance)
-
-
-def test_a_camera_with_two_focals_keeps_them_beside_one_with_square_pixels(tmp_path):
-    model, database = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=2, cameras=2)
-    for camera in model.cameras.values():
-        camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL if camera.camera_id == 1 else pycolmap.CameraModelId.OPENCV
-        camera.params = camera_params(camera_matrix(890, 890, 500, 400), camera.model.name)
-
-    found, deviations = adjust(model, database)
-
-    assert found.cameras[2].model.name == TWO_FOCALS
-    assert found.cameras[1].mean_focal_length() == pytest.approx(900, rel=0.01)
-    assert set(deviations) <= {"f", "fx", "fy"}
 
 
 def test_a_model_moves_as_a_whole(tmp_path):

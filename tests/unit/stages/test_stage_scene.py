@@ -1,3 +1,4 @@
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,18 @@ from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.settings import Settings
 from sfm_app.stages import scene
-from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchedImage, MatchGraph, Rejected, ViewGraph
+from sfm_app.types import (
+    Calibration,
+    CameraModel,
+    EpipolarFit,
+    Intrinsics,
+    MatchedImage,
+    MatchGraph,
+    Rejected,
+    Scene,
+    ViewGraph,
+)
+from sfm_app.workspace import StageRecord, Workspace
 
 K = camera_matrix(800.0, 800.0, 320.0, 240.0)
 
@@ -142,3 +154,39 @@ def test_a_failure_says_what_was_seen():
         "no pair has parallax",
     ):
         assert part in text
+
+
+def test_refined_cameras_stand_beside_the_calibration_and_leave_it_valid(tmp_path):
+    place = Workspace(tmp_path)
+    before = Intrinsics({"one": known()})
+    place.calibration.write_text(json.dumps(before.to_dict()))
+    place.finish("intrinsics", StageRecord("abc", 1.0, {}, place.sizes(("calibration.json",))), {})
+    camera = CameraModel("OPENCV", (800.0,) * 8, K, 640, 480, {"fx": 1.5, "cx": 2.5}, ("centre",))
+
+    scene.write_refined(
+        Scene(tmp_path, {}, {}, {"one": camera}, 10, 20, 0.3), SimpleNamespace(workspace=place)
+    )  # fmt: skip
+
+    found = json.loads(place.calibration.read_text())
+    assert found["refined"]["one"]["deviations"] == {"fx": 1.5, "cx": 2.5}
+    assert (found["refined"]["one"]["K"], found["refined"]["one"]["determined"]) == (K.tolist(), ["centre"])
+    assert Intrinsics.from_dict(found).to_dict() == before.to_dict()
+    assert place.is_current("intrinsics", "abc")
+
+
+def test_what_is_known_of_refined_cameras_goes_by_their_names():
+    images = {
+        key: SimpleNamespace(name=f"{key}.jpg", camera_id=7 if key < 3 else 8, has_pose=key != 4) for key in range(1, 5)
+    }
+    adjusted = SimpleNamespace(
+        model=SimpleNamespace(images=images),
+        deviations={7: {"fx": 1.0}, 8: {"fx": 2.0}},
+        determined={7: ("k1",), 8: ()},
+    )
+
+    found = scene.refined_by_name(adjusted, {"1.jpg": "a", "2.jpg": "a", "3.jpg": "b", "4.jpg": "c"})
+
+    assert found == {
+        "a": {"deviations": {"fx": 1.0}, "determined": ("k1",)},
+        "b": {"deviations": {"fx": 2.0}, "determined": ()},
+    }

@@ -1,0 +1,206 @@
+"""What a whole bundle of photos says about its cameras, and how much of that is believed.
+
+As for pairs (`priors`): each part of a camera has a narrow prior about its usual value and a wide one, and is freed
+where the evidence for the wide one (the marginal likelihood, by Laplace's approximation) outweighs how rare such
+cameras are. Freed or not, the prior stays in the estimate: what the photos do not determine stays where it usually is.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.bundle import CAMERA, CX, CY, FX, FY, K1, K2, P1, P2, Reduced
+from sfm_app.geometry.positive import inverse_of_positive
+from sfm_app.selfcal.priors import ASPECT, CENTRE, FREE_SHARE, LENS, NARROW, WIDE
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+LOG_FOCAL, LOG_ASPECT = FX, FY
+"""What stands in place of fx and fy: log sqrt(fx fy) and log fy/fx."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Parameters of a camera that are freed together."""
+
+    name: str
+    places: tuple[int, ...]
+    narrow: float
+    """Standard deviation about the usual value; the centre's in longer sides."""
+    wide: float
+    share: float
+    """Share of cameras for which the wide prior is the right one."""
+    stays: bool
+    """Whether it stays as it is where the photos do not determine it; else it is drawn to its usual value. Mapping
+    knows centre and aspect from the calibration, but finds a lens with nothing to hold it."""
+
+
+PARTS = (
+    Part("centre", (CX, CY), NARROW[CENTRE], WIDE[CENTRE], FREE_SHARE[CENTRE], True),
+    Part("aspect", (LOG_ASPECT,), NARROW[ASPECT], WIDE[ASPECT], FREE_SHARE[ASPECT], True),
+    Part("k1", (K1,), NARROW[LENS], WIDE[LENS], FREE_SHARE[LENS], False),
+    Part("k2", (K2,), 0.01, 0.2, 0.3, False),
+    Part("p1 p2", (P1, P2), 0.0002, 0.002, 0.05, True),
+)
+FOCAL_SPREAD = 0.7
+"""Prior standard deviation of log f about what mapping found: none to speak of."""
+UNDETERMINED = 0.5
+"""A part whose prior the photos do not make narrower than this stays as it is: freeing it adds more than it removes."""
+FEW = 2.0
+"""So much further off are cameras of few photos, whose misfit does not average out."""
+SWEEPS = 5
+"""At most so many times all cameras are asked which of their parts are free."""
+MISFIT = 4.0
+"""Errors of cameras, in what independent noise in the observations explains: lenses are not quite of the model's form,
+neighbouring observations err alike. Measured on photos with known cameras."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Usual:
+    """What is believed about the cameras before the bundle is asked, one row each."""
+
+    centres: FloatArray
+    """(C, 2) where the centre usually is, in pixels: the middle of the photo."""
+    sides: FloatArray
+    """(C,) longer side in pixels."""
+    asked: BoolArray
+    """(C, 5) whether the photos are asked about a part, in the order of PARTS; else it stays as it is."""
+
+    def precision(self, free: BoolArray) -> FloatArray:
+        """(C, 8) of the prior when `free` (C, 5) says what has the wide one."""
+        deviation = np.full((len(free), CAMERA), FOCAL_SPREAD)
+        for k, part in enumerate(PARTS):
+            unit = self.sides if part.name == "centre" else np.ones(len(free))
+            sigma = np.where(free[:, k], part.wide, part.narrow) * unit
+            deviation[:, list(part.places)] = sigma[:, None]
+        return np.asarray(deviation**-2.0, np.float64)
+
+    def away(self, params: FloatArray) -> FloatArray:
+        """(C, 8) from the cameras to their usual values; none for the focal, nor for what the photos are not asked."""
+        away = np.zeros_like(params)
+        away[:, [CX, CY]] = self.centres - params[:, [CX, CY]]
+        away[:, LOG_ASPECT] = np.log(params[:, FX] / params[:, FY])
+        away[:, [K1, K2, P1, P2]] = -params[:, [K1, K2, P1, P2]]
+        return np.where(spread(self.asked), away, 0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Where the cameras are most probably."""
+
+    params: FloatArray
+    """(C, 8) as in `Bundle`."""
+    deviations: FloatArray
+    """(C, 8) their standard deviations."""
+    free: BoolArray
+    """(C, 5) the parts that have the wide prior, in the order of PARTS."""
+    determined: BoolArray
+    """(C, 5) the parts about which the photos say more than the prior."""
+    step: float
+    """The largest change of a parameter, in standard deviations."""
+
+
+def estimate(params: FloatArray, reduced: Reduced, usual: Usual) -> Estimate:
+    """The most probable cameras, with the most probable choice of freed parts; undetermined parts stay.
+
+    The deviations are those of all parts, about the value that was chosen, even where that is the present one.
+    """
+    T = _by_logarithms(params)
+    weight = (MISFIT * reduced.noise_px) ** -2.0
+    H, g = weight * _product(T.T, _product(reduced.H, T)), weight * _product(T.T, reduced.g)
+    away = usual.away(params)
+    free = _choose(H, g, away, usual)
+    precision = usual.precision(free)
+    soft, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
+    determined = usual.asked & _determined(covariance, precision)
+    changing = spread(determined | (usual.asked & ~np.array([part.stays for part in PARTS])))
+    step, own = _posterior(H, g, precision, away, changing)
+    variances = np.sum(_product(T, covariance) * T, axis=1) + _product(T, soft - step) ** 2
+    deviations = np.sqrt(variances).reshape(params.shape) * np.where(usual.asked.all(axis=1), 1.0, FEW)[:, None]
+    largest = float(np.max(np.abs(step[changing.ravel()]) / np.sqrt(np.diag(own)[changing.ravel()])))
+    return Estimate(_moved(params, step.reshape(params.shape)), deviations, free & determined, determined, largest)
+
+
+def spread(parts: BoolArray) -> BoolArray:
+    """(C, 8) the parameters of some parts (C, 5), and of the focal."""
+    chosen = np.ones((len(parts), CAMERA), np.bool_)
+    for k, part in enumerate(PARTS):
+        chosen[:, list(part.places)] = parts[:, [k]]
+    return chosen
+
+
+def _posterior(
+    H: FloatArray, g: FloatArray, precision: FloatArray, away: FloatArray, changing: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Mean step (8C,) and covariance (8C, 8C) of what is changing (C, 8); 0 elsewhere."""
+    places = np.flatnonzero(changing)
+    step, covariance = np.zeros(len(g)), np.zeros_like(H)
+    block = np.ix_(places, places)
+    covariance[block] = inverse_of_positive((H + np.diag(precision.ravel()))[block])
+    step[places] = _product(covariance[block], (g + (precision * away).ravel())[places])
+    return step, covariance
+
+
+def _determined(covariance: FloatArray, precision: FloatArray) -> BoolArray:
+    """(C, 5) as in `Estimate`."""
+    narrower = np.sqrt(np.diag(covariance)).reshape(precision.shape) < UNDETERMINED * precision**-0.5
+    return np.stack([narrower[:, list(part.places)].all(axis=1) for part in PARTS], axis=1)
+
+
+def _choose(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual) -> BoolArray:
+    """The most probable choice (C, 5) for each camera, the others as they were in the sweep before, until none changes.
+
+    What the photos and the other cameras say about one camera is its marginal posterior without its own prior.
+    """
+    free, everything = np.zeros((len(away), len(PARTS)), np.bool_), np.ones_like(away, np.bool_)
+    for _ in range(SWEEPS):
+        before, precision = free, usual.precision(free)
+        step, covariance = _posterior(H, g, precision, away, everything)
+        free = np.empty_like(before)
+        for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
+            marginal = np.asarray(np.linalg.inv(covariance[np.ix_(own, own)]), np.float64)
+            own_H = marginal - np.diag(precision[camera])
+            own_g = marginal @ step[own] - precision[camera] * away[camera]
+            free[camera] = _best(own_H, own_g, away[camera], usual, camera)
+        if np.array_equal(free, before):
+            break
+    return free
+
+
+def _best(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual, camera: int) -> BoolArray:
+    """The most probable choice (5,) for one camera; of equals the one that frees less."""
+    trials = np.array(sorted(product((False, True), repeat=len(PARTS)), key=sum))
+    trials = trials[~np.any(trials & ~usual.asked[camera], axis=1)]
+    precision = Usual(usual.centres, np.full(len(trials), usual.sides[camera]), trials).precision(trials)
+    covariance = np.linalg.inv(H + precision[:, :, None] * np.eye(CAMERA))
+    pull = g + precision * away
+    share = np.array([part.share for part in PARTS])
+    value = 0.5 * np.einsum("ti,tij,tj->t", pull, covariance, pull) - 0.5 * np.sum(precision * away**2, axis=1)
+    value += 0.5 * np.sum(np.log(precision), axis=1) + 0.5 * np.linalg.slogdet(covariance)[1]
+    value += np.sum(np.log(np.where(trials, share, 1.0 - share)), axis=1)
+    return np.asarray(trials[np.argmax(value)], np.bool_)
+
+
+def _by_logarithms(params: FloatArray) -> FloatArray:
+    """(8C, 8C) derivatives of the parameters by those with log f and log fy/fx in place of fx and fy."""
+    T = np.eye(params.size)
+    for camera, values in enumerate(params):
+        x, y = CAMERA * camera + FX, CAMERA * camera + FY
+        T[x, [x, y]] = values[FX], -0.5 * values[FX]
+        T[y, [x, y]] = values[FY], 0.5 * values[FY]
+    return T
+
+
+def _product(A: FloatArray, B: FloatArray) -> FloatArray:
+    """A B without BLAS, whose sums depend on its threads."""
+    return np.asarray(np.einsum("ij,j...->i...", A, B), np.float64)
+
+
+def _moved(params: FloatArray, step: FloatArray) -> FloatArray:
+    moved = params + step
+    moved[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
+    moved[:, FY] = params[:, FY] * np.exp(step[:, LOG_FOCAL] + 0.5 * step[:, LOG_ASPECT])
+    return moved

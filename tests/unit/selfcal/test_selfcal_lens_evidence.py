@@ -1,0 +1,159 @@
+"""What a bundle says about its cameras, on bundles whose poses and points are the true ones."""
+
+import numpy as np
+import pytest
+
+from sfm_app.geometry.bundle import Bundle, project, reduce
+from sfm_app.selfcal.lens_evidence import PARTS, Usual, estimate
+
+SIZE = np.array([1000.0, 800.0])
+PLAIN = (900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0)
+NAMES = [part.name for part in PARTS]
+
+
+def seen(*true, photos=8, noise_px=0.3, seed=0, points=600):
+    """Photos of a box of points from all around, some of each camera; as measured through the true cameras."""
+    rng = np.random.default_rng(seed)
+    depth = 3.0 * true[0][0] / 900.0
+    X = rng.uniform(-1, 1, (points, 3))
+    R = np.array([turn(0.3 * k - 1.0, 0.2 * (-1) ** k, 0.5 * k) for k in range(photos * len(true))])
+    t = np.tile([0.0, 0.0, depth], (len(R), 1)) + rng.uniform(-0.1, 0.1, (len(R), 3))
+    photo, point = (index.ravel() for index in np.meshgrid(range(len(R)), range(points), indexing="ij"))
+    camera = np.repeat(np.arange(len(true)), photos)
+    bundle = Bundle(np.array(true), camera, R, t, X, photo, point, np.zeros((len(photo), 2)))
+    x = project(bundle)[0]
+    inside = np.all((x > 0) & (x < SIZE), axis=1)
+    kept = np.bincount(point[inside], minlength=points) > 2
+    inside &= kept[point]
+    x += rng.normal(scale=noise_px, size=x.shape)
+    return Bundle(np.array(true), camera, R, t, X[kept], photo[inside], (np.cumsum(kept) - 1)[point[inside]], x[inside])
+
+
+def turn(pan, tilt, roll):
+    axes = np.cos([pan, tilt, roll]), np.sin([pan, tilt, roll])
+    (a, b, c), (p, q, r) = axes
+    return (
+        np.array([[c, -r, 0], [r, c, 0], [0, 0, 1]])
+        @ np.array([[1, 0, 0], [0, b, -q], [0, q, b]])
+        @ np.array([[a, 0, p], [0, 1, 0], [-p, 0, a]])
+    )
+
+
+def starting_at(bundle, *params):
+    return Bundle(
+        np.array(params), bundle.camera, bundle.R, bundle.t, bundle.X, bundle.photo, bundle.point, bundle.x
+    )  # fmt: skip
+
+
+def asked(*cameras):
+    """All about some cameras, of others only k1."""
+    only_k1 = np.array([name == "k1" for name in NAMES])
+    rows = np.array([only_k1 | bool(all_of) for all_of in cameras])
+    return Usual(np.tile(SIZE / 2, (len(rows), 1)), np.full(len(rows), SIZE.max()), rows)
+
+
+def answer(bundle, *cameras):
+    return estimate(bundle.params, reduce(bundle, 1.0), asked(*(cameras or (True,) * len(bundle.params))))
+
+
+def freed(found, camera=0):
+    return {name for name, on in zip(NAMES, found.free[camera], strict=True) if on}
+
+
+@pytest.mark.parametrize(
+    ("change", "parts"),
+    [
+        ({}, set()),
+        ({2: 620.0}, {"centre"}),
+        ({1: 1150.0}, {"aspect"}),
+        ({4: -0.1}, {"k1"}),
+        ({4: -0.2, 5: 0.2}, {"k1", "k2"}),
+        ({6: 0.004, 7: -0.003}, {"p1 p2"}),
+    ],
+)
+def test_a_part_is_freed_where_the_photos_ask_for_it(change, parts):
+    true = list(PLAIN)
+    for place, value in change.items():
+        true[place] = value
+
+    found = answer(seen(true))
+
+    assert freed(found) == parts
+    assert np.all(np.abs(found.params[0] - true) < 3 * found.deviations[0])
+
+
+def test_one_step_finds_a_camera_that_is_a_little_off():
+    true = [900.0, 900.0, 505.0, 396.0, -0.1, 0.0, 0.0, 0.0]
+    bundle = starting_at(seen(true), [894.0, 894.0, 490.0, 404.0, -0.09, 0.0, 0.0, 0.0])
+
+    found = answer(bundle)
+
+    assert found.params[0] == pytest.approx(true, abs=1.5)
+    assert found.params[0, 4] == pytest.approx(-0.1, abs=0.004)
+    assert found.step > 1
+    assert answer(starting_at(bundle, found.params[0])).step < found.step / 3
+
+
+def test_stated_deviations_are_those_of_independent_noise_times_the_misfit():
+    true = [900.0, 900.0, 540.0, 390.0, 0.0, 0.0, 0.0, 0.0]
+    found = [answer(seen(true, seed=seed, photos=5, points=200)) for seed in range(40)]
+
+    scatter = np.std([one.params[0, :4] for one in found], axis=0)
+    stated = np.mean([one.deviations[0, :4] for one in found], axis=0)
+
+    assert np.all((stated > 1.5 * scatter) & (stated < 8 * scatter))
+
+
+def test_what_is_not_determined_stays_where_it_is_and_may_be_off():
+    true = [30000.0, 30000.0, 506.0, 395.0, 0.0, 0.0, 0.0, 0.0]
+    bundle = starting_at(seen(true, noise_px=1.0), [30000.0, 30000.0, 498.0, 401.0, 0.0, 0.0, 0.0, 0.0])
+
+    found = answer(bundle)
+
+    assert found.params[0, 2:4].tolist() == [498.0, 401.0]
+    assert not found.determined[0, NAMES.index("centre")]
+    assert np.all((found.deviations[0, 2:4] > 6) & (found.deviations[0, 2:4] < 20))
+
+
+def test_a_camera_of_few_photos_is_asked_for_focal_and_k1_only():
+    other = [700.0, 700.0, 620.0, 400.0, -0.1, 0.0, 0.0, 0.0]
+    bundle = seen(list(PLAIN), other, photos=5)
+    bundle = starting_at(bundle, list(PLAIN), [702.0, 702.0, 500.0, 400.0, -0.1, 0.0, 0.0, 0.0])
+
+    found = answer(bundle, True, False)
+
+    assert found.params[1, 2:4].tolist() == [500.0, 400.0]
+    assert found.params[1, 5:].tolist() == [0, 0, 0]
+    assert freed(found, 1) <= {"k1"}
+
+
+def test_derivatives_are_those_of_differences():
+    bundle = seen([900.0, 950.0, 510.0, 390.0, -0.1, 0.05, 0.002, -0.003], photos=2, points=5)
+    _, by_camera, by_pose, by_point = project(bundle)
+    h = 1e-6
+
+    for k in range(8):
+        off = np.zeros((1, 8))
+        off[0, k] = h
+        ahead, behind = (project(starting_at(bundle, *(bundle.params + s * off)))[0] for s in (1, -1))
+        assert by_camera[:, :, k] == pytest.approx((ahead - behind) / (2 * h), rel=1e-4, abs=1e-4)
+    for k in range(3):
+        moved = [
+            Bundle(bundle.params, bundle.camera, bundle.R, bundle.t + s * h * np.eye(3)[k], bundle.X, bundle.photo,
+                   bundle.point, bundle.x) for s in (1, -1)
+        ]  # fmt: skip
+        assert by_pose[:, :, 3 + k] == pytest.approx((project(moved[0])[0] - project(moved[1])[0]) / (2 * h), rel=1e-4)
+        turned = [
+            Bundle(bundle.params, bundle.camera, turn(*(s * h * np.array([0, -1, 0]))) @ bundle.R if k == 0 else
+                   turn(*(s * h * np.array([1, 0, 0]))) @ bundle.R if k == 1 else
+                   turn(*(s * h * np.array([0, 0, 1]))) @ bundle.R,
+                   bundle.t, bundle.X, bundle.photo, bundle.point, bundle.x) for s in (1, -1)
+        ]  # fmt: skip
+        difference = (project(turned[0])[0] - project(turned[1])[0]) / (2 * h)
+        assert np.abs(by_pose[:, :, k]) == pytest.approx(np.abs(difference), rel=1e-3, abs=1e-3)
+        shifted = [
+            Bundle(bundle.params, bundle.camera, bundle.R, bundle.t, bundle.X + s * h * np.eye(3)[k], bundle.photo,
+                   bundle.point, bundle.x) for s in (1, -1)
+        ]  # fmt: skip
+        difference = (project(shifted[0])[0] - project(shifted[1])[0]) / (2 * h)
+        assert by_point[:, :, k] == pytest.approx(difference, rel=1e-4, abs=1e-4)
