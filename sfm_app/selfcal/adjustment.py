@@ -28,6 +28,9 @@ ALONE = np.array([0.3, 0.15, 0.15, 0.2, 0.2])
 LOWER_QUARTILE = 0.288
 """Of that gain, where two degrees of freedom are noise (chi^2 / 2)."""
 LEAST_SIGMA_PX = 0.1
+FEW_PHOTOS, CAUTION = 5, 0.25
+"""A camera of fewer photos answers to what no model holds (a lens, a wall that is not quite still) with a focal and a centre of
+its own: what its pairs say counts as if their noise were twice as large."""
 ROUNDS = 25
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e8
 ARRIVED = 2e-5
@@ -100,6 +103,9 @@ class Matches:
         self.photos = np.asarray(photos, dtype=np.int64)
         self.count = count
         self.least_sigma = LEAST_SIGMA_PX / unit_px
+        taken = [len(np.unique(self.photos[self.cameras == camera])) for camera in range(count)]
+        few = np.array(taken, np.int64) < FEW_PHOTOS
+        self.trust = np.where(few[self.cameras].any(axis=1), CAUTION, 1.0)
 
     @cached_property
     def redundancy(self) -> float:
@@ -213,7 +219,7 @@ def _stepped(
     matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
 ) -> tuple[State, float]:
     """One step that lowers the cost, damped as far as that needs, and the damping for the next."""
-    factors = state.weights / state.scale
+    factors = matches.trust * state.weights / state.scale
     cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
     while damping < MOST_DAMPING:
         trial = _tried(matches, state, prior, system, damping)
@@ -227,7 +233,7 @@ def _tried(
     matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
 ) -> State:
     reduced, gradients, back, own = _reduced(*system, damping)
-    H, g = matches.scattered(Information(reduced, gradients, np.empty(0)), state.weights / state.scale)
+    H, g = matches.scattered(Information(reduced, gradients, np.empty(0)), matches.trust * state.weights / state.scale)
     H += np.diag(prior.precision.ravel())
     g += (prior.precision * (prior.mean - state.thetas)).ravel()
     step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g).reshape(-1, CAMERA)

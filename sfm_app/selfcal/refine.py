@@ -63,7 +63,7 @@ class Fit:
     @property
     def evidence(self) -> Evidence:
         """What all pairs say, as if the matches of one keypoint were worth what they are."""
-        trust = self.state.weights / (self.state.scale * self.matches.redundancy)
+        trust = self.matches.trust * self.state.weights / (self.state.scale * self.matches.redundancy)
         H, g = self.matches.scattered(self.information, trust)
         return Evidence(self.state.thetas, H, g, float(np.sum(self.state.weights)), self.usual)
 
