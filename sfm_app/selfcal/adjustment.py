@@ -29,8 +29,8 @@ LOWER_QUARTILE = 0.288
 """Of that gain, where two degrees of freedom are noise (chi^2 / 2)."""
 LEAST_SIGMA_PX = 0.1
 FEW_PHOTOS, CAUTION = 5, 0.25
-"""A camera of fewer photos answers to what no model holds (a lens, a wall that is not quite still) with a focal and a centre of
-its own: what its pairs say counts as if their noise were twice as large."""
+"""A camera of fewer photos answers to what no model holds (a lens, a wall that is not quite still) with a focal and a
+centre of its own: what its pairs say counts as if their noise were twice as large."""
 ROUNDS = 25
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e8
 ARRIVED = 2e-5
