@@ -8,10 +8,9 @@ import click
 
 from sfm_app import __version__
 from sfm_app.api import calibrate_photos, reconstruct
+from sfm_app.cli.camera_text import intrinsics_lines, intrinsics_summary
 from sfm_app.cli.display import (
     Terminal,
-    intrinsics_lines,
-    intrinsics_summary,
     print_json,
     print_lines,
     run_lines,

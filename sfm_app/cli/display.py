@@ -4,7 +4,6 @@ import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from rich.console import Console
@@ -13,8 +12,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.progress import Progress as Bars
 
 from sfm_app.api import Run
-from sfm_app.report import field_of_view_deg, held_text, lens_text
-from sfm_app.types import Intrinsics
+from sfm_app.cli.camera_text import intrinsics_lines, intrinsics_summary
+from sfm_app.cli.scene_text import scene_lines, scene_summary
 
 STAGE_TITLES = {
     "photos": "reading photos",
@@ -26,10 +25,6 @@ STAGE_TITLES = {
     "mesh": "surface",
     "files": "files",
 }
-
-KEY_PAIRS = 3
-PHOTOS = 4
-"""So many are named to people; --json has all."""
 
 
 class Terminal:
@@ -89,17 +84,7 @@ def run_summary(run: Run) -> dict[str, Any]:
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
     }
     if run.scene:
-        summary["scene"] = {
-            "registered": len(run.scene.registered),
-            "of": len(run.scene.registered) + len(run.scene.unregistered),
-            "unregistered": dict(run.scene.unregistered),
-            "points": run.scene.points,
-            "mean_reprojection_px": round(run.scene.mean_reprojection_px, 3),
-            "cameras": {
-                name: {**camera.to_dict(), "K": camera.K.round(3).tolist()}
-                for name, camera in run.scene.cameras.items()
-            },
-        }
+        summary["scene"] = scene_summary(run.scene, counts.get("scene", {}))
     if run.mesh_path:
         summary["mesh"] = {"triangles": counts["mesh"].get("triangles"), "files": [str(p) for p in model_files(run)]}
     return summary
@@ -119,17 +104,7 @@ def run_lines(run: Run) -> list[str]:
     if run.calibration:
         lines += intrinsics_lines(run.calibration)
     if run.scene:
-        scene = summary["scene"]
-        lines.append(
-            f"scene       {scene['registered']} of {scene['of']} photos placed, {scene['points']} points, "
-            f"mean reprojection error {scene['mean_reprojection_px']} px"
-        )
-        lines += [f"            no place for {name}: {reason}" for name, reason in scene["unregistered"].items()]
-        many = len(run.scene.cameras) > 1
-        for name, camera in run.scene.cameras.items():
-            lines.append(
-                f"            camera {f'{name} ' if many else ''}refined: {_k_text(camera.K, camera.deviations)}"
-            )
+        lines += scene_lines(run.scene, run.manifest.get("stages", {}).get("scene", {}).get("counts", {}))
     if run.mesh_path:
         lines.append(f"mesh        {summary['mesh']['triangles']} triangles")
         lines += [f"            {path}" for path in summary["mesh"]["files"]]
@@ -142,41 +117,6 @@ def run_lines(run: Run) -> list[str]:
     return lines
 
 
-def intrinsics_summary(intrinsics: Intrinsics) -> dict[str, Any]:
-    """Calibrations, plain, for --json."""
-    names = intrinsics.photos
-    cameras = {
-        name: {"field_of_view_deg": [round(angle, 2) for angle in field_of_view_deg(camera)], **camera.to_dict()}
-        for name, camera in intrinsics.cameras.items()
-    }
-    for camera in cameras.values():
-        camera["key_pairs"] = [[names.get(key, str(key)) for key in pair] for pair in camera["key_pairs"]]
-    return cameras
-
-
-def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
-    """Calibrations, for people."""
-    many = len(intrinsics.cameras) > 1
-    lines = []
-    for name, camera in intrinsics.cameras.items():
-        lines.append(f"camera      {f'{name}: ' if many else ''}{_k_text(camera.K, camera.spread)}")
-        mine = [photo for photo, of in intrinsics.camera_of.items() if of == name]
-        if many and mine:
-            more = f" and {len(mine) - PHOTOS} more" if len(mine) > PHOTOS else ""
-            lines.append(f"            took {', '.join(mine[:PHOTOS])}{more}")
-        if not camera.identifiable:
-            source = {"exif": "EXIF's claim", "guess": "a guess"}.get(camera.method, camera.method)
-            lines.append(f"            these photos do not determine it ({camera.reason}): {source}")
-        across, down = field_of_view_deg(camera)
-        lines.append(f"            sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom")
-        lines += [f"            {text}" for text in (lens_text(camera), held_text(camera)) if text]
-        if camera.key_pairs:
-            named = [[intrinsics.photos.get(key, str(key)) for key in pair] for pair in camera.key_pairs[:KEY_PAIRS]]
-            best = ", ".join(f"{first} + {second}" for first, second in named)
-            lines.append(f"            best pairs of photos to start from: {best}")
-    return lines
-
-
 def model_files(run: Run) -> list[Path]:
     """The mesh in all its formats."""
     return sorted(run.out.glob("model.*"))
@@ -186,11 +126,3 @@ def table(rows: Mapping[str, str]) -> list[str]:
     """Two columns."""
     width = max(map(len, rows), default=0)
     return [f"{name:{width}}  {text}" for name, text in rows.items()]
-
-
-def _k_text(K: Any, spread: Mapping[str, float] = MappingProxyType({})) -> str:
-    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    parts = (
-        f"{name} {value:.1f}" + (f" +- {spread[name]:.1f}" if name in spread else "") for name, value in values.items()
-    )
-    return "  ".join(parts) + " px"

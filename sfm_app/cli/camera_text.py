@@ -1,0 +1,56 @@
+"""What a run says about its cameras: for people, and plain."""
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any
+
+from sfm_app.report import field_of_view_deg, held_text, lens_text
+from sfm_app.types import Intrinsics
+
+KEY_PAIRS = 3
+PHOTOS = 4
+"""So many are named to people; --json has all."""
+
+
+def intrinsics_summary(intrinsics: Intrinsics) -> dict[str, Any]:
+    """Calibrations, plain, for --json."""
+    names = intrinsics.photos
+    cameras = {
+        name: {"field_of_view_deg": [round(angle, 2) for angle in field_of_view_deg(camera)], **camera.to_dict()}
+        for name, camera in intrinsics.cameras.items()
+    }
+    for camera in cameras.values():
+        camera["key_pairs"] = [[names.get(key, str(key)) for key in pair] for pair in camera["key_pairs"]]
+    return cameras
+
+
+def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
+    """Calibrations, for people."""
+    many = len(intrinsics.cameras) > 1
+    lines = []
+    for name, camera in intrinsics.cameras.items():
+        lines.append(f"camera      {f'{name}: ' if many else ''}{k_text(camera.K, camera.spread)}")
+        mine = [photo for photo, of in intrinsics.camera_of.items() if of == name]
+        if many and mine:
+            more = f" and {len(mine) - PHOTOS} more" if len(mine) > PHOTOS else ""
+            lines.append(f"            took {', '.join(mine[:PHOTOS])}{more}")
+        if not camera.identifiable:
+            source = {"exif": "EXIF's claim", "guess": "a guess"}.get(camera.method, camera.method)
+            lines.append(f"            these photos do not determine it ({camera.reason}): {source}")
+        across, down = field_of_view_deg(camera)
+        lines.append(f"            sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom")
+        lines += [f"            {text}" for text in (lens_text(camera), held_text(camera)) if text]
+        if camera.key_pairs:
+            named = [[intrinsics.photos.get(key, str(key)) for key in pair] for pair in camera.key_pairs[:KEY_PAIRS]]
+            best = ", ".join(f"{first} + {second}" for first, second in named)
+            lines.append(f"            best pairs of photos to start from: {best}")
+    return lines
+
+
+def k_text(K: Any, spread: Mapping[str, float] = MappingProxyType({})) -> str:
+    """Focals and centre in pixels, with standard deviations where there are some."""
+    values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    parts = (
+        f"{name} {value:.1f}" + (f" +- {spread[name]:.1f}" if name in spread else "") for name, value in values.items()
+    )
+    return "  ".join(parts) + " px"

@@ -1,0 +1,72 @@
+"""What a run says about its scene: for people, and plain."""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from sfm_app.cli.camera_text import k_text
+from sfm_app.types import Scene
+
+NAMES = 4
+"""Photos of another model that are named."""
+MAPPERS = {"incremental": "photo after photo", "global": "all at once"}
+CONTRADICTED = 0.1
+"""From this share of the matches on, people are told."""
+
+
+def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
+    """The scene, plain, for --json.
+
+    Args:
+        scene: what the stage gave.
+        counts: what it counted.
+    """
+    kept = ("mapper", "pairs", "pairs_dropped", "cut_apart", "other_models", "orientation")
+    cameras = {name: {**camera.to_dict(), "K": camera.K.round(3).tolist()} for name, camera in scene.cameras.items()}
+    return {
+        "registered": len(scene.registered),
+        "of": len(scene.registered) + len(scene.unregistered),
+        "unregistered": dict(scene.unregistered),
+        "points": scene.points,
+        "mean_reprojection_px": round(scene.mean_reprojection_px, 3),
+        "cameras": cameras,
+    } | {key: counts[key] for key in kept if key in counts}
+
+
+def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
+    """The scene, for people; arguments as in `scene_summary`."""
+    summary = scene_summary(scene, counts)
+    yield (
+        f"scene       {summary['registered']} of {summary['of']} photos placed, {scene.points} points, "
+        f"mean reprojection error {summary['mean_reprojection_px']} px"
+    )
+    yield from (f"            {text}" for text in _how(summary, counts))
+    yield from (f"            no place for {name}: {reason}" for name, reason in scene.unregistered.items())
+    many = len(scene.cameras) > 1
+    for name, camera in scene.cameras.items():
+        yield f"            camera {f'{name} ' if many else ''}refined: {k_text(camera.K, camera.deviations)}"
+
+
+def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]:
+    if summary.get("mapper") in MAPPERS:
+        dropped = sum(summary.get("pairs_dropped", {}).values())
+        contradicting = f"; {dropped} pairs that do not fit were left out" if dropped else ""
+        yield f"mapped {MAPPERS[summary['mapper']]}{contradicting}"
+    for photos in summary.get("cut_apart", ()):
+        yield f"cut apart, because more matches contradict the join than bear it out: {photos}"
+    for number, names in enumerate(summary.get("other_models", ()), start=1):
+        more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
+        yield f"another model of {len(names)} photos in other_models/{number}: {', '.join(names[:NAMES])}{more}"
+    explained, against = counts.get("explained_matches", 0), counts.get("contradicted_matches", 0)
+    if against > CONTRADICTED * (explained + against):
+        yield (
+            f"beware: {100 * against / (explained + against):.0f} % of the matches between these photos contradict it; "
+            "look for places that look alike"
+        )
+    orientation = summary.get("orientation", {})
+    if orientation:
+        sure = max(orientation["up_deviation_deg"], 0.1)
+        yield f"upright by {orientation['up']}, to about {sure:.1f} degrees; in {_unit(orientation)}"
+
+
+def _unit(orientation: Mapping[str, Any]) -> str:
+    return "metres by GPS" if orientation["unit"] == "metre" else "a unit of its own"

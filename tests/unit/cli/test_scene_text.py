@@ -1,0 +1,57 @@
+from pathlib import Path
+
+import numpy as np
+
+from sfm_app.cli.scene_text import scene_lines, scene_summary
+from sfm_app.types import CameraModel, Scene
+
+K = np.array([[900.0, 0, 320], [0, 901.0, 240], [0, 0, 1]])
+PLACED = {f"{number}.jpg": np.eye(3, 4) for number in range(5)}
+CAMERA = CameraModel("OPENCV", (900.0, 901, 320, 240, 0, 0, 0, 0), K, 640, 480, {"fx": 1.25})
+COUNTS = {
+    "mapper": "global",
+    "pairs_dropped": {"contradicts other pairs": 3, "points behind a camera": 1},
+    "explained_matches": 900,
+    "contradicted_matches": 20,
+    "orientation": {"up": "vanishing lines", "up_deviation_deg": 0.31, "unit": "about the size of the scene"},
+}
+
+
+def told(**counts):
+    scene = Scene(Path("sparse"), PLACED, {"x.jpg": "shares no scene"}, {"one": CAMERA}, 1234, 5000, 0.321)
+    return "\n".join(scene_lines(scene, COUNTS | counts)), scene_summary(scene, COUNTS | counts)
+
+
+def test_people_read_how_many_photos_are_placed_how_and_how_sure_the_camera_is():
+    text, summary = told()
+
+    assert "5 of 6 photos placed, 1234 points, mean reprojection error 0.321 px" in text
+    assert "mapped all at once; 4 pairs that do not fit were left out" in text
+    assert "no place for x.jpg: shares no scene" in text
+    assert "fx 900.0 +- 1.2" in text and "fy 901.0  cx" in text
+    assert "upright by vanishing lines, to about 0.3 degrees; in a unit of its own" in text
+    assert "beware" not in text and "another model" not in text
+    assert summary["mapper"] == "global" and summary["cameras"]["one"]["K"][0][0] == 900.0
+
+
+def test_other_models_and_cuts_are_named():
+    text, summary = told(
+        other_models=[[f"b{n}.jpg" for n in range(6)], ["c.jpg", "d.jpg", "e.jpg"]], cut_apart=["a, b"]
+    )
+
+    assert "another model of 6 photos in other_models/1: b0.jpg, b1.jpg, b2.jpg, b3.jpg and 2 more" in text
+    assert "another model of 3 photos in other_models/2: c.jpg, d.jpg, e.jpg\n" in text
+    assert "cut apart, because more matches contradict the join than bear it out: a, b" in text
+    assert len(summary["other_models"][0]) == 6
+
+
+def test_a_model_that_many_matches_contradict_comes_with_a_warning():
+    text, _ = told(contradicted_matches=300)
+
+    assert "beware: 25 % of the matches between these photos contradict it" in text
+
+
+def test_metres_are_named():
+    text, _ = told(orientation=COUNTS["orientation"] | {"unit": "metre"})
+
+    assert "in metres by GPS" in text
