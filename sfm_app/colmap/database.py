@@ -59,8 +59,8 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
             images[entry.image_id] = MatchedImage(
                 entry.image_id, photo.name, photo.group, photo.width, photo.height, photo.exif_focal_px
             )
-            found = database.read_keypoints(entry.image_id)
-            keypoints[entry.image_id] = np.asarray(found, np.float64).reshape(len(found), -1)[:, :2].copy()
+            found = np.asarray(database.read_keypoints(entry.image_id), np.float64)
+            keypoints[entry.image_id] = found[:, :2].copy() if len(found) else np.zeros((0, 2))  # a white wall
         pair_ids, rows = database.read_all_matches()
     matches = {_pair(pair_id): np.asarray(row, np.uint32) for pair_id, row in zip(pair_ids, rows, strict=True)}
     return MatchGraph(images, keypoints, dict(sorted(matches.items())))
