@@ -57,6 +57,21 @@ def test_degenerate_pairs_are_named(scene, seed):
     assert fit.degeneracy == scene
 
 
+@pytest.mark.parametrize(("rows", "name"), [(20, "rotation"), (200, "")])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_rotation_stays_one_although_rows_of_bricks_are_mismatched(seed, rows, name):
+    """Off by whole bricks, matches agree with an epipole at the vanishing point of the rows."""
+    x1, x2 = views("rotation", seed, outliers=0)
+    epipole = np.array([2500.0, 300.0])
+    x2[:rows] += np.random.default_rng(seed).uniform(-0.2, 0.2, (rows, 1)) * (epipole - x2[:rows])
+
+    H = K @ TURN @ np.linalg.inv(K)
+    fit = judge(x1, x2, np.cross([*epipole, 1.0], H.T).T, EpipolarSettings())
+
+    assert fit.inliers[:rows].all()
+    assert fit.degeneracy == name
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_a_plane_with_enough_in_front_of_it_is_no_plane(seed):
     fit = ESTIMATORS["lev-ransac"][0](*views("planar", seed, off_plane=200), EpipolarSettings(), seed)
