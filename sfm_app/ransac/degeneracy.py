@@ -27,8 +27,8 @@ _EXTENT = (0.01, 0.99)
 _FOCALS = np.geomspace(0.4, 6.0, 60)
 """Focal lengths that are tried for a rotation, in sides of the box around the points."""
 _PARALLAX_OF_A_MOTION = 0.05
-"""Share of the inliers off the plane below which a rotation stays one. Mismatches on repeated structure, rows of bricks,
-have a vanishing point in common: they agree with an epipole there far more often than accident has it."""
+"""Share of the inliers off the plane below which a rotation stays one. Mismatches on rows of bricks have a vanishing
+point in common: they agree with an epipole there far more often than accident has it."""
 _ROTATION_TOLERANCE = 0.05
 """A rotation stretches nothing; a homography that stretches less than this, for some focal length, counts as one."""
 

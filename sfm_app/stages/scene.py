@@ -12,7 +12,7 @@ from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.mapping import PhotoCounter, continue_mapping
 from sfm_app.colmap.model import model_from_seed, read_scene, turn_upright
 from sfm_app.context import RunContext
-from sfm_app.errors import ReconstructionError
+from sfm_app.diagnosis import why_no_depth, why_no_scene
 from sfm_app.geometry.camera import rays
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.geometry.seed import TwoViewSeed, two_view_seed
@@ -52,7 +52,13 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
     candidates = rank_seeds(matches, views, intrinsics, run)
     best, tried = best_model(candidates, matches, views, run)
     if best is None:
-        raise ReconstructionError(nothing_found(views, candidates, tried), hint=HINT)
+        details = "; ".join(tried) or "no pair has parallax enough to start from"
+        raise why_no_scene(matches, views, run.settings.matching.max_image_size_px).error(details)
+    placed = {image.image_id for image in best.images.values() if image.has_pose}
+    known = all(intrinsics.camera(matches.images[key]).method != "guess" for key in placed)
+    doubt = why_no_depth(matches, views, placed, camera_known=known)
+    if doubt:
+        raise doubt.error()
     with backend("adjusting the bundle"):
         best, deviations = adjust(best, run.workspace.database)
         turn_upright(best)
@@ -71,9 +77,6 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         seeds_tried=tried,
     )
     return scene
-
-
-HINT = "photos that overlap more, from places a step or two apart (turning on the spot is not enough), may help"
 
 
 def rank_seeds(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> list[Candidate]:
@@ -181,20 +184,6 @@ def load_scene(photos: PhotoSet, intrinsics: Intrinsics, run: RunContext) -> Sce
     with backend("reading the sparse model"):
         unregistered = record.counts.get("unregistered", {}) if record else {}
         return read_scene(run.workspace.sparse, names, unregistered)
-
-
-def nothing_found(views: ViewGraph, candidates: list[Candidate], tried: list[str]) -> str:
-    """What was seen, in one line."""
-    inliers = sorted(fit.inlier_count for fit in views.fits.values())
-    degenerate = sum(bool(fit.degeneracy) for fit in views.fits.values())
-    parts = [
-        f"{len(views.fits)} pairs with {inliers[0]} to {inliers[-1]} inliers",
-        f"{degenerate} of them planar, on one line, or without parallax" if degenerate else "",
-        *(f"{count} pairs rejected: {reason}" for reason, count in views.reasons.items()),
-        "" if candidates else "no pair has parallax enough to start from",
-        "; ".join(tried),
-    ]
-    return "no pair of photos grows into a model: " + ", ".join(filter(None, parts))
 
 
 def _names(pair: PairId, matches: MatchGraph) -> str:

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import write_epipolar_fits
 from sfm_app.context import RunContext
-from sfm_app.errors import ReconstructionError
+from sfm_app.diagnosis import why_no_scene
 from sfm_app.ransac.stationary import covers, find_stationary, fit_moving
 from sfm_app.settings import Settings
 from sfm_app.types import EpipolarFit, MatchGraph, PairId, Rejected, ViewGraph
@@ -46,10 +46,7 @@ def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
         stationary=sum(count for _, count in found.values()),
     )
     if not graph.fits:
-        raise ReconstructionError(
-            f"none of {len(pairs)} pairs of photos shows the same scene: " + reasons_text(graph),
-            hint="take photos of one place that overlap by more than half",
-        )
+        raise why_no_scene(matches, graph, run.settings.matching.max_image_size_px).error()
     with run.workspace.replacing(run.workspace.view_graph) as path:
         np.savez_compressed(path, allow_pickle=False, **graph.to_arrays())
     with backend("writing epipolar geometries"):
@@ -70,8 +67,3 @@ def load_view_graph(run: RunContext) -> ViewGraph:
     """Read view_graph.npz back."""
     with np.load(run.workspace.view_graph, allow_pickle=False) as arrays:
         return ViewGraph.from_arrays(dict(arrays))
-
-
-def reasons_text(graph: ViewGraph) -> str:
-    """Why pairs were rejected, for people."""
-    return ", ".join(f"{count} {reason}" for reason, count in graph.reasons.items())

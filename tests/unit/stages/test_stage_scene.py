@@ -128,17 +128,3 @@ def test_every_photo_without_a_place_has_a_reason():
         "5.jpg": "shares inliers only with photos that have no place either",
         "6.jpg": "shares no scene with any other photo",
     }
-
-
-def test_a_failure_says_what_was_seen():
-    views = ViewGraph({(1, 2): fit(40), (1, 3): fit(17, "planar")}, {(2, 3): Rejected("too few inliers")})
-
-    text = scene.nothing_found(views, [], ["1.jpg + 2.jpg: 0 photos"])
-
-    for part in (
-        "2 pairs with 17 to 40 inliers",
-        "1 of them planar",
-        "1 pairs rejected: too few inliers",
-        "no pair has parallax",
-    ):
-        assert part in text
