@@ -93,7 +93,7 @@ def why_no_scene(matches: MatchGraph, views: ViewGraph, feature_side_px: int) ->
     photos = len(matches.images)
     reasons = Counter(views.reasons)
     twins = {pair for pair, rejected in views.rejected.items() if rejected.reason == SAME_PHOTO}
-    if len(connected_groups(matches.images, twins)) == 1:
+    if twins and len(connected_groups(matches.images, twins)) == 1:
         return Diagnosis("copies", f"{photos} copies of one photo, or nearly")
     counts = sorted(len(points) for points in matches.keypoints.values())
     features = f"{counts[0]} to {counts[-1]} features per photo" if counts[-1] else "no features"
