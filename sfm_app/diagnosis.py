@@ -10,16 +10,12 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from sfm_app.errors import ReconstructionError
-from sfm_app.geometry.camera import guessed_camera_matrix
-from sfm_app.geometry.rotation import rotation_distances
 from sfm_app.ransac.stationary import ONLY_A_LOGO, SAME_PHOTO
+from sfm_app.ransac.verdict import matches_off_plane
+from sfm_app.settings import EpipolarSettings, MatchSettings
 from sfm_app.types import MatchedImage, MatchGraph, PairId, ViewGraph
 
-FloatArray = NDArray[np.float64]
 Cause = Literal["copies", "texture", "logo", "nothing", "rotation", "planar", "collinear", "unclear"]
 
 NOTHING_MATCHED = ViewGraph({}, {})
@@ -31,15 +27,9 @@ more, the poorest real photos one per 630."""
 PLANE_PHOTOS = 3
 """Photos of a plane from which a parameter of the camera follows: m views of an unknown plane give 2 m equations for
 the plane's 4 unknowns and those of the camera (Triggs 1998)."""
-SUSPICIOUS = 0.2
-"""Share of the inliers in pairs that look like a rotation from which on it is asked whether the camera only turned."""
-TURNED, TURNED_SIDES = 0.95, 0.01
-"""It did when rotations with one focal length explain this share of the inliers, to this many longer sides: what is
-left for lens and optical centre. A baseline that shows less could not be triangulated either."""
-FOCALS = np.geomspace(0.5, 5.0, 20)
-"""Focal lengths that are tried, in longer sides."""
-PAIRS_ASKED, INLIERS_ASKED = 50, 100
-"""Those with most inliers, and the first of these."""
+LEAST_PARALLAX = 0.01
+"""Share of all inliers that has to show parallax. Panoramas taken for something else have 0.2 % (mismatches), frames of
+a video that hardly moves 15 %."""
 
 STEP = "take each photo from another place, a step or two from the last"
 OVERLAP = "take photos of one place that overlap by more than half"
@@ -54,10 +44,10 @@ HINTS: dict[Cause, str] = {
     "unclear": f"photos that overlap more may help; {STEP}",
 }
 
-DEGENERATE: dict[str, tuple[Cause, str]] = {
-    "rotation": ("rotation", "the camera only turned: photos from one spot hold no depth"),
-    "planar": ("planar", "everything lies in one plane"),
-    "collinear": ("collinear", "all that the photos have in common lies on one line"),
+DEGENERATE: dict[Cause, str] = {
+    "rotation": "the camera only turned: photos from one spot hold no depth",
+    "planar": "everything lies in one plane",
+    "collinear": "all that the photos have in common lies on one line",
 }
 """What pairs without a determined F have in common."""
 
@@ -80,16 +70,16 @@ class Diagnosis:
         return ReconstructionError(f"{self.message}; {details}" if details else self.message, hint=self.hint)
 
 
-def why_no_scene(matches: MatchGraph, views: ViewGraph, feature_side_px: int) -> Diagnosis:
+def why_no_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) -> Diagnosis:
     """The main reason why photos cannot be reconstructed.
 
     Args:
         matches: all photos and their matches.
         views: what became of the pairs; empty where no two photos have matches.
-        feature_side_px: longer side at which features were looked for, in pixels.
+        options: those under which features were looked for.
     """
     if views.fits:
-        return of_fits(matches, views, set(matches.images))
+        return of_fits(views, set(matches.images))
     photos = len(matches.images)
     reasons = Counter(views.reasons)
     twins = {pair for pair, rejected in views.rejected.items() if rejected.reason == SAME_PHOTO}
@@ -97,7 +87,7 @@ def why_no_scene(matches: MatchGraph, views: ViewGraph, feature_side_px: int) ->
         return Diagnosis("copies", f"{photos} copies of one photo, or nearly")
     counts = sorted(len(points) for points in matches.keypoints.values())
     features = f"{counts[0]} to {counts[-1]} features per photo" if counts[-1] else "no features"
-    bare = [_pixels_per_feature(image, matches, feature_side_px) for image in matches.images.values()]
+    bare = [_pixels_per_feature(image, matches, options.max_image_size_px) for image in matches.images.values()]
     if median(bare) > BARE_PX:
         return Diagnosis("texture", f"hardly any texture: {features}, and no two photos have enough in common")
     if reasons[ONLY_A_LOGO] > reasons.total() / 2:
@@ -107,7 +97,7 @@ def why_no_scene(matches: MatchGraph, views: ViewGraph, feature_side_px: int) ->
 
 
 def why_no_depth(
-    matches: MatchGraph, views: ViewGraph, photos: Collection[int], *, camera_known: bool
+    matches: MatchGraph, views: ViewGraph, photos: Collection[int], options: EpipolarSettings, *, camera_known: bool
 ) -> Diagnosis | None:
     """Why a model of these photos could be wrong without showing it; None where they hold depth.
 
@@ -118,41 +108,19 @@ def why_no_depth(
         matches: all photos and their matches.
         views: what became of the pairs.
         photos: ids of those that have a place in the model.
+        options: those under which the pairs were fitted.
         camera_known: whether K rests on more than a guess.
     """
     kinds = votes(views, photos)
-    if not kinds:
+    if kinds[""] >= kinds.total() / 2:
         return None
-    if only_turned(matches, views, photos):
-        return of_fits(matches, views, photos)
-    if "" in kinds or ("planar" in kinds and (camera_known or len(photos) >= PLANE_PHOTOS)):
+    firm = [pair for pair in _among(views, photos) if not views.fits[pair].degeneracy]
+    parallax = sum(matches_off_plane(*matches.points(pair), views.fits[pair].F, options) for pair in firm)
+    if parallax >= LEAST_PARALLAX * kinds.total():
         return None
-    return of_fits(matches, views, photos)
-
-
-def only_turned(matches: MatchGraph, views: ViewGraph, photos: Collection[int]) -> bool:
-    """Whether a camera that stayed in its place explains what these photos have in common.
-
-    Pairs judge that one by one, each with a focal length of its own, and mismatches on repeated structure mislead them;
-    here one focal length has to do for all. Nothing is asked where hardly any pair looks like a rotation.
-    """
-    kinds = votes(views, photos)
-    if kinds["rotation"] <= SUSPICIOUS * kinds.total():
-        return False
-    pairs = sorted(_among(views, photos), key=lambda pair: -views.fits[pair].inlier_count)[:PAIRS_ASKED]
-    some = [[x[views.fits[pair].inliers][:INLIERS_ASKED] for x in matches.points(pair)] for pair in pairs]
-    counts = [views.fits[pair].inlier_count for pair in pairs]
-
-    def explained(pair: PairId, x1: FloatArray, x2: FloatArray, focal: float) -> float:
-        first, second = (matches.images[key] for key in pair)
-        distances = rotation_distances(x1, x2, _guess(first, focal), _guess(second, focal))
-        return float(np.mean(distances < TURNED_SIDES * max(second.width, second.height)))
-
-    def share(focal: float) -> float:
-        shares = [explained(pair, x1, x2, focal) for pair, (x1, x2) in zip(pairs, some, strict=True)]
-        return float(np.average(shares, weights=counts))
-
-    return any(share(focal) >= TURNED for focal in FOCALS)
+    found = of_fits(views, photos)
+    by_plane = found.cause == "planar" and (camera_known or len(photos) >= PLANE_PHOTOS)
+    return None if by_plane else found
 
 
 def votes(views: ViewGraph, photos: Collection[int]) -> Counter[str]:
@@ -172,16 +140,13 @@ def connected_groups(photos: Iterable[int], pairs: Iterable[PairId]) -> list[set
     return sorted(groups, key=lambda group: (-len(group), min(group)))
 
 
-def of_fits(matches: MatchGraph, views: ViewGraph, photos: Collection[int]) -> Diagnosis:
+def of_fits(views: ViewGraph, photos: Collection[int]) -> Diagnosis:
     """What the pairs among some photos, at least one of them, have against a reconstruction."""
     kinds, pairs = votes(views, photos), _among(views, photos)
-    named = Counter(views.fits[pair].degeneracy for pair in pairs)
-    turned = only_turned(matches, views, photos)
-    kind = "rotation" if turned else max((k for k in kinds if k), key=lambda k: kinds[k], default="")
-    if turned or (kind and kinds[""] < kinds.total() / 2):
-        share = "" if turned else f" ({named[kind]} of {len(pairs)} pairs)"
-        cause, text = DEGENERATE[kind]
-        return Diagnosis(cause, f"{text}{share}")
+    if kinds[""] < kinds.total() / 2:
+        kind = max(DEGENERATE, key=lambda kind: kinds[kind])
+        named = sum(views.fits[pair].degeneracy == kind for pair in pairs)
+        return Diagnosis(kind, f"{DEGENERATE[kind]} ({named} of {len(pairs)} pairs)")
     inliers = sorted(views.fits[pair].inlier_count for pair in pairs)
     rejected = "".join(f", {count} rejected: {reason}" for reason, count in views.reasons.items())
     seen = f"{len(pairs)} pairs with {inliers[0]} to {inliers[-1]} inliers{rejected}"
@@ -196,7 +161,3 @@ def _among(views: ViewGraph, photos: Collection[int]) -> list[PairId]:
 def _pixels_per_feature(image: MatchedImage, matches: MatchGraph, feature_side_px: int) -> float:
     shrunk = min(1.0, feature_side_px / max(image.width, image.height))
     return image.width * image.height * shrunk**2 / max(1, len(matches.keypoints[image.id]))
-
-
-def _guess(image: MatchedImage, focal: float) -> FloatArray:
-    return guessed_camera_matrix((image.width, image.height), focal * max(image.width, image.height))

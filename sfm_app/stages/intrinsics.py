@@ -24,7 +24,7 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
         pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split
     )
     intrinsics = Intrinsics(
-        cameras={camera.name: explained(camera, matches, views) for camera in cameras},
+        cameras={camera.name: explained(camera, views) for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
         photos={image.id: image.name for image in matches.images.values()},
     )
@@ -40,12 +40,12 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
     return intrinsics
 
 
-def explained(camera: Camera, matches: MatchGraph, views: ViewGraph) -> Calibration:
+def explained(camera: Camera, views: ViewGraph) -> Calibration:
     """What was found; where that is nothing, with what the pairs are that could not be asked."""
     kinds = votes(views, camera.photos)
     if camera.found.identifiable or not kinds.total() > kinds[""]:
         return camera.found
-    return replace(camera.found, reason=f"{camera.found.reason}; {of_fits(matches, views, camera.photos).message}")
+    return replace(camera.found, reason=f"{camera.found.reason}; {of_fits(views, camera.photos).message}")
 
 
 def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> PhotoPairs:

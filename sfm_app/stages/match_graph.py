@@ -31,7 +31,7 @@ def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
         colmap={"extraction": extraction, "matching": matching},
     )
     if not graph.matches:
-        raise why_no_scene(graph, NOTHING_MATCHED, options.max_image_size_px).error()
+        raise why_no_scene(graph, NOTHING_MATCHED, options).error()
     return graph
 
 

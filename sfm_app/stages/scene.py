@@ -53,10 +53,10 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
     best, tried = best_model(candidates, matches, views, run)
     if best is None:
         details = "; ".join(tried) or "no pair has parallax enough to start from"
-        raise why_no_scene(matches, views, run.settings.matching.max_image_size_px).error(details)
+        raise why_no_scene(matches, views, run.settings.matching).error(details)
     placed = {image.image_id for image in best.images.values() if image.has_pose}
     known = all(intrinsics.camera(matches.images[key]).method != "guess" for key in placed)
-    doubt = why_no_depth(matches, views, placed, camera_known=known)
+    doubt = why_no_depth(matches, views, placed, run.settings.epipolar, camera_known=known)
     if doubt:
         raise doubt.error()
     with backend("adjusting the bundle"):

@@ -46,7 +46,7 @@ def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
         stationary=sum(count for _, count in found.values()),
     )
     if not graph.fits:
-        raise why_no_scene(matches, graph, run.settings.matching.max_image_size_px).error()
+        raise why_no_scene(matches, graph, run.settings.matching).error()
     with run.workspace.replacing(run.workspace.view_graph) as path:
         np.savez_compressed(path, allow_pickle=False, **graph.to_arrays())
     with backend("writing epipolar geometries"):

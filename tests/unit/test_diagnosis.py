@@ -4,7 +4,9 @@ import pytest
 from sfm_app.diagnosis import HINTS, NOTHING_MATCHED, connected_groups, why_no_depth, why_no_scene
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.camera import camera_matrix
+from sfm_app.geometry.epipolar import eight_point
 from sfm_app.ransac.stationary import ONLY_A_LOGO, SAME_PHOTO
+from sfm_app.settings import EpipolarSettings, MatchSettings
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, Rejected, ViewGraph
 
@@ -38,7 +40,12 @@ def turned(moved, kinds, photos=4, noise=0.4):
         keypoints[key] = seen[:, :2] / seen[:, 2:] + rng.normal(scale=noise, size=(300, 2))
     pairs = [(a, b) for a in images for b in images if a < b]
     rows = np.tile(np.arange(300, dtype=np.uint32)[:, None], 2)
-    fits = {pair: fit(300, kind) for pair, kind in zip(pairs, kinds, strict=True)}
+    Fs = [eight_point(*(keypoints[key] for key in pair)) for pair in pairs]
+    everything = np.ones(300, bool)
+    fits = {
+        pair: EpipolarFit(F, everything, everything * 1.0, 10, 0.3, kind)
+        for pair, F, kind in zip(pairs, Fs, kinds, strict=True)
+    }
     return MatchGraph(images, keypoints, dict.fromkeys(pairs, rows)), ViewGraph(fits, {})
 
 
@@ -58,7 +65,7 @@ def turned(moved, kinds, photos=4, noise=0.4):
     ],
 )
 def test_photos_that_no_pair_connects(matches, views, cause, says):
-    found = why_no_scene(matches, views, feature_side_px=1600)
+    found = why_no_scene(matches, views, MatchSettings())
 
     assert (found.cause, says in found.message) == (cause, True)
 
@@ -66,8 +73,8 @@ def test_photos_that_no_pair_connects(matches, views, cause, says):
 def test_features_are_counted_in_the_photo_as_it_was_searched():
     large = MatchGraph({1: MatchedImage(1, "1.jpg", "one", 6400, 4800)}, {1: np.zeros((3000, 2))}, {})
 
-    assert why_no_scene(large, NOTHING_MATCHED, 1600).cause != "texture"
-    assert why_no_scene(large, NOTHING_MATCHED, 6400).cause == "texture"
+    assert why_no_scene(large, NOTHING_MATCHED, MatchSettings()).cause != "texture"
+    assert why_no_scene(large, NOTHING_MATCHED, MatchSettings(max_image_size_px=6400)).cause == "texture"
 
 
 @pytest.mark.parametrize(
@@ -79,36 +86,30 @@ def test_features_are_counted_in_the_photo_as_it_was_searched():
         ({"": 600, "planar": 500}, "unclear", "2 pairs with 500 to 600 inliers, 1 rejected: too few inliers"),
     ],
 )
-def test_pairs_vote_with_their_inliers(monkeypatch, kinds, cause, says):
-    monkeypatch.setattr("sfm_app.diagnosis.only_turned", lambda *_: False)
+def test_pairs_vote_with_their_inliers(kinds, cause, says):
     fits = {(1, key): fit(count, kind) for key, (kind, count) in enumerate(kinds.items(), start=2)}
     views = ViewGraph(fits, {(2, 3): Rejected("too few inliers")})
 
-    found = why_no_scene(photos((900,) * 5), views, 1600)
+    found = why_no_scene(photos((900,) * 5), views, MatchSettings())
 
     assert (found.cause, says in found.message) == (cause, True)
 
 
-@pytest.mark.parametrize(
-    "kinds",
-    [
-        ["rotation"] * 6,
-        ["rotation", "planar", "rotation", "", "planar", "planar"],
-        ["rotation", "rotation", "", "", "", ""],  # misjudged: a focal that all have in common shows it
-    ],
-)
-def test_a_panorama_is_one_although_pairs_are_misjudged(kinds):
-    matches, views = turned((0.0, 0.0, 0.0), kinds)
-
-    assert why_no_scene(matches, views, 1600).cause == "rotation"
-    assert why_no_depth(matches, views, [1, 2, 3, 4], camera_known=True).cause == "rotation"
+MOSTLY_TURNED = ["rotation", "planar", "rotation", "", "rotation", ""]
 
 
-def test_a_camera_that_moved_did_not_only_turn_whatever_some_pairs_say():
-    matches, views = turned((0.4, 0.0, 0.0), ["rotation", "rotation", "", "", "", ""])
+def test_a_panorama_is_one_although_pairs_are_misjudged():
+    matches, views = turned((0.0, 0.0, 0.0), MOSTLY_TURNED)
 
-    assert why_no_depth(matches, views, [1, 2, 3, 4], camera_known=False) is None
-    assert why_no_scene(matches, views, 1600).cause == "unclear"
+    assert why_no_scene(matches, views, MatchSettings()).cause == "rotation"
+    assert why_no_depth(matches, views, [1, 2, 3, 4], EpipolarSettings(), camera_known=True).cause == "rotation"
+
+
+@pytest.mark.parametrize("moved", [(0.2, 0.0, 0.0), (0.4, 0.0, 0.0)])
+def test_a_few_pairs_with_parallax_hold_depth_whatever_the_others_say(moved):
+    matches, views = turned(moved, MOSTLY_TURNED)
+
+    assert why_no_depth(matches, views, [1, 2, 3, 4], EpipolarSettings(), camera_known=False) is None
 
 
 @pytest.mark.parametrize(
@@ -124,17 +125,17 @@ def test_a_camera_that_moved_did_not_only_turn_whatever_some_pairs_say():
 def test_a_model_needs_depth_or_a_plane_and_its_camera(kind, count, camera_known, cause):
     matches, views = turned((0.4, 0.0, 0.0), [kind] * 6)
 
-    found = why_no_depth(matches, views, range(1, count + 1), camera_known=camera_known)
+    found = why_no_depth(matches, views, range(1, count + 1), EpipolarSettings(), camera_known=camera_known)
 
     assert (found.cause if found else None) == cause
 
 
 def test_a_model_that_no_pair_supports_is_not_judged():
-    assert why_no_depth(photos((900,) * 3), NOTHING_MATCHED, [1, 2], camera_known=False) is None
+    assert why_no_depth(photos((900,) * 3), NOTHING_MATCHED, [1, 2], EpipolarSettings(), camera_known=False) is None
 
 
 def test_a_diagnosis_ends_the_run_with_exit_code_4():
-    error = why_no_scene(photos((0, 0)), NOTHING_MATCHED, 1600).error("two seeds tried")
+    error = why_no_scene(photos((0, 0)), NOTHING_MATCHED, MatchSettings()).error("two seeds tried")
 
     assert isinstance(error, ReconstructionError) and error.exit_code == 4
     assert str(error).endswith("; two seeds tried") and error.hint == HINTS["texture"]
