@@ -79,7 +79,7 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
                 entry.image_id, photo.name, photo.group, photo.width, photo.height, photo.exif_focal_px, photo.gps
             )
             found = np.asarray(database.read_keypoints(entry.image_id), np.float64)
-            keypoints[entry.image_id] = found[:, :2].copy() if len(found) else np.empty((0, 2))
+            keypoints[entry.image_id] = found[:, :2].copy() if len(found) else np.zeros((0, 2))  # a white wall
         pair_ids, rows = database.read_all_matches()
     matches = {_pair(pair_id): np.asarray(row, np.uint32) for pair_id, row in zip(pair_ids, rows, strict=True)}
     return MatchGraph(images, keypoints, dict(sorted(matches.items())))

@@ -11,6 +11,7 @@ from sfm_app.ransac.chance import MOST_FALSE_ALARMS, false_alarms_of, squared_mi
 from sfm_app.ransac.degeneracy import find_degeneracy
 from sfm_app.ransac.leverage import prior_validity
 from sfm_app.ransac.loop import search
+from sfm_app.ransac.planes import OFF_PLANE, dominant_homography, transfer_distance
 from sfm_app.ransac.points import Matches, check_points, prepare
 from sfm_app.ransac.recipe import Recipe
 from sfm_app.ransac.refits import last_fit
@@ -108,6 +109,27 @@ def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings)
     if len(matches.points) < options.min_inliers:
         return Rejected(TOO_FEW_MATCHES)
     return _judge_any(first, second, matches, _in_frame(F, matches.unit_px, matches.centre), 1, options)
+
+
+def matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> int:
+    """How many distinct inliers of F show parallax: those off the plane that holds most of them.
+
+    Args:
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
+        F: (3, 3) of rank 2, at least 3 inliers.
+        options: the threshold.
+
+    Raises:
+        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+    """
+    matches = prepare(*check_points(x1, x2), seed=0)
+    threshold = options.max_error_px / matches.unit_px
+    in_frame = _in_frame(F, matches.unit_px, matches.centre)
+    f = np.ascontiguousarray(in_frame / np.linalg.norm(in_frame))
+    agreeing = np.asfortranarray(matches.points[squared_distances(matches.points, f.reshape(9)) <= threshold**2])
+    H = dominant_homography(agreeing, f, threshold)
+    return int(np.count_nonzero(transfer_distance(H, agreeing) > OFF_PLANE * threshold))
 
 
 def _in_frame(F: ArrayLike, unit_px: float, centre: FloatArray) -> FloatArray:

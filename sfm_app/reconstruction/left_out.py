@@ -1,4 +1,4 @@
-"""Why photos have no place, and why there is no model at all."""
+"""Why photos have no place."""
 
 from collections.abc import Iterator, Sequence
 
@@ -25,22 +25,6 @@ def left_out(
                 f"belongs to another model, of {len(model)} photos" if model else _reason(photo, posed, views, graph)
             )
     return reasons
-
-
-def nothing_found(views: ViewGraph, graph: PoseGraph, tried: Sequence[str]) -> str:
-    """What was seen, in one line."""
-    inliers = sorted(fit.inlier_count for fit in views.fits.values())
-    degenerate = sum(bool(fit.degeneracy) for fit in views.fits.values())
-    turned = sum(pose.kind == "rotation" for pose in graph.poses.values())
-    parts = [
-        f"{len(views.fits)} pairs with {inliers[0]} to {inliers[-1]} inliers",
-        f"{degenerate} of them planar, on one line, or without parallax" if degenerate else "",
-        *(f"{count} pairs rejected: {reason}" for reason, count in views.reasons.items()),
-        f"{turned} pairs between which the camera only turned" if turned else "",
-        "" if tried else "no pair has parallax enough to start from",
-        "; ".join(tried),
-    ]
-    return "no pair of photos grows into a model: " + ", ".join(filter(None, parts))
 
 
 def _reason(photo: int, posed: set[int], views: ViewGraph, graph: PoseGraph) -> str:

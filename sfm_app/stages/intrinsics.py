@@ -1,7 +1,6 @@
 """intrinsics: ViewGraph -> Intrinsics."""
 
 import json
-from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +8,7 @@ import numpy as np
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import write_calibrations
 from sfm_app.context import RunContext
+from sfm_app.diagnosis import of_fits, votes
 from sfm_app.selfcal import Camera, calibrate_photo_set, pair_weights
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
 
@@ -41,13 +41,11 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
 
 
 def explained(camera: Camera, views: ViewGraph) -> Calibration:
-    """What was found; where that is nothing, with the pairs that could not be asked."""
-    members = set(camera.photos)
-    kinds = Counter(fit.degeneracy for pair, fit in views.fits.items() if fit.degeneracy and members.issuperset(pair))
-    if camera.found.identifiable or not kinds:
+    """What was found; where that is nothing, with what the pairs are that could not be asked."""
+    kinds = votes(views, camera.photos)
+    if camera.found.identifiable or not kinds.total() > kinds[""]:
         return camera.found
-    left_out = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
-    return replace(camera.found, reason=f"{camera.found.reason}; pairs that show no camera: {left_out}")
+    return replace(camera.found, reason=f"{camera.found.reason}; {of_fits(views, camera.photos).message}")
 
 
 def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> PhotoPairs:

@@ -4,7 +4,7 @@ from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.colmap.features import extract_features, match_exhaustively
 from sfm_app.context import RunContext
-from sfm_app.errors import ReconstructionError
+from sfm_app.diagnosis import NOTHING_MATCHED, why_no_scene
 from sfm_app.types import MatchGraph, PhotoSet
 
 
@@ -31,12 +31,7 @@ def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
         colmap={"extraction": extraction, "matching": matching},
     )
     if not graph.matches:
-        features = [len(points) for points in graph.keypoints.values()]
-        raise ReconstructionError(
-            f"no two of {len(names)} photos have anything in common "
-            f"({min(features)} to {max(features)} features per photo)",
-            hint="take photos that overlap by more than half and show texture",
-        )
+        raise why_no_scene(graph, NOTHING_MATCHED, options).error()
     return graph
 
 

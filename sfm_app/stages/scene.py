@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,13 +11,11 @@ from sfm_app.colmap.backend import backend
 from sfm_app.colmap.bundle import Adjusted, adjust
 from sfm_app.colmap.model import photos_of, read_scene
 from sfm_app.context import RunContext
-from sfm_app.errors import ReconstructionError
+from sfm_app.diagnosis import why_no_depth, why_no_scene
 from sfm_app.reconstruction import Outcome, reconstruct
-from sfm_app.reconstruction.left_out import left_out, names_of, nothing_found
+from sfm_app.reconstruction.left_out import left_out, names_of
 from sfm_app.reconstruction.orientation import orient
 from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
-
-HINT = "photos that overlap more, from places a step or two apart (turning on the spot is not enough), may help"
 
 
 def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
@@ -25,9 +24,7 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
     Raises:
         ReconstructionError: no pair of photos grows into a model; says what was seen.
     """
-    outcome = reconstruct(matches, views, intrinsics, run)
-    if not outcome.models:
-        raise ReconstructionError(nothing_found(views, outcome.graph, outcome.tried), hint=HINT)
+    outcome = with_depth(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
     with backend("adjusting the bundle"):
         adjusted = [adjust(attempt.model, run.workspace.database) for attempt in outcome.models]
     models = [found.model for found in adjusted]
@@ -51,6 +48,30 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         **how_it_was_made(outcome),
     )
     return scene
+
+
+def with_depth(
+    outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
+) -> Outcome:
+    """Without the models of photos that hold no depth: these could be anything.
+
+    Raises:
+        ReconstructionError: no model is left; says what was seen.
+    """
+    kept, doubts = [], []
+    for attempt in outcome.models:
+        placed = set(photos_of(attempt.model))
+        known = all(intrinsics.camera(matches.images[photo]).method != "guess" for photo in placed)
+        doubt = why_no_depth(matches, views, placed, run.settings.epipolar, camera_known=known)
+        if doubt:
+            doubts.append(doubt)
+        else:
+            kept.append(attempt)
+    if doubts and not kept:
+        raise doubts[0].error()
+    if not kept:
+        raise why_no_scene(matches, views, run.settings.matching).error("; ".join(outcome.tried))
+    return replace(outcome, models=tuple(kept))
 
 
 def how_it_was_made(outcome: Outcome) -> dict[str, Any]:

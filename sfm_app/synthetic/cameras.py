@@ -168,6 +168,23 @@ def orbit(
     return Views.of(camera, [look_at(middle + distance * way, middle) for way in around])
 
 
+def panorama(
+    camera: Camera, photos: int = 6, step_deg: float = 12.0, centre: tuple[float, float, float] = (0.0, 1.5, 4.5)
+) -> Views:
+    """Photos from one spot, turned from left to right, each a little up or down and rolled: they hold no depth.
+
+    Args:
+        camera: takes all photos.
+        photos: >= 2.
+        step_deg: angle from photo to photo, in degrees.
+        centre: the spot, in scene units; the middle of the photos looks towards -z.
+    """
+    azimuth = np.radians(step_deg) * (np.arange(photos) - (photos - 1) / 2)
+    tilt, roll_deg = 0.05 * np.cos(np.pi * np.arange(photos)), 3.0 * np.sin(2.0 * np.arange(photos))
+    spot, ways = np.array(centre), np.column_stack([np.sin(azimuth), tilt, -np.cos(azimuth)])
+    return Views.of(camera, [look_at(spot, spot + way, roll) for way, roll in zip(ways, roll_deg, strict=True)])
+
+
 def look_at(centre: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> FloatArray:
     """(3, 4) cam_from_world of a camera at `centre` (3,) that looks at `aim` (3,), world y up.
 

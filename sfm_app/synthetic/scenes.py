@@ -6,8 +6,11 @@ from types import MappingProxyType
 from sfm_app.errors import ConfigError
 from sfm_app.synthetic.bodies import SyntheticScene
 from sfm_app.synthetic.courtyard import courtyard
+from sfm_app.synthetic.small_scenes import heap, poster
 
-SCENES: Mapping[str, Callable[[], SyntheticScene]] = MappingProxyType({"courtyard": courtyard})
+SCENES: Mapping[str, Callable[[], SyntheticScene]] = MappingProxyType(
+    {"courtyard": courtyard, "poster": poster, "heap": heap}
+)
 
 
 def build_scene(name: str = "courtyard") -> SyntheticScene:

@@ -7,6 +7,7 @@ from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.ransac import ESTIMATORS, judge
 from sfm_app.ransac.degeneracy import is_rotation, off_dominant_line
+from sfm_app.ransac.verdict import matches_off_plane
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
@@ -55,6 +56,36 @@ def test_degenerate_pairs_are_named(scene, seed):
     fit = ESTIMATORS["lev-ransac"][0](*views(scene, seed), EpipolarSettings(), seed)
     assert isinstance(fit, EpipolarFit)
     assert fit.degeneracy == scene
+
+
+@pytest.mark.parametrize(("rows", "name"), [(20, "rotation"), (200, "")])
+@pytest.mark.parametrize("seed", range(5))
+def test_a_rotation_stays_one_although_rows_of_bricks_are_mismatched(seed, rows, name):
+    """Off by whole bricks, matches agree with an epipole at the vanishing point of the rows."""
+    x1, x2 = views("rotation", seed, outliers=0)
+    epipole = np.array([2500.0, 300.0])
+    x2[:rows] += np.random.default_rng(seed).uniform(-0.2, 0.2, (rows, 1)) * (epipole - x2[:rows])
+
+    H = K @ TURN @ np.linalg.inv(K)
+    fit = judge(x1, x2, np.cross([*epipole, 1.0], H.T).T, EpipolarSettings())
+
+    assert fit.inliers[:rows].all()
+    assert fit.degeneracy == name
+
+
+@pytest.mark.parametrize(("scene", "off_plane"), [("rotation", 0), ("planar", 0), ("planar", 50), ("planar", 300)])
+def test_matches_off_the_plane_are_counted(scene, off_plane):
+    x1, x2 = views(scene, 1, off_plane=off_plane, outliers=0)
+
+    count = matches_off_plane(x1 + 3000.0, x2 + 3000.0, moved_by(TRUTH, 3000.0), EpipolarSettings())
+
+    assert 0.7 * off_plane <= count <= off_plane
+
+
+def moved_by(F, px):
+    """F of pixels that are moved right and down."""
+    back = np.array([[1.0, 0.0, -px], [0.0, 1.0, -px], [0.0, 0.0, 1.0]])
+    return back.T @ F @ back
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -15,6 +15,7 @@ from sfm_app.synthetic.cameras import (
     look_at,
     make_camera,
     orbit,
+    panorama,
     pixel_rays,
 )
 
@@ -183,3 +184,12 @@ def test_impossible_arcs_are_refused(options, named):
 def test_impossible_cameras_are_refused():
     with pytest.raises(ConfigError, match="out of range"):
         make_camera(960, 640, focal_widths=0.0)
+
+
+def test_a_panorama_is_taken_from_one_spot():
+    views = panorama(make_camera(96, 64), photos=5, step_deg=10.0, centre=(1.0, 2.0, 3.0))
+    poses = list(views.cam_from_world.values())
+    turned = [np.degrees(np.arccos(np.clip(a[2, :3] @ b[2, :3], -1, 1))) for a, b in combinations(poses, 2)]
+
+    assert np.allclose([camera_centre(pose) for pose in poses], [1.0, 2.0, 3.0])
+    assert 9.0 < min(turned) < 12.0 and 38.0 < max(turned) < 42.0

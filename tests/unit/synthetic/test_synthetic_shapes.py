@@ -74,7 +74,12 @@ def test_ground_faces_up_and_is_uneven():
     assert np.allclose(np.ptp(floor.vertices[:, [0, 2]], axis=0), [2.0, 4.0])
 
 
-@pytest.mark.parametrize("name", SCENES)
+def test_a_poster_is_flat_and_all_scenes_have_their_names():
+    assert np.ptp(build_scene("poster").vertices[:, 2]) < 0.2
+    assert [build_scene(name).name for name in SCENES] == list(SCENES)
+
+
+@pytest.mark.parametrize("name", ["courtyard", "heap"])
 def test_scenes_are_sound_and_not_planar(name):
     scene = build_scene(name)
     vertices, faces = scene.vertices, scene.faces

@@ -1,0 +1,163 @@
+"""Why photos give no scene: one sentence and what to do about it, from what the early stages counted.
+
+Pairs say what they are (see `ransac.degeneracy`, `ransac.stationary`), some of them wrongly; here they vote, each with
+its inliers. A whole set is a panorama when most of what it has in common is.
+"""
+
+from collections import Counter
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from statistics import median
+from typing import Literal
+
+from sfm_app.errors import ReconstructionError
+from sfm_app.ransac.stationary import ONLY_A_LOGO, SAME_PHOTO
+from sfm_app.ransac.verdict import matches_off_plane
+from sfm_app.settings import EpipolarSettings, MatchSettings
+from sfm_app.types import MatchedImage, MatchGraph, PairId, ViewGraph
+
+Cause = Literal["copies", "texture", "logo", "nothing", "rotation", "planar", "collinear", "unclear"]
+
+NOTHING_MATCHED = ViewGraph({}, {})
+"""Where no two photos have matches."""
+
+BARE_PX = 800.0
+"""Pixels per feature above which a photo shows hardly any texture: sensor noise on a white wall gives one per 1100 or
+more, the poorest real photos one per 630."""
+PLANE_PHOTOS = 3
+"""Photos of a plane from which a parameter of the camera follows: m views of an unknown plane give 2 m equations for
+the plane's 4 unknowns and those of the camera (Triggs 1998)."""
+LEAST_PARALLAX = 0.01
+"""Share of all inliers that has to show parallax. Panoramas taken for something else have 0.2 % (mismatches), frames of
+a video that hardly moves 15 %."""
+
+STEP = "take each photo from another place, a step or two from the last"
+OVERLAP = "take photos of one place that overlap by more than half"
+HINTS: dict[Cause, str] = {
+    "copies": STEP,
+    "texture": "plain surfaces show nothing to match: take in things with texture, sharp and in good light",
+    "logo": OVERLAP,
+    "nothing": OVERLAP,
+    "rotation": f"{STEP}: turning on the spot is not enough",
+    "planar": "take photos that show things before and behind the plane, or at least three of the plane from the sides",
+    "collinear": OVERLAP,
+    "unclear": f"photos that overlap more may help; {STEP}",
+}
+
+DEGENERATE: dict[Cause, str] = {
+    "rotation": "the camera only turned: photos from one spot hold no depth",
+    "planar": "everything lies in one plane",
+    "collinear": "all that the photos have in common lies on one line",
+}
+"""What pairs without a determined F have in common."""
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """Why there is no scene."""
+
+    cause: Cause
+    message: str
+    """One line."""
+
+    @property
+    def hint(self) -> str:
+        """What to do, one line."""
+        return HINTS[self.cause]
+
+    def error(self, details: str = "") -> ReconstructionError:
+        """As the error that ends the run."""
+        return ReconstructionError(f"{self.message}; {details}" if details else self.message, hint=self.hint)
+
+
+def why_no_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) -> Diagnosis:
+    """The main reason why photos cannot be reconstructed.
+
+    Args:
+        matches: all photos and their matches.
+        views: what became of the pairs; empty where no two photos have matches.
+        options: those under which features were looked for.
+    """
+    if views.fits:
+        return of_fits(views, set(matches.images))
+    photos = len(matches.images)
+    reasons = Counter(views.reasons)
+    twins = {pair for pair, rejected in views.rejected.items() if rejected.reason == SAME_PHOTO}
+    if twins and len(connected_groups(matches.images, twins)) == 1:
+        return Diagnosis("copies", f"{photos} copies of one photo, or nearly")
+    counts = sorted(len(points) for points in matches.keypoints.values())
+    features = f"{counts[0]} to {counts[-1]} features per photo" if counts[-1] else "no features"
+    bare = [_pixels_per_feature(image, matches, options.max_image_size_px) for image in matches.images.values()]
+    if median(bare) > BARE_PX:
+        return Diagnosis("texture", f"hardly any texture: {features}, and no two photos have enough in common")
+    if reasons[ONLY_A_LOGO] > reasons.total() / 2:
+        return Diagnosis("logo", f"the photos have {ONLY_A_LOGO}")
+    seen = ", ".join([f"{count} pairs: {reason}" for reason, count in reasons.items()] or ["no pair has a match"])
+    return Diagnosis("nothing", f"the {photos} photos show nothing in common ({features}; {seen})")
+
+
+def why_no_depth(
+    matches: MatchGraph, views: ViewGraph, photos: Collection[int], options: EpipolarSettings, *, camera_known: bool
+) -> Diagnosis | None:
+    """Why a model of these photos could be wrong without showing it; None where they hold depth.
+
+    Pairs without parallax fit any epipole, and with a wrong K a rotation looks like parallax. A plane leaves F open but
+    not E: where the camera is known, or photos enough to find it from the plane, it can be reconstructed.
+
+    Args:
+        matches: all photos and their matches.
+        views: what became of the pairs.
+        photos: ids of those that have a place in the model.
+        options: those under which the pairs were fitted.
+        camera_known: whether K rests on more than a guess.
+    """
+    kinds = votes(views, photos)
+    if kinds[""] >= kinds.total() / 2:
+        return None
+    firm = [pair for pair in _among(views, photos) if not views.fits[pair].degeneracy]
+    parallax = sum(matches_off_plane(*matches.points(pair), views.fits[pair].F, options) for pair in firm)
+    if parallax >= LEAST_PARALLAX * kinds.total():
+        return None
+    found = of_fits(views, photos)
+    by_plane = found.cause == "planar" and (camera_known or len(photos) >= PLANE_PHOTOS)
+    return None if by_plane else found
+
+
+def votes(views: ViewGraph, photos: Collection[int]) -> Counter[str]:
+    """Inliers of the pairs among some photos by what leaves their F open, "" where nothing does."""
+    found: Counter[str] = Counter()
+    for pair in _among(views, photos):
+        found[views.fits[pair].degeneracy] += views.fits[pair].inlier_count
+    return found
+
+
+def connected_groups(photos: Iterable[int], pairs: Iterable[PairId]) -> list[set[int]]:
+    """Photos that hang together through pairs, the largest group first."""
+    groups = [{photo} for photo in photos]
+    for pair in pairs:
+        joined = [group for group in groups if not group.isdisjoint(pair)]
+        groups = [group for group in groups if group.isdisjoint(pair)] + [set().union(*joined)]
+    return sorted(groups, key=lambda group: (-len(group), min(group)))
+
+
+def of_fits(views: ViewGraph, photos: Collection[int]) -> Diagnosis:
+    """What the pairs among some photos, at least one of them, have against a reconstruction."""
+    kinds, pairs = votes(views, photos), _among(views, photos)
+    if kinds[""] < kinds.total() / 2:
+        kind = max(DEGENERATE, key=lambda kind: kinds[kind])
+        named = sum(views.fits[pair].degeneracy == kind for pair in pairs)
+        return Diagnosis(kind, f"{DEGENERATE[kind]} ({named} of {len(pairs)} pairs)")
+    inliers = sorted(views.fits[pair].inlier_count for pair in pairs)
+    rejected = "".join(f", {count} rejected: {reason}" for reason, count in views.reasons.items())
+    seen = f"{len(pairs)} pairs with {inliers[0]} to {inliers[-1]} inliers{rejected}"
+    return Diagnosis("unclear", f"no pair of photos grows into a model ({seen})")
+
+
+def _among(views: ViewGraph, photos: Collection[int]) -> list[PairId]:
+    members = set(photos)
+    return [pair for pair in views.fits if members.issuperset(pair)]
+
+
+def _pixels_per_feature(image: MatchedImage, matches: MatchGraph, feature_side_px: int) -> float:
+    shrunk = min(1.0, feature_side_px / max(image.width, image.height))
+    return image.width * image.height * shrunk**2 / max(1, len(matches.keypoints[image.id]))
