@@ -70,17 +70,20 @@ def map_globally(
         shutil.copyfile(database, scratch / "database.db")
         (scratch / "names.json").write_text(json.dumps(list(names)), encoding="utf-8")
         command = [sys.executable, "-m", "sfm_app.colmap.global_mapping", str(scratch), str(photo_dir), str(seed)]
-        with subprocess.Popen(  # noqa: S603 - our own module, no shell
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-        ) as process:
+        # what it says goes to a file: nobody empties a pipe while it runs, and a full one would make it wait for ever
+        said = scratch / "errors.txt"
+        with (
+            said.open("wb") as errors,
+            subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors) as process,  # noqa: S603 - our module
+        ):
             while process.poll() is None:
                 if token.is_cancelled:
                     process.kill()
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(0.1)
-            errors = process.stderr.read() if process.stderr else ""
         if process.returncode:
-            raise RuntimeError(errors.strip().splitlines()[-1] if errors.strip() else "the global mapper was stopped")
+            lines = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            raise RuntimeError(lines[-1] if lines else "the global mapper was stopped")
         found = scratch / "model"
         return pycolmap.Reconstruction(found) if found.exists() else None
     finally:
