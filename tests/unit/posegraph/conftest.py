@@ -71,7 +71,10 @@ def two_views():
         X = rng.uniform([-2, -1.5, 4], [2, 1.5, 8], (right + second, 3))
         if scene == "wall":
             X[:, 2] = 6.0 + 0.3 * X[:, 0] - 0.2 * X[:, 1]
-        x1, x2 = projected(X, np.eye(3), np.zeros(3), radial), projected(X, R, 0.0 * t if scene == "turn" else t, radial)
+        x1, x2 = (
+            projected(X, np.eye(3), np.zeros(3), radial),
+            projected(X, R, 0.0 * t if scene == "turn" else t, radial),
+        )
         # the same points again, one pane of a facade further: another pose explains them
         x2[right:] = projected(X[right:] + [0.6, 0.0, 0.3], R, t + [0.0, 0.5, -0.2], radial)
         x1, x2 = (x + rng.normal(0.0, noise_px, x.shape) for x in (x1, x2))

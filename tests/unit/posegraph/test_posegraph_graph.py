@@ -54,7 +54,9 @@ class Photos:
         """Matches of a place that looks the same from another side."""
         X = self.rng.uniform([-2, -1.5, 4.5], [2, 1.5, 7.5], (count, 3))
         R = turn(0, degrees, 0) @ self.rotation(pair)
-        self.match(pair, self.seen(X, np.eye(3), np.zeros(3)), self.seen(X @ R.T, np.eye(3), np.array([-1.0, 0.2, 0.5])))
+        self.match(
+            pair, self.seen(X, np.eye(3), np.zeros(3)), self.seen(X @ R.T, np.eye(3), np.array([-1.0, 0.2, 0.5]))
+        )
 
     def spoil(self, pair, right):
         """Leave a pair so many right matches, and false ones instead of the others."""

@@ -27,7 +27,7 @@ def test_a_pair_is_called_what_its_inliers_are_of(two_views, scene, kind, seed):
     pose = estimated(views.pair(), fit_of(views, views.F))
 
     assert pose.kind == kind
-    assert views.errors_deg(pose.R, pose.t)[0] < 0.3 
+    assert views.errors_deg(pose.R, pose.t)[0] < 0.3
     assert not pose.guided
 
 
@@ -35,7 +35,9 @@ def test_some_points_off_the_wall_make_a_pair_that_is_not_planar(two_views):
     wall, box = two_views(scene="wall"), two_views(1)
     share = {}
     for off in (4, 40):
-        both = type(wall)(*(np.vstack([a[off:], b[:off]]) for a, b in ((wall.x1, box.x1), (wall.x2, box.x2))), 200, wall.R, wall.t)
+        both = type(wall)(
+            *(np.vstack([a[off:], b[:off]]) for a, b in ((wall.x1, box.x1), (wall.x2, box.x2))), 200, wall.R, wall.t
+        )
         share[off] = estimated(both.pair(), fit_of(both, both.F)).kind
 
     assert share == {4: "planar", 40: "calibrated"}

@@ -168,4 +168,6 @@ def test_a_loop_counts_by_its_weaker_other_pair():
 def test_pairs_in_no_loop_are_all_alike():
     rotations = truth(4)
 
-    assert set(supported(relative(rotations, [(0, 1), (1, 2), (2, 3)]), dict.fromkeys(combinations(range(4), 2), 5.0)).values()) == {1.0}
+    assert set(
+        supported(relative(rotations, [(0, 1), (1, 2), (2, 3)]), dict.fromkeys(combinations(range(4), 2), 5.0)).values()
+    ) == {1.0}
