@@ -6,7 +6,7 @@ import pytest
 from sfm_app.colmap.backend import backend, plain, pycolmap
 from sfm_app.colmap.bundle import adjust, main_camera
 from sfm_app.colmap.database import SQUARE_PIXELS, TWO_FOCALS, camera_params
-from sfm_app.colmap.model import turn_upright
+from sfm_app.colmap.model import part_of, photos_of, turn_upright
 from sfm_app.errors import BackendError, ConfigError
 from sfm_app.geometry.camera import camera_matrix
 
@@ -111,6 +111,18 @@ def test_a_model_is_turned_upright_centred_and_scaled(tmp_path):
     if np.linalg.norm(up) > 1e-3:
         assert up[1] / np.linalg.norm(up) == pytest.approx(1, abs=1e-6)
     assert model.compute_mean_reprojection_error() == pytest.approx(error, rel=1e-4)
+
+
+def test_a_part_of_a_model_can_be_adjusted_and_the_whole_stays(tmp_path):
+    model, database = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=6)
+
+    part = part_of(model, (1, 3, 4))
+    found, deviations = adjust(part, database)
+
+    assert photos_of(found) == sorted(found.images) == [1, 3, 4] and photos_of(model) == [1, 2, 3, 4, 5, 6]
+    assert all(point.track.length() >= 2 for point in found.points3D.values())
+    assert found.num_points3D() > 350
+    assert "f" in deviations or "fx" in deviations
 
 
 def test_camera_parameters_of_both_models():
