@@ -135,7 +135,7 @@ def test_the_last_line_of_a_mapper_that_fails_is_the_error(synthetic, monkeypatc
     place, _ = synthetic
     replaced(monkeypatch, tmp_path, "echo first >&2; echo 'RuntimeError: at last' >&2; exit 3")
 
-    with pytest.raises(RuntimeError, match="^RuntimeError: at last$"):
+    with pytest.raises(RuntimeError, match=r"^RuntimeError: at last$"):
         mapped_globally(place, ["any"])
 
     assert [path.name for path in place.iterdir()] == ["database.db"]
@@ -157,7 +157,7 @@ def test_a_mapper_that_says_much_does_not_wait_for_somebody_to_listen(synthetic,
     timer = threading.Timer(20.0, token.cancel)  # so that a mapper that waits fails this test and does not hang it
     timer.start()
 
-    with pytest.raises(RuntimeError, match="^the end$"):
+    with pytest.raises(RuntimeError, match=r"^the end$"):
         mapped_globally(place, ["any"], token)
 
     timer.cancel()

@@ -76,7 +76,7 @@ def two_views():
             projected(X, R, 0.0 * t if scene == "turn" else t, radial),
         )
         # the same points again, one pane of a facade further: another pose explains them
-        x2[right:] = projected(X[right:] + [0.6, 0.0, 0.3], R, t + [0.0, 0.5, -0.2], radial)
+        x2[right:] = projected(X[right:] + np.array([0.6, 0.0, 0.3]), R, t + np.array([0.0, 0.5, -0.2]), radial)
         x1, x2 = (x + rng.normal(0.0, noise_px, x.shape) for x in (x1, x2))
         others = [rng.uniform((0, 0), SIZE, (false, 2)) for _ in range(2)]
         return TwoViews(np.vstack([x1, others[0]]), np.vstack([x2, others[1]]), right, R, t)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.essential import relative_pose
 from sfm_app.geometry.epipolar import cross_matrix, eight_point
+from sfm_app.geometry.essential import relative_pose
 from sfm_app.geometry.triangulation import triangulate, triangulation_angle_deg
 from sfm_app.posegraph.pair_pose import depths, estimated, in_front, ray_angles_deg, turn_distances
 from sfm_app.types import EpipolarFit

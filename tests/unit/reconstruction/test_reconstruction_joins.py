@@ -40,7 +40,7 @@ def test_a_handful_of_matches_neither_joins_nor_cuts():
     few = dict.fromkeys([(1, 5), (1, 6), (2, 5), (2, 6), (3, 5)], 15)
 
     assert parts(LEFT | RIGHT | few, range(1, 8)) == [(1, 2, 3, 4), (5, 6, 7)]
-    assert parts(LEFT | RIGHT | {(4, 5): 16} | {pair: -15 for pair in few}, range(1, 8)) == [tuple(range(1, 8))]
+    assert parts(LEFT | RIGHT | {(4, 5): 16} | dict.fromkeys(few, -15), range(1, 8)) == [tuple(range(1, 8))]
 
 
 def test_a_photo_that_no_pair_holds_stays_alone():

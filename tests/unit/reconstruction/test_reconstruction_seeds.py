@@ -131,7 +131,7 @@ def test_points_all_over_the_photos_come_before_a_clump():
 
 
 def test_coverage_is_the_share_of_cells_that_the_points_could_fill():
-    images, keypoints = photos(2)
+    images, _ = photos(2)
     cells = (np.stack(np.meshgrid(np.arange(8), np.arange(8)), -1).reshape(-1, 2) + 0.5) * [80, 60]
     rows = {(1, 2): np.tile(np.arange(64, dtype=np.uint32)[:, None], 2)}
 
