@@ -4,7 +4,8 @@ import pytest
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.geometry.essential import decompose_essential, nearest_essential
-from sfm_app.posegraph.refine import pose_distances, refined
+from sfm_app.geometry.pose_steps import moved
+from sfm_app.posegraph.refine import SIGMAS_PX, pose_distances, refined
 
 
 def started(views, used):
@@ -47,6 +48,21 @@ def test_false_matches_and_a_second_structure_hardly_move_the_pose(two_views):
     assert np.all(ends < [0.05, 0.2]) and np.all(ends > [0.001, 0.005])
     assert np.all(ends < 0.5 * starts)
     assert np.all(ends < 1.5 * clean)
+
+
+def test_no_pose_nearby_explains_the_matches_better(two_views):
+    """The end is a minimum of Cauchy's loss at its last, narrow scale."""
+    views, rng = two_views(false=60, second=20), np.random.default_rng(0)
+    R, t = refined(views.rays, views.focals, *started(views, np.arange(40)))
+
+    def cost(pose):
+        squared = pose_distances(views.rays, views.focals, pose[:9].reshape(3, 3), pose[9:]) ** 2
+        return np.log1p(squared / SIGMAS_PX[-1] ** 2).sum()
+
+    end = np.concatenate([R.ravel(), t])
+    nearby = [cost(moved(end, 2e-4 * rng.normal(size=5))) for _ in range(100)]
+    assert cost(end) < min(nearby) + 1e-4
+    assert cost(end) < 0.98 * cost(np.concatenate([np.ravel(part) for part in started(views, np.arange(40))]))
 
 
 def test_matches_that_say_nothing_leave_the_pose_as_it_is(two_views):
