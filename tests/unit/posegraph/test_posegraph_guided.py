@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -27,6 +29,34 @@ def test_with_a_wrong_rotation_nothing_is_believed(two_views, seed):
     views = two_views(seed, right=60, false=240)
 
     assert guided_pose(views.pair(), off(views, 20.0), LEAST, seed) is None
+
+
+@pytest.mark.parametrize(("degrees", "believed"), [(1.5, True), (2.5, False), (4.0, False)])
+def test_a_pose_that_leaves_the_rotation_it_was_given_is_not_believed(two_views, degrees, believed):
+    """All matches are right, and the fit finds the true pose each time."""
+    views = two_views()
+
+    assert (guided_pose(views.pair(), off(views, degrees), LEAST, 0) is not None) == believed
+
+
+@pytest.mark.parametrize(("reversed_matches", "believed"), [(0, True), (6, True), (20, False)])
+def test_a_pose_with_matches_behind_the_cameras_is_not_believed(two_views, reversed_matches, believed):
+    """In a shift along x, a match the wrong way round lies on its epipolar line, behind the cameras."""
+    views = two_views(R=np.eye(3), t=np.array([1.0, 0.0, 0.0]))
+    x1, x2 = views.x1.copy(), views.x2.copy()
+    x1[:reversed_matches], x2[:reversed_matches] = views.x2[:reversed_matches], views.x1[:reversed_matches]
+
+    pose = guided_pose(replace(views, x1=x1, x2=x2).pair(), np.eye(3), LEAST, 0)
+
+    assert (pose is not None) == believed
+
+
+def test_a_step_too_short_to_be_seen_gives_no_direction(two_views):
+    """Its points lie before both cameras, but a turn alone explains them, too."""
+    short, long = (two_views(t=step * two_views().t, noise_px=0.05) for step in (0.01, 0.2))
+
+    assert guided_pose(short.pair(), short.R, LEAST, 0) is None
+    assert guided_pose(long.pair(), long.R, LEAST, 0) is not None
 
 
 def test_matches_of_nothing_are_not_believed(two_views):

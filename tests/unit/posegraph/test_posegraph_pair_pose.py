@@ -87,6 +87,16 @@ def test_the_pose_is_right_only_when_the_camera_knows_its_lens(two_views):
     assert errors[0] > 4 * errors[1] and errors[0] > 1.0
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_pose_starts_from_rays_where_a_lens_has_bent_the_photos(two_views, seed):
+    """F knows no lens, and is off by degrees where there is one."""
+    views = two_views(seed, radial=-0.2)
+    pair, bent = views.pair([two_views.camera(-0.2)] * 2), views.pair()
+
+    assert views.errors_deg(*pair.start(fit_of(views))).max() < 0.7
+    assert views.errors_deg(*bent.start(fit_of(views))).max() > 1.5
+
+
 def test_depths_are_those_of_triangulated_points(two_views):
     views = two_views(noise_px=0.0)
     x1, x2 = views.rays[:, :2], views.rays[:, 2:]

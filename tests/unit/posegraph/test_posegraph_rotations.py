@@ -73,6 +73,20 @@ def test_pairs_that_are_wrong_each_in_its_own_way_may_weigh_as_much_as_others():
     assert min(angles[pair] for pair in wrong) > 10 > 2 > max(angles[pair] for pair in pairs if pair not in wrong)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_wrong_pairs_with_more_matches_than_others_are_seen_through_by_loops(seed):
+    """The heaviest edges alone would lay the first rotations along the wrong pairs."""
+    rng, rotations = np.random.default_rng([seed, 5]), truth(12, seed)
+    pairs = relative(rotations, combinations(range(12), 2), seed=seed)
+    wrong = [list(pairs)[k] for k in rng.permutation(len(pairs))[:22]]
+    pairs |= dict(zip(wrong, truth(len(wrong), seed + 100), strict=True))
+    weights = {pair: (75.0 if pair in wrong else 50.0) * rng.uniform(0.8, 1.2) for pair in pairs}
+
+    found, _ = average_rotations(pairs, weights)
+
+    assert 0.05 < errors_deg(found, rotations).max() < 1.5
+
+
 def test_averaging_makes_the_noise_of_pairs_smaller():
     rotations = truth(12)
     pairs = relative(rotations, combinations(range(12), 2), noise_deg=2.0)

@@ -213,11 +213,33 @@ def test_the_parts_of_a_cut_model_are_models_of_their_own_and_named(synthetic, r
     assert found.support == found.models[0].support == pytest.approx(150)
 
 
+def only(synthetic, *pairs):
+    """Matches and F's of these pairs alone."""
+    matches = replace(synthetic.matches, matches={pair: synthetic.matches.matches[pair] for pair in pairs})
+    return matches, replace(synthetic.views, fits={pair: synthetic.views.fits[pair] for pair in pairs})
+
+
+def test_a_group_of_two_photos_is_mapped_when_there_is_no_other(synthetic, run, cameras, mapped):
+    seen = mapped(without(synthetic.copy(), [1, 2, 4, 6]))
+
+    found = reconstruct(*only(synthetic, (3, 5)), cameras(), run())
+
+    assert [photos for photos, _ in seen] == [(3, 5)]
+    assert photos_of(found.models[0].model) == [3, 5]
+
+
+def test_the_model_with_most_photos_is_the_main_one(synthetic, run, cameras, mapped):
+    pairs = [(1, 2), (1, 3), (2, 3), (4, 5), (4, 6), (5, 6)]
+    mapped(without(synthetic.copy(), [3, 4, 5, 6]), without(synthetic.copy(), [1, 2, 3]))
+
+    found = reconstruct(*only(synthetic, *pairs), cameras(), run())
+
+    assert [photos_of(attempt.model) for attempt in found.models] == [[4, 5, 6], [1, 2]]
+    assert found.tried == ("2 photos", "3 photos")
+
+
 def test_every_group_is_mapped_but_lesser_ones_of_two_photos(synthetic, run, cameras, mapped):
-    matches = replace(synthetic.matches, matches={
-        pair: rows for pair, rows in synthetic.matches.matches.items() if pair in ((1, 2), (3, 4), (3, 5), (4, 5))
-    })  # fmt: skip
-    views = replace(synthetic.views, fits={pair: synthetic.views.fits[pair] for pair in matches.matches})
+    matches, views = only(synthetic, (1, 2), (3, 4), (3, 5), (4, 5))
     seen = mapped(without(synthetic.copy(), [1, 2, 6]))
 
     found = reconstruct(matches, views, cameras(), run())
