@@ -44,9 +44,9 @@ def test_a_photo_whose_nearest_pair_was_dropped_says_why():
     reasons = left_out({1, 2}, [], photos(5), views, pose_graph(dropped))
 
     assert reasons == {
-        "3.jpg": f"could not be placed: 20 inliers with the nearest photo that was, but that pair {CONTRADICTS}",
+        "3.jpg": f"could not be placed: 20 inliers with the nearest photo that was, but that pair was dropped: {CONTRADICTS}",
         "4.jpg": "could not be placed: 30 inliers with the nearest photo that was",
-        "5.jpg": f"could not be placed: 18 inliers with the nearest photo that was, but that pair {TOO_FEW}",
+        "5.jpg": f"could not be placed: 18 inliers with the nearest photo that was, but that pair was dropped: {TOO_FEW}",
     }
 
 

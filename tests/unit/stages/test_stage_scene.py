@@ -90,7 +90,7 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
     assert found.unregistered == {
         **{name[key]: "belongs to another model, of 3 photos" for key in (5, 6, 7)},
         name[8]: "could not be placed: 20 inliers with the nearest photo that was, "
-        "but that pair contradicts other pairs",
+        "but that pair was dropped: contradicts other pairs",
     }
     assert run.counts["registered"] == 4 and run.counts["of"] == 8
     assert run.counts["other_models"] == [[name[key] for key in (5, 6, 7)]]
