@@ -144,9 +144,9 @@ def test_neither_the_world_nor_the_order_of_pairs_matters(seed, axis, order):
     )
 
     back = {photo: gauge[photo].T @ turn for photo, turn in second.items()}
-    assert errors_deg(back, first).max() < 1e-6 * 180
+    assert errors_deg(back, first).max() < np.degrees(1e-6)
     assert list(same) == names
-    np.testing.assert_allclose([same[pair] for pair in pairs], list(angles.values()), atol=1e-4)
+    np.testing.assert_allclose([same[pair] for pair in pairs], list(angles.values()), atol=np.degrees(1e-6))
 
 
 def supported(pairs, weights):
