@@ -42,11 +42,12 @@ def test_a_photo_whose_nearest_pair_was_dropped_says_why():
     dropped = {(1, 3): BEHIND, (2, 3): CONTRADICTS, (1, 5): TOO_FEW}
 
     reasons = left_out({1, 2}, [], photos(5), views, pose_graph(dropped))
+    near = "inliers with the nearest photo that was"
 
     assert reasons == {
-        "3.jpg": f"could not be placed: 20 inliers with the nearest photo that was, but that pair was dropped: {CONTRADICTS}",
-        "4.jpg": "could not be placed: 30 inliers with the nearest photo that was",
-        "5.jpg": f"could not be placed: 18 inliers with the nearest photo that was, but that pair was dropped: {TOO_FEW}",
+        "3.jpg": f"could not be placed: 20 {near}, but that pair was dropped: {CONTRADICTS}",
+        "4.jpg": f"could not be placed: 30 {near}",
+        "5.jpg": f"could not be placed: 18 {near}, but that pair was dropped: {TOO_FEW}",
     }
 
 
