@@ -9,6 +9,9 @@ from typing import Any
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.mapping import largest
 
+ADJUSTMENTS, GAIN = 2, 1e-3
+"""Rounds of adjustment, and the share of its cost that a step must gain."""
+
 
 def main(scratch: Path, photo_dir: Path, seed: int) -> None:
     """Write the largest model into SCRATCH/model; nothing where there is none."""
@@ -22,13 +25,15 @@ def main(scratch: Path, photo_dir: Path, seed: int) -> None:
 
 
 def global_options(seed: int, names: Sequence[str]) -> Any:
-    """COLMAP's defaults, on our relative poses as they are."""
+    """COLMAP's defaults, on our relative poses as they are; adjusted roughly, because the last adjustment is ours."""
     options = pycolmap.GlobalPipelineOptions()
     options.image_names = list(names)
     options.min_model_size = 2
     options.decompose_relative_pose = False
     options.num_threads = options.mapper.num_threads = 1
     mapper = options.mapper
+    mapper.ba_num_iterations = ADJUSTMENTS
+    mapper.bundle_adjustment.ceres.solver_options.function_tolerance = GAIN
     parts = (options, mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation)
     for part in parts:
         part.random_seed = seed

@@ -16,13 +16,16 @@ from typing import Any
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import SQUARE_PIXELS
 
+LOCAL_GAIN, GLOBAL_GAIN = 1e-3, 1e-4
+"""Share of its cost that a step of an adjustment must gain, or it was the last."""
 GLOBAL_REFINEMENT = 1.3
 """All of a model is adjusted again when it has grown by this factor; with K known, more often gains nothing."""
 
 
 def map_incrementally(
-    database: Path, photo_dir: Path, start: Any, scratch: Path, seed: int, tick: Callable[[], None], token: Any
-) -> Any | None:
+    database: Path, photo_dir: Path, start: Any, scratch: Path, seed: int, tick: Callable[[], None], token: Any,
+    *, known: bool,
+) -> Any | None:  # fmt: skip
     """Register photo after photo, beginning with the ones in `start`; None when COLMAP gives nothing back.
 
     Args:
@@ -33,13 +36,15 @@ def map_incrementally(
         seed: of COLMAP's own sampling.
         tick: called before every further photo.
         token: stops the mapping.
+        known: whether the cameras are known too well for mapping to improve them.
     """
     shutil.rmtree(scratch, ignore_errors=True)
     for name in ("start", "found"):
         (scratch / name).mkdir(parents=True)
     start.write(scratch / "start")
-    options = incremental_options(seed)
-    options.ba_refine_extra_params = all(_lens_to_be_found(camera) for camera in start.cameras.values())
+    options = incremental_options(seed, known=known)
+    seek_lens = not known and all(_lens_to_be_found(camera) for camera in start.cameras.values())
+    options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = seek_lens
     models = pycolmap.incremental_mapping(
         database, photo_dir, scratch / "found", options,
         input_path=scratch / "start", next_image_callback=tick, cancellation_token=token,
@@ -48,51 +53,71 @@ def map_incrementally(
     return largest(models)
 
 
-def map_globally(
-    database: Path, photo_dir: Path, names: Sequence[str], scratch: Path, seed: int, token: Any
-) -> Any | None:
-    """Find the poses of all these photos at once (GLOMAP: rotations, positions, adjustment); None where that fails.
-
-    COLMAP gives no way to stop this, so it runs in a process of its own, on a copy of the database: two mappers that
-    open one file lock each other out.
+def prepare_globally(database: Path, scratch: Path) -> None:
+    """Copy the database for `map_globally`: two mappers that open one file lock each other out.
 
     Args:
-        database: photos, keypoints, two-view geometries with relative poses, K.
-        photo_dir: for the colours of the points.
-        names: photos to place.
-        scratch: a folder of ours that is emptied first and gone afterwards.
-        seed: of COLMAP's own sampling.
-        token: stops the mapping.
+        database: photos, keypoints, two-view geometries with relative poses, K; nobody may have it open.
+        scratch: a folder of ours that is emptied first.
     """
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
+    shutil.copyfile(database, scratch / "database.db")
+
+
+def map_globally(photo_dir: Path, names: Sequence[str], scratch: Path, seed: int, token: Any) -> Any | None:
+    """Find the poses of all these photos at once (GLOMAP: rotations, positions, adjustment).
+
+    COLMAP gives no way to stop this, so it runs in a process of its own.
+
+    Args:
+        photo_dir: for the colours of the points.
+        names: photos to place.
+        scratch: a folder of ours from `prepare_globally`; gone afterwards.
+        seed: of COLMAP's own sampling.
+        token: stops the mapping.
+
+    Returns:
+        The model; None where it was stopped, or found nothing.
+
+    Raises:
+        RuntimeError: COLMAP failed.
+    """
     try:
-        shutil.copyfile(database, scratch / "database.db")
         (scratch / "names.json").write_text(json.dumps(list(names)), encoding="utf-8")
         command = [sys.executable, "-m", "sfm_app.colmap.global_mapping", str(scratch), str(photo_dir), str(seed)]
-        with subprocess.Popen(  # noqa: S603 - our own module, no shell
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-        ) as process:
+        # what it says goes to a file: nobody empties a pipe while it runs, and a full one would make it wait for ever
+        said = scratch / "errors.txt"
+        with (
+            said.open("wb") as errors,
+            subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors) as process,  # noqa: S603 - our module
+        ):
             while process.poll() is None:
                 if token.is_cancelled:
                     process.kill()
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     process.wait(0.1)
-            errors = process.stderr.read() if process.stderr else ""
-        if process.returncode:
-            raise RuntimeError(errors.strip().splitlines()[-1] if errors.strip() else "the global mapper was stopped")
+        if process.returncode and not token.is_cancelled:
+            lines = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            raise RuntimeError(lines[-1] if lines else f"the global mapper ended with {process.returncode}")
         found = scratch / "model"
-        return pycolmap.Reconstruction(found) if found.exists() else None
+        return pycolmap.Reconstruction(found) if found.exists() and not token.is_cancelled else None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def incremental_options(seed: int) -> Any:
-    """COLMAP's defaults, except that small photo sets count and only the model at hand is grown."""
+def incremental_options(seed: int, *, known: bool = False) -> Any:
+    """COLMAP's defaults, except that small photo sets count and only the model at hand is grown.
+
+    Adjustments stop when they gain little, and cameras that are `known` stay as they are: the last adjustment is ours.
+    """
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2
     options.multiple_models = False
     options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_REFINEMENT
+    options.ba_local_function_tolerance, options.ba_global_function_tolerance = LOCAL_GAIN, GLOBAL_GAIN
+    options.ba_local_max_refinements, options.ba_global_max_refinements = 1, 2
+    options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not known
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
     return options

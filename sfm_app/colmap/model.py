@@ -87,6 +87,7 @@ def part_of(model: Any, photos: Sequence[int]) -> Any:
     for image in _posed(model):
         if image.image_id not in members:
             part.deregister_frame(image.frame_id)
+    part.tear_down()  # with frames that have no pose, no covariance can be estimated
     return part
 
 

@@ -18,10 +18,9 @@ Map = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
 
 LEAST_IN_FRONT = 0.75
 """A pair with a smaller share of its inliers before both cameras has a wrong pose, or matches that are."""
-LEAST_AGREEMENT_DEG = 5.0
-"""A pair may be this far from the rotations of its photos, or four times as far as most are, which is more where
-cameras are guesses."""
-SPREADS = 4.0
+AGREEMENT_DEG, GUESSED_DEG, SPREADS = 5.0, 15.0, 4.0
+"""A pair may be this far from the rotations of its photos, further where a camera is a guess, or so many times as far
+as most pairs are."""
 ENOUGH = 100.0
 """From so many inliers on, more of them make a pair hardly more believable."""
 WEAK = 2.0
@@ -65,8 +64,11 @@ def build_pose_graph(
     found = dict(zip(views.fits, run_map(from_fit, list(views.fits.items()), "relative poses"), strict=True))
     poses, dropped = _plausible(found, options.min_inliers)
     rotations, angles = averaged(poses)
-    limit = max(LEAST_AGREEMENT_DEG, SPREADS * float(np.median(list(angles.values()) or [0.0])))
-    for pair in [pair for pair, angle in angles.items() if angle > limit]:
+    typical = SPREADS * float(np.median(list(angles.values()) or [0.0]))
+    limits = {
+        pair: max(typical, GUESSED_DEG if poses[pair].kind == "uncalibrated" else AGREEMENT_DEG) for pair in angles
+    }
+    for pair in [pair for pair, angle in angles.items() if angle > limits[pair]]:
         dropped[pair] = CONTRADICTS
         del poses[pair]
 

@@ -40,10 +40,11 @@ def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> Relat
         return None
     turned, t = refined(pair.rays[near], pair.focals, R, t)
     inliers = pair.inliers(turned, t)
-    found = pair.pose(turned, t, inliers, guided=True)
     turn_deg = float(np.degrees(Rotation.from_matrix(R.T @ turned).magnitude()))
-    firm = found.inlier_count >= min_inliers and found.in_front >= LEAST_IN_FRONT and turn_deg <= MOST_TURN_DEG
-    return found if firm and found.kind != "rotation" else None
+    if np.count_nonzero(inliers) < min_inliers or turn_deg > MOST_TURN_DEG:
+        return None
+    found = pair.pose(turned, t, inliers, guided=True)
+    return found if found.in_front >= LEAST_IN_FRONT and found.kind != "rotation" else None
 
 
 def sampled_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> FloatArray | None:

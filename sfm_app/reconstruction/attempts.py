@@ -1,18 +1,26 @@
 """COLMAP's two mappers on one group of photos, side by side, and the better of what they made."""
 
-from collections.abc import Callable, Sequence
+import contextlib
+import logging
+import shutil
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
+import numpy as np
+
 from sfm_app.colmap.backend import backend, interruptible
-from sfm_app.colmap.mapping import map_globally, map_incrementally
+from sfm_app.colmap.mapping import map_globally, map_incrementally, prepare_globally
 from sfm_app.colmap.model import model_from_seed
 from sfm_app.context import RunContext
 from sfm_app.reconstruction.left_out import names_of
 from sfm_app.reconstruction.seeds import Candidate, rank_seeds, seed_of
 from sfm_app.reconstruction.support import Explained, explained_pairs, support
-from sfm_app.types import Intrinsics, MatchGraph, PairId, PoseGraph, ViewGraph
+from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph, ViewGraph
+
+logger = logging.getLogger("sfm_app")
 
 ENOUGH = 0.9
 """A model with this share of its group ends the search for a better seed."""
@@ -22,9 +30,14 @@ LEAST_GLOBAL = 3
 """Photos: of two, positions have no scale to agree on."""
 EQUAL = 0.01
 """Models that explain as many matches but for this share count as equal; of them, the one with most points is taken."""
+CONTRADICTED = 0.01
+"""Share of the inliers of fundamental matrices that may contradict a model which leaves nothing to be wished for."""
+WELL_KNOWN = 0.01
+"""Relative deviation of a focal that mapping leaves alone."""
+GLOBAL_FOLDER = ".global"
 
-Maker = Callable[[Any], Any]
-"""What makes a model, or None, until a token stops it."""
+Maker = Callable[[Any], "list[Attempt]"]
+"""What makes models until a token stops it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,26 +73,40 @@ class Attempt:
         return support(self.explained)
 
 
+class Stop:
+    """Stops a mapper when the whole run is stopped, or when its model is no longer needed."""
+
+    def __init__(self, token: Any) -> None:
+        self.token, self.needless = token, False
+
+    @property
+    def is_cancelled(self) -> bool:
+        """Whether to stop."""
+        return self.needless or bool(self.token.is_cancelled)
+
+
 def attempts(group: Group, run: RunContext) -> list[Attempt]:
     """What the mappers of the settings make of a group.
 
     Photo by photo from the best seed and all at once, side by side; where neither places most photos, from the next
-    seeds. What is tried never depends on which mapper is done first.
+    seeds. What is tried never depends on which mapper is done first: a model photo by photo that leaves nothing to be
+    wished for makes the other one needless, whether or not it is there.
     """
     options = run.settings.scene
     at_once = options.mapper != "incremental" and len(group.photos) >= LEAST_GLOBAL
     seeds = rank_seeds(group.matches, group.graph, group.intrinsics, group.photos, options.min_seed_angle_deg)
     seeds = seeds[: options.seed_pairs] if options.mapper != "global" or not at_once else []
-    todo: list[tuple[str, str, Maker]] = [_from_seed(group, candidate, run) for candidate in seeds]
-    first = ([_all_at_once(group, run)] if at_once else []) + todo[:1]
-    found = _judged(group, first, run)
-    for maker in todo[1:]:
-        if _settled(found, len(group.photos)):
-            break
-        found += _judged(group, [maker], run)
-    best = better(found)
-    if best is not None and best.mapper == "global" and best.photos < len(group.photos):
-        found += _judged(group, [_from_model(best.model, run)], run)
+    if at_once:
+        prepare_globally(run.workspace.database, run.workspace.root / GLOBAL_FOLDER)
+    with _mapping(group, run) as made:
+        found = made(lambda token: _first_round(group, seeds[:1], at_once, run, token))
+        for seed in seeds[1:]:
+            if _settled(found, len(group.photos)):
+                break
+            found += made(partial(_from_seed, group, seed, run))
+        best = better(found)
+        if best is not None and best.mapper == "global" and best.photos < len(group.photos):
+            found += made(partial(_completed, group, best, run))
     return found
 
 
@@ -91,6 +118,47 @@ def better(found: Sequence[Attempt]) -> Attempt | None:
     return max(equal, key=lambda attempt: (attempt.photos, attempt.model.num_points3D()), default=None)
 
 
+def flawless(attempt: Attempt, photos: int) -> bool:
+    """Whether a model holds all photos and next to nothing contradicts it."""
+    inliers = sum(pair.inliers for pair in attempt.explained.values())
+    against = sum(pair.contradicted for pair in attempt.explained.values())
+    return attempt.photos == photos and against <= CONTRADICTED * inliers
+
+
+@contextlib.contextmanager
+def _mapping(group: Group, run: RunContext) -> Iterator[Callable[[Maker], list[Attempt]]]:
+    """What makes attempts in a thread that Ctrl-C can stop."""
+
+    def made(make: Maker) -> list[Attempt]:
+        found: list[Attempt] = []
+        interruptible(lambda token: found.extend(make(token)), lambda: None)
+        return found
+
+    run.progress.start("mapping", max(len(group.photos) - 2, 1))
+    try:
+        with backend("mapping photos"):
+            yield made
+    finally:
+        run.progress.finish()
+
+
+def _first_round(group: Group, seeds: Sequence[Candidate], at_once: bool, run: RunContext, token: Any) -> list[Attempt]:
+    stop = Stop(token)
+
+    def photo_by_photo(seed: Candidate) -> Attempt:
+        (attempt,) = _from_seed(group, seed, run, token)
+        stop.needless = flawless(attempt, len(group.photos))
+        return attempt
+
+    with ThreadPoolExecutor(min(run.workers, 2), thread_name_prefix="mapper") as pool:
+        grown = [pool.submit(photo_by_photo, seed) for seed in seeds]
+        placed = [pool.submit(_all_at_once, group, run, stop)] if at_once else []
+        found = [future.result() for future in (*grown, *placed)]
+    if stop.needless:
+        found[1:] = [Attempt("global", None, {}, "all at once: not needed") for _ in placed]
+    return found
+
+
 def _settled(found: Sequence[Attempt], photos: int) -> bool:
     """Whether another seed is unlikely to give more."""
     counts = [attempt.photos for attempt in found if attempt.photos]
@@ -98,61 +166,50 @@ def _settled(found: Sequence[Attempt], photos: int) -> bool:
     return most >= ENOUGH * photos or (counts.count(most) > 1 and most >= CONFIRMED * photos)
 
 
-def _judged(group: Group, makers: Sequence[tuple[str, str, Maker]], run: RunContext) -> list[Attempt]:
-    """What each maker gives, made side by side, in the order of the makers."""
-    models: list[Any] = []
-
-    def call(token: Any) -> None:
-        with ThreadPoolExecutor(min(run.workers, len(makers)), thread_name_prefix="mapper") as pool:
-            models.extend(pool.map(lambda maker: maker[2](token), makers))
-
-    with backend("mapping photos"):
-        if makers:
-            run.progress.start("mapping", len(makers) * max(len(group.photos) - 2, 1))
-            try:
-                interruptible(call, lambda: None)
-            finally:
-                run.progress.finish()
-        return [
-            _attempt(group, mapper, how, model, run) for (mapper, how, _), model in zip(makers, models, strict=True)
-        ]
+def _all_at_once(group: Group, run: RunContext, stop: Stop) -> Attempt:
+    names, scratch = names_of(group.photos, group.matches), run.workspace.root / GLOBAL_FOLDER
+    try:
+        model = None if stop.is_cancelled else map_globally(run.workspace.photos, names, scratch, run.seed, stop)
+    except RuntimeError as err:  # another mapper may do better
+        logger.info("the global mapper failed: %s", err)
+        return Attempt("global", None, {}, f"all at once: failed, {err}")
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return _judged(group, "global", "all at once", model, run)
 
 
-def _attempt(group: Group, mapper: str, how: str, model: Any, run: RunContext) -> Attempt:
+def _from_seed(group: Group, seed: Candidate, run: RunContext, token: Any) -> list[Attempt]:
+    rows = group.matches.matches[seed.pair][seed.pose.inliers]
+    points = seed_of(group.matches, seed, group.intrinsics)
+    start = model_from_seed(run.workspace.database, seed.pair, rows, points)
+    how = f"from {' + '.join(names_of(seed.pair, group.matches))}"
+    return [_judged(group, "incremental", how, _grown(group, start, run, token), run)]
+
+
+def _completed(group: Group, best: Attempt, run: RunContext, token: Any) -> list[Attempt]:
+    """Photos that the global mapper left out may fit into what it made."""
+    model = _grown(group, best.model, run, token)
+    return [_judged(group, "incremental", "what was left out, photo by photo", model, run)]
+
+
+def _grown(group: Group, start: Any, run: RunContext, token: Any) -> Any:
+    place = run.workspace
+    return map_incrementally(
+        place.database, place.photos, start, place.root / ".mapping", run.seed, run.progress.advance, token,
+        known=all(well_known(group.intrinsics.camera(group.matches.images[photo])) for photo in group.photos),
+    )  # fmt: skip
+
+
+def well_known(camera: Calibration) -> bool:
+    """Whether a focal is known too well for the first few photos of a mapping to improve it."""
+    spread = camera.spread.get("fx", np.inf)
+    return camera.identifiable and spread <= WELL_KNOWN * camera.K[0, 0]
+
+
+def _judged(group: Group, mapper: str, how: str, model: Any, run: RunContext) -> Attempt:
     placed = int(model.num_reg_images()) if model is not None else 0
     note = f"{how}: {placed} photos"
     if placed < 2 or model.num_points3D() < run.settings.scene.min_points:
         return Attempt(mapper, None, {}, note)
     explained = explained_pairs(model, group.matches, group.views, run.settings.epipolar.max_error_px)
     return Attempt(mapper, model, explained, note)
-
-
-def _all_at_once(group: Group, run: RunContext) -> tuple[str, str, Maker]:
-    place, names = run.workspace, names_of(group.photos, group.matches)
-
-    def make(token: Any) -> Any:
-        model = map_globally(place.database, place.photos, names, place.root / ".global", run.seed, token)
-        run.progress.advance(max(len(names) - 2, 1))
-        return model
-
-    return "global", "all at once", make
-
-
-def _from_seed(group: Group, candidate: Candidate, run: RunContext) -> tuple[str, str, Maker]:
-    def make(token: Any) -> Any:
-        rows = group.matches.matches[candidate.pair][candidate.pose.inliers]
-        seed = seed_of(group.matches, candidate, group.intrinsics)
-        return _grown(model_from_seed(run.workspace.database, candidate.pair, rows, seed), run, token)
-
-    return "incremental", f"from {' + '.join(names_of(candidate.pair, group.matches))}", make
-
-
-def _from_model(model: Any, run: RunContext) -> tuple[str, str, Maker]:
-    """Photos that the global mapper left out may fit into what it made."""
-    return "incremental", "what was left out, photo by photo", lambda token: _grown(model, run, token)
-
-
-def _grown(start: Any, run: RunContext, token: Any) -> Any:
-    place = run.workspace
-    scratch = place.root / ".mapping"
-    return map_incrementally(place.database, place.photos, start, scratch, run.seed, run.progress.advance, token)

@@ -33,7 +33,7 @@ def _reason(photo: int, posed: set[int], views: ViewGraph, graph: PoseGraph) -> 
     if to_posed:
         nearest = max(to_posed, key=lambda other: (to_posed[other], -other))
         contradiction = graph.dropped.get((min(photo, nearest), max(photo, nearest)))
-        because = f", but that pair {contradiction}" if contradiction else ""
+        because = f", but that pair was dropped: {contradiction}" if contradiction else ""
         return f"could not be placed: {to_posed[nearest]} inliers with the nearest photo that was{because}"
     return (
         "shares inliers only with photos that have no place either" if edges else "shares no scene with any other photo"

@@ -47,7 +47,7 @@ class PoseGraph:
     rotations: Mapping[int, FloatArray]
     """By photo: (3, 3) rotation from the world; every group of photos has a world of its own."""
     groups: tuple[tuple[int, ...], ...]
-    """Photos that hang together, the group with the most inliers first."""
+    """Photos that hang together, the largest group first."""
 
     def group_of(self, photo: int) -> tuple[int, ...]:
         """All photos that hang together with this one; empty where none does."""

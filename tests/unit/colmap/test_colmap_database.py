@@ -5,7 +5,9 @@ import sqlite3
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
+from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import (
     SQUARE_PIXELS,
     TWO_FOCALS,
@@ -15,10 +17,11 @@ from sfm_app.colmap.database import (
     read_match_graph,
     write_calibrations,
     write_epipolar_fits,
+    write_pose_graph,
 )
 from sfm_app.colmap.model import model_from_seed
 from sfm_app.geometry.seed import TwoViewSeed
-from sfm_app.types import Calibration, EpipolarFit, Intrinsics, Photo, PhotoSet
+from sfm_app.types import Calibration, EpipolarFit, Intrinsics, Photo, PhotoSet, PoseGraph, RelativePose
 
 NAMES = ("b.png", "a.png", "c.png")
 
@@ -71,6 +74,34 @@ def test_fits_replace_the_two_view_geometries(stored):
         geometry = database.read_two_view_geometry(1, 2)
     assert np.allclose(geometry.F, np.diag([1.0, 2, 3]))
     assert np.array_equal(geometry.inlier_matches, matches[:9])
+
+
+KINDS = {"calibrated": "CALIBRATED", "uncalibrated": "UNCALIBRATED", "planar": "PLANAR", "rotation": "PANORAMIC"}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_relative_poses_replace_the_two_view_geometries(stored, kind):
+    path, photos, _, matches = stored
+    graph = read_match_graph(path, photos)
+    write_epipolar_fits(path, graph, {(1, 2): EpipolarFit(np.eye(3), np.ones(12, bool), np.ones(12), 5, 0.3)})
+    R, t = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.6, 0.0, -0.8])
+    inliers = np.arange(12) % 2 == 0
+    pose = RelativePose(R, t, inliers, 9.0, 1.0, kind)
+
+    write_pose_graph(path, graph, PoseGraph({(1, 2): pose}, {(1, 3): "contradicts other pairs"}, {}, ()))
+
+    with opened(path) as database:
+        geometry = database.read_two_view_geometry(1, 2)
+        assert database.num_verified_image_pairs() == 1
+    assert geometry.config == getattr(pycolmap.TwoViewGeometryConfiguration, KINDS[kind]).value
+    np.testing.assert_allclose(geometry.cam2_from_cam1.matrix(), np.column_stack([R, t]), atol=1e-12)
+    X = np.random.default_rng(0).uniform([-1, -1, 4], [1, 1, 6], (5, 3))
+    np.testing.assert_allclose(np.einsum("ni,ij,nj->n", X @ R.T + t, geometry.E, X), 0, atol=1e-12)
+    assert np.array_equal(geometry.inlier_matches, matches[inliers])
+
+    write_pose_graph(path, graph, PoseGraph({}, {}, {}, ()))
+    with opened(path) as database:
+        assert database.num_verified_image_pairs() == 0
 
 
 def calibration(f=130.0, aspect=1.0, **others):

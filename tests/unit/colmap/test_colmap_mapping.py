@@ -1,11 +1,22 @@
+"""COLMAP's two mappers as we call them."""
+
+import stat
+import sys
+import threading
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
 from sfm_app.colmap import mapping
 from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.database import opened
+from sfm_app.colmap.global_mapping import global_options
 
 UNKNOWN = ("SIMPLE_RADIAL", [900.0, 500, 400, 0])
 KNOWN = ("SIMPLE_RADIAL", [900.0, 500, 400, -0.1])
 TWO_FOCALS = ("OPENCV", [900.0, 800, 500, 400, 0, 0, 0, 0])
+NEVER = SimpleNamespace(is_cancelled=False)
 
 
 @pytest.mark.parametrize(
@@ -29,8 +40,142 @@ def test_mapping_seeks_the_lens_only_where_nothing_is_known_about_it(tmp_path, m
         return {0: start}
 
     monkeypatch.setattr(mapping.pycolmap, "incremental_mapping", grow)
+    place = tmp_path / "database.db", tmp_path, start, tmp_path / "scratch"
 
-    found = mapping.continue_mapping(tmp_path / "database.db", tmp_path, start, tmp_path / "scratch", 0, lambda: None)
+    found = mapping.map_incrementally(*place, 0, lambda: None, NEVER)
 
     assert found is start
     assert seen == [sought]
+
+
+@pytest.fixture(scope="module")
+def synthetic(tmp_path_factory):
+    """A folder with the database of five photos of COLMAP's making, and the true model."""
+    place = tmp_path_factory.mktemp("synthetic")
+    pycolmap.set_random_seed(1)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 5
+    options.num_points3D, options.two_view_geometry_has_relative_pose = 100, True
+    options.camera_has_prior_focal_length = True
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev = 0.2
+    with opened(place / "database.db") as database:
+        model = pycolmap.synthesize_dataset(options, database)
+        pycolmap.synthesize_noise(noise, model, database)
+    return place, model
+
+
+def mapped_globally(place, names, token=NEVER, seed=0):
+    return mapping.map_globally(place / "database.db", place, names, place / ".global", seed, token)
+
+
+def centres(model):
+    return np.array([model.images[key].projection_center() for key in sorted(model.images)])
+
+
+def spans(points):
+    """Distances between all points, as shares of the largest: what scale and frame leave alone."""
+    found = np.linalg.norm(points[:, None] - points[None], axis=2)
+    return found / found.max()
+
+
+def test_all_photos_at_once_give_the_true_model_the_same_bytes_twice(synthetic, tmp_path):
+    place, true = synthetic
+    names = [image.name for image in true.images.values()]
+    before = (place / "database.db").read_bytes()
+
+    written = []
+    for number in range(2):
+        model = mapped_globally(place, names)
+        target = tmp_path / str(number)
+        target.mkdir()
+        model.write(target)
+        written.append({path.name: path.read_bytes() for path in target.iterdir()})
+
+    assert model.num_reg_images() == 5 and model.num_points3D() > 90
+    assert 1e-5 < np.abs(spans(centres(model)) - spans(centres(true))).max() < 0.01
+    assert written[0] == written[1] and "images.bin" in written[0]
+    assert [path.name for path in place.iterdir()] == ["database.db"]
+    assert (place / "database.db").read_bytes() == before
+
+
+def test_only_the_photos_asked_for_are_placed_and_of_none_comes_nothing(synthetic):
+    place, true = synthetic
+    names = sorted(image.name for image in true.images.values())[:3]
+
+    model = mapped_globally(place, names)
+
+    assert sorted(image.name for image in model.images.values() if image.has_pose) == names
+    assert mapped_globally(place, ["no such photo"]) is None
+
+
+def replaced(monkeypatch, place, text):
+    """Let a shell script take the place of the mapper's process."""
+    script = place / "child.sh"
+    script.write_text(f"#!/bin/sh\n{text}\n")
+    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setattr(sys, "executable", str(script))
+
+
+def test_a_cancelled_token_stops_the_mapper(synthetic, monkeypatch, tmp_path):
+    place, _ = synthetic
+    replaced(monkeypatch, tmp_path, "exec sleep 600")
+    token = pycolmap.CancellationToken()
+    timer = threading.Timer(0.3, token.cancel)
+    timer.start()
+
+    with pytest.raises(RuntimeError, match="the global mapper was stopped"):
+        mapped_globally(place, ["any"], token)
+
+    timer.join()
+    assert [path.name for path in place.iterdir()] == ["database.db"]
+
+
+def test_the_last_line_of_a_mapper_that_fails_is_the_error(synthetic, monkeypatch, tmp_path):
+    place, _ = synthetic
+    replaced(monkeypatch, tmp_path, "echo first >&2; echo 'RuntimeError: at last' >&2; exit 3")
+
+    with pytest.raises(RuntimeError, match=r"^RuntimeError: at last$"):
+        mapped_globally(place, ["any"])
+
+    assert [path.name for path in place.iterdir()] == ["database.db"]
+
+
+def test_what_colmap_raises_in_its_process_is_raised_here(tmp_path):
+    (tmp_path / "database.db").write_bytes(b"no database at all")
+
+    with pytest.raises(RuntimeError, match="No registered database factory"):
+        mapped_globally(tmp_path, ["any"])
+
+    assert [path.name for path in tmp_path.iterdir()] == ["database.db"]
+
+
+def test_a_mapper_that_says_much_does_not_wait_for_somebody_to_listen(synthetic, monkeypatch, tmp_path):
+    place, _ = synthetic
+    replaced(monkeypatch, tmp_path, "head -c 1000000 /dev/zero | tr '\\0' x >&2; echo >&2; echo 'the end' >&2; exit 1")
+    token = pycolmap.CancellationToken()
+    timer = threading.Timer(20.0, token.cancel)  # so that a mapper that waits fails this test and does not hang it
+    timer.start()
+
+    with pytest.raises(RuntimeError, match=r"^the end$"):
+        mapped_globally(place, ["any"], token)
+
+    timer.cancel()
+
+
+def test_options_are_ours_for_both_mappers():
+    incremental, at_once = mapping.incremental_options(7), global_options(7, ["a", "b"])
+
+    assert (incremental.num_threads, incremental.mapper.num_threads, incremental.multiple_models) == (1, 1, False)
+    assert (at_once.num_threads, at_once.mapper.num_threads, list(at_once.image_names)) == (1, 1, ["a", "b"])
+    assert not at_once.decompose_relative_pose  # ours are better than what COLMAP makes of F
+    parts = [incremental, incremental.mapper, incremental.triangulation, at_once, at_once.mapper]
+    parts += [at_once.mapper.rotation_averaging, at_once.mapper.global_positioning, at_once.mapper.retriangulation]
+    assert {part.random_seed for part in parts} == {7}
+
+
+def test_of_several_models_the_one_with_most_photos_counts():
+    models = {key: SimpleNamespace(num_reg_images=lambda count=count: count) for key, count in ((0, 2), (1, 5), (2, 3))}
+
+    assert mapping.largest(models) is models[1]
+    assert mapping.largest({}) is None

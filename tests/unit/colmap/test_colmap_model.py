@@ -4,8 +4,18 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import backend, plain, pycolmap
+from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.database import SQUARE_PIXELS, TWO_FOCALS, camera_params
-from sfm_app.colmap.model import focal_px, move, posed_photos, viewing_rays
+from sfm_app.colmap.model import (
+    cameras_of,
+    focal_px,
+    move,
+    part_of,
+    photos_of,
+    placed_views,
+    posed_photos,
+    viewing_rays,
+)
 from sfm_app.errors import BackendError, ConfigError
 from sfm_app.geometry.similarity import Similarity
 
@@ -58,6 +68,54 @@ def test_rays_of_a_lens_meet_the_points_that_the_photo_shows(tmp_path):
 
     assert 0.1 < np.sqrt(np.mean((sine * focal_px(model, key)) ** 2)) < 0.8, "the noise of 0.3 px"
     assert ((rays * truth).sum(axis=1) > 0).all()
+
+
+def test_placed_views_see_the_points_where_they_are(tmp_path):
+    """Through a lens, with two focals: the rays of keypoints meet the model's points."""
+    model, _ = synthetic(tmp_path, [900.0, 850.0, 510.0, 390.0, -0.1, 0.0, 0.0, 0.0], noise_px=0.0, photos=4)
+    model.deregister_frame(model.images[4].frame_id)
+    keypoints = {key: np.array([p.xy for p in image.points2D]) for key, image in model.images.items()}
+
+    views = placed_views(model, keypoints)
+
+    assert sorted(views) == [1, 2, 3]
+    for key, view in views.items():
+        seen = [(k, p.point3D_id) for k, p in enumerate(model.images[key].points2D) if p.has_point3D()]
+        X = np.array([model.points3D[number].xyz for _, number in seen]) @ view.R.T + view.t
+        np.testing.assert_allclose(view.rays[[k for k, _ in seen]], X[:, :2] / X[:, 2:], atol=1e-5)
+        assert view.focals.tolist() == [900.0, 850.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "params", "focals"),
+    [("SIMPLE_RADIAL", [880.0, 510.0, 390.0, -0.1], (880, 880)),
+     ("OPENCV", [900.0, 850.0, 510.0, 390.0, -0.1, 0.02, 0.0, 0.0], (900, 850))],
+)  # fmt: skip
+def test_cameras_are_read_with_their_first_radial_term(tmp_path, name, params, focals):
+    model, _ = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=3)
+    model.deregister_frame(model.images[2].frame_id)
+    for camera in model.cameras.values():
+        camera.model = getattr(pycolmap.CameraModelId, name)
+        camera.params = params
+
+    found = cameras_of(model)
+
+    assert sorted(found) == [1, 3]
+    for K, radial in found.values():
+        assert (K[0, 0], K[1, 1], K[0, 2], K[1, 2], radial) == (*focals, 510.0, 390.0, -0.1)
+
+
+def test_a_part_of_a_model_can_be_adjusted_and_the_whole_stays(tmp_path):
+    model, database = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=6)
+
+    part = part_of(model, (1, 3, 4))
+    adjusted = adjust(part, database)
+    found = adjusted.model
+
+    assert photos_of(found) == sorted(found.images) == [1, 3, 4] and photos_of(model) == [1, 2, 3, 4, 5, 6]
+    assert all(point.track.length() >= 2 for point in found.points3D.values())
+    assert found.num_points3D() > 350
+    assert all(0 < deviations["fx"] < 20 for deviations in adjusted.deviations.values())
 
 
 def test_camera_parameters_of_both_models():

@@ -1,12 +1,19 @@
 import json
+import shutil
+from itertools import combinations
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.database import opened
+from sfm_app.colmap.model import part_of, photos_of
+from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.camera import camera_matrix
-from sfm_app.geometry.epipolar import eight_point
-from sfm_app.settings import Settings
+from sfm_app.reconstruction import Outcome
+from sfm_app.reconstruction.attempts import Attempt
+from sfm_app.reconstruction.support import Explained
 from sfm_app.stages import scene
 from sfm_app.types import (
     Calibration,
@@ -15,150 +22,159 @@ from sfm_app.types import (
     Intrinsics,
     MatchedImage,
     MatchGraph,
-    Rejected,
+    Photo,
+    PhotoSet,
+    PoseGraph,
+    RelativePose,
     Scene,
     ViewGraph,
-)
+)  # fmt: skip
 from sfm_app.workspace import StageRecord, Workspace
 
-K = camera_matrix(800.0, 800.0, 320.0, 240.0)
+
+@pytest.fixture(scope="module")
+def synthetic(tmp_path_factory):
+    """Eight photos of COLMAP's making: their database and the true model."""
+    place = tmp_path_factory.mktemp("synthetic")
+    pycolmap.set_random_seed(1)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 8
+    options.num_points3D, options.camera_params = 100, [1280.0, 512.0, 384.0, 0.0]
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev = 0.2
+    with opened(place / "database.db") as database:
+        model = pycolmap.synthesize_dataset(options, database)
+        pycolmap.synthesize_noise(noise, model, database)
+    return place / "database.db", model
 
 
-def two_views(radial=0.0, pairs=((1, 2), (1, 3)), group="one"):
-    """Photos that look at the same points from places a step apart, through a lens, with their noisy F's."""
-    rng = np.random.default_rng(4)
-    X = rng.uniform([-2, -1.5, 5], [2, 1.5, 8], (120, 3))
-    keypoints, fits = {}, {}
-    for key in {key for pair in pairs for key in pair}:
-        x = (X - [0.8 * (key - 1), 0, 0])[:, :2] / X[:, 2:]
-        keypoints[key] = (x * (1 + radial * (x**2).sum(1, keepdims=True))) * 800 + [320, 240]
-        keypoints[key] += rng.normal(scale=0.2, size=x.shape)
-    rows = np.tile(np.arange(120, dtype=np.uint32)[:, None], 2)
-    for pair in pairs:
-        F = eight_point(keypoints[pair[0]], keypoints[pair[1]])
-        fits[pair] = EpipolarFit(F, np.ones(120, bool), np.ones(120), 10, 0.3)
-    images = {key: MatchedImage(key, f"{key}.jpg", group, 640, 480) for key in keypoints}
-    return MatchGraph(images, keypoints, dict.fromkeys(pairs, rows)), ViewGraph(fits, {})
+@pytest.fixture
+def run(synthetic, tmp_path):
+    """A run whose folder holds the database; `counts` is what it recorded."""
+    shutil.copyfile(synthetic[0], tmp_path / "database.db")
+    counts = {}
+    return SimpleNamespace(workspace=Workspace(tmp_path), counts=counts, record=counts.update)
 
 
-def ranked(matches, views, intrinsics):
-    run = SimpleNamespace(settings=Settings(), map=lambda function, items, _: [function(item) for item in items])
-    return scene.rank_seeds(matches, views, intrinsics, run)
+def attempt(model, explained=None):
+    return Attempt("global", model, explained or {}, "all at once")
 
 
-def known(radial=0.0, key_pairs=()):
-    return Calibration(K, 640, 480, "zero-curves", True, radial=radial, key_pairs=key_pairs)
+def outcome(*attempts, graph=None, **others):
+    cameras = Intrinsics({"one": Calibration(camera_matrix(1280, 1280, 512, 384), 1024, 768, "zero-curves", True)})
+    return Outcome(attempts, graph or PoseGraph({}, {}, {}, ()), cameras, **{"tried": ("a", "b"), **others})
 
 
-def test_a_seed_is_made_from_what_the_photos_show_without_their_lens():
-    matches, views = two_views(radial=-0.25)
-
-    straight = ranked(matches, views, Intrinsics({"one": known(-0.25)}))[0].seed
-    bent = ranked(matches, views, Intrinsics({"one": known()}))[0].seed
-
-    off = [np.degrees(np.arccos(min(1, (np.trace(seed.R) - 1) / 2))) for seed in (straight, bent)]
-    assert off[0] < 0.3 < 1.0 < off[1]
-    assert abs(straight.t @ [-1, 0, 0]) > 0.9999
-    assert np.median(straight.points[:, 2]) * 1.6 == pytest.approx(6.5, abs=0.5)
+def pose(kind, guided=False):
+    return RelativePose(np.eye(3), np.eye(3)[0], np.ones(20, bool), 10.0, 1.0, kind, guided)
 
 
-def test_pairs_that_agree_with_the_camera_start_before_pairs_that_do_not():
-    matches, views = two_views()
-
-    by_score = ranked(matches, views, Intrinsics({"one": known()}))
-    agreeing = ranked(matches, views, Intrinsics({"one": known(key_pairs=((1, 2),))}))
-
-    assert [candidate.pair for candidate in by_score] == [(1, 3), (1, 2)]  # the wider angle
-    assert [candidate.pair for candidate in agreeing] == [(1, 2), (1, 3)]
+def inputs(model, fits=((1, 8),)):
+    images = {key: MatchedImage(key, model.images[key].name, "one", 1024, 768) for key in sorted(model.images)}
+    fit = EpipolarFit(np.eye(3), np.ones(20, bool), np.ones(20), 10, 0.3)
+    return MatchGraph(images, {}, {}), ViewGraph(dict.fromkeys(fits, fit), {})
 
 
-def test_cameras_are_those_that_took_the_photos_not_those_of_their_group():
-    matches, views = two_views(pairs=((1, 2),))
-    other = Calibration(np.diag([2.0, 2.0, 1.0]) @ K, 640, 480, "zero-curves", True)
-    apart = Intrinsics({"one": other, "one #2": known()}, {"1.jpg": "one #2", "2.jpg": "one #2"})
+def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthetic, run, monkeypatch):
+    true = synthetic[1]
+    main, other = part_of(true, (1, 2, 3, 4)), part_of(true, (5, 6, 7))
+    for camera in main.cameras.values():
+        camera.params = [1270.0, 512.0, 384.0, 0.0]
+    made = outcome(attempt(main), attempt(other), graph=PoseGraph({}, {(1, 8): "contradicts other pairs"}, {}, ()))
+    monkeypatch.setattr(scene, "reconstruct", lambda *_: made)
+    matches, views = inputs(true)
+    name = {key: image.name for key, image in matches.images.items()}
 
-    assert np.array_equal(
-        ranked(matches, views, apart)[0].seed.points,
-        ranked(matches, views, Intrinsics({"one": known()}))[0].seed.points,
+    found = scene.reconstruct_scene(matches, views, made.intrinsics, run)
+
+    assert sorted(found.cam_from_world) == [name[key] for key in (1, 2, 3, 4)]
+    assert found.cameras["one"].K[0, 0] == pytest.approx(1280, rel=0.003)
+    assert 0.1 < found.mean_reprojection_px < 0.5
+    assert found.unregistered == {
+        **{name[key]: "belongs to another model, of 3 photos" for key in (5, 6, 7)},
+        name[8]: "could not be placed: 20 inliers with the nearest photo that was, "
+        "but that pair was dropped: contradicts other pairs",
+    }
+    assert run.counts["registered"] == 4 and run.counts["of"] == 8
+    assert run.counts["other_models"] == [[name[key] for key in (5, 6, 7)]]
+    assert run.counts["pairs_dropped"] == {"contradicts other pairs": 1}
+    assert photos_of(pycolmap.Reconstruction(run.workspace.other_models / "1")) == [5, 6, 7]
+
+    record = StageRecord("", 0.0, run.counts)
+    run.workspace.finish("scene", record, {})
+    photos = PhotoSet(run.workspace.root, tuple(Photo(text, 1024, 768, "one") for text in name.values()))
+    again = scene.load_scene(photos, made.intrinsics, run)
+    assert again.unregistered == found.unregistered and again.points == found.points
+    assert all(np.array_equal(again.cam_from_world[key], value) for key, value in found.cam_from_world.items())
+
+
+def test_without_a_model_the_error_says_what_was_seen_and_what_may_help(synthetic, run, monkeypatch):
+    monkeypatch.setattr(scene, "reconstruct", lambda *_: outcome(tried=("all at once: 0 photos",)))
+    matches, views = inputs(synthetic[1])
+
+    with pytest.raises(ReconstructionError, match="1 pairs with 20 to 20 inliers, all at once: 0 photos") as caught:
+        scene.reconstruct_scene(matches, views, outcome().intrinsics, run)
+
+    assert "overlap" in caught.value.hint
+    assert not run.workspace.sparse.exists() and run.counts == {}
+
+
+def test_how_it_was_made_counts_pairs_and_matches():
+    kinds = ["calibrated", "planar", "calibrated", "rotation"]
+    poses = {
+        pair: pose(kind, guided=kind == "planar")
+        for pair, kind in zip(combinations(range(4), 2), kinds, strict=False)
+    }  # fmt: skip
+    dropped = {(1, 3): "contradicts other pairs", (2, 3): "contradicts other pairs", (1, 2): "points behind a camera"}
+    explained = {(0, 1): Explained(50, 40, 3), (0, 2): Explained(60, 50, 4)}
+    model = SimpleNamespace(num_reg_images=lambda: 4)
+
+    found = scene.how_it_was_made(
+        outcome(attempt(model, explained), graph=PoseGraph(poses, dropped, {}, ()), cuts=("c, d",), passes=2)
     )
 
-
-def fit(inliers, degeneracy=""):
-    return EpipolarFit(np.eye(3), np.arange(50) < inliers, np.ones(50), 10, 0.3, degeneracy)
-
-
-def graph(photos):
-    images = {key: MatchedImage(key, f"{key}.jpg", "one", 100, 100) for key in range(1, photos + 1)}
-    return MatchGraph(images, {}, {})
-
-
-def model(photos):
-    images = {key: SimpleNamespace(image_id=key, has_pose=True) for key in range(1, photos + 1)}
-    return SimpleNamespace(images=images, num_reg_images=lambda: photos)
-
-
-def try_seeds(monkeypatch, outcomes, photos=10, seed_pairs=5):
-    """What `best_model` makes of seeds that grow into models of so many photos."""
-    views = ViewGraph({(key, key + 1): fit(40) for key in range(1, photos)}, {})
-    candidates = [SimpleNamespace(pair=(key, key + 1)) for key in range(1, len(outcomes) + 1)]
-    grown = iter(outcomes)
-    monkeypatch.setattr(scene, "grow", lambda *_: model(count) if (count := next(grown)) else None)
-    run = SimpleNamespace(settings=Settings.from_mapping({"scene": {"seed_pairs": seed_pairs}}))
-    best, tried = scene.best_model(candidates, graph(photos), views, run)
-    return best.num_reg_images() if best else None, len(tried)
-
-
-@pytest.mark.parametrize(
-    ("outcomes", "photos", "tries"),
-    [
-        ((10, 3), 10, 1),  # all photos: nothing better can come
-        ((0, 0, 9), 9, 3),  # seeds that fail are followed by the next best
-        ((3, 3, 7, 2, 2), 7, 5),  # few photos, twice the same, are no reason to stop
-        ((6, 6, 9), 6, 2),  # more than half, twice the same: the others hang loose
-        ((0, 0, 0, 0, 0, 10), None, 5),  # no more tries than allowed
-    ],
-)
-def test_seeds_are_tried_until_one_grows(monkeypatch, outcomes, photos, tries):
-    assert try_seeds(monkeypatch, outcomes) == (photos, tries)
-
-
-def test_photos_of_a_second_place_do_not_count_against_a_seed():
-    views = ViewGraph({(1, 2): fit(40), (2, 3): fit(40), (7, 8): fit(40)}, {(3, 7): Rejected("too few inliers")})
-
-    assert scene.connected((1, 2), views) == {1, 2, 3}
-    assert scene.connected((7, 8), views) == {7, 8}
-
-
-def test_every_photo_without_a_place_has_a_reason():
-    views = ViewGraph({(1, 2): fit(40), (1, 3): fit(17), (2, 3): fit(20), (4, 5): fit(30)}, {})
-
-    reasons = scene.left_out(model(2), graph(6), views)
-
-    assert reasons == {
-        "3.jpg": "could not be placed: at most 20 inliers with a photo that was",
-        "4.jpg": "shares inliers only with photos that have no place either",
-        "5.jpg": "shares inliers only with photos that have no place either",
-        "6.jpg": "shares no scene with any other photo",
+    assert found == {
+        "mapper": "global",
+        "tried": ["a", "b"],
+        "passes": 2,
+        "explained_matches": 110,
+        "contradicted_matches": 7,
+        "cut_apart": ["c, d"],
+        "pairs": {"calibrated": 2, "planar": 1, "rotation": 1, "found with the help of others": 1},
+        "pairs_dropped": {"contradicts other pairs": 2, "points behind a camera": 1},
     }
 
 
-def test_a_failure_says_what_was_seen():
-    views = ViewGraph({(1, 2): fit(40), (1, 3): fit(17, "planar")}, {(2, 3): Rejected("too few inliers")})
+def files(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
-    text = scene.nothing_found(views, [], ["1.jpg + 2.jpg: 0 photos"])
 
-    for part in (
-        "2 pairs with 17 to 40 inliers",
-        "1 of them planar",
-        "1 pairs rejected: too few inliers",
-        "no pair has parallax",
-    ):
-        assert part in text
+def test_models_are_written_as_a_whole_and_nothing_of_an_earlier_run_is_left(synthetic, run):
+    place = run.workspace
+    parts = [part_of(synthetic[1], photos) for photos in ((1, 2, 3, 4), (5, 6), (7, 8))]
+    for folder in (place.sparse, place.other_models / "7", place.root / ".sparse"):
+        folder.mkdir(parents=True)
+        (folder / "old.bin").write_bytes(b"old")
+
+    scene.write_models(parts, run)
+
+    written = files(place.sparse)
+    assert "images.bin" in written and "old.bin" not in written
+    assert sorted(path.name for path in place.other_models.iterdir()) == ["1", "2"]
+    assert sorted(path.name for path in place.root.iterdir()) == ["database.db", "other_models", "sparse"]
+    found = [place.sparse, place.other_models / "1", place.other_models / "2"]
+    assert [photos_of(pycolmap.Reconstruction(folder)) for folder in found] == [[1, 2, 3, 4], [5, 6], [7, 8]]
+
+    scene.write_models(parts[1:2], run)
+
+    assert photos_of(pycolmap.Reconstruction(place.sparse)) == [5, 6]
+    assert not place.other_models.exists()
 
 
 def test_refined_cameras_stand_beside_the_calibration_and_leave_it_valid(tmp_path):
     place = Workspace(tmp_path)
-    before = Intrinsics({"one": known()})
+    K = camera_matrix(800.0, 800.0, 320.0, 240.0)
+    before = Intrinsics({"one": Calibration(K, 640, 480, "zero-curves", True)})
     place.calibration.write_text(json.dumps(before.to_dict()))
     place.finish("intrinsics", StageRecord("abc", 1.0, {}, place.sizes(("calibration.json",))), {})
     camera = CameraModel("OPENCV", (800.0,) * 8, K, 640, 480, {"fx": 1.5, "cx": 2.5}, ("centre",))
