@@ -57,7 +57,7 @@ def try_out(run, cameras, monkeypatch):
     waits until the other one is done.
     """
 
-    def make(grown, at_once=None, late="", count=COUNT, points=500, **scene):
+    def make(grown, at_once=None, late="", count=COUNT, points=500, contradicted=0, completed=0, **scene):
         images = {key: MatchedImage(key, f"{key}.jpg", "one", 1024, 768) for key in range(1, count + 1)}
         rng = np.random.default_rng(0)
         keypoints = {key: rng.uniform((0, 0), (1024, 768), (400, 2)) for key in images}
@@ -77,20 +77,25 @@ def try_out(run, cameras, monkeypatch):
             done[mapper].set()
             return result
 
-        def grow(database, photo_dir, start, scratch, seed, tick, token):
+        def grow(database, photo_dir, start, scratch, seed, tick, token, *, known):
+            if not isinstance(start, tuple):  # what another mapper made
+                return model(completed, points) if completed else None
             placed = grown[start[0] - 1] if start[0] <= len(grown) else 0
             if isinstance(placed, Exception):
                 raise placed
             return finish("incremental", model(placed, points) if placed else None)
 
-        def place(database, photo_dir, names, scratch, seed, token):
+        def place(photo_dir, names, scratch, seed, token):
             assert list(names) == [f"{key}.jpg" for key in images]
+            if isinstance(at_once, Exception):
+                raise at_once
             return finish("global", model(at_once, points) if at_once else None)
 
         monkeypatch.setattr(module, "model_from_seed", lambda *arguments: arguments[1])
         monkeypatch.setattr(module, "map_incrementally", grow)
         monkeypatch.setattr(module, "map_globally", place)
-        explained = {(0, 1): Explained(100, 100, 0)}
+        monkeypatch.setattr(module, "prepare_globally", lambda *_: None)
+        explained = {(0, 1): Explained(100, 100, contradicted)}
         monkeypatch.setattr(module, "explained_pairs", lambda *_: explained)
         return attempts(group, run(**scene)), calls
 
@@ -104,20 +109,40 @@ def summary(found):
 def test_both_mappers_are_tried_and_one_good_model_is_enough(try_out):
     found, _ = try_out([9, 10], at_once=3)
 
-    assert summary(found) == [("global", 3), ("incremental", 9)]
-    assert [attempt.note for attempt in found] == ["all at once: 3 photos", "from 1.jpg + 2.jpg: 9 photos"]
-    assert found[1].support == 50 and found[1].model.num_reg_images() == 9
+    assert summary(found) == [("incremental", 9), ("global", 3)]
+    assert [attempt.note for attempt in found] == ["from 1.jpg + 2.jpg: 9 photos", "all at once: 3 photos"]
+    assert found[0].support == 50 and found[0].model.num_reg_images() == 9
+
+
+@pytest.mark.parametrize("late", ["global", "incremental"])
+def test_a_flawless_model_makes_the_other_one_needless_whether_or_not_it_is_there(try_out, late):
+    found, _ = try_out([10], at_once=10 if late == "incremental" else None)
+
+    assert summary(found) == [("incremental", 10), ("global", 0)]
+    assert found[1].note == "all at once: not needed"
+
+
+def test_a_model_of_all_photos_that_matches_contradict_is_not_flawless(try_out):
+    assert summary(try_out([10], at_once=10, contradicted=2)[0]) == [("incremental", 10), ("global", 10)]
+    assert summary(try_out([10], at_once=10, contradicted=1)[0]) == [("incremental", 10), ("global", 0)]
+
+
+def test_a_global_mapper_that_fails_leaves_the_other_model(try_out):
+    found, _ = try_out([9], at_once=RuntimeError("bad day"))
+
+    assert summary(found) == [("incremental", 9), ("global", 0)]
+    assert found[1].note == "all at once: failed, bad day"
 
 
 @pytest.mark.parametrize(
     ("grown", "at_once", "placed"),
     [
-        ([10, 3], 2, [2, 10]),  # nothing better can come
-        ([2, 3], 9, [9, 2]),  # nor after the other mapper
+        ([10, 3], 2, [10, 0]),  # nothing better can come
+        ([2, 3], 9, [2, 9, 0]),  # nor after the other mapper
         ([0, 0, 9], 0, [0, 0, 0, 9]),  # what fails is followed by the next best
         ([3, 3, 7, 2, 2], 3, [3, 3, 3, 7, 2, 2]),  # few photos, several times the same, are no reason to stop
         ([6, 9], 6, [6, 6]),  # more than half, twice the same: the others hang loose
-        ([5, 4, 5, 9], 2, [2, 5, 4, 5]),  # also with another between them
+        ([5, 4, 5, 9], 2, [5, 2, 4, 5]),  # also with another between them
         ([0, 0, 0, 0, 0, 10], 0, [0, 0, 0, 0, 0, 0]),  # no more seeds than allowed
     ],
 )
@@ -133,12 +158,19 @@ def test_it_does_not_matter_which_mapper_is_done_first(try_out, late):
     found, calls = try_out([4, 7, 7, 7], at_once=4, late=late)
 
     assert calls[:2] == (["incremental", "global"] if late == "global" else ["global", "incremental"])
-    assert summary(found) == [("global", 4), ("incremental", 4), ("incremental", 7), ("incremental", 7)]
+    assert summary(found) == [("incremental", 4), ("global", 4), ("incremental", 7), ("incremental", 7)]
 
 
 def test_one_mapper_alone(try_out):
     assert summary(try_out([5, 10], at_once=10, mapper="incremental")[0]) == [("incremental", 5), ("incremental", 10)]
-    assert summary(try_out([5, 10], at_once=4, mapper="global")[0]) == [("global", 4)]
+    assert summary(try_out([5, 10], at_once=10, mapper="global")[0]) == [("global", 10)]
+
+
+def test_photos_that_the_global_mapper_left_out_get_a_second_chance(try_out):
+    found, _ = try_out([3], at_once=8, completed=10, seed_pairs=1)
+
+    assert summary(found) == [("incremental", 3), ("global", 8), ("incremental", 10)]
+    assert found[2].note == "what was left out, photo by photo: 10 photos"
 
 
 def test_of_two_photos_positions_have_no_scale_to_agree_on(try_out):
@@ -147,9 +179,9 @@ def test_of_two_photos_positions_have_no_scale_to_agree_on(try_out):
 
 
 def test_without_seeds_all_photos_can_still_be_placed_at_once(try_out):
-    found, _ = try_out([10], at_once=8, min_seed_angle_deg=25.0)
+    found, _ = try_out([10], at_once=10, min_seed_angle_deg=25.0)
 
-    assert summary(found) == [("global", 8)]
+    assert summary(found) == [("global", 10)]
     assert try_out([10], min_seed_angle_deg=25.0, mapper="incremental")[0] == []
 
 
@@ -158,7 +190,7 @@ def test_a_model_with_too_few_points_is_none(try_out):
 
     assert [attempt.model for attempt in found] == [None] * len(found)
     assert [attempt.support for attempt in found] == [0.0] * len(found)
-    assert found[0].note == "all at once: 10 photos"
+    assert [attempt.note for attempt in found[:2]] == ["from 1.jpg + 2.jpg: 10 photos", "all at once: 10 photos"]
     assert len(try_out([10], at_once=10, points=30)[0]) == 2
 
 

@@ -1,8 +1,8 @@
 import numpy as np
 
 from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, TOO_FEW
-from sfm_app.reconstruction.left_out import left_out, names_of, nothing_found
-from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, PoseGraph, Rejected, RelativePose, ViewGraph
+from sfm_app.reconstruction.left_out import left_out, names_of
+from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, PoseGraph, RelativePose, ViewGraph
 
 
 def fit(inliers, degeneracy=""):
@@ -60,27 +60,6 @@ def test_of_photos_equally_near_the_first_is_the_nearest():
 
 def test_when_all_photos_have_a_place_none_has_a_reason():
     assert left_out({1, 2}, [], photos(2), ViewGraph({(1, 2): fit(40)}, {}), pose_graph()) == {}
-
-
-def test_a_failure_says_what_was_seen():
-    views = ViewGraph({(1, 2): fit(40), (1, 3): fit(17, "planar")}, {(2, 3): Rejected("too few inliers")})
-    graph = pose_graph(poses={(1, 2): pose(), (1, 3): pose("rotation")})
-
-    text = nothing_found(views, graph, ["from 1.jpg + 2.jpg: 0 photos", "all at once: 0 photos"])
-
-    assert text == (
-        "no pair of photos grows into a model: 2 pairs with 17 to 40 inliers, "
-        "1 of them planar, on one line, or without parallax, 1 pairs rejected: too few inliers, "
-        "1 pairs between which the camera only turned, from 1.jpg + 2.jpg: 0 photos; all at once: 0 photos"
-    )
-
-
-def test_a_failure_without_a_try_says_that_there_was_nothing_to_start_from():
-    text = nothing_found(ViewGraph({(1, 2): fit(40)}, {}), pose_graph(), [])
-
-    assert text == (
-        "no pair of photos grows into a model: 1 pairs with 40 to 40 inliers, no pair has parallax enough to start from"
-    )
 
 
 def test_names_come_in_the_order_of_the_photos_given():

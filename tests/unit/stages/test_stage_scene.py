@@ -14,6 +14,7 @@ from sfm_app.geometry.camera import camera_matrix
 from sfm_app.reconstruction import Outcome
 from sfm_app.reconstruction.attempts import Attempt
 from sfm_app.reconstruction.support import Explained
+from sfm_app.settings import Settings
 from sfm_app.stages import scene
 from sfm_app.types import (
     Calibration,
@@ -53,7 +54,10 @@ def run(synthetic, tmp_path):
     """A run whose folder holds the database; `counts` is what it recorded."""
     shutil.copyfile(synthetic[0], tmp_path / "database.db")
     counts = {}
-    return SimpleNamespace(workspace=Workspace(tmp_path), counts=counts, record=counts.update)
+    return SimpleNamespace(
+        workspace=Workspace(tmp_path), counts=counts, record=counts.update, settings=Settings(),
+        map=lambda function, items, _: [function(item) for item in items],
+    )  # fmt: skip
 
 
 def attempt(model, explained=None):
@@ -85,6 +89,8 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
     matches, views = inputs(true)
     name = {key: image.name for key, image in matches.images.items()}
 
+    run.workspace.calibration.write_text(json.dumps(made.intrinsics.to_dict()))
+
     found = scene.reconstruct_scene(matches, views, made.intrinsics, run)
 
     assert sorted(found.cam_from_world) == [name[key] for key in (1, 2, 3, 4)]
@@ -112,7 +118,7 @@ def test_without_a_model_the_error_says_what_was_seen_and_what_may_help(syntheti
     monkeypatch.setattr(scene, "reconstruct", lambda *_: outcome(tried=("all at once: 0 photos",)))
     matches, views = inputs(synthetic[1])
 
-    with pytest.raises(ReconstructionError, match="1 pairs with 20 to 20 inliers, all at once: 0 photos") as caught:
+    with pytest.raises(ReconstructionError, match=r"1 pairs with 20 to 20 inliers\); all at once: 0 photos") as caught:
         scene.reconstruct_scene(matches, views, outcome().intrinsics, run)
 
     assert "overlap" in caught.value.hint
