@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -143,7 +142,7 @@ def before_adjustment(out: Path, truth: Mapping[str, TruePhoto]) -> Row:
 def stated_deviations(out: Path, model: Model, truth: Mapping[str, TruePhoto]) -> Row:
     """Standard deviations after bundle adjustment, and the errors counted in them; of several cameras the worst."""
     _, camera_of = _calibration(out)
-    by_camera = _stated(out, camera_of, model)
+    by_camera = _stated(out)
     row: Row = {}
     for photo in sorted(set(model.K) & set(truth)):
         K, true = model.K[photo], truth[photo].K
@@ -164,14 +163,11 @@ def _place(K: NDArray[np.float64], name: str) -> float:
     return float(np.mean([K[place] for place in PLACES[name]]))
 
 
-def _stated(out: Path, camera_of: Mapping[str, str], model: Model) -> dict[str, Mapping[str, float]]:
-    """By camera; figures without a camera's name are those of the camera that took most photos."""
-    manifest = json.loads((out / "manifest.json").read_text(encoding="utf-8"))
-    found: Mapping[str, Any] = manifest["stages"].get("scene", {}).get("counts", {}).get("deviations_px", {})
-    flat = {name: value for name, value in found.items() if isinstance(value, (int, float))}
-    nested = {name: values for name, values in found.items() if isinstance(values, dict)}
-    used = Counter(camera_of[photo] for photo in model.poses if photo in camera_of)
-    return nested | ({used.most_common(1)[0][0]: flat} if flat and used else {})
+def _stated(out: Path) -> dict[str, Mapping[str, float]]:
+    """By camera: what calibration.json says about the refined cameras."""
+    path = out / "calibration.json"
+    refined = json.loads(path.read_text(encoding="utf-8")).get("refined", {}) if path.exists() else {}
+    return {name: camera["deviations"] for name, camera in refined.items()}
 
 
 def _calibration(out: Path) -> tuple[dict[str, Any], dict[str, str]]:

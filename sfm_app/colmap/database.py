@@ -52,20 +52,19 @@ def opened(path: Path) -> Iterator[Any]:
         database.close()
 
 
-def create_database(path: Path, photo_dir: Path, photos: PhotoSet) -> None:
+def create_database(path: Path, photos: PhotoSet) -> None:
     """Enter photos and cameras in a fixed order.
 
     Feature extraction would do it too, but numbers photos as its threads finish with them: not twice the same.
     """
-    with opened(path):
-        pass
-    for members in photos.groups.values():
-        K = guessed_camera_matrix((members[0].width, members[0].height))
-        options = pycolmap.ImageReaderOptions()
-        options.camera_model = SQUARE_PIXELS
-        options.camera_params = ",".join(str(value) for value in camera_params(K, SQUARE_PIXELS))
-        names = [photo.name for photo in members]
-        pycolmap.import_images(path, photo_dir, pycolmap.CameraMode.SINGLE, names, options)
+    with opened(path) as database, pycolmap.DatabaseTransaction(database):
+        for camera_id, members in enumerate(photos.groups.values(), start=1):
+            size = members[0].width, members[0].height
+            _write_camera(database, camera_id, Calibration(guessed_camera_matrix(size), *size, "guess", False))
+            for photo in sorted(members, key=lambda photo: photo.name):
+                image = pycolmap.Image(name=photo.name, camera_id=camera_id)
+                image.image_id = database.write_image(image)
+                _write_frame(database, image)
 
 
 def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
@@ -117,9 +116,7 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
         for image in database.read_all_images():
             image.camera_id = ids[used[image.image_id]]
             database.update_image(image)
-            frame = pycolmap.Frame(frame_id=image.image_id, rig_id=image.camera_id)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame, use_frame_id=True)
+            _write_frame(database, image)
     # pycolmap can only clear all cameras at once, and only while no image refers to one
     with contextlib.closing(sqlite3.connect(path)) as database, database:
         database.execute("DELETE FROM cameras WHERE camera_id > ?", (len(ids),))
@@ -143,6 +140,13 @@ def _write_camera(database: Any, camera_id: int, calibration: Calibration) -> No
     rig = pycolmap.Rig(rig_id=camera_id)
     rig.add_ref_sensor(camera.sensor_id)
     database.write_rig(rig, use_rig_id=True)
+
+
+def _write_frame(database: Any, image: Any) -> None:
+    """The frame of one photo that COLMAP wants around it."""
+    frame = pycolmap.Frame(frame_id=image.image_id, rig_id=image.camera_id)
+    frame.add_data_id(image.data_id)
+    database.write_frame(frame, use_frame_id=True)
 
 
 def camera_model(calibration: Calibration) -> str:

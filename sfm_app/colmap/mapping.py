@@ -16,10 +16,11 @@ from typing import Any
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import SQUARE_PIXELS
 
-LOCAL_GAIN, GLOBAL_GAIN = 1e-3, 1e-4
-"""Share of its cost that a step of an adjustment must gain, or it was the last."""
-GLOBAL_REFINEMENT = 1.3
-"""All of a model is adjusted again when it has grown by this factor; with K known, more often gains nothing."""
+LOCAL_GAIN, GLOBAL_GAIN, GLOBAL_REFINEMENT = 1e-3, 1e-4, 1.3
+"""Share of its cost that a step of an adjustment must gain, or it was the last: of a few photos, of all. All are
+adjusted again when the model has grown by the third."""
+KNOWN_LOCAL_GAIN, KNOWN_GLOBAL_GAIN, KNOWN_GLOBAL_REFINEMENT = 1e-2, 1e-3, 2.0
+"""The same where K is known: poses and points alone converge in a few steps, and the last adjustment is ours."""
 
 
 def map_incrementally(
@@ -30,7 +31,7 @@ def map_incrementally(
 
     Args:
         database: photos, keypoints, two-view geometries, K.
-        photo_dir: for the colours of the points.
+        photo_dir: COLMAP wants to know it.
         start: a reconstruction with at least two posed photos.
         scratch: a folder of ours that is emptied first and gone afterwards.
         seed: of COLMAP's own sampling.
@@ -71,7 +72,7 @@ def map_globally(photo_dir: Path, names: Sequence[str], scratch: Path, seed: int
     COLMAP gives no way to stop this, so it runs in a process of its own.
 
     Args:
-        photo_dir: for the colours of the points.
+        photo_dir: COLMAP wants to know it.
         names: photos to place.
         scratch: a folder of ours from `prepare_globally`; gone afterwards.
         seed: of COLMAP's own sampling.
@@ -114,9 +115,12 @@ def incremental_options(seed: int, *, known: bool = False) -> Any:
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2
     options.multiple_models = False
-    options.ba_global_frames_ratio = options.ba_global_points_ratio = GLOBAL_REFINEMENT
-    options.ba_local_function_tolerance, options.ba_global_function_tolerance = LOCAL_GAIN, GLOBAL_GAIN
-    options.ba_local_max_refinements, options.ba_global_max_refinements = 1, 2
+    usual = (LOCAL_GAIN, GLOBAL_GAIN, GLOBAL_REFINEMENT)
+    local_gain, global_gain, growth = (KNOWN_LOCAL_GAIN, KNOWN_GLOBAL_GAIN, KNOWN_GLOBAL_REFINEMENT) if known else usual
+    options.ba_local_function_tolerance, options.ba_global_function_tolerance = local_gain, global_gain
+    options.ba_global_frames_ratio = options.ba_global_points_ratio = growth
+    options.ba_local_max_refinements, options.ba_global_max_refinements = 1, 1 if known else 2
+    options.extract_colors = False
     options.ba_refine_focal_length = options.mapper.abs_pose_refine_focal_length = not known
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed

@@ -81,6 +81,11 @@ def cameras_of(model: Any) -> dict[int, tuple[NDArray[np.float64], float]]:
     return found
 
 
+def colour(model: Any, photo_dir: Path, workers: int) -> None:
+    """Give every point the mean colour of its pixels."""
+    model.extract_colors_for_all_images(photo_dir, num_threads=workers)
+
+
 def part_of(model: Any, photos: Sequence[int]) -> Any:
     """A copy of a model with these photos only, and the points that at least two of them see."""
     part, members = pycolmap.Reconstruction(model), set(photos)

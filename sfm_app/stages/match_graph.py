@@ -19,7 +19,7 @@ def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
     for suffix in ("", "-wal", "-shm"):
         place.database.with_name(place.database.name + suffix).unlink(missing_ok=True)
     with backend("finding features"):
-        create_database(place.database, place.photos, photos)
+        create_database(place.database, photos)
         extraction = extract_features(place.database, place.photos, names, options, run.workers, run.progress)
     with backend("matching photos"):
         matching = match_exhaustively(place.database, len(names), options, run.workers, run.progress)

@@ -9,7 +9,7 @@ from typing import Any
 
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.bundle import Adjusted, adjust
-from sfm_app.colmap.model import photos_of, read_scene
+from sfm_app.colmap.model import colour, photos_of, read_scene
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_depth, why_no_scene
 from sfm_app.reconstruction import Outcome, reconstruct
@@ -28,6 +28,9 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
     with backend("adjusting the bundle"):
         adjusted = [adjust(attempt.model, run.workspace.database) for attempt in outcome.models]
     models = [found.model for found in adjusted]
+    with backend("reading colours"):
+        for model in models:
+            colour(model, run.workspace.photos, run.workers)
     orientations = [orient(model, matches, run) for model in models]
     write_models(models, run)
     members = [photos_of(model) for model in models]

@@ -118,17 +118,17 @@ def test_truth_changes_with_the_photos(tmp_path):
 def left_behind(folder, deviations):
     cameras = {"wide": {"identifiable": True, "K": K.tolist()}, "long": {"identifiable": False, "K": K.tolist()}}
     camera_of = {"a.png": "wide", "b.png": "wide", "c.png": "long"}
-    (folder / "calibration.json").write_text(json.dumps({"cameras": cameras, "camera_of": camera_of}))
-    stages = {"scene": {"counts": {"deviations_px": deviations}}}
-    (folder / "manifest.json").write_text(json.dumps({"stages": stages}))
+    refined = {name: {"deviations": values} for name, values in deviations.items()}
+    document = {"cameras": cameras, "camera_of": camera_of, "refined": refined}
+    (folder / "calibration.json").write_text(json.dumps(document))
     found = {name: camera_matrix(1004.0, 1010.0, 401.0, 300.0) for name in "ab"} | {
         "c": camera_matrix(1050, 1060, 400, 300)
     }
     return Model({name: POSES[name] for name in "abc"}, found, 1, 1, 0.1)
 
 
-def test_errors_are_counted_in_the_deviations_of_the_camera_with_most_photos(tmp_path):
-    model = left_behind(tmp_path, {"fx": 2.0, "fy": 3.0, "cx": 0.25})
+def test_errors_are_counted_in_the_deviations_of_the_camera_that_took_the_photo(tmp_path):
+    model = left_behind(tmp_path, {"wide": {"fx": 2.0, "fy": 3.0, "cx": 0.25}})
 
     row = stated_deviations(tmp_path, model, truth())
 

@@ -36,7 +36,7 @@ def stored(tmp_path):
         Image.new("RGB", sizes[groups[name]]).save(tmp_path / name)
     photos = PhotoSet(tmp_path, tuple(Photo(name, *sizes[groups[name]], groups[name]) for name in NAMES))
     path = tmp_path / "database.db"
-    create_database(path, tmp_path, photos)
+    create_database(path, photos)
     keypoints = rng.uniform(0, 90, (20, 2)).astype(np.float32)
     matches = np.column_stack([np.arange(12), np.arange(12)[::-1]]).astype(np.uint32)
     with opened(path) as database:

@@ -55,7 +55,7 @@ def run(synthetic, tmp_path):
     shutil.copyfile(synthetic[0], tmp_path / "database.db")
     counts = {}
     return SimpleNamespace(
-        workspace=Workspace(tmp_path), counts=counts, record=counts.update, settings=Settings(),
+        workspace=Workspace(tmp_path), counts=counts, record=counts.update, settings=Settings(), workers=1,
         map=lambda function, items, _: [function(item) for item in items],
     )  # fmt: skip
 
