@@ -49,11 +49,9 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
     second pass: with them, relative poses are right that were not before. The better of both passes counts.
     """
     first = _pass(matches, views, intrinsics, run)
-    if not first.models:
+    if not first.models or not worth_another(first, intrinsics, matches):
         return first
     learned = learned_intrinsics(first.models[0], intrinsics, matches)
-    if learned is None:
-        return first
     second = replace(_pass(matches, views, learned, run), passes=2)
     if second.support > first.support:
         return second
@@ -61,24 +59,34 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
     return first
 
 
-def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGraph) -> Intrinsics | None:
-    """The cameras as a model has them; None where that is no news."""
-    if model.photos < LEARNED_FROM:
-        return None
-    cameras, news = dict(intrinsics.cameras), False
+def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
+    """Whether the cameras that mapping found may show more: they are news, or photos of the main group stayed out."""
+    main = outcome.models[0]
+    placed = photos_of(main.model)
+    if len(placed) < LEARNED_FROM:
+        return False
+    learned = learned_intrinsics(main, intrinsics, matches)
+    used = {intrinsics.name_of(matches.images[photo]) for photo in placed}
+    news = any(_far(intrinsics.cameras[name], learned.cameras[name]) for name in used)
+    anywhere = {photo for model in outcome.models for photo in photos_of(model.model)}
+    return news or not anywhere.issuperset(outcome.graph.group_of(placed[0]))
+
+
+def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGraph) -> Intrinsics:
+    """The cameras as a model has them."""
     with backend("reading cameras"):
         found = cameras_of(model.model)
+    cameras = dict(intrinsics.cameras)
     for photo, (K, radial) in found.items():
         name = intrinsics.name_of(matches.images[photo])
-        before = intrinsics.cameras[name]
-        after = replace(before, K=K, radial=radial, identifiable=True, reason="", method="mapping")
-        news = news or not before.identifiable or _far(before, after)
-        cameras[name] = after
-    return replace(intrinsics, cameras=cameras) if news else None
+        cameras[name] = replace(
+            intrinsics.cameras[name], K=K, radial=radial, identifiable=True, reason="", method="mapping"
+        )
+    return replace(intrinsics, cameras=cameras)
 
 
 def _far(before: Calibration, after: Calibration) -> bool:
-    return abs(float(np.log(after.focal_px / before.focal_px))) > MOVED
+    return not before.identifiable or abs(float(np.log(after.focal_px / before.focal_px))) > MOVED
 
 
 def _pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:

@@ -12,6 +12,7 @@ from sfm_app.reconstruction import passes as module
 from sfm_app.reconstruction.attempts import Attempt
 from sfm_app.reconstruction.passes import learned_intrinsics, reconstruct, taken_apart
 from sfm_app.reconstruction.support import Explained, explained_pairs
+from sfm_app.types import PoseGraph
 
 FOCAL = 1280.0
 TRUE = [FOCAL, 512.0, 384.0, 0.0]
@@ -130,11 +131,25 @@ def learned(model, synthetic, intrinsics):
     return learned_intrinsics(Attempt("global", model, {}, ""), intrinsics, synthetic.matches)
 
 
+def worth(model, synthetic, intrinsics, photos=6):
+    graph = PoseGraph({}, {}, {}, (tuple(range(1, photos + 1)),))
+    found = module.Outcome((Attempt("global", model, {}, ""),), graph, intrinsics, ())
+    return module.worth_another(found, intrinsics, synthetic.matches)
+
+
 def test_two_photos_teach_no_camera(synthetic, cameras):
     guess = cameras(method="guess", identifiable=False)
 
-    assert learned(without(synthetic.copy(), [3, 4, 5, 6]), synthetic, guess) is None
-    assert learned(without(synthetic.copy(), [4, 5, 6]), synthetic, guess) is not None
+    assert not worth(without(synthetic.copy(), [3, 4, 5, 6]), synthetic, guess)
+    assert worth(without(synthetic.copy(), [4, 5, 6]), synthetic, guess)
+
+
+def test_photos_of_the_main_group_that_stayed_out_are_worth_another_pass(synthetic, cameras):
+    known = cameras(FOCAL)
+
+    assert not worth(with_camera(synthetic.copy(), TRUE), synthetic, known)
+    assert worth(without(with_camera(synthetic.copy(), TRUE), [6]), synthetic, known)
+    assert not worth(without(with_camera(synthetic.copy(), TRUE), [6]), synthetic, known, photos=5)
 
 
 def test_what_is_learned_is_focal_centre_and_lens(synthetic, cameras):
