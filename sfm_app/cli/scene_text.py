@@ -20,7 +20,7 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
         scene: what the stage gave.
         counts: what it counted.
     """
-    kept = ("mapper", "pairs", "pairs_dropped", "cut_apart", "other_models", "orientation")
+    kept = ("mapper", "mapper_reason", "pairs", "pairs_dropped", "cut_apart", "other_models", "orientation")
     cameras = {name: {**camera.to_dict(), "K": camera.K.round(3).tolist()} for name, camera in scene.cameras.items()}
     return {
         "registered": len(scene.registered),
@@ -49,8 +49,10 @@ def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
 def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]:
     if summary.get("mapper") in MAPPERS:
         dropped = sum(summary.get("pairs_dropped", {}).values())
-        contradicting = f"; {dropped} pairs that do not fit were left out" if dropped else ""
-        yield f"mapped {MAPPERS[summary['mapper']]}{contradicting}"
+        because = f": {counts['mapper_reason']}" if counts.get("mapper_reason") else ""
+        yield f"mapped {MAPPERS[summary['mapper']]}{because}"
+        if dropped:
+            yield f"{dropped} pairs of photos that do not fit the others were left out"
     for photos in summary.get("cut_apart", ()):
         yield f"cut apart, because more matches contradict the join than bear it out: {photos}"
     for number, names in enumerate(summary.get("other_models", ()), start=1):

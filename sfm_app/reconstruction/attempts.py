@@ -118,6 +118,18 @@ def better(found: Sequence[Attempt]) -> Attempt | None:
     return max(equal, key=lambda attempt: (attempt.photos, attempt.model.num_points3D()), default=None)
 
 
+def why(best: Attempt, found: Sequence[Attempt], photos: int) -> str:
+    """Why this attempt of several was taken, in a few words."""
+    if flawless(best, photos):
+        return f"it places all {photos} photos and next to nothing contradicts it"
+    others = [attempt for attempt in found if attempt is not best and attempt.model is not None]
+    if not others:
+        return "nothing else gave a model"
+    rival = max(others, key=lambda attempt: attempt.support)
+    counts = [sum(pair.matches for pair in attempt.explained.values()) for attempt in (best, rival)]
+    return f"it explains {counts[0]} matches with {best.photos} photos, the next best {counts[1]} with {rival.photos}"
+
+
 def flawless(attempt: Attempt, photos: int) -> bool:
     """Whether a model holds all photos and next to nothing contradicts it."""
     inliers = sum(pair.inliers for pair in attempt.explained.values())

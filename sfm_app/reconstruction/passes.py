@@ -10,7 +10,7 @@ from sfm_app.colmap.database import write_calibrations, write_pose_graph
 from sfm_app.colmap.model import cameras_of, part_of, photos_of
 from sfm_app.context import RunContext
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
-from sfm_app.reconstruction.attempts import Attempt, Group, attempts, better
+from sfm_app.reconstruction.attempts import Attempt, Group, attempts, better, why
 from sfm_app.reconstruction.joins import sound_parts
 from sfm_app.reconstruction.left_out import names_of
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
@@ -32,6 +32,8 @@ class Outcome:
     """As the mapping had them."""
     tried: tuple[str, ...]
     """Every attempt, for people."""
+    reason: str = ""
+    """Why the main model's mapper was chosen."""
     cuts: tuple[str, ...] = ()
     """What was taken apart because matches contradict the join."""
     passes: int = 1
@@ -95,6 +97,7 @@ def _pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Ru
     graph = build_pose_graph(matches, views, intrinsics, options, run.map)
     _enter(graph, intrinsics, matches, run)
     models: list[Attempt] = []
+    reasons: dict[str, str] = {}
     tried: list[str] = []
     cuts: list[str] = []
     for number, photos in enumerate(graph.groups):
@@ -104,11 +107,13 @@ def _pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Ru
         tried += [attempt.note for attempt in found]
         best = better(found)
         if best is not None:
+            reasons[best.note] = why(best, found, len(photos))
             parts = taken_apart(best)
             models += parts
             cuts += [", ".join(names_of(sorted(photos_of(part.model)), matches)) for part in parts if len(parts) > 1]
     models.sort(key=lambda attempt: (-attempt.photos, -attempt.support))
-    return Outcome(tuple(models), graph, intrinsics, tuple(tried), tuple(cuts))
+    reason = reasons[models[0].note] if models else ""
+    return Outcome(tuple(models), graph, intrinsics, tuple(tried), reason, tuple(cuts))
 
 
 def taken_apart(attempt: Attempt) -> list[Attempt]:

@@ -13,7 +13,9 @@ from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph
 DISSENT = 0.1
 """What counts of a seed whose pair contradicts the camera matrix that other pairs agree on."""
 FLAT = 0.5
-"""What counts of one whose points lie on a plane: its pose is less certain."""
+"""What counts of one whose points lie on a plane, or whose camera moved along its axis: its pose is less certain."""
+FORWARD = 0.95
+"""Share of the translation along the camera's axis that counts as such."""
 GRID = 8
 """Photos are looked at in so many cells across and down: points everywhere make a better start than a clump."""
 
@@ -35,7 +37,8 @@ def rank_seeds(
     for pair, pose in graph.poses.items():
         if members.issuperset(pair) and pose.kind != "rotation" and pose.angle_deg >= min_angle_deg:
             cameras = [intrinsics.camera(matches.images[photo]) for photo in pair]
-            worth = coverage(matches, pair, pose) * agreement(pair, cameras) * (FLAT if pose.kind == "planar" else 1.0)
+            worth = coverage(matches, pair, pose) * agreement(pair, cameras)
+            worth *= FLAT if pose.kind == "planar" or abs(pose.t[2]) > FORWARD else 1.0
             score = pose.inlier_count * min(pose.angle_deg / GOOD_ANGLE_DEG, 1.0) * pose.in_front**4 * worth
             found.append(Candidate(pair, pose, score))
     return sorted(found, key=lambda candidate: (-candidate.score, candidate.pair))

@@ -84,6 +84,7 @@ def how_it_was_made(outcome: Outcome) -> dict[str, Any]:
     kinds = [pose.kind for pose in poses]
     return {
         "mapper": main.mapper,
+        "mapper_reason": outcome.reason,
         "tried": list(outcome.tried),
         "passes": outcome.passes,
         "explained_matches": sum(pair.matches for pair in main.explained.values()),

@@ -10,6 +10,7 @@ PLACED = {f"{number}.jpg": np.eye(3, 4) for number in range(5)}
 CAMERA = CameraModel("OPENCV", (900.0, 901, 320, 240, 0, 0, 0, 0), K, 640, 480, {"fx": 1.25})
 COUNTS = {
     "mapper": "global",
+    "mapper_reason": "it explains more",
     "pairs_dropped": {"contradicts other pairs": 3, "points behind a camera": 1},
     "explained_matches": 900,
     "contradicted_matches": 20,
@@ -26,7 +27,8 @@ def test_people_read_how_many_photos_are_placed_how_and_how_sure_the_camera_is()
     text, summary = told()
 
     assert "5 of 6 photos placed, 1234 points, mean reprojection error 0.321 px" in text
-    assert "mapped all at once; 4 pairs that do not fit were left out" in text
+    assert "mapped all at once: it explains more\n" in text
+    assert "4 pairs of photos that do not fit the others were left out" in text
     assert "no place for x.jpg: shares no scene" in text
     assert "fx 900.0 +- 1.2" in text and "fy 901.0  cx" in text
     assert "upright by vanishing lines, to about 0.3 degrees; in a unit of its own" in text

@@ -6,7 +6,7 @@ import pytest
 
 from sfm_app.errors import BackendError
 from sfm_app.reconstruction import attempts as module
-from sfm_app.reconstruction.attempts import Attempt, Group, attempts, better
+from sfm_app.reconstruction.attempts import Attempt, Group, attempts, better, why
 from sfm_app.reconstruction.support import Explained
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, RelativePose, ViewGraph
 
@@ -125,6 +125,15 @@ def test_a_flawless_model_makes_the_other_one_needless_whether_or_not_it_is_ther
 def test_a_model_of_all_photos_that_matches_contradict_is_not_flawless(try_out):
     assert summary(try_out([10], at_once=10, contradicted=2)[0]) == [("incremental", 10), ("global", 10)]
     assert summary(try_out([10], at_once=10, contradicted=1)[0]) == [("incremental", 10), ("global", 0)]
+
+
+def test_why_a_model_was_taken_is_said():
+    best, rival, nothing = attempt(10, 1000), attempt(9, 900), Attempt("global", None, {}, "")
+    contradicted = Attempt("global", model(10), {(0, 1): Explained(90, 100, 10)}, "")
+
+    assert why(best, [best, nothing], 10) == "it places all 10 photos and next to nothing contradicts it"
+    assert why(contradicted, [contradicted, nothing], 10) == "nothing else gave a model"
+    assert why(best, [rival, best], 11) == "it explains 2000 matches with 10 photos, the next best 1800 with 9"
 
 
 def test_a_global_mapper_that_fails_leaves_the_other_model(try_out):

@@ -66,7 +66,7 @@ def attempt(model, explained=None):
 
 def outcome(*attempts, graph=None, **others):
     cameras = Intrinsics({"one": Calibration(camera_matrix(1280, 1280, 512, 384), 1024, 768, "zero-curves", True)})
-    return Outcome(attempts, graph or PoseGraph({}, {}, {}, ()), cameras, **{"tried": ("a", "b"), **others})
+    return Outcome(attempts, graph or PoseGraph({}, {}, {}, ()), cameras, **{"tried": ("a", "b"), "reason": "it explains more", **others})
 
 
 def pose(kind, guided=False):
@@ -141,6 +141,7 @@ def test_how_it_was_made_counts_pairs_and_matches():
 
     assert found == {
         "mapper": "global",
+        "mapper_reason": "it explains more",
         "tried": ["a", "b"],
         "passes": 2,
         "explained_matches": 110,
