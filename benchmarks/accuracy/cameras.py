@@ -126,13 +126,16 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", default=list(BARS), metavar="SET", help='"NAME" or "NAME CHANGE"')
     parser.add_argument("--each", nargs="*", default=EACH, help="sets in which every photo has its own camera")
     parser.add_argument("--ours-only", action="store_true", help="without stock pycolmap")
+    parser.add_argument("--without", nargs="*", default=[], choices=STOCK, help="ways of stock pycolmap to leave out")
     parser.add_argument("--also", nargs="*", default=ALSO, metavar="TABLE.KEY=VALUE", help="ours under this, too")
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="runs of every method")
     parser.add_argument("--twice", action="store_true", help="ours at least twice: are the bytes the same?")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--name", default="cameras", help="name of the result files")
     args = parser.parse_args()
-    these = methods(overrides(args.also), ours_only=args.ours_only)
+    these = [
+        method for method in methods(overrides(args.also), ours_only=args.ours_only) if method.name not in args.without
+    ]
     with tempfile.TemporaryDirectory(prefix="cameras-") as scratch:
         runs = list(all_runs(args, these, args.cache or Path(scratch)))
     rows = medians(runs)

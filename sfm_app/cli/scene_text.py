@@ -52,7 +52,7 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
         because = f": {counts['mapper_reason']}" if counts.get("mapper_reason") else ""
         yield f"mapped {MAPPERS[summary['mapper']]}{because}"
         if dropped:
-            yield f"{dropped} pairs of photos that do not fit the others were left out"
+            yield f"pairs of photos left out because they do not fit the others: {dropped}"
     for photos in summary.get("cut_apart", ()):
         yield f"cut apart, because more matches contradict the join than bear it out: {photos}"
     for number, names in enumerate(summary.get("other_models", ()), start=1):

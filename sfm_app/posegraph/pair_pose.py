@@ -20,7 +20,8 @@ SAMPLE = 200
 """Points that choose among the four poses of an essential matrix."""
 LEAST = 8
 """Inliers, below which a pair says nothing about its pose."""
-ROTATION_ROUNDS = 10
+ROTATION_ROUNDS, ROTATION_DEG = 10, 5.0
+"""Rays of a wider angle than this are not explained by a rotation: the search for it is spared."""
 
 
 class Pair:
@@ -56,12 +57,12 @@ class Pair:
         """A pose with what its inliers say about it."""
         used = self.rays[inliers]
         front = in_front(used, R, t)
-        angles = ray_angles_deg(used[front], R)
+        angle_deg = float(np.median(ray_angles_deg(used[front], R))) if front.any() else 0.0
         return RelativePose(
             R, t, inliers,
-            angle_deg=float(np.median(angles)) if len(angles) else 0.0,
+            angle_deg=angle_deg,
             in_front=float(front.mean()) if len(used) else 0.0,
-            kind=self.kind(used, R, t) if self.trusted else "uncalibrated",
+            kind=self.kind(used, R, t, angle_deg) if self.trusted else "uncalibrated",
             guided=guided,
         )  # fmt: skip
 
@@ -69,13 +70,14 @@ class Pair:
         """(M,) which matches lie within the threshold of a pose."""
         return pose_distances(self.rays, self.focals, R, t) <= self.max_error_px
 
-    def kind(self, used: FloatArray, R: FloatArray, t: FloatArray) -> str:
+    def kind(self, used: FloatArray, R: FloatArray, t: FloatArray, angle_deg: float) -> str:
         """What the inliers of a pose are of: see `RelativePose.kind`."""
         unit = float(self.focals.mean())
-        if np.mean(turn_distances(used, self.focals, R) <= OFF_PLANE * self.max_error_px) >= MANY:
+        within = OFF_PLANE * self.max_error_px
+        if angle_deg < ROTATION_DEG and np.mean(turn_distances(used, self.focals, R) <= within) >= MANY:
             return "rotation"
         H = dominant_homography(np.asfortranarray(used), cross_matrix(t) @ R, self.max_error_px / unit)
-        off_plane = transfer_distance(H, used) > OFF_PLANE * self.max_error_px / unit
+        off_plane = transfer_distance(H, used) > within / unit
         return "planar" if np.mean(off_plane) <= 1.0 - MANY else "calibrated"
 
 

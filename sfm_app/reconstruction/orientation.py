@@ -22,7 +22,7 @@ logger = logging.getLogger("sfm_app")
 
 FloatArray = NDArray[np.float64]
 
-LINE_PHOTOS = 16
+LINE_PHOTOS = 10
 """Photos that lines are sought in, spread over the set."""
 
 

@@ -28,7 +28,7 @@ def test_people_read_how_many_photos_are_placed_how_and_how_sure_the_camera_is()
 
     assert "5 of 6 photos placed, 1234 points, mean reprojection error 0.321 px" in text
     assert "mapped all at once: it explains more\n" in text
-    assert "4 pairs of photos that do not fit the others were left out" in text
+    assert "pairs of photos left out because they do not fit the others: 4" in text
     assert "no place for x.jpg: shares no scene" in text
     assert "fx 900.0 +- 1.2" in text and "fy 901.0  cx" in text
     assert "upright by vanishing lines, to about 0.3 degrees; in a unit of its own" in text

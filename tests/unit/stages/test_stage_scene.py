@@ -66,7 +66,12 @@ def attempt(model, explained=None):
 
 def outcome(*attempts, graph=None, **others):
     cameras = Intrinsics({"one": Calibration(camera_matrix(1280, 1280, 512, 384), 1024, 768, "zero-curves", True)})
-    return Outcome(attempts, graph or PoseGraph({}, {}, {}, ()), cameras, **{"tried": ("a", "b"), "reason": "it explains more", **others})
+    return Outcome(
+        attempts,
+        graph or PoseGraph({}, {}, {}, ()),
+        cameras,
+        **{"tried": ("a", "b"), "reason": "it explains more", **others},
+    )
 
 
 def pose(kind, guided=False):
