@@ -1,6 +1,8 @@
 """How the finished scene is put before the viewer: upright, centred, and in metres where GPS says how large it is."""
 
 import logging
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.model import focal_px, move, posed_photos, viewing_rays
+from sfm_app.colmap.model import focal_px, move, photos_of, posed_photos, viewing_rays
 from sfm_app.context import RunContext
 from sfm_app.geometry.georeference import Georeference, NoGeoreference, georeference, position_at
 from sfm_app.geometry.segments import line_segments
@@ -26,20 +28,35 @@ LINE_PHOTOS = 10
 """Photos that lines are sought in, spread over the set."""
 
 
-def orient(model: Any, matches: MatchGraph, run: RunContext) -> dict[str, Any]:
+Searched = Mapping[int, "Future[FloatArray]"]
+"""By photo: its line segments (N, 4) in pixels, when they are found."""
+
+
+def search_lines(models: Sequence[Any], matches: MatchGraph, run: RunContext) -> Searched:
+    """Begin to look for line segments in some photos of every model; the caller goes on meanwhile."""
+    searched = {}
+    for model in models:
+        posed = photos_of(model)
+        for k in np.unique(np.linspace(0, len(posed) - 1, LINE_PHOTOS).astype(int)):
+            file = run.workspace.photos / matches.images[posed[k]].name
+            searched[posed[k]] = run.executor.submit(photo_segments, file)
+    return searched
+
+
+def orient(model: Any, matches: MatchGraph, searched: Searched) -> dict[str, Any]:
     """Move the model into the frame of glTF viewers: y up, seen from +z, centred, of size about 1 or in metres.
 
     Args:
         model: COLMAP's model; changed in place.
         matches: knows the photos' names and GPS positions.
-        run: where the photos lie.
+        searched: lines in photos.
 
     Returns:
         How it was done, for the manifest.
     """
     with backend("reading the model"):
         poses, points = posed_photos(model)
-    segments = lines_of(model, list(poses), matches, run)
+    segments = lines_of(model, searched)
     matrices = np.array(list(poses.values()))
     R, centres = matrices[:, :, :3], -np.einsum("nij,ni->nj", matrices[:, :, :3], matrices[:, :, 3])
     upright = up_direction(R, centres, points, segments)
@@ -59,13 +76,11 @@ def orient(model: Any, matches: MatchGraph, run: RunContext) -> dict[str, Any]:
     return entry
 
 
-def lines_of(model: Any, posed: list[int], matches: MatchGraph, run: RunContext) -> Segments:
-    """Line segments, in the world, of some of the photos that have a pose."""
-    chosen = [posed[k] for k in np.unique(np.linspace(0, len(posed) - 1, LINE_PHOTOS).astype(int))]
-    files = [run.workspace.photos / matches.images[key].name for key in chosen]
-    found = run.map(photo_segments, files, "lines in the photos")
+def lines_of(model: Any, searched: Searched) -> Segments:
+    """Line segments, in the world, of the photos of a model."""
+    found = {photo: searched[photo].result() for photo in photos_of(model) if photo in searched}
     with backend("looking along lines in the photos"):
-        return joined([_in_world(model, key, lines) for key, lines in zip(chosen, found, strict=True)])
+        return joined([_in_world(model, photo, lines) for photo, lines in found.items()])
 
 
 def photo_segments(path: Path) -> FloatArray:

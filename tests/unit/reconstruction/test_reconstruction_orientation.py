@@ -1,3 +1,4 @@
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -8,7 +9,7 @@ import pytest
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.model import posed_photos
 from sfm_app.geometry.georeference import enu_m, position_at
-from sfm_app.reconstruction.orientation import orient, photo_segments
+from sfm_app.reconstruction.orientation import orient, photo_segments, search_lines
 from sfm_app.synthetic.cameras import arc, make_camera
 from sfm_app.types import GpsPosition, MatchedImage, MatchGraph
 from sfm_app.workspace import Workspace
@@ -43,7 +44,7 @@ def scene(tmp_path, positions):
         key: MatchedImage(key, name, "one", 480, 320, gps=gps)
         for key, (name, gps) in enumerate(zip(views.cam_from_world, positions(views), strict=True), start=1)
     }
-    run = SimpleNamespace(workspace=Workspace(tmp_path), map=lambda function, items, _: [function(i) for i in items])
+    run = SimpleNamespace(workspace=Workspace(tmp_path), executor=ThreadPoolExecutor(1))
     return views, model_of(views), MatchGraph(images, {}, {}), run
 
 
@@ -59,7 +60,7 @@ def true_positions(views):
 def test_without_gps_the_model_has_size_one_and_stands_upright(tmp_path):
     views, model, matches, run = scene(tmp_path, lambda views: [None] * len(views.cam_from_world))
 
-    entry = orient(model, matches, run)
+    entry = orient(model, matches, search_lines([model], matches, run))
     poses, points = posed_photos(model)
 
     assert entry["up"] == "camera roll" and entry["gps"] == "not used: the photos have no positions"
@@ -75,7 +76,7 @@ def test_with_gps_the_model_is_in_metres_and_knows_its_place(tmp_path):
     _, model, matches, run = scene(tmp_path, true_positions)
     shape = posed_photos(model)[1]
 
-    entry = orient(model, matches, run)
+    entry = orient(model, matches, search_lines([model], matches, run))
     points = posed_photos(model)[1]
 
     assert entry["unit"] == "metre" and entry["gps"] == "12 of 12 positions agree"

@@ -1,5 +1,6 @@
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from itertools import combinations
 from types import SimpleNamespace
 
@@ -56,7 +57,7 @@ def run(synthetic, tmp_path):
     counts = {}
     return SimpleNamespace(
         workspace=Workspace(tmp_path), counts=counts, record=counts.update, settings=Settings(), workers=1,
-        map=lambda function, items, _: [function(item) for item in items],
+        executor=ThreadPoolExecutor(1),
     )  # fmt: skip
 
 
