@@ -5,12 +5,13 @@ its inliers. A whole set is a panorama when most of what it has in common is.
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterable
+from collections.abc import Collection
 from dataclasses import dataclass
 from statistics import median
 from typing import Literal
 
 from sfm_app.errors import ReconstructionError
+from sfm_app.posegraph.groups import connected_groups
 from sfm_app.ransac.stationary import ONLY_A_LOGO, SAME_PHOTO
 from sfm_app.ransac.verdict import matches_off_plane
 from sfm_app.settings import EpipolarSettings, MatchSettings
@@ -83,7 +84,7 @@ def why_no_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) 
     photos = len(matches.images)
     reasons = Counter(views.reasons)
     twins = {pair for pair, rejected in views.rejected.items() if rejected.reason == SAME_PHOTO}
-    if twins and len(connected_groups(matches.images, twins)) == 1:
+    if twins and len(connected_groups(twins, matches.images)) == 1:
         return Diagnosis("copies", f"{photos} copies of one photo, or nearly")
     counts = sorted(len(points) for points in matches.keypoints.values())
     features = f"{counts[0]} to {counts[-1]} features per photo" if counts[-1] else "no features"
@@ -129,15 +130,6 @@ def votes(views: ViewGraph, photos: Collection[int]) -> Counter[str]:
     for pair in _among(views, photos):
         found[views.fits[pair].degeneracy] += views.fits[pair].inlier_count
     return found
-
-
-def connected_groups(photos: Iterable[int], pairs: Iterable[PairId]) -> list[set[int]]:
-    """Photos that hang together through pairs, the largest group first."""
-    groups = [{photo} for photo in photos]
-    for pair in pairs:
-        joined = [group for group in groups if not group.isdisjoint(pair)]
-        groups = [group for group in groups if group.isdisjoint(pair)] + [set().union(*joined)]
-    return sorted(groups, key=lambda group: (-len(group), min(group)))
 
 
 def of_fits(views: ViewGraph, photos: Collection[int]) -> Diagnosis:

@@ -40,7 +40,10 @@ def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
         f"mean reprojection error {summary['mean_reprojection_px']} px"
     )
     yield from (f"            {text}" for text in _how(summary, counts))
-    yield from (f"            no place for {name}: {reason}" for name, reason in scene.unregistered.items())
+    named = {name for names in summary.get("other_models", ()) for name in names}
+    for name, reason in scene.unregistered.items():
+        if name not in named:
+            yield f"            no place for {name}: {reason}"
     many = len(scene.cameras) > 1
     for name, camera in scene.cameras.items():
         yield f"            camera {f'{name} ' if many else ''}refined: {k_text(camera.K, camera.deviations)}"

@@ -1,12 +1,13 @@
 """The pose graph: relative poses of pairs that agree with each other."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.posegraph.groups import connected_groups
 from sfm_app.posegraph.guided import guided_pose
 from sfm_app.posegraph.pair_pose import Pair, estimated
 from sfm_app.posegraph.rotations import agreeing_loops, average_rotations
@@ -113,15 +114,6 @@ def unconfirmed(poses: Mapping[PairId, RelativePose], firm: float) -> list[PairI
     )
 
 
-def connected(pairs: Iterable[PairId]) -> list[set[int]]:
-    """Photos that hang together through pairs."""
-    groups: list[set[int]] = []
-    for pair in pairs:
-        joined = set(pair).union(*(group for group in groups if not group.isdisjoint(pair)))
-        groups = [*(group for group in groups if group.isdisjoint(pair)), joined]
-    return groups
-
-
 def _plausible(
     found: Mapping[PairId, RelativePose | None], min_inliers: int
 ) -> tuple[dict[PairId, RelativePose], dict[PairId, str]]:
@@ -137,6 +129,6 @@ def _plausible(
 
 
 def _groups(poses: Mapping[PairId, RelativePose]) -> tuple[tuple[int, ...], ...]:
-    groups = [tuple(sorted(group)) for group in connected(poses)]
+    groups = [tuple(sorted(group)) for group in connected_groups(poses)]
     inliers = {group: sum(p.inlier_count for pair, p in poses.items() if pair[0] in group) for group in groups}
     return tuple(sorted(groups, key=lambda group: (-len(group), -inliers[group], group)))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.diagnosis import HINTS, NOTHING_MATCHED, connected_groups, why_no_depth, why_no_scene
+from sfm_app.diagnosis import HINTS, NOTHING_MATCHED, why_no_depth, why_no_scene
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import eight_point
@@ -139,8 +139,3 @@ def test_a_diagnosis_ends_the_run_with_exit_code_4():
 
     assert isinstance(error, ReconstructionError) and error.exit_code == 4
     assert str(error).endswith("; two seeds tried") and error.hint == HINTS["texture"]
-
-
-def test_groups_are_photos_that_hang_together_the_largest_first():
-    assert connected_groups(range(1, 8), [(1, 2), (4, 5), (5, 6), (6, 4)]) == [{4, 5, 6}, {1, 2}, {3}, {7}]
-    assert connected_groups([], []) == []

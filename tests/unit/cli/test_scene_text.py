@@ -45,6 +45,8 @@ def test_other_models_and_cuts_are_named():
     assert "another model of 3 photos in other_models/2: c.jpg, d.jpg, e.jpg\n" in text
     assert "cut apart, because more matches contradict the join than bear it out: a, b" in text
     assert len(summary["other_models"][0]) == 6
+    assert "no place for x.jpg" in text
+    assert "no place for x.jpg" not in told(other_models=[["x.jpg"]])[0], "said once is enough"
 
 
 def test_a_model_that_many_matches_contradict_comes_with_a_warning():

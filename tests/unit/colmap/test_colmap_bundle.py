@@ -14,32 +14,26 @@ PLAIN = [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
-def synthetic(tmp_path, true_params=PLAIN, noise_px=0.3, photos=8, cameras=1, start=(880.0, 500.0, 400.0, 0.0), seed=1):
-    """A model as mapping leaves it: one focal, a centre that may be off; and its database."""
-    pycolmap.set_random_seed(seed)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = cameras, 1, photos
-    options.num_points3D = 400
-    options.camera_width, options.camera_height = WIDTH, HEIGHT
-    options.camera_model_id = pycolmap.CameraModelId.OPENCV
-    options.camera_params = true_params
-    with pycolmap.Database.open(tmp_path / "database.db") as database:
-        model = pycolmap.synthesize_dataset(options, database)
-        noise = pycolmap.SyntheticNoiseOptions()
-        noise.point2D_stddev = noise_px
-        pycolmap.synthesize_noise(noise, model, database)
-    for point_id in [key for key, point in model.points3D.items() if point.track.length() < 2]:
-        model.delete_point3D(point_id)
-    for camera in model.cameras.values():
-        camera.model = getattr(pycolmap.CameraModelId, SQUARE_PIXELS)
-        camera.params = start
-    return model, tmp_path / "database.db"
+@pytest.fixture
+def mapped(synthetic):
+    """Makes a model as mapping leaves it: one focal, a centre that may be off; and its database."""
+
+    def make(true_params=PLAIN, noise_px=0.3, photos=8, cameras=1, start=(880.0, 500.0, 400.0, 0.0), seed=1):
+        model, database = synthetic(true_params, noise_px, photos, cameras, seed)
+        for point_id in [key for key, point in model.points3D.items() if point.track.length() < 2]:
+            model.delete_point3D(point_id)
+        for camera in model.cameras.values():
+            camera.model = getattr(pycolmap.CameraModelId, SQUARE_PIXELS)
+            camera.params = start
+        return model, database
+
+    return make
 
 
 @pytest.mark.parametrize("radial", [0.0, -0.08])
-def test_focal_centre_and_lens_are_found_as_far_off_as_stated(tmp_path, radial):
+def test_focal_centre_and_lens_are_found_as_far_off_as_stated(mapped, radial):
     true = [900.0, 900.0, 530.0, 380.0, radial, 0.0, 0.0, 0.0]
-    found = adjust(*synthetic(tmp_path, true, start=(880.0, 500.0, 400.0, radial)))
+    found = adjust(*mapped(true, start=(880.0, 500.0, 400.0, radial)))
     camera, deviations = found.model.cameras[1], found.deviations[1]
 
     assert "centre" in found.determined[1]
@@ -52,9 +46,9 @@ def test_focal_centre_and_lens_are_found_as_far_off_as_stated(tmp_path, radial):
     assert 0.2 < found.model.compute_mean_reprojection_error() < 0.5
 
 
-def test_a_narrow_view_keeps_its_centre_and_says_that_it_may_be_off(tmp_path):
+def test_a_narrow_view_keeps_its_centre_and_says_that_it_may_be_off(mapped):
     true = [3000.0, 3000.0, 506.0, 395.0, 0.0, 0.0, 0.0, 0.0]
-    found = adjust(*synthetic(tmp_path, true, noise_px=0.6, start=(2940.0, 500.0, 400.0, 0.0)))
+    found = adjust(*mapped(true, noise_px=0.6, start=(2940.0, 500.0, 400.0, 0.0)))
     camera, deviations = found.model.cameras[1], found.deviations[1]
 
     assert "centre" not in found.determined[1]
@@ -63,30 +57,29 @@ def test_a_narrow_view_keeps_its_centre_and_says_that_it_may_be_off(tmp_path):
     assert abs(camera.params[0] - 3000) < 3 * deviations["fx"]
 
 
-def test_squeezed_photos_have_two_focals_others_one(tmp_path):
+def test_squeezed_photos_have_two_focals_others_one(mapped):
     squeezed = [900.0, 1200.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]
-    (model, database), start = synthetic(tmp_path, squeezed), camera_matrix(890, 1190, 500, 400)
+    square = adjust(*mapped(noise_px=1.0)).model.cameras[1].params
+    assert square[0] == pytest.approx(square[1], rel=1e-3)
+    (model, database), start = mapped(squeezed), camera_matrix(890, 1190, 500, 400)
     model.cameras[1].model = pycolmap.CameraModelId.OPENCV
     model.cameras[1].params = camera_params(start, "OPENCV")
 
     found = adjust(model, database).model.cameras[1].params
 
     assert found[:2] == pytest.approx([900, 1200], rel=0.003)
-    (tmp_path / "square").mkdir()
-    square = adjust(*synthetic(tmp_path / "square", noise_px=1.0)).model.cameras[1].params
-    assert square[0] == pytest.approx(square[1], rel=1e-3)
 
 
-def test_two_photos_change_focal_and_k1_only(tmp_path):
-    found = adjust(*synthetic(tmp_path, noise_px=1.0, photos=2, start=(900.0, 500.0, 400.0, 0.0)))
+def test_two_photos_change_focal_and_k1_only(mapped):
+    found = adjust(*mapped(noise_px=1.0, photos=2, start=(900.0, 500.0, 400.0, 0.0)))
 
     assert found.model.cameras[1].params[2:4].tolist() == [500.0, 400.0]
     assert found.model.cameras[1].params[5:] == pytest.approx([0, 0, 0], abs=1e-9)
     assert not set(found.determined[1]) - {"k1"}
 
 
-def test_the_camera_with_most_photos_does_not_free_one_of_a_single_photo(tmp_path):
-    model, database = synthetic(tmp_path, photos=5, cameras=2, start=(890.0, 500.0, 400.0, 0.0))
+def test_the_camera_with_most_photos_does_not_free_one_of_a_single_photo(mapped):
+    model, database = mapped(photos=5, cameras=2, start=(890.0, 500.0, 400.0, 0.0))
     lone, *others = sorted(image_id for image_id in model.reg_image_ids() if model.images[image_id].camera_id == 2)
     for image_id in others:
         model.deregister_frame(model.images[image_id].frame_id)
@@ -101,8 +94,8 @@ def test_the_camera_with_most_photos_does_not_free_one_of_a_single_photo(tmp_pat
         assert found.model.cameras[key].mean_focal_length() == pytest.approx(900, rel=tolerance)
 
 
-def test_the_same_model_gives_the_same_bytes_and_stays_as_it_was(tmp_path):
-    model, database = synthetic(tmp_path)
+def test_the_same_model_gives_the_same_bytes_and_stays_as_it_was(mapped, tmp_path):
+    model, database = mapped()
     before = model.cameras[1].params.copy()
 
     for name in ("first", "second"):
@@ -114,8 +107,8 @@ def test_the_same_model_gives_the_same_bytes_and_stays_as_it_was(tmp_path):
     assert np.array_equal(model.cameras[1].params, before)
 
 
-def test_the_covariance_of_the_cameras_is_that_of_colmap(tmp_path):
-    model, _ = synthetic(tmp_path, cameras=2, photos=4)
+def test_the_covariance_of_the_cameras_is_that_of_colmap(mapped):
+    model, _ = mapped(cameras=2, photos=4)
     for camera in model.cameras.values():
         camera.model, camera.params = pycolmap.CameraModelId.OPENCV, PLAIN
     solve(model)

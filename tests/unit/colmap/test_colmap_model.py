@@ -19,28 +19,9 @@ from sfm_app.colmap.model import (
 from sfm_app.errors import BackendError, ConfigError
 from sfm_app.geometry.similarity import Similarity
 
-WIDTH, HEIGHT = 1000, 800
 
-
-def synthetic(tmp_path, true_params, noise_px=0.3, photos=8, cameras=1):
-    """A COLMAP model with known cameras, so many photos of each, and its database."""
-    pycolmap.set_random_seed(1)
-    options = pycolmap.SyntheticDatasetOptions()
-    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = cameras, 1, photos
-    options.num_points3D = 400
-    options.camera_width, options.camera_height = WIDTH, HEIGHT
-    options.camera_model_id = pycolmap.CameraModelId.OPENCV
-    options.camera_params = true_params
-    with pycolmap.Database.open(tmp_path / "database.db") as database:
-        model = pycolmap.synthesize_dataset(options, database)
-        noise = pycolmap.SyntheticNoiseOptions()
-        noise.point2D_stddev = noise_px
-        pycolmap.synthesize_noise(noise, model, database)
-    return model, tmp_path / "database.db"
-
-
-def test_a_model_moves_as_a_whole(tmp_path):
-    model, _ = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0])
+def test_a_model_moves_as_a_whole(synthetic):
+    model, _ = synthetic([900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0])
     error = model.compute_mean_reprojection_error()
     poses, points = posed_photos(model)
     similarity = Similarity(7.0, np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([30.0, -5, 2]))
@@ -55,8 +36,8 @@ def test_a_model_moves_as_a_whole(tmp_path):
     assert model.compute_mean_reprojection_error() == pytest.approx(error, rel=1e-4)
 
 
-def test_rays_of_a_lens_meet_the_points_that_the_photo_shows(tmp_path):
-    model, _ = synthetic(tmp_path, [900.0, 900.0, 530.0, 380.0, -0.08, 0.0, 0.0, 0.0])
+def test_rays_of_a_lens_meet_the_points_that_the_photo_shows(synthetic):
+    model, _ = synthetic([900.0, 900.0, 530.0, 380.0, -0.08, 0.0, 0.0, 0.0])
     poses, _ = posed_photos(model)
     key = min(poses)
     seen = [point for point in model.images[key].points2D if point.has_point3D()]
@@ -70,9 +51,9 @@ def test_rays_of_a_lens_meet_the_points_that_the_photo_shows(tmp_path):
     assert ((rays * truth).sum(axis=1) > 0).all()
 
 
-def test_placed_views_see_the_points_where_they_are(tmp_path):
+def test_placed_views_see_the_points_where_they_are(synthetic):
     """Through a lens, with two focals: the rays of keypoints meet the model's points."""
-    model, _ = synthetic(tmp_path, [900.0, 850.0, 510.0, 390.0, -0.1, 0.0, 0.0, 0.0], noise_px=0.0, photos=4)
+    model, _ = synthetic([900.0, 850.0, 510.0, 390.0, -0.1, 0.0, 0.0, 0.0], noise_px=0.0, photos=4)
     model.deregister_frame(model.images[4].frame_id)
     keypoints = {key: np.array([p.xy for p in image.points2D]) for key, image in model.images.items()}
 
@@ -91,8 +72,8 @@ def test_placed_views_see_the_points_where_they_are(tmp_path):
     [("SIMPLE_RADIAL", [880.0, 510.0, 390.0, -0.1], (880, 880)),
      ("OPENCV", [900.0, 850.0, 510.0, 390.0, -0.1, 0.02, 0.0, 0.0], (900, 850))],
 )  # fmt: skip
-def test_cameras_are_read_with_their_first_radial_term(tmp_path, name, params, focals):
-    model, _ = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=3)
+def test_cameras_are_read_with_their_first_radial_term(synthetic, name, params, focals):
+    model, _ = synthetic([900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=3)
     model.deregister_frame(model.images[2].frame_id)
     for camera in model.cameras.values():
         camera.model = getattr(pycolmap.CameraModelId, name)
@@ -105,8 +86,8 @@ def test_cameras_are_read_with_their_first_radial_term(tmp_path, name, params, f
         assert (K[0, 0], K[1, 1], K[0, 2], K[1, 2], radial) == (*focals, 510.0, 390.0, -0.1)
 
 
-def test_a_part_of_a_model_can_be_adjusted_and_the_whole_stays(tmp_path):
-    model, database = synthetic(tmp_path, [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=6)
+def test_a_part_of_a_model_can_be_adjusted_and_the_whole_stays(synthetic):
+    model, database = synthetic([900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=6)
 
     part = part_of(model, (1, 3, 4))
     adjusted = adjust(part, database)

@@ -8,7 +8,8 @@ from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
-from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, TOO_FEW, connected
+from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, TOO_FEW
+from sfm_app.posegraph.groups import connected_groups
 from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchedImage, MatchGraph, Rejected, ViewGraph
 
 OPTIONS = PoseGraphOptions(max_error_px=1.5, min_inliers=16, seed=0)
@@ -226,5 +227,6 @@ def test_results_do_not_depend_on_the_order_in_which_pairs_are_done():
 def test_photos_that_hang_together(order):
     pairs = [(1, 2), (3, 4), (5, 6), (2, 3), (8, 9)][::order]
 
-    assert sorted(map(sorted, connected(pairs))) == [[1, 2, 3, 4], [5, 6], [8, 9]]
-    assert connected([]) == []
+    assert connected_groups(pairs) == [{1, 2, 3, 4}, {5, 6}, {8, 9}]
+    assert connected_groups(pairs, range(1, 8)) == [{1, 2, 3, 4}, {5, 6}, {8, 9}, {7}]
+    assert connected_groups([]) == []
