@@ -15,7 +15,7 @@ import pluggy
 from numpy.typing import NDArray
 
 from sfm_app.errors import ConfigError, PluginError
-from sfm_app.meshing import EXPORTERS
+from sfm_app.formats import EXPORTERS
 from sfm_app.ransac import ESTIMATORS
 from sfm_app.selfcal import CALIBRATORS, SEVERAL_CAMERAS
 from sfm_app.settings import CalibrationSettings, EpipolarSettings

@@ -110,6 +110,16 @@ class MeshSettings(Section):
     min_island: float = Field(
         0.01, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
     )
+    faces: int = Field(200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh")
+
+
+class TextureSettings(Section):
+    """The pictures on the surface."""
+
+    max_page_px: int = Field(4096, ge=256, le=16384, description="longest side of a page of texture, in pixels")
+    unseen: Literal["color", "cut"] = Field(
+        "color", description="triangles that no photo sees: color: painted like what is around them; cut: left out"
+    )
 
 
 class Settings(Section):
@@ -125,6 +135,7 @@ class Settings(Section):
     scene: SceneSettings = SceneSettings()
     depth: DepthSettings = DepthSettings()
     mesh: MeshSettings = MeshSettings()
+    texture: TextureSettings = TextureSettings()
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], where: str = "settings") -> "Settings":
@@ -157,13 +168,13 @@ QUALITY_PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "matching": {"max_image_size_px": 1000, "max_features": 4096},
         "depth": {"max_image_size_px": 640, "neighbours": 3},
-        "mesh": {"poisson_depth": 9},
+        "mesh": {"poisson_depth": 9, "faces": 50_000},
     },
     "normal": {},
     "high": {
         "matching": {"max_image_size_px": 3200, "max_features": 16384},
         "depth": {"max_image_size_px": 2000, "neighbours": 6},
-        "mesh": {"poisson_depth": 11},
+        "mesh": {"poisson_depth": 11, "faces": 1_000_000},
     },
 }
 

@@ -6,6 +6,7 @@ SciPy is imported where it is used: a program that only estimates fundamental ma
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.triangles import vertex_normals
 from sfm_app.types import Surface
 
 NEIGHBOURS = 6
@@ -48,19 +49,9 @@ def trim_unsupported(surface: Surface, points: NDArray[np.float64], normals: NDA
     spacing = _spacing(points)
     spacing = np.minimum(spacing, MAX_SPREAD * np.median(spacing))
     distance, nearest = cKDTree(points).query(surface.vertices)
-    cosine = np.sum(vertex_normals(surface) * normals[nearest], axis=1)
+    cosine = np.sum(vertex_normals(surface.vertices, surface.faces) * normals[nearest], axis=1)
     supported = (distance <= REACH * spacing[nearest]) & (cosine >= MIN_COSINE)
     return select_faces(surface, supported[surface.faces].all(axis=1))
-
-
-def vertex_normals(surface: Surface) -> NDArray[np.float64]:
-    """(V, 3) unit normals, each the mean over the triangles at the vertex by their area; 0 where there are none."""
-    corners = surface.vertices[surface.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    at, size = surface.faces.ravel(), len(surface.vertices)
-    total = np.stack([np.bincount(at, np.repeat(across[:, i], 3), size) for i in range(3)], axis=1)
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0))
 
 
 def _spacing(points: NDArray[np.float64]) -> NDArray[np.float64]:

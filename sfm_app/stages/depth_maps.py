@@ -9,7 +9,8 @@ from pathlib import Path
 
 import cv2
 
-from sfm_app.colmap.dense import fuse, read_depth, read_grey, read_views, undistort, write_depth, write_maps
+from sfm_app.colmap.dense import read_depth, read_grey, read_views, undistort, write_depth, write_maps
+from sfm_app.colmap.surface import fuse
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.settings import DepthSettings

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_app.colmap.dense import poisson, read_fused
+from sfm_app.colmap.surface import poisson, read_fused
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.meshing import drop_islands, octree_depth, trim_unsupported

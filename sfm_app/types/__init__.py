@@ -12,6 +12,7 @@ from sfm_app.types.calibration import Calibration, Intrinsics
 from sfm_app.types.camera_pairs import CameraPairs, PhotoPairs
 from sfm_app.types.epipolar import EpipolarFit, Rejected, ViewGraph
 from sfm_app.types.matches import MatchedImage, MatchGraph, PairId
+from sfm_app.types.model import Frustum, Model, Texture
 from sfm_app.types.photos import GpsPosition, Photo, PhotoSet, UnusablePhoto
 from sfm_app.types.pose_graph import PoseGraph, RelativePose
 from sfm_app.types.scene import CameraModel, Scene
@@ -22,10 +23,12 @@ __all__ = [
     "CameraModel",
     "CameraPairs",
     "EpipolarFit",
+    "Frustum",
     "GpsPosition",
     "Intrinsics",
     "MatchGraph",
     "MatchedImage",
+    "Model",
     "PairId",
     "Photo",
     "PhotoPairs",
@@ -35,6 +38,7 @@ __all__ = [
     "RelativePose",
     "Scene",
     "Surface",
+    "Texture",
     "UnusablePhoto",
     "ViewGraph",
 ]

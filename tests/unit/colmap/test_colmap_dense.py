@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.dense import fuse, poisson, read_depth, read_fused, read_grey, read_views, undistort, write_maps
+from sfm_app.colmap.dense import read_depth, read_grey, read_views, undistort, write_maps
+from sfm_app.colmap.surface import fuse, poisson, read_fused
 from sfm_app.errors import BackendError
 from sfm_app.stereo import DepthMap
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from sfm_app.geometry.triangles import vertex_normals
 from sfm_app.meshing import drop_islands, octree_depth, trim_unsupported
-from sfm_app.meshing.clean import select_faces, vertex_normals
+from sfm_app.meshing.clean import select_faces
 from sfm_app.types import Surface
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -9,8 +9,8 @@ import pytest
 import trimesh
 
 from sfm_app.errors import ReconstructionError
-from sfm_app.meshing import EXPORTERS
-from sfm_app.meshing.export import srgb_to_linear
+from sfm_app.formats import EXPORTERS
+from sfm_app.formats.mesh_files import srgb_to_linear
 
 
 @pytest.fixture

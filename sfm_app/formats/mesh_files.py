@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import ReconstructionError
-from sfm_app.meshing.clean import vertex_normals
-from sfm_app.types import Surface
+from sfm_app.geometry.triangles import vertex_normals
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -71,7 +70,7 @@ def _mesh(vertices: Vertices, faces: Faces) -> "Trimesh":
 
     if len(faces) == 0:
         raise ReconstructionError("the mesh has no triangles", hint="take more photos with more overlap")
-    normals = vertex_normals(Surface(vertices, faces, np.zeros((len(vertices), 3), np.uint8)))
+    normals = vertex_normals(vertices, faces)
     # triangles without area leave a corner without a normal; glTF wants length 1 everywhere
     normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 1.0, 0.0)
     return Trimesh(vertices, faces, vertex_normals=normals, process=False)

@@ -1,0 +1,1 @@
+"""Pictures for the triangles of a surface, from the photos that see them."""

@@ -1,0 +1,42 @@
+"""What goes into a model file."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.types.surface import Surface
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Texture:
+    """Pictures for the triangles of a surface."""
+
+    uv: NDArray[np.float32]
+    """(T, 3, 2) place of each corner of each triangle on its page, in [0, 1]; (0, 0) is the page's top-left corner."""
+    page: NDArray[np.int32]
+    """(T,) page of each triangle."""
+    pages: tuple[NDArray[np.uint8], ...]
+    """(H, W, 3) RGB each."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frustum:
+    """A photo as it stands in the scene."""
+
+    name: str
+    K: NDArray[np.float64]
+    """(3, 3) in pixels, without the lens."""
+    cam_from_world: NDArray[np.float64]
+    """(3, 4) [R | t]."""
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    """A surface with or without a texture, or points (a surface without triangles) and the cameras that saw them."""
+
+    surface: Surface
+    texture: Texture | None = None
+    cameras: tuple[Frustum, ...] = ()
