@@ -8,7 +8,12 @@ IndexArray = NDArray[np.int64]
 
 
 def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """(V, 3) unit normals of vertices (V, 3) and faces (T, 3), each the mean over the triangles at the vertex by their area; 0 where there are none."""
+    """(V, 3) unit normals, each the mean over the triangles at the vertex by their area; 0 where there are none.
+
+    Args:
+        vertices: (V, 3).
+        faces: (T, 3) vertex indices, counter-clockwise seen from outside.
+    """
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     at, size = faces.ravel(), len(vertices)

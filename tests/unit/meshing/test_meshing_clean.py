@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.triangles import vertex_normals
 from sfm_app.meshing import drop_islands, octree_depth, trim_unsupported
 from sfm_app.meshing.clean import select_faces
 from sfm_app.types import Surface
@@ -94,11 +93,6 @@ def test_selection_keeps_corners_and_colours_together():
     np.testing.assert_array_equal(found.colors[found.faces], surface.colors[surface.faces[keep]])
     assert set(found.faces.ravel()) == set(range(len(found.vertices)))
     assert found.faces.dtype == np.int64
-
-
-def test_normals_stand_on_the_surface():
-    np.testing.assert_allclose(vertex_normals(sheet(4)), np.broadcast_to(UP, (25, 3)))
-    np.testing.assert_allclose(vertex_normals(sheet(4, flipped=True)), np.broadcast_to(-UP, (25, 3)))
 
 
 def test_octree_cells_match_the_spacing_of_the_points():
