@@ -2,13 +2,14 @@
 
 run = sfm_app.reconstruct("photos/", "out/")
 cal = sfm_app.calibrate_photos("photos/")
+sfm_app.export_model("out/", "obj")
 fit = sfm_app.estimate_fundamental(x1, x2)
 cal = sfm_app.calibrate_fundamentals(Fs, (width, height))
 """
 
 from importlib.metadata import version
 
-from sfm_app.api import Run, calibrate_fundamentals, calibrate_photos, estimate_fundamental, reconstruct
+from sfm_app.api import Run, calibrate_fundamentals, calibrate_photos, estimate_fundamental, export_model, reconstruct
 from sfm_app.errors import BackendError, ConfigError, InputError, PluginError, ReconstructionError, SfmError
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, EpipolarFit, Intrinsics, Rejected
@@ -32,5 +33,6 @@ __all__ = [
     "calibrate_fundamentals",
     "calibrate_photos",
     "estimate_fundamental",
+    "export_model",
     "reconstruct",
 ]

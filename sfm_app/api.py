@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfm_app.context import RunContext
+from sfm_app.errors import ConfigError
 from sfm_app.parallel import make_executor, worker_count
 from sfm_app.plugins import load_plugins
 from sfm_app.progress import Progress, Silent
 from sfm_app.ransac import check_points
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Intrinsics, Rejected, Scene
-from sfm_app.workspace import Workspace
+from sfm_app.workspace import Workspace, save_files
 
 PathLike = str | os.PathLike[str]
 
@@ -73,6 +74,41 @@ def reconstruct(
             mesh_path=products("files")[-1] if "files" in done else None,
             manifest=run.workspace.manifest(),
         )
+
+
+def export_model(
+    out: PathLike, file_format: str = "", target: PathLike | None = None, *, points: bool = False
+) -> tuple[Path, ...]:
+    """Write the model of a finished run in another format, or to another place; nothing is computed anew.
+
+    Args:
+        out: output folder of the run.
+        file_format: "ply", "glb", "obj", or another that `sfm-app plugins` lists; that of `target` where empty.
+        target: file to write; OUT/model.FORMAT, or OUT/points.FORMAT, where None.
+        points: the points and cameras of the sparse reconstruction instead of the model.
+
+    Returns:
+        The files: first the one to open, then those that it needs beside it.
+
+    Raises:
+        ConfigError: no format has that name, or the target is named like another one.
+        InputError: the run has not come so far, or the target cannot be written.
+    """
+    from sfm_app.pipeline import stored_model  # loads COLMAP, as above
+
+    plugins = load_plugins()
+    place = Path(target) if target is not None else Path(out)
+    named = place.suffix.removeprefix(".").lower() if target is not None and not place.is_dir() else ""
+    exporter = plugins.exporter(file_format or named)
+    if file_format and named in plugins.exporters and named != file_format:
+        raise ConfigError(f"{place.name} is no name for {file_format}", hint=f"name it {place.stem}.{file_format}")
+    if place.is_dir():
+        place /= "points" if points else "model"
+    with opened_run(Path(out), Settings(), None) as run:
+        model = stored_model(run, points=points)
+    place = place if place.suffix.lower() == f".{exporter.name}" else Path(f"{place}.{exporter.name}")
+    files = exporter.write(model, place.stem)
+    return save_files(dict(zip([place.name, *list(files)[1:]], files.values(), strict=True)), place.parent)
 
 
 def calibrate_photos(

@@ -3,16 +3,21 @@
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 from sfm_app.parallel import ordered_map
 from sfm_app.plugins import Plugins
 from sfm_app.progress import Progress, Silent, track
 from sfm_app.settings import Settings
-from sfm_app.workspace import Workspace
+from sfm_app.types import Model
+from sfm_app.workspace import Workspace, save_files
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
+
+STANDARD_FORMATS = ("ply", "glb")
+"""What every run writes its models as; `sfm-app export` makes others of them."""
 
 
 @dataclass(slots=True)
@@ -41,3 +46,15 @@ class RunContext:
     def record(self, **counts: Any) -> None:
         """Note figures of the current stage for the manifest; plain numbers, strings, lists and dicts."""
         self.counts |= counts
+
+    def model_paths(self, name: str) -> tuple[Path, ...]:
+        """Where a model of this name lies in the output folder."""
+        return tuple(self.workspace.root / f"{name}.{suffix}" for suffix in STANDARD_FORMATS)
+
+    def write_model(self, model: Model, name: str) -> tuple[Path, ...]:
+        """Write a model into the output folder in every standard format and note how large the files are."""
+        paths = self.model_paths(name)
+        for suffix in STANDARD_FORMATS:
+            save_files(self.plugins.exporter(suffix).write(model, name), self.workspace.root)
+        self.record(bytes={path.name: path.stat().st_size for path in paths})
+        return paths

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.colmap.backend import versions as colmap_versions
+from sfm_app.colmap.model import sparse_model
 from sfm_app.context import RunContext
-from sfm_app.errors import ConfigError, SfmError
+from sfm_app.errors import ConfigError, InputError, SfmError
 from sfm_app.parallel import ordered_map
 from sfm_app.stages.depth_maps import make_depth_maps
 from sfm_app.stages.files import load_files, write_files
@@ -22,6 +23,7 @@ from sfm_app.stages.mesh import load_surface, make_mesh
 from sfm_app.stages.photos import list_files, load_photo_set, read_photos
 from sfm_app.stages.scene import load_scene, reconstruct_scene
 from sfm_app.stages.view_graph import build_view_graph, load_view_graph
+from sfm_app.types import Model
 from sfm_app.workspace import StageRecord, fingerprint
 
 logger = logging.getLogger("sfm_app")
@@ -87,12 +89,54 @@ STAGES = (
     ),
     Stage(
         "files", ("mesh",), (), ("model.ply", "model.glb"),
-        make=lambda products, run: write_files(products("mesh"), run),
+        make=lambda products, run: write_files(finished_model(products), run),
         load=lambda _, run: load_files(run),
     ),
 )  # fmt: skip
 
 NAMES = tuple(stage.name for stage in STAGES)
+
+
+def finished_model(products: Products) -> Model:
+    """What the files of the model hold."""
+    return Model(products("mesh"))
+
+
+def stored_model(run: RunContext, *, points: bool = False) -> Model:
+    """The finished model, or the points and cameras, that a run left behind; nothing is computed.
+
+    Raises:
+        InputError: the run has not come so far, or its files are gone; says which stage is missing.
+    """
+    place = run.workspace
+    if not place.manifest().get("stages"):
+        raise InputError(f"{place.root} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote")
+    for name in ("scene",) if points else STAGES[-1].takes:
+        if place.record(name) is None:
+            raise InputError(
+                f"{place.root} holds no {'points' if points else 'model'} yet: stage `{name}` is missing",
+                hint=_how_on(run),
+            )
+    try:
+        return sparse_model(place.sparse) if points else finished_model(loader({}, run))
+    except OSError as err:
+        raise InputError(f"{place.root} is not complete: {err.strerror}: {err.filename}", hint=_how_on(run)) from err
+
+
+def _how_on(run: RunContext) -> str:
+    go_on = f"`sfm-app run PHOTOS -o {run.workspace.root}` goes on where it stopped"
+    return f"{go_on}; `--points` exports the points and cameras" if run.workspace.record("scene") else go_on
+
+
+def loader(found: dict[str, Any], run: RunContext) -> Products:
+    """Gives what is in `found`, and loads what is not."""
+
+    def products(name: str) -> Any:
+        if name not in found:
+            found[name] = STAGES[NAMES.index(name)].load(products, run)
+        return found[name]
+
+    return products
 
 
 def run_stages(folder: Path, run: RunContext, first: str = "", last: str = "files") -> Products:
@@ -109,12 +153,7 @@ def run_stages(folder: Path, run: RunContext, first: str = "", last: str = "file
     run.workspace.create()
     redo = False
 
-    def products(name: str) -> Any:
-        if name not in found:
-            stage = STAGES[NAMES.index(name)]
-            found[name] = stage.load(products, run)
-        return found[name]
-
+    products = loader(found, run)
     with logged(run):
         for stage in STAGES[: NAMES.index(last) + 1]:
             prints[stage.name] = stage_fingerprint(stage, prints, run)

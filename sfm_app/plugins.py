@@ -4,7 +4,7 @@ A plug-in is an installed package with an entry point in the group ``sfm_app``; 
 `hookimpl` that are named as in `Hooks`.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType, ModuleType
@@ -19,7 +19,7 @@ from sfm_app.formats import EXPORTERS
 from sfm_app.ransac import ESTIMATORS
 from sfm_app.selfcal import CALIBRATORS, SEVERAL_CAMERAS
 from sfm_app.settings import CalibrationSettings, EpipolarSettings
-from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Rejected
+from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Model, Rejected
 
 GROUP = "sfm_app"
 hookspec = pluggy.HookspecMarker(GROUP)
@@ -66,13 +66,23 @@ class Calibrator:
     """Whether groups that disagree are split, and pairs between cameras used, by the program's own method."""
 
 
+class WriteModel(Protocol):
+    """Makes model files, by their names: first the one to open, `name` with the format as suffix, then those beside it.
+
+    Takes a surface with a texture (pages of pictures), a surface with a colour per vertex, or points and cameras; the
+    same model gives the same bytes. ReconstructionError where the model is empty.
+    """
+
+    def __call__(self, model: Model, name: str, /) -> Mapping[str, bytes]: ...
+
+
 @dataclass(frozen=True, slots=True)
 class Exporter:
-    """A file format for the mesh: `write` makes bytes of vertices (V, 3), faces (T, 3) and colours (V, 3)."""
+    """A file format for models."""
 
     name: str
-    """The file's suffix without dot."""
-    write: Callable[[FloatArray, NDArray[np.int64], NDArray[np.uint8]], bytes]
+    """Of the format: the suffix, without dot, of the file to open."""
+    write: WriteModel
     summary: str = ""
 
 
@@ -89,7 +99,7 @@ class Hooks:
 
     @hookspec
     def sfm_exporters(self) -> Iterable[Exporter]:  # type: ignore[empty-body]
-        """Mesh file formats."""
+        """File formats for models."""
 
 
 class BuiltIns:
@@ -126,6 +136,10 @@ class Plugins:
     def calibrator(self, name: str) -> Calibrator:
         """The calibrator of that name; ConfigError names the known ones."""
         return _named(self.calibrators, name, "calibrator")
+
+    def exporter(self, name: str) -> Exporter:
+        """The file format of that name; ConfigError names the known ones."""
+        return _named(self.exporters, name, "file format")
 
 
 def load_plugins(modules: Sequence[ModuleType | object] = (), *, installed: bool = True) -> Plugins:

@@ -134,19 +134,35 @@ class Workspace:
 
     @contextlib.contextmanager
     def replacing(self, target: Path) -> Iterator[Path]:
-        """A path beside `target` to write to; it takes the target's place when the block ends without an error."""
-        target.parent.mkdir(parents=True, exist_ok=True)
-        beside = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
-        try:
+        """As the function of that name."""
+        with replacing(target) as beside:
             yield beside
-            beside.replace(target)
-        finally:
-            beside.unlink(missing_ok=True)
 
     def sizes(self, files: tuple[str, ...]) -> dict[str, int]:
         """Sizes of what a stage wrote, as its record holds them."""
         found = {name: _size(self.root / name) for name in files}
         return {name: size for name, size in found.items() if size is not None}
+
+
+@contextlib.contextmanager
+def replacing(target: Path) -> Iterator[Path]:
+    """A path beside `target` to write to; it takes the target's place when the block ends without an error."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    beside = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
+    try:
+        yield beside
+        beside.replace(target)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def save_files(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:
+    """Write files, each complete or not at all, the first one last: it names the others."""
+    paths = tuple(folder / name for name in files)
+    for path, data in reversed(list(zip(paths, files.values(), strict=True))):
+        with replacing(path) as beside:
+            beside.write_bytes(data)
+    return paths
 
 
 def fingerprint(*parts: Any) -> str:

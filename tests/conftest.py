@@ -4,11 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 
-from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
+from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera, orbit
 from sfm_app.synthetic.photo_folder import load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.scenes import build_scene
+from sfm_app.types import Frustum, Model, Surface, Texture
 
 
 @pytest.fixture(scope="session")
@@ -32,3 +34,31 @@ def unrelated(tmp_path_factory) -> Path:
         fine = rng.normal(0, 12, (320, 480, 3))
         Image.fromarray(np.clip(np.asarray(coarse) + fine, 0, 255).astype(np.uint8)).save(place / f"{seed}.jpg")
     return place
+
+
+@pytest.fixture(scope="session")
+def ball() -> Model:
+    """A unit ball with a colour per vertex that says where the vertex is."""
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    vertices = np.array(mesh.vertices, np.float64)
+    colors = np.clip(128 + 120 * vertices, 0, 255).astype(np.uint8)
+    return Model(Surface(vertices, np.array(mesh.faces, np.int64), colors))
+
+
+@pytest.fixture(scope="session")
+def textured_ball(ball) -> Model:
+    """The ball seen from above on a red page, and its lower half on a wide blue one."""
+    corners = ball.surface.vertices[ball.surface.faces]
+    page = (corners[:, :, 1].mean(axis=1) < 0).astype(np.int32)
+    uv = (0.5 + 0.45 * corners[:, :, [0, 2]]).astype(np.float32)
+    pages = np.full((64, 64, 3), (200, 40, 30), np.uint8), np.full((32, 96, 3), (30, 60, 200), np.uint8)
+    return Model(ball.surface, Texture(uv, page, pages))
+
+
+@pytest.fixture(scope="session")
+def cloud(ball) -> Model:
+    """The ball's vertices as points, and three cameras around them that look at the middle."""
+    K = np.array([[800.0, 0, 310], [0, 820, 250], [0, 0, 1]])
+    poses = orbit(make_camera(640, 480), 3, 120.0, 4.0, (0.0, 0.0, 0.0)).cam_from_world
+    cameras = tuple(Frustum(name, K, pose, 640, 480) for name, pose in poses.items())
+    return Model(Surface(ball.surface.vertices, np.zeros((0, 3), np.int64), ball.surface.colors), cameras=cameras)

@@ -7,10 +7,11 @@ from typing import Any
 import click
 
 from sfm_app import __version__
-from sfm_app.api import calibrate_photos, reconstruct
+from sfm_app.api import calibrate_photos, export_model, reconstruct
 from sfm_app.cli.camera_text import intrinsics_lines, intrinsics_summary
 from sfm_app.cli.display import (
     Terminal,
+    file_lines,
     print_json,
     print_lines,
     run_lines,
@@ -20,7 +21,7 @@ from sfm_app.cli.display import (
 from sfm_app.cli.doctor import examine
 from sfm_app.cli.options import output_options, settings_from, settings_options
 from sfm_app.demo import demo_lines, run_demo
-from sfm_app.errors import SfmError
+from sfm_app.errors import ConfigError, SfmError
 from sfm_app.pipeline import NAMES
 from sfm_app.plugins import load_plugins
 
@@ -92,6 +93,22 @@ def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any)
     progress = Terminal(quiet=flags["quiet"])
     found = calibrate_photos(photos, settings_from(flags), out=out, figure=figure, progress=progress)
     print_json(intrinsics_summary(found)) if flags["as_json"] else print_lines(intrinsics_lines(found))
+
+
+@main.command()
+@click.argument("out", type=click.Path(path_type=Path))
+@click.option("--format", "file_format", default="", help="ply, glb, obj, ...  [default: as FILE is named]")
+@click.option(
+    "-o", "--output", "target", type=click.Path(path_type=Path), help="File to write.  [default: OUT/model.FORMAT]"
+)
+@click.option("--points", is_flag=True, help="The sparse points and the cameras instead of the model.")
+@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
+def export(out: Path, file_format: str, target: Path | None, points: bool, as_json: bool) -> None:
+    """Write the model of the run in OUT in another format, without computing anything anew."""
+    if not file_format and not (target and target.suffix):
+        raise ConfigError("no format is named", hint=f"--format {'|'.join(load_plugins().exporters)}, or -o model.obj")
+    files = export_model(out, file_format, target, points=points)
+    print_json([str(path) for path in files]) if as_json else print_lines(file_lines(files))
 
 
 @main.command()

@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ STAGE_TITLES = {
     "mesh": "surface",
     "files": "files",
 }
+
+MEGABYTE = 1e6
 
 
 class Terminal:
@@ -84,9 +86,11 @@ def run_summary(run: Run) -> dict[str, Any]:
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
     }
     if run.scene:
-        summary["scene"] = scene_summary(run.scene, counts.get("scene", {}))
+        points = [str(path) for path in written(run, "scene")]
+        summary["scene"] = {**scene_summary(run.scene, counts.get("scene", {})), "files": points}
     if run.mesh_path:
-        summary["mesh"] = {"triangles": counts["mesh"].get("triangles"), "files": [str(p) for p in model_files(run)]}
+        files = [str(path) for path in written(run, "files")]
+        summary["mesh"] = {"triangles": counts["mesh"].get("triangles"), "files": files}
     return summary
 
 
@@ -105,9 +109,10 @@ def run_lines(run: Run) -> list[str]:
         lines += intrinsics_lines(run.calibration)
     if run.scene:
         lines += scene_lines(run.scene, run.manifest.get("stages", {}).get("scene", {}).get("counts", {}))
+        lines += [f"            points and cameras: {line}" for line in file_lines(written(run, "scene"))]
     if run.mesh_path:
         lines.append(f"mesh        {summary['mesh']['triangles']} triangles")
-        lines += [f"            {path}" for path in summary["mesh"]["files"]]
+        lines += [f"            {line}" for line in file_lines(written(run, "files"))]
     seconds = summary["seconds"]
     lines.append(
         "seconds     "
@@ -117,9 +122,15 @@ def run_lines(run: Run) -> list[str]:
     return lines
 
 
-def model_files(run: Run) -> list[Path]:
-    """The mesh in all its formats."""
-    return sorted(run.out.glob("model.*"))
+def written(run: Run, stage: str) -> list[Path]:
+    """The model files that a stage wrote and that are still there, the one to open first."""
+    names = run.manifest.get("stages", {}).get(stage, {}).get("counts", {}).get("bytes", {})
+    return [run.out / name for name in reversed(names) if (run.out / name).exists()]
+
+
+def file_lines(paths: Sequence[Path]) -> list[str]:
+    """Files with their sizes."""
+    return [f"{path}  {path.stat().st_size / MEGABYTE:.1f} MB" for path in paths]
 
 
 def table(rows: Mapping[str, str]) -> list[str]:

@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.backend import backend, pycolmap
 from sfm_app.colmap.database import opened
 from sfm_app.geometry.seed import TwoViewSeed
 from sfm_app.geometry.similarity import Similarity
-from sfm_app.types import CameraModel, PairId, Scene
+from sfm_app.types import CameraModel, Frustum, Model, PairId, Scene, Surface
+
+CONFIRMED = 100
+"""From so many points with three photos on, their box says how far the scene goes."""
 
 
 def model_from_seed(database: Path, pair: PairId, matches: NDArray[np.uint32], seed: TwoViewSeed) -> Any:
@@ -105,6 +108,31 @@ def posed_photos(model: Any) -> tuple[dict[int, NDArray[np.float64]], NDArray[np
     poses = {image.image_id: np.asarray(image.cam_from_world().matrix(), np.float64) for image in _posed(model)}
     points = np.array([model.points3D[key].xyz for key in sorted(model.points3D)]).reshape(-1, 3)
     return poses, points
+
+
+def sparse_model(model_dir: Path) -> Model:
+    """The coloured points of a model on disk, and its photos where they were taken, in order of ids.
+
+    Points that two photos see have no third one to confirm them, and the wrong ones among them lie far out, where they
+    make the scene a dot in its viewer: outside the box of the confirmed points they are left out.
+    """
+    with backend("reading the sparse model"):
+        model = pycolmap.Reconstruction(model_dir)
+    found = [model.points3D[key] for key in sorted(model.points3D)]
+    places = np.array([point.xyz for point in found], np.float64).reshape(-1, 3)
+    colors = np.array([point.color for point in found], np.uint8).reshape(-1, 3)
+    confirmed = np.array([point.track.length() > 2 for point in found], bool)
+    if np.count_nonzero(confirmed) >= CONFIRMED:
+        low, high = places[confirmed].min(axis=0), places[confirmed].max(axis=0)
+        inside = ((places >= low) & (places <= high)).all(axis=1)
+        places, colors = places[inside], colors[inside]
+    cameras = tuple(_frustum(image, model.cameras[image.camera_id]) for image in _posed(model))
+    return Model(Surface(places, np.zeros((0, 3), np.int64), colors), cameras=cameras)
+
+
+def _frustum(image: Any, camera: Any) -> Frustum:
+    K, pose = camera.calibration_matrix(), image.cam_from_world().matrix()
+    return Frustum(image.name, np.asarray(K, np.float64), np.asarray(pose, np.float64), camera.width, camera.height)
 
 
 def viewing_rays(model: Any, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,13 +9,16 @@ from typing import Any
 
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.bundle import Adjusted, adjust
-from sfm_app.colmap.model import colour, photos_of, read_scene
+from sfm_app.colmap.model import colour, photos_of, read_scene, sparse_model
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_depth, why_no_scene
 from sfm_app.reconstruction import Outcome, reconstruct
 from sfm_app.reconstruction.left_out import left_out, names_of
 from sfm_app.reconstruction.orientation import orient, search_lines
 from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
+
+POINTS = "points"
+"""Name of the files with the points and cameras."""
 
 
 def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
@@ -34,6 +37,7 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
             colour(model, run.workspace.photos, run.workers)
     orientations = [orient(model, matches, lines) for model in models]
     write_models(models, run)
+    run.write_model(sparse_model(run.workspace.sparse), POINTS)
     members = [photos_of(model) for model in models]
     reasons = left_out(set(members[0]), members[1:], matches, views, outcome.graph)
     names = {image.name: intrinsics.name_of(image) for image in matches.images.values()}

@@ -28,7 +28,7 @@ def test_built_ins_are_there_and_lead_the_listing():
     assert next(iter(found.estimators)) == "lev-ransac"
     assert {"lev-ransac", "lev-ransac-thesis", "never"} <= set(found.estimators)
     assert {"zero-curves", "zero-curves-thesis"} <= set(found.calibrators)
-    assert {"ply", "glb"} <= set(found.exporters)
+    assert {"ply", "glb", "obj"} <= set(found.exporters)
     assert found.estimator("never").fit is never
 
 

@@ -1,0 +1,81 @@
+"""Cameras drawn into a scene."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.types import Frustum, Model
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+CAMERA_COLOR = (255, 96, 32)
+"""sRGB of the cameras: an orange that walls, trees and skies do not have."""
+
+FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
+"""Lines between the camera's centre (0) and the corners of its picture (1 to 4)."""
+
+DOTS = 12
+"""Per edge, where a format has no lines."""
+
+LEAST_SHARE, MOST_SHARE = 0.01, 0.1
+"""How deep a frustum is drawn, in sizes of the scene: it can be seen, and does not hide what it stands before."""
+
+
+def camera_lines(model: Model) -> tuple[FloatArray, IndexArray]:
+    """The cameras of a model as wire frames: corners (5 C, 3), and lines (8 C, 2) between them."""
+    cameras = model.cameras
+    if not cameras:
+        return np.zeros((0, 3)), np.zeros((0, 2), np.int64)
+    depth = frustum_depth(np.array([centre(camera) for camera in cameras]), model.surface.vertices)
+    corners = np.concatenate([frustum_corners(camera, depth) for camera in cameras])
+    starts = 5 * np.arange(len(cameras), dtype=np.int64)
+    return corners, (starts[:, None, None] + np.array(FRUSTUM_EDGES)).reshape(-1, 2)
+
+
+def camera_dots(model: Model) -> tuple[FloatArray, NDArray[np.uint8]]:
+    """The cameras of a model as dotted wire frames: places (D, 3) and colours (D, 3)."""
+    corners, lines = camera_lines(model)
+    along = np.linspace(0.0, 1.0, DOTS, endpoint=False)[:, None, None]
+    dots = ((1 - along) * corners[lines[:, 0]] + along * corners[lines[:, 1]]).reshape(-1, 3)
+    return dots, painted(len(dots))
+
+
+def painted(count: int) -> NDArray[np.uint8]:
+    """The cameras' colour for so many vertices."""
+    return np.tile(np.array(CAMERA_COLOR, np.uint8), (count, 1))
+
+
+def centre(camera: Frustum) -> FloatArray:
+    """Where a camera stands: (3,)."""
+    return np.asarray(-camera.cam_from_world[:, :3].T @ camera.cam_from_world[:, 3])
+
+
+def frustum_corners(camera: Frustum, depth: float) -> FloatArray:
+    """(5, 3) the camera's centre and, at this depth, the corners of its picture from the top left one on, clockwise."""
+    pixels = [(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]
+    rays = np.linalg.solve(camera.K, np.column_stack([np.array(pixels, np.float64), np.ones(4)]).T).T
+    seen = np.concatenate([np.zeros((1, 3)), depth * rays])
+    return np.asarray((seen - camera.cam_from_world[:, 3]) @ camera.cam_from_world[:, :3])
+
+
+def frustum_depth(centres: FloatArray, points: FloatArray) -> float:
+    """How deep the frusta are drawn: half the usual distance between neighbouring cameras, within bounds."""
+    size = scene_size(np.concatenate([centres, points]))
+    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    np.fill_diagonal(apart, np.inf)
+    step = float(np.median(apart.min(axis=1))) if len(centres) > 1 else np.inf
+    return float(np.clip(0.5 * step, LEAST_SHARE * size, MOST_SHARE * size))
+
+
+def scene_size(points: FloatArray) -> float:
+    """Diagonal of the box that holds nine of ten coordinates along each axis; 1 where all points are one."""
+    low, high = np.percentile(points, [5, 95], axis=0)
+    return float(np.linalg.norm(high - low)) or 1.0
+
+
+def with_cameras(model: Model) -> tuple[FloatArray, NDArray[np.uint8], IndexArray]:
+    """The vertices of a model and behind them the corners of its cameras, their colours, and the cameras' lines."""
+    corners, lines = camera_lines(model)
+    surface = model.surface
+    colors = np.concatenate([surface.colors, painted(len(corners))])
+    return np.concatenate([surface.vertices, corners]), colors, lines + len(surface.vertices)

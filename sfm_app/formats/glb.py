@@ -1,0 +1,144 @@
+"""Binary glTF 2.0: one file that web viewers, game engines and Blender open.
+
+Photographed colours carry their light already, and a viewer that lights them once more makes them darker on one side
+and pale on the other. So the material is KHR_materials_unlit: three.js, Babylon.js, model-viewer, Blender and others
+show the colours as the photos have them. Where the extension is unknown the material is a rough, matt surface, lit by
+the normals, which are there for that and for relighting. It is not listed as required: nobody has to refuse the file.
+Without a material a viewer would take glTF's default, which is metal and looks black.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.formats.checks import check, unit_normals
+from sfm_app.formats.frusta import CAMERA_COLOR, camera_lines, centre, frustum_depth
+from sfm_app.formats.gltf import Glb
+from sfm_app.formats.pages import jpeg, pages_in_use, split_corners
+from sfm_app.types import Frustum, Model, Texture
+
+UNLIT = "KHR_materials_unlit"
+POINTS, LINES = 0, 1
+LINEAR, MIPMAPS, CLAMPED = 9729, 9987, 33071
+
+FLIP = np.diag([1.0, -1.0, -1.0])
+"""COLMAP's camera looks along +z with y down, that of glTF along -z with y up."""
+
+
+def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
+    """Triangles with their texture or with a colour per vertex; else points; and the cameras, if there are any.
+
+    Args:
+        model: what to write.
+        name: of the file, without suffix; also of the node in it.
+
+    Returns:
+        One file.
+
+    Raises:
+        ReconstructionError: the model is empty or not finite.
+    """
+    check(model)
+    glb = Glb(extensionsUsed=[UNLIT], scene=0)
+    if model.texture is not None and len(model.surface.faces):
+        primitives = textured(glb, model, model.texture)
+    else:
+        primitives = [coloured(glb, model)]
+    mesh = glb.add("meshes", {"name": name, "primitives": primitives})
+    nodes = [glb.add("nodes", {"name": name, "mesh": mesh})]
+    if model.cameras:
+        nodes += cameras(glb, model)
+    glb.add("scenes", {"name": name, "nodes": nodes})
+    return {f"{name}.glb": glb.to_bytes()}
+
+
+def textured(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
+    """One primitive and one material per page."""
+    surface, normals = model.surface, unit_normals(model.surface)
+    sampler = glb.add("samplers", {"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED})
+    primitives = []
+    for page in pages_in_use(texture.page):
+        here = texture.page == page
+        old, uv, faces = split_corners(surface.faces[here], texture.uv[here])
+        image = glb.add(
+            "images",
+            {"name": f"page {page}", "mimeType": "image/jpeg", "bufferView": glb.add_view(jpeg(texture.pages[page]))},
+        )
+        picture = glb.add("textures", {"sampler": sampler, "source": image})
+        material = photographed(glb, f"page {page}", baseColorTexture={"index": picture})
+        attributes = shape(glb, surface.vertices[old], normals[old]) | {"TEXCOORD_0": glb.add_vertices(uv)}
+        primitives.append({"attributes": attributes, "indices": glb.add_indices(faces, len(old)), "material": material})
+    return primitives
+
+
+def coloured(glb: Glb, model: Model) -> dict[str, Any]:
+    """Triangles, or points where there are none, with a colour per vertex."""
+    surface = model.surface
+    normals = unit_normals(surface) if len(surface.faces) else None
+    attributes = shape(glb, surface.vertices, normals) | {"COLOR_0": glb.add_vertices(linear_colors(surface.colors))}
+    primitive = {"attributes": attributes, "material": photographed(glb, "colours")}
+    if normals is None:
+        return primitive | {"mode": POINTS}
+    return primitive | {"indices": glb.add_indices(surface.faces, len(surface.vertices))}
+
+
+def shape(glb: Glb, vertices: NDArray[np.float64], normals: NDArray[np.float64] | None) -> dict[str, int]:
+    """Where vertices lie and where they face."""
+    attributes = {"POSITION": glb.add_vertices(vertices.astype(np.float32), bounds=True)}
+    return attributes if normals is None else attributes | {"NORMAL": glb.add_vertices(normals.astype(np.float32))}
+
+
+def photographed(glb: Glb, name: str, **base: Any) -> int:
+    """A material that shows its colours as they are; both sides, since an open surface has no inside to hide."""
+    return glb.add(
+        "materials",
+        {
+            "name": name,
+            "doubleSided": True,
+            "pbrMetallicRoughness": {**base, "metallicFactor": 0.0, "roughnessFactor": 1.0},
+            "extensions": {UNLIT: {}},
+        },
+    )
+
+
+def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Linear light in [0, 1] of 8-bit sRGB colours, same shape (IEC 61966-2-1).
+
+    glTF multiplies colours of vertices into the light as they are, so they have to be linear, while photos are sRGB.
+    Floats: 8 linear bits show steps in the shadows, and not every reader knows 16.
+    """
+    value = np.arange(256) / 255.0
+    light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return light.astype(np.float32)[colors]
+
+
+def cameras(glb: Glb, model: Model) -> list[int]:
+    """The cameras twice: as lines that every viewer draws, and as glTF's cameras, to look through; numbers of nodes."""
+    corners, lines = camera_lines(model)
+    color = linear_colors(np.array(CAMERA_COLOR, np.uint8))
+    material = photographed(glb, "cameras", baseColorFactor=[*(round(float(part), 6) for part in color), 1.0])
+    primitive = {
+        "attributes": shape(glb, corners, None),
+        "indices": glb.add_indices(lines, len(corners)),
+        "mode": LINES,
+        "material": material,
+    }
+    mesh = glb.add("meshes", {"name": "cameras", "primitives": [primitive]})
+    nodes = [glb.add("nodes", {"name": "cameras", "mesh": mesh})]
+    near = 0.1 * frustum_depth(np.array([centre(camera) for camera in model.cameras]), model.surface.vertices)
+    return nodes + [glb.add("nodes", camera_node(glb, camera, near)) for camera in model.cameras]
+
+
+def camera_node(glb: Glb, camera: Frustum, near: float) -> dict[str, Any]:
+    """A camera of glTF where the photo was taken; its centre is in the middle, as glTF knows no other."""
+    lens = {
+        "yfov": float(2 * np.arctan(camera.height / (2 * camera.K[1, 1]))),
+        "aspectRatio": float(camera.width / camera.K[0, 0] * camera.K[1, 1] / camera.height),
+        "znear": near,
+    }
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = camera.cam_from_world[:, :3].T @ FLIP, centre(camera)
+    number = glb.add("cameras", {"name": camera.name, "type": "perspective", "perspective": lens})
+    return {"name": camera.name, "camera": number, "matrix": matrix.T.ravel().tolist()}

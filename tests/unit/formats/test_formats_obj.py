@@ -1,0 +1,83 @@
+"""OBJ files, read line by line and by other programs."""
+
+import io
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from sfm_app.formats.obj import DIGITS, write_obj
+from sfm_app.meshing.open3d import load_open3d
+from sfm_app.types import Model, Surface
+
+
+def lines(files, start):
+    text = next(iter(files.values())).decode()
+    return [line.split()[1:] for line in text.splitlines() if line.split()[0] == start]
+
+
+def test_every_corner_has_its_vertex_its_place_in_the_texture_and_its_normal(textured_ball):
+    surface, texture = textured_ball.surface, textured_ball.texture
+    files = write_obj(textured_ball, "model")
+
+    v, vt, vn = (np.array(lines(files, key), float) for key in ("v", "vt", "vn"))
+    corners = np.array([[corner.split("/") for corner in face] for face in lines(files, "f")], int) - 1
+    order = np.concatenate([np.flatnonzero(texture.page == page) for page in (0, 1)])
+    np.testing.assert_allclose(v[corners[:, :, 0]], surface.vertices[surface.faces[order]], atol=1e-6)
+    np.testing.assert_allclose(vt[corners[:, :, 1]] * [1, -1] + [0, 1], texture.uv[order], atol=1e-6)
+    np.testing.assert_allclose(np.sum(v[corners[:, :, 0]] * vn[corners[:, :, 2]], axis=2), 1, atol=0.02)
+    assert len(np.unique(vt, axis=0)) == len(vt)
+
+
+def test_the_materials_name_the_pages_beside_them(textured_ball):
+    files = write_obj(textured_ball, "my model")
+
+    assert list(files) == ["my model.obj", "my_model.mtl", "my_model_0.jpg", "my_model_1.jpg"]
+    assert lines(files, "mtllib") == [["my_model.mtl"]]
+    assert lines(files, "usemtl") == [["page_0"], ["page_1"]]
+    for number, page in enumerate(textured_ball.texture.pages):
+        assert f"newmtl page_{number}\n" in files["my_model.mtl"].decode()
+        assert f"map_Kd my_model_{number}.jpg\n" in files["my_model.mtl"].decode()
+        np.testing.assert_allclose(np.asarray(Image.open(io.BytesIO(files[f"my_model_{number}.jpg"]))), page, atol=4)
+
+
+def test_without_a_texture_vertices_carry_the_colours(ball):
+    files = write_obj(ball, "model")
+
+    v = np.array(lines(files, "v"), float)
+    assert list(files) == ["model.obj"]
+    np.testing.assert_allclose(255 * v[:, 3:], ball.surface.colors, atol=0.02)
+
+
+def test_points_and_cameras(cloud):
+    files = write_obj(cloud, "model")
+
+    assert len(lines(files, "p")) == len(cloud.surface.vertices)
+    assert len(lines(files, "l")) == 8 * len(cloud.cameras)
+    assert np.array(lines(files, "l"), int).max() == len(lines(files, "v"))
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 250.0, 1e7])
+def test_coordinates_are_as_exact_as_the_model_is_large(ball, size):
+    surface = Surface(size * ball.surface.vertices, ball.surface.faces, ball.surface.colors)
+
+    v = np.array(lines(write_obj(Model(surface), "model"), "v"), float)[:, :3]
+
+    error = np.abs(v - surface.vertices).max() / size
+    assert error < 10.0**-DIGITS
+    assert size >= 1e7 or error > 0
+
+
+def test_trimesh_and_open3d_show_both_pages(textured_ball, tmp_path):
+    for name, data in write_obj(textured_ball, "my model").items():
+        (tmp_path / name).write_bytes(data)
+    path = tmp_path / "my model.obj"
+
+    parts = trimesh.load_scene(path, process=False).geometry.values()
+    model = load_open3d().io.read_triangle_model(str(path))
+
+    colors = sorted(tuple(part.visual.to_color().vertex_colors[:, :3].mean(axis=0)) for part in parts)
+    np.testing.assert_allclose(colors, [(30, 60, 200), (200, 40, 30)], atol=4)
+    assert sum(len(part.mesh.triangles) for part in model.meshes) == len(textured_ball.surface.faces)
+    assert sum(material.albedo_img is not None for material in model.materials) == 2
