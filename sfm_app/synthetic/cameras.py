@@ -137,6 +137,45 @@ def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Vie
     return Views.of(camera, poses)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PastOptions:
+    """A walk along a wall that faces +z, hand-held, each photo turned towards the middle as far as it likes.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+
+    photos: int = 12
+    """>= 2."""
+    length: float = 8.0
+    """Of the walk along x, in scene units, > 0."""
+    distance: tuple[float, float] = (5.0, 7.0)
+    """Range of z, in scene units."""
+    height: tuple[float, float] = (1.2, 2.2)
+    """Range of y, in scene units."""
+    aim: tuple[float, float] = (2.0, 3.2)
+    """Range of the height on the wall that the photos look at, in scene units."""
+    roll_deg: float = 5.0
+    """Largest roll either way, in degrees, [0, 180]."""
+
+    def __post_init__(self) -> None:
+        if self.photos < 2 or not (0 < self.length < math.inf and 0 <= self.roll_deg <= 180):
+            raise ConfigError("synthetic cameras: photos, length or roll_deg is out of range")
+
+
+def past(camera: Camera, options: PastOptions | None = None, seed: int = 0) -> Views:
+    """Hand-held photos along a wall in the plane z = 0, from left to right, named view_00.jpg and so on."""
+    options = options or PastOptions()
+    rng = np.random.default_rng([seed, 13])
+    count = options.photos
+    x = options.length * (np.arange(count) / (count - 1) - 0.5)
+    centres = np.column_stack([x, _spread(options.height, count, rng), _spread(options.distance, count, rng)])
+    # parallel axes would leave the focal length undetermined
+    aims = np.column_stack([x * _spread((0.2, 0.9), count, rng), _spread(options.aim, count, rng), np.zeros(count)])
+    roll_deg = _spread((-options.roll_deg, options.roll_deg), count, rng)
+    return Views.of(camera, [look_at(c, a, roll) for c, a, roll in zip(centres, aims, roll_deg, strict=True)])
+
+
 def orbit(
     camera: Camera,
     photos: int = 12,

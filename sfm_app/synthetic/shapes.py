@@ -1,6 +1,7 @@
 """Triangle meshes of simple bodies, y up, counter-clockwise seen from outside."""
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -93,10 +94,50 @@ def ball(radius: float, segments: int = 96, bumps: float = 0.0, seed: int = 0) -
     """A sphere around the origin; `bumps` is the depth of random dents as a share of the radius."""
     angle = np.linspace(-0.5, 0.5, segments // 2 + 1) * math.pi
     round_ball = _turned(np.column_stack([np.cos(angle), np.sin(angle)]), segments, 360.0, (0, 0.0))
-    rng = np.random.default_rng([seed, 7])
-    waves = rng.normal(size=(24, 3)) * np.linspace(2.0, 9.0, 24)[:, None]
-    dents = np.cos(round_ball[0] @ waves.T + rng.uniform(0.0, 2.0 * math.pi, 24)).sum(axis=1) / math.sqrt(12.0)
+    dents = waves(round_ball[0], seed)
     return _joined([(round_ball[0] * radius * (1.0 + bumps * dents[:, None]), round_ball[1])])
+
+
+def waves(points: FloatArray, seed: int) -> FloatArray:
+    """Smooth noise of unit variance at points (N, 3): cosines of 24 directions, 0.7 to 3 units long."""
+    rng = np.random.default_rng([seed, 7])
+    vectors = rng.normal(size=(24, 3)) * np.linspace(2.0, 9.0, 24)[:, None]
+    found = np.cos(points @ vectors.T + rng.uniform(0.0, 2.0 * math.pi, 24)).sum(axis=1) / math.sqrt(12.0)
+    return np.asarray(found)
+
+
+def carved(
+    field: Callable[[FloatArray], FloatArray],
+    height: tuple[float, float],
+    reach: float,
+    rows: int = 220,
+    segments: int = 240,
+) -> Shape:
+    """The outside of a body around the y axis, closed at the top and the bottom: what a sculptor can carve all round.
+
+    Args:
+        field: positive inside the body at points (N, 3).
+        height: lowest and highest level that is looked at.
+        reach: the body lies within this distance of the axis.
+        rows: levels.
+        segments: steps around the axis.
+    """
+    angle = 2.0 * math.pi * np.arange(segments) / segments
+    # turning from +x towards -z is right-handed about +y
+    ways = np.column_stack([np.cos(angle), np.zeros(segments), -np.sin(angle)])
+    levels = np.linspace(*height, rows)
+    radius = np.stack([_outermost(field, ways, level, reach) for level in levels], axis=1)
+    radius[:, [0, -1]] = 0.0
+    vertices = ways[:, None] * radius[..., None] + np.array([0.0, 1.0, 0.0]) * levels[:, None]
+    return _joined([(vertices.reshape(-1, 3), _strips(segments, rows, segments))])
+
+
+def assembled(parts: Sequence[Shape]) -> Shape:
+    """One body made of several; its texture runs on from part to part."""
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
+    return Shape(vertices, faces, np.concatenate([part.normals for part in parts]), vertices)
 
 
 def ground(x: tuple[float, float], z: tuple[float, float], unevenness: float, spacing: float = 0.1) -> Shape:
@@ -117,10 +158,37 @@ def _turned(
     height = np.broadcast_to(profile[None, :, 1], radius.shape)
     # turning from +x towards -z is right-handed about +y
     vertices = np.stack([radius * np.cos(angle)[:, None], height, -radius * np.sin(angle)[:, None]], axis=-1)
-    ring = np.arange(segments)[:, None] * len(profile) + np.arange(len(profile) - 1)
-    step = (ring + len(profile)) % (count * len(profile))
+    return vertices.reshape(-1, 3), _strips(segments, len(profile), count)
+
+
+def _strips(segments: int, rows: int, count: int) -> IndexArray:
+    """Triangles between `segments` pairs of neighbours among `count` columns of `rows` vertices; the last meets the
+    first where there are as many."""
+    ring = np.arange(segments)[:, None] * rows + np.arange(rows - 1)
+    step = (ring + rows) % (count * rows)
     faces = np.concatenate([np.stack([ring, step, step + 1], -1), np.stack([ring, step + 1, ring + 1], -1)])
-    return vertices.reshape(-1, 3), faces.reshape(-1, 3)
+    return faces.reshape(-1, 3)
+
+
+def _outermost(
+    field: Callable[[FloatArray], FloatArray], ways: FloatArray, level: float, reach: float, steps: int = 32
+) -> FloatArray:
+    """Distance (N,) at which rays from outside along -`ways` (N, 3) enter the body at a level; 0 where they miss."""
+
+    def inside(radius: FloatArray) -> NDArray[np.bool_]:
+        points = ways[:, None] * radius[..., None] + np.array([0.0, level, 0.0])
+        return np.asarray(field(points.reshape(-1, 3)).reshape(radius.shape) > 0)
+
+    radii = np.broadcast_to(np.linspace(reach, 0.0, steps + 1), (len(ways), steps + 1))
+    found = inside(radii)
+    at = found.argmax(axis=1)
+    outer = np.take_along_axis(radii, np.maximum(at - 1, 0)[:, None], axis=1)
+    inner = np.take_along_axis(radii, at[:, None], axis=1)
+    for _ in range(8):
+        middle = 0.5 * (outer + inner)
+        is_in = inside(middle)
+        inner, outer = np.where(is_in, middle, inner), np.where(is_in, outer, middle)
+    return np.where(found.any(axis=1), inner[:, 0], 0.0)
 
 
 def _grid(a: FloatArray, b: FloatArray) -> tuple[FloatArray, IndexArray]:
