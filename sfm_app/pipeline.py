@@ -21,6 +21,7 @@ from sfm_app.stages.match_graph import load_match_graph, match_photos
 from sfm_app.stages.mesh import load_surface, make_mesh
 from sfm_app.stages.photos import list_files, load_photo_set, read_photos
 from sfm_app.stages.scene import load_scene, reconstruct_scene
+from sfm_app.stages.texture import load_texture, make_texture
 from sfm_app.stages.view_graph import build_view_graph, load_view_graph
 from sfm_app.workspace import StageRecord, fingerprint
 
@@ -86,8 +87,13 @@ STAGES = (
         load=lambda _, run: load_surface(run.workspace.dense),
     ),
     Stage(
-        "files", ("mesh",), (), ("model.ply", "model.glb"),
-        make=lambda products, run: write_files(products("mesh"), run),
+        "texture", ("scene", "mesh"), ("texture",), ("dense/texture.npz",),
+        make=lambda products, run: make_texture(products("scene"), products("mesh"), run.settings.texture, run),
+        load=lambda _, run: load_texture(run.workspace.dense),
+    ),
+    Stage(
+        "files", ("texture",), (), ("model.ply", "model.glb"),
+        make=lambda products, run: write_files(products("texture").surface, run),
         load=lambda _, run: load_files(run),
     ),
 )  # fmt: skip
