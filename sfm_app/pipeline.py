@@ -22,6 +22,7 @@ from sfm_app.stages.match_graph import load_match_graph, match_photos
 from sfm_app.stages.mesh import load_surface, make_mesh
 from sfm_app.stages.photos import list_files, load_photo_set, read_photos
 from sfm_app.stages.scene import load_scene, reconstruct_scene
+from sfm_app.stages.texture import load_texture, make_texture
 from sfm_app.stages.view_graph import build_view_graph, load_view_graph
 from sfm_app.types import Model
 from sfm_app.workspace import StageRecord, fingerprint
@@ -88,18 +89,18 @@ STAGES = (
         load=lambda _, run: load_surface(run.workspace.dense),
     ),
     Stage(
-        "files", ("mesh",), (), ("model.ply", "model.glb"),
-        make=lambda products, run: write_files(finished_model(products), run),
+        "texture", ("scene", "mesh"), ("texture",), ("dense/texture.npz",),
+        make=lambda products, run: make_texture(products("scene"), products("mesh"), run.settings.texture, run),
+        load=lambda _, run: load_texture(run.workspace.dense),
+    ),
+    Stage(
+        "files", ("texture",), (), ("model.ply", "model.glb"),
+        make=lambda products, run: write_files(products("texture"), run),
         load=lambda _, run: load_files(run),
     ),
 )  # fmt: skip
 
 NAMES = tuple(stage.name for stage in STAGES)
-
-
-def finished_model(products: Products) -> Model:
-    """What the files of the model hold."""
-    return Model(products("mesh"))
 
 
 def stored_model(run: RunContext, *, points: bool = False) -> Model:
@@ -118,7 +119,7 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
                 hint=_how_on(run),
             )
     try:
-        return sparse_model(place.sparse) if points else finished_model(loader({}, run))
+        return sparse_model(place.sparse) if points else loader({}, run)("texture")
     except OSError as err:
         raise InputError(f"{place.root} is not complete: {err.strerror}: {err.filename}", hint=_how_on(run)) from err
 

@@ -117,6 +117,7 @@ class TextureSettings(Section):
     """The pictures on the surface."""
 
     max_page_px: int = Field(4096, ge=256, le=16384, description="longest side of a page of texture, in pixels")
+    max_pages: int = Field(4, ge=1, le=64, description="most pages; where the photos show more, it is scaled down")
     unseen: Literal["color", "cut"] = Field(
         "color", description="triangles that no photo sees: color: painted like what is around them; cut: left out"
     )
@@ -169,12 +170,14 @@ QUALITY_PRESETS: dict[str, dict[str, Any]] = {
         "matching": {"max_image_size_px": 1000, "max_features": 4096},
         "depth": {"max_image_size_px": 640, "neighbours": 3},
         "mesh": {"poisson_depth": 9, "faces": 50_000},
+        "texture": {"max_page_px": 2048, "max_pages": 1},
     },
     "normal": {},
     "high": {
         "matching": {"max_image_size_px": 3200, "max_features": 16384},
         "depth": {"max_image_size_px": 2000, "neighbours": 6},
         "mesh": {"poisson_depth": 11, "faces": 1_000_000},
+        "texture": {"max_page_px": 8192},
     },
 }
 

@@ -176,6 +176,7 @@ def read_scene(
         points=model.num_points3D(),
         observations=model.compute_num_observations(),
         mean_reprojection_px=float(model.compute_mean_reprojection_error()),
+        camera_of={image.name: names[image.name] for image in posed},
     )
 
 

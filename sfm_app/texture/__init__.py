@@ -1,1 +1,7 @@
-"""Pictures for the triangles of a surface, from the photos that see them."""
+"""Pictures on a surface, from the photos that show it best."""
+
+from sfm_app.texture.assemble import Load, Spread, texture_surface
+from sfm_app.texture.looking import Hidden
+from sfm_app.texture.views import PhotoView, photo_view
+
+__all__ = ["Hidden", "Load", "PhotoView", "Spread", "photo_view", "texture_surface"]

@@ -45,6 +45,8 @@ class Scene:
     points: int
     observations: int
     mean_reprojection_px: float
+    camera_of: Mapping[str, str] = field(default_factory=dict)
+    """Name of the camera by photo that has a pose."""
 
     @property
     def registered(self) -> tuple[str, ...]:

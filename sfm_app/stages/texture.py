@@ -1,0 +1,55 @@
+"""texture: Scene, Surface and photos -> Model with a texture."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sfm_app.context import RunContext
+from sfm_app.meshing.occlusion import Occluders
+from sfm_app.settings import TextureSettings
+from sfm_app.texture import PhotoView, photo_view, texture_surface
+from sfm_app.types import Model, Scene, Surface, Texture
+
+TEXTURE = "texture.npz"
+
+
+def make_texture(scene: Scene, surface: Surface, options: TextureSettings, run: RunContext) -> Model:
+    """Paint the surface with the photos at full size, and keep it beside the depth maps."""
+    views = [
+        photo_view(name, scene.cameras[scene.camera_of[name]], pose) for name, pose in scene.cam_from_world.items()
+    ]
+    hidden = Occluders(surface.vertices, surface.faces).hidden
+    load = partial(read_photo, run.workspace.photos)
+    model, figures = texture_surface(surface, views, load, hidden, options, run.map)
+    run.record(**figures)
+    save_texture(model, run)
+    return model
+
+
+def read_photo(photo_dir: Path, view: PhotoView) -> NDArray[np.uint8]:
+    """(height, width, 3) RGB of a photo at the size of the view; smaller ones are averaged, not picked."""
+    with Image.open(photo_dir / view.name) as image:
+        photo = image.convert("RGB")
+    if photo.size != (view.width, view.height):
+        photo = photo.resize((view.width, view.height), Image.Resampling.BOX)
+    return np.asarray(photo)
+
+
+def save_texture(model: Model, run: RunContext) -> None:
+    """Write dense/texture.npz."""
+    surface, texture = model.surface, model.texture
+    pages = {} if texture is None else {f"page{number}": page for number, page in enumerate(texture.pages)}
+    places = {} if texture is None else {"uv": texture.uv, "page": texture.page}
+    with run.workspace.replacing(run.workspace.dense / TEXTURE) as path:
+        np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors, **places, **pages)
+
+
+def load_texture(dense_dir: Path) -> Model:
+    """The model that `make_texture` left in a dense workspace."""
+    with np.load(dense_dir / TEXTURE) as stored:
+        surface = Surface(stored["vertices"], stored["faces"], stored["colors"])
+        pages = tuple(stored[f"page{number}"] for number in range(len(stored.files) - 5))
+        return Model(surface, Texture(stored["uv"], stored["page"], pages))

@@ -1,0 +1,243 @@
+"""From a surface and photos to a textured surface: the steps of the texture in their order."""
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.settings import TextureSettings
+from sfm_app.texture.blending import Blend, blend_weights
+from sfm_app.texture.charts import Charts, make_charts, without_specks
+from sfm_app.texture.consistency import strangers
+from sfm_app.texture.exposure import photo_gains
+from sfm_app.texture.facets import NONE, Facets, IntArray, facets
+from sfm_app.texture.labels import choose_photos
+from sfm_app.texture.levelling import level
+from sfm_app.texture.looking import Hidden, Look, look, sharpness_factors
+from sfm_app.texture.packing import Layout, pack
+from sfm_app.texture.painting import Canvas, canvas, fill_background, finished, paint
+from sfm_app.texture.unseen import block_sizes, square_texels, squares, vertex_colors, without
+from sfm_app.texture.views import PhotoView
+from sfm_app.types import Model, Rejected, Surface, Texture
+
+FloatArray = NDArray[np.float64]
+Load = Callable[[PhotoView], NDArray[np.uint8]]
+"""Gives the (height, width, 3) RGB of a view at the view's size; OSError where it cannot be read."""
+Spread = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
+"""Results of a function for all items, in order; may run in parallel. The last argument says what is being done."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """What the photos show of the triangles, and which of them may be believed."""
+
+    worth: NDArray[np.float32]
+    """(P, T) pixels times cosine times sharpness; 0 where a photo must not be used."""
+    colors: NDArray[np.uint8]
+    """(P, T, 3)"""
+    gains: FloatArray
+    """(P, 3)"""
+    strange: int
+    """Triangles, over all photos, that show something else."""
+
+    @property
+    def usable(self) -> NDArray[np.bool_]:
+        return self.worth > 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """All that is decided before a photo is painted."""
+
+    mesh: Facets
+    seen: Seen
+    chosen: IntArray
+    """(T,) photo of each triangle, -1 for none."""
+    charts: Charts
+    layout: Layout
+    corners: FloatArray
+    """(T, 3, 2) texels of the corners of the triangles that photos see."""
+    page: IntArray
+    """(T,) page of each triangle."""
+    squares: NDArray[np.int64]
+    """(U, 3) page, x, y of the squares of the triangles that no photo sees."""
+    blend: Blend
+    allowed: NDArray[np.float32]
+    """(T, 3) sum of the weights, at each corner, of the photos that may be used for the triangle."""
+
+
+def texture_surface(
+    surface: Surface, views: Sequence[PhotoView], load: Load, hidden: Hidden, options: TextureSettings, spread: Spread
+) -> tuple[Model, dict[str, Any]]:
+    """Paint a surface with photos.
+
+    Args:
+        surface: triangles in the frame of the views.
+        views: the registered photos.
+        load: reads a photo.
+        hidden: the occlusion test for this surface.
+        options: pages, and what happens to triangles that no photo sees.
+        spread: runs work for each photo.
+
+    Returns:
+        The surface (cut, if asked for; its colours taken from the photos) with its texture, and figures for the manifest.
+    """
+    mesh = facets(surface)
+    looks = spread(partial(_look_at, mesh=mesh, load=load, hidden=hidden), views, "looking at the surface")
+    seen = _believe(looks, mesh)
+    chosen = without_specks(choose_photos(seen.worth, mesh), seen.usable, mesh.neighbours)
+    unseen = chosen == NONE
+    if options.unseen == "cut" and not unseen.all():
+        mesh = facets(without(surface, unseen))
+        kept = ~unseen
+        seen = Seen(seen.worth[:, kept], seen.colors[:, kept], seen.gains, seen.strange)
+        chosen = chosen[kept]
+    plan = _plan(mesh, seen, chosen, views, options)
+    canvases = [
+        canvas(size, np.flatnonzero((plan.page == page) & (chosen != NONE)), plan.corners)
+        for page, size in enumerate(plan.layout.sizes)
+    ]
+    work = partial(_paint_photo, plan=plan, views=views, load=load, canvases=canvases, lock=threading.Lock())
+    spread(work, [p for p, found in enumerate(looks) if isinstance(found, Look)], "painting")
+    return _finish(plan, canvases), _figures(plan, views, looks, int(unseen.sum()))
+
+
+def _look_at(view: PhotoView, mesh: Facets, load: Load, hidden: Hidden) -> Look | Rejected:
+    try:
+        photo = load(view)
+    except OSError as err:
+        return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
+    return look(view, photo, mesh, hidden)
+
+
+def _believe(looks: Sequence[Look | Rejected], mesh: Facets) -> Seen:
+    """Even out what the photos say, and leave out what only one of them says."""
+    blank = Look(np.zeros(len(mesh.faces), np.float32), np.zeros((len(mesh.faces), 3), np.uint8), 0.0)
+    found = [one if isinstance(one, Look) else blank for one in looks]
+    worth, colors = np.stack([one.worth for one in found]), np.stack([one.color for one in found])
+    sharp = np.array([one.sharpness for one in found])
+    read = sharp > 0
+    sharp[read] = sharpness_factors(sharp[read])
+    worth *= sharp[:, None].astype(np.float32)
+    gains = photo_gains(colors, worth > 0)
+    strange = strangers(colors, gains, worth > 0, mesh.neighbours)
+    worth[strange] = 0.0
+    return Seen(worth, colors, gains, int(strange.sum()))
+
+
+def _plan(
+    mesh: Facets, seen: Seen, chosen: IntArray, views: Sequence[PhotoView], options: TextureSettings
+) -> Plan:
+    charts = make_charts(chosen, np.array([view.row for view in views]), mesh, options.max_page_px / 2)
+    blocks = block_sizes(int((chosen == NONE).sum()))
+    layout, places = pack(charts, blocks, options.max_page_px, options.max_pages)
+    corners, page = charts.corners * layout.scale, np.zeros(len(chosen), np.int32)
+    drawn = chosen != NONE
+    corners[drawn] += layout.shift[charts.of[drawn]][:, None, :]
+    page[drawn] = layout.page[charts.of[drawn]]
+    cells = squares(places, blocks, int((~drawn).sum()))
+    page[~drawn] = cells[:, 0]
+    blend = level(blend_weights(chosen, seen.usable, mesh), seen.colors, seen.gains, seen.usable, mesh)
+    allowed = _allowed_weight(blend, seen.usable, chosen, mesh)
+    return Plan(mesh, seen, chosen, charts, layout, corners, page, cells, blend, allowed)
+
+
+def _paint_photo(
+    photo: int, plan: Plan, views: Sequence[PhotoView], load: Load, canvases: Sequence[Canvas], lock: threading.Lock
+) -> None:
+    """Add one photo to all pages; one photo paints at a time, while others are read."""
+    triangles, weights, offsets = _shares(photo, plan)
+    if not len(triangles):
+        return
+    view, scale = views[photo], plan.layout.scale
+    if scale < 1.0:
+        view = view.scaled(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
+    pixels, points = load(view), plan.mesh.vertices[plan.mesh.faces[triangles]]
+    for number, page in enumerate(canvases):
+        there = plan.page[triangles] == number
+        shares = points[there], weights[there], offsets[there]
+        with lock:
+            paint(
+                pixels, view.row, 1.0 / plan.seen.gains[photo], triangles[there], plan.corners, *shares,
+                page.owner, page.total,
+            )  # fmt: skip
+
+
+def _shares(photo: int, plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
+    """Triangles that a photo counts for, its weights (N, 3) at their corners, and its offsets (N, 3, 3) there."""
+    mesh, part = plan.mesh, plan.blend.of(photo)
+    weight = np.zeros(len(mesh.vertices), np.float32)
+    offset = np.zeros((len(mesh.vertices), 3), np.float32)
+    weight[plan.blend.vertex[part]], offset[plan.blend.vertex[part]] = plan.blend.weight[part], plan.blend.offset[part]
+    own = plan.chosen == photo
+    allowed = (plan.seen.usable[photo] | own) & (plan.chosen != NONE)
+    shares = np.where(allowed[:, None], weight[mesh.faces], 0.0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shares = np.where(plan.allowed > 0, shares / plan.allowed, own[:, None]).astype(np.float32)
+    triangles = np.flatnonzero((shares > 0).any(axis=1))
+    return triangles, shares[triangles], offset[mesh.faces[triangles]]
+
+
+def _allowed_weight(
+    blend: Blend, usable: NDArray[np.bool_], chosen: IntArray, mesh: Facets
+) -> NDArray[np.float32]:
+    total = np.zeros(mesh.faces.shape, np.float32)
+    weight = np.zeros(len(mesh.vertices), np.float32)
+    for photo in range(len(usable)):
+        part = blend.of(photo)
+        weight[blend.vertex[part]] = blend.weight[part]
+        allowed = usable[photo] | (chosen == photo)
+        total += np.where(allowed[:, None], weight[mesh.faces], 0.0)
+        weight[blend.vertex[part]] = 0.0
+    return total
+
+
+def _finish(plan: Plan, canvases: Sequence[Canvas]) -> Model:
+    """Round the pages, colour what no photo sees, and fill what lies between the charts."""
+    drawn = plan.chosen != NONE
+    pages, painted = (list(part) for part in zip(*(finished(page) for page in canvases), strict=True))
+    corner_colors = np.zeros((len(drawn), 3, 3))
+    for number, page in enumerate(pages):
+        there = np.flatnonzero(drawn & (plan.page == number))
+        at = np.floor(plan.corners[there]).astype(np.int64)
+        corner_colors[there] = page[at[..., 1].clip(0, page.shape[0] - 1), at[..., 0].clip(0, page.shape[1] - 1)]
+    colors = vertex_colors(plan.mesh, drawn, corner_colors[drawn])
+    corners = plan.corners.copy()
+    texels = square_texels(colors[plan.mesh.faces[~drawn]])
+    number, x, y = plan.squares.T
+    for dy in (0, 1):
+        for dx in (0, 1):
+            for k, page in enumerate(pages):
+                here = number == k
+                page[y[here] + dy, x[here] + dx] = texels[here, dy, dx]
+                painted[k][y[here] + dy, x[here] + dx] = True
+    corners[~drawn] = np.stack([x, y], axis=1)[:, None, :] + np.array([[0.5, 0.5], [1.5, 0.5], [0.5, 1.5]])
+    sizes = np.array(plan.layout.sizes, np.float64)
+    uv = (corners / sizes[plan.page][:, None, :]).astype(np.float32)
+    surface = Surface(plan.mesh.vertices, plan.mesh.faces, np.round(colors).astype(np.uint8))
+    filled = tuple(fill_background(page, mask) for page, mask in zip(pages, painted, strict=True))
+    return Model(surface, Texture(uv, plan.page, filled))
+
+
+def _figures(plan: Plan, views: Sequence[PhotoView], looks: Sequence[Look | Rejected], unseen: int) -> dict[str, Any]:
+    """What the manifest says."""
+    covered = sum(width * height for width, height in plan.layout.sizes)
+    return {
+        "charts": len(plan.charts.photo),
+        "pages": [list(size) for size in plan.layout.sizes],
+        "texels": covered,
+        "scale": round(plan.layout.scale, 3),
+        "unseen_triangles": unseen,
+        "strange_views_of_triangles": plan.seen.strange,
+        "gains": {
+            view.name: [round(float(gain), 3) for gain in gains]
+            for view, gains in zip(views, plan.seen.gains, strict=True)
+        },
+        "rejected": {
+            view.name: found.reason for view, found in zip(views, looks, strict=True) if isinstance(found, Rejected)
+        },
+    }

@@ -1,0 +1,149 @@
+"""Charts: connected triangles of one photo, laid out as they lie in that photo.
+
+The photo is the parametrisation: nothing is stretched, and a texel is a pixel. Triangles that a photo sees cannot
+cover each other in it, but for those at the rim of what hides others; these get charts of their own.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.texture.facets import NONE, Facets, IntArray
+from sfm_app.texture.views import project
+
+FloatArray = NDArray[np.float64]
+
+SMALL = 12
+"""Charts of fewer triangles go over to the photo of a neighbouring chart that sees them, too."""
+ROUNDS = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Charts:
+    """Which triangles lie on which chart, and where in the chart's photo."""
+
+    of: IntArray
+    """(T,) chart of each triangle, -1 for none."""
+    photo: IntArray
+    """(C,) photo of each chart."""
+    corners: FloatArray
+    """(T, 3, 2) place of the corners in the photo, in its pixels."""
+
+
+def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: float) -> Charts:
+    """Charts from one photo per triangle.
+
+    Args:
+        chosen: (T,) photo of each triangle, -1 for none.
+        cameras: (P, 20) rows of the views.
+        mesh: the surface.
+        tile_px: charts are cut at multiples of this in the photo, so that each fits on a page.
+    """
+    corners = np.zeros((len(mesh.faces), 3, 2))
+    _project_corners(chosen, cameras, mesh.vertices, mesh.faces, corners)
+    tiles = np.floor(corners.mean(axis=1) / tile_px).astype(np.int64)
+    group = np.where(chosen == NONE, NONE, (chosen * 4096 + tiles[:, 1]) * 4096 + tiles[:, 0])
+    of, count = components(group, mesh.neighbours)
+    photo = np.full(count, NONE, np.int32)
+    photo[of[of != NONE]] = chosen[of != NONE]
+    return Charts(of, photo, corners)
+
+
+def components(group: NDArray[np.int64], neighbours: IntArray) -> tuple[IntArray, int]:
+    """Connected triangles of equal group: (T,) number of the component, -1 where the group is -1, and their count."""
+    of = np.full(len(group), NONE, np.int32)
+    return of, _flood(group, neighbours, of)
+
+
+def without_specks(chosen: IntArray, usable: NDArray[np.bool_], neighbours: IntArray) -> IntArray:
+    """Give charts of a few triangles the photo of a neighbour that may be used for all of them.
+
+    Args:
+        chosen: (T,) photo of each triangle, -1 for none.
+        usable: (P, T) whether a photo may be used for a triangle.
+        neighbours: (T, 3) triangles beside each triangle.
+    """
+    chosen = chosen.copy()
+    for _ in range(ROUNDS):
+        of, count = components(chosen.astype(np.int64), neighbours)
+        sizes = np.bincount(of[of != NONE], minlength=count)
+        order = np.argsort(of, kind="stable").astype(np.int32)
+        starts = np.concatenate([[0], np.cumsum(sizes)]) + int(np.count_nonzero(of == NONE))
+        if not _absorb(sizes, starts, order, usable, neighbours, chosen):
+            break
+    return chosen
+
+
+@kernel
+def _project_corners(
+    chosen: IntArray, cameras: FloatArray, vertices: FloatArray, faces: NDArray[np.int64], corners: FloatArray
+) -> None:
+    for f in range(len(faces)):
+        if chosen[f] == NONE:
+            continue
+        for k in range(3):
+            i = faces[f, k]
+            u, v, _ = project(cameras[chosen[f]], vertices[i, 0], vertices[i, 1], vertices[i, 2])
+            corners[f, k, 0], corners[f, k, 1] = u, v
+
+
+@kernel
+def _flood(group: NDArray[np.int64], neighbours: IntArray, of: IntArray) -> int:
+    stack = np.empty(len(group), np.int64)
+    count = 0
+    for seed in range(len(group)):
+        if group[seed] == NONE or of[seed] != NONE:
+            continue
+        stack[0], top = seed, 1
+        of[seed] = count
+        while top:
+            top -= 1
+            f = stack[top]
+            for k in range(3):
+                g = neighbours[f, k]
+                if g != NONE and of[g] == NONE and group[g] == group[f]:
+                    of[g] = count
+                    stack[top] = g
+                    top += 1
+        count += 1
+    return count
+
+
+@kernel
+def _absorb(
+    sizes: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    order: IntArray,
+    usable: NDArray[np.bool_],
+    neighbours: IntArray,
+    chosen: IntArray,
+) -> int:
+    """Small components take the neighbouring photo with the longest common border; how many did."""
+    absorbed = 0
+    border = np.zeros(len(usable), np.int64)
+    for c in range(len(sizes)):
+        if sizes[c] >= SMALL:
+            continue
+        border[:] = 0
+        own = chosen[order[starts[c]]]
+        for at in range(starts[c], starts[c + 1]):
+            for k in range(3):
+                g = neighbours[order[at], k]
+                if g != NONE and chosen[g] != NONE and chosen[g] != own:
+                    border[chosen[g]] += 1
+        best = NONE
+        for p in range(len(usable)):
+            if border[p] == 0 or (best != NONE and border[p] <= border[best]):
+                continue
+            possible = True
+            for at in range(starts[c], starts[c + 1]):
+                possible = possible and usable[p, order[at]]
+            if possible:
+                best = p
+        if best != NONE:
+            for at in range(starts[c], starts[c + 1]):
+                chosen[order[at]] = best
+            absorbed += 1
+    return absorbed

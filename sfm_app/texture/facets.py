@@ -1,0 +1,57 @@
+"""The triangles of a surface and what lies beside each of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.types import Surface
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+
+NONE = -1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Facets:
+    """A surface with tables that the texture needs again and again."""
+
+    surface: Surface
+    neighbours: IntArray
+    """(T, 3) the triangle across edge k, from corner k to corner k + 1; -1 at borders and where more than two meet."""
+    edges: NDArray[np.int64]
+    """(E, 2) vertices of every edge, each once, smaller first."""
+    spacing: float
+    """Median length of an edge."""
+
+    @property
+    def vertices(self) -> FloatArray:
+        return self.surface.vertices
+
+    @property
+    def faces(self) -> NDArray[np.int64]:
+        return self.surface.faces
+
+
+def facets(surface: Surface) -> Facets:
+    """Look up the neighbours of all triangles."""
+    starts, ends = surface.faces.ravel(), np.roll(surface.faces, -1, axis=1).ravel()
+    key = np.minimum(starts, ends) * np.int64(len(surface.vertices)) + np.maximum(starts, ends)
+    order = np.argsort(key, kind="stable")
+    ranked = key[order]
+    first = np.flatnonzero(np.concatenate([[True], ranked[1:] != ranked[:-1]])) if len(ranked) else np.empty(0, int)
+    shared = np.diff(np.append(first, len(ranked)))
+    neighbours = np.full(len(key), NONE, np.int32)
+    one, other = order[first[shared == 2]], order[first[shared == 2] + 1]
+    neighbours[one], neighbours[other] = other // 3, one // 3
+    edges = np.column_stack(np.divmod(ranked[first], np.int64(max(len(surface.vertices), 1))))
+    lengths = np.linalg.norm(surface.vertices[edges[:, 0]] - surface.vertices[edges[:, 1]], axis=1)
+    spacing = float(np.median(lengths)) if len(lengths) else 0.0
+    return Facets(surface, neighbours.reshape(-1, 3), edges, spacing)
+
+
+def at_vertices(values: FloatArray, faces: NDArray[np.int64], size: int) -> FloatArray:
+    """(V,) sum over the corners of triangles of one value per triangle (T,) or per corner (T, 3)."""
+    per_corner = np.broadcast_to(values[:, None] if values.ndim == 1 else values, faces.shape)
+    return np.bincount(faces.ravel(), per_corner.ravel(), size)

@@ -1,0 +1,169 @@
+"""One photo for every triangle: good ones, and few seams.
+
+A Markov random field over the triangles (Lempitsky & Ivanov, CVPR 2007; Waechter et al., ECCV 2014): a triangle pays
+for a worse photo, an edge pays its length when its two triangles take different photos. Solved by sequential
+tree-reweighted message passing (Kolmogorov, PAMI 2006), then improved triangle by triangle.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.texture.facets import NONE, Facets, IntArray
+
+FloatArray = NDArray[np.float64]
+
+CANDIDATES = 8
+"""Best photos of a triangle that are considered."""
+PRICE_OF_DETAIL = 0.35
+"""Of a photo with 1/e of the best one's pixels, beside 1 for a seam as long as the triangle's edge."""
+MOST_LOST = 3.0
+"""Natural logarithm beyond which a photo is no worse."""
+ROUNDS = 12
+
+
+def choose_photos(worth: NDArray[np.float32], mesh: Facets) -> IntArray:
+    """The photo that colours each triangle.
+
+    Args:
+        worth: (P, T) of each photo for each triangle, >= 0; 0 where it must not be used.
+        mesh: the surface.
+
+    Returns:
+        (T,) index of a photo, -1 where none may be used.
+    """
+    photos, triangles = worth.shape
+    kept = min(CANDIDATES, photos)
+    labels = np.argsort(-worth, axis=0, kind="stable")[:kept].T.astype(np.int32)
+    values = np.take_along_axis(worth, labels.T, axis=0).T.astype(np.float64)
+    best = values[:, :1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        lost = np.log(best / values)
+    cost = (PRICE_OF_DETAIL * _relative_size(mesh)[:, None] * np.minimum(lost, MOST_LOST)).astype(np.float32)
+    labels[values <= 0] = NONE
+    price = _edge_prices(mesh)
+    back = _places_at_neighbours(mesh.neighbours)
+    chosen = np.full(triangles, NONE, np.int32)
+    messages = np.zeros((triangles, 3, kept), np.float32)
+    for _ in range(ROUNDS):
+        for forward in (True, False):
+            _pass_messages(labels, cost, mesh.neighbours, back, price, messages, forward)
+    _decode(labels, cost, mesh.neighbours, price, messages, chosen)
+    for _ in range(ROUNDS):
+        if not _improve(labels, cost, mesh.neighbours, price, chosen):
+            break
+    return chosen
+
+
+def _relative_size(mesh: Facets) -> FloatArray:
+    """(T,) square root of the area of a triangle over that of one with three usual edges."""
+    corners = mesh.vertices[mesh.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    usual = np.sqrt(3.0) / 4.0 * max(mesh.spacing, 1e-300) ** 2
+    return np.sqrt(0.5 * np.linalg.norm(across, axis=1) / usual)
+
+
+def _edge_prices(mesh: Facets) -> NDArray[np.float32]:
+    """(T, 3) length of the edges from corner k to k + 1 in usual edges."""
+    corners = mesh.vertices[mesh.faces]
+    lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    return (lengths / max(mesh.spacing, 1e-300)).astype(np.float32)
+
+
+def _places_at_neighbours(neighbours: IntArray) -> IntArray:
+    """(T, 3) at which place of its neighbour's row a triangle stands."""
+    own = np.arange(len(neighbours))[:, None, None]
+    return np.asarray(np.argmax(neighbours[neighbours] == own, axis=2), np.int32)
+
+
+@kernel
+def _pass_messages(
+    labels: IntArray,
+    cost: NDArray[np.float32],
+    neighbours: IntArray,
+    back: IntArray,
+    price: NDArray[np.float32],
+    messages: NDArray[np.float32],
+    forward: bool,
+) -> None:
+    """One sweep; messages[f, k] is what neighbour k of f says about the labels of f."""
+    triangles, kept = labels.shape
+    belief = np.empty(kept)
+    for step in range(triangles):
+        f = step if forward else triangles - 1 - step
+        before = after = 0
+        for k in range(3):
+            before += NONE < neighbours[f, k] < f
+            after += neighbours[f, k] > f
+        share = 1.0 / max(before, after, 1)
+        for m in range(kept):
+            belief[m] = cost[f, m] + messages[f, 0, m] + messages[f, 1, m] + messages[f, 2, m]
+        for k in range(3):
+            g = neighbours[f, k]
+            if g == NONE or (g > f) != forward or labels[f, 0] == NONE or labels[g, 0] == NONE:
+                continue
+            least = np.inf
+            for m in range(kept):
+                if labels[f, m] != NONE:
+                    least = min(least, share * belief[m] - messages[f, k, m])
+            lowest = np.inf
+            for n in range(kept):
+                value = least + price[f, k]
+                for m in range(kept):
+                    if labels[f, m] == labels[g, n]:
+                        value = min(value, share * belief[m] - messages[f, k, m])
+                messages[g, back[f, k], n] = value
+                lowest = min(lowest, value)
+            for n in range(kept):
+                messages[g, back[f, k], n] -= lowest
+
+
+@kernel
+def _decode(
+    labels: IntArray,
+    cost: NDArray[np.float32],
+    neighbours: IntArray,
+    price: NDArray[np.float32],
+    messages: NDArray[np.float32],
+    chosen: IntArray,
+) -> None:
+    """Label after label, given those before and what the messages say about those behind."""
+    for f in range(len(labels)):
+        least = np.inf
+        for m in range(labels.shape[1]):
+            if labels[f, m] == NONE:
+                continue
+            value = cost[f, m]
+            for k in range(3):
+                g = neighbours[f, k]
+                if g > f:
+                    value += messages[f, k, m]
+                elif g != NONE and chosen[g] != NONE and chosen[g] != labels[f, m]:
+                    value += price[f, k]
+            if value < least:
+                least = value
+                chosen[f] = labels[f, m]
+
+
+@kernel
+def _improve(
+    labels: IntArray, cost: NDArray[np.float32], neighbours: IntArray, price: NDArray[np.float32], chosen: IntArray
+) -> int:
+    """Let every triangle take what suits it best beside its neighbours; how many changed."""
+    changed = 0
+    for f in range(len(labels)):
+        least, best = np.inf, chosen[f]
+        for m in range(labels.shape[1]):
+            if labels[f, m] == NONE:
+                continue
+            value = float(cost[f, m])
+            for k in range(3):
+                g = neighbours[f, k]
+                if g != NONE and chosen[g] != NONE and chosen[g] != labels[f, m]:
+                    value += price[f, k]
+            if value < least:
+                least, best = value, labels[f, m]
+        if best != chosen[f]:
+            chosen[f] = best
+            changed += 1
+    return changed

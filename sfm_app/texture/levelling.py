@@ -1,0 +1,131 @@
+"""Offsets that make photos equal where they meet; see `blending`."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.texture.blending import Blend
+from sfm_app.texture.facets import Facets, at_vertices
+
+FloatArray = NDArray[np.float64]
+
+STIFFNESS = 4.0
+"""Of the offsets along a chart, beside 1 for the difference at a seam."""
+HOLD = 1e-3
+"""Weight of "no offset"."""
+STEPS = 150
+ENOUGH = 1e-3
+"""Of the residual of the offsets, relative to the beginning."""
+
+
+def level(
+    blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets
+) -> Blend:
+    """The blend with the offsets that least squares give it.
+
+    Args:
+        blend: weights of the photos at the vertices.
+        colors: (P, T, 3) RGB of the triangles in the photos.
+        gains: (P, 3) of the photos.
+        usable: (P, T) whether a photo may be used for a triangle.
+        mesh: the surface.
+    """
+    values = _node_colors(blend, colors, gains, usable, mesh)
+    first, second = _meetings(blend, len(mesh.vertices))
+    start, end = _ties(blend, mesh)
+    right = np.zeros((len(blend.vertex), 3))
+    gap = values[second] - values[first]
+    known = np.isfinite(gap).all(axis=1)
+    first, second, gap = first[known], second[known], gap[known]
+    for channel in range(3):
+        right[:, channel] += np.bincount(first, gap[:, channel], len(right))
+        right[:, channel] -= np.bincount(second, gap[:, channel], len(right))
+    weights = np.concatenate([np.ones(len(first)), np.full(len(start), STIFFNESS)])
+    offsets = solve_ties(np.concatenate([first, start]), np.concatenate([second, end]), weights, HOLD, right)
+    return replace(blend, offset=offsets.astype(np.float32))
+
+
+def solve_ties(
+    one: NDArray[np.int64], other: NDArray[np.int64], weights: FloatArray, hold: float | FloatArray, right: FloatArray
+) -> FloatArray:
+    """(N, C) x with (graph Laplacian + hold) x = right, by conjugate gradients.
+
+    Args:
+        one: (E,) node at one end of each tie.
+        other: (E,) node at the other end.
+        weights: (E,) of the ties.
+        hold: what is added to the diagonal, > 0 somewhere in each connected part; a number or (N,).
+        right: (N, C).
+    """
+    from scipy.sparse import coo_matrix, diags
+
+    size = len(right)
+    diagonal = np.bincount(one, weights, size) + np.bincount(other, weights, size) + hold
+    rows, columns = np.concatenate([one, other]), np.concatenate([other, one])
+    ties = coo_matrix((-np.concatenate([weights, weights]), (rows, columns)), shape=(size, size)).tocsr()
+    matrix = (ties + diags(diagonal)).tocsr()
+    x = np.zeros_like(right)
+    residual = right.copy()
+    scaled = residual / diagonal[:, None]
+    way, energy = scaled.copy(), np.einsum("nc,nc->c", residual, scaled)
+    enough = ENOUGH**2 * energy
+    for _ in range(STEPS):
+        if np.all(energy <= enough):
+            break
+        moved = matrix @ way
+        step = _ratio(energy, np.einsum("nc,nc->c", way, moved))
+        x += step * way
+        residual -= step * moved
+        scaled = residual / diagonal[:, None]
+        before, energy = energy, np.einsum("nc,nc->c", residual, scaled)
+        way = scaled + _ratio(energy, before) * way
+    return x
+
+
+def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
+    return np.divide(above, below, out=np.zeros_like(above), where=below > 0)
+
+
+def _node_colors(
+    blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets
+) -> FloatArray:
+    """(N, 3) mean colour, after the gain, of the triangles around a vertex that the photo may be used for; or NaN."""
+    values = np.full((len(blend.vertex), 3), np.nan)
+    size = len(mesh.vertices)
+    for photo in range(len(usable)):
+        part = blend.of(photo)
+        at = blend.vertex[part]
+        faces = mesh.faces[usable[photo]]
+        count = at_vertices(np.ones(len(faces)), faces, size)[at]
+        for channel in range(3):
+            total = at_vertices(colors[photo, usable[photo], channel].astype(np.float64), faces, size)[at]
+            mean = np.divide(total, count, out=np.full(len(at), np.nan), where=count > 0)
+            values[part, channel] = mean / gains[photo, channel]
+    return values
+
+
+def _meetings(blend: Blend, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Every node beside the heaviest one of its vertex, and that one."""
+    order = np.lexsort((-blend.weight, blend.vertex))
+    heads = np.full(size, -1, np.int64)
+    ranked = blend.vertex[order]
+    first = np.concatenate([[True], ranked[1:] != ranked[:-1]]) if len(ranked) else np.empty(0, bool)
+    heads[ranked[first]] = order[first]
+    others = order[~first]
+    return others, heads[blend.vertex[others]]
+
+
+def _ties(blend: Blend, mesh: Facets) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs of nodes of one photo at the two ends of an edge."""
+    start, end = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    node = np.full(len(mesh.vertices), -1, np.int64)
+    for photo in range(len(blend.starts) - 1):
+        part = blend.of(photo)
+        node[blend.vertex[part]] = np.arange(part.start, part.stop)
+        ends = node[mesh.edges]
+        both = (ends >= 0).all(axis=1)
+        start.append(ends[both, 0])
+        end.append(ends[both, 1])
+        node[blend.vertex[part]] = -1
+    return np.concatenate(start), np.concatenate(end)

@@ -1,0 +1,139 @@
+"""What one photo shows of every triangle: whether it sees it, how well, and in which colour."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.texture.facets import Facets, at_vertices
+from sfm_app.texture.views import PhotoView, project, sample
+
+FloatArray = NDArray[np.float64]
+Hidden = Callable[[FloatArray, FloatArray, float], NDArray[np.bool_]]
+"""Which of (N, 3) points are hidden from a camera at (3,); the third argument is the slack next to a point."""
+
+SLACK = 1.0
+"""Of the occlusion test, in median edges: the surface's own roughness hides nothing."""
+MIN_COSINE = 0.1
+"""A triangle seen more obliquely than this is not seen: its few pixels would be smeared over it."""
+BORDER_PX = 2.0
+"""Pixels at the rim of a photo that are not used: resampling and demosaicing end there."""
+RIM_WORTH = 0.25
+"""Worth of a triangle beside one that is hidden: where the surface is a pixel off, it shows what hides the other."""
+SHARPNESS_RANGE = (0.2, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """One photo's view of all triangles."""
+
+    worth: NDArray[np.float32]
+    """(T,) pixels times cosine of the viewing angle; 0 where the photo does not see the triangle."""
+    color: NDArray[np.uint8]
+    """(T, 3) mean RGB; 0 where not seen."""
+    sharpness: float
+    """Energy of the finest detail relative to that of twice its size; falls with blur, hardly varies with content."""
+
+
+def look(view: PhotoView, photo: NDArray[np.uint8], mesh: Facets, hidden: Hidden) -> Look:
+    """Judge every triangle in one photo.
+
+    Args:
+        view: lens and pose.
+        photo: (height, width, 3) RGB, of the view's size.
+        mesh: the surface.
+        hidden: the occlusion test.
+    """
+    worth = np.zeros(len(mesh.faces), np.float32)
+    color = np.zeros((len(mesh.faces), 3), np.uint8)
+    _measure(view.row, photo, mesh.vertices, mesh.faces, worth, color)
+    candidates = np.flatnonzero(worth)
+    points = np.unique(mesh.faces[candidates])
+    covered = np.zeros(len(mesh.vertices), np.bool_)
+    covered[points] = hidden(mesh.vertices[points], view.centre, SLACK * mesh.spacing)
+    centres = mesh.vertices[mesh.faces[candidates]].mean(axis=1)
+    blocked = hidden(centres, view.centre, SLACK * mesh.spacing) | covered[mesh.faces[candidates]].all(axis=1)
+    blocked |= covered[mesh.faces[candidates]].sum(axis=1) == 2
+    occluded = np.zeros(len(mesh.faces))
+    occluded[candidates[blocked]] = 1.0
+    beside = at_vertices(occluded, mesh.faces, len(mesh.vertices)) > 0
+    beside |= covered
+    worth[beside[mesh.faces].any(axis=1)] *= RIM_WORTH
+    worth[candidates[blocked]] = 0.0
+    color[worth == 0] = 0
+    return Look(worth, color, sharpness(photo))
+
+
+def sharpness(photo: NDArray[np.uint8]) -> float:
+    """Ratio of the energies of the Laplacian at full and at half size, >= 0."""
+    grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
+    half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    fine, coarse = (float(np.mean(np.square(cv2.Laplacian(part, cv2.CV_32F)))) for part in (grey, half))
+    return fine / coarse if coarse > 0 else 0.0
+
+
+def sharpness_factors(sharpness_of: NDArray[np.float64]) -> FloatArray:
+    """(P,) factors for the worth of each photo, 1 for a photo as sharp as the median one."""
+    middle = float(np.median(sharpness_of)) if len(sharpness_of) else 0.0
+    relative = sharpness_of / middle if middle > 0 else np.ones(len(sharpness_of))
+    return np.asarray(np.clip(relative, *SHARPNESS_RANGE), np.float64)
+
+
+@kernel
+def _measure(
+    camera: FloatArray,
+    photo: NDArray[np.uint8],
+    vertices: FloatArray,
+    faces: NDArray[np.int64],
+    worth: NDArray[np.float32],
+    color: NDArray[np.uint8],
+) -> None:
+    """Area in pixels times cosine, and mean colour, of the triangles that face the camera within the photo."""
+    height, width = photo.shape[0], photo.shape[1]
+    x, y, pixel = np.empty(4), np.empty(4), np.empty((4, 2))
+    corner = np.empty((4, 3))
+    for f in range(len(faces)):
+        for axis in range(3):
+            corner[3, axis] = 0.0
+            for k in range(3):
+                corner[k, axis] = vertices[faces[f, k], axis]
+                corner[3, axis] += corner[k, axis] / 3.0
+        inside = True
+        for k in range(4):
+            x[k], y[k], depth = project(camera, corner[k, 0], corner[k, 1], corner[k, 2])
+            inside = inside and depth > 0.0 and BORDER_PX <= x[k] <= width - BORDER_PX
+            inside = inside and BORDER_PX <= y[k] <= height - BORDER_PX
+        if not inside:
+            continue
+        cosine = _cosine(camera, corner)
+        # y runs down in the photo: what is counter-clockwise from outside has a negative area here
+        area = -0.5 * ((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]))
+        if cosine < MIN_COSINE or area <= 0.0:
+            continue
+        worth[f] = area * cosine
+        for channel in range(3):
+            total = 0.0
+            for k in range(4):
+                total += sample(photo, x[k], y[k], channel)
+            color[f, channel] = int(total / 4.0 + 0.5)
+
+
+@kernel
+def _cosine(camera: FloatArray, corner: FloatArray) -> float:
+    """Between the triangle's normal and the way from its centre to the camera."""
+    ax, ay, az = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
+    bx, by, bz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
+    nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+    # the camera's own axes times its translation give the way without the centre
+    wx = wy = wz = 0.0
+    for row in range(3):
+        at = 8 + 4 * row
+        along = camera[at] * corner[3, 0] + camera[at + 1] * corner[3, 1] + camera[at + 2] * corner[3, 2] + camera[at + 3]
+        wx -= camera[at] * along
+        wy -= camera[at + 1] * along
+        wz -= camera[at + 2] * along
+    size = np.sqrt((nx * nx + ny * ny + nz * nz) * (wx * wx + wy * wy + wz * wz))
+    return (nx * wx + ny * wy + nz * wz) / size if size > 0.0 else 0.0

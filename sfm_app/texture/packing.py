@@ -1,0 +1,172 @@
+"""Charts onto pages, like bricks in a falling-block game (Levy et al., SIGGRAPH 2002, section 4).
+
+Each chart comes with the profile of its upper and lower side and is set down where it rests on the horizon of what
+lies there already, as high up on the page as possible. Tall charts come first.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.texture.charts import Charts
+from sfm_app.texture.facets import NONE, IntArray
+
+FloatArray = NDArray[np.float64]
+
+CELL = 4
+"""Texels per step of the profiles."""
+MARGIN = 2
+"""Texels around a chart that belong to it."""
+FILL = 0.7
+"""Share of a page that charts usually cover."""
+TIGHTER = 0.9
+"""Scale of the next try, where the charts do not fit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Layout:
+    """Where the charts lie."""
+
+    page: IntArray
+    """(C,) page of each chart."""
+    shift: IntArray
+    """(C, 2) whole texels from the photo's pixels (times `scale`) to the page's."""
+    scale: float
+    """Texels per pixel of the photos, <= 1."""
+    sizes: tuple[tuple[int, int], ...]
+    """(width, height) of each page."""
+
+
+def pack(charts: Charts, blocks: IntArray, max_page_px: int, max_pages: int) -> tuple[Layout, IntArray]:
+    """Lay charts, and rectangles beside them, onto as few pages as possible; smaller where they do not fit.
+
+    Args:
+        charts: their triangles in pixels of the photos.
+        blocks: (B, 2) widths and heights of rectangles, which are never scaled.
+        max_page_px: longest side of a page.
+        max_pages: most pages.
+
+    Returns:
+        The layout of the charts, and (B, 3) page, x and y of the rectangles.
+    """
+    scale = 1.0
+    while True:
+        placed = _try_to_pack(charts, blocks, scale, max_page_px, max_pages)
+        if placed is not None:
+            return placed
+        scale *= TIGHTER
+
+
+def _try_to_pack(
+    charts: Charts, blocks: IntArray, scale: float, max_page_px: int, max_pages: int
+) -> tuple[Layout, IntArray] | None:
+    count = len(charts.photo)
+    origin, cells, starts, low, high = _profiles(charts, scale)
+    block_cells = -(-blocks // CELL)
+    area = float(np.sum(high - low)) + float(np.sum(block_cells.astype(np.int64).prod(axis=1)))
+    widest = max((int(c) for c in np.concatenate([cells[:, 0], block_cells[:, 0]])), default=1)
+    page_cells = max_page_px // CELL
+    width = min(page_cells, max(widest, int(np.ceil(np.sqrt(area / FILL)))))
+    if widest > page_cells or area > max_pages * page_cells * width:
+        return None
+    starts = np.concatenate([starts, starts[-1] + np.cumsum(block_cells[:, 0])])
+    low = np.concatenate([low, np.zeros(int(block_cells[:, 0].sum()), np.int64)])
+    high = np.concatenate([high, np.repeat(block_cells[:, 1], block_cells[:, 0]).astype(np.int64)])
+    heights = np.concatenate([cells[:, 1], block_cells[:, 1]]).astype(np.int64)
+    order = np.lexsort((np.arange(len(heights)), -heights))
+    place = np.full((len(heights), 3), NONE, np.int32)
+    horizon = np.zeros((max_pages, width), np.int64)
+    if not _set_down(order, starts, low, high, page_cells, horizon, place):
+        return None
+    used = int(place[:, 0].max(initial=-1)) + 1
+    sizes = tuple((width * CELL, int(horizon[page].max()) * CELL) for page in range(used))
+    shift = CELL * place[:count, 1:] - origin
+    return Layout(place[:count, 0], shift.astype(np.int32), scale, sizes), place[count:] * np.array([1, CELL, CELL])
+
+
+def _profiles(charts: Charts, scale: float) -> tuple[IntArray, IntArray, NDArray[np.int64], ...]:  # type: ignore[misc]
+    """Origin in texels (C, 2), size in cells (C, 2), start of each chart's columns (C + 1,), and the two profiles."""
+    count = len(charts.photo)
+    drawn = np.flatnonzero(charts.of != NONE)
+    of, corners = charts.of[drawn], charts.corners[drawn] * scale
+    least, most = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    for k in range(3):
+        np.minimum.at(least, of, corners[:, k])
+        np.maximum.at(most, of, corners[:, k])
+    origin = (np.floor(least) - MARGIN).astype(np.int32)
+    cells = (-(-(np.ceil(most) + MARGIN - origin) // CELL)).astype(np.int32)
+    starts = np.concatenate([[0], np.cumsum(cells[:, 0], dtype=np.int64)])
+    low = np.full(int(starts[-1]), np.iinfo(np.int64).max)
+    high = np.zeros(int(starts[-1]), np.int64)
+    _outline(of, corners - origin[of][:, None, :], starts, low, high)
+    return origin, cells, starts, np.minimum(low, high), high
+
+
+@kernel
+def _outline(
+    of: IntArray, corners: FloatArray, starts: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]
+) -> None:
+    """Widen the profiles of the charts by each triangle and its margin, column by column."""
+    for f in range(len(of)):
+        first, columns = starts[of[f]], starts[of[f] + 1] - starts[of[f]]
+        left = min(corners[f, 0, 0], corners[f, 1, 0], corners[f, 2, 0]) - MARGIN
+        right = max(corners[f, 0, 0], corners[f, 1, 0], corners[f, 2, 0]) + MARGIN
+        for column in range(max(int(left // CELL), 0), min(int(right // CELL) + 1, columns)):
+            x0, x1 = column * CELL - MARGIN, (column + 1) * CELL + MARGIN
+            top, bottom = np.inf, -np.inf
+            for k in range(3):
+                ax, ay = corners[f, k, 0], corners[f, k, 1]
+                bx, by = corners[f, (k + 1) % 3, 0], corners[f, (k + 1) % 3, 1]
+                if max(ax, bx) < x0 or min(ax, bx) > x1:
+                    continue
+                if ax == bx:
+                    top, bottom = min(top, ay, by), max(bottom, ay, by)
+                    continue
+                for x in (x0, x1):
+                    y = ay + min(max((x - ax) / (bx - ax), 0.0), 1.0) * (by - ay)
+                    top, bottom = min(top, y), max(bottom, y)
+            if top <= bottom:
+                low[first + column] = min(low[first + column], int((top - MARGIN) // CELL))
+                high[first + column] = max(high[first + column], int((bottom + MARGIN) // CELL) + 1)
+
+
+@kernel
+def _set_down(
+    order: NDArray[np.int64],
+    starts: NDArray[np.int64],
+    low: NDArray[np.int64],
+    high: NDArray[np.int64],
+    page_height: int,
+    horizon: NDArray[np.int64],
+    place: IntArray,
+) -> bool:
+    """Place every chart; False when one does not fit on any page."""
+    pages, width = horizon.shape
+    for c in order:
+        first, columns = starts[c], starts[c + 1] - starts[c]
+        deepest = 0
+        for j in range(columns):
+            deepest = max(deepest, high[first + j])
+        for page in range(pages):
+            best_x, best_y = -1, page_height - deepest + 1
+            for x in range(width - columns + 1):
+                y = 0
+                for j in range(columns):
+                    if high[first + j] > low[first + j]:
+                        y = max(y, horizon[page, x + j] - low[first + j])
+                        if y >= best_y:
+                            break
+                if y < best_y:
+                    best_x, best_y = x, y
+            if best_x < 0:
+                continue
+            place[c, 0], place[c, 1], place[c, 2] = page, best_x, best_y
+            for j in range(columns):
+                if high[first + j] > low[first + j]:
+                    horizon[page, best_x + j] = best_y + high[first + j]
+            break
+        if place[c, 0] == NONE:
+            return False
+    return True

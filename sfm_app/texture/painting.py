@@ -1,0 +1,171 @@
+"""Pixels of the photos into the texels of the pages.
+
+First every texel gets an owner: the triangle that it lies in or, in the margin of a chart, the nearest one. Then each
+photo adds its share to the texels of the triangles that it counts for: the texel's point on the surface is projected
+through pose and lens, and the photo is read there; nothing is resampled twice.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.texture.facets import NONE, IntArray
+from sfm_app.texture.packing import MARGIN
+from sfm_app.texture.views import project, sample
+
+FloatArray = NDArray[np.float64]
+
+FINE = 256
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Canvas:
+    """A page under way."""
+
+    owner: IntArray
+    """(H, W) triangle that a texel belongs to, -1 for none."""
+    total: IntArray
+    """(H, W, 3) sum of what the photos gave, in 1 / FINE grey levels: whole numbers add up alike in any order."""
+
+
+def canvas(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatArray) -> Canvas:
+    """An empty page whose texels have owners.
+
+    Args:
+        size: (width, height).
+        triangles: (N,) the page's triangles.
+        corners: (T, 3, 2) texels.
+    """
+    owner = np.full((size[1], size[0]), NONE, np.int32)
+    _own(triangles, corners, 0.0, owner)
+    for margin in range(1, MARGIN + 1):
+        _own(triangles, corners, margin - 0.5, owner)
+    return Canvas(owner, np.zeros((size[1], size[0], 3), np.int32))
+
+
+@kernel
+def _own(triangles: NDArray[np.int64], corners: FloatArray, reach: float, owner: IntArray) -> None:
+    """Claim free texels within `reach` of each triangle."""
+    height, width = owner.shape
+    for f in triangles:
+        ax, ay = corners[f, 0, 0], corners[f, 0, 1]
+        bx, by = corners[f, 1, 0], corners[f, 1, 1]
+        cx, cy = corners[f, 2, 0], corners[f, 2, 1]
+        x0, x1 = max(int(min(ax, bx, cx) - reach - 0.5), 0), min(int(max(ax, bx, cx) + reach + 0.5), width - 1)
+        y0, y1 = max(int(min(ay, by, cy) - reach - 0.5), 0), min(int(max(ay, by, cy) + reach + 0.5), height - 1)
+        for y in range(y0, y1 + 1):
+            for x in range(x0, x1 + 1):
+                if owner[y, x] == NONE and _distance(corners[f], x + 0.5, y + 0.5) <= reach:
+                    owner[y, x] = f
+
+
+@kernel
+def _distance(corner: FloatArray, x: float, y: float) -> float:
+    """From a point to a triangle; 0 inside."""
+    turn = (corner[1, 0] - corner[0, 0]) * (corner[2, 1] - corner[0, 1])
+    turn -= (corner[1, 1] - corner[0, 1]) * (corner[2, 0] - corner[0, 0])
+    sign = 1.0 if turn >= 0.0 else -1.0
+    inside, nearest = turn != 0.0, np.inf
+    for k in range(3):
+        ax, ay = corner[k, 0], corner[k, 1]
+        ex, ey = corner[(k + 1) % 3, 0] - ax, corner[(k + 1) % 3, 1] - ay
+        inside = inside and sign * (ex * (y - ay) - ey * (x - ax)) >= 0.0
+        length = ex * ex + ey * ey
+        along = ((x - ax) * ex + (y - ay) * ey) / length if length > 0.0 else 0.0
+        along = min(max(along, 0.0), 1.0)
+        nearest = min(nearest, np.hypot(x - ax - along * ex, y - ay - along * ey))
+    return 0.0 if inside else nearest
+
+
+@kernel
+def paint(
+    photo: NDArray[np.uint8],
+    camera: FloatArray,
+    brightness: FloatArray,
+    triangles: NDArray[np.int64],
+    corners: FloatArray,
+    points: FloatArray,
+    weights: NDArray[np.float32],
+    offsets: NDArray[np.float32],
+    owner: IntArray,
+    total: IntArray,
+) -> None:
+    """Add one photo to a page.
+
+    Args:
+        photo: (height, width, 3) RGB.
+        camera: (20,) lens and pose of the photo at this size.
+        brightness: (3,) factors, one over the photo's gains.
+        triangles: (N,) those of the page that the photo counts for.
+        corners: (T, 3, 2) texels.
+        points: (N, 3, 3) corners in the scene.
+        weights: (N, 3) of the photo at the corners.
+        offsets: (N, 3, 3) grey levels to add, by corner and channel.
+        owner: (H, W) of the page.
+        total: (H, W, 3) of the page.
+    """
+    height, width = owner.shape
+    part = np.empty(3)
+    for n in range(len(triangles)):
+        f = triangles[n]
+        ax, ay = corners[f, 0, 0], corners[f, 0, 1]
+        bx, by = corners[f, 1, 0] - ax, corners[f, 1, 1] - ay
+        cx, cy = corners[f, 2, 0] - ax, corners[f, 2, 1] - ay
+        turn = bx * cy - by * cx
+        x0, x1 = int(min(0.0, bx, cx) + ax - MARGIN - 1), int(max(0.0, bx, cx) + ax + MARGIN + 1)
+        y0, y1 = int(min(0.0, by, cy) + ay - MARGIN - 1), int(max(0.0, by, cy) + ay + MARGIN + 1)
+        for y in range(max(y0, 0), min(y1, height - 1) + 1):
+            for x in range(max(x0, 0), min(x1, width - 1) + 1):
+                if owner[y, x] != f:
+                    continue
+                dx, dy = x + 0.5 - ax, y + 0.5 - ay
+                if turn != 0.0:
+                    part[1], part[2] = (dx * cy - dy * cx) / turn, (bx * dy - by * dx) / turn
+                else:
+                    part[1] = part[2] = 0.0
+                # thin triangles must not throw the points of their margin far away
+                part[1], part[2] = min(max(part[1], -1.0), 2.0), min(max(part[2], -1.0), 2.0)
+                part[0] = 1.0 - part[1] - part[2]
+                px = part[0] * points[n, 0, 0] + part[1] * points[n, 1, 0] + part[2] * points[n, 2, 0]
+                py = part[0] * points[n, 0, 1] + part[1] * points[n, 1, 1] + part[2] * points[n, 2, 1]
+                pz = part[0] * points[n, 0, 2] + part[1] * points[n, 1, 2] + part[2] * points[n, 2, 2]
+                u, v, _ = project(camera, px, py, pz)
+                inner = 0.0
+                for k in range(3):
+                    part[k] = max(part[k], 0.0)
+                    inner += part[k]
+                weight = (part[0] * weights[n, 0] + part[1] * weights[n, 1] + part[2] * weights[n, 2]) / inner
+                if weight <= 0.0:
+                    continue
+                for channel in range(3):
+                    value = brightness[channel] * sample(photo, u, v, channel)
+                    for k in range(3):
+                        value += part[k] / inner * offsets[n, k, channel]
+                    total[y, x, channel] += int(np.floor(FINE * weight * value + 0.5))
+
+
+def finished(page: Canvas) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """The page as 8-bit RGB, black where nobody owns it, and where it is owned."""
+    return np.clip((page.total + FINE // 2) // FINE, 0, 255).astype(np.uint8), page.owner != NONE
+
+
+def fill_background(page: NDArray[np.uint8], painted: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Texels that nobody owns take the mean colour of what is painted in the smallest block around them.
+
+    Blocks are those of mip maps, so a page made smaller by a viewer keeps its colours up to the rim of the charts.
+    """
+    if painted.all() or min(page.shape[:2]) < 2:
+        return page
+    height, width = page.shape[0] // 2, page.shape[1] // 2
+    sums, counts = np.zeros((height, width, 3), np.uint16), np.zeros((height, width), np.uint8)
+    for dy in (0, 1):
+        for dx in (0, 1):
+            part = np.s_[dy : 2 * height : 2, dx : 2 * width : 2]
+            sums += np.where(painted[part][..., None], page[part], 0)
+            counts += painted[part]
+    means = (sums // np.maximum(counts, 1)[..., None]).astype(np.uint8)
+    coarse = fill_background(means, counts > 0)
+    rows, columns = (np.minimum(np.arange(n) // 2, m - 1) for n, m in zip(page.shape[:2], (height, width), strict=True))
+    return np.where(painted[..., None], page, coarse[rows][:, columns])

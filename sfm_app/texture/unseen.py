@@ -1,0 +1,88 @@
+"""Triangles that no photo sees: coloured like what is around them, or cut away."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.texture.facets import Facets, at_vertices
+from sfm_app.texture.levelling import solve_ties
+from sfm_app.types import Surface
+
+FloatArray = NDArray[np.float64]
+
+CELL = 2
+"""Texels on a side of the square that an unseen triangle gets: bilinear reading inside it is exact."""
+BLOCK = 256
+"""Most such squares beside each other."""
+HOLD = 1e-4
+"""Weight of the colour that an unseen vertex had before, beside 1 for each neighbour: for parts that no photo sees."""
+
+
+def vertex_colors(mesh: Facets, seen: NDArray[np.bool_], corner_colors: FloatArray) -> FloatArray:
+    """Colours of all vertices, spread from the triangles that photos see over those that none does.
+
+    Args:
+        mesh: the surface; its colours stay where nothing seen is connected.
+        seen: (T,)
+        corner_colors: (S, 3, 3) RGB at the corners of the seen triangles.
+
+    Returns:
+        (V, 3) in 0..255.
+    """
+    faces, size = mesh.faces[seen], len(mesh.vertices)
+    count = at_vertices(np.ones(len(faces)), faces, size)
+    sums = [np.bincount(faces.ravel(), corner_colors[..., channel].ravel(), size) for channel in range(3)]
+    known = count > 0
+    colors = mesh.surface.colors.astype(np.float64)
+    colors[known] = np.stack(sums, axis=1)[known] / count[known, None]
+    free = np.full(size, -1, np.int64)
+    free[~known] = np.arange(size - known.sum())
+    if known.all() or not known.any():
+        return colors
+    ends = free[mesh.edges]
+    inner = (ends >= 0).all(axis=1)
+    rim = (ends >= 0).any(axis=1) & ~inner
+    outside = np.where(ends[rim, 0] < 0, mesh.edges[rim, 0], mesh.edges[rim, 1])
+    inside = ends[rim].max(axis=1)
+    hold = HOLD + np.bincount(inside, minlength=int((~known).sum()))
+    right = HOLD * colors[~known]
+    for channel in range(3):
+        right[:, channel] += np.bincount(inside, colors[outside, channel], len(right))
+    spread = solve_ties(ends[inner, 0], ends[inner, 1], np.ones(int(inner.sum())), hold, right)
+    colors[~known] = np.clip(spread, 0, 255)
+    return colors
+
+
+def block_sizes(triangles: int) -> NDArray[np.int32]:
+    """(B, 2) width and height in texels of the rectangles that hold a square for each of so many triangles."""
+    sizes = []
+    for start in range(0, triangles, BLOCK * BLOCK):
+        count = min(triangles - start, BLOCK * BLOCK)
+        columns = min(BLOCK, int(np.ceil(np.sqrt(count))))
+        sizes.append((columns * CELL, -(-count // columns) * CELL))
+    return np.array(sizes, np.int32).reshape(-1, 2)
+
+
+def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int) -> NDArray[np.int64]:
+    """(N, 3) page, x and y of the square of each triangle, row by row through the blocks."""
+    found = []
+    for (page, left, top), (width, _) in zip(places, sizes, strict=True):
+        count = min(triangles - sum(map(len, found)), BLOCK * BLOCK)
+        row, column = np.divmod(np.arange(count), width // CELL)
+        found.append(np.column_stack([np.full(count, page), left + CELL * column, top + CELL * row]))
+    return np.concatenate(found).astype(np.int64) if found else np.empty((0, 3), np.int64)
+
+
+def square_texels(corner_colors: FloatArray) -> NDArray[np.uint8]:
+    """(N, 2, 2, 3) texels whose bilinear interpolation gives colours (N, 3, 3) at the corners.
+
+    The first corner lies on the top-left texel's centre, the second on the right one's, the third on the lower one's.
+    """
+    a, b, c = (corner_colors[:, k] for k in range(3))
+    texels = np.stack([np.stack([a, b], axis=1), np.stack([c, b + c - a], axis=1)], axis=1)
+    return np.asarray(np.round(np.clip(texels, 0, 255)), np.uint8)
+
+
+def without(surface: Surface, unseen: NDArray[np.bool_]) -> Surface:
+    """The surface without these triangles and the vertices that only they use."""
+    used, faces = np.unique(surface.faces[~unseen], return_inverse=True)
+    return Surface(surface.vertices[used], faces.reshape(-1, 3).astype(np.int64), surface.colors[used])

@@ -1,0 +1,95 @@
+"""Photos as the texture sees them: a lens, a pose, and a kernel that projects through both."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.errors import ReconstructionError
+from sfm_app.jit import kernel
+from sfm_app.types import CameraModel
+
+FloatArray = NDArray[np.float64]
+
+LENS = 8
+"""COLMAP's OPENCV parameters fx, fy, cx, cy, k1, k2, p1, p2 come first in a camera row; the pose [R | t] follows."""
+LEAST_SLOPE = 0.1
+"""Where the distorted radius grows more slowly than this with the true one, the lens is about to fold."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PhotoView:
+    """A registered photo and its camera."""
+
+    name: str
+    lens: tuple[float, ...]
+    """fx, fy, cx, cy in pixels, k1, k2, p1, p2 as in COLMAP's OPENCV."""
+    cam_from_world: FloatArray
+    """(3, 4) [R | t]."""
+    width: int
+    height: int
+
+    @property
+    def row(self) -> FloatArray:
+        """(20,) lens and pose for the kernels."""
+        return np.concatenate([self.lens, self.cam_from_world.ravel()])
+
+    @property
+    def centre(self) -> FloatArray:
+        """(3,) where the camera stands."""
+        return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3], np.float64)
+
+    def scaled(self, width: int, height: int) -> "PhotoView":
+        """The same view in a photo of another size."""
+        sx, sy = width / self.width, height / self.height
+        fx, fy, cx, cy, *rest = self.lens
+        return replace(self, lens=(fx * sx, fy * sy, cx * sx, cy * sy, *rest), width=width, height=height)
+
+
+def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> PhotoView:
+    """The view of a registered photo.
+
+    Raises:
+        ReconstructionError: the camera has another model than OPENCV, to which every run adjusts its cameras.
+    """
+    if camera.model != "OPENCV":
+        raise ReconstructionError(f"the texture cannot use a camera of the model {camera.model}")
+    return PhotoView(name, tuple(camera.params), cam_from_world, camera.width, camera.height)
+
+
+def camera_centres(views: Sequence[PhotoView]) -> FloatArray:
+    """(P, 3)."""
+    return np.array([view.centre for view in views]).reshape(-1, 3)
+
+
+@kernel
+def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Pixel of a world point, and its depth: 0 where the point is behind the camera or beyond what the lens maps."""
+    depth = camera[16] * x + camera[17] * y + camera[18] * z + camera[19]
+    if depth <= 0.0:
+        return 0.0, 0.0, 0.0
+    u = (camera[8] * x + camera[9] * y + camera[10] * z + camera[11]) / depth
+    v = (camera[12] * x + camera[13] * y + camera[14] * z + camera[15]) / depth
+    k1, k2, p1, p2 = camera[4], camera[5], camera[6], camera[7]
+    r2 = u * u + v * v
+    if 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) < LEAST_SLOPE:
+        return 0.0, 0.0, 0.0
+    radial = 1.0 + r2 * (k1 + k2 * r2)
+    ud = u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)
+    vd = v * radial + 2.0 * p2 * u * v + p1 * (r2 + 2.0 * v * v)
+    return camera[0] * ud + camera[2], camera[1] * vd + camera[3], depth
+
+
+@kernel
+def sample(photo: NDArray[np.uint8], x: float, y: float, channel: int) -> float:
+    """Bilinear value at a pixel position; the border's value beyond the border."""
+    height, width = photo.shape[0], photo.shape[1]
+    x = min(max(x - 0.5, 0.0), width - 1.0)
+    y = min(max(y - 0.5, 0.0), height - 1.0)
+    left, top = int(x), int(y)
+    right, below = min(left + 1, width - 1), min(top + 1, height - 1)
+    a, b = x - left, y - top
+    upper = (1.0 - a) * photo[top, left, channel] + a * photo[top, right, channel]
+    lower = (1.0 - a) * photo[below, left, channel] + a * photo[below, right, channel]
+    return (1.0 - b) * upper + b * lower
