@@ -26,7 +26,7 @@ STAGE_TITLES = {
     "files": "files",
 }
 
-MEGABYTE = 1e6
+MEGABYTE, KILOBYTE = 1e6, 1e3
 
 
 class Terminal:
@@ -130,7 +130,12 @@ def written(run: Run, stage: str) -> list[Path]:
 
 def file_lines(paths: Sequence[Path]) -> list[str]:
     """Files with their sizes."""
-    return [f"{path}  {path.stat().st_size / MEGABYTE:.1f} MB" for path in paths]
+    return [f"{path}  {size_text(path.stat().st_size)}" for path in paths]
+
+
+def size_text(size: int) -> str:
+    """Bytes as people read them."""
+    return f"{size / MEGABYTE:.1f} MB" if size >= MEGABYTE else f"{size / KILOBYTE:.0f} kB"
 
 
 def table(rows: Mapping[str, str]) -> list[str]:

@@ -89,4 +89,4 @@ def rows(form: str, values: NDArray[np.generic]) -> str:
 
 def decimals(vertices: NDArray[np.float64]) -> int:
     """Decimals that give `DIGITS` digits of the size of the model."""
-    return max(0, DIGITS - int(np.floor(np.log10(scene_size(vertices)))))
+    return max(0, DIGITS - int(np.floor(np.log10(scene_size(vertices) or 1.0))))

@@ -10,18 +10,25 @@ from click.testing import CliRunner
 import sfm_app
 from sfm_app.cli import main
 from sfm_app.formats import EXPORTERS
-from sfm_app.stages.mesh import SURFACE
+from sfm_app.pipeline import NAMES, STAGES
 from sfm_app.workspace import StageRecord, Workspace
+
+LAST = STAGES[NAMES.index(STAGES[-1].takes[-1])]
+"""The stage whose product the files of the model hold."""
 
 
 @pytest.fixture
-def finished(ball, tmp_path):
-    """What a run leaves that has come to its mesh."""
+def finished(textured_ball, tmp_path):
+    """What a run leaves that has only its files to write."""
     place = Workspace(tmp_path / "out")
     place.dense.mkdir(parents=True)
-    surface = ball.surface
-    np.savez(place.dense / SURFACE, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
-    for stage in ("scene", "depth_maps", "mesh"):
+    surface, texture = textured_ball.surface, textured_ball.texture
+    np.savez(
+        place.root / LAST.files[0],
+        vertices=surface.vertices, faces=surface.faces, colors=surface.colors,
+        uv=texture.uv, page=texture.page, page0=texture.pages[0], page1=texture.pages[1],
+    )  # fmt: skip
+    for stage in NAMES[:-1]:
         place.finish(stage, StageRecord("", 0.0), {})
     return place.root
 
@@ -31,11 +38,12 @@ def call(*arguments):
 
 
 @pytest.mark.parametrize("name", EXPORTERS)
-def test_the_file_is_what_the_run_would_have_written(ball, finished, name):
-    (path,) = sfm_app.export_model(finished, name)
+def test_the_file_is_what_the_run_would_have_written(ball, textured_ball, finished, name):
+    paths = sfm_app.export_model(finished, name)
 
-    assert path == finished / f"model.{name}"
-    assert path.read_bytes() == EXPORTERS[name][0](ball, "model")[path.name]
+    assert paths[0] == finished / f"model.{name}"
+    made = [EXPORTERS[name][0](model, "model") for model in (ball, textured_ball)]
+    assert {path.name: path.read_bytes() for path in paths} in made
 
 
 @pytest.mark.parametrize(
@@ -79,7 +87,7 @@ def test_a_run_without_a_mesh_says_what_is_missing_and_what_to_do(tmp_path):
     result = call(place.root, "--format", "obj")
 
     assert result.exit_code == 3
-    assert "holds no model yet: stage `mesh` is missing" in result.stderr
+    assert f"holds no model yet: stage `{LAST.name}` is missing" in result.stderr
     assert f"sfm-app run PHOTOS -o {place.root}" in result.stderr and "--points" in result.stderr
 
 
@@ -102,15 +110,25 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path, place):
 
 
 def test_a_surface_that_has_gone_is_missed_by_name(finished):
-    (finished / "dense" / SURFACE).unlink()
+    (finished / LAST.files[0]).unlink()
 
     result = call(finished, "--format", "ply")
 
-    assert (result.exit_code, SURFACE in result.stderr) == (3, True)
+    assert (result.exit_code, LAST.files[0] in result.stderr) == (3, True)
 
 
 def test_sizes_are_told_to_people_and_paths_to_scripts(finished):
     people, scripts = call(finished, "--format", "obj"), call(finished, "--format", "obj", "--json")
 
-    assert people.stdout == f"{finished / 'model.obj'}  0.0 MB\n"
-    assert json.loads(scripts.stdout) == [str(finished / "model.obj")]
+    size_kb = (finished / "model.obj").stat().st_size / 1e3
+    assert people.stdout.splitlines()[0] == f"{finished / 'model.obj'}  {size_kb:.0f} kB"
+    assert json.loads(scripts.stdout)[0] == str(finished / "model.obj")
+
+
+def test_a_target_that_cannot_be_written_is_named(finished, tmp_path):
+    (tmp_path / "file").write_text("in the way")
+
+    result = call(finished, "-o", tmp_path / "file" / "model.glb")
+
+    assert (result.exit_code, "cannot write" in result.stderr) == (3, True)
+    assert str(tmp_path / "file") in result.stderr
