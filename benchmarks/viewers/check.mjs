@@ -1,4 +1,5 @@
 // node check.mjs FOLDER: the Khronos validator and three.js on every GLB in FOLDER.
+// CHROME names another browser than the bundled one, which is for Linux.
 // Prints JSON {name: {validator, three}} and leaves NAME.png, a view of the model, beside each file.
 import chromium from '@sparticuz/chromium';
 import validator from 'gltf-validator';
@@ -55,7 +56,7 @@ async function shown(browser, port, file) {
 const folder = path.resolve(process.argv[2]);
 const server = await serve(folder);
 const browser = await puppeteer.launch({
-  args: [...chromium.args, ...SOFTWARE], executablePath: await chromium.executablePath(), headless: 'shell',
+  args: [...chromium.args, ...SOFTWARE], executablePath: process.env.CHROME ?? await chromium.executablePath(), headless: 'shell',
 });
 const found = {};
 try {
