@@ -6,7 +6,7 @@ INSTALLED := $(VENV)/.installed
 JOBS ?= 2
 PLUGINS := $(wildcard plugins/*)
 
-.PHONY: demo test lint format clean
+.PHONY: demo test lint format viewers clean
 
 demo: $(INSTALLED)
 	$(BIN)/sfm-app demo -o demo
@@ -28,6 +28,11 @@ $(INSTALLED): pyproject.toml constraints.txt $(PLUGINS:=/pyproject.toml)
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]' $(PLUGINS:%=-e %)
 	touch $@
+
+# RUNS: output folders of finished runs, such as RUNS="demo out"; needs Node
+viewers: $(INSTALLED)
+	npm --prefix benchmarks/viewers install --no-audit --no-fund --no-package-lock
+	$(BIN)/python benchmarks/accuracy/viewers.py $(RUNS)
 
 clean:
 	rm -rf $(VENV) demo .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfm_app.context import RunContext
-from sfm_app.errors import ConfigError
+from sfm_app.errors import ConfigError, InputError
 from sfm_app.parallel import make_executor, worker_count
 from sfm_app.plugins import load_plugins
 from sfm_app.progress import Progress, Silent
@@ -108,7 +108,11 @@ def export_model(
         model = stored_model(run, points=points)
     place = place if place.suffix.lower() == f".{exporter.name}" else Path(f"{place}.{exporter.name}")
     files = exporter.write(model, place.stem)
-    return save_files(dict(zip([place.name, *list(files)[1:]], files.values(), strict=True)), place.parent)
+    named_so = dict(zip([place.name, *list(files)[1:]], files.values(), strict=True))
+    try:
+        return save_files(named_so, place.parent)
+    except OSError as err:
+        raise InputError(f"cannot write {place}: {err.strerror}", hint="name another file with -o") from err
 
 
 def calibrate_photos(

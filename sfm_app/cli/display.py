@@ -26,7 +26,7 @@ STAGE_TITLES = {
     "files": "files",
 }
 
-MEGABYTE = 1e6
+MEGABYTE, KILOBYTE = 1e6, 1e3
 
 
 class Terminal:
@@ -90,7 +90,8 @@ def run_summary(run: Run) -> dict[str, Any]:
         summary["scene"] = {**scene_summary(run.scene, counts.get("scene", {})), "files": points}
     if run.mesh_path:
         files = [str(path) for path in written(run, "files")]
-        summary["mesh"] = {"triangles": counts["mesh"].get("triangles"), "files": files}
+        about = {key: counts["files"][key] for key in ("pages_px", "jpeg_quality") if key in counts["files"]}
+        summary["mesh"] = {"triangles": counts["mesh"].get("triangles"), **about, "files": files}
     return summary
 
 
@@ -111,7 +112,7 @@ def run_lines(run: Run) -> list[str]:
         lines += scene_lines(run.scene, run.manifest.get("stages", {}).get("scene", {}).get("counts", {}))
         lines += [f"            points and cameras: {line}" for line in file_lines(written(run, "scene"))]
     if run.mesh_path:
-        lines.append(f"mesh        {summary['mesh']['triangles']} triangles")
+        lines.append(f"mesh        {summary['mesh']['triangles']} triangles{texture_text(summary['mesh'])}")
         lines += [f"            {line}" for line in file_lines(written(run, "files"))]
     seconds = summary["seconds"]
     lines.append(
@@ -122,6 +123,12 @@ def run_lines(run: Run) -> list[str]:
     return lines
 
 
+def texture_text(mesh: Mapping[str, Any]) -> str:
+    """The pages of texture, where there are some."""
+    pages = " and ".join(f"{width} x {height}" for width, height in mesh.get("pages_px", ()))
+    return f", texture {pages} px, JPEG of quality {mesh['jpeg_quality']}" if pages else ""
+
+
 def written(run: Run, stage: str) -> list[Path]:
     """The model files that a stage wrote and that are still there, the one to open first."""
     names = run.manifest.get("stages", {}).get(stage, {}).get("counts", {}).get("bytes", {})
@@ -130,7 +137,12 @@ def written(run: Run, stage: str) -> list[Path]:
 
 def file_lines(paths: Sequence[Path]) -> list[str]:
     """Files with their sizes."""
-    return [f"{path}  {path.stat().st_size / MEGABYTE:.1f} MB" for path in paths]
+    return [f"{path}  {size_text(path.stat().st_size)}" for path in paths]
+
+
+def size_text(size: int) -> str:
+    """Bytes as people read them."""
+    return f"{size / MEGABYTE:.1f} MB" if size >= MEGABYTE else f"{size / KILOBYTE:.0f} kB"
 
 
 def table(rows: Mapping[str, str]) -> list[str]:

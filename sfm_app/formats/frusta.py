@@ -59,18 +59,18 @@ def frustum_corners(camera: Frustum, depth: float) -> FloatArray:
 
 
 def frustum_depth(centres: FloatArray, points: FloatArray) -> float:
-    """How deep the frusta are drawn: half the usual distance between neighbouring cameras, within bounds."""
-    size = scene_size(np.concatenate([centres, points]))
+    """How deep the frusta are drawn: a third of the usual distance between neighbouring cameras, within bounds."""
+    size = max(scene_size(centres), scene_size(points)) or 1.0
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(apart, np.inf)
     step = float(np.median(apart.min(axis=1))) if len(centres) > 1 else np.inf
-    return float(np.clip(0.5 * step, LEAST_SHARE * size, MOST_SHARE * size))
+    return float(np.clip(step / 3, LEAST_SHARE * size, MOST_SHARE * size))
 
 
 def scene_size(points: FloatArray) -> float:
-    """Diagonal of the box that holds nine of ten coordinates along each axis; 1 where all points are one."""
+    """Diagonal of the box that holds nine of ten coordinates along each axis."""
     low, high = np.percentile(points, [5, 95], axis=0)
-    return float(np.linalg.norm(high - low)) or 1.0
+    return float(np.linalg.norm(high - low))
 
 
 def with_cameras(model: Model) -> tuple[FloatArray, NDArray[np.uint8], IndexArray]:

@@ -17,6 +17,9 @@ DIGITS = 6
 ACROSS = 10 ** (DIGITS + 1)
 """Makes one number of a place in the texture."""
 
+CHUNK = 50_000
+"""Rows that are formatted at once: Python numbers take several times the memory of their text."""
+
 MATERIAL = "newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 0\n"
 """`illum 0` shows the colours as they are: photos carry their light already."""
 
@@ -83,10 +86,11 @@ def textured_lines(model: Model, texture: Texture, pages: list[int]) -> Iterator
 
 
 def rows(form: str, values: NDArray[np.generic]) -> str:
-    """Every row of an array (N, C) as text; one format for all is ten times faster than one per row."""
-    return form * len(values) % tuple(values.ravel().tolist())
+    """Every row of an array (N, C) as text; one format for many is ten times faster than one per row."""
+    parts = (values[start : start + CHUNK] for start in range(0, len(values), CHUNK))
+    return "".join(form * len(part) % tuple(part.ravel().tolist()) for part in parts)
 
 
 def decimals(vertices: NDArray[np.float64]) -> int:
     """Decimals that give `DIGITS` digits of the size of the model."""
-    return max(0, DIGITS - int(np.floor(np.log10(scene_size(vertices)))))
+    return max(0, DIGITS - int(np.floor(np.log10(scene_size(vertices) or 1.0))))

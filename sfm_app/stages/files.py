@@ -12,10 +12,9 @@ NAME = "model"
 def write_files(model: Model, run: RunContext) -> tuple[Path, ...]:
     """Write the finished model in every standard format; the last one is the one to open."""
     paths = run.write_model(model, NAME)
-    pages = model.texture.pages if model.texture else ()
-    run.record(
-        pages_px=[[page.shape[1], page.shape[0]] for page in pages], jpeg_quality=JPEG_QUALITY if pages else None
-    )
+    if model.texture is not None:
+        sizes = [[page.shape[1], page.shape[0]] for page in model.texture.pages]
+        run.record(pages_px=sizes, jpeg_quality=JPEG_QUALITY)
     return paths
 
 

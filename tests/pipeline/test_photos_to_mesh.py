@@ -140,6 +140,7 @@ def test_the_literal_methods_are_one_flag_away(rendered, tmp_path):
     summary = json.loads(result.stdout)
     assert summary["scene"]["registered"] >= 5
     assert not (tmp_path / "out" / "dense").exists()
+    assert summary["scene"]["files"] == [str(tmp_path / "out" / f"points.{suffix}") for suffix in ("glb", "ply")]
 
 
 def heed_interrupts():

@@ -3,7 +3,7 @@ import json
 import pytest
 
 from sfm_app.api import Run
-from sfm_app.cli.display import intrinsics_lines, intrinsics_summary, run_lines, run_summary
+from sfm_app.cli.display import intrinsics_lines, intrinsics_summary, run_lines, run_summary, size_text
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
 
@@ -69,3 +69,37 @@ def test_refined_cameras_stand_with_their_deviations(tmp_path):
     found = json.loads(json.dumps(run_summary(run)))["scene"]["cameras"]["one"]
     assert found["deviations"] == deviations and found["determined"] == ["centre"]
     assert found["K"] == K.tolist() and found["params"][4] == -0.05
+
+
+def test_model_files_stand_with_their_sizes_the_one_to_open_first(tmp_path):
+    sizes = {"model.ply": 2_340_000, "model.glb": 4_000, "points.ply": 10, "points.glb": 20}
+    for name, size in sizes.items():
+        (tmp_path / name).write_bytes(bytes(size))
+    (tmp_path / "points.ply").unlink()
+    counts = {
+        "scene": {"bytes": {name: sizes[name] for name in ("points.ply", "points.glb")}},
+        "mesh": {"triangles": 7},
+        "files": {
+            "bytes": {name: sizes[name] for name in ("model.ply", "model.glb")},
+            "pages_px": [[4096, 2048], [512, 512]],
+            "jpeg_quality": 90,
+        },
+    }
+    stages = {name: {"counts": part, "seconds": 1.0} for name, part in counts.items()}
+    scene = Scene(tmp_path, {}, {}, {}, 10, 20, 0.3)
+    run = Run(tmp_path, None, scene, None, tmp_path / "model.glb", {"stages": stages})
+
+    lines = [line.strip() for line in run_lines(run)]
+    start = lines.index("mesh        7 triangles, texture 4096 x 2048 and 512 x 512 px, JPEG of quality 90")
+    assert lines[start + 1 : start + 3] == [f"{tmp_path}/model.glb  4 kB", f"{tmp_path}/model.ply  2.3 MB"]
+    assert lines[start - 1] == f"points and cameras: {tmp_path}/points.glb  0 kB"
+    summary = run_summary(run)
+    assert [summary[part]["files"] for part in ("scene", "mesh")] == [
+        [f"{tmp_path}/points.glb"],
+        [f"{tmp_path}/model.glb", f"{tmp_path}/model.ply"],
+    ]
+
+
+@pytest.mark.parametrize(("size", "text"), [(0, "0 kB"), (999, "1 kB"), (355_764, "356 kB"), (15_133_688, "15.1 MB")])
+def test_sizes_are_told_as_people_read_them(size, text):
+    assert size_text(size) == text

@@ -14,6 +14,7 @@ from sfm_app.colmap.model import (
     photos_of,
     placed_views,
     posed_photos,
+    sparse_model,
     viewing_rays,
 )
 from sfm_app.errors import BackendError, ConfigError
@@ -122,3 +123,41 @@ def test_options_become_plain_values():
 
     assert options["sift"]["max_ratio"] == 0.8
     assert isinstance(options["type"], str)
+
+
+def test_points_and_cameras_of_a_model_on_disk(synthetic, tmp_path):
+    model, _ = synthetic([900.0, 850.0, 510.0, 390.0, -0.1, 0.0, 0.0, 0.0], noise_px=0.0)
+    model.deregister_frame(model.images[4].frame_id)
+    model.write(tmp_path)
+
+    found = sparse_model(tmp_path)
+
+    poses, points = posed_photos(model)
+    np.testing.assert_array_equal(found.surface.vertices, points)
+    assert len(found.surface.colors) == len(points) and found.surface.faces.shape == (0, 3)
+    assert [camera.name for camera in found.cameras] == [model.images[key].name for key in poses]
+    for camera, pose in zip(found.cameras, poses.values(), strict=True):
+        np.testing.assert_allclose(camera.cam_from_world, pose)
+        np.testing.assert_allclose(camera.K, [[900, 0, 510], [0, 850, 390], [0, 0, 1]])
+
+
+def test_points_of_two_photos_count_where_three_photos_see_the_scene(synthetic, tmp_path):
+    model, _ = synthetic(noise_px=0.0)
+    _, points = posed_photos(model)
+    before = len(points)
+    for place in (points.mean(axis=0), points.max(axis=0) + 1.0, points.mean(axis=0) - [0, 0, 1e3]):
+        track = pycolmap.Track()
+        for image in (1, 2):
+            track.add_element(image, free_keypoint(model, image))
+        model.add_point3D(place, track, np.zeros(3, np.uint8))
+    model.write(tmp_path)
+
+    found = sparse_model(tmp_path)
+
+    assert len(found.surface.vertices) == before + 1
+
+
+def free_keypoint(model, image_id):
+    """A new keypoint of a photo, that no point has yet."""
+    image = model.images[image_id]
+    return next(i for i, point in enumerate(image.points2D) if not point.has_point3D())

@@ -11,7 +11,7 @@ import trimesh
 from PIL import Image
 
 from sfm_app.formats.glb import linear_colors, write_glb
-from sfm_app.formats.pages import JPEG_QUALITY, split_corners
+from sfm_app.formats.pages import jpeg, split_corners
 from sfm_app.meshing.open3d import load_open3d
 from sfm_app.types import Model, Surface
 
@@ -232,5 +232,10 @@ def test_open3d_reads_all_kinds(model, tmp_path):
     assert len(pictures) == (len(model.texture.pages) if model.texture else 0)
 
 
-def test_quality_decides_the_size_of_a_page():
-    assert 80 <= JPEG_QUALITY <= 95
+def test_colours_of_neighbouring_charts_stay_apart():
+    page = np.zeros((64, 64, 3), np.uint8)
+    page[:, ::2], page[:, 1::2] = (220, 30, 30), (30, 30, 220)
+
+    back = np.asarray(Image.open(io.BytesIO(jpeg(page)))).astype(float)
+
+    assert 0 < np.abs(back - page).mean() < 6

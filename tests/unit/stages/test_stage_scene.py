@@ -10,8 +10,10 @@ import pytest
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import opened
 from sfm_app.colmap.model import part_of, photos_of
+from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.camera import camera_matrix
+from sfm_app.plugins import load_plugins
 from sfm_app.reconstruction import Outcome
 from sfm_app.reconstruction.attempts import Attempt
 from sfm_app.reconstruction.support import Explained
@@ -52,13 +54,9 @@ def synthetic(tmp_path_factory):
 
 @pytest.fixture
 def run(synthetic, tmp_path):
-    """A run whose folder holds the database; `counts` is what it recorded."""
+    """A run whose folder holds the database."""
     shutil.copyfile(synthetic[0], tmp_path / "database.db")
-    counts = {}
-    return SimpleNamespace(
-        workspace=Workspace(tmp_path), counts=counts, record=counts.update, settings=Settings(), workers=1,
-        executor=ThreadPoolExecutor(1),
-    )  # fmt: skip
+    return RunContext(Settings(), Workspace(tmp_path), load_plugins(), ThreadPoolExecutor(1), 1)
 
 
 def attempt(model, explained=None):
@@ -111,6 +109,10 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
     assert run.counts["other_models"] == [[name[key] for key in (5, 6, 7)]]
     assert run.counts["pairs_dropped"] == {"contradicts other pairs": 1}
     assert photos_of(pycolmap.Reconstruction(run.workspace.other_models / "1")) == [5, 6, 7]
+
+    assert list(run.counts["bytes"]) == ["points.ply", "points.glb"]
+    for file, size in run.counts["bytes"].items():
+        assert (run.workspace.root / file).stat().st_size == size > 1000
 
     record = StageRecord("", 0.0, run.counts)
     run.workspace.finish("scene", record, {})

@@ -1,0 +1,80 @@
+"""The part of the viewers' check that needs no browser."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import viewers
+
+from sfm_app.formats.glb import write_glb
+from sfm_app.formats.ply import write_ply
+
+SILENT = {
+    "validator": {"errors": 0, "warnings": 0, "messages": [], "triangles": 5120},
+    "three": {
+        "triangles": 5120, "points": 0, "textures": 2, "finite": True, "covered": 0.5, "said": [],
+        "most": [0xC85A3C, 0x285AC8],
+    },
+}  # fmt: skip
+
+
+def subject(model, place):
+    for name, data in {**write_glb(model, viewers.SAMPLE), **write_ply(model, viewers.SAMPLE)}.items():
+        (place / name).write_bytes(data)
+    return viewers.Subject(viewers.SAMPLE, place / "sample.glb", place / "sample.ply")
+
+
+def test_the_sample_is_as_it_should_be(tmp_path):
+    row = viewers.checked(subject(viewers.sample(), tmp_path), SILENT)
+
+    assert row["ok"] == "yes"
+    assert (row["Open3D"], row["trimesh"]) == ("5120 triangles + 2 pages", "5120 triangles")
+    assert (row["open edges"], row["outward"], row["off centre"]) == (0, 1.0, pytest.approx(0, abs=0.02))
+
+
+def changed(**parts):
+    model = viewers.sample()
+    return replace(model, surface=replace(model.surface, **{key: make(model.surface) for key, make in parts.items()}))
+
+
+@pytest.mark.parametrize(
+    ("model", "fault"),
+    [
+        (changed(faces=lambda surface: surface.faces[:, ::-1]), "normals"),
+        (changed(vertices=lambda surface: surface.vertices + np.array([2.0, 0, 0])), "off centre"),
+        (changed(faces=lambda surface: np.concatenate([surface.faces[:-1], [[0, 0, 1]]])), "degenerate triangles"),
+        (changed(faces=lambda surface: np.concatenate([surface.faces[1:], surface.faces[1:2]])), "not manifold"),
+    ],
+    ids=["inside out", "far away", "a line", "twice"],
+)
+def test_what_is_wrong_with_a_surface_is_named(tmp_path, model, fault):
+    assert fault in viewers.checked(subject(model, tmp_path), SILENT)["ok"].split("; ")
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "fault"),
+    [
+        ("validator", {"warnings": 1, "messages": ["ODD"]}, "the validator objects: ODD"),
+        ("validator", {"triangles": 5119}, "readers count other triangles"),
+        ("three", {"said": ["no texture"]}, "three.js complains"),
+        ("three", {"covered": 0.0}, "nothing to see"),
+        ("three", {"textures": 1}, "Open3D misses pages"),
+        ("three", {"most": [0xC85A3C, 0x000000]}, "other colours"),
+    ],
+)
+def test_what_viewers_do_not_like_is_named(tmp_path, part, value, fault):
+    seen = {**SILENT, part: {**SILENT[part], **value}}
+
+    assert viewers.checked(subject(viewers.sample(), tmp_path), seen)["ok"] == fault
+
+
+def test_normals_that_look_at_no_camera_count(cloud, ball):
+    vertices = ball.surface.vertices
+    assert viewers.facing(vertices, vertices, cloud.cameras) == pytest.approx(0.6, abs=0.15)
+    assert viewers.facing(vertices, vertices, ()) == 0
+
+
+def test_a_page_has_both_tables_and_every_picture(tmp_path):
+    page = viewers.markdown([viewers.checked(subject(viewers.sample(), tmp_path), SILENT)])
+
+    assert page.count("| sample |") == 2 and "viewers-sample.png" in page
