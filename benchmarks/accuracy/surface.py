@@ -32,11 +32,11 @@ ABOUT = (
     "around all that the photos see); completeness: share of the area of the true surface that two photos see (in the "
     "photo, not hidden, at less than 80 degrees) with mesh within 1 %; F: harmonic mean; median: of the distances, in "
     "% of the size. sparse: COLMAP's Poisson surface through the sparse points of the same run, under the trimming "
-    "that suits it best. Real photos: the finished model is rendered into the camera of every photo that has a place, lens "
-    "and all; coverage: share of the photo's pixels that show it; PSNR: on those, after a gain and an offset per "
+    "that suits it best. Real photos: the finished model is rendered into the camera of every photo that has a place, "
+    "lens and all; coverage: share of the photo's pixels that show it; PSNR: on those, after a gain and an offset per "
     "channel; means over the photos, and the worst photo. left out: photos whose texture was made without them, "
-    "geometry kept; PSNR in them, and how much lower it is than with them. Seconds as in the manifest; MB: most memory "
-    "of a process that did nothing but that stage; together: all stages behind the cameras but the files."
+    "geometry kept; PSNR in them, and how much lower it is than with them. Seconds as in the manifest; MB: most "
+    "memory of a process that did nothing but that stage; together: all stages behind the cameras but the files."
 )
 
 

@@ -53,7 +53,7 @@ def save_page(page: Pixels, path: Path) -> None:
         shrink = min(1.0, width / page.shape[1])
         size = round(page.shape[1] * shrink), round(page.shape[0] * shrink)
         small = cv2.resize(page, size, interpolation=cv2.INTER_AREA)
-        picture = Image.fromarray(small).quantize(COLORS, dither=Image.Dither.NONE)
+        picture = Image.fromarray(small).quantize(COLORS, kmeans=2, dither=Image.Dither.NONE)
         picture.save(path, format="PNG", optimize=True)
         if path.stat().st_size <= BYTES:
             return
