@@ -19,8 +19,8 @@ TALL_PX, WIDE_PX = 800, 1000
 """Largest height and width of one picture; a page has two by two of them."""
 OVER = 2
 """Pictures are rendered this many times as large and averaged."""
-COLORS = 256
-"""Of a page, which keeps PNGs small."""
+COLORS, PALETTE_PIXELS = 256, 20_000
+"""Of a page, which keeps PNGs small, and the pixels that its colours are chosen by."""
 WIDTHS_PX, BYTES = (1600, 1400, 1200, 1000, 800), 600_000
 """Of a page."""
 
@@ -49,11 +49,23 @@ def model_page(out: Path, name: str, model: PreparedModel) -> Pixels:
 def save_page(page: Pixels, path: Path) -> None:
     """A PNG of at most `WIDTHS_PX[0]` and `BYTES`, in few colours; narrower where it would be larger."""
     path.parent.mkdir(parents=True, exist_ok=True)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(palette_of(page).tobytes())
     for width in WIDTHS_PX:
         shrink = min(1.0, width / page.shape[1])
         size = round(page.shape[1] * shrink), round(page.shape[0] * shrink)
         small = cv2.resize(page, size, interpolation=cv2.INTER_AREA)
-        picture = Image.fromarray(small).quantize(COLORS, kmeans=2, dither=Image.Dither.NONE)
+        picture = Image.fromarray(small).quantize(palette=palette, dither=Image.Dither.NONE)
         picture.save(path, format="PNG", optimize=True)
         if path.stat().st_size <= BYTES:
             return
+
+
+def palette_of(page: Pixels) -> Pixels:
+    """(COLORS, 3) that stand for the colours of a page, by k-means on some of its pixels."""
+    pixels = page.reshape(-1, 3)
+    some = pixels[np.random.default_rng(0).integers(0, len(pixels), PALETTE_PIXELS)].astype(np.float32)
+    cv2.setRNGSeed(0)
+    criteria = (cv2.TERM_CRITERIA_MAX_ITER, 10, 0.0)
+    _, _, centres = cv2.kmeans(some, COLORS, None, criteria, 1, cv2.KMEANS_RANDOM_CENTERS)
+    return np.round(np.clip(centres, 0, 255)).astype(np.uint8)
