@@ -64,7 +64,7 @@ def surface_error(
     """
     aligned = align_centres(centres, truth)(vertices)
     points = sample_surface(aligned, faces, samples)
-    return float(np.median(_distances(points, truth.vertices, truth.faces)) / scene_size(truth))
+    return float(np.median(surface_distances(points, truth.vertices, truth.faces)) / scene_size(truth))
 
 
 def surface_coverage(
@@ -81,7 +81,7 @@ def surface_coverage(
     aligned = align_centres(centres, truth)(vertices)
     if not _area(aligned, faces).sum() > 0:
         raise ValueError("the surface has no area")
-    return float(np.mean(_distances(seen_points(truth), aligned, faces) <= tolerance * scene_size(truth)))
+    return float(np.mean(surface_distances(seen_points(truth), aligned, faces) <= tolerance * scene_size(truth)))
 
 
 def scene_size(truth: Truth) -> float:
@@ -122,27 +122,36 @@ def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: in
     Raises:
         ValueError: the surface has no area.
     """
+    return sample_triangles(vertices, faces, count, seed)[0]
+
+
+def sample_triangles(
+    vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0
+) -> tuple[FloatArray, IndexArray]:
+    """As `sample_surface`, with the triangle (count,) of each point."""
     area = _area(vertices, faces)
     if not area.sum() > 0:
         raise ValueError("the surface has no area")
     rng = np.random.default_rng(seed)
-    corners = vertices[faces[rng.choice(len(faces), count, p=area / area.sum())]]
+    chosen = rng.choice(len(faces), count, p=area / area.sum())
+    corners = vertices[faces[chosen]]
     u, v = rng.uniform(size=(2, count, 1))
     # folding the unit square onto the triangle keeps the points even
     outside = u + v > 1.0
     u, v = np.where(outside, 1.0 - u, u), np.where(outside, 1.0 - v, v)
-    return np.asarray(corners[:, 0] * (1.0 - u - v) + corners[:, 1] * u + corners[:, 2] * v)
+    return np.asarray(corners[:, 0] * (1.0 - u - v) + corners[:, 1] * u + corners[:, 2] * v), chosen
+
+
+def surface_distances(points: FloatArray, vertices: FloatArray, faces: IndexArray) -> FloatArray:
+    """(N,) distance of points (N, 3) to the nearest place on the triangles; in single precision."""
+    queries = load_open3d().core.Tensor(points.astype(np.float32))
+    return np.asarray(ray_caster(vertices, faces).compute_distance(queries).numpy(), dtype=np.float64)
 
 
 def _coarse(camera: Camera) -> Camera:
     shrink = SEEN_RAYS / max(camera.width, camera.height)
     K = np.diag([shrink, shrink, 1.0]) @ camera.K
     return Camera(K, round(camera.width * shrink), round(camera.height * shrink), camera.radial)
-
-
-def _distances(points: FloatArray, vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    queries = load_open3d().core.Tensor(points.astype(np.float32))
-    return np.asarray(ray_caster(vertices, faces).compute_distance(queries).numpy(), dtype=np.float64)
 
 
 def _area(vertices: FloatArray, faces: IndexArray) -> FloatArray:

@@ -82,7 +82,11 @@ def _shelf() -> list[Body]:
             book = box(deep, high, thick, spacing=0.05).moved((0.03 + deep / 2, y, z + thick / 2))
             bodies.append(Body(book, cover))
             z += thick + 0.002
-    return [*bodies, Body(ball(0.12).moved((0.16, 1.37, 2.0)), MARBLE), Body(_vase(0.6).moved((0.15, 1.25, 2.45)), PAINT)]
+    return [
+        *bodies,
+        Body(ball(0.12).moved((0.16, 1.37, 2.0)), MARBLE),
+        Body(_vase(0.6).moved((0.15, 1.25, 2.45)), PAINT),
+    ]
 
 
 def _pictures() -> list[Body]:
@@ -134,7 +138,8 @@ def _armchair() -> list[Body]:
 
 def _things() -> list[Body]:
     pot = revolved(
-        np.array([[0.0, 0.0], [0.13, 0.0], [0.19, 0.28], [0.21, 0.28], [0.21, 0.33], [0.17, 0.33], [0.0, 0.31]]), sharp=True
+        np.array([[0.0, 0.0], [0.13, 0.0], [0.19, 0.28], [0.21, 0.28], [0.21, 0.33], [0.17, 0.33], [0.0, 0.31]]),
+        sharp=True,
     )
     return [
         Body(box(1.5, 0.015, 1.1, spacing=0.06).moved((1.5, 0.0, 1.6), turn_deg=8.0), RUG),

@@ -86,7 +86,9 @@ def _windows() -> list[Body]:
         y = FLOORS[floor][1]
         bodies.append(Body(box(0.8, 0.16, 0.18, spacing=0.06).moved((x, y, 0.08)), TERRACOTTA))
         bodies += [
-            Body(ball(0.15, bumps=0.12, seed=round(10 * x) + j + 50).moved((x - 0.27 + 0.27 * j, y + 0.22, 0.1)), FLOWERS)
+            Body(
+                ball(0.15, bumps=0.12, seed=round(10 * x) + j + 50).moved((x - 0.27 + 0.27 * j, y + 0.22, 0.1)), FLOWERS
+            )
             for j in range(3)
         ]
     return bodies
@@ -120,7 +122,9 @@ def _courses() -> list[Body]:
     plinth = assembled([box(3.85, 0.4, 0.14).moved((side * 2.575, -0.02, 0.05)) for side in (-1.0, 1.0)])
     brackets = [box(0.14, 0.2, 0.3).moved((x, top - 0.14, 0.12)) for x in np.linspace(-4.3, 4.3, 22)]
     quoins = [
-        box(0.5 if k % 2 else 0.36, 0.3, 0.1).moved((side * (WIDTH / 2 - (0.25 if k % 2 else 0.18)), 3.02 + 0.31 * k, 0.03))
+        box(0.5 if k % 2 else 0.36, 0.3, 0.1).moved(
+            (side * (WIDTH / 2 - (0.25 if k % 2 else 0.18)), 3.02 + 0.31 * k, 0.03)
+        )
         for k in range(9)
         for side in (-1.0, 1.0)
     ]
@@ -157,7 +161,9 @@ def _balcony() -> list[Body]:
     """On the portal."""
     y = 2.6
     baluster = revolved(
-        np.array([[0.0, 0.0], [0.05, 0.0], [0.05, 0.04], [0.03, 0.1], [0.06, 0.22], [0.03, 0.42], [0.05, 0.5], [0.05, 0.55]]),
+        np.array(
+            [[0.0, 0.0], [0.05, 0.0], [0.05, 0.04], [0.03, 0.1], [0.06, 0.22], [0.03, 0.42], [0.05, 0.5], [0.05, 0.55]]
+        ),
         segments=32,
     )
     front = [baluster.moved((x, y + 0.12, 0.8)) for x in np.linspace(-1.1, 1.1, 10)]
@@ -173,7 +179,8 @@ def _balcony() -> list[Body]:
 
 def _street() -> list[Body]:
     pot = revolved(
-        np.array([[0.0, 0.0], [0.2, 0.0], [0.3, 0.45], [0.33, 0.45], [0.33, 0.52], [0.27, 0.52], [0.0, 0.5]]), sharp=True
+        np.array([[0.0, 0.0], [0.2, 0.0], [0.3, 0.45], [0.33, 0.45], [0.33, 0.52], [0.27, 0.52], [0.0, 0.5]]),
+        sharp=True,
     )
     return [
         Body(pot.moved((-1.75, 0.0, 0.6)), TERRACOTTA),

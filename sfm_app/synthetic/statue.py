@@ -85,7 +85,8 @@ def bust_field(points: FloatArray) -> FloatArray:
 def _bust() -> list[Body]:
     foot = revolved(
         np.array([[0.0, 0.0], [0.36, 0.0], [0.36, 0.05], [0.26, 0.08], [0.2, 0.14], [0.2, 0.24], [0.0, 0.24]]),
-        segments=72, sharp=True,
+        segments=72,
+        sharp=True,
     )
     wreath = torus(0.205, 0.026).moved((0.0, PLINTH_TOP_Y + 1.14, -0.04), tilt_deg=12.0)
     return [
@@ -112,8 +113,13 @@ def _plinth() -> list[Body]:
 
 
 def _terrace() -> list[Body]:
-    drum = revolved(np.array([[0.0, 0.0], [0.17, 0.0], [0.17, 0.5], [0.0, 0.5]]), segments=72, sharp=True, flutes=(14, 0.1))
-    pot = revolved(np.array([[0.0, 0.0], [0.13, 0.0], [0.2, 0.3], [0.22, 0.3], [0.22, 0.35], [0.17, 0.35], [0.0, 0.33]]), sharp=True)
+    drum = revolved(
+        np.array([[0.0, 0.0], [0.17, 0.0], [0.17, 0.5], [0.0, 0.5]]), segments=72, sharp=True, flutes=(14, 0.1)
+    )
+    pot = revolved(
+        np.array([[0.0, 0.0], [0.13, 0.0], [0.2, 0.3], [0.22, 0.3], [0.22, 0.35], [0.17, 0.35], [0.0, 0.33]]),
+        sharp=True,
+    )
     return [
         Body(ground((-1.7, 1.7), (-1.7, 1.7), unevenness=0.015), replace(PAVING, scale=0.35)),
         Body(drum.moved((1.15, 0.17, 0.95), turn_deg=35.0, tilt_deg=90.0), LIMESTONE),

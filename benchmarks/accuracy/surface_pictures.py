@@ -1,0 +1,71 @@
+"""A page of pictures per model: a photo, the model from there and from beside it, and its bare shape."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.demo import walked_around
+from sfm_app.synthetic.cameras import Camera
+from sfm_app.synthetic.pictures import PreparedModel, render_model, render_shape
+
+Pixels = NDArray[np.uint8]
+ASIDE_DEG = 25.0
+"""How far the view from beside is turned away from the photo's."""
+TALL_PX, WIDE_PX = 800, 1000
+"""Largest height and width of one picture; a page has two by two of them."""
+OVER = 2
+"""Pictures are rendered this many times as large and averaged."""
+COLORS, PALETTE_PIXELS = 256, 20_000
+"""Of a page, which keeps PNGs small, and the pixels that its colours are chosen by."""
+WIDTHS_PX, BYTES = (1600, 1400, 1200, 1000, 800), 600_000
+"""Of a page."""
+
+
+def model_page(out: Path, name: str, model: PreparedModel) -> Pixels:
+    """Photo, model from its camera; model from beside, bare shape: (H, W, 3)."""
+    sparse = pycolmap.Reconstruction(out / "sparse")
+    image = next(image for image in sparse.images.values() if image.name == name)
+    camera, pose = sparse.cameras[image.camera_id], np.asarray(image.cam_from_world().matrix())
+    photo = np.asarray(Image.open(out / "photos" / name).convert("RGB"))
+    shrink = min(TALL_PX / camera.height, WIDE_PX / camera.width)
+    size = round(camera.width * shrink), round(camera.height * shrink)
+    K = np.diag([OVER * size[0] / camera.width, OVER * size[1] / camera.height, 1.0]) @ camera.calibration_matrix()
+    ours = Camera(K, OVER * size[0], OVER * size[1])
+    aside = walked_around(pose, model.model.surface, ASIDE_DEG)
+    views = [
+        photo,
+        render_model(model, ours, pose).on(),
+        render_model(model, ours, aside).on(),
+        render_shape(model, ours, aside).on(),
+    ]
+    a, b, c, d = (np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_AREA), np.uint8) for view in views)
+    return np.concatenate([np.concatenate([a, b], axis=1), np.concatenate([c, d], axis=1)])
+
+
+def save_page(page: Pixels, path: Path) -> None:
+    """A PNG of at most `WIDTHS_PX[0]` and `BYTES`, in few colours; narrower where it would be larger."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(palette_of(page).tobytes())
+    for width in WIDTHS_PX:
+        shrink = min(1.0, width / page.shape[1])
+        size = round(page.shape[1] * shrink), round(page.shape[0] * shrink)
+        small = cv2.resize(page, size, interpolation=cv2.INTER_AREA)
+        picture = Image.fromarray(small).quantize(palette=palette, dither=Image.Dither.NONE)
+        picture.save(path, format="PNG", optimize=True)
+        if path.stat().st_size <= BYTES:
+            return
+
+
+def palette_of(page: Pixels) -> Pixels:
+    """(COLORS, 3) that stand for the colours of a page, by k-means on some of its pixels."""
+    pixels = page.reshape(-1, 3)
+    some = pixels[np.random.default_rng(0).integers(0, len(pixels), PALETTE_PIXELS)].astype(np.float32)
+    cv2.setRNGSeed(0)
+    criteria = (cv2.TERM_CRITERIA_MAX_ITER, 10, 0.0)
+    _, _, centres = cv2.kmeans(some, COLORS, None, criteria, 1, cv2.KMEANS_RANDOM_CENTERS)
+    return np.round(np.clip(centres, 0, 255)).astype(np.uint8)

@@ -1,0 +1,123 @@
+"""Pictures of a finished model: with its texture as a camera would see it, or its bare shape in grey."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.synthetic.cameras import Camera, camera_centre, pixel_rays
+from sfm_app.synthetic.render import cast, ray_caster
+from sfm_app.types import Surface
+from sfm_app.types.model import Model, Texture
+
+FloatArray = NDArray[np.float64]
+Colors = NDArray[np.uint8]
+BoolArray = NDArray[np.bool_]
+GREY, INSIDE = np.array([205.0, 205.0, 205.0]), np.array([196.0, 120.0, 110.0])
+"""Of the bare shape in full light, seen from outside and from inside."""
+AMBIENT = 0.25
+"""Light that reaches every face of the bare shape, 0..1."""
+LAMP = np.array([-0.45, -0.65, -1.0]) / np.linalg.norm([-0.45, -0.65, -1.0])
+"""Direction from a face to the lamp, in the camera's frame: over the photographer's left shoulder."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PreparedModel:
+    """A model ready for many pictures."""
+
+    model: Model
+    rays: Any
+    """Open3D RaycastingScene; None where there are no triangles."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """What a camera sees of a model."""
+
+    colors: Colors
+    """(H, W, 3) RGB; 0 where nothing is seen."""
+    covered: BoolArray
+    """(H, W) where the model is seen."""
+
+    def on(self, background: tuple[int, int, int] = (255, 255, 255)) -> Colors:
+        """(H, W, 3) with a colour where nothing is seen."""
+        return np.where(self.covered[..., None], self.colors, np.array(background, np.uint8))
+
+
+def prepare_model(model: Model) -> PreparedModel:
+    """Build the ray-casting structure once for all pictures."""
+    surface = model.surface
+    return PreparedModel(model, ray_caster(surface.vertices, surface.faces) if len(surface.faces) else None)
+
+
+def render_model(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
+    """The model with its own colours, without light: the texture, or the colours of the vertices where there is none.
+
+    Both sides of a triangle are seen. A pixel shows the model at its centre, so that a texture much finer than the
+    pixels flickers.
+
+    Args:
+        model: in the frame of `cam_from_world`.
+        camera: intrinsics, size and distortion.
+        cam_from_world: (3, 4) pose.
+    """
+    directions = pixel_rays(camera) @ cam_from_world[:, :3]
+    return view_along(model, camera_centre(cam_from_world), directions.reshape(camera.height, camera.width, 3))
+
+
+def view_along(model: Model | PreparedModel, origin: FloatArray, directions: FloatArray) -> Picture:
+    """As `render_model`, for any lens: rays from origin (3,) along directions (H, W, 3) of any length."""
+    prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
+    shape = directions.shape[:2]
+    if prepared.rays is None:
+        return Picture(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.bool_))
+    hits = cast(prepared.rays, origin, directions.reshape(-1, 3))
+    covered = np.isfinite(hits["t_hit"]).reshape(shape)
+    face = np.where(covered, hits["primitive_ids"].reshape(shape), 0).astype(np.int64)
+    uv = hits["primitive_uvs"].reshape(*shape, 2).astype(np.float64)
+    weights = np.concatenate([1.0 - uv.sum(axis=-1, keepdims=True), uv], axis=-1)
+    surface, texture = prepared.model.surface, prepared.model.texture
+    colors = _from_vertices(surface, face, weights) if texture is None else _from_pages(texture, face, weights)
+    return Picture(np.where(covered[..., None], colors, 0).astype(np.uint8), covered)
+
+
+def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
+    """The bare shape in grey, each triangle lit by itself, so that every bump shows; reddish where seen from inside.
+
+    Arguments as for `render_model`.
+    """
+    prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
+    shape = camera.height, camera.width
+    if prepared.rays is None:
+        return Picture(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.bool_))
+    R = cam_from_world[:, :3]
+    directions = pixel_rays(camera) @ R
+    hits = cast(prepared.rays, camera_centre(cam_from_world), directions)
+    normals = hits["primitive_normals"].astype(np.float64)
+    inside = (normals * directions).sum(axis=1) > 0
+    facing = np.abs(normals @ (LAMP @ R))
+    light = AMBIENT + (1.0 - AMBIENT) * np.where(np.isfinite(facing), facing, 0.0)
+    covered = np.isfinite(hits["t_hit"])
+    colors = light[:, None] * np.where(inside[:, None], INSIDE, GREY) * covered[:, None]
+    return Picture(np.round(colors).astype(np.uint8).reshape(*shape, 3), covered.reshape(shape))
+
+
+def _from_vertices(surface: Surface, face: NDArray[np.int64], weights: FloatArray) -> FloatArray:
+    corners = surface.colors[surface.faces[face]].astype(np.float64)
+    return np.asarray(np.round(np.einsum("hwk,hwkc->hwc", weights, corners)))
+
+
+def _from_pages(texture: Texture, face: NDArray[np.int64], weights: FloatArray) -> Colors:
+    """Bilinear look-up; texel centres at +0.5, the border repeated."""
+    place = np.einsum("hwk,hwkc->hwc", weights, texture.uv[face].astype(np.float64))
+    page_of = texture.page[face]
+    found = np.zeros((*face.shape, 3), np.uint8)
+    for number, page in enumerate(texture.pages):
+        here = page_of == number
+        if here.any():
+            at = (place * [page.shape[1], page.shape[0]] - 0.5).astype(np.float32)
+            seen = cv2.remap(page, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            found[here] = seen[here]
+    return found

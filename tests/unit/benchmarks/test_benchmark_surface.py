@@ -1,0 +1,219 @@
+import json
+
+import numpy as np
+import pytest
+from cameras_bars import least, most
+from PIL import Image
+from report import document, problems
+from surface_bars import BARS, asked
+from surface_measure import cost
+from surface_photos import Likeness, likeness, photo_scores, psnr_db, spread_out
+from surface_pictures import BYTES, WIDTHS_PX, save_page
+from surface_report import page
+from surface_rival import points_ply
+from surface_run import Said
+from surface_sets import REAL, RENDERED, SurfaceSet, part_of, surface_set
+from surface_truth import seen_places, truth_scores
+
+from sfm_app.geometry.similarity import Similarity
+from sfm_app.synthetic.cameras import Views, axis_rotation, look_at, make_camera
+from sfm_app.synthetic.photo_folder import Truth
+from sfm_app.synthetic.pictures import Picture
+from sfm_app.synthetic.scenes import WALKS
+from sfm_app.types import Surface
+
+TURN = Similarity(2.5, axis_rotation(np.array([0.6, 0.0, 0.8]), 40.0), np.array([3.0, -1.0, 2.0]))
+
+
+def sheet(x, y=0.0, side=2.0, *, down=False):
+    """A square of that side in the plane of that height, in the middle at x: (4, 3) and two triangles that face up."""
+    h = side / 2
+    vertices = np.array([[x - h, y, -h], [x - h, y, h], [x + h, y, h], [x + h, y, -h]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    return vertices, faces[:, ::-1] if down else faces
+
+
+def joined(*parts):
+    starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts[:-1])])
+    faces = [faces + start for (_, faces), start in zip(parts, starts, strict=True)]
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(faces)
+
+
+def truth_of(*parts):
+    """Three photos from above, which see all of a square of side 2 at the origin."""
+    camera = make_camera(120, 120, centre=(0.5, 0.5))
+    eyes = ((0.0, 3.0, 0.6), (0.7, 3.0, -0.3), (-0.7, 3.2, -0.3))
+    views = Views.of(camera, [look_at(np.array(eye), np.zeros(3)) for eye in eyes])
+    return Truth(dict(views.cameras), dict(views.cam_from_world), *joined(*parts))
+
+
+def scores(truth, vertices, faces):
+    """As for a reconstruction in a frame of its own."""
+    centres = {name: TURN(centre[None])[0] for name, centre in truth.centres.items()}
+    surface = Surface(TURN(vertices), faces, np.zeros((len(vertices), 3), np.uint8))
+    return truth_scores(surface, centres, truth, seen_places(truth, samples=4000))
+
+
+def test_the_truth_itself_is_accurate_and_complete():
+    truth = truth_of(sheet(0.0))
+    found = scores(truth, truth.vertices, truth.faces)
+    assert (found["accuracy %"], found["completeness %"], found["F %"], found["within 0.1 %"]) == (100, 100, 100, 100)
+    assert found["median %"] < 1e-3
+
+
+@pytest.mark.parametrize(("raised", "accuracy", "completeness"), [(0.004, 100, 100), (0.007, 0, 100), (0.012, 0, 0)])
+def test_half_a_percent_is_right_and_one_percent_is_there(raised, accuracy, completeness):
+    truth = truth_of(sheet(0.0))
+    size = np.sqrt(8.0)
+    found = scores(truth, *sheet(0.0, y=raised * size))
+    assert (found["accuracy %"], found["completeness %"]) == (accuracy, completeness)
+    assert found["median %"] == pytest.approx(100 * raised, rel=0.02)
+
+
+def test_what_is_missing_costs_completeness_and_what_is_invented_accuracy():
+    truth = truth_of(sheet(0.0))
+    vertices, faces = truth.vertices, truth.faces
+    half = scores(truth, vertices, faces[:1])
+    assert half["accuracy %"] == 100 and 48 < half["completeness %"] < 53
+    more = scores(truth, *joined((vertices, faces), sheet(0.0, y=0.5)))
+    assert 49 < more["accuracy %"] < 51 and more["completeness %"] == 100
+    assert half["F %"] == pytest.approx(2 * 100 * half["completeness %"] / (100 + half["completeness %"]), abs=0.01)
+
+
+def test_nothing_is_asked_where_fewer_than_two_photos_see_anything():
+    hidden, underside, far = sheet(0.0, y=-0.5, side=1.0), sheet(0.0, y=-0.01, down=True), sheet(9.0)
+    seen = seen_places(truth_of(sheet(0.0), hidden, underside, far), samples=6000)
+    assert np.abs(seen[:, 1]).max() < 1e-6, "neither what lies behind nor what faces away"
+    assert np.abs(seen[:, [0, 2]]).max() <= 1.0, "nor what is outside of the photos"
+    assert np.ptp(seen[:, 0]) > 1.9 and np.ptp(seen[:, 2]) > 1.9
+
+
+def test_more_photos_see_less():
+    truth = truth_of(sheet(0.0, side=5.0))
+    counts = [len(seen_places(truth, photos, samples=4000)) for photos in (1, 2, 3, 4)]
+    assert 4000 > counts[0] > counts[1] > counts[2] > counts[3] == 0
+
+
+def test_an_empty_mesh_has_no_scores():
+    truth = truth_of(sheet(0.0))
+    assert set(scores(truth, np.zeros((0, 3)), np.zeros((0, 3), np.int64)).values()) == {None}
+
+
+def test_psnr_does_not_mind_exposure_but_noise():
+    rng = np.random.default_rng(0)
+    scene = rng.uniform(60, 180, (20_000, 3))
+    photo = scene * [0.8, 1.1, 0.9] + [10, -20, 30]
+    for noise in (2.0, 8.0):
+        noisy = photo + rng.normal(scale=noise, size=scene.shape)
+        # gains and offsets take out the exposure but not the noise; rounding adds 1/12 twice
+        expected = 20 * np.log10(255 / np.sqrt(noise**2 + 1 / 6))
+        assert psnr_db(np.round(scene).astype(np.uint8), np.round(noisy).astype(np.uint8)) == pytest.approx(
+            expected, abs=0.15
+        )
+    flat = np.full((100, 3), 90, np.uint8)
+    assert psnr_db(flat, flat + np.uint8(7)) > 80, "one colour fits another"
+
+
+def test_likeness_counts_covered_pixels_alone():
+    photo = np.zeros((40, 60, 3), np.uint8)
+    photo[:, 20:] = np.random.default_rng(1).integers(50, 200, (40, 40, 3))
+    covered = np.zeros((40, 60), bool)
+    covered[:, 30:] = True
+    found = likeness(Picture(photo * covered[..., None], covered), photo)
+    assert found.coverage == 0.5 and found.coverage_not_black == 0.75 and found.psnr_db > 80
+    covered[:, :59] = False
+    assert np.isnan(likeness(Picture(photo, covered), photo).psnr_db), "40 pixels say nothing"
+
+
+def test_the_worst_photo_stands_beside_the_mean():
+    row = photo_scores(
+        {"a": Likeness(0.9, 0.95, 25.0), "b": Likeness(0.5, 0.65, 21.0), "c": Likeness(0.1, 0.2, np.nan)}
+    )
+    assert (row["coverage %"], row["worst coverage %"], row["coverage of not black %"]) == (50.0, 10.0, 60.0)
+    assert (row["PSNR dB"], row["worst PSNR dB"]) == (23.0, 21.0)
+    assert photo_scores({"c": Likeness(0.0, 0.0, np.nan)})["PSNR dB"] is None
+
+
+def test_photos_to_leave_out_are_spread_evenly():
+    names = [f"{k}" for k in range(11)]
+    assert spread_out(names, 1) == ["5"] and spread_out(names, 3) == ["2", "5", "8"]
+    assert spread_out(names, 11) == spread_out(names, 20) == names
+
+
+def test_cost_is_that_of_all_stages_but_the_files():
+    said = {
+        "scene": Said("", 50.0, 900), "depth_maps": Said("", 10.0, 500), "mesh": Said("", 7.5, 700),
+        "texture": Said("", 2.0, 400), "files": Said("", 1.0, 300),
+    }  # fmt: skip
+    row = cost(said)
+    stages = [name for name in ("depth_maps", "mesh", "texture") if f"s of {name}" in row]
+    assert {"depth_maps", "mesh"} <= set(stages)
+    assert row["seconds together"] == sum(said[name].seconds for name in stages)
+    assert row["MB mesh"] == 700 and row["s of files"] == 1.0 and row["failed"] == ""
+    stopped = cost({"scene": Said("", 50.0, 900), "depth_maps": Said("depth_maps: no", None, 100)})
+    assert stopped["failed"] == "depth_maps: no" and stopped["seconds together"] is None
+
+
+def test_every_set_has_its_bars_and_they_are_judged_both_ways():
+    assert set(BARS) == set(RENDERED) | set(REAL) and set(RENDERED) <= set(WALKS)
+    assert BARS["statue"] == (least("accuracy %", 90.0), least("completeness %", 85.0))
+    assert most("seconds together", 90.0) in BARS["fountain-P11"]
+    assert least("worst coverage %", 75.0) in BARS["Herz-Jesus-P8"]
+    assert least("worst coverage %", 50.0) in BARS["castle-P19"]
+    rows = asked([{"photos": "statue", "accuracy %": 90.0, "completeness %": 84.9}, {"photos": "corner"}])
+    assert [row["met"] for row in rows] == ["yes", "**no**", "not measured", "not measured"]
+    late = asked([{"photos": "fountain-P11", "seconds together": 90.1}])
+    assert [row["met"] for row in late if "seconds" in row["asked"]] == ["**no**"]
+
+
+def test_the_page_and_the_document_hold_what_was_measured(tmp_path):
+    rows = [
+        {"photos": "statue", "method": "sfm-app", "failed": "", "placed": 22, "accuracy %": 95.0, "completeness %": 91,
+         "seconds together": 80.0, "s of mesh": 20.0, "MB mesh": 900},
+        {"photos": "kermit11", "method": "sfm-app", "failed": "mesh: no surface", "seconds together": None},
+    ]  # fmt: skip
+    text = page("About.", rows, [], "surface")
+    assert "| statue | accuracy % at least 90 | 95 | yes |" in text and "mesh: no surface" in text
+    assert "![statue](surface-statue.png)" in text and "surface-kermit11.png" not in text
+    assert not problems(json.loads(json.dumps(document("surface", "About.", {}, {}, rows))))
+
+
+def test_sets_are_rendered_scenes_or_folders_and_parts_are_links(tmp_path):
+    images = tmp_path / "data" / "pond" / "images"
+    images.mkdir(parents=True)
+    for k in range(4):
+        Image.new("RGB", (8, 8)).save(images / f"{k}.png")
+    whole = surface_set("pond", tmp_path / "data", tmp_path)
+    assert whole.count == 4 and whole.truth is None
+    part = part_of(whole, 3, tmp_path / "cache")
+    assert [path.name for path in sorted(part.photos.iterdir())] == ["0.png", "1.png", "2.png"]
+    assert isinstance(part, SurfaceSet) and part.count == 3 and all(path.is_symlink() for path in part.photos.iterdir())
+    with pytest.raises(ValueError, match="'lake' is neither"):
+        surface_set("lake", tmp_path / "data", tmp_path)
+
+
+def test_pages_of_pictures_stay_small_and_keep_their_colours(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 256, (700, 2000, 3)).astype(np.uint8)
+    plain = np.zeros((900, 2000, 3), np.uint8)
+    plain[:, :1000], plain[:, 1000:] = (200, 40, 90), (30, 160, 220)
+    save_page(noise, tmp_path / "noise.png")
+    save_page(plain, tmp_path / "plain.png")
+    with Image.open(tmp_path / "noise.png") as narrow, Image.open(tmp_path / "plain.png") as wide:
+        assert narrow.width < wide.width == WIDTHS_PX[0] and wide.height == 720
+        assert wide.convert("RGB").getpixel((10, 10)) == (200, 40, 90)
+        assert wide.convert("RGB").getpixel((1500, 700)) == (30, 160, 220)
+    assert (tmp_path / "plain.png").stat().st_size <= BYTES
+
+
+def test_points_are_written_as_colmap_reads_them(tmp_path):
+    import trimesh
+
+    rng = np.random.default_rng(2)
+    points, normals = rng.normal(size=(2, 30, 3))
+    colors = rng.integers(0, 256, (30, 3)).astype(np.uint8)
+    path = tmp_path / "points.ply"
+    path.write_bytes(points_ply(points, normals, colors))
+    vertex = trimesh.load(path).metadata["_ply_raw"]["vertex"]["data"]
+    assert np.allclose(np.stack([vertex[c] for c in ("x", "y", "z")], axis=1), points, atol=1e-6)
+    assert np.allclose(np.stack([vertex[c] for c in ("nx", "ny", "nz")], axis=1), normals, atol=1e-6)
+    assert np.array_equal(np.stack([vertex[c] for c in ("red", "green", "blue")], axis=1), colors)
