@@ -23,6 +23,7 @@ STAGE_TITLES = {
     "scene": "camera poses and points",
     "depth_maps": "depth maps",
     "mesh": "surface",
+    "texture": "texture",
     "files": "files",
 }
 
