@@ -101,14 +101,15 @@ class MeshSettings(Section):
     """The surface through the depth maps."""
 
     poisson_depth: int = Field(10, ge=5, le=14, description="greatest depth of the Poisson octree")
-    trim: float = Field(
-        6.0,
-        ge=0,
-        le=20,
-        description="surface in cells coarser than this depth of the octree is cut off; 0 keeps a closed surface",
+    trim: bool = Field(True, description="cut off surface that no photo confirms; false keeps Poisson's closed surface")
+    max_gap: float = Field(
+        20.0, ge=0, le=1000, description="gaps in what photos confirm are closed up to this width, in triangles"
     )
     min_island: float = Field(
-        0.01, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
+        0.002, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
+    )
+    max_error: float = Field(
+        0.2, ge=0, le=10, description="simplification may move the surface so far, in edges of Poisson's triangles"
     )
     faces: int = Field(200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh")
 

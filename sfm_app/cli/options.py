@@ -16,7 +16,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 def settings_options(command: Command) -> Command:
-    """--config, --seed, --workers, --quality, --estimator, --calibrator, --mapper, --set, -v."""
+    """--config, --seed, --workers, --quality, --estimator, --calibrator, --mapper, --faces, --set, -v."""
     options = (
         click.option(
             "--config", type=click.Path(path_type=Path), help="Settings file (TOML); `sfm-app config` prints one."
@@ -27,6 +27,7 @@ def settings_options(command: Command) -> Command:
         click.option("--estimator", help="Estimator of fundamental matrices.  [default: lev-ransac]"),
         click.option("--calibrator", help="Calibrator.  [default: zero-curves]"),
         click.option("--mapper", help="auto, incremental or global.  [default: auto]"),
+        click.option("--faces", type=int, help="Most triangles of the mesh.  [default: 200000]"),
         click.option("--set", "assignments", multiple=True, metavar="TABLE.KEY=VALUE", help="Any other setting."),
         click.option("-v", "--verbose", count=True, help="Show what COLMAP says; -vv shows all of it."),
     )
@@ -46,6 +47,8 @@ def settings_from(flags: Mapping[str, Any]) -> Settings:
     for key, table in (("estimator", "epipolar"), ("calibrator", "calibration"), ("mapper", "scene")):
         if flags[key] is not None:
             overrides = merged(overrides, {table: {key: flags[key]}})
+    if flags["faces"] is not None:
+        overrides = merged(overrides, {"mesh": {"faces": flags["faces"]}})
     for assignment in flags["assignments"]:
         overrides = merged(overrides, assigned(assignment))
     if flags["config"] is not None:

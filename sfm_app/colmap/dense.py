@@ -61,6 +61,17 @@ def read_grey(dense_dir: Path, view: View) -> NDArray[np.uint8]:
     return np.asarray(image, np.uint8)
 
 
+def read_color(dense_dir: Path, view: View) -> NDArray[np.uint8]:
+    """The undistorted photo of a view, (H, W, 3) RGB."""
+    image = cv2.imdecode(np.fromfile(dense_dir / "images" / view.name, np.uint8), cv2.IMREAD_COLOR_RGB)
+    return np.asarray(image, np.uint8)
+
+
+def map_file(dense_dir: Path, view: View) -> Path:
+    """Where the confirmed depths of a view lie, if it has any."""
+    return _map_path(dense_dir, "depth_maps", view, "geometric")
+
+
 def write_depth(dense_dir: Path, view: View, depth: NDArray[np.float32], kind: Kind) -> None:
     """Write a depth map, (H, W), 0 where unknown."""
     known = depth[depth > 0]

@@ -1,4 +1,4 @@
-"""COLMAP's fusion of depth maps, and Poisson's surface through the fused points."""
+"""COLMAP's fusion of depth maps, Poisson's surface through the fused points, and fewer triangles for it."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,16 +13,19 @@ from sfm_app.types import Surface
 
 FUSED = "fused.ply"
 MAX_NORMAL_ERROR_DEG = 25.0
+BORDER_WEIGHT = 10.0
+"""How much dearer it is to move a border than the surface."""
 
 
-def fuse(dense_dir: Path, views: Sequence[View], min_views: int, box: NDArray[np.float64]) -> int:
-    """Fuse the geometric maps of these views into `fused.ply`; gives the number of points.
+def fuse(dense_dir: Path, views: Sequence[View], min_views: int, box: NDArray[np.float64], target: Path) -> None:
+    """Fuse the geometric maps of these views into the PLY file `target`.
 
     Args:
         dense_dir: dense workspace.
         views: those that have maps.
         min_views: photos that have to see a point.
         box: (2, 3) lowest and highest coordinates that are kept.
+        target: in any folder.
     """
     config = "".join(f"{view.name}\n" for view in views)
     (dense_dir / "stereo" / "fusion.cfg").write_text(config, encoding="utf-8")
@@ -33,8 +36,8 @@ def fuse(dense_dir: Path, views: Sequence[View], min_views: int, box: NDArray[np
     options.bounding_box = (box[0].astype(np.float32), box[1].astype(np.float32))
     options.num_threads = 1  # with more, the points depend on which thread comes first
     with backend("fusing depth maps"):
-        fused = pycolmap.stereo_fusion(dense_dir / FUSED, dense_dir, options=options, output_type="ply")
-    return int(fused.num_points3D())
+        pycolmap.stereo_fusion(target, dense_dir, options=options, output_type="ply")
+        target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; nobody asks
 
 
 def read_fused(dense_dir: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -45,22 +48,54 @@ def read_fused(dense_dir: Path) -> tuple[NDArray[np.float64], NDArray[np.float64
     return points.astype(np.float64), normals.astype(np.float64)
 
 
-def poisson(dense_dir: Path, depth: int, trim: float) -> Surface:
-    """Poisson's surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points, with their colours.
+def poisson(dense_dir: Path, depth: int) -> Surface:
+    """Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points, with their colours.
 
     Args:
         dense_dir: dense workspace.
         depth: of the octree; the finest cell is the largest extent of the points over 2^depth.
-        trim: surface in cells of a lower depth than this, where points are few, is left out; 0: none.
     """
     options = pycolmap.PoissonMeshingOptions()
-    options.depth, options.trim = depth, trim
+    options.depth, options.trim = depth, 0.0
     options.num_threads = 1  # with more: other triangles in every run, and many times slower where cores are shared
     path = dense_dir / "poisson.ply"
     with backend("finding the surface"):
         pycolmap.poisson_meshing(dense_dir / FUSED, path, options=options)
-        mesh = trimesh.load(path, process=False)
+        surface = _read(path)
         path.unlink()
+    return surface
+
+
+def simplify(surface: Surface, share: float, max_error: float, scratch: Path) -> Surface:
+    """Collapse edges, cheapest first by their quadric error (Garland and Heckbert, SIGGRAPH 1997).
+
+    Each vertex has the colour of the one that was nearest before.
+
+    Args:
+        surface: a manifold; its borders are kept.
+        share: of the triangles at which it stops, in (0, 1].
+        max_error: largest root of the summed squared distances of a vertex from the planes that it stands for; 0: any.
+        scratch: folder for two files that go again.
+    """
+    from scipy.spatial import cKDTree
+
+    options = pycolmap.MeshSimplificationOptions()
+    options.target_face_ratio, options.max_error = share, max_error**2
+    options.boundary_weight = BORDER_WEIGHT
+    options.num_threads = 1  # with more, the triangles may depend on which thread comes first
+    given, found = scratch / "fine.ply", scratch / "coarse.ply"
+    with backend("simplifying the surface"):
+        trimesh.Trimesh(surface.vertices, surface.faces, process=False).export(given)
+        pycolmap.simplify_mesh(given, found, options)
+        simple = _read(found)
+        given.unlink()
+        found.unlink()
+    _, nearest = cKDTree(surface.vertices).query(simple.vertices)  # pycolmap 4.2 reads no colours
+    return Surface(simple.vertices, simple.faces, surface.colors[nearest])
+
+
+def _read(path: Path) -> Surface:
+    mesh = trimesh.load(path, process=False)
     return Surface(
         np.asarray(mesh.vertices, np.float64),
         np.asarray(mesh.faces, np.int64),

@@ -20,3 +20,24 @@ def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
     total = np.stack([np.bincount(at, np.repeat(across[:, i], 3), size) for i in range(3)], axis=1)
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0))
+
+
+def edges_of(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
+    """Every edge once, (E, 2) with the lower vertex first, and (T, 3) the edges ab, bc, ca of each triangle."""
+    ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
+    size = int(faces.max(initial=0)) + 1
+    keys, at = np.unique(ends[:, 0] * size + ends[:, 1], return_inverse=True)
+    return np.stack(np.divmod(keys, size), axis=1), at.reshape(-1, 3)
+
+
+def areas(vertices: FloatArray, faces: IndexArray) -> FloatArray:
+    """(T,) areas of the triangles."""
+    corners = vertices[faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(0.5 * np.linalg.norm(across, axis=1))
+
+
+def median_edge(vertices: FloatArray, faces: IndexArray) -> float:
+    """Median length of the edges."""
+    edges, _ = edges_of(faces)
+    return float(np.median(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)))

@@ -1,5 +1,24 @@
-"""From a raw surface to a clean mesh."""
+"""From a raw surface to a clean mesh: what photos confirm, with smooth borders, as a manifold, coloured."""
 
-from sfm_app.meshing.clean import drop_islands, octree_depth, trim_unsupported
+from sfm_app.meshing.borders import bridge_gaps, cut, smooth_support
+from sfm_app.meshing.clean import drop_islands, octree_depth, select_faces
+from sfm_app.meshing.manifold import make_manifold
+from sfm_app.meshing.paint import Paint, sample_colors
+from sfm_app.meshing.visibility import CONFIRMED, SEEN_THROUGH, SILENT, Eye, judge
 
-__all__ = ["drop_islands", "octree_depth", "trim_unsupported"]
+__all__ = [
+    "CONFIRMED",
+    "SEEN_THROUGH",
+    "SILENT",
+    "Eye",
+    "Paint",
+    "bridge_gaps",
+    "cut",
+    "drop_islands",
+    "judge",
+    "make_manifold",
+    "octree_depth",
+    "sample_colors",
+    "select_faces",
+    "smooth_support",
+]

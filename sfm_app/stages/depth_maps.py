@@ -1,4 +1,4 @@
-"""depth_maps: Scene -> COLMAP dense workspace with depth maps, normal maps and fused points."""
+"""depth_maps: Scene -> COLMAP dense workspace with depth and normal maps."""
 
 import shutil
 from collections import Counter
@@ -10,11 +10,10 @@ from pathlib import Path
 import cv2
 
 from sfm_app.colmap.dense import read_depth, read_grey, read_views, undistort, write_depth, write_maps
-from sfm_app.colmap.surface import fuse
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.settings import DepthSettings
-from sfm_app.stereo import DepthMap, View, confirm_depths, match_depths, rank_neighbours, region
+from sfm_app.stereo import DepthMap, View, confirm_depths, match_depths, rank_neighbours
 from sfm_app.types import Rejected, Scene
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
@@ -24,7 +23,7 @@ CONFIRMING = 2
 
 
 def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: DepthSettings, run: RunContext) -> Path:
-    """Give every photo that has neighbours a depth and a normal map, and fuse them all.
+    """Give every photo that has neighbours a depth and a normal map.
 
     Returns:
         The dense workspace.
@@ -53,11 +52,6 @@ def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: Dep
             f"none of {len(views)} photos gets a depth map: {_most_common(rejected)}",
             hint=HINT,
         )
-    fusable = [view for view in views if view.name in coverage]
-    points = fuse(dense_dir, fusable, 1 + min(options.min_agreeing, len(fusable) - 1), region(views))
-    run.record(fused_points=points)
-    if not points:
-        raise ReconstructionError("the depth maps do not agree on any point", hint=HINT)
     return dense_dir
 
 

@@ -3,37 +3,63 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sfm_app.colmap.surface import poisson, read_fused
+from sfm_app.colmap.dense import map_file, read_color, read_depth, read_views
+from sfm_app.colmap.surface import FUSED, fuse, poisson, read_fused, simplify
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
-from sfm_app.meshing import drop_islands, octree_depth, trim_unsupported
+from sfm_app.geometry.triangles import median_edge, vertex_normals
+from sfm_app.meshing import (
+    CONFIRMED,
+    SEEN_THROUGH,
+    Eye,
+    Paint,
+    bridge_gaps,
+    cut,
+    drop_islands,
+    judge,
+    make_manifold,
+    octree_depth,
+    sample_colors,
+    smooth_support,
+)
+from sfm_app.parallel import ordered_map
+from sfm_app.progress import track
 from sfm_app.settings import MeshSettings
+from sfm_app.stereo import View, region
 from sfm_app.types import Surface
 
 SURFACE = "surface.npz"
+HINT = "take more photos, a step apart, with more overlap; OUT/points.ply and OUT/points.glb have the sparse points"
 
-KEPT_LEVELS = 2
-"""Poisson's trimming leaves at least the surface in this many of its finest levels: few points make a coarse octree."""
+MIN_POINTS = 100
+"""Fewer fused points carry no surface."""
+SMOOTHING = 20
+"""Averages over neighbours that take the fringe off the border."""
 
 
 def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surface:
-    """Span a surface over the fused points, cut off what they do not support, and keep it beside them.
+    """Span a surface over the fused points, keep what the photos confirm, simplify it, and keep it beside them.
 
     Raises:
-        ReconstructionError: nothing is left.
+        ReconstructionError: the depth maps do not give a surface; says why.
         BackendError: COLMAP failed.
     """
-    points, normals = read_fused(dense_dir)
+    views = [view for view in read_views(dense_dir) if map_file(dense_dir, view).exists()]
+    points = fused_points(dense_dir, views, run)
     depth = octree_depth(points, options.poisson_depth)
-    raw = poisson(dense_dir, depth, min(options.trim, depth - KEPT_LEVELS))
-    trimmed = trim_unsupported(raw, points, normals) if options.trim else raw
-    surface = drop_islands(trimmed, options.min_island)
-    run.record(
-        poisson_depth=depth, raw_triangles=len(raw.faces), vertices=len(surface.vertices), triangles=len(surface.faces)
-    )
+    raw = poisson(dense_dir, depth)
+    trimmed = trim(raw, dense_dir, views, options, run) if options.trim else raw
+    detailed = drop_islands(trimmed, options.min_island)
+    run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
+    if not len(detailed.faces):
+        raise ReconstructionError("no surface is left: the photos confirm no part of it", hint=HINT)
+    surface = make_manifold(simplified(detailed, options, dense_dir))
     if not len(surface.faces):
-        raise ReconstructionError("no surface is left after cleaning", hint="take more photos with more overlap")
+        raise ReconstructionError("no surface is left after simplification", hint=HINT)
+    surface = painted(surface, dense_dir, views, run)
+    run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
     with run.workspace.replacing(dense_dir / SURFACE) as path:
         np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
     return surface
@@ -43,3 +69,67 @@ def load_surface(dense_dir: Path) -> Surface:
     """The surface that `make_mesh` left in a dense workspace."""
     with np.load(dense_dir / SURFACE) as stored:
         return Surface(stored["vertices"], stored["faces"], stored["colors"])
+
+
+def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.float64]:
+    """(N, 3) points of all depth maps together, fused anew only where a depth map is younger than they are."""
+    target = dense_dir / FUSED
+    youngest = max((map_file(dense_dir, view).stat().st_mtime_ns for view in views), default=0)
+    if not target.exists() or target.stat().st_mtime_ns <= youngest:
+        with run.workspace.replacing(target) as path:
+            fuse(dense_dir, views, 1 + min(run.settings.depth.min_agreeing, len(views) - 1), region(views), path)
+    points, _ = read_fused(dense_dir)
+    run.record(fused_points=len(points))
+    if len(points) < MIN_POINTS:
+        raise ReconstructionError(
+            f"the {len(views)} depth maps agree on {len(points) or 'no'} points only: too few for a surface", hint=HINT
+        )
+    return points
+
+
+def trim(surface: Surface, dense_dir: Path, views: list[View], options: MeshSettings, run: RunContext) -> Surface:
+    """Keep what depth maps confirm and do not see through, and the small gaps in it."""
+    normals = vertex_normals(surface.vertices, surface.faces)
+
+    def look(view: View) -> NDArray[np.uint8]:
+        return judge(surface.vertices, normals, eye(dense_dir, view), run.settings.depth.consistency)
+
+    confirmed, through = np.zeros((2, len(normals)), np.int32)
+    verdicts = ordered_map(run.executor, look, views, ahead=run.workers)
+    for verdict in track(run.progress, verdicts, "confirming the surface", len(views)):
+        confirmed += verdict == CONFIRMED
+        through += verdict == SEEN_THROUGH
+    free = through > confirmed
+    support = np.where((confirmed > 0) & ~free, 1.0, -1.0)
+    support = bridge_gaps(surface, support, free, options.max_gap)
+    return cut(surface, bridge_gaps(surface, smooth_support(surface, support, SMOOTHING), free, options.max_gap))
+
+
+def simplified(surface: Surface, options: MeshSettings, dense_dir: Path) -> Surface:
+    """As few triangles as the error allows, and no more than asked for."""
+    simple = surface
+    if options.max_error:
+        edge = median_edge(surface.vertices, surface.faces)
+        simple = simplify(surface, 1.0 / len(surface.faces), options.max_error * edge, dense_dir)
+    if len(simple.faces) > options.faces:
+        simple = simplify(simple, options.faces / len(simple.faces), 0.0, dense_dir)
+    return simple
+
+
+def painted(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> Surface:
+    """The surface with the colours that the photos show at its vertices."""
+    normals = vertex_normals(surface.vertices, surface.faces)
+
+    def look(view: View) -> Paint:
+        image = read_color(dense_dir, view)
+        return sample_colors(surface.vertices, normals, eye(dense_dir, view), image, run.settings.depth.consistency)
+
+    paint = Paint.none(len(normals))
+    for one in track(run.progress, ordered_map(run.executor, look, views, ahead=run.workers), "colours", len(views)):
+        paint.add(one)
+    return Surface(surface.vertices, surface.faces, paint.over(surface.colors))
+
+
+def eye(dense_dir: Path, view: View) -> Eye:
+    """A photo's camera with its confirmed depths."""
+    return Eye(view.K, view.R, view.t, read_depth(dense_dir, view, "geometric"), view.sample_px)

@@ -89,7 +89,7 @@ def test_a_second_run_does_nothing(finished, rendered):
 def test_a_changed_setting_redoes_only_what_it_touches(finished, rendered, tmp_path):
     run, _ = finished
     before = {name: stage["fingerprint"] for name, stage in run.manifest["stages"].items()}
-    changed = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 480}, "mesh": {"trim": 5.5}})
+    changed = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 480}, "mesh": {"max_gap": 10}})
 
     after = sfm_app.reconstruct(rendered[0], run.out, changed).manifest["stages"]
 

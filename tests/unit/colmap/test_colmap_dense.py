@@ -3,12 +3,14 @@
 import cv2
 import numpy as np
 import pytest
+import trimesh
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import read_depth, read_grey, read_views, undistort, write_maps
-from sfm_app.colmap.surface import fuse, poisson, read_fused
+from sfm_app.colmap.surface import FUSED, fuse, poisson, read_fused, simplify
 from sfm_app.errors import BackendError
 from sfm_app.stereo import DepthMap
+from sfm_app.types import Surface
 
 NORMAL = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
 DISTANCE = 5.0
@@ -66,11 +68,10 @@ def test_views_are_those_of_the_model(workspace):
 def test_fused_points_lie_on_the_plane_and_face_the_cameras(workspace):
     dense, views = workspace
 
-    count = fuse(dense, views, 3, BOX)
+    fuse(dense, views, 3, BOX, dense / FUSED)
     points, normals = read_fused(dense)
 
-    assert count == len(points)
-    assert 1000 < count < 120 * 90
+    assert 1000 < len(points) < 120 * 90
     assert abs(np.median(points @ NORMAL) - DISTANCE) < 4e-4  # depths taken half a pixel aside would make it 2e-3
     assert np.max(np.abs(points @ NORMAL - DISTANCE)) < 0.02
     # with the three planes of the normal map in the wrong order this is 1
@@ -80,21 +81,58 @@ def test_fused_points_lie_on_the_plane_and_face_the_cameras(workspace):
 def test_the_box_cuts_the_points(workspace):
     dense, views = workspace
 
-    fuse(dense, views, 2, np.array([[0.0, -50, -50], [50, 50, 50]]))
+    fuse(dense, views, 2, np.array([[0.0, -50, -50], [50, 50, 50]]), dense / FUSED)
     assert read_fused(dense)[0][:, 0].min() >= 0
 
 
 def test_the_surface_has_the_shape_and_the_colours_of_the_points(workspace):
     dense, views = workspace
-    fuse(dense, views, 3, BOX)
+    fuse(dense, views, 3, BOX, dense / FUSED)
 
-    surface = poisson(dense, 6, 4.0)
+    surface = poisson(dense, 6)
 
-    inside = np.all(np.abs(surface.vertices[:, :2]) < 1, axis=1)
+    inside = np.all(np.abs(surface.vertices[:, :2]) < 1, axis=1) & (np.abs(surface.vertices @ NORMAL - DISTANCE) < 0.3)
     assert np.count_nonzero(inside) > 100
     assert np.percentile(np.abs(surface.vertices[inside] @ NORMAL - DISTANCE), 90) < 0.02
     assert np.all(np.abs(np.median(surface.colors[inside], axis=0) - [200, 100, 80]) <= 45)
     assert not (dense / "poisson.ply").exists()
+
+
+def wavy(size: int) -> Surface:
+    """A square of two halves, flat on the left, wavy on the right, in the unit square."""
+    y, x = np.mgrid[: size + 1, : size + 1] / size
+    z = np.where(x > 0.5, 0.03 * (1 - np.cos(8 * np.pi * (x - 0.5))), 0.0)
+    at = np.arange((size + 1) ** 2).reshape(size + 1, size + 1)
+    a, b, c, d = (corner.ravel() for corner in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
+    vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3)
+    colors = np.broadcast_to(np.uint8([200, 100, 50]), vertices.shape)
+    return Surface(vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), colors)
+
+
+def test_simplification_spares_what_is_curved_and_keeps_borders_and_colours(tmp_path):
+    fine = wavy(40)
+
+    found = simplify(fine, 0.2, 0.0, tmp_path)
+
+    assert 0.15 * len(fine.faces) < len(found.faces) <= 0.2 * len(fine.faces)
+    middles = found.vertices[found.faces].mean(axis=1)[:, 0]
+    assert np.count_nonzero(middles > 0.5) > 10 * np.count_nonzero(middles < 0.5)
+    np.testing.assert_allclose(
+        [found.vertices.min(axis=0)[:2], found.vertices.max(axis=0)[:2]], [[0, 0], [1, 1]], atol=0.01
+    )
+    assert np.all(np.abs(found.colors.astype(int) - [200, 100, 50]) <= 1)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("max_error", [3e-3, 1e-2])
+def test_simplification_by_error_stops_where_it_would_move_the_surface(tmp_path, max_error):
+    fine = wavy(40)
+
+    found = simplify(fine, 1e-4, max_error, tmp_path)
+
+    closest = trimesh.proximity.closest_point_naive(trimesh.Trimesh(found.vertices, found.faces), fine.vertices)[1]
+    assert 0.05 * max_error < closest.max() < 2 * max_error
+    assert 20 < len(found.faces) < 0.5 * len(fine.faces)
 
 
 def test_missing_inputs_are_backend_errors(tmp_path, workspace):

@@ -1,0 +1,108 @@
+"""Where a surface ends: small gaps in what is measured are bridged, and the border is cut along a smooth line.
+
+SciPy is imported where it is used: a program that only estimates fundamental matrices starts without it.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.triangles import edges_of
+from sfm_app.meshing.clean import select_faces
+from sfm_app.types import Surface
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+MAX_FREE = 0.5
+"""A gap is not bridged where photos see through this share of it."""
+
+
+def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], max_width: float) -> FloatArray:
+    """Support the unsupported patches that are small and not mostly seen through.
+
+    Args:
+        surface: closed or open.
+        support: (V,) positive where photos confirm the surface, negative where none does.
+        free: (V,) where photos see through the surface.
+        max_width: of a patch that is bridged, in edges of the surface around it; it may be longer than wide.
+
+    Returns:
+        (V,) support, 1 on the patches bridged.
+    """
+    from scipy.sparse.csgraph import connected_components, dijkstra
+
+    inside = support > 0
+    if not inside.any() or inside.all():
+        return support
+    edges, _ = edges_of(surface.faces)
+    length = np.linalg.norm(surface.vertices[edges[:, 0]] - surface.vertices[edges[:, 1]], axis=1)
+    ends_inside = inside[edges].sum(axis=1)
+    outer = edges[ends_inside == 0]
+    count, patch = connected_components(_graph(outer, len(support)), directed=False)
+    rim, rim_length = edges[ends_inside == 1], length[ends_inside == 1]
+    rim_patch = patch[np.where(inside[rim[:, 0]], rim[:, 1], rim[:, 0])]
+    scale = np.bincount(rim_patch, rim_length, count) / np.maximum(np.bincount(rim_patch, minlength=count), 1)
+    ways = _graph(edges, len(support), length)
+    reach = dijkstra(ways, directed=False, indices=np.flatnonzero(inside), min_only=True)
+    depth = np.zeros(count)
+    np.maximum.at(depth, patch, np.where(inside, 0.0, reach))
+    free_share = np.bincount(patch, free, count) / np.bincount(patch, minlength=count)
+    bridged = (2.0 * depth <= max_width * scale) & (free_share < MAX_FREE)
+    return np.where(~inside & bridged[patch], 1.0, support)
+
+
+def smooth_support(surface: Surface, support: FloatArray, steps: int) -> FloatArray:
+    """(V,) support after `steps` averages over the vertex and its neighbours: the border loses its fringe."""
+    edges, _ = edges_of(surface.faces)
+    graph = _graph(edges, len(support))
+    neighbours = np.maximum(np.bincount(edges.ravel(), minlength=len(support)), 1)
+    for _ in range(steps):
+        support = 0.5 * support + 0.5 * (graph @ support + graph.T @ support) / neighbours
+    return support
+
+
+def _graph(edges: IndexArray, size: int, weights: FloatArray | None = None) -> Any:
+    from scipy.sparse import coo_array
+
+    return coo_array(
+        (np.ones(len(edges)) if weights is None else weights, (edges[:, 0], edges[:, 1])), (size, size)
+    ).tocsr()
+
+
+def cut(surface: Surface, support: FloatArray) -> Surface:
+    """The part of a surface where the support, linear along the edges, is positive; triangles on the border are split.
+
+    Args:
+        surface: any.
+        support: (V,).
+    """
+    edges, edge_of = edges_of(surface.faces)
+    support = np.where(support == 0, -1e-9, support)
+    a, b = support[edges].T
+    crossed = (a > 0) != (b > 0)
+    share = np.divide(a, a - b, out=np.zeros_like(a), where=crossed)[crossed, None]
+    first, second = edges[crossed].T
+    vertices = surface.vertices[first] * (1 - share) + surface.vertices[second] * share
+    colors = surface.colors[first] * (1 - share) + surface.colors[second] * share
+    new = np.full(len(edges), -1)
+    new[crossed] = len(surface.vertices) + np.arange(len(vertices))
+    faces = _split(surface.faces, new[edge_of], support[surface.faces] > 0)
+    all_colors = np.concatenate([surface.colors, np.rint(colors).astype(np.uint8)])
+    extended = Surface(np.concatenate([surface.vertices, vertices]), faces, all_colors)
+    return select_faces(extended, np.ones(len(faces), bool))
+
+
+def _split(faces: IndexArray, middle: IndexArray, inside: NDArray[np.bool_]) -> IndexArray:
+    """Triangles whose corners are inside, and what is left of those with one or two; `middle` (T, 3) on ab, bc, ca."""
+    parts = [faces[inside.all(axis=1)]]
+    count = inside.sum(axis=1)
+    for corner in range(3):
+        a, b, c = corner, (corner + 1) % 3, (corner + 2) % 3
+        one = (count == 1) & inside[:, a]
+        parts.append(np.stack([faces[one, a], middle[one, a], middle[one, c]], axis=1))
+        two = (count == 2) & ~inside[:, a]
+        parts.append(np.stack([middle[two, a], faces[two, b], faces[two, c]], axis=1))
+        parts.append(np.stack([middle[two, a], faces[two, c], middle[two, c]], axis=1))
+    return np.concatenate(parts)

@@ -1,0 +1,85 @@
+"""A mesh that every program can work with: no degenerate or doubled triangles, a manifold with one orientation."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.triangles import areas, edges_of
+from sfm_app.meshing.clean import select_faces
+from sfm_app.types import Surface
+
+MIN_HEIGHT = 1e-7
+"""A triangle is degenerate below this height, as a share of the surface's size; single precision resolves no less."""
+
+
+def make_manifold(surface: Surface) -> Surface:
+    """The surface as an oriented manifold.
+
+    Every edge then has one triangle, or two that run along it in opposite directions; those at a vertex form one fan.
+
+    What is degenerate, not finite or doubled goes; of more than two triangles at an edge, and of two with the same
+    direction, the smallest go; vertices where fans only touch are split.
+    """
+    surface = select_faces(surface, _proper(surface))
+    while len(surface.faces):
+        bad = _crowded(surface)
+        if not bad.any():
+            break
+        surface = select_faces(surface, ~bad)
+    return split_fans(surface)
+
+
+def _proper(surface: Surface) -> NDArray[np.bool_]:
+    """(T,) triangles that are finite and have a height, each set of corners once."""
+    corners = surface.vertices[surface.faces]
+    sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    area = areas(surface.vertices, surface.faces)
+    finite = np.isfinite(area)
+    size = np.ptp(surface.vertices[np.isfinite(surface.vertices).all(axis=1)], axis=0).max(initial=0.0)
+    _, first = np.unique(np.sort(surface.faces, axis=1), axis=0, return_index=True)
+    proper = np.zeros(len(surface.faces), bool)
+    proper[first] = True
+    return np.asarray(proper & finite & (2.0 * area > MIN_HEIGHT * size * sides))
+
+
+def _crowded(surface: Surface) -> NDArray[np.bool_]:
+    """(T,) the smallest triangle at every edge that has too many, or two with the same direction."""
+    edges, edge_of = edges_of(surface.faces)
+    forward = surface.faces < np.roll(surface.faces, -1, axis=1)
+    uses = np.stack([np.bincount(edge_of[way], minlength=len(edges)) for way in (forward, ~forward)])
+    wrong = np.asarray((uses > 1).any(axis=0))
+    bad = np.zeros(len(surface.faces), bool)
+    if wrong.any():
+        area = areas(surface.vertices, surface.faces)
+        face, side = np.nonzero(wrong[edge_of])
+        order = np.lexsort((face, area[face], edge_of[face, side]))
+        at = edge_of[face, side][order]
+        bad[face[order][np.diff(at, prepend=-1) > 0]] = True
+    return bad
+
+
+def split_fans(surface: Surface) -> Surface:
+    """Give every fan of triangles around a vertex its own copy of the vertex."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    count = len(surface.faces)
+    _, edge_of = edges_of(surface.faces)
+    # corners of two triangles belong together where the triangles share an edge that ends there
+    order = np.argsort(edge_of, axis=None, kind="stable")
+    same = np.flatnonzero(np.diff(edge_of.ravel()[order]) == 0)
+    face_a, side_a = np.divmod(order[same], 3)
+    face_b, side_b = np.divmod(order[same + 1], 3)
+    joined = [
+        (3 * face_a + side_a, 3 * face_b + (side_b + 1) % 3),
+        (3 * face_a + (side_a + 1) % 3, 3 * face_b + side_b),
+    ]
+    rows, cols = np.concatenate(joined, axis=1)
+    graph = coo_array((np.ones(len(rows), bool), (rows, cols)), (3 * count, 3 * count))
+    _, fan = connected_components(graph, directed=False)
+    _, first, faces = np.unique(fan, return_index=True, return_inverse=True)
+    vertex = surface.faces.ravel()[first]
+    order = np.argsort(vertex, kind="stable")
+    rank = np.empty(len(order), np.int64)
+    rank[order] = np.arange(len(order))
+    vertex = vertex[order]
+    return Surface(surface.vertices[vertex], rank[faces].reshape(-1, 3), surface.colors[vertex])

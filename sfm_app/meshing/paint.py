@@ -1,0 +1,87 @@
+"""Colours of a surface's vertices, from the photos that see them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.meshing.visibility import CONFIRMED, Eye, FloatArray, judge
+
+ColorImage = NDArray[np.uint8]
+"""(H, W, 3) RGB."""
+
+
+@dataclass(slots=True, eq=False)
+class Paint:
+    """Colours gathered photo by photo, and how much they weigh."""
+
+    total: NDArray[np.float32]
+    """(V, 3) weighted sum of the colours."""
+    weight: NDArray[np.float32]
+    """(V,)."""
+
+    @classmethod
+    def none(cls, count: int) -> "Paint":
+        """No colour yet for `count` vertices."""
+        return cls(np.zeros((count, 3), np.float32), np.zeros(count, np.float32))
+
+    def add(self, other: "Paint") -> None:
+        """Add what another photo says."""
+        self.total += other.total
+        self.weight += other.weight
+
+    def over(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """(V, 3) the mean of the photos; vertices that no photo shows keep what they have in `colors`."""
+        mean = self.total / np.maximum(self.weight, np.finfo(np.float32).tiny)[:, None]
+        return np.where(self.weight[:, None] > 0, np.rint(mean), colors).astype(np.uint8)
+
+
+def sample_colors(points: FloatArray, normals: FloatArray, eye: Eye, image: ColorImage, tolerance: float) -> Paint:
+    """What one photo adds: its colours where it confirms the points, weighted by the pixels that a patch there gets.
+
+    Args:
+        points: (N, 3).
+        normals: (N, 3) unit.
+        eye: the photo's camera and depth map.
+        image: (H, W, 3) as large as the depth map.
+        tolerance: as for `judge`.
+    """
+    paint = Paint.none(len(points))
+    seen = judge(points, normals, eye, tolerance) == CONFIRMED
+    _sample(points, normals, seen, eye.projection, eye.center, eye.focal_px**2, image, paint.total, paint.weight)
+    return paint
+
+
+@kernel
+def _sample(
+    points: FloatArray,
+    normals: FloatArray,
+    seen: NDArray[np.bool_],
+    P: FloatArray,
+    center: FloatArray,
+    scale: float,
+    image: ColorImage,
+    total: NDArray[np.float32],
+    weight: NDArray[np.float32],
+) -> None:
+    height, width = image.shape[0], image.shape[1]
+    for k in range(len(points)):
+        if not seen[k]:
+            continue
+        X, Y, Z = points[k, 0], points[k, 1], points[k, 2]
+        z = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]
+        u = (P[0, 0] * X + P[0, 1] * Y + P[0, 2] * Z + P[0, 3]) / z - 0.5
+        v = (P[1, 0] * X + P[1, 1] * Y + P[1, 2] * Z + P[1, 3]) / z - 0.5
+        col, row = int(np.floor(u)), int(np.floor(v))
+        if not (0 <= col < width - 1 and 0 <= row < height - 1):
+            continue
+        x, y, w = center[0] - X, center[1] - Y, center[2] - Z
+        facing = (normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * w) / np.sqrt(x * x + y * y + w * w)
+        share = facing * scale / (z * z)
+        weight[k] = share
+        right, down = u - col, v - row
+        for c in range(3):
+            upper = image[row, col, c] * (1 - right) + image[row, col + 1, c] * right
+            lower = image[row + 1, col, c] * (1 - right) + image[row + 1, col + 1, c] * right
+            total[k, c] = share * (upper * (1 - down) + lower * down)

@@ -1,0 +1,101 @@
+"""What a photo says about points in space: its depth map confirms them, sees through them, or is silent."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+
+FloatArray = NDArray[np.float64]
+DepthArray = NDArray[np.float32]
+"""(H, W) depth along the optical axis in scene units, 0 where unknown."""
+
+SILENT, CONFIRMED, SEEN_THROUGH = 0, 1, 2
+MIN_COSINE = 0.1
+"""Least cosine between a surface's normal and the ray to the photo that confirms it."""
+THROUGH = 3.0
+"""What a photo sees lies this many tolerances behind a point that it sees through."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Eye:
+    """A posed photo without distortion and what it knows of depth."""
+
+    K: FloatArray
+    """(3, 3) camera matrix in pixels."""
+    R: FloatArray
+    """(3, 3) rotation of cam_from_world."""
+    t: FloatArray
+    """(3,) translation of cam_from_world."""
+    depth: DepthArray
+    sample_px: float
+    """Where inside its pixel a depth is taken, in x and y; 0.5 is the pixel's centre."""
+
+    @property
+    def projection(self) -> FloatArray:
+        """(3, 4) K [R | t]; its last row gives the depth."""
+        return np.asarray(self.K @ np.column_stack([self.R, self.t]))
+
+    @property
+    def center(self) -> FloatArray:
+        """(3,) centre of projection in the world."""
+        return np.asarray(-self.R.T @ self.t)
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels per unit of length at depth 1, the mean of both directions."""
+        return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
+
+
+def judge(points: FloatArray, normals: FloatArray, eye: Eye, tolerance: float) -> NDArray[np.uint8]:
+    """Per point (N, 3) with its unit normal (N, 3): CONFIRMED, SEEN_THROUGH or SILENT.
+
+    A point is confirmed where the depths around it reach its own within the relative tolerance and it faces the photo;
+    it is seen through where all of them lie well behind it. Hidden points and empty places of the map say nothing.
+    """
+    verdict = np.zeros(len(points), np.uint8)
+    _judge(points, normals, eye.projection, eye.center, eye.depth, np.array([eye.sample_px, tolerance]), verdict)
+    return verdict
+
+
+@kernel
+def _judge(
+    points: FloatArray,
+    normals: FloatArray,
+    P: FloatArray,
+    center: FloatArray,
+    depth: DepthArray,
+    options: FloatArray,
+    verdict: NDArray[np.uint8],
+) -> None:
+    height, width = depth.shape
+    sample_px, tolerance = options[0], options[1]
+    for k in range(len(points)):
+        X, Y, Z = points[k, 0], points[k, 1], points[k, 2]
+        z = P[2, 0] * X + P[2, 1] * Y + P[2, 2] * Z + P[2, 3]
+        if z <= 0:
+            continue
+        u = (P[0, 0] * X + P[0, 1] * Y + P[0, 2] * Z + P[0, 3]) / z - sample_px
+        v = (P[1, 0] * X + P[1, 1] * Y + P[1, 2] * Z + P[1, 3]) / z - sample_px
+        col, row = int(np.floor(u)), int(np.floor(v))
+        if not (0 <= col < width - 1 and 0 <= row < height - 1):
+            continue
+        low, high, known, near = np.inf, 0.0, 0, False
+        for i in range(row, row + 2):
+            for j in range(col, col + 2):
+                d = depth[i, j]
+                if d > 0:
+                    low, high, known = min(low, d), max(high, d), known + 1
+                    near = near or abs(d - z) <= tolerance * z
+        if known == 0:
+            continue
+        # on a slope the four depths bracket the point's; across a step they do not belong together
+        between = low <= z <= high and high - low <= 2.0 * THROUGH * tolerance * z
+        if near or between:
+            x, y, w = center[0] - X, center[1] - Y, center[2] - Z
+            facing = normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * w
+            if facing > MIN_COSINE * np.sqrt(x * x + y * y + w * w):
+                verdict[k] = CONFIRMED
+        elif known == 4 and low > (1.0 + THROUGH * tolerance) * z:
+            verdict[k] = SEEN_THROUGH

@@ -1,0 +1,59 @@
+"""What a depth map says about points, and the colours that it lends them."""
+
+import numpy as np
+import pytest
+
+from sfm_app.meshing import CONFIRMED, SEEN_THROUGH, SILENT, Eye, Paint, judge, sample_colors
+
+FACING = np.array([[0.0, 0.0, -1.0]])
+
+
+@pytest.fixture
+def eye():
+    """Looks along +z at a wall 10 away, that is empty on the right and 5 away at the bottom."""
+    depth = np.full((60, 80), 10.0, np.float32)
+    depth[:, 60:] = 0
+    depth[40:] = 5
+    K = np.array([[100.0, 0, 40], [0, 100, 30], [0, 0, 1]])
+    return Eye(K, np.eye(3), np.zeros(3), depth, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("point", "verdict"),
+    [
+        ((0, 0, 10.0), CONFIRMED),
+        ((0, 0, 9.95), CONFIRMED),
+        ((0, 0, 9.8), SILENT),
+        ((0, 0, 9.0), SEEN_THROUGH),
+        ((0, 0, 11.0), SILENT),
+        ((3, 0, 10.0), SILENT),
+        ((0, 1.0, 5.0), CONFIRMED),
+        ((0, 0.745, 7.4), SILENT),  # on the step from 10 to 5
+        ((0, 0, -10.0), SILENT),
+        ((9, 0, 10.0), SILENT),
+    ],
+)
+def test_verdicts(eye, point, verdict):
+    assert judge(np.array([point]), FACING, eye, 0.01) == verdict
+
+
+def test_the_back_of_a_surface_is_not_confirmed(eye):
+    assert judge(np.array([[0, 0, 10.0]]), -FACING, eye, 0.01) == SILENT
+
+
+def test_colours_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
+    image = np.zeros((60, 80, 3), np.uint8)
+    image[..., 0] = np.arange(80) * 2
+    points = np.array([[0, 0, 10.0], [0.5, -1, 10.0], [3, 0, 10.0]])
+    normals = np.repeat(FACING, 3, axis=0)
+
+    paint = sample_colors(points, normals, eye, image, 0.01)
+    near = Eye(np.diag([2.0, 2, 1]) @ eye.K, eye.R, eye.t, np.full((120, 160), 10.0, np.float32), 0.5)
+    closer = sample_colors(points, normals, near, np.full((120, 160, 3), 255, np.uint8), 0.01)
+
+    np.testing.assert_allclose(paint.over(np.full((3, 3), 7, np.uint8))[:, 0], [79, 89, 7], atol=1)
+    np.testing.assert_allclose(closer.weight[:2], 4 * paint.weight[:2])
+    both = Paint.none(3)
+    both.add(paint)
+    both.add(closer)
+    np.testing.assert_allclose(both.over(np.zeros((3, 3), np.uint8))[0, 0], (79 + 4 * 255) / 5, atol=1)
