@@ -16,7 +16,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 def settings_options(command: Command) -> Command:
-    """--config, --seed, --workers, --quality, --estimator, --calibrator, --mapper, --set, -v."""
+    """--config, --seed, --workers, --quality, --estimator, --calibrator, --mapper, --unseen, --set, -v."""
     options = (
         click.option(
             "--config", type=click.Path(path_type=Path), help="Settings file (TOML); `sfm-app config` prints one."
@@ -27,6 +27,9 @@ def settings_options(command: Command) -> Command:
         click.option("--estimator", help="Estimator of fundamental matrices.  [default: lev-ransac]"),
         click.option("--calibrator", help="Calibrator.  [default: zero-curves]"),
         click.option("--mapper", help="auto, incremental or global.  [default: auto]"),
+        click.option(
+            "--unseen", type=click.Choice(("color", "cut")), help="Triangles that no photo sees.  [default: color]"
+        ),
         click.option("--set", "assignments", multiple=True, metavar="TABLE.KEY=VALUE", help="Any other setting."),
         click.option("-v", "--verbose", count=True, help="Show what COLMAP says; -vv shows all of it."),
     )
@@ -43,7 +46,12 @@ def settings_from(flags: Mapping[str, Any]) -> Settings:
     """Settings from the shared options; flags win over the file."""
     show_log(flags["verbose"])
     overrides: dict[str, Any] = {key: flags[key] for key in ("seed", "workers", "quality") if flags[key] is not None}
-    for key, table in (("estimator", "epipolar"), ("calibrator", "calibration"), ("mapper", "scene")):
+    for key, table in (
+        ("estimator", "epipolar"),
+        ("calibrator", "calibration"),
+        ("mapper", "scene"),
+        ("unseen", "texture"),
+    ):
         if flags[key] is not None:
             overrides = merged(overrides, {table: {key: flags[key]}})
     for assignment in flags["assignments"]:
