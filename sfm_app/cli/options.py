@@ -15,8 +15,12 @@ from sfm_app.settings import Quality, Settings, merged
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
+OWN_FLAGS = {"estimator": "epipolar", "calibrator": "calibration", "mapper": "scene", "faces": "mesh", "unseen": "texture"}
+"""Settings with a flag of their own, and their tables."""
+
+
 def settings_options(command: Command) -> Command:
-    """--config, --seed, --workers, --quality, --estimator, --calibrator, --mapper, --faces, --set, -v."""
+    """--config, --seed, --workers, --quality, --estimator, --calibrator, --mapper, --faces, --unseen, --set, -v."""
     options = (
         click.option(
             "--config", type=click.Path(path_type=Path), help="Settings file (TOML); `sfm-app config` prints one."
@@ -28,6 +32,9 @@ def settings_options(command: Command) -> Command:
         click.option("--calibrator", help="Calibrator.  [default: zero-curves]"),
         click.option("--mapper", help="auto, incremental or global.  [default: auto]"),
         click.option("--faces", type=int, help="Most triangles of the mesh.  [default: 200000]"),
+        click.option(
+            "--unseen", type=click.Choice(("color", "cut")), help="Triangles that no photo sees.  [default: color]"
+        ),
         click.option("--set", "assignments", multiple=True, metavar="TABLE.KEY=VALUE", help="Any other setting."),
         click.option("-v", "--verbose", count=True, help="Show what COLMAP says; -vv shows all of it."),
     )
@@ -44,11 +51,9 @@ def settings_from(flags: Mapping[str, Any]) -> Settings:
     """Settings from the shared options; flags win over the file."""
     show_log(flags["verbose"])
     overrides: dict[str, Any] = {key: flags[key] for key in ("seed", "workers", "quality") if flags[key] is not None}
-    for key, table in (("estimator", "epipolar"), ("calibrator", "calibration"), ("mapper", "scene")):
+    for key, table in OWN_FLAGS.items():
         if flags[key] is not None:
             overrides = merged(overrides, {table: {key: flags[key]}})
-    if flags["faces"] is not None:
-        overrides = merged(overrides, {"mesh": {"faces": flags["faces"]}})
     for assignment in flags["assignments"]:
         overrides = merged(overrides, assigned(assignment))
     if flags["config"] is not None:

@@ -20,13 +20,13 @@ class Occluders:
         self._scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces.astype(np.uint32)))
 
-    def hidden(self, points: NDArray[np.float64], centre: NDArray[np.float64], slack: float) -> NDArray[np.bool_]:
+    def hidden(self, centre: NDArray[np.float64], slack: float, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """(N,) whether a triangle lies between a point and the camera.
 
         Args:
-            points: (N, 3).
             centre: (3,) of the camera.
             slack: length of the first part of the way that does not count; the points' own triangles are there.
+            points: (N, 3).
         """
         way = centre - points
         length = np.linalg.norm(way, axis=1, keepdims=True)

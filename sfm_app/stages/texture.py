@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,15 +42,19 @@ def read_photo(photo_dir: Path, view: PhotoView) -> NDArray[np.uint8]:
 def save_texture(model: Model, run: RunContext) -> None:
     """Write dense/texture.npz."""
     surface, texture = model.surface, model.texture
-    pages = {} if texture is None else {f"page{number}": page for number, page in enumerate(texture.pages)}
-    places = {} if texture is None else {"uv": texture.uv, "page": texture.page}
+    stored: dict[str, Any] = {"vertices": surface.vertices, "faces": surface.faces, "colors": surface.colors}
+    if texture is not None:
+        stored |= {"uv": texture.uv, "page": texture.page}
+        stored |= {f"page{number}": page for number, page in enumerate(texture.pages)}
     with run.workspace.replacing(run.workspace.dense / TEXTURE) as path:
-        np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors, **places, **pages)
+        np.savez(path, **stored)
 
 
 def load_texture(dense_dir: Path) -> Model:
     """The model that `make_texture` left in a dense workspace."""
     with np.load(dense_dir / TEXTURE) as stored:
         surface = Surface(stored["vertices"], stored["faces"], stored["colors"])
-        pages = tuple(stored[f"page{number}"] for number in range(len(stored.files) - 5))
+        if "uv" not in stored:
+            return Model(surface)
+        pages = tuple(stored[f"page{number}"] for number in range(sum(name[4:].isdigit() for name in stored.files)))
         return Model(surface, Texture(stored["uv"], stored["page"], pages))

@@ -84,7 +84,7 @@ def texture_surface(
         spread: runs work for each photo.
 
     Returns:
-        The surface (cut, if asked for; its colours taken from the photos) with its texture, and figures for the manifest.
+        The surface with its texture, cut if asked for and with colours from the photos; and figures for the manifest.
     """
     mesh = facets(surface)
     looks = spread(partial(_look_at, mesh=mesh, load=load, hidden=hidden), views, "looking at the surface")
@@ -129,9 +129,7 @@ def _believe(looks: Sequence[Look | Rejected], mesh: Facets) -> Seen:
     return Seen(worth, colors, gains, int(strange.sum()))
 
 
-def _plan(
-    mesh: Facets, seen: Seen, chosen: IntArray, views: Sequence[PhotoView], options: TextureSettings
-) -> Plan:
+def _plan(mesh: Facets, seen: Seen, chosen: IntArray, views: Sequence[PhotoView], options: TextureSettings) -> Plan:
     charts = make_charts(chosen, np.array([view.row for view in views]), mesh, options.max_page_px / 2)
     blocks = block_sizes(int((chosen == NONE).sum()))
     layout, places = pack(charts, blocks, options.max_page_px, options.max_pages)
@@ -182,9 +180,7 @@ def _shares(photo: int, plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.float
     return triangles, shares[triangles], offset[mesh.faces[triangles]]
 
 
-def _allowed_weight(
-    blend: Blend, usable: NDArray[np.bool_], chosen: IntArray, mesh: Facets
-) -> NDArray[np.float32]:
+def _allowed_weight(blend: Blend, usable: NDArray[np.bool_], chosen: IntArray, mesh: Facets) -> NDArray[np.float32]:
     total = np.zeros(mesh.faces.shape, np.float32)
     weight = np.zeros(len(mesh.vertices), np.float32)
     for photo in range(len(usable)):

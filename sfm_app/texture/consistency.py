@@ -89,7 +89,8 @@ def _deviations(
 @kernel
 def _median(values: NDArray[np.float64]) -> float:
     ranked = np.sort(values)
-    return 0.5 * (ranked[(len(values) - 1) // 2] + ranked[len(values) // 2])
+    middle: float = 0.5 * (ranked[(len(values) - 1) // 2] + ranked[len(values) // 2])
+    return middle
 
 
 @kernel

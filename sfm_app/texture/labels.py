@@ -60,14 +60,14 @@ def _relative_size(mesh: Facets) -> FloatArray:
     corners = mesh.vertices[mesh.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     usual = np.sqrt(3.0) / 4.0 * max(mesh.spacing, 1e-300) ** 2
-    return np.sqrt(0.5 * np.linalg.norm(across, axis=1) / usual)
+    return np.asarray(np.sqrt(0.5 * np.linalg.norm(across, axis=1) / usual), np.float64)
 
 
 def _edge_prices(mesh: Facets) -> NDArray[np.float32]:
     """(T, 3) length of the edges from corner k to k + 1 in usual edges."""
     corners = mesh.vertices[mesh.faces]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
-    return (lengths / max(mesh.spacing, 1e-300)).astype(np.float32)
+    return np.asarray(lengths / max(mesh.spacing, 1e-300), np.float32)
 
 
 def _places_at_neighbours(neighbours: IntArray) -> IntArray:

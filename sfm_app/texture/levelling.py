@@ -14,14 +14,12 @@ STIFFNESS = 4.0
 """Of the offsets along a chart, beside 1 for the difference at a seam."""
 HOLD = 1e-3
 """Weight of "no offset"."""
-STEPS = 150
-ENOUGH = 1e-3
+STEPS = 100
+ENOUGH = 1e-2
 """Of the residual of the offsets, relative to the beginning."""
 
 
-def level(
-    blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets
-) -> Blend:
+def level(blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets) -> Blend:
     """The blend with the offsets that least squares give it.
 
     Args:

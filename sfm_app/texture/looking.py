@@ -2,18 +2,19 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.texture.facets import Facets, at_vertices
+from sfm_app.texture.facets import Facets
 from sfm_app.texture.views import PhotoView, project, sample
 
 FloatArray = NDArray[np.float64]
-Hidden = Callable[[FloatArray, FloatArray, float], NDArray[np.bool_]]
-"""Which of (N, 3) points are hidden from a camera at (3,); the third argument is the slack next to a point."""
+Hidden = Callable[[FloatArray, float, FloatArray], NDArray[np.bool_]]
+"""For a camera at (3,) and the slack next to a point: which of (N, 3) points are hidden."""
 
 SLACK = 1.0
 """Of the occlusion test, in median edges: the surface's own roughness hides nothing."""
@@ -21,8 +22,9 @@ MIN_COSINE = 0.1
 """A triangle seen more obliquely than this is not seen: its few pixels would be smeared over it."""
 BORDER_PX = 2.0
 """Pixels at the rim of a photo that are not used: resampling and demosaicing end there."""
-RIM_WORTH = 0.25
-"""Worth of a triangle beside one that is hidden: where the surface is a pixel off, it shows what hides the other."""
+RIM_RINGS, RIM_WORTH = 2, 0.5
+"""Each ring of triangles next to those that a photo does not see is worth so much less: where the surface is a pixel
+off, they show what lies before or behind it."""
 SHARPNESS_RANGE = (0.2, 1.0)
 
 
@@ -51,20 +53,30 @@ def look(view: PhotoView, photo: NDArray[np.uint8], mesh: Facets, hidden: Hidden
     color = np.zeros((len(mesh.faces), 3), np.uint8)
     _measure(view.row, photo, mesh.vertices, mesh.faces, worth, color)
     candidates = np.flatnonzero(worth)
-    points = np.unique(mesh.faces[candidates])
-    covered = np.zeros(len(mesh.vertices), np.bool_)
-    covered[points] = hidden(mesh.vertices[points], view.centre, SLACK * mesh.spacing)
-    centres = mesh.vertices[mesh.faces[candidates]].mean(axis=1)
-    blocked = hidden(centres, view.centre, SLACK * mesh.spacing) | covered[mesh.faces[candidates]].all(axis=1)
-    blocked |= covered[mesh.faces[candidates]].sum(axis=1) == 2
-    occluded = np.zeros(len(mesh.faces))
-    occluded[candidates[blocked]] = 1.0
-    beside = at_vertices(occluded, mesh.faces, len(mesh.vertices)) > 0
-    beside |= covered
-    worth[beside[mesh.faces].any(axis=1)] *= RIM_WORTH
-    worth[candidates[blocked]] = 0.0
+    worth[candidates[_blocked(candidates, mesh, partial(hidden, view.centre, SLACK * mesh.spacing))]] = 0.0
     color[worth == 0] = 0
+    beyond = worth == 0
+    for _ in range(RIM_RINGS):
+        touched = np.zeros(len(mesh.vertices), np.bool_)
+        touched[mesh.faces[beyond]] = True
+        beyond = touched[mesh.faces].any(axis=1)
+        worth[beyond] *= RIM_WORTH
     return Look(worth, color, sharpness(photo))
+
+
+def _blocked(
+    candidates: NDArray[np.int64], mesh: Facets, hidden: Callable[[FloatArray], NDArray[np.bool_]]
+) -> NDArray[np.bool_]:
+    """Which of the triangles (N,) are hidden, at the centre or at two corners."""
+    corners = mesh.faces[candidates]
+    covered = np.zeros(len(mesh.vertices), np.bool_)
+    covered[corners] = True
+    points = np.flatnonzero(covered)
+    covered[points] = hidden(mesh.vertices[points])
+    blocked = covered[corners].sum(axis=1, dtype=np.int8) > 1
+    open_ones = np.flatnonzero(~blocked)
+    blocked[open_ones] = hidden(mesh.vertices[corners[open_ones]].mean(axis=1))
+    return blocked
 
 
 def sharpness(photo: NDArray[np.uint8]) -> float:
@@ -93,8 +105,7 @@ def _measure(
 ) -> None:
     """Area in pixels times cosine, and mean colour, of the triangles that face the camera within the photo."""
     height, width = photo.shape[0], photo.shape[1]
-    x, y, pixel = np.empty(4), np.empty(4), np.empty((4, 2))
-    corner = np.empty((4, 3))
+    x, y, corner = np.empty(4), np.empty(4), np.empty((4, 3))
     for f in range(len(faces)):
         for axis in range(3):
             corner[3, axis] = 0.0
@@ -131,7 +142,9 @@ def _cosine(camera: FloatArray, corner: FloatArray) -> float:
     wx = wy = wz = 0.0
     for row in range(3):
         at = 8 + 4 * row
-        along = camera[at] * corner[3, 0] + camera[at + 1] * corner[3, 1] + camera[at + 2] * corner[3, 2] + camera[at + 3]
+        along = (
+            camera[at] * corner[3, 0] + camera[at + 1] * corner[3, 1] + camera[at + 2] * corner[3, 2] + camera[at + 3]
+        )
         wx -= camera[at] * along
         wy -= camera[at + 1] * along
         wz -= camera[at + 2] * along

@@ -21,8 +21,10 @@ MARGIN = 2
 """Texels around a chart that belong to it."""
 FILL = 0.7
 """Share of a page that charts usually cover."""
-TIGHTER = 0.9
+TIGHTER = 0.95
 """Scale of the next try, where the charts do not fit."""
+LEAST_SCALE = 0.05
+"""A picture this small is none: rather more pages."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,17 +48,27 @@ def pack(charts: Charts, blocks: IntArray, max_page_px: int, max_pages: int) -> 
         charts: their triangles in pixels of the photos.
         blocks: (B, 2) widths and heights of rectangles, which are never scaled.
         max_page_px: longest side of a page.
-        max_pages: most pages.
+        max_pages: most pages, unless the margins of tiny charts alone need more.
 
     Returns:
         The layout of the charts, and (B, 3) page, x and y of the rectangles.
     """
-    scale = 1.0
+    scale = min(1.0, float(np.sqrt(FILL * max_pages * max_page_px**2 / max(_area(charts), 1.0))))
     while True:
         placed = _try_to_pack(charts, blocks, scale, max_page_px, max_pages)
         if placed is not None:
             return placed
-        scale *= TIGHTER
+        if scale > LEAST_SCALE:
+            scale *= TIGHTER
+        else:  # many small charts: their margins fill the pages
+            max_pages += 1
+
+
+def _area(charts: Charts) -> float:
+    """Square pixels under all charts."""
+    a, b, c = (charts.corners[:, k] for k in range(3))
+    turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    return float(np.sum(np.abs(turn[charts.of != NONE])) / 2)
 
 
 def _try_to_pack(
@@ -86,7 +98,9 @@ def _try_to_pack(
     return Layout(place[:count, 0], shift.astype(np.int32), scale, sizes), place[count:] * np.array([1, CELL, CELL])
 
 
-def _profiles(charts: Charts, scale: float) -> tuple[IntArray, IntArray, NDArray[np.int64], ...]:  # type: ignore[misc]
+def _profiles(
+    charts: Charts, scale: float
+) -> tuple[IntArray, IntArray, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Origin in texels (C, 2), size in cells (C, 2), start of each chart's columns (C + 1,), and the two profiles."""
     count = len(charts.photo)
     drawn = np.flatnonzero(charts.of != NONE)

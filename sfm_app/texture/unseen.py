@@ -11,7 +11,7 @@ FloatArray = NDArray[np.float64]
 
 CELL = 2
 """Texels on a side of the square that an unseen triangle gets: bilinear reading inside it is exact."""
-BLOCK = 256
+BLOCK = 64
 """Most such squares beside each other."""
 HOLD = 1e-4
 """Weight of the colour that an unseen vertex had before, beside 1 for each neighbour: for parts that no photo sees."""
@@ -43,7 +43,7 @@ def vertex_colors(mesh: Facets, seen: NDArray[np.bool_], corner_colors: FloatArr
     rim = (ends >= 0).any(axis=1) & ~inner
     outside = np.where(ends[rim, 0] < 0, mesh.edges[rim, 0], mesh.edges[rim, 1])
     inside = ends[rim].max(axis=1)
-    hold = HOLD + np.bincount(inside, minlength=int((~known).sum()))
+    hold = np.asarray(HOLD + np.bincount(inside, minlength=int((~known).sum())), np.float64)
     right = HOLD * colors[~known]
     for channel in range(3):
         right[:, channel] += np.bincount(inside, colors[outside, channel], len(right))
@@ -64,9 +64,9 @@ def block_sizes(triangles: int) -> NDArray[np.int32]:
 
 def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int) -> NDArray[np.int64]:
     """(N, 3) page, x and y of the square of each triangle, row by row through the blocks."""
-    found = []
-    for (page, left, top), (width, _) in zip(places, sizes, strict=True):
-        count = min(triangles - sum(map(len, found)), BLOCK * BLOCK)
+    found: list[NDArray[np.int64]] = []
+    for number, ((page, left, top), (width, _)) in enumerate(zip(places, sizes, strict=True)):
+        count = min(triangles - number * BLOCK * BLOCK, BLOCK * BLOCK)
         row, column = np.divmod(np.arange(count), width // CELL)
         found.append(np.column_stack([np.full(count, page), left + CELL * column, top + CELL * row]))
     return np.concatenate(found).astype(np.int64) if found else np.empty((0, 3), np.int64)

@@ -90,6 +90,7 @@ def sample(photo: NDArray[np.uint8], x: float, y: float, channel: int) -> float:
     left, top = int(x), int(y)
     right, below = min(left + 1, width - 1), min(top + 1, height - 1)
     a, b = x - left, y - top
-    upper = (1.0 - a) * photo[top, left, channel] + a * photo[top, right, channel]
-    lower = (1.0 - a) * photo[below, left, channel] + a * photo[below, right, channel]
-    return (1.0 - b) * upper + b * lower
+    upper: float = (1.0 - a) * photo[top, left, channel] + a * photo[top, right, channel]
+    lower: float = (1.0 - a) * photo[below, left, channel] + a * photo[below, right, channel]
+    value: float = (1.0 - b) * upper + b * lower
+    return value
