@@ -44,7 +44,7 @@ def match_depths(
         if isinstance(rectification, Rejected):
             reason = rectification.reason
             continue
-        left, right = rectification.warp(image, load(neighbour))
+        left, right = rectification.warp(image, load(neighbour), (view, neighbour))
         disparity = disparities(left, right, rectification.disparities)
         found.append(depths_from_disparities(disparity, rectification, view, neighbour))
         if len(found) == count:
