@@ -12,9 +12,6 @@ BLOCK_PX = 3
 NO_DISPARITY = -1.0
 MIN_PARALLAX_PX = 1.0
 """Less says nothing about the depth: next to the epipole, and far away."""
-FLAT_WINDOW_PX = 9
-FLAT_RANGE = 4
-"""Grey levels; a window with less between its darkest and brightest pixel holds nothing that could be matched."""
 
 
 def disparities(left: GreyImage, right: GreyImage, count: int) -> NDArray[np.float32]:
@@ -41,12 +38,6 @@ def disparities(left: GreyImage, right: GreyImage, count: int) -> NDArray[np.flo
     return np.where(sixteenths < 0, NO_DISPARITY, sixteenths / 16.0).astype(np.float32)
 
 
-def has_texture(image: GreyImage) -> NDArray[np.bool_]:
-    """(H, W) where there is something to match; in skies the matcher only spreads what is beside."""
-    window = np.ones((FLAT_WINDOW_PX, FLAT_WINDOW_PX), np.uint8)
-    return np.asarray(cv2.subtract(cv2.dilate(image, window), cv2.erode(image, window)) >= FLAT_RANGE)
-
-
 def depths_from_disparities(
     disparity: NDArray[np.float32], rectification: Rectification, reference: View, neighbour: View
 ) -> tuple[DepthArray, DepthArray]:
@@ -65,7 +56,9 @@ def depths_from_disparities(
     depth = np.zeros((reference.height, reference.width), np.float32)
     parallax = np.zeros_like(depth)
     r = rectification
-    canvas = np.array([r.baseline, r.theta_max, r.phi_min, r.columns_per_rad, r.rows_per_rad, r.disparities, r.offset_px])
+    canvas = np.array(
+        [r.baseline, r.theta_max, r.phi_min, r.columns_per_rad, r.rows_per_rad, r.disparities, r.offset_px]
+    )
     _lift(disparity, canvas, to_rectified, np.column_stack([M, m]), reference.sample_px, size, depth, parallax)
     return depth, parallax
 

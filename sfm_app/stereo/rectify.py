@@ -28,9 +28,9 @@ BORDER_SAMPLES = 33
 class Rectification:
     """How the reference (left) and its neighbour (right) come onto one canvas.
 
-    A direction at the angle theta from the baseline, in the plane at the angle phi about it, comes to the column
-    ``(theta_max - theta) * columns_per_rad + disparities`` of the left canvas, `offset_px` further in the right one, and
-    to the row ``(phi - phi_min) * rows_per_rad``. The disparity of a point is therefore its triangulation angle times
+    A direction at the angle theta from the baseline, in the plane at the angle phi about it, comes to the row
+    ``(phi - phi_min) * rows_per_rad`` and the column ``(theta_max - theta) * columns_per_rad + disparities`` of the
+    left canvas, `offset_px` further in the right one. So the disparity of a point is its triangulation angle times
     `columns_per_rad`, less `offset_px`, and lies in [0, disparities).
     """
 
