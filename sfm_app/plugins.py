@@ -19,9 +19,11 @@ from sfm_app.formats import EXPORTERS
 from sfm_app.ransac import ESTIMATORS
 from sfm_app.selfcal import CALIBRATORS, SEVERAL_CAMERAS
 from sfm_app.settings import CalibrationSettings, EpipolarSettings
+from sfm_app.stereo import CPU, DEPTH_METHODS, MakeDepthMaps
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Model, Rejected
 
 GROUP = "sfm_app"
+AUTO = "auto"
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
 
@@ -86,6 +88,22 @@ class Exporter:
     summary: str = ""
 
 
+def _always() -> str:
+    return ""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthMethod:
+    """A named way to make depth maps."""
+
+    name: str
+    make: MakeDepthMaps
+    """Takes a `sfm_app.stereo.DepthTask`."""
+    summary: str = ""
+    unavailable: Callable[[], str] = _always
+    """Why it cannot run on this machine; empty where it can."""
+
+
 class Hooks:
     """What a plug-in may define, all optional."""
 
@@ -100,6 +118,10 @@ class Hooks:
     @hookspec
     def sfm_exporters(self) -> Iterable[Exporter]:  # type: ignore[empty-body]
         """File formats for models."""
+
+    @hookspec
+    def sfm_depth_methods(self) -> Iterable[DepthMethod]:  # type: ignore[empty-body]
+        """Ways to make depth maps."""
 
 
 class BuiltIns:
@@ -120,6 +142,10 @@ class BuiltIns:
     def sfm_exporters(self) -> Iterable[Exporter]:
         return [Exporter(name, write, summary) for name, (write, summary) in EXPORTERS.items()]
 
+    @hookimpl
+    def sfm_depth_methods(self) -> Iterable[DepthMethod]:
+        return [DepthMethod(name, make, summary) for name, (make, summary) in DEPTH_METHODS.items()]
+
 
 @dataclass(frozen=True, slots=True)
 class Plugins:
@@ -128,6 +154,7 @@ class Plugins:
     estimators: Mapping[str, Estimator]
     calibrators: Mapping[str, Calibrator]
     exporters: Mapping[str, Exporter]
+    depth_methods: Mapping[str, DepthMethod]
 
     def estimator(self, name: str) -> Estimator:
         """The estimator of that name; ConfigError names the known ones."""
@@ -140,6 +167,29 @@ class Plugins:
     def exporter(self, name: str) -> Exporter:
         """The file format of that name; ConfigError names the known ones."""
         return _named(self.exporters, name, "file format")
+
+    def depth_method(self, name: str) -> tuple[DepthMethod, str]:
+        """The way to make depth maps of that name, or with "auto" the best that runs here; and why this one.
+
+        Raises:
+            ConfigError: no method has that name, or it cannot run on this machine.
+        """
+        if name != AUTO:
+            method = _named(self.depth_methods, name, "depth method")
+            if reason := method.unavailable():
+                raise ConfigError(
+                    f"the depth method '{name}' cannot run here: {reason}",
+                    hint=f"'{AUTO}' takes what this machine can do, '{CPU}' runs everywhere",
+                )
+            return method, "asked for"
+        # whoever installs another method wants it used
+        others = [method for method in self.depth_methods.values() if method.name != CPU]
+        reasons = {method.name: method.unavailable() for method in others}
+        for method in others:
+            if not reasons[method.name]:
+                return method, "installed and able to run here"
+        missing = "; ".join(f"{other} cannot run here: {reason}" for other, reason in reasons.items())
+        return self.depth_methods[CPU], missing or "no other method is installed"
 
 
 def load_plugins(modules: Sequence[ModuleType | object] = (), *, installed: bool = True) -> Plugins:
@@ -177,6 +227,7 @@ def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
         estimators=_by_name(manager.hook.sfm_estimators()),
         calibrators=_by_name(manager.hook.sfm_calibrators()),
         exporters=_by_name(manager.hook.sfm_exporters()),
+        depth_methods=_by_name(manager.hook.sfm_depth_methods()),
     )
 
 

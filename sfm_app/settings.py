@@ -87,8 +87,12 @@ class SceneSettings(Section):
 
 
 class DepthSettings(Section):
-    """Depth maps on CPU."""
+    """Depth maps."""
 
+    method: str = Field(
+        "auto",
+        description="name of the method (see `sfm-app plugins`); auto: on the GPU where one can be used, else cpu",
+    )
     max_image_size_px: int = Field(1000, ge=64, le=16384, description="longer side of the depth maps, in pixels")
     neighbours: int = Field(4, ge=1, le=20, description="photos that each photo is matched with")
     consistency: float = Field(

@@ -138,11 +138,12 @@ def config(**flags: Any) -> None:
 
 @main.command()
 def plugins() -> None:
-    """List estimators, calibrators and file formats."""
+    """List estimators, calibrators, file formats and depth methods."""
     found = load_plugins()
     for title, parts in (
         ("estimators", found.estimators),
         ("calibrators", found.calibrators),
         ("exporters", found.exporters),
+        ("depth methods", found.depth_methods),
     ):
         print_lines([f"{title}:", *(f"  {line}" for line in table({p.name: p.summary for p in parts.values()}))])

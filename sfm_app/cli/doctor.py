@@ -25,7 +25,8 @@ def examine() -> dict[str, str]:
         "free disk here": f"{disk / GIGABYTE:.0f} GB"
         + ("" if disk > ENOUGH_DISK else ": little; dense stereo needs about 2 GB"),
         **versions(),
-        "COLMAP with CUDA": "yes" if has_cuda() else "no: depth maps are made on the CPU",
+        "COLMAP with CUDA": "yes" if has_cuda() else "no",
+        "depth maps": _depth_maps(),
         "ray casting (Open3D)": _open3d(),
         "plug-ins": _plugins(),
     }
@@ -37,6 +38,14 @@ def _memory() -> str:
         return f"{int(lines['MemAvailable'].split()[0]) / 2**20:.0f} GB free"
     except (OSError, KeyError, ValueError):
         return "unknown on this system"
+
+
+def _depth_maps() -> str:
+    try:
+        method, reason = load_plugins().depth_method("auto")
+    except SfmError as err:
+        return f"broken: {err}"
+    return f"{method.name} ({reason})"
 
 
 def _open3d() -> str:
@@ -51,4 +60,12 @@ def _plugins() -> str:
         found = load_plugins()
     except SfmError as err:
         return f"broken: {err}"
-    return f"{len(found.estimators)} estimators, {len(found.calibrators)} calibrators, {len(found.exporters)} formats"
+    return ", ".join(
+        f"{len(parts)} {name}"
+        for name, parts in (
+            ("estimators", found.estimators),
+            ("calibrators", found.calibrators),
+            ("formats", found.exporters),
+            ("depth methods", found.depth_methods),
+        )
+    )

@@ -1,18 +1,18 @@
 """COLMAP's dense workspace: undistorted photos, depth and normal maps."""
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend, pycolmap
-from sfm_app.stereo import DepthMap, View
+from sfm_app.stereo import DepthMap, Estimate, Kind, View
 
 JPEG_QUALITY = 98
-Kind = Literal["photometric", "geometric"]
-"""COLMAP's names for a depth map before and after the check against the other photos."""
+DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
 
 
 def undistort(model_dir: Path, photo_dir: Path, dense_dir: Path, max_side_px: int) -> None:
@@ -72,33 +72,84 @@ def map_file(dense_dir: Path, view: View) -> Path:
     return _map_path(dense_dir, "depth_maps", view, "geometric")
 
 
-def write_depth(dense_dir: Path, view: View, depth: NDArray[np.float32], kind: Kind) -> None:
-    """Write a depth map, (H, W), 0 where unknown."""
-    known = depth[depth > 0]
-    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
-    path = _map_path(dense_dir, "depth_maps", view, kind)
-    with backend(f"writing the depth map of {view.name}"):
-        pycolmap.DepthMap.from_array(np.ascontiguousarray(depth), low, high).write(path)
+class DenseStore:
+    """The photos and maps of a dense workspace, as `sfm_app.stereo.DepthStore` has them."""
+
+    def __init__(self, dense_dir: Path) -> None:
+        self.dense_dir = dense_dir
+
+    def photo(self, view: View) -> NDArray[np.uint8]:
+        return read_grey(self.dense_dir, view)
+
+    def has(self, view: View, kind: Kind) -> bool:
+        # the depth map is what is written last
+        return _map_path(self.dense_dir, DEPTHS, view, kind).is_file()
+
+    def read_estimate(self, view: View) -> Estimate:
+        confidence = _read_depth_format(self.dense_dir, CONFIDENCES, view, "photometric")
+        return Estimate(read_depth(self.dense_dir, view, "photometric"), confidence)
+
+    def write_estimate(self, view: View, estimate: Estimate) -> None:
+        _write_depth_format(self.dense_dir, CONFIDENCES, view, estimate.confidence, "photometric")
+        _write_depth_format(self.dense_dir, DEPTHS, view, estimate.depth, "photometric")
+
+    def write_maps(self, view: View, maps: DepthMap) -> None:
+        write_maps(self.dense_dir, view, maps)
 
 
 def read_depth(dense_dir: Path, view: View, kind: Kind) -> NDArray[np.float32]:
     """Read a depth map, (H, W), 0 where unknown."""
-    with backend(f"reading the depth map of {view.name}"):
-        stored = pycolmap.DepthMap()
-        stored.read(_map_path(dense_dir, "depth_maps", view, kind))
-    return np.array(stored.to_array(), np.float32)
+    return _read_depth_format(dense_dir, DEPTHS, view, kind)
+
+
+def read_normals(dense_dir: Path, view: View) -> NDArray[np.float32]:
+    """Read the normals of the geometric map, (H, W, 3) in the camera frame, towards the camera; 0 where unknown."""
+    with backend(f"reading the normal map of {view.name}"):
+        stored = pycolmap.NormalMap()
+        stored.read(_map_path(dense_dir, NORMALS, view, "geometric"))
+    # pycolmap says (H, W, 3), but x, y and z lie in planes
+    planes = np.array(stored.to_array(), np.float32)
+    return np.ascontiguousarray(planes.reshape(3, *planes.shape[:2]).transpose(1, 2, 0))
 
 
 def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
     """Write the confirmed depths and the normals of a view, as COLMAP's fusion expects them."""
-    write_depth(dense_dir, view, maps.depth, "geometric")
-    with backend(f"writing the normal map of {view.name}"):
-        # pycolmap takes (H, W, 3) but stores the bytes as they come, where COLMAP keeps x, y and z in planes.
-        planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
-        pycolmap.NormalMap.from_array(planes).write(_map_path(dense_dir, "normal_maps", view, "geometric"))
+    # pycolmap takes (H, W, 3) but stores the bytes as they come, where COLMAP keeps x, y and z in planes.
+    planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
+    with backend(f"writing the normal map of {view.name}"), _whole(_map_path(dense_dir, NORMALS, view)) as path:
+        pycolmap.NormalMap.from_array(planes).write(path)
+    _write_depth_format(dense_dir, DEPTHS, view, maps.depth, "geometric")
 
 
-def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind) -> Path:
-    path = dense_dir / "stereo" / folder / f"{view.name}.{kind}.bin"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
+def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
+    """Remove what is of no use once the geometric maps are there."""
+    for view in views:
+        for folder in (DEPTHS, NORMALS, CONFIDENCES):
+            _map_path(dense_dir, folder, view, "photometric").unlink(missing_ok=True)
+
+
+def _read_depth_format(dense_dir: Path, folder: str, view: View, kind: Kind) -> NDArray[np.float32]:
+    with backend(f"reading the depth map of {view.name}"):
+        stored = pycolmap.DepthMap()
+        stored.read(_map_path(dense_dir, folder, view, kind))
+    return np.array(stored.to_array(), np.float32)
+
+
+def _write_depth_format(dense_dir: Path, folder: str, view: View, values: NDArray[np.float32], kind: Kind) -> None:
+    known = values[values > 0]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    with backend(f"writing the depth map of {view.name}"), _whole(_map_path(dense_dir, folder, view, kind)) as path:
+        pycolmap.DepthMap.from_array(np.ascontiguousarray(values), low, high).write(path)
+
+
+def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind = "geometric") -> Path:
+    return dense_dir / "stereo" / folder / f"{view.name}.{kind}.bin"
+
+
+@contextmanager
+def _whole(target: Path) -> Iterator[Path]:
+    """A path beside `target`, which it becomes when everything is written."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    beside = target.with_name(f".{target.name}")
+    yield beside
+    beside.replace(target)

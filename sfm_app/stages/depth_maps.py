@@ -2,84 +2,86 @@
 
 import shutil
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
+from hashlib import blake2b
+from importlib.metadata import version
 from pathlib import Path
 
 import cv2
+import numpy as np
 
-from sfm_app.colmap.dense import read_depth, read_grey, read_views, undistort, write_depth, write_maps
+from sfm_app.colmap.backend import versions
+from sfm_app.colmap.dense import DenseStore, drop_estimates, read_depth, read_views, undistort
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.settings import DepthSettings
-from sfm_app.stereo import DepthMap, View, confirm_depths, match_depths, rank_neighbours
+from sfm_app.stereo import DepthTask, View, rank_neighbours
 from sfm_app.types import Rejected, Scene
+from sfm_app.workspace import fingerprint
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
 CONFIRMING = 2
 """A depth map is checked against this many times as many photos as it was made from."""
+UNFINISHED = "unfinished.txt"
+"""In the dense workspace while maps are being made: what they are made from. It says whether a killed run can go on."""
 
 
 def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: DepthSettings, run: RunContext) -> Path:
-    """Give every photo that has neighbours a depth and a normal map.
+    """Give every photo that has neighbours a depth and a normal map; a run that was killed goes on where it stopped.
 
     Returns:
         The dense workspace.
 
     Raises:
         ReconstructionError: no photo gets a depth map.
+        ConfigError: the method that was asked for cannot run here.
         BackendError: COLMAP failed.
     """
-    shutil.rmtree(dense_dir, ignore_errors=True)
-    undistort(scene.model_dir, photo_dir, dense_dir, options.max_image_size_px)
+    method, why = run.plugins.depth_method(options.method)
+    run.record(method=method.name, method_reason=why)
+    prepare(scene, photo_dir, dense_dir, options, method.name)
     views = read_views(dense_dir)
     ranked = rank_neighbours(views, CONFIRMING * options.neighbours)
     with single_threaded_opencv():
-        match = partial(match_view, views=views, ranked=ranked, dense_dir=dense_dir, options=options)
-        matched = run.map(match, range(len(views)), "matching depths")
-    usable = [found is None for found in matched]
-    confirm = partial(confirm_view, views=views, ranked=ranked, usable=usable, dense_dir=dense_dir, options=options)
-    confirmed = run.map(confirm, [index for index in range(len(views)) if usable[index]], "confirming depths")
-    coverage = {name: found for name, found in confirmed if isinstance(found, float)}
-    rejected = [found.reason for found in matched if found] + [
-        f.reason for _, f in confirmed if isinstance(f, Rejected)
-    ]
-    run.record(depth_maps=len(coverage), rejected=dict(Counter(rejected)), coverage=coverage)
-    if not coverage:
-        raise ReconstructionError(
-            f"none of {len(views)} photos gets a depth map: {_most_common(rejected)}",
-            hint=HINT,
-        )
+        found = method.make(DepthTask(dense_dir, views, ranked, options, DenseStore(dense_dir), run.map))
+    record(dense_dir, views, found, run)
+    drop_estimates(dense_dir, views)
+    (dense_dir / UNFINISHED).unlink()
     return dense_dir
 
 
-def match_view(
-    index: int, views: list[View], ranked: list[list[int]], dense_dir: Path, options: DepthSettings
-) -> Rejected | None:
-    """Write the photometric depth map of one view, or say why there is none."""
-    candidates = [views[other] for other in ranked[index]]
-    load = partial(read_grey, dense_dir)
-    depth = match_depths(views[index], candidates, load, options.neighbours, options.consistency)
-    if isinstance(depth, Rejected):
-        return depth
-    write_depth(dense_dir, views[index], depth, "photometric")
-    return None
+def prepare(scene: Scene, photo_dir: Path, dense_dir: Path, options: DepthSettings, method: str) -> None:
+    """Undistort the photos, unless a killed run has left a workspace with the same inputs, settings and versions."""
+    model = [(file.name, blake2b(file.read_bytes()).hexdigest()) for file in sorted(scene.model_dir.glob("*.bin"))]
+    photos = [(name, (photo_dir / name).stat().st_size) for name in sorted(scene.registered)]
+    programs = {name: version(name) for name in ("sfm-app", "numba", "opencv-contrib-python-headless")} | versions()
+    inputs = fingerprint(model, photos, options.model_dump(), method, programs)
+    marker = dense_dir / UNFINISHED
+    if marker.is_file() and marker.read_text(encoding="utf-8") == inputs:
+        return
+    shutil.rmtree(dense_dir, ignore_errors=True)
+    undistort(scene.model_dir, photo_dir, dense_dir, options.max_image_size_px)
+    marker.write_text(inputs, encoding="utf-8")
 
 
-def confirm_view(
-    index: int, views: list[View], ranked: list[list[int]], usable: list[bool], dense_dir: Path, options: DepthSettings
-) -> tuple[str, float | Rejected]:
-    """Write the geometric depth and normal map of one view; gives its name and the share of its pixels with a depth."""
-    view = views[index]
-    others = [(views[o], read_depth(dense_dir, views[o], "photometric")) for o in ranked[index] if usable[o]]
-    depth = read_depth(dense_dir, view, "photometric")
-    maps = confirm_depths(view, depth, others, options.min_agreeing, options.consistency)
-    if isinstance(maps, DepthMap):
-        write_maps(dense_dir, view, maps)
-        return view.name, round(maps.coverage, 3)
-    return view.name, maps
+def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | None], run: RunContext) -> None:
+    """Note what share of each photo has a depth, and why photos have none.
+
+    Raises:
+        ReconstructionError: none has.
+    """
+    rejected = Counter(reason.reason for reason in found if reason)
+    coverage = {
+        view.name: round(float(np.mean(read_depth(dense_dir, view, "geometric") > 0)), 3)
+        for view, reason in zip(views, found, strict=True)
+        if not reason
+    }
+    run.record(depth_maps=len(coverage), rejected=dict(rejected), coverage=coverage)
+    if not coverage:
+        reason = rejected.most_common(1)[0][0] if rejected else "no photos"
+        raise ReconstructionError(f"none of {len(views)} photos gets a depth map: {reason}", hint=HINT)
 
 
 @contextmanager
@@ -91,7 +93,3 @@ def single_threaded_opencv() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(before)
-
-
-def _most_common(reasons: list[str]) -> str:
-    return Counter(reasons).most_common(1)[0][0] if reasons else "no photos"

@@ -1,17 +1,25 @@
 """Depth maps of a photo: matched with its neighbours, then checked against their depth maps."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses
-from sfm_app.stereo.matching import depths_from_disparities, disparities, has_texture
-from sfm_app.stereo.normals import fit_planes
+from sfm_app.stereo.matching import depths_from_disparities, disparities
+from sfm_app.stereo.normals import fit_planes, normals_of
+from sfm_app.stereo.patch_match import PlaneArray, improve_planes
 from sfm_app.stereo.rectify import rectify
 from sfm_app.stereo.view import DepthArray, GreyImage, View
 from sfm_app.types import Rejected
+
+SWEEPS = 1
+"""The second improves a hundredth of the pixels and takes as long as the first."""
+MIN_CONFIDENCE = 0.3
+"""Correlation below which the photos show nothing in common there: skies and blank walls."""
+UNSURE, SURE = 0.5, 0.8
+"""Correlation below which one more depth map has to agree, and from which on one less is enough."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,42 +36,77 @@ class DepthMap:
         return float(np.count_nonzero(self.depth) / self.depth.size)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Estimate:
+    """Depths of one photo before other depth maps were asked."""
+
+    depth: DepthArray
+    confidence: NDArray[np.float32]
+    """(H, W) in [0, 1]: how well the better half of the neighbours look alike there; 0 where the depth is 0."""
+
+
 def match_depths(
     view: View, candidates: Sequence[View], load: Callable[[View], GreyImage], count: int, tolerance: float
-) -> DepthArray | Rejected:
-    """Match a photo with the first `count` candidates that can be rectified with it, and merge what they say.
+) -> Estimate | Rejected:
+    """Match a photo with the first `count` candidates that can be rectified with it, and find what suits them all.
 
-    Returns:
-        (H, W) depth before any check against other depth maps, or why there is none.
+    Semi-global matching with each neighbour gives depths; where they agree they start PatchMatch with all neighbours.
     """
     image = load(view)
+    # images have their values at the pixels' centres
+    centered = replace(view, sample_px=0.5)
+    used: list[tuple[View, GreyImage]] = []
     found: list[tuple[DepthArray, DepthArray]] = []
     reason = "no photo shares enough points"
     for neighbour in candidates:
-        rectification = rectify(view, neighbour)
+        rectification = rectify(centered, neighbour)
         if isinstance(rectification, Rejected):
             reason = rectification.reason
             continue
-        left, right = rectification.warp(image, load(neighbour))
+        used.append((neighbour, load(neighbour)))
+        left, right = rectification.warp(image, used[-1][1], (centered, neighbour))
         disparity = disparities(left, right, rectification.disparities)
-        found.append(depths_from_disparities(disparity, rectification, view, neighbour))
+        found.append(depths_from_disparities(disparity, rectification, centered, neighbour))
         if len(found) == count:
             break
     if not found:
         return Rejected(reason)
     depth, _ = merge_hypotheses(np.stack([d for d, _ in found]), np.stack([p for _, p in found]), tolerance)
-    return np.where(has_texture(image), depth, np.float32(0))
+    planes = _started(depth)
+    cost = improve_planes(planes, centered, image, used, SWEEPS)
+    return _sampled(planes, cost, view.sample_px)
+
+
+def _started(depth: DepthArray) -> PlaneArray:
+    """Planes at the depths themselves, with the slopes of what is around them."""
+    planes = fit_planes(depth)
+    planes[..., 0] = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
+    return planes
+
+
+def _sampled(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) -> Estimate:
+    """Depths and confidences where a view wants them in its pixels."""
+    shift = np.float32(sample_px - 0.5)
+    inverse = planes[..., 0] + shift * (planes[..., 1] + planes[..., 2])
+    known = (planes[..., 0] > 0) & (inverse > 0) & (cost < 1 - MIN_CONFIDENCE)
+    depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=known)
+    return Estimate(depth, np.where(known, 1 - cost, np.float32(0)))
 
 
 def confirm_depths(
-    view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], min_agreeing: int, tolerance: float
+    view: View, estimate: Estimate, others: Sequence[tuple[View, DepthArray]], min_agreeing: int, tolerance: float
 ) -> DepthMap | Rejected:
-    """Keep the depths that enough other depth maps confirm, and add normals."""
-    enough = min(min_agreeing, len(others))
-    if enough == 0:
+    """Keep the depths that enough other depth maps confirm, and add normals.
+
+    Enough is `min_agreeing`, one more where the photos look little alike, one less (but not none) where very much.
+    """
+    if not others:
         return Rejected("no other depth map to compare with")
-    confirmed = np.where(count_agreeing(view, depth, others, tolerance) >= enough, depth, np.float32(0))
-    normals, planes = fit_planes(view, confirmed)
+    agreeing = count_agreeing(view, estimate.depth, others, tolerance)
+    enough = min_agreeing + (estimate.confidence < UNSURE) - 1 * (estimate.confidence > SURE)
+    confirmed = np.where(agreeing >= np.clip(enough, 1, len(others)), estimate.depth, np.float32(0))
+    planes = fit_planes(confirmed)
     if not planes.any():
         return Rejected("no depth is confirmed by other photos")
-    return DepthMap(planes, normals)
+    depth = np.divide(1, planes[..., 0], out=np.zeros_like(confirmed), where=planes[..., 0] > 0)
+    return DepthMap(depth, normals_of(planes, view))

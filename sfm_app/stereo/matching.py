@@ -10,9 +10,8 @@ from sfm_app.stereo.view import DepthArray, FloatArray, GreyImage, View
 
 BLOCK_PX = 3
 NO_DISPARITY = -1.0
-FLAT_WINDOW_PX = 9
-FLAT_RANGE = 4
-"""Grey levels; a window with less between its darkest and brightest pixel holds nothing that could be matched."""
+MIN_PARALLAX_PX = 1.0
+"""Less says nothing about the depth: next to the epipole, and far away."""
 
 
 def disparities(left: GreyImage, right: GreyImage, count: int) -> NDArray[np.float32]:
@@ -39,12 +38,6 @@ def disparities(left: GreyImage, right: GreyImage, count: int) -> NDArray[np.flo
     return np.where(sixteenths < 0, NO_DISPARITY, sixteenths / 16.0).astype(np.float32)
 
 
-def has_texture(image: GreyImage) -> NDArray[np.bool_]:
-    """(H, W) where there is something to match; in skies the matcher only spreads what is beside."""
-    window = np.ones((FLAT_WINDOW_PX, FLAT_WINDOW_PX), np.uint8)
-    return np.asarray(cv2.subtract(cv2.dilate(image, window), cv2.erode(image, window)) >= FLAT_RANGE)
-
-
 def depths_from_disparities(
     disparity: NDArray[np.float32], rectification: Rectification, reference: View, neighbour: View
 ) -> tuple[DepthArray, DepthArray]:
@@ -52,53 +45,68 @@ def depths_from_disparities(
 
     Returns:
         (H, W) depth of the reference's pixels, 0 where unknown or not seen by the neighbour, and (H, W) the parallax
-        focal * baseline / depth in pixels, to which the relative accuracy of the depth is proportional.
+        in pixels, to which the relative accuracy of the depth is proportional.
     """
     K_inv = np.linalg.inv(reference.K)
     to_rectified = rectification.rotation @ reference.R.T @ K_inv
     # x of the neighbour = M x z + m for the pixel x of the reference at depth z
     M = neighbour.K @ neighbour.R @ reference.R.T @ K_inv
     m = neighbour.K @ (neighbour.t - neighbour.R @ reference.R.T @ reference.t)
-    focal_baseline = rectification.focal_px * rectification.baseline
     size = np.array([reference.height, reference.width, neighbour.height, neighbour.width])
     depth = np.zeros((reference.height, reference.width), np.float32)
     parallax = np.zeros_like(depth)
-    constants = np.array([focal_baseline, rectification.offset_px, reference.sample_px])
-    _lift(disparity, rectification.left, to_rectified, np.column_stack([M, m]), constants, size, depth, parallax)
+    r = rectification
+    canvas = np.array(
+        [r.baseline, r.theta_max, r.phi_min, r.columns_per_rad, r.rows_per_rad, r.disparities, r.offset_px]
+    )
+    _lift(disparity, canvas, to_rectified, np.column_stack([M, m]), reference.sample_px, size, depth, parallax)
     return depth, parallax
 
 
 @kernel
 def _lift(
     disparity: NDArray[np.float32],
-    H: FloatArray,
+    canvas: FloatArray,
     to_rectified: FloatArray,
     P: FloatArray,
-    constants: FloatArray,
+    sample: float,
     size: NDArray[np.int64],
     depth: DepthArray,
     parallax: DepthArray,
 ) -> None:
-    focal_baseline, offset, sample = constants
+    baseline, theta_max, phi_min, columns_per_rad, rows_per_rad, margin, offset = canvas
+    R = to_rectified
     for row in range(size[0]):
         for col in range(size[1]):
             x, y = col + sample, row + sample
-            w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
-            u = (H[0, 0] * x + H[0, 1] * y + H[0, 2]) / w - 0.5
-            v = (H[1, 0] * x + H[1, 1] * y + H[1, 2]) / w - 0.5
+            a = R[0, 0] * x + R[0, 1] * y + R[0, 2]
+            b = R[1, 0] * x + R[1, 1] * y + R[1, 2]
+            c = R[2, 0] * x + R[2, 1] * y + R[2, 2]
+            across = np.sqrt(b * b + c * c)
+            theta = np.arctan2(across, a)
+            u = (theta_max - theta) * columns_per_rad + margin - 0.5
+            v = (np.arctan2(b, c) - phi_min) * rows_per_rad - 0.5
             d = _interpolated(disparity, u, v)
             if d < 0 or d + offset <= 0:
                 continue
-            z = focal_baseline / (d + offset) / (to_rectified[2, 0] * x + to_rectified[2, 1] * y + to_rectified[2, 2])
+            angle = (d + offset) / columns_per_rad
+            if theta + angle >= np.pi or across <= 0:
+                continue
+            # law of sines in the epipolar triangle; across = |ray| sin(theta)
+            sine = np.sin(angle) * np.sin(theta + angle) / np.sin(theta)
+            shift = columns_per_rad * sine
+            if shift < MIN_PARALLAX_PX:
+                continue
+            z = baseline * np.sin(theta + angle) / np.sin(angle) / np.sqrt(a * a + across * across)
             p2 = z * (P[2, 0] * x + P[2, 1] * y + P[2, 2]) + P[2, 3]
-            if p2 <= 0 or z <= 0:
+            if p2 <= 0:
                 continue
             p0 = (z * (P[0, 0] * x + P[0, 1] * y + P[0, 2]) + P[0, 3]) / p2
             p1 = (z * (P[1, 0] * x + P[1, 1] * y + P[1, 2]) + P[1, 3]) / p2
             # beyond the neighbour's border the matcher only guesses from what is beside
             if 2 < p0 < size[3] - 2 and 2 < p1 < size[2] - 2:
                 depth[row, col] = z
-                parallax[row, col] = d + offset
+                parallax[row, col] = shift
 
 
 @kernel

@@ -1,9 +1,10 @@
-"""Normals of a depth map."""
+"""Planes through depth maps, and their normals."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
+from sfm_app.stereo.patch_match import PlaneArray
 from sfm_app.stereo.view import DepthArray, FloatArray, View
 
 SIGMA_PX = 2.5
@@ -15,51 +16,40 @@ MIN_WEIGHT = 0.25
 """Least share of the window that has to be filled."""
 
 
-def fit_planes(view: View, depth: DepthArray) -> tuple[NDArray[np.float32], DepthArray]:
+def fit_planes(depth: DepthArray) -> PlaneArray:
     """Plane through the surroundings of every pixel, by least squares.
 
     A plane n'X = 1 has the inverse depth n'x at the ray x = K^-1 (u, v, 1), which is linear in n and in the noise.
 
     Returns:
-        (H, W, 3) unit normals in the camera frame that point to the camera, and (H, W) the plane's depth at the pixel;
-        both 0 where there is no depth or too little around it.
+        (H, W, 3) inverse depth at the pixel and its slopes per pixel; 0 where there is no depth or little around it.
     """
-    normals = np.zeros((*depth.shape, 3), np.float32)
-    planes = np.zeros_like(depth)
+    planes = np.zeros((*depth.shape, 3), np.float32)
     steps = np.arange(-RADIUS_PX, RADIUS_PX + 1)
     profile = np.exp(-0.5 * (steps / SIGMA_PX) ** 2)
-    K_inv = np.asarray(np.linalg.inv(view.K), np.float64)
-    _fit(depth, K_inv, view.sample_px, np.outer(profile, profile), normals, planes)
-    return normals, planes
+    _fit(depth, np.outer(profile, profile), planes)
+    return planes
+
+
+def normals_of(planes: PlaneArray, view: View) -> NDArray[np.float32]:
+    """(H, W, 3) unit normals in the camera frame that point to the camera; 0 where the inverse depth is 0."""
+    q, qu, qv = (planes[..., k].astype(np.float64) for k in range(3))
+    row, col = np.indices(q.shape) + view.sample_px
+    # n'K^-1 (u, v, 1) = q + qu (u - u0) + qv (v - v0) for all u, v
+    normals = np.stack([qu, qv, q - qu * col - qv * row], axis=-1) @ view.K
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    unit: NDArray[np.float64] = np.divide(-normals, length, out=np.zeros_like(normals), where=(q > 0)[..., None])
+    return np.asarray(unit, np.float32)
 
 
 @kernel
-def _fit(
-    depth: DepthArray,
-    K_inv: FloatArray,
-    sample_px: float,
-    window: FloatArray,
-    normals: NDArray[np.float32],
-    planes: DepthArray,
-) -> None:
+def _fit(depth: DepthArray, window: FloatArray, planes: PlaneArray) -> None:
     for row in range(depth.shape[0]):
         for col in range(depth.shape[1]):
-            if depth[row, col] <= 0:
-                continue
-            g0, gu, gv = _slopes(depth, row, col, window)
-            if g0 <= 0:
-                continue
-            # n'K^-1 (u, v, 1) = g0 + gu (u - u0) + gv (v - v0) for all u, v:
-            # solve K^-1' n = (gu, gv, g0 - gu u0 - gv v0),
-            # K^-1 being upper triangular
-            nx = gu / K_inv[0, 0]
-            ny = (gv - K_inv[0, 1] * nx) / K_inv[1, 1]
-            nz = g0 - gu * (col + sample_px) - gv * (row + sample_px) - K_inv[0, 2] * nx - K_inv[1, 2] * ny
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            normals[row, col, 0] = -nx / length
-            normals[row, col, 1] = -ny / length
-            normals[row, col, 2] = -nz / length
-            planes[row, col] = 1.0 / g0
+            if depth[row, col] > 0:
+                g0, gu, gv = _slopes(depth, row, col, window)
+                if g0 > 0:
+                    planes[row, col, 0], planes[row, col, 1], planes[row, col, 2] = g0, gu, gv
 
 
 @kernel

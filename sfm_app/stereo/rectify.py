@@ -1,6 +1,8 @@
-"""Two posed photos turned so that matches lie in the same row, on a canvas made to measure.
+"""Two posed photos on canvases whose rows are epipolar planes and whose columns are angles from the baseline.
 
-Fusiello, Trucco, Verri: A compact algorithm for rectification of stereo pairs. Machine Vision and Applications 2000.
+Pollefeys, Koch, Van Gool: A simple and efficient rectification method for general motion. ICCV 1999; here on the sphere
+of directions. Planar rectification stretches photos without limit towards the epipole; this one serves motion in any
+direction, forward and backward as well as sideways.
 """
 
 from dataclasses import dataclass
@@ -11,127 +13,147 @@ import numpy as np
 from sfm_app.stereo.view import FloatArray, GreyImage, View
 from sfm_app.types import Rejected
 
-MIN_AXIS_SINE = 0.4
-"""Least sine between baseline and viewing direction; closer to the epipole the stretching ruins the photos."""
 MAX_DISPARITIES = 256
 MAX_GROWTH = 2.0
 """Largest area of the canvas in areas of the photo."""
 DISPARITY_STEP = 16
 """OpenCV wants multiples of this."""
 MIN_POINTS = 5
+MARGIN_PX = 4.0
+"""Disparities searched beyond those of the sparse points, at either end."""
+BORDER_SAMPLES = 33
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectification:
-    """How the reference (left) and its neighbour (right) come into one frame.
+    """How the reference (left) and its neighbour (right) come onto one canvas.
 
-    A point at depth Z of that frame has the disparity ``focal_px * baseline / Z - offset_px`` in [0, disparities).
+    A direction at the angle theta from the baseline, in the plane at the angle phi about it, comes to the row
+    ``(phi - phi_min) * rows_per_rad`` and the column ``(theta_max - theta) * columns_per_rad + disparities`` of the
+    left canvas, `offset_px` further in the right one. So the disparity of a point is its triangulation angle times
+    `columns_per_rad`, less `offset_px`, and lies in [0, disparities).
     """
 
     rotation: FloatArray
-    """(3, 3) rectified camera from world; the x axis points from the reference to the neighbour."""
-    left: FloatArray
-    """(3, 3) rectified pixels from pixels of the reference."""
-    right: FloatArray
-    """(3, 3) rectified pixels from pixels of the neighbour."""
-    size: tuple[int, int]
-    """Width and height of both rectified images in pixels."""
-    focal_px: float
+    """(3, 3) rectified frame from world; the x axis points from the reference to the neighbour."""
     baseline: float
+    theta_max: float
+    phi_min: float
+    columns_per_rad: float
+    rows_per_rad: float
+    size: tuple[int, int]
+    """Width and height of both canvases in pixels; the first `disparities` columns are room that OpenCV needs."""
     offset_px: float
     disparities: int
 
-    def warp(self, reference: GreyImage, neighbour: GreyImage) -> tuple[GreyImage, GreyImage]:
-        """Both photos on the common canvas, black where they have no pixels."""
-        to_center = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-        to_index = np.linalg.inv(to_center)  # OpenCV has pixel centres at whole numbers
-        left, right = (
-            cv2.warpPerspective(image, to_index @ H @ to_center, self.size, flags=cv2.INTER_CUBIC)
-            for image, H in ((reference, self.left), (neighbour, self.right))
-        )
-        return np.asarray(left, np.uint8), np.asarray(right, np.uint8)
+    def warp(self, reference: GreyImage, neighbour: GreyImage, views: tuple[View, View]) -> tuple[GreyImage, GreyImage]:
+        """Both photos on the canvas, black where they have no pixels; the photos may be smaller than their views."""
+        left = self._warp(reference, views[0], 0.0)
+        return left, self._warp(neighbour, views[1], self.offset_px)
+
+    def _warp(self, image: GreyImage, view: View, shift_px: float) -> GreyImage:
+        columns = np.arange(self.size[0]) + 0.5 - self.disparities - shift_px
+        theta = self.theta_max - columns / self.columns_per_rad
+        phi = self.phi_min + (np.arange(self.size[1]) + 0.5)[:, None] / self.rows_per_rad
+        scale = np.diag([image.shape[1] / view.width, image.shape[0] / view.height, 1.0])
+        M = (scale @ view.K @ view.R @ self.rotation.T).astype(np.float32)
+        cos, sin = np.cos(theta).astype(np.float32), np.sin(theta).astype(np.float32)
+        across = np.sin(phi).astype(np.float32), np.cos(phi).astype(np.float32)
+        x, y, w = (cos * row[0] + sin * (across[0] * row[1] + across[1] * row[2]) for row in M)
+        ahead = w > 1e-6
+        # OpenCV has pixel centres at whole numbers
+        u = np.where(ahead, x / np.where(ahead, w, 1), -9) - np.float32(0.5)
+        v = np.where(ahead, y / np.where(ahead, w, 1), -9) - np.float32(0.5)
+        return np.asarray(cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT), np.uint8)
 
 
-def rectify(reference: View, neighbour: View) -> Rectification | Rejected:
-    """Turn both views about their centres until the baseline is the x axis, whatever its direction in the photos.
+def rectify(reference: View, neighbour: View, scale: float = 1.0) -> Rectification | Rejected:
+    """Lay the rows of a canvas along the epipolar planes, whatever the direction of the baseline.
 
-    The canvas shows what both photos see of the depths that the reference's sparse points span, at the reference's
-    resolution (less where the disparities would exceed `MAX_DISPARITIES`), and leaves room on the left for the largest
-    disparity, because OpenCV finds nothing in that margin.
+    The canvas shows what both photos see of the depths that the reference's sparse points span, at `scale` times the
+    reference's resolution; at less where the disparities would exceed `MAX_DISPARITIES` or its area `MAX_GROWTH`.
     """
     rotation = _rectified_rotation(reference, neighbour)
-    if isinstance(rotation, Rejected):
-        return rotation
-    left = rotation @ reference.R.T @ np.linalg.inv(reference.K)
-    right = rotation @ neighbour.R.T @ np.linalg.inv(neighbour.K)
-    boxes = [_bounds(H, view) for H, view in ((left, reference), (right, neighbour))]
-    points = (reference.points - reference.center) @ rotation.T
-    points = points[points[:, 2] > 0]
-    if boxes[0] is None or boxes[1] is None:
-        return Rejected("the neighbour looks in another direction")
-    if len(points) < MIN_POINTS:
+    if rotation is None:
+        return Rejected("same place")
+    angles = _triangulation_angles(reference, neighbour, rotation)
+    if len(angles) < MIN_POINTS:
         return Rejected("too few sparse points")
-    baseline = float(np.linalg.norm(neighbour.center - reference.center))
-    near, far = _disparity_range(baseline / points[:, 2])
-    low, high = _canvas(boxes[0], boxes[1], near, far)
+    near, far = _angle_range(angles)
+    left, right = _bounds(rotation, reference), _bounds(rotation, neighbour)
+    # theta grows by the triangulation angle from the reference to the neighbour
+    low = np.maximum(left[0], right[0] - [near, 0])
+    high = np.minimum(left[1], right[1] - [far, 0])
     if np.any(high - low <= 0):
         return Rejected("the photos do not overlap")
-    focal = _focal_px(left, reference)
-    focal *= min(1.0, MAX_DISPARITIES / (focal * (near - far) + 8), _shrink(focal * (high - low), reference))
-    steps = int(np.ceil((focal * (near - far) + 8) / DISPARITY_STEP))
-    disparities, offset = steps * DISPARITY_STEP, focal * far - 4
-    K_left = np.array([[focal, 0, disparities - focal * low[0]], [0, focal, -focal * low[1]], [0, 0, 1]])
-    K_right = K_left + np.array([[0, 0, offset], [0, 0, 0], [0, 0, 0]])
-    width, height = np.ceil(focal * (high - low)).astype(int)
-    size = (int(width) + disparities, int(height))
-    return Rectification(rotation, K_left @ left, K_right @ right, size, focal, baseline, offset, disparities)
+    per_rad = scale * float(np.sqrt(reference.K[0, 0] * reference.K[1, 1]))
+    widest = 1.0 if low[0] < np.pi / 2 < high[0] else float(np.sin([low[0], high[0]]).max())
+    area = per_rad**2 * widest * float(np.prod(high - low))
+    largest = MAX_GROWTH * scale**2 * reference.width * reference.height
+    per_rad *= min(1.0, MAX_DISPARITIES / (per_rad * (near - far) + 2 * MARGIN_PX), float(np.sqrt(largest / area)))
+    steps = int(np.ceil((per_rad * (near - far) + 2 * MARGIN_PX) / DISPARITY_STEP))
+    width = int(np.ceil(per_rad * (high[0] - low[0]))) + steps * DISPARITY_STEP
+    height = int(np.ceil(per_rad * widest * (high[1] - low[1])))
+    return Rectification(
+        rotation,
+        float(np.linalg.norm(neighbour.center - reference.center)),
+        theta_max=float(high[0]),
+        phi_min=float(low[1]),
+        columns_per_rad=per_rad,
+        rows_per_rad=per_rad * widest,
+        size=(width, height),
+        offset_px=per_rad * far - MARGIN_PX,
+        disparities=steps * DISPARITY_STEP,
+    )
 
 
-def _rectified_rotation(reference: View, neighbour: View) -> FloatArray | Rejected:
+def _rectified_rotation(reference: View, neighbour: View) -> FloatArray | None:
     baseline = neighbour.center - reference.center
     length = np.linalg.norm(baseline)
     if length == 0:
-        return Rejected("same place")
+        return None
     x = baseline / length
-    mean_axis = reference.R[2] + neighbour.R[2]
-    mean_axis /= max(float(np.linalg.norm(mean_axis)), 1e-12)
-    z = mean_axis - (mean_axis @ x) * x
-    if np.linalg.norm(z) < MIN_AXIS_SINE:
-        return Rejected("motion along the viewing direction")
+    # the half plane phi = 0 holds the reference's axis; where the motion is along it, its row direction instead
+    z = max((reference.R[2], reference.R[1]), key=lambda axis: float(np.linalg.norm(np.cross(axis, x))) > 1e-3)
+    z = z - (z @ x) * x
     z /= np.linalg.norm(z)
     return np.stack([x, np.cross(z, x), z])
 
 
-def _bounds(H: FloatArray, view: View) -> FloatArray | None:
-    """Lowest and highest x and y, (2, 2), of the photo's border; None where it is 70 degrees off the axis."""
-    w, h = float(view.width), float(view.height)
-    corners = np.array([[0, 0, 1], [w, 0, 1], [w, h, 1], [0, h, 1]]) @ H.T
-    corners /= np.linalg.norm(corners, axis=1, keepdims=True)
-    if np.any(corners[:, 2] < 0.34):
-        return None
-    xy = corners[:, :2] / corners[:, 2:]
-    return np.stack([xy.min(axis=0), xy.max(axis=0)])
+def _directions(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Angle theta from the x axis and phi about it, from the z axis, of rays (N, 3)."""
+    return np.arctan2(np.hypot(rays[:, 1], rays[:, 2]), rays[:, 0]), np.arctan2(rays[:, 1], rays[:, 2])
 
 
-def _disparity_range(disparities: FloatArray) -> tuple[float, float]:
-    """Largest and smallest disparity, per focal length, of the surface; sparse points rarely reach its ends."""
-    low, high = np.percentile(disparities, [1, 99])
+def _triangulation_angles(reference: View, neighbour: View, rotation: FloatArray) -> FloatArray:
+    """(N,) angles, in radians, under which the reference's sparse points in front of both see the baseline."""
+    ahead = (reference.depths > 0) & (reference.points @ neighbour.R[2] + neighbour.t[2] > 0)
+    points = reference.points[ahead]
+    return np.asarray(
+        _directions((points - neighbour.center) @ rotation.T)[0]
+        - _directions((points - reference.center) @ rotation.T)[0]
+    )
+
+
+def _angle_range(angles: FloatArray) -> tuple[float, float]:
+    """Largest and smallest triangulation angle of the surface; sparse points rarely reach its ends."""
+    low, high = np.percentile(angles, [1, 99])
     margin = 0.15 * (high - low) + 0.02 * high
     return float(high + margin), float(max(low - margin, 0.25 * low))
 
 
-def _canvas(left: FloatArray, right: FloatArray, near: float, far: float) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper corner of what the reference and, shifted by some disparity, the neighbour both cover."""
-    low = np.maximum(left[0], right[0] + [far, 0])
-    high = np.minimum(left[1], right[1] + [near, 0])
-    return low, high
-
-
-def _focal_px(H: FloatArray, view: View) -> float:
-    """Focal length at which the middle of the photo keeps its size: a homography scales areas by det(H) / z^3."""
-    z = H[2] @ [view.width / 2, view.height / 2, 1]
-    return float(np.sqrt(z**3 / np.linalg.det(H)))
-
-
-def _shrink(canvas_px: FloatArray, view: View) -> float:
-    return float(np.sqrt(MAX_GROWTH * view.width * view.height / np.prod(canvas_px)))
+def _bounds(rotation: FloatArray, view: View) -> FloatArray:
+    """Lowest and highest theta and phi, (2, 2), in a photo; all of phi where it shows an end of the baseline."""
+    s, e = np.linspace(0, 1, BORDER_SAMPLES), np.ones(BORDER_SAMPLES)
+    border = np.concatenate([np.stack(side, -1) for side in ((s, 0 * e), (s, e), (0 * e, s), (e, s))])
+    pixels = np.column_stack([border * [view.width, view.height], np.ones(len(border))])
+    theta, phi = _directions(pixels @ np.linalg.inv(view.K).T @ view.R @ rotation.T)
+    low, high = np.array([theta.min(), phi.min()]), np.array([theta.max(), phi.max()])
+    for sign, end in ((1.0, 0.0), (-1.0, np.pi)):
+        epipole = sign * (view.K @ view.R @ rotation[0])
+        shown = epipole[2] > 0 and 0 <= epipole[0] <= view.width * epipole[2]
+        if shown and 0 <= epipole[1] <= view.height * epipole[2]:
+            low, high = np.array([min(low[0], end), -np.pi]), np.array([max(high[0], end), np.pi])
+    if high[1] - low[1] > np.pi:  # the photo lies across the seam at phi = pi
+        low[1], high[1] = -np.pi, np.pi
+    return np.stack([low, high])

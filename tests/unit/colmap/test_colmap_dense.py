@@ -1,15 +1,26 @@
 """The dense workspace: what we write is what COLMAP's fusion understands."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 import trimesh
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.dense import read_depth, read_grey, read_views, undistort, write_maps
+from sfm_app.colmap.dense import (
+    DenseStore,
+    drop_estimates,
+    read_depth,
+    read_grey,
+    read_normals,
+    read_views,
+    undistort,
+    write_maps,
+)
 from sfm_app.colmap.surface import FUSED, fuse, poisson, read_fused, simplify
 from sfm_app.errors import BackendError
-from sfm_app.stereo import DepthMap
+from sfm_app.stereo import DepthMap, Estimate
 from sfm_app.types import Surface
 
 NORMAL = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
@@ -76,6 +87,51 @@ def test_fused_points_lie_on_the_plane_and_face_the_cameras(workspace):
     assert np.max(np.abs(points @ NORMAL - DISTANCE)) < 0.02
     # with the three planes of the normal map in the wrong order this is 1
     np.testing.assert_allclose(normals, np.broadcast_to(-NORMAL, normals.shape), atol=1e-3)
+
+
+def test_maps_come_back_as_they_were(workspace):
+    dense, views = workspace
+    rng = np.random.default_rng(0)
+    view = replace(views[0], name="other.png")
+    maps = DepthMap(rng.uniform(1, 2, (90, 120)).astype(np.float32), rng.normal(size=(90, 120, 3)).astype(np.float32))
+    store = DenseStore(dense)
+    assert not store.has(view, "geometric")
+
+    write_maps(dense, view, maps)
+
+    np.testing.assert_array_equal(read_depth(dense, view, "geometric"), maps.depth)
+    np.testing.assert_array_equal(read_normals(dense, view), maps.normals)
+    assert (store.has(view, "geometric"), store.has(view, "photometric")) == (True, False)
+
+
+def test_estimates_come_and_go(workspace):
+    dense, views = workspace
+    store, depth = DenseStore(dense), np.full((90, 120), 3.0, np.float32)
+    store.write_estimate(views[0], Estimate(depth, depth / 4))
+
+    found = store.read_estimate(views[0])
+
+    np.testing.assert_array_equal(found.depth, depth)
+    np.testing.assert_array_equal(found.confidence, depth / 4)
+    drop_estimates(dense, views)
+    assert not store.has(views[0], "photometric")
+    assert not list(dense.rglob("*.photometric.bin"))
+    assert store.has(views[0], "geometric")
+
+
+def test_a_map_appears_complete_or_not_at_all(workspace, monkeypatch):
+    dense, views = workspace
+    store, view = DenseStore(dense), replace(views[0], name="killed.png")
+    monkeypatch.setattr("pathlib.Path.replace", interrupt)
+
+    with pytest.raises(KeyboardInterrupt):
+        store.write_maps(view, DepthMap(np.ones((90, 120), np.float32), np.ones((90, 120, 3), np.float32)))
+
+    assert not store.has(view, "geometric")
+
+
+def interrupt(*_):
+    raise KeyboardInterrupt
 
 
 def test_the_box_cuts_the_points(workspace):

@@ -1,9 +1,11 @@
 """From photos to confirmed depth maps."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from sfm_app.stereo import DepthMap, confirm_depths, match_depths, rank_neighbours, region
+from sfm_app.stereo import DepthMap, Estimate, confirm_depths, match_depths, rank_neighbours, region
 from sfm_app.stereo.view import View
 from sfm_app.types import Rejected
 
@@ -25,7 +27,7 @@ def matched(plane, views):
 
 
 def others(views, matched, index):
-    return [(views[j], matched[j]) for j in range(len(views)) if j != index]
+    return [(views[j], matched[j].depth) for j in range(len(views)) if j != index]
 
 
 def test_confirmed_depths_lie_on_the_plane(plane, views, matched):
@@ -45,7 +47,7 @@ def test_confirmed_depths_lie_on_the_plane(plane, views, matched):
 
 
 def test_false_depths_do_not_get_through(views, matched):
-    wrong = np.where(matched[1] > 0, matched[1] * np.float32(1.04), np.float32(0))
+    wrong = replace(matched[1], depth=matched[1].depth * np.float32(1.04))
 
     found = confirm_depths(views[1], wrong, others(views, matched, 1), 2, 0.01)
 
@@ -62,7 +64,8 @@ def test_two_photos_confirm_each_other(views, matched):
 def test_same_input_gives_the_same_bytes(plane, views, matched):
     again = match_depths(views[1], [views[j] for j in rank_neighbours(views, 3)[1]], plane.photo, 3, 0.01)
 
-    assert again.tobytes() == matched[1].tobytes()
+    assert again.depth.tobytes() == matched[1].depth.tobytes()
+    assert again.confidence.tobytes() == matched[1].confidence.tobytes()
 
 
 def test_a_photo_without_neighbours_is_a_value_with_a_reason(plane, views):
@@ -70,8 +73,32 @@ def test_a_photo_without_neighbours_is_a_value_with_a_reason(plane, views):
     same_place = match_depths(views[0], [views[0]], plane.photo, 3, 0.01)
     assert same_place == Rejected("same place")
     empty = np.zeros((180, 240), np.float32)
-    assert isinstance(confirm_depths(views[0], empty, [(views[1], empty)], 2, 0.01), Rejected)
-    assert isinstance(confirm_depths(views[0], empty, [], 2, 0.01), Rejected)
+    nothing = Estimate(empty, empty)
+    assert isinstance(confirm_depths(views[0], nothing, [(views[1], empty)], 2, 0.01), Rejected)
+    assert isinstance(confirm_depths(views[0], nothing, [], 2, 0.01), Rejected)
+
+
+@pytest.mark.parametrize(("confidence", "needed"), [(0.9, 1), (0.7, 2), (0.4, 3)])
+def test_the_less_alike_photos_look_the_more_have_to_agree(plane, views, confidence, needed):
+    truth = [plane.depth(view) for view in views]
+    estimate = Estimate(truth[1], np.full_like(truth[1], confidence))
+    true, false = [(views[j], truth[j]) for j in (0, 2, 3)], [(views[j], 1.5 * truth[j]) for j in (0, 2, 3)]
+
+    for agreeing in range(4):
+        found = confirm_depths(views[1], estimate, true[:agreeing] + false[agreeing:], 2, 0.01)
+        assert isinstance(found, DepthMap) == (agreeing >= needed)
+
+
+def test_blank_photos_are_left_empty(views):
+    rng = np.random.default_rng(0)
+
+    def sky(view):
+        return rng.normal(200, 1.5, (view.height, view.width)).astype(np.uint8)
+
+    found = match_depths(views[1], [views[0], views[2]], sky, 2, 0.01)
+
+    assert np.mean(found.depth > 0) < 0.02
+    assert np.array_equal(found.depth > 0, found.confidence > 0)
 
 
 def test_region_leaves_strays_out():

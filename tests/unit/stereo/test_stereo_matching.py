@@ -3,22 +3,23 @@
 import numpy as np
 import pytest
 
-from sfm_app.stereo.matching import depths_from_disparities, disparities, has_texture
+from sfm_app.stereo.matching import depths_from_disparities, disparities
 from sfm_app.stereo.rectify import rectify
 
 
-@pytest.mark.parametrize("center", [(0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0.3, -0.3, 0.1)])
+@pytest.mark.parametrize("center", [(0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0.3, -0.3, 0.1), (0.1, 0, 0.9)])
 @pytest.mark.parametrize("sample_px", [0.0, 0.5])
 def test_finds_the_plane_whatever_the_baseline(plane, make_view, center, sample_px):
     view, neighbour = make_view((0, 0, 0), sample_px=sample_px), make_view(center, turn=(0.02, -0.03, 0.05))
     rectification = rectify(view, neighbour)
 
-    disparity = disparities(*rectification.warp(plane.photo(view), plane.photo(neighbour)), rectification.disparities)
+    canvases = rectification.warp(plane.photo(view), plane.photo(neighbour), (view, neighbour))
+    disparity = disparities(*canvases, rectification.disparities)
     depth, parallax = depths_from_disparities(disparity, rectification, view, neighbour)
 
     known = depth > 0
     error_px = ((depth / plane.depth(view) - 1) * parallax)[known]
-    assert np.mean(known) > 0.7
+    assert np.mean(known) > (0.7 if center[2] < 0.5 else 0.5)  # forward there is nothing about the epipole
     assert abs(np.median(error_px)) < 0.08  # pixel centres misplaced in one of the photos would make it 0.5
     assert 0.01 < np.median(np.abs(error_px)) < 0.15
     assert np.array_equal(parallax > 0, known)
@@ -34,13 +35,3 @@ def test_pixels_that_the_neighbour_does_not_see_have_no_depth(plane, make_view):
     moved = 230 * 1.0 / depth.max()  # pixels by which the neighbour sees everything further left
     assert not depth[:, : int(moved) + 2].any()
     assert depth[5:-5, int(moved) + 4 : -5].all()
-
-
-def test_a_flat_sky_has_no_texture():
-    image = np.full((40, 60), 250, np.uint8)
-    image[20:] = np.random.default_rng(0).integers(0, 255, (20, 60))
-
-    found = has_texture(image)
-
-    assert not found[:15].any()
-    assert found[20:].all()

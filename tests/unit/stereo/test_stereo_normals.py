@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.stereo.normals import fit_planes
+from sfm_app.stereo.normals import fit_planes, normals_of
 from sfm_app.stereo.view import View
 
 slope = st.floats(-1.0, 1.0)
@@ -27,9 +27,10 @@ def test_a_plane_comes_back_exactly(a, b, skew, sample_px):
     normal = np.array([a, b, 3.0]) / np.linalg.norm([a, b, 3.0])
     depth = plane_depth(view, normal, 5.0)
 
-    normals, planes = fit_planes(view, depth)
+    planes = fit_planes(depth)
+    normals = normals_of(planes, view)
 
-    np.testing.assert_allclose(planes, depth, rtol=2e-6)
+    np.testing.assert_allclose(planes[..., 0] * depth, 1, rtol=2e-6)
     np.testing.assert_allclose(normals, np.broadcast_to(-normal, normals.shape), atol=1e-3)
 
 
@@ -38,9 +39,9 @@ def test_noise_is_smoothed_but_not_away():
     depth = plane_depth(view, np.array([0, 0, 1.0]), 5.0)
     noisy = depth + np.random.default_rng(0).normal(0, 0.01, depth.shape).astype(np.float32)
 
-    _, planes = fit_planes(view, noisy)
+    planes = fit_planes(noisy)
 
-    inside = (planes - depth)[5:-5, 5:-5]
+    inside = (1 / planes[..., 0] - depth)[5:-5, 5:-5]
     assert 0.0005 < inside.std() < 0.003
 
 
@@ -49,17 +50,17 @@ def test_steps_stay_sharp():
     depth = np.full((20, 30), 5.0, np.float32)
     depth[:, 15:] = 6.0
 
-    normals, planes = fit_planes(view, depth)
+    planes = fit_planes(depth)
 
-    np.testing.assert_allclose(planes, depth, rtol=1e-6)
-    np.testing.assert_allclose(normals[..., 2], -1.0, atol=1e-5)
+    np.testing.assert_allclose(planes[..., 0] * depth, 1, rtol=1e-6)
+    np.testing.assert_allclose(normals_of(planes, view)[..., 2], -1.0, atol=1e-5)
 
 
 def test_specks_and_empty_pixels_get_nothing():
     depth = np.zeros((20, 30), np.float32)
     depth[10, 10:13] = 5.0
 
-    normals, planes = fit_planes(view_with(np.diag([100.0, 100.0, 1.0])), depth)
+    planes = fit_planes(depth)
 
     assert not planes.any()
-    assert not normals.any()
+    assert not normals_of(planes, view_with(np.diag([100.0, 100.0, 1.0]))).any()

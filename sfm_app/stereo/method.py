@@ -1,0 +1,102 @@
+"""What a way to make depth maps gets and gives, and the one that runs on every machine."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.settings import DepthSettings
+from sfm_app.stereo.depth import DepthMap, Estimate, confirm_depths, match_depths
+from sfm_app.stereo.view import GreyImage, View
+from sfm_app.types import Rejected
+
+Kind = Literal["photometric", "geometric"]
+"""COLMAP's names for a depth map before and after the check against the other photos."""
+
+
+class DepthStore(Protocol):
+    """Where photos come from and maps go; a map appears complete or not at all."""
+
+    def photo(self, view: View, /) -> GreyImage:
+        """The photo without distortion, (H, W)."""
+
+    def has(self, view: View, kind: Kind, /) -> bool:
+        """Whether a map is there."""
+
+    def read_estimate(self, view: View, /) -> Estimate:
+        """The photometric map."""
+
+    def write_estimate(self, view: View, estimate: Estimate, /) -> None:
+        """Keep the photometric map."""
+
+    def write_maps(self, view: View, maps: DepthMap, /) -> None:
+        """Keep the geometric maps."""
+
+
+class Map(Protocol):
+    """Results in the order of the items, computed in parallel, with progress under a label."""
+
+    def __call__(
+        self, function: Callable[[int], Rejected | None], items: Sequence[int], label: str, /
+    ) -> list[Rejected | None]: ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthTask:
+    """What has to be done. Maps that are there already come from the same inputs and settings and can stay."""
+
+    folder: Path
+    """COLMAP's dense workspace with the undistorted photos and their model."""
+    views: Sequence[View]
+    ranked: Sequence[Sequence[int]]
+    """Per view the views that serve it best, best first."""
+    options: DepthSettings
+    store: DepthStore
+    map: Map
+
+
+MakeDepthMaps = Callable[[DepthTask], list[Rejected | None]]
+"""Leaves geometric depth and normal maps in the workspace; says for every view why it has none, or None."""
+
+
+def make_on_cpu(task: DepthTask) -> list[Rejected | None]:
+    """Match every photo with its neighbours, then keep what the depth maps of other photos confirm."""
+    everything = range(len(task.views))
+    matched = task.map(partial(_match, task=task), everything, "matching depths")
+    usable = np.array([found is None for found in matched])
+    confirm = partial(_confirm, task=task, usable=usable)
+    confirmed = iter(task.map(confirm, [index for index in everything if usable[index]], "confirming depths"))
+    return [next(confirmed) if found is None else found for found in matched]
+
+
+def _match(index: int, task: DepthTask) -> Rejected | None:
+    view = task.views[index]
+    if task.store.has(view, "photometric"):
+        return None
+    candidates = [task.views[other] for other in task.ranked[index]]
+    found = match_depths(view, candidates, task.store.photo, task.options.neighbours, task.options.consistency)
+    if isinstance(found, Rejected):
+        return found
+    task.store.write_estimate(view, found)
+    return None
+
+
+def _confirm(index: int, task: DepthTask, usable: NDArray[np.bool_]) -> Rejected | None:
+    view = task.views[index]
+    if task.store.has(view, "geometric"):
+        return None
+    others = [
+        (task.views[other], task.store.read_estimate(task.views[other]).depth)
+        for other in task.ranked[index]
+        if usable[other]
+    ]
+    estimate = task.store.read_estimate(view)
+    found = confirm_depths(view, estimate, others, task.options.min_agreeing, task.options.consistency)
+    if isinstance(found, Rejected):
+        return found
+    task.store.write_maps(view, found)
+    return None

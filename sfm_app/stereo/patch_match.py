@@ -1,0 +1,244 @@
+"""A plane for every pixel, passed on from pixel to pixel where the photos like it better.
+
+Bleyer, Rhemann, Rother: PatchMatch stereo. BMVC 2011; Schoenberger et al.: Pixelwise view selection for unstructured
+multi-view stereo. ECCV 2016 (the weighted correlation). Semi-global matching sees the world as steps and widens what
+stands in front; started from its depths, one or two sweeps find slanted surfaces and the true borders.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.stereo.view import FloatArray, GreyImage, View
+
+PlaneArray = NDArray[np.float32]
+"""(H, W, 3): inverse depth q and its slopes, q + qu du + qv dv at (du, dv) pixels beside; q = 0 where unknown."""
+
+REACH = 2
+STRIDE_PX = 2
+"""The window has (2 REACH + 1)^2 pixels, so far apart."""
+SIDE = 2 * REACH + 1
+BORDER = REACH * STRIDE_PX
+SIGMA_PX = 4.0
+FALLOFF_GREY = 12.0
+"""Pixels that differ so much in grey from the middle weigh 1/e: they may belong to something else."""
+NOISE_GREY = 2.0
+"""Standard deviation of grey that is no texture."""
+NO_MATCH = 2.0
+"""The cost where no neighbour sees the pixel; worse than any."""
+MIN_GAIN = 0.01
+"""A plane that is better by less is not taken: noise alone would make flat areas rough."""
+STEPS_PX = (0.5, 0.15)
+"""Largest random changes that are tried, in pixels of parallax."""
+SLOPE = 0.2
+"""The same for the slopes, as a share of it per pixel."""
+SAME_PX, SAME_SLOPE = 0.1, 0.03
+"""Parallax within which two planes count as one, at the pixel and per pixel beside it."""
+MIN_AREA, MAX_AREA = 0.1, 8.0
+"""Areas of a pixel in the neighbour between which it can be compared."""
+
+
+def improve_planes(
+    planes: PlaneArray, view: View, image: GreyImage, others: Sequence[tuple[View, GreyImage]], sweeps: int
+) -> NDArray[np.float32]:
+    """Improve planes about the pixels' centres in place: down and to the right, then back, and so on.
+
+    A pixel tries the planes of the two pixels that the sweep has just left, and small changes of its own. A plane costs
+    1 - the normalised cross-correlation of the pixel's window with its image in a neighbour, the mean over the better
+    half of the neighbours, because the others may see something in front. Weights in the window fall with the distance
+    and with the difference in grey from the middle.
+
+    Returns:
+        (H, W) cost in [0, 2]; 2 where nothing is known.
+    """
+    height, width = (max(photo.shape[side] for _, photo in others) for side in (0, 1))
+    stack = np.zeros((len(others), height, width), np.float32)
+    projections, sizes = np.empty((len(others), 3, 4)), np.empty((len(others), 2), np.int64)
+    K_inv = np.linalg.inv(view.K)
+    for k, (other, photo) in enumerate(others):
+        stack[k, : photo.shape[0], : photo.shape[1]] = photo
+        sizes[k] = photo.shape
+        relative = other.R @ view.R.T
+        projections[k] = other.K @ np.column_stack([relative @ K_inv, other.t - relative @ view.t])
+    steps = np.arange(-REACH, REACH + 1) * STRIDE_PX
+    near = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2) / SIGMA_PX**2)
+    alike = np.exp(-np.arange(256) / FALLOFF_GREY)
+    cost = np.full(image.shape, NO_MATCH, np.float32)
+    for sweep in range(sweeps):
+        _sweep(sweep, image, (near, alike), (stack.ravel(), width, sizes, projections), planes, cost)
+    return cost
+
+
+@kernel
+def _sweep(
+    sweep: int, image: GreyImage, falloff: Any, others: Any, planes: PlaneArray, cost: NDArray[np.float32]
+) -> None:
+    height, width = image.shape
+    step = 1 if sweep % 2 == 0 else -1
+    weights, greys = np.empty(SIDE * SIDE, np.float32), np.empty(SIDE * SIDE, np.float32)
+    costs = np.empty(len(others[3]))
+    best, trial = np.empty(3), np.empty(3)
+    for k in range(BORDER, height - BORDER):
+        row = k if step == 1 else height - 1 - k
+        # every row has its own random numbers (a linear congruential generator of Knuth's)
+        state = np.uint64(2 * row + 1) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(sweep)
+        for m in range(BORDER, width - BORDER):
+            col = m if step == 1 else width - 1 - m
+            mean, variance = _read_window(image, row, col, falloff, weights, greys)
+            window = (weights, greys, mean, variance)
+            for c in range(3):
+                best[c] = planes[row, col, c]
+            known = best[0] > 0
+            lowest = float(cost[row, col])
+            if known and sweep == 0:
+                lowest = _cost(row, col, best, window, others, costs)
+            unit = _inverse_depth_per_px(row, col, best[0], others[3]) if known else 0.0
+            for side in range(2):
+                r, s = (row - step, col) if side == 0 else (row, col - step)
+                if planes[r, s, 0] <= 0:
+                    continue
+                trial[1], trial[2] = planes[r, s, 1], planes[r, s, 2]
+                trial[0] = planes[r, s, 0] + (col - s) * trial[1] + (row - r) * trial[2]
+                slopes = abs(trial[1] - best[1]) + abs(trial[2] - best[2])
+                if abs(trial[0] - best[0]) < SAME_PX * unit and slopes < SAME_SLOPE * unit:
+                    continue
+                lowest = _better(row, col, trial, best, lowest, window, others, costs)
+            if lowest < NO_MATCH:
+                unit = _inverse_depth_per_px(row, col, best[0], others[3])
+                for size_px in STEPS_PX:
+                    for c in range(3):
+                        state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+                        number = 2.0 * (np.float64(state >> np.uint64(11)) / 9007199254740992.0) - 1.0  # in [-1, 1)
+                        trial[c] = best[c] + number * size_px * unit * (1.0 if c == 0 else SLOPE)
+                    lowest = _better(row, col, trial, best, lowest, window, others, costs)
+            for c in range(3):
+                planes[row, col, c] = best[c]
+            cost[row, col] = lowest
+
+
+@kernel
+def _read_window(
+    image: GreyImage, row: int, col: int, falloff: Any, weights: NDArray[np.float32], greys: NDArray[np.float32]
+) -> tuple[float, float]:
+    """Fill in weights, of sum 1, and grey values around a pixel; gives their weighted mean and variance."""
+    near, alike = falloff
+    middle = np.int64(image[row, col])  # int() of an unsigned number stays unsigned
+    total, mean, square = 0.0, 0.0, 0.0
+    k = 0
+    for i in range(SIDE):
+        for j in range(SIDE):
+            grey = np.int64(image[row + (i - REACH) * STRIDE_PX, col + (j - REACH) * STRIDE_PX])
+            weight = near[i, j] * alike[abs(grey - middle)]
+            weights[k], greys[k] = weight, grey
+            total += weight
+            mean += weight * grey
+            square += weight * grey * grey
+            k += 1
+    for k in range(SIDE * SIDE):
+        weights[k] /= total
+    mean /= total
+    return mean, max(0.0, square / total - mean * mean)
+
+
+@kernel
+def _inverse_depth_per_px(row: int, col: int, q: float, projections: FloatArray) -> float:
+    """Change of the inverse depth that moves the pixel by one pixel in the neighbour where it moves most."""
+    most = 1e-12
+    x, y = col + 0.5, row + 0.5
+    for k in range(len(projections)):
+        P = projections[k]
+        w = P[2, 0] * x + P[2, 1] * y + P[2, 2] + P[2, 3] * q
+        if w > 0:
+            u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] + P[0, 3] * q) / w
+            v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] + P[1, 3] * q) / w
+            most = max(most, np.hypot(P[0, 3] - u * P[2, 3], P[1, 3] - v * P[2, 3]) / w)
+    return 1.0 / most
+
+
+@kernel
+def _better(
+    row: int, col: int, trial: FloatArray, best: FloatArray, lowest: float, window: Any, others: Any, costs: FloatArray
+) -> float:
+    """Replace the best plane where the trial is better; gives the lower cost."""
+    if trial[0] <= 0:
+        return lowest
+    found = _cost(row, col, trial, window, others, costs)
+    if found >= lowest - MIN_GAIN:
+        return lowest
+    for c in range(3):
+        best[c] = trial[c]
+    return found
+
+
+@kernel
+def _cost(row: int, col: int, plane: FloatArray, window: Any, others: Any, costs: FloatArray) -> float:
+    stack, stride, sizes, projections = others
+    x, y, q = col + 0.5, row + 0.5, plane[0]
+    count = 0
+    for k in range(len(projections)):
+        P = projections[k]
+        w = P[2, 0] * x + P[2, 1] * y + P[2, 2] + P[2, 3] * q
+        if w <= 0:
+            continue
+        u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] + P[0, 3] * q) / w
+        v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] + P[1, 3] * q) / w
+        # within a window the plane's homography is affine
+        wu, wv = P[2, 0] + P[2, 3] * plane[1], P[2, 1] + P[2, 3] * plane[2]
+        uu = (P[0, 0] + P[0, 3] * plane[1] - u * wu) / w
+        uv = (P[0, 1] + P[0, 3] * plane[2] - u * wv) / w
+        vu = (P[1, 0] + P[1, 3] * plane[1] - v * wu) / w
+        vv = (P[1, 1] + P[1, 3] * plane[2] - v * wv) / w
+        u, v = u - 0.5, v - 0.5
+        du, dv = BORDER * (abs(uu) + abs(uv)), BORDER * (abs(vu) + abs(vv))
+        inside = u - du >= 0 and v - dv >= 0 and u + du < sizes[k, 1] - 1 and v + dv < sizes[k, 0] - 1
+        if not (inside and MIN_AREA < uu * vv - uv * vu < MAX_AREA):
+            continue
+        start = k * (len(stack) // len(projections))
+        found = 1.0 - _correlation(stack, start, stride, (u, v, uu, uv, vu, vv), window)
+        place = count  # insertion keeps the costs in rising order
+        while place > 0 and costs[place - 1] > found:
+            costs[place] = costs[place - 1]
+            place -= 1
+        costs[place] = found
+        count += 1
+    if count == 0:
+        return NO_MATCH
+    used = min(count, (len(projections) + 1) // 2)
+    total = 0.0
+    for k in range(used):
+        total += costs[k]
+    return total / used
+
+
+@kernel
+def _correlation(stack: NDArray[np.float32], start: int, stride: int, affine: Any, window: Any) -> float:
+    """Weighted normalised cross-correlation of a window and its image; noise on both sides lowers it."""
+    weights, greys, mean, variance = window
+    u, v = np.float32(affine[0]), np.float32(affine[1])
+    uu, uv, vu, vv = np.float32(affine[2]), np.float32(affine[3]), np.float32(affine[4]), np.float32(affine[5])
+    one, square, mixed = np.float32(0), np.float32(0), np.float32(0)
+    k = 0
+    for i in range(SIDE):
+        b = np.float32((i - REACH) * STRIDE_PX)
+        for j in range(SIDE):
+            a = np.float32((j - REACH) * STRIDE_PX)
+            x, y = u + a * uu + b * uv, v + a * vu + b * vv
+            column, line = np.int32(x), np.int32(y)
+            fx, fy = x - np.float32(column), y - np.float32(line)
+            # unsigned indices spare the test for negative ones, a third of the time
+            above = np.uint64(start + line * stride + column)
+            below = above + np.uint64(stride)
+            upper = stack[above] + fx * (stack[above + np.uint64(1)] - stack[above])
+            lower = stack[below] + fx * (stack[below + np.uint64(1)] - stack[below])
+            grey = upper + fy * (lower - upper)
+            weighted = weights[k] * grey
+            one += weighted
+            square += weighted * grey
+            mixed += weighted * greys[k]
+            k += 1
+    noise = NOISE_GREY * NOISE_GREY
+    spread = (variance + noise) * (max(0.0, float(square - one * one)) + noise)
+    return float((mixed - one * mean) / np.sqrt(spread))

@@ -1,0 +1,84 @@
+"""Planes per pixel: found where they are slanted, spread where nothing was known, costly where nothing is to be seen."""
+
+import numpy as np
+import pytest
+
+from sfm_app.stereo.normals import normals_of
+from sfm_app.stereo.patch_match import NO_MATCH, improve_planes
+
+CENTERS = [(0.5, 0, 0), (-0.4, 0.2, 0), (0, 0.5, 0.3)]
+
+
+@pytest.fixture(scope="module")
+def setting(plane, make_view):
+    """A view, its photo and three neighbours with theirs."""
+    view = make_view((0, 0, 0))
+    others = [make_view(center, turn=(0.02, -0.03, 0.05)) for center in CENTERS]
+    return view, plane.photo(view), [(other, plane.photo(other)) for other in others]
+
+
+def improved(setting, planes, sweeps=2, image=None):
+    view, photo, others = setting
+    planes = planes.copy()
+    return planes, improve_planes(planes, view, photo if image is None else image, others, sweeps)
+
+
+def seeds(plane, view):
+    """The true inverse depth, level, in every tenth row; nothing elsewhere."""
+    planes = np.zeros((view.height, view.width, 3), np.float32)
+    planes[10::10, 10:-10, 0] = 1 / plane.depth(view)[10::10, 10:-10]
+    return planes
+
+
+def test_the_plane_spreads_with_its_slope(plane, setting):
+    planes, cost = improved(setting, seeds(plane, setting[0]))
+
+    inside = np.zeros(cost.shape, bool)
+    inside[25:-25, 45:-45] = True
+    known = inside & (cost < 0.5)
+    error = np.abs(planes[..., 0] * plane.depth(setting[0]) - 1)[known]
+    assert known.sum() > 0.95 * inside.sum()
+    assert 1e-5 < np.median(error) < 1e-3
+    cosine = -(normals_of(planes, setting[0])[known] @ plane.normal)
+    assert 0.5 < np.degrees(np.arccos(np.median(cosine))) < 9
+
+
+def test_more_sweeps_never_cost_more(plane, setting):
+    (_, once), (_, twice) = (improved(setting, seeds(plane, setting[0]), sweeps) for sweeps in (1, 2))
+
+    assert np.all(twice <= once)
+    assert twice.mean() < once.mean()
+
+
+def test_wrong_depths_are_costly(plane, setting):
+    planes = np.zeros((*setting[1].shape, 3), np.float32)
+    planes[..., 0] = 1.3 / plane.depth(setting[0])
+
+    _, cost = improved(setting, planes, 0)
+    _, swept = improved(setting, planes, 1)
+
+    assert np.all(cost == NO_MATCH)  # without a sweep nothing is looked at
+    assert np.median(swept[30:-30, 50:-50]) > 0.4
+
+
+def test_a_flat_photo_is_like_nothing(plane, setting):
+    _, cost = improved(setting, seeds(plane, setting[0]), image=np.full_like(setting[1], 128))
+
+    assert np.all(cost >= 0.95)
+
+
+def test_one_hidden_view_does_not_matter(plane, setting):
+    view, photo, others = setting
+    hidden = [(others[0][0], np.zeros_like(others[0][1])), *others[1:]]
+    planes = seeds(plane, view)
+
+    cost = improve_planes(planes, view, photo, hidden, 2)
+
+    assert np.median(cost[30:-30, 50:-50]) < 0.3
+
+
+def test_same_input_gives_the_same_bytes(plane, setting):
+    one, again = (improved(setting, seeds(plane, setting[0])) for _ in range(2))
+
+    assert one[0].tobytes() == again[0].tobytes()
+    assert one[1].tobytes() == again[1].tobytes()
