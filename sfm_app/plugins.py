@@ -4,7 +4,7 @@ A plug-in is an installed package with an entry point in the group ``sfm_app``; 
 `hookimpl` that are named as in `Hooks`.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType, ModuleType
