@@ -33,9 +33,6 @@ BROWSER = Path(__file__).parents[1] / "viewers"
 SAMPLE = "sample"
 PAGES = ((200, 90, 60), (40, 90, 200))
 """sRGB of the pages of the sample."""
-COLOURS = 256
-"""Of the published screenshots, to keep them small."""
-
 ABOUT = """\
 Every GLB through the Khronos validator, three.js in headless Chromium, Open3D and trimesh; the surface as its PLY has
 it. on screen: share of the picture that the model covers. outward: share of the vertices whose normal looks at a
@@ -76,7 +73,7 @@ def main() -> int:
         seen = in_browser(Path(scratch))
         rows = [checked(subject, seen[subject.name]) for subject in subjects]
         for subject in subjects:
-            picture = Image.open(subject.glb.with_suffix(".png")).convert("RGB").quantize(COLOURS)
+            picture = Image.open(subject.glb.with_suffix(".png")).convert("RGB")
             picture.save(options.results / f"viewers-{subject.name}.png", optimize=True)
     packages = json.loads((BROWSER / "package.json").read_text(encoding="utf-8"))["dependencies"]
     found = document("viewers", ABOUT, {"packages": packages, "limits": LIMITS}, {"browser": seen["browser"]}, rows)

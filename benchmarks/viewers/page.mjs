@@ -9,8 +9,8 @@ const FOV = 35;
 const MARGIN = 1.08;
 const FAR_OUT = 0.01;
 
-// What is to be in view: cameras, and the rest without the farthest vertices on each side, which would make it small.
-function middling(scene) {
+// What is to be in view: everything, but of points not the farthest on each side, which would make the rest small.
+function middling(scene, farOut) {
   const places = [];
   const lines = [];
   scene.traverse((object) => {
@@ -24,8 +24,8 @@ function middling(scene) {
   const high = new THREE.Vector3();
   for (const axis of ['x', 'y', 'z']) {
     const sorted = Float64Array.from(places, (place) => place[axis]).sort();
-    low[axis] = sorted[Math.floor(FAR_OUT * (sorted.length - 1))];
-    high[axis] = sorted[Math.ceil((1 - FAR_OUT) * (sorted.length - 1))];
+    low[axis] = sorted[Math.floor(farOut * (sorted.length - 1))];
+    high[axis] = sorted[Math.ceil((1 - farOut) * (sorted.length - 1))];
   }
   const inner = new THREE.Box3(low, high);
   const kept = [...places.filter((place) => inner.containsPoint(place)), ...lines];
@@ -94,7 +94,7 @@ window.show = async (url, size) => {
   scene.add(gltf.scene, new THREE.HemisphereLight(0xffffff, 0x888888, 2), new THREE.DirectionalLight(0xffffff, 2));
   const box = new THREE.Box3().setFromObject(gltf.scene);
   scene.updateMatrixWorld();
-  renderer.render(scene, framed(middling(gltf.scene), size.width / size.height));
+  renderer.render(scene, framed(middling(gltf.scene, parts.triangles ? 0 : FAR_OUT), size.width / size.height));
   return {
     ...parts, ...drawn(renderer, background, size), cameras: gltf.cameras.length,
     low: box.min.toArray(), high: box.max.toArray(), png: renderer.domElement.toDataURL('image/png'),
