@@ -17,7 +17,7 @@ from sfm_app.synthetic.pictures import Picture, PreparedModel, view_along
 
 Pixels = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
-BLACK = 16
+BLACK = 32
 """Grey level below which a pixel of a photo on black shows nothing."""
 LEAST_PIXELS = 1000
 """Covered pixels that a photo's likeness is judged by."""
@@ -42,8 +42,10 @@ class Likeness:
 
     coverage: float
     """Share of the pixels that show the model, 0..1."""
+    not_black: float
+    """Share of the photo's pixels that are not black: on a black background nothing can be seen."""
     coverage_not_black: float
-    """The same among the pixels of the photo that are not black."""
+    """Share of those that show the model."""
     psnr_db: float
     """On the covered pixels after the rendering's exposure is adjusted; nan where next to nothing is covered."""
 
@@ -78,7 +80,7 @@ def likeness(picture: Picture, photo: Pixels) -> Likeness:
     if covered.sum() >= LEAST_PIXELS:
         psnr = psnr_db(picture.colors[covered], photo[covered])
     on_lit = float(covered[lit].mean()) if lit.any() else 0.0
-    return Likeness(float(covered.mean()), on_lit, psnr)
+    return Likeness(float(covered.mean()), float(lit.mean()), on_lit, psnr)
 
 
 def psnr_db(rendering: Pixels, photo: Pixels) -> float:
@@ -98,6 +100,7 @@ def photo_scores(found: Mapping[str, Likeness]) -> Row:
     return {
         "coverage %": round(fmean(coverage), 1),
         "worst coverage %": round(min(coverage), 1),
+        "not black %": round(100.0 * fmean(one.not_black for one in found.values()), 1),
         "coverage of not black %": round(100.0 * fmean(one.coverage_not_black for one in found.values()), 1),
         "PSNR dB": round(fmean(psnr), 2) if psnr else None,
         "worst PSNR dB": round(min(psnr), 2) if psnr else None,

@@ -67,5 +67,5 @@ def palette_of(page: Pixels) -> Pixels:
     some = pixels[np.random.default_rng(0).integers(0, len(pixels), PALETTE_PIXELS)].astype(np.float32)
     cv2.setRNGSeed(0)
     criteria = (cv2.TERM_CRITERIA_MAX_ITER, 10, 0.0)
-    _, _, centres = cv2.kmeans(some, COLORS, None, criteria, 1, cv2.KMEANS_RANDOM_CENTERS)
+    _, _, centres = cv2.kmeans(some, COLORS, None, criteria, 1, cv2.KMEANS_PP_CENTERS)
     return np.round(np.clip(centres, 0, 255)).astype(np.uint8)

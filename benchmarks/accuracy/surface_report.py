@@ -11,7 +11,8 @@ TRUTH = (
     "sparse: trim",
 )  # fmt: skip
 PHOTOS = (
-    "photos", "placed", "triangles", "texture pages", "coverage %", "worst coverage %", "coverage of not black %",
+    "photos", "placed", "triangles", "texture pages", "coverage %", "worst coverage %", "not black %",
+    "coverage of not black %",
     "PSNR dB", "worst PSNR dB", "left out", "left out: PSNR dB", "left out: PSNR lower by dB",
 )  # fmt: skip
 COST = ("photos", "placed", "seconds together", "seconds per photo")

@@ -1,6 +1,7 @@
 """A colossal bust on a plinth, seen all round: a closed body, smooth in the face, fine in hair and folds."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +63,7 @@ def statue_views(camera: Camera, seed: int = 0) -> Views:
     return arc(camera, walk, seed)
 
 
+@cache
 def bust() -> Shape:
     """The stone itself, standing on y = 0."""
     return carved(bust_field, (0.02, 1.24), reach=0.62)
@@ -69,14 +71,15 @@ def bust() -> Shape:
 
 def bust_field(points: FloatArray) -> FloatArray:
     """Positive inside: blobs that run together (Blinn, ACM TOG 1982), with curls in the hair and folds in the cloth."""
-    parts = np.stack([
-        blob[6] * np.exp(SHARPNESS * (1.0 - (((points - blob[:3]) / blob[3:6]) ** 2).sum(axis=1))) for blob in BLOBS
-    ])  # fmt: skip
-    hair = np.clip(parts[HAIR].sum(axis=0), 0.0, 1.0)
+    middles, axes, weights = BLOBS[:, :3], BLOBS[:, 3:6], BLOBS[:, 6]
+    # the squared distances to all middles, in half axes, as products of matrices
+    squares = points**2 @ axes.T**-2.0 - 2.0 * points @ (middles / axes**2).T + ((middles / axes) ** 2).sum(axis=1)
+    parts = weights * np.exp(SHARPNESS * (1.0 - squares))
+    hair = np.clip(parts[:, HAIR].sum(axis=1), 0.0, 1.0)
     x, y, z = points.T
     # rings about one shoulder, as cloth hangs from it
     folds = np.cos(46.0 * np.hypot(x - 0.42, y - 0.62) + 4.0 * z) * np.clip((0.52 - y) / 0.1, 0.0, 1.0)
-    found = parts.sum(axis=0) - 1.0 + 0.2 * np.clip((y - 0.06) / 0.04, 0.0, 1.0) * folds
+    found = parts.sum(axis=1) - 1.0 + 0.2 * np.clip((y - 0.06) / 0.04, 0.0, 1.0) * folds
     curly = hair > 0.01
     found[curly] += 0.22 * hair[curly] * waves(9.0 * points[curly], 3)
     return np.asarray(found)

@@ -120,18 +120,23 @@ def test_likeness_counts_covered_pixels_alone():
     covered = np.zeros((40, 60), bool)
     covered[:, 30:] = True
     found = likeness(Picture(photo * covered[..., None], covered), photo)
-    assert found.coverage == 0.5 and found.coverage_not_black == 0.75 and found.psnr_db > 80
+    assert (
+        found.coverage == 0.5
+        and found.coverage_not_black == 0.75
+        and found.not_black == pytest.approx(2 / 3)
+        and found.psnr_db > 80
+    )
     covered[:, :59] = False
     assert np.isnan(likeness(Picture(photo, covered), photo).psnr_db), "40 pixels say nothing"
 
 
 def test_the_worst_photo_stands_beside_the_mean():
     row = photo_scores(
-        {"a": Likeness(0.9, 0.95, 25.0), "b": Likeness(0.5, 0.65, 21.0), "c": Likeness(0.1, 0.2, np.nan)}
+        {"a": Likeness(0.9, 0.9, 0.95, 25.0), "b": Likeness(0.5, 0.7, 0.65, 21.0), "c": Likeness(0.1, 0.5, 0.2, np.nan)}
     )
     assert (row["coverage %"], row["worst coverage %"], row["coverage of not black %"]) == (50.0, 10.0, 60.0)
-    assert (row["PSNR dB"], row["worst PSNR dB"]) == (23.0, 21.0)
-    assert photo_scores({"c": Likeness(0.0, 0.0, np.nan)})["PSNR dB"] is None
+    assert (row["PSNR dB"], row["worst PSNR dB"], row["not black %"]) == (23.0, 21.0, 70.0)
+    assert photo_scores({"c": Likeness(0.0, 0.0, 0.0, np.nan)})["PSNR dB"] is None
 
 
 def test_photos_to_leave_out_are_spread_evenly():
