@@ -15,7 +15,9 @@ from sfm_app.settings import Quality, Settings, merged
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
-OWN_FLAGS = {"estimator": "epipolar", "calibrator": "calibration", "mapper": "scene", "faces": "mesh", "unseen": "texture"}
+OWN_FLAGS = {
+    "estimator": "epipolar", "calibrator": "calibration", "mapper": "scene", "faces": "mesh", "unseen": "texture",
+}  # fmt: skip
 """Settings with a flag of their own, and their tables."""
 
 
