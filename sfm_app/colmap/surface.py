@@ -69,7 +69,7 @@ def poisson(dense_dir: Path, depth: int) -> Surface:
 def simplify(surface: Surface, share: float, max_error: float, scratch: Path) -> Surface:
     """Collapse edges, cheapest first by their quadric error (Garland and Heckbert, SIGGRAPH 1997).
 
-    Each vertex has the colour of the one that was nearest before.
+    Each vertex has the mean colour of those that it stands for.
 
     Args:
         surface: a manifold; its borders are kept.
@@ -77,8 +77,6 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
         max_error: largest root of the summed squared distances of a vertex from the planes that it stands for; 0: any.
         scratch: folder for two files that go again.
     """
-    from scipy.spatial import cKDTree
-
     options = pycolmap.MeshSimplificationOptions()
     options.target_face_ratio, options.max_error = share, max_error**2
     options.boundary_weight = BORDER_WEIGHT
@@ -90,8 +88,20 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
         simple = _read(found)
         given.unlink()
         found.unlink()
-    _, nearest = cKDTree(surface.vertices).query(simple.vertices)  # pycolmap 4.2 reads no colours
-    return Surface(simple.vertices, simple.faces, surface.colors[nearest])
+    return Surface(simple.vertices, simple.faces, _mean_colors(surface, simple.vertices))
+
+
+def _mean_colors(surface: Surface, vertices: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(V, 3) mean colour of the old vertices to which each new one (V, 3) is nearest; pycolmap 4.2 reads no colours."""
+    from scipy.spatial import cKDTree
+
+    _, at = cKDTree(vertices).query(surface.vertices)
+    count = np.bincount(at, minlength=len(vertices))
+    total = np.stack([np.bincount(at, channel, len(vertices)) for channel in surface.colors.T], axis=1)
+    mean = np.rint(total / np.maximum(count, 1)[:, None]).astype(np.uint8)
+    alone = np.flatnonzero(count == 0)
+    mean[alone] = surface.colors[cKDTree(surface.vertices).query(vertices[alone])[1]]
+    return mean
 
 
 def _read(path: Path) -> Surface:
