@@ -13,6 +13,7 @@ from sfm_app.types import Surface
 
 FUSED = "fused.ply"
 MAX_NORMAL_ERROR_DEG = 25.0
+CACHE_GB = 2.0
 BORDER_WEIGHT = 10.0
 """How much dearer it is to move a border than the surface."""
 
@@ -34,6 +35,7 @@ def fuse(dense_dir: Path, views: Sequence[View], min_views: int, box: NDArray[np
     # The depths have been checked already; normals from disparities are noisier than those of COLMAP's PatchMatch.
     options.max_normal_error = MAX_NORMAL_ERROR_DEG
     options.bounding_box = (box[0].astype(np.float32), box[1].astype(np.float32))
+    options.use_cache, options.cache_size = True, CACHE_GB  # else all maps of all photos are in memory at once
     options.num_threads = 1  # with more, the points depend on which thread comes first
     with backend("fusing depth maps"):
         pycolmap.stereo_fusion(target, dense_dir, options=options, output_type="ply")

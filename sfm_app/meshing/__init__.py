@@ -1,6 +1,6 @@
 """From a raw surface to a clean mesh: what photos confirm, with smooth borders, as a manifold, coloured."""
 
-from sfm_app.meshing.borders import Support, bridge_gaps, cut, smooth_support, trim
+from sfm_app.meshing.borders import Support, bridge_gaps, cut, drop_doubtful, smooth_support, trim
 from sfm_app.meshing.clean import drop_islands, octree_depth, select_faces
 from sfm_app.meshing.manifold import make_manifold
 from sfm_app.meshing.paint import Paint, sample_colors
@@ -15,6 +15,7 @@ __all__ = [
     "Support",
     "bridge_gaps",
     "cut",
+    "drop_doubtful",
     "drop_islands",
     "judge",
     "make_manifold",

@@ -33,6 +33,9 @@ HINT = "take more photos, a step apart, with more overlap; OUT/points.ply and OU
 MIN_POINTS = 100
 """Fewer fused points carry no surface."""
 
+SURE = 2 / 3
+"""A part stays when this share of the photos that a fused point needs confirm its average vertex."""
+
 
 def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surface:
     """Span a surface over the fused points, keep what the photos confirm, simplify it, and keep it beside them.
@@ -46,7 +49,8 @@ def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surfac
     depth = octree_depth(points, options.poisson_depth)
     raw = poisson(dense_dir, depth)
     colored, support = looked_at(raw, dense_dir, views, run)
-    trimmed = trim(colored, support, options.max_gap) if options.trim else colored
+    least = SURE * photos_needed(views, run)
+    trimmed = trim(colored, support, options.max_gap, least) if options.trim else colored
     detailed = drop_islands(trimmed, options.min_island)
     run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
     if not len(detailed.faces):
@@ -72,7 +76,7 @@ def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray
     youngest = max((map_file(dense_dir, view).stat().st_mtime_ns for view in views), default=0)
     if not target.exists() or target.stat().st_mtime_ns <= youngest:
         with run.workspace.replacing(target) as path:
-            fuse(dense_dir, views, 1 + min(run.settings.depth.min_agreeing, len(views) - 1), region(views), path)
+            fuse(dense_dir, views, photos_needed(views, run), region(views), path)
     points, _ = read_fused(dense_dir)
     run.record(fused_points=len(points))
     if len(points) < MIN_POINTS:
@@ -80,6 +84,11 @@ def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray
             f"the {len(views)} depth maps agree on {len(points) or 'no'} points only: too few for a surface", hint=HINT
         )
     return points
+
+
+def photos_needed(views: list[View], run: RunContext) -> int:
+    """How many photos have to see a fused point."""
+    return min(1 + run.settings.depth.min_agreeing, len(views))
 
 
 def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> tuple[Surface, Support]:
