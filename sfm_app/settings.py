@@ -110,10 +110,10 @@ class MeshSettings(Section):
         20.0, ge=0, le=1000, description="gaps in what photos confirm are closed up to this width, in triangles"
     )
     min_island: float = Field(
-        0.002, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
+        0.001, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
     )
     max_error: float = Field(
-        0.2, ge=0, le=10, description="simplification may move the surface so far, in edges of Poisson's triangles"
+        0.15, ge=0, le=10, description="simplification may move the surface so far, in edges of Poisson's triangles"
     )
     faces: int = Field(200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh")
 

@@ -13,6 +13,7 @@ from sfm_app.types import Surface
 
 FUSED = "fused.ply"
 MAX_NORMAL_ERROR_DEG = 25.0
+CACHE_GB = 2.0
 BORDER_WEIGHT = 10.0
 """How much dearer it is to move a border than the surface."""
 
@@ -34,6 +35,7 @@ def fuse(dense_dir: Path, views: Sequence[View], min_views: int, box: NDArray[np
     # The depths have been checked already; normals from disparities are noisier than those of COLMAP's PatchMatch.
     options.max_normal_error = MAX_NORMAL_ERROR_DEG
     options.bounding_box = (box[0].astype(np.float32), box[1].astype(np.float32))
+    options.use_cache, options.cache_size = True, CACHE_GB  # else all maps of all photos are in memory at once
     options.num_threads = 1  # with more, the points depend on which thread comes first
     with backend("fusing depth maps"):
         pycolmap.stereo_fusion(target, dense_dir, options=options, output_type="ply")
@@ -69,7 +71,7 @@ def poisson(dense_dir: Path, depth: int) -> Surface:
 def simplify(surface: Surface, share: float, max_error: float, scratch: Path) -> Surface:
     """Collapse edges, cheapest first by their quadric error (Garland and Heckbert, SIGGRAPH 1997).
 
-    Each vertex has the colour of the one that was nearest before.
+    Each vertex has the mean colour of those that it stands for.
 
     Args:
         surface: a manifold; its borders are kept.
@@ -77,8 +79,6 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
         max_error: largest root of the summed squared distances of a vertex from the planes that it stands for; 0: any.
         scratch: folder for two files that go again.
     """
-    from scipy.spatial import cKDTree
-
     options = pycolmap.MeshSimplificationOptions()
     options.target_face_ratio, options.max_error = share, max_error**2
     options.boundary_weight = BORDER_WEIGHT
@@ -90,8 +90,20 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
         simple = _read(found)
         given.unlink()
         found.unlink()
-    _, nearest = cKDTree(surface.vertices).query(simple.vertices)  # pycolmap 4.2 reads no colours
-    return Surface(simple.vertices, simple.faces, surface.colors[nearest])
+    return Surface(simple.vertices, simple.faces, _mean_colors(surface, simple.vertices))
+
+
+def _mean_colors(surface: Surface, vertices: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(V, 3) mean colour of the old vertices to which each new one (V, 3) is nearest; pycolmap 4.2 reads no colours."""
+    from scipy.spatial import cKDTree
+
+    _, at = cKDTree(vertices).query(surface.vertices)
+    count = np.bincount(at, minlength=len(vertices))
+    total = np.stack([np.bincount(at, channel, len(vertices)) for channel in surface.colors.T], axis=1)
+    mean = np.rint(total / np.maximum(count, 1)[:, None]).astype(np.uint8)
+    alone = np.flatnonzero(count == 0)
+    mean[alone] = surface.colors[cKDTree(surface.vertices).query(vertices[alone])[1]]
+    return mean
 
 
 def _read(path: Path) -> Surface:

@@ -1,6 +1,6 @@
 """From a raw surface to a clean mesh: what photos confirm, with smooth borders, as a manifold, coloured."""
 
-from sfm_app.meshing.borders import bridge_gaps, cut, smooth_support
+from sfm_app.meshing.borders import Support, bridge_gaps, cut, drop_doubtful, smooth_support, trim
 from sfm_app.meshing.clean import drop_islands, octree_depth, select_faces
 from sfm_app.meshing.manifold import make_manifold
 from sfm_app.meshing.paint import Paint, sample_colors
@@ -12,8 +12,10 @@ __all__ = [
     "SILENT",
     "Eye",
     "Paint",
+    "Support",
     "bridge_gaps",
     "cut",
+    "drop_doubtful",
     "drop_islands",
     "judge",
     "make_manifold",
@@ -21,4 +23,5 @@ __all__ = [
     "sample_colors",
     "select_faces",
     "smooth_support",
+    "trim",
 ]

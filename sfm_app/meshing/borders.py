@@ -3,6 +3,7 @@
 SciPy is imported where it is used: a program that only estimates fundamental matrices starts without it.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,13 +11,52 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.triangles import edges_of
 from sfm_app.meshing.clean import select_faces
+from sfm_app.meshing.visibility import CONFIRMED, SEEN_THROUGH
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
+SMOOTHING = 20
+"""Averages over neighbours that take the fringe off the border."""
 MAX_FREE = 0.5
 """A gap is not bridged where photos see through this share of it."""
+
+
+@dataclass(slots=True, eq=False)
+class Support:
+    """How many photos confirm each vertex of a surface, and how many see through it."""
+
+    confirmed: NDArray[np.int32]
+    """(V,)."""
+    through: NDArray[np.int32]
+    """(V,)."""
+
+    @classmethod
+    def none(cls, count: int) -> "Support":
+        """No photo yet for `count` vertices."""
+        return cls(np.zeros(count, np.int32), np.zeros(count, np.int32))
+
+    def add(self, verdict: NDArray[np.uint8]) -> None:
+        """Add what one photo says, see `judge`."""
+        self.confirmed += verdict == CONFIRMED
+        self.through += verdict == SEEN_THROUGH
+
+
+def trim(surface: Surface, support: Support, max_gap: float, least: float) -> Surface:
+    """Keep what photos confirm and do not see through, and the small gaps in it; the border is a smooth line.
+
+    Args:
+        surface: closed, as Poisson gives it.
+        support: of its vertices.
+        max_gap: as for `bridge_gaps`.
+        least: as for `drop_doubtful`.
+    """
+    free = support.through > support.confirmed
+    sign = np.where((support.confirmed > 0) & ~free, 1.0, -1.0)
+    smooth = smooth_support(surface, bridge_gaps(surface, sign, free, max_gap), SMOOTHING)
+    whole = bridge_gaps(surface, smooth, free, max_gap)
+    return cut(surface, drop_doubtful(surface, whole, support.confirmed, least))
 
 
 def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], max_width: float) -> FloatArray:
@@ -51,6 +91,20 @@ def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], 
     free_share = np.bincount(patch, free, count) / np.bincount(patch, minlength=count)
     bridged = (2.0 * depth <= max_width * scale) & (free_share < MAX_FREE)
     return np.where(~inside & bridged[patch], 1.0, support)
+
+
+def drop_doubtful(surface: Surface, support: FloatArray, confirmed: NDArray[np.int32], least: float) -> FloatArray:
+    """Take the support from connected parts that fewer photos than `least` confirm on average.
+
+    Crumbs around outlines are like that: chance agreement of two or three photos, and the gaps between them bridged.
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    edges, _ = edges_of(surface.faces)
+    inside = support > 0
+    count, part = connected_components(_graph(edges[inside[edges].all(axis=1)], len(support)), directed=False)
+    mean = np.bincount(part, confirmed, count) / np.bincount(part, minlength=count)
+    return np.where(inside & (mean[part] < least), -1.0, support)
 
 
 def smooth_support(surface: Surface, support: FloatArray, steps: int) -> FloatArray:

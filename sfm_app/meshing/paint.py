@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.meshing.visibility import CONFIRMED, Eye, FloatArray, judge
+from sfm_app.meshing.visibility import CONFIRMED, Eye, FloatArray
 
 ColorImage = NDArray[np.uint8]
 """(H, W, 3) RGB."""
@@ -37,19 +37,30 @@ class Paint:
         return np.where(self.weight[:, None] > 0, np.rint(mean), colors).astype(np.uint8)
 
 
-def sample_colors(points: FloatArray, normals: FloatArray, eye: Eye, image: ColorImage, tolerance: float) -> Paint:
+def sample_colors(
+    points: FloatArray, normals: FloatArray, verdict: NDArray[np.uint8], eye: Eye, image: ColorImage
+) -> Paint:
     """What one photo adds: its colours where it confirms the points, weighted by the pixels that a patch there gets.
 
     Args:
         points: (N, 3).
         normals: (N, 3) unit.
-        eye: the photo's camera and depth map.
-        image: (H, W, 3) as large as the depth map.
-        tolerance: as for `judge`.
+        verdict: (N,) what `judge` says about them.
+        eye: the photo's camera.
+        image: (H, W, 3) as large as its depth map.
     """
     paint = Paint.none(len(points))
-    seen = judge(points, normals, eye, tolerance) == CONFIRMED
-    _sample(points, normals, seen, eye.projection, eye.center, eye.focal_px**2, image, paint.total, paint.weight)
+    _sample(
+        points,
+        normals,
+        verdict == CONFIRMED,
+        eye.projection,
+        eye.center,
+        eye.focal_px**2,
+        image,
+        paint.total,
+        paint.weight,
+    )
     return paint
 
 

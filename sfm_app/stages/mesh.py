@@ -11,18 +11,15 @@ from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.triangles import median_edge, vertex_normals
 from sfm_app.meshing import (
-    CONFIRMED,
-    SEEN_THROUGH,
     Eye,
     Paint,
-    bridge_gaps,
-    cut,
+    Support,
     drop_islands,
     judge,
     make_manifold,
     octree_depth,
     sample_colors,
-    smooth_support,
+    trim,
 )
 from sfm_app.parallel import ordered_map
 from sfm_app.progress import track
@@ -35,8 +32,9 @@ HINT = "take more photos, a step apart, with more overlap; OUT/points.ply and OU
 
 MIN_POINTS = 100
 """Fewer fused points carry no surface."""
-SMOOTHING = 20
-"""Averages over neighbours that take the fringe off the border."""
+
+SURE = 2 / 3
+"""A part stays when this share of the photos that a fused point needs confirm its average vertex."""
 
 
 def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surface:
@@ -50,7 +48,9 @@ def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surfac
     points = fused_points(dense_dir, views, run)
     depth = octree_depth(points, options.poisson_depth)
     raw = poisson(dense_dir, depth)
-    trimmed = trim(raw, dense_dir, views, options, run) if options.trim else raw
+    colored, support = looked_at(raw, dense_dir, views, run)
+    least = SURE * photos_needed(views, run)
+    trimmed = trim(colored, support, options.max_gap, least) if options.trim else colored
     detailed = drop_islands(trimmed, options.min_island)
     run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
     if not len(detailed.faces):
@@ -58,7 +58,6 @@ def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surfac
     surface = make_manifold(simplified(detailed, options, dense_dir))
     if not len(surface.faces):
         raise ReconstructionError("no surface is left after simplification", hint=HINT)
-    surface = painted(surface, dense_dir, views, run)
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
     with run.workspace.replacing(dense_dir / SURFACE) as path:
         np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
@@ -77,7 +76,7 @@ def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray
     youngest = max((map_file(dense_dir, view).stat().st_mtime_ns for view in views), default=0)
     if not target.exists() or target.stat().st_mtime_ns <= youngest:
         with run.workspace.replacing(target) as path:
-            fuse(dense_dir, views, 1 + min(run.settings.depth.min_agreeing, len(views) - 1), region(views), path)
+            fuse(dense_dir, views, photos_needed(views, run), region(views), path)
     points, _ = read_fused(dense_dir)
     run.record(fused_points=len(points))
     if len(points) < MIN_POINTS:
@@ -87,22 +86,27 @@ def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray
     return points
 
 
-def trim(surface: Surface, dense_dir: Path, views: list[View], options: MeshSettings, run: RunContext) -> Surface:
-    """Keep what depth maps confirm and do not see through, and the small gaps in it."""
+def photos_needed(views: list[View], run: RunContext) -> int:
+    """How many photos have to see a fused point."""
+    return min(1 + run.settings.depth.min_agreeing, len(views))
+
+
+def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> tuple[Surface, Support]:
+    """The surface in the colours of the photos, and what they say about each of its vertices."""
     normals = vertex_normals(surface.vertices, surface.faces)
+    tolerance = run.settings.depth.consistency
 
-    def look(view: View) -> NDArray[np.uint8]:
-        return judge(surface.vertices, normals, eye(dense_dir, view), run.settings.depth.consistency)
+    def look(view: View) -> tuple[NDArray[np.uint8], Paint]:
+        eye = Eye(view.K, view.R, view.t, read_depth(dense_dir, view, "geometric"), view.sample_px)
+        verdict = judge(surface.vertices, normals, eye, tolerance)
+        return verdict, sample_colors(surface.vertices, normals, verdict, eye, read_color(dense_dir, view))
 
-    confirmed, through = np.zeros((2, len(normals)), np.int32)
-    verdicts = ordered_map(run.executor, look, views, ahead=run.workers)
-    for verdict in track(run.progress, verdicts, "confirming the surface", len(views)):
-        confirmed += verdict == CONFIRMED
-        through += verdict == SEEN_THROUGH
-    free = through > confirmed
-    support = np.where((confirmed > 0) & ~free, 1.0, -1.0)
-    support = bridge_gaps(surface, support, free, options.max_gap)
-    return cut(surface, bridge_gaps(surface, smooth_support(surface, support, SMOOTHING), free, options.max_gap))
+    support, paint = Support.none(len(normals)), Paint.none(len(normals))
+    found = ordered_map(run.executor, look, views, ahead=run.workers)
+    for verdict, colors in track(run.progress, found, "confirming the surface", len(views)):
+        support.add(verdict)
+        paint.add(colors)
+    return Surface(surface.vertices, surface.faces, paint.over(surface.colors)), support
 
 
 def simplified(surface: Surface, options: MeshSettings, dense_dir: Path) -> Surface:
@@ -114,22 +118,3 @@ def simplified(surface: Surface, options: MeshSettings, dense_dir: Path) -> Surf
     if len(simple.faces) > options.faces:
         simple = simplify(simple, options.faces / len(simple.faces), 0.0, dense_dir)
     return simple
-
-
-def painted(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> Surface:
-    """The surface with the colours that the photos show at its vertices."""
-    normals = vertex_normals(surface.vertices, surface.faces)
-
-    def look(view: View) -> Paint:
-        image = read_color(dense_dir, view)
-        return sample_colors(surface.vertices, normals, eye(dense_dir, view), image, run.settings.depth.consistency)
-
-    paint = Paint.none(len(normals))
-    for one in track(run.progress, ordered_map(run.executor, look, views, ahead=run.workers), "colours", len(views)):
-        paint.add(one)
-    return Surface(surface.vertices, surface.faces, paint.over(surface.colors))
-
-
-def eye(dense_dir: Path, view: View) -> Eye:
-    """A photo's camera with its confirmed depths."""
-    return Eye(view.K, view.R, view.t, read_depth(dense_dir, view, "geometric"), view.sample_px)

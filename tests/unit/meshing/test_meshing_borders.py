@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.geometry.triangles import areas
-from sfm_app.meshing import bridge_gaps, cut, smooth_support
+from sfm_app.meshing import Support, bridge_gaps, cut, drop_doubtful, smooth_support, trim
 
 
 def nowhere(surface):
@@ -60,6 +60,30 @@ def test_gaps_that_photos_see_through_stay_open(sheet):
     hole = np.linalg.norm(surface.vertices - [10, 10, 0], axis=1) < 2.5
 
     assert np.all((bridge_gaps(surface, np.where(hole, -1.0, 1.0), hole, 12.0) < 0) == hole)
+
+
+def test_parts_that_few_photos_confirm_are_dropped(sheet, together):
+    surface = together(sheet(9), sheet(4, origin=(50, 0, 0)), sheet(4, origin=(80, 0, 0)))
+    x = surface.vertices[:, 0]
+    confirmed = np.select([x < 20, x < 60], [3, 2], np.arange(len(x)) % 2 * 3).astype(np.int32)  # 3, 2, 1.5
+
+    found = drop_doubtful(surface, np.ones(len(x)), confirmed, 2.0)
+
+    np.testing.assert_array_equal(found > 0, x < 60)
+
+
+def test_trimming_keeps_what_is_confirmed_with_its_pinholes_closed(sheet, together):
+    surface = together(sheet(40), sheet(6, origin=(60, 0, 0)))
+    x, y = surface.vertices[:, 0], surface.vertices[:, 1]
+    support = Support.none(len(x))
+    support.confirmed[(x < 30) | (x > 50)] = 3
+    support.confirmed[(np.abs(x - 10) < 1.5) & (np.abs(y - 10) < 1.5)] = 0  # a pinhole
+    support.through[x > 50] = 4
+
+    found = trim(surface, support, 12.0, 2.0)
+
+    assert total(found) == pytest.approx(29.5 * 40, rel=0.02)
+    assert found.vertices[:, 0].max() < 32
 
 
 def test_smoothing_takes_the_teeth_off_a_border_and_keeps_its_place(sheet):

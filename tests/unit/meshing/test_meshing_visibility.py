@@ -47,9 +47,10 @@ def test_colours_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
     points = np.array([[0, 0, 10.0], [0.5, -1, 10.0], [3, 0, 10.0]])
     normals = np.repeat(FACING, 3, axis=0)
 
-    paint = sample_colors(points, normals, eye, image, 0.01)
+    paint = sample_colors(points, normals, judge(points, normals, eye, 0.01), eye, image)
     near = Eye(np.diag([2.0, 2, 1]) @ eye.K, eye.R, eye.t, np.full((120, 160), 10.0, np.float32), 0.5)
-    closer = sample_colors(points, normals, near, np.full((120, 160, 3), 255, np.uint8), 0.01)
+    white = np.full((120, 160, 3), 255, np.uint8)
+    closer = sample_colors(points, normals, judge(points, normals, near, 0.01), near, white)
 
     np.testing.assert_allclose(paint.over(np.full((3, 3), 7, np.uint8))[:, 0], [79, 89, 7], atol=1)
     np.testing.assert_allclose(closer.weight[:2], 4 * paint.weight[:2])

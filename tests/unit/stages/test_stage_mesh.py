@@ -1,0 +1,151 @@
+"""From true depth maps of a ball seen all round to its closed surface."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.dense import map_file, read_views, write_maps
+from sfm_app.context import RunContext
+from sfm_app.errors import ReconstructionError
+from sfm_app.geometry.triangles import edges_of, vertex_normals
+from sfm_app.parallel import make_executor
+from sfm_app.plugins import load_plugins
+from sfm_app.settings import Settings
+from sfm_app.stages.mesh import load_surface, make_mesh
+from sfm_app.stereo import DepthMap
+from sfm_app.synthetic.cameras import look_at
+from sfm_app.workspace import Workspace
+
+DISTANCE, FOCAL, WIDTH, HEIGHT = 4.0, 190.0, 120, 110
+WAYS = np.array([[np.cos(a) * np.cos(e), np.sin(e), np.sin(a) * np.cos(e)] for e in (-0.9, 0, 0.9) for a in range(6)])
+
+
+def write_model(place):
+    """Cameras all round the unit ball, and points on it."""
+    model = pycolmap.Reconstruction()
+    params = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=params)
+    model.add_camera_with_trivial_rig(camera)
+    for index, way in enumerate(WAYS, start=1):
+        pose = pycolmap.Rigid3d(look_at(DISTANCE * way, np.zeros(3)))
+        model.add_image_with_trivial_frame(pycolmap.Image(image_id=index, name=f"{index:02d}.png", camera_id=1), pose)
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    for image in model.images.values():
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(np.zeros(2)) for _ in points])
+    for index, xyz in enumerate(points):
+        track = pycolmap.Track()
+        for image_id in model.images:
+            track.add_element(image_id, index)
+        model.add_point3D(xyz, track, np.zeros(3, np.uint8))
+    (place / "sparse").mkdir(parents=True)
+    model.write(place / "sparse")
+
+
+def true_maps(view):
+    """Depth and normals of the ball."""
+    y, x = np.mgrid[: view.height, : view.width] + view.sample_px
+    rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(view.K).T
+    center = view.t  # of the ball, in the camera
+    a, b = np.sum(rays**2, axis=-1), rays @ center
+    root = b**2 - a * (center @ center - 1)
+    depth = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, 0)
+    normals = np.where(root[..., None] > 0, rays * depth[..., None] - center, 0)
+    grazing = -np.sum(normals * rays, axis=-1) < 0.3 * np.sqrt(a)
+    return DepthMap(
+        *(np.where(m, 0, v).astype(np.float32) for m, v in ((grazing, depth), (grazing[..., None], normals)))
+    )
+
+
+@pytest.fixture(scope="module")
+def dense(tmp_path_factory):
+    place = tmp_path_factory.mktemp("ball") / "dense"
+    write_model(place)
+    (place / "images").mkdir()
+    for view in read_views(place):
+        cv2.imwrite(str(place / "images" / view.name), np.full((HEIGHT, WIDTH, 3), (40, 90, 200), np.uint8))
+        write_maps(place, view, true_maps(view))
+    return place
+
+
+def run_in(dense, workers=2, **mesh):
+    settings = Settings.from_mapping({"mesh": mesh})
+    return RunContext(settings, Workspace(dense.parent), load_plugins(), make_executor(workers), workers)
+
+
+def made(dense, **options):
+    run = run_in(dense, **options)
+    return make_mesh(dense, run.settings.mesh, run), run.counts
+
+
+@pytest.fixture(scope="module")
+def ball(dense):
+    return made(dense)
+
+
+def test_a_closed_thing_seen_all_round_is_closed(ball):
+    surface, counts = ball
+    corners = surface.vertices[surface.faces]
+    edges, edge_of = edges_of(surface.faces)
+
+    assert np.array_equal(np.bincount(edge_of.ravel()), np.full(len(edges), 2))
+    assert len(surface.vertices) - len(edges) + len(surface.faces) == 2
+    assert np.sum(np.linalg.det(corners)) / 6 == pytest.approx(4 / 3 * np.pi, rel=0.02)
+    assert np.percentile(np.abs(np.linalg.norm(surface.vertices, axis=1) - 1), 95) < 0.01
+    assert counts["triangles"] == len(surface.faces) < 0.6 * counts["raw_triangles"]
+
+
+def test_normals_point_outward_and_colours_are_those_of_the_photos(ball):
+    surface, _ = ball
+    normals = vertex_normals(surface.vertices, surface.faces)
+
+    assert np.sum(normals * surface.vertices, axis=1).min() > 0.5
+    np.testing.assert_array_equal(np.median(surface.colors, axis=0), [200, 90, 40])
+
+
+def test_fewer_faces_do_not_fuse_again_and_one_worker_gives_the_same_bytes(dense, ball):
+    stamp = (dense / "fused.ply").stat().st_mtime_ns
+
+    few, _ = made(dense, faces=500)
+    again, _ = made(dense, workers=1)
+
+    assert (dense / "fused.ply").stat().st_mtime_ns == stamp
+    assert 400 < len(few.faces) <= 500
+    for name in ("vertices", "faces", "colors"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(ball[0], name))
+        np.testing.assert_array_equal(getattr(load_surface(dense), name), getattr(again, name))
+
+
+def test_what_no_photo_sees_is_cut_off_or_kept_closed(dense, tmp_path):
+    half = tmp_path / "dense"
+    shutil.copytree(dense, half)
+    (half / "fused.ply").unlink(missing_ok=True)
+    for view in read_views(half):
+        if view.center[2] < 1.0:
+            map_file(half, view).unlink()
+
+    cut, _ = made(half)
+    closed, _ = made(half, trim=False)
+
+    assert -0.75 < cut.vertices[:, 2].min() < 0.2
+    assert closed.vertices[:, 2].min() < -0.75
+
+
+def test_maps_that_agree_on_nothing_give_an_error_that_says_so(dense, tmp_path):
+    poor = tmp_path / "dense"
+    shutil.copytree(dense, poor)
+    (poor / "fused.ply").unlink(missing_ok=True)
+    rng = np.random.default_rng(0)
+    for view in read_views(poor)[:3]:
+        maps = true_maps(view)
+        wrong = maps.depth * rng.uniform(0.5, 1.5, maps.depth.shape).astype(np.float32)
+        write_maps(poor, view, DepthMap(wrong, maps.normals))
+    for view in read_views(poor)[3:]:
+        map_file(poor, view).unlink()
+
+    with pytest.raises(ReconstructionError, match=r"3 depth maps agree on \w+ points") as err:
+        made(poor)
+    assert "points.ply" in err.value.hint
