@@ -43,7 +43,8 @@ def strangers(
         for _ in range(ROUNDS):
             before = smooth.copy()
             _average(before, seen[photo], neighbours, smooth)
-        found[photo] = seen[photo] & (smooth > OUTLYING)
+        _mark(smooth, seen[photo], neighbours, found[photo])
+    found &= seen.sum(axis=0) >= LEAST_VIEWS
     _spare_the_last(found, seen)
     return found
 
@@ -108,6 +109,21 @@ def _average(
                 total += before[g]
                 count += 1
         after[f] = total / count
+
+
+@kernel
+def _mark(
+    score: NDArray[np.float32], seen: NDArray[np.bool_], neighbours: IntArray, found: NDArray[np.bool_]
+) -> None:
+    """Triangles that deviate, and those beside them, which a stranger may cover in part."""
+    for f in range(len(score)):
+        if not seen[f]:
+            continue
+        found[f] = score[f] > OUTLYING
+        for k in range(3):
+            g = neighbours[f, k]
+            if g != NONE and seen[g] and score[g] > OUTLYING:
+                found[f] = True
 
 
 @kernel
