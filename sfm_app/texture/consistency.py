@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.texture.facets import NONE, IntArray
+from sfm_app.texture.middle import median
 
 LEAST_VIEWS = 3
 """Two photos that disagree do not say which of them is right."""
@@ -72,7 +73,7 @@ def _deviations(
                 if seen[p, f]:
                     level[count] = colors[p, f, channel] * scale[p, channel]
                     count += 1
-            middle = _median(level[:count])
+            middle = median(level, count)
             for p in range(photos):
                 if seen[p, f]:
                     far[p] = max(far[p], abs(colors[p, f, channel] * scale[p, channel] - middle))
@@ -81,17 +82,10 @@ def _deviations(
             if seen[p, f]:
                 level[count] = far[p]
                 count += 1
-        usual = LEVELS + _median(level[:count])
+        usual = LEVELS + median(level, count)
         for p in range(photos):
             if seen[p, f]:
                 score[p, f] = far[p] / usual
-
-
-@kernel
-def _median(values: NDArray[np.float64]) -> float:
-    ranked = np.sort(values)
-    middle: float = 0.5 * (ranked[(len(values) - 1) // 2] + ranked[len(values) // 2])
-    return middle
 
 
 @kernel
@@ -112,9 +106,7 @@ def _average(
 
 
 @kernel
-def _mark(
-    score: NDArray[np.float32], seen: NDArray[np.bool_], neighbours: IntArray, found: NDArray[np.bool_]
-) -> None:
+def _mark(score: NDArray[np.float32], seen: NDArray[np.bool_], neighbours: IntArray, found: NDArray[np.bool_]) -> None:
     """Triangles that deviate, and those beside them, which a stranger may cover in part."""
     for f in range(len(score)):
         if not seen[f]:
