@@ -36,7 +36,8 @@ class Seen:
     """What the photos show of the triangles, and which of them may be believed."""
 
     worth: NDArray[np.float32]
-    """(P, T) pixels times cosine times sharpness; 0 where a photo must not be used."""
+    """(P, T) pixels times cosine times sharpness; 0 where a photo does not see a triangle, negative where it shows
+    something else."""
     colors: NDArray[np.uint8]
     """(P, T, 3)"""
     gains: FloatArray
@@ -45,8 +46,14 @@ class Seen:
     """Triangles, over all photos, that show something else."""
 
     @property
+    def visible(self) -> NDArray[np.bool_]:
+        """(P, T) whether a photo sees a triangle."""
+        return np.asarray(self.worth != 0)
+
+    @property
     def usable(self) -> NDArray[np.bool_]:
-        return self.worth > 0
+        """(P, T) whether a photo sees a triangle and shows the surface there."""
+        return np.asarray(self.worth > 0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +132,7 @@ def _believe(looks: Sequence[Look | Rejected], mesh: Facets) -> Seen:
     worth *= sharp[:, None].astype(np.float32)
     gains = photo_gains(colors, worth > 0)
     strange = strangers(colors, gains, worth > 0, mesh.neighbours)
-    worth[strange] = 0.0
+    worth[strange] *= -1.0
     return Seen(worth, colors, gains, int(strange.sum()))
 
 
@@ -149,6 +156,8 @@ def _paint_photo(
 ) -> None:
     """Add one photo to all pages; one photo paints at a time, while others are read."""
     triangles, weights, offsets = _shares(photo, plan)
+    beside = plan.mesh.neighbours[triangles]
+    rims = (beside == NONE) | ~plan.seen.visible[photo, beside]
     if not len(triangles):
         return
     view, scale = views[photo], plan.layout.scale
@@ -157,7 +166,7 @@ def _paint_photo(
     pixels, points = load(view), plan.mesh.vertices[plan.mesh.faces[triangles]]
     for number, page in enumerate(canvases):
         there = plan.page[triangles] == number
-        shares = points[there], weights[there], offsets[there]
+        shares = points[there], weights[there], offsets[there], rims[there]
         with lock:
             paint(
                 pixels, view.row, 1.0 / plan.seen.gains[photo], triangles[there], plan.corners, *shares,

@@ -15,9 +15,13 @@ from sfm_app.texture.views import project
 
 FloatArray = NDArray[np.float64]
 
+MOST_LAYERS = 4
+"""Of triangles over each other in one photo; what still overlaps then shows the same pixels twice."""
 SMALL = 12
 """Charts of fewer triangles go over to the photo of a neighbouring chart that sees them, too."""
 ROUNDS = 3
+EDGE = 1e-6
+"""Barycentric coordinates below count as on the edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,9 +50,61 @@ def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: fl
     tiles = np.floor(corners.mean(axis=1) / tile_px).astype(np.int64)
     group = np.where(chosen == NONE, NONE, (chosen * 4096 + tiles[:, 1]) * 4096 + tiles[:, 0])
     of, count = components(group, mesh.neighbours)
+    for layer in range(1, MOST_LAYERS):
+        folded = folds(of, count, corners)
+        if not folded.any():
+            break
+        group[folded] += layer << 40
+        of, count = components(group, mesh.neighbours)
     photo = np.full(count, NONE, np.int32)
     photo[of[of != NONE]] = chosen[of != NONE]
     return Charts(of, photo, corners)
+
+
+def folds(of: IntArray, count: int, corners: FloatArray) -> NDArray[np.bool_]:
+    """(T,) triangles that cover others of the same chart.
+
+    Args:
+        of: (T,) chart of each triangle, -1 for none.
+        count: how many charts there are.
+        corners: (T, 3, 2) pixels.
+    """
+    order = np.argsort(of, kind="stable")[np.count_nonzero(of == NONE) :]
+    starts = np.concatenate([[0], np.cumsum(np.bincount(of[order], minlength=count))])
+    folded = np.zeros(len(of), np.bool_)
+    _find_folds(order, starts, corners, folded)
+    return folded
+
+
+@kernel
+def _find_folds(
+    order: NDArray[np.int64], starts: NDArray[np.int64], corners: FloatArray, folded: NDArray[np.bool_]
+) -> None:
+    """Draw each chart pixel by pixel; who comes second to a pixel lies over the first."""
+    for c in range(len(starts) - 1):
+        left = top = np.inf
+        right = bottom = -np.inf
+        for f in order[starts[c] : starts[c + 1]]:
+            for k in range(3):
+                left, right = min(left, corners[f, k, 0]), max(right, corners[f, k, 0])
+                top, bottom = min(top, corners[f, k, 1]), max(bottom, corners[f, k, 1])
+        width, height = int(right - left) + 2, int(bottom - top) + 2
+        taken = np.zeros((height, width), np.bool_)
+        for f in order[starts[c] : starts[c + 1]]:
+            ax, ay = corners[f, 0, 0] - left, corners[f, 0, 1] - top
+            bx, by = corners[f, 1, 0] - left, corners[f, 1, 1] - top
+            cx, cy = corners[f, 2, 0] - left, corners[f, 2, 1] - top
+            turn = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+            if turn == 0.0:
+                continue
+            for y in range(int(min(ay, by, cy)), int(max(ay, by, cy)) + 1):
+                for x in range(int(min(ax, bx, cx)), int(max(ax, bx, cx)) + 1):
+                    # strictly inside: neighbours share the pixels on their common edge
+                    u = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / turn
+                    v = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / turn
+                    if min(u, v, 1.0 - u - v) > EDGE:
+                        folded[f] = folded[f] or taken[y, x]
+                        taken[y, x] = True
 
 
 def components(group: NDArray[np.int64], neighbours: IntArray) -> tuple[IntArray, int]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.texture.facets import NONE, IntArray
+from sfm_app.texture.middle import median
 
 LEAST_VIEWS = 3
 """Two photos that disagree do not say which of them is right."""
@@ -43,7 +44,8 @@ def strangers(
         for _ in range(ROUNDS):
             before = smooth.copy()
             _average(before, seen[photo], neighbours, smooth)
-        found[photo] = seen[photo] & (smooth > OUTLYING)
+        _mark(smooth, seen[photo], neighbours, found[photo])
+    found &= seen.sum(axis=0) >= LEAST_VIEWS
     _spare_the_last(found, seen)
     return found
 
@@ -71,7 +73,7 @@ def _deviations(
                 if seen[p, f]:
                     level[count] = colors[p, f, channel] * scale[p, channel]
                     count += 1
-            middle = _median(level[:count])
+            middle = median(level, count)
             for p in range(photos):
                 if seen[p, f]:
                     far[p] = max(far[p], abs(colors[p, f, channel] * scale[p, channel] - middle))
@@ -80,17 +82,10 @@ def _deviations(
             if seen[p, f]:
                 level[count] = far[p]
                 count += 1
-        usual = LEVELS + _median(level[:count])
+        usual = LEVELS + median(level, count)
         for p in range(photos):
             if seen[p, f]:
                 score[p, f] = far[p] / usual
-
-
-@kernel
-def _median(values: NDArray[np.float64]) -> float:
-    ranked = np.sort(values)
-    middle: float = 0.5 * (ranked[(len(values) - 1) // 2] + ranked[len(values) // 2])
-    return middle
 
 
 @kernel
@@ -108,6 +103,19 @@ def _average(
                 total += before[g]
                 count += 1
         after[f] = total / count
+
+
+@kernel
+def _mark(score: NDArray[np.float32], seen: NDArray[np.bool_], neighbours: IntArray, found: NDArray[np.bool_]) -> None:
+    """Triangles that deviate, and those beside them, which a stranger may cover in part."""
+    for f in range(len(score)):
+        if not seen[f]:
+            continue
+        found[f] = score[f] > OUTLYING
+        for k in range(3):
+            g = neighbours[f, k]
+            if g != NONE and seen[g] and score[g] > OUTLYING:
+                found[f] = True
 
 
 @kernel

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
+from sfm_app.texture.middle import median
 
 FloatArray = NDArray[np.float64]
 
@@ -71,8 +72,7 @@ def _add_equations(
                 count += 1
         if count < 2:
             continue
-        ranked = np.sort(level[:count])
-        middle = 0.5 * (ranked[(count - 1) // 2] + ranked[count // 2])
+        middle = median(level, count)
         total = mean = 0.0
         for p in range(photos):
             weight[p] = 0.0

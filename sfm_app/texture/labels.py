@@ -20,13 +20,14 @@ PRICE_OF_DETAIL = 0.35
 MOST_LOST = 3.0
 """Natural logarithm beyond which a photo is no worse."""
 ROUNDS = 12
+TINY = 1e-30
 
 
 def choose_photos(worth: NDArray[np.float32], mesh: Facets) -> IntArray:
     """The photo that colours each triangle.
 
     Args:
-        worth: (P, T) of each photo for each triangle, >= 0; 0 where it must not be used.
+        worth: (P, T) of each photo for each triangle, at most 0 where it must not be used.
         mesh: the surface.
 
     Returns:
@@ -37,8 +38,7 @@ def choose_photos(worth: NDArray[np.float32], mesh: Facets) -> IntArray:
     labels = np.argsort(-worth, axis=0, kind="stable")[:kept].T.astype(np.int32)
     values = np.take_along_axis(worth, labels.T, axis=0).T.astype(np.float64)
     best = values[:, :1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        lost = np.log(best / values)
+    lost = np.log(np.maximum(best, TINY) / np.maximum(values, TINY))
     cost = (PRICE_OF_DETAIL * _relative_size(mesh)[:, None] * np.minimum(lost, MOST_LOST)).astype(np.float32)
     labels[values <= 0] = NONE
     price = _edge_prices(mesh)

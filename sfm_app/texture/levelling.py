@@ -29,13 +29,9 @@ def level(blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: ND
         usable: (P, T) whether a photo may be used for a triangle.
         mesh: the surface.
     """
-    values = _node_colors(blend, colors, gains, usable, mesh)
-    first, second = _meetings(blend, len(mesh.vertices))
+    first, second, gap = _gaps(blend, colors, gains, usable, mesh)
     start, end = _ties(blend, mesh)
     right = np.zeros((len(blend.vertex), 3))
-    gap = values[second] - values[first]
-    known = np.isfinite(gap).all(axis=1)
-    first, second, gap = first[known], second[known], gap[known]
     for channel in range(3):
         right[:, channel] += np.bincount(first, gap[:, channel], len(right))
         right[:, channel] -= np.bincount(second, gap[:, channel], len(right))
@@ -85,22 +81,32 @@ def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
     return np.divide(above, below, out=np.zeros_like(above), where=below > 0)
 
 
-def _node_colors(
+def _gaps(
     blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets
-) -> FloatArray:
-    """(N, 3) mean colour, after the gain, of the triangles around a vertex that the photo may be used for; or NaN."""
-    values = np.full((len(blend.vertex), 3), np.nan)
-    size = len(mesh.vertices)
+) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
+    """Where two photos meet at a vertex: node, the vertex's heaviest node, and how much brighter (M, 3) that one is.
+
+    Compared are the triangles at the vertex that both photos may be used for; nodes without any are left out.
+    """
+    others, heads = _meetings(blend, len(mesh.vertices))
+    photo_of = np.repeat(np.arange(len(usable)), np.diff(blend.starts))
+    gaps = np.full((len(others), 3), np.nan)
     for photo in range(len(usable)):
-        part = blend.of(photo)
-        at = blend.vertex[part]
-        faces = mesh.faces[usable[photo]]
-        count = at_vertices(np.ones(len(faces)), faces, size)[at]
+        rows = np.flatnonzero(photo_of[others] == photo)
+        head_photo = np.full(len(mesh.vertices), -1, np.int64)
+        head_photo[blend.vertex[others[rows]]] = photo_of[heads[rows]]
+        near = np.flatnonzero(usable[photo] & (head_photo[mesh.faces] >= 0).any(axis=1))
+        corners = mesh.faces[near]
+        head = head_photo[corners]
+        both = (head >= 0) & usable[head, near[:, None]]
+        difference = colors[head, near[:, None]] / gains[head] - (colors[photo, near] / gains[photo])[:, None]
+        at = blend.vertex[others[rows]]
+        count = at_vertices(both.astype(np.float64), corners, len(mesh.vertices))[at]
         for channel in range(3):
-            total = at_vertices(colors[photo, usable[photo], channel].astype(np.float64), faces, size)[at]
-            mean = np.divide(total, count, out=np.full(len(at), np.nan), where=count > 0)
-            values[part, channel] = mean / gains[photo, channel]
-    return values
+            total = at_vertices(np.where(both, difference[..., channel], 0.0), corners, len(mesh.vertices))[at]
+            gaps[rows, channel] = np.divide(total, count, out=np.full(len(rows), np.nan), where=count > 0)
+    known = np.isfinite(gaps[:, 0])
+    return others[known], heads[known], gaps[known]
 
 
 def _meetings(blend: Blend, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

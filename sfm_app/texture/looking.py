@@ -76,7 +76,7 @@ def _blocked(
     blocked = covered[corners].sum(axis=1, dtype=np.int8) > 1
     open_ones = np.flatnonzero(~blocked)
     blocked[open_ones] = hidden(mesh.vertices[corners[open_ones]].mean(axis=1))
-    return blocked
+    return np.asarray(blocked, np.bool_)
 
 
 def sharpness(photo: NDArray[np.uint8]) -> float:

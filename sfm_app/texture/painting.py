@@ -18,6 +18,9 @@ from sfm_app.texture.views import project, sample
 FloatArray = NDArray[np.float64]
 
 FINE = 256
+INSET_PX, MOST_INSET = 1.5, 0.3
+"""Where a photo stops seeing the surface, its pixels mix with what lies behind: texels closer to such an edge repeat
+what lies this far inside, or this share of the triangle's height."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,6 +92,7 @@ def paint(
     points: FloatArray,
     weights: NDArray[np.float32],
     offsets: NDArray[np.float32],
+    rims: NDArray[np.bool_],
     owner: IntArray,
     total: IntArray,
 ) -> None:
@@ -103,17 +107,22 @@ def paint(
         points: (N, 3, 3) corners in the scene.
         weights: (N, 3) of the photo at the corners.
         offsets: (N, 3, 3) grey levels to add, by corner and channel.
+        rims: (N, 3) whether the edge from corner k to k + 1 is where the photo stops seeing the surface.
         owner: (H, W) of the page.
         total: (H, W, 3) of the page.
     """
     height, width = owner.shape
-    part = np.empty(3)
+    part, least = np.empty(3), np.empty(3)
     for n in range(len(triangles)):
         f = triangles[n]
         ax, ay = corners[f, 0, 0], corners[f, 0, 1]
         bx, by = corners[f, 1, 0] - ax, corners[f, 1, 1] - ay
         cx, cy = corners[f, 2, 0] - ax, corners[f, 2, 1] - ay
         turn = bx * cy - by * cx
+        for k in range(3):
+            a, b = corners[f, (k + 1) % 3], corners[f, (k + 2) % 3]
+            height_px = abs(turn) / max(np.hypot(b[0] - a[0], b[1] - a[1]), 1e-9)
+            least[k] = min(INSET_PX / max(height_px, 1e-9), MOST_INSET) if rims[n, (k + 1) % 3] else -2.0
         x0, x1 = int(min(0.0, bx, cx) + ax - MARGIN - 1), int(max(0.0, bx, cx) + ax + MARGIN + 1)
         y0, y1 = int(min(0.0, by, cy) + ay - MARGIN - 1), int(max(0.0, by, cy) + ay + MARGIN + 1)
         for y in range(max(y0, 0), min(y1, height - 1) + 1):
@@ -128,6 +137,7 @@ def paint(
                 # thin triangles must not throw the points of their margin far away
                 part[1], part[2] = min(max(part[1], -1.0), 2.0), min(max(part[2], -1.0), 2.0)
                 part[0] = 1.0 - part[1] - part[2]
+                _keep_off(part, least)
                 px = part[0] * points[n, 0, 0] + part[1] * points[n, 1, 0] + part[2] * points[n, 2, 0]
                 py = part[0] * points[n, 0, 1] + part[1] * points[n, 1, 1] + part[2] * points[n, 2, 1]
                 pz = part[0] * points[n, 0, 2] + part[1] * points[n, 1, 2] + part[2] * points[n, 2, 2]
@@ -144,6 +154,18 @@ def paint(
                     for k in range(3):
                         value += part[k] / inner * offsets[n, k, channel]
                     total[y, x, channel] += int(np.floor(FINE * weight * value + 0.5))
+
+
+@kernel
+def _keep_off(part: FloatArray, least: FloatArray) -> None:
+    """Raise barycentric coordinates to what they have to be at least, at the cost of the others."""
+    for k in range(3):
+        lack = least[k] - part[k]
+        if lack > 0.0:
+            rest = part[(k + 1) % 3] + part[(k + 2) % 3]
+            for j in (k + 1, k + 2):
+                part[j % 3] -= lack * part[j % 3] / rest if rest != 0.0 else 0.5 * lack
+            part[k] = least[k]
 
 
 def finished(page: Canvas) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

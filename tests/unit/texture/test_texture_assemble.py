@@ -1,0 +1,180 @@
+"""A painted box whose photos are known to the pixel."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from painted_box import HALF, Album, around, box, on_surface, one_by_one, paint_at
+
+from sfm_app.meshing.occlusion import Occluders
+from sfm_app.settings import TextureSettings
+from sfm_app.texture import texture_surface
+from sfm_app.types import Model
+
+VIEWS = around()
+BOX = box()
+
+
+def textured(album, surface=BOX, views=VIEWS, spread=one_by_one, **options) -> tuple[Model, dict]:
+    hidden = Occluders(surface.vertices, surface.faces).hidden
+    return texture_surface(surface, views, album.load, hidden, TextureSettings(**options), spread)
+
+
+def seen_part(model):
+    """Triangles that do not lie in the box's bottom."""
+    return model.surface.vertices[model.surface.faces][:, :, 1].max(axis=1) > -HALF[1] + 1e-6
+
+
+def errors(model):
+    _, points, colors = on_surface(model, among=seen_part(model))
+    return np.abs(colors - paint_at(points)).max(axis=1)
+
+
+@pytest.fixture(scope="module")
+def plain():
+    return textured(Album())
+
+
+def test_every_point_has_its_colour(plain):
+    model, figures = plain
+    wrong = errors(model)
+    assert np.median(wrong) < 2.0
+    assert np.quantile(wrong, 0.99) < 6.0
+    assert 200 < figures["unseen_triangles"] < 400  # the bottom has 288; its neighbours may be seen too obliquely
+    assert figures["strange_views_of_triangles"] == 0
+    assert np.abs(np.array(list(figures["gains"].values())) - 1.0).max() < 0.01
+
+
+def test_vertices_get_the_photos_colours(plain):
+    model, _ = plain
+    above = model.surface.vertices[:, 1] > -0.99 * HALF[1]
+    wrong = np.abs(model.surface.colors[above] - paint_at(model.surface.vertices[above])).max(axis=1)
+    assert np.quantile(wrong, 0.95) < 6.0
+
+
+def test_pages_are_as_large_as_what_the_photos_show(plain):
+    model, figures = plain
+    texture = model.texture
+    assert figures["scale"] == 1.0
+    assert len(texture.pages) == 1
+    assert texture.uv.min() >= 0
+    assert texture.uv.max() <= 1
+    size = np.array(texture.pages[0].shape[1::-1])
+    a, b, c = (texture.uv[:, k] * size for k in range(3))
+    covered = _areas(a, b, c).sum()
+    assert 0.3 < covered / size.prod() < 1.0
+
+
+def _areas(a, b, c):
+    return np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2
+
+
+def test_a_darker_photo_is_found_and_leaves_no_seam():
+    dark = VIEWS[2].name
+    model, figures = textured(Album(exposure={dark: 0.7}))
+    gains = figures["gains"]
+    ratio = np.array(gains[dark]) / np.mean([gains[view.name] for view in VIEWS if view.name != dark], axis=0)
+    np.testing.assert_allclose(ratio, 0.7, atol=0.01)
+    _, points, colors = on_surface(model, among=seen_part(model))
+    factor = np.median(colors / paint_at(points))  # the common exposure is free
+    assert np.quantile(np.abs(colors / factor - paint_at(points)).max(axis=1), 0.99) < 7.0
+
+
+def test_a_passer_by_is_absent():
+    crossing = {VIEWS[4].name: (slice(70, 150), slice(120, 170))}
+    model, figures = textured(Album(passers_by=crossing))
+    assert figures["strange_views_of_triangles"] > 30
+    wrong = errors(model)
+    assert np.quantile(wrong, 0.99) < 8.0
+    assert wrong.max() < 60.0  # magenta is some 120 away
+
+
+def test_two_photos_alone_keep_what_they_disagree_on():
+    """Nobody can say which of two is right, but the texture must exist."""
+    pair = VIEWS[4:6]
+    crossing = {VIEWS[4].name: (slice(70, 150), slice(120, 170))}
+    model, figures = textured(Album(passers_by=crossing), views=pair)
+    assert figures["strange_views_of_triangles"] == 0
+    assert model.texture is not None
+
+
+def test_unseen_triangles_look_like_what_is_around_them(plain):
+    model, _ = plain
+    _, _, colors = on_surface(model, among=~seen_part(model))
+    rim = model.surface.colors[np.isclose(model.surface.vertices[:, 1], -HALF[1])]
+    assert colors.min() > rim.min() - 3
+    assert colors.max() < rim.max() + 3
+    assert colors.std(axis=0).min() > 3.0  # not one flat colour
+
+
+def test_unseen_triangles_can_be_cut(plain):
+    model, figures = textured(Album(), unseen="cut")
+    assert len(model.surface.faces) == len(BOX.faces) - figures["unseen_triangles"]
+    assert len(model.texture.uv) == len(model.texture.page) == len(model.surface.faces)
+    assert np.unique(model.surface.faces).tolist() == list(range(len(model.surface.vertices)))
+    assert seen_part(model).all()
+    assert np.quantile(errors(model), 0.99) < 6.0
+
+
+def test_small_pages_make_everything_smaller():
+    model, figures = textured(Album(), max_page_px=256, max_pages=1)
+    assert all(max(page.shape[:2]) <= 256 for page in model.texture.pages)
+    assert len(model.texture.pages) == 1
+    assert 0.2 < figures["scale"] < 1.0
+    assert np.quantile(errors(model), 0.99) < 10.0
+
+
+def test_threads_do_not_change_a_byte(plain):
+    def last_first(function, items, label):
+        with ThreadPoolExecutor(3) as executor:
+            waiting = [executor.submit(function, item) for item in reversed(items)]
+            return [future.result() for future in reversed(waiting)]
+
+    model, figures = textured(Album(), spread=last_first)
+    assert figures == plain[1]
+    for ours, theirs in zip(model.texture.pages, plain[0].texture.pages, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    np.testing.assert_array_equal(model.texture.uv, plain[0].texture.uv)
+
+
+def test_a_photo_that_is_gone_is_counted():
+    gone = VIEWS[0].name
+    model, figures = textured(Album(lost=(gone,)))
+    assert figures["rejected"] == {gone: "cannot be read: No such file or directory"}
+    assert np.quantile(errors(model), 0.99) < 8.0
+
+
+def test_without_any_photo_the_old_colours_remain():
+    lost = tuple(view.name for view in VIEWS)
+    model, figures = textured(Album(lost=lost))
+    assert figures["unseen_triangles"] == len(BOX.faces)
+    _, _, colors = on_surface(model)
+    np.testing.assert_allclose(colors, 77.0, atol=0.5)
+
+
+def test_an_occluder_leaves_no_print():
+    """A board between one camera and the box: the box must not show the board's colour."""
+    views = VIEWS
+    board_at = views[4].centre * 0.6
+    side = np.cross(board_at, [0.0, 1.0, 0.0])
+    side *= 0.25 / np.linalg.norm(side)
+    up = np.array([0.0, 0.25, 0.0])
+    corners = np.array([board_at - side - up, board_at + side - up, board_at + side + up, board_at - side + up])
+    faces = np.concatenate([BOX.faces, len(BOX.vertices) + np.array([[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]])])
+    surface = replace(
+        BOX, vertices=np.concatenate([BOX.vertices, corners]), faces=faces,
+        colors=np.concatenate([BOX.colors, np.zeros((4, 3), np.uint8)]),
+    )  # fmt: skip
+    x, y = _pixels(views[4], corners).T
+    rectangle = (slice(int(y.min()), int(y.max()) + 1), slice(int(x.min()), int(x.max()) + 1))
+    model, _ = textured(Album(passers_by={views[4].name: rectangle}), surface=surface, views=views[3:6])
+    among = np.concatenate([seen_part(replace(model, surface=BOX)), np.zeros(4, bool)])
+    _, points, colors = on_surface(model, among=among & (surface.vertices[faces].mean(axis=1) @ views[4].centre > 0.5))
+    assert np.quantile(np.abs(colors - paint_at(points)).max(axis=1), 0.97) < 12.0
+
+
+def _pixels(view, points):
+    local = points @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]
+    plane = local[:, :2] / local[:, 2:]
+    return plane * np.array(view.lens[:2]) + np.array(view.lens[2:4])
