@@ -62,10 +62,12 @@ def save_page(page: Pixels, path: Path) -> None:
 
 
 def palette_of(page: Pixels) -> Pixels:
-    """(COLORS, 3) that stand for the colours of a page, by k-means on some of its pixels."""
-    pixels = page.reshape(-1, 3)
+    """(COLORS, 3) that stand for the colours of a page: white, and k-means of some of its pixels that are not."""
+    pixels = page[page.min(axis=2) < 255]
+    if not len(pixels):
+        return np.full((COLORS, 3), 255, np.uint8)
     some = pixels[np.random.default_rng(0).integers(0, len(pixels), PALETTE_PIXELS)].astype(np.float32)
     cv2.setRNGSeed(0)
     criteria = (cv2.TERM_CRITERIA_MAX_ITER, 10, 0.0)
-    _, _, centres = cv2.kmeans(some, COLORS, None, criteria, 1, cv2.KMEANS_PP_CENTERS)
-    return np.round(np.clip(centres, 0, 255)).astype(np.uint8)
+    _, _, centres = cv2.kmeans(some, COLORS - 1, None, criteria, 1, cv2.KMEANS_PP_CENTERS)
+    return np.append(np.round(np.clip(centres, 0, 255)).astype(np.uint8), np.full((1, 3), 255, np.uint8), axis=0)

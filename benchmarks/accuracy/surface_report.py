@@ -20,8 +20,9 @@ COST = ("photos", "placed", "seconds together", "seconds per photo")
 
 def page(about: str, rows: Sequence[Row], parts: Sequence[Row], name: str) -> str:
     """Bars first, then all figures; `name` is that of the result files."""
-    stages = [name for name in dict.fromkeys(key for row in rows for key in row) if name.startswith(("s of ", "MB "))]
-    files = [name for name in dict.fromkeys(key for row in rows for key in row) if name.startswith("kB ")]
+    columns = list(dict.fromkeys(key for row in (*rows, *parts) for key in row))
+    stages = [key for key in columns if key.startswith(("s of ", "MB "))]
+    files = [key for key in columns if key.startswith("kB ")]
     found = [
         f"# Surfaces\n\n{about}\n",
         f"## Asked and measured\n\n{table(asked(rows))}" if asked(rows) else "",
@@ -32,7 +33,8 @@ def page(about: str, rows: Sequence[Row], parts: Sequence[Row], name: str) -> st
         _part("Failed", [row for row in rows if row["failed"]], ("photos", "failed")),
     ]
     pictures = [f"![{row['photos']}]({name}-{row['photos']}.png)" for row in rows if not row["failed"]]
-    found.append("## Pictures\n\nA photo, the model from its camera, from beside it, and its bare shape.\n")
+    if pictures:
+        found.append("## Pictures\n\nA photo, the model from its camera, from beside it, and its bare shape.\n")
     return "\n".join([*(part for part in found if part), *pictures, ""])
 
 

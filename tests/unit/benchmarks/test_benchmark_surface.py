@@ -177,7 +177,9 @@ def test_the_page_and_the_document_hold_what_was_measured(tmp_path):
          "seconds together": 80.0, "s of mesh": 20.0, "MB mesh": 900},
         {"photos": "kermit11", "method": "sfm-app", "failed": "mesh: no surface", "seconds together": None},
     ]  # fmt: skip
-    text = page("About.", rows, [], "surface")
+    parts = [{"photos": "pond first 3", "failed": "", "seconds per photo": 4.25, "s of texture": 7.75}]
+    text = page("About.", rows, parts, "surface")
+    assert "| pond first 3 | 4.25 | 7.75 |" in text
     assert "| statue | accuracy % at least 90 | 95 | yes |" in text and "mesh: no surface" in text
     assert "![statue](surface-statue.png)" in text and "surface-kermit11.png" not in text
     assert not problems(json.loads(json.dumps(document("surface", "About.", {}, {}, rows))))
@@ -201,12 +203,14 @@ def test_pages_of_pictures_stay_small_and_keep_their_colours(tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (700, 2000, 3)).astype(np.uint8)
     plain = np.zeros((900, 2000, 3), np.uint8)
     plain[:, :1000], plain[:, 1000:] = (200, 40, 90), (30, 160, 220)
+    plain[800:, :200] = 255
     save_page(noise, tmp_path / "noise.png")
     save_page(plain, tmp_path / "plain.png")
     with Image.open(tmp_path / "noise.png") as narrow, Image.open(tmp_path / "plain.png") as wide:
         assert narrow.width < wide.width == WIDTHS_PX[0] and wide.height == 720
         assert wide.convert("RGB").getpixel((10, 10)) == (200, 40, 90)
         assert wide.convert("RGB").getpixel((1500, 700)) == (30, 160, 220)
+        assert wide.convert("RGB").getpixel((10, 700)) == (255, 255, 255)
     assert (tmp_path / "plain.png").stat().st_size <= BYTES
 
 
