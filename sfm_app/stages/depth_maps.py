@@ -72,11 +72,11 @@ def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | No
     Raises:
         ReconstructionError: none has.
     """
-    rejected = Counter(reason.reason for reason in found if reason)
+    rejected = Counter(reason.reason for reason in found if reason is not None)
     coverage = {
         view.name: round(float(np.mean(read_depth(dense_dir, view, "geometric") > 0)), 3)
         for view, reason in zip(views, found, strict=True)
-        if not reason
+        if reason is None
     }
     run.record(depth_maps=len(coverage), rejected=dict(rejected), coverage=coverage)
     if not coverage:

@@ -32,7 +32,7 @@ def disparities(left: GreyImage, right: GreyImage, count: int) -> NDArray[np.flo
         uniquenessRatio=10,
         speckleWindowSize=100,
         speckleRange=2,
-        mode=cv2.STEREO_SGBM_MODE_SGBM,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # five directions take a third longer and give no more
     )
     sixteenths = matcher.compute(left, right)
     return np.where(sixteenths < 0, NO_DISPARITY, sixteenths / 16.0).astype(np.float32)

@@ -31,8 +31,8 @@ NO_MATCH = 2.0
 """The cost where no neighbour sees the pixel; worse than any."""
 MIN_GAIN = 0.01
 """A plane that is better by less is not taken: noise alone would make flat areas rough."""
-STEPS_PX = (0.5, 0.15)
-"""Largest random changes that are tried, in pixels of parallax."""
+STEP_PX = 0.3
+"""Largest random change that is tried, in pixels of parallax."""
 SLOPE = 0.2
 """The same for the slopes, as a share of it per pixel."""
 SAME_PX, SAME_SLOPE = 0.1, 0.03
@@ -108,12 +108,11 @@ def _sweep(
                 lowest = _better(row, col, trial, best, lowest, window, others, costs)
             if lowest < NO_MATCH:
                 unit = _inverse_depth_per_px(row, col, best[0], others[3])
-                for size_px in STEPS_PX:
-                    for c in range(3):
-                        state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-                        number = 2.0 * (np.float64(state >> np.uint64(11)) / 9007199254740992.0) - 1.0  # in [-1, 1)
-                        trial[c] = best[c] + number * size_px * unit * (1.0 if c == 0 else SLOPE)
-                    lowest = _better(row, col, trial, best, lowest, window, others, costs)
+                for c in range(3):
+                    state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
+                    number = 2.0 * (np.float64(state >> np.uint64(11)) / 9007199254740992.0) - 1.0  # in [-1, 1)
+                    trial[c] = best[c] + number * STEP_PX * unit * (1.0 if c == 0 else SLOPE)
+                lowest = _better(row, col, trial, best, lowest, window, others, costs)
             for c in range(3):
                 planes[row, col, c] = best[c]
             cost[row, col] = lowest

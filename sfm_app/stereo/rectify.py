@@ -60,7 +60,7 @@ class Rectification:
         cos, sin = np.cos(theta).astype(np.float32), np.sin(theta).astype(np.float32)
         across = np.sin(phi).astype(np.float32), np.cos(phi).astype(np.float32)
         x, y, w = (cos * row[0] + sin * (across[0] * row[1] + across[1] * row[2]) for row in M)
-        ahead = w > 1e-6
+        ahead = (w > 1e-6) & (sin > 0)  # beyond the end of the baseline everything comes once more, mirrored
         # OpenCV has pixel centres at whole numbers
         u = np.where(ahead, x / np.where(ahead, w, 1), -9) - np.float32(0.5)
         v = np.where(ahead, y / np.where(ahead, w, 1), -9) - np.float32(0.5)
