@@ -71,9 +71,12 @@ def load_surface(dense_dir: Path) -> Surface:
 
 
 def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.float64]:
-    """(N, 3) points of all depth maps together, fused anew only where a depth map is younger than they are."""
+    """(N, 3) points of all depth maps together, fused anew only where a depth map, or their folder, is younger."""
+    if not views:
+        raise ReconstructionError("no photo has a depth map", hint=HINT)
     target = dense_dir / FUSED
-    youngest = max((map_file(dense_dir, view).stat().st_mtime_ns for view in views), default=0)
+    files = [map_file(dense_dir, view) for view in views]
+    youngest = max(path.stat().st_mtime_ns for path in (*files, files[0].parent))
     if not target.exists() or target.stat().st_mtime_ns <= youngest:
         with run.workspace.replacing(target) as path:
             fuse(dense_dir, views, photos_needed(views, run), region(views), path)
