@@ -108,6 +108,8 @@ def _mean_colors(surface: Surface, vertices: NDArray[np.float64]) -> NDArray[np.
 
 def _read(path: Path) -> Surface:
     mesh = trimesh.load(path, process=False)
+    if not isinstance(mesh, trimesh.Trimesh):  # a file without triangles
+        return Surface(np.empty((0, 3)), np.empty((0, 3), np.int64), np.empty((0, 3), np.uint8))
     return Surface(
         np.asarray(mesh.vertices, np.float64),
         np.asarray(mesh.faces, np.int64),

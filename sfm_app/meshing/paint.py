@@ -47,20 +47,13 @@ def sample_colors(
         normals: (N, 3) unit.
         verdict: (N,) what `judge` says about them.
         eye: the photo's camera.
-        image: (H, W, 3) as large as its depth map.
+        image: (H, W, 3), what its depth map covers, at any size.
     """
     paint = Paint.none(len(points))
-    _sample(
-        points,
-        normals,
-        verdict == CONFIRMED,
-        eye.projection,
-        eye.center,
-        eye.focal_px**2,
-        image,
-        paint.total,
-        paint.weight,
-    )
+    scale = np.array(image.shape[:2]) / eye.depth.shape
+    projection = np.diag([scale[1], scale[0], 1.0]) @ eye.projection
+    seen = verdict == CONFIRMED
+    _sample(points, normals, seen, projection, eye.center, eye.focal_px**2, image, paint.total, paint.weight)
     return paint
 
 

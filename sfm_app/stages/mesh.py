@@ -47,20 +47,27 @@ def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surfac
     views = [view for view in read_views(dense_dir) if map_file(dense_dir, view).exists()]
     points = fused_points(dense_dir, views, run)
     depth = octree_depth(points, options.poisson_depth)
-    raw = poisson(dense_dir, depth)
+    raw = some(poisson(dense_dir, depth), "the fused points span no surface")
     colored, support = looked_at(raw, dense_dir, views, run)
     least = SURE * photos_needed(views, run)
     trimmed = trim(colored, support, options.max_gap, least) if options.trim else colored
-    detailed = drop_islands(trimmed, options.min_island)
+    detailed = some(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
     run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
-    if not len(detailed.faces):
-        raise ReconstructionError("no surface is left: the photos confirm no part of it", hint=HINT)
-    surface = make_manifold(simplified(detailed, options, dense_dir))
-    if not len(surface.faces):
-        raise ReconstructionError("no surface is left after simplification", hint=HINT)
+    surface = some(make_manifold(simplified(detailed, options, dense_dir)), "the surface has no extent")
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
     with run.workspace.replacing(dense_dir / SURFACE) as path:
         np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
+    return surface
+
+
+def some(surface: Surface, otherwise: str) -> Surface:
+    """The surface, which has triangles.
+
+    Raises:
+        ReconstructionError: it has none.
+    """
+    if not len(surface.faces):
+        raise ReconstructionError(otherwise, hint=HINT)
     return surface
 
 
@@ -71,9 +78,12 @@ def load_surface(dense_dir: Path) -> Surface:
 
 
 def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.float64]:
-    """(N, 3) points of all depth maps together, fused anew only where a depth map is younger than they are."""
+    """(N, 3) points of all depth maps together, fused anew only where a depth map, or their folder, is younger."""
+    if not views:
+        raise ReconstructionError("no photo has a depth map", hint=HINT)
     target = dense_dir / FUSED
-    youngest = max((map_file(dense_dir, view).stat().st_mtime_ns for view in views), default=0)
+    files = [map_file(dense_dir, view) for view in views]
+    youngest = max(path.stat().st_mtime_ns for path in (*files, files[0].parent))
     if not target.exists() or target.stat().st_mtime_ns <= youngest:
         with run.workspace.replacing(target) as path:
             fuse(dense_dir, views, photos_needed(views, run), region(views), path)

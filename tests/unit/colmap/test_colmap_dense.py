@@ -191,6 +191,17 @@ def test_simplification_by_error_stops_where_it_would_move_the_surface(tmp_path,
     assert 20 < len(found.faces) < 0.5 * len(fine.faces)
 
 
+def test_points_in_one_spot_give_a_surface_without_triangles(tmp_path):
+    header = "ply\nformat ascii 1.0\nelement vertex 120\n"
+    header += "".join(f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz"))
+    header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
+    (tmp_path / FUSED).write_text(header + "1 1 1 0 0 1 9 9 9\n" * 120)
+
+    surface = poisson(tmp_path, 2)
+
+    assert (surface.vertices.shape, surface.faces.shape, surface.colors.shape) == ((0, 3), (0, 3), (0, 3))
+
+
 def test_missing_inputs_are_backend_errors(tmp_path, workspace):
     with pytest.raises(BackendError, match="undistorting photos"):
         undistort(tmp_path / "none", tmp_path, tmp_path / "dense", 100)

@@ -54,6 +54,10 @@ def test_colours_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
 
     np.testing.assert_allclose(paint.over(np.full((3, 3), 7, np.uint8))[:, 0], [79, 89, 7], atol=1)
     np.testing.assert_allclose(closer.weight[:2], 4 * paint.weight[:2])
+    large = sample_colors(
+        points, normals, judge(points, normals, eye, 0.01), eye, image.repeat(2, axis=0).repeat(2, axis=1)
+    )
+    np.testing.assert_allclose(large.total[:2], paint.total[:2], rtol=0.02)
     both = Paint.none(3)
     both.add(paint)
     both.add(closer)

@@ -122,7 +122,6 @@ def test_fewer_faces_do_not_fuse_again_and_one_worker_gives_the_same_bytes(dense
 def test_what_no_photo_sees_is_cut_off_or_kept_closed(dense, tmp_path):
     half = tmp_path / "dense"
     shutil.copytree(dense, half)
-    (half / "fused.ply").unlink(missing_ok=True)
     for view in read_views(half):
         if view.center[2] < 1.0:
             map_file(half, view).unlink()
@@ -137,7 +136,6 @@ def test_what_no_photo_sees_is_cut_off_or_kept_closed(dense, tmp_path):
 def test_maps_that_agree_on_nothing_give_an_error_that_says_so(dense, tmp_path):
     poor = tmp_path / "dense"
     shutil.copytree(dense, poor)
-    (poor / "fused.ply").unlink(missing_ok=True)
     rng = np.random.default_rng(0)
     for view in read_views(poor)[:3]:
         maps = true_maps(view)
@@ -149,3 +147,10 @@ def test_maps_that_agree_on_nothing_give_an_error_that_says_so(dense, tmp_path):
     with pytest.raises(ReconstructionError, match=r"3 depth maps agree on \w+ points") as err:
         made(poor)
     assert "points.ply" in err.value.hint
+
+
+def test_without_depth_maps_there_is_no_surface(dense, tmp_path):
+    shutil.copytree(dense / "sparse", tmp_path / "dense" / "sparse")
+
+    with pytest.raises(ReconstructionError, match="no photo has a depth map"):
+        made(tmp_path / "dense")
