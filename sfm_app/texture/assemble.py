@@ -20,7 +20,7 @@ from sfm_app.texture.levelling import level
 from sfm_app.texture.looking import Hidden, Look, look, sharpness_factors
 from sfm_app.texture.packing import Layout, pack
 from sfm_app.texture.painting import Canvas, canvas, fill_background, finished, paint
-from sfm_app.texture.unseen import block_sizes, square_texels, squares, vertex_colors, without
+from sfm_app.texture.unseen import along_a_curve, block_sizes, square_texels, squares, vertex_colors, without
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
 
@@ -144,7 +144,8 @@ def _plan(mesh: Facets, seen: Seen, chosen: IntArray, views: Sequence[PhotoView]
     drawn = chosen != NONE
     corners[drawn] += layout.shift[charts.of[drawn]][:, None, :]
     page[drawn] = layout.page[charts.of[drawn]]
-    cells = squares(places, blocks, int((~drawn).sum()))
+    cells = np.empty((int((~drawn).sum()), 3), np.int64)
+    cells[along_a_curve(mesh.vertices[mesh.faces[~drawn]].mean(axis=1))] = squares(places, blocks, len(cells))
     page[~drawn] = cells[:, 0]
     blend = level(blend_weights(chosen, seen.usable, mesh), seen.colors, seen.gains, seen.usable, mesh)
     allowed = _allowed_weight(blend, seen.usable, chosen, mesh)

@@ -35,12 +35,10 @@ def choose_photos(worth: NDArray[np.float32], mesh: Facets) -> IntArray:
     """
     photos, triangles = worth.shape
     kept = min(CANDIDATES, photos)
-    labels = np.argsort(-worth, axis=0, kind="stable")[:kept].T.astype(np.int32)
-    values = np.take_along_axis(worth, labels.T, axis=0).T.astype(np.float64)
-    best = values[:, :1]
-    lost = np.log(np.maximum(best, TINY) / np.maximum(values, TINY))
+    labels, values = np.full((triangles, kept), NONE, np.int32), np.zeros((triangles, kept), np.float32)
+    _keep_best(worth, labels, values)
+    lost = np.log(np.maximum(values[:, :1], TINY) / np.maximum(values, TINY))
     cost = (PRICE_OF_DETAIL * _relative_size(mesh)[:, None] * np.minimum(lost, MOST_LOST)).astype(np.float32)
-    labels[values <= 0] = NONE
     price = _edge_prices(mesh)
     back = _places_at_neighbours(mesh.neighbours)
     chosen = np.full(triangles, NONE, np.int32)
@@ -74,6 +72,22 @@ def _places_at_neighbours(neighbours: IntArray) -> IntArray:
     """(T, 3) at which place of its neighbour's row a triangle stands."""
     own = np.arange(len(neighbours))[:, None, None]
     return np.asarray(np.argmax(neighbours[neighbours] == own, axis=2), np.int32)
+
+
+@kernel
+def _keep_best(worth: NDArray[np.float32], labels: IntArray, values: NDArray[np.float32]) -> None:
+    """The photos of most worth for each triangle, best first; equals in their order."""
+    photos, triangles = worth.shape
+    kept = labels.shape[1]
+    for p in range(photos):
+        for f in range(triangles):
+            if worth[p, f] <= values[f, kept - 1]:
+                continue
+            at = kept - 1
+            while at > 0 and worth[p, f] > values[f, at - 1]:
+                values[f, at], labels[f, at] = values[f, at - 1], labels[f, at - 1]
+                at -= 1
+            values[f, at], labels[f, at] = worth[p, f], p
 
 
 @kernel

@@ -13,6 +13,7 @@ CELL = 2
 """Texels on a side of the square that an unseen triangle gets: bilinear reading inside it is exact."""
 BLOCK = 64
 """Most such squares beside each other."""
+CURVE_BITS = 12
 HOLD = 1e-4
 """Weight of the colour that an unseen vertex had before, beside 1 for each neighbour: for parts that no photo sees."""
 
@@ -70,6 +71,21 @@ def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int)
         row, column = np.divmod(np.arange(count), width // CELL)
         found.append(np.column_stack([np.full(count, page), left + CELL * column, top + CELL * row]))
     return np.concatenate(found).astype(np.int64) if found else np.empty((0, 3), np.int64)
+
+
+def along_a_curve(points: FloatArray) -> NDArray[np.int64]:
+    """Order (N,) of points (N, 3) in which most have those near them beside them (Morton 1966).
+
+    Squares beside each other then have like colours, and lossy compression of the page does little harm.
+    """
+    low = points.min(axis=0, initial=np.inf)
+    span = max(float(np.max(points.max(axis=0, initial=-np.inf) - low, initial=0.0)), 1e-300)
+    grid = ((points - low) / span * (2**CURVE_BITS - 1)).astype(np.int64)
+    code = np.zeros(len(points), np.int64)
+    for bit in range(CURVE_BITS):
+        for axis in range(3):
+            code |= ((grid[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
 
 
 def square_texels(corner_colors: FloatArray) -> NDArray[np.uint8]:

@@ -76,6 +76,16 @@ def test_manifest_accounts_for_every_stage(finished):
     assert run.manifest["settings"]["quality"] == "draft"
 
 
+def test_the_texture_covers_the_mesh(finished):
+    run, _ = finished
+    counts = run.manifest["stages"]["texture"]["counts"]
+
+    assert counts["unseen_triangles"] < 0.25 * run.manifest["stages"]["mesh"]["counts"]["triangles"]
+    assert len(counts["pages"]) == 1
+    assert counts["rejected"] == {}
+    np.testing.assert_allclose(list(counts["gains"].values()), 1.0, atol=0.05)  # rendered with one exposure
+
+
 def test_a_second_run_does_nothing(finished, rendered):
     run, _ = finished
     stamps = {path: path.stat().st_mtime_ns for path in run.out.rglob("*") if path.is_file() and path.name != "log.txt"}
@@ -93,7 +103,7 @@ def test_a_changed_setting_redoes_only_what_it_touches(finished, rendered, tmp_p
 
     after = sfm_app.reconstruct(rendered[0], run.out, changed).manifest["stages"]
 
-    assert [name for name in NAMES if after[name]["fingerprint"] != before[name]] == ["mesh", "files"]
+    assert [name for name in NAMES if after[name]["fingerprint"] != before[name]] == ["mesh", "texture", "files"]
     sfm_app.reconstruct(rendered[0], run.out, DRAFT)
 
 

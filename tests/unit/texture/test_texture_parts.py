@@ -22,7 +22,7 @@ from sfm_app.texture.looking import sharpness, sharpness_factors
 from sfm_app.texture.middle import median
 from sfm_app.texture.packing import MARGIN, pack
 from sfm_app.texture.painting import canvas, fill_background
-from sfm_app.texture.unseen import block_sizes, square_texels, squares
+from sfm_app.texture.unseen import along_a_curve, block_sizes, square_texels, squares
 from sfm_app.texture.views import project, sample
 from sfm_app.types import CameraModel, Surface
 
@@ -298,3 +298,10 @@ def test_ties_are_solved_as_by_elimination():
         matrix[j, i] -= w
     found = solve_ties(one, other, weights, 0.5, right)
     np.testing.assert_allclose(found, np.linalg.solve(matrix, right), atol=0.02)
+
+
+def test_points_near_each_other_come_after_each_other():
+    points = np.random.default_rng(4).uniform(-3, 5, (2000, 3))
+    steps = np.linalg.norm(np.diff(points[along_a_curve(points)], axis=0), axis=1)
+    assert np.median(steps) < 0.15 * np.median(np.linalg.norm(np.diff(points, axis=0), axis=1))
+    assert len(along_a_curve(np.empty((0, 3)))) == 0
