@@ -42,7 +42,8 @@ ABOUT = (
 
 def measure(photos: SurfaceSet, out: Path, args: argparse.Namespace) -> Row:
     """Everything about one set."""
-    said = run_stages(photos.photos, out, ("scene", *dense_stages()), args.settings, again=not args.keep)
+    again = () if args.keep else dense_stages()
+    said = run_stages(photos.photos, out, ("scene", *dense_stages()), args.settings, again)
     row: Row = {"photos": photos.name, "method": "sfm-app", **cost(said), "of": photos.count}
     if row["failed"]:
         return row
@@ -68,7 +69,7 @@ def measure_parts(whole: SurfaceSet, counts: Sequence[int], cache: Path, setting
     for count in counts:
         part = part_of(whole, count, cache)
         out = cache / "surface" / f"{whole.name}-{count}"
-        said = run_stages(part.photos, out, ("scene", *dense_stages()), settings, again=True)
+        said = run_stages(part.photos, out, ("scene", *dense_stages()), settings, dense_stages())
         row: Row = {"photos": part.name, "method": "sfm-app", **cost(said), "of": count}
         if not row["failed"]:
             placed = len(placed_photos(out))

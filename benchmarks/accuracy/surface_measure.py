@@ -91,7 +91,8 @@ def left_out(
         stages = dense_stages()[:-1]
         if first not in stages:
             return {"left out": f"there is no stage {first}"}
-        said = run_stages(photos.photos, target, stages[stages.index(first) :], settings, again=True)
+        stages = stages[stages.index(first) :]
+        said = run_stages(photos.photos, target, stages, settings, again=stages)
         if any(one.failed for one in said.values()):
             return {"left out": next(one.failed for one in said.values() if one.failed)}
         without = prepare_model(finished_model(photos.photos, target, Settings.from_mapping(settings)))

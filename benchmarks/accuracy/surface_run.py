@@ -31,7 +31,7 @@ class Said:
 
 
 def run_stages(
-    photos: Path, out: Path, stages: Sequence[str], settings: Mapping[str, Any], *, again: bool
+    photos: Path, out: Path, stages: Sequence[str], settings: Mapping[str, Any], again: Sequence[str] = ()
 ) -> dict[str, Said]:
     """Run the program stage by stage; stops where one fails.
 
@@ -40,11 +40,11 @@ def run_stages(
         out: output folder.
         stages: each runs up to its name, and so includes what comes before it and is missing.
         settings: beside the defaults.
-        again: whether to do the stages again that are up to date; otherwise what they said is read.
+        again: stages to do again though they are up to date; what the others said before is read.
     """
     found: dict[str, Said] = {}
     for stage in stages:
-        first, path = stage if again else "", out / RESULT.format(stage=stage)
+        first, path = stage if stage in again else "", out / RESULT.format(stage=stage)
         before = path.stat().st_mtime if path.exists() else 0.0
         command = [sys.executable, __file__, str(photos), str(out), first, stage, json.dumps(settings)]
         done = run_process(command, capture_output=True, text=True, check=False)
