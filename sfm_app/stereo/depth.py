@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses
+from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses, without_specks
 from sfm_app.stereo.matching import depths_from_disparities, disparities
 from sfm_app.stereo.normals import fit_planes, normals_of
 from sfm_app.stereo.patch_match import PlaneArray, improve_planes
@@ -96,7 +96,7 @@ def _sampled(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) ->
 def confirm_depths(
     view: View, estimate: Estimate, others: Sequence[tuple[View, DepthArray]], min_agreeing: int, tolerance: float
 ) -> DepthMap | Rejected:
-    """Keep the depths that enough other depth maps confirm, and add normals.
+    """Keep the depths that enough other depth maps confirm over more than a speck, and add normals.
 
     Enough is `min_agreeing`, one more where the photos look little alike, one less (but not none) where very much.
     """
@@ -105,7 +105,7 @@ def confirm_depths(
     agreeing = count_agreeing(view, estimate.depth, others, tolerance)
     enough = min_agreeing + (estimate.confidence < UNSURE) - 1 * (estimate.confidence > SURE)
     confirmed = np.where(agreeing >= np.clip(enough, 1, len(others)), estimate.depth, np.float32(0))
-    planes = fit_planes(confirmed)
+    planes = fit_planes(without_specks(confirmed, tolerance))
     if not planes.any():
         return Rejected("no depth is confirmed by other photos")
     depth = np.divide(1, planes[..., 0], out=np.zeros_like(confirmed), where=planes[..., 0] > 0)
