@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType, ModuleType
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 import pluggy
@@ -19,11 +19,13 @@ from sfm_app.formats import EXPORTERS
 from sfm_app.ransac import ESTIMATORS
 from sfm_app.selfcal import CALIBRATORS, SEVERAL_CAMERAS
 from sfm_app.settings import CalibrationSettings, EpipolarSettings
-from sfm_app.stereo import CPU, DEPTH_METHODS, MakeDepthMaps
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Model, Rejected
 
+if TYPE_CHECKING:  # OpenCV, which stereo needs, takes longer to load than an estimator to run
+    from sfm_app.stereo import DepthTask
+
 GROUP = "sfm_app"
-AUTO = "auto"
+AUTO, CPU = "auto", "cpu"
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
 
@@ -88,8 +90,20 @@ class Exporter:
     summary: str = ""
 
 
+class MakeDepthMaps(Protocol):
+    """Leaves geometric depth and normal maps in the workspace; says for every view why it has none, or None."""
+
+    def __call__(self, task: "DepthTask", /) -> list[Rejected | None]: ...
+
+
 def _always() -> str:
     return ""
+
+
+def _make_on_cpu(task: "DepthTask") -> list[Rejected | None]:
+    from sfm_app.stereo import make_on_cpu
+
+    return make_on_cpu(task)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +112,6 @@ class DepthMethod:
 
     name: str
     make: MakeDepthMaps
-    """Takes a `sfm_app.stereo.DepthTask`."""
     summary: str = ""
     unavailable: Callable[[], str] = _always
     """Why it cannot run on this machine; empty where it can."""
@@ -144,7 +157,7 @@ class BuiltIns:
 
     @hookimpl
     def sfm_depth_methods(self) -> Iterable[DepthMethod]:
-        return [DepthMethod(name, make, summary) for name, (make, summary) in DEPTH_METHODS.items()]
+        return [DepthMethod(CPU, _make_on_cpu, "semi-global matching and PatchMatch, on every machine")]
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,11 +2,17 @@
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.stereo.view import DepthArray, FloatArray, View
+
+MIN_PATCH = 2e-4
+"""Smaller connected patches, as a share of the photo, are chance: errors agree, but not over an area."""
+LEVELS = 16
+"""Steps that the tolerance is cut into where depths become whole numbers."""
 
 
 def merge_hypotheses(
@@ -75,6 +81,19 @@ def count_agreeing(
         P = other.K @ np.column_stack([relative @ K_inv, other.t - relative @ view.t])
         _count(depth, other_depth, P, tolerance, view.sample_px, agreeing)
     return agreeing
+
+
+def without_specks(depth: DepthArray, tolerance: float) -> DepthArray:
+    """The depth map without small patches in which depths differ by less than the tolerance from pixel to pixel."""
+    known = depth > 0
+    if not known.any():
+        return depth
+    logarithm = np.log(np.where(known, depth, depth[known].min()), dtype=np.float32)
+    levels = 1 + (logarithm - logarithm.min()) * (LEVELS / tolerance)
+    # 16 bits: what is farther than that is far
+    patches = np.where(known, np.clip(levels, 1, 32000), -32000).astype(np.int16)
+    cv2.filterSpeckles(patches, -32000, int(MIN_PATCH * depth.size), LEVELS)
+    return np.where(patches > 0, depth, np.float32(0))
 
 
 @kernel

@@ -6,18 +6,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses
+from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses, without_specks
 from sfm_app.stereo.matching import depths_from_disparities, disparities
 from sfm_app.stereo.normals import fit_planes, normals_of
-from sfm_app.stereo.patch_match import PlaneArray, improve_planes
+from sfm_app.stereo.patch_match import NO_MATCH, PlaneArray, improve_planes
 from sfm_app.stereo.rectify import rectify
 from sfm_app.stereo.view import DepthArray, GreyImage, View
 from sfm_app.types import Rejected
 
 SWEEPS = 1
 """The second improves a hundredth of the pixels and takes as long as the first."""
-MIN_CONFIDENCE = 0.3
-"""Correlation below which the photos show nothing in common there: skies and blank walls."""
+WEAK = 0.3
+"""Correlation below which there is next to nothing to be seen: in skies depths agree by chance at most, on plain walls
+semi-global matching bridges what is between the windows in every photo alike."""
+WEAK_NEED = 2
+"""That many more depth maps have to agree there; where there are not so many, it stays empty."""
 UNSURE, SURE = 0.5, 0.8
 """Correlation below which one more depth map has to agree, and from which on one less is enough."""
 
@@ -88,24 +91,27 @@ def _sampled(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) ->
     """Depths and confidences where a view wants them in its pixels."""
     shift = np.float32(sample_px - 0.5)
     inverse = planes[..., 0] + shift * (planes[..., 1] + planes[..., 2])
-    known = (planes[..., 0] > 0) & (inverse > 0) & (cost < 1 - MIN_CONFIDENCE)
+    known = (planes[..., 0] > 0) & (inverse > 0) & (cost < NO_MATCH)
     depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=known)
-    return Estimate(depth, np.where(known, 1 - cost, np.float32(0)))
+    return Estimate(depth, np.where(known, np.maximum(1 - cost, 0), np.float32(0)))
 
 
 def confirm_depths(
     view: View, estimate: Estimate, others: Sequence[tuple[View, DepthArray]], min_agreeing: int, tolerance: float
 ) -> DepthMap | Rejected:
-    """Keep the depths that enough other depth maps confirm, and add normals.
+    """Keep the depths that enough other depth maps confirm over more than a speck, and add normals.
 
-    Enough is `min_agreeing`, one more where the photos look little alike, one less (but not none) where very much.
+    Enough is `min_agreeing`; one more where the photos look little alike, two where they hardly do; one less, but not
+    none, where they look very much alike.
     """
     if not others:
         return Rejected("no other depth map to compare with")
     agreeing = count_agreeing(view, estimate.depth, others, tolerance)
-    enough = min_agreeing + (estimate.confidence < UNSURE) - 1 * (estimate.confidence > SURE)
-    confirmed = np.where(agreeing >= np.clip(enough, 1, len(others)), estimate.depth, np.float32(0))
-    planes = fit_planes(confirmed)
+    confidence = estimate.confidence
+    enough = np.clip(min_agreeing + (confidence < UNSURE) - 1 * (confidence > SURE), 1, len(others))
+    enough = np.where(confidence < WEAK, min_agreeing + WEAK_NEED, enough)
+    confirmed = np.where(agreeing >= enough, estimate.depth, np.float32(0))
+    planes = fit_planes(without_specks(confirmed, tolerance))
     if not planes.any():
         return Rejected("no depth is confirmed by other photos")
     depth = np.divide(1, planes[..., 0], out=np.zeros_like(confirmed), where=planes[..., 0] > 0)

@@ -59,12 +59,12 @@ class DepthTask:
     map: Map
 
 
-MakeDepthMaps = Callable[[DepthTask], list[Rejected | None]]
-"""Leaves geometric depth and normal maps in the workspace; says for every view why it has none, or None."""
-
-
 def make_on_cpu(task: DepthTask) -> list[Rejected | None]:
-    """Match every photo with its neighbours, then keep what the depth maps of other photos confirm."""
+    """Match every photo with its neighbours, then keep what the depth maps of other photos confirm.
+
+    Returns:
+        For every view why it has no maps, or None.
+    """
     everything = range(len(task.views))
     matched = task.map(partial(_match, task=task), everything, "matching depths")
     usable = np.array([found is None for found in matched])

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses
+from sfm_app.stereo.consistency import MIN_PATCH, count_agreeing, merge_hypotheses, without_specks
 
 
 def pixels(*values: float) -> np.ndarray:
@@ -58,3 +58,24 @@ def test_true_depths_are_confirmed_and_wrong_ones_are_not(plane, make_view):
 def test_a_depth_behind_the_other_camera_is_not_confirmed(plane, make_view):
     view, ahead = make_view((0, 0, 0)), make_view((0, 0, 9))
     assert not count_agreeing(view, plane.depth(view), [(ahead, np.abs(plane.depth(ahead)))], 0.01).any()
+
+
+def test_specks_go_and_thin_things_stay():
+    depth = np.zeros((300, 400), np.float32)
+    depth[50:250, 100:300] = np.linspace(4, 6, 200, dtype=np.float32)  # slanted: a pixel differs little from the next
+    depth[100:104, 150:154] = 9.0  # hangs behind the surface
+    depth[10:14, 10:14] = 5.0
+    depth[280:282, 20:220] = 3.0
+
+    found = without_specks(depth, 0.01)
+
+    assert 16 < MIN_PATCH * depth.size < 400
+    assert not found[100:104, 150:154].any()
+    assert not found[10:14, 10:14].any()
+    assert np.array_equal(found[280:282], depth[280:282])
+    assert np.count_nonzero(found) == 200 * 200 - 16 + 400
+
+
+def test_nothing_has_no_specks():
+    empty = np.zeros((30, 40), np.float32)
+    assert not without_specks(empty, 0.01).any()

@@ -78,9 +78,10 @@ def test_a_photo_without_neighbours_is_a_value_with_a_reason(plane, views):
     assert isinstance(confirm_depths(views[0], nothing, [], 2, 0.01), Rejected)
 
 
-@pytest.mark.parametrize(("confidence", "needed"), [(0.9, 1), (0.7, 2), (0.4, 3)])
+@pytest.mark.parametrize(("confidence", "needed"), [(0.9, 1), (0.7, 2), (0.4, 3), (0.1, 4)])
 def test_the_less_alike_photos_look_the_more_have_to_agree(plane, views, confidence, needed):
     truth = [plane.depth(view) for view in views]
+    # four of three never agree: what is hardly to be seen stays empty in small sets
     estimate = Estimate(truth[1], np.full_like(truth[1], confidence))
     true, false = [(views[j], truth[j]) for j in (0, 2, 3)], [(views[j], 1.5 * truth[j]) for j in (0, 2, 3)]
 
@@ -97,8 +98,9 @@ def test_blank_photos_are_left_empty(views):
 
     found = match_depths(views[1], [views[0], views[2]], sky, 2, 0.01)
 
-    assert np.mean(found.depth > 0) < 0.02
-    assert np.array_equal(found.depth > 0, found.confidence > 0)
+    assert np.median(found.confidence) < 0.3
+    sure = confirm_depths(views[1], found, [(views[j], found.depth) for j in (0, 2)], 2, 0.01)
+    assert isinstance(sure, Rejected) or sure.coverage < 0.02
 
 
 def test_region_leaves_strays_out():
