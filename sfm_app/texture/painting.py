@@ -90,8 +90,7 @@ def paint(
     triangles: NDArray[np.int64],
     corners: FloatArray,
     points: FloatArray,
-    weights: NDArray[np.float32],
-    offsets: NDArray[np.float32],
+    shares: NDArray[np.float32],
     rims: NDArray[np.bool_],
     owner: IntArray,
     total: IntArray,
@@ -105,8 +104,7 @@ def paint(
         triangles: (N,) those of the page that the photo counts for.
         corners: (T, 3, 2) texels.
         points: (N, 3, 3) corners in the scene.
-        weights: (N, 3) of the photo at the corners.
-        offsets: (N, 3, 3) grey levels to add, by corner and channel.
+        shares: (N, 3, 4) at each corner the weight of the photo, and the grey levels to add to its channels.
         rims: (N, 3) whether the edge from corner k to k + 1 is where the photo stops seeing the surface.
         owner: (H, W) of the page.
         total: (H, W, 3) of the page.
@@ -146,13 +144,13 @@ def paint(
                 for k in range(3):
                     part[k] = max(part[k], 0.0)
                     inner += part[k]
-                weight = (part[0] * weights[n, 0] + part[1] * weights[n, 1] + part[2] * weights[n, 2]) / inner
+                weight = (part[0] * shares[n, 0, 0] + part[1] * shares[n, 1, 0] + part[2] * shares[n, 2, 0]) / inner
                 if weight <= 0.0:
                     continue
                 for channel in range(3):
                     value = brightness[channel] * sample(photo, u, v, channel)
                     for k in range(3):
-                        value += part[k] / inner * offsets[n, k, channel]
+                        value += part[k] / inner * shares[n, k, 1 + channel]
                     total[y, x, channel] += int(np.floor(FINE * weight * value + 0.5))
 
 
