@@ -19,15 +19,17 @@ TEXTURE = "texture.npz"
 
 def make_texture(scene: Scene, surface: Surface, options: TextureSettings, run: RunContext) -> Model:
     """Paint the surface with the photos at full size, and keep it beside the depth maps."""
-    views = [
-        photo_view(name, scene.cameras[scene.camera_of[name]], pose) for name, pose in scene.cam_from_world.items()
-    ]
     hidden = Occluders(surface.vertices, surface.faces).hidden
     load = partial(read_photo, run.workspace.photos)
-    model, figures = texture_surface(surface, views, load, hidden, options, run.map)
+    model, figures = texture_surface(surface, photo_views(scene), load, hidden, options, run.map)
     run.record(**figures)
     save_texture(model, run)
     return model
+
+
+def photo_views(scene: Scene) -> list[PhotoView]:
+    """The registered photos as the texture sees them."""
+    return [photo_view(name, scene.cameras[scene.camera_of[name]], pose) for name, pose in scene.cam_from_world.items()]
 
 
 def read_photo(photo_dir: Path, view: PhotoView) -> NDArray[np.uint8]:

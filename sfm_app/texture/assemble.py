@@ -46,11 +46,6 @@ class Seen:
     """Triangles, over all photos, that show something else."""
 
     @property
-    def visible(self) -> NDArray[np.bool_]:
-        """(P, T) whether a photo sees a triangle."""
-        return np.asarray(self.worth != 0)
-
-    @property
     def usable(self) -> NDArray[np.bool_]:
         """(P, T) whether a photo sees a triangle and shows the surface there."""
         return np.asarray(self.worth > 0)
@@ -156,38 +151,35 @@ def _paint_photo(
     photo: int, plan: Plan, views: Sequence[PhotoView], load: Load, canvases: Sequence[Canvas], lock: threading.Lock
 ) -> None:
     """Add one photo to all pages; one photo paints at a time, while others are read."""
-    triangles, weights, offsets = _shares(photo, plan)
-    beside = plan.mesh.neighbours[triangles]
-    rims = (beside == NONE) | ~plan.seen.visible[photo, beside]
+    triangles, shares = _shares(photo, plan)
     if not len(triangles):
         return
+    beside = plan.mesh.neighbours[triangles]
+    rims = (beside == NONE) | (plan.seen.worth[photo, beside] == 0)
     view, scale = views[photo], plan.layout.scale
     if scale < 1.0:
         view = view.scaled(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
     pixels, points = load(view), plan.mesh.vertices[plan.mesh.faces[triangles]]
     for number, page in enumerate(canvases):
         there = plan.page[triangles] == number
-        shares = points[there], weights[there], offsets[there], rims[there]
+        what = triangles[there], plan.corners, points[there], shares[there], rims[there]
         with lock:
-            paint(
-                pixels, view.row, 1.0 / plan.seen.gains[photo], triangles[there], plan.corners, *shares,
-                page.owner, page.total,
-            )  # fmt: skip
+            paint(pixels, view.row, 1.0 / plan.seen.gains[photo], *what, page.owner, page.total)
 
 
-def _shares(photo: int, plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float32]]:
-    """Triangles that a photo counts for, its weights (N, 3) at their corners, and its offsets (N, 3, 3) there."""
+def _shares(photo: int, plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Triangles that a photo counts for, and its weight and offsets (N, 3, 4) at their corners."""
     mesh, part = plan.mesh, plan.blend.of(photo)
     weight = np.zeros(len(mesh.vertices), np.float32)
     offset = np.zeros((len(mesh.vertices), 3), np.float32)
     weight[plan.blend.vertex[part]], offset[plan.blend.vertex[part]] = plan.blend.weight[part], plan.blend.offset[part]
     own = plan.chosen == photo
-    allowed = (plan.seen.usable[photo] | own) & (plan.chosen != NONE)
+    allowed = ((plan.seen.worth[photo] > 0) | own) & (plan.chosen != NONE)
     shares = np.where(allowed[:, None], weight[mesh.faces], 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
         shares = np.where(plan.allowed > 0, shares / plan.allowed, own[:, None]).astype(np.float32)
     triangles = np.flatnonzero((shares > 0).any(axis=1))
-    return triangles, shares[triangles], offset[mesh.faces[triangles]]
+    return triangles, np.concatenate([shares[triangles][:, :, None], offset[mesh.faces[triangles]]], axis=2)
 
 
 def _allowed_weight(blend: Blend, usable: NDArray[np.bool_], chosen: IntArray, mesh: Facets) -> NDArray[np.float32]:

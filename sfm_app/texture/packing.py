@@ -80,7 +80,7 @@ def _try_to_pack(
     area = float(np.sum(high - low)) + float(np.sum(block_cells.astype(np.int64).prod(axis=1)))
     widest = max((int(c) for c in np.concatenate([cells[:, 0], block_cells[:, 0]])), default=1)
     page_cells = max_page_px // CELL
-    width = min(page_cells, max(widest, int(np.ceil(np.sqrt(area / FILL)))))
+    width = page_cells if scale < 1.0 else min(page_cells, max(widest, int(np.ceil(np.sqrt(area / FILL)))))
     if widest > page_cells or area > max_pages * page_cells * width:
         return None
     starts = np.concatenate([starts, starts[-1] + np.cumsum(block_cells[:, 0])])

@@ -21,6 +21,7 @@ FINE = 256
 INSET_PX, MOST_INSET = 1.5, 0.3
 """Where a photo stops seeing the surface, its pixels mix with what lies behind: texels closer to such an edge repeat
 what lies this far inside, or this share of the triangle's height."""
+ANYTHING = -9.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,8 +91,7 @@ def paint(
     triangles: NDArray[np.int64],
     corners: FloatArray,
     points: FloatArray,
-    weights: NDArray[np.float32],
-    offsets: NDArray[np.float32],
+    shares: NDArray[np.float32],
     rims: NDArray[np.bool_],
     owner: IntArray,
     total: IntArray,
@@ -105,8 +105,7 @@ def paint(
         triangles: (N,) those of the page that the photo counts for.
         corners: (T, 3, 2) texels.
         points: (N, 3, 3) corners in the scene.
-        weights: (N, 3) of the photo at the corners.
-        offsets: (N, 3, 3) grey levels to add, by corner and channel.
+        shares: (N, 3, 4) at each corner the weight of the photo, and the grey levels to add to its channels.
         rims: (N, 3) whether the edge from corner k to k + 1 is where the photo stops seeing the surface.
         owner: (H, W) of the page.
         total: (H, W, 3) of the page.
@@ -119,10 +118,7 @@ def paint(
         bx, by = corners[f, 1, 0] - ax, corners[f, 1, 1] - ay
         cx, cy = corners[f, 2, 0] - ax, corners[f, 2, 1] - ay
         turn = bx * cy - by * cx
-        for k in range(3):
-            a, b = corners[f, (k + 1) % 3], corners[f, (k + 2) % 3]
-            height_px = abs(turn) / max(np.hypot(b[0] - a[0], b[1] - a[1]), 1e-9)
-            least[k] = min(INSET_PX / max(height_px, 1e-9), MOST_INSET) if rims[n, (k + 1) % 3] else -2.0
+        _set_insets(corners[f], rims[n], abs(turn), least)
         x0, x1 = int(min(0.0, bx, cx) + ax - MARGIN - 1), int(max(0.0, bx, cx) + ax + MARGIN + 1)
         y0, y1 = int(min(0.0, by, cy) + ay - MARGIN - 1), int(max(0.0, by, cy) + ay + MARGIN + 1)
         for y in range(max(y0, 0), min(y1, height - 1) + 1):
@@ -142,18 +138,41 @@ def paint(
                 py = part[0] * points[n, 0, 1] + part[1] * points[n, 1, 1] + part[2] * points[n, 2, 1]
                 pz = part[0] * points[n, 0, 2] + part[1] * points[n, 1, 2] + part[2] * points[n, 2, 2]
                 u, v, _ = project(camera, px, py, pz)
-                inner = 0.0
-                for k in range(3):
-                    part[k] = max(part[k], 0.0)
-                    inner += part[k]
-                weight = (part[0] * weights[n, 0] + part[1] * weights[n, 1] + part[2] * weights[n, 2]) / inner
-                if weight <= 0.0:
-                    continue
-                for channel in range(3):
-                    value = brightness[channel] * sample(photo, u, v, channel)
-                    for k in range(3):
-                        value += part[k] / inner * offsets[n, k, channel]
-                    total[y, x, channel] += int(np.floor(FINE * weight * value + 0.5))
+                _add(photo, brightness, (u, v), part, shares[n], total[y, x])
+
+
+@kernel
+def _add(
+    photo: NDArray[np.uint8],
+    brightness: FloatArray,
+    position: tuple[float, float],
+    part: FloatArray,
+    share: NDArray[np.float32],
+    texel: IntArray,
+) -> None:
+    """Add what a photo shows at a position to a texel; weight and offset are those at the nearest inner point."""
+    inner = 0.0
+    for k in range(3):
+        part[k] = max(part[k], 0.0)
+        inner += part[k]
+    weight = (part[0] * share[0, 0] + part[1] * share[1, 0] + part[2] * share[2, 0]) / inner
+    if weight <= 0.0:
+        return
+    for channel in range(3):
+        value = brightness[channel] * sample(photo, position[0], position[1], channel)
+        for k in range(3):
+            value += part[k] / inner * share[k, 1 + channel]
+        texel[channel] += int(np.floor(FINE * weight * value + 0.5))
+
+
+@kernel
+def _set_insets(corner: FloatArray, rim: NDArray[np.bool_], double_area: float, least: FloatArray) -> None:
+    """Least barycentric coordinates of a triangle's texels: away from rims, anything elsewhere."""
+    for k in range(3):
+        a, b = (k + 1) % 3, (k + 2) % 3
+        length = np.hypot(corner[b, 0] - corner[a, 0], corner[b, 1] - corner[a, 1])
+        height_px = max(double_area / max(length, 1e-9), 1e-9)
+        least[k] = min(INSET_PX / height_px, MOST_INSET) if rim[a] else ANYTHING
 
 
 @kernel
