@@ -1,0 +1,107 @@
+"""Plain walls: areas of even colour whose known depths lie on one plane are that plane, between what is known.
+
+Where a photo shows nothing but one colour there is nothing to match, and what matching finds there is scattered and
+rough. People paint flat things evenly, so that a plane says more than each pixel does (Gallup, Frahm, Pollefeys:
+Piecewise planar and non-planar stereo for urban scene reconstruction. CVPR 2010). Nothing is carried on beyond the
+known depths, and skies have none.
+"""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.stereo.view import DepthArray, FloatArray, GreyImage
+
+BLUR_PX = 1.5
+MAX_SLOPE = 2.5
+"""Grey levels per pixel of the blurred photo within an area."""
+MIN_AREA = 0.002
+"""Of an area, as a share of the photo; smaller gaps are closed by the surface."""
+MIN_KNOWN = 0.1
+"""Least share of an area that has a depth."""
+MIN_ON_PLANE = 0.8
+"""Least share of the known depths that lie on the plane."""
+SAMPLES, SAMPLED_PIXELS = 100, 2000
+CELLS = 6
+"""Along each side of an area: known depths are averaged in cells, which tells a bend from noise."""
+CELL_PIXELS = 25
+MAX_BEND = 0.3
+"""Largest root mean square over the cells, in tolerances."""
+
+
+def bridge_even_areas(depth: DepthArray, image: GreyImage, tolerance: float) -> DepthArray:
+    """Put areas of even colour on their planes, as far as known depths reach around them.
+
+    Args:
+        depth: (H, W) depths that other photos confirm, 0 where unknown.
+        image: (H, W) the photo.
+        tolerance: largest relative difference of depths that agree.
+
+    Returns:
+        (H, W) depth; pixels of other areas are as before.
+    """
+    bridged = depth.copy()
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(_even(image).view(np.uint8), connectivity=4)
+    for label in range(1, len(stats)):
+        left, top, width, height, area = stats[label]
+        if area < MIN_AREA * image.size:
+            continue
+        box = np.s_[top : top + height, left : left + width]
+        _bridge(bridged[box], labels[box] == label, tolerance)
+    return bridged
+
+
+def _even(image: GreyImage) -> NDArray[np.bool_]:
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR_PX)
+    slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125))
+    return np.asarray(slope < MAX_SLOPE)
+
+
+def _bridge(depth: DepthArray, area: NDArray[np.bool_], tolerance: float) -> None:
+    """Replace the depths of an area, in its box, where it is a plane."""
+    known = area & (depth > 0)
+    if np.count_nonzero(known) < max(MIN_KNOWN * np.count_nonzero(area), CELL_PIXELS):
+        return
+    row, col = np.nonzero(known)
+    A = np.column_stack([np.ones(len(row)), col, row])
+    inverse = np.asarray(1.0 / depth[known], np.float64)
+    plane = _consensus_plane(A, inverse, tolerance)
+    residual = A @ plane / inverse - 1.0
+    on_plane = np.abs(residual) < tolerance
+    bend = _bend(row[on_plane], col[on_plane], residual[on_plane], depth.shape)
+    if np.mean(on_plane) < MIN_ON_PLANE or bend > MAX_BEND * tolerance:
+        return
+    within = np.zeros(depth.shape, np.uint8)
+    hull = cv2.convexHull(np.column_stack([col, row])[on_plane].astype(np.int32))
+    cv2.fillConvexPoly(within, hull, 1)
+    row, col = np.nonzero(area & (within > 0))
+    depth[row, col] = 1.0 / (plane[0] + plane[1] * col + plane[2] * row)
+
+
+def _consensus_plane(A: FloatArray, inverse: FloatArray, tolerance: float) -> FloatArray:
+    """Inverse depth as a linear function of column and row, (3,): the one that most pixels agree with."""
+    rng = np.random.default_rng(0)
+    some = rng.integers(0, len(A), SAMPLED_PIXELS)
+    best, most = np.array([np.median(inverse), 0.0, 0.0]), 0
+    for triple in rng.integers(0, len(A), (SAMPLES, 3)):
+        if abs(np.linalg.det(A[triple])) < 1.0:  # on a line
+            continue
+        plane = np.linalg.solve(A[triple], inverse[triple])
+        agreeing = int(np.count_nonzero(np.abs(A[some] @ plane / inverse[some] - 1.0) < tolerance))
+        if agreeing > most:
+            best, most = plane, agreeing
+    for _ in range(3):
+        agrees = np.abs(A @ best / inverse - 1.0) < tolerance
+        if np.count_nonzero(agrees) < 3:
+            break
+        best = np.linalg.lstsq(A[agrees], inverse[agrees], rcond=None)[0]
+    return np.asarray(best)
+
+
+def _bend(row: NDArray[np.int64], col: NDArray[np.int64], residual: FloatArray, shape: tuple[int, ...]) -> float:
+    """Root mean square of the mean residuals of cells."""
+    cell = row * CELLS // shape[0] * CELLS + col * CELLS // shape[1]
+    count = np.bincount(cell, minlength=CELLS**2)
+    full = count >= CELL_PIXELS
+    means = np.bincount(cell, residual, CELLS**2)[full] / count[full]
+    return float(np.sqrt(np.mean(means**2))) if len(means) else np.inf
