@@ -63,7 +63,7 @@ def _bridge(depth: DepthArray, area: NDArray[np.bool_], tolerance: float) -> Non
     if np.count_nonzero(known) < max(MIN_KNOWN * np.count_nonzero(area), CELL_PIXELS):
         return
     row, col = np.nonzero(known)
-    A = np.column_stack([np.ones(len(row)), col, row])
+    A = np.asarray(np.column_stack([np.ones(len(row)), col, row]), np.float64)
     inverse = np.asarray(1.0 / depth[known], np.float64)
     plane = _consensus_plane(A, inverse, tolerance)
     residual = A @ plane / inverse - 1.0
