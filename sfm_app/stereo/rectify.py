@@ -21,6 +21,8 @@ DISPARITY_STEP = 16
 MIN_POINTS = 5
 MARGIN_PX = 4.0
 """Disparities searched beyond those of the sparse points, at either end."""
+NEARER = 2.0
+"""How much closer than the nearest sparse points the surface may come."""
 BORDER_SAMPLES = 33
 
 
@@ -79,14 +81,14 @@ def rectify(reference: View, neighbour: View, scale: float = 1.0) -> Rectificati
     angles = _triangulation_angles(reference, neighbour, rotation)
     if len(angles) < MIN_POINTS:
         return Rejected("too few sparse points")
-    near, far = _angle_range(angles)
+    per_rad = scale * float(np.sqrt(reference.K[0, 0] * reference.K[1, 1]))
+    near, far = _angle_range(angles, (MAX_DISPARITIES - 2 * MARGIN_PX) / per_rad)
     left, right = _bounds(rotation, reference), _bounds(rotation, neighbour)
     # theta grows by the triangulation angle from the reference to the neighbour
     low = np.maximum(left[0], right[0] - [near, 0])
     high = np.minimum(left[1], right[1] - [far, 0])
     if np.any(high - low <= 0):
         return Rejected("the photos do not overlap")
-    per_rad = scale * float(np.sqrt(reference.K[0, 0] * reference.K[1, 1]))
     widest = 1.0 if low[0] < np.pi / 2 < high[0] else float(np.sin([low[0], high[0]]).max())
     area = per_rad**2 * widest * float(np.prod(high - low))
     largest = MAX_GROWTH * scale**2 * reference.width * reference.height
@@ -135,11 +137,16 @@ def _triangulation_angles(reference: View, neighbour: View, rotation: FloatArray
     )
 
 
-def _angle_range(angles: FloatArray) -> tuple[float, float]:
-    """Largest and smallest triangulation angle of the surface; sparse points rarely reach its ends."""
+def _angle_range(angles: FloatArray, room: float) -> tuple[float, float]:
+    """Largest and smallest triangulation angle of the surface; sparse points rarely reach its ends.
+
+    Least of all the near one: pavements at one's feet have few features. It is sought as far as `room`, what can be
+    searched without making the photos smaller, allows.
+    """
     low, high = np.percentile(angles, [1, 99])
     margin = 0.15 * (high - low) + 0.02 * high
-    return float(high + margin), float(max(low - margin, 0.25 * low))
+    far = max(low - margin, 0.25 * low)
+    return float(max(high + margin, min(NEARER * high, far + room))), float(far)
 
 
 def _bounds(rotation: FloatArray, view: View) -> FloatArray:
