@@ -6,25 +6,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.api import Run, reconstruct
 from sfm_app.errors import InputError
 from sfm_app.progress import Progress
 from sfm_app.settings import Settings
-from sfm_app.stages.mesh import load_surface
+from sfm_app.stages.texture import load_texture
 from sfm_app.synthetic.cameras import Camera, arc, camera_centre, make_camera
-from sfm_app.synthetic.compare import centre_error_percent, focal_error_percent, surface_coverage, surface_error
+from sfm_app.synthetic.compare import (
+    centre_error_percent,
+    focal_error_percent,
+    surface_accuracy,
+    surface_coverage,
+    surface_error,
+)
 from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.render import render_mesh
+from sfm_app.synthetic.pictures import beside_photo
 from sfm_app.synthetic.scenes import build_scene
-from sfm_app.types import Scene, Surface
+from sfm_app.types import Model, Scene
 from sfm_app.workspace import Workspace
 
 SIZE = (960, 640)
-ASIDE_DEG = -30.0
-"""How far the last view of the picture is turned away from the photo's."""
+"""Of the photos, and of each of the four views in the picture, in pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +47,13 @@ class DemoResult:
     refined_centre_error_percent: float
     surface_error_percent: float
     """Median distance of the mesh to the true surface, in percent of the scene's size."""
+    surface_accuracy_percent: float
+    """Share of the mesh within 0.5 % of the scene's size of the true surface."""
     surface_coverage_percent: float
     """Share of what the photos see that the mesh covers within 1 % of the scene's size."""
     triangles: int
+    pages_px: list[list[int]]
+    """Width and height of each page of texture."""
     seconds_rendering: float
     seconds_reconstruction: float
     files: list[str]
@@ -69,9 +77,9 @@ def run_demo(out: Path, settings: Settings, progress: Progress) -> DemoResult:
     done = time.perf_counter()
     if run.scene is None or run.calibration is None:
         raise InputError("the demo's reconstruction is incomplete", hint=f"remove {out} and try again")
-    surface = load_surface(Workspace(run.out).dense)
-    draw(surface, run.scene, out)
-    return compared(run, run.scene, surface, truth, (rendered - start, done - rendered), out)
+    model = load_texture(Workspace(run.out).dense)
+    draw(model, run.scene, out)
+    return compared(run, run.scene, model, truth, (rendered - start, done - rendered), out)
 
 
 def render_photos(out: Path, progress: Progress) -> Truth:
@@ -85,15 +93,13 @@ def render_photos(out: Path, progress: Progress) -> Truth:
     return truth
 
 
-def compared(
-    run: Run, scene: Scene, surface: Surface, truth: Truth, seconds: tuple[float, float], out: Path
-) -> DemoResult:
+def compared(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[float, float], out: Path) -> DemoResult:
     """Set what was found beside what is true."""
     refined = next(iter(scene.cameras.values())).K
     found = run.calibration.K if run.calibration else refined
     centres = {name: camera_centre(pose) for name, pose in scene.cam_from_world.items()}
-    error = surface_error(surface.vertices, surface.faces, centres, truth)
-    coverage = surface_coverage(surface.vertices, surface.faces, centres, truth)
+    surface, pages = model.surface, model.texture.pages if model.texture else ()
+    found_surface = surface.vertices, surface.faces, centres, truth
     return DemoResult(
         photos=len(truth.cam_from_world),
         registered=len(scene.registered),
@@ -104,39 +110,30 @@ def compared(
         refined_focal_error_percent=round(focal_error_percent(refined, truth), 3),
         centre_error_percent=round(centre_error_percent(found, truth), 3),
         refined_centre_error_percent=round(centre_error_percent(refined, truth), 3),
-        surface_error_percent=round(100 * error, 3),
-        surface_coverage_percent=round(100 * coverage, 1),
+        surface_error_percent=round(100 * surface_error(*found_surface), 3),
+        surface_accuracy_percent=round(100 * surface_accuracy(*found_surface), 1),
+        surface_coverage_percent=round(100 * surface_coverage(*found_surface), 1),
         triangles=len(surface.faces),
+        pages_px=[[page.shape[1], page.shape[0]] for page in pages],
         seconds_rendering=round(seconds[0], 1),
         seconds_reconstruction=round(seconds[1], 1),
         files=[str(path) for path in (*sorted(run.out.glob("model.*")), out / "model.png")],
     )
 
 
-def draw(surface: Surface, scene: Scene, out: Path) -> None:
-    """OUT/model.png: a photo, the mesh from where it was taken, and the mesh from beside it."""
+def draw(model: Model, scene: Scene, out: Path) -> None:
+    """OUT/model.png: a photo and the model from where it was taken; below, the model from beside and its bare shape."""
     names = sorted(scene.cam_from_world)
     name = names[len(names) // 2]
-    model = next(iter(scene.cameras.values()))
-    camera = Camera(model.K, model.width, model.height)
-    pose = scene.cam_from_world[name]
+    found = scene.cameras[scene.camera_of[name]]
+    camera = Camera(found.K, found.width, found.height)
     photo = np.asarray(Image.open(out / "photos" / name).convert("RGB"))
-    mesh_views = [render_mesh(surface, camera, view) for view in (pose, walked_around(pose, surface, ASIDE_DEG))]
-    Image.fromarray(np.concatenate([photo, *mesh_views], axis=1)).save(out / "model.png")
-
-
-def walked_around(pose: NDArray[np.float64], surface: Surface, angle_deg: float) -> NDArray[np.float64]:
-    """The pose of somebody who walked around what a camera looks at, in a frame with y up."""
-    R, t = pose[:, :3], pose[:, 3]
-    depth = float(np.median(surface.vertices @ R[2] + t[2]))
-    middle = R.T @ (np.array([0.0, 0.0, depth]) - t)
-    cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
-    turned = R @ np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
-    return np.column_stack([turned, R @ middle + t - turned @ middle])
+    Image.fromarray(beside_photo(photo, model, camera, scene.cam_from_world[name])).save(out / "model.png")
 
 
 def demo_lines(result: DemoResult) -> list[str]:
     """The result for people."""
+    pages = " and ".join(f"{width} x {height}" for width, height in result.pages_px)
     return [
         f"true camera     {k_text(result.true_K)}",
         f"found           {k_text(result.found_K)}   focal {result.focal_error_percent} % off, "
@@ -145,7 +142,9 @@ def demo_lines(result: DemoResult) -> list[str]:
         f"centre {result.refined_centre_error_percent} % off, after bundle adjustment",
         f"photos placed   {result.registered} of {result.photos}",
         f"mesh            {result.triangles} triangles; half of it lies within {result.surface_error_percent} % of the "
-        f"scene's size of the true surface; covers {result.surface_coverage_percent} % of what the photos see",
+        f"scene's size of the true surface, {result.surface_accuracy_percent} % within 0.5 %; "
+        f"covers {result.surface_coverage_percent} % of what the photos see",
+        *([f"texture         {pages} px"] if pages else []),
         f"seconds         {result.seconds_reconstruction} reconstruction, {result.seconds_rendering} rendering",
         *(f"                {path}" for path in result.files),
     ]

@@ -8,17 +8,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.demo import walked_around
 from sfm_app.synthetic.cameras import Camera
-from sfm_app.synthetic.pictures import PreparedModel, render_model, render_shape
+from sfm_app.synthetic.pictures import PreparedModel, beside_photo
 
 Pixels = NDArray[np.uint8]
-ASIDE_DEG = 25.0
-"""How far the view from beside is turned away from the photo's."""
 TALL_PX, WIDE_PX = 800, 1000
 """Largest height and width of one picture; a page has two by two of them."""
-OVER = 2
-"""Pictures are rendered this many times as large and averaged."""
 COLORS, PALETTE_PIXELS = 256, 20_000
 """Of a page, which keeps PNGs small, and the pixels that its colours are chosen by."""
 WIDTHS_PX, BYTES = (1600, 1400, 1200, 1000, 800), 600_000
@@ -33,17 +28,8 @@ def model_page(out: Path, name: str, model: PreparedModel) -> Pixels:
     photo = np.asarray(Image.open(out / "photos" / name).convert("RGB"))
     shrink = min(TALL_PX / camera.height, WIDE_PX / camera.width)
     size = round(camera.width * shrink), round(camera.height * shrink)
-    K = np.diag([OVER * size[0] / camera.width, OVER * size[1] / camera.height, 1.0]) @ camera.calibration_matrix()
-    ours = Camera(K, OVER * size[0], OVER * size[1])
-    aside = walked_around(pose, model.model.surface, ASIDE_DEG)
-    views = [
-        photo,
-        render_model(model, ours, pose).on(),
-        render_model(model, ours, aside).on(),
-        render_shape(model, ours, aside).on(),
-    ]
-    a, b, c, d = (np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_AREA), np.uint8) for view in views)
-    return np.concatenate([np.concatenate([a, b], axis=1), np.concatenate([c, d], axis=1)])
+    K = np.diag([size[0] / camera.width, size[1] / camera.height, 1.0]) @ camera.calibration_matrix()
+    return beside_photo(photo, model, Camera(K, *size), pose)
 
 
 def save_page(page: Pixels, path: Path) -> None:

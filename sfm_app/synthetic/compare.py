@@ -16,6 +16,8 @@ IndexArray = NDArray[np.int64]
 
 # Rays per photo, along its longer side, that find out which part of the true surface was seen.
 SEEN_RAYS = 96
+# Points that stand for a surface.
+SAMPLES = 20_000
 
 
 def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
@@ -44,7 +46,7 @@ def surface_error(
     faces: IndexArray,
     centres: Mapping[str, FloatArray],
     truth: Truth,
-    samples: int = 20_000,
+    samples: int = SAMPLES,
 ) -> float:
     """Median distance of a reconstructed surface to the true one, as a share of the scene's size.
 
@@ -62,9 +64,21 @@ def surface_error(
     Raises:
         ValueError: fewer than 3 common photos, their centres lie on a line, or the surface has no area.
     """
-    aligned = align_centres(centres, truth)(vertices)
-    points = sample_surface(aligned, faces, samples)
-    return float(np.median(surface_distances(points, truth.vertices, truth.faces)) / scene_size(truth))
+    return float(np.median(_distances_to_truth(vertices, faces, centres, truth, samples)))
+
+
+def surface_accuracy(
+    vertices: FloatArray,
+    faces: IndexArray,
+    centres: Mapping[str, FloatArray],
+    truth: Truth,
+    tolerance: float = 0.005,
+) -> float:
+    """Share of a reconstructed surface, by area, that lies within `tolerance` scene sizes of the true one.
+
+    Arguments and errors as for `surface_error`.
+    """
+    return float(np.mean(_distances_to_truth(vertices, faces, centres, truth) <= tolerance))
 
 
 def surface_coverage(
@@ -146,6 +160,18 @@ def surface_distances(points: FloatArray, vertices: FloatArray, faces: IndexArra
     """(N,) distance of points (N, 3) to the nearest place on the triangles; in single precision."""
     queries = load_open3d().core.Tensor(points.astype(np.float32))
     return np.asarray(ray_caster(vertices, faces).compute_distance(queries).numpy(), dtype=np.float64)
+
+
+def _distances_to_truth(
+    vertices: FloatArray,
+    faces: IndexArray,
+    centres: Mapping[str, FloatArray],
+    truth: Truth,
+    samples: int = SAMPLES,
+) -> FloatArray:
+    """(samples,) distances of places spread evenly over a reconstructed surface to the true one, in scene sizes."""
+    points = sample_surface(align_centres(centres, truth)(vertices), faces, samples)
+    return surface_distances(points, truth.vertices, truth.faces) / scene_size(truth)
 
 
 def _coarse(camera: Camera) -> Camera:

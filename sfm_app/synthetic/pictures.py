@@ -1,4 +1,4 @@
-"""Pictures of a finished model: with its texture as a camera would see it, or its bare shape in grey."""
+"""Pictures of a finished model: in its own colours as a camera would see it, its bare shape in grey, beside a photo."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +21,10 @@ AMBIENT = 0.25
 """Light that reaches every face of the bare shape, 0..1."""
 LAMP = np.array([-0.45, -0.65, -1.0]) / np.linalg.norm([-0.45, -0.65, -1.0])
 """Direction from a face to the lamp, in the camera's frame: over the photographer's left shoulder."""
+ASIDE_DEG = 25.0
+"""How far the view from beside is turned away from the photo's."""
+OVER = 2
+"""The pictures beside a photo are rendered this many times as large and averaged."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +106,42 @@ def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: F
     covered = np.isfinite(hits["t_hit"])
     colors = light[:, None] * np.where(inside[:, None], INSIDE, GREY) * covered[:, None]
     return Picture(np.round(colors).astype(np.uint8).reshape(*shape, 3), covered.reshape(shape))
+
+
+def beside_photo(photo: Colors, model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Colors:
+    """A photo and the model from its camera; below, the model from beside and there its bare shape.
+
+    Args:
+        photo: (h, w, 3) RGB; brought to the camera's size.
+        model: in the frame of `cam_from_world`, with y up.
+        camera: intrinsics and distortion, and the size of each of the four pictures.
+        cam_from_world: (3, 4) pose.
+
+    Returns:
+        (2 height, 2 width, 3) RGB.
+    """
+    prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
+    size = camera.width, camera.height
+    fine = Camera(np.diag([OVER, OVER, 1.0]) @ camera.K, OVER * size[0], OVER * size[1], camera.radial)
+    aside = walked_around(cam_from_world, prepared.model.surface, ASIDE_DEG)
+    views = [
+        photo,
+        render_model(prepared, fine, cam_from_world).on(),
+        render_model(prepared, fine, aside).on(),
+        render_shape(prepared, fine, aside).on(),
+    ]
+    a, b, c, d = (np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_AREA), np.uint8) for view in views)
+    return np.concatenate([np.concatenate([a, b], axis=1), np.concatenate([c, d], axis=1)])
+
+
+def walked_around(pose: FloatArray, surface: Surface, angle_deg: float) -> FloatArray:
+    """The pose of somebody who walked around what a camera looks at, in a frame with y up."""
+    R, t = pose[:, :3], pose[:, 3]
+    depth = float(np.median(surface.vertices @ R[2] + t[2]))
+    middle = R.T @ (np.array([0.0, 0.0, depth]) - t)
+    cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    turned = R @ np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
+    return np.column_stack([turned, R @ middle + t - turned @ middle])
 
 
 def _from_vertices(surface: Surface, face: NDArray[np.int64], weights: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Rendering by ray casting: a synthetic scene to a photo, a finished mesh to a picture."""
+"""Rendering by ray casting: a synthetic scene to a photo."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +11,6 @@ from sfm_app.meshing.open3d import load_open3d
 from sfm_app.synthetic.bodies import SyntheticScene
 from sfm_app.synthetic.cameras import Camera, camera_centre, pixel_rays
 from sfm_app.synthetic.textures import mixture
-from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
 NO_HIT = 0xFFFFFFFF
@@ -89,33 +88,6 @@ def render_scene(
                 total,
             )
     return (total / supersampling**2).reshape(camera.height, camera.width, 3)
-
-
-def render_mesh(
-    surface: Surface, camera: Camera, cam_from_world: FloatArray, background: tuple[int, int, int] = (255, 255, 255)
-) -> NDArray[np.uint8]:
-    """A picture of a coloured mesh, with the colours as they are, from both sides, without light.
-
-    Args:
-        surface: vertices in the frame of `cam_from_world`.
-        camera: intrinsics, size and distortion.
-        cam_from_world: (3, 4) pose.
-        background: RGB where nothing is hit.
-
-    Returns:
-        (height, width, 3) RGB.
-    """
-    picture = np.tile(np.array(background, dtype=np.float64), (camera.height * camera.width, 1))
-    if len(surface.faces):
-        directions = pixel_rays(camera) @ cam_from_world[:, :3]
-        caster = ray_caster(surface.vertices, surface.faces)
-        hits = cast(caster, camera_centre(cam_from_world), directions)
-        hit = np.isfinite(hits["t_hit"])
-        uv = hits["primitive_uvs"][hit].astype(np.float64)
-        weights = np.column_stack([1.0 - uv.sum(axis=1), uv])
-        corners = surface.faces[hits["primitive_ids"][hit]]
-        picture[hit] = np.einsum("nk,nkc->nc", weights, surface.colors[corners].astype(np.float64))
-    return np.round(np.clip(picture, 0, 255)).astype(np.uint8).reshape(camera.height, camera.width, 3)
 
 
 def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:

@@ -13,6 +13,7 @@ from sfm_app.synthetic.compare import (
     sample_surface,
     scene_size,
     seen_points,
+    surface_accuracy,
     surface_coverage,
     surface_error,
 )
@@ -94,6 +95,7 @@ def test_alignment_needs_three_known_photos_off_a_line(photos):
 def test_the_truth_in_another_frame_has_no_error(photos, seed):
     vertices, faces, centres = moved(photos[1], random_similarity(np.random.default_rng(seed)))
     assert surface_error(vertices, faces, centres, photos[1]) < 1e-5
+    assert surface_accuracy(vertices, faces, centres, photos[1], tolerance=1e-5) == 1.0
     assert surface_coverage(vertices, faces, centres, photos[1]) == 1.0
 
 
@@ -104,6 +106,17 @@ def test_the_error_is_the_distance_over_the_scene_size(plane_truth, offset):
     assert error == pytest.approx(offset / scene_size(plane_truth), rel=1e-3)
     assert surface_coverage(raised, plane_truth.faces, plane_truth.centres, plane_truth, tolerance=error * 1.01) == 1.0
     assert surface_coverage(raised, plane_truth.faces, plane_truth.centres, plane_truth, tolerance=error * 0.99) == 0.0
+
+
+def test_accuracy_is_the_share_of_the_area_that_is_near(plane_truth):
+    size = scene_size(plane_truth)
+    # a third of the surface's area is 0.6 % of the size above the truth, the rest 0.4 %
+    above = np.array([0.0, 0.006 * size, 0.0]), np.array([0.0, 0.004 * size, 0.0])
+    vertices = np.concatenate([plane_truth.vertices + offset for offset in above])
+    faces = np.concatenate([plane_truth.faces[:1], plane_truth.faces + 4])
+    assert surface_accuracy(vertices, faces, plane_truth.centres, plane_truth) == pytest.approx(2 / 3, abs=0.02)
+    assert surface_accuracy(vertices, faces, plane_truth.centres, plane_truth, tolerance=0.0061) == 1.0
+    assert surface_accuracy(vertices, faces, plane_truth.centres, plane_truth, tolerance=0.0039) == 0.0
 
 
 def test_coverage_tells_half_a_surface_from_a_whole_one(plane_truth):
@@ -141,5 +154,7 @@ def test_a_surface_without_area_is_refused(photos):
     nothing = np.zeros((0, 3), dtype=np.int64)
     with pytest.raises(ValueError, match="no area"):
         surface_error(truth.vertices, nothing, truth.centres, truth)
+    with pytest.raises(ValueError, match="no area"):
+        surface_accuracy(truth.vertices, nothing, truth.centres, truth)
     with pytest.raises(ValueError, match="no area"):
         surface_coverage(truth.vertices, nothing, truth.centres, truth)

@@ -1,8 +1,15 @@
 import numpy as np
 import pytest
 
-from sfm_app.synthetic.cameras import Camera, make_camera
-from sfm_app.synthetic.pictures import prepare_model, render_model, render_shape, view_along
+from sfm_app.synthetic.cameras import Camera, camera_centre, look_at, make_camera
+from sfm_app.synthetic.pictures import (
+    beside_photo,
+    prepare_model,
+    render_model,
+    render_shape,
+    view_along,
+    walked_around,
+)
 from sfm_app.types import Surface
 from sfm_app.types.model import Model, Texture
 
@@ -92,3 +99,35 @@ def test_a_model_without_triangles_is_not_seen():
     for picture in (render_model(empty, camera, STRAIGHT), render_shape(empty, camera, STRAIGHT)):
         assert picture.colors.shape == (16, 20, 3) and not picture.covered.any()
         assert np.all(picture.on() == 255)
+
+
+def test_beside_a_photo_stand_the_model_from_its_camera_from_aside_and_its_bare_shape():
+    camera = Camera(np.array([[20.0, 0, 40.0], [0, 20.0, 20.0], [0, 0, 1]]), 80, 40)
+    photo = np.full((80, 160, 3), (10, 200, 30), np.uint8)
+    page = beside_photo(photo, textured(np.full((8, 8, 3), (200, 40, 30), np.uint8)), camera, STRAIGHT)
+    views = {"photo": page[:40, :80], "model": page[:40, 80:], "aside": page[40:, :80], "shape": page[40:, 80:]}
+    seen = {name: np.any(view != 255, axis=2) for name, view in views.items()}
+
+    assert page.shape == (80, 160, 3) and page.dtype == np.uint8
+    assert np.all(views["photo"] == [10, 200, 30])
+    assert np.all(views["model"][10:30, 40:60] == [200, 40, 30]) and seen["model"].sum() == 20 * 20
+    # its right edge has come nearer: 20 cos 25 / (1 - sin 25) = 31 px from the left one, and 35 px high instead of 20
+    assert 700 < np.all(views["aside"] == [200, 40, 30], axis=2).sum() <= seen["aside"].sum() < 950
+    assert np.array_equal(seen["aside"], seen["shape"])
+    inner = views["shape"][np.all(views["aside"] == [200, 40, 30], axis=2)]
+    assert np.ptp(inner, axis=1).max() == 0 and 50 < inner.min() <= inner.max() < 206
+
+
+@pytest.mark.parametrize("angle_deg", [25.0, -90.0])
+def test_walking_around_keeps_height_distance_and_what_is_in_the_middle(angle_deg):
+    surface = Surface(np.random.default_rng(0).normal(size=(99, 3)), FACES, RED_TO_BLUE)
+    pose = look_at(np.array([1.0, 2.0, 6.0]), np.zeros(3))
+    walked = walked_around(pose, surface, angle_deg)
+    depth = np.median(surface.vertices @ pose[2, :3] + pose[2, 3])
+    middle = pose[:, :3].T @ (np.array([0.0, 0.0, depth]) - pose[:, 3])
+
+    assert walked[:, :3] @ middle + walked[:, 3] == pytest.approx([0.0, 0.0, depth])
+    before, after = camera_centre(pose) - middle, camera_centre(walked) - middle
+    assert after[1] == pytest.approx(before[1]) and np.linalg.norm(after) == pytest.approx(np.linalg.norm(before))
+    turned = before[[0, 2]] @ after[[0, 2]] / np.linalg.norm(before[[0, 2]]) ** 2
+    assert turned == pytest.approx(np.cos(np.radians(angle_deg)), abs=1e-9)

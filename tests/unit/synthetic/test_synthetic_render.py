@@ -5,10 +5,9 @@ import pytest
 
 from sfm_app.synthetic.bodies import Body, SyntheticScene
 from sfm_app.synthetic.cameras import Camera, camera_centre, look_at, make_camera, pixel_rays
-from sfm_app.synthetic.render import cast, prepare, ray_caster, render_mesh, render_scene
+from sfm_app.synthetic.render import cast, prepare, ray_caster, render_scene
 from sfm_app.synthetic.shapes import box
 from sfm_app.synthetic.textures import Material
-from sfm_app.types import Surface
 
 
 @pytest.fixture(scope="module")
@@ -106,24 +105,3 @@ def test_distortion_moves_the_rim_but_not_the_centre(prepared, four_views):
     barrel = Camera(plain.K, 120, 80, radial=-0.4)
     difference = np.abs(render_scene(prepared, plain, pose) - render_scene(prepared, barrel, pose)).mean(axis=2)
     assert difference[38:42, 58:62].mean() < 0.3 * difference[:, :10].mean()
-
-
-def test_a_mesh_is_drawn_with_its_colours_where_it_is():
-    camera = Camera(np.array([[10.0, 0, 10.0], [0, 10.0, 5.0], [0, 0, 1]]), 20, 10)
-    # a square over the right half of the picture, red to blue downwards, one unit in front
-    vertices = np.array([[0.0, -0.5, 1.0], [1.0, -0.5, 1.0], [1.0, 0.5, 1.0], [0.0, 0.5, 1.0]])
-    colors = np.array([[250, 0, 0], [250, 0, 0], [0, 0, 250], [0, 0, 250]], dtype=np.uint8)
-    surface = Surface(vertices, np.array([[0, 1, 2], [0, 2, 3]]), colors)
-
-    image = render_mesh(surface, camera, np.eye(3, 4), background=(1, 2, 3))
-
-    assert image.shape == (10, 20, 3) and image.dtype == np.uint8
-    assert np.all(image[:, :10] == [1, 2, 3])
-    share = (np.arange(10) + 0.5) / 10
-    assert np.allclose(image[:, 10:, 0], np.round(250 * (1 - share))[:, None], atol=1)
-    assert np.allclose(image[:, 10:, 2], np.round(250 * share)[:, None], atol=1)
-
-
-def test_an_empty_mesh_is_background():
-    empty = Surface(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), np.zeros((0, 3), dtype=np.uint8))
-    assert np.all(render_mesh(empty, make_camera(20, 16), np.eye(3, 4)) == 255)
