@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses, without_specks
 from sfm_app.stereo.matching import depths_from_disparities, disparities
 from sfm_app.stereo.normals import fit_planes, normals_of
+from sfm_app.stereo.outlines import without_spill
 from sfm_app.stereo.patch_match import NO_MATCH, PlaneArray, improve_planes
 from sfm_app.stereo.rectify import rectify
 from sfm_app.stereo.view import DepthArray, GreyImage, View
@@ -97,9 +98,14 @@ def _sampled(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) ->
 
 
 def confirm_depths(
-    view: View, estimate: Estimate, others: Sequence[tuple[View, DepthArray]], min_agreeing: int, tolerance: float
+    view: View,
+    image: GreyImage,
+    estimate: Estimate,
+    others: Sequence[tuple[View, DepthArray]],
+    min_agreeing: int,
+    tolerance: float,
 ) -> DepthMap | Rejected:
-    """Keep the depths that enough other depth maps confirm over more than a speck, and add normals.
+    """Keep the depths that enough other depth maps confirm over more than a speck, cut at outlines, and add normals.
 
     Enough is `min_agreeing`; one more where the photos look little alike, two where they hardly do; one less, but not
     none, where they look very much alike.
@@ -111,7 +117,7 @@ def confirm_depths(
     enough = np.clip(min_agreeing + (confidence < UNSURE) - 1 * (confidence > SURE), 1, len(others))
     enough = np.where(confidence < WEAK, min_agreeing + WEAK_NEED, enough)
     confirmed = np.where(agreeing >= enough, estimate.depth, np.float32(0))
-    planes = fit_planes(without_specks(confirmed, tolerance))
+    planes = fit_planes(without_specks(without_spill(confirmed, image), tolerance))
     if not planes.any():
         return Rejected("no depth is confirmed by other photos")
     depth = np.divide(1, planes[..., 0], out=np.zeros_like(confirmed), where=planes[..., 0] > 0)

@@ -94,8 +94,8 @@ def _confirm(index: int, task: DepthTask, usable: NDArray[np.bool_]) -> Rejected
         for other in task.ranked[index]
         if usable[other]
     ]
-    estimate = task.store.read_estimate(view)
-    found = confirm_depths(view, estimate, others, task.options.min_agreeing, task.options.consistency)
+    photo, estimate = task.store.photo(view), task.store.read_estimate(view)
+    found = confirm_depths(view, photo, estimate, others, task.options.min_agreeing, task.options.consistency)
     if isinstance(found, Rejected):
         return found
     task.store.write_maps(view, found)

@@ -31,7 +31,7 @@ def others(views, matched, index):
 
 
 def test_confirmed_depths_lie_on_the_plane(plane, views, matched):
-    found = confirm_depths(views[1], matched[1], others(views, matched, 1), 2, 0.01)
+    found = confirm_depths(views[1], plane.photo(views[1]), matched[1], others(views, matched, 1), 2, 0.01)
 
     assert isinstance(found, DepthMap)
     known = found.depth > 0
@@ -46,16 +46,16 @@ def test_confirmed_depths_lie_on_the_plane(plane, views, matched):
     assert not found.normals[~known].any()
 
 
-def test_false_depths_do_not_get_through(views, matched):
+def test_false_depths_do_not_get_through(plane, views, matched):
     wrong = replace(matched[1], depth=matched[1].depth * np.float32(1.04))
 
-    found = confirm_depths(views[1], wrong, others(views, matched, 1), 2, 0.01)
+    found = confirm_depths(views[1], plane.photo(views[1]), wrong, others(views, matched, 1), 2, 0.01)
 
     assert isinstance(found, Rejected) or found.coverage < 0.02
 
 
-def test_two_photos_confirm_each_other(views, matched):
-    found = confirm_depths(views[1], matched[1], others(views, matched, 1)[:1], 2, 0.01)
+def test_two_photos_confirm_each_other(plane, views, matched):
+    found = confirm_depths(views[1], plane.photo(views[1]), matched[1], others(views, matched, 1)[:1], 2, 0.01)
 
     assert isinstance(found, DepthMap)
     assert found.coverage > 0.4
@@ -73,9 +73,9 @@ def test_a_photo_without_neighbours_is_a_value_with_a_reason(plane, views):
     same_place = match_depths(views[0], [views[0]], plane.photo, 3, 0.01)
     assert same_place == Rejected("same place")
     empty = np.zeros((180, 240), np.float32)
-    nothing = Estimate(empty, empty)
-    assert isinstance(confirm_depths(views[0], nothing, [(views[1], empty)], 2, 0.01), Rejected)
-    assert isinstance(confirm_depths(views[0], nothing, [], 2, 0.01), Rejected)
+    nothing, blank = Estimate(empty, empty), np.zeros((180, 240), np.uint8)
+    assert isinstance(confirm_depths(views[0], blank, nothing, [(views[1], empty)], 2, 0.01), Rejected)
+    assert isinstance(confirm_depths(views[0], blank, nothing, [], 2, 0.01), Rejected)
 
 
 @pytest.mark.parametrize(("confidence", "needed"), [(0.9, 1), (0.7, 2), (0.4, 3), (0.1, 4)])
@@ -86,7 +86,7 @@ def test_the_less_alike_photos_look_the_more_have_to_agree(plane, views, confide
     true, false = [(views[j], truth[j]) for j in (0, 2, 3)], [(views[j], 1.5 * truth[j]) for j in (0, 2, 3)]
 
     for agreeing in range(4):
-        found = confirm_depths(views[1], estimate, true[:agreeing] + false[agreeing:], 2, 0.01)
+        found = confirm_depths(views[1], plane.photo(views[1]), estimate, true[:agreeing] + false[agreeing:], 2, 0.01)
         assert isinstance(found, DepthMap) == (agreeing >= needed)
 
 
@@ -99,7 +99,7 @@ def test_blank_photos_are_left_empty(views):
     found = match_depths(views[1], [views[0], views[2]], sky, 2, 0.01)
 
     assert np.median(found.confidence) < 0.3
-    sure = confirm_depths(views[1], found, [(views[j], found.depth) for j in (0, 2)], 2, 0.01)
+    sure = confirm_depths(views[1], sky(views[1]), found, [(views[j], found.depth) for j in (0, 2)], 2, 0.01)
     assert isinstance(sure, Rejected) or sure.coverage < 0.02
 
 
