@@ -19,8 +19,8 @@ IndexArray = NDArray[np.int64]
 
 SMOOTHING = 20
 """Averages over neighbours that take the fringe off the border."""
-MAX_FREE = 0.5
-"""A gap is not bridged where photos see through this share of it."""
+MAX_FREE = 0.1
+"""A gap is not bridged where photos see through this share of it: then it is the way around an edge, not a hole."""
 
 
 @dataclass(slots=True, eq=False)

@@ -10,6 +10,7 @@ from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses, without
 from sfm_app.stereo.even_areas import bridge_even_areas
 from sfm_app.stereo.matching import depths_from_disparities, disparities
 from sfm_app.stereo.normals import fit_planes, normals_of
+from sfm_app.stereo.outlines import without_spill
 from sfm_app.stereo.patch_match import NO_MATCH, PlaneArray, improve_planes
 from sfm_app.stereo.rectify import rectify
 from sfm_app.stereo.view import DepthArray, GreyImage, View
@@ -105,7 +106,7 @@ def confirm_depths(
     min_agreeing: int,
     tolerance: float,
 ) -> DepthMap | Rejected:
-    """Keep the depths that enough other depth maps confirm over more than a speck, bridge plain walls, add normals.
+    """Keep the depths that enough other maps confirm, cut at outlines; drop specks, bridge plain walls, add normals.
 
     Enough is `min_agreeing`; one more where the photos look little alike, two where they hardly do; one less, but not
     none, where they look very much alike.
@@ -117,7 +118,8 @@ def confirm_depths(
     enough = np.clip(min_agreeing + (confidence < UNSURE) - 1 * (confidence > SURE), 1, len(others))
     enough = np.where(confidence < WEAK, min_agreeing + WEAK_NEED, enough)
     confirmed = np.where(agreeing >= enough, estimate.depth, np.float32(0))
-    planes = fit_planes(bridge_even_areas(without_specks(confirmed, tolerance), image, tolerance))
+    confirmed = without_specks(without_spill(confirmed, image), tolerance)
+    planes = fit_planes(bridge_even_areas(confirmed, image, tolerance))
     if not planes.any():
         return Rejected("no depth is confirmed by other photos")
     depth = np.divide(1, planes[..., 0], out=np.zeros_like(confirmed), where=planes[..., 0] > 0)

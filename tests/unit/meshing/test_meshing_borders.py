@@ -62,6 +62,17 @@ def test_gaps_that_photos_see_through_stay_open(sheet):
     assert np.all((bridge_gaps(surface, np.where(hole, -1.0, 1.0), hole, 12.0) < 0) == hole)
 
 
+@pytest.mark.parametrize(("free_rows", "closed"), [(1, True), (5, False)])
+def test_a_gap_is_the_way_around_an_edge_where_photos_see_through_a_part_of_it(sheet, free_rows, closed):
+    surface = sheet(30)
+    y = surface.vertices[:, 1]
+    band = (y > 5) & (y < 21)  # 15 rows
+
+    found = bridge_gaps(surface, np.where(band, -1.0, 1.0), band & (y < 5.5 + free_rows), 20.0)
+
+    assert np.all(found[band] > 0) == closed
+
+
 def test_parts_that_few_photos_confirm_are_dropped(sheet, together):
     surface = together(sheet(9), sheet(4, origin=(50, 0, 0)), sheet(4, origin=(80, 0, 0)))
     x = surface.vertices[:, 0]

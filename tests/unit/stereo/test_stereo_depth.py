@@ -73,9 +73,9 @@ def test_a_photo_without_neighbours_is_a_value_with_a_reason(plane, views):
     same_place = match_depths(views[0], [views[0]], plane.photo, 3, 0.01)
     assert same_place == Rejected("same place")
     empty = np.zeros((180, 240), np.float32)
-    nothing = Estimate(empty, empty)
-    assert isinstance(confirm_depths(views[0], plane.photo(views[0]), nothing, [(views[1], empty)], 2, 0.01), Rejected)
-    assert isinstance(confirm_depths(views[0], plane.photo(views[0]), nothing, [], 2, 0.01), Rejected)
+    nothing, blank = Estimate(empty, empty), np.zeros((180, 240), np.uint8)
+    assert isinstance(confirm_depths(views[0], blank, nothing, [(views[1], empty)], 2, 0.01), Rejected)
+    assert isinstance(confirm_depths(views[0], blank, nothing, [], 2, 0.01), Rejected)
 
 
 @pytest.mark.parametrize(("confidence", "needed"), [(0.9, 1), (0.7, 2), (0.4, 3), (0.1, 4)])

@@ -1,0 +1,51 @@
+"""Depths that spill over the outline of a thing onto what is beside it."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.stereo.patch_match import BORDER
+from sfm_app.stereo.view import DepthArray, GreyImage
+
+REACH_PX = BORDER + 1
+"""A window with its middle so far beside an outline still holds a pixel of it; where there is nothing else to be seen,
+that pixel alone decides."""
+SURROUNDINGS_PX = 4 * REACH_PX + 1
+"""Side of the square around a pixel in which it is compared with what has a depth and what has none."""
+NOISE_GREY = 3.0
+"""Least standard deviation of greys: noise, and traces of compression."""
+ODDS = 8.0
+"""So many times more likely has a pixel's grey to be among those without a depth than among those with one."""
+LEAST_PX = 5
+"""Pixels that say what the surroundings look like."""
+
+
+def without_spill(depth: DepthArray, image: GreyImage) -> DepthArray:
+    """The depth map without rims that look like the empty side, not like the surface that they continue.
+
+    Skies and plain backgrounds have no depth of their own, but a window of correlation that reaches a thing in front
+    of them finds that thing's: a seam as wide as half the window, in every photo alike, so that no check between photos
+    takes it off. The pixels themselves tell: greys with a depth, away from the rim, and greys without one are each
+    taken as normally distributed around a pixel. Next to gaps in a plain surface both look the same, and nothing goes.
+
+    Args:
+        depth: (H, W), 0 where unknown.
+        image: (H, W).
+    """
+    known = depth > 0
+    inner = cv2.distanceTransform(known.astype(np.uint8), cv2.DIST_L2, 3) > REACH_PX
+    grey = image.astype(np.float32)
+    spilt = _log_likelihood(grey, ~known) > _log_likelihood(grey, inner) + np.log(ODDS)
+    return np.where(spilt & ~inner, np.float32(0), depth)
+
+
+def _log_likelihood(grey: NDArray[np.float32], among: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """(H, W) of each pixel's grey among the marked pixels around it; nan, which compares as false, if there are few."""
+    side = (SURROUNDINGS_PX, SURROUNDINGS_PX)
+    marked = among.astype(np.float32)
+    count = cv2.blur(marked, side)
+    enough = count * SURROUNDINGS_PX**2 > LEAST_PX - 0.5
+    share = np.where(enough, count, np.float32(np.nan))
+    mean = cv2.blur(grey * marked, side) / share
+    variance = np.maximum(cv2.blur(grey * grey * marked, side) / share - mean * mean, 0.0) + NOISE_GREY**2
+    return np.asarray(-0.5 * ((grey - mean) ** 2 / variance + np.log(variance)), np.float32)
