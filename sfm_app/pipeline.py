@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 from sfm_app.colmap.backend import versions as colmap_versions
 from sfm_app.colmap.model import sparse_model
@@ -107,7 +108,7 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
     """The finished model, or the points and cameras, that a run left behind; nothing is computed.
 
     Raises:
-        InputError: the run has not come so far, or its files are gone; says which stage is missing.
+        InputError: the run has not come so far (says which stage is missing), or its files are gone or damaged.
     """
     place = run.workspace
     if not place.manifest().get("stages"):
@@ -122,6 +123,8 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
         return sparse_model(place.sparse) if points else loader({}, run)("texture")
     except OSError as err:
         raise InputError(f"{place.root} is not complete: {err.strerror}: {err.filename}", hint=_how_on(run)) from err
+    except (BadZipFile, EOFError, KeyError, ValueError) as err:
+        raise InputError(f"the model in {place.root} is damaged", hint=_how_on(run)) from err
 
 
 def _how_on(run: RunContext) -> str:

@@ -14,6 +14,8 @@ from sfm_app.types import Surface
 FUSED = "fused.ply"
 MAX_NORMAL_ERROR_DEG = 25.0
 CACHE_GB = 2.0
+FULL_DEPTH = 5
+"""Poisson's least depth. One surface of a lower depth, and COLMAP makes all later ones of the process coarser."""
 BORDER_WEIGHT = 10.0
 """How much dearer it is to move a border than the surface."""
 
@@ -55,10 +57,10 @@ def poisson(dense_dir: Path, depth: int) -> Surface:
 
     Args:
         dense_dir: dense workspace.
-        depth: of the octree; the finest cell is the largest extent of the points over 2^depth.
+        depth: of the octree, FULL_DEPTH where less; the finest cell is the largest extent of the points over 2^depth.
     """
     options = pycolmap.PoissonMeshingOptions()
-    options.depth, options.trim = depth, 0.0
+    options.depth, options.trim = max(depth, FULL_DEPTH), 0.0
     options.num_threads = 1  # with more: other triangles in every run, and many times slower where cores are shared
     path = dense_dir / "poisson.ply"
     with backend("finding the surface"):

@@ -54,7 +54,8 @@ def save_texture(model: Model, run: RunContext) -> None:
 
 def load_texture(dense_dir: Path) -> Model:
     """The model that `make_texture` left in a dense workspace."""
-    with np.load(dense_dir / TEXTURE) as stored:
+    # opened here, because NumPy leaves a damaged file open
+    with (dense_dir / TEXTURE).open("rb") as file, np.load(file) as stored:
         surface = Surface(stored["vertices"], stored["faces"], stored["colors"])
         if "uv" not in stored:
             return Model(surface)

@@ -1,6 +1,8 @@
 """Rendered photos end to end: the command a user types, on a scene whose camera and surface are known."""
 
+import itertools
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,10 +15,12 @@ from click.testing import CliRunner
 
 import sfm_app
 from sfm_app.cli import main
+from sfm_app.colmap.dense import DenseStore
 from sfm_app.pipeline import NAMES
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import camera_centre
 from sfm_app.synthetic.compare import centre_error_percent, focal_error_percent, surface_error
+from sfm_app.workspace import Workspace
 
 DRAFT = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 480}})
 
@@ -56,14 +60,15 @@ def test_mesh_lies_on_the_true_surface(finished):
     assert error < 0.01
 
 
-def test_glb_loads_upright_and_coloured(finished):
+def test_glb_loads_upright_and_textured(finished):
     run, _ = finished
-    # with the material trimesh keeps vertex colours as an attribute only
-    (mesh,) = trimesh.load(run.mesh_path, process=False, skip_materials=True).geometry.values()
+    (mesh,) = trimesh.load(run.mesh_path, process=False).geometry.values()
+    page = np.asarray(mesh.visual.material.baseColorTexture)
 
     assert run.mesh_path.name == "model.glb"
-    assert mesh.visual.kind == "vertex"
-    assert np.std(mesh.visual.vertex_colors[:, :3], axis=0).min() > 10
+    assert len(mesh.visual.uv) == len(mesh.vertices)
+    assert mesh.visual.uv.min() >= 0 and mesh.visual.uv.max() <= 1
+    assert page.std(axis=(0, 1)).min() > 10
     up = np.mean([-pose[1, :3] for pose in run.scene.cam_from_world.values()], axis=0)
     assert up[1] / np.linalg.norm(up) > 0.99
 
@@ -98,13 +103,54 @@ def test_a_second_run_does_nothing(finished, rendered):
 
 def test_a_changed_setting_redoes_only_what_it_touches(finished, rendered, tmp_path):
     run, _ = finished
+    shutil.copytree(run.out, tmp_path / "out", symlinks=True)
     before = {name: stage["fingerprint"] for name, stage in run.manifest["stages"].items()}
     changed = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 480}, "mesh": {"max_gap": 10}})
 
-    after = sfm_app.reconstruct(rendered[0], run.out, changed).manifest["stages"]
+    after = sfm_app.reconstruct(rendered[0], tmp_path / "out", changed).manifest["stages"]
 
     assert [name for name in NAMES if after[name]["fingerprint"] != before[name]] == ["mesh", "texture", "files"]
-    sfm_app.reconstruct(rendered[0], run.out, DRAFT)
+
+
+class Killed(BaseException):
+    """What no program catches."""
+
+
+def killed_at(number, monkeypatch, method, *arguments, **options):
+    """A run that ends when it is about to keep its `number`-th map by this method of the store of depth maps."""
+    keep, calls = getattr(DenseStore, method), itertools.count(1)
+
+    def fail(store, view, maps):
+        if next(calls) >= number:
+            raise Killed
+        keep(store, view, maps)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(DenseStore, method, fail)
+        sfm_app.reconstruct(*arguments, **options)
+
+
+def depth_files(out, kind):
+    return {path: path.stat().st_mtime_ns for path in (out / "dense/stereo/depth_maps").glob(f"*.{kind}.bin")}
+
+
+def test_a_run_killed_among_its_depth_maps_ends_with_the_same_bytes(finished, rendered, tmp_path, monkeypatch):
+    whole, out = finished[0].out, tmp_path / "out"
+    shutil.copytree(whole, out, symlinks=True)
+    expected = (whole / "model.glb").read_bytes()
+
+    killed_at(4, monkeypatch, "write_estimate", rendered[0], out, DRAFT, first="depth_maps")
+    matched = depth_files(out, "photometric")
+    assert len(matched) == 3
+    killed_at(3, monkeypatch, "write_maps", rendered[0], out, DRAFT)
+    assert depth_files(out, "photometric").items() > matched.items()
+    confirmed = depth_files(out, "geometric")
+    assert len(confirmed) == 2
+    assert "depth_maps" not in Workspace(out).manifest()["stages"]
+    run = sfm_app.reconstruct(rendered[0], out, DRAFT)
+
+    assert depth_files(out, "geometric").items() > confirmed.items()
+    assert run.mesh_path.read_bytes() == expected
 
 
 def test_one_worker_and_two_give_the_same_bytes(rendered, tmp_path):
@@ -131,26 +177,27 @@ def test_calibrate_prints_json(rendered):
     assert focal_error_percent(np.array(camera["K"]), truth) < 2.0
 
 
-def test_the_literal_methods_are_one_flag_away(rendered, tmp_path):
-    photos, _ = rendered
-    flags = [
-        "--estimator",
-        "lev-ransac-thesis",
-        "--calibrator",
-        "zero-curves-thesis",
-        "--until",
-        "scene",
-        "--json",
-        "-q",
-    ]
+def test_the_literal_methods_give_points_that_open(rendered, tmp_path):
+    """`--until scene` with the methods as they stand in print."""
+    out = tmp_path / "out"
+    literal = ["--estimator", "lev-ransac-thesis", "--calibrator", "zero-curves-thesis"]
+    flags = ["-o", str(out), "--quality", "draft", *literal, "--until", "scene", "--json", "-q"]
 
-    result = CliRunner().invoke(main, ["run", str(photos), "-o", str(tmp_path / "out"), "--quality", "draft", *flags])
+    result = CliRunner().invoke(main, ["run", str(rendered[0]), *flags])
 
     assert result.exit_code == 0, result.stderr
-    summary = json.loads(result.stdout)
-    assert summary["scene"]["registered"] >= 5
-    assert not (tmp_path / "out" / "dense").exists()
-    assert summary["scene"]["files"] == [str(tmp_path / "out" / f"points.{suffix}") for suffix in ("glb", "ply")]
+    scene = json.loads(result.stdout)["scene"]
+    assert scene["registered"] >= 5
+    assert not (out / "dense").exists()
+    assert scene["files"] == [str(out / f"points.{suffix}") for suffix in ("glb", "ply")]
+    web = trimesh.load(out / "points.glb", process=False).geometry
+    count = len(web["points"].vertices)
+    assert 0.9 * scene["points"] < count <= scene["points"]  # without those far out
+    assert len(web["cameras"].entities) > 0
+    cloud = trimesh.load(out / "points.ply", process=False)
+    np.testing.assert_allclose(cloud.vertices[:count], web["points"].vertices, atol=1e-5)
+    assert len(cloud.vertices) > count  # the cameras, dotted
+    assert np.std(cloud.colors[:count, :3], axis=0).min() > 10
 
 
 def heed_interrupts():

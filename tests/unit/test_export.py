@@ -38,12 +38,11 @@ def call(*arguments):
 
 
 @pytest.mark.parametrize("name", EXPORTERS)
-def test_the_file_is_what_the_run_would_have_written(ball, textured_ball, finished, name):
+def test_the_file_is_what_the_run_would_have_written(textured_ball, finished, name):
     paths = sfm_app.export_model(finished, name)
 
     assert paths[0] == finished / f"model.{name}"
-    made = [EXPORTERS[name][0](model, "model") for model in (ball, textured_ball)]
-    assert {path.name: path.read_bytes() for path in paths} in made
+    assert {path.name: path.read_bytes() for path in paths} == EXPORTERS[name][0](textured_ball, "model")
 
 
 @pytest.mark.parametrize(
@@ -115,6 +114,27 @@ def test_a_surface_that_has_gone_is_missed_by_name(finished):
     result = call(finished, "--format", "ply")
 
     assert (result.exit_code, LAST.files[0] in result.stderr) == (3, True)
+
+
+@pytest.mark.parametrize("left", [0, 100, -1])
+def test_a_surface_that_was_cut_off_is_no_crash(finished, left):
+    stored = finished / LAST.files[0]
+    stored.write_bytes(stored.read_bytes()[:left])
+
+    result = call(finished, "--format", "ply")
+
+    assert (result.exit_code, "is damaged" in result.stderr) == (3, True)
+    assert "goes on where it stopped" in result.stderr
+
+
+def test_a_model_without_a_texture_has_the_colours_of_its_vertices(ball, finished):
+    np.savez(
+        finished / LAST.files[0], vertices=ball.surface.vertices, faces=ball.surface.faces, colors=ball.surface.colors
+    )
+
+    (path,) = sfm_app.export_model(finished, "glb")
+
+    assert path.read_bytes() == EXPORTERS["glb"][0](ball, "model")["model.glb"]
 
 
 def test_sizes_are_told_to_people_and_paths_to_scripts(finished):

@@ -23,7 +23,8 @@ def test_an_estimator_refuses_bad_input_clearly():
 
 
 def test_the_import_leaves_out_what_an_estimator_does_not_need():
-    heavy = {"cv2", "open3d", "pycolmap", "trimesh", "scipy.optimize", "scipy.sparse", "scipy.spatial", "rich"}
+    heavy = {"cv2", "open3d", "pycolmap", "trimesh", "matplotlib", "PIL", "rich"}
+    heavy |= {"scipy.optimize", "scipy.sparse", "scipy.spatial"}
     lists = "import sys, sfm_app; print(*sys.modules)"
 
     done = subprocess.run([sys.executable, "-c", lists], capture_output=True, text=True, check=True)

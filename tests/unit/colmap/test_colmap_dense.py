@@ -165,6 +165,16 @@ def wavy(size: int) -> Surface:
     return Surface(vertices, np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)]), colors)
 
 
+def test_a_surface_does_not_depend_on_those_before_it(workspace):
+    dense, views = workspace
+    fuse(dense, views, 3, BOX, dense / FUSED)
+
+    before, _, after = (poisson(dense, depth) for depth in (6, 2, 6))
+
+    np.testing.assert_array_equal(after.vertices, before.vertices)
+    np.testing.assert_array_equal(after.faces, before.faces)
+
+
 def test_simplification_spares_what_is_curved_and_keeps_borders_and_colours(tmp_path):
     fine = wavy(40)
 
