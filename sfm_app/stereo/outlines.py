@@ -14,7 +14,7 @@ SURROUNDINGS_PX = 4 * REACH_PX + 1
 """Side of the square around a pixel in which it is compared with what has a depth and what has none."""
 NOISE_GREY = 3.0
 """Least standard deviation of greys: noise, and traces of compression."""
-ODDS = 8.0
+ODDS = 20.0
 """So many times more likely has a pixel's grey to be among those without a depth than among those with one."""
 LEAST_PX = 5
 """Pixels that say what the surroundings look like."""
