@@ -14,7 +14,7 @@ SURROUNDINGS_PX = 4 * REACH_PX + 1
 """Side of the square around a pixel in which it is compared with what has a depth and what has none."""
 NOISE_GREY = 3.0
 """Least standard deviation of greys: noise, and traces of compression."""
-ODDS = 20.0
+ODDS = 8.0
 """So many times more likely has a pixel's grey to be among those without a depth than among those with one."""
 LEAST_PX = 5
 """Pixels that say what the surroundings look like."""
@@ -26,16 +26,19 @@ def without_spill(depth: DepthArray, image: GreyImage) -> DepthArray:
     Skies and plain backgrounds have no depth of their own, but a window of correlation that reaches a thing in front
     of them finds that thing's: a seam as wide as half the window, in every photo alike, so that no check between photos
     takes it off. The pixels themselves tell: greys with a depth, away from the rim, and greys without one are each
-    taken as normally distributed around a pixel. Next to gaps in a plain surface both look the same, and nothing goes.
+    taken as normally distributed around a pixel. Next to gaps in a plain surface both look the same, and nothing goes;
+    nor does it next to gaps narrower than two rims, which lie in surfaces rather than beside them.
 
     Args:
         depth: (H, W), 0 where unknown.
         image: (H, W).
     """
     known = depth > 0
-    inner = cv2.distanceTransform(known.astype(np.uint8), cv2.DIST_L2, 3) > REACH_PX
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH_PX + 1, 2 * REACH_PX + 1))
+    empty = cv2.morphologyEx((~known).astype(np.uint8), cv2.MORPH_OPEN, disc)
+    inner = known & (cv2.distanceTransform(1 - empty, cv2.DIST_L2, 3) > REACH_PX)
     grey = image.astype(np.float32)
-    spilt = _log_likelihood(grey, ~known) > _log_likelihood(grey, inner) + np.log(ODDS)
+    spilt = _log_likelihood(grey, empty > 0) > _log_likelihood(grey, inner) + np.log(ODDS)
     return np.where(spilt & ~inner, np.float32(0), depth)
 
 

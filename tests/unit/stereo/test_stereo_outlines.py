@@ -49,6 +49,15 @@ def test_nothing_goes_around_a_hole_in_a_surface_of_one_look():
     assert np.mean(found[known] > 0) > 0.995
 
 
+def test_a_narrow_gap_lies_in_a_surface_and_keeps_its_rim():
+    crack = np.abs(COL - 40) < REACH_PX
+    grey = np.where(np.abs(COL - 40) < REACH_PX + 4, 60, 200).astype(np.uint8)
+
+    np.testing.assert_array_equal(without_spill(depths(~crack), grey), depths(~crack))
+    broad = np.abs(COL - 40) <= REACH_PX + 1
+    assert np.all(without_spill(depths(~broad), grey)[np.abs(COL - 40) < REACH_PX + 4] == 0)
+
+
 def test_what_is_thin_has_no_inside_to_compare_with_and_stays():
     wire = np.abs(COL - 40) < REACH_PX - 2
 
