@@ -63,6 +63,7 @@ def reconstruct(
     from sfm_app.pipeline import run_stages  # loads COLMAP, which an estimator alone can do without
 
     with opened_run(Path(out), settings or Settings(), progress) as run:
+        run.plugins.depth_method(run.settings.depth.method)  # refused now, not when half of the work is done
         products = run_stages(Path(photos), run, first, last)
         done = run.workspace.manifest().get("stages", {})
         scene = products("scene") if "scene" in done else None

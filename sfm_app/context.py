@@ -1,7 +1,8 @@
 """What a stage gets besides its inputs: workers, seed, progress, and a place to note what it counted."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -42,6 +43,11 @@ class RunContext:
         """Results in the order of the items, computed in parallel, with a progress bar."""
         results = ordered_map(self.executor, function, items, ahead=2 * self.workers)
         return list(track(self.progress, results, label, len(items)))
+
+    @contextmanager
+    def step(self, label: str) -> Iterator[None]:
+        """Show that a long piece of work, which cannot say how far it is, is under way."""
+        yield from track(self.progress, [None], label, 1)
 
     def record(self, **counts: Any) -> None:
         """Note figures of the current stage for the manifest; plain numbers, strings, lists and dicts."""

@@ -143,6 +143,8 @@ def file_lines(paths: Sequence[Path]) -> list[str]:
 
 def size_text(size: int) -> str:
     """Bytes as people read them."""
+    if size < KILOBYTE:
+        return f"{size} bytes"
     return f"{size / MEGABYTE:.1f} MB" if size >= MEGABYTE else f"{size / KILOBYTE:.0f} kB"
 
 

@@ -102,16 +102,6 @@ def read_depth(dense_dir: Path, view: View, kind: Kind) -> NDArray[np.float32]:
     return _read_depth_format(dense_dir, DEPTHS, view, kind)
 
 
-def read_normals(dense_dir: Path, view: View) -> NDArray[np.float32]:
-    """Read the normals of the geometric map, (H, W, 3) in the camera frame, towards the camera; 0 where unknown."""
-    with backend(f"reading the normal map of {view.name}"):
-        stored = pycolmap.NormalMap()
-        stored.read(_map_path(dense_dir, NORMALS, view, "geometric"))
-    # pycolmap says (H, W, 3), but x, y and z lie in planes
-    planes = np.array(stored.to_array(), np.float32)
-    return np.ascontiguousarray(planes.reshape(3, *planes.shape[:2]).transpose(1, 2, 0))
-
-
 def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
     """Write the confirmed depths and the normals of a view, as COLMAP's fusion expects them."""
     # pycolmap takes (H, W, 3) but stores the bytes as they come, where COLMAP keeps x, y and z in planes.

@@ -3,6 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.types import Surface
+
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
@@ -41,3 +43,9 @@ def median_edge(vertices: FloatArray, faces: IndexArray) -> float:
     """Median length of the edges."""
     edges, _ = edges_of(faces)
     return float(np.median(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)))
+
+
+def select_faces(surface: Surface, keep: NDArray[np.bool_]) -> Surface:
+    """The marked triangles (T,) with the vertices that they use, in the old order."""
+    used, faces = np.unique(surface.faces[keep], return_inverse=True)
+    return Surface(surface.vertices[used], faces.reshape(-1, 3).astype(np.int64), surface.colors[used])

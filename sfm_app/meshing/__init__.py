@@ -1,7 +1,7 @@
 """From a raw surface to a clean mesh: what photos confirm, with smooth borders, as a manifold, coloured."""
 
 from sfm_app.meshing.borders import Support, bridge_gaps, cut, drop_doubtful, smooth_support, trim
-from sfm_app.meshing.clean import drop_islands, octree_depth, select_faces
+from sfm_app.meshing.clean import drop_islands, octree_depth
 from sfm_app.meshing.manifold import make_manifold
 from sfm_app.meshing.paint import Paint, sample_colors
 from sfm_app.meshing.visibility import CONFIRMED, SEEN_THROUGH, SILENT, Eye, judge
@@ -21,7 +21,6 @@ __all__ = [
     "make_manifold",
     "octree_depth",
     "sample_colors",
-    "select_faces",
     "smooth_support",
     "trim",
 ]

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.triangles import edges_of
-from sfm_app.meshing.clean import select_faces
+from sfm_app.geometry.triangles import edges_of, select_faces
 from sfm_app.meshing.visibility import CONFIRMED, SEEN_THROUGH
 from sfm_app.types import Surface
 

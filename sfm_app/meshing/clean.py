@@ -6,6 +6,7 @@ SciPy is imported where it is used: a program that only estimates fundamental ma
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.triangles import select_faces
 from sfm_app.types import Surface
 
 MIN_POINTS = 1.25
@@ -45,9 +46,3 @@ def drop_islands(surface: Surface, min_share: float) -> Surface:
     part_of_face = part[a]
     triangles = np.bincount(part_of_face)
     return select_faces(surface, triangles[part_of_face] >= min_share * len(surface.faces))
-
-
-def select_faces(surface: Surface, keep: NDArray[np.bool_]) -> Surface:
-    """The marked triangles (T,) with the vertices that they use, in the old order."""
-    used, faces = np.unique(surface.faces[keep], return_inverse=True)
-    return Surface(surface.vertices[used], faces.reshape(-1, 3).astype(np.int64), surface.colors[used])

@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.triangles import areas, edges_of
-from sfm_app.meshing.clean import select_faces
+from sfm_app.geometry.triangles import areas, edges_of, select_faces
 from sfm_app.types import Surface
 
 MIN_HEIGHT = 1e-7

@@ -47,20 +47,22 @@ def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surfac
     views = [view for view in read_views(dense_dir) if map_file(dense_dir, view).exists()]
     points = fused_points(dense_dir, views, run)
     depth = octree_depth(points, options.poisson_depth)
-    raw = some(poisson(dense_dir, depth), "the fused points span no surface")
+    with run.step("finding the surface"):
+        raw = nonempty(poisson(dense_dir, depth), "the fused points span no surface")
     colored, support = looked_at(raw, dense_dir, views, run)
     least = SURE * photos_needed(views, run)
     trimmed = trim(colored, support, options.max_gap, least) if options.trim else colored
-    detailed = some(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
+    detailed = nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
     run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
-    surface = some(make_manifold(simplified(detailed, options, dense_dir)), "the surface has no extent")
+    with run.step("simplifying"):
+        surface = nonempty(make_manifold(simplified(detailed, options, dense_dir)), "the surface has no extent")
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
     with run.workspace.replacing(dense_dir / SURFACE) as path:
         np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
     return surface
 
 
-def some(surface: Surface, otherwise: str) -> Surface:
+def nonempty(surface: Surface, otherwise: str) -> Surface:
     """The surface, which has triangles.
 
     Raises:
@@ -85,7 +87,7 @@ def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray
     files = [map_file(dense_dir, view) for view in views]
     youngest = max(path.stat().st_mtime_ns for path in (*files, files[0].parent))
     if not target.exists() or target.stat().st_mtime_ns <= youngest:
-        with run.workspace.replacing(target) as path:
+        with run.step("fusing depth maps"), run.workspace.replacing(target) as path:
             fuse(dense_dir, views, photos_needed(views, run), region(views), path)
     points, _ = read_fused(dense_dir)
     run.record(fused_points=len(points))

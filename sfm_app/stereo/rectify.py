@@ -69,10 +69,10 @@ class Rectification:
         return np.asarray(cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT), np.uint8)
 
 
-def rectify(reference: View, neighbour: View, scale: float = 1.0) -> Rectification | Rejected:
+def rectify(reference: View, neighbour: View) -> Rectification | Rejected:
     """Lay the rows of a canvas along the epipolar planes, whatever the direction of the baseline.
 
-    The canvas shows what both photos see of the depths that the reference's sparse points span, at `scale` times the
+    The canvas shows what both photos see of the depths that the reference's sparse points span, at the
     reference's resolution; at less where the disparities would exceed `MAX_DISPARITIES` or its area `MAX_GROWTH`.
     """
     rotation = _rectified_rotation(reference, neighbour)
@@ -81,7 +81,7 @@ def rectify(reference: View, neighbour: View, scale: float = 1.0) -> Rectificati
     angles = _triangulation_angles(reference, neighbour, rotation)
     if len(angles) < MIN_POINTS:
         return Rejected("too few sparse points")
-    per_rad = scale * float(np.sqrt(reference.K[0, 0] * reference.K[1, 1]))
+    per_rad = float(np.sqrt(reference.K[0, 0] * reference.K[1, 1]))
     near, far = _angle_range(angles, (MAX_DISPARITIES - 2 * MARGIN_PX) / per_rad)
     left, right = _bounds(rotation, reference), _bounds(rotation, neighbour)
     # theta grows by the triangulation angle from the reference to the neighbour
@@ -91,7 +91,7 @@ def rectify(reference: View, neighbour: View, scale: float = 1.0) -> Rectificati
         return Rejected("the photos do not overlap")
     widest = 1.0 if low[0] < np.pi / 2 < high[0] else float(np.sin([low[0], high[0]]).max())
     area = per_rad**2 * widest * float(np.prod(high - low))
-    largest = MAX_GROWTH * scale**2 * reference.width * reference.height
+    largest = MAX_GROWTH * reference.width * reference.height
     per_rad *= min(1.0, MAX_DISPARITIES / (per_rad * (near - far) + 2 * MARGIN_PX), float(np.sqrt(largest / area)))
     steps = int(np.ceil((per_rad * (near - far) + 2 * MARGIN_PX) / DISPARITY_STEP))
     width = int(np.ceil(per_rad * (high[0] - low[0]))) + steps * DISPARITY_STEP

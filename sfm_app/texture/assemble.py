@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.triangles import select_faces
 from sfm_app.settings import TextureSettings
 from sfm_app.texture.blending import Blend, blend_weights
 from sfm_app.texture.charts import Charts, make_charts, without_specks
@@ -20,7 +21,7 @@ from sfm_app.texture.levelling import level
 from sfm_app.texture.looking import Hidden, Look, look, sharpness_factors
 from sfm_app.texture.packing import Layout, pack
 from sfm_app.texture.painting import Canvas, canvas, fill_background, finished, paint
-from sfm_app.texture.unseen import along_a_curve, block_sizes, square_texels, squares, vertex_colors, without
+from sfm_app.texture.unseen import along_a_curve, block_sizes, square_texels, squares, vertex_colors
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
 
@@ -94,7 +95,7 @@ def texture_surface(
     chosen = without_specks(choose_photos(seen.worth, mesh), seen.usable, mesh.neighbours)
     unseen = chosen == NONE
     if options.unseen == "cut" and not unseen.all():
-        mesh = facets(without(surface, unseen))
+        mesh = facets(select_faces(surface, ~unseen))
         kept = ~unseen
         seen = Seen(seen.worth[:, kept], seen.colors[:, kept], seen.gains, seen.strange)
         chosen = chosen[kept]

@@ -5,7 +5,6 @@ from numpy.typing import NDArray
 
 from sfm_app.texture.facets import Facets, at_vertices
 from sfm_app.texture.levelling import solve_ties
-from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
 
@@ -96,9 +95,3 @@ def square_texels(corner_colors: FloatArray) -> NDArray[np.uint8]:
     a, b, c = (corner_colors[:, k] for k in range(3))
     texels = np.stack([np.stack([a, b], axis=1), np.stack([c, b + c - a], axis=1)], axis=1)
     return np.asarray(np.round(np.clip(texels, 0, 255)), np.uint8)
-
-
-def without(surface: Surface, unseen: NDArray[np.bool_]) -> Surface:
-    """The surface without these triangles and the vertices that only they use."""
-    used, faces = np.unique(surface.faces[~unseen], return_inverse=True)
-    return Surface(surface.vertices[used], faces.reshape(-1, 3).astype(np.int64), surface.colors[used])

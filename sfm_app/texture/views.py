@@ -1,6 +1,5 @@
 """Photos as the texture sees them: a lens, a pose, and a kernel that projects through both."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,11 +55,6 @@ def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> Ph
     if camera.model != "OPENCV":
         raise ReconstructionError(f"the texture cannot use a camera of the model {camera.model}")
     return PhotoView(name, tuple(camera.params), cam_from_world, camera.width, camera.height)
-
-
-def camera_centres(views: Sequence[PhotoView]) -> FloatArray:
-    """(P, 3)."""
-    return np.array([view.centre for view in views]).reshape(-1, 3)
 
 
 @kernel

@@ -22,6 +22,15 @@ def test_an_estimator_refuses_bad_input_clearly():
         sfm_app.calibrate_fundamentals(np.eye(3)[None], (640, 480), method="kruppa5")
 
 
+def test_a_method_that_does_not_exist_is_refused_before_any_work(tmp_path):
+    settings = sfm_app.Settings.from_mapping({"depth": {"method": "guess"}})
+
+    with pytest.raises(sfm_app.ConfigError, match="no depth method is named 'guess'"):
+        sfm_app.reconstruct(tmp_path, tmp_path / "out", settings)
+
+    assert not (tmp_path / "out").exists()
+
+
 def test_the_import_leaves_out_what_an_estimator_does_not_need():
     heavy = {"cv2", "open3d", "pycolmap", "trimesh", "matplotlib", "PIL", "rich"}
     heavy |= {"scipy.optimize", "scipy.sparse", "scipy.spatial"}

@@ -92,7 +92,7 @@ def test_model_files_stand_with_their_sizes_the_one_to_open_first(tmp_path):
     lines = [line.strip() for line in run_lines(run)]
     start = lines.index("mesh        7 triangles, texture 4096 x 2048 and 512 x 512 px, JPEG of quality 90")
     assert lines[start + 1 : start + 3] == [f"{tmp_path}/model.glb  4 kB", f"{tmp_path}/model.ply  2.3 MB"]
-    assert lines[start - 1] == f"points and cameras: {tmp_path}/points.glb  0 kB"
+    assert lines[start - 1] == f"points and cameras: {tmp_path}/points.glb  {size_text(sizes['points.glb'])}"
     summary = run_summary(run)
     assert [summary[part]["files"] for part in ("scene", "mesh")] == [
         [f"{tmp_path}/points.glb"],
@@ -100,6 +100,8 @@ def test_model_files_stand_with_their_sizes_the_one_to_open_first(tmp_path):
     ]
 
 
-@pytest.mark.parametrize(("size", "text"), [(0, "0 kB"), (999, "1 kB"), (355_764, "356 kB"), (15_133_688, "15.1 MB")])
+@pytest.mark.parametrize(
+    ("size", "text"), [(0, "0 bytes"), (999, "999 bytes"), (355_764, "356 kB"), (15_133_688, "15.1 MB")]
+)
 def test_sizes_are_told_as_people_read_them(size, text):
     assert size_text(size) == text

@@ -13,7 +13,6 @@ from sfm_app.colmap.dense import (
     drop_estimates,
     read_depth,
     read_grey,
-    read_normals,
     read_views,
     undistort,
     write_maps,
@@ -100,7 +99,6 @@ def test_maps_come_back_as_they_were(workspace):
     write_maps(dense, view, maps)
 
     np.testing.assert_array_equal(read_depth(dense, view, "geometric"), maps.depth)
-    np.testing.assert_array_equal(read_normals(dense, view), maps.normals)
     assert (store.has(view, "geometric"), store.has(view, "photometric")) == (True, False)
 
 

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.meshing import drop_islands, octree_depth, select_faces
+from sfm_app.geometry.triangles import select_faces
+from sfm_app.meshing import drop_islands, octree_depth
 
 
 @pytest.mark.parametrize(("share", "left"), [(0.0, 2), (0.05, 2), (0.15, 1)])

@@ -104,13 +104,12 @@ def test_keeps_the_resolution_of_the_reference(center):
     spots = np.array([[160.0, 120, 1], [161, 120, 1], [160, 121, 1]]) @ np.linalg.inv(K).T
     middle = on_canvas(found, reference, spots)
     assert 0.97 < abs(np.linalg.det(middle[1:] - middle[0])) < 1.03
-    assert 0.45 < rectify(reference, view_at(center), 0.5).columns_per_rad / found.columns_per_rad < 0.55
 
 
 def test_disparities_are_limited_by_shrinking():
     near = np.column_stack([np.linspace(-0.3, 0.3, 50), np.zeros(50), np.linspace(0.3, 8, 50)])
 
-    found = rectify(view_at([0, 0, 0], points=near), view_at([1.2, 0, 0], turned(0, 0.2, 0)), 2.0)
+    found = rectify(view_at([0, 0, 0], points=near), view_at([1.2, 0, 0], turned(0, 0.2, 0)))
 
     assert isinstance(found, Rectification), found
     assert found.disparities % DISPARITY_STEP == 0
