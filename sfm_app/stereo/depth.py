@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +26,9 @@ WEAK_NEED = 2
 """That many more depth maps have to agree there; where there are not so many, it stays empty."""
 UNSURE, SURE = 0.5, 0.8
 """Correlation below which one more depth map has to agree, and from which on one less is enough."""
+
+CLIPPED_GREY = 4
+"""Within so many levels of black or of white nothing is seen, and what matching finds there comes from beside it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +83,14 @@ def match_depths(
     depth, _ = merge_hypotheses(np.stack([d for d, _ in found]), np.stack([p for _, p in found]), tolerance)
     planes = _started(depth)
     cost = improve_planes(planes, centered, image, used, SWEEPS)
+    cost[clipped(image)] = NO_MATCH
     return _sampled(planes, cost, view.sample_px)
+
+
+def clipped(image: GreyImage) -> NDArray[np.bool_]:
+    """(H, W) whether a photo is black or blown out at a pixel and around it."""
+    around = cv2.blur(image, (3, 3))
+    return np.asarray((around <= CLIPPED_GREY) | (around >= 255 - CLIPPED_GREY))
 
 
 def _started(depth: DepthArray) -> PlaneArray:

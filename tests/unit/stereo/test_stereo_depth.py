@@ -112,3 +112,16 @@ def test_region_leaves_strays_out():
 
     assert np.all((low > -1.5) & (low < -1.2))
     assert np.all((high < 1.5) & (high > 1.2))
+
+
+@pytest.mark.parametrize("grey", [0, 255])
+def test_what_is_black_or_blown_out_is_not_made_up_from_what_is_beside_it(plane, views, grey):
+    def photo(view):
+        pixels = plane.photo(view).clip(20, 235)
+        pixels[:, 120:] = grey
+        return pixels
+
+    found = match_depths(views[1], [views[0], views[2]], photo, 2, 0.01)
+
+    assert np.mean(found.depth[5:-5, 5:119] > 0) > 0.8
+    assert not found.depth[:, 121:].any()
