@@ -18,6 +18,8 @@ ODDS = 8.0
 """So many times more likely has a pixel's grey to be among those without a depth than among those with one."""
 LEAST_PX = 5
 """Pixels that say what the surroundings look like."""
+ANY_GREY = 0.5 * np.log(2.0 * np.pi) - np.log(256.0)
+"""Log likelihood of a grey where nothing is known: all are alike. Things as thin as their rims are such."""
 
 
 def without_spill(depth: DepthArray, image: GreyImage) -> DepthArray:
@@ -38,7 +40,8 @@ def without_spill(depth: DepthArray, image: GreyImage) -> DepthArray:
     empty = cv2.morphologyEx((~known).astype(np.uint8), cv2.MORPH_OPEN, disc)
     inner = known & (cv2.distanceTransform(1 - empty, cv2.DIST_L2, 3) > REACH_PX)
     grey = image.astype(np.float32)
-    spilt = _log_likelihood(grey, empty > 0) > _log_likelihood(grey, inner) + np.log(ODDS)
+    thing = _log_likelihood(grey, inner)
+    spilt = _log_likelihood(grey, empty > 0) > np.where(np.isnan(thing), ANY_GREY, thing) + np.log(ODDS)
     return np.where(spilt & ~inner, np.float32(0), depth)
 
 
