@@ -98,13 +98,13 @@ class DepthSettings(Section):
     consistency: float = Field(
         0.01, gt=0, le=1, description="largest relative depth difference between photos that agree"
     )
-    min_agreeing: int = Field(2, ge=1, le=20, description="other photos that have to agree with a depth")
+    min_agreeing: int = Field(1, ge=1, le=20, description="other photos that have to agree with a depth")
 
 
 class MeshSettings(Section):
     """The surface through the depth maps."""
 
-    poisson_depth: int = Field(10, ge=5, le=14, description="greatest depth of the Poisson octree")
+    poisson_depth: int = Field(12, ge=5, le=14, description="greatest depth of the Poisson octree")
     trim: bool = Field(True, description="cut off surface that no photo confirms; false keeps Poisson's closed surface")
     max_gap: float = Field(
         20.0, ge=0, le=1000, description="gaps in what photos confirm are closed up to this width, in triangles"
@@ -174,14 +174,14 @@ QUALITY_PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "matching": {"max_image_size_px": 1000, "max_features": 4096},
         "depth": {"max_image_size_px": 640, "neighbours": 3},
-        "mesh": {"poisson_depth": 9, "faces": 50_000},
+        "mesh": {"poisson_depth": 10, "faces": 50_000},
         "texture": {"max_page_px": 2048, "max_pages": 1},
     },
     "normal": {},
     "high": {
         "matching": {"max_image_size_px": 3200, "max_features": 16384},
         "depth": {"max_image_size_px": 2000, "neighbours": 6},
-        "mesh": {"poisson_depth": 11, "faces": 1_000_000},
+        "mesh": {"poisson_depth": 13, "faces": 1_000_000},
         "texture": {"max_page_px": 8192},
     },
 }

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sfm_app.geometry.triangles import select_faces
 from sfm_app.types import Surface
 
-MIN_POINTS = 1.25
+MIN_POINTS = 1.4
 """Least mean number of points in an occupied cell of Poisson's finest grid."""
 MARGIN = 1.1
 """Width of Poisson's cube in extents of the points."""

@@ -11,7 +11,7 @@ from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses, without
 from sfm_app.stereo.even_areas import bridge_even_areas
 from sfm_app.stereo.matching import depths_from_disparities, disparities
 from sfm_app.stereo.normals import fit_planes, normals_of
-from sfm_app.stereo.outlines import without_spill
+from sfm_app.stereo.outlines import rims, without_spill
 from sfm_app.stereo.patch_match import NO_MATCH, PlaneArray, improve_planes
 from sfm_app.stereo.rectify import rectify
 from sfm_app.stereo.view import DepthArray, GreyImage, View
@@ -22,10 +22,10 @@ SWEEPS = 1
 WEAK = 0.3
 """Correlation below which there is next to nothing to be seen: in skies depths agree by chance at most, on plain walls
 semi-global matching bridges what is between the windows in every photo alike."""
-WEAK_NEED = 2
+WEAK_NEED = 3
 """That many more depth maps have to agree there; where there are not so many, it stays empty."""
-UNSURE, SURE = 0.5, 0.8
-"""Correlation below which one more depth map has to agree, and from which on one less is enough."""
+UNSURE = 0.5
+"""Correlation below which one more depth map has to agree."""
 
 CLIPPED_GREY = 4
 """Within so many levels of black or of white nothing is seen, and what matching finds there comes from beside it."""
@@ -119,17 +119,19 @@ def confirm_depths(
 ) -> DepthMap | Rejected:
     """Keep the depths that enough other maps confirm, cut at outlines; drop specks, bridge plain walls, add normals.
 
-    Enough is `min_agreeing`; one more where the photos look little alike, two where they hardly do; one less, but not
-    none, where they look very much alike.
+    Enough is `min_agreeing`; one more where the photos look little alike and beside broad empty places, three more
+    where they hardly do.
     """
     if not others:
         return Rejected("no other depth map to compare with")
     agreeing = count_agreeing(view, estimate.depth, others, tolerance)
     confidence = estimate.confidence
-    enough = np.clip(min_agreeing + (confidence < UNSURE) - 1 * (confidence > SURE), 1, len(others))
-    enough = np.where(confidence < WEAK, min_agreeing + WEAK_NEED, enough)
+    least, more = (min(need, len(others)) for need in (min_agreeing, min_agreeing + 1))
+    enough = np.where(confidence < UNSURE, more, least)
+    enough[confidence < WEAK] = min_agreeing + WEAK_NEED
     confirmed = np.where(agreeing >= enough, estimate.depth, np.float32(0))
-    confirmed = without_specks(without_spill(confirmed, image), tolerance)
+    doubtful = rims(confirmed > 0) & (agreeing < more)
+    confirmed = without_specks(without_spill(np.where(doubtful, np.float32(0), confirmed), image), tolerance)
     planes = fit_planes(bridge_even_areas(confirmed, image, tolerance))
     if not planes.any():
         return Rejected("no depth is confirmed by other photos")

@@ -36,13 +36,22 @@ def without_spill(depth: DepthArray, image: GreyImage) -> DepthArray:
         image: (H, W).
     """
     known = depth > 0
-    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH_PX + 1, 2 * REACH_PX + 1))
-    empty = cv2.morphologyEx((~known).astype(np.uint8), cv2.MORPH_OPEN, disc)
-    inner = known & (cv2.distanceTransform(1 - empty, cv2.DIST_L2, 3) > REACH_PX)
+    empty, rim = _broad(~known), rims(known)
     grey = image.astype(np.float32)
-    thing = _log_likelihood(grey, inner)
-    spilt = _log_likelihood(grey, empty > 0) > np.where(np.isnan(thing), ANY_GREY, thing) + np.log(ODDS)
-    return np.where(spilt & ~inner, np.float32(0), depth)
+    thing = _log_likelihood(grey, known & ~rim)
+    spilt = _log_likelihood(grey, empty) > np.where(np.isnan(thing), ANY_GREY, thing) + np.log(ODDS)
+    return np.where(spilt & rim, np.float32(0), depth)
+
+
+def rims(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(H, W) the pixels with a depth that lie within `REACH_PX` of an empty place broader than two rims."""
+    away = cv2.distanceTransform(1 - _broad(~known).view(np.uint8), cv2.DIST_L2, 3)
+    return np.asarray(known & (away <= REACH_PX))
+
+
+def _broad(empty: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH_PX + 1, 2 * REACH_PX + 1))
+    return np.asarray(cv2.morphologyEx(empty.view(np.uint8), cv2.MORPH_OPEN, disc)).view(np.bool_)
 
 
 def _log_likelihood(grey: NDArray[np.float32], among: NDArray[np.bool_]) -> NDArray[np.float32]:

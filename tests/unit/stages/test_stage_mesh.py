@@ -136,11 +136,9 @@ def test_what_no_photo_sees_is_cut_off_or_kept_closed(dense, tmp_path):
 def test_maps_that_agree_on_nothing_give_an_error_that_says_so(dense, tmp_path):
     poor = tmp_path / "dense"
     shutil.copytree(dense, poor)
-    rng = np.random.default_rng(0)
-    for view in read_views(poor)[:3]:
+    for view, factor in zip(read_views(poor)[:3], (1.0, 1.6, 2.7), strict=True):
         maps = true_maps(view)
-        wrong = maps.depth * rng.uniform(0.5, 1.5, maps.depth.shape).astype(np.float32)
-        write_maps(poor, view, DepthMap(wrong, maps.normals))
+        write_maps(poor, view, DepthMap(maps.depth * np.float32(factor), maps.normals))
     for view in read_views(poor)[3:]:
         map_file(poor, view).unlink()
 

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.stereo.outlines import REACH_PX, without_spill
+from sfm_app.stereo.outlines import REACH_PX, rims, without_spill
 
 SIDE = 80
 ROW, COL = np.indices((SIDE, SIDE))
@@ -66,6 +66,14 @@ def test_what_is_thin_keeps_what_does_not_look_like_the_empty_side():
     found = without_spill(depths(seam), grey)
 
     np.testing.assert_array_equal(found > 0, wire)
+
+
+def test_rims_lie_beside_what_is_broadly_empty():
+    away = np.abs(COL - 20) - 2 * REACH_PX  # of the columns to the right of a gap four rims wide
+
+    found = rims((away > 0) & (np.abs(COL - 60) > 1))
+
+    np.testing.assert_array_equal(found, (away > 0) & (away <= REACH_PX))
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1))
