@@ -29,8 +29,11 @@ FLAT = 0.2
 PICTURE_PX = 256
 """Longer side of the small photos: wide enough for ledges and window sills, too small for texture."""
 
-BLUR_PX, BLACK, DARK_REACH_PX = 2.0, 20, 7
-"""Blur before slopes are taken; grey level below which nothing is lit, and how far around such pixels none count."""
+BLUR_PX = 2.0
+"""Blur before slopes are taken."""
+
+BLACK, BROAD_PX, BORDER_PX = 20, 15, 6
+"""Areas so dark and so broad are a background without light, whose border is no ledge; and how wide that border is."""
 
 NO_CHANGE = 1e-6
 """Root mean square of normals or log brightness below which they are all the same, and digits are all that is left."""
@@ -145,8 +148,7 @@ def ledges_are_lit(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDA
         if picture is None or min(picture.shape) < 3:
             continue
         grey = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), BLUR_PX)
-        lit = cv2.erode(grey, np.ones((DARK_REACH_PX, DARK_REACH_PX)))[1:-1, 1:-1] > BLACK
-        slope = _slope(np.sqrt(grey), R @ up)[lit]
+        slope = _slope(np.sqrt(grey), R @ up)[~_black_background(grey)[1:-1, 1:-1]]
         power = (slope**2).sum()
         found.append(float((slope * np.abs(slope)).sum() / power) if power > 0 else 0.0)
     return float(np.mean(found)) if found else 0.0
@@ -172,6 +174,12 @@ def sky_is_above(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArr
         above, below = even[height > border], even[height < -border]
         found.append(float(above.mean() - below.mean()) if above.size and below.size else 0.0)
     return float(np.mean(found)) if found else 0.0
+
+
+def _black_background(grey: NDArray[np.float32]) -> NDArray[np.bool_]:
+    broad, border = (np.ones((width, width), np.uint8) for width in (BROAD_PX, 2 * BORDER_PX + 1))
+    black = cv2.morphologyEx((grey < BLACK).astype(np.uint8), cv2.MORPH_OPEN, broad)
+    return np.asarray(cv2.dilate(black, border) > 0)
 
 
 def _slope(grey: NDArray[np.float32], axis: FloatArray) -> NDArray[np.float32]:
