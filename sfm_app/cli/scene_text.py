@@ -11,7 +11,7 @@ NAMES = 4
 MAPPERS = {"incremental": "photo after photo", "global": "all at once"}
 CONTRADICTED = 0.1
 """From this share of the matches on, people are told."""
-UNSURE_ODDS = 5.0
+UNSURE_ODDS = 10.0
 """Below these odds to one that up is up, too."""
 
 
