@@ -18,8 +18,9 @@ FloatArray = NDArray[np.float64]
 ROLLS_DEG, PITCH_DEG = (4.0, 12.0, 30.0), 20.0
 """Standard deviations, sideways of careful, careless and wild photographers, and along the view of all."""
 
-MOST = 4.5
-"""What one photo at most counts against a direction: three standard deviations, so that wild photos are outvoted."""
+MOST, MOST_DOWN = 4.5, 3.0
+"""What one photo at most counts against a direction: three standard deviations, so that wild photos are outvoted; and
+less where it looks steeply down, as people do at what lies on floors and tables."""
 
 TURNED = (0.0, 3.0, 6.0, 3.0)
 """Evidence, as -log of odds, that it takes to believe that all photos are turned by 0, 90, 180, 270 degrees: one folder
@@ -30,6 +31,9 @@ ODD_ONE = 1.0
 
 VOICES = 8
 """Photos of one walk are no independent witnesses: more than so many count as so many."""
+
+CLIMB = 0.1
+"""Half of all walks go up and down by less than this share of their way."""
 
 STEPS = 20
 
@@ -55,7 +59,8 @@ def ups_from_roll(rotations: FloatArray, centres: FloatArray) -> tuple[Roll, ...
 
     Roll alone does not tell portrait photos of a wall from landscape photos of the same wall lying on its side, so
     two weaker signs join in: people look about horizontally, and they walk rather than climb. Of the directions that
-    the photos propose the best is refined by weighted least squares. Opposite turns have opposite directions.
+    the photos propose the best is refined by weighted least squares. Opposite turns have opposite directions, unless
+    cameras look steeply down.
 
     Args:
         rotations: (N, 3, 3) cam_from_world, N >= 1; camera axes x right, y down, z forward.
@@ -100,16 +105,17 @@ def _tilts(up: FloatArray, rotations: FloatArray) -> tuple[NDArray[np.intp], Flo
 def _cost(up: FloatArray, turn: int, rotations: FloatArray, roll_deg: float) -> float:
     """-log likelihood of the poses if the set as a whole is turned by `turn` quarters."""
     turns, roll, pitch = _tilts(up, rotations)
-    tilts = [np.minimum(_squares(sine, deg), MOST) for sine, deg in ((roll, roll_deg), (pitch, PITCH_DEG))]
-    per_photo = sum(tilts) + ODD_ONE * (turns != turn) + np.log(roll_deg)
+    sideways = np.minimum(_squares(roll, roll_deg), MOST)
+    along_view = np.minimum(_squares(pitch, PITCH_DEG), np.where(pitch < 0, MOST_DOWN, MOST))
+    per_photo = sideways + along_view + ODD_ONE * (turns != turn) + np.log(roll_deg)
     return float(min(len(rotations), VOICES) * per_photo.mean() + TURNED[turn])
 
 
 def _climbing(up: FloatArray, centres: FloatArray) -> float:
-    """-log likelihood of how much of the cameras' spread is height."""
+    """-log likelihood of how much of the cameras' spread is height: Cauchy, since a few do climb."""
     spread = centres - centres.mean(axis=0)
     total = float((spread**2).sum())
-    return min(len(centres), VOICES) * 0.5 * float(((spread @ up) ** 2).sum()) / total if total > 0 else 0.0
+    return float(np.log1p(((spread @ up) ** 2).sum() / (total * CLIMB**2))) if total > 0 else 0.0
 
 
 def _refined(up: FloatArray, rotations: FloatArray, roll_deg: float) -> FloatArray:

@@ -140,6 +140,18 @@ def test_opposite_turns_have_opposite_directions(build_house):
         assert roll.up == pytest.approx(-opposite.up)
 
 
+@pytest.mark.parametrize("turn_deg", [0, 90])
+def test_three_steps_along_a_wall_are_level(build_house, turn_deg):
+    """Nothing but the walk tells which of the two verticals it is."""
+    house = build_house((turn_deg + 1.0, turn_deg - 2.0, turn_deg + 0.5), sweep_deg=15.0, lines=(0, 0))
+    nothing = Scenery(np.zeros((0, 3)), np.zeros(0), (np.zeros(0, np.int64),) * 3, (None,) * 3)
+
+    standing = stand(ups_from_roll(house.rotations, house.centres), house.rotations, house.centres, nothing)
+
+    assert abs(standing.roll.up @ house.up) > 0.98
+    assert 0.2 < standing.not_on_its_side < 8
+
+
 def test_ledges_are_lit_from_above():
     upright, sideways = look_at(np.array([0, 0, 5.0]), np.zeros(3))[:, :3], stripes(ledge_rows()).T
     found = ledges_are_lit(UP, [upright], [stripes(ledge_rows())])
