@@ -84,6 +84,9 @@ class SceneSettings(Section):
         2.0, gt=0, le=90, description="least median triangulation angle of a seed pair, in degrees"
     )
     min_points: int = Field(30, ge=6, le=10000, description="a model with fewer points counts as failed")
+    turn_deg: Literal["auto", 0, 90, 180, 270] = Field(
+        "auto", description="by how much most photos have to be turned clockwise to be upright, in degrees"
+    )
 
 
 class DepthSettings(Section):

@@ -38,17 +38,21 @@ Every GLB through the Khronos validator, three.js in headless Chromium, Open3D a
 it. on screen: share of the picture that the model covers. outward: share of the vertices whose normal looks at a
 camera; 1 for a closed surface whose volume is positive. double edges: with more than two triangles; open edges: with
 one. off centre: distance of the surface's middle (median over its area) from 0, in sizes of the scene. up +- deg:
-standard deviation of up as its evidence has it. ok: names what is not as it should be."""
+standard deviation of up, up odds: odds to one against a model on its head or side, both as their evidence has it and
+no proof. photos turned: by how many degrees clockwise the program believes that the photos have to be turned; wrong
+where people who look at them say otherwise. ok: names what is not as it should be."""
 FILES = (
     "file", "MB", "triangles", "points", "pages", "errors", "warnings", "on screen", "three.js", "Open3D", "trimesh",
     "ok",
 )  # fmt: skip
 SURFACES = (
     "file", "triangles", "not finite", "degenerate", "double edges", "open edges", "outward", "off centre", "up by",
-    "up +- deg", "ok",
+    "up +- deg", "up odds", "photos turned", "ok",
 )  # fmt: skip
 
-LIMITS = {"outward": 0.95, "off centre": 0.2, "up +- deg": 3.0, "on screen": 0.002}
+LIMITS = {"outward": 0.95, "off centre": 0.2, "up +- deg": 3.0, "up odds": 20.0, "on screen": 0.002}
+TURNED_DEG = {"temple16": 270}
+"""By run: how far its photos have to be turned clockwise to be upright, as people see it; the others are upright."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +64,7 @@ class Subject:
     ply: Path
     cameras: tuple[Frustum, ...] = ()
     orientation: Mapping[str, Any] | None = None
+    run: str = ""
 
 
 def main() -> int:
@@ -94,7 +99,7 @@ def gather(runs: Sequence[Path], place: Path) -> list[Subject]:
         for kind, name in (("model", run.name), ("points", f"{run.name}-points")):
             if (run / f"{kind}.glb").exists():
                 copy = shutil.copyfile(run / f"{kind}.glb", place / f"{name}.glb")
-                found.append(Subject(name, copy, run / f"{kind}.ply", cameras, orientation))
+                found.append(Subject(name, copy, run / f"{kind}.ply", cameras, orientation, run.name))
     return found
 
 
@@ -155,7 +160,9 @@ def faults(subject: Subject, seen: Mapping[str, Any], readers: Mapping[str, Mapp
         "not manifold": row.get("double edges"),
         "normals": row.get("outward", 1.0) < LIMITS["outward"],
         "off centre": row.get("off centre", 0.0) > LIMITS["off centre"],
-        "not upright": row.get("up +- deg", 0.0) > LIMITS["up +- deg"],
+        "vertical not sure": row.get("up +- deg", 0.0) > LIMITS["up +- deg"],
+        "up not sure": row.get("up odds", np.inf) < LIMITS["up odds"],
+        "on its head or side": row.get("photos turned", 0) != TURNED_DEG.get(subject.run, 0),
         "other colours": subject.name == SAMPLE and not shows_pages(three["most"]),
     }
     return [what for what, fault in tests.items() if fault]
@@ -192,7 +199,10 @@ def looked_at(subject: Subject) -> Row:
     vertices, faces, normals = (np.asarray(part) for part in (mesh.vertices, mesh.triangles, mesh.vertex_normals))
     row: Row = {"not finite": int((~np.isfinite(np.concatenate([vertices, normals]))).any(axis=1).sum())}
     if subject.orientation:
-        row |= {"up by": subject.orientation["up"], "up +- deg": subject.orientation["up_deviation_deg"]}
+        found = subject.orientation
+        row |= {"up by": found["up"], "up +- deg": found["up_deviation_deg"]}
+        row |= {"up odds": min(found["up_sign_odds"], found["up_axis_odds"])}
+        row |= {"photos turned": found["photos_turned_deg"]}
     if not len(faces):
         return row
     edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)

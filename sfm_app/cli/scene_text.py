@@ -11,6 +11,8 @@ NAMES = 4
 MAPPERS = {"incremental": "photo after photo", "global": "all at once"}
 CONTRADICTED = 0.1
 """From this share of the matches on, people are told."""
+UNSURE_ODDS = 10.0
+"""Below these odds to one that up is up, too."""
 
 
 def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
@@ -71,6 +73,17 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
     if orientation:
         sure = max(orientation["up_deviation_deg"], 0.1)
         yield f"upright by {orientation['up']}, to about {sure:.1f} degrees; in {_unit(orientation)}"
+        yield from _perhaps_not_upright(orientation)
+
+
+def _perhaps_not_upright(orientation: Mapping[str, Any]) -> Iterator[str]:
+    """What to do if the model stands the wrong way up, where that is well possible."""
+    mistakes = {"up_sign_odds": ("stand upside down", (180,)), "up_axis_odds": ("lie on its side", (90, 270))}
+    for key, (what, turns) in mistakes.items():
+        odds = orientation.get(key, UNSURE_ODDS)
+        if odds < UNSURE_ODDS:
+            others = " or ".join(str((orientation["photos_turned_deg"] + turn) % 360) for turn in turns)
+            yield f"beware: it may {what} (odds {odds:.1f} to 1 against); if so, --set scene.turn_deg={others} helps"
 
 
 def _unit(orientation: Mapping[str, Any]) -> str:

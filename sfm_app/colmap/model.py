@@ -110,6 +110,34 @@ def posed_photos(model: Any) -> tuple[dict[int, NDArray[np.float64]], NDArray[np
     return poses, points
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenPoints:
+    """Points of a model, and which photos see them."""
+
+    points: NDArray[np.float64]
+    """(P, 3)"""
+    colors: NDArray[np.uint8]
+    """(P, 3)"""
+    seen: tuple[NDArray[np.int64], ...]
+    """Per photo with a pose, in order of ids, the points that it sees."""
+
+
+def seen_points(model: Any, most: int) -> SeenPoints:
+    """The points of a model, or so many of them, drawn with a fixed seed."""
+    keys = sorted(model.points3D)
+    chosen = np.sort(np.random.default_rng(0).permutation(len(keys))[:most])
+    found = [model.points3D[keys[k]] for k in chosen]
+    seen: dict[int, list[int]] = {image_id: [] for image_id in photos_of(model)}
+    for number, point in enumerate(found):
+        for image_id in {element.image_id for element in point.track.elements} & seen.keys():
+            seen[image_id].append(number)
+    return SeenPoints(
+        np.array([point.xyz for point in found], np.float64).reshape(-1, 3),
+        np.array([point.color for point in found], np.uint8).reshape(-1, 3),
+        tuple(np.array(numbers, np.int64) for numbers in seen.values()),
+    )
+
+
 def sparse_model(model_dir: Path) -> Model:
     """The coloured points of a model on disk, and its photos where they were taken, in order of ids.
 

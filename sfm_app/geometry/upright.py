@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.directions import across, axis_angle_deg, basis_across, unit
 from sfm_app.geometry.planes import dominant_plane
-from sfm_app.geometry.roll import Roll, up_from_roll
+from sfm_app.geometry.roll import Roll, ups_from_roll
 from sfm_app.geometry.similarity import Similarity
+from sfm_app.geometry.standing import Scenery, Standing, stand
 from sfm_app.geometry.vanishing import Segments, level_direction, square_frame, vanishing_near
 
 FloatArray = NDArray[np.float64]
@@ -38,8 +39,13 @@ class Upright:
     """`LINES`, `ROLL`, `GROUND` or `GPS`."""
     deviation_deg: float
     """Standard deviation of `up`, in degrees, as its evidence has it."""
-    roll: Roll
-    """What the cameras alone say."""
+    standing: Standing
+    """Which way up the photos are, and how sure that is."""
+
+    @property
+    def roll(self) -> Roll:
+        """What the cameras alone say about up, once it is known which way up the photos are."""
+        return self.standing.roll
 
     @property
     def off_roll_deg(self) -> float:
@@ -47,33 +53,43 @@ class Upright:
         return float(axis_angle_deg(self.up, self.roll.up))
 
     def turned_to(self, up: FloatArray, deviation_deg: float) -> "Upright":
-        """The same, with up as GPS has it."""
-        return replace(self, up=up, level=None, found_by=GPS, deviation_deg=deviation_deg)
+        """The same, with up as GPS has it: heights know their sign."""
+        sure = Standing(self.roll, self.standing.evidence, np.inf, np.inf)
+        return replace(self, up=up, level=None, found_by=GPS, deviation_deg=deviation_deg, standing=sure)
 
 
-def up_direction(rotations: FloatArray, centres: FloatArray, points: FloatArray, segments: Segments) -> Upright:
+def up_direction(
+    rotations: FloatArray, centres: FloatArray, scenery: Scenery, segments: Segments, turn_deg: int | None = None
+) -> Upright:
     """Up from the vertical lines of the scene near where the cameras' roll has it; else from roll, or from the ground.
 
     Args:
         rotations: (N, 3, 3) cam_from_world of the photos, N >= 1.
         centres: (N, 3) camera centres.
-        points: (P, 3) of the scene.
+        scenery: what the photos show; tells the ways up apart in which they may have been taken.
         segments: lines in the photos; may be empty.
+        turn_deg: by how much the photos have to be turned clockwise to stand upright: 0, 90, 180 or 270; None where
+            nobody knows.
     """
-    roll = up_from_roll(rotations, centres, points)
+    rolls = ups_from_roll(rotations, centres)
+    if turn_deg is None:
+        standing = stand(rolls, rotations, centres, scenery)
+    else:
+        standing = Standing(rolls[turn_deg // 90], {}, np.inf, np.inf)
+    roll = standing.roll
     lines = vanishing_near(roll.up, segments)
     if lines is not None:
         level = level_direction(lines.direction, segments)
         if level is None:
-            return Upright(lines.direction, None, LINES, lines.deviation_deg, roll)
+            return Upright(lines.direction, None, LINES, lines.deviation_deg, standing)
         frame, deviation_deg = square_frame(lines.direction, level, segments)
         # verticals alone and all edges together err in their own ways: the gap between them says by how much
         gap_deg = float(axis_angle_deg(frame[0], lines.direction))
-        return Upright(frame[0], frame[1], LINES, float(np.hypot(deviation_deg, gap_deg)), roll)
-    ground = dominant_plane(points, roll.up, FLOOR_DEG) if roll.spread_deg > UNSURE_DEG else None
+        return Upright(frame[0], frame[1], LINES, float(np.hypot(deviation_deg, gap_deg)), standing)
+    ground = dominant_plane(scenery.points, roll.up, FLOOR_DEG) if roll.spread_deg > UNSURE_DEG else None
     if ground is not None:
-        return Upright(ground.normal, None, GROUND, ground.deviation_deg, roll)
-    return Upright(roll.up, None, ROLL, roll.deviation_deg, roll)
+        return Upright(ground.normal, None, GROUND, ground.deviation_deg, standing)
+    return Upright(roll.up, None, ROLL, roll.deviation_deg, standing)
 
 
 def facing(upright: Upright, rotations: FloatArray, points: FloatArray) -> tuple[FloatArray, str]:

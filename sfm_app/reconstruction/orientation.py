@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.model import focal_px, move, photos_of, posed_photos, viewing_rays
+from sfm_app.colmap.model import focal_px, move, photos_of, posed_photos, seen_points, viewing_rays
 from sfm_app.context import RunContext
+from sfm_app.geometry.cues import small_picture
 from sfm_app.geometry.georeference import Georeference, NoGeoreference, georeference, position_at
 from sfm_app.geometry.segments import line_segments
 from sfm_app.geometry.similarity import Similarity
+from sfm_app.geometry.standing import Scenery, odds
 from sfm_app.geometry.upright import LINES, Upright, facing, up_direction, viewer_frame
 from sfm_app.geometry.vanishing import Segments, joined, segment_planes
 from sfm_app.types import MatchGraph
@@ -24,42 +27,56 @@ logger = logging.getLogger("sfm_app")
 
 FloatArray = NDArray[np.float64]
 
-LINE_PHOTOS = 10
-"""Photos that lines are sought in, spread over the set."""
+LOOKED_AT = 10
+"""Photos that are looked at, spread over the set."""
+
+SCENERY_POINTS = 8000
+"""Points that say which way up they are; more say no more."""
 
 
-Searched = Mapping[int, "Future[FloatArray]"]
-"""By photo: its line segments (N, 4) in pixels, when they are found."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """What one photo tells about how it was held."""
+
+    lines: FloatArray
+    """(N, 4) line segments in its pixels."""
+    picture: NDArray[np.uint8] | None
+    """The photo itself, grey and small; None where it could not be read."""
 
 
-def search_lines(models: Sequence[Any], matches: MatchGraph, run: RunContext) -> Searched:
-    """Begin to look for line segments in some photos of every model; the caller goes on meanwhile."""
-    searched = {}
+Looks = Mapping[int, "Future[Look]"]
+"""By photo, when it has been looked at."""
+
+
+def look_at_photos(models: Sequence[Any], matches: MatchGraph, run: RunContext) -> Looks:
+    """Begin to look at some photos of every model; the caller goes on meanwhile."""
+    looks = {}
     for model in models:
         posed = photos_of(model)
-        for k in np.unique(np.linspace(0, len(posed) - 1, LINE_PHOTOS).astype(int)):
+        for k in np.unique(np.linspace(0, len(posed) - 1, LOOKED_AT).astype(int)):
             file = run.workspace.photos / matches.images[posed[k]].name
-            searched[posed[k]] = run.executor.submit(photo_segments, file)
-    return searched
+            looks[posed[k]] = run.executor.submit(look_at, file)
+    return looks
 
 
-def orient(model: Any, matches: MatchGraph, searched: Searched) -> dict[str, Any]:
+def orient(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int | None = None) -> dict[str, Any]:
     """Move the model into the frame of glTF viewers: y up, seen from +z, centred, of size about 1 or in metres.
 
     Args:
-        model: COLMAP's model; changed in place.
+        model: COLMAP's model, coloured; changed in place.
         matches: knows the photos' names and GPS positions.
-        searched: lines in photos.
+        looks: at photos.
+        turn_deg: by how much the photos have to be turned clockwise to stand upright; None where nobody knows.
 
     Returns:
         How it was done, for the manifest.
     """
     with backend("reading the model"):
         poses, points = posed_photos(model)
-    segments = lines_of(model, searched)
     matrices = np.array(list(poses.values()))
     R, centres = matrices[:, :, :3], -np.einsum("nij,ni->nj", matrices[:, :, :3], matrices[:, :, 3])
-    upright = up_direction(R, centres, points, segments)
+    found = {photo: looks[photo].result() for photo in poses if photo in looks}
+    upright = up_direction(R, centres, scenery_of(model, found), lines_of(model, found), turn_deg)
     positions = [matches.images[key].gps for key in poses]
     gps = georeference(centres, positions, upright.up, up_is_sure=upright.found_by == LINES)
     metres = None
@@ -76,21 +93,31 @@ def orient(model: Any, matches: MatchGraph, searched: Searched) -> dict[str, Any
     return entry
 
 
-def lines_of(model: Any, searched: Searched) -> Segments:
+def lines_of(model: Any, looks: Mapping[int, Look]) -> Segments:
     """Line segments, in the world, of the photos of a model."""
-    found = {photo: searched[photo].result() for photo in photos_of(model) if photo in searched}
     with backend("looking along lines in the photos"):
-        return joined([_in_world(model, photo, lines) for photo, lines in found.items()])
+        return joined([_in_world(model, photo, look.lines) for photo, look in looks.items()])
 
 
-def photo_segments(path: Path) -> FloatArray:
-    """Line segments (N, 4) of a photo in its pixels; none where OpenCV cannot read it."""
+def scenery_of(model: Any, looks: Mapping[int, Look]) -> Scenery:
+    """What a model and its photos show."""
+    with backend("reading the points"):
+        shown = seen_points(model, SCENERY_POINTS)
+    pictures = tuple(looks[photo].picture if photo in looks else None for photo in photos_of(model))
+    return Scenery(shown.points, shown.colors.mean(axis=1), shown.seen, pictures)
+
+
+def look_at(path: Path) -> Look:
+    """Lines and brightness of a photo; nothing where OpenCV cannot read it."""
     try:
         data = np.fromfile(path, np.uint8)  # OpenCV does not open names beyond ASCII on every system
     except OSError:
         data = np.zeros(0, np.uint8)
-    grey = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
-    return np.zeros((0, 4)) if grey is None else line_segments(np.asarray(grey, np.uint8))
+    read = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+    if read is None:
+        return Look(np.zeros((0, 4)), None)
+    grey = np.asarray(read, np.uint8)
+    return Look(line_segments(grey), small_picture(grey))
 
 
 def _in_world(model: Any, image_id: int, lines: FloatArray) -> Segments:
@@ -100,12 +127,16 @@ def _in_world(model: Any, image_id: int, lines: FloatArray) -> Segments:
 
 def how_it_stands(upright: Upright, front: str) -> dict[str, Any]:
     """Up and front, for the manifest."""
+    standing = upright.standing
     return {
         "up": upright.found_by,
         "up_deviation_deg": round(upright.deviation_deg, 3),
         "off_camera_roll_deg": round(upright.off_roll_deg, 2),
         "camera_roll_spread_deg": round(upright.roll.spread_deg, 2),
         "photos_turned_deg": upright.roll.turn_deg,
+        "up_sign_odds": odds(standing.not_upside_down),
+        "up_axis_odds": odds(standing.not_on_its_side),
+        "up_evidence_nats": {name: round(nats, 1) for name, nats in standing.evidence.items()},
         "front": front,
     }
 

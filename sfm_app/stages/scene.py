@@ -14,7 +14,7 @@ from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_depth, why_no_scene
 from sfm_app.reconstruction import Outcome, reconstruct
 from sfm_app.reconstruction.left_out import left_out, names_of
-from sfm_app.reconstruction.orientation import orient, search_lines
+from sfm_app.reconstruction.orientation import look_at_photos, orient
 from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
 
 POINTS = "points"
@@ -28,14 +28,15 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         ReconstructionError: no pair of photos grows into a model; says what was seen.
     """
     outcome = with_depth(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
-    lines = search_lines([attempt.model for attempt in outcome.models], matches, run)
+    looks = look_at_photos([attempt.model for attempt in outcome.models], matches, run)
     with backend("adjusting the bundle"):
         adjusted = [adjust(attempt.model, run.workspace.database) for attempt in outcome.models]
     models = [found.model for found in adjusted]
     with backend("reading colours"):
         for model in models:
             colour(model, run.workspace.photos, run.workers)
-    orientations = [orient(model, matches, lines) for model in models]
+    turn_deg = None if run.settings.scene.turn_deg == "auto" else run.settings.scene.turn_deg
+    orientations = [orient(model, matches, looks, turn_deg) for model in models]
     write_models(models, run)
     run.write_model(sparse_model(run.workspace.sparse), POINTS)
     members = [photos_of(model) for model in models]

@@ -37,3 +37,12 @@ def test_herz_jesus_is_calibrated_without_exif():
     assert found.identifiable
     assert found.main.focal_px == pytest.approx(truth[0, 0], rel=0.01)
     assert np.hypot(*(found.K[:2, 2] - truth[:2, 2])) < 0.02 * 1536
+
+
+def test_temple16_stands_upright_though_all_its_photos_lie_on_their_side(tmp_path):
+    run = sfm_app.reconstruct(photo_set("temple16"), tmp_path / "out", last="scene")
+    orientation = run.manifest["stages"]["scene"]["counts"]["orientation"]
+
+    assert orientation["photos_turned_deg"] == 270, "the steps are on the left in most photos"
+    assert 10 < orientation["up_sign_odds"] < 1e5
+    assert orientation["up_deviation_deg"] < 2

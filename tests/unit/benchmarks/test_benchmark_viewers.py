@@ -32,6 +32,29 @@ def test_the_sample_is_as_it_should_be(tmp_path):
     assert (row["open edges"], row["outward"], row["off centre"]) == (0, 1.0, pytest.approx(0, abs=0.02))
 
 
+STANDING = {
+    "up": "camera roll", "up_deviation_deg": 1.0, "up_sign_odds": 900.0, "up_axis_odds": 30.0, "photos_turned_deg": 0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("run", "found", "ok"),
+    [
+        ("castle", {}, "yes"),
+        ("castle", {"up_deviation_deg": 4.0}, "vertical not sure"),
+        ("castle", {"up_sign_odds": 3.0}, "up not sure"),
+        ("castle", {"up_axis_odds": 3.0}, "up not sure"),
+        ("castle", {"photos_turned_deg": 180}, "on its head or side"),
+        ("temple16", {"photos_turned_deg": 270}, "yes"),
+        ("temple16", {"photos_turned_deg": 90}, "on its head or side"),
+    ],
+)
+def test_a_model_stands_upright_when_people_would_turn_its_photos_alike(tmp_path, run, found, ok):
+    stands = replace(subject(viewers.sample(), tmp_path), orientation=STANDING | found, run=run)
+
+    assert viewers.checked(stands, SILENT)["ok"] == ok
+
+
 def changed(**parts):
     model = viewers.sample()
     return replace(model, surface=replace(model.surface, **{key: make(model.surface) for key, make in parts.items()}))

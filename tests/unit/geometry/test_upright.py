@@ -3,7 +3,7 @@ import pytest
 
 from sfm_app.geometry.directions import axis_angle_deg
 from sfm_app.geometry.planes import dominant_plane
-from sfm_app.geometry.roll import up_from_roll
+from sfm_app.geometry.standing import Scenery
 from sfm_app.geometry.upright import CAMERAS, GROUND, LINES, ROLL, WALL, facing, up_direction, viewer_frame
 from sfm_app.geometry.vanishing import joined, vanishing_near
 
@@ -15,8 +15,15 @@ def error_deg(found, true):
     return float(np.degrees(np.arccos(np.clip(found @ true, -1, 1))))
 
 
-def found_up(scene, segments=None):
-    return up_direction(scene.rotations, scene.centres, scene.points, scene.segments if segments is None else segments)
+def shown(scene, points=None):
+    """Points that all photos see, without light; no pictures."""
+    points, photos = scene.points if points is None else points, len(scene.rotations)
+    return Scenery(points, np.full(len(points), 100.0), (np.arange(len(points)),) * photos, (None,) * photos)
+
+
+def found_up(scene, segments=None, points=None, turn_deg=None):
+    segments = scene.segments if segments is None else segments
+    return up_direction(scene.rotations, scene.centres, shown(scene, points), segments, turn_deg)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -79,8 +86,21 @@ def test_what_is_near_is_down(build_house, turn_deg):
     floor = np.random.default_rng(3).uniform([-4, 0, -4], [4, 0, 4], (300, 3)) @ scene.turned.T
 
     for ground, up in ((floor, scene.up), (floor + 4.0 * scene.up, -scene.up)):
-        points = np.concatenate([scene.points, ground])
-        assert error_deg(up_from_roll(scene.rotations, scene.centres, points).up, up) < 8
+        upright = found_up(scene, joined([]), np.concatenate([scene.points, ground]))
+        assert error_deg(upright.up, up) < 8
+        assert 3 < upright.standing.not_upside_down < 7
+
+
+@pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])
+def test_who_knows_how_the_photos_are_turned_is_believed(build_house, turn_deg):
+    scene = build_house(HAND_HELD, sweep_deg=90.0)
+
+    upright = found_up(scene, turn_deg=turn_deg)
+
+    assert upright.roll.turn_deg == turn_deg and upright.standing.least_nats == np.inf
+    # what has to be turned clockwise to be upright has its top on the left
+    top = {0: [0, -1], 90: [-1, 0], 180: [0, 1], 270: [1, 0]}[turn_deg]
+    assert (scene.rotations @ upright.up)[:, :2].mean(axis=0) == pytest.approx(top, abs=0.15)
 
 
 def test_cameras_that_nobody_held_level_stand_on_the_ground(build_house):
@@ -89,7 +109,7 @@ def test_cameras_that_nobody_held_level_stand_on_the_ground(build_house):
     floor = rng.uniform([-4, -0.01, -4], [4, 0.01, 4], (300, 3)) @ scene.turned.T
     standing = np.concatenate([scene.points, floor])
 
-    upright = up_direction(scene.rotations, scene.centres, standing, joined([]))
+    upright = found_up(scene, joined([]), standing)
 
     assert upright.found_by == GROUND
     assert error_deg(upright.up, scene.up) < 1

@@ -9,7 +9,7 @@ import pytest
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.model import posed_photos
 from sfm_app.geometry.georeference import enu_m, position_at
-from sfm_app.reconstruction.orientation import orient, photo_segments, search_lines
+from sfm_app.reconstruction.orientation import look_at, look_at_photos, orient
 from sfm_app.synthetic.cameras import arc, make_camera
 from sfm_app.types import GpsPosition, MatchedImage, MatchGraph
 from sfm_app.workspace import Workspace
@@ -60,7 +60,7 @@ def true_positions(views):
 def test_without_gps_the_model_has_size_one_and_stands_upright(tmp_path):
     views, model, matches, run = scene(tmp_path, lambda views: [None] * len(views.cam_from_world))
 
-    entry = orient(model, matches, search_lines([model], matches, run))
+    entry = orient(model, matches, look_at_photos([model], matches, run))
     poses, points = posed_photos(model)
 
     assert entry["up"] == "camera roll" and entry["gps"] == "not used: the photos have no positions"
@@ -76,7 +76,7 @@ def test_with_gps_the_model_is_in_metres_and_knows_its_place(tmp_path):
     _, model, matches, run = scene(tmp_path, true_positions)
     shape = posed_photos(model)[1]
 
-    entry = orient(model, matches, search_lines([model], matches, run))
+    entry = orient(model, matches, look_at_photos([model], matches, run))
     points = posed_photos(model)[1]
 
     assert entry["unit"] == "metre" and entry["gps"] == "12 of 12 positions agree"
@@ -97,10 +97,29 @@ def test_with_gps_the_model_is_in_metres_and_knows_its_place(tmp_path):
         assert enu == pytest.approx(enu_m([matches.images[key].gps], origin)[0], abs=4), "up is only that of roll"
 
 
-def test_a_photo_that_is_gone_has_no_lines(tmp_path):
+def test_the_manifest_says_why_up_is_up(tmp_path):
+    _, model, matches, run = scene(tmp_path, lambda views: [None] * len(views.cam_from_world))
+    looks = look_at_photos([model], matches, run)
+
+    entry = orient(model, matches, looks)
+    ups = [pose[1, 1] for pose in posed_photos(model)[0].values()]
+    again = orient(model, matches, looks, turn_deg=180)
+
+    assert entry["photos_turned_deg"] == 0 and again["photos_turned_deg"] == 180
+    assert 100 < entry["up_sign_odds"] < 1000, "the scene shows nothing: it is habit alone"
+    assert entry["up_axis_odds"] > 5
+    assert set(entry["up_evidence_nats"].values()) == {0.0} and again["up_evidence_nats"] == {}
+    assert again["up_sign_odds"] > 1e6
+    assert [pose[1, 1] for pose in posed_photos(model)[0].values()] == pytest.approx([-up for up in ups], abs=1e-6)
+
+
+def test_a_photo_that_is_gone_tells_nothing(tmp_path):
     picture = np.zeros((200, 300), np.uint8)
     picture[:, 150:] = 200
     cv2.imwrite(str(tmp_path / "a.png"), picture)
 
-    assert photo_segments(tmp_path / "a.png") == pytest.approx(np.array([[150, 0, 150, 200]]), abs=2)
-    assert photo_segments(Path(tmp_path / "b.png")).shape == (0, 4)
+    seen, gone = look_at(tmp_path / "a.png"), look_at(Path(tmp_path / "b.png"))
+
+    assert seen.lines == pytest.approx(np.array([[150, 0, 150, 200]]), abs=2)
+    assert seen.picture.shape == (171, 256) and seen.picture[:, 200].min() > 190
+    assert gone.lines.shape == (0, 4) and gone.picture is None
