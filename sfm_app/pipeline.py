@@ -173,7 +173,7 @@ def run_stages(folder: Path, run: RunContext, first: str = "", last: str = "file
 def make(stage: Stage, products: Products, print_of_inputs: str, run: RunContext) -> Any:
     """Run one stage and enter it in the manifest."""
     run.progress.stage(stage.name)
-    run.counts = {}
+    run.counts, run.inputs = {}, print_of_inputs
     start = time.perf_counter()
     try:
         product = stage.make(products, run)
