@@ -36,7 +36,7 @@ def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: Dep
     """
     method, why = run.plugins.depth_method(options.method)
     run.record(method=method.name, method_reason=why)
-    prepare(scene, photo_dir, dense_dir, options, fingerprint(run.inputs, method.name))
+    prepare(scene, photo_dir, dense_dir, method.name, run)
     views = read_views(dense_dir)
     ranked = rank_neighbours(views, CONFIRMING * options.neighbours)
     with single_threaded_opencv():
@@ -47,12 +47,13 @@ def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: Dep
     return dense_dir
 
 
-def prepare(scene: Scene, photo_dir: Path, dense_dir: Path, options: DepthSettings, inputs: str) -> None:
+def prepare(scene: Scene, photo_dir: Path, dense_dir: Path, method: str, run: RunContext) -> None:
     """Undistort the photos, unless a killed run has left a workspace with the same model and other inputs."""
     model = [(file.name, blake2b(file.read_bytes()).hexdigest()) for file in sorted(scene.model_dir.glob("*.bin"))]
-    made_from = fingerprint(inputs, model)
+    made_from = fingerprint(run.inputs, method, model)
     if not can_go_on(dense_dir, made_from):
-        undistort(scene.model_dir, photo_dir, dense_dir, options.max_image_size_px)
+        largest = run.settings.depth.max_image_size_px
+        undistort(scene.model_dir, photo_dir, dense_dir, largest, run.workers, run.progress)
         mark_unfinished(dense_dir, made_from)
 
 

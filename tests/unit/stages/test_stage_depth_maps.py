@@ -11,7 +11,8 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import DenseStore, read_views
 from sfm_app.errors import ConfigError, ReconstructionError
 from sfm_app.plugins import DepthMethod, hookimpl, load_plugins
-from sfm_app.settings import DepthSettings
+from sfm_app.progress import Silent
+from sfm_app.settings import DepthSettings, Settings
 from sfm_app.stages.depth_maps import make_depth_maps
 from sfm_app.stereo import DepthMap
 from sfm_app.types import Rejected
@@ -67,8 +68,11 @@ class Method:
 
 def run_stage(scene, ways, inputs="", **settings):
     counts = {}
-    run = SimpleNamespace(plugins=ways.plugins, record=lambda **more: counts.update(more), map=None, inputs=inputs)
     options = DepthSettings(**{"method": "ours", **settings})
+    run = SimpleNamespace(
+        plugins=ways.plugins, record=lambda **more: counts.update(more), map=None, inputs=inputs,
+        settings=Settings(depth=options), workers=2, progress=Silent(),
+    )  # fmt: skip
     assert make_depth_maps(scene, scene.photo_dir, scene.dense_dir, options, run) == scene.dense_dir
     return counts
 
