@@ -32,6 +32,8 @@ class StageRecord:
     counts: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, int] = field(default_factory=dict)
     """What the stage wrote, with the size in bytes; -1 for what later stages add to (folders, SHARED)."""
+    peak_mb: int | None = None
+    """Most memory that the process had held by the end of the stage, in MB; None where the system does not say."""
 
 
 class Workspace:

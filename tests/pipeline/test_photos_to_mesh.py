@@ -81,6 +81,9 @@ def test_manifest_accounts_for_every_stage(finished):
     assert tuple(run.manifest["stages"]) == NAMES
     assert run.manifest["stages"]["scene"]["counts"]["registered"] == len(run.scene.registered)
     assert run.manifest["settings"]["quality"] == "draft"
+    peaks = [stage["peak_mb"] for stage in run.manifest["stages"].values()]
+    assert peaks == sorted(peaks)
+    assert 100 < peaks[0] <= peaks[-1] < 4000
 
 
 def test_the_texture_covers_the_mesh(finished):
