@@ -32,6 +32,20 @@ Spread = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Looks:
+    """What the photos show of the triangles."""
+
+    worth: NDArray[np.float32]
+    """(P, T) pixels times cosine; 0 where a photo does not see a triangle."""
+    colors: NDArray[np.uint8]
+    """(P, T, 3)"""
+    sharpness: FloatArray
+    """(P,) as in `Look`; 0 for photos that cannot be read."""
+    rejected: Sequence[Rejected | None]
+    """Why photos cannot be read."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Seen:
     """What the photos show of the triangles, and which of them may be believed."""
 
@@ -89,8 +103,7 @@ def texture_surface(
         The surface with its texture, cut if asked for and with colours from the photos; and figures for the manifest.
     """
     mesh = facets(surface)
-    look_at = partial(_look_at, views=views, mesh=mesh, store=store, hidden=hidden)
-    looks = spread(look_at, range(len(views)), "looking at the surface")
+    looks = _look_at_all(views, mesh, store, hidden, spread)
     seen = _believe(looks, mesh)
     chosen = without_specks(choose_photos(seen.worth, mesh), seen.usable, mesh.neighbours)
     unseen = chosen == NONE
@@ -106,31 +119,45 @@ def texture_surface(
     ]
     pages = Pages(canvases, len(views), store)
     work = partial(_paint_photo, plan=plan, views=views, store=store, pages=pages)
-    spread(work, [p for p, found in enumerate(looks) if isinstance(found, Look)], "painting")
-    return _finish(plan, canvases), _figures(plan, views, looks, int(unseen.sum()))
+    spread(work, [photo for photo, reason in enumerate(looks.rejected) if reason is None], "painting")
+    return _finish(plan, canvases), _figures(plan, views, looks.rejected, int(unseen.sum()))
 
 
-def _look_at(photo: int, views: Sequence[PhotoView], mesh: Facets, store: Store, hidden: Hidden) -> Look | Rejected:
-    kept = store.recall(f"look{photo}")
+def _look_at_all(views: Sequence[PhotoView], mesh: Facets, store: Store, hidden: Hidden, spread: Spread) -> Looks:
+    shape = (len(views), len(mesh.faces))
+    worth, colors = np.zeros(shape, np.float32), np.zeros((*shape, 3), np.uint8)
+    sharpness = np.zeros(len(views))
+
+    def look_at(photo: int) -> Rejected | None:
+        found = _look_at(f"look{photo}", views[photo], mesh, store, hidden)
+        if isinstance(found, Rejected):
+            return found
+        worth[photo], colors[photo], sharpness[photo] = found.worth, found.color, found.sharpness
+        return None
+
+    rejected = spread(look_at, range(len(views)), "looking at the surface")
+    return Looks(worth, colors, sharpness, rejected)
+
+
+def _look_at(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: Hidden) -> Look | Rejected:
+    kept = store.recall(name)
     if kept is not None:
         return Look(kept["worth"], kept["color"], float(kept["sharpness"]))
     try:
-        pixels = store.photo(views[photo])
+        photo = store.photo(view)
     except OSError as err:
         return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
-    found = look(views[photo], pixels, mesh, hidden)
-    store.keep(f"look{photo}", {"worth": found.worth, "color": found.color, "sharpness": np.array(found.sharpness)})
+    found = look(view, photo, mesh, hidden)
+    store.keep(name, {"worth": found.worth, "color": found.color, "sharpness": np.array(found.sharpness)})
     return found
 
 
-def _believe(looks: Sequence[Look | Rejected], mesh: Facets) -> Seen:
-    """Even out what the photos say, and leave out what only one of them says."""
-    blank = Look(np.zeros(len(mesh.faces), np.float32), np.zeros((len(mesh.faces), 3), np.uint8), 0.0)
-    found = [one if isinstance(one, Look) else blank for one in looks]
-    worth, colors = np.stack([one.worth for one in found]), np.stack([one.color for one in found])
-    sharp = np.array([one.sharpness for one in found])
-    read = sharp > 0
-    sharp[read] = sharpness_factors(sharp[read])
+def _believe(looks: Looks, mesh: Facets) -> Seen:
+    """Even out what the photos say, in place, and mark what only one of them says."""
+    worth, colors = looks.worth, looks.colors
+    read = looks.sharpness > 0
+    sharp = np.zeros(len(read))
+    sharp[read] = sharpness_factors(looks.sharpness[read])
     worth *= sharp[:, None].astype(np.float32)
     gains = photo_gains(colors, worth > 0)
     strange = strangers(colors, gains, worth > 0, mesh.neighbours)
@@ -228,7 +255,9 @@ def _finish(plan: Plan, canvases: Sequence[Canvas]) -> Model:
     return Model(surface, Texture(uv, plan.page, filled))
 
 
-def _figures(plan: Plan, views: Sequence[PhotoView], looks: Sequence[Look | Rejected], unseen: int) -> dict[str, Any]:
+def _figures(
+    plan: Plan, views: Sequence[PhotoView], rejected: Sequence[Rejected | None], unseen: int
+) -> dict[str, Any]:
     """What the manifest says."""
     covered = sum(width * height for width, height in plan.layout.sizes)
     return {
@@ -242,7 +271,5 @@ def _figures(plan: Plan, views: Sequence[PhotoView], looks: Sequence[Look | Reje
             view.name: [round(float(gain), 3) for gain in gains]
             for view, gains in zip(views, plan.seen.gains, strict=True)
         },
-        "rejected": {
-            view.name: found.reason for view, found in zip(views, looks, strict=True) if isinstance(found, Rejected)
-        },
+        "rejected": {view.name: found.reason for view, found in zip(views, rejected, strict=True) if found is not None},
     }
