@@ -33,6 +33,8 @@ class RunContext:
     progress: Progress = field(default_factory=Silent)
     counts: dict[str, Any] = field(default_factory=dict)
     """What the current stage has counted so far."""
+    inputs: str = ""
+    """Fingerprint of everything that the current stage's result depends on."""
 
     @property
     def seed(self) -> int:

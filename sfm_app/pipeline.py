@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -173,7 +174,7 @@ def run_stages(folder: Path, run: RunContext, first: str = "", last: str = "file
 def make(stage: Stage, products: Products, print_of_inputs: str, run: RunContext) -> Any:
     """Run one stage and enter it in the manifest."""
     run.progress.stage(stage.name)
-    run.counts = {}
+    run.counts, run.inputs = {}, print_of_inputs
     start = time.perf_counter()
     try:
         product = stage.make(products, run)
@@ -181,11 +182,19 @@ def make(stage: Stage, products: Products, print_of_inputs: str, run: RunContext
         logger.info("%s stopped: %s; counted so far: %s", stage.name, err, run.counts)
         raise
     seconds = round(time.perf_counter() - start, 2)
-    record = StageRecord(print_of_inputs, seconds, run.counts, run.workspace.sizes(stage.files))
+    sizes = run.workspace.sizes(stage.files)
+    record = StageRecord(print_of_inputs, seconds, run.counts, sizes, peak_memory_mb())
     run.workspace.finish(stage.name, record, manifest_head(run))
     logger.info("%s took %.2f s", stage.name, seconds)
     run.progress.stage_done(seconds)
     return product
+
+
+def peak_memory_mb() -> int | None:
+    """Most memory that this process has held; None where the system is not Linux."""
+    status = Path("/proc/self/status")
+    found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text(encoding="utf-8")) if status.exists() else None
+    return int(found[1]) // 1024 if found else None
 
 
 def folder_fingerprint(folder: Path, run: RunContext) -> str:

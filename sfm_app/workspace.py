@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import json
 import os
+import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -17,6 +18,8 @@ DATABASE = "database.db"
 CALIBRATION = "calibration.json"
 SHARED = (DATABASE, CALIBRATION)
 """Files that later stages add to."""
+UNFINISHED = "unfinished.txt"
+"""In a folder while a stage fills it: what it is filled from. It says whether a killed run can go on there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +32,8 @@ class StageRecord:
     counts: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, int] = field(default_factory=dict)
     """What the stage wrote, with the size in bytes; -1 for what later stages add to (folders, SHARED)."""
+    peak_mb: int | None = None
+    """Most memory that the process had held by the end of the stage, in MB; None where the system does not say."""
 
 
 class Workspace:
@@ -154,6 +159,31 @@ def replacing(target: Path) -> Iterator[Path]:
         beside.replace(target)
     finally:
         beside.unlink(missing_ok=True)
+
+
+def can_go_on(folder: Path, made_from: str) -> bool:
+    """Whether a killed run was filling this folder from the same inputs; if not, what is there is removed.
+
+    Args:
+        folder: may be missing.
+        made_from: fingerprint of the inputs.
+    """
+    marker = folder / UNFINISHED
+    if marker.is_file() and marker.read_text(encoding="utf-8") == made_from:
+        return True
+    shutil.rmtree(folder, ignore_errors=True)
+    return False
+
+
+def mark_unfinished(folder: Path, made_from: str) -> None:
+    """From now on a run that is killed can go on in this folder, which is made if it is missing."""
+    with replacing(folder / UNFINISHED) as path:
+        path.write_text(made_from, encoding="utf-8")
+
+
+def mark_finished(folder: Path) -> None:
+    """The folder is filled; the next time it is filled from nothing."""
+    (folder / UNFINISHED).unlink()
 
 
 def save_files(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:

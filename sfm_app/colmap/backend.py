@@ -10,8 +10,9 @@ from typing import Any
 import pycolmap
 
 from sfm_app.errors import BackendError, SfmError
+from sfm_app.progress import Progress
 
-__all__ = ["backend", "has_cuda", "interruptible", "plain", "pycolmap", "show_log", "versions"]
+__all__ = ["backend", "counted", "has_cuda", "interruptible", "plain", "pycolmap", "show_log", "versions"]
 
 zlib.crc32(b"")  # the import above is there for its side effect
 pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
@@ -65,6 +66,28 @@ def interruptible(call: Callable[["pycolmap.CancellationToken"], None], poll: Ca
         except KeyboardInterrupt:
             token.cancel()
             raise
+
+
+def counted(
+    call: Callable[["pycolmap.CancellationToken"], None],
+    done: Callable[[], int],
+    label: str,
+    total: int,
+    progress: Progress,
+) -> None:
+    """The same, with a bar: `done` says how many of `total` steps are behind."""
+    seen = 0
+
+    def poll() -> None:
+        nonlocal seen
+        before, seen = seen, done()
+        progress.advance(seen - before)
+
+    progress.start(label, total)
+    try:
+        interruptible(call, poll)
+    finally:
+        progress.finish()
 
 
 def plain(options: dict[str, Any]) -> dict[str, Any]:

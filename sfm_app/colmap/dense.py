@@ -8,14 +8,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import backend, pycolmap
+from sfm_app.colmap.backend import backend, counted, pycolmap
+from sfm_app.progress import Progress
 from sfm_app.stereo import DepthMap, Estimate, Kind, View
 
 JPEG_QUALITY = 98
 DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
 
 
-def undistort(model_dir: Path, photo_dir: Path, dense_dir: Path, max_side_px: int) -> None:
+def undistort(
+    model_dir: Path, photo_dir: Path, dense_dir: Path, max_side_px: int, workers: int, progress: Progress
+) -> None:
     """Write photos without distortion and the model that fits them into a dense workspace.
 
     Raises:
@@ -23,9 +26,18 @@ def undistort(model_dir: Path, photo_dir: Path, dense_dir: Path, max_side_px: in
     """
     options = pycolmap.UndistortCameraOptions()
     options.max_image_size = max_side_px
-    dense_dir.mkdir(parents=True, exist_ok=True)
+    photos = dense_dir / "images"
+    photos.mkdir(parents=True, exist_ok=True)
+
+    def call(token: "pycolmap.CancellationToken") -> None:
+        pycolmap.undistort_images(
+            dense_dir, model_dir, photo_dir, undistort_options=options, jpeg_quality=JPEG_QUALITY,
+            num_threads=workers, cancellation_token=token,
+        )  # fmt: skip
+
     with backend("undistorting photos"):
-        pycolmap.undistort_images(dense_dir, model_dir, photo_dir, undistort_options=options, jpeg_quality=JPEG_QUALITY)
+        total = pycolmap.Reconstruction(model_dir).num_reg_images()
+        counted(call, lambda: sum(path.is_file() for path in photos.rglob("*")), "undistorting", total, progress)
 
 
 def read_views(dense_dir: Path) -> list[View]:

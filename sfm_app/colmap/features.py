@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from sfm_app.colmap.backend import interruptible, plain, pycolmap
+from sfm_app.colmap.backend import counted, plain, pycolmap
 from sfm_app.colmap.database import opened
 from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
@@ -68,16 +68,5 @@ def _counted(
     The reader is COLMAP's own SQLite, opened once before the call: a second SQLite in the process (Python's) would drop
     the locks of the first whenever it closes the file, and COLMAP aborts.
     """
-    progress.start(*work)
-    seen = 0
-    try:
-        with opened(database) as reader:
-
-            def poll() -> None:
-                nonlocal seen
-                before, seen = seen, done(reader)
-                progress.advance(seen - before)
-
-            interruptible(call, poll)
-    finally:
-        progress.finish()
+    with opened(database) as reader:
+        counted(call, lambda: done(reader), *work, progress)

@@ -1,31 +1,26 @@
 """depth_maps: Scene -> COLMAP dense workspace with depth and normal maps."""
 
-import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from hashlib import blake2b
-from importlib.metadata import version
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from sfm_app.colmap.backend import versions
 from sfm_app.colmap.dense import DenseStore, drop_estimates, read_depth, read_views, undistort
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.settings import DepthSettings
 from sfm_app.stereo import DepthTask, View, rank_neighbours
 from sfm_app.types import Rejected, Scene
-from sfm_app.workspace import fingerprint
+from sfm_app.workspace import can_go_on, fingerprint, mark_finished, mark_unfinished
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
 CONFIRMING = 2
 """A depth map is checked against this many times as many photos as it was made from."""
-UNFINISHED = "unfinished.txt"
-"""In the dense workspace while maps are being made: what they are made from. It says whether a killed run can go on."""
 
 
 def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: DepthSettings, run: RunContext) -> Path:
@@ -41,29 +36,25 @@ def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: Dep
     """
     method, why = run.plugins.depth_method(options.method)
     run.record(method=method.name, method_reason=why)
-    prepare(scene, photo_dir, dense_dir, options, method.name)
+    prepare(scene, photo_dir, dense_dir, method.name, run)
     views = read_views(dense_dir)
     ranked = rank_neighbours(views, CONFIRMING * options.neighbours)
     with single_threaded_opencv():
         found = method.make(DepthTask(dense_dir, views, ranked, options, DenseStore(dense_dir), run.map))
     record(dense_dir, views, found, run)
     drop_estimates(dense_dir, views)
-    (dense_dir / UNFINISHED).unlink()
+    mark_finished(dense_dir)
     return dense_dir
 
 
-def prepare(scene: Scene, photo_dir: Path, dense_dir: Path, options: DepthSettings, method: str) -> None:
-    """Undistort the photos, unless a killed run has left a workspace with the same inputs, settings and versions."""
+def prepare(scene: Scene, photo_dir: Path, dense_dir: Path, method: str, run: RunContext) -> None:
+    """Undistort the photos, unless a killed run has left a workspace with the same model and other inputs."""
     model = [(file.name, blake2b(file.read_bytes()).hexdigest()) for file in sorted(scene.model_dir.glob("*.bin"))]
-    photos = [(name, (photo_dir / name).stat().st_size) for name in sorted(scene.registered)]
-    programs = {name: version(name) for name in ("sfm-app", "numba", "opencv-contrib-python-headless")} | versions()
-    inputs = fingerprint(model, photos, options.model_dump(), method, programs)
-    marker = dense_dir / UNFINISHED
-    if marker.is_file() and marker.read_text(encoding="utf-8") == inputs:
-        return
-    shutil.rmtree(dense_dir, ignore_errors=True)
-    undistort(scene.model_dir, photo_dir, dense_dir, options.max_image_size_px)
-    marker.write_text(inputs, encoding="utf-8")
+    made_from = fingerprint(run.inputs, method, model)
+    if not can_go_on(dense_dir, made_from):
+        largest = run.settings.depth.max_image_size_px
+        undistort(scene.model_dir, photo_dir, dense_dir, largest, run.workers, run.progress)
+        mark_unfinished(dense_dir, made_from)
 
 
 def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | None], run: RunContext) -> None:

@@ -1,8 +1,11 @@
 """texture: Scene, Surface and photos -> Model with a texture."""
 
-from functools import partial
+import shutil
+from collections.abc import Mapping
+from hashlib import blake2b
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,18 +16,62 @@ from sfm_app.meshing.occlusion import Occluders
 from sfm_app.settings import TextureSettings
 from sfm_app.texture import PhotoView, photo_view, texture_surface
 from sfm_app.types import Model, Scene, Surface, Texture
+from sfm_app.workspace import can_go_on, fingerprint, mark_unfinished, replacing
 
 TEXTURE = "texture.npz"
+PARTS = "texture_parts"
+"""In the dense workspace while the texture is made: what is done with each photo."""
 
 
 def make_texture(scene: Scene, surface: Surface, options: TextureSettings, run: RunContext) -> Model:
-    """Paint the surface with the photos at full size, and keep it beside the depth maps."""
+    """Paint the surface with the photos at full size, and keep it beside the depth maps.
+
+    A run that was killed goes on where it stopped.
+    """
+    views, parts = photo_views(scene), run.workspace.dense / PARTS
+    cameras = [(view.name, view.row.tolist(), view.width, view.height) for view in views]
+    made_from = fingerprint(run.inputs, cameras, digest(surface))
+    if not can_go_on(parts, made_from):
+        mark_unfinished(parts, made_from)
     hidden = Occluders(surface.vertices, surface.faces).hidden
-    load = partial(read_photo, run.workspace.photos)
-    model, figures = texture_surface(surface, photo_views(scene), load, hidden, options, run.map)
+    store = Files(run.workspace.photos, parts)
+    model, figures = texture_surface(surface, views, store, hidden, options, run.map)
     run.record(**figures)
     save_texture(model, run)
+    shutil.rmtree(parts)
     return model
+
+
+class Files:
+    """Photos of a folder, and arrays in files, as `sfm_app.texture.Store` has them."""
+
+    def __init__(self, photo_dir: Path, folder: Path) -> None:
+        self.photo_dir, self.folder = photo_dir, folder
+
+    def photo(self, view: PhotoView) -> NDArray[np.uint8]:
+        return read_photo(self.photo_dir, view)
+
+    def recall(self, name: str) -> dict[str, NDArray[Any]] | None:
+        try:
+            with self._path(name).open("rb") as file, np.load(file) as stored:
+                return dict(stored)
+        except (OSError, ValueError, EOFError, BadZipFile):  # not there, or damaged
+            return None
+
+    def keep(self, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+        with replacing(self._path(name)) as path:
+            np.savez(path, allow_pickle=False, **arrays)
+
+    def _path(self, name: str) -> Path:
+        return self.folder / f"{name}.npz"
+
+
+def digest(surface: Surface) -> str:
+    """Hash of vertices, triangles and colours."""
+    found = blake2b()
+    for part in (surface.vertices, surface.faces, surface.colors):
+        found.update(part.tobytes())
+    return found.hexdigest()
 
 
 def photo_views(scene: Scene) -> list[PhotoView]:

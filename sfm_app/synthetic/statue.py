@@ -54,10 +54,10 @@ def statue() -> SyntheticScene:
     return SyntheticScene("statue", (*_terrace(), *_plinth(), *_bust()), to_light=(0.5, 0.75, 0.42), sky=0.6)
 
 
-def statue_views(camera: Camera, seed: int = 0) -> Views:
-    """22 hand-held photos all round."""
+def statue_views(camera: Camera, seed: int = 0, photos: int = 22) -> Views:
+    """Hand-held photos all round."""
     walk = ArcOptions(
-        photos=22, sweep_deg=344.0, distance=(3.3, 4.3), height=(1.0, 2.9), aim=(0.0, 1.2, 0.0), aim_spread=0.2,
+        photos=photos, sweep_deg=344.0, distance=(3.3, 4.3), height=(1.0, 2.9), aim=(0.0, 1.2, 0.0), aim_spread=0.2,
         roll_deg=5.0,
     )  # fmt: skip
     return arc(camera, walk, seed)

@@ -1,6 +1,5 @@
 """From a surface and photos to a textured surface: the steps of the texture in their order."""
 
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -20,16 +19,30 @@ from sfm_app.texture.labels import choose_photos
 from sfm_app.texture.levelling import level
 from sfm_app.texture.looking import Hidden, Look, look, sharpness_factors
 from sfm_app.texture.packing import Layout, pack
+from sfm_app.texture.pages import Pages
 from sfm_app.texture.painting import Canvas, canvas, fill_background, finished, paint
+from sfm_app.texture.store import Store
 from sfm_app.texture.unseen import along_a_curve, block_sizes, square_texels, squares, vertex_colors
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
 
 FloatArray = NDArray[np.float64]
-Load = Callable[[PhotoView], NDArray[np.uint8]]
-"""Gives the (height, width, 3) RGB of a view at the view's size; OSError where it cannot be read."""
 Spread = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
 """Results of a function for all items, in order; may run in parallel. The last argument says what is being done."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Looks:
+    """What the photos show of the triangles."""
+
+    worth: NDArray[np.float32]
+    """(P, T) pixels times cosine; 0 where a photo does not see a triangle."""
+    colors: NDArray[np.uint8]
+    """(P, T, 3)"""
+    sharpness: FloatArray
+    """(P,) as in `Look`; 0 for photos that cannot be read."""
+    rejected: Sequence[Rejected | None]
+    """Why photos cannot be read."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,14 +87,14 @@ class Plan:
 
 
 def texture_surface(
-    surface: Surface, views: Sequence[PhotoView], load: Load, hidden: Hidden, options: TextureSettings, spread: Spread
+    surface: Surface, views: Sequence[PhotoView], store: Store, hidden: Hidden, options: TextureSettings, spread: Spread
 ) -> tuple[Model, dict[str, Any]]:
     """Paint a surface with photos.
 
     Args:
         surface: triangles in the frame of the views.
         views: the registered photos.
-        load: reads a photo.
+        store: gives photos, and keeps what was done with each, so that a killed run can go on.
         hidden: the occlusion test for this surface.
         options: pages, and what happens to triangles that no photo sees.
         spread: runs work for each photo.
@@ -90,7 +103,7 @@ def texture_surface(
         The surface with its texture, cut if asked for and with colours from the photos; and figures for the manifest.
     """
     mesh = facets(surface)
-    looks = spread(partial(_look_at, mesh=mesh, load=load, hidden=hidden), views, "looking at the surface")
+    looks = _look_at_all(views, mesh, store, hidden, spread)
     seen = _believe(looks, mesh)
     chosen = without_specks(choose_photos(seen.worth, mesh), seen.usable, mesh.neighbours)
     unseen = chosen == NONE
@@ -104,27 +117,47 @@ def texture_surface(
         canvas(size, np.flatnonzero((plan.page == page) & (chosen != NONE)), plan.corners)
         for page, size in enumerate(plan.layout.sizes)
     ]
-    work = partial(_paint_photo, plan=plan, views=views, load=load, canvases=canvases, lock=threading.Lock())
-    spread(work, [p for p, found in enumerate(looks) if isinstance(found, Look)], "painting")
-    return _finish(plan, canvases), _figures(plan, views, looks, int(unseen.sum()))
+    pages = Pages(canvases, len(views), store)
+    work = partial(_paint_photo, plan=plan, views=views, store=store, pages=pages)
+    spread(work, [photo for photo, reason in enumerate(looks.rejected) if reason is None], "painting")
+    return _finish(plan, canvases), _figures(plan, views, looks.rejected, int(unseen.sum()))
 
 
-def _look_at(view: PhotoView, mesh: Facets, load: Load, hidden: Hidden) -> Look | Rejected:
+def _look_at_all(views: Sequence[PhotoView], mesh: Facets, store: Store, hidden: Hidden, spread: Spread) -> Looks:
+    shape = (len(views), len(mesh.faces))
+    worth, colors = np.zeros(shape, np.float32), np.zeros((*shape, 3), np.uint8)
+    sharpness = np.zeros(len(views))
+
+    def look_at(photo: int) -> Rejected | None:
+        found = _look_at(f"look{photo}", views[photo], mesh, store, hidden)
+        if isinstance(found, Rejected):
+            return found
+        worth[photo], colors[photo], sharpness[photo] = found.worth, found.color, found.sharpness
+        return None
+
+    rejected = spread(look_at, range(len(views)), "looking at the surface")
+    return Looks(worth, colors, sharpness, rejected)
+
+
+def _look_at(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: Hidden) -> Look | Rejected:
+    kept = store.recall(name)
+    if kept is not None:
+        return Look(kept["worth"], kept["color"], float(kept["sharpness"]))
     try:
-        photo = load(view)
+        photo = store.photo(view)
     except OSError as err:
         return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
-    return look(view, photo, mesh, hidden)
+    found = look(view, photo, mesh, hidden)
+    store.keep(name, {"worth": found.worth, "color": found.color, "sharpness": np.array(found.sharpness)})
+    return found
 
 
-def _believe(looks: Sequence[Look | Rejected], mesh: Facets) -> Seen:
-    """Even out what the photos say, and leave out what only one of them says."""
-    blank = Look(np.zeros(len(mesh.faces), np.float32), np.zeros((len(mesh.faces), 3), np.uint8), 0.0)
-    found = [one if isinstance(one, Look) else blank for one in looks]
-    worth, colors = np.stack([one.worth for one in found]), np.stack([one.color for one in found])
-    sharp = np.array([one.sharpness for one in found])
-    read = sharp > 0
-    sharp[read] = sharpness_factors(sharp[read])
+def _believe(looks: Looks, mesh: Facets) -> Seen:
+    """Even out what the photos say, in place, and mark what only one of them says."""
+    worth, colors = looks.worth, looks.colors
+    read = looks.sharpness > 0
+    sharp = np.zeros(len(read))
+    sharp[read] = sharpness_factors(looks.sharpness[read])
     worth *= sharp[:, None].astype(np.float32)
     gains = photo_gains(colors, worth > 0)
     strange = strangers(colors, gains, worth > 0, mesh.neighbours)
@@ -148,10 +181,10 @@ def _plan(mesh: Facets, seen: Seen, chosen: IntArray, views: Sequence[PhotoView]
     return Plan(mesh, seen, chosen, charts, layout, corners, page, cells, blend, allowed)
 
 
-def _paint_photo(
-    photo: int, plan: Plan, views: Sequence[PhotoView], load: Load, canvases: Sequence[Canvas], lock: threading.Lock
-) -> None:
-    """Add one photo to all pages; one photo paints at a time, while others are read."""
+def _paint_photo(photo: int, plan: Plan, views: Sequence[PhotoView], store: Store, pages: Pages) -> None:
+    """Add one photo to all pages, unless it is there; one photo paints at a time, while others are read."""
+    if pages.has[photo]:
+        return
     triangles, shares = _shares(photo, plan)
     if not len(triangles):
         return
@@ -160,11 +193,11 @@ def _paint_photo(
     view, scale = views[photo], plan.layout.scale
     if scale < 1.0:
         view = view.scaled(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
-    pixels, points = load(view), plan.mesh.vertices[plan.mesh.faces[triangles]]
-    for number, page in enumerate(canvases):
-        there = plan.page[triangles] == number
-        what = triangles[there], plan.corners, points[there], shares[there], rims[there]
-        with lock:
+    pixels, points = store.photo(view), plan.mesh.vertices[plan.mesh.faces[triangles]]
+    with pages.painting(photo) as canvases:
+        for number, page in enumerate(canvases):
+            there = plan.page[triangles] == number
+            what = triangles[there], plan.corners, points[there], shares[there], rims[there]
             paint(pixels, view.row, 1.0 / plan.seen.gains[photo], *what, page.owner, page.total)
 
 
@@ -222,7 +255,9 @@ def _finish(plan: Plan, canvases: Sequence[Canvas]) -> Model:
     return Model(surface, Texture(uv, plan.page, filled))
 
 
-def _figures(plan: Plan, views: Sequence[PhotoView], looks: Sequence[Look | Rejected], unseen: int) -> dict[str, Any]:
+def _figures(
+    plan: Plan, views: Sequence[PhotoView], rejected: Sequence[Rejected | None], unseen: int
+) -> dict[str, Any]:
     """What the manifest says."""
     covered = sum(width * height for width, height in plan.layout.sizes)
     return {
@@ -236,7 +271,5 @@ def _figures(plan: Plan, views: Sequence[PhotoView], looks: Sequence[Look | Reje
             view.name: [round(float(gain), 3) for gain in gains]
             for view, gains in zip(views, plan.seen.gains, strict=True)
         },
-        "rejected": {
-            view.name: found.reason for view, found in zip(views, looks, strict=True) if isinstance(found, Rejected)
-        },
+        "rejected": {view.name: found.reason for view, found in zip(views, rejected, strict=True) if found is not None},
     }

@@ -8,6 +8,7 @@ shadows, highlights and people who walk through count little.
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.positive import solve_positive
 from sfm_app.jit import kernel
 from sfm_app.texture.middle import median
 
@@ -52,7 +53,7 @@ def _log_gains(logs: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
         normal, right = np.zeros((photos, photos)), np.zeros(photos)
         _add_equations(logs, usable, gains, normal, right)
         prior = PRIOR * max(np.trace(normal) / photos, 1e-12)
-        gains = np.linalg.solve(normal + prior * np.eye(photos), right)
+        gains = solve_positive(normal + prior * np.eye(photos), right[:, None])[:, 0]
         gains -= gains.mean()
     return gains
 

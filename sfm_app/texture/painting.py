@@ -189,7 +189,9 @@ def _keep_off(part: FloatArray, least: FloatArray) -> None:
 
 def finished(page: Canvas) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """The page as 8-bit RGB, black where nobody owns it, and where it is owned."""
-    return np.clip((page.total + FINE // 2) // FINE, 0, 255).astype(np.uint8), page.owner != NONE
+    levels = page.total + FINE // 2
+    levels //= FINE  # in place: a page has as many as two hundred megabytes of sums
+    return np.clip(levels, 0, 255, out=levels).astype(np.uint8), page.owner != NONE
 
 
 def fill_background(page: NDArray[np.uint8], painted: NDArray[np.bool_]) -> NDArray[np.uint8]:

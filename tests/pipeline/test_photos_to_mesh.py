@@ -18,8 +18,10 @@ from sfm_app.cli import main
 from sfm_app.colmap.dense import DenseStore
 from sfm_app.pipeline import NAMES
 from sfm_app.settings import Settings
+from sfm_app.stages.texture import PARTS, Files
 from sfm_app.synthetic.cameras import camera_centre
 from sfm_app.synthetic.compare import centre_error_percent, focal_error_percent, surface_error
+from sfm_app.texture import pages
 from sfm_app.workspace import Workspace
 
 DRAFT = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 480}})
@@ -79,6 +81,9 @@ def test_manifest_accounts_for_every_stage(finished):
     assert tuple(run.manifest["stages"]) == NAMES
     assert run.manifest["stages"]["scene"]["counts"]["registered"] == len(run.scene.registered)
     assert run.manifest["settings"]["quality"] == "draft"
+    peaks = [stage["peak_mb"] for stage in run.manifest["stages"].values()]
+    assert peaks == sorted(peaks)
+    assert 100 < peaks[0] <= peaks[-1] < 4000
 
 
 def test_the_texture_covers_the_mesh(finished):
@@ -116,41 +121,61 @@ class Killed(BaseException):
     """What no program catches."""
 
 
-def killed_at(number, monkeypatch, method, *arguments, **options):
-    """A run that ends when it is about to keep its `number`-th map by this method of the store of depth maps."""
-    keep, calls = getattr(DenseStore, method), itertools.count(1)
+def killed_at(number, monkeypatch, store, method, *arguments, **options):
+    """A run that ends when it is about to keep its `number`-th thing by this method of a store."""
+    keep, calls = getattr(store, method), itertools.count(1)
 
-    def fail(store, view, maps):
+    def fail(*what):
         if next(calls) >= number:
             raise Killed
-        keep(store, view, maps)
+        keep(*what)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(DenseStore, method, fail)
+        patch.setattr(store, method, fail)
         sfm_app.reconstruct(*arguments, **options)
 
 
-def depth_files(out, kind):
-    return {path: path.stat().st_mtime_ns for path in (out / "dense/stereo/depth_maps").glob(f"*.{kind}.bin")}
+def stamps(folder, pattern):
+    return {path: path.stat().st_mtime_ns for path in folder.glob(pattern)}
 
 
 def test_a_run_killed_among_its_depth_maps_ends_with_the_same_bytes(finished, rendered, tmp_path, monkeypatch):
     whole, out = finished[0].out, tmp_path / "out"
+    maps = out / "dense/stereo/depth_maps"
     shutil.copytree(whole, out, symlinks=True)
     expected = (whole / "model.glb").read_bytes()
 
-    killed_at(4, monkeypatch, "write_estimate", rendered[0], out, DRAFT, first="depth_maps")
-    matched = depth_files(out, "photometric")
+    killed_at(4, monkeypatch, DenseStore, "write_estimate", rendered[0], out, DRAFT, first="depth_maps")
+    matched = stamps(maps, "*.photometric.bin")
     assert len(matched) == 3
-    killed_at(3, monkeypatch, "write_maps", rendered[0], out, DRAFT)
-    assert depth_files(out, "photometric").items() > matched.items()
-    confirmed = depth_files(out, "geometric")
+    killed_at(3, monkeypatch, DenseStore, "write_maps", rendered[0], out, DRAFT)
+    assert stamps(maps, "*.photometric.bin").items() > matched.items()
+    confirmed = stamps(maps, "*.geometric.bin")
     assert len(confirmed) == 2
     assert "depth_maps" not in Workspace(out).manifest()["stages"]
     run = sfm_app.reconstruct(rendered[0], out, DRAFT)
 
-    assert depth_files(out, "geometric").items() > confirmed.items()
+    assert stamps(maps, "*.geometric.bin").items() > confirmed.items()
     assert run.mesh_path.read_bytes() == expected
+
+
+def test_a_run_killed_in_its_texture_ends_with_the_same_bytes(finished, rendered, tmp_path, monkeypatch):
+    whole, out = finished[0], tmp_path / "out"
+    parts = out / "dense" / PARTS
+    shutil.copytree(whole.out, out, symlinks=True)
+    monkeypatch.setattr(pages, "EVERY_S", -1.0)
+    monkeypatch.setattr(pages, "MOST_OF_THE_TIME", np.inf)
+
+    killed_at(4, monkeypatch, Files, "keep", rendered[0], out, DRAFT, first="texture")
+    looks = stamps(parts, "look*.npz")
+    assert len(looks) == 3
+    killed_at(len(whole.scene.registered), monkeypatch, Files, "keep", rendered[0], out, DRAFT)
+    assert stamps(parts, "look*.npz").items() > looks.items()
+    assert (parts / f"{pages.KEPT}.npz").exists()
+    run = sfm_app.reconstruct(rendered[0], out, DRAFT)
+
+    assert run.mesh_path.read_bytes() == whole.mesh_path.read_bytes()
+    assert not parts.exists()
 
 
 def test_one_worker_and_two_give_the_same_bytes(rendered, tmp_path):

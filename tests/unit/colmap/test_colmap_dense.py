@@ -19,6 +19,7 @@ from sfm_app.colmap.dense import (
 )
 from sfm_app.colmap.surface import FUSED, fuse, poisson, read_fused, simplify
 from sfm_app.errors import BackendError
+from sfm_app.progress import Silent
 from sfm_app.stereo import DepthMap, Estimate
 from sfm_app.types import Surface
 
@@ -53,7 +54,7 @@ def workspace(tmp_path_factory):
             track.add_element(image_id, index)
         model.add_point3D(xyz, track, np.zeros(3, np.uint8))
     model.write(place / "sparse")
-    undistort(place / "sparse", place / "photos", place / "dense", 1000)
+    undistort(place / "sparse", place / "photos", place / "dense", 1000, 1, Silent())
     views = read_views(place / "dense")
     for view in views:
         y, x = np.mgrid[: view.height, : view.width] + view.sample_px
@@ -212,6 +213,6 @@ def test_points_in_one_spot_give_a_surface_without_triangles(tmp_path):
 
 def test_missing_inputs_are_backend_errors(tmp_path, workspace):
     with pytest.raises(BackendError, match="undistorting photos"):
-        undistort(tmp_path / "none", tmp_path, tmp_path / "dense", 100)
+        undistort(tmp_path / "none", tmp_path, tmp_path / "dense", 100, 1, Silent())
     with pytest.raises(BackendError, match=r"depth map of 1\.png"):
         read_depth(tmp_path, workspace[1][0], "geometric")

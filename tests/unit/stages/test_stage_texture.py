@@ -1,13 +1,17 @@
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from PIL import Image
 
-from sfm_app.stages.texture import load_texture, read_photo, save_texture
+from sfm_app.stages import texture
+from sfm_app.stages.texture import Files, digest, load_texture, make_texture, read_photo, save_texture
 from sfm_app.texture import PhotoView
-from sfm_app.types import Model, Surface, Texture
+from sfm_app.types import CameraModel, Model, Surface, Texture
 from sfm_app.workspace import Workspace
 
+POSE = np.eye(3, 4)
 SURFACE = Surface(np.eye(3), np.array([[0, 1, 2]]), np.full((3, 3), 9, np.uint8))
 
 
@@ -45,3 +49,59 @@ def test_photos_are_rgb_and_of_the_view_s_size(tmp_path):
     assert small.shape == (10, 20, 3)
     assert (small[:, :10] == 0).all()
     assert (small[:, 10:] == 200).all()
+
+
+def test_arrays_come_back_by_name_and_damaged_ones_count_as_none(tmp_path):
+    files = Files(tmp_path, tmp_path / "parts")
+    assert files.recall("look0") is None
+
+    files.keep("look0", {"worth": np.arange(3), "sharpness": np.array(0.5)})
+    files.keep("look0", {"worth": np.arange(4)})
+
+    assert list(files.recall("look0")) == ["worth"]
+    assert files.recall("look0")["worth"].tolist() == [0, 1, 2, 3]
+    (path,) = (tmp_path / "parts").iterdir()
+    path.write_bytes(path.read_bytes()[:50])
+    assert files.recall("look0") is None
+    path.write_bytes(b"")
+    assert files.recall("look0") is None
+
+
+def test_the_digest_of_a_surface_is_that_of_all_its_parts():
+    same = Surface(np.eye(3), np.array([[0, 1, 2]]), np.full((3, 3), 9, np.uint8))
+    others = [
+        replace(SURFACE, vertices=2 * np.eye(3)),
+        replace(SURFACE, faces=np.array([[0, 2, 1]])),
+        replace(SURFACE, colors=np.full((3, 3), 8, np.uint8)),
+    ]
+
+    assert digest(same) == digest(SURFACE)
+    assert len({digest(surface) for surface in (SURFACE, *others)}) == 4
+
+
+@pytest.mark.parametrize("change", ["", "inputs", "camera", "surface"])
+def test_nothing_is_used_that_was_found_with_something_else(tmp_path, monkeypatch, change):
+    """The first run is killed at its second photo; photos that it has looked at are not read again."""
+    found = []
+
+    def texture_surface(surface, views, store, hidden, options, spread):
+        found.append(store.recall("look0"))
+        if len(found) == 1:
+            store.keep("look0", {"worth": np.arange(3)})
+            raise KeyboardInterrupt
+        return Model(surface), {}
+
+    def run_stage(inputs="", focal=50.0, surface=SURFACE):
+        camera = CameraModel("OPENCV", (focal, 50.0, 30.0, 20.0, 0, 0, 0, 0), np.eye(3), 60, 40)
+        scene = SimpleNamespace(cameras={"one": camera}, camera_of={"a.png": "one"}, cam_from_world={"a.png": POSE})
+        run = SimpleNamespace(workspace=Workspace(tmp_path), inputs=inputs, map=None, record=dict)
+        make_texture(scene, surface, None, run)
+
+    monkeypatch.setattr(texture, "texture_surface", texture_surface)
+    with pytest.raises(KeyboardInterrupt):
+        run_stage()
+    others = {"inputs": "others", "camera": 51.0, "surface": replace(SURFACE, vertices=2 * np.eye(3))}
+    run_stage(**({"focal" if change == "camera" else change: others[change]} if change else {}))
+
+    assert (found[1] is None) == bool(change)
+    assert not (tmp_path / "dense" / texture.PARTS).exists()

@@ -73,13 +73,22 @@ def photograph(view):
 
 @dataclass
 class Album:
-    """Loads photos for the texture, as the program loads files."""
+    """Photos for the texture, and what it keeps, as the program has them in files."""
 
     exposure: dict[str, float] = field(default_factory=dict)
     passers_by: dict[str, tuple[slice, slice]] = field(default_factory=dict)
     lost: tuple[str, ...] = ()
+    kept: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
+    asked: list[str] = field(default_factory=list)
 
-    def load(self, view):
+    def recall(self, name):
+        return self.kept.get(name)
+
+    def keep(self, name, arrays):
+        self.kept[name] = {key: array.copy() for key, array in arrays.items()}
+
+    def photo(self, view):
+        self.asked.append(view.name)
         if view.name in self.lost:
             raise FileNotFoundError(2, "No such file or directory")
         photo = photograph(view).astype(float)

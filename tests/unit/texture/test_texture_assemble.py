@@ -18,7 +18,7 @@ BOX = box()
 
 def textured(album, surface=BOX, views=VIEWS, spread=one_by_one, **options) -> tuple[Model, dict]:
     hidden = Occluders(surface.vertices, surface.faces).hidden
-    return texture_surface(surface, views, album.load, hidden, TextureSettings(**options), spread)
+    return texture_surface(surface, views, album, hidden, TextureSettings(**options), spread)
 
 
 def seen_part(model):

@@ -1,0 +1,58 @@
+"""The benchmark of a hundred photos: its memory figures and its page."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hundred import held_mb, page
+
+from sfm_app.pipeline import NAMES
+
+HOLDS = "import sys; held = bytearray({mb}_000_000); print(flush=True); sys.stdin.read()"
+PARENT = "import subprocess, sys; held = bytearray(50_000_000); subprocess.run([sys.executable, '-c', sys.argv[1]])"
+LINUX_ONLY = pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="only Linux tells the memory so")
+
+
+def held_by(*arguments):
+    """What a process holds once it, or its child, has said so."""
+    command = [sys.executable, "-c", *arguments]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        held = held_mb(process.pid)
+        process.stdin.close()
+        process.wait()
+    return held
+
+
+@LINUX_ONLY
+def test_memory_is_that_of_a_process_and_of_its_children():
+    alone = held_by(HOLDS.format(mb=200))
+    together = held_by(PARENT, HOLDS.format(mb=200))
+
+    assert 190 < alone < 260
+    assert 45 < together - alone < 90
+
+
+@LINUX_ONLY
+def test_a_process_that_has_ended_holds_nothing():
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        process.wait()
+
+        assert held_mb(process.pid) == 0
+
+
+def test_the_page_has_stages_in_rows_and_numbers_of_photos_in_columns():
+    rows = [
+        {"method": "sfm-app", "photos": count, "placed": count - 1}
+        | {f"s of {name}": float(count) for name in NAMES}
+        | {f"MB {name}": 10 * count + number for number, name in enumerate(NAMES)}
+        for count in (50, 100)
+    ]
+
+    lines = page(rows).splitlines()
+
+    assert "49 of 50, 99 of 100" in lines[2]
+    assert "| stage | s, 50 photos | s, 100 photos | MB, 50 photos | MB, 100 photos |" in lines
+    assert "| mesh | 50 | 100 | 506 | 1006 |" in lines
+    assert f"| together | {50 * len(NAMES)} | {100 * len(NAMES)} | 508 | 1008 |" in lines
