@@ -4,10 +4,11 @@ from sfm_app.meshing.borders import Support, bridge_gaps, cut, drop_doubtful, sm
 from sfm_app.meshing.clean import drop_islands, octree_depth
 from sfm_app.meshing.manifold import make_manifold
 from sfm_app.meshing.paint import Paint, sample_colors
-from sfm_app.meshing.visibility import CONFIRMED, SEEN_THROUGH, SILENT, Eye, judge
+from sfm_app.meshing.visibility import CONFIRMED, EMPTY, SEEN_THROUGH, SILENT, Eye, judge
 
 __all__ = [
     "CONFIRMED",
+    "EMPTY",
     "SEEN_THROUGH",
     "SILENT",
     "Eye",

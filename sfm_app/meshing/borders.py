@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.triangles import edges_of, select_faces
-from sfm_app.meshing.visibility import CONFIRMED, SEEN_THROUGH
+from sfm_app.meshing.visibility import CONFIRMED, EMPTY, SEEN_THROUGH
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
@@ -21,25 +21,38 @@ SMOOTHING = 20
 MAX_FREE = 0.1
 """A gap is not bridged where photos see through this share of it: then it is the way around an edge, not a hole."""
 
+MIN_SHARE = 0.25
+"""Of the photos that should see a vertex so many confirm it; the depth maps of the others are empty there. Flakes of
+sky beside outlines are never seen through, and the more photos, the more of them are confirmed by one or two."""
+
 
 @dataclass(slots=True, eq=False)
 class Support:
-    """How many photos confirm each vertex of a surface, and how many see through it."""
+    """How many photos confirm each vertex of a surface, see through it, and know nothing where it should be."""
 
     confirmed: NDArray[np.int32]
     """(V,)."""
     through: NDArray[np.int32]
     """(V,)."""
+    empty: NDArray[np.int32]
+    """(V,)."""
 
     @classmethod
     def none(cls, count: int) -> "Support":
         """No photo yet for `count` vertices."""
-        return cls(np.zeros(count, np.int32), np.zeros(count, np.int32))
+        return cls(*(np.zeros(count, np.int32) for _ in range(3)))
 
     def add(self, verdict: NDArray[np.uint8]) -> None:
         """Add what one photo says, see `judge`."""
         self.confirmed += verdict == CONFIRMED
         self.through += verdict == SEEN_THROUGH
+        self.empty += verdict == EMPTY
+
+    @property
+    def believed(self) -> NDArray[np.bool_]:
+        """(V,) whether enough of the photos that would see a vertex confirm it."""
+        enough = self.confirmed >= MIN_SHARE * (self.confirmed + self.empty)
+        return np.asarray((self.confirmed > 0) & (self.through <= self.confirmed) & enough)
 
 
 def trim(surface: Surface, support: Support, max_gap: float, least: float) -> Surface:
@@ -52,7 +65,7 @@ def trim(surface: Surface, support: Support, max_gap: float, least: float) -> Su
         least: as for `drop_doubtful`.
     """
     free = support.through > support.confirmed
-    sign = np.where((support.confirmed > 0) & ~free, 1.0, -1.0)
+    sign = np.where(support.believed, 1.0, -1.0)
     smooth = smooth_support(surface, bridge_gaps(surface, sign, free, max_gap), SMOOTHING)
     whole = bridge_gaps(surface, smooth, free, max_gap)
     return cut(surface, drop_doubtful(surface, whole, support.confirmed, least))

@@ -1,4 +1,4 @@
-"""What a photo says about points in space: its depth map confirms them, sees through them, or is silent."""
+"""What a photo says about points in space: its depth map confirms them, sees through them, is empty, or silent."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ FloatArray = NDArray[np.float64]
 DepthArray = NDArray[np.float32]
 """(H, W) depth along the optical axis in scene units, 0 where unknown."""
 
-SILENT, CONFIRMED, SEEN_THROUGH = 0, 1, 2
+SILENT, CONFIRMED, SEEN_THROUGH, EMPTY = 0, 1, 2, 3
 MIN_COSINE = 0.1
 """Least cosine between a surface's normal and the ray to the photo that confirms it."""
 THROUGH = 3.0
@@ -49,10 +49,11 @@ class Eye:
 
 
 def judge(points: FloatArray, normals: FloatArray, eye: Eye, tolerance: float) -> NDArray[np.uint8]:
-    """Per point (N, 3) with its unit normal (N, 3): CONFIRMED, SEEN_THROUGH or SILENT.
+    """Per point (N, 3) with its unit normal (N, 3): CONFIRMED, SEEN_THROUGH, EMPTY or SILENT.
 
     A point is confirmed where the depths around it reach its own within the relative tolerance and it faces the photo;
-    it is seen through where all of them lie well behind it. Hidden points and empty places of the map say nothing.
+    it is seen through where all of them lie well behind it. The map is empty where it faces the photo and there are no
+    depths around it. About hidden points it is silent.
     """
     verdict = np.zeros(len(points), np.uint8)
     _judge(points, normals, eye.projection, eye.center, eye.depth, np.array([eye.sample_px, tolerance]), verdict)
@@ -88,14 +89,12 @@ def _judge(
                 if d > 0:
                     low, high, known = min(low, d), max(high, d), known + 1
                     near = near or abs(d - z) <= tolerance * z
-        if known == 0:
-            continue
         # on a slope the four depths bracket the point's; across a step they do not belong together
         between = low <= z <= high and high - low <= 2.0 * THROUGH * tolerance * z
-        if near or between:
+        if near or between or known == 0:
             x, y, w = center[0] - X, center[1] - Y, center[2] - Z
             facing = normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * w
             if facing > MIN_COSINE * np.sqrt(x * x + y * y + w * w):
-                verdict[k] = CONFIRMED
+                verdict[k] = EMPTY if known == 0 else CONFIRMED
         elif known == 4 and low > (1.0 + THROUGH * tolerance) * z:
             verdict[k] = SEEN_THROUGH

@@ -97,6 +97,18 @@ def test_trimming_keeps_what_is_confirmed_with_its_pinholes_closed(sheet, togeth
     assert found.vertices[:, 0].max() < 32
 
 
+@pytest.mark.parametrize(("empty", "kept"), [(2, 1.0), (5, 1.0), (7, 0.5), (40, 0.5)])
+def test_what_most_photos_know_nothing_about_is_dropped_however_many_there_are(sheet, empty, kept):
+    surface = sheet(40)
+    support = Support.none(len(surface.vertices))
+    support.confirmed[:] = 2
+    support.empty[surface.vertices[:, 0] > 20] = empty
+
+    found = trim(surface, support, 12.0, 1.0)
+
+    assert total(found) == pytest.approx(kept * 40 * 40, rel=0.03)
+
+
 def test_smoothing_takes_the_teeth_off_a_border_and_keeps_its_place(sheet):
     surface = sheet(40)
     x, y = surface.vertices[:, 0], surface.vertices[:, 1]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.meshing import CONFIRMED, SEEN_THROUGH, SILENT, Eye, Paint, judge, sample_colors
+from sfm_app.meshing import CONFIRMED, EMPTY, SEEN_THROUGH, SILENT, Eye, Paint, judge, sample_colors
 
 FACING = np.array([[0.0, 0.0, -1.0]])
 
@@ -26,7 +26,7 @@ def eye():
         ((0, 0, 9.8), SILENT),
         ((0, 0, 9.0), SEEN_THROUGH),
         ((0, 0, 11.0), SILENT),
-        ((3, 0, 10.0), SILENT),
+        ((3, 0, 10.0), EMPTY),
         ((0, 1.0, 5.0), CONFIRMED),
         ((0, 0.745, 7.4), SILENT),  # on the step from 10 to 5
         ((0, 0, -10.0), SILENT),
@@ -39,6 +39,7 @@ def test_verdicts(eye, point, verdict):
 
 def test_the_back_of_a_surface_is_not_confirmed(eye):
     assert judge(np.array([[0, 0, 10.0]]), -FACING, eye, 0.01) == SILENT
+    assert judge(np.array([[3, 0, 10.0]]), -FACING, eye, 0.01) == SILENT
 
 
 def test_colours_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
