@@ -113,7 +113,7 @@ class MeshSettings(Section):
         20.0, ge=0, le=1000, description="gaps in what photos confirm are closed up to this width, in triangles"
     )
     min_island: float = Field(
-        0.001, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
+        0.003, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
     )
     max_error: float = Field(
         0.15, ge=0, le=10, description="simplification may move the surface so far, in edges of Poisson's triangles"

@@ -57,7 +57,7 @@ class View:
         return self.K @ np.column_stack([self.R, self.t])
 
 
-def region(views: Sequence[View], margin: float = 5.0) -> FloatArray:
+def region(views: Sequence[View], margin: float = 0.2) -> FloatArray:
     """Box (2, 3) around the sparse points: lowest and highest coordinates, without the strays, widened by a share."""
     points = np.concatenate([view.points for view in views])
     low, high = np.percentile(points, [1, 99], axis=0)

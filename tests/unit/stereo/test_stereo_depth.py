@@ -108,7 +108,7 @@ def test_region_leaves_strays_out():
     points[0] = 500.0
     view = View("v", np.eye(3), np.eye(3), np.zeros(3), 10, 10, np.arange(1000), points)
 
-    low, high = region([view], 0.2)
+    low, high = region([view])
 
     assert np.all((low > -1.5) & (low < -1.2))
     assert np.all((high < 1.5) & (high > 1.2))
