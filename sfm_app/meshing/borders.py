@@ -49,10 +49,15 @@ class Support:
         self.empty += verdict == EMPTY
 
     @property
+    def free(self) -> NDArray[np.bool_]:
+        """(V,) whether more photos see through a vertex than confirm it."""
+        return np.asarray(self.through > self.confirmed)
+
+    @property
     def believed(self) -> NDArray[np.bool_]:
         """(V,) whether enough of the photos that would see a vertex confirm it."""
         enough = self.confirmed >= MIN_SHARE * (self.confirmed + self.empty)
-        return np.asarray((self.confirmed > 0) & (self.through <= self.confirmed) & enough)
+        return np.asarray((self.confirmed > 0) & ~self.free & enough)
 
 
 def trim(surface: Surface, support: Support, max_gap: float, least: float) -> Surface:
@@ -64,10 +69,9 @@ def trim(surface: Surface, support: Support, max_gap: float, least: float) -> Su
         max_gap: as for `bridge_gaps`.
         least: as for `drop_doubtful`.
     """
-    free = support.through > support.confirmed
     sign = np.where(support.believed, 1.0, -1.0)
-    smooth = smooth_support(surface, bridge_gaps(surface, sign, free, max_gap), SMOOTHING)
-    whole = bridge_gaps(surface, smooth, free, max_gap)
+    smooth = smooth_support(surface, bridge_gaps(surface, sign, support.free, max_gap), SMOOTHING)
+    whole = bridge_gaps(surface, smooth, support.free, max_gap)
     return cut(surface, drop_doubtful(surface, whole, support.confirmed, least))
 
 
