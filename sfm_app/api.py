@@ -38,7 +38,7 @@ class Run:
     mesh_path: Path | None
     """model.glb; model.ply lies beside it."""
     manifest: dict[str, Any]
-    """manifest.json as it stands now."""
+    """manifest.json, with the stages up to the one where the run stopped."""
 
 
 def reconstruct(
@@ -60,12 +60,13 @@ def reconstruct(
     Raises:
         SfmError: see `sfm_app.errors`; carries what went wrong and what to do.
     """
-    from sfm_app.pipeline import run_stages  # loads COLMAP, which an estimator alone can do without
+    from sfm_app.pipeline import NAMES, run_stages  # loads COLMAP, which an estimator alone can do without
 
     with opened_run(Path(out), settings or Settings(), progress) as run:
         run.plugins.depth_method(run.settings.depth.method)  # refused now, not when half of the work is done
         products = run_stages(Path(photos), run, first, last)
-        done = run.workspace.manifest().get("stages", {})
+        manifest = run.workspace.manifest()
+        done = {name: manifest["stages"][name] for name in NAMES[: NAMES.index(last) + 1]}
         scene = products("scene") if "scene" in done else None
         return Run(
             out=run.workspace.root,
@@ -73,7 +74,7 @@ def reconstruct(
             scene=scene,
             model_dir=scene.model_dir if scene else None,
             mesh_path=products("files")[-1] if "files" in done else None,
-            manifest=run.workspace.manifest(),
+            manifest={**manifest, "stages": done},
         )
 
 

@@ -26,6 +26,9 @@ FLOOR_DEG, WALL_DEG = (0.0, 20.0), (80.0, 90.0)
 SQUARE_WITHIN_DEG = 30.0
 """The front is turned to the viewer when it is this near; a view across a corner stays one."""
 
+MIDDLE = (0.2, 0.8)
+"""Quantiles of the points between which the middle of the scene is half way."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Upright:
@@ -113,7 +116,7 @@ def facing(upright: Upright, rotations: FloatArray, points: FloatArray) -> tuple
 
 
 def viewer_frame(up: FloatArray, towards: FloatArray, points: FloatArray, metres: float | None = None) -> Similarity:
-    """The similarity into the frame of glTF viewers: y up, z to the viewer, the middle of the points at 0.
+    """The similarity into the frame of glTF viewers: y up, z to the viewer, the points about 0.
 
     Args:
         up: (3,) unit vector in the world.
@@ -122,7 +125,9 @@ def viewer_frame(up: FloatArray, towards: FloatArray, points: FloatArray, metres
         metres: per unit of the world; where None, four of five points come to lie within 1 of the middle.
     """
     R = np.stack([np.cross(up, towards), up, towards])
-    centre = np.median(points, axis=0)
-    size = float(np.percentile(np.linalg.norm(points - centre, axis=1), 80))
+    # The median would follow the points to where most of them happen to be, the whole box the farthest few.
+    turned = points @ R.T
+    centre = np.mean(np.quantile(turned, MIDDLE, axis=0), axis=0)
+    size = float(np.percentile(np.linalg.norm(turned - centre, axis=1), 80))
     scale = 1.0 / max(size, 1e-12) if metres is None else metres
-    return Similarity(scale, R, -scale * R @ centre)
+    return Similarity(scale, R, -scale * centre)

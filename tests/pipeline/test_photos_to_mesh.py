@@ -106,6 +106,16 @@ def test_a_second_run_does_nothing(finished, rendered):
     assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
 
 
+def test_a_run_that_stops_early_says_nothing_of_an_older_mesh(finished, rendered):
+    whole, _ = finished
+
+    run = sfm_app.reconstruct(rendered[0], whole.out, DRAFT, last="scene")
+
+    assert run.mesh_path is None and run.scene.points == whole.scene.points
+    assert tuple(run.manifest["stages"]) == NAMES[: NAMES.index("scene") + 1]
+    assert tuple(Workspace(whole.out).manifest()["stages"]) == NAMES
+
+
 def test_a_changed_setting_redoes_only_what_it_touches(finished, rendered, tmp_path):
     run, _ = finished
     shutil.copytree(run.out, tmp_path / "out", symlinks=True)

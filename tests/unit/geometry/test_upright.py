@@ -160,6 +160,18 @@ def test_the_viewer_sees_the_scene_upright_centred_and_of_size_one(build_house):
     assert metric.scale == 2.5
 
 
+def test_neither_where_points_crowd_nor_far_ones_move_the_middle_of_the_scene():
+    rng = np.random.default_rng(5)
+    even, crowd = rng.uniform(-1, 1, (4000, 3)), rng.uniform([0.5, -1, -1], [1, 1, 1], (2500, 3))
+    far = np.tile([400.0, 0.0, 0.0], (60, 1))
+    seen = viewer_frame(np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), np.concatenate([even, crowd, far]))
+
+    middle = seen(np.zeros((1, 3)))[0] / seen.scale
+
+    assert -0.25 < middle[0] < -0.1  # the median lies at 0.47
+    assert np.abs(middle[1:]).max() < 0.05
+
+
 def test_no_plane_where_points_fill_space():
     cloud = np.random.default_rng(0).normal(size=(2000, 3))
 
