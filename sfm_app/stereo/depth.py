@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.stereo.blank_areas import without_surface
 from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses, without_specks
 from sfm_app.stereo.even_areas import bridge_even_areas
 from sfm_app.stereo.matching import depths_from_disparities, disparities
@@ -120,7 +121,7 @@ def confirm_depths(
     """Keep the depths that enough other maps confirm, cut at outlines; drop specks, bridge plain walls, add normals.
 
     Enough is `min_agreeing`; one more where the photos look little alike and beside broad empty places, three more
-    where they hardly do.
+    where they hardly do, and never in skies.
     """
     if not others:
         return Rejected("no other depth map to compare with")
@@ -129,7 +130,8 @@ def confirm_depths(
     least, more = (min(need, len(others)) for need in (min_agreeing, min_agreeing + 1))
     enough = np.where(confidence < UNSURE, more, least)
     enough[confidence < WEAK] = min_agreeing + WEAK_NEED
-    confirmed = np.where(agreeing >= enough, estimate.depth, np.float32(0))
+    sound = (estimate.depth > 0) & (agreeing >= enough)
+    confirmed = np.where(sound & ~without_surface(confidence, sound), estimate.depth, np.float32(0))
     doubtful = rims(confirmed > 0) & (agreeing < more)
     confirmed = without_specks(without_spill(np.where(doubtful, np.float32(0), confirmed), image), tolerance)
     planes = fit_planes(bridge_even_areas(confirmed, image, tolerance))
