@@ -3,6 +3,7 @@
 
 python benchmarks/accuracy/surface.py DATA --cache CACHE --left-out 3 --parts castle-P19 5 10 19
 python benchmarks/accuracy/surface.py --sets statue corner --cache CACHE
+python benchmarks/accuracy/surface.py --sets statue@1 facade@1 corner@1 courtyard --cache CACHE --name surface-fresh
 python benchmarks/accuracy/surface.py DATA --sets fountain-P11 --cache CACHE --keep --name surface-fountain
 """
 

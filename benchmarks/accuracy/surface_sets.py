@@ -9,7 +9,7 @@ from photo_sets import FORMATS
 from sfm_app.api import opened_run
 from sfm_app.pipeline import NAMES, run_stages
 from sfm_app.settings import Settings
-from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth, write_photo_folder
+from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.scenes import WALKS, build_scene, scene_views
 from sfm_app.types.model import Model
 
@@ -35,12 +35,18 @@ class SurfaceSet:
 def surface_set(name: str, data: Path | None, cache: Path) -> SurfaceSet:
     """A scene of the program's own, rendered once into the cache, or DATA/NAME/images.
 
+    Args:
+        name: of a scene, SCENE@SEED for another walk and other noise, or of a folder.
+        data: folder of folders.
+        cache: for what is rendered.
+
     Raises:
         ValueError: neither is there.
     """
-    if name in WALKS:
+    scene, _, seed = name.partition("@")
+    if scene in WALKS:
         folder = cache / "rendered" / name
-        return SurfaceSet(name, folder / "photos", _rendered(name, folder))
+        return SurfaceSet(name, folder / "photos", _rendered(scene, int(seed or 0), folder))
     if data is None or not (data / name / "images").is_dir():
         raise ValueError(f"'{name}' is neither a rendered scene ({', '.join(WALKS)}) nor a folder of DATA")
     return SurfaceSet(name, data / name / "images", None)
@@ -70,7 +76,8 @@ def dense_stages() -> Sequence[str]:
     return NAMES[NAMES.index("scene") + 1 :]
 
 
-def _rendered(name: str, folder: Path) -> Truth:
+def _rendered(name: str, seed: int, folder: Path) -> Truth:
     if not (folder / "truth.json").exists():  # written last
-        save_truth(write_photo_folder(folder / "photos", build_scene(name), scene_views(name)), folder)
+        options = PhotoOptions(seed=seed)
+        save_truth(write_photo_folder(folder / "photos", build_scene(name), scene_views(name, seed), options), folder)
     return load_truth(folder)
