@@ -17,12 +17,13 @@ from sfm_app.colmap.model import sparse_model
 from sfm_app.context import RunContext
 from sfm_app.errors import ConfigError, InputError, SfmError
 from sfm_app.parallel import ordered_map
+from sfm_app.photos import place_of
 from sfm_app.stages.depth_maps import make_depth_maps
 from sfm_app.stages.files import load_files, write_files
 from sfm_app.stages.intrinsics import calibrate, load_intrinsics
 from sfm_app.stages.match_graph import load_match_graph, match_photos
 from sfm_app.stages.mesh import load_surface, make_mesh
-from sfm_app.stages.photos import list_files, load_photo_set, read_photos
+from sfm_app.stages.photos import files_of, load_photo_set, read_photos
 from sfm_app.stages.scene import load_scene, reconstruct_scene
 from sfm_app.stages.texture import load_texture, make_texture
 from sfm_app.stages.view_graph import build_view_graph, load_view_graph
@@ -159,7 +160,7 @@ def run_stages(folder: Path, run: RunContext, first: str = "", last: str = "file
     redo = False
 
     products = loader(found, run)
-    with logged(run):
+    with run.workspace.held(), logged(run):
         for stage in STAGES[: NAMES.index(last) + 1]:
             prints[stage.name] = stage_fingerprint(stage, prints, run)
             redo = redo or stage.name == first or not run.workspace.is_current(stage.name, prints[stage.name])
@@ -199,11 +200,14 @@ def peak_memory_mb() -> int | None:
 
 def folder_fingerprint(folder: Path, run: RunContext) -> str:
     """Hash of the names and bytes of all files in the photo folder."""
-    names = list_files(folder, exclude=run.workspace.root)
+    names = files_of(folder, run)
 
     def digest(name: str) -> str:
+        place = place_of(folder, name)
+        if isinstance(place, str):
+            return place
         try:
-            with (folder / name).open("rb") as file:
+            with place.open("rb") as file:
                 return hashlib.file_digest(file, "blake2b").hexdigest()
         except OSError:
             return "unreadable"
@@ -234,7 +238,7 @@ def versions() -> dict[str, str]:
 @contextmanager
 def logged(run: RunContext) -> Iterator[None]:
     """Keep a log in the output folder, with the traceback of whatever ends the run."""
-    handler = logging.FileHandler(run.workspace.log, encoding="utf-8")
+    handler = logging.FileHandler(run.workspace.log, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

@@ -4,12 +4,16 @@ import contextlib
 import hashlib
 import json
 import os
+import platform
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from sfm_app.errors import InputError
 
@@ -18,6 +22,7 @@ DATABASE = "database.db"
 CALIBRATION = "calibration.json"
 SHARED = (DATABASE, CALIBRATION)
 """Files that later stages add to."""
+LOCK, HOLDER = ".lock", ".held-by.txt"
 UNFINISHED = "unfinished.txt"
 """In a folder while a stage fills it: what it is filled from. It says whether a killed run can go on there."""
 
@@ -94,6 +99,30 @@ class Workspace:
             raise InputError(
                 f"cannot write to {self.root}: {err.strerror}", hint="name another output folder with -o"
             ) from err
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other runs out; the system lets go of it when this process ends, however it ends.
+
+        Raises:
+            InputError: another run is at work here.
+        """
+        holder = self.root / HOLDER
+        lock = FileLock(self.root / LOCK, timeout=0)
+        try:
+            lock.acquire()
+        except Timeout:
+            raise InputError(
+                f"another run is at work in {self.root}: {_said(holder)}",
+                hint="wait for it, end it, or name another output folder with -o",
+            ) from None
+        try:
+            started = datetime.now().astimezone().isoformat(" ", "seconds")
+            holder.write_text(f"process {os.getpid()} on {platform.node()} since {started}\n", encoding="utf-8")
+            yield
+        finally:
+            holder.unlink(missing_ok=True)
+            lock.release()
 
     def manifest(self) -> dict[str, Any]:
         """The manifest as written last; empty when there is none or it cannot be read (then everything is redone)."""
@@ -199,6 +228,13 @@ def fingerprint(*parts: Any) -> str:
     """Hash of JSON-able parts, independent of the order of keys."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _said(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8").strip() or "it has just begun"
+    except (OSError, UnicodeDecodeError):
+        return "it has just begun"
 
 
 def _size(path: Path) -> int | None:
