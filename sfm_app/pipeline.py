@@ -4,7 +4,7 @@ import hashlib
 import logging
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -15,7 +15,7 @@ from zipfile import BadZipFile
 from sfm_app.colmap.backend import versions as colmap_versions
 from sfm_app.colmap.model import sparse_model
 from sfm_app.context import RunContext
-from sfm_app.errors import ConfigError, InputError, SfmError
+from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError, SfmError
 from sfm_app.parallel import ordered_map
 from sfm_app.photos import place_of
 from sfm_app.stages.depth_maps import make_depth_maps
@@ -125,8 +125,6 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
         return sparse_model(place.sparse) if points else loader({}, run)("texture")
     except OSError as err:
         raise InputError(f"{place.root} is not complete: {err.strerror}: {err.filename}", hint=_how_on(run)) from err
-    except (BadZipFile, EOFError, KeyError, ValueError) as err:
-        raise InputError(f"the model in {place.root} is damaged", hint=_how_on(run)) from err
 
 
 def _how_on(run: RunContext) -> str:
@@ -139,14 +137,26 @@ def loader(found: dict[str, Any], run: RunContext) -> Products:
 
     def products(name: str) -> Any:
         if name not in found:
-            found[name] = STAGES[NAMES.index(name)].load(products, run)
+            try:
+                found[name] = STAGES[NAMES.index(name)].load(products, run)
+            except DamagedProductError:
+                raise
+            except (OSError, ValueError, TypeError, LookupError, BadZipFile, EOFError, BackendError) as err:
+                gone = isinstance(err, FileNotFoundError)
+                what = f"is not complete: {err.filename} is gone" if gone else "is damaged"
+                left = f"what stage `{name}` left in {run.workspace.root} {what}"
+                raise DamagedProductError(left, _how_on(run), name) from err
         return found[name]
 
     return products
 
 
-def run_stages(folder: Path, run: RunContext, first: str = "", last: str = "files") -> Products:
+def run_stages(
+    folder: Path, run: RunContext, first: str = "", last: str = "files", wanted: Sequence[str] = ()
+) -> Products:
     """Run what is not up to date, up to stage `last`; everything from stage `first` on is done again.
+
+    Stages whose files are damaged are done again, too. The products of the stages `wanted` are read before it ends.
 
     Raises:
         SfmError: see errors.py; what was finished before stays valid.
@@ -154,21 +164,35 @@ def run_stages(folder: Path, run: RunContext, first: str = "", last: str = "file
     for name in filter(None, (first, last)):
         if name not in NAMES:
             raise ConfigError(f"no stage is named '{name}'", hint=f"stages: {', '.join(NAMES)}")
+    run.workspace.create()
+    with run.workspace.held(), logged(run):
+        for _ in STAGES:
+            try:
+                return _through(folder, run, first, last, wanted)
+            except DamagedProductError as err:
+                logger.info("%s", err)
+                run.progress.stage(err.stage, "damaged: done again")
+                first = err.stage
+        return _through(folder, run, first, last, wanted)
+
+
+def _through(folder: Path, run: RunContext, first: str, last: str, wanted: Sequence[str]) -> Products:
+    """As `run_stages`, once."""
     found: dict[str, Any] = {"folder": folder}
     prints: dict[str, str] = {"folder": folder_fingerprint(folder, run)}
-    run.workspace.create()
-    redo = False
-
     products = loader(found, run)
-    with run.workspace.held(), logged(run):
-        for stage in STAGES[: NAMES.index(last) + 1]:
-            prints[stage.name] = stage_fingerprint(stage, prints, run)
-            redo = redo or stage.name == first or not run.workspace.is_current(stage.name, prints[stage.name])
-            if not redo:
-                run.progress.stage(stage.name, "up to date")
-                continue
-            run.workspace.forget(NAMES[NAMES.index(stage.name) :])
-            found[stage.name] = make(stage, products, prints[stage.name], run)
+    redo = False
+    for stage in STAGES[: NAMES.index(last) + 1]:
+        prints[stage.name] = stage_fingerprint(stage, prints, run)
+        redo = redo or stage.name == first or not run.workspace.is_current(stage.name, prints[stage.name])
+        if not redo:
+            run.progress.stage(stage.name, "up to date")
+            continue
+        run.workspace.forget(NAMES[NAMES.index(stage.name) :])
+        found[stage.name] = make(stage, products, prints[stage.name], run)
+    for name in wanted:
+        if NAMES.index(name) <= NAMES.index(last):
+            products(name)
     return products
 
 

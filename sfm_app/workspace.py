@@ -82,6 +82,16 @@ class Workspace:
         return self.root / "dense"
 
     @property
+    def database_marker(self) -> Path:
+        """Beside the database while it is filled: what it is filled from."""
+        return self.root / f"database.{UNFINISHED}"
+
+    @property
+    def view_graph_parts(self) -> Path:
+        """Fundamental matrices while they are estimated."""
+        return self.root / "view_graph_parts"
+
+    @property
     def log(self) -> Path:
         return self.root / "log.txt"
 
@@ -197,11 +207,18 @@ def can_go_on(folder: Path, made_from: str) -> bool:
         folder: may be missing.
         made_from: fingerprint of the inputs.
     """
-    marker = folder / UNFINISHED
-    if marker.is_file() and marker.read_text(encoding="utf-8") == made_from:
+    if is_made_from(folder / UNFINISHED, made_from):
         return True
     shutil.rmtree(folder, ignore_errors=True)
     return False
+
+
+def is_made_from(marker: Path, made_from: str) -> bool:
+    """Whether a file says so."""
+    try:
+        return marker.read_text(encoding="utf-8") == made_from
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def mark_unfinished(folder: Path, made_from: str) -> None:
