@@ -140,7 +140,7 @@ class Workspace:
             found = json.loads((self.root / MANIFEST).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return {}
-        return found if isinstance(found, dict) else {}
+        return found if isinstance(found, dict) and isinstance(found.get("stages", {}), dict) else {}
 
     def record(self, stage: str) -> StageRecord | None:
         """The record of a finished stage, if the manifest has a sound one."""
