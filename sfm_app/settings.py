@@ -142,6 +142,7 @@ class Settings(Section):
     seed: int = Field(0, ge=0, lt=2**32, description="same seed, same result")
     workers: int = Field(0, ge=0, le=1024, description="parallel workers; 0: one per core")
     quality: Quality = Field("normal", description="preset for image sizes and mesh resolution")
+    plugins: bool = Field(True, description="load installed plug-ins; false: nothing but what the program itself has")
     photos: PhotoSettings = PhotoSettings()
     matching: MatchSettings = MatchSettings()
     epipolar: EpipolarSettings = EpipolarSettings()

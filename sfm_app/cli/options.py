@@ -41,6 +41,7 @@ def settings_options(command: Command) -> Command:
         click.option(
             "--unseen", type=click.Choice(("color", "cut")), help="Triangles that no photo sees.  [default: color]"
         ),
+        click.option("--no-plugins", is_flag=True, help="Load nothing but what the program itself has."),
         click.option("--set", "assignments", multiple=True, metavar="TABLE.KEY=VALUE", help="Any other setting."),
         click.option("-v", "--verbose", count=True, help="Show what COLMAP says; -vv shows all of it."),
     )
@@ -57,6 +58,8 @@ def settings_from(flags: Mapping[str, Any]) -> Settings:
     """Settings from the shared options; flags win over the file."""
     show_log(flags["verbose"])
     overrides: dict[str, Any] = {key: flags[key] for key in ("seed", "workers", "quality") if flags[key] is not None}
+    if flags["no_plugins"]:
+        overrides["plugins"] = False
     for key, table in OWN_FLAGS.items():
         if flags[key] is not None:
             overrides = merged(overrides, {table: {key: flags[key]}})

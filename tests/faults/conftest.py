@@ -12,7 +12,6 @@ from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
 from sfm_app.synthetic.scenes import build_scene
 
 QUICK = ("--quality", "draft", "--set", "depth.max_image_size_px=240", "--faces", "3000", "-q", "--workers", "2")
-KILLED = -9
 
 
 @dataclass(frozen=True)
@@ -30,10 +29,14 @@ class Folder:
         names += [f"sparse/{part}.bin" for part in ("cameras", "images", "points3D")]
         return {name: (out / name).read_bytes() for name in names}
 
+    def command(self, out: Path) -> list[str]:
+        """Arguments of `sfm-app`."""
+        return ["run", str(self.photos), "-o", str(out), *QUICK]
+
     def run(self, out: Path, point: str = "count") -> "subprocess.CompletedProcess[str]":
         """`sfm-app run` in a process of its own, killed at a point."""
         script = Path(__file__).with_name("killed.py")
-        command = [sys.executable, str(script), point, "run", str(self.photos), "-o", str(out), *QUICK]
+        command = [sys.executable, str(script), point, *self.command(out)]
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
 
 

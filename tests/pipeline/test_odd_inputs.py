@@ -269,6 +269,11 @@ COMMANDS = {
     "wrong type": (["{photos}", "-o", "{here}/out", "--set", "mesh.faces=many"], 2, "mesh.faces"),
     "out of range": (["{photos}", "-o", "{here}/out", "--seed", "-1"], 2, "seed"),
     "not finite": (["{photos}", "-o", "{here}/out", "--set", "mesh.max_gap=nan"], 2, "mesh.max_gap"),
+    "a plug-in that is not loaded": (
+        ["{photos}", "-o", "{here}/out", "--no-plugins", "--estimator", "poselib-lo-ransac"],
+        2,
+        "no estimator is named",
+    ),
     "unknown cameras": (["{photos}", "-o", "{here}/out", "--cameras", "two"], 2, "photos.cameras"),
     "unknown stage": (["{photos}", "-o", "{here}/out", "--until", "lunch"], 2, "lunch"),
 }
