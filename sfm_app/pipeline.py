@@ -164,22 +164,24 @@ def run_stages(
     for name in filter(None, (first, last)):
         if name not in NAMES:
             raise ConfigError(f"no stage is named '{name}'", hint=f"stages: {', '.join(NAMES)}")
+    photos = folder_fingerprint(folder, run)
     run.workspace.create()
     with run.workspace.held(), logged(run):
         for _ in STAGES:
             try:
-                return _through(folder, run, first, last, wanted)
+                return _through((folder, photos), run, (first, last), wanted)
             except DamagedProductError as err:
                 logger.info("%s", err)
                 run.progress.stage(err.stage, "damaged: done again")
                 first = err.stage
-        return _through(folder, run, first, last, wanted)
+        return _through((folder, photos), run, (first, last), wanted)
 
 
-def _through(folder: Path, run: RunContext, first: str, last: str, wanted: Sequence[str]) -> Products:
-    """As `run_stages`, once."""
-    found: dict[str, Any] = {"folder": folder}
-    prints: dict[str, str] = {"folder": folder_fingerprint(folder, run)}
+def _through(folder: tuple[Path, str], run: RunContext, ends: tuple[str, str], wanted: Sequence[str]) -> Products:
+    """As `run_stages`, once; the folder with its fingerprint."""
+    first, last = ends
+    found: dict[str, Any] = {"folder": folder[0]}
+    prints: dict[str, str] = {"folder": folder[1]}
     products = loader(found, run)
     redo = False
     for stage in STAGES[: NAMES.index(last) + 1]:

@@ -20,6 +20,8 @@ from sfm_app.errors import InputError
 MANIFEST = "manifest.json"
 DATABASE = "database.db"
 CALIBRATION = "calibration.json"
+WRITTEN = ("photos", "sparse", "dense", "other_models", DATABASE, CALIBRATION)
+"""What a run removes before it writes it."""
 SHARED = (DATABASE, CALIBRATION)
 """Files that later stages add to."""
 LOCK, HOLDER = ".lock", ".held-by.txt"
@@ -99,8 +101,14 @@ class Workspace:
         """Make the folder and prove that it can be written to.
 
         Raises:
-            InputError: it cannot.
+            InputError: it cannot, or it holds what a run would write over.
         """
+        known = any((self.root / name).exists() for name in (LOCK, MANIFEST))
+        foreign = [] if known else [name for name in WRITTEN if (self.root / name).exists()]
+        if foreign:
+            raise InputError(
+                f"{self.root / foreign[0]} is there, and no run has made it", hint="name another output folder with -o"
+            )
         try:
             self.root.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.root):

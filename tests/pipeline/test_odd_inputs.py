@@ -3,7 +3,6 @@
 import json
 import os
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -258,6 +257,8 @@ COMMANDS = {
     "photos where the run writes": (["{photos}", "-o", "{here}"], 3, "keeps its own files"),
     "the run's own photos": (["{here}/old/photos", "-o", "{here}/old"], 3, "keeps its own files"),
     "links to photos": (["{here}/old/photos", "-o", "{here}/new"], 3, "1 a link out of the folder"),
+    "somebody's photos in the output": (["{photos}", "-o", "{here}/old"], 3, "no run has made it"),
+    "somebody's model in the output": (["{photos}", "-o", "{here}/colmap"], 3, "no run has made it"),
     "output is a file": (["{photos}", "-o", "{photos}/a.jpg"], 3, "cannot write to"),
     "in use": (["{photos}", "-o", "{here}/held"], 3, "another run is at work"),
     "no list": (["{photos}", "-o", "{here}/out", "--images", "{here}/none.txt"], 3, "cannot read"),
@@ -284,15 +285,16 @@ def test_every_refusal_is_one_line_and_a_hint(folder, tmp_path, case):
     arguments, code, words = COMMANDS[case]
     (tmp_path / "old" / "photos").mkdir(parents=True)
     (tmp_path / "old" / "photos" / "a.jpg").symlink_to(folder / "a.jpg")
-    (tmp_path / "held").mkdir()
+    for name in ("held", "colmap/sparse"):
+        (tmp_path / name).mkdir(parents=True)
     (tmp_path / "empty.txt").write_text("")
     (tmp_path / "list.txt").write_text("../held\n/etc/passwd\n")
-    before = {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*") if not path.is_dir()}
 
     with FileLock(tmp_path / "held" / LOCK):
+        before = {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")}
         result = call("run", *(argument.format(here=tmp_path, photos=folder) for argument in arguments))
 
     assert result.exit_code == code, result.stderr
     assert words in result.stderr and "Traceback" not in result.output
     assert result.stdout == ""
-    assert all(Path(path).lstat().st_mtime_ns == stamp for path, stamp in before.items())  # nothing is lost
+    assert all(path.lstat().st_mtime_ns == stamp for path, stamp in before.items())  # nothing is lost, nothing left
