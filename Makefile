@@ -6,13 +6,17 @@ INSTALLED := $(VENV)/.installed
 JOBS ?= 2
 PLUGINS := $(wildcard plugins/*)
 
-.PHONY: demo test lint format viewers clean
+.PHONY: demo test faults lint format viewers clean
 
 demo: $(INSTALLED)
 	$(BIN)/sfm-app demo -o demo
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+# `kill -9` at many points of a run; ten minutes
+faults: $(INSTALLED)
+	SFM_APP_FAULTS=1 $(BIN)/python -m pytest -n $(JOBS) tests/faults
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

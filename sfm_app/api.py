@@ -64,7 +64,7 @@ def reconstruct(
 
     with opened_run(Path(out), settings or Settings(), progress) as run:
         run.plugins.depth_method(run.settings.depth.method)  # refused now, not when half of the work is done
-        products = run_stages(Path(photos), run, first, last)
+        products = run_stages(Path(photos), run, first, last, wanted=("intrinsics", "scene", "files"))
         manifest = run.workspace.manifest()
         done = {name: manifest["stages"][name] for name in NAMES[: NAMES.index(last) + 1]}
         scene = products("scene") if "scene" in done else None
@@ -142,7 +142,7 @@ def calibrate_photos(
         tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch,
         opened_run(Path(out or scratch), settings or Settings(), progress) as run,
     ):
-        products = run_stages(Path(photos), run, last="intrinsics")
+        products = run_stages(Path(photos), run, last="intrinsics", wanted=("match_graph", "view_graph", "intrinsics"))
         found: Intrinsics = products("intrinsics")
         if figure is not None:
             draw_intrinsics(Path(figure), products("match_graph"), products("view_graph"), found)
@@ -202,7 +202,7 @@ def calibrate_fundamentals(
 @contextmanager
 def opened_run(out: Path, settings: Settings, progress: Progress | None) -> Iterator[RunContext]:
     """A run with its workers, which end with it."""
-    plugins = load_plugins()
+    plugins = load_plugins(installed=settings.plugins)
     plugins.estimator(settings.epipolar.estimator)  # unknown names are refused before any work is done
     plugins.calibrator(settings.calibration.calibrator)
     workers = worker_count(settings.workers)

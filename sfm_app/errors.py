@@ -5,6 +5,7 @@
     SfmError                    anything below                                   exit 1
     ├── ConfigError             a setting is unknown, mistyped or out of range   exit 2
     ├── InputError              photos or files are missing or unreadable        exit 3
+    │   └── DamagedProductError what a stage has left can no longer be read
     ├── ReconstructionError     the photos do not support a reconstruction       exit 4
     ├── BackendError            COLMAP failed; its own error is the cause        exit 5
     └── PluginError             a plug-in is broken or clashes with another      exit 6
@@ -43,6 +44,21 @@ class InputError(SfmError):
     """Photos or files are missing or unreadable, or the output cannot be written."""
 
     exit_code = 3
+
+
+class DamagedProductError(InputError):
+    """What a stage has left in the output folder can no longer be read.
+
+    Args:
+        message: one line.
+        hint: what to do, one line.
+        stage: that has to be done again.
+    """
+
+    def __init__(self, message: str, hint: str, stage: str) -> None:
+        super().__init__(message, hint)
+        self.args = (message, hint, stage)  # as above
+        self.stage = stage
 
 
 class ReconstructionError(SfmError):

@@ -4,7 +4,7 @@ import hashlib
 import logging
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -15,14 +15,15 @@ from zipfile import BadZipFile
 from sfm_app.colmap.backend import versions as colmap_versions
 from sfm_app.colmap.model import sparse_model
 from sfm_app.context import RunContext
-from sfm_app.errors import ConfigError, InputError, SfmError
+from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError, SfmError
 from sfm_app.parallel import ordered_map
+from sfm_app.photos import place_of
 from sfm_app.stages.depth_maps import make_depth_maps
 from sfm_app.stages.files import load_files, write_files
 from sfm_app.stages.intrinsics import calibrate, load_intrinsics
 from sfm_app.stages.match_graph import load_match_graph, match_photos
 from sfm_app.stages.mesh import load_surface, make_mesh
-from sfm_app.stages.photos import list_files, load_photo_set, read_photos
+from sfm_app.stages.photos import files_of, load_photo_set, read_photos
 from sfm_app.stages.scene import load_scene, reconstruct_scene
 from sfm_app.stages.texture import load_texture, make_texture
 from sfm_app.stages.view_graph import build_view_graph, load_view_graph
@@ -124,8 +125,6 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
         return sparse_model(place.sparse) if points else loader({}, run)("texture")
     except OSError as err:
         raise InputError(f"{place.root} is not complete: {err.strerror}: {err.filename}", hint=_how_on(run)) from err
-    except (BadZipFile, EOFError, KeyError, ValueError) as err:
-        raise InputError(f"the model in {place.root} is damaged", hint=_how_on(run)) from err
 
 
 def _how_on(run: RunContext) -> str:
@@ -138,14 +137,26 @@ def loader(found: dict[str, Any], run: RunContext) -> Products:
 
     def products(name: str) -> Any:
         if name not in found:
-            found[name] = STAGES[NAMES.index(name)].load(products, run)
+            try:
+                found[name] = STAGES[NAMES.index(name)].load(products, run)
+            except DamagedProductError:
+                raise
+            except (OSError, ValueError, TypeError, LookupError, BadZipFile, EOFError, BackendError) as err:
+                gone = isinstance(err, FileNotFoundError)
+                what = f"is not complete: {err.filename} is gone" if gone else "is damaged"
+                left = f"what stage `{name}` left in {run.workspace.root} {what}"
+                raise DamagedProductError(left, _how_on(run), name) from err
         return found[name]
 
     return products
 
 
-def run_stages(folder: Path, run: RunContext, first: str = "", last: str = "files") -> Products:
+def run_stages(
+    folder: Path, run: RunContext, first: str = "", last: str = "files", wanted: Sequence[str] = ()
+) -> Products:
     """Run what is not up to date, up to stage `last`; everything from stage `first` on is done again.
+
+    Stages whose files are damaged are done again, too. The products of the stages `wanted` are read before it ends.
 
     Raises:
         SfmError: see errors.py; what was finished before stays valid.
@@ -153,21 +164,37 @@ def run_stages(folder: Path, run: RunContext, first: str = "", last: str = "file
     for name in filter(None, (first, last)):
         if name not in NAMES:
             raise ConfigError(f"no stage is named '{name}'", hint=f"stages: {', '.join(NAMES)}")
-    found: dict[str, Any] = {"folder": folder}
-    prints: dict[str, str] = {"folder": folder_fingerprint(folder, run)}
+    photos = folder_fingerprint(folder, run)
     run.workspace.create()
-    redo = False
+    with run.workspace.held(), logged(run):
+        for _ in STAGES:
+            try:
+                return _through((folder, photos), run, (first, last), wanted)
+            except DamagedProductError as err:
+                logger.info("%s", err)
+                run.progress.stage(err.stage, "damaged: done again")
+                first = err.stage
+        return _through((folder, photos), run, (first, last), wanted)
 
+
+def _through(folder: tuple[Path, str], run: RunContext, ends: tuple[str, str], wanted: Sequence[str]) -> Products:
+    """As `run_stages`, once; the folder with its fingerprint."""
+    first, last = ends
+    found: dict[str, Any] = {"folder": folder[0]}
+    prints: dict[str, str] = {"folder": folder[1]}
     products = loader(found, run)
-    with logged(run):
-        for stage in STAGES[: NAMES.index(last) + 1]:
-            prints[stage.name] = stage_fingerprint(stage, prints, run)
-            redo = redo or stage.name == first or not run.workspace.is_current(stage.name, prints[stage.name])
-            if not redo:
-                run.progress.stage(stage.name, "up to date")
-                continue
-            run.workspace.forget(NAMES[NAMES.index(stage.name) :])
-            found[stage.name] = make(stage, products, prints[stage.name], run)
+    redo = False
+    for stage in STAGES[: NAMES.index(last) + 1]:
+        prints[stage.name] = stage_fingerprint(stage, prints, run)
+        redo = redo or stage.name == first or not run.workspace.is_current(stage.name, prints[stage.name])
+        if not redo:
+            run.progress.stage(stage.name, "up to date")
+            continue
+        run.workspace.forget(NAMES[NAMES.index(stage.name) :])
+        found[stage.name] = make(stage, products, prints[stage.name], run)
+    for name in wanted:
+        if NAMES.index(name) <= NAMES.index(last):
+            products(name)
     return products
 
 
@@ -199,11 +226,14 @@ def peak_memory_mb() -> int | None:
 
 def folder_fingerprint(folder: Path, run: RunContext) -> str:
     """Hash of the names and bytes of all files in the photo folder."""
-    names = list_files(folder, exclude=run.workspace.root)
+    names = files_of(folder, run)
 
     def digest(name: str) -> str:
+        place = place_of(folder, name)
+        if isinstance(place, str):
+            return place
         try:
-            with (folder / name).open("rb") as file:
+            with place.open("rb") as file:
                 return hashlib.file_digest(file, "blake2b").hexdigest()
         except OSError:
             return "unreadable"
@@ -234,7 +264,7 @@ def versions() -> dict[str, str]:
 @contextmanager
 def logged(run: RunContext) -> Iterator[None]:
     """Keep a log in the output folder, with the traceback of whatever ends the run."""
-    handler = logging.FileHandler(run.workspace.log, encoding="utf-8")
+    handler = logging.FileHandler(run.workspace.log, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

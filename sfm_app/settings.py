@@ -26,9 +26,14 @@ class Section(BaseModel):
 class PhotoSettings(Section):
     """Which photos are used and which of them share a camera."""
 
-    cameras: Literal["auto", "single", "each"] = Field(
-        "auto", description="auto: same size and same EXIF camera share one; single: all share one; each: none share"
+    images: str = Field("", description="text file that names the photos to use, one per line; all where empty")
+    cameras: Literal["auto", "single", "folder", "each"] = Field(
+        "auto",
+        description="auto: same size and same EXIF camera share one; single: all share one; folder: those of a folder; "
+        "each: none share",
     )
+    keep_all: bool = Field(False, description="use copies of photos, too")
+    max_megapixels: float = Field(64.0, ge=0.1, le=178, description="larger photos are scaled down to so many")
     min_side_px: int = Field(64, ge=16, le=4096, description="photos with a shorter side are left out, in pixels")
 
 
@@ -137,6 +142,7 @@ class Settings(Section):
     seed: int = Field(0, ge=0, lt=2**32, description="same seed, same result")
     workers: int = Field(0, ge=0, le=1024, description="parallel workers; 0: one per core")
     quality: Quality = Field("normal", description="preset for image sizes and mesh resolution")
+    plugins: bool = Field(True, description="load installed plug-ins; false: nothing but what the program itself has")
     photos: PhotoSettings = PhotoSettings()
     matching: MatchSettings = MatchSettings()
     epipolar: EpipolarSettings = EpipolarSettings()

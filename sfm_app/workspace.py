@@ -4,20 +4,27 @@ import contextlib
 import hashlib
 import json
 import os
+import platform
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from sfm_app.errors import InputError
 
 MANIFEST = "manifest.json"
 DATABASE = "database.db"
 CALIBRATION = "calibration.json"
+WRITTEN = ("photos", "sparse", "dense", "other_models", DATABASE, CALIBRATION)
+"""What a run removes before it writes it."""
 SHARED = (DATABASE, CALIBRATION)
 """Files that later stages add to."""
+LOCK, HOLDER = ".lock", ".held-by.txt"
 UNFINISHED = "unfinished.txt"
 """In a folder while a stage fills it: what it is filled from. It says whether a killed run can go on there."""
 
@@ -77,6 +84,16 @@ class Workspace:
         return self.root / "dense"
 
     @property
+    def database_marker(self) -> Path:
+        """Beside the database while it is filled: what it is filled from."""
+        return self.root / f"database.{UNFINISHED}"
+
+    @property
+    def view_graph_parts(self) -> Path:
+        """Fundamental matrices while they are estimated."""
+        return self.root / "view_graph_parts"
+
+    @property
     def log(self) -> Path:
         return self.root / "log.txt"
 
@@ -84,8 +101,14 @@ class Workspace:
         """Make the folder and prove that it can be written to.
 
         Raises:
-            InputError: it cannot.
+            InputError: it cannot, or it holds what a run would write over.
         """
+        known = any((self.root / name).exists() for name in (LOCK, MANIFEST))
+        foreign = [] if known else [name for name in WRITTEN if (self.root / name).exists()]
+        if foreign:
+            raise InputError(
+                f"{self.root / foreign[0]} is there, and no run has made it", hint="name another output folder with -o"
+            )
         try:
             self.root.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.root):
@@ -95,13 +118,37 @@ class Workspace:
                 f"cannot write to {self.root}: {err.strerror}", hint="name another output folder with -o"
             ) from err
 
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other runs out; the system lets go of it when this process ends, however it ends.
+
+        Raises:
+            InputError: another run is at work here.
+        """
+        holder = self.root / HOLDER
+        lock = FileLock(self.root / LOCK, timeout=0)
+        try:
+            lock.acquire()
+        except Timeout:
+            raise InputError(
+                f"another run is at work in {self.root}: {_said(holder)}",
+                hint="wait for it, end it, or name another output folder with -o",
+            ) from None
+        try:
+            started = datetime.now().astimezone().isoformat(" ", "seconds")
+            holder.write_text(f"process {os.getpid()} on {platform.node()} since {started}\n", encoding="utf-8")
+            yield
+        finally:
+            holder.unlink(missing_ok=True)
+            lock.release()
+
     def manifest(self) -> dict[str, Any]:
         """The manifest as written last; empty when there is none or it cannot be read (then everything is redone)."""
         try:
             found = json.loads((self.root / MANIFEST).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return {}
-        return found if isinstance(found, dict) else {}
+        return found if isinstance(found, dict) and isinstance(found.get("stages", {}), dict) else {}
 
     def record(self, stage: str) -> StageRecord | None:
         """The record of a finished stage, if the manifest has a sound one."""
@@ -168,11 +215,18 @@ def can_go_on(folder: Path, made_from: str) -> bool:
         folder: may be missing.
         made_from: fingerprint of the inputs.
     """
-    marker = folder / UNFINISHED
-    if marker.is_file() and marker.read_text(encoding="utf-8") == made_from:
+    if is_made_from(folder / UNFINISHED, made_from):
         return True
     shutil.rmtree(folder, ignore_errors=True)
     return False
+
+
+def is_made_from(marker: Path, made_from: str) -> bool:
+    """Whether a file says so."""
+    try:
+        return marker.read_text(encoding="utf-8") == made_from
+    except (OSError, UnicodeDecodeError):
+        return False
 
 
 def mark_unfinished(folder: Path, made_from: str) -> None:
@@ -199,6 +253,13 @@ def fingerprint(*parts: Any) -> str:
     """Hash of JSON-able parts, independent of the order of keys."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _said(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8").strip() or "it has just begun"
+    except (OSError, UnicodeDecodeError):
+        return "it has just begun"
 
 
 def _size(path: Path) -> int | None:

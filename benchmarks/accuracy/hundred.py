@@ -17,6 +17,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from photo_sets import put
 from PIL import Image
 from report import RESULTS, Row, document, table, write
 
@@ -36,7 +37,7 @@ EVERY_S = 0.1
 
 
 def photo_folder(count: int, cache: Path) -> Path:
-    """Every so many of the photos all round, as links; all are rendered once into the cache."""
+    """Every so many of the photos all round; all are rendered once into the cache."""
     whole = cache / "hundred" / "photos"
     if not whole.exists():
         beside = whole.with_name("rendering")
@@ -48,8 +49,7 @@ def photo_folder(count: int, cache: Path) -> Path:
     part = cache / "hundred" / f"photos-{count}"
     part.mkdir(exist_ok=True)
     for path in sorted(whole.iterdir())[:: PHOTOS // count][:count]:
-        if not (part / path.name).exists():
-            (part / path.name).symlink_to(path.resolve())
+        put(path, part)
     return part
 
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from photo_sets import FORMATS
+from photo_sets import FORMATS, put
 
 from sfm_app.api import opened_run
 from sfm_app.pipeline import NAMES, run_stages
@@ -53,13 +53,12 @@ def surface_set(name: str, data: Path | None, cache: Path) -> SurfaceSet:
 
 
 def part_of(whole: SurfaceSet, count: int, cache: Path) -> SurfaceSet:
-    """The first photos of a set, as links."""
+    """The first photos of a set."""
     folder = cache / "parts" / f"{whole.name}-{count}"
     folder.mkdir(parents=True, exist_ok=True)
     photos = sorted(path for path in whole.photos.iterdir() if path.suffix.lower() in FORMATS)
     for photo in photos[:count]:
-        if not (folder / photo.name).exists():
-            (folder / photo.name).symlink_to(photo.resolve())
+        put(photo, folder)
     return SurfaceSet(f"{whole.name} first {count}", folder, None)
 
 

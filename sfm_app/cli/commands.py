@@ -16,6 +16,7 @@ from sfm_app.cli.display import (
     print_lines,
     run_lines,
     run_summary,
+    shown,
     table,
 )
 from sfm_app.cli.doctor import examine
@@ -48,7 +49,7 @@ class Commands(click.Group):
 
 def fail(message: str, hint: str, code: int) -> None:
     """Say what went wrong and what to do about it, and end."""
-    click.echo(f"error: {message}" + (f"\nhint: {hint}" if hint else ""), err=True)
+    click.echo(f"error: {shown(message)}" + (f"\nhint: {shown(hint)}" if hint else ""), err=True)
     sys.exit(code)
 
 
@@ -133,7 +134,7 @@ def doctor(as_json: bool) -> None:
 @settings_options
 def config(**flags: Any) -> None:
     """Print all settings as TOML, with what the other options change."""
-    print_lines([settings_from(flags).to_toml().rstrip()])
+    print_lines(settings_from(flags).to_toml().splitlines())
 
 
 @main.command()

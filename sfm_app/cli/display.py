@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,8 @@ STAGE_TITLES = {
 }
 
 MEGABYTE, KILOBYTE = 1e6, 1e3
+NAMED = 5
+"""Files of one kind that are named; the manifest has all."""
 
 
 class Terminal:
@@ -71,7 +73,12 @@ def print_json(value: Any) -> None:
 
 def print_lines(lines: list[str]) -> None:
     """Lines on stdout."""
-    sys.stdout.write("\n".join(lines) + "\n")
+    sys.stdout.write("\n".join(map(shown, lines)) + "\n")
+
+
+def shown(text: str) -> str:
+    """A text in which names of files cannot move the cursor, nor break the line."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def run_summary(run: Run) -> dict[str, Any]:
@@ -81,7 +88,7 @@ def run_summary(run: Run) -> dict[str, Any]:
     photos = counts.get("photos", {})
     summary: dict[str, Any] = {
         "out": str(run.out),
-        "photos": {"usable": photos.get("usable"), "unusable": photos.get("unusable", {})},
+        "photos": {key: photos.get(key, {}) for key in ("usable", "unusable", "notes")},
         "pairs": {key: counts.get("view_graph", {}).get(key) for key in ("kept", "rejected")},
         "calibration": intrinsics_summary(run.calibration) if run.calibration else None,
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
@@ -100,7 +107,7 @@ def run_lines(run: Run) -> list[str]:
     """The figures of a run, for people."""
     summary = run_summary(run)
     lines = [f"photos      {summary['photos']['usable']} usable"]
-    lines += [f"            left out: {name}: {reason}" for name, reason in summary["photos"]["unusable"].items()]
+    lines += [f"            {line}" for line in photo_lines(summary["photos"])]
     if summary["pairs"]["kept"] is not None:
         rejected = ", ".join(f"{count} {reason}" for reason, count in summary["pairs"]["rejected"].items())
         lines.append(
@@ -122,6 +129,18 @@ def run_lines(run: Run) -> list[str]:
         + f"; all {sum(seconds.values()):.1f}"
     )
     return lines
+
+
+def photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
+    """What was left out, reason by reason, and what people should know about the others."""
+    by_reason: dict[str, list[str]] = {}
+    for name, reason in photos["unusable"].items():
+        by_reason.setdefault(reason, []).append(name)
+    for name, notes in photos["notes"].items():
+        yield f"{name}: {', '.join(notes)}"
+    for reason, names in by_reason.items():
+        more = f" and {len(names) - NAMED} more (all of them in manifest.json)" if len(names) > NAMED else ""
+        yield f"left out: {', '.join(names[:NAMED])}{more}: {reason}"
 
 
 def texture_text(mesh: Mapping[str, Any]) -> str:

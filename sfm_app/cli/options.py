@@ -16,13 +16,14 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 OWN_FLAGS = {
-    "estimator": "epipolar", "calibrator": "calibration", "mapper": "scene", "faces": "mesh", "unseen": "texture",
+    "images": "photos", "cameras": "photos", "keep_all": "photos", "estimator": "epipolar", "calibrator": "calibration",
+    "mapper": "scene", "faces": "mesh", "unseen": "texture",
 }  # fmt: skip
 """Settings with a flag of their own, and their tables."""
 
 
 def settings_options(command: Command) -> Command:
-    """--config, --seed, --workers, --quality, --estimator, --calibrator, --mapper, --faces, --unseen, --set, -v."""
+    """From --config to -v: all that changes settings."""
     options = (
         click.option(
             "--config", type=click.Path(path_type=Path), help="Settings file (TOML); `sfm-app config` prints one."
@@ -30,6 +31,9 @@ def settings_options(command: Command) -> Command:
         click.option("--seed", type=int, help="Same seed, same result.  [default: 0]"),
         click.option("--workers", type=int, help="Parallel workers.  [default: one per core]"),
         click.option("--quality", type=click.Choice(get_args(Quality)), help="Preset of sizes.  [default: normal]"),
+        click.option("--images", help="Text file that names the photos to use, one per line.  [default: all]"),
+        click.option("--cameras", help="auto, single, folder or each: which photos share one.  [default: auto]"),
+        click.option("--keep-all", is_flag=True, default=None, help="Use copies of photos, too."),
         click.option("--estimator", help="Estimator of fundamental matrices.  [default: lev-ransac]"),
         click.option("--calibrator", help="Calibrator.  [default: zero-curves]"),
         click.option("--mapper", help="auto, incremental or global.  [default: auto]"),
@@ -37,6 +41,7 @@ def settings_options(command: Command) -> Command:
         click.option(
             "--unseen", type=click.Choice(("color", "cut")), help="Triangles that no photo sees.  [default: color]"
         ),
+        click.option("--no-plugins", is_flag=True, help="Load nothing but what the program itself has."),
         click.option("--set", "assignments", multiple=True, metavar="TABLE.KEY=VALUE", help="Any other setting."),
         click.option("-v", "--verbose", count=True, help="Show what COLMAP says; -vv shows all of it."),
     )
@@ -53,6 +58,8 @@ def settings_from(flags: Mapping[str, Any]) -> Settings:
     """Settings from the shared options; flags win over the file."""
     show_log(flags["verbose"])
     overrides: dict[str, Any] = {key: flags[key] for key in ("seed", "workers", "quality") if flags[key] is not None}
+    if flags["no_plugins"]:
+        overrides["plugins"] = False
     for key, table in OWN_FLAGS.items():
         if flags[key] is not None:
             overrides = merged(overrides, {table: {key: flags[key]}})

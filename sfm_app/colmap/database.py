@@ -52,6 +52,23 @@ def opened(path: Path) -> Iterator[Any]:
         database.close()
 
 
+def is_sound(path: Path) -> bool:
+    """Whether SQLite finds nothing torn in a database; what a killed run left half done it takes back."""
+    if not path.is_file():
+        return False
+    try:
+        with contextlib.closing(sqlite3.connect(path)) as connection:
+            return bool(connection.execute("PRAGMA quick_check(1)").fetchone() == ("ok",))
+    except sqlite3.Error:
+        return False
+
+
+def remove_database(path: Path) -> None:
+    """Take away a database with what SQLite keeps beside it."""
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+
+
 def create_database(path: Path, photos: PhotoSet) -> None:
     """Enter photos and cameras in a fixed order.
 

@@ -1,25 +1,32 @@
 """match_graph: PhotoSet -> MatchGraph."""
 
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.database import create_database, read_match_graph
+from sfm_app.colmap.database import create_database, is_sound, read_match_graph, remove_database
 from sfm_app.colmap.features import extract_features, match_exhaustively
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import NOTHING_MATCHED, why_no_scene
 from sfm_app.types import MatchGraph, PhotoSet
+from sfm_app.workspace import is_made_from
 
 
 def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
     """Find SIFT features and match every photo with every other, without geometric verification.
+
+    What a killed run has found of the same photos stays.
 
     Raises:
         ReconstructionError: no two photos have matches.
     """
     place, options = run.workspace, run.settings.matching
     names = [photo.name for photo in photos.photos]
-    for suffix in ("", "-wal", "-shm"):
-        place.database.with_name(place.database.name + suffix).unlink(missing_ok=True)
+    marker = place.database_marker
+    if not (is_made_from(marker, run.inputs) and is_sound(place.database)):
+        marker.unlink(missing_ok=True)
+        remove_database(place.database)
+        with backend("entering photos"):
+            create_database(place.database, photos)
+        marker.write_text(run.inputs, encoding="utf-8")
     with backend("finding features"):
-        create_database(place.database, photos)
         extraction = extract_features(place.database, place.photos, names, options, run.workers, run.progress)
     with backend("matching photos"):
         matching = match_exhaustively(place.database, len(names), options, run.workers, run.progress)
@@ -30,12 +37,19 @@ def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
         matches=sum(len(rows) for rows in graph.matches.values()),
         colmap={"extraction": extraction, "matching": matching},
     )
+    marker.unlink()
     if not graph.matches:
         raise why_no_scene(graph, NOTHING_MATCHED, options).error()
     return graph
 
 
 def load_match_graph(photos: PhotoSet, run: RunContext) -> MatchGraph:
-    """Read the match graph back from the database."""
+    """Read the match graph back from the database.
+
+    Raises:
+        ValueError: the database is torn; COLMAP would end the program.
+    """
+    if not is_sound(run.workspace.database):
+        raise ValueError(f"{run.workspace.database} is damaged")
     with backend("reading the database"):
         return read_match_graph(run.workspace.database, photos)

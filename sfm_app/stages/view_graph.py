@@ -1,5 +1,9 @@
 """view_graph: MatchGraph -> ViewGraph."""
 
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,15 +11,27 @@ from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import write_epipolar_fits
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_scene
+from sfm_app.parallel import ordered_map
+from sfm_app.progress import track
 from sfm_app.ransac.stationary import covers, find_stationary, fit_moving
 from sfm_app.settings import Settings
 from sfm_app.types import EpipolarFit, MatchGraph, PairId, Rejected, ViewGraph
+from sfm_app.workspace import can_go_on, mark_unfinished, replacing
 
 BoolArray = NDArray[np.bool_]
 
 
+Fitted = tuple[EpipolarFit | Rejected, int]
+"""What became of a pair, and how many of its matches stand still in the picture."""
+
+PART = 64
+"""Pairs that are kept together, so that a run that is killed has to do no more again."""
+
+
 def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
     """Fit every pair on its own, seeded by the run's seed and its ids, and count why pairs fell.
+
+    A run that was killed goes on where it stopped.
 
     Raises:
         ReconstructionError: no pair has a usable epipolar geometry.
@@ -23,7 +39,7 @@ def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
     options = run.settings.epipolar
     estimator = run.plugins.estimator(options.estimator)
 
-    def fit_pair(pair: PairId) -> tuple[EpipolarFit | Rejected, int]:
+    def fit_pair(pair: PairId) -> Fitted:
         seed = int(np.random.SeedSequence([run.seed, *pair]).generate_state(1)[0])
         points, still = matches.points(pair), stationary_matches(matches, pair, run.settings)
         if not still.any():
@@ -33,11 +49,8 @@ def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
         return fit_moving(estimator.fit, points, still, wide, options, seed), int(np.count_nonzero(still))
 
     pairs = list(matches.matches)
-    found = dict(zip(pairs, run.map(fit_pair, pairs, "epipolar geometry"), strict=True))
-    graph = ViewGraph(
-        fits={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, EpipolarFit)},
-        rejected={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, Rejected)},
-    )
+    found = in_parts(fit_pair, pairs, run)
+    graph = graph_of(found)
     run.record(
         kept=len(graph.fits),
         rejected=graph.reasons,
@@ -51,7 +64,52 @@ def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
         np.savez_compressed(path, allow_pickle=False, **graph.to_arrays())
     with backend("writing epipolar geometries"):
         write_epipolar_fits(run.workspace.database, matches, graph.fits)
+    shutil.rmtree(run.workspace.view_graph_parts)
     return graph
+
+
+def graph_of(found: Mapping[PairId, Fitted]) -> ViewGraph:
+    """Pairs with a geometry, and those without."""
+    return ViewGraph(
+        fits={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, EpipolarFit)},
+        rejected={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, Rejected)},
+    )
+
+
+def in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run: RunContext) -> dict[PairId, Fitted]:
+    """What `fit_pair` makes of every pair, in their order; parts that are complete are kept as they come."""
+    folder = run.workspace.view_graph_parts
+    if not can_go_on(folder, run.inputs):
+        mark_unfinished(folder, run.inputs)
+    parts = {folder / f"{first:06d}.npz": pairs[first : first + PART] for first in range(0, len(pairs), PART)}
+    left = [pair for path, part in parts.items() if not path.exists() for pair in part]
+    fitted = ordered_map(run.executor, fit_pair, left, ahead=2 * run.workers)
+    results = track(run.progress, fitted, "epipolar geometry", len(left))
+    found: dict[PairId, Fitted] = {}
+    for path, part in parts.items():
+        if path.exists():
+            found |= read_part(path)
+        else:
+            done = dict(zip(part, results, strict=False))
+            write_part(path, done)
+            found |= done
+    return {pair: found[pair] for pair in pairs}
+
+
+def write_part(path: Path, found: Mapping[PairId, Fitted]) -> None:
+    """Keep some pairs."""
+    still = np.array([[*pair, count] for pair, (_, count) in found.items()], np.int64)
+    with replacing(path) as beside:
+        np.savez(beside, allow_pickle=False, still=still, **graph_of(found).to_arrays())
+
+
+def read_part(path: Path) -> dict[PairId, Fitted]:
+    """What `write_part` has kept."""
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = dict(stored)
+    graph = ViewGraph.from_arrays(arrays)
+    every: dict[PairId, EpipolarFit | Rejected] = {**graph.fits, **graph.rejected}
+    return {(int(a), int(b)): (every[int(a), int(b)], int(count)) for a, b, count in arrays["still"]}
 
 
 def stationary_matches(matches: MatchGraph, pair: PairId, settings: Settings) -> BoolArray:

@@ -21,7 +21,7 @@ class Photo:
     """One usable photo."""
 
     name: str
-    """Path inside the folder, with forward slashes."""
+    """What it goes by everywhere: its path inside the folder, with forward slashes, unless COLMAP cannot have that."""
     width: int
     """Upright width in pixels, after EXIF orientation."""
     height: int
@@ -31,9 +31,20 @@ class Photo:
     exif_focal_px: float | None = None
     """Focal length that EXIF claims, in pixels of this photo; a hint, never trusted."""
     needs_copy: bool = False
-    """True where COLMAP cannot read the file as it is (orientation, palette, 16 bit)."""
+    """True where COLMAP cannot read the file as it is (orientation, palette, 16 bit, format, size)."""
     gps: GpsPosition | None = None
     """Where EXIF claims it was taken; a hint, never trusted."""
+    original: str = ""
+    """Path inside the folder; the name where empty."""
+    lossy: bool = True
+    """Whether the file's format has lost something already."""
+    notes: tuple[str, ...] = ()
+    """What people should know about how it is read."""
+
+    @property
+    def path(self) -> str:
+        """Path inside the folder."""
+        return self.original or self.name
 
 
 @dataclass(frozen=True, slots=True)

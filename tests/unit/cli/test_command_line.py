@@ -48,7 +48,7 @@ def make_truncated(folder):
     ("make", "says"),
     [
         (make_empty, "the folder is empty"),
-        (make_text_files, "2 not a JPEG or PNG photo"),
+        (make_text_files, "2 not a photo"),
         (make_one_photo, "only one usable photo"),
         (make_truncated, "2 truncated or damaged"),
     ],

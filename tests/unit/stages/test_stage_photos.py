@@ -13,8 +13,15 @@ from sfm_app.settings import Settings
 from sfm_app.stages.photos import load_photo_set, read_photos
 from sfm_app.workspace import Workspace
 
-PIXELS = np.random.default_rng(0).integers(0, 255, (96, 128, 3), np.uint8)
-PIXELS[:48] //= 3  # the upper half is dark, so that turning shows
+
+def pixels(seed=0):
+    """A picture of its own; the upper half is dark, so that turning shows."""
+    found = np.random.default_rng(seed).integers(0, 255, (96, 128, 3), np.uint8)
+    found[:48] //= 3
+    return found
+
+
+PIXELS = pixels()
 
 
 @pytest.fixture
@@ -29,8 +36,8 @@ def run(tmp_path):
 def folder(tmp_path):
     place = tmp_path / "photos"
     place.mkdir()
-    for name in ("a.jpg", "b.png"):
-        Image.fromarray(PIXELS).save(place / name)
+    for seed, name in enumerate(("a.jpg", "b.png"), start=1):
+        Image.fromarray(pixels(seed)).save(place / name)
     return place
 
 
@@ -44,6 +51,7 @@ def test_every_file_is_used_or_has_a_reason(folder, run):
     (folder / "cut.jpg").write_bytes((folder / "a.jpg").read_bytes()[:2000])
     Image.fromarray(PIXELS[:40, :40]).save(folder / "tiny.png")
     (folder / ".hidden.jpg").write_bytes(b"x")
+    (folder / "copy.png").write_bytes((folder / "b.png").read_bytes())
     (folder / "sub dir").mkdir()
     Image.fromarray(PIXELS).save(folder / "sub dir" / "ü b.jpg")
 
@@ -51,13 +59,15 @@ def test_every_file_is_used_or_has_a_reason(folder, run):
 
     assert [photo.name for photo in found.photos] == ["a.jpg", "b.png", "sub dir/ü b.jpg"]
     assert reasons(found) == {
-        "notes.txt": "not a JPEG or PNG photo",
-        "empty.jpg": "not a JPEG or PNG photo",
+        ".hidden.jpg": "hidden",
+        "notes.txt": "not a photo",
+        "empty.jpg": "empty",
         "cut.jpg": "truncated or damaged",
         "tiny.png": "smaller than 64 px",
+        "copy.png": "the same picture as b.png",
     }
     assert load_photo_set(run) == found
-    assert np.array_equal(np.asarray(Image.open(run.workspace.photos / "b.png")), PIXELS)
+    assert np.array_equal(np.asarray(Image.open(run.workspace.photos / "b.png")), pixels(2))
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
@@ -196,7 +206,7 @@ def test_the_output_folder_inside_the_photos_is_not_read(folder, tmp_path):
     ("names", "says"),
     [
         ((), "no usable photo in .*: the folder is empty"),
-        (("notes.txt", "more.txt"), "no usable photo in .*: 2 not a JPEG or PNG photo"),
+        (("notes.txt", "more.txt"), "no usable photo in .*: 2 not a photo"),
         (("one.jpg",), "only one usable photo"),
     ],
 )

@@ -1,8 +1,8 @@
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
+from sfm_app.context import RunContext
+from sfm_app.parallel import make_executor
 from sfm_app.plugins import load_plugins
 from sfm_app.ransac.stationary import ONLY_A_LOGO
 from sfm_app.settings import Settings
@@ -28,16 +28,9 @@ def match_graph(widths=(640, 640, 640)):
 @pytest.fixture
 def build(tmp_path, monkeypatch):
     monkeypatch.setattr(view_graph, "write_epipolar_fits", lambda *_: None)
-    counts = {}
-    run = SimpleNamespace(
-        settings=Settings(),
-        seed=0,
-        plugins=load_plugins(),
-        workspace=Workspace(tmp_path),
-        map=lambda function, items, _: [function(item) for item in items],
-        record=lambda **found: counts.update(found),
-    )
-    return lambda matches: (view_graph.build_view_graph(matches, run), counts)
+    with make_executor(2) as executor:
+        run = RunContext(Settings(), Workspace(tmp_path), load_plugins(), executor, 2, inputs="these")
+        yield lambda matches: (view_graph.build_view_graph(matches, run), run.counts)
 
 
 def test_time_stamps_are_taken_out_and_counted(build):
@@ -52,3 +45,47 @@ def test_nothing_is_stationary_in_photos_of_different_size(build):
     _, counts = build(match_graph(widths=(640, 800, 800)))
 
     assert counts["stationary"] == 0
+
+
+class Killed(BaseException):
+    """What no program catches."""
+
+
+def test_a_killed_run_goes_on_with_the_pair_that_it_had_come_to(build, tmp_path, monkeypatch):
+    matches = match_graph()
+    build(matches)
+    expected = (tmp_path / "view_graph.npz").read_bytes()
+    monkeypatch.setattr(view_graph, "PART", 1)
+    write, written = view_graph.write_part, []
+
+    def dies_at_the_second(path, found):
+        if written:
+            raise Killed
+        written.append(path)
+        write(path, found)
+
+    with monkeypatch.context() as patch, pytest.raises(Killed):
+        patch.setattr(view_graph, "write_part", dies_at_the_second)
+        build(matches)
+    stamp = written[0].stat().st_mtime_ns
+    parts = []
+    monkeypatch.setattr(view_graph, "write_part", lambda path, found: (parts.append(path), write(path, found)))
+    monkeypatch.setattr(view_graph.shutil, "rmtree", lambda _: parts.append(written[0].stat().st_mtime_ns))
+    build(matches)
+
+    assert len(parts) == 2 and parts[0] != written[0] and parts[1] == stamp
+    assert (tmp_path / "view_graph.npz").read_bytes() == expected
+
+
+def test_parts_come_back_as_they_were(build, tmp_path):
+    graph, _ = build(match_graph())
+    found = {pair: (fit, 3) for pair, fit in graph.fits.items()} | {
+        pair: (no, 0) for pair, no in graph.rejected.items()
+    }
+
+    view_graph.write_part(tmp_path / "part.npz", found)
+    again = view_graph.read_part(tmp_path / "part.npz")
+
+    assert [count for _, count in again.values()] == [3, 0]
+    arrays = [view_graph.graph_of(parts).to_arrays() for parts in (found, again)]
+    assert all(np.array_equal(arrays[0][name], arrays[1][name]) for name in arrays[0])

@@ -1,0 +1,57 @@
+"""Copies: the same picture saved twice, smaller, or as another format. They add nothing, and no pair has a parallax."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sfm_app.types import Photo, UnusablePhoto
+
+SIDE_PX = 32
+"""Side of the small pictures that are compared."""
+ALIKE = 0.015
+"""Root mean square difference, as a share of the contrast, of pictures that are one. A step of a thousandth of the
+width to the side makes more of it; saving a picture anew, smaller or as JPEG, less."""
+LEAST_CONTRAST = 4.0
+"""Grey levels; of pictures with less nothing can be said."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Glance:
+    """A usable photo and a small grey picture of it."""
+
+    photo: Photo
+    small: NDArray[np.float32]
+    """(SIDE_PX, SIDE_PX) upright."""
+
+
+def small_picture(upright: Image.Image) -> NDArray[np.float32]:
+    """What is kept of a photo to compare it."""
+    reduced = upright.convert("L").resize((SIDE_PX, SIDE_PX), Image.Resampling.LANCZOS, reducing_gap=6.0)
+    return np.asarray(reduced, np.float32)
+
+
+def without_copies(glances: Sequence[Glance]) -> tuple[list[Photo], list[UnusablePhoto]]:
+    """The photos, of every picture the largest, and the copies; both in the order given."""
+    order = sorted(range(len(glances)), key=lambda k: (-_pixels(glances[k].photo), k))
+    small = np.array([glance.small for glance in glances], np.float32).reshape(len(glances), SIDE_PX**2)
+    contrast = small.std(axis=1)
+    kept: list[int] = []
+    same: dict[int, int] = {}
+    for k in order:
+        off = np.sqrt(np.mean((small[kept] - small[k]) ** 2, axis=1)) / max(contrast[k], LEAST_CONTRAST)
+        if contrast[k] >= LEAST_CONTRAST and off.min(initial=np.inf) < ALIKE:
+            same[k] = kept[int(off.argmin())]
+        else:
+            kept.append(k)
+    photos = [glances[k].photo for k in sorted(kept)]
+    copies = [
+        UnusablePhoto(glances[k].photo.path, f"the same picture as {glances[same[k]].photo.path}") for k in sorted(same)
+    ]
+    return photos, copies
+
+
+def _pixels(photo: Photo) -> int:
+    return photo.width * photo.height

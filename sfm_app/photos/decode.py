@@ -1,0 +1,130 @@
+"""From the bytes of a file to an upright picture of 8 bits, or the reason why there is none."""
+
+import importlib
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError, features
+
+from sfm_app.photos.exif import EXIF_IFD, GPS_IFD, orientation
+
+FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
+"""What is always read."""
+LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
+"""A copy as JPEG loses next to nothing more."""
+
+HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")
+AVIF_BRANDS = (b"avif", b"avis")
+
+
+class UnreadableError(Exception):
+    """Why a file gives no picture; the message is for people."""
+
+
+@cache
+def formats() -> tuple[str, ...]:
+    """What can be read here: HEIC needs the extra, AVIF a Pillow that was built with it."""
+    found = FORMATS + (("AVIF",) if features.check("avif") else ())
+    try:
+        importlib.import_module("pillow_heif").register_heif_opener()
+    except ImportError:
+        return found
+    return (*found, "HEIF")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """The first picture of a file."""
+
+    image: Image.Image
+    """With its pixels, as the file has them."""
+    exif: Image.Exif
+    """Empty where it is damaged: the picture may be fine all the same."""
+    frames: int
+    """Pictures in the file."""
+
+
+def read_picture(path: Path) -> Picture:
+    """Decode a file as a whole.
+
+    Raises:
+        UnreadableError: it is no photo, or a damaged one.
+    """
+    try:
+        with Image.open(path, formats=formats()) as image:
+            frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)  # the others of an MPO are previews
+            image.seek(0)
+            image.load()
+            return Picture(image, _exif_of(image), frames)
+    except UnidentifiedImageError:
+        raise UnreadableError(_no_photo(path)) from None
+    except Image.DecompressionBombError:
+        raise UnreadableError("too many pixels") from None
+    except PermissionError:
+        raise UnreadableError("not readable: permission denied") from None
+    except Exception:  # whatever a decoder makes of damaged bytes
+        raise UnreadableError("truncated or damaged") from None
+
+
+def _exif_of(image: Image.Image) -> Image.Exif:
+    try:
+        exif = image.getexif()
+        exif.get_ifd(EXIF_IFD)
+        exif.get_ifd(GPS_IFD)
+    except Exception:  # as above
+        return Image.Exif()
+    return exif
+
+
+def upright(picture: Picture) -> Image.Image:
+    """The picture upright by EXIF, in RGB or grey of 8 bits, what is transparent on white."""
+    turned = orientation(picture.exif)
+    flat = _eight_bit(picture.image)
+    return flat.transpose(ORIENTATIONS[turned]) if turned in ORIENTATIONS else flat
+
+
+ORIENTATIONS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What undoes an EXIF orientation."""
+
+
+def _eight_bit(image: Image.Image) -> Image.Image:
+    if image.mode.startswith("I") or image.mode == "F":
+        return Image.fromarray(_levels(np.asarray(image)))
+    if image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info:
+        white = Image.new("RGBA", image.size, "white")
+        return Image.alpha_composite(white, image.convert("RGBA")).convert("RGB")
+    return image if image.mode in ("RGB", "L") else image.convert("RGB")
+
+
+def _levels(deep: NDArray[Any]) -> NDArray[np.uint8]:
+    """Grey of 16 bits, or of what range ever, in 256 levels."""
+    values = np.nan_to_num(deep.astype(np.float64))
+    low, high = (0.0, 65535.0) if values.min() >= 0 and 255 < values.max() <= 65535 else (values.min(), values.max())
+    return np.asarray(np.clip((values - low) * (255.0 / max(high - low, 1e-12)), 0, 255), np.uint8)
+
+
+def _no_photo(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            head = file.read(12)
+    except OSError:
+        head = b""
+    if not head:
+        return "empty"
+    if head[4:8] == b"ftyp" and head[8:12] in HEIC_BRANDS:
+        return "HEIC photos need `pip install 'sfm-app[heic]'`"
+    if head[4:8] == b"ftyp" and head[8:12] in AVIF_BRANDS:
+        return "AVIF photos need a newer Pillow: `pip install -U pillow`"
+    return "not a photo"

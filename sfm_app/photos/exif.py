@@ -1,0 +1,88 @@
+"""What EXIF says about a photo: hints that are never trusted."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from PIL import Image
+
+from sfm_app.types import GpsPosition
+
+MAKE, MODEL, ORIENTATION, EXIF_IFD, GPS_IFD = 0x010F, 0x0110, 0x0112, 0x8769, 0x8825
+FOCAL_MM, FOCAL_35MM, ZOOM = 0x920A, 0xA405, 0xA404
+GPS_LATITUDE_REF, GPS_LATITUDE, GPS_LONGITUDE_REF, GPS_LONGITUDE, GPS_ALTITUDE_REF, GPS_ALTITUDE = range(1, 7)
+
+FULL_FRAME_WIDTH_MM = 36.0
+LOWEST_M, HIGHEST_M = -1000.0, 20_000.0
+"""Altitudes that a photo may be taken at."""
+
+
+def orientation(exif: Image.Exif) -> int:
+    """1 to 8: how the pixels have to be turned and mirrored to stand upright; 1 where they are, or where unknown."""
+    value = exif.get(ORIENTATION, 1)
+    return value if isinstance(value, int) and 1 <= value <= 8 else 1
+
+
+def camera_name(exif: Image.Exif) -> str:
+    """Make, model, focal length and digital zoom in one text; empty where nothing is said."""
+    details = exif.get_ifd(EXIF_IFD)
+    said = [exif.get(MAKE), exif.get(MODEL), details.get(FOCAL_MM), _zoom(details.get(ZOOM))]
+    return " ".join(text for text in (printable(value) for value in said) if text)
+
+
+def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
+    """Focal length in pixels by the one for 35 mm film; None where it is missing or cannot be true."""
+    try:
+        focal = float(exif.get_ifd(EXIF_IFD).get(FOCAL_35MM)) * longer_side / FULL_FRAME_WIDTH_MM  # type: ignore[arg-type]
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return focal if 0.1 * longer_side < focal < 50 * longer_side else None
+
+
+def gps_position(exif: Image.Exif) -> GpsPosition | None:
+    """The position; None where it is missing or cannot be true.
+
+    Cameras without a fix write zeros: latitude and longitude 0 is open sea, and counts as missing.
+    """
+    entries: Mapping[int, Any] = exif.get_ifd(GPS_IFD)
+    latitude = _degrees(entries.get(GPS_LATITUDE), entries.get(GPS_LATITUDE_REF), "NS", 90.0)
+    longitude = _degrees(entries.get(GPS_LONGITUDE), entries.get(GPS_LONGITUDE_REF), "EW", 180.0)
+    if latitude is None or longitude is None or latitude == longitude == 0.0:
+        return None
+    return GpsPosition(latitude, longitude, _altitude_m(entries.get(GPS_ALTITUDE), entries.get(GPS_ALTITUDE_REF)))
+
+
+def printable(value: object) -> str:
+    """A value as a text without control characters; empty for None."""
+    text = "" if value is None else str(value)
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())
+
+
+def _zoom(value: Any) -> str | None:
+    """Digital zoom crops the picture: another camera. 0 and 1 say that it was not used."""
+    try:
+        return None if float(value) in (0.0, 1.0) else f"x{float(value):g}"
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+
+
+def _degrees(parts: Any, reference: Any, sides: str, largest: float) -> float | None:
+    """Signed degrees from EXIF's degrees, minutes and seconds and the letter of the side."""
+    try:
+        degrees, minutes, seconds = (float(part) for part in parts)
+        side = sides.index(str(reference).strip("\0 ").upper()[:1] or "?")
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    if not (degrees >= 0 and 0 <= minutes <= 60 and 0 <= seconds <= 60):
+        return None
+    value = degrees + minutes / 60 + seconds / 3600
+    return (-value if side else value) if value <= largest else None
+
+
+def _altitude_m(altitude: Any, reference: Any) -> float | None:
+    try:
+        value = float(altitude)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    below = reference in (1, b"\x01")
+    value = -value if below else value
+    return value if LOWEST_M <= value <= HIGHEST_M else None

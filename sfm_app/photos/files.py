@@ -1,0 +1,82 @@
+"""Which files of a folder are looked at, and where they lie. Nothing outside the folder is read."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from sfm_app.errors import InputError
+
+HINT = "name the folder that holds the photos"
+
+
+def list_files(folder: Path, out: Path, listed_in: Path | None = None) -> list[str]:
+    """Names of all files below the folder, with forward slashes, sorted.
+
+    Hidden folders and links to folders are not entered and count as one file. The output folder is left out.
+
+    Args:
+        folder: of photos.
+        out: output folder; may lie in it.
+        listed_in: text file that names those to look at, one per line, as seen from the folder; all where None.
+
+    Raises:
+        InputError: there is no such folder, it cannot be read, or the run would write into it.
+    """
+    if not folder.exists():
+        raise InputError(f"no such folder: {folder}", hint=HINT)
+    if not folder.is_dir():
+        raise InputError(f"not a folder: {folder}", hint=f"{HINT}, not a photo")
+    _keep_apart(folder.resolve(), out.resolve())
+    try:
+        next(folder.iterdir(), None)
+    except OSError as err:
+        raise InputError(f"cannot read {folder}: {err.strerror}") from err
+    if listed_in is not None:
+        return _listed(listed_in)
+    return sorted(path.relative_to(folder).as_posix() for path in _walk(folder, out.resolve()))
+
+
+def place_of(folder: Path, name: str) -> Path | str:
+    """Where a file really lies, links followed, or why it is not opened."""
+    root, place = folder.resolve(), folder / name
+    if Path(name).name.startswith("."):
+        return "hidden"
+    try:
+        real = place.resolve()
+    except (OSError, RuntimeError):  # links in a ring
+        return "a link that leads nowhere"
+    if not real.is_relative_to(root):
+        return "a link out of the folder" if place.is_symlink() else "outside the folder"
+    if not real.exists():
+        return "a link that leads nowhere" if place.is_symlink() else "not there"
+    if real.is_dir():
+        return "a link to a folder" if place.is_symlink() else "a folder"
+    return real if real.is_file() else "not a file"  # pipes would never end
+
+
+def _keep_apart(folder: Path, out: Path) -> None:
+    """Raises InputError where the run would write over its photos."""
+    if folder == out:
+        raise InputError(f"{folder} cannot be the photos and the output", hint="name another output folder with -o")
+    written = [out / name for name in ("photos", "sparse", "dense", "other_models")]
+    if any(folder.is_relative_to(place) for place in written):
+        raise InputError(
+            f"{folder} lies where the run in {out} keeps its own files", hint="name another output folder with -o"
+        )
+
+
+def _listed(file: Path) -> list[str]:
+    try:
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as err:
+        reason = err.strerror if isinstance(err, OSError) else "not a UTF-8 text"
+        raise InputError(f"cannot read {file}: {reason}", hint="one photo per line, as seen from the folder") from err
+    return sorted({Path(line).as_posix() for line in lines if line.strip()})
+
+
+def _walk(folder: Path, out: Path) -> Iterator[Path]:
+    for place, folders, files in os.walk(folder):
+        here = Path(place)
+        closed = [name for name in folders if name.startswith(".") or (here / name).is_symlink()]
+        folders[:] = [name for name in folders if name not in closed and (here / name).resolve() != out]
+        yield from (here / name for name in (*files, *closed))

@@ -1,0 +1,37 @@
+"""`kill -9`, then the same command again: the same bytes as a run that nobody disturbed."""
+
+import json
+import os
+
+import pytest
+
+KILLED = -9
+STEPS = 15
+"""So many steps lie between the first file that appears and the last."""
+ALWAYS = {"before:4", "after:12", "match_exhaustive:60"}
+IN_COLMAP = ["extract_features:60", "extract_features:400", "match_exhaustive:60", "undistort_images:40"]
+
+IN_COLMAP_CALLS = {point.split(":")[0] for point in IN_COLMAP}
+
+needs_time = pytest.mark.skipif("SFM_APP_FAULTS" not in os.environ, reason="`make faults` tries all points")
+
+
+POINTS = [f"{when}:{step}" for when in ("before", "after") for step in range(STEPS + 1)] + IN_COLMAP
+
+
+@pytest.mark.parametrize("point", [pytest.param(p, marks=() if p in ALWAYS else needs_time) for p in POINTS])
+def test_a_killed_run_ends_with_the_same_bytes(undisturbed, tmp_path, point):
+    when, amount = point.split(":")
+    if when in ("before", "after"):
+        amount = str(1 + round(int(amount) * (undisturbed.appeared - 1) / STEPS))
+    out = tmp_path / "out"
+
+    killed = undisturbed.run(out, f"{when}:{amount}")
+    assert killed.returncode == KILLED or when in IN_COLMAP_CALLS, killed.stderr  # COLMAP may have been faster
+    stages = json.loads((out / "manifest.json").read_text())["stages"] if (out / "manifest.json").exists() else {}
+    for stage in stages.values():  # the manifest is never ahead of the files
+        assert all((out / name).exists() for name in stage["files"])
+    again = undisturbed.run(out)
+
+    assert again.returncode == 0, again.stderr
+    assert undisturbed.result(out) == undisturbed.result(undisturbed.out)

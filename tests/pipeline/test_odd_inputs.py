@@ -1,0 +1,300 @@
+"""Folders and machines as people have them: every file is used or left out with a reason, every refusal is a line."""
+
+import json
+import os
+import zlib
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from filelock import FileLock
+from PIL import Image, features
+
+from sfm_app.cli import main
+from sfm_app.workspace import LOCK
+
+SIZE = (128, 96)
+USED = "used"
+
+
+def picture(seed=0, size=SIZE):
+    """A picture of its own, of soft blots."""
+    blots = Image.fromarray(np.random.default_rng(seed).integers(0, 255, (12, 16, 3), np.uint8))
+    return blots.resize(size, Image.Resampling.BICUBIC)
+
+
+def call(*arguments):
+    return CliRunner().invoke(main, [*map(str, arguments), "--workers", "1", "-q"])
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two good photos."""
+    place = tmp_path / "photos"
+    place.mkdir()
+    picture(1).save(place / "a.jpg")
+    picture(2).save(place / "b.png")
+    return place
+
+
+def saved(name, kind=None, mode=None, **options):
+    """A picture in another format or mode."""
+
+    def make(folder):
+        image = picture()
+        (image.convert(mode) if mode else image).save(folder / name, kind, **options)
+
+    return make
+
+
+def written(name, content):
+    return lambda folder: (folder / name).write_bytes(content)
+
+
+def sixteen_bits(folder):
+    Image.fromarray(np.asarray(picture())[..., 0].astype(np.uint16) * 257).save(folder / "x.png")
+
+
+def floats(folder):
+    Image.fromarray(np.asarray(picture())[..., 0].astype(np.float32)).save(folder / "x.tif")
+
+
+def cut(folder):
+    (folder / "x.jpg").write_bytes((folder / "a.jpg").read_bytes()[:-500])
+
+
+def bomb(folder):
+    picture().save(folder / "x.png")
+    data = bytearray((folder / "x.png").read_bytes())
+    data[16:24] = (60_000).to_bytes(4, "big") * 2
+    data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")
+    (folder / "x.png").write_bytes(data)
+
+
+def bad_exif(folder):
+    exif = Image.Exif()
+    exif[0x0110] = "Box Brownie"
+    picture().save(folder / "x.jpg", exif=exif)
+    data = (folder / "x.jpg").read_bytes()
+    at = data.index(b"Exif\0\0") + 6
+    (folder / "x.jpg").write_bytes(data[:at] + b"\xff" * 20 + data[at + 20 :])
+
+
+def turned(folder):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    picture().save(folder / "x.jpg", exif=exif)
+
+
+def same_name(folder):
+    (folder / "in").mkdir()
+    picture().save(folder / "in" / "a.jpg")
+
+
+def folder_named_so(folder):
+    (folder / "in.jpg").mkdir()
+    picture().save(folder / "in.jpg" / "x.jpg")
+
+
+def link(name, target):
+    return lambda folder: (folder / name).symlink_to(target)
+
+
+def smaller_copy(folder):
+    Image.open(folder / "a.jpg").resize((96, 72), Image.Resampling.LANCZOS).save(folder / "x.jpg", quality=95)
+
+
+def exact_copy(folder):
+    (folder / "x.png").write_bytes((folder / "b.png").read_bytes())
+
+
+def locked(folder):
+    picture().save(folder / "x.jpg")
+    (folder / "x.jpg").chmod(0)
+
+
+FILES = {
+    "CMYK": (saved("x.jpg", mode="CMYK"), "x.jpg", USED),
+    "progressive": (saved("x.jpg", progressive=True), "x.jpg", USED),
+    "colour profile": (saved("x.jpg", icc_profile=b"no profile at all"), "x.jpg", USED),
+    "grey": (saved("x.png", mode="L"), "x.png", USED),
+    "palette": (saved("x.png", mode="P"), "x.png", USED),
+    "two levels": (saved("x.png", mode="1"), "x.png", USED),
+    "alpha": (saved("x.png", mode="RGBA"), "x.png", USED),
+    "16 bit": (sixteen_bits, "x.png", USED),
+    "floating point": (floats, "x.tif", USED),
+    "TIFF": (saved("x.tif"), "x.tif", USED),
+    "WebP": (saved("x.webp"), "x.webp", USED),
+    "BMP": (saved("x.bmp"), "x.bmp", USED),
+    "AVIF": (saved("x.avif"), "x.avif", USED) if features.check("avif") else (turned, "x.jpg", USED),
+    "JPEG named PNG": (saved("x.png", "JPEG"), "x.png", USED),
+    "no ending": (saved("x", "PNG"), "x", USED),
+    "capitals": (saved("X.JPG"), "X.JPG", USED),
+    "turned": (turned, "x.jpg", USED),
+    "damaged EXIF": (bad_exif, "x.jpg", USED),
+    "many pages": (saved("x.tif", save_all=True, append_images=[picture(7)]), "x.tif", USED),
+    "animated": (saved("x.png", save_all=True, append_images=[picture(7)]), "x.png", USED),
+    "spaces": (saved("  x  .jpg"), "  x  .jpg", USED),
+    "umlauts": (saved("\u00e4\u00f6\u00fc.jpg"), "\u00e4\u00f6\u00fc.jpg", USED),
+    "emoji": (saved("\U0001f600.jpg"), "\U0001f600.jpg", USED),
+    "line break": (saved("x\ny.jpg"), "x\ny.jpg", USED),
+    "escape": (saved("\x1b[2J.jpg"), "\x1b[2J.jpg", USED),
+    "not UTF-8": (saved("\udcff.jpg"), "\udcff.jpg", USED),
+    "SQL": (saved("'); drop table images; --.jpg"), "'); drop table images; --.jpg", USED),
+    "an option": (saved("--help.jpg"), "--help.jpg", USED),
+    "same name in two folders": (same_name, "in/a.jpg", USED),
+    "a folder named like a photo": (folder_named_so, "in.jpg/x.jpg", USED),
+    "HEIC": (written("x.heic", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(90)), "x.heic", ""),
+    "GIF": (saved("x.gif"), "x.gif", "not a photo"),
+    "text": (written("x.txt", b"a text"), "x.txt", "not a photo"),
+    "PDF": (written("x.pdf", b"%PDF-1.7\n"), "x.pdf", "not a photo"),
+    "empty": (written("x.jpg", b""), "x.jpg", "empty"),
+    "cut off": (cut, "x.jpg", "truncated or damaged"),
+    "noise": (written("x.jpg", bytes(range(256)) * 30), "x.jpg", "not a photo"),
+    "bomb": (bomb, "x.png", "too many pixels"),
+    "tiny": (lambda folder: picture(5, (40, 40)).save(folder / "x.png"), "x.png", "smaller than 64 px"),
+    "hidden": (saved(".x.jpg"), ".x.jpg", "hidden"),
+    "exact copy": (exact_copy, "x.png", "the same picture as b.png"),
+    "smaller copy": (smaller_copy, "x.jpg", "the same picture as a.jpg"),
+    "link inside": (link("x.jpg", "a.jpg"), "x.jpg", "the same picture as a.jpg"),
+    "link outside": (link("x.jpg", "../secret.jpg"), "x.jpg", "a link out of the folder"),
+    "link to nothing": (link("x.jpg", "nothing.jpg"), "x.jpg", "a link that leads nowhere"),
+    "link to itself": (link("x.jpg", "x.jpg"), "x.jpg", "a link that leads nowhere"),
+    "link to a folder": (link("x", ".."), "x", "a link out of the folder"),
+    "pipe": (lambda folder: os.mkfifo(folder / "x.jpg"), "x.jpg", "not a file"),
+}
+
+
+@pytest.mark.parametrize("case", FILES)
+def test_every_file_is_accounted_for(folder, tmp_path, case):
+    make, name, expected = FILES[case]
+    picture(9).save(tmp_path / "secret.jpg")
+    make(folder)
+
+    result = call("run", folder, "-o", tmp_path / "out", "--until", "photos", "--json")
+
+    assert result.exit_code == 0, result.stderr
+    found = json.loads(result.stdout)["photos"]
+    assert found["usable"] == (3 if expected == USED else 2)
+    assert list(found["unusable"]) == ([] if expected == USED else [name])
+    assert expected in found["unusable"].get(name, USED)
+    stored = [path for path in (tmp_path / "out" / "photos").rglob("*") if path.is_file()]
+    assert len(stored) == found["usable"]
+    assert all("".join(path.name.split()).isprintable() for path in stored)
+    told = call("run", folder, "-o", tmp_path / "out", "--until", "photos").stdout
+    assert all(line.isprintable() for line in told.splitlines())
+    assert sorted(tmp_path.iterdir()) == [tmp_path / "out", folder, tmp_path / "secret.jpg"]
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may read everything")
+def test_a_file_that_may_not_be_read(folder, tmp_path):
+    locked(folder)
+    result = call("run", folder, "-o", tmp_path / "out", "--until", "photos", "--json")
+
+    assert json.loads(result.stdout)["photos"]["unusable"] == {"x.jpg": "not readable: permission denied"}
+
+
+def nothing(folder, out): ...
+
+
+def garbage_manifest(folder, out):
+    (out / "manifest.json").write_bytes(b"\xff\x00{]")
+
+
+def half_a_manifest(folder, out):
+    whole = (out / "manifest.json").read_bytes()
+    (out / "manifest.json").write_bytes(whole[: len(whole) // 2])
+
+
+def foreign_manifest(folder, out):
+    (out / "manifest.json").write_text('{"stages": {"photos": {"made": "by another program"}, "scene": 3}}')
+
+
+def list_as_manifest(folder, out):
+    (out / "manifest.json").write_text('["stages"]')
+
+
+def stages_as_list(folder, out):
+    (out / "manifest.json").write_text('{"stages": ["photos"]}')
+
+
+def half_a_photo_set(folder, out):
+    whole = (out / "photos.json").read_bytes()
+    (out / "photos.json").write_bytes(whole[: len(whole) // 2] + b"!" * (len(whole) - len(whole) // 2))
+
+
+def photos_gone(folder, out):
+    for path in (out / "photos").iterdir():
+        path.unlink()
+
+
+def photo_changed(folder, out):
+    picture(30).save(folder / "a.jpg")
+
+
+DISTURBED = (
+    nothing, garbage_manifest, half_a_manifest, foreign_manifest, list_as_manifest, stages_as_list, half_a_photo_set,
+    photo_changed,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("disturb", DISTURBED)
+def test_what_lies_in_the_output_folder_never_stops_a_run(folder, tmp_path, disturb):
+    command = ("run", folder, "-o", tmp_path / "out", "--until", "photos", "--json")
+    assert call(*command).exit_code == 0
+    disturb(folder, tmp_path / "out")
+
+    result = call(*command)
+
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["photos"]["usable"] == 2
+
+
+COMMANDS = {
+    "no folder": (["{here}/nowhere", "-o", "{here}/out"], 3, "no such folder"),
+    "a photo": (["{photos}/a.jpg", "-o", "{here}/out"], 3, "not a folder"),
+    "photos are the output": (["{photos}", "-o", "{photos}"], 3, "cannot be the photos and the output"),
+    "photos where the run writes": (["{photos}", "-o", "{here}"], 3, "keeps its own files"),
+    "the run's own photos": (["{here}/old/photos", "-o", "{here}/old"], 3, "keeps its own files"),
+    "links to photos": (["{here}/old/photos", "-o", "{here}/new"], 3, "1 a link out of the folder"),
+    "somebody's photos in the output": (["{photos}", "-o", "{here}/old"], 3, "no run has made it"),
+    "somebody's model in the output": (["{photos}", "-o", "{here}/colmap"], 3, "no run has made it"),
+    "output is a file": (["{photos}", "-o", "{photos}/a.jpg"], 3, "cannot write to"),
+    "in use": (["{photos}", "-o", "{here}/held"], 3, "another run is at work"),
+    "no list": (["{photos}", "-o", "{here}/out", "--images", "{here}/none.txt"], 3, "cannot read"),
+    "an empty list": (["{photos}", "-o", "{here}/out", "--images", "{here}/empty.txt"], 3, "no usable photo"),
+    "a list of others": (["{photos}", "-o", "{here}/out", "--images", "{here}/list.txt"], 3, "outside the folder"),
+    "no settings": (["{photos}", "-o", "{here}/out", "--config", "{here}/none.toml"], 2, "cannot read"),
+    "no TOML": (["{photos}", "-o", "{here}/out", "--config", "{photos}/a.jpg"], 2, "is not a TOML file"),
+    "unknown table": (["{photos}", "-o", "{here}/out", "--set", "colmap.x=1"], 2, "unknown setting"),
+    "wrong type": (["{photos}", "-o", "{here}/out", "--set", "mesh.faces=many"], 2, "mesh.faces"),
+    "out of range": (["{photos}", "-o", "{here}/out", "--seed", "-1"], 2, "seed"),
+    "not finite": (["{photos}", "-o", "{here}/out", "--set", "mesh.max_gap=nan"], 2, "mesh.max_gap"),
+    "a plug-in that is not loaded": (
+        ["{photos}", "-o", "{here}/out", "--no-plugins", "--estimator", "poselib-lo-ransac"],
+        2,
+        "no estimator is named",
+    ),
+    "unknown cameras": (["{photos}", "-o", "{here}/out", "--cameras", "two"], 2, "photos.cameras"),
+    "unknown stage": (["{photos}", "-o", "{here}/out", "--until", "lunch"], 2, "lunch"),
+}
+
+
+@pytest.mark.parametrize("case", COMMANDS)
+def test_every_refusal_is_one_line_and_a_hint(folder, tmp_path, case):
+    arguments, code, words = COMMANDS[case]
+    (tmp_path / "old" / "photos").mkdir(parents=True)
+    (tmp_path / "old" / "photos" / "a.jpg").symlink_to(folder / "a.jpg")
+    for name in ("held", "colmap/sparse"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "empty.txt").write_text("")
+    (tmp_path / "list.txt").write_text("../held\n/etc/passwd\n")
+
+    with FileLock(tmp_path / "held" / LOCK):
+        before = {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")}
+        result = call("run", *(argument.format(here=tmp_path, photos=folder) for argument in arguments))
+
+    assert result.exit_code == code, result.stderr
+    assert words in result.stderr and "Traceback" not in result.output
+    assert result.stdout == ""
+    assert all(path.lstat().st_mtime_ns == stamp for path, stamp in before.items())  # nothing is lost, nothing left

@@ -1,0 +1,124 @@
+"""Formats, pixel depths and damage."""
+
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image, features
+
+from sfm_app.photos import UnreadableError, read_picture, upright
+
+BARS = np.repeat(np.arange(0, 256, 8, np.uint8)[None], 24, axis=0)
+COLORS = np.stack([BARS, BARS[:, ::-1], 255 - BARS // 2], axis=-1)
+LOSSLESS = {"PNG": {}, "TIFF": {"compression": "tiff_lzw"}, "BMP": {}, "WEBP": {"lossless": True}}
+
+
+@pytest.mark.parametrize("kind", LOSSLESS)
+def test_formats(tmp_path, kind):
+    Image.fromarray(COLORS).save(tmp_path / "x", kind, **LOSSLESS[kind])
+
+    assert np.array_equal(np.asarray(upright(read_picture(tmp_path / "x"))), COLORS)
+
+
+@pytest.mark.parametrize("options", [{"progressive": True}, {"optimize": True}, {"subsampling": 0}])
+def test_jpeg(tmp_path, options):
+    Image.fromarray(COLORS).save(tmp_path / "x.jpg", quality=98, **options)
+
+    seen = np.asarray(upright(read_picture(tmp_path / "x.jpg")), int)
+    assert 0 < np.abs(seen - COLORS).mean() < 3
+
+
+@pytest.mark.skipif(not features.check("avif"), reason="this Pillow has no AVIF")
+def test_avif(tmp_path):
+    Image.fromarray(COLORS).save(tmp_path / "x.avif", quality=95)
+
+    assert np.abs(np.asarray(upright(read_picture(tmp_path / "x.avif")), int) - COLORS).mean() < 5
+
+
+def test_heic_names_the_extra_or_is_read(tmp_path):
+    path = tmp_path / "IMG_0001.HEIC"
+    path.write_bytes(b"\x00\x00\x00\x18ftypheic\x00\x00\x00\x00mif1heic" + bytes(50))
+
+    with pytest.raises(UnreadableError) as caught:
+        read_picture(path)
+    assert "sfm-app[heic]" in str(caught.value) or str(caught.value) in ("not a photo", "truncated or damaged")
+
+
+@pytest.mark.parametrize("kind", ["PNG", "TIFF"])
+def test_sixteen_bits_become_eight(tmp_path, kind):
+    Image.fromarray(BARS.astype(np.uint16) * 257).save(tmp_path / "x", kind)
+
+    assert np.array_equal(np.asarray(upright(read_picture(tmp_path / "x"))), BARS)
+
+
+def test_floating_point_fills_the_range(tmp_path):
+    Image.fromarray(BARS.astype(np.float32) / 100 - 1).save(tmp_path / "x.tif")
+
+    seen = np.asarray(upright(read_picture(tmp_path / "x.tif")), int)
+    assert seen.min() == 0 and seen.max() == 255
+    assert np.abs(seen - BARS.astype(int) * 255 / 248).max() <= 1
+
+
+def test_what_is_transparent_is_white(tmp_path):
+    clear = np.dstack([COLORS, np.where(BARS < 128, 0, 255).astype(np.uint8)])
+    Image.fromarray(clear).save(tmp_path / "x.png")
+
+    seen = np.asarray(upright(read_picture(tmp_path / "x.png")))
+    assert (seen[:, :16] == 255).all()
+    assert np.array_equal(seen[:, 16:], COLORS[:, 16:])
+
+
+@pytest.mark.parametrize("kind", ["TIFF", "PNG", "WEBP"])
+def test_of_many_pictures_the_first(tmp_path, kind):
+    first, second = Image.fromarray(COLORS), Image.fromarray(COLORS[:, ::-1])
+    third = Image.fromarray(255 - COLORS)
+    options = {"lossless": True} if kind == "WEBP" else {}
+    first.save(tmp_path / "x", kind, save_all=True, append_images=[second, third], **options)
+
+    picture = read_picture(tmp_path / "x")
+    assert picture.frames == 3
+    assert np.array_equal(np.asarray(upright(picture)), COLORS)
+
+
+@pytest.mark.parametrize("content", [b"", b"GIF89a, or so it says", b"%PDF-1.7", b"\x00" * 5000])
+def test_what_is_no_photo(tmp_path, content):
+    (tmp_path / "x.jpg").write_bytes(content)
+
+    with pytest.raises(UnreadableError, match="not a photo" if content else "empty"):
+        read_picture(tmp_path / "x.jpg")
+
+
+@pytest.mark.parametrize("kind", ["JPEG", "PNG", "TIFF", "WEBP", "BMP"])
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_what_is_cut_off(tmp_path, kind, share):
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)
+    Image.fromarray(noise).save(tmp_path / "x", kind)
+    whole = (tmp_path / "x").read_bytes()
+    (tmp_path / "x").write_bytes(whole[: int(share * len(whole))])
+
+    with pytest.raises(UnreadableError, match=r"truncated or damaged|not a photo"):
+        read_picture(tmp_path / "x")
+
+
+def test_a_bomb_is_refused_before_it_goes_off(tmp_path):
+    Image.fromarray(np.zeros((8, 8), np.uint8)).save(tmp_path / "x.png")
+    data = bytearray((tmp_path / "x.png").read_bytes())
+    data[16:24] = (60_000).to_bytes(4, "big") * 2  # width and height
+    data[29:33] = zlib.crc32(bytes(data[12:29])).to_bytes(4, "big")
+    (tmp_path / "x.png").write_bytes(data)
+
+    with pytest.raises(UnreadableError, match="too many pixels"):
+        read_picture(tmp_path / "x.png")
+
+
+def test_damaged_exif_does_no_harm(tmp_path):
+    exif = Image.Exif()
+    exif[0x0110] = "Box Brownie"
+    Image.fromarray(COLORS).save(tmp_path / "x.jpg", exif=exif)
+    data = (tmp_path / "x.jpg").read_bytes()
+    at = data.index(b"Exif\0\0") + 6
+    (tmp_path / "x.jpg").write_bytes(data[:at] + b"\xff" * 20 + data[at + 20 :])
+
+    picture = read_picture(tmp_path / "x.jpg")
+    assert dict(picture.exif) == {}
+    assert picture.image.size == (32, 24)
