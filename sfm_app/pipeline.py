@@ -142,8 +142,9 @@ def loader(found: dict[str, Any], run: RunContext) -> Products:
             except DamagedProductError:
                 raise
             except (OSError, ValueError, TypeError, LookupError, BadZipFile, EOFError, BackendError) as err:
-                gone = isinstance(err, FileNotFoundError)
-                what = f"is not complete: {err.filename} is gone" if gone else "is damaged"
+                what = "is damaged"
+                if isinstance(err, FileNotFoundError):
+                    what = f"is not complete: {err.filename} is gone"
                 left = f"what stage `{name}` left in {run.workspace.root} {what}"
                 raise DamagedProductError(left, _how_on(run), name) from err
         return found[name]
