@@ -22,7 +22,7 @@ from sfm_app.stages.texture import PARTS, Files
 from sfm_app.synthetic.cameras import camera_centre
 from sfm_app.synthetic.compare import centre_error_percent, focal_error_percent, surface_error
 from sfm_app.texture import pages
-from sfm_app.workspace import Workspace
+from sfm_app.workspace import LOCK, Workspace
 
 DRAFT = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 480}})
 
@@ -98,7 +98,8 @@ def test_the_texture_covers_the_mesh(finished):
 
 def test_a_second_run_does_nothing(finished, rendered):
     run, _ = finished
-    stamps = {path: path.stat().st_mtime_ns for path in run.out.rglob("*") if path.is_file() and path.name != "log.txt"}
+    kept = [path for path in run.out.rglob("*") if path.is_file() and path.name not in ("log.txt", LOCK)]
+    stamps = {path: path.stat().st_mtime_ns for path in kept}
 
     again = sfm_app.reconstruct(rendered[0], run.out, DRAFT)
 
