@@ -118,6 +118,21 @@ class Workspace:
                 f"cannot write to {self.root}: {err.strerror}", hint="name another output folder with -o"
             ) from err
 
+    def keep_apart(self, photos: Path) -> None:
+        """Check that a run would not write over its photos.
+
+        Raises:
+            InputError: it would.
+        """
+        folder, out = photos.resolve(), self.root.resolve()
+        if folder == out:
+            raise InputError(f"{photos} cannot be the photos and the output", hint="name another output folder with -o")
+        if any(folder.is_relative_to(out / name) for name in WRITTEN):
+            raise InputError(
+                f"{photos} lies where the run in {self.root} keeps its own files",
+                hint="name another output folder with -o",
+            )
+
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
         """Keep other runs out; the system lets go of it when this process ends, however it ends.

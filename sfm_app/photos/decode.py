@@ -111,7 +111,9 @@ def _eight_bit(image: Image.Image) -> Image.Image:
 def _levels(deep: NDArray[Any]) -> NDArray[np.uint8]:
     """Grey of 16 bits, or of what range ever, in 256 levels."""
     values = np.nan_to_num(deep.astype(np.float64))
-    low, high = (0.0, 65535.0) if values.min() >= 0 and 255 < values.max() <= 65535 else (values.min(), values.max())
+    low, high = values.min(), values.max()
+    if deep.dtype.kind in "iu" and low >= 0 and high <= 65535:
+        low, high = 0.0, 65535.0 if high > 255 else 255.0
     return np.asarray(np.clip((values - low) * (255.0 / max(high - low, 1e-12)), 0, 255), np.uint8)
 
 

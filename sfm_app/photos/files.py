@@ -20,13 +20,12 @@ def list_files(folder: Path, out: Path, listed_in: Path | None = None) -> list[s
         listed_in: text file that names those to look at, one per line, as seen from the folder; all where None.
 
     Raises:
-        InputError: there is no such folder, it cannot be read, or the run would write into it.
+        InputError: there is no such folder, or it cannot be read.
     """
     if not folder.exists():
         raise InputError(f"no such folder: {folder}", hint=HINT)
     if not folder.is_dir():
         raise InputError(f"not a folder: {folder}", hint=f"{HINT}, not a photo")
-    _keep_apart(folder.resolve(), out.resolve())
     try:
         next(folder.iterdir(), None)
     except OSError as err:
@@ -52,17 +51,6 @@ def place_of(folder: Path, name: str) -> Path | str:
     if real.is_dir():
         return "a link to a folder" if place.is_symlink() else "a folder"
     return real if real.is_file() else "not a file"  # pipes would never end
-
-
-def _keep_apart(folder: Path, out: Path) -> None:
-    """Raises InputError where the run would write over its photos."""
-    if folder == out:
-        raise InputError(f"{folder} cannot be the photos and the output", hint="name another output folder with -o")
-    written = [out / name for name in ("photos", "sparse", "dense", "other_models")]
-    if any(folder.is_relative_to(place) for place in written):
-        raise InputError(
-            f"{folder} lies where the run in {out} keeps its own files", hint="name another output folder with -o"
-        )
 
 
 def _listed(file: Path) -> list[str]:

@@ -66,7 +66,12 @@ def read_photos(folder: Path, run: RunContext) -> PhotoSet:
 
 
 def files_of(folder: Path, run: RunContext) -> list[str]:
-    """Names of all files that a run has to account for."""
+    """Names of all files that a run has to account for.
+
+    Raises:
+        InputError: the folder is missing or unreadable, or the run would write over it.
+    """
+    run.workspace.keep_apart(folder)
     chosen = run.settings.photos.images
     return list_files(folder, run.workspace.root, Path(chosen) if chosen else None)
 
@@ -134,10 +139,13 @@ def save_photo_set(photos: PhotoSet, run: RunContext) -> None:
 
 
 def load_photo_set(run: RunContext) -> PhotoSet:
-    """Read photos.json back."""
+    """Read photos.json back; what is gone of the photos that were laid out is laid out again."""
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
-    photos = tuple(_photo(entry) for entry in values["photos"])
-    return PhotoSet(Path(values["folder"]), photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]))
+    folder, photos = Path(values["folder"]), tuple(_photo(entry) for entry in values["photos"])
+    for photo in photos:
+        if not (run.workspace.photos / photo.name).exists():
+            laid_out(photo, folder=folder, target=run.workspace.photos)
+    return PhotoSet(folder, photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]))
 
 
 def _photo(entry: Mapping[str, Any]) -> Photo:

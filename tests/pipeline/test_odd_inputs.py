@@ -223,11 +223,6 @@ def half_a_photo_set(folder, out):
     (out / "photos.json").write_bytes(whole[: len(whole) // 2] + b"!" * (len(whole) - len(whole) // 2))
 
 
-def photos_gone(folder, out):
-    for path in (out / "photos").iterdir():
-        path.unlink()
-
-
 def photo_changed(folder, out):
     picture(30).save(folder / "a.jpg")
 
@@ -248,6 +243,17 @@ def test_what_lies_in_the_output_folder_never_stops_a_run(folder, tmp_path, dist
 
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["photos"]["usable"] == 2
+
+
+def test_photos_that_are_gone_from_the_output_are_laid_out_again(folder, tmp_path):
+    assert call("run", folder, "-o", tmp_path / "out", "--until", "photos").exit_code == 0
+    for path in (tmp_path / "out" / "photos").iterdir():
+        path.unlink()
+
+    call("run", folder, "-o", tmp_path / "out", "--until", "match_graph")
+
+    assert sorted(path.name for path in (tmp_path / "out" / "photos").iterdir()) == ["a.jpg", "b.png"]
+    assert all(path.exists() for path in (tmp_path / "out" / "photos").iterdir())
 
 
 COMMANDS = {

@@ -88,3 +88,17 @@ def test_the_database_may_grow_but_not_vanish(place):
     assert place.is_current("photos", "abc")
     (place.root / "database.db").unlink()
     assert not place.is_current("photos", "abc")
+
+
+@pytest.mark.parametrize("inside", ["photos", "photos/2024", "sparse", "dense/images", "other_models/1"])
+def test_photos_are_never_where_the_run_writes(tmp_path, inside):
+    with pytest.raises(InputError, match="keeps its own files") as caught:
+        Workspace(tmp_path).keep_apart(tmp_path / inside)
+    assert "-o" in caught.value.hint
+
+
+def test_photos_beside_what_the_run_writes_are_fine(tmp_path):
+    Workspace(tmp_path).keep_apart(tmp_path / "my photos")
+    Workspace(tmp_path / "photos" / "out").keep_apart(tmp_path / "photos")
+    with pytest.raises(InputError, match="cannot be the photos and the output"):
+        Workspace(tmp_path).keep_apart(tmp_path)

@@ -51,6 +51,13 @@ def test_sixteen_bits_become_eight(tmp_path, kind):
     assert np.array_equal(np.asarray(upright(read_picture(tmp_path / "x"))), BARS)
 
 
+def test_dark_sixteen_bits_are_not_made_bright(tmp_path):
+    dark = BARS.astype(np.uint16) * 10
+    Image.fromarray(dark).save(tmp_path / "x.png")
+
+    assert np.array_equal(np.asarray(upright(read_picture(tmp_path / "x.png"))), dark // 257)
+
+
 def test_floating_point_fills_the_range(tmp_path):
     Image.fromarray(BARS.astype(np.float32) / 100 - 1).save(tmp_path / "x.tif")
 

@@ -76,23 +76,6 @@ def test_the_output_folder_is_left_out(folder):
     assert list_files(folder, folder / "out") == ["a.jpg", "b.jpg", "inner/a.jpg"]
 
 
-@pytest.mark.parametrize("inside", ["photos", "photos/2024", "sparse", "dense/images", "other_models/1"])
-def test_photos_are_never_where_the_run_writes(tmp_path, inside):
-    (tmp_path / inside).mkdir(parents=True)
-
-    with pytest.raises(InputError, match="keeps its own files") as caught:
-        list_files(tmp_path / inside, tmp_path)
-    assert "-o" in caught.value.hint
-
-
-def test_photos_beside_what_the_run_writes_are_fine(folder, tmp_path):
-    (tmp_path / "my photos").mkdir()
-
-    assert list_files(tmp_path / "my photos", tmp_path) == []
-    with pytest.raises(InputError, match="cannot be the photos and the output"):
-        list_files(folder, folder)
-
-
 def test_a_list_names_the_photos(folder, out, tmp_path):
     names = tmp_path / "list.txt"
     names.write_text("\ufeffinner/a.jpg\r\n\nb.jpg\nb.jpg\nmissing.jpg\n../secret.jpg\n/etc/passwd\n", "utf-8")
