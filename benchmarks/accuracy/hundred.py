@@ -1,12 +1,13 @@
 #!/usr/bin/env python3
-"""What a hundred photos of 12 megapixels cost: seconds and memory of every stage, beside those of half as many.
+"""What hundreds of photos of 12 megapixels cost: seconds and memory of every stage, beside those of half as many.
 
 python benchmarks/accuracy/hundred.py --cache CACHE
-python benchmarks/accuracy/hundred.py --cache CACHE --counts 100 --set quality=draft
+python benchmarks/accuracy/hundred.py --cache CACHE --counts 50 100 --set quality=draft
 """
 
 import argparse
 import json
+import os
 import re
 import subprocess
 import sys
@@ -28,10 +29,11 @@ from sfm_app.synthetic.statue import statue, statue_views
 
 ABOUT = (
     "`sfm-app run` as a user types it, on two cores: photos of the rendered statue from all round, enlarged to 3000 x "
-    "4000 pixels (JPEG, quality 90). Seconds: as in the manifest. MB: most memory held at any moment of the stage by "
-    "the one process that goes through all stages, with the processes that it starts."
+    "4000 pixels (JPEG, quality 90). CPU: seconds of both cores together, which other work changes least. "
+    "Seconds: as in the manifest. MB: most memory held at any moment of the stage by the one process that goes through "
+    "all stages, with the processes that it starts."
 )
-PHOTOS, SMALL, LARGE, QUALITY = 100, (750, 1000), (3000, 4000), 90
+PHOTOS, SMALL, LARGE, QUALITY = 200, (750, 1000), (3000, 4000), 90
 EVERY_S = 0.1
 """Between looks at the memory."""
 
@@ -53,10 +55,10 @@ def photo_folder(count: int, cache: Path) -> Path:
     return part
 
 
-def memory_of_stages(command: Sequence[str]) -> dict[str, int]:
-    """Run `sfm-app run` and give the most memory of each stage, in MB. Linux only."""
+def cost_of_stages(command: Sequence[str]) -> tuple[dict[str, int], dict[str, float]]:
+    """Run `sfm-app run` and give the most memory of each stage, in MB, and its CPU seconds. Linux only."""
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    stage, peaks = [NAMES[0]], dict.fromkeys(NAMES, 0)
+    stage, peaks, spent = [NAMES[0]], dict.fromkeys(NAMES, 0), dict.fromkeys(NAMES, 0.0)
 
     def read(lines: Iterable[str]) -> None:
         for line in lines:
@@ -72,11 +74,19 @@ def memory_of_stages(command: Sequence[str]) -> dict[str, int]:
         held = held_mb(process.pid)
         if now == stage[0]:
             peaks[now] = max(peaks[now], held)
+            spent[now] = cpu_s(process.pid) or spent[now]
         time.sleep(EVERY_S)
     reader.join()
     if process.returncode:
         raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}")
-    return peaks
+    ends = [0.0, *spent.values()]
+    return peaks, {name: end - start for name, start, end in zip(NAMES, ends, ends[1:], strict=False)}
+
+
+def cpu_s(process: int) -> float:
+    """CPU seconds of a process and of its children that have ended; 0 where it has ended itself."""
+    after_name = text_of(Path(f"/proc/{process}/stat")).rpartition(")")[2].split()
+    return sum(map(int, after_name[11:15])) / os.sysconf("SC_CLK_TCK")
 
 
 def held_mb(process: int) -> int:
@@ -106,11 +116,11 @@ def measure(count: int, cache: Path, settings: Sequence[str]) -> Row:
     out = Path(tempfile.mkdtemp(prefix=f"run-{count}-", dir=cache / "hundred"))
     flags = [part for assignment in settings for part in ("--set", assignment)]
     photos = photo_folder(count, cache)
-    peaks = memory_of_stages([sys.executable, "-m", "sfm_app", "run", str(photos), "-o", str(out), *flags])
+    peaks, spent = cost_of_stages([sys.executable, "-m", "sfm_app", "run", str(photos), "-o", str(out), *flags])
     stages: dict[str, Any] = json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"]
     row: Row = {"method": "sfm-app", "photos": count, "placed": stages["scene"]["counts"]["registered"]}
     for name in NAMES:
-        row |= {f"s of {name}": stages[name]["seconds"], f"MB {name}": peaks[name]}
+        row |= {f"s of {name}": stages[name]["seconds"], f"CPU {name}": spent[name], f"MB {name}": peaks[name]}
     return row
 
 
@@ -118,22 +128,24 @@ def page(rows: Sequence[Row]) -> str:
     """One row per stage, and by number of photos its seconds and its memory."""
     lines: list[Row] = [
         {"stage": name}
+        | {f"CPU, {row['photos']} photos": row[f"CPU {name}"] for row in rows}
         | {f"s, {row['photos']} photos": row[f"s of {name}"] for row in rows}
         | {f"MB, {row['photos']} photos": row[f"MB {name}"] for row in rows}
         for name in NAMES
     ]
     total: Row = {"stage": "together"}
     for row in rows:
+        total[f"CPU, {row['photos']} photos"] = sum(row[f"CPU {name}"] for name in NAMES)
         total[f"s, {row['photos']} photos"] = sum(row[f"s of {name}"] for name in NAMES)
         total[f"MB, {row['photos']} photos"] = max(row[f"MB {name}"] for name in NAMES)
     placed = ", ".join(f"{row['placed']} of {row['photos']}" for row in rows)
-    return f"# A hundred photos\n\n{ABOUT} Photos that have a place: {placed}.\n\n{table([*lines, total])}"
+    return f"# Hundreds of photos\n\n{ABOUT} Photos that have a place: {placed}.\n\n{table([*lines, total])}"
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, help="keeps the rendered photos and the runs")
-    parser.add_argument("--counts", type=int, nargs="+", default=[50, 100], help="photos, each a divisor of 100")
+    parser.add_argument("--counts", type=int, nargs="+", default=[100, 200], help="photos, each a divisor of 200")
     parser.add_argument("--set", dest="settings", nargs="*", default=[], metavar="TABLE.KEY=VALUE")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--name", default="hundred", help="name of the result files")

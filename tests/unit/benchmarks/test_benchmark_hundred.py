@@ -1,11 +1,13 @@
-"""The benchmark of a hundred photos: its memory figures and its page."""
+"""The benchmark of hundreds of photos: its figures and its page."""
 
+import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
-from hundred import held_mb, page
+from hundred import cpu_s, held_mb, page
 
 from sfm_app.pipeline import NAMES
 
@@ -42,10 +44,20 @@ def test_a_process_that_has_ended_holds_nothing():
         assert held_mb(process.pid) == 0
 
 
+@LINUX_ONLY
+def test_cpu_seconds_are_those_of_the_process():
+    before, spent = time.process_time(), cpu_s(os.getpid())
+    while time.process_time() < before + 0.3:
+        pass
+
+    assert 0.25 < cpu_s(os.getpid()) - spent < 0.6
+
+
 def test_the_page_has_stages_in_rows_and_numbers_of_photos_in_columns():
     rows = [
         {"method": "sfm-app", "photos": count, "placed": count - 1}
         | {f"s of {name}": float(count) for name in NAMES}
+        | {f"CPU {name}": 2.0 * count for name in NAMES}
         | {f"MB {name}": 10 * count + number for number, name in enumerate(NAMES)}
         for count in (50, 100)
     ]
@@ -53,6 +65,8 @@ def test_the_page_has_stages_in_rows_and_numbers_of_photos_in_columns():
     lines = page(rows).splitlines()
 
     assert "49 of 50, 99 of 100" in lines[2]
-    assert "| stage | s, 50 photos | s, 100 photos | MB, 50 photos | MB, 100 photos |" in lines
-    assert "| mesh | 50 | 100 | 506 | 1006 |" in lines
-    assert f"| together | {50 * len(NAMES)} | {100 * len(NAMES)} | 508 | 1008 |" in lines
+    columns = " | ".join(f"{figure}, {count} photos" for figure in ("CPU", "s", "MB") for count in (50, 100))
+    assert f"| stage | {columns} |" in lines
+    assert "| mesh | 100 | 200 | 50 | 100 | 506 | 1006 |" in lines
+    n = len(NAMES)
+    assert f"| together | {n * 100} | {n * 200} | {n * 50} | {n * 100} | 508 | 1008 |" in lines
