@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
+from sfm_app.colmap.backend import check_written
 from sfm_app.colmap.backend import versions as colmap_versions
 from sfm_app.colmap.model import sparse_model
 from sfm_app.context import RunContext
@@ -207,6 +208,8 @@ def make(stage: Stage, products: Products, print_of_inputs: str, run: RunContext
     try:
         product = stage.make(products, run)
     except SfmError as err:
+        if isinstance(err, BackendError):
+            check_written(*(path for path in run.workspace.root.iterdir() if path.is_file()))
         logger.info("%s stopped: %s; counted so far: %s", stage.name, err, run.counts)
         raise
     seconds = round(time.perf_counter() - start, 2)
@@ -262,10 +265,17 @@ def versions() -> dict[str, str]:
     return {name: version(name) for name in parts} | colmap_versions()
 
 
+class LogFile(logging.FileHandler):
+    """A log that says nothing of a full disk: the run does."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        pass
+
+
 @contextmanager
 def logged(run: RunContext) -> Iterator[None]:
     """Keep a log in the output folder, with the traceback of whatever ends the run."""
-    handler = logging.FileHandler(run.workspace.log, encoding="utf-8", errors="backslashreplace")
+    handler = LogFile(run.workspace.log, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
     logger.addHandler(handler)
     logger.setLevel(logging.INFO)

@@ -1,5 +1,6 @@
 """The commands."""
 
+import errno
 import sys
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,8 @@ from sfm_app.pipeline import NAMES
 from sfm_app.plugins import load_plugins
 
 INTERRUPTED = 130
+FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
+"""What the system calls a disk that is full, for all or for this user."""
 
 
 class Commands(click.Group):
@@ -42,9 +45,16 @@ class Commands(click.Group):
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise
         except OSError as err:  # a full disk, a folder that went away
-            fail(f"{err.strerror or err}: {err.filename or 'a file of this run'}", "what was finished stays valid", 3)
+            fail(*told(err), 3)
         except Exception as err:  # a bug: the user gets one line, log.txt has the traceback
             fail(f"unexpected {type(err).__name__}: {err}", "this is a bug; please report it with OUT/log.txt", 1)
+
+
+def told(err: OSError) -> tuple[str, str]:
+    """What the system has refused, and what to do about it."""
+    if err.errno in FULL:
+        return f"the disk is full ({err.strerror})", "make room; the same command goes on where this one stopped"
+    return f"{err.strerror or err}: {err.filename or 'a file of this run'}", "what was finished stays valid"
 
 
 def fail(message: str, hint: str, code: int) -> None:

@@ -1,10 +1,12 @@
 """pycolmap, imported once and safely, and the one edge at which its errors become ours."""
 
 import contextlib
+import tempfile
 import zlib  # before pycolmap, whose own deflate symbols otherwise break every later use of zlib in this process
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
+from pathlib import Path
 from typing import Any
 
 import pycolmap
@@ -12,17 +14,30 @@ import pycolmap
 from sfm_app.errors import BackendError, SfmError
 from sfm_app.progress import Progress
 
-__all__ = ["backend", "counted", "has_cuda", "interruptible", "plain", "pycolmap", "show_log", "versions"]
+__all__ = [
+    "backend", "check_written", "counted", "has_cuda", "interruptible", "log_level", "plain", "pycolmap", "show_log",
+    "versions",
+]  # fmt: skip
+
+ROOM = 1_000_000
+"""Bytes that have to be left: more than any program keeps back before it writes."""
 
 zlib.crc32(b"")  # the import above is there for its side effect
 pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
 
 
+LEVELS = tuple(getattr(pycolmap.logging.Level, name).value for name in ("FATAL", "WARNING", "INFO"))
+
+
 def show_log(level: int) -> None:
     """Let COLMAP speak on stderr: 0 not at all, 1 warnings, 2 everything."""
-    levels = (pycolmap.logging.Level.FATAL, pycolmap.logging.Level.WARNING, pycolmap.logging.Level.INFO)
-    pycolmap.logging.minloglevel = levels[min(level, 2)].value
+    pycolmap.logging.minloglevel = LEVELS[min(level, 2)]
     pycolmap.logging.alsologtostderr = level > 0
+
+
+def log_level() -> int:
+    """What `show_log` has set last."""
+    return LEVELS.index(pycolmap.logging.minloglevel)
 
 
 def has_cuda() -> bool:
@@ -48,6 +63,18 @@ def backend(doing: str) -> Iterator[None]:
             f"COLMAP failed while {doing}: {reason[-1] if reason else type(err).__name__}",
             hint="run again with -v to see what COLMAP says",
         ) from err
+
+
+def check_written(*files: Path) -> None:
+    """Check that files which COLMAP has written could have been longer: it does not say when the disk is full.
+
+    Raises:
+        OSError: nothing more can be written, and why.
+    """
+    longest = max((file.stat().st_size for file in files), default=0)
+    with tempfile.TemporaryFile(dir=files[0].parent) as probe:
+        probe.seek(longest)
+        probe.write(bytes(ROOM))
 
 
 def interruptible(call: Callable[["pycolmap.CancellationToken"], None], poll: Callable[[], None]) -> None:

@@ -1,6 +1,7 @@
 """COLMAP's SQLite database: photos and cameras in, keypoints and matches out, our epipolar geometries and K back in."""
 
 import contextlib
+import ctypes
 import sqlite3
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -49,7 +50,11 @@ def opened(path: Path) -> Iterator[Any]:
     try:
         yield database
     finally:
-        database.close()
+        try:
+            database.close()
+        except RuntimeError:  # a full disk; its destructor would try once more, and end the program
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(database))
+            raise
 
 
 def is_sound(path: Path) -> bool:
@@ -74,7 +79,7 @@ def create_database(path: Path, photos: PhotoSet) -> None:
 
     Feature extraction would do it too, but numbers photos as its threads finish with them: not twice the same.
     """
-    with opened(path) as database, pycolmap.DatabaseTransaction(database):
+    with opened(path) as database:
         for camera_id, members in enumerate(photos.groups.values(), start=1):
             size = members[0].width, members[0].height
             _write_camera(database, camera_id, Calibration(guessed_camera_matrix(size), *size, "guess", False))
@@ -103,7 +108,7 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
 
 def write_epipolar_fits(path: Path, matches: MatchGraph, fits: Mapping[PairId, EpipolarFit]) -> None:
     """Replace all two-view geometries by ours."""
-    with opened(path) as database, pycolmap.DatabaseTransaction(database):
+    with opened(path) as database:
         database.clear_two_view_geometries()
         for pair, fit in fits.items():
             database.write_two_view_geometry(*pair, _two_view_geometry(fit, matches.matches[pair]))
@@ -111,7 +116,7 @@ def write_epipolar_fits(path: Path, matches: MatchGraph, fits: Mapping[PairId, E
 
 def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
     """Replace all two-view geometries by our relative poses, with the essential matrices they stand for."""
-    with opened(path) as database, pycolmap.DatabaseTransaction(database):
+    with opened(path) as database:
         database.clear_two_view_geometries()
         for pair, pose in graph.poses.items():
             database.write_two_view_geometry(*pair, _posed_geometry(pose, matches.matches[pair]))
@@ -125,7 +130,7 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
     """
     used = {image.id: intrinsics.name_of(image) for image in matches.images.values()}
     ids = {name: number for number, name in enumerate(dict.fromkeys(used[key] for key in sorted(used)), start=1)}
-    with opened(path) as database, pycolmap.DatabaseTransaction(database):
+    with opened(path) as database:
         database.clear_frames()
         database.clear_rigs()
         for name, camera_id in ids.items():

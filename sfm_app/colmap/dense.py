@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import backend, counted, pycolmap
+from sfm_app.colmap.apart import relay, started
+from sfm_app.colmap.backend import backend, check_written, pycolmap
 from sfm_app.progress import Progress
 from sfm_app.stereo import DepthMap, Estimate, Kind, View
 
-JPEG_QUALITY = 98
 DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
 
 
@@ -22,22 +22,14 @@ def undistort(
     """Write photos without distortion and the model that fits them into a dense workspace.
 
     Raises:
-        BackendError: COLMAP cannot read the model or the photos.
+        BackendError: COLMAP cannot read the model or the photos, or cannot write.
     """
-    options = pycolmap.UndistortCameraOptions()
-    options.max_image_size = max_side_px
-    photos = dense_dir / "images"
-    photos.mkdir(parents=True, exist_ok=True)
-
-    def call(token: "pycolmap.CancellationToken") -> None:
-        pycolmap.undistort_images(
-            dense_dir, model_dir, photo_dir, undistort_options=options, jpeg_quality=JPEG_QUALITY,
-            num_threads=workers, cancellation_token=token,
-        )  # fmt: skip
-
-    with backend("undistorting photos"):
-        total = pycolmap.Reconstruction(model_dir).num_reg_images()
-        counted(call, lambda: sum(path.is_file() for path in photos.rglob("*")), "undistorting", total, progress)
+    (dense_dir / "images").mkdir(parents=True, exist_ok=True)
+    places = {"dense": str(dense_dir), "model": str(model_dir), "photos": str(photo_dir)}
+    task = {**places, "max_side_px": max_side_px, "workers": workers}
+    with started("sfm_app.colmap.undistort_process", task) as process:
+        relay(process, progress)
+        process.check("undistorting photos")
 
 
 def read_views(dense_dir: Path) -> list[View]:
@@ -154,4 +146,5 @@ def _whole(target: Path) -> Iterator[Path]:
     target.parent.mkdir(parents=True, exist_ok=True)
     beside = target.with_name(f".{target.name}")
     yield beside
+    check_written(beside)
     beside.replace(target)

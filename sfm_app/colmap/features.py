@@ -1,72 +1,33 @@
-"""COLMAP's SIFT features and raw matches, on CPU, without its geometric verification."""
+"""SIFT features and raw matches of all photos: a process of its own fills the database."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sfm_app.colmap.backend import counted, plain, pycolmap
-from sfm_app.colmap.database import opened
+from sfm_app.colmap.apart import relay, started
 from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
 
 
-def extract_features(
+def find_and_match(
     database: Path, photo_dir: Path, names: Sequence[str], options: MatchSettings, workers: int, progress: Progress
 ) -> dict[str, Any]:
-    """Find SIFT features of all photos; returns the options in force for the manifest."""
-    extraction = pycolmap.FeatureExtractionOptions()
-    extraction.max_image_size = options.max_image_size_px
-    extraction.num_threads = workers
-    extraction.use_gpu = False
-    extraction.sift.max_num_features = options.max_features
+    """Find features of all photos and match every photo with every other; what is in the database stays.
 
-    def call(token: Any) -> None:
-        pycolmap.extract_features(
-            database, photo_dir, list(names), extraction_options=extraction,
-            device=pycolmap.Device.cpu, cancellation_token=token,
-        )  # fmt: skip
+    Returns:
+        The options in force, for the manifest.
 
-    def done(reader: Any) -> int:
-        return sum(reader.exists_keypoints(image_id) for image_id in range(1, len(names) + 1))
-
-    _counted(call, database, done, ("features", len(names)), progress)
-    return plain(extraction.todict())
-
-
-def match_exhaustively(
-    database: Path, photos: int, options: MatchSettings, workers: int, progress: Progress
-) -> dict[str, Any]:
-    """Match every photo with every other; returns the options in force for the manifest."""
-    matching = pycolmap.FeatureMatchingOptions()
-    matching.skip_geometric_verification = True
-    matching.num_threads = workers
-    matching.use_gpu = False
-    matching.sift.max_ratio = options.max_ratio
-
-    def call(token: Any) -> None:
-        pycolmap.match_exhaustive(
-            database, matching_options=matching, device=pycolmap.Device.cpu, cancellation_token=token
-        )
-
-    def done(reader: Any) -> int:
-        return int(reader.num_matched_image_pairs())
-
-    _counted(call, database, done, ("matching", math.comb(photos, 2)), progress)
-    return plain(matching.todict())
-
-
-def _counted(
-    call: Callable[[Any], None],
-    database: Path,
-    done: Callable[[Any], int],
-    work: tuple[str, int],
-    progress: Progress,
-) -> None:
-    """Run a COLMAP call and show how far it is, as read from the database.
-
-    The reader is COLMAP's own SQLite, opened once before the call: a second SQLite in the process (Python's) would drop
-    the locks of the first whenever it closes the file, and COLMAP aborts.
+    Raises:
+        BackendError: COLMAP failed.
     """
-    with opened(database) as reader:
-        counted(call, lambda: done(reader), *work, progress)
+    task = {
+        "database": str(database),
+        "photos": str(photo_dir),
+        "names": list(names),
+        "options": options.model_dump(),
+        "workers": workers,
+    }
+    with started("sfm_app.colmap.feature_process", task) as process:
+        found = relay(process, progress)
+        process.check("matching photos" if found else "finding features")
+    return found

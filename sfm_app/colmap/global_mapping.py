@@ -1,27 +1,27 @@
-"""COLMAP's global mapper as a process of its own: SCRATCH PHOTOS SEED; see `mapping.map_globally`."""
+"""COLMAP's global mapper as a process of its own; see `mapping.map_globally`."""
 
-import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.apart import served
+from sfm_app.colmap.backend import check_written, pycolmap
 from sfm_app.colmap.mapping import largest
 
 ADJUSTMENTS, GAIN = 2, 1e-3
 """Rounds of adjustment, and the share of its cost that a step must gain."""
 
 
-def main(scratch: Path, photo_dir: Path, seed: int) -> None:
-    """Write the largest model into SCRATCH/model; nothing where there is none."""
-    names = json.loads((scratch / "names.json").read_text(encoding="utf-8"))
+def work(task: dict[str, Any]) -> None:
+    """Write the largest model into `model` in the scratch folder; nothing where there is none."""
+    scratch, options = Path(task["scratch"]), global_options(task["seed"], task["names"])
     (scratch / "all").mkdir()
-    models = pycolmap.global_mapping(scratch / "database.db", photo_dir, scratch / "all", global_options(seed, names))
+    models = pycolmap.global_mapping(scratch / "database.db", Path(task["photos"]), scratch / "all", options)
     model = largest(models)
     if model is not None:
         (scratch / "model").mkdir()
         model.write(scratch / "model")
+        check_written(*(scratch / "model").iterdir())
 
 
 def global_options(seed: int, names: Sequence[str]) -> Any:
@@ -41,4 +41,4 @@ def global_options(seed: int, names: Sequence[str]) -> Any:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]))
+    served(work)

@@ -4,16 +4,13 @@ Both run on one thread each: COLMAP's sums over several threads come out differe
 repeated structure that decided whether a model was right.
 """
 
-import contextlib
-import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.apart import started
+from sfm_app.colmap.backend import check_written, pycolmap
 from sfm_app.colmap.database import SQUARE_PIXELS
 
 LOCAL_GAIN, GLOBAL_GAIN, GLOBAL_REFINEMENT = 1e-3, 1e-4, 1.3
@@ -21,6 +18,7 @@ LOCAL_GAIN, GLOBAL_GAIN, GLOBAL_REFINEMENT = 1e-3, 1e-4, 1.3
 adjusted again when the model has grown by the third."""
 KNOWN_LOCAL_GAIN, KNOWN_GLOBAL_GAIN, KNOWN_GLOBAL_REFINEMENT = 1e-2, 1e-3, 2.0
 """The same where K is known: poses and points alone converge in a few steps, and the last adjustment is ours."""
+POLL_S = 0.1
 
 
 def map_incrementally(
@@ -43,6 +41,7 @@ def map_incrementally(
     for name in ("start", "found"):
         (scratch / name).mkdir(parents=True)
     start.write(scratch / "start")
+    check_written(*(scratch / "start").iterdir())
     options = incremental_options(seed, known=known)
     seek_lens = not known and all(_lens_to_be_found(camera) for camera in start.cameras.values())
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = seek_lens
@@ -82,27 +81,17 @@ def map_globally(photo_dir: Path, names: Sequence[str], scratch: Path, seed: int
         The model; None where it was stopped, or found nothing.
 
     Raises:
-        RuntimeError: COLMAP failed.
+        BackendError: COLMAP failed.
     """
+    task = {"scratch": str(scratch), "photos": str(photo_dir), "seed": seed, "names": list(names)}
     try:
-        (scratch / "names.json").write_text(json.dumps(list(names)), encoding="utf-8")
-        command = [sys.executable, "-m", "sfm_app.colmap.global_mapping", str(scratch), str(photo_dir), str(seed)]
-        # what it says goes to a file: nobody empties a pipe while it runs, and a full one would make it wait for ever
-        said = scratch / "errors.txt"
-        with (
-            said.open("wb") as errors,
-            subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors) as process,  # noqa: S603 - our module
-        ):
-            while process.poll() is None:
+        with started("sfm_app.colmap.global_mapping", task) as process:
+            while not process.ended(POLL_S):
                 if token.is_cancelled:
-                    process.kill()
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    process.wait(0.1)
-        if process.returncode and not token.is_cancelled:
-            lines = said.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            raise RuntimeError(lines[-1] if lines else f"the global mapper ended with {process.returncode}")
+                    return None
+            process.check("mapping all photos at once")
         found = scratch / "model"
-        return pycolmap.Reconstruction(found) if found.exists() and not token.is_cancelled else None
+        return pycolmap.Reconstruction(found) if found.exists() else None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
 

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import backend, pycolmap
+from sfm_app.colmap.backend import backend, check_written, pycolmap
 from sfm_app.stereo import View
 from sfm_app.types import Surface
 
@@ -41,6 +41,7 @@ def fuse(dense_dir: Path, views: Sequence[View], min_views: int, box: NDArray[np
     options.num_threads = 1  # with more, the points depend on which thread comes first
     with backend("fusing depth maps"):
         pycolmap.stereo_fusion(target, dense_dir, options=options, output_type="ply")
+        check_written(target)
         target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; nobody asks
 
 
@@ -65,6 +66,7 @@ def poisson(dense_dir: Path, depth: int) -> Surface:
     path = dense_dir / "poisson.ply"
     with backend("finding the surface"):
         pycolmap.poisson_meshing(dense_dir / FUSED, path, options=options)
+        check_written(path)
         surface = _read(path)
         path.unlink()
     return surface
@@ -89,6 +91,7 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
     with backend("simplifying the surface"):
         trimesh.Trimesh(surface.vertices, surface.faces, process=False).export(given)
         pycolmap.simplify_mesh(given, found, options)
+        check_written(given, found)
         simple = _read(found)
         given.unlink()
         found.unlink()

@@ -15,6 +15,7 @@ from sfm_app.colmap.backend import backend, interruptible
 from sfm_app.colmap.mapping import map_globally, map_incrementally, prepare_globally
 from sfm_app.colmap.model import model_from_seed
 from sfm_app.context import RunContext
+from sfm_app.errors import BackendError
 from sfm_app.reconstruction.left_out import names_of
 from sfm_app.reconstruction.seeds import Candidate, rank_seeds, seed_of
 from sfm_app.reconstruction.support import Explained, explained_pairs, support
@@ -182,7 +183,7 @@ def _all_at_once(group: Group, run: RunContext, stop: Stop) -> Attempt:
     names, scratch = names_of(group.photos, group.matches), run.workspace.root / GLOBAL_FOLDER
     try:
         model = None if stop.is_cancelled else map_globally(run.workspace.photos, names, scratch, run.seed, stop)
-    except RuntimeError as err:  # another mapper may do better
+    except BackendError as err:  # another mapper may do better
         logger.info("the global mapper failed: %s", err)
         return Attempt("global", None, {}, f"all at once: failed, {err}")
     finally:

@@ -2,7 +2,7 @@
 
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import create_database, is_sound, read_match_graph, remove_database
-from sfm_app.colmap.features import extract_features, match_exhaustively
+from sfm_app.colmap.features import find_and_match
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import NOTHING_MATCHED, why_no_scene
 from sfm_app.types import MatchGraph, PhotoSet
@@ -26,16 +26,13 @@ def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
         with backend("entering photos"):
             create_database(place.database, photos)
         marker.write_text(run.inputs, encoding="utf-8")
-    with backend("finding features"):
-        extraction = extract_features(place.database, place.photos, names, options, run.workers, run.progress)
-    with backend("matching photos"):
-        matching = match_exhaustively(place.database, len(names), options, run.workers, run.progress)
+    in_force = find_and_match(place.database, place.photos, names, options, run.workers, run.progress)
     graph = load_match_graph(photos, run)
     run.record(
         keypoints={graph.images[key].name: len(points) for key, points in graph.keypoints.items()},
         pairs=len(graph.matches),
         matches=sum(len(rows) for rows in graph.matches.values()),
-        colmap={"extraction": extraction, "matching": matching},
+        colmap=in_force,
     )
     marker.unlink()
     if not graph.matches:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sfm_app.colmap.backend import backend
+from sfm_app.colmap.backend import backend, check_written
 from sfm_app.colmap.bundle import Adjusted, adjust
 from sfm_app.colmap.model import colour, photos_of, read_scene, sparse_model
 from sfm_app.context import RunContext
@@ -118,6 +118,7 @@ def write_model(model: Any, target: Path) -> None:
     beside.mkdir(parents=True)
     with backend("writing the sparse model"):
         model.write(beside)
+        check_written(*beside.iterdir())
     shutil.rmtree(target, ignore_errors=True)
     beside.rename(target)
 

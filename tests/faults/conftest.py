@@ -1,8 +1,9 @@
 """A small folder of photos, and what a run that nobody disturbed makes of it."""
 
+import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -29,15 +30,20 @@ class Folder:
         names += [f"sparse/{part}.bin" for part in ("cameras", "images", "points3D")]
         return {name: (out / name).read_bytes() for name in names}
 
-    def command(self, out: Path) -> list[str]:
-        """Arguments of `sfm-app`."""
-        return ["run", str(self.photos), "-o", str(out), *QUICK]
-
-    def run(self, out: Path, point: str = "count") -> "subprocess.CompletedProcess[str]":
-        """`sfm-app run` in a process of its own, killed at a point."""
-        script = Path(__file__).with_name("killed.py")
-        command = [sys.executable, str(script), point, *self.command(out)]
+    def run(self, out: Path, what: str = "kill", moment: str = "never") -> "subprocess.CompletedProcess[str]":
+        """`sfm-app run` in a process of its own, disturbed at a moment."""
+        script = Path(__file__).with_name("disturbed.py")
+        command = [sys.executable, str(script), what, moment, "run", str(self.photos), "-o", str(out), *QUICK]
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+
+    def copied(self, place: Path) -> "Folder":
+        """The same photos in a place where they may be spoilt."""
+        shutil.copytree(self.photos, place / "photos")
+        return replace(self, photos=place / "photos")
+
+    def moment(self, share: float) -> int:
+        """The number of the file that appears after this share of all."""
+        return 1 + round(share * (self.appeared - 1))
 
 
 @pytest.fixture(scope="session")
@@ -48,3 +54,15 @@ def undisturbed(tmp_path_factory):
     done = Folder(place / "photos", place / "out", 0).run(place / "out")
     assert done.returncode == 0, done.stderr
     return Folder(place / "photos", place / "out", int(done.stdout.split()[-1]))
+
+
+@pytest.fixture
+def refused():
+    """Checks that a run ended with one line and a hint, and with nothing that users should not see."""
+
+    def check(done, *codes):
+        assert done.returncode in codes, done.stderr
+        lines = done.stderr.strip().splitlines()
+        assert len(lines) == 2 and lines[0].startswith("error: ") and lines[1].startswith("hint: "), done.stderr
+
+    return check

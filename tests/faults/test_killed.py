@@ -8,8 +8,8 @@ import pytest
 KILLED = -9
 STEPS = 15
 """So many steps lie between the first file that appears and the last."""
-ALWAYS = {"before:4", "after:12", "match_exhaustive:60"}
-IN_COLMAP = ["extract_features:60", "extract_features:400", "match_exhaustive:60", "undistort_images:40"]
+ALWAYS = {"before:4", "after:12", "matching:60"}
+IN_COLMAP = [f"{what}:{ms}" for what in ("features", "matching", "undistorting") for ms in (0, 60, 400)]
 
 needs_time = pytest.mark.skipif("SFM_APP_FAULTS" not in os.environ, reason="`make faults` tries all points")
 
@@ -21,10 +21,10 @@ POINTS = [f"{when}:{step}" for when in ("before", "after") for step in range(STE
 def test_a_killed_run_ends_with_the_same_bytes(undisturbed, tmp_path, point):
     when, amount = point.split(":")
     if when in ("before", "after"):
-        amount = str(1 + round(int(amount) * (undisturbed.appeared - 1) / STEPS))
+        amount = str(undisturbed.moment(int(amount) / STEPS))
     out = tmp_path / "out"
 
-    killed = undisturbed.run(out, f"{when}:{amount}")
+    killed = undisturbed.run(out, "kill", f"{when}:{amount}")
     assert killed.returncode == KILLED, killed.stderr
     stages = json.loads((out / "manifest.json").read_text())["stages"] if (out / "manifest.json").exists() else {}
     for stage in stages.values():  # the manifest is never ahead of the files

@@ -137,7 +137,7 @@ def test_why_a_model_was_taken_is_said():
 
 
 def test_a_global_mapper_that_fails_leaves_the_other_model(try_out):
-    found, _ = try_out([9], at_once=RuntimeError("bad day"))
+    found, _ = try_out([9], at_once=BackendError("bad day"))
 
     assert summary(found) == [("incremental", 9), ("global", 0)]
     assert found[1].note == "all at once: failed, bad day"

@@ -1,0 +1,149 @@
+"""Parts of COLMAP in processes of their own: some cannot be stopped, and some end the program they run in.
+
+COLMAP aborts where its database cannot be written, and a decoder may crash on a photo. In a process of its own that is
+an error like any other. It ends when the program that started it ends, however that ends: nothing goes on writing.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from typing import IO, Any
+
+from sfm_app.colmap.backend import log_level, show_log
+from sfm_app.errors import BackendError
+from sfm_app.progress import Progress
+
+ENDED_EARLY = 1
+REPORTS = 3
+"""File descriptor for what a process says to the one that started it."""
+
+
+class Apart:
+    """A running process."""
+
+    def __init__(self, process: "subprocess.Popen[str]", said: IO[bytes]) -> None:
+        self.process, self._said = process, said
+
+    def messages(self) -> Iterator[dict[str, Any]]:
+        """What it reports, until it ends."""
+        for line in self.process.stdout or ():
+            if line.endswith("\n"):  # else it was killed as it spoke
+                yield json.loads(line)
+
+    def ended(self, wait_s: float) -> bool:
+        """Whether it has ended, or does so within that time."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(wait_s)
+        return self.process.poll() is not None
+
+    def check(self, doing: str) -> None:
+        """Wait for its end, and see that it went well.
+
+        Raises:
+            BackendError: it failed, or it was ended.
+        """
+        code = self.process.wait()
+        if not code:
+            return
+        if code == -signal.SIGKILL:
+            raise BackendError(
+                f"COLMAP was ended from outside while {doing}: perhaps the memory was full",
+                hint="run again with --workers 1, or with --quality draft",
+            )
+        self._said.seek(0)
+        lines = self._said.read().decode(errors="replace").split("\n")
+        last = next((line.strip() for line in reversed(lines) if line.strip()), f"it ended with {code}")
+        why = last if code > 0 else f"it crashed ({signal.Signals(-code).name})"  # what it says then is addresses
+        raise BackendError(f"COLMAP failed while {doing}: {why}", hint="run again with -v to see what COLMAP says")
+
+
+@contextlib.contextmanager
+def started(module: str, task: Mapping[str, Any]) -> Iterator[Apart]:
+    """A module of ours at work on a task; ended with the block, if it still runs.
+
+    Args:
+        module: calls `served`.
+        task: as JSON can hold it.
+    """
+    command = [sys.executable, "-m", module]
+    loud = log_level()
+    # what it says goes to a file: nobody empties a pipe while it runs, and a full one would make it wait for ever
+    with (
+        tempfile.TemporaryFile() as said,
+        subprocess.Popen(  # noqa: S603 - our module
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=None if loud else said, text=True
+        ) as process,
+    ):
+        try:
+            with contextlib.suppress(BrokenPipeError):  # it has failed already: `check` says how
+                print(json.dumps({"log_level": loud, **task}), file=process.stdin, flush=True)
+            yield Apart(process, said)
+        finally:
+            if process.poll() is None:
+                process.kill()
+
+
+def served(work: Callable[[dict[str, Any]], None]) -> None:
+    """In the process: do the task, and end when the one that started it does."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one that started it
+    os.dup2(sys.stdout.fileno(), REPORTS)
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints is no report
+    line = sys.stdin.readline()
+    if not line:
+        return
+    task = json.loads(line)
+    show_log(task["log_level"])
+
+    def watch() -> None:
+        while os.read(sys.stdin.fileno(), 1):
+            pass
+        os._exit(ENDED_EARLY)
+
+    threading.Thread(target=watch, daemon=True).start()
+    work(task)
+
+
+def report(**message: Any) -> None:
+    """In the process: say something to the one that started it."""
+    os.write(REPORTS, f"{json.dumps(message)}\n".encode())
+
+
+class Reported:
+    """Progress that goes to the one that started the process."""
+
+    def stage(self, name: str, note: str = "") -> None: ...
+
+    def stage_done(self, seconds: float) -> None: ...
+
+    def start(self, label: str, total: int) -> None:
+        report(start=label, total=total)
+
+    def advance(self, steps: int = 1) -> None:
+        report(advance=steps)
+
+    def finish(self) -> None:
+        report(finish=True)
+
+
+def relay(process: Apart, progress: Progress) -> dict[str, Any]:
+    """Show the progress of a process until it ends; what else it has reported comes back."""
+    found: dict[str, Any] = {}
+    try:
+        for message in process.messages():
+            if "start" in message:
+                progress.start(message["start"], message["total"])
+            elif "advance" in message:
+                progress.advance(message["advance"])
+            elif "finish" in message:
+                progress.finish()
+            else:
+                found |= message
+    finally:
+        progress.finish()
+    return found
