@@ -112,6 +112,8 @@ def chosen_from(source: Path, run: RunContext) -> Chosen:
 
 def write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None:
     """Write the frames that are not there yet."""
+    for half in run.workspace.frames.glob(".*"):  # of a run that was killed while it wrote
+        half.unlink()
     places = {frame: run.workspace.frames / f"{stem_of(source)}_{frame:06d}.jpg" for frame in frames}
     missing = [frame for frame, place in places.items() if not place.exists()]
     if not missing:

@@ -80,11 +80,13 @@ def test_a_killed_run_does_not_choose_again(clip, run):
     run.workspace.frames_marker.write_text(json.dumps(marker))
     first, second = sorted(run.workspace.frames.iterdir())[:2]
     second.unlink()
+    second.with_name(f".{second.stem}.123.jpg").write_bytes(b"half")
     stamp = first.stat().st_mtime_ns
 
     killed(clip, run)
 
     assert len(json.loads(run.workspace.frames_marker.read_text())["frames"]) == 3
+    assert not list(run.workspace.frames.glob(".*"))
     assert second.exists() and first.stat().st_mtime_ns == stamp
 
 
