@@ -45,12 +45,12 @@ def reconstruct(
     photos: PathLike, out: PathLike, settings: Settings | None = None, *,
     first: str = "", last: str = "files", progress: Progress | None = None,
 ) -> Run:  # fmt: skip
-    """Turn a folder of photos into a mesh: OUT/model.ply and OUT/model.glb.
+    """Turn a folder of photos, or a video, into a mesh: OUT/model.ply and OUT/model.glb.
 
     What lies in `out` already and is up to date is not done again.
 
     Args:
-        photos: folder with JPEG or PNG photos of one place; nothing about the camera needs to be known.
+        photos: folder with photos of one place, or a video; nothing about the camera needs to be known.
         out: output folder; made if it is not there.
         settings: defaults where None.
         first: do everything from this stage on again.
@@ -121,10 +121,10 @@ def calibrate_photos(
     photos: PathLike, settings: Settings | None = None, *,
     out: PathLike | None = None, figure: PathLike | None = None, progress: Progress | None = None,
 ) -> Intrinsics:  # fmt: skip
-    """Find the camera matrix of a folder of photos, without reconstructing the scene.
+    """Find the camera matrix of a folder of photos, or of a video, without reconstructing the scene.
 
     Args:
-        photos: folder with photos.
+        photos: folder with photos, or a video.
         settings: defaults where None.
         out: keeps features and matches there for a later run; a temporary folder where None.
         figure: PNG, SVG or PDF file in which the pairs' votes and zero curves are drawn; none where None.

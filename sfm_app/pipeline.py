@@ -18,9 +18,10 @@ from sfm_app.colmap.model import sparse_model
 from sfm_app.context import RunContext
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError, SfmError
 from sfm_app.parallel import ordered_map
-from sfm_app.photos import place_of
+from sfm_app.photos import head_of, is_video, place_of
 from sfm_app.stages.depth_maps import make_depth_maps
 from sfm_app.stages.files import load_files, write_files
+from sfm_app.stages.frames import photos_of, settings_for
 from sfm_app.stages.intrinsics import calibrate, load_intrinsics
 from sfm_app.stages.match_graph import load_match_graph, match_photos
 from sfm_app.stages.mesh import load_surface, make_mesh
@@ -28,7 +29,7 @@ from sfm_app.stages.photos import files_of, load_photo_set, read_photos
 from sfm_app.stages.scene import load_scene, reconstruct_scene
 from sfm_app.stages.texture import load_texture, make_texture
 from sfm_app.stages.view_graph import build_view_graph, load_view_graph
-from sfm_app.types import Model
+from sfm_app.types import Model, PhotoSet
 from sfm_app.workspace import StageRecord, fingerprint
 
 logger = logging.getLogger("sfm_app")
@@ -54,8 +55,8 @@ class Stage:
 
 STAGES = (
     Stage(
-        "photos", (), ("photos",), ("photos.json", "photos"),
-        make=lambda products, run: read_photos(products("folder"), run),
+        "photos", (), ("photos",), ("photos.json", "photos", "frames"),
+        make=lambda products, run: photos_from(products("folder"), run),
         load=lambda _, run: load_photo_set(run),
     ),
     Stage(
@@ -158,6 +159,7 @@ def run_stages(
 ) -> Products:
     """Run what is not up to date, up to stage `last`; everything from stage `first` on is done again.
 
+    The folder may be a video.
     Stages whose files are damaged are done again, too. The products of the stages `wanted` are read before it ends.
 
     Raises:
@@ -166,7 +168,9 @@ def run_stages(
     for name in filter(None, (first, last)):
         if name not in NAMES:
             raise ConfigError(f"no stage is named '{name}'", hint=f"stages: {', '.join(NAMES)}")
-    photos = folder_fingerprint(folder, run)
+    run.settings = settings_for(folder, run.settings)
+    run.workspace.keep_apart(folder)
+    photos = source_fingerprint(folder, run)
     run.workspace.create()
     with run.workspace.held(), logged(run):
         for _ in STAGES:
@@ -228,23 +232,34 @@ def peak_memory_mb() -> int | None:
     return int(found[1]) // 1024 if found else None
 
 
-def folder_fingerprint(folder: Path, run: RunContext) -> str:
-    """Hash of the names and bytes of all files in the photo folder."""
+def photos_from(source: Path, run: RunContext) -> PhotoSet:
+    """The photos of a folder, or the frames of a video."""
+    with photos_of(source, run) as folder:
+        return read_photos(folder, run)
+
+
+def source_fingerprint(folder: Path, run: RunContext) -> str:
+    """Hash of the names and bytes of all files in the photo folder, or of the bytes of a video."""
+    if is_video(head_of(folder)):
+        return fingerprint(str(folder.resolve()), digest(folder))
     names = files_of(folder, run)
 
-    def digest(name: str) -> str:
+    def digest_of(name: str) -> str:
         place = place_of(folder, name)
-        if isinstance(place, str):
-            return place
-        try:
-            with place.open("rb") as file:
-                return hashlib.file_digest(file, "blake2b").hexdigest()
-        except OSError:
-            return "unreadable"
+        return place if isinstance(place, str) else digest(place)
 
     return fingerprint(
-        str(folder.resolve()), names, list(ordered_map(run.executor, digest, names, ahead=4 * run.workers))
+        str(folder.resolve()), names, list(ordered_map(run.executor, digest_of, names, ahead=4 * run.workers))
     )
+
+
+def digest(file: Path) -> str:
+    """Hash of the bytes of a file."""
+    try:
+        with file.open("rb") as opened:
+            return hashlib.file_digest(opened, "blake2b").hexdigest()
+    except OSError:
+        return "unreadable"
 
 
 def stage_fingerprint(stage: Stage, prints: Mapping[str, str], run: RunContext) -> str:

@@ -32,6 +32,7 @@ class PhotoSettings(Section):
         description="auto: same size and same EXIF camera share one; single: all share one; folder: those of a folder; "
         "each: none share",
     )
+    max_frames: int = Field(100, ge=2, le=2000, description="most frames of a video that are used")
     keep_all: bool = Field(False, description="use copies of photos, too")
     max_megapixels: float = Field(64.0, ge=0.1, le=178, description="larger photos are scaled down to so many")
     min_side_px: int = Field(64, ge=16, le=4096, description="photos with a shorter side are left out, in pixels")

@@ -20,7 +20,7 @@ from sfm_app.errors import InputError
 MANIFEST = "manifest.json"
 DATABASE = "database.db"
 CALIBRATION = "calibration.json"
-WRITTEN = ("photos", "sparse", "dense", "other_models", DATABASE, CALIBRATION)
+WRITTEN = ("photos", "frames", "sparse", "dense", "other_models", DATABASE, CALIBRATION)
 """What a run removes before it writes it."""
 SHARED = (DATABASE, CALIBRATION)
 """Files that later stages add to."""
@@ -53,6 +53,16 @@ class Workspace:
     def photos(self) -> Path:
         """Upright photos that COLMAP can read: links where the file is fine, copies where not."""
         return self.root / "photos"
+
+    @property
+    def frames(self) -> Path:
+        """The chosen frames of a video."""
+        return self.root / "frames"
+
+    @property
+    def frames_marker(self) -> Path:
+        """Beside the frames until they are read: which were chosen, and what from."""
+        return self.root / "frames.unfinished.json"
 
     @property
     def database(self) -> Path:

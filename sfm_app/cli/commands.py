@@ -66,7 +66,7 @@ def fail(message: str, hint: str, code: int) -> None:
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="sfm-app")
 def main() -> None:
-    """Turn a folder of photos about which nothing is known into a 3D model."""
+    """Turn a folder of photos, or a video, about which nothing is known into a 3D model."""
 
 
 @main.command()
@@ -79,7 +79,7 @@ def main() -> None:
 @settings_options
 @output_options
 def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: Any) -> None:
-    """Reconstruct PHOTOS: camera, poses and a mesh as OUT/model.ply and OUT/model.glb.
+    """Reconstruct PHOTOS, a folder or a video: camera, poses and a mesh as OUT/model.ply and OUT/model.glb.
 
     What lies in OUT and is up to date is not done again: an interrupted run goes on where it stopped.
     """
@@ -100,7 +100,7 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
 @settings_options
 @output_options
 def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any) -> None:
-    """Find the camera matrix of PHOTOS, without reconstructing the scene."""
+    """Find the camera matrix of PHOTOS, a folder or a video, without reconstructing the scene."""
     progress = Terminal(quiet=flags["quiet"])
     found = calibrate_photos(photos, settings_from(flags), out=out, figure=figure, progress=progress)
     print_json(intrinsics_summary(found)) if flags["as_json"] else print_lines(intrinsics_lines(found))

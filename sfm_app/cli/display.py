@@ -89,6 +89,7 @@ def run_summary(run: Run) -> dict[str, Any]:
     summary: dict[str, Any] = {
         "out": str(run.out),
         "photos": {key: photos.get(key, {}) for key in ("usable", "unusable", "notes")},
+        **({"video": photos["video"]} if "video" in photos else {}),
         "pairs": {key: counts.get("view_graph", {}).get(key) for key in ("kept", "rejected")},
         "calibration": intrinsics_summary(run.calibration) if run.calibration else None,
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
@@ -106,7 +107,8 @@ def run_summary(run: Run) -> dict[str, Any]:
 def run_lines(run: Run) -> list[str]:
     """The figures of a run, for people."""
     summary = run_summary(run)
-    lines = [f"photos      {summary['photos']['usable']} usable"]
+    lines = list(video_lines(summary["video"])) if "video" in summary else []
+    lines.append(f"photos      {summary['photos']['usable']} usable")
     lines += [f"            {line}" for line in photo_lines(summary["photos"])]
     if summary["pairs"]["kept"] is not None:
         rejected = ", ".join(f"{count} {reason}" for reason, count in summary["pairs"]["rejected"].items())
@@ -129,6 +131,14 @@ def run_lines(run: Run) -> list[str]:
         + f"; all {sum(seconds.values()):.1f}"
     )
     return lines
+
+
+def video_lines(video: Mapping[str, Any]) -> Iterator[str]:
+    """Which frames were chosen, and why the others were not."""
+    others = ", ".join(f"{count} {reason}" for reason, count in video["left_out"].items())
+    more = f"; not chosen: {others}" if others else ""
+    yield f"video       {video['frames']} frames, {video['chosen']} chosen{more}"
+    yield from (f"            {note}" for note in video["notes"])
 
 
 def photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:

@@ -16,7 +16,8 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 OWN_FLAGS = {
-    "images": "photos", "cameras": "photos", "keep_all": "photos", "estimator": "epipolar", "calibrator": "calibration",
+    "images": "photos", "cameras": "photos", "keep_all": "photos", "max_frames": "photos",
+    "estimator": "epipolar", "calibrator": "calibration",
     "mapper": "scene", "faces": "mesh", "unseen": "texture",
 }  # fmt: skip
 """Settings with a flag of their own, and their tables."""
@@ -33,6 +34,7 @@ def settings_options(command: Command) -> Command:
         click.option("--quality", type=click.Choice(get_args(Quality)), help="Preset of sizes.  [default: normal]"),
         click.option("--images", help="Text file that names the photos to use, one per line.  [default: all]"),
         click.option("--cameras", help="auto, single, folder or each: which photos share one.  [default: auto]"),
+        click.option("--max-frames", type=int, help="Most frames of a video that are used.  [default: 100]"),
         click.option("--keep-all", is_flag=True, default=None, help="Use copies of photos, too."),
         click.option("--estimator", help="Estimator of fundamental matrices.  [default: lev-ransac]"),
         click.option("--calibrator", help="Calibrator.  [default: zero-curves]"),

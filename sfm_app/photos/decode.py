@@ -10,15 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError, features
 
-from sfm_app.photos.exif import EXIF_IFD, GPS_IFD, orientation
+from sfm_app.photos.containers import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
+from sfm_app.photos.exif import EXIF_IFD, GPS_IFD, orientation, printable
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 """What is always read."""
 LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
 """A copy as JPEG loses next to nothing more."""
-
-HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")
-AVIF_BRANDS = (b"avif", b"avis")
 
 
 class UnreadableError(Exception):
@@ -120,7 +118,7 @@ def _levels(deep: NDArray[Any]) -> NDArray[np.uint8]:
 def _no_photo(path: Path) -> str:
     try:
         with path.open("rb") as file:
-            head = file.read(12)
+            head = file.read(HEAD_BYTES)
     except OSError:
         head = b""
     if not head:
@@ -129,4 +127,4 @@ def _no_photo(path: Path) -> str:
         return "HEIC photos need `pip install 'sfm-app[heic]'`"
     if head[4:8] == b"ftyp" and head[8:12] in AVIF_BRANDS:
         return "AVIF photos need a newer Pillow: `pip install -U pillow`"
-    return "not a photo"
+    return f"a video; run it alone: sfm-app run {printable(path.name)}" if is_video(head) else "not a photo"

@@ -5,8 +5,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sfm_app.errors import InputError
+from sfm_app.photos.containers import ENDINGS
 
 HINT = "name the folder that holds the photos"
+VIDEOS = "MP4, MOV, MKV, WebM, AVI and MPEG are read: copy the file again, or save it as MP4"
 
 
 def list_files(folder: Path, out: Path, listed_in: Path | None = None) -> list[str]:
@@ -22,10 +24,8 @@ def list_files(folder: Path, out: Path, listed_in: Path | None = None) -> list[s
     Raises:
         InputError: there is no such folder, or it cannot be read.
     """
-    if not folder.exists():
-        raise InputError(f"no such folder: {folder}", hint=HINT)
     if not folder.is_dir():
-        raise InputError(f"not a folder: {folder}", hint=f"{HINT}, not a photo")
+        raise _no_folder(folder)
     try:
         next(folder.iterdir(), None)
     except OSError as err:
@@ -33,6 +33,18 @@ def list_files(folder: Path, out: Path, listed_in: Path | None = None) -> list[s
     if listed_in is not None:
         return _listed(listed_in)
     return sorted(path.relative_to(folder).as_posix() for path in _walk(folder, out.resolve()))
+
+
+def _no_folder(path: Path) -> InputError:
+    """What is said of a path that is neither a folder nor a video."""
+    if not path.exists():
+        what = "file" if path.suffix.lower() in ENDINGS else "folder"
+        return InputError(f"no such {what}: {path}", hint=f"{HINT}, or a video")
+    if path.suffix.lower() not in ENDINGS or not path.is_file():
+        return InputError(f"not a folder: {path}", hint=f"{HINT}, or a video, not a photo")
+    if not os.access(path, os.R_OK):
+        return InputError(f"cannot read {path}: permission denied")
+    return InputError(f"{path} is empty" if not path.stat().st_size else f"not a video: {path}", hint=VIDEOS)
 
 
 def place_of(folder: Path, name: str) -> Path | str:

@@ -1,5 +1,6 @@
 """The photos as COLMAP gets them: links to files that it can read, upright 8-bit copies of the others."""
 
+import os
 import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -46,7 +47,7 @@ def lay_out(photo: Photo, folder: Path, target: Path) -> None:
     if isinstance(source, str):
         raise UnreadableError(source)
     if not photo.needs_copy:
-        _link(source, place)
+        _link(source, place, relative=folder.parent.resolve() == target.parent.resolve())
         return
     copy = upright(read_picture(source))
     if copy.size != (photo.width, photo.height):
@@ -57,8 +58,9 @@ def lay_out(photo: Photo, folder: Path, target: Path) -> None:
         copy.save(place, "PNG", compress_level=1)
 
 
-def _link(source: Path, place: Path) -> None:
+def _link(source: Path, place: Path, *, relative: bool) -> None:
+    """Frames lie in the output folder and move with it; photos of the user stay where they are."""
     try:
-        place.symlink_to(source)
+        place.symlink_to(os.path.relpath(source, place.parent.resolve()) if relative else source)
     except OSError:  # Windows without the right to link, some network drives
         shutil.copyfile(source, place)

@@ -1,5 +1,6 @@
 """photos: folder -> PhotoSet."""
 
+import errno
 import json
 import shutil
 from collections import Counter
@@ -69,9 +70,8 @@ def files_of(folder: Path, run: RunContext) -> list[str]:
     """Names of all files that a run has to account for.
 
     Raises:
-        InputError: the folder is missing or unreadable, or the run would write over it.
+        InputError: the folder is missing or unreadable.
     """
-    run.workspace.keep_apart(folder)
     chosen = run.settings.photos.images
     return list_files(folder, run.workspace.root, Path(chosen) if chosen else None)
 
@@ -133,17 +133,21 @@ def laid_out(photo: Photo, *, folder: Path, target: Path) -> None:
 
 
 def save_photo_set(photos: PhotoSet, run: RunContext) -> None:
-    """Write photos.json."""
+    """Write photos.json; frames of a video, which lie in the output folder, move with it."""
+    folder = "" if photos.folder == run.workspace.frames else str(photos.folder)
     with run.workspace.replacing(run.workspace.photo_set) as path:
-        path.write_text(json.dumps({**asdict(photos), "folder": str(photos.folder)}, indent=1) + "\n", encoding="utf-8")
+        path.write_text(json.dumps({**asdict(photos), "folder": folder}, indent=1) + "\n", encoding="utf-8")
 
 
 def load_photo_set(run: RunContext) -> PhotoSet:
     """Read photos.json back; what is gone of the photos that were laid out is laid out again."""
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
-    folder, photos = Path(values["folder"]), tuple(_photo(entry) for entry in values["photos"])
+    folder = Path(values["folder"]) if values["folder"] else run.workspace.frames
+    photos = tuple(_photo(entry) for entry in values["photos"])
     for photo in photos:
         if not (run.workspace.photos / photo.name).exists():
+            if folder == run.workspace.frames and not (folder / photo.path).exists():
+                raise FileNotFoundError(errno.ENOENT, "no such frame", str(folder / photo.path))
             laid_out(photo, folder=folder, target=run.workspace.photos)
     return PhotoSet(folder, photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]))
 

@@ -4,6 +4,7 @@ import json
 import os
 import zlib
 
+import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -108,6 +109,20 @@ def exact_copy(folder):
     (folder / "x.png").write_bytes((folder / "b.png").read_bytes())
 
 
+def video(path, shifts, code="MJPG"):
+    """A picture that moves to the left by so many pixels from frame to frame."""
+    wide = np.asarray(picture(6, (640, 96)))
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*code), 30.0, SIZE)
+    for at in np.cumsum(shifts):
+        writer.write(np.ascontiguousarray(wide[:, at : at + SIZE[0], ::-1]))
+    writer.release()
+
+
+def video_as_photo(folder):
+    video(folder / "x.mp4", [9] * 3, "mp4v")
+    (folder / "x.mp4").rename(folder / "x.jpg")
+
+
 def locked(folder):
     picture().save(folder / "x.jpg")
     (folder / "x.jpg").chmod(0)
@@ -161,6 +176,9 @@ FILES = {
     "link to nothing": (link("x.jpg", "nothing.jpg"), "x.jpg", "a link that leads nowhere"),
     "link to itself": (link("x.jpg", "x.jpg"), "x.jpg", "a link that leads nowhere"),
     "link to a folder": (link("x", ".."), "x", "a link out of the folder"),
+    "video": (lambda folder: video(folder / "x.avi", [9] * 3), "x.avi", "a video; run it alone: sfm-app run x.avi"),
+    "video named photo": (video_as_photo, "x.jpg", "a video; run it alone"),
+    "sound": (written("x.m4a", b"\0\0\0\x18ftypM4A " + bytes(90)), "x.m4a", "not a photo"),
     "pipe": (lambda folder: os.mkfifo(folder / "x.jpg"), "x.jpg", "not a file"),
 }
 
@@ -259,6 +277,18 @@ def test_photos_that_are_gone_from_the_output_are_laid_out_again(folder, tmp_pat
 COMMANDS = {
     "no folder": (["{here}/nowhere", "-o", "{here}/out"], 3, "no such folder"),
     "a photo": (["{photos}/a.jpg", "-o", "{here}/out"], 3, "not a folder"),
+    "no such video": (["{here}/none.mp4", "-o", "{here}/out"], 3, "no such file"),
+    "no video": (["{videos}/text.mp4", "-o", "{here}/out"], 3, "not a video"),
+    "a list of videos": (["{videos}/list.mp4", "-o", "{here}/out"], 3, "not a video"),
+    "an address": (["http://127.0.0.1/clip.mp4", "-o", "{here}/out"], 3, "no such file"),
+    "an empty video": (["{videos}/empty.mov", "-o", "{here}/out"], 3, "empty.mov is empty"),
+    "a folder named video": (["{videos}/folder.mp4", "-o", "{here}/out"], 3, "the folder is empty"),
+    "half a video": (["{videos}/half.mp4", "-o", "{here}/out"], 3, "damaged, cut off"),
+    "the head of a video": (["{videos}/head.avi", "-o", "{here}/out"], 3, "no frame can be decoded"),
+    "a camera that stands": (["{videos}/still.avi", "-o", "{here}/out"], 3, "the camera does not move"),
+    "a list with a video": (["{videos}/clip.avi", "-o", "{here}/out", "--images", "{here}/list.txt"], 2, "--images"),
+    "a video where the run writes": (["{here}/old/photos/x.avi", "-o", "{here}/old"], 3, "keeps its own files"),
+    "one frame of a video": (["{videos}/clip.avi", "-o", "{here}/out", "--max-frames", "1"], 2, "photos.max_frames"),
     "photos are the output": (["{photos}", "-o", "{photos}"], 3, "cannot be the photos and the output"),
     "photos where the run writes": (["{photos}", "-o", "{here}"], 3, "keeps its own files"),
     "the run's own photos": (["{here}/old/photos", "-o", "{here}/old"], 3, "keeps its own files"),
@@ -286,11 +316,27 @@ COMMANDS = {
 }
 
 
+def some_videos(place, another):
+    """One that can be used, and others."""
+    (place / "folder.mp4").mkdir(parents=True)
+    (place / "text.mp4").write_text("a text")
+    (place / "list.mp4").write_text("ffconcat version 1.0\nfile clip.avi\n")
+    (place / "empty.mov").write_bytes(b"")
+    video(place / "clip.avi", [4] * 12)
+    video(place / "still.avi", [0] * 12)
+    video(place / "whole.mp4", [4] * 12, "mp4v")
+    another.write_bytes((place / "clip.avi").read_bytes())
+    whole = (place / "whole.mp4").read_bytes()
+    (place / "half.mp4").write_bytes(whole[: len(whole) // 2])
+    (place / "head.avi").write_bytes((place / "clip.avi").read_bytes()[:6000])
+
+
 @pytest.mark.parametrize("case", COMMANDS)
 def test_every_refusal_is_one_line_and_a_hint(folder, tmp_path, case):
     arguments, code, words = COMMANDS[case]
     (tmp_path / "old" / "photos").mkdir(parents=True)
     (tmp_path / "old" / "photos" / "a.jpg").symlink_to(folder / "a.jpg")
+    some_videos(tmp_path / "videos", tmp_path / "old" / "photos" / "x.avi")
     for name in ("held", "colmap/sparse"):
         (tmp_path / name).mkdir(parents=True)
     (tmp_path / "empty.txt").write_text("")
@@ -298,7 +344,9 @@ def test_every_refusal_is_one_line_and_a_hint(folder, tmp_path, case):
 
     with FileLock(tmp_path / "held" / LOCK):
         before = {path: path.lstat().st_mtime_ns for path in tmp_path.rglob("*")}
-        result = call("run", *(argument.format(here=tmp_path, photos=folder) for argument in arguments))
+        result = call(
+            "run", *(text.format(here=tmp_path, photos=folder, videos=tmp_path / "videos") for text in arguments)
+        )
 
     assert result.exit_code == code, result.stderr
     assert words in result.stderr and "Traceback" not in result.output
