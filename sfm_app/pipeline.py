@@ -23,7 +23,7 @@ from sfm_app.stages.files import load_files, write_files
 from sfm_app.stages.intrinsics import calibrate, load_intrinsics
 from sfm_app.stages.match_graph import load_match_graph, match_photos
 from sfm_app.stages.mesh import load_surface, make_mesh
-from sfm_app.stages.photos import files_of, load_photo_set, read_photos
+from sfm_app.stages.photos import files_of, load_photo_set, mask_folder, masks_of, read_photos
 from sfm_app.stages.scene import load_scene, reconstruct_scene
 from sfm_app.stages.texture import load_texture, make_texture
 from sfm_app.stages.view_graph import build_view_graph, load_view_graph
@@ -53,7 +53,7 @@ class Stage:
 
 STAGES = (
     Stage(
-        "photos", (), ("photos",), ("photos.json", "photos"),
+        "photos", (), ("photos",), ("photos.json", "photos", "masks"),
         make=lambda products, run: read_photos(products("folder"), run),
         load=lambda _, run: load_photo_set(run),
     ),
@@ -226,8 +226,16 @@ def peak_memory_mb() -> int | None:
 
 
 def folder_fingerprint(folder: Path, run: RunContext) -> str:
-    """Hash of the names and bytes of all files in the photo folder."""
-    names = files_of(folder, run)
+    """Hash of the names and bytes of all files in the photo folder, and in that of the masks where there is one."""
+    parts = [*_contents(folder, files_of(folder, run), run)]
+    masks = mask_folder(run)
+    if masks is not None:
+        parts += _contents(masks, masks_of(folder, run), run)
+    return fingerprint(*parts)
+
+
+def _contents(folder: Path, names: Sequence[str], run: RunContext) -> tuple[str, Sequence[str], list[str]]:
+    """Where a folder lies, and names and hashes of files in it; instead of a hash, why a file is not read."""
 
     def digest(name: str) -> str:
         place = place_of(folder, name)
@@ -239,9 +247,8 @@ def folder_fingerprint(folder: Path, run: RunContext) -> str:
         except OSError:
             return "unreadable"
 
-    return fingerprint(
-        str(folder.resolve()), names, list(ordered_map(run.executor, digest, names, ahead=4 * run.workers))
-    )
+    found = ordered_map(run.executor, digest, names, ahead=4 * run.workers)
+    return str(folder.resolve()), names, list(found)
 
 
 def stage_fingerprint(stage: Stage, prints: Mapping[str, str], run: RunContext) -> str:
