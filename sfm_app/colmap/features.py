@@ -12,9 +12,16 @@ from sfm_app.settings import MatchSettings
 
 
 def extract_features(
-    database: Path, photo_dir: Path, names: Sequence[str], options: MatchSettings, workers: int, progress: Progress
-) -> dict[str, Any]:
-    """Find SIFT features of all photos; returns the options in force for the manifest."""
+    database: Path, photo_dir: Path, names: Sequence[str], options: MatchSettings, workers: int, progress: Progress,
+    mask_dir: Path | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Find SIFT features of all photos; returns the options in force for the manifest.
+
+    Where masks are given every photo needs one, NAME.png: COLMAP passes over photos without.
+    """
+    reader = pycolmap.ImageReaderOptions()
+    if mask_dir is not None:
+        reader.mask_path = mask_dir
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = options.max_image_size_px
     extraction.num_threads = workers
@@ -23,7 +30,7 @@ def extract_features(
 
     def call(token: Any) -> None:
         pycolmap.extract_features(
-            database, photo_dir, list(names), extraction_options=extraction,
+            database, photo_dir, list(names), reader_options=reader, extraction_options=extraction,
             device=pycolmap.Device.cpu, cancellation_token=token,
         )  # fmt: skip
 

@@ -27,7 +27,9 @@ def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
             create_database(place.database, photos)
         marker.write_text(run.inputs, encoding="utf-8")
     with backend("finding features"):
-        extraction = extract_features(place.database, place.photos, names, options, run.workers, run.progress)
+        extraction = extract_features(
+            place.database, place.photos, names, options, run.workers, run.progress, run.mask_dir
+        )
     with backend("matching photos"):
         matching = match_exhaustively(place.database, len(names), options, run.workers, run.progress)
     graph = load_match_graph(photos, run)
