@@ -106,9 +106,10 @@ def without_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uin
         return pixels
     hidden = (~used).view(np.uint8)
     _, nearest = cv2.distanceTransformWithLabels(hidden, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    colors = np.zeros((int(nearest.max()) + 1, 3), np.uint8)
-    colors[nearest[used]] = pixels[used]
-    return np.asarray(np.where(used[..., None], pixels, colors[nearest]))
+    seeds = np.flatnonzero(used)
+    place = np.zeros(len(seeds) + 1, np.int64)  # labels count from 1
+    place[nearest.ravel()[seeds]] = seeds
+    return np.asarray(pixels.reshape(-1, 3)[place[nearest]])
 
 
 def _fitted(photo: Photo, folder: Path, masks: Path) -> BoolImage:
