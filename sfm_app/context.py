@@ -41,6 +41,11 @@ class RunContext:
         """The run's seed; parts derive theirs from it and from their own ids."""
         return self.settings.seed
 
+    @property
+    def mask_dir(self) -> Path | None:
+        """Where the masks of all photos lie once they are laid out; None where no masks are given."""
+        return self.workspace.masks if self.settings.photos.masks else None
+
     def map(self, function: Callable[[Item], Result], items: Sequence[Item], label: str) -> list[Result]:
         """Results in the order of the items, computed in parallel, with a progress bar."""
         results = ordered_map(self.executor, function, items, ahead=2 * self.workers)

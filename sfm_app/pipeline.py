@@ -25,7 +25,7 @@ from sfm_app.stages.frames import photos_of, settings_for
 from sfm_app.stages.intrinsics import calibrate, load_intrinsics
 from sfm_app.stages.match_graph import load_match_graph, match_photos
 from sfm_app.stages.mesh import load_surface, make_mesh
-from sfm_app.stages.photos import files_of, load_photo_set, read_photos
+from sfm_app.stages.photos import files_of, load_photo_set, mask_folder, masks_of, read_photos
 from sfm_app.stages.scene import load_scene, reconstruct_scene
 from sfm_app.stages.texture import load_texture, make_texture
 from sfm_app.stages.view_graph import build_view_graph, load_view_graph
@@ -55,7 +55,7 @@ class Stage:
 
 STAGES = (
     Stage(
-        "photos", (), ("photos",), ("photos.json", "photos", "frames"),
+        "photos", (), ("photos",), ("photos.json", "photos", "frames", "masks"),
         make=lambda products, run: photos_from(products("folder"), run),
         load=lambda _, run: load_photo_set(run),
     ),
@@ -238,19 +238,24 @@ def photos_from(source: Path, run: RunContext) -> PhotoSet:
         return read_photos(folder, run)
 
 
-def source_fingerprint(folder: Path, run: RunContext) -> str:
-    """Hash of the names and bytes of all files in the photo folder, or of the bytes of a video."""
-    if is_video(head_of(folder)):
-        return fingerprint(str(folder.resolve()), digest(folder))
-    names = files_of(folder, run)
+def source_fingerprint(source: Path, run: RunContext) -> str:
+    """Hash of the names and bytes of all files in the photo folder, or of a video, and in that of the masks."""
+    parts: list[Any] = [str(source.resolve())]
+    parts += [digest(source)] if is_video(head_of(source)) else _contents(source, files_of(source, run), run)
+    masks = mask_folder(run)
+    if masks is not None:
+        parts += [str(masks.resolve()), *_contents(masks, masks_of(source, run), run)]
+    return fingerprint(*parts)
+
+
+def _contents(folder: Path, names: Sequence[str], run: RunContext) -> list[Any]:
+    """Names and hashes of files in a folder; instead of a hash, why a file is not read."""
 
     def digest_of(name: str) -> str:
         place = place_of(folder, name)
         return place if isinstance(place, str) else digest(place)
 
-    return fingerprint(
-        str(folder.resolve()), names, list(ordered_map(run.executor, digest_of, names, ahead=4 * run.workers))
-    )
+    return [names, list(ordered_map(run.executor, digest_of, names, ahead=4 * run.workers))]
 
 
 def digest(file: Path) -> str:

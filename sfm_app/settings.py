@@ -27,6 +27,9 @@ class PhotoSettings(Section):
     """Which photos are used and which of them share a camera."""
 
     images: str = Field("", description="text file that names the photos to use, one per line; all where empty")
+    masks: str = Field(
+        "", description="folder of masks: what is black in its sub/a.jpg.png is not used of sub/a.jpg; none where empty"
+    )
     cameras: Literal["auto", "single", "folder", "each"] = Field(
         "auto",
         description="auto: same size and same EXIF camera share one; single: all share one; folder: those of a folder; "

@@ -20,7 +20,7 @@ from sfm_app.errors import InputError
 MANIFEST = "manifest.json"
 DATABASE = "database.db"
 CALIBRATION = "calibration.json"
-WRITTEN = ("photos", "frames", "sparse", "dense", "other_models", DATABASE, CALIBRATION)
+WRITTEN = ("photos", "frames", "masks", "sparse", "dense", "other_models", DATABASE, CALIBRATION)
 """What a run removes before it writes it."""
 SHARED = (DATABASE, CALIBRATION)
 """Files that later stages add to."""
@@ -63,6 +63,11 @@ class Workspace:
     def frames_marker(self) -> Path:
         """Beside the frames until they are read: which were chosen, and what from."""
         return self.root / "frames.unfinished.json"
+
+    @property
+    def masks(self) -> Path:
+        """Masks of the photos, upright and of their size, where masks are given."""
+        return self.root / "masks"
 
     @property
     def database(self) -> Path:
@@ -128,15 +133,15 @@ class Workspace:
                 f"cannot write to {self.root}: {err.strerror}", hint="name another output folder with -o"
             ) from err
 
-    def keep_apart(self, photos: Path) -> None:
-        """Check that a run would not write over its photos.
+    def keep_apart(self, photos: Path, what: str = "photos") -> None:
+        """Check that a run would not write over its photos, or its masks.
 
         Raises:
             InputError: it would.
         """
         folder, out = photos.resolve(), self.root.resolve()
         if folder == out:
-            raise InputError(f"{photos} cannot be the photos and the output", hint="name another output folder with -o")
+            raise InputError(f"{photos} cannot be the {what} and the output", hint="name another output folder with -o")
         if any(folder.is_relative_to(out / name) for name in WRITTEN):
             raise InputError(
                 f"{photos} lies where the run in {self.root} keeps its own files",

@@ -90,6 +90,7 @@ def run_summary(run: Run) -> dict[str, Any]:
         "out": str(run.out),
         "photos": {key: photos.get(key, {}) for key in ("usable", "unusable", "notes")},
         **({"video": photos["video"]} if "video" in photos else {}),
+        "masks": photos.get("masks"),
         "pairs": {key: counts.get("view_graph", {}).get(key) for key in ("kept", "rejected")},
         "calibration": intrinsics_summary(run.calibration) if run.calibration else None,
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
@@ -110,6 +111,8 @@ def run_lines(run: Run) -> list[str]:
     lines = list(video_lines(summary["video"])) if "video" in summary else []
     lines.append(f"photos      {summary['photos']['usable']} usable")
     lines += [f"            {line}" for line in photo_lines(summary["photos"])]
+    if summary["masks"] is not None:
+        lines += mask_lines(summary["masks"], summary["photos"]["usable"])
     if summary["pairs"]["kept"] is not None:
         rejected = ", ".join(f"{count} {reason}" for reason, count in summary["pairs"]["rejected"].items())
         lines.append(
@@ -149,8 +152,20 @@ def photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
     for name, notes in photos["notes"].items():
         yield f"{name}: {', '.join(notes)}"
     for reason, names in by_reason.items():
-        more = f" and {len(names) - NAMED} more (all of them in manifest.json)" if len(names) > NAMED else ""
-        yield f"left out: {', '.join(names[:NAMED])}{more}: {reason}"
+        yield f"left out: {some(names)}: {reason}"
+
+
+def mask_lines(masks: Mapping[str, Any], photos: int) -> Iterator[str]:
+    """How many photos have a mask, and which files are of none of them."""
+    yield f"masks       {masks['photos']} of {photos} photos"
+    if masks["unused"]:
+        yield f"            of no photo that is used: {some(masks['unused'])}"
+
+
+def some(names: Sequence[str]) -> str:
+    """The first few names, and how many more there are."""
+    more = f" and {len(names) - NAMED} more (all of them in manifest.json)" if len(names) > NAMED else ""
+    return f"{', '.join(names[:NAMED])}{more}"
 
 
 def texture_text(mesh: Mapping[str, Any]) -> str:

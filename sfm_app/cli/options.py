@@ -16,7 +16,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 OWN_FLAGS = {
-    "images": "photos", "cameras": "photos", "keep_all": "photos", "max_frames": "photos",
+    "images": "photos", "masks": "photos", "cameras": "photos", "keep_all": "photos", "max_frames": "photos",
     "estimator": "epipolar", "calibrator": "calibration",
     "mapper": "scene", "faces": "mesh", "unseen": "texture",
 }  # fmt: skip
@@ -33,6 +33,10 @@ def settings_options(command: Command) -> Command:
         click.option("--workers", type=int, help="Parallel workers.  [default: one per core]"),
         click.option("--quality", type=click.Choice(get_args(Quality)), help="Preset of sizes.  [default: normal]"),
         click.option("--images", help="Text file that names the photos to use, one per line.  [default: all]"),
+        click.option(
+            "--masks",
+            help="Folder of masks: of sub/a.jpg, what is black in sub/a.jpg.png is not used.  [default: none]",
+        ),
         click.option("--cameras", help="auto, single, folder or each: which photos share one.  [default: auto]"),
         click.option("--max-frames", type=int, help="Most frames of a video that are used.  [default: 100]"),
         click.option("--keep-all", is_flag=True, default=None, help="Use copies of photos, too."),

@@ -10,10 +10,14 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.apart import relay, started
 from sfm_app.colmap.backend import backend, check_written, pycolmap
+from sfm_app.colmap.masks import used_pixels
 from sfm_app.progress import Progress
 from sfm_app.stereo import DepthMap, Estimate, Kind, View
 
 DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
+MASKED = -1.0
+"""In place of the depth where a photo is masked. COLMAP's fusion takes it for none; `sfm_app.meshing` does not take it
+for empty space."""
 
 
 def undistort(
@@ -94,6 +98,10 @@ class DenseStore:
         return Estimate(read_depth(self.dense_dir, view, "photometric"), confidence)
 
     def write_estimate(self, view: View, estimate: Estimate) -> None:
+        used = used_pixels(self.dense_dir, view)
+        if used is not None:
+            # sure, so that what is masked is no part of the blank area beside it
+            estimate = Estimate(estimate.depth * used, np.where(used, estimate.confidence, np.float32(1)))
         _write_depth_format(self.dense_dir, CONFIDENCES, view, estimate.confidence, "photometric")
         _write_depth_format(self.dense_dir, DEPTHS, view, estimate.depth, "photometric")
 
@@ -102,7 +110,7 @@ class DenseStore:
 
 
 def read_depth(dense_dir: Path, view: View, kind: Kind) -> NDArray[np.float32]:
-    """Read a depth map, (H, W), 0 where unknown."""
+    """Read a depth map, (H, W), 0 where unknown, MASKED where the photo is masked."""
     return _read_depth_format(dense_dir, DEPTHS, view, kind)
 
 
@@ -113,6 +121,14 @@ def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
     with backend(f"writing the normal map of {view.name}"), _whole(_map_path(dense_dir, NORMALS, view)) as path:
         pycolmap.NormalMap.from_array(planes).write(path)
     _write_depth_format(dense_dir, DEPTHS, view, maps.depth, "geometric")
+
+
+def hide_masked(dense_dir: Path, view: View) -> None:
+    """Put MASKED into the confirmed depths of a view where it is masked, whoever has made them."""
+    used, file = used_pixels(dense_dir, view), map_file(dense_dir, view)
+    if used is not None and file.exists():
+        depth = read_depth(dense_dir, view, "geometric")
+        _write_depth_format(dense_dir, DEPTHS, view, np.where(used, depth, np.float32(MASKED)), "geometric")
 
 
 def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:

@@ -15,12 +15,15 @@ def work(task: dict[str, Any]) -> None:
     """Find features of all photos and match every photo with every other; reports the options in force."""
     database, photo_dir, names = Path(task["database"]), Path(task["photos"]), task["names"]
     options = MatchSettings.model_validate(task["options"])
-    report(extraction=extract(database, photo_dir, names, options, task["workers"]))
+    reader = pycolmap.ImageReaderOptions()
+    if task["masks"]:
+        reader.mask_path = Path(task["masks"])
+    report(extraction=extract(database, photo_dir, names, reader, options, task["workers"]))
     report(matching=match(database, len(names), options, task["workers"]))
 
 
 def extract(
-    database: Path, photo_dir: Path, names: Sequence[str], options: MatchSettings, workers: int
+    database: Path, photo_dir: Path, names: Sequence[str], reader: Any, options: MatchSettings, workers: int
 ) -> dict[str, Any]:
     """Find SIFT features of all photos."""
     extraction = pycolmap.FeatureExtractionOptions()
@@ -31,7 +34,7 @@ def extract(
 
     def call(token: Any) -> None:
         pycolmap.extract_features(
-            database, photo_dir, list(names), extraction_options=extraction,
+            database, photo_dir, list(names), reader_options=reader, extraction_options=extraction,
             device=pycolmap.Device.cpu, cancellation_token=token,
         )  # fmt: skip
 

@@ -10,9 +10,19 @@ from sfm_app.settings import MatchSettings
 
 
 def find_and_match(
-    database: Path, photo_dir: Path, names: Sequence[str], options: MatchSettings, workers: int, progress: Progress
-) -> dict[str, Any]:
+    database: Path, photo_dir: Path, names: Sequence[str], options: MatchSettings, workers: int, progress: Progress,
+    mask_dir: Path | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Find features of all photos and match every photo with every other; what is in the database stays.
+
+    Args:
+        database: knows the photos.
+        photo_dir: holds them.
+        names: of the photos.
+        options: of features and matches.
+        workers: threads.
+        progress: shown progress.
+        mask_dir: has a mask of every photo, `name.png`: no keypoints where it is black.
 
     Returns:
         The options in force, for the manifest.
@@ -23,6 +33,7 @@ def find_and_match(
     task = {
         "database": str(database),
         "photos": str(photo_dir),
+        "masks": str(mask_dir) if mask_dir else None,
         "names": list(names),
         "options": options.model_dump(),
         "workers": workers,

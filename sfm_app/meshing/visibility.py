@@ -29,6 +29,7 @@ class Eye:
     t: FloatArray
     """(3,) translation of cam_from_world."""
     depth: DepthArray
+    """0 where unknown, negative where the photo is masked and says nothing."""
     sample_px: float
     """Where inside its pixel a depth is taken, in x and y; 0.5 is the pixel's centre."""
 
@@ -53,7 +54,7 @@ def judge(points: FloatArray, normals: FloatArray, eye: Eye, tolerance: float) -
 
     A point is confirmed where the depths around it reach its own within the relative tolerance and it faces the photo;
     it is seen through where all of them lie well behind it. The map is empty where it faces the photo and there are no
-    depths around it. About hidden points it is silent.
+    depths around it. About hidden points, and where it is masked, it is silent.
     """
     verdict = np.zeros(len(points), np.uint8)
     _judge(points, normals, eye.projection, eye.center, eye.depth, np.array([eye.sample_px, tolerance]), verdict)
@@ -82,15 +83,18 @@ def _judge(
         col, row = int(np.floor(u)), int(np.floor(v))
         if not (0 <= col < width - 1 and 0 <= row < height - 1):
             continue
-        low, high, known, near = np.inf, 0.0, 0, False
+        low, high, known, masked, near = np.inf, 0.0, 0, 0, False
         for i in range(row, row + 2):
             for j in range(col, col + 2):
                 d = depth[i, j]
                 if d > 0:
                     low, high, known = min(low, d), max(high, d), known + 1
                     near = near or abs(d - z) <= tolerance * z
+                masked += d < 0
         # on a slope the four depths bracket the point's; across a step they do not belong together
         between = low <= z <= high and high - low <= 2.0 * THROUGH * tolerance * z
+        if known == 0 and masked > 0:
+            continue
         if near or between or known == 0:
             x, y, w = center[0] - X, center[1] - Y, center[2] - Z
             facing = normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * w

@@ -9,10 +9,22 @@ from sfm_app.photos.files import list_files, place_of
 from sfm_app.photos.following import Follower, Look
 from sfm_app.photos.groups import grouped
 from sfm_app.photos.layout import lay_out, stored_names
+from sfm_app.photos.masks import (
+    MASK_HINT,
+    find_mask,
+    lay_out_mask,
+    list_masks,
+    mask_place,
+    read_used,
+    save_used,
+    unused_masks,
+    without_masked,
+)
 from sfm_app.photos.video import opened
 
 __all__ = [
     "LOSSY",
+    "MASK_HINT",
     "Choice",
     "Follower",
     "Glance",
@@ -21,19 +33,27 @@ __all__ = [
     "UnreadableError",
     "camera_name",
     "choose",
+    "find_mask",
     "focal_px",
     "gps_position",
     "grouped",
     "head_of",
     "is_video",
     "lay_out",
+    "lay_out_mask",
     "list_files",
+    "list_masks",
+    "mask_place",
     "opened",
     "orientation",
     "place_of",
     "read_picture",
+    "read_used",
+    "save_used",
     "small_picture",
     "stored_names",
+    "unused_masks",
     "upright",
     "without_copies",
+    "without_masked",
 ]

@@ -34,8 +34,11 @@ def small_picture(upright: Image.Image) -> NDArray[np.float32]:
 
 
 def without_copies(glances: Sequence[Glance]) -> tuple[list[Photo], list[UnusablePhoto]]:
-    """The photos, of every picture the largest, and the copies; both in the order given."""
-    order = sorted(range(len(glances)), key=lambda k: (-_pixels(glances[k].photo), k))
+    """The photos, of every picture the largest, of those with a mask where there are any; and the copies.
+
+    Both in the order given.
+    """
+    order = sorted(range(len(glances)), key=lambda k: (not glances[k].photo.mask, -_pixels(glances[k].photo), k))
     small = np.array([glance.small for glance in glances], np.float32).reshape(len(glances), SIDE_PX**2)
     contrast = small.std(axis=1)
     kept: list[int] = []

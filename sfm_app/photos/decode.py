@@ -80,9 +80,12 @@ def _exif_of(image: Image.Image) -> Image.Exif:
 
 def upright(picture: Picture) -> Image.Image:
     """The picture upright by EXIF, in RGB or grey of 8 bits, what is transparent on white."""
-    turned = orientation(picture.exif)
-    flat = _eight_bit(picture.image)
-    return flat.transpose(ORIENTATIONS[turned]) if turned in ORIENTATIONS else flat
+    return turned_upright(_eight_bit(picture.image), orientation(picture.exif))
+
+
+def turned_upright(image: Image.Image, turned: int) -> Image.Image:
+    """The image after its EXIF orientation is undone."""
+    return image.transpose(ORIENTATIONS[turned]) if turned in ORIENTATIONS else image
 
 
 ORIENTATIONS = {

@@ -1,7 +1,7 @@
 """Which files of a folder are looked at, and where they lie. Nothing outside the folder is read."""
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from sfm_app.errors import InputError
@@ -11,7 +11,7 @@ HINT = "name the folder that holds the photos"
 VIDEOS = "MP4, MOV, MKV, WebM, AVI and MPEG are read: copy the file again, or save it as MP4"
 
 
-def list_files(folder: Path, out: Path, listed_in: Path | None = None) -> list[str]:
+def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: Sequence[Path] = ()) -> list[str]:
     """Names of all files below the folder, with forward slashes, sorted.
 
     Hidden folders and links to folders are not entered and count as one file. The output folder is left out.
@@ -20,6 +20,7 @@ def list_files(folder: Path, out: Path, listed_in: Path | None = None) -> list[s
         folder: of photos.
         out: output folder; may lie in it.
         listed_in: text file that names those to look at, one per line, as seen from the folder; all where None.
+        closed: other folders that are left out, like that for the output.
 
     Raises:
         InputError: there is no such folder, or it cannot be read.
@@ -32,7 +33,8 @@ def list_files(folder: Path, out: Path, listed_in: Path | None = None) -> list[s
         raise InputError(f"cannot read {folder}: {err.strerror}") from err
     if listed_in is not None:
         return _listed(listed_in)
-    return sorted(path.relative_to(folder).as_posix() for path in _walk(folder, out.resolve()))
+    left_out = {place.resolve() for place in (out, *closed)}
+    return sorted(path.relative_to(folder).as_posix() for path in _walk(folder, left_out))
 
 
 def _no_folder(path: Path) -> InputError:
@@ -74,9 +76,9 @@ def _listed(file: Path) -> list[str]:
     return sorted({Path(line).as_posix() for line in lines if line.strip()})
 
 
-def _walk(folder: Path, out: Path) -> Iterator[Path]:
+def _walk(folder: Path, left_out: set[Path]) -> Iterator[Path]:
     for place, folders, files in os.walk(folder):
         here = Path(place)
         closed = [name for name in folders if name.startswith(".") or (here / name).is_symlink()]
-        folders[:] = [name for name in folders if name not in closed and (here / name).resolve() != out]
+        folders[:] = [name for name in folders if name not in closed and (here / name).resolve() not in left_out]
         yield from (here / name for name in (*files, *closed))

@@ -3,13 +3,15 @@
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from hashlib import blake2b
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from sfm_app.colmap.dense import DenseStore, drop_estimates, read_depth, read_views, undistort
+from sfm_app.colmap.dense import DenseStore, drop_estimates, hide_masked, read_depth, read_views, undistort
+from sfm_app.colmap.masks import mask_undistorter
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.settings import DepthSettings
@@ -41,6 +43,8 @@ def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: Dep
     ranked = rank_neighbours(views, CONFIRMING * options.neighbours)
     with single_threaded_opencv():
         found = method.make(DepthTask(dense_dir, views, ranked, options, DenseStore(dense_dir), run.map))
+    if run.mask_dir is not None:
+        run.map(partial(hide_masked, dense_dir), views, "masking depth maps")
     record(dense_dir, views, found, run)
     drop_estimates(dense_dir, views)
     mark_finished(dense_dir)
@@ -48,12 +52,15 @@ def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: Dep
 
 
 def prepare(scene: Scene, photo_dir: Path, dense_dir: Path, method: str, run: RunContext) -> None:
-    """Undistort the photos, unless a killed run has left a workspace with the same model and other inputs."""
+    """Undistort photos and masks, unless a killed run has left a workspace with the same model and other inputs."""
     model = [(file.name, blake2b(file.read_bytes()).hexdigest()) for file in sorted(scene.model_dir.glob("*.bin"))]
     made_from = fingerprint(run.inputs, method, model)
     if not can_go_on(dense_dir, made_from):
         largest = run.settings.depth.max_image_size_px
         undistort(scene.model_dir, photo_dir, dense_dir, largest, run.workers, run.progress)
+        if run.mask_dir is not None:
+            undistort_mask = mask_undistorter(scene.model_dir, run.mask_dir, dense_dir)
+            run.map(undistort_mask, read_views(dense_dir), "undistorting masks")
         mark_unfinished(dense_dir, made_from)
 
 

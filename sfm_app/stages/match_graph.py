@@ -26,7 +26,7 @@ def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
         with backend("entering photos"):
             create_database(place.database, photos)
         marker.write_text(run.inputs, encoding="utf-8")
-    in_force = find_and_match(place.database, place.photos, names, options, run.workers, run.progress)
+    in_force = find_and_match(place.database, place.photos, names, options, run.workers, run.progress, run.mask_dir)
     graph = load_match_graph(photos, run)
     run.record(
         keypoints={graph.images[key].name: len(points) for key, points in graph.keypoints.items()},

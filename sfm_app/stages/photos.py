@@ -5,7 +5,7 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,20 +14,26 @@ from sfm_app.context import RunContext
 from sfm_app.errors import InputError
 from sfm_app.photos import (
     LOSSY,
+    MASK_HINT,
     Glance,
     Picture,
     UnreadableError,
     camera_name,
+    find_mask,
     focal_px,
     gps_position,
     grouped,
     lay_out,
+    lay_out_mask,
     list_files,
+    list_masks,
+    mask_place,
     orientation,
     place_of,
     read_picture,
     small_picture,
     stored_names,
+    unused_masks,
     upright,
     without_copies,
 )
@@ -43,22 +49,27 @@ def read_photos(folder: Path, run: RunContext) -> PhotoSet:
     """Look at every file of the folder and lay the usable photos out for COLMAP.
 
     Raises:
-        InputError: the folder is missing, or fewer than two photos are usable.
+        InputError: the folder is missing, fewer than two photos are usable, or a mask is not.
     """
     options = run.settings.photos
     names = files_of(folder, run)
     found = run.map(partial(read_photo, folder, options=options), names, "photos")
     glances = [photo for photo in found if isinstance(photo, Glance)]
     unusable = [photo for photo in found if isinstance(photo, UnusablePhoto)]
+    glances, blackened = masked(glances, folder, run)
     photos, copies = without_copies(glances) if not options.keep_all else ([g.photo for g in glances], [])
-    unusable = sorted(unusable + copies, key=lambda photo: photo.name)
+    unusable = sorted(unusable + blackened + copies, key=lambda photo: photo.name)
     if len(photos) < 2:
         raise InputError(
             too_few(folder, len(photos), unusable), hint="two photos of one place are the least; 10 to 50 work best"
         )
-    photo_set = PhotoSet(folder, tuple(stored_names(grouped(photos, options.cameras))), tuple(unusable))
-    shutil.rmtree(run.workspace.photos, ignore_errors=True)
+    named = tuple(stored_names(grouped(photos, options.cameras)))
+    photo_set = PhotoSet(folder, named, tuple(unusable), mask_folder(run))
+    for place in (run.workspace.photos, run.workspace.masks):
+        shutil.rmtree(place, ignore_errors=True)
     run.map(partial(laid_out, folder=folder, target=run.workspace.photos), photo_set.photos, "laying photos out")
+    if photo_set.masks is not None:
+        lay_out_masks(photo_set, photo_set.masks, run)
     save_photo_set(photo_set, run)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
     run.record(notes={photo.path: list(photo.notes) for photo in photos if photo.notes})
@@ -72,8 +83,54 @@ def files_of(folder: Path, run: RunContext) -> list[str]:
     Raises:
         InputError: the folder is missing or unreadable.
     """
-    chosen = run.settings.photos.images
-    return list_files(folder, run.workspace.root, Path(chosen) if chosen else None)
+    chosen, masks = run.settings.photos.images, mask_folder(run)
+    return list_files(
+        folder, run.workspace.root, Path(chosen) if chosen else None, closed=() if masks is None else (masks,)
+    )
+
+
+def mask_folder(run: RunContext) -> Path | None:
+    """The folder of masks; None where none is given."""
+    return Path(run.settings.photos.masks) if run.settings.photos.masks else None
+
+
+def masks_of(folder: Path, run: RunContext) -> list[str]:
+    """Names of all files in the folder of masks; none where no masks are given.
+
+    Raises:
+        InputError: it is missing or unreadable, holds the photos themselves, or the run would write over it.
+    """
+    masks = mask_folder(run)
+    if masks is None:
+        return []
+    run.workspace.keep_apart(masks, "masks")
+    return list_masks(masks, folder, run.workspace.root)
+
+
+def masked(glances: list[Glance], folder: Path, run: RunContext) -> tuple[list[Glance], list[UnusablePhoto]]:
+    """The photos with their masks, and those of which nothing is left.
+
+    Raises:
+        InputError: a mask cannot be used, or no photo has one.
+    """
+    masks, names = mask_folder(run), masks_of(folder, run)
+    if masks is None:
+        return glances, []
+    found = run.map(lambda glance: find_mask(glance.photo, folder, masks), glances, "masks")
+    if glances and all(isinstance(photo, Photo) and not photo.mask for photo in found):
+        raise InputError(f"none of the {len(names)} files in {masks} is the mask of a photo", hint=MASK_HINT)
+    kept = [
+        replace(glance, photo=photo) for glance, photo in zip(glances, found, strict=True) if isinstance(photo, Photo)
+    ]
+    return kept, [photo for photo in found if isinstance(photo, UnusablePhoto)]
+
+
+def lay_out_masks(photo_set: PhotoSet, masks: Path, run: RunContext) -> None:
+    """Put a mask of every photo into the workspace, and count them."""
+    lay_out = partial(lay_out_mask, folder=photo_set.folder, masks=masks, target=run.workspace.masks)
+    run.map(lay_out, photo_set.photos, "laying masks out")
+    unused = unused_masks(masks_of(photo_set.folder, run), photo_set.photos)
+    run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})
 
 
 def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | UnusablePhoto:
@@ -136,20 +193,24 @@ def save_photo_set(photos: PhotoSet, run: RunContext) -> None:
     """Write photos.json; frames of a video, which lie in the output folder, move with it."""
     folder = "" if photos.folder == run.workspace.frames else str(photos.folder)
     with run.workspace.replacing(run.workspace.photo_set) as path:
-        path.write_text(json.dumps({**asdict(photos), "folder": folder}, indent=1) + "\n", encoding="utf-8")
+        places = {"folder": folder, "masks": str(photos.masks) if photos.masks else None}
+        path.write_text(json.dumps(asdict(photos) | places, indent=1) + "\n", encoding="utf-8")
 
 
 def load_photo_set(run: RunContext) -> PhotoSet:
-    """Read photos.json back; what is gone of the photos that were laid out is laid out again."""
+    """Read photos.json back; what is gone of the photos and masks that were laid out is laid out again."""
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
     folder = Path(values["folder"]) if values["folder"] else run.workspace.frames
     photos = tuple(_photo(entry) for entry in values["photos"])
+    masks = Path(values["masks"]) if values["masks"] else None
     for photo in photos:
         if not (run.workspace.photos / photo.name).exists():
             if folder == run.workspace.frames and not (folder / photo.path).exists():
                 raise FileNotFoundError(errno.ENOENT, "no such frame", str(folder / photo.path))
             laid_out(photo, folder=folder, target=run.workspace.photos)
-    return PhotoSet(folder, photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]))
+        if masks is not None and not mask_place(run.workspace.masks, photo.name).exists():
+            lay_out_mask(photo, folder, masks, run.workspace.masks)
+    return PhotoSet(folder, photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]), masks)
 
 
 def _photo(entry: Mapping[str, Any]) -> Photo:

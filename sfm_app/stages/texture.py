@@ -13,6 +13,7 @@ from PIL import Image
 
 from sfm_app.context import RunContext
 from sfm_app.meshing.occlusion import Occluders
+from sfm_app.photos import read_used, without_masked
 from sfm_app.settings import TextureSettings
 from sfm_app.texture import PhotoView, photo_view, texture_surface
 from sfm_app.types import Model, Scene, Surface, Texture
@@ -34,7 +35,7 @@ def make_texture(scene: Scene, surface: Surface, options: TextureSettings, run: 
     if not can_go_on(parts, made_from):
         mark_unfinished(parts, made_from)
     hidden = Occluders(surface.vertices, surface.faces).hidden
-    store = Files(run.workspace.photos, parts)
+    store = Files(run.workspace.photos, parts, run.mask_dir)
     model, figures = texture_surface(surface, views, store, hidden, options, run.map)
     run.record(**figures)
     save_texture(model, run)
@@ -43,13 +44,16 @@ def make_texture(scene: Scene, surface: Surface, options: TextureSettings, run: 
 
 
 class Files:
-    """Photos of a folder, and arrays in files, as `sfm_app.texture.Store` has them."""
+    """Photos and masks of two folders, and arrays in files, as `sfm_app.texture.Store` has them."""
 
-    def __init__(self, photo_dir: Path, folder: Path) -> None:
-        self.photo_dir, self.folder = photo_dir, folder
+    def __init__(self, photo_dir: Path, folder: Path, mask_dir: Path | None = None) -> None:
+        self.photo_dir, self.folder, self.mask_dir = photo_dir, folder, mask_dir
 
     def photo(self, view: PhotoView) -> NDArray[np.uint8]:
-        return read_photo(self.photo_dir, view)
+        return read_photo(self.photo_dir, view, self.used(view))
+
+    def used(self, view: PhotoView) -> NDArray[np.bool_] | None:
+        return None if self.mask_dir is None else read_used(self.mask_dir, view.name)
 
     def recall(self, name: str) -> dict[str, NDArray[Any]] | None:
         try:
@@ -79,10 +83,15 @@ def photo_views(scene: Scene) -> list[PhotoView]:
     return [photo_view(name, scene.cameras[scene.camera_of[name]], pose) for name, pose in scene.cam_from_world.items()]
 
 
-def read_photo(photo_dir: Path, view: PhotoView) -> NDArray[np.uint8]:
-    """(height, width, 3) RGB of a photo at the size of the view; smaller ones are averaged, not picked."""
+def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
+    """(height, width, 3) RGB of a photo at the size of the view; smaller ones are averaged, not picked.
+
+    Where a mask says which pixels may be used, nothing is seen of the others.
+    """
     with Image.open(photo_dir / view.name) as image:
         photo = image.convert("RGB")
+    if used is not None:
+        photo = Image.fromarray(without_masked(np.asarray(photo), used))
     if photo.size != (view.width, view.height):
         photo = photo.resize((view.width, view.height), Image.Resampling.BOX)
     return np.asarray(photo)

@@ -144,10 +144,10 @@ def _look_at(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: Hid
     if kept is not None:
         return Look(kept["worth"], kept["color"], float(kept["sharpness"]))
     try:
-        photo = store.photo(view)
+        photo, used = store.photo(view), store.used(view)
     except OSError as err:
         return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
-    found = look(view, photo, mesh, hidden)
+    found = look(view, photo, used, mesh, hidden)
     store.keep(name, {"worth": found.worth, "color": found.color, "sharpness": np.array(found.sharpness)})
     return found
 

@@ -25,6 +25,8 @@ BORDER_PX = 2.0
 RIM_RINGS, RIM_WORTH = 2, 0.5
 """Each ring of triangles next to those that a photo does not see is worth so much less: where the surface is a pixel
 off, they show what lies before or behind it."""
+MASK_RIM_PX = 1.0
+"""A triangle with a masked pixel so near is not seen: colours are read between pixels."""
 SHARPNESS_RANGE = (0.2, 1.0)
 
 
@@ -40,18 +42,25 @@ class Look:
     """Energy of the finest detail relative to that of twice its size; falls with blur, hardly varies with content."""
 
 
-def look(view: PhotoView, photo: NDArray[np.uint8], mesh: Facets, hidden: Hidden) -> Look:
+def look(
+    view: PhotoView, photo: NDArray[np.uint8], used: NDArray[np.bool_] | None, mesh: Facets, hidden: Hidden
+) -> Look:
     """Judge every triangle in one photo.
 
     Args:
         view: lens and pose.
         photo: (height, width, 3) RGB, of the view's size.
+        used: (height, width) which of its pixels may be used; None where all may.
         mesh: the surface.
         hidden: the occlusion test.
     """
     worth = np.zeros(len(mesh.faces), np.float32)
     color = np.zeros((len(mesh.faces), 3), np.uint8)
     _measure(view.row, photo, mesh.vertices, mesh.faces, worth, color)
+    if used is not None:
+        masked = np.zeros((view.height + 1, view.width + 1), np.int32)
+        np.cumsum(np.cumsum(~used, axis=0, dtype=np.int32), axis=1, out=masked[1:, 1:])
+        _drop_masked(view.row, masked, mesh.vertices, mesh.faces, worth)
     candidates = np.flatnonzero(worth)
     worth[candidates[_blocked(candidates, mesh, partial(hidden, view.centre, SLACK * mesh.spacing))]] = 0.0
     color[worth == 0] = 0
@@ -61,7 +70,7 @@ def look(view: PhotoView, photo: NDArray[np.uint8], mesh: Facets, hidden: Hidden
         touched[mesh.faces[beyond]] = True
         beyond = touched[mesh.faces].any(axis=1)
         worth[beyond] *= RIM_WORTH
-    return Look(worth, color, sharpness(photo))
+    return Look(worth, color, sharpness(photo, used))
 
 
 def _blocked(
@@ -79,12 +88,21 @@ def _blocked(
     return np.asarray(blocked, np.bool_)
 
 
-def sharpness(photo: NDArray[np.uint8]) -> float:
-    """Ratio of the energies of the Laplacian at full and at half size, >= 0."""
+def sharpness(photo: NDArray[np.uint8], used: NDArray[np.bool_] | None = None) -> float:
+    """Ratio of the energies of the Laplacian at full and at half size, where the photo may be used; >= 0."""
     grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
     half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    fine, coarse = (float(np.mean(np.square(cv2.Laplacian(part, cv2.CV_32F)))) for part in (grey, half))
+    fine, coarse = (_energy(part, used) for part in (grey, half))
     return fine / coarse if coarse > 0 else 0.0
+
+
+def _energy(grey: NDArray[np.uint8], used: NDArray[np.bool_] | None) -> float:
+    energy = np.square(cv2.Laplacian(grey, cv2.CV_32F))
+    if used is None:
+        return float(np.mean(energy))
+    size = grey.shape[1], grey.shape[0]
+    counted = energy[cv2.resize(used.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0]
+    return float(np.mean(counted)) if counted.size else 0.0
 
 
 def sharpness_factors(sharpness_of: NDArray[np.float64]) -> FloatArray:
@@ -130,6 +148,62 @@ def _measure(
             for k in range(4):
                 total += sample(photo, x[k], y[k], channel)
             color[f, channel] = int(total / 4.0 + 0.5)
+
+
+@kernel
+def _drop_masked(
+    camera: FloatArray,
+    masked: NDArray[np.int32],
+    vertices: FloatArray,
+    faces: NDArray[np.int64],
+    worth: NDArray[np.float32],
+) -> None:
+    """Set the worth of the triangles that show a masked pixel to 0.
+
+    Args:
+        camera: lens and pose.
+        masked: (height + 1, width + 1) how many pixels above and to the left of each are masked.
+        vertices: of the surface.
+        faces: of the surface.
+        worth: (T,) positive only for triangles within the photo.
+    """
+    corner = np.empty((3, 2))
+    for f in range(len(faces)):
+        if worth[f] <= 0.0:
+            continue
+        for k in range(3):
+            v = faces[f, k]
+            corner[k, 0], corner[k, 1], _ = project(camera, vertices[v, 0], vertices[v, 1], vertices[v, 2])
+        top = int(min(corner[0, 1], corner[1, 1], corner[2, 1]) - MASK_RIM_PX)
+        bottom = int(max(corner[0, 1], corner[1, 1], corner[2, 1]) + MASK_RIM_PX) + 1
+        for y in range(max(top, 0), min(bottom, masked.shape[0] - 1)):
+            left, right = _span(corner, y - MASK_RIM_PX, y + 1 + MASK_RIM_PX)
+            if left > right:
+                continue
+            x0 = max(int(left - MASK_RIM_PX), 0)
+            x1 = min(int(right + MASK_RIM_PX) + 1, masked.shape[1] - 1)
+            if x0 < x1 and masked[y + 1, x1] - masked[y, x1] - masked[y + 1, x0] + masked[y, x0] > 0:
+                worth[f] = 0.0
+                break
+
+
+@kernel
+def _span(corner: FloatArray, top: float, bottom: float) -> tuple[float, float]:
+    """Least and greatest x of a triangle (3, 2) between two heights; empty (inf, -inf) where it is not there."""
+    left, right = np.inf, -np.inf
+    for k in range(3):
+        ax, ay, bx, by = corner[k, 0], corner[k, 1], corner[(k + 1) % 3, 0], corner[(k + 1) % 3, 1]
+        if max(ay, by) < top or min(ay, by) > bottom:
+            continue
+        first = last = 0.0
+        if ay != by:
+            first, last = (top - ay) / (by - ay), (bottom - ay) / (by - ay)
+        else:
+            last = 1.0
+        for part in (min(max(first, 0.0), 1.0), min(max(last, 0.0), 1.0)):
+            x = ax + part * (bx - ax)
+            left, right = min(left, x), max(right, x)
+    return left, right
 
 
 @kernel

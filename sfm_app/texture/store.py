@@ -15,6 +15,12 @@ class Store(Protocol):
     def photo(self, view: PhotoView, /) -> NDArray[np.uint8]:
         """(height, width, 3) RGB of a view at the view's size; OSError where it cannot be read."""
 
+    def used(self, view: PhotoView, /) -> NDArray[np.bool_] | None:
+        """(height, width) which pixels of a photo at full size may be used; None where all may.
+
+        Photos show nothing of the others: these have the colour of one that may be used. OSError as above.
+        """
+
     def recall(self, name: str, /) -> Mapping[str, NDArray[Any]] | None:
         """What was kept under a name, if anything was."""
 

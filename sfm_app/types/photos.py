@@ -40,6 +40,8 @@ class Photo:
     """Whether the file's format has lost something already."""
     notes: tuple[str, ...] = ()
     """What people should know about how it is read."""
+    mask: str = ""
+    """Path of its mask inside the folder of masks; empty where all of it may be used."""
 
     @property
     def path(self) -> str:
@@ -62,6 +64,8 @@ class PhotoSet:
     folder: Path
     photos: tuple[Photo, ...]
     unusable: tuple[UnusablePhoto, ...] = ()
+    masks: Path | None = None
+    """Folder of masks; None where none is given."""
 
     @property
     def groups(self) -> dict[str, tuple[Photo, ...]]:

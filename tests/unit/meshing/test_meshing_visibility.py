@@ -42,6 +42,16 @@ def test_the_back_of_a_surface_is_not_confirmed(eye):
     assert judge(np.array([[3, 0, 10.0]]), -FACING, eye, 0.01) == SILENT
 
 
+def test_what_is_masked_says_nothing(eye):
+    """Where a photo is empty it speaks against a surface; where it is masked it does not."""
+    eye.depth[:20, 60:] = -1
+    points = np.array([[3, -1.5, 10.0], [3, 0, 10.0], [1.95, -1.5, 10.0], [1.95, -1.5, 9.0]])
+
+    verdict = judge(points, FACING.repeat(4, axis=0), eye, 0.01)
+
+    assert verdict.tolist() == [SILENT, EMPTY, CONFIRMED, SILENT]
+
+
 def test_colours_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
     image = np.zeros((60, 80, 3), np.uint8)
     image[..., 0] = np.arange(80) * 2

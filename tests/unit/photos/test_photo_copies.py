@@ -1,6 +1,7 @@
 """Copies of a photo are found, and what only looks alike is not one."""
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,3 +79,12 @@ def test_all_copies_of_one_go_to_one():
 
     assert names(kept) == ["c"]
     assert {photo.reason for photo in copies} == {"the same picture as c"}
+
+
+def test_of_copies_the_one_with_a_mask_stays():
+    """Else what somebody has masked would be used from its copy."""
+    large, small = glance("a.jpg", scene()), glance("b.jpg", scene().resize((160, 120), Image.Resampling.LANCZOS))
+    masked = replace(small, photo=replace(small.photo, mask="b.jpg.png"))
+
+    assert names(without_copies([large, small])[0]) == ["a.jpg"]
+    assert names(without_copies([large, masked])[0]) == ["b.jpg"]

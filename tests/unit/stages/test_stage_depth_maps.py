@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.dense import DenseStore, read_views
+from sfm_app.colmap.dense import MASKED, DenseStore, read_depth, read_views
 from sfm_app.errors import ConfigError, ReconstructionError
+from sfm_app.photos import save_used
 from sfm_app.plugins import DepthMethod, hookimpl, load_plugins
 from sfm_app.progress import Silent
 from sfm_app.settings import DepthSettings, Settings
@@ -66,20 +67,24 @@ class Method:
         return load_plugins([SimpleNamespace(sfm_depth_methods=sfm_depth_methods)], installed=False)
 
 
-def run_stage(scene, ways, inputs="", **settings):
+def run_stage(scene, ways, inputs="", mask_dir=None, **settings):
     counts = {}
     options = DepthSettings(**{"method": "ours", **settings})
     run = SimpleNamespace(
-        plugins=ways.plugins, record=lambda **more: counts.update(more), map=None, inputs=inputs,
-        settings=Settings(depth=options), workers=2, progress=Silent(),
+        plugins=ways.plugins, record=lambda **more: counts.update(more), map=one_by_one, inputs=inputs,
+        settings=Settings(depth=options), workers=2, progress=Silent(), mask_dir=mask_dir,
     )  # fmt: skip
     assert make_depth_maps(scene, scene.photo_dir, scene.dense_dir, options, run) == scene.dense_dir
     return counts
 
 
-def kill_at(scene, name):
+def one_by_one(function, items, label):
+    return [function(item) for item in items]
+
+
+def kill_at(scene, name, **options):
     with pytest.raises(KeyboardInterrupt):
-        run_stage(scene, Method(kill_at=name))
+        run_stage(scene, Method(kill_at=name), **options)
 
 
 def test_the_manifest_says_what_was_done(scene):
@@ -123,6 +128,24 @@ def test_nothing_is_kept_that_was_made_from_something_else(scene, change):
     run_stage(scene, method, inputs="others" if change == "inputs" else "")
 
     assert method.asked == ["1.png", "2.png", "3.png"]
+
+
+def test_what_is_masked_has_no_depth_whatever_method_made_it(scene, tmp_path):
+    """Also in maps that a killed run left before they were masked."""
+    used = np.ones((60, 80), bool)
+    used[:, :40] = False
+    for name in scene.registered:
+        save_used(tmp_path / "masks", name, used if name == "1.png" else used | True)
+    kill_at(scene, "3.png", mask_dir=tmp_path / "masks")
+
+    counts = run_stage(scene, Method(), mask_dir=tmp_path / "masks")
+
+    view = read_views(scene.dense_dir)[0]
+    depth = read_depth(scene.dense_dir, view, "geometric")
+    assert (depth[:, :40] == MASKED).all()
+    assert (depth[:30, 43:] == 3).all()
+    assert counts["coverage"]["1.png"] == pytest.approx(0.25, abs=0.03)
+    assert counts["coverage"]["2.png"] == counts["coverage"]["3.png"] == 0.5
 
 
 def test_estimates_are_removed_at_the_end(scene):

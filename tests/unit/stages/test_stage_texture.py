@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sfm_app.photos import save_used
 from sfm_app.stages import texture
 from sfm_app.stages.texture import Files, digest, load_texture, make_texture, read_photo, save_texture
 from sfm_app.texture import PhotoView
@@ -51,6 +52,23 @@ def test_photos_are_rgb_and_of_the_view_s_size(tmp_path):
     assert (small[:, 10:] == 200).all()
 
 
+@pytest.mark.parametrize("scale", [1.0, 0.5, 0.13])
+def test_nothing_is_seen_of_what_is_masked_at_any_size(tmp_path, scale):
+    photo, used = np.full((40, 60, 3), (20, 120, 90), np.uint8), np.ones((40, 60), bool)
+    used[10:31, 17:44] = used[:, 3] = False
+    photo[~used] = (255, 0, 255)
+    Image.fromarray(photo).save(tmp_path / "a.png")
+    save_used(tmp_path / "masks", "a.png", used)
+    view = PhotoView("a.png", (50.0, 50.0, 30.0, 20.0, 0, 0, 0, 0), np.eye(3, 4), 60, 40)
+    files = Files(tmp_path, tmp_path / "parts", tmp_path / "masks")
+
+    seen = files.photo(view.scaled(round(60 * scale), round(40 * scale)))
+
+    np.testing.assert_array_equal(files.used(view), used)
+    assert (seen == (20, 120, 90)).all()
+    assert Files(tmp_path, tmp_path / "parts").used(view) is None
+
+
 def test_arrays_come_back_by_name_and_damaged_ones_count_as_none(tmp_path):
     files = Files(tmp_path, tmp_path / "parts")
     assert files.recall("look0") is None
@@ -94,7 +112,7 @@ def test_nothing_is_used_that_was_found_with_something_else(tmp_path, monkeypatc
     def run_stage(inputs="", focal=50.0, surface=SURFACE):
         camera = CameraModel("OPENCV", (focal, 50.0, 30.0, 20.0, 0, 0, 0, 0), np.eye(3), 60, 40)
         scene = SimpleNamespace(cameras={"one": camera}, camera_of={"a.png": "one"}, cam_from_world={"a.png": POSE})
-        run = SimpleNamespace(workspace=Workspace(tmp_path), inputs=inputs, map=None, record=dict)
+        run = SimpleNamespace(workspace=Workspace(tmp_path), inputs=inputs, map=None, record=dict, mask_dir=None)
         make_texture(scene, surface, None, run)
 
     monkeypatch.setattr(texture, "texture_surface", texture_surface)

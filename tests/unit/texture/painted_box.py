@@ -77,6 +77,7 @@ class Album:
 
     exposure: dict[str, float] = field(default_factory=dict)
     passers_by: dict[str, tuple[slice, slice]] = field(default_factory=dict)
+    masks: dict[str, np.ndarray] = field(default_factory=dict)
     lost: tuple[str, ...] = ()
     kept: dict[str, dict[str, np.ndarray]] = field(default_factory=dict)
     asked: list[str] = field(default_factory=list)
@@ -86,6 +87,9 @@ class Album:
 
     def keep(self, name, arrays):
         self.kept[name] = {key: array.copy() for key, array in arrays.items()}
+
+    def used(self, view):
+        return self.masks.get(view.name)
 
     def photo(self, view):
         self.asked.append(view.name)

@@ -3,6 +3,7 @@
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from painted_box import HALF, Album, around, box, on_surface, one_by_one, paint_at
@@ -99,6 +100,47 @@ def test_two_photos_alone_keep_what_they_disagree_on():
     assert model.texture is not None
 
 
+CROSSING = (slice(70, 150), slice(120, 170))
+
+
+def masked_crossing(view):
+    """All but the passer-by, and but a line across the photo that is thinner than a triangle."""
+    used = np.ones((view.height, view.width), bool)
+    used[CROSSING] = used[100, :] = False
+    return used
+
+
+def test_a_photo_is_used_for_the_triangles_that_show_nothing_masked():
+    view = VIEWS[4]
+    used = masked_crossing(view)
+    near = cv2.erode(used.view(np.uint8), np.ones((7, 7), np.uint8)) > 0
+
+    whole = textured(Album(), views=[view], unseen="cut")[0].surface
+    kept = textured(Album(masks={view.name: used}), views=[view], unseen="cut")[0].surface
+
+    parts = np.random.default_rng(0).dirichlet([1.0] * 3, 300)
+    shown = [_pixels(view, np.einsum("nk,tkc->tnc", parts, part.vertices[part.faces])) for part in (whole, kept)]
+    in_whole, in_kept = (np.floor(at).astype(int) for at in shown)
+    assert used[in_kept[..., 1], in_kept[..., 0]].all()
+    clear = near[in_whole[..., 1], in_whole[..., 0]].all(axis=1)
+    assert 0.5 * len(clear) < clear.sum() <= len(kept.faces) < 0.9 * len(clear)
+
+
+def test_what_lies_under_a_mask_does_not_change_a_byte():
+    """Two photos cannot say which of them is right where they disagree, a mask can."""
+    pair, crossing = VIEWS[4:6], {VIEWS[4].name: CROSSING}
+    masks = {VIEWS[4].name: masked_crossing(VIEWS[4])}
+
+    without, _ = textured(Album(passers_by=crossing), views=pair)
+    model, figures = textured(Album(passers_by=crossing, masks=masks), views=pair)
+    expected, same = textured(Album(masks=masks), views=pair)
+
+    assert figures == same
+    np.testing.assert_array_equal(model.texture.pages[0], expected.texture.pages[0])
+    np.testing.assert_array_equal(model.surface.colors, expected.surface.colors)
+    assert not np.array_equal(without.texture.pages[0], expected.texture.pages[0])
+
+
 def test_unseen_triangles_look_like_what_is_around_them(plain):
     model, _ = plain
     _, _, colors = on_surface(model, among=~seen_part(model))
@@ -176,5 +218,5 @@ def test_an_occluder_leaves_no_print():
 
 def _pixels(view, points):
     local = points @ view.cam_from_world[:, :3].T + view.cam_from_world[:, 3]
-    plane = local[:, :2] / local[:, 2:]
+    plane = local[..., :2] / local[..., 2:]
     return plane * np.array(view.lens[:2]) + np.array(view.lens[2:4])

@@ -1,0 +1,64 @@
+"""Masks in COLMAP's dense workspace: without distortion and at the size of the photos there."""
+
+from collections.abc import Callable
+from math import ceil
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.colmap.backend import backend, pycolmap
+from sfm_app.photos import mask_place, read_used, save_used
+from sfm_app.stereo import View
+
+MASKS = "masks"
+REACH_PX = 2
+"""Pixels around what is masked that are not used either: colours are read between four pixels, half a pixel aside."""
+
+BoolImage = NDArray[np.bool_]
+"""(H, W)."""
+
+
+def mask_undistorter(model_dir: Path, mask_dir: Path, dense_dir: Path) -> Callable[[View], None]:
+    """A function that writes the mask of an undistorted photo.
+
+    Args:
+        model_dir: model with the photos' lenses.
+        mask_dir: masks of the photos as they are laid out.
+        dense_dir: workspace with the undistorted photos.
+    """
+    with backend("reading the model"):
+        model = pycolmap.Reconstruction(model_dir)
+        cameras = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+
+    def undistort(view: View) -> None:
+        used = _undistorted(read_used(mask_dir, view.name), cameras[view.name], view)
+        save_used(dense_dir / MASKS, view.name, used)
+
+    return undistort
+
+
+def used_pixels(dense_dir: Path, view: View) -> BoolImage | None:
+    """(H, W) which pixels of an undistorted photo may be used; None where no masks are given."""
+    place = dense_dir / MASKS
+    return read_used(place, view.name) if mask_place(place, view.name).exists() else None
+
+
+def _undistorted(used: BoolImage, camera: "pycolmap.Camera", view: View) -> BoolImage:
+    """A pixel is used where all is that it shows in part."""
+    x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(view.K).T
+    with backend(f"undistorting the mask of {view.name}"):
+        at = np.floor(camera.img_from_cam(rays)).astype(np.int64).reshape(view.height, view.width, 2)
+    col, row = at[..., 0], at[..., 1]
+    height, width = used.shape
+    inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
+    whole = _shrunk(used, ceil(max(camera.focal_length_x / view.K[0, 0], camera.focal_length_y / view.K[1, 1])))
+    return _shrunk(inside & whole[row.clip(0, height - 1), col.clip(0, width - 1)], REACH_PX)
+
+
+def _shrunk(used: BoolImage, reach: int) -> BoolImage:
+    """Without the pixels that have an unused one so near."""
+    square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    return np.asarray(cv2.erode(used.view(np.uint8), square)) > 0

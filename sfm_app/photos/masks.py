@@ -1,0 +1,162 @@
+"""Masks: pictures that say which pixels of a photo may be used, named and painted as COLMAP wants them.
+
+The mask of `sub/a.jpg` is `sub/a.jpg.png` or `sub/a.png` in a folder of its own; what is black or transparent there is
+not used. A mask is for the photo as people see it.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sfm_app.errors import InputError
+from sfm_app.photos.decode import UnreadableError, read_picture, turned_upright
+from sfm_app.photos.exif import orientation
+from sfm_app.photos.files import list_files, place_of
+from sfm_app.types import Photo, UnusablePhoto
+
+ENDING = ".png"
+MASK_HINT = "the mask of sub/a.jpg is sub/a.jpg.png or sub/a.png in the folder of masks, of the size of the photo"
+USED = 255
+SIDEWAYS = 5
+"""EXIF orientations from here on change width and height."""
+
+BoolImage = NDArray[np.bool_]
+"""(H, W)."""
+
+
+def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
+    """Names of all files below the folder of masks, as `list_files` has them, without photos and output.
+
+    Raises:
+        InputError: there is no such folder, or it is that of the photos.
+    """
+    if not masks.is_dir():
+        what = "not a folder" if masks.exists() else "no such folder"
+        raise InputError(f"{what} of masks: {masks}", hint=MASK_HINT)
+    if masks.resolve() == photos.resolve():
+        raise InputError(f"the masks lie among the photos in {photos}", hint="give the masks a folder of their own")
+    return list_files(masks, out, closed=(photos,))
+
+
+def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
+    """The photo with its mask, if it has one; unusable where all of it is masked.
+
+    Raises:
+        InputError: the mask cannot be used; says why.
+    """
+    names = f"{photo.path}{ENDING}", str(PurePosixPath(photo.path).with_suffix(ENDING))
+    name = next((name for name in names if os.path.lexists(masks / name)), "")
+    if not name:
+        return photo
+    found = replace(photo, mask=name)
+    if not np.any(_fitted(found, folder, masks)):
+        return UnusablePhoto(photo.path, f"its mask {name} is all black")
+    return found
+
+
+def unused_masks(names: Sequence[str], photos: Sequence[Photo]) -> list[str]:
+    """Which files of the folder of masks are the mask of no photo; hidden ones are nobody's."""
+    used = {photo.mask for photo in photos}
+    return [name for name in names if name not in used and not PurePosixPath(name).name.startswith(".")]
+
+
+def lay_out_mask(photo: Photo, folder: Path, masks: Path, target: Path) -> None:
+    """Put the mask of a photo below `target`, upright and at the photo's size; all white where it has none.
+
+    COLMAP passes over photos without a mask when it is given any.
+
+    Raises:
+        InputError: as `find_mask`.
+        OSError: the target cannot be written.
+    """
+    used = _fitted(photo, folder, masks) if photo.mask else np.full((photo.height, photo.width), True)
+    save_used(target, photo.name, used)
+
+
+def mask_place(target: Path, name: str) -> Path:
+    """Where the mask of the photo that goes by this name is laid out."""
+    return target / f"{name}{ENDING}"
+
+
+def save_used(target: Path, name: str, used: BoolImage) -> None:
+    """Write which pixels of a photo may be used as a mask of black and white."""
+    place = mask_place(target, name)
+    place.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(_painted(used)).save(place, "PNG", compress_level=1)
+
+
+def read_used(target: Path, name: str) -> BoolImage:
+    """(H, W) what `save_used` wrote; OSError where it cannot be read."""
+    with Image.open(mask_place(target, name)) as image:
+        return np.asarray(image) > 0
+
+
+def without_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uint8]:
+    """A photo (H, W, 3) whose masked pixels take the colour of the nearest one that may be used.
+
+    Then neither interpolation nor a smaller size brings back what is masked.
+    """
+    if used.all() or not used.any():
+        return pixels
+    hidden = (~used).view(np.uint8)
+    _, nearest = cv2.distanceTransformWithLabels(hidden, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    seeds = np.flatnonzero(used)
+    place = np.zeros(len(seeds) + 1, np.int64)  # labels count from 1
+    place[nearest.ravel()[seeds]] = seeds
+    return np.asarray(pixels.reshape(-1, 3)[place[nearest]])
+
+
+def _fitted(photo: Photo, folder: Path, masks: Path) -> BoolImage:
+    """(H, W) which pixels of the upright photo its mask leaves."""
+    try:
+        place = place_of(masks, photo.mask)
+        if isinstance(place, str):
+            raise UnreadableError(place)
+        picture = read_picture(place)
+        mask = turned_upright(_black_and_white(picture.image), orientation(picture.exif))
+        size = photo.width, photo.height
+        if not _alike(mask.size, size):
+            mask = _turned_like(photo, mask, folder)
+    except UnreadableError as err:
+        raise InputError(f"the mask {photo.mask} cannot be used: {err}", hint=MASK_HINT) from err
+    return np.asarray(mask if mask.size == size else mask.resize(size, Image.Resampling.NEAREST)) > 0
+
+
+def _turned_like(photo: Photo, mask: Image.Image, folder: Path) -> Image.Image:
+    """A mask that fits the photo as its file has it, before EXIF turns it."""
+    if _alike(mask.size[::-1], (photo.width, photo.height)):
+        source = place_of(folder, photo.path)
+        turned = orientation(read_picture(source).exif) if isinstance(source, Path) else 1
+        if turned >= SIDEWAYS:
+            return turned_upright(mask, turned)
+    width, height = mask.size
+    raise UnreadableError(f"it has {width} x {height} pixels, its photo {photo.width} x {photo.height}")
+
+
+def _alike(one: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes have the same shape, to within a pixel of the smaller one."""
+    return abs(one[0] * other[1] - one[1] * other[0]) <= max(*one, *other)
+
+
+def _black_and_white(image: Image.Image) -> Image.Image:
+    """White where any channel is not black and the picture not transparent."""
+    if image.mode.startswith("I") or image.mode == "F":
+        used = np.asarray(image) != 0
+    elif image.mode in ("1", "L") and "transparency" not in image.info:
+        used = np.asarray(image.convert("L")) > 0
+    elif image.mode in ("RGB", "CMYK", "YCbCr", "LAB", "HSV") and "transparency" not in image.info:
+        used = np.asarray(image.convert("RGB")).any(axis=2)
+    else:
+        channels = np.asarray(image.convert("RGBA"))
+        used = channels[..., :3].any(axis=2) & (channels[..., 3] > 0)
+    return Image.fromarray(_painted(used))
+
+
+def _painted(used: BoolImage) -> NDArray[np.uint8]:
+    return np.where(used, np.uint8(USED), np.uint8(0))
