@@ -1,6 +1,7 @@
 """The commands."""
 
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,7 @@ def fail(message: str, hint: str, code: int) -> None:
 @click.version_option(__version__, prog_name="sfm-app")
 def main() -> None:
     """Turn a folder of photos about which nothing is known into a 3D model."""
+    warnings.filterwarnings("ignore", module=r"PIL\b")  # what is wrong with a photo is said once, and in our words
 
 
 @main.command()

@@ -13,6 +13,7 @@ from sfm_app.context import RunContext
 from sfm_app.errors import InputError
 from sfm_app.photos import (
     LOSSY,
+    MOST_FRAMES,
     Glance,
     Picture,
     UnreadableError,
@@ -94,7 +95,8 @@ def described(name: str, picture: Picture, options: PhotoSettings) -> Glance | U
     if min(size) < options.min_side_px:
         return UnusablePhoto(name, f"smaller than {options.min_side_px} px")
     width, height = scaled(size, options.max_megapixels * MEGA)
-    notes = [f"the first of its {picture.frames} pictures"] if picture.frames > 1 else []
+    many = f"its {picture.frames}" if picture.frames <= MOST_FRAMES else f"more than {MOST_FRAMES}"
+    notes = [f"the first of {many} pictures"] if picture.frames > 1 else []
     if (width, height) != size:
         notes.append(f"scaled down from {size[0]} x {size[1]} to {width} x {height} pixels")
     eight_bit = image.mode in ("RGB", "L") and "transparency" not in image.info
