@@ -9,26 +9,29 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
-from zipfile import BadZipFile
+from typing import Any, cast
 
 from sfm_app.colmap.backend import versions as colmap_versions
+from sfm_app.colmap.database import matches_seal
+from sfm_app.colmap.dense import MAPS
 from sfm_app.colmap.model import sparse_model
-from sfm_app.context import RunContext
-from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError, SfmError
+from sfm_app.context import STANDARD_FORMATS, RunContext
+from sfm_app.errors import ConfigError, DamagedProductError, InputError, SfmError
 from sfm_app.parallel import ordered_map
 from sfm_app.photos import place_of
 from sfm_app.stages.depth_maps import make_depth_maps
+from sfm_app.stages.files import NAME as MODEL
 from sfm_app.stages.files import load_files, write_files
-from sfm_app.stages.intrinsics import calibrate, load_intrinsics
+from sfm_app.stages.intrinsics import calibrate, intrinsics_seal, load_intrinsics
 from sfm_app.stages.match_graph import load_match_graph, match_photos
-from sfm_app.stages.mesh import load_surface, make_mesh
+from sfm_app.stages.mesh import SURFACE, load_surface, make_mesh
 from sfm_app.stages.photos import files_of, load_photo_set, read_photos
 from sfm_app.stages.scene import load_scene, reconstruct_scene
-from sfm_app.stages.texture import load_texture, make_texture
+from sfm_app.stages.texture import TEXTURE, load_texture, make_texture
 from sfm_app.stages.view_graph import build_view_graph, load_view_graph
+from sfm_app.stored import seal
 from sfm_app.types import Model
-from sfm_app.workspace import StageRecord, fingerprint
+from sfm_app.workspace import StageRecord, Workspace, fingerprint
 
 logger = logging.getLogger("sfm_app")
 
@@ -49,28 +52,34 @@ class Stage:
     """What it leaves in the output folder."""
     make: Callable[[Products, RunContext], Any]
     load: Callable[[Products, RunContext], Any]
+    seal: Callable[[Workspace], str]
+    """Hash of what `load` reads and later stages leave alone: COLMAP hangs or ends on damaged files."""
 
 
 STAGES = (
     Stage(
         "photos", (), ("photos",), ("photos.json", "photos"),
         make=lambda products, run: read_photos(products("folder"), run),
-        load=lambda _, run: load_photo_set(run),
+        load=lambda products, run: load_photo_set(products("folder"), run),
+        seal=lambda place: seal(place.root, place.photo_set.name),
     ),
     Stage(
         "match_graph", ("photos",), ("matching",), ("database.db",),
         make=lambda products, run: match_photos(products("photos"), run),
         load=lambda products, run: load_match_graph(products("photos"), run),
+        seal=lambda place: matches_seal(place.database),
     ),
     Stage(
         "view_graph", ("match_graph",), ("epipolar", "seed"), ("view_graph.npz",),
         make=lambda products, run: build_view_graph(products("match_graph"), run),
         load=lambda _, run: load_view_graph(run),
+        seal=lambda place: seal(place.root, place.view_graph.name),
     ),
     Stage(
         "intrinsics", ("match_graph", "view_graph"), ("calibration", "photos", "seed"), ("calibration.json",),
         make=lambda products, run: calibrate(products("match_graph"), products("view_graph"), run),
         load=lambda _, run: load_intrinsics(run),
+        seal=intrinsics_seal,
     ),
     Stage(
         "scene", ("photos", "match_graph", "view_graph", "intrinsics"), ("scene", "epipolar", "seed"), ("sparse",),
@@ -78,6 +87,7 @@ STAGES = (
             products("match_graph"), products("view_graph"), products("intrinsics"), run
         ),
         load=lambda products, run: load_scene(products("photos"), products("intrinsics"), run),
+        seal=lambda place: seal(place.root, place.sparse.name),
     ),
     Stage(
         "depth_maps", ("scene",), ("depth",), ("dense",),
@@ -85,21 +95,25 @@ STAGES = (
             products("scene"), run.workspace.photos, run.workspace.dense, run.settings.depth, run
         ),
         load=lambda _, run: run.workspace.dense,
+        seal=lambda place: seal(place.dense, *MAPS),
     ),
     Stage(
         "mesh", ("depth_maps",), ("mesh",), ("dense/surface.npz",),
         make=lambda products, run: make_mesh(products("depth_maps"), run.settings.mesh, run),
         load=lambda _, run: load_surface(run.workspace.dense),
+        seal=lambda place: seal(place.dense, SURFACE),
     ),
     Stage(
         "texture", ("scene", "mesh"), ("texture",), ("dense/texture.npz",),
         make=lambda products, run: make_texture(products("scene"), products("mesh"), run.settings.texture, run),
         load=lambda _, run: load_texture(run.workspace.dense),
+        seal=lambda place: seal(place.dense, TEXTURE),
     ),
     Stage(
         "files", ("texture",), (), ("model.ply", "model.glb"),
         make=lambda products, run: write_files(products("texture"), run),
         load=lambda _, run: load_files(run),
+        seal=lambda place: seal(place.root, *(f"{MODEL}.{suffix}" for suffix in STANDARD_FORMATS)),
     ),
 )  # fmt: skip
 
@@ -121,10 +135,10 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
                 f"{place.root} holds no {'points' if points else 'model'} yet: stage `{name}` is missing",
                 hint=_how_on(run),
             )
-    try:
-        return sparse_model(place.sparse) if points else loader({}, run)("texture")
-    except OSError as err:
-        raise InputError(f"{place.root} is not complete: {err.strerror}: {err.filename}", hint=_how_on(run)) from err
+    if not points:
+        return cast(Model, loader({}, run)("texture"))
+    with undamaged("scene", run):
+        return sparse_model(place.sparse)
 
 
 def _how_on(run: RunContext) -> str:
@@ -137,19 +151,31 @@ def loader(found: dict[str, Any], run: RunContext) -> Products:
 
     def products(name: str) -> Any:
         if name not in found:
-            try:
+            with undamaged(name, run):
                 found[name] = STAGES[NAMES.index(name)].load(products, run)
-            except DamagedProductError:
-                raise
-            except (OSError, ValueError, TypeError, LookupError, BadZipFile, EOFError, BackendError) as err:
-                what = "is damaged"
-                if isinstance(err, FileNotFoundError):
-                    what = f"is not complete: {err.filename} is gone"
-                left = f"what stage `{name}` left in {run.workspace.root} {what}"
-                raise DamagedProductError(left, _how_on(run), name) from err
         return found[name]
 
     return products
+
+
+@contextmanager
+def undamaged(name: str, run: RunContext) -> Iterator[None]:
+    """Check what a stage has left, and read it.
+
+    Raises:
+        DamagedProductError: it is not as it was left, or cannot be read.
+    """
+    try:
+        record = run.workspace.record(name)
+        if record is None or record.seal != STAGES[NAMES.index(name)].seal(run.workspace):
+            raise ValueError(f"the files of stage `{name}` are not as it left them")
+        yield
+    except InputError:
+        raise
+    except Exception as err:  # whatever decoders make of damaged bytes
+        what = f"is not complete: {err.filename} is gone" if isinstance(err, FileNotFoundError) else "is damaged"
+        left = f"what stage `{name}` left in {run.workspace.root} {what}"
+        raise DamagedProductError(left, _how_on(run), name) from err
 
 
 def run_stages(
@@ -172,7 +198,7 @@ def run_stages(
             try:
                 return _through((folder, photos), run, (first, last), wanted)
             except DamagedProductError as err:
-                logger.info("%s", err)
+                logger.info("%s", err, exc_info=err)
                 run.progress.stage(err.stage, "damaged: done again")
                 first = err.stage
         return _through((folder, photos), run, (first, last), wanted)
@@ -211,7 +237,7 @@ def make(stage: Stage, products: Products, print_of_inputs: str, run: RunContext
         raise
     seconds = round(time.perf_counter() - start, 2)
     sizes = run.workspace.sizes(stage.files)
-    record = StageRecord(print_of_inputs, seconds, run.counts, sizes, peak_memory_mb())
+    record = StageRecord(print_of_inputs, seconds, run.counts, sizes, peak_memory_mb(), stage.seal(run.workspace))
     run.workspace.finish(stage.name, record, manifest_head(run))
     logger.info("%s took %.2f s", stage.name, seconds)
     run.progress.stage_done(seconds)

@@ -32,6 +32,7 @@ from sfm_app.photos import (
     without_copies,
 )
 from sfm_app.settings import PhotoSettings
+from sfm_app.stored import is_below, seal
 from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
 
 MEGA = 1_000_000
@@ -135,17 +136,28 @@ def laid_out(photo: Photo, *, folder: Path, target: Path) -> None:
 
 
 def save_photo_set(photos: PhotoSet, run: RunContext) -> None:
-    """Write photos.json."""
+    """Write photos.json, with hashes of the copies."""
+    copies = {photo.name: _copy_seal(photo, run) for photo in photos.photos}
+    values = {**asdict(photos), "folder": str(photos.folder), "copies": copies}
     with run.workspace.replacing(run.workspace.photo_set) as path:
-        path.write_text(json.dumps({**asdict(photos), "folder": str(photos.folder)}, indent=1) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
 
 
-def load_photo_set(run: RunContext) -> PhotoSet:
-    """Read photos.json back; what is gone of the photos that were laid out is laid out again."""
+def _copy_seal(photo: Photo, run: RunContext) -> str | None:
+    """Hash of the bytes of a copy; None where a link leads to the photo, or where nothing is."""
+    place = run.workspace.photos / photo.name
+    return seal(run.workspace.photos, photo.name) if place.is_file() and not place.is_symlink() else None
+
+
+def load_photo_set(folder: Path, run: RunContext) -> PhotoSet:
+    """Read photos.json back; what is gone of the photos that were laid out, or was damaged, is laid out again."""
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
-    folder, photos = Path(values["folder"]), tuple(_photo(entry) for entry in values["photos"])
+    photos = tuple(_photo(entry) for entry in values["photos"])
+    if not all(is_below(photo.name) for photo in photos):
+        raise ValueError(f"{run.workspace.photo_set} names photos outside of their folder")
     for photo in photos:
-        if not (run.workspace.photos / photo.name).exists():
+        place, copy = run.workspace.photos / photo.name, values["copies"].get(photo.name)
+        if copy != _copy_seal(photo, run) or not (copy or place.resolve() == place_of(folder, photo.path)):
             laid_out(photo, folder=folder, target=run.workspace.photos)
     return PhotoSet(folder, photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]))
 
