@@ -1,36 +1,35 @@
 """The stages in order: the program's table of contents, and the loop that runs them."""
 
-import hashlib
 import logging
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
-from zipfile import BadZipFile
+from typing import Any, cast
 
 from sfm_app.colmap.backend import check_written
-from sfm_app.colmap.backend import versions as colmap_versions
+from sfm_app.colmap.database import matches_seal
+from sfm_app.colmap.dense import MAPS
 from sfm_app.colmap.model import sparse_model
-from sfm_app.context import RunContext
-from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError, SfmError
-from sfm_app.parallel import ordered_map
-from sfm_app.photos import head_of, is_video, place_of
+from sfm_app.context import STANDARD_FORMATS, RunContext
+from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
+from sfm_app.inputs import Source, manifest_head, source_of, stage_print, why_again
 from sfm_app.stages.depth_maps import make_depth_maps
+from sfm_app.stages.files import NAME as MODEL
 from sfm_app.stages.files import load_files, write_files
-from sfm_app.stages.frames import photos_of, settings_for
-from sfm_app.stages.intrinsics import calibrate, load_intrinsics
+from sfm_app.stages.frames import folder_of, photos_of, settings_for
+from sfm_app.stages.intrinsics import calibrate, intrinsics_seal, load_intrinsics
 from sfm_app.stages.match_graph import load_match_graph, match_photos
-from sfm_app.stages.mesh import load_surface, make_mesh
-from sfm_app.stages.photos import files_of, load_photo_set, mask_folder, masks_of, read_photos
+from sfm_app.stages.mesh import SURFACE, load_surface, make_mesh
+from sfm_app.stages.photos import load_photo_set, read_photos
 from sfm_app.stages.scene import load_scene, reconstruct_scene
-from sfm_app.stages.texture import load_texture, make_texture
+from sfm_app.stages.texture import TEXTURE, load_texture, make_texture
 from sfm_app.stages.view_graph import build_view_graph, load_view_graph
+from sfm_app.stored import seal
 from sfm_app.types import Model, PhotoSet
-from sfm_app.workspace import StageRecord, fingerprint
+from sfm_app.workspace import StageRecord, Workspace
 
 logger = logging.getLogger("sfm_app")
 
@@ -46,33 +45,39 @@ class Stage:
     takes: tuple[str, ...]
     """Stages whose products it needs."""
     settings: tuple[str, ...]
-    """Tables of the settings that its result depends on."""
+    """Settings, or tables of them, that its result depends on."""
     files: tuple[str, ...]
     """What it leaves in the output folder."""
     make: Callable[[Products, RunContext], Any]
     load: Callable[[Products, RunContext], Any]
+    seal: Callable[[Workspace], str]
+    """Hash of what `load` reads and later stages leave alone: COLMAP hangs or ends on damaged files."""
 
 
 STAGES = (
     Stage(
-        "photos", (), ("photos",), ("photos.json", "photos", "frames", "masks"),
-        make=lambda products, run: photos_from(products("folder"), run),
-        load=lambda _, run: load_photo_set(run),
+        "photos", ("source",), ("photos",), ("photos.json", "photos", "frames", "masks"),
+        make=lambda products, run: photos_from(products("source"), run),
+        load=lambda products, run: load_photo_set(folder_of(products("source"), run), run),
+        seal=lambda place: seal(place.root, place.photo_set.name),
     ),
     Stage(
         "match_graph", ("photos",), ("matching",), ("database.db",),
         make=lambda products, run: match_photos(products("photos"), run),
         load=lambda products, run: load_match_graph(products("photos"), run),
+        seal=lambda place: matches_seal(place.database),
     ),
     Stage(
         "view_graph", ("match_graph",), ("epipolar", "seed"), ("view_graph.npz",),
         make=lambda products, run: build_view_graph(products("match_graph"), run),
         load=lambda _, run: load_view_graph(run),
+        seal=lambda place: seal(place.root, place.view_graph.name),
     ),
     Stage(
-        "intrinsics", ("match_graph", "view_graph"), ("calibration", "photos", "seed"), ("calibration.json",),
+        "intrinsics", ("match_graph", "view_graph"), ("calibration", "photos.cameras", "seed"), ("calibration.json",),
         make=lambda products, run: calibrate(products("match_graph"), products("view_graph"), run),
         load=lambda _, run: load_intrinsics(run),
+        seal=intrinsics_seal,
     ),
     Stage(
         "scene", ("photos", "match_graph", "view_graph", "intrinsics"), ("scene", "epipolar", "seed"), ("sparse",),
@@ -80,6 +85,7 @@ STAGES = (
             products("match_graph"), products("view_graph"), products("intrinsics"), run
         ),
         load=lambda products, run: load_scene(products("photos"), products("intrinsics"), run),
+        seal=lambda place: seal(place.root, place.sparse.name),
     ),
     Stage(
         "depth_maps", ("scene",), ("depth",), ("dense",),
@@ -87,25 +93,30 @@ STAGES = (
             products("scene"), run.workspace.photos, run.workspace.dense, run.settings.depth, run
         ),
         load=lambda _, run: run.workspace.dense,
+        seal=lambda place: seal(place.dense, *MAPS),
     ),
     Stage(
         "mesh", ("depth_maps",), ("mesh",), ("dense/surface.npz",),
         make=lambda products, run: make_mesh(products("depth_maps"), run.settings.mesh, run),
         load=lambda _, run: load_surface(run.workspace.dense),
+        seal=lambda place: seal(place.dense, SURFACE),
     ),
     Stage(
         "texture", ("scene", "mesh"), ("texture",), ("dense/texture.npz",),
         make=lambda products, run: make_texture(products("scene"), products("mesh"), run.settings.texture, run),
         load=lambda _, run: load_texture(run.workspace.dense),
+        seal=lambda place: seal(place.dense, TEXTURE),
     ),
     Stage(
         "files", ("texture",), (), ("model.ply", "model.glb"),
         make=lambda products, run: write_files(products("texture"), run),
         load=lambda _, run: load_files(run),
+        seal=lambda place: seal(place.root, *(f"{MODEL}.{suffix}" for suffix in STANDARD_FORMATS)),
     ),
 )  # fmt: skip
 
 NAMES = tuple(stage.name for stage in STAGES)
+PHOTOS = NAMES[0]
 
 
 def stored_model(run: RunContext, *, points: bool = False) -> Model:
@@ -123,10 +134,10 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
                 f"{place.root} holds no {'points' if points else 'model'} yet: stage `{name}` is missing",
                 hint=_how_on(run),
             )
-    try:
-        return sparse_model(place.sparse) if points else loader({}, run)("texture")
-    except OSError as err:
-        raise InputError(f"{place.root} is not complete: {err.strerror}: {err.filename}", hint=_how_on(run)) from err
+    if not points:
+        return cast(Model, loader({}, run)("texture"))
+    with undamaged("scene", run):
+        return sparse_model(place.sparse)
 
 
 def _how_on(run: RunContext) -> str:
@@ -139,27 +150,38 @@ def loader(found: dict[str, Any], run: RunContext) -> Products:
 
     def products(name: str) -> Any:
         if name not in found:
-            try:
+            with undamaged(name, run):
                 found[name] = STAGES[NAMES.index(name)].load(products, run)
-            except DamagedProductError:
-                raise
-            except (OSError, ValueError, TypeError, LookupError, BadZipFile, EOFError, BackendError) as err:
-                what = "is damaged"
-                if isinstance(err, FileNotFoundError):
-                    what = f"is not complete: {err.filename} is gone"
-                left = f"what stage `{name}` left in {run.workspace.root} {what}"
-                raise DamagedProductError(left, _how_on(run), name) from err
         return found[name]
 
     return products
 
 
+@contextmanager
+def undamaged(name: str, run: RunContext) -> Iterator[None]:
+    """Check what a stage has left, and read it.
+
+    Raises:
+        DamagedProductError: it is not as it was left, or cannot be read.
+    """
+    try:
+        record = run.workspace.record(name)
+        if record is None or record.seal != STAGES[NAMES.index(name)].seal(run.workspace):
+            raise ValueError(f"the files of stage `{name}` are not as it left them")
+        yield
+    except InputError:
+        raise
+    except Exception as err:  # whatever decoders make of damaged bytes
+        what = f"is not complete: {err.filename} is gone" if isinstance(err, FileNotFoundError) else "is damaged"
+        left = f"what stage `{name}` left in {run.workspace.root} {what}"
+        raise DamagedProductError(left, _how_on(run), name) from err
+
+
 def run_stages(
-    folder: Path, run: RunContext, first: str = "", last: str = "files", wanted: Sequence[str] = ()
+    source: Path, run: RunContext, first: str = "", last: str = "files", wanted: Sequence[str] = ()
 ) -> Products:
     """Run what is not up to date, up to stage `last`; everything from stage `first` on is done again.
 
-    The folder may be a video.
     Stages whose files are damaged are done again, too. The products of the stages `wanted` are read before it ends.
 
     Raises:
@@ -168,68 +190,52 @@ def run_stages(
     for name in filter(None, (first, last)):
         if name not in NAMES:
             raise ConfigError(f"no stage is named '{name}'", hint=f"stages: {', '.join(NAMES)}")
-    run.settings = settings_for(folder, run.settings)
-    run.workspace.keep_apart(folder)
-    photos = source_fingerprint(folder, run)
+    run.settings = settings_for(source, run.settings)
+    run.workspace.keep_apart(source)
+    inputs = source_of(source, run)
     run.workspace.create()
     with run.workspace.held(), logged(run):
         for _ in STAGES:
             try:
-                return _through((folder, photos), run, (first, last), wanted)
+                return _through(inputs, run, (first, last), wanted)
             except DamagedProductError as err:
-                logger.info("%s", err)
+                logger.info("%s", err, exc_info=err)
                 run.progress.stage(err.stage, "damaged: done again")
-                first = err.stage
-        return _through((folder, photos), run, (first, last), wanted)
+                forget(err.stage, run)
+                first = ""
+        return _through(inputs, run, (first, last), wanted)
 
 
-def _through(folder: tuple[Path, str], run: RunContext, ends: tuple[str, str], wanted: Sequence[str]) -> Products:
-    """As `run_stages`, once; the folder with its fingerprint."""
+def _through(source: Source, run: RunContext, ends: tuple[str, str], wanted: Sequence[str]) -> Products:
+    """As `run_stages`, once."""
     first, last = ends
-    found: dict[str, Any] = {"folder": folder[0]}
-    prints: dict[str, str] = {"folder": folder[1]}
+    found: dict[str, Any] = {"source": source.place}
+    prints: dict[str, str] = {"source": source.print}
     products = loader(found, run)
-    redo = False
+    redone = ""
     for stage in STAGES[: NAMES.index(last) + 1]:
-        prints[stage.name] = stage_fingerprint(stage, prints, run)
-        redo = redo or stage.name == first or not run.workspace.is_current(stage.name, prints[stage.name])
-        if not redo:
+        prints[stage.name] = stage_print(stage.name, stage.settings, [prints[name] for name in stage.takes], run)
+        again = why_again(stage.name, stage.settings, prints[stage.name], run)
+        if stage.name == first or redone:
+            again = again or (f"after {redone}" if redone else "as you said")
+        if again is None:
             run.progress.stage(stage.name, "up to date")
-            continue
-        run.workspace.forget(NAMES[NAMES.index(stage.name) :])
-        found[stage.name] = make(stage, products, prints[stage.name], run)
+        else:
+            forget(stage.name, run)
+            found[stage.name] = make(stage, products, (source, prints[stage.name]), again, run)
+            if stage.name == first or stage.name != PHOTOS:
+                redone = stage.name
+        if stage.name == PHOTOS:  # what changed in the folder may not matter to the photos that are used
+            prints[PHOTOS] = source.content(products(PHOTOS))
     for name in wanted:
         if NAMES.index(name) <= NAMES.index(last):
             products(name)
     return products
 
 
-def make(stage: Stage, products: Products, print_of_inputs: str, run: RunContext) -> Any:
-    """Run one stage and enter it in the manifest."""
-    run.progress.stage(stage.name)
-    run.counts, run.inputs = {}, print_of_inputs
-    start = time.perf_counter()
-    try:
-        product = stage.make(products, run)
-    except SfmError as err:
-        if isinstance(err, BackendError):
-            check_written(*(path for path in run.workspace.root.iterdir() if path.is_file()))
-        logger.info("%s stopped: %s; counted so far: %s", stage.name, err, run.counts)
-        raise
-    seconds = round(time.perf_counter() - start, 2)
-    sizes = run.workspace.sizes(stage.files)
-    record = StageRecord(print_of_inputs, seconds, run.counts, sizes, peak_memory_mb())
-    run.workspace.finish(stage.name, record, manifest_head(run))
-    logger.info("%s took %.2f s", stage.name, seconds)
-    run.progress.stage_done(seconds)
-    return product
-
-
-def peak_memory_mb() -> int | None:
-    """Most memory that this process has held; None where the system is not Linux."""
-    status = Path("/proc/self/status")
-    found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text(encoding="utf-8")) if status.exists() else None
-    return int(found[1]) // 1024 if found else None
+def forget(name: str, run: RunContext) -> None:
+    """Take a stage out of the manifest, and those that build on its files; nobody builds on those of the photos."""
+    run.workspace.forget((name,) if name == PHOTOS else NAMES[NAMES.index(name) :])
 
 
 def photos_from(source: Path, run: RunContext) -> PhotoSet:
@@ -238,51 +244,58 @@ def photos_from(source: Path, run: RunContext) -> PhotoSet:
         return read_photos(folder, run)
 
 
-def source_fingerprint(source: Path, run: RunContext) -> str:
-    """Hash of the names and bytes of all files in the photo folder, or of a video, and in that of the masks."""
-    parts: list[Any] = [str(source.resolve())]
-    parts += [digest(source)] if is_video(head_of(source)) else _contents(source, files_of(source, run), run)
-    masks = mask_folder(run)
-    if masks is not None:
-        parts += [str(masks.resolve()), *_contents(masks, masks_of(source, run), run)]
-    return fingerprint(*parts)
+def make(stage: Stage, products: Products, inputs: tuple[Source, str], again: str, run: RunContext) -> Any:
+    """Run one stage and enter it in the manifest.
 
-
-def _contents(folder: Path, names: Sequence[str], run: RunContext) -> list[Any]:
-    """Names and hashes of files in a folder; instead of a hash, why a file is not read."""
-
-    def digest_of(name: str) -> str:
-        place = place_of(folder, name)
-        return place if isinstance(place, str) else digest(place)
-
-    return [names, list(ordered_map(run.executor, digest_of, names, ahead=4 * run.workers))]
-
-
-def digest(file: Path) -> str:
-    """Hash of the bytes of a file."""
+    Args:
+        stage: to be run.
+        products: of the stages before.
+        inputs: what the user has given, and the fingerprint of all that the stage's result depends on.
+        again: why it is done, where it was there before.
+        run: the run.
+    """
+    run.progress.stage(stage.name, f"again: {again}" if again else "")
+    logger.info("%s begins%s", stage.name, f" again: {again}" if again else "")
+    run.counts, run.inputs = {}, inputs[1]
+    start = time.perf_counter()
     try:
-        with file.open("rb") as opened:
-            return hashlib.file_digest(opened, "blake2b").hexdigest()
-    except OSError:
-        return "unreadable"
+        product = stage.make(products, run)
+        disturbed(inputs[0], run)
+    except Exception as err:
+        logger.info("%s stopped: %s; counted so far: %s", stage.name, err, run.counts)
+        disturbed(inputs[0], run, by=err)
+        raise
+    seconds = round(time.perf_counter() - start, 2)
+    sizes = run.workspace.sizes(stage.files)
+    record = StageRecord(inputs[1], seconds, run.counts, sizes, peak_memory_mb(), stage.seal(run.workspace))
+    run.workspace.finish(stage.name, record, manifest_head(run))
+    logger.info("%s took %.2f s", stage.name, seconds)
+    run.progress.stage_done(seconds)
+    return product
 
 
-def stage_fingerprint(stage: Stage, prints: Mapping[str, str], run: RunContext) -> str:
-    """Hash of everything that a stage's result depends on: its inputs, its settings, the versions."""
-    settings = run.settings.model_dump()
-    inputs = [prints[name] for name in stage.takes or ("folder",)]
-    return fingerprint(stage.name, versions(), {name: settings[name] for name in stage.settings}, inputs)
+def disturbed(source: Source, run: RunContext, by: Exception | None = None) -> None:
+    """Check whether something from outside has disturbed a stage, and perhaps made it fail.
+
+    Raises:
+        InputError: the output folder, or a photo, is not there any more, or is another one.
+        OSError: the disk is full; COLMAP does not always say so.
+    """
+    run.workspace.check_there()
+    try:
+        source.check()
+    except InputError as err:
+        run.workspace.discard_unfinished()
+        raise err from by
+    if isinstance(by, BackendError):
+        check_written(*(path for path in run.workspace.root.iterdir() if path.is_file()))
 
 
-def manifest_head(run: RunContext) -> dict[str, Any]:
-    """What the manifest says besides the stages."""
-    return {"program": "sfm-app", "versions": versions(), "settings": run.settings.model_dump()}
-
-
-def versions() -> dict[str, str]:
-    """Versions of what computes the result."""
-    parts = ("sfm-app", "numpy", "numba", "opencv-contrib-python-headless", "open3d")
-    return {name: version(name) for name in parts} | colmap_versions()
+def peak_memory_mb() -> int | None:
+    """Most memory that this process has held; None where the system is not Linux."""
+    status = Path("/proc/self/status")
+    found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text(encoding="utf-8")) if status.exists() else None
+    return int(found[1]) // 1024 if found else None
 
 
 class LogFile(logging.FileHandler):

@@ -14,6 +14,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sfm_app.errors import ConfigError
 
+MOST_TOML_BYTES = 20_000
+"""A file with every setting has a fifth of it; a megabyte of dots takes minutes to read."""
+TOLD, SHOWN = 20, 100
+"""Problems that are told, and characters of a wrong value."""
+
 Quality = Literal["draft", "normal", "high"]
 
 
@@ -161,15 +166,17 @@ class Settings(Section):
         """Check nested values on top of the preset they name.
 
         Raises:
-            ConfigError: a key is unknown, or a value has the wrong type or lies out of range; names all of them.
+            ConfigError: a key is unknown, or a value has the wrong type or lies out of range; names the first TOLD.
         """
         preset = QUALITY_PRESETS.get(str(values.get("quality", "normal")), {})
         try:
             return cls.model_validate(merged(preset, values))
         except ValidationError as err:
-            problems = [_problem(dict(e)) for e in err.errors()]
+            errors = err.errors(include_url=False)
+            problems = [_problem(dict(e)) for e in errors[:TOLD]]
+            more = f"; and {len(errors) - TOLD} more" if len(errors) > TOLD else ""
             raise ConfigError(
-                f"{where}: " + "; ".join(text for text, _ in problems),
+                f"{where}: " + "; ".join(text for text, _ in problems) + more,
                 hint=next((hint for _, hint in problems if hint), "`sfm-app config` prints every setting"),
             ) from None
 
@@ -202,12 +209,19 @@ QUALITY_PRESETS: dict[str, dict[str, Any]] = {
 
 def read_toml(path: Path) -> dict[str, Any]:
     """Read a TOML file, or say what is wrong with it."""
+    hint = "`sfm-app config` prints a valid one"
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        with path.open("rb") as file:
+            text = file.read(MOST_TOML_BYTES + 1)
+        if len(text) > MOST_TOML_BYTES:
+            raise ConfigError(f"{path} is no settings file: it is larger than {MOST_TOML_BYTES} bytes", hint=hint)
+        return tomllib.loads(text.decode("utf-8"))
     except OSError as err:
         raise ConfigError(f"cannot read {path}: {err.strerror}") from err
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
-        raise ConfigError(f"{path} is not a TOML file: {err}", hint="`sfm-app config` prints a valid one") from err
+    except RecursionError:
+        raise ConfigError(f"{path} is no settings file: it is nested too deeply", hint=hint) from None
+    except ValueError as err:  # no TOML, no UTF-8, numbers of thousands of digits
+        raise ConfigError(f"{path} is not a TOML file: {err}", hint=hint) from err
 
 
 def merged(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
@@ -223,12 +237,20 @@ def _problem(error: dict[str, Any]) -> tuple[str, str]:
     *table, key = [str(part) for part in error["loc"]] or ["settings"]
     name = ".".join((*table, key))
     if error["type"] != "extra_forbidden":
-        return f"'{name}': {error['msg'].lower()}, got {error['input']!r}", ""
+        return f"'{name}': {error['msg'].lower()}, got {_shown(error['input'])}", ""
     section: Any = Settings
     for part in table:
         section = section.model_fields[part].annotation
     close = difflib.get_close_matches(key, section.model_fields, n=1)
-    return f"unknown setting '{name}'", f"did you mean '{'.'.join((*table, close[0]))}'?" if close else ""
+    return f"unknown setting {_shown(name)}", f"did you mean '{'.'.join((*table, close[0]))}'?" if close else ""
+
+
+def _shown(value: object) -> str:
+    try:
+        text = repr(value)
+    except (RecursionError, ValueError):  # nested deeply; numbers of thousands of digits
+        text = f"a {type(value).__name__}"
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
 def _toml_lines(section: BaseModel, table: str = "") -> Iterator[str]:

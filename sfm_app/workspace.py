@@ -25,6 +25,12 @@ WRITTEN = ("photos", "frames", "masks", "sparse", "dense", "other_models", DATAB
 SHARED = (DATABASE, CALIBRATION)
 """Files that later stages add to."""
 LOCK, HOLDER = ".lock", ".held-by.txt"
+LOG, PARTS = "log.txt", "view_graph_parts"
+FOLLOWED = (*WRITTEN, LOCK, HOLDER, LOG, PARTS)
+"""What a run writes to without replacing it: a link would lead it out of the folder."""
+CHECK = "check"
+"""In a record: hash of the rest. What was changed by hand, or is half of it, is no record."""
+MOST_MANIFEST_BYTES = 64_000_000
 UNFINISHED = "unfinished.txt"
 """In a folder while a stage fills it: what it is filled from. It says whether a killed run can go on there."""
 
@@ -41,6 +47,8 @@ class StageRecord:
     """What the stage wrote, with the size in bytes; -1 for what later stages add to (folders, SHARED)."""
     peak_mb: int | None = None
     """Most memory that the process had held by the end of the stage, in MB; None where the system does not say."""
+    seal: str = ""
+    """Hash of what later runs read of it, so that damage is found before it is read."""
 
 
 class Workspace:
@@ -106,17 +114,17 @@ class Workspace:
     @property
     def view_graph_parts(self) -> Path:
         """Fundamental matrices while they are estimated."""
-        return self.root / "view_graph_parts"
+        return self.root / PARTS
 
     @property
     def log(self) -> Path:
-        return self.root / "log.txt"
+        return self.root / LOG
 
     def create(self) -> None:
         """Make the folder and prove that it can be written to.
 
         Raises:
-            InputError: it cannot, or it holds what a run would write over.
+            InputError: it cannot, or it holds what a run would write over, or links through which it would write.
         """
         known = any((self.root / name).exists() for name in (LOCK, MANIFEST))
         foreign = [] if known else [name for name in WRITTEN if (self.root / name).exists()]
@@ -124,6 +132,9 @@ class Workspace:
             raise InputError(
                 f"{self.root / foreign[0]} is there, and no run has made it", hint="name another output folder with -o"
             )
+        link = next(self._links(), None)
+        if link:
+            raise InputError(f"{link} is a link, and no run has made it", hint="name another output folder with -o")
         try:
             self.root.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self.root):
@@ -132,6 +143,14 @@ class Workspace:
             raise InputError(
                 f"cannot write to {self.root}: {err.strerror}", hint="name another output folder with -o"
             ) from err
+
+    def _links(self) -> Iterator[Path]:
+        """Links that no run has made; those of the photos are replaced when they are laid out."""
+        for path in (self.root / name for name in FOLLOWED):
+            if path.is_symlink():
+                yield path
+            elif path.name != self.photos.name:
+                yield from (below for below in path.rglob("*") if below.is_symlink())
 
     def keep_apart(self, photos: Path, what: str = "photos") -> None:
         """Check that a run would not write over its photos, or its masks.
@@ -172,30 +191,44 @@ class Workspace:
             holder.unlink(missing_ok=True)
             lock.release()
 
+    def check_there(self) -> None:
+        """Check that the folder of a run at work is still there.
+
+        Raises:
+            InputError: it is gone.
+        """
+        if not (self.root / LOCK).exists():
+            raise InputError(f"{self.root} was removed while the run was at work", hint="run again")
+
+    def discard_unfinished(self) -> None:
+        """Let no run go on with what a stage has left half done."""
+        for path in (self.database_marker, self.frames_marker, *self.root.glob(f"*/{UNFINISHED}")):
+            path.unlink(missing_ok=True)
+        for path in self.dense.glob(f"*/{UNFINISHED}"):
+            path.unlink(missing_ok=True)
+
     def manifest(self) -> dict[str, Any]:
         """The manifest as written last; empty when there is none or it cannot be read (then everything is redone)."""
+        path = self.root / MANIFEST
         try:
-            found = json.loads((self.root / MANIFEST).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
+            if path.stat().st_size > MOST_MANIFEST_BYTES:
+                return {}
+            found = json.loads(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
             return {}
         return found if isinstance(found, dict) and isinstance(found.get("stages", {}), dict) else {}
 
     def record(self, stage: str) -> StageRecord | None:
-        """The record of a finished stage, if the manifest has a sound one."""
+        """The record of a finished stage, if the manifest has one, just as it was written."""
         entry = self.manifest().get("stages", {}).get(stage)
         try:
-            return StageRecord(**entry)
-        except TypeError:
+            return StageRecord(**entry) if entry.pop(CHECK) == fingerprint(entry) else None
+        except (AttributeError, KeyError, TypeError, RecursionError):
             return None
 
-    def is_current(self, stage: str, fingerprint: str) -> bool:
-        """Whether the stage was finished with these inputs and its files are still as it left them."""
-        record = self.record(stage)
-        return (
-            record is not None
-            and record.fingerprint == fingerprint
-            and all(_size(self.root / name) == size for name, size in record.files.items())
-        )
+    def is_as_left(self, record: StageRecord, file: str) -> bool:
+        """Whether a file of a finished stage still has the size that it had."""
+        return _size(self.root / file) == record.files[file]
 
     def forget(self, stages: tuple[str, ...]) -> None:
         """Take stages out of the manifest before their files are touched, so that it is never ahead of the files."""
@@ -206,7 +239,8 @@ class Workspace:
 
     def finish(self, stage: str, record: StageRecord, head: Mapping[str, Any]) -> None:
         """Enter a finished stage; `head` (settings, versions, ...) replaces the rest of the manifest."""
-        stages = self.manifest().get("stages", {}) | {stage: asdict(record)}
+        entry = json.loads(json.dumps(asdict(record)))
+        stages = self.manifest().get("stages", {}) | {stage: {**entry, CHECK: fingerprint(entry)}}
         self.write_manifest({**head, "stages": stages})
 
     def write_manifest(self, manifest: Mapping[str, Any]) -> None:

@@ -2,6 +2,7 @@
 
 import errno
 import sys
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -67,6 +68,7 @@ def fail(message: str, hint: str, code: int) -> None:
 @click.version_option(__version__, prog_name="sfm-app")
 def main() -> None:
     """Turn a folder of photos, or a video, about which nothing is known into a 3D model."""
+    warnings.filterwarnings("ignore", module=r"PIL\b")  # what is wrong with a photo is said once, and in our words
 
 
 @main.command()

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from sfm_app.colmap.backend import has_cuda
 from sfm_app.errors import SfmError
+from sfm_app.inputs import versions
 from sfm_app.meshing.open3d import load_open3d
 from sfm_app.parallel import worker_count
-from sfm_app.pipeline import versions
 from sfm_app.plugins import load_plugins
 
 GIGABYTE = 2**30

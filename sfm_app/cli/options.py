@@ -83,9 +83,9 @@ def assigned(text: str) -> dict[str, Any]:
         raise ConfigError(f"--set {text}: no '=' in it", hint="write --set depth.neighbours=6")
     try:
         return tomllib.loads(f"{name}={value}")
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         pass
     try:
         return tomllib.loads(f'{name}="{value}"')  # a word without quotes
-    except tomllib.TOMLDecodeError as err:
+    except (ValueError, RecursionError) as err:
         raise ConfigError(f"--set {text}: not TOML: {err}", hint="write --set depth.neighbours=6") from None

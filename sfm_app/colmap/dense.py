@@ -13,11 +13,14 @@ from sfm_app.colmap.backend import backend, check_written, pycolmap
 from sfm_app.colmap.masks import used_pixels
 from sfm_app.progress import Progress
 from sfm_app.stereo import DepthMap, Estimate, Kind, View
+from sfm_app.stored import is_below
 
 DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
 MASKED = -1.0
 """In place of the depth where a photo is masked. COLMAP's fusion takes it for none; `sfm_app.meshing` does not take it
 for empty space."""
+MAPS = ("sparse", "images", f"stereo/{DEPTHS}", f"stereo/{NORMALS}")
+"""What the maps of a finished workspace are read from."""
 
 
 def undistort(
@@ -41,6 +44,8 @@ def read_views(dense_dir: Path) -> list[View]:
     with backend("reading the undistorted model"):
         model = pycolmap.Reconstruction(dense_dir / "sparse")
         images = sorted(model.images.values(), key=lambda image: image.name)
+        if not all(is_below(image.name) for image in images):
+            raise ValueError(f"{dense_dir} names photos outside of it")
         return [_view(model, image) for image in images if image.has_pose]
 
 

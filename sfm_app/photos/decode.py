@@ -18,6 +18,11 @@ FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
 """A copy as JPEG loses next to nothing more."""
 
+LARGE_PX = 50_000_000
+LEAST_BYTES_PER_PX = 0.02
+"""Large photos have more, however hard they are compressed; an area of one colour has less."""
+MOST_FRAMES = 100
+
 
 class UnreadableError(Exception):
     """Why a file gives no picture; the message is for people."""
@@ -43,7 +48,7 @@ class Picture:
     exif: Image.Exif
     """Empty where it is damaged: the picture may be fine all the same."""
     frames: int
-    """Pictures in the file."""
+    """Pictures in the file; they are not counted beyond MOST_FRAMES."""
 
 
 def read_picture(path: Path) -> Picture:
@@ -54,18 +59,44 @@ def read_picture(path: Path) -> Picture:
     """
     try:
         with Image.open(path, formats=formats()) as image:
-            frames = 1 if image.format == "MPO" else getattr(image, "n_frames", 1)  # the others of an MPO are previews
+            _refuse_bombs(image, path)
+            frames = _frames_of(image)
             image.seek(0)
             image.load()
             return Picture(image, _exif_of(image), frames)
     except UnidentifiedImageError:
         raise UnreadableError(_no_photo(path)) from None
+    except UnreadableError:
+        raise
     except Image.DecompressionBombError:
         raise UnreadableError("too many pixels") from None
+    except MemoryError:
+        raise UnreadableError("too large for the memory of this machine") from None
     except PermissionError:
         raise UnreadableError("not readable: permission denied") from None
     except Exception:  # whatever a decoder makes of damaged bytes
         raise UnreadableError("truncated or damaged") from None
+
+
+def _refuse_bombs(image: Image.Image, path: Path) -> None:
+    """Pillow refuses what is larger still."""
+    pixels = image.width * image.height
+    if pixels > LARGE_PX and path.stat().st_size < LEAST_BYTES_PER_PX * pixels:
+        raise UnreadableError("too many pixels for a file of its size")
+
+
+def _frames_of(image: Image.Image) -> int:
+    """How many pictures a file holds, or MOST_FRAMES + 1; the others of an MPO are previews."""
+    if image.format == "MPO":
+        return 1
+    if image.format != "TIFF":
+        return getattr(image, "n_frames", 1)
+    for frame in range(1, MOST_FRAMES + 1):  # a list, of which nobody knows how long it is
+        try:
+            image.seek(frame)
+        except EOFError:
+            return frame
+    return MOST_FRAMES + 1
 
 
 def _exif_of(image: Image.Image) -> Image.Exif:
@@ -127,7 +158,8 @@ def _no_photo(path: Path) -> str:
     if not head:
         return "empty"
     if head[4:8] == b"ftyp" and head[8:12] in HEIC_BRANDS:
-        return "HEIC photos need `pip install 'sfm-app[heic]'`"
+        return "truncated or damaged" if "HEIF" in formats() else "HEIC photos need `pip install 'sfm-app[heic]'`"
     if head[4:8] == b"ftyp" and head[8:12] in AVIF_BRANDS:
-        return "AVIF photos need a newer Pillow: `pip install -U pillow`"
+        needed = "AVIF photos need a newer Pillow: `pip install -U pillow`"
+        return "truncated or damaged" if "AVIF" in formats() else needed
     return f"a video; run it alone: sfm-app run {printable(path.name)}" if is_video(head) else "not a photo"

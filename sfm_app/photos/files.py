@@ -56,11 +56,14 @@ def place_of(folder: Path, name: str) -> Path | str:
         return "hidden"
     try:
         real = place.resolve()
-    except (OSError, RuntimeError):  # links in a ring
+        there = real.exists()
+    except RuntimeError:  # links in a ring
         return "a link that leads nowhere"
+    except (OSError, ValueError) as err:  # lists may hold what is no name; folders may be closed
+        return f"not readable: {getattr(err, 'strerror', 'no name').lower()}"
     if not real.is_relative_to(root):
         return "a link out of the folder" if place.is_symlink() else "outside the folder"
-    if not real.exists():
+    if not there:
         return "a link that leads nowhere" if place.is_symlink() else "not there"
     if real.is_dir():
         return "a link to a folder" if place.is_symlink() else "a folder"
@@ -70,7 +73,7 @@ def place_of(folder: Path, name: str) -> Path | str:
 def _listed(file: Path) -> list[str]:
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as err:
+    except (OSError, ValueError) as err:
         reason = err.strerror if isinstance(err, OSError) else "not a UTF-8 text"
         raise InputError(f"cannot read {file}: {reason}", hint="one photo per line, as seen from the folder") from err
     return sorted({Path(line).as_posix() for line in lines if line.strip()})

@@ -10,6 +10,7 @@ from PIL import Image
 
 from sfm_app.photos.decode import UnreadableError, read_picture, upright
 from sfm_app.photos.files import place_of
+from sfm_app.stored import is_below
 from sfm_app.types import Photo
 
 READ_BY_COLMAP = (".jpg", ".jpeg", ".png")
@@ -42,7 +43,10 @@ def lay_out(photo: Photo, folder: Path, target: Path) -> None:
         UnreadableError: the file has changed since it was looked at.
     """
     place = target / photo.name
+    if not (is_below(photo.name) and place.parent.resolve().is_relative_to(target.resolve())):
+        raise UnreadableError("its name leads out of the folder")
     place.parent.mkdir(parents=True, exist_ok=True)
+    place.unlink(missing_ok=True)  # what is written to a link goes where the link leads
     source = place_of(folder, photo.path)
     if isinstance(source, str):
         raise UnreadableError(source)

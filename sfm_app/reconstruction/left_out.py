@@ -21,9 +21,12 @@ def left_out(
     for photo, image in matches.images.items():
         if photo not in posed:
             model = next((model for model in others if photo in model), None)
-            reasons[image.name] = (
-                f"belongs to another model, of {len(model)} photos" if model else _reason(photo, posed, views, graph)
-            )
+            if model:
+                reasons[image.name] = f"belongs to another model, of {len(model)} photos"
+            elif not len(matches.keypoints[photo]):
+                reasons[image.name] = "no features were found in it"
+            else:
+                reasons[image.name] = _reason(photo, posed, views, graph)
     return reasons
 
 

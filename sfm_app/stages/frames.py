@@ -45,6 +45,11 @@ def settings_for(source: Path, settings: Settings) -> Settings:
     return settings.model_copy(update={"photos": settings.photos.model_copy(update={"cameras": cameras})})
 
 
+def folder_of(source: Path, run: RunContext) -> Path:
+    """Where the photos lie."""
+    return run.workspace.frames if is_video(head_of(source)) else source
+
+
 @contextmanager
 def photos_of(source: Path, run: RunContext) -> Iterator[Path]:
     """The folder of photos: the source itself, or the chosen frames of a video.

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.database import write_calibrations
+from sfm_app.colmap.database import cameras_seal, write_calibrations
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import of_fits, votes
 from sfm_app.selfcal import Camera, calibrate_photo_set, pair_weights
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
+from sfm_app.workspace import Workspace, fingerprint
 
 
 def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
@@ -66,6 +67,13 @@ def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGrap
 def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> CameraPairs:
     """What a calibrator gets to know about the photos of one camera."""
     return photo_pairs(images, matches, views).among([image.id for image in images])
+
+
+def intrinsics_seal(place: Workspace) -> str:
+    """Hash of what this stage left: calibration.json without what the scene adds, and the cameras of the database."""
+    known = json.loads(place.calibration.read_text(encoding="utf-8"))
+    known.pop("refined", None)
+    return fingerprint(known, cameras_seal(place.database))
 
 
 def load_intrinsics(run: RunContext) -> Intrinsics:

@@ -25,9 +25,13 @@ from sfm_app.parallel import ordered_map
 from sfm_app.progress import track
 from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View, region
+from sfm_app.stored import load_arrays, seal
 from sfm_app.types import Surface
+from sfm_app.workspace import is_made_from
 
 SURFACE = "surface.npz"
+WHOLE = "fused.txt"
+"""Hash of the fused points: a run that goes on does not read damaged ones."""
 HINT = "take more photos, a step apart, with more overlap; OUT/points.ply and OUT/points.glb have the sparse points"
 
 MIN_POINTS = 100
@@ -75,8 +79,8 @@ def nonempty(surface: Surface, otherwise: str) -> Surface:
 
 def load_surface(dense_dir: Path) -> Surface:
     """The surface that `make_mesh` left in a dense workspace."""
-    with np.load(dense_dir / SURFACE) as stored:
-        return Surface(stored["vertices"], stored["faces"], stored["colors"])
+    stored = load_arrays(dense_dir / SURFACE)
+    return Surface(stored["vertices"], stored["faces"], stored["colors"])
 
 
 def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.float64]:
@@ -86,9 +90,12 @@ def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray
     target = dense_dir / FUSED
     files = [map_file(dense_dir, view) for view in views]
     youngest = max(path.stat().st_mtime_ns for path in (*files, files[0].parent))
-    if not target.exists() or target.stat().st_mtime_ns <= youngest:
+    whole = dense_dir / WHOLE
+    sealed = target.exists() and is_made_from(whole, seal(dense_dir, FUSED))
+    if not sealed or target.stat().st_mtime_ns <= youngest:
         with run.step("fusing depth maps"), run.workspace.replacing(target) as path:
             fuse(dense_dir, views, photos_needed(views, run), region(views), path)
+        whole.write_text(seal(dense_dir, FUSED), encoding="utf-8")
     points, _ = read_fused(dense_dir)
     run.record(fused_points=len(points))
     if len(points) < MIN_POINTS:

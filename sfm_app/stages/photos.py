@@ -13,36 +13,24 @@ from typing import Any
 from sfm_app.context import RunContext
 from sfm_app.errors import InputError
 from sfm_app.photos import (
-    LOSSY,
     MASK_HINT,
     Glance,
-    Picture,
     UnreadableError,
-    camera_name,
     find_mask,
-    focal_px,
-    gps_position,
     grouped,
     lay_out,
     lay_out_mask,
     list_files,
     list_masks,
     mask_place,
-    orientation,
     place_of,
-    read_picture,
-    small_picture,
+    read_photo,
     stored_names,
     unused_masks,
-    upright,
     without_copies,
 )
-from sfm_app.settings import PhotoSettings
+from sfm_app.stored import is_below, seal
 from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
-
-MEGA = 1_000_000
-LINKED = ("JPEG", "MPO", "PNG")
-"""Formats that COLMAP reads and writes as they are."""
 
 
 def read_photos(folder: Path, run: RunContext) -> PhotoSet:
@@ -133,48 +121,6 @@ def lay_out_masks(photo_set: PhotoSet, masks: Path, run: RunContext) -> None:
     run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})
 
 
-def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | UnusablePhoto:
-    """Decode one file to know that it is a whole photo, what camera took it, and what it looks like."""
-    place = place_of(folder, name)
-    if isinstance(place, str):
-        return UnusablePhoto(name, place)
-    try:
-        return described(name, read_picture(place), options)
-    except UnreadableError as err:
-        return UnusablePhoto(name, str(err))
-
-
-def described(name: str, picture: Picture, options: PhotoSettings) -> Glance | UnusablePhoto:
-    """What is known about a photo, and what it looks like."""
-    image, exif = picture.image, picture.exif
-    size = image.size[::-1] if orientation(exif) >= 5 else image.size
-    if min(size) < options.min_side_px:
-        return UnusablePhoto(name, f"smaller than {options.min_side_px} px")
-    width, height = scaled(size, options.max_megapixels * MEGA)
-    notes = [f"the first of its {picture.frames} pictures"] if picture.frames > 1 else []
-    if (width, height) != size:
-        notes.append(f"scaled down from {size[0]} x {size[1]} to {width} x {height} pixels")
-    eight_bit = image.mode in ("RGB", "L") and "transparency" not in image.info
-    photo = Photo(
-        name=name,
-        width=width,
-        height=height,
-        group=camera_name(exif),
-        exif_focal_px=focal_px(exif, max(width, height)),
-        needs_copy=not (image.format in LINKED and eight_bit and orientation(exif) == 1 and (width, height) == size),
-        gps=gps_position(exif),
-        lossy=image.format in LOSSY,
-        notes=tuple(notes),
-    )
-    return Glance(photo, small_picture(upright(picture)))
-
-
-def scaled(size: tuple[int, int], most_px: float) -> tuple[int, int]:
-    """Width and height of a picture with not more pixels than that."""
-    share = min(1.0, (most_px / (size[0] * size[1])) ** 0.5)
-    return max(1, int(size[0] * share)), max(1, int(size[1] * share))
-
-
 def laid_out(photo: Photo, *, folder: Path, target: Path) -> None:
     """Put one photo into the workspace.
 
@@ -190,21 +136,28 @@ def laid_out(photo: Photo, *, folder: Path, target: Path) -> None:
 
 
 def save_photo_set(photos: PhotoSet, run: RunContext) -> None:
-    """Write photos.json; frames of a video, which lie in the output folder, move with it."""
-    folder = "" if photos.folder == run.workspace.frames else str(photos.folder)
+    """Write photos.json, with hashes of the copies."""
+    known = {"photos": [asdict(photo) for photo in photos.photos], "unusable": [asdict(p) for p in photos.unusable]}
+    copies = {photo.name: _copy_seal(photo, run) for photo in photos.photos}
     with run.workspace.replacing(run.workspace.photo_set) as path:
-        places = {"folder": folder, "masks": str(photos.masks) if photos.masks else None}
-        path.write_text(json.dumps(asdict(photos) | places, indent=1) + "\n", encoding="utf-8")
+        path.write_text(json.dumps({**known, "copies": copies}, indent=1) + "\n", encoding="utf-8")
 
 
-def load_photo_set(run: RunContext) -> PhotoSet:
-    """Read photos.json back; what is gone of the photos and masks that were laid out is laid out again."""
+def _copy_seal(photo: Photo, run: RunContext) -> str | None:
+    """Hash of the bytes of a copy; None where a link leads to the photo, or where nothing is."""
+    place = run.workspace.photos / photo.name
+    return seal(run.workspace.photos, photo.name) if place.is_file() and not place.is_symlink() else None
+
+
+def load_photo_set(folder: Path, run: RunContext) -> PhotoSet:
+    """Read photos.json back; what is gone of what was laid out, or was damaged, is laid out again."""
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
-    folder = Path(values["folder"]) if values["folder"] else run.workspace.frames
-    photos = tuple(_photo(entry) for entry in values["photos"])
-    masks = Path(values["masks"]) if values["masks"] else None
+    photos, masks = tuple(_photo(entry) for entry in values["photos"]), mask_folder(run)
+    if not all(is_below(photo.name) for photo in photos):
+        raise ValueError(f"{run.workspace.photo_set} names photos outside of their folder")
     for photo in photos:
-        if not (run.workspace.photos / photo.name).exists():
+        place, copy = run.workspace.photos / photo.name, values["copies"].get(photo.name)
+        if copy != _copy_seal(photo, run) or not (copy or place.resolve() == place_of(folder, photo.path)):
             if folder == run.workspace.frames and not (folder / photo.path).exists():
                 raise FileNotFoundError(errno.ENOENT, "no such frame", str(folder / photo.path))
             laid_out(photo, folder=folder, target=run.workspace.photos)

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from sfm_app.context import RunContext
 from sfm_app.meshing.occlusion import Occluders
 from sfm_app.photos import read_used, without_masked
 from sfm_app.settings import TextureSettings
+from sfm_app.stored import load_arrays
 from sfm_app.texture import PhotoView, photo_view, texture_surface
 from sfm_app.types import Model, Scene, Surface, Texture
 from sfm_app.workspace import can_go_on, fingerprint, mark_unfinished, replacing
@@ -57,9 +57,8 @@ class Files:
 
     def recall(self, name: str) -> dict[str, NDArray[Any]] | None:
         try:
-            with self._path(name).open("rb") as file, np.load(file) as stored:
-                return dict(stored)
-        except (OSError, ValueError, EOFError, BadZipFile):  # not there, or damaged
+            return load_arrays(self._path(name))
+        except Exception:  # not there, or damaged, of which decoders make whatever they like
             return None
 
     def keep(self, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -110,10 +109,9 @@ def save_texture(model: Model, run: RunContext) -> None:
 
 def load_texture(dense_dir: Path) -> Model:
     """The model that `make_texture` left in a dense workspace."""
-    # opened here, because NumPy leaves a damaged file open
-    with (dense_dir / TEXTURE).open("rb") as file, np.load(file) as stored:
-        surface = Surface(stored["vertices"], stored["faces"], stored["colors"])
-        if "uv" not in stored:
-            return Model(surface)
-        pages = tuple(stored[f"page{number}"] for number in range(sum(name[4:].isdigit() for name in stored.files)))
-        return Model(surface, Texture(stored["uv"], stored["page"], pages))
+    stored = load_arrays(dense_dir / TEXTURE)
+    surface = Surface(stored["vertices"], stored["faces"], stored["colors"])
+    if "uv" not in stored:
+        return Model(surface)
+    pages = tuple(stored[f"page{number}"] for number in range(sum(name[4:].isdigit() for name in stored)))
+    return Model(surface, Texture(stored["uv"], stored["page"], pages))

@@ -15,6 +15,7 @@ from sfm_app.parallel import ordered_map
 from sfm_app.progress import track
 from sfm_app.ransac.stationary import covers, find_stationary, fit_moving
 from sfm_app.settings import Settings
+from sfm_app.stored import load_arrays
 from sfm_app.types import EpipolarFit, MatchGraph, PairId, Rejected, ViewGraph
 from sfm_app.workspace import can_go_on, mark_unfinished, replacing
 
@@ -82,17 +83,17 @@ def in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run:
     if not can_go_on(folder, run.inputs):
         mark_unfinished(folder, run.inputs)
     parts = {folder / f"{first:06d}.npz": pairs[first : first + PART] for first in range(0, len(pairs), PART)}
-    left = [pair for path, part in parts.items() if not path.exists() for pair in part]
+    known = {path: read_part(path, part) for path, part in parts.items()}
+    left = [pair for path, part in parts.items() if known[path] is None for pair in part]
     fitted = ordered_map(run.executor, fit_pair, left, ahead=2 * run.workers)
     results = track(run.progress, fitted, "epipolar geometry", len(left))
     found: dict[PairId, Fitted] = {}
     for path, part in parts.items():
-        if path.exists():
-            found |= read_part(path)
-        else:
+        done = known[path]
+        if done is None:
             done = dict(zip(part, results, strict=False))
             write_part(path, done)
-            found |= done
+        found |= done
     return {pair: found[pair] for pair in pairs}
 
 
@@ -103,13 +104,16 @@ def write_part(path: Path, found: Mapping[PairId, Fitted]) -> None:
         np.savez(beside, allow_pickle=False, still=still, **graph_of(found).to_arrays())
 
 
-def read_part(path: Path) -> dict[PairId, Fitted]:
-    """What `write_part` has kept."""
-    with np.load(path, allow_pickle=False) as stored:
-        arrays = dict(stored)
-    graph = ViewGraph.from_arrays(arrays)
-    every: dict[PairId, EpipolarFit | Rejected] = {**graph.fits, **graph.rejected}
-    return {(int(a), int(b)): (every[int(a), int(b)], int(count)) for a, b, count in arrays["still"]}
+def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, Fitted] | None:
+    """What `write_part` has kept; None where there is nothing, or nothing sound."""
+    try:
+        arrays = load_arrays(path)
+        graph = ViewGraph.from_arrays(arrays)
+        every: dict[PairId, EpipolarFit | Rejected] = {**graph.fits, **graph.rejected}
+        still = {(int(a), int(b)): int(count) for a, b, count in arrays["still"]}
+        return {pair: (every[pair], still[pair]) for pair in pairs}
+    except Exception:  # whatever decoders make of damaged bytes
+        return None
 
 
 def stationary_matches(matches: MatchGraph, pair: PairId, settings: Settings) -> BoolArray:
@@ -123,5 +127,4 @@ def stationary_matches(matches: MatchGraph, pair: PairId, settings: Settings) ->
 
 def load_view_graph(run: RunContext) -> ViewGraph:
     """Read view_graph.npz back."""
-    with np.load(run.workspace.view_graph, allow_pickle=False) as arrays:
-        return ViewGraph.from_arrays(dict(arrays))
+    return ViewGraph.from_arrays(load_arrays(run.workspace.view_graph))

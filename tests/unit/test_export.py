@@ -29,7 +29,7 @@ def finished(textured_ball, tmp_path):
         uv=texture.uv, page=texture.page, page0=texture.pages[0], page1=texture.pages[1],
     )  # fmt: skip
     for stage in NAMES[:-1]:
-        place.finish(stage, StageRecord("", 0.0), {})
+        place.finish(stage, StageRecord("", 0.0, seal=LAST.seal(place)), {})
     return place.root
 
 
@@ -131,6 +131,8 @@ def test_a_model_without_a_texture_has_the_colours_of_its_vertices(ball, finishe
     np.savez(
         finished / LAST.files[0], vertices=ball.surface.vertices, faces=ball.surface.faces, colors=ball.surface.colors
     )
+    place = Workspace(finished)
+    place.finish(LAST.name, StageRecord("", 0.0, seal=LAST.seal(place)), {})
 
     (path,) = sfm_app.export_model(finished, "glb")
 

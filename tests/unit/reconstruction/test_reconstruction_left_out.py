@@ -13,8 +13,15 @@ def pose(kind="calibrated"):
     return RelativePose(np.eye(3), np.eye(3)[0], np.ones(50, bool), 10.0, 1.0, kind)
 
 
-def photos(count):
-    return MatchGraph({key: MatchedImage(key, f"{key}.jpg", "one", 100, 100) for key in range(1, count + 1)}, {}, {})
+def photos(count, blank=()):
+    images = {key: MatchedImage(key, f"{key}.jpg", "one", 100, 100) for key in range(1, count + 1)}
+    return MatchGraph(images, {key: np.ones((0 if key in blank else 9, 2)) for key in images}, {})
+
+
+def test_a_photo_without_features_says_so():
+    reasons = left_out({1, 2}, [], photos(4, blank=(4,)), ViewGraph({(1, 2): fit(40)}, {}), pose_graph())
+
+    assert reasons == {"3.jpg": "shares no scene with any other photo", "4.jpg": "no features were found in it"}
 
 
 def pose_graph(dropped=None, poses=None):

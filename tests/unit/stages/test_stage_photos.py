@@ -66,7 +66,7 @@ def test_every_file_is_used_or_has_a_reason(folder, run):
         "tiny.png": "smaller than 64 px",
         "copy.png": "the same picture as b.png",
     }
-    assert load_photo_set(run) == found
+    assert load_photo_set(folder, run) == found
     assert np.array_equal(np.asarray(Image.open(run.workspace.photos / "b.png")), pixels(2))
 
 
@@ -147,7 +147,7 @@ def with_gps(folder, **entries):
 
 def read_gps(folder, run):
     found = read_photos(folder, run)
-    assert load_photo_set(run) == found
+    assert load_photo_set(folder, run) == found
     return next(photo.gps for photo in found.photos if photo.name == "where.jpg")
 
 

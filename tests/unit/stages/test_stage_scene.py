@@ -80,7 +80,7 @@ def pose(kind, guided=False):
 def inputs(model, fits=((1, 8),)):
     images = {key: MatchedImage(key, model.images[key].name, "one", 1024, 768) for key in sorted(model.images)}
     fit = EpipolarFit(np.eye(3), np.ones(20, bool), np.ones(20), 10, 0.3)
-    return MatchGraph(images, {}, {}), ViewGraph(dict.fromkeys(fits, fit), {})
+    return MatchGraph(images, dict.fromkeys(images, np.ones((20, 2))), {}), ViewGraph(dict.fromkeys(fits, fit), {})
 
 
 def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthetic, run, monkeypatch):

@@ -1,0 +1,57 @@
+"""What one file of the folder is: a usable photo, or why not."""
+
+from pathlib import Path
+
+from sfm_app.photos.copies import Glance, small_picture
+from sfm_app.photos.decode import LOSSY, MOST_FRAMES, Picture, UnreadableError, read_picture, upright
+from sfm_app.photos.exif import camera_name, focal_px, gps_position, orientation
+from sfm_app.photos.files import place_of
+from sfm_app.settings import PhotoSettings
+from sfm_app.types import Photo, UnusablePhoto
+
+MEGA = 1_000_000
+LINKED = ("JPEG", "MPO", "PNG")
+"""Formats that COLMAP reads and writes as they are."""
+
+
+def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | UnusablePhoto:
+    """Decode one file to know that it is a whole photo, what camera took it, and what it looks like."""
+    place = place_of(folder, name)
+    if isinstance(place, str):
+        return UnusablePhoto(name, place)
+    try:
+        return described(name, read_picture(place), options)
+    except UnreadableError as err:
+        return UnusablePhoto(name, str(err))
+
+
+def described(name: str, picture: Picture, options: PhotoSettings) -> Glance | UnusablePhoto:
+    """What is known about a photo, and what it looks like."""
+    image, exif = picture.image, picture.exif
+    size = image.size[::-1] if orientation(exif) >= 5 else image.size
+    if min(size) < options.min_side_px:
+        return UnusablePhoto(name, f"smaller than {options.min_side_px} px")
+    width, height = scaled(size, options.max_megapixels * MEGA)
+    many = f"its {picture.frames}" if picture.frames <= MOST_FRAMES else f"more than {MOST_FRAMES}"
+    notes = [f"the first of {many} pictures"] if picture.frames > 1 else []
+    if (width, height) != size:
+        notes.append(f"scaled down from {size[0]} x {size[1]} to {width} x {height} pixels")
+    eight_bit = image.mode in ("RGB", "L") and "transparency" not in image.info
+    photo = Photo(
+        name=name,
+        width=width,
+        height=height,
+        group=camera_name(exif),
+        exif_focal_px=focal_px(exif, max(width, height)),
+        needs_copy=not (image.format in LINKED and eight_bit and orientation(exif) == 1 and (width, height) == size),
+        gps=gps_position(exif),
+        lossy=image.format in LOSSY,
+        notes=tuple(notes),
+    )
+    return Glance(photo, small_picture(upright(picture)))
+
+
+def scaled(size: tuple[int, int], most_px: float) -> tuple[int, int]:
+    """Width and height of a picture with not more pixels than that."""
+    share = min(1.0, (most_px / (size[0] * size[1])) ** 0.5)
+    return max(1, int(size[0] * share)), max(1, int(size[1] * share))

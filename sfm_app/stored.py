@@ -1,0 +1,60 @@
+"""What lies on disk and may have been damaged since: hashes of it, and arrays read with limits."""
+
+import hashlib
+from collections.abc import Iterator
+from pathlib import Path, PurePath
+from typing import Any
+from zipfile import ZipFile
+
+import numpy as np
+from numpy.typing import NDArray
+
+MOST_BYTES, MOST_INFLATED = 1_000_000_000, 200
+"""Arrays of ours are larger, or more times as large as their file, but not both; deflate can do 1000 with zeros."""
+
+
+def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz file; no objects, which would be code.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it holds something else, or far more than its size allows. Damaged files raise much else.
+    """
+    # opened here, because NumPy leaves a damaged file open
+    with path.open("rb") as file:
+        with ZipFile(file) as members:
+            inflated = sum(member.file_size for member in members.infolist())
+        if inflated > max(MOST_BYTES, MOST_INFLATED * path.stat().st_size):
+            raise ValueError(f"{path} holds {inflated} bytes")
+        file.seek(0)
+        with np.load(file, allow_pickle=False) as stored:
+            return dict(stored)
+
+
+def seal(root: Path, *names: str) -> str:
+    """Hash of the names and bytes of files and of what lies in folders, links left out.
+
+    Raises:
+        FileNotFoundError: one of them is gone.
+    """
+    found = hashlib.blake2b(digest_size=16)
+    for name in names:
+        for path in _files(root / name):
+            with path.open("rb") as file:
+                content = hashlib.file_digest(file, "blake2b").hexdigest()
+            found.update(f"{path.relative_to(root).as_posix()!r} {content}\n".encode())
+    return found.hexdigest()
+
+
+def is_below(name: str) -> bool:
+    """Whether a name leads to a place below the folder that it is joined to, as far as one can tell from the name."""
+    path = PurePath(name)
+    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
+
+
+def _files(path: Path) -> Iterator[Path]:
+    if not path.is_dir():
+        yield path
+        return
+    below = (place for place in path.rglob("*") if place.is_file() and not place.is_symlink())
+    yield from sorted(place for place in below if not place.name.startswith("."))
