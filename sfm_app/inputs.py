@@ -127,8 +127,7 @@ def why_again(name: str, settings: Sequence[str], inputs: str, run: RunContext) 
     record = run.workspace.record(name)
     if record is None:
         return ""
-    spoilt = [file for file in record.files if not run.workspace.is_as_left(record, file)]
-    if spoilt:
+    if spoilt := run.workspace.spoilt(record):
         return f"{spoilt[0]} is gone or was changed"
     if record.fingerprint == inputs:
         return None

@@ -41,7 +41,7 @@ class PhotoSettings(Section):
         "each: none share",
     )
     max_frames: int = Field(100, ge=2, le=2000, description="most frames of a video that are used")
-    keep_all: bool = Field(False, description="use copies of photos, too")
+    keep_all: bool = Field(False, description="use copies, blurred photos and screenshots, too")
     max_megapixels: float = Field(64.0, ge=0.1, le=178, description="larger photos are scaled down to so many")
     min_side_px: int = Field(64, ge=16, le=4096, description="photos with a shorter side are left out, in pixels")
 

@@ -226,9 +226,9 @@ class Workspace:
         except (AttributeError, KeyError, TypeError, RecursionError):
             return None
 
-    def is_as_left(self, record: StageRecord, file: str) -> bool:
-        """Whether a file of a finished stage still has the size that it had."""
-        return _size(self.root / file) == record.files[file]
+    def spoilt(self, record: StageRecord) -> list[str]:
+        """Files of a finished stage that are gone or have another size."""
+        return [name for name, size in record.files.items() if _size(self.root / name) != size]
 
     def forget(self, stages: tuple[str, ...]) -> None:
         """Take stages out of the manifest before their files are touched, so that it is never ahead of the files."""

@@ -39,7 +39,7 @@ def settings_options(command: Command) -> Command:
         ),
         click.option("--cameras", help="auto, single, folder or each: which photos share one.  [default: auto]"),
         click.option("--max-frames", type=int, help="Most frames of a video that are used.  [default: 100]"),
-        click.option("--keep-all", is_flag=True, default=None, help="Use copies of photos, too."),
+        click.option("--keep-all", is_flag=True, default=None, help="Use copies, blurred photos and screenshots, too."),
         click.option("--estimator", help="Estimator of fundamental matrices.  [default: lev-ransac]"),
         click.option("--calibrator", help="Calibrator.  [default: zero-curves]"),
         click.option("--mapper", help="auto, incremental or global.  [default: auto]"),

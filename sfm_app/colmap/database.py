@@ -136,8 +136,9 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
         for entry in sorted(database.read_all_images(), key=lambda entry: entry.image_id):
             photo = by_name[entry.name]
             images[entry.image_id] = MatchedImage(
-                entry.image_id, photo.name, photo.group, photo.width, photo.height, photo.exif_focal_px, photo.gps
-            )
+                entry.image_id, photo.name, photo.group, photo.width, photo.height,
+                photo.exif_focal_px, photo.gps, photo.turn_deg,
+            )  # fmt: skip
             found = np.asarray(database.read_keypoints(entry.image_id), np.float64)
             keypoints[entry.image_id] = found[:, :2].copy() if len(found) else np.zeros((0, 2))  # a white wall
         pair_ids, rows = database.read_all_matches()

@@ -2,11 +2,12 @@
 
 from sfm_app.photos.choosing import choose
 from sfm_app.photos.containers import head_of, is_video
-from sfm_app.photos.copies import Glance, small_picture, without_copies
+from sfm_app.photos.copies import without_copies
 from sfm_app.photos.decode import UnreadableError, read_picture, upright
 from sfm_app.photos.describe import read_photo
 from sfm_app.photos.files import list_files, place_of
 from sfm_app.photos.following import Follower, Look
+from sfm_app.photos.glance import Glance
 from sfm_app.photos.groups import grouped
 from sfm_app.photos.layout import lay_out, stored_names
 from sfm_app.photos.masks import (
@@ -20,6 +21,7 @@ from sfm_app.photos.masks import (
     unused_masks,
     without_masked,
 )
+from sfm_app.photos.screening import screened
 from sfm_app.photos.video import opened
 
 __all__ = [
@@ -44,7 +46,7 @@ __all__ = [
     "read_picture",
     "read_used",
     "save_used",
-    "small_picture",
+    "screened",
     "stored_names",
     "unused_masks",
     "upright",

@@ -1,36 +1,17 @@
 """Copies: the same picture saved twice, smaller, or as another format. They add nothing, and no pair has a parallax."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 
+from sfm_app.photos.glance import SIDE_PX, Glance
 from sfm_app.types import Photo, UnusablePhoto
 
-SIDE_PX = 32
-"""Side of the small pictures that are compared."""
 ALIKE = 0.015
 """Root mean square difference, as a share of the contrast, of pictures that are one. A step of a thousandth of the
 width to the side makes more of it; saving a picture anew, smaller or as JPEG, less."""
 LEAST_CONTRAST = 4.0
 """Grey levels; of pictures with less nothing can be said."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Glance:
-    """A usable photo and a small grey picture of it."""
-
-    photo: Photo
-    small: NDArray[np.float32]
-    """(SIDE_PX, SIDE_PX) upright."""
-
-
-def small_picture(upright: Image.Image) -> NDArray[np.float32]:
-    """What is kept of a photo to compare it."""
-    reduced = upright.convert("L").resize((SIDE_PX, SIDE_PX), Image.Resampling.LANCZOS, reducing_gap=6.0)
-    return np.asarray(reduced, np.float32)
 
 
 def without_copies(glances: Sequence[Glance]) -> tuple[list[Photo], list[UnusablePhoto]]:

@@ -119,6 +119,14 @@ def turned_upright(image: Image.Image, turned: int) -> Image.Image:
     return image.transpose(ORIENTATIONS[turned]) if turned in ORIENTATIONS else image
 
 
+def turned_back(upright: Image.Image, turn_deg: int) -> Image.Image:
+    """What has to be turned clockwise by so much to be upright."""
+    return upright.transpose(TURNS[turn_deg]) if turn_deg else upright
+
+
+TURNS = {90: Image.Transpose.ROTATE_90, 180: Image.Transpose.ROTATE_180, 270: Image.Transpose.ROTATE_270}
+"""What turns counterclockwise."""
+
 ORIENTATIONS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,

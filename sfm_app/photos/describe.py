@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from sfm_app.photos.copies import Glance, small_picture
 from sfm_app.photos.decode import LOSSY, MOST_FRAMES, Picture, UnreadableError, read_picture, upright
-from sfm_app.photos.exif import camera_name, focal_px, gps_position, orientation
+from sfm_app.photos.exif import camera_name, focal_px, gps_position, orientation, turn_deg
 from sfm_app.photos.files import place_of
+from sfm_app.photos.glance import Glance, glance
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import Photo, UnusablePhoto
 
@@ -28,7 +28,8 @@ def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | U
 def described(name: str, picture: Picture, options: PhotoSettings) -> Glance | UnusablePhoto:
     """What is known about a photo, and what it looks like."""
     image, exif = picture.image, picture.exif
-    size = image.size[::-1] if orientation(exif) >= 5 else image.size
+    turn = turn_deg(exif)
+    size = image.size[::-1] if orientation(exif) >= 5 and not turn else image.size
     if min(size) < options.min_side_px:
         return UnusablePhoto(name, f"smaller than {options.min_side_px} px")
     width, height = scaled(size, options.max_megapixels * MEGA)
@@ -46,9 +47,10 @@ def described(name: str, picture: Picture, options: PhotoSettings) -> Glance | U
         needs_copy=not (image.format in LINKED and eight_bit and orientation(exif) == 1 and (width, height) == size),
         gps=gps_position(exif),
         lossy=image.format in LOSSY,
+        turn_deg=turn,
         notes=tuple(notes),
     )
-    return Glance(photo, small_picture(upright(picture)))
+    return glance(photo, upright(picture))
 
 
 def scaled(size: tuple[int, int], most_px: float) -> tuple[int, int]:

@@ -22,6 +22,11 @@ def orientation(exif: Image.Exif) -> int:
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
+def turn_deg(exif: Image.Exif) -> int:
+    """By how much a camera that was held so has to be turned clockwise: 0 where the picture is mirrored, too."""
+    return {3: 180, 6: 90, 8: 270}.get(orientation(exif), 0)
+
+
 def camera_name(exif: Image.Exif) -> str:
     """Make, model, focal length and digital zoom in one text; empty where nothing is said."""
     details = exif.get_ifd(EXIF_IFD)

@@ -1,4 +1,4 @@
-"""The photos as COLMAP gets them: links to files that it can read, upright 8-bit copies of the others."""
+"""The photos as COLMAP gets them: links to files that it can read, 8-bit copies of the others, as the sensor lies."""
 
 import os
 import shutil
@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image
 
-from sfm_app.photos.decode import UnreadableError, read_picture, upright
+from sfm_app.photos.decode import UnreadableError, read_picture, turned_back, upright
 from sfm_app.photos.files import place_of
 from sfm_app.stored import is_below
 from sfm_app.types import Photo
@@ -53,7 +53,7 @@ def lay_out(photo: Photo, folder: Path, target: Path) -> None:
     if not photo.needs_copy:
         _link(source, place, relative=folder.parent.resolve() == target.parent.resolve())
         return
-    copy = upright(read_picture(source))
+    copy = turned_back(upright(read_picture(source)), photo.turn_deg)
     if copy.size != (photo.width, photo.height):
         copy = copy.resize((photo.width, photo.height), Image.Resampling.LANCZOS)
     if photo.lossy:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.errors import InputError
-from sfm_app.photos.decode import UnreadableError, read_picture, turned_upright
+from sfm_app.photos.decode import UnreadableError, read_picture, turned_back, turned_upright
 from sfm_app.photos.exif import orientation
 from sfm_app.photos.files import list_files, place_of
 from sfm_app.types import Photo, UnusablePhoto
@@ -113,30 +113,31 @@ def without_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uin
 
 
 def _fitted(photo: Photo, folder: Path, masks: Path) -> BoolImage:
-    """(H, W) which pixels of the upright photo its mask leaves."""
+    """(H, W) which pixels of the photo, as it is laid out, its mask leaves."""
     try:
         place = place_of(masks, photo.mask)
         if isinstance(place, str):
             raise UnreadableError(place)
         picture = read_picture(place)
         mask = turned_upright(_black_and_white(picture.image), orientation(picture.exif))
-        size = photo.width, photo.height
+        size = (photo.height, photo.width) if photo.turn_deg in (90, 270) else (photo.width, photo.height)
         if not _alike(mask.size, size):
-            mask = _turned_like(photo, mask, folder)
+            mask = _turned_like(photo, size, mask, folder)
     except UnreadableError as err:
         raise InputError(f"the mask {photo.mask} cannot be used: {err}", hint=MASK_HINT) from err
-    return np.asarray(mask if mask.size == size else mask.resize(size, Image.Resampling.NEAREST)) > 0
+    fitted = mask if mask.size == size else mask.resize(size, Image.Resampling.NEAREST)
+    return np.asarray(turned_back(fitted, photo.turn_deg)) > 0
 
 
-def _turned_like(photo: Photo, mask: Image.Image, folder: Path) -> Image.Image:
+def _turned_like(photo: Photo, size: tuple[int, int], mask: Image.Image, folder: Path) -> Image.Image:
     """A mask that fits the photo as its file has it, before EXIF turns it."""
-    if _alike(mask.size[::-1], (photo.width, photo.height)):
+    if _alike(mask.size[::-1], size):
         source = place_of(folder, photo.path)
         turned = orientation(read_picture(source).exif) if isinstance(source, Path) else 1
         if turned >= SIDEWAYS:
             return turned_upright(mask, turned)
     width, height = mask.size
-    raise UnreadableError(f"it has {width} x {height} pixels, its photo {photo.width} x {photo.height}")
+    raise UnreadableError(f"it has {width} x {height} pixels, its photo {size[0]} x {size[1]}")
 
 
 def _alike(one: tuple[int, int], other: tuple[int, int]) -> bool:

@@ -54,8 +54,8 @@ def look_at_photos(models: Sequence[Any], matches: MatchGraph, run: RunContext) 
     for model in models:
         posed = photos_of(model)
         for k in np.unique(np.linspace(0, len(posed) - 1, LOOKED_AT).astype(int)):
-            file = run.workspace.photos / matches.images[posed[k]].name
-            looks[posed[k]] = run.executor.submit(look_at, file)
+            image = matches.images[posed[k]]
+            looks[posed[k]] = run.executor.submit(look_at, run.workspace.photos / image.name, image.turn_deg)
     return looks
 
 
@@ -74,7 +74,9 @@ def orient(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int | None =
     with backend("reading the model"):
         poses, points = posed_photos(model)
     matrices = np.array(list(poses.values()))
-    R, centres = matrices[:, :, :3], -np.einsum("nij,ni->nj", matrices[:, :, :3], matrices[:, :, 3])
+    centres = -np.einsum("nij,ni->nj", matrices[:, :, :3], matrices[:, :, 3])
+    turns = [matches.images[photo].turn_deg for photo in poses]
+    R = np.array([turned(rotation, turn) for rotation, turn in zip(matrices[:, :, :3], turns, strict=True)])
     found = {photo: looks[photo].result() for photo in poses if photo in looks}
     upright = up_direction(R, centres, scenery_of(model, found), lines_of(model, found), turn_deg)
     positions = [matches.images[key].gps for key in poses]
@@ -93,6 +95,12 @@ def orient(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int | None =
     return entry
 
 
+def turned(R: FloatArray, turn_deg: int) -> FloatArray:
+    """(3, 3) cam_from_world of a photo once it is turned clockwise by a multiple of 90 degrees."""
+    cosine, sine = round(np.cos(np.radians(turn_deg))), round(np.sin(np.radians(turn_deg)))
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ R
+
+
 def lines_of(model: Any, looks: Mapping[int, Look]) -> Segments:
     """Line segments, in the world, of the photos of a model."""
     with backend("looking along lines in the photos"):
@@ -107,8 +115,8 @@ def scenery_of(model: Any, looks: Mapping[int, Look]) -> Scenery:
     return Scenery(shown.points, shown.colors.mean(axis=1), shown.seen, pictures)
 
 
-def look_at(path: Path) -> Look:
-    """Lines and brightness of a photo; nothing where OpenCV cannot read it."""
+def look_at(path: Path, turn_deg: int = 0) -> Look:
+    """Lines of a photo, and its brightness once it is upright; nothing where OpenCV cannot read it."""
     try:
         data = np.fromfile(path, np.uint8)  # OpenCV does not open names beyond ASCII on every system
     except OSError:
@@ -117,7 +125,7 @@ def look_at(path: Path) -> Look:
     if read is None:
         return Look(np.zeros((0, 4)), None)
     grey = np.asarray(read, np.uint8)
-    return Look(line_segments(grey), small_picture(grey))
+    return Look(line_segments(grey), np.rot90(small_picture(grey), -turn_deg // 90))
 
 
 def _in_world(model: Any, image_id: int, lines: FloatArray) -> Segments:

@@ -25,6 +25,7 @@ from sfm_app.photos import (
     mask_place,
     place_of,
     read_photo,
+    screened,
     stored_names,
     unused_masks,
     without_copies,
@@ -45,8 +46,8 @@ def read_photos(folder: Path, run: RunContext) -> PhotoSet:
     glances = [photo for photo in found if isinstance(photo, Glance)]
     unusable = [photo for photo in found if isinstance(photo, UnusablePhoto)]
     glances, blackened = masked(glances, folder, run)
-    photos, copies = without_copies(glances) if not options.keep_all else ([g.photo for g in glances], [])
-    unusable = sorted(unusable + blackened + copies, key=lambda photo: photo.name)
+    photos, needless = chosen(glances, keep_all=options.keep_all)
+    unusable = sorted(unusable + blackened + needless, key=lambda photo: photo.name)
     if len(photos) < 2:
         raise InputError(
             too_few(folder, len(photos), unusable), hint="two photos of one place are the least; 10 to 50 work best"
@@ -63,6 +64,15 @@ def read_photos(folder: Path, run: RunContext) -> PhotoSet:
     run.record(notes={photo.path: list(photo.notes) for photo in photos if photo.notes})
     run.record(gps=sum(photo.gps is not None for photo in photos))
     return photo_set
+
+
+def chosen(glances: list[Glance], *, keep_all: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
+    """The photos that are worth their time, and the others."""
+    if keep_all:
+        return [glance.photo for glance in glances], []
+    useful, useless = screened(glances)
+    photos, copies = without_copies(useful)
+    return photos, useless + copies
 
 
 def files_of(folder: Path, run: RunContext) -> list[str]:

@@ -23,6 +23,8 @@ class MatchedImage:
     height: int
     exif_focal_px: float | None = None
     gps: GpsPosition | None = None
+    turn_deg: int = 0
+    """By how much it has to be turned clockwise to be upright, as far as EXIF and its shape say so."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,9 +23,9 @@ class Photo:
     name: str
     """What it goes by everywhere: its path inside the folder, with forward slashes, unless COLMAP cannot have that."""
     width: int
-    """Upright width in pixels, after EXIF orientation."""
+    """Width in pixels as it is laid out: as the sensor lies, so that photos of one camera have one size."""
     height: int
-    """Upright height in pixels."""
+    """Height in pixels."""
     group: str
     """Photos of one group share one camera."""
     exif_focal_px: float | None = None
@@ -38,6 +38,8 @@ class Photo:
     """Path inside the folder; the name where empty."""
     lossy: bool = True
     """Whether the file's format has lost something already."""
+    turn_deg: int = 0
+    """By how much it has to be turned clockwise to be upright: 0, 90, 180 or 270."""
     notes: tuple[str, ...] = ()
     """What people should know about how it is read."""
     mask: str = ""

@@ -11,6 +11,7 @@ import pytest
 import sfm_app
 from sfm_app.context import RunContext
 from sfm_app.errors import SfmError
+from sfm_app.inputs import why_again
 from sfm_app.pipeline import NAMES, STAGES, loader, stored_model
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings
@@ -158,7 +159,7 @@ def decide(made, run):
     """All that a run asks of the manifest, and what `export` reads."""
     before = made.outside()
     for stage in STAGES:
-        run.workspace.is_current(stage.name, "abc")
+        why_again(stage.name, stage.settings, "abc", run)
         load(made, run, stage.name)
     for points in (False, True):
         try:

@@ -8,7 +8,7 @@ from PIL import Image
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.colmap.dense import MASKED, DenseStore, hide_masked, read_depth, read_views, undistort, write_maps
-from sfm_app.colmap.features import extract_features
+from sfm_app.colmap.features import find_and_match
 from sfm_app.colmap.masks import REACH_PX, mask_undistorter, used_pixels
 from sfm_app.colmap.surface import FUSED, fuse, read_fused
 from sfm_app.photos import save_used
@@ -67,7 +67,7 @@ def test_no_keypoint_lies_in_what_is_masked(place, tmp_path):
     for masks in (None, root / "masks"):
         database = tmp_path / f"{masks is None}.db"
         create_database(database, photos)
-        extract_features(database, root / "photos", NAMES, MatchSettings(), 1, Silent(), masks)
+        find_and_match(database, root / "photos", NAMES, MatchSettings(), 1, Silent(), masks)
         graph = read_match_graph(database, photos)
         found[masks] = {graph.images[key].name: np.floor(at).astype(int) for key, at in graph.keypoints.items()}
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.photos import Glance, small_picture, without_copies
+from sfm_app.photos import without_copies
+from sfm_app.photos.glance import glance as look
 from sfm_app.types import Photo
 
 
@@ -22,7 +23,7 @@ def scene(seed=0, shift=0):
 
 
 def glance(name, image):
-    return Glance(Photo(name, *image.size, "one"), small_picture(image))
+    return look(Photo(name, *image.size, "one"), image)
 
 
 def saved(image, **options):

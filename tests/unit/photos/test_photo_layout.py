@@ -51,9 +51,9 @@ def test_what_it_was_called_is_kept():
 @pytest.mark.parametrize(
     ("cameras", "expected"),
     [
-        ("auto", ["60x40 X", "60x40 X", "60x40 Y", "40x60 X"]),
-        ("single", ["60x40", "60x40", "60x40", "40x60"]),
-        ("folder", ["60x40 in", "60x40 .", "60x40 in", "40x60 in"]),
+        ("auto", ["60x40 X", "60x40 X", "60x40 Y", "60x40 X"]),
+        ("single", ["60x40", "60x40", "60x40", "60x40"]),
+        ("folder", ["60x40 in", "60x40 .", "60x40 in", "60x40 in"]),
         ("each", ["60x40 in/a", "60x40 b", "60x40 in/c", "40x60 in/d"]),
     ],
 )
@@ -66,6 +66,30 @@ def test_groups(cameras, expected):
     ]
 
     assert [photo.group for photo in grouped(photos, cameras)] == expected
+
+
+def laid(sizes):
+    """Sizes and turns of photos of these sizes, laid out."""
+    photos = [Photo(f"{number}.jpg", *size, "") for number, size in enumerate(sizes)]
+    return [(photo.width, photo.height, photo.turn_deg, photo.needs_copy) for photo in grouped(photos, "auto")]
+
+
+def test_photos_on_end_lie_as_most_of_their_camera():
+    assert laid([(60, 40), (40, 60)]) == [(60, 40, 0, False), (60, 40, 90, True)]
+    assert laid([(60, 40), (40, 60), (40, 60)]) == [(40, 60, 90, True), (40, 60, 0, False), (40, 60, 0, False)]
+    assert laid([(40, 60), (40, 60)]) == [(40, 60, 0, False)] * 2
+    assert laid([(60, 40), (40, 50)]) == [(60, 40, 0, False), (40, 50, 0, False)]
+
+
+@pytest.mark.parametrize("turn", [90, 180, 270])
+def test_a_turned_photo_is_laid_out_as_the_sensor_lay(tmp_path, turn):
+    upright = np.rot90(PIXELS, -turn // 90)
+    Image.fromarray(np.ascontiguousarray(upright)).save(tmp_path / "x.png")
+
+    lay_out(Photo("x.png", 60, 40, "g", needs_copy=True, lossy=False, turn_deg=turn), tmp_path, tmp_path / "target")
+
+    with Image.open(tmp_path / "target" / "x.png") as seen:
+        assert np.array_equal(np.asarray(seen), PIXELS)
 
 
 @pytest.mark.parametrize("kind", ["TIFF", "BMP", "WEBP", "PNG"])

@@ -9,7 +9,7 @@ import pytest
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.model import posed_photos
 from sfm_app.geometry.georeference import enu_m, position_at
-from sfm_app.reconstruction.orientation import look_at, look_at_photos, orient
+from sfm_app.reconstruction.orientation import look_at, look_at_photos, orient, turned
 from sfm_app.synthetic.cameras import arc, make_camera
 from sfm_app.types import GpsPosition, MatchedImage, MatchGraph
 from sfm_app.workspace import Workspace
@@ -55,6 +55,15 @@ def true_positions(views):
     axes = np.stack([right, [0, 0, 1.0], -ahead])
     centres = [-pose[:, :3].T @ pose[:, 3] for pose in views.cam_from_world.values()]
     return [position_at(METRES * centre @ axes, GpsPosition(48.2, 16.37, 170.0)) for centre in centres]
+
+
+ROTATIONS = {
+    0: [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+    90: [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],  # on end: what is down is on the right of the sensor
+    180: [[-1, 0, 0], [0, -1, 0], [0, 0, 1]],
+    270: [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
+}
+"""cam_from_world by how far the picture has to be turned clockwise."""
 
 
 def test_without_gps_the_model_has_size_one_and_stands_upright(tmp_path):
@@ -111,6 +120,24 @@ def test_the_manifest_says_why_up_is_up(tmp_path):
     assert set(entry["up_evidence_nats"].values()) == {0.0} and again["up_evidence_nats"] == {}
     assert again["up_sign_odds"] > 1e6
     assert [pose[1, 1] for pose in posed_photos(model)[0].values()] == pytest.approx([-up for up in ups], abs=1e-6)
+
+
+@pytest.mark.parametrize("turn", [0, 90, 180, 270])
+def test_a_turned_photo_is_upright_once_it_is_turned(turn):
+    R = np.array(ROTATIONS[turn], float)  # a level camera, held so that its picture has to be turned by that
+
+    assert np.allclose(turned(R, turn), np.eye(3))
+
+
+def test_a_turned_photo_is_looked_at_upright(tmp_path):
+    picture = np.zeros((200, 300), np.uint8)
+    picture[:, 150:] = 200
+    cv2.imwrite(str(tmp_path / "a.png"), picture)
+
+    looks = [look_at(tmp_path / "a.png", turn).picture for turn in (0, 90, 180, 270)]
+
+    assert looks[0][:, -1].mean() > 150 and looks[1][-1].mean() > 150  # what is right goes down, left, up
+    assert looks[2][:, 0].mean() > 150 and looks[3][0].mean() > 150
 
 
 def test_a_photo_that_is_gone_tells_nothing(tmp_path):

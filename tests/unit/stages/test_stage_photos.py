@@ -71,7 +71,7 @@ def test_every_file_is_used_or_has_a_reason(folder, run):
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_exif_orientation_is_applied_to_what_colmap_sees(folder, run, orientation):
+def test_a_camera_that_was_turned_keeps_its_layout_and_mirrors_are_undone(folder, run, orientation):
     exif = Image.Exif()
     exif[0x0112] = orientation
     Image.fromarray(PIXELS).save(folder / "turned.png", exif=exif)
@@ -80,12 +80,13 @@ def test_exif_orientation_is_applied_to_what_colmap_sees(folder, run, orientatio
     seen = Image.open(run.workspace.photos / "turned.png")
     seen.load()
 
-    assert (photo.width, photo.height) == seen.size == ((96, 128) if orientation >= 5 else (128, 96))
+    assert (photo.width, photo.height) == seen.size == (128, 96)
+    assert photo.turn_deg == {3: 180, 6: 90, 8: 270}.get(orientation, 90 if orientation in (5, 7) else 0)
     assert seen.getexif().get(0x0112, 1) == 1
     assert photo.needs_copy == (orientation != 1)
-    expected = {3: PIXELS[::-1, ::-1], 6: np.rot90(PIXELS, -1), 8: np.rot90(PIXELS, 1)}.get(orientation)
-    if expected is not None:
-        assert np.array_equal(np.asarray(seen), expected)
+    upright = {2: PIXELS[:, ::-1], 4: PIXELS[::-1], 5: PIXELS.swapaxes(0, 1), 7: np.rot90(PIXELS, 2).swapaxes(0, 1)}
+    expected = np.rot90(upright.get(orientation, PIXELS), orientation in (5, 7))  # these two lie as the others then
+    assert np.array_equal(np.asarray(seen), expected)
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "P", "LA", "I;16", "1", "CMYK"])

@@ -202,7 +202,7 @@ def test_refined_cameras_stand_beside_the_calibration_and_leave_it_valid(tmp_pat
     assert found["refined"]["one"]["deviations"] == {"fx": 1.5, "cx": 2.5}
     assert (found["refined"]["one"]["K"], found["refined"]["one"]["determined"]) == (K.tolist(), ["centre"])
     assert Intrinsics.from_dict(found).to_dict() == before.to_dict()
-    assert place.is_current("intrinsics", "abc")
+    assert not place.spoilt(place.record("intrinsics"))
 
 
 def test_what_is_known_of_refined_cameras_goes_by_their_names():
