@@ -212,25 +212,33 @@ def _through(source: Source, run: RunContext, ends: tuple[str, str], wanted: Seq
     found: dict[str, Any] = {"source": source.place}
     prints: dict[str, str] = {"source": source.print}
     products = loader(found, run)
-    redone = ""
-    for stage in STAGES[: NAMES.index(last) + 1]:
-        prints[stage.name] = stage_print(stage.name, stage.settings, [prints[name] for name in stage.takes], run)
-        again = why_again(stage.name, stage.settings, prints[stage.name], run)
-        if stage.name == first or redone:
-            again = again or (f"after {redone}" if redone else "as you said")
+
+    def do(stage: Stage, again: str | None) -> None:
         if again is None:
             run.progress.stage(stage.name, "up to date")
-        else:
-            forget(stage.name, run)
-            found[stage.name] = make(stage, products, (source, prints[stage.name]), again, run)
-            if stage.name == first or stage.name != PHOTOS:
-                redone = stage.name
-        if stage.name == PHOTOS:  # what changed in the folder may not matter to the photos that are used
-            prints[PHOTOS] = source.content(products(PHOTOS))
+            return
+        forget(stage.name, run)
+        found[stage.name] = make(stage, products, (source, prints[stage.name]), again, run)
+
+    do(STAGES[0], why(STAGES[0], prints, first, run))
+    prints[PHOTOS] = source.content(products(PHOTOS))  # what else changed in the folder does not matter
+    reasons = {stage.name: why(stage, prints, first, run) for stage in STAGES[1 : NAMES.index(last) + 1]}
+    redone = PHOTOS if first == PHOTOS else ""
+    for stage in STAGES[1 : NAMES.index(last) + 1]:
+        again = reasons[stage.name]
+        do(stage, f"after {redone}" if again is None and redone else again)
+        redone = redone if again is None else stage.name
     for name in wanted:
         if NAMES.index(name) <= NAMES.index(last):
             products(name)
     return products
+
+
+def why(stage: Stage, prints: dict[str, str], first: str, run: RunContext) -> str | None:
+    """As `why_again`; enters what the stage depends on in `prints`."""
+    prints[stage.name] = stage_print(stage.name, stage.settings, [prints[name] for name in stage.takes], run)
+    again = why_again(stage.name, stage.settings, prints[stage.name], run)
+    return "as you said" if again is None and stage.name == first else again
 
 
 def forget(name: str, run: RunContext) -> None:

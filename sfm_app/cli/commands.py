@@ -1,6 +1,7 @@
 """The commands."""
 
 import errno
+import os
 import sys
 import warnings
 from pathlib import Path
@@ -23,6 +24,7 @@ from sfm_app.cli.display import (
 )
 from sfm_app.cli.doctor import examine
 from sfm_app.cli.options import output_options, settings_from, settings_options
+from sfm_app.colmap.backend import left_running
 from sfm_app.demo import demo_lines, run_demo
 from sfm_app.errors import ConfigError, SfmError
 from sfm_app.pipeline import NAMES
@@ -35,6 +37,15 @@ FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
 
 class Commands(click.Group):
     """Turns errors into one line and an exit code, in one place."""
+
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return super().main(*args, **kwargs)
+        finally:
+            if left_running():  # at an end that waits, or takes away what the call works on, it would crash
+                sys.stdout.flush()
+                sys.stderr.flush()
+                os._exit(INTERRUPTED)
 
     def invoke(self, ctx: click.Context) -> Any:
         try:

@@ -17,7 +17,7 @@ from typing import IO, Any
 
 from sfm_app.colmap.backend import log_level, show_log
 from sfm_app.errors import BackendError
-from sfm_app.progress import Progress
+from sfm_app.progress import Progress, Silent
 
 ENDED_EARLY = 1
 REPORTS = 3
@@ -87,6 +87,24 @@ def started(module: str, task: Mapping[str, Any]) -> Iterator[Apart]:
         finally:
             if process.poll() is None:
                 process.kill()
+
+
+def finished(module: str, task: Mapping[str, Any], doing: str, progress: Progress | None = None) -> dict[str, Any]:
+    """A module of ours to its end; what it has reported comes back.
+
+    Args:
+        module: calls `served`.
+        task: as JSON can hold it.
+        doing: what errors call it.
+        progress: shown progress.
+
+    Raises:
+        BackendError: COLMAP failed.
+    """
+    with started(module, task) as process:
+        found = relay(process, progress or Silent())
+        process.check(doing)
+    return found
 
 
 def served(work: Callable[[dict[str, Any]], None]) -> None:

@@ -2,12 +2,13 @@
 
 import contextlib
 import tempfile
+import threading
 import zlib  # before pycolmap, whose own deflate symbols otherwise break every later use of zlib in this process
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pycolmap
 
@@ -15,10 +16,14 @@ from sfm_app.errors import BackendError, SfmError
 from sfm_app.progress import Progress
 
 __all__ = [
-    "backend", "check_written", "counted", "has_cuda", "interruptible", "log_level", "plain", "pycolmap", "show_log",
-    "versions",
+    "backend", "check_written", "counted", "has_cuda", "interruptible", "left_running", "log_level", "patiently",
+    "plain", "pycolmap", "show_log", "versions",
 ]  # fmt: skip
 
+Result = TypeVar("Result")
+
+LEFT, POLL_S = "colmap-alone", 0.2
+"""Name of threads that nobody waits for, and how often one looks whether they are done."""
 ROOM = 1_000_000
 """Bytes that have to be left: more than any program keeps back before it writes."""
 
@@ -75,6 +80,32 @@ def check_written(*files: Path) -> None:
     with tempfile.TemporaryFile(dir=files[0].parent) as probe:
         probe.seek(longest)
         probe.write(bytes(ROOM))
+
+
+def patiently(call: Callable[[], Result]) -> Result:
+    """Run a COLMAP call that nobody can stop, so that Ctrl-C is heard at once; then the call is left behind.
+
+    See `left_running`.
+    """
+    found: Future[Result] = Future()
+
+    def run() -> None:
+        try:
+            found.set_result(call())
+        except BaseException as err:
+            found.set_exception(err)
+
+    threading.Thread(target=run, name=LEFT, daemon=True).start()
+    while True:
+        with contextlib.suppress(NotYet):
+            return found.result(timeout=POLL_S)
+        if found.done():
+            return found.result()
+
+
+def left_running() -> bool:
+    """Whether a call of COLMAP is still at work: then a program must end without waiting for it."""
+    return any(thread.name == LEFT for thread in threading.enumerate())
 
 
 def interruptible(call: Callable[["pycolmap.CancellationToken"], None], poll: Callable[[], None]) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.backend import patiently, pycolmap
 from sfm_app.colmap.database import TWO_FOCALS, camera_params, opened
 from sfm_app.geometry.bundle import POSE, Bundle, Reduced, cost, moved, reduce
 from sfm_app.selfcal.lens_evidence import PARTS, Estimate, Usual, estimate
@@ -81,7 +81,7 @@ def solve(model: Any) -> None:
     for camera_id in used_cameras(model):
         config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve()
+    patiently(pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve)
 
 
 def improve_tracks(model: Any, graph: Any) -> int:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.apart import relay, started
+from sfm_app.colmap.apart import finished
 from sfm_app.colmap.backend import backend, check_written, pycolmap
 from sfm_app.colmap.masks import used_pixels
 from sfm_app.progress import Progress
@@ -34,9 +34,7 @@ def undistort(
     (dense_dir / "images").mkdir(parents=True, exist_ok=True)
     places = {"dense": str(dense_dir), "model": str(model_dir), "photos": str(photo_dir)}
     task = {**places, "max_side_px": max_side_px, "workers": workers}
-    with started("sfm_app.colmap.undistort_process", task) as process:
-        relay(process, progress)
-        process.check("undistorting photos")
+    finished("sfm_app.colmap.undistort_process", task, "undistorting photos", progress)
 
 
 def read_views(dense_dir: Path) -> list[View]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import backend, pycolmap
+from sfm_app.colmap.backend import backend, patiently, pycolmap
 from sfm_app.colmap.database import opened
 from sfm_app.geometry.seed import TwoViewSeed
 from sfm_app.geometry.similarity import Similarity
@@ -86,7 +86,7 @@ def cameras_of(model: Any) -> dict[int, tuple[NDArray[np.float64], float]]:
 
 def colour(model: Any, photo_dir: Path, workers: int) -> None:
     """Give every point the mean colour of its pixels."""
-    model.extract_colors_for_all_images(photo_dir, num_threads=workers)
+    patiently(lambda: model.extract_colors_for_all_images(photo_dir, num_threads=workers))
 
 
 def part_of(model: Any, photos: Sequence[int]) -> Any:

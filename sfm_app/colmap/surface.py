@@ -7,17 +7,14 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import backend, check_written, pycolmap
+from sfm_app.colmap.apart import finished
+from sfm_app.colmap.backend import backend
 from sfm_app.stereo import View
 from sfm_app.types import Surface
 
 FUSED = "fused.ply"
-MAX_NORMAL_ERROR_DEG = 25.0
-CACHE_GB = 2.0
 FULL_DEPTH = 5
-"""Poisson's least depth. One surface of a lower depth, and COLMAP makes all later ones of the process coarser."""
-BORDER_WEIGHT = 10.0
-"""How much dearer it is to move a border than the surface."""
+"""Poisson's least depth: with less, what little there is becomes coarser still."""
 
 
 def fuse(dense_dir: Path, views: Sequence[View], min_views: int, box: NDArray[np.float64], target: Path) -> None:
@@ -32,17 +29,9 @@ def fuse(dense_dir: Path, views: Sequence[View], min_views: int, box: NDArray[np
     """
     config = "".join(f"{view.name}\n" for view in views)
     (dense_dir / "stereo" / "fusion.cfg").write_text(config, encoding="utf-8")
-    options = pycolmap.StereoFusionOptions()
-    options.min_num_pixels = min_views
-    # The depths have been checked already; normals from disparities are noisier than those of COLMAP's PatchMatch.
-    options.max_normal_error = MAX_NORMAL_ERROR_DEG
-    options.bounding_box = (box[0].astype(np.float32), box[1].astype(np.float32))
-    options.use_cache, options.cache_size = True, CACHE_GB  # else all maps of all photos are in memory at once
-    options.num_threads = 1  # with more, the points depend on which thread comes first
-    with backend("fusing depth maps"):
-        pycolmap.stereo_fusion(target, dense_dir, options=options, output_type="ply")
-        check_written(target)
-        target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; nobody asks
+    task = {"dense": str(dense_dir), "target": str(target), "min_views": min_views, "box": box.tolist()}
+    finished("sfm_app.colmap.surface_process", {"do": "fuse", **task}, "fusing depth maps")
+    target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; nobody asks
 
 
 def read_fused(dense_dir: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -60,15 +49,11 @@ def poisson(dense_dir: Path, depth: int) -> Surface:
         dense_dir: dense workspace.
         depth: of the octree, FULL_DEPTH where less; the finest cell is the largest extent of the points over 2^depth.
     """
-    options = pycolmap.PoissonMeshingOptions()
-    options.depth, options.trim = max(depth, FULL_DEPTH), 0.0
-    options.num_threads = 1  # with more: other triangles in every run, and many times slower where cores are shared
     path = dense_dir / "poisson.ply"
-    with backend("finding the surface"):
-        pycolmap.poisson_meshing(dense_dir / FUSED, path, options=options)
-        check_written(path)
-        surface = _read(path)
-        path.unlink()
+    task = {"points": str(dense_dir / FUSED), "target": str(path), "depth": max(depth, FULL_DEPTH)}
+    finished("sfm_app.colmap.surface_process", {"do": "poisson", **task}, "finding the surface")
+    surface = _read(path)
+    path.unlink()
     return surface
 
 
@@ -83,18 +68,13 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
         max_error: largest root of the summed squared distances of a vertex from the planes that it stands for; 0: any.
         scratch: folder for two files that go again.
     """
-    options = pycolmap.MeshSimplificationOptions()
-    options.target_face_ratio, options.max_error = share, max_error**2
-    options.boundary_weight = BORDER_WEIGHT
-    options.num_threads = 1  # with more, the triangles may depend on which thread comes first
     given, found = scratch / "fine.ply", scratch / "coarse.ply"
-    with backend("simplifying the surface"):
-        trimesh.Trimesh(surface.vertices, surface.faces, process=False).export(given)
-        pycolmap.simplify_mesh(given, found, options)
-        check_written(given, found)
-        simple = _read(found)
-        given.unlink()
-        found.unlink()
+    trimesh.Trimesh(surface.vertices, surface.faces, process=False).export(given)
+    task = {"mesh": str(given), "target": str(found), "share": share, "max_error": max_error}
+    finished("sfm_app.colmap.surface_process", {"do": "simplify", **task}, "simplifying the surface")
+    simple = _read(found)
+    given.unlink()
+    found.unlink()
     return Surface(simple.vertices, simple.faces, _mean_colors(surface, simple.vertices))
 
 

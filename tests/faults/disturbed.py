@@ -1,6 +1,6 @@
 """Run the program and disturb it at a chosen moment: disturbed.py WHAT MOMENT ARGUMENTS.
 
-WHAT is "kill" (as by `kill -9`), "out-gone", "photo-gone" or "photo-changed". MOMENT is "before:N" or "after:N" for the
+WHAT is "kill" (as by `kill -9`), "interrupt" (as by Ctrl-C), "out-gone", "photo-gone" or "photo-changed". MOMENT is "before:N" or "after:N" for the
 Nth file that appears (every file of a run appears by a rename), "features:MS", "matching:MS" or "undistorting:MS" for
 so many milliseconds after COLMAP has begun with that in a process of its own, "full:KB" for a disk that takes no file
 of more than so many kilobytes, or "never", which says how many files appeared.
@@ -72,6 +72,7 @@ def prepare(what: str, moment: str, arguments: list[str]) -> None:
     """Have it happen."""
     disturb = {
         "kill": die,
+        "interrupt": lambda: os.kill(os.getpid(), signal.SIGINT),
         "out-gone": lambda: shutil.rmtree(arguments[arguments.index("-o") + 1], ignore_errors=True),
         "photo-gone": lambda: photo(arguments).unlink(),
         "photo-changed": lambda: change(photo(arguments)),
