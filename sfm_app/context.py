@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sfm_app.parallel import ordered_map
+from sfm_app.parallel import make_executor, ordered_map
+from sfm_app.plan import SHARE_OF_MACHINE, machine_memory_mb
 from sfm_app.plugins import Plugins
 from sfm_app.progress import Progress, Silent, track
 from sfm_app.settings import Settings
@@ -40,6 +41,22 @@ class RunContext:
     def seed(self) -> int:
         """The run's seed; parts derive theirs from it and from their own ids."""
         return self.settings.seed
+
+    @property
+    def memory_mb(self) -> float:
+        """Most memory that may be held."""
+        return 1000 * self.settings.max_memory_gb or SHARE_OF_MACHINE * machine_memory_mb()
+
+    @contextmanager
+    def with_workers(self, workers: int) -> Iterator[None]:
+        """So many workers instead of what the settings say."""
+        before = self.workers, self.executor
+        with make_executor(workers) as executor:
+            self.workers, self.executor = workers, executor
+            try:
+                yield
+            finally:
+                self.workers, self.executor = before
 
     @property
     def mask_dir(self) -> Path | None:

@@ -16,6 +16,7 @@ from sfm_app.colmap.model import sparse_model
 from sfm_app.context import STANDARD_FORMATS, RunContext
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
 from sfm_app.inputs import Source, manifest_head, source_of, stage_print, why_again
+from sfm_app.plan import plan_within
 from sfm_app.stages.depth_maps import make_depth_maps
 from sfm_app.stages.files import NAME as MODEL
 from sfm_app.stages.files import load_files, write_files
@@ -224,14 +225,38 @@ def _through(source: Source, run: RunContext, ends: tuple[str, str], wanted: Seq
     prints[PHOTOS] = source.content(products(PHOTOS))  # what else changed in the folder does not matter
     reasons = {stage.name: why(stage, prints, first, run) for stage in STAGES[1 : NAMES.index(last) + 1]}
     redone = PHOTOS if first == PHOTOS else ""
-    for stage in STAGES[1 : NAMES.index(last) + 1]:
-        again = reasons[stage.name]
-        do(stage, f"after {redone}" if again is None and redone else again)
-        redone = redone if again is None else stage.name
+    with planned(products(PHOTOS), [name for name, again in reasons.items() if redone or again is not None], run):
+        for stage in STAGES[1 : NAMES.index(last) + 1]:
+            again = reasons[stage.name]
+            do(stage, f"after {redone}" if again is None and redone else again)
+            redone = redone if again is None else stage.name
     for name in wanted:
         if NAMES.index(name) <= NAMES.index(last):
             products(name)
     return products
+
+
+@contextmanager
+def planned(photos: PhotoSet, todo: Sequence[str], run: RunContext) -> Iterator[None]:
+    """Say what the stages from the first of these on will cost, and hold the memory that they may have.
+
+    Raises:
+        ConfigError: the photos need more than the user allows.
+    """
+    if not todo:
+        yield
+        return
+    ahead = [stage.name for stage in STAGES[NAMES.index(todo[0]) : NAMES.index(todo[-1]) + 1]]
+    plan = plan_within(photos.photos, run.settings, run.workers, run.memory_mb, ahead)
+    if run.settings.max_memory_gb and plan.peak_mb(ahead) > run.memory_mb:
+        raise ConfigError(
+            f"{plan.photos} photos need about {plan.peak_mb(ahead) / 1000:.1f} GB, more than --max-memory",
+            hint="allow more, use fewer photos, or --quality draft",
+        )
+    run.progress.say(plan.text(ahead))
+    logger.info("%s", plan.text(ahead))
+    with run.with_workers(plan.workers):
+        yield
 
 
 def why(stage: Stage, prints: dict[str, str], first: str, run: RunContext) -> str | None:

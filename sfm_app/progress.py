@@ -15,6 +15,9 @@ class Progress(Protocol):
     def stage_done(self, seconds: float) -> None:
         """The stage that began last is over, after so long."""
 
+    def say(self, text: str) -> None:
+        """Something that people should know before they wait."""
+
     def start(self, label: str, total: int) -> None:
         """Work of `total` steps begins."""
 
@@ -31,6 +34,8 @@ class Silent:
     def stage(self, name: str, note: str = "") -> None: ...
 
     def stage_done(self, seconds: float) -> None: ...
+
+    def say(self, text: str) -> None: ...
 
     def start(self, label: str, total: int) -> None: ...
 

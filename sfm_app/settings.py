@@ -151,6 +151,9 @@ class Settings(Section):
     seed: int = Field(0, ge=0, lt=2**32, description="same seed, same result")
     workers: int = Field(0, ge=0, le=1024, description="parallel workers; 0: one per core")
     quality: Quality = Field("normal", description="preset for image sizes and mesh resolution")
+    max_memory_gb: float = Field(
+        0.0, ge=0, le=4096, description="most memory that is used, in GB; 0: as much as the machine has, less a fifth"
+    )
     plugins: bool = Field(True, description="load installed plug-ins; false: nothing but what the program itself has")
     photos: PhotoSettings = PhotoSettings()
     matching: MatchSettings = MatchSettings()

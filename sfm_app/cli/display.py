@@ -51,6 +51,9 @@ class Terminal:
     def stage_done(self, seconds: float) -> None:
         self.console.print(f"    [dim]{seconds:.1f} s[/dim]")
 
+    def say(self, text: str) -> None:
+        self.console.print(escape(text))
+
     def start(self, label: str, total: int) -> None:
         self.task = self.bars.add_task(escape(label), total=total)
         self.bars.start()

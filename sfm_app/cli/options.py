@@ -31,6 +31,7 @@ def settings_options(command: Command) -> Command:
         ),
         click.option("--seed", type=int, help="Same seed, same result.  [default: 0]"),
         click.option("--workers", type=int, help="Parallel workers.  [default: one per core]"),
+        click.option("--max-memory", type=float, metavar="GB", help="Most memory that is used.  [default: 4/5 of all]"),
         click.option("--quality", type=click.Choice(get_args(Quality)), help="Preset of sizes.  [default: normal]"),
         click.option("--images", help="Text file that names the photos to use, one per line.  [default: all]"),
         click.option(
@@ -64,6 +65,8 @@ def settings_from(flags: Mapping[str, Any]) -> Settings:
     """Settings from the shared options; flags win over the file."""
     show_log(flags["verbose"])
     overrides: dict[str, Any] = {key: flags[key] for key in ("seed", "workers", "quality") if flags[key] is not None}
+    if flags["max_memory"] is not None:
+        overrides["max_memory_gb"] = flags["max_memory"]
     if flags["no_plugins"]:
         overrides["plugins"] = False
     for key, table in OWN_FLAGS.items():

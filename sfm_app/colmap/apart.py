@@ -139,6 +139,8 @@ class Reported:
 
     def stage_done(self, seconds: float) -> None: ...
 
+    def say(self, text: str) -> None: ...
+
     def start(self, label: str, total: int) -> None:
         report(start=label, total=total)
 

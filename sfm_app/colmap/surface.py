@@ -17,7 +17,14 @@ FULL_DEPTH = 5
 """Poisson's least depth: with less, what little there is becomes coarser still."""
 
 
-def fuse(dense_dir: Path, views: Sequence[View], min_views: int, box: NDArray[np.float64], target: Path) -> None:
+def fuse(
+    dense_dir: Path,
+    views: Sequence[View],
+    min_views: int,
+    box: NDArray[np.float64],
+    target: Path,
+    cache_gb: float = 2.0,
+) -> None:
     """Fuse the geometric maps of these views into the PLY file `target`.
 
     Args:
@@ -26,11 +33,12 @@ def fuse(dense_dir: Path, views: Sequence[View], min_views: int, box: NDArray[np
         min_views: photos that have to see a point.
         box: (2, 3) lowest and highest coordinates that are kept.
         target: in any folder.
+        cache_gb: memory for the maps of photos; with less, they are read more often.
     """
     config = "".join(f"{view.name}\n" for view in views)
     (dense_dir / "stereo" / "fusion.cfg").write_text(config, encoding="utf-8")
     task = {"dense": str(dense_dir), "target": str(target), "min_views": min_views, "box": box.tolist()}
-    finished("sfm_app.colmap.surface_process", {"do": "fuse", **task}, "fusing depth maps")
+    finished("sfm_app.colmap.surface_process", {"do": "fuse", "cache_gb": cache_gb, **task}, "fusing depth maps")
     target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; nobody asks
 
 

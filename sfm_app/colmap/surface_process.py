@@ -13,7 +13,6 @@ from sfm_app.colmap.apart import served
 from sfm_app.colmap.backend import check_written, pycolmap
 
 MAX_NORMAL_ERROR_DEG = 25.0
-CACHE_GB = 2.0
 BORDER_WEIGHT = 10.0
 """How much dearer it is to move a border than the surface."""
 
@@ -32,7 +31,7 @@ def fuse(task: dict[str, Any]) -> None:
     options.max_normal_error = MAX_NORMAL_ERROR_DEG
     low, high = np.array(task["box"], np.float32)
     options.bounding_box = (low, high)
-    options.use_cache, options.cache_size = True, CACHE_GB  # else all maps of all photos are in memory at once
+    options.use_cache, options.cache_size = True, task["cache_gb"]  # else all maps of all photos are in memory at once
     options.num_threads = 1
     pycolmap.stereo_fusion(Path(task["target"]), Path(task["dense"]), options=options, output_type="ply")
 

@@ -1,9 +1,12 @@
 """From the bytes of a file to an upright picture of 8 bits, or the reason why there is none."""
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -22,6 +25,7 @@ LARGE_PX = 50_000_000
 LEAST_BYTES_PER_PX = 0.02
 """Large photos have more, however hard they are compressed; an area of one colour has less."""
 MOST_FRAMES = 100
+ONE_AT_A_TIME = Lock()
 
 
 class UnreadableError(Exception):
@@ -76,6 +80,18 @@ def read_picture(path: Path) -> Picture:
         raise UnreadableError("not readable: permission denied") from None
     except Exception:  # whatever a decoder makes of damaged bytes
         raise UnreadableError("truncated or damaged") from None
+
+
+@contextmanager
+def room_for(path: Path) -> Iterator[None]:
+    """Large photos are dealt with one at a time: each takes ten bytes per pixel and more."""
+    try:
+        with Image.open(path, formats=formats()) as image:
+            pixels = image.width * image.height
+    except Exception:  # who reads it says so
+        pixels = 0
+    with ONE_AT_A_TIME if pixels > LARGE_PX / 2 else nullcontext():
+        yield
 
 
 def _refuse_bombs(image: Image.Image, path: Path) -> None:

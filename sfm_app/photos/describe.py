@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from sfm_app.photos.decode import LOSSY, MOST_FRAMES, Picture, UnreadableError, read_picture, upright
+from sfm_app.photos.decode import LOSSY, MOST_FRAMES, Picture, UnreadableError, read_picture, room_for, upright
 from sfm_app.photos.exif import camera_name, focal_px, gps_position, orientation, turn_deg
 from sfm_app.photos.files import place_of
 from sfm_app.photos.glance import Glance, glance
@@ -20,7 +20,8 @@ def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | U
     if isinstance(place, str):
         return UnusablePhoto(name, place)
     try:
-        return described(name, read_picture(place), options)
+        with room_for(place):
+            return described(name, read_picture(place), options)
     except UnreadableError as err:
         return UnusablePhoto(name, str(err))
 

@@ -8,7 +8,7 @@ from pathlib import Path, PurePosixPath
 
 from PIL import Image
 
-from sfm_app.photos.decode import UnreadableError, read_picture, turned_back, upright
+from sfm_app.photos.decode import UnreadableError, read_picture, room_for, turned_back, upright
 from sfm_app.photos.files import place_of
 from sfm_app.stored import is_below
 from sfm_app.types import Photo
@@ -53,6 +53,11 @@ def lay_out(photo: Photo, folder: Path, target: Path) -> None:
     if not photo.needs_copy:
         _link(source, place, relative=folder.parent.resolve() == target.parent.resolve())
         return
+    with room_for(source):
+        _copy(photo, source, place)
+
+
+def _copy(photo: Photo, source: Path, place: Path) -> None:
     copy = turned_back(upright(read_picture(source)), photo.turn_deg)
     if copy.size != (photo.width, photo.height):
         copy = copy.resize((photo.width, photo.height), Image.Resampling.LANCZOS)

@@ -22,6 +22,7 @@ from sfm_app.meshing import (
     trim,
 )
 from sfm_app.parallel import ordered_map
+from sfm_app.plan import cache_gb
 from sfm_app.progress import track
 from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View, region
@@ -94,7 +95,7 @@ def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray
     sealed = target.exists() and is_made_from(whole, seal(dense_dir, FUSED))
     if not sealed or target.stat().st_mtime_ns <= youngest:
         with run.step("fusing depth maps"), run.workspace.replacing(target) as path:
-            fuse(dense_dir, views, photos_needed(views, run), region(views), path)
+            fuse(dense_dir, views, photos_needed(views, run), region(views), path, cache_gb(run.memory_mb))
         whole.write_text(seal(dense_dir, FUSED), encoding="utf-8")
     points, _ = read_fused(dense_dir)
     run.record(fused_points=len(points))

@@ -1,9 +1,9 @@
 """Run the program and disturb it at a chosen moment: disturbed.py WHAT MOMENT ARGUMENTS.
 
-WHAT is "kill" (as by `kill -9`), "interrupt" (as by Ctrl-C), "out-gone", "photo-gone" or "photo-changed". MOMENT is "before:N" or "after:N" for the
-Nth file that appears (every file of a run appears by a rename), "features:MS", "matching:MS" or "undistorting:MS" for
-so many milliseconds after COLMAP has begun with that in a process of its own, "full:KB" for a disk that takes no file
-of more than so many kilobytes, or "never", which says how many files appeared.
+WHAT is "kill" (as by `kill -9`), "interrupt" (as by Ctrl-C), "out-gone", "photo-gone" or "photo-changed". MOMENT is
+"before:N" or "after:N" for the Nth file that appears (every file of a run appears by a rename), "features:MS",
+"matching:MS" or "undistorting:MS" for so many milliseconds after COLMAP has begun with that in a process of its own,
+"full:KB" for a disk that takes no file of more than so many kilobytes, or "never", which says how many files appeared.
 """
 
 import itertools

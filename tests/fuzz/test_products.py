@@ -52,7 +52,7 @@ def load(made, run, stage):
     """The product, or the error that is allowed."""
     before = made.outside()
     try:
-        return loader({"folder": made.photos}, run)(stage)
+        return loader({"source": made.photos}, run)(stage)
     except SfmError as err:
         assert "\n" not in str(err)
         return err

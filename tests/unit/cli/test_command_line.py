@@ -155,7 +155,7 @@ def test_the_module_runs_as_a_program():
         (
             OSError(28, "No space left on device", "out/dense/fused.ply"),
             3,
-            "No space left on device: out/dense/fused.ply",
+            "the disk is full (No space left on device)",
         ),
         (ZeroDivisionError("by accident"), 1, "unexpected ZeroDivisionError: by accident"),
         (KeyboardInterrupt(), 130, "interrupted"),

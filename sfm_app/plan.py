@@ -1,0 +1,133 @@
+"""What a run will cost, before it is spent: minutes and memory, by photos, pairs and settings; and how both are held.
+
+The figures come from photos of 12 megapixels on one core of a server of 2023 (`benchmarks/accuracy/hundred.py`). Other
+machines differ by a factor of two, and so do other scenes.
+"""
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from sfm_app.settings import Settings
+from sfm_app.types import Photo
+
+MEGA = 1e6
+SHARE_OF_MACHINE = 0.8
+"""Of its memory, where nobody says how much may be used."""
+FEATURES_PER_MP = 4500
+"""Photos with little texture have fewer."""
+
+ALONE = ("scene", "mesh")
+"""Stages in which more workers are of little use."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What a run is expected to cost with so many workers."""
+
+    photos: int
+    pairs: int
+    workers: int
+    core_seconds: Mapping[str, float]
+    """By stage."""
+    memory_mb: Mapping[str, float]
+    """Most memory at any moment, by stage."""
+
+    def minutes(self, stages: Iterable[str]) -> float:
+        """How long these stages take."""
+        return sum(self.core_seconds[name] / (1 if name in ALONE else self.workers) for name in stages) / 60
+
+    def peak_mb(self, stages: Iterable[str]) -> float:
+        """Most memory that these stages hold."""
+        return max((self.memory_mb[name] for name in stages), default=0.0)
+
+    def text(self, stages: Iterable[str]) -> str:
+        """For people."""
+        names = list(stages)
+        minutes, gigabytes = self.minutes(names), self.peak_mb(names) / 1000
+        how_long = f"{_rounded(minutes)} minutes" if minutes >= 1.5 else "a minute or two"
+        workers = f"{self.workers} worker{'s' if self.workers > 1 else ''}"
+        return f"{self.photos} photos, {self.pairs} pairs: about {how_long} and up to {gigabytes:.1f} GB with {workers}"
+
+
+def cache_gb(limit_mb: float) -> float:
+    """What fusion may keep of depth maps; the points and the surface want memory, too."""
+    return min(2.0, max(0.25, (limit_mb - 1000) / 2000))
+
+
+def plan_of(photos: Iterable[Photo], settings: Settings, workers: int) -> Plan:
+    """Expected costs of all stages behind the photos.
+
+    Args:
+        photos: that are used.
+        settings: in force.
+        workers: that work at once.
+    """
+    sizes = [(photo.width, photo.height) for photo in photos]
+    count, pairs = len(sizes), math.comb(len(sizes), 2)
+    largest = max((width * height for width, height in sizes), default=0) / MEGA
+    searched = [_megapixels(size, settings.matching.max_image_size_px) for size in sizes]
+    mapped = [_megapixels(size, settings.depth.max_image_size_px) for size in sizes]
+    features = sum(min(settings.matching.max_features, FEATURES_PER_MP * one) for one in searched) / max(count, 1)
+    pages = settings.texture.max_pages * settings.texture.max_page_px**2 / MEGA
+    return Plan(
+        count,
+        pairs,
+        workers,
+        core_seconds={
+            "match_graph": sum(searched) + 0.25 * pairs * (features / 8192) ** 2,
+            "view_graph": 0.04 * pairs * features / 8192,
+            "intrinsics": 0.03 * pairs,
+            "scene": 2.0 * count,
+            "depth_maps": 3.0 * sum(mapped) * settings.depth.neighbours,
+            "mesh": 15 + 2.0 * sum(mapped),
+            "texture": 0.1 * sum(width * height for width, height in sizes) / MEGA,
+            "files": 1.0,
+        },
+        memory_mb={
+            "match_graph": 450 + workers * (120 + 220 * max(searched, default=0) + 8 * largest) + 0.04 * pairs,
+            "view_graph": 450 + 0.05 * pairs + 1.0 * count,
+            "intrinsics": 500 + 0.06 * pairs,
+            "scene": 500 + 14.0 * count,
+            "depth_maps": 450 + workers * 150 * max(mapped, default=0) + 3.0 * count,
+            "mesh": 900 + min(2000, 30 * sum(mapped)) + 0.0 * count,
+            "texture": 600 + 8 * pages + workers * 25 * largest + 8.0 * count,
+            "files": 500 + 8 * pages,
+        },
+    )
+
+
+def plan_within(
+    photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float, stages: Iterable[str]
+) -> Plan:
+    """The plan with the most workers, up to so many, that holds no more memory; with one where that is too much."""
+    chosen, names = list(photos), list(stages)
+    plans = (plan_of(chosen, settings, number) for number in range(workers, 0, -1))
+    return next((plan for plan in plans if plan.peak_mb(names) <= limit_mb), plan_of(chosen, settings, 1))
+
+
+def machine_memory_mb() -> float:
+    """What this machine, or the container that this is, has; infinite where the system does not say."""
+    found = [math.inf]
+    for path, unit in (("/proc/meminfo", 1 / 1000), ("/sys/fs/cgroup/memory.max", 1 / MEGA)):
+        try:
+            said = re.search(r"(?:MemTotal:\s+)?(\d+)", Path(path).read_text(encoding="utf-8"))
+        except OSError:
+            continue
+        if said:
+            found.append(int(said[1]) * unit)
+    return min(found)
+
+
+def _megapixels(size: tuple[int, int], longest: int) -> float:
+    """Of a photo that is scaled down to that longer side."""
+    scale = min(1.0, longest / max(size))
+    return size[0] * size[1] * scale**2 / MEGA
+
+
+def _rounded(minutes: float) -> int:
+    """To one digit, or two that say something."""
+    step = 1 if minutes < 10 else 5 if minutes < 60 else 10
+    return max(1, round(minutes / step) * step)
