@@ -57,13 +57,14 @@ def cache_gb(limit_mb: float) -> float:
     return min(2.0, max(0.25, (limit_mb - 1000) / 2000))
 
 
-def plan_of(photos: Iterable[Photo], settings: Settings, workers: int) -> Plan:
+def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float = math.inf) -> Plan:
     """Expected costs of all stages behind the photos.
 
     Args:
         photos: that are used.
         settings: in force.
         workers: that work at once.
+        limit_mb: memory that they may have; fusion keeps less where there is little.
     """
     sizes = [(photo.width, photo.height) for photo in photos]
     count, pairs = len(sizes), math.comb(len(sizes), 2)
@@ -90,11 +91,11 @@ def plan_of(photos: Iterable[Photo], settings: Settings, workers: int) -> Plan:
             "match_graph": 450 + workers * (120 + 220 * max(searched, default=0) + 8 * largest) + 0.04 * pairs,
             "view_graph": 450 + 0.05 * pairs + 1.0 * count,
             "intrinsics": 500 + 0.06 * pairs,
-            "scene": 500 + 14.0 * count,
-            "depth_maps": 450 + workers * 150 * max(mapped, default=0) + 3.0 * count,
-            "mesh": 900 + min(2000, 30 * sum(mapped)) + 0.0 * count,
-            "texture": 600 + 8 * pages + workers * 25 * largest + 8.0 * count,
-            "files": 500 + 8 * pages,
+            "scene": 700 + 14.0 * count,
+            "depth_maps": 750 + workers * 150 * max(mapped, default=0) + 5.0 * count,
+            "mesh": 950 + min(1000 * cache_gb(limit_mb), 30 * sum(mapped)),
+            "texture": 850 + 8 * pages + workers * 25 * largest + 9.0 * count,
+            "files": 850 + 8 * pages + 5.0 * count,
         },
     )
 
@@ -104,8 +105,8 @@ def plan_within(
 ) -> Plan:
     """The plan with the most workers, up to so many, that holds no more memory; with one where that is too much."""
     chosen, names = list(photos), list(stages)
-    plans = (plan_of(chosen, settings, number) for number in range(workers, 0, -1))
-    return next((plan for plan in plans if plan.peak_mb(names) <= limit_mb), plan_of(chosen, settings, 1))
+    plans = (plan_of(chosen, settings, number, limit_mb) for number in range(workers, 0, -1))
+    return next((plan for plan in plans if plan.peak_mb(names) <= limit_mb), plan_of(chosen, settings, 1, limit_mb))
 
 
 def machine_memory_mb() -> float:
