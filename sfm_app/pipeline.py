@@ -57,7 +57,7 @@ class Stage:
 
 STAGES = (
     Stage(
-        "photos", ("source",), ("photos",), ("photos.json", "photos", "frames", "masks"),
+        "photos", ("source",), ("photos", "max_memory_gb"), ("photos.json", "photos", "frames", "masks"),
         make=lambda products, run: photos_from(products("source"), run),
         load=lambda products, run: load_photo_set(folder_of(products("source"), run), run),
         seal=lambda place: seal(place.root, place.photo_set.name),

@@ -52,6 +52,11 @@ class Plan:
         return f"{self.photos} photos, {self.pairs} pairs: about {how_long} and up to {gigabytes:.1f} GB with {workers}"
 
 
+def megapixels_within(limit_mb: float) -> float:
+    """How large a photo may be that is painted with by one worker."""
+    return max(2.0, (limit_mb - 1600) / 25)
+
+
 def cache_gb(limit_mb: float) -> float:
     """What fusion may keep of depth maps; the points and the surface want memory, too."""
     return min(2.0, max(0.25, (limit_mb - 1000) / 2000))

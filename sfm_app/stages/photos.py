@@ -30,6 +30,8 @@ from sfm_app.photos import (
     unused_masks,
     without_copies,
 )
+from sfm_app.plan import megapixels_within
+from sfm_app.settings import PhotoSettings
 from sfm_app.stored import is_below, seal
 from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
 
@@ -40,7 +42,7 @@ def read_photos(folder: Path, run: RunContext) -> PhotoSet:
     Raises:
         InputError: the folder is missing, fewer than two photos are usable, or a mask is not.
     """
-    options = run.settings.photos
+    options = within_memory(run)
     names = files_of(folder, run)
     found = run.map(partial(read_photo, folder, options=options), names, "photos")
     glances = [photo for photo in found if isinstance(photo, Glance)]
@@ -64,6 +66,15 @@ def read_photos(folder: Path, run: RunContext) -> PhotoSet:
     run.record(notes={photo.path: list(photo.notes) for photo in photos if photo.notes})
     run.record(gps=sum(photo.gps is not None for photo in photos))
     return photo_set
+
+
+def within_memory(run: RunContext) -> PhotoSettings:
+    """The settings for photos; where the user allows only so much memory, larger ones are scaled down."""
+    options = run.settings.photos
+    if not run.settings.max_memory_gb:
+        return options
+    largest = min(options.max_megapixels, megapixels_within(run.memory_mb))
+    return options.model_copy(update={"max_megapixels": largest})
 
 
 def chosen(glances: list[Glance], *, keep_all: bool) -> tuple[list[Photo], list[UnusablePhoto]]:

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from sfm_app.pipeline import NAMES
-from sfm_app.plan import cache_gb, machine_memory_mb, plan_of, plan_within
+from sfm_app.plan import cache_gb, machine_memory_mb, megapixels_within, plan_of, plan_within
 from sfm_app.settings import Settings
 from sfm_app.types import Photo
 
@@ -53,6 +53,16 @@ def test_workers_are_as_many_as_the_memory_holds():
 
 def test_small_photos_need_little():
     assert plan_of(photos(11, 640, 480), Settings(), 2).peak_mb(STAGES) < 1700
+
+
+@pytest.mark.parametrize(("limit_gb", "low", "high"), [(1, 2, 2), (2, 12, 20), (4, 80, 120)])
+def test_photos_may_be_as_large_as_one_worker_can_paint_with(limit_gb, low, high):
+    largest = megapixels_within(1000 * limit_gb)
+
+    assert low <= largest <= high
+    side = int((1e6 * largest) ** 0.5)
+    if largest > 2:
+        assert plan_of(photos(10, side, side), DRAFT, 1, 1000 * limit_gb).memory_mb["texture"] <= 1000 * limit_gb
 
 
 def test_fusion_keeps_what_is_left():

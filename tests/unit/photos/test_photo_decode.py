@@ -43,7 +43,7 @@ def test_heic_is_read_where_the_extra_is_there(tmp_path):
     (tmp_path / "cut.heic").write_bytes(cut)
 
     assert np.abs(np.asarray(upright(read_picture(tmp_path / "x.heic")), int) - COLORS).mean() < 5
-    with pytest.raises(UnreadableError, match="^truncated or damaged$"):
+    with pytest.raises(UnreadableError, match=r"^truncated or damaged$"):
         read_picture(tmp_path / "cut.heic")
 
 

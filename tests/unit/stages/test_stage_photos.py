@@ -193,6 +193,16 @@ def test_a_position_that_cannot_be_true_is_none(folder, run, entries):
     assert read_gps(folder, run) is None
 
 
+def test_photos_too_large_for_the_memory_are_scaled_down_and_say_so(folder, run):
+    run.settings = Settings.from_mapping({"max_memory_gb": 1})
+    Image.fromarray(np.tile(PIXELS, (20, 14, 1))).save(folder / "large.jpg", quality=50)
+
+    photo = next(photo for photo in read_photos(folder, run).photos if photo.name == "large.jpg")
+
+    assert 1.9e6 < photo.width * photo.height <= 2e6
+    assert photo.notes == (f"scaled down from 1792 x 1920 to {photo.width} x {photo.height} pixels",)
+
+
 def test_the_output_folder_inside_the_photos_is_not_read(folder, tmp_path):
     workspace = Workspace(folder / "out")
     workspace.create()
