@@ -54,7 +54,7 @@ class Plan:
 
 def megapixels_within(limit_mb: float) -> float:
     """How large a photo may be that is painted with by one worker."""
-    return max(2.0, (limit_mb - 1600) / 25)
+    return max(2.0, (limit_mb - 1650) / 8)
 
 
 def cache_gb(limit_mb: float) -> float:
@@ -99,7 +99,7 @@ def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb:
             "scene": 700 + 14.0 * count,
             "depth_maps": 750 + workers * 150 * max(mapped, default=0) + 5.0 * count,
             "mesh": 950 + min(1000 * cache_gb(limit_mb), 30 * sum(mapped)),
-            "texture": 850 + 8 * pages + workers * 25 * largest + 9.0 * count,
+            "texture": 1000 + 8 * pages + workers * 8 * largest + 9.0 * count,
             "files": 850 + 8 * pages + 5.0 * count,
         },
     )

@@ -55,7 +55,7 @@ def test_small_photos_need_little():
     assert plan_of(photos(11, 640, 480), Settings(), 2).peak_mb(STAGES) < 1700
 
 
-@pytest.mark.parametrize(("limit_gb", "low", "high"), [(1, 2, 2), (2, 12, 20), (4, 80, 120)])
+@pytest.mark.parametrize(("limit_gb", "low", "high"), [(1, 2, 2), (1.8, 12, 24), (3, 120, 240)])
 def test_photos_may_be_as_large_as_one_worker_can_paint_with(limit_gb, low, high):
     largest = megapixels_within(1000 * limit_gb)
 
