@@ -21,6 +21,7 @@ from sfm_app.workspace import fingerprint
 Stamp = tuple[int, int]
 """Size in bytes, and time of the last change in nanoseconds."""
 
+OTHER_PHOTOS = "the photos have changed"
 CHANGES = 3
 """So many are named."""
 
@@ -112,7 +113,12 @@ def digest(file: Path) -> str:
 
 def stage_print(name: str, settings: Sequence[str], inputs: Sequence[str], run: RunContext) -> str:
     """Hash of everything that a stage's result depends on: its inputs, its settings, the versions."""
-    return fingerprint(name, versions(), {key: value_of(run.settings.model_dump(), key) for key in settings}, inputs)
+    return fingerprint(name, made_with(settings, run), inputs)
+
+
+def made_with(settings: Sequence[str], run: RunContext) -> dict[str, Any]:
+    """The values of these settings, and the versions of what computes the result."""
+    return {"settings": {key: value_of(run.settings.model_dump(), key) for key in settings}, "versions": versions()}
 
 
 def why_again(name: str, settings: Sequence[str], inputs: str, run: RunContext) -> str | None:
@@ -131,21 +137,20 @@ def why_again(name: str, settings: Sequence[str], inputs: str, run: RunContext) 
         return f"{spoilt[0]} is gone or was changed"
     if record.fingerprint == inputs:
         return None
-    before, now = run.workspace.manifest(), _plain(manifest_head(run))
-    found = [*_changes(before, now, [f"settings.{key}" for key in settings]), *_changes(before, now, ["versions"])]
+    found = list(_changes(record.made_with, json.loads(json.dumps(made_with(settings, run)))))
     more = f" and {len(found) - CHANGES} more" if len(found) > CHANGES else ""
-    return f"{', '.join(found[:CHANGES])}{more}" if found else "the photos have changed"
+    return f"{', '.join(found[:CHANGES])}{more}" if found else OTHER_PHOTOS
 
 
-def _changes(before: Any, now: Any, keys: Sequence[str]) -> Iterator[str]:
-    """Values below these keys that are others now."""
-    for key in keys:
-        old, new = value_of(before, key), value_of(now, key)
-        if isinstance(old, dict) and isinstance(new, dict):
-            yield from _changes(before, now, [f"{key}.{name}" for name in new])
+def _changes(before: Any, now: Mapping[str, Any], name: str = "") -> Iterator[str]:
+    """Values that are others now, by their dotted names."""
+    for key, new in now.items():
+        old = before.get(key) if isinstance(before, Mapping) else None
+        inner = f"{name}.{key}".removeprefix(".").removeprefix("settings.").removeprefix("versions.")
+        if isinstance(new, dict):
+            yield from _changes(old, new, inner.removeprefix("settings").removeprefix("versions"))
         elif old != new:
-            short = key.removeprefix("settings.").removeprefix("versions.")
-            yield f"{short} {json.dumps(old)} -> {json.dumps(new)}"
+            yield f"{inner} {json.dumps(old)} -> {json.dumps(new)}"
 
 
 def value_of(values: Any, key: str) -> Any:
@@ -153,11 +158,6 @@ def value_of(values: Any, key: str) -> Any:
     for name in key.split("."):
         values = values.get(name) if isinstance(values, Mapping) else None
     return values
-
-
-def _plain(values: Mapping[str, Any]) -> Any:
-    """As JSON gives it back."""
-    return json.loads(json.dumps(values))
 
 
 def manifest_head(run: RunContext) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from sfm_app.colmap.dense import MAPS
 from sfm_app.colmap.model import sparse_model
 from sfm_app.context import STANDARD_FORMATS, RunContext
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
-from sfm_app.inputs import Source, manifest_head, source_of, stage_print, why_again
+from sfm_app.inputs import OTHER_PHOTOS, Source, made_with, manifest_head, source_of, stage_print, why_again
 from sfm_app.plan import plan_within
 from sfm_app.stages.depth_maps import make_depth_maps
 from sfm_app.stages.files import NAME as MODEL
@@ -228,7 +228,7 @@ def _through(source: Source, run: RunContext, ends: tuple[str, str], wanted: Seq
     with planned(products(PHOTOS), [name for name, again in reasons.items() if redone or again is not None], run):
         for stage in STAGES[1 : NAMES.index(last) + 1]:
             again = reasons[stage.name]
-            do(stage, f"after {redone}" if again is None and redone else again)
+            do(stage, f"after {redone}" if redone and again in (None, OTHER_PHOTOS) else again)
             redone = redone if again is None else stage.name
     for name in wanted:
         if NAMES.index(name) <= NAMES.index(last):
@@ -263,7 +263,7 @@ def why(stage: Stage, prints: dict[str, str], first: str, run: RunContext) -> st
     """As `why_again`; enters what the stage depends on in `prints`."""
     prints[stage.name] = stage_print(stage.name, stage.settings, [prints[name] for name in stage.takes], run)
     again = why_again(stage.name, stage.settings, prints[stage.name], run)
-    return "as you said" if again is None and stage.name == first else again
+    return "as asked" if again is None and stage.name == first else again
 
 
 def forget(name: str, run: RunContext) -> None:
@@ -300,7 +300,8 @@ def make(stage: Stage, products: Products, inputs: tuple[Source, str], again: st
         raise
     seconds = round(time.perf_counter() - start, 2)
     sizes = run.workspace.sizes(stage.files)
-    record = StageRecord(inputs[1], seconds, run.counts, sizes, peak_memory_mb(), stage.seal(run.workspace))
+    used = made_with(stage.settings, run)
+    record = StageRecord(inputs[1], seconds, run.counts, sizes, peak_memory_mb(), used, stage.seal(run.workspace))
     run.workspace.finish(stage.name, record, manifest_head(run))
     logger.info("%s took %.2f s", stage.name, seconds)
     run.progress.stage_done(seconds)

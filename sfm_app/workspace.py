@@ -47,6 +47,8 @@ class StageRecord:
     """What the stage wrote, with the size in bytes; -1 for what later stages add to (folders, SHARED)."""
     peak_mb: int | None = None
     """Most memory that the process had held by the end of the stage, in MB; None where the system does not say."""
+    made_with: Mapping[str, Any] = field(default_factory=dict)
+    """The settings and versions that its result depends on."""
     seal: str = ""
     """Hash of what later runs read of it, so that damage is found before it is read."""
 
