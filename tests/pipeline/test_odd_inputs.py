@@ -3,6 +3,7 @@
 import json
 import os
 import zlib
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -160,6 +161,7 @@ FILES = {
     "same name in two folders": (same_name, "in/a.jpg", USED),
     "a folder named like a photo": (folder_named_so, "in.jpg/x.jpg", USED),
     "HEIC": (written("x.heic", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(90)), "x.heic", ""),
+    "blurred": (lambda folder: picture(5, (800, 600)).save(folder / "x.jpg"), "x.jpg", "blurred beyond use"),
     "GIF": (saved("x.gif"), "x.gif", "not a photo"),
     "text": (written("x.txt", b"a text"), "x.txt", "not a photo"),
     "PDF": (written("x.pdf", b"%PDF-1.7\n"), "x.pdf", "not a photo"),
@@ -311,6 +313,10 @@ COMMANDS = {
         2,
         "no estimator is named",
     ),
+    "too little memory": (["{photos}", "-o", "{here}/out", "--max-memory", "0.1"], 2, "more than --max-memory"),
+    "no masks": (["{photos}", "-o", "{here}/out", "--masks", "{here}/none"], 3, "no such folder of masks"),
+    "masks of other photos": (["{photos}", "-o", "{here}/out", "--masks", "{here}/held"], 3, "is the mask of a photo"),
+    "photos as masks": (["{photos}", "-o", "{here}/out", "--masks", "{photos}"], 3, "the masks lie among the photos"),
     "unknown cameras": (["{photos}", "-o", "{here}/out", "--cameras", "two"], 2, "photos.cameras"),
     "unknown stage": (["{photos}", "-o", "{here}/out", "--until", "lunch"], 2, "lunch"),
 }
@@ -352,3 +358,42 @@ def test_every_refusal_is_one_line_and_a_hint(folder, tmp_path, case):
     assert words in result.stderr and "Traceback" not in result.output
     assert result.stdout == ""
     assert all(path.lstat().st_mtime_ns == stamp for path, stamp in before.items())  # nothing is lost, nothing left
+
+
+def odd_inputs_page():
+    """docs/odd-inputs.md."""
+
+    def plain(text):
+        return "".join(c if c.isprintable() and c not in "|\udcff" else repr(c)[1:-1] for c in text)
+
+    files = [(case, name, "used" if says == USED else f"left out: {says}") for case, (_, name, says) in FILES.items()]
+    commands = [
+        (case, " ".join(words).format(here="HERE", photos="PHOTOS", videos="VIDEOS"), code, says)
+        for case, (words, code, says) in COMMANDS.items()
+    ]
+    return "\n".join(
+        [
+            "# Odd inputs, and what comes of them",
+            "",
+            "Each line is a test (`tests/pipeline/test_odd_inputs.py`), which keeps this page as it is.",
+            "",
+            "## Files beside two good photos (exit code 0)",
+            "",
+            "| what | its name | what becomes of it |",
+            "|---|---|---|",
+            *(f"| {case} | `{plain(name)}` | {plain(says)} |" for case, name, says in files),
+            "",
+            "## Refusals: one line, and a hint",
+            "",
+            "| what | `sfm-app run` | exit code | the line says |",
+            "|---|---|---|---|",
+            *(f"| {case} | `{plain(words)}` | {code} | {plain(says)} |" for case, words, code, says in commands),
+            "",
+        ]
+    )
+
+
+def test_the_page_of_odd_inputs_is_up_to_date():
+    page = Path(__file__).parents[2] / "docs" / "odd-inputs.md"
+
+    assert page.read_text(encoding="utf-8") == odd_inputs_page()
