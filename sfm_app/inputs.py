@@ -55,15 +55,17 @@ class Source:
         ]
         return fingerprint(used, photos.masks is not None)
 
-    def check(self) -> None:
-        """Check that nothing has changed since.
+    def check(self, photos: PhotoSet) -> None:
+        """Check that none of these photos, nor a mask of theirs, nor the video, has changed since.
 
         Raises:
             InputError: something has.
         """
-        for path, stamp in self.stamps.items():
+        used = {self.place} | {self.place / photo.path for photo in photos.photos}
+        used |= {photos.masks / photo.mask for photo in photos.photos if photos.masks and photo.mask}
+        for path in sorted(used & self.stamps.keys()):
             now = _stamp(path)
-            if now != stamp:
+            if now != self.stamps[path]:
                 what = "is gone" if now is None else "has changed"
                 raise InputError(f"{path} {what} since the run began", hint="run again when all is as it shall be")
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import dropwhile
 from pathlib import Path
 from typing import Any, cast
 
@@ -225,7 +226,8 @@ def _through(source: Source, run: RunContext, ends: tuple[str, str], wanted: Seq
     prints[PHOTOS] = source.content(products(PHOTOS))  # what else changed in the folder does not matter
     reasons = {stage.name: why(stage, prints, first, run) for stage in STAGES[1 : NAMES.index(last) + 1]}
     redone = PHOTOS if first == PHOTOS else ""
-    with planned(products(PHOTOS), [name for name, again in reasons.items() if redone or again is not None], run):
+    ahead = list(dropwhile(lambda name: not redone and reasons[name] is None, reasons))
+    with planned(products(PHOTOS), ahead, run):
         for stage in STAGES[1 : NAMES.index(last) + 1]:
             again = reasons[stage.name]
             do(stage, f"after {redone}" if redone and again in (None, OTHER_PHOTOS) else again)
@@ -237,16 +239,15 @@ def _through(source: Source, run: RunContext, ends: tuple[str, str], wanted: Seq
 
 
 @contextmanager
-def planned(photos: PhotoSet, todo: Sequence[str], run: RunContext) -> Iterator[None]:
-    """Say what the stages from the first of these on will cost, and hold the memory that they may have.
+def planned(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> Iterator[None]:
+    """Say what these stages will cost, and hold the memory that they may have.
 
     Raises:
         ConfigError: the photos need more than the user allows.
     """
-    if not todo:
+    if not ahead:
         yield
         return
-    ahead = [stage.name for stage in STAGES[NAMES.index(todo[0]) : NAMES.index(todo[-1]) + 1]]
     plan = plan_within(photos.photos, run.settings, run.workers, run.memory_mb, ahead)
     if run.settings.max_memory_gb and plan.peak_mb(ahead) > run.memory_mb:
         raise ConfigError(
@@ -293,10 +294,10 @@ def make(stage: Stage, products: Products, inputs: tuple[Source, str], again: st
     start = time.perf_counter()
     try:
         product = stage.make(products, run)
-        disturbed(inputs[0], run)
+        disturbed(inputs[0], product if stage.name == PHOTOS else products(PHOTOS), run)
     except Exception as err:
         logger.info("%s stopped: %s; counted so far: %s", stage.name, err, run.counts)
-        disturbed(inputs[0], run, by=err)
+        disturbed(inputs[0], None if stage.name == PHOTOS else products(PHOTOS), run, by=err)
         raise
     seconds = round(time.perf_counter() - start, 2)
     sizes = run.workspace.sizes(stage.files)
@@ -308,8 +309,14 @@ def make(stage: Stage, products: Products, inputs: tuple[Source, str], again: st
     return product
 
 
-def disturbed(source: Source, run: RunContext, by: Exception | None = None) -> None:
+def disturbed(source: Source, photos: PhotoSet | None, run: RunContext, by: Exception | None = None) -> None:
     """Check whether something from outside has disturbed a stage, and perhaps made it fail.
+
+    Args:
+        source: what the user has given.
+        photos: that are used; None where nobody knows yet.
+        run: the run.
+        by: how the stage has failed, if it has.
 
     Raises:
         InputError: the output folder, or a photo, is not there any more, or is another one.
@@ -317,7 +324,8 @@ def disturbed(source: Source, run: RunContext, by: Exception | None = None) -> N
     """
     run.workspace.check_there()
     try:
-        source.check()
+        if photos is not None:
+            source.check(photos)
     except InputError as err:
         run.workspace.discard_unfinished()
         raise err from by

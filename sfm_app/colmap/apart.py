@@ -71,7 +71,7 @@ def started(module: str, task: Mapping[str, Any]) -> Iterator[Apart]:
         module: calls `served`.
         task: as JSON can hold it.
     """
-    command = [sys.executable, "-m", module]
+    command = [sys.executable, "-P", "-m", module]  # -P: nothing is imported from the folder that one happens to be in
     loud = log_level()
     # what it says goes to a file: nobody empties a pipe while it runs, and a full one would make it wait for ever
     with (

@@ -103,15 +103,16 @@ def test_only_photos_that_are_used_matter_to_later_stages(run, folder):
 
 @pytest.mark.parametrize(("change", "says"), [("unlink", "is gone since"), ("touch", "has changed since")])
 def test_photos_that_change_under_a_run_are_seen(run, folder, change, says):
-    source = source_of(folder, run)
-    source.check()
+    source, used = source_of(folder, run), photos(folder, "a.jpg", "b.jpg")
+    (folder / "notes.txt").write_text("who cares")
+    source.check(used)
     if change == "unlink":
         (folder / "a.jpg").unlink()
     else:
         os.utime(folder / "a.jpg", ns=(1, 1))
 
     with pytest.raises(InputError, match=says):
-        source.check()
+        source.check(used)
 
 
 def test_values_are_found_by_dotted_names():

@@ -50,6 +50,15 @@ def test_what_libraries_print_is_no_report(child):
     assert call(child("print('hello'); os.system('echo hello'); report(end=True)")) == [{"end": True}]
 
 
+def test_nothing_is_imported_from_the_current_folder(child, tmp_path, monkeypatch):
+    for name in ("json", "zlib", "numpy", "pycolmap"):
+        (tmp_path / "here").mkdir(exist_ok=True)
+        (tmp_path / "here" / f"{name}.py").write_text("raise SystemExit('got in')")
+    monkeypatch.chdir(tmp_path / "here")
+
+    assert call(child("report(well=True)")) == [{"well": True}]
+
+
 def test_progress_comes_through(child):
     class Seen(list):
         def start(self, label, total):
