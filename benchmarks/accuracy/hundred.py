@@ -74,7 +74,7 @@ def cost_of_stages(command: Sequence[str]) -> tuple[dict[str, int], dict[str, fl
         held = held_mb(process.pid)
         if now == stage[0]:
             peaks[now] = max(peaks[now], held)
-            spent[now] = cpu_s(process.pid) or spent[now]
+            spent[now] = max(spent[now], cpu_s(process.pid))
         time.sleep(EVERY_S)
     reader.join()
     if process.returncode:
@@ -84,17 +84,20 @@ def cost_of_stages(command: Sequence[str]) -> tuple[dict[str, int], dict[str, fl
 
 
 def cpu_s(process: int) -> float:
-    """CPU seconds of a process and of its children that have ended; 0 where it has ended itself."""
-    after_name = text_of(Path(f"/proc/{process}/stat")).rpartition(")")[2].split()
-    return sum(map(int, after_name[11:15])) / os.sysconf("SC_CLK_TCK")
+    """CPU seconds of a process and of all that it has started; 0 where it has ended."""
+    return (_ticks(process) + sum(_ticks(child) for child in children(process))) / os.sysconf("SC_CLK_TCK")
 
 
 def held_mb(process: int) -> int:
     """Most memory that a process held since it was last counted anew, with what its children hold now."""
     own = memory_kb(process)
+    return max(own["VmHWM"], own["VmRSS"] + sum(memory_kb(child)["VmRSS"] for child in children(process))) // 1024
+
+
+def children(process: int) -> list[int]:
+    """Processes that it has started and that still run."""
     lists = Path(f"/proc/{process}/task").glob("*/children")
-    children = [memory_kb(int(child)) for path in lists for child in text_of(path).split()]
-    return max(own["VmHWM"], own["VmRSS"] + sum(child["VmRSS"] for child in children)) // 1024
+    return [int(child) for path in lists for child in text_of(path).split()]
 
 
 def memory_kb(process: int) -> dict[str, int]:
@@ -109,6 +112,11 @@ def text_of(path: Path) -> str:
         return path.read_text(encoding="utf-8")
     except OSError:
         return ""
+
+
+def _ticks(process: int) -> int:
+    after_name = text_of(Path(f"/proc/{process}/stat")).rpartition(")")[2].split()
+    return sum(map(int, after_name[11:15]))
 
 
 def measure(count: int, cache: Path, settings: Sequence[str]) -> Row:

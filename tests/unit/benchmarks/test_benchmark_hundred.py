@@ -53,6 +53,19 @@ def test_cpu_seconds_are_those_of_the_process():
     assert 0.25 < cpu_s(os.getpid()) - spent < 0.6
 
 
+@LINUX_ONLY
+def test_cpu_seconds_are_those_of_children_at_work_too():
+    work = "import time\nwhile time.process_time() < 0.5: pass\nprint(flush=True)\ninput()"
+    before = cpu_s(os.getpid())
+    with subprocess.Popen([sys.executable, "-c", work], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        during = cpu_s(os.getpid())
+        process.communicate(b"end")
+
+    assert 0.45 < during - before < 2.0
+    assert 0.45 < cpu_s(os.getpid()) - before < 2.0
+
+
 def test_the_page_has_stages_in_rows_and_numbers_of_photos_in_columns():
     rows = [
         {"method": "sfm-app", "photos": count, "placed": count - 1}
