@@ -190,7 +190,8 @@ class Workspace:
             holder.write_text(f"process {os.getpid()} on {platform.node()} since {started}\n", encoding="utf-8")
             yield
         finally:
-            holder.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # the folder may be gone, or closed: the run says so itself
+                holder.unlink(missing_ok=True)
             lock.release()
 
     def check_there(self) -> None:

@@ -87,6 +87,7 @@ def prepare(what: str, moment: str, arguments: list[str]) -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells let what they start with & ignore it
     prepare(sys.argv[1], sys.argv[2], sys.argv[3:])
     try:
         main(sys.argv[3:], standalone_mode=False)
