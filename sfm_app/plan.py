@@ -58,8 +58,12 @@ def megapixels_within(limit_mb: float) -> float:
 
 
 def cache_gb(limit_mb: float) -> float:
-    """What fusion may keep of depth maps; the points and the surface want memory, too."""
-    return min(2.0, max(0.25, (limit_mb - 1000) / 2000))
+    """What fusion may keep of depth maps; the points and the surface want memory, too.
+
+    It takes what it needs, 28 MB per megapixel of depth maps. Where that is more than it may keep, it reads all maps
+    again and again: 200 photos were not done after half an hour with 2 GB.
+    """
+    return min(64.0, max(0.25, (limit_mb - 1500) / 1000))
 
 
 def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float = math.inf) -> Plan:
@@ -96,9 +100,9 @@ def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb:
             "match_graph": 450 + workers * (120 + 220 * max(searched, default=0) + 8 * largest) + 0.04 * pairs,
             "view_graph": 450 + 0.05 * pairs + 1.0 * count,
             "intrinsics": 500 + 0.06 * pairs,
-            "scene": 700 + 14.0 * count,
+            "scene": 700 + 15.5 * count,
             "depth_maps": 750 + workers * 150 * max(mapped, default=0) + 5.0 * count,
-            "mesh": 950 + min(1000 * cache_gb(limit_mb), 30 * sum(mapped)),
+            "mesh": 950 + min(1000 * cache_gb(limit_mb), 28 * sum(mapped)),
             "texture": 1000 + 8 * pages + workers * 8 * largest + 9.0 * count,
             "files": 850 + 8 * pages + 5.0 * count,
         },

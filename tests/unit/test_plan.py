@@ -66,7 +66,14 @@ def test_photos_may_be_as_large_as_one_worker_can_paint_with(limit_gb, low, high
 
 
 def test_fusion_keeps_what_is_left():
-    assert [cache_gb(limit) for limit in (500, 3000, 64000)] == [0.25, 1.0, 2.0]
+    assert [cache_gb(limit) for limit in (500, 3500, math.inf)] == [0.25, 2.0, 64.0]
+
+
+def test_two_hundred_photos_of_twelve_megapixels_need_no_more_than_eight_gigabytes():
+    plan = plan_within(photos(200), Settings(), 8, 8000, STAGES)
+
+    assert plan.peak_mb(STAGES) <= 8000 and plan.workers >= 2
+    assert 3000 < plan_of(photos(200), Settings(), 2).memory_mb["mesh"] < 6000
 
 
 def test_the_machine_has_some_memory():
