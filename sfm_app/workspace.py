@@ -28,6 +28,7 @@ LOCK, HOLDER = ".lock", ".held-by.txt"
 LOG, PARTS = "log.txt", "view_graph_parts"
 FOLLOWED = (*WRITTEN, LOCK, HOLDER, LOG, PARTS)
 """What a run writes to without replacing it: a link would lead it out of the folder."""
+PHOTO_SET, VIEW_GRAPH = "photos.json", "view_graph.npz"
 CHECK = "check"
 """In a record: hash of the rest. What was changed by hand, or is half of it, is no record."""
 MOST_MANIFEST_BYTES = 64_000_000
@@ -85,11 +86,11 @@ class Workspace:
 
     @property
     def photo_set(self) -> Path:
-        return self.root / "photos.json"
+        return self.root / PHOTO_SET
 
     @property
     def view_graph(self) -> Path:
-        return self.root / "view_graph.npz"
+        return self.root / VIEW_GRAPH
 
     @property
     def calibration(self) -> Path:
@@ -197,10 +198,15 @@ class Workspace:
     def check_there(self) -> None:
         """Check that the folder of a run at work is still there.
 
+        What the run has written there since is marked as its own, so that the next one does not take it for foreign.
+
         Raises:
             InputError: it is gone.
         """
         if not (self.root / LOCK).exists():
+            left = {path.name for path in self.root.iterdir()} if self.root.is_dir() else set()
+            if left and left <= {*FOLLOWED, PHOTO_SET, VIEW_GRAPH}:
+                (self.root / LOCK).touch()
             raise InputError(f"{self.root} was removed while the run was at work", hint="run again")
 
     def discard_unfinished(self) -> None:
