@@ -121,9 +121,9 @@ def _ticks(process: int) -> int:
 
 def measure(count: int, cache: Path, settings: Sequence[str]) -> Row:
     """One run from nothing."""
+    photos = photo_folder(count, cache)
     out = Path(tempfile.mkdtemp(prefix=f"run-{count}-", dir=cache / "hundred"))
     flags = [part for assignment in settings for part in ("--set", assignment)]
-    photos = photo_folder(count, cache)
     peaks, spent = cost_of_stages([sys.executable, "-m", "sfm_app", "run", str(photos), "-o", str(out), *flags])
     stages: dict[str, Any] = json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"]
     row: Row = {"method": "sfm-app", "photos": count, "placed": stages["scene"]["counts"]["registered"]}
