@@ -1,6 +1,7 @@
 """The output folder: what lies in it, what of it is up to date, and the manifest that says so."""
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
@@ -140,12 +141,18 @@ class Workspace:
             raise InputError(f"{link} is a link, and no run has made it", hint="name another output folder with -o")
         try:
             self.root.mkdir(parents=True, exist_ok=True)
+        except OSError as err:
+            raise _cannot_write(self.root, err) from err
+        self._check_writable()
+
+    def _check_writable(self) -> None:
+        try:
             with tempfile.TemporaryFile(dir=self.root):
                 pass
         except OSError as err:
-            raise InputError(
-                f"cannot write to {self.root}: {err.strerror}", hint="name another output folder with -o"
-            ) from err
+            if err.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            raise _cannot_write(self.root, err) from err
 
     def _links(self) -> Iterator[Path]:
         """Links that no run has made; those of the photos are replaced when they are laid out."""
@@ -196,18 +203,20 @@ class Workspace:
             lock.release()
 
     def check_there(self) -> None:
-        """Check that the folder of a run at work is still there.
+        """Check that the folder of a run at work is still there, and open.
 
-        What the run has written there since is marked as its own, so that the next one does not take it for foreign.
+        What the run has written there since it was removed is marked as its own: the next one must not take it for
+        foreign.
 
         Raises:
-            InputError: it is gone.
+            InputError: it is gone, or nothing can be written there.
         """
         if not (self.root / LOCK).exists():
             left = {path.name for path in self.root.iterdir()} if self.root.is_dir() else set()
             if left and left <= {*FOLLOWED, PHOTO_SET, VIEW_GRAPH}:
                 (self.root / LOCK).touch()
             raise InputError(f"{self.root} was removed while the run was at work", hint="run again")
+        self._check_writable()
 
     def discard_unfinished(self) -> None:
         """Let no run go on with what a stage has left half done."""
@@ -326,6 +335,13 @@ def fingerprint(*parts: Any) -> str:
     """Hash of JSON-able parts, independent of the order of keys."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+
+
+def _cannot_write(folder: Path, err: OSError) -> InputError:
+    return InputError(
+        f"cannot write to {folder}: {err.strerror}",
+        hint="make it writable, and the same command goes on; or name another output folder with -o",
+    )
 
 
 def _said(file: Path) -> str:

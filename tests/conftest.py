@@ -1,5 +1,7 @@
 """Fixtures that several groups of tests share."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -62,3 +64,19 @@ def cloud(ball) -> Model:
     poses = orbit(make_camera(640, 480), 3, 120.0, 4.0, (0.0, 0.0, 0.0)).cam_from_world
     cameras = tuple(Frustum(name, K, pose, 640, 480) for name, pose in poses.items())
     return Model(Surface(ball.surface.vertices, np.zeros((0, 3), np.int64), ball.surface.colors), cameras=cameras)
+
+
+@pytest.fixture(scope="session")
+def as_ordinary_user(tmp_path_factory):
+    """Runs Python with arguments as somebody whom the modes of files keep out, also where root runs the tests."""
+    script = Path(__file__).with_name("ordinary.py")
+    closed = tmp_path_factory.mktemp("closed") / "file"
+    closed.touch(0)
+
+    def run(*arguments):
+        command = [sys.executable, str(script), *map(str, arguments)]
+        return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+
+    if run("-c", f"open({str(closed)!r})").returncode == 0:
+        pytest.skip("here, modes keep nobody out")
+    return run

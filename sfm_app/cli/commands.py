@@ -66,7 +66,8 @@ def told(err: OSError) -> tuple[str, str]:
     """What the system has refused, and what to do about it."""
     if err.errno in FULL:
         return f"the disk is full ({err.strerror})", "make room; the same command goes on where this one stopped"
-    return f"{err.strerror or err}: {err.filename or 'a file of this run'}", "what was finished stays valid"
+    where = err.filename or "a file of this run"
+    return f"{err.strerror or err}: {where}", "when that is mended, the same command goes on"
 
 
 def fail(message: str, hint: str, code: int) -> None:

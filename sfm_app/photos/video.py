@@ -68,6 +68,8 @@ class Video:
         """Frames that were read so far."""
         self.seconds = 0.0
         """When the last of them is shown."""
+        self.black = 0
+        """Frames that were looked at and are black all over: so OpenCV gives those that are interlaced."""
 
     @property
     def stride(self) -> int:
@@ -95,6 +97,9 @@ class Video:
                 continue
             found, picture = self._capture.retrieve()
             if not found:
+                continue
+            if not picture.any():
+                self.black += 1
                 continue
             if size is None:
                 shrunk = min(1.0, SMALL_PX / max(picture.shape[:2]))

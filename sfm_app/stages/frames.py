@@ -16,6 +16,8 @@ from sfm_app.settings import Settings
 
 HINT = "walk around while you film, slowly, and keep the thing in view"
 DAMAGED = "play it to see whether it is whole; save it as MP4 with H.264"
+INTERLACED = "save it deinterlaced (progressive), as MP4 with H.264"
+BLACK = "black"
 LONGEST_STEM = 40
 
 
@@ -94,7 +96,9 @@ def chosen_from(source: Path, run: RunContext) -> Chosen:
             looks = [follower.look(number, small) for number, small in pictures]
     except UnreadableError as err:
         raise InputError(f"cannot read {source}: {err}", hint=DAMAGED) from err
-    looked_at, notes = len(looks), []
+    looked_at, notes = len(looks) + video.black, []
+    if video.black and not looks:
+        raise InputError(f"cannot read {source}: all frames come out black, as interlaced ones do", hint=INTERLACED)
     if video.cut_short:
         looks = looks[:-1]  # it may be half a picture
         notes = [f"the file is cut off or damaged after {video.seconds:.1f} s; what comes before is used"]
@@ -109,7 +113,7 @@ def chosen_from(source: Path, run: RunContext) -> Chosen:
         "seconds": round(video.seconds, 2),
         "looked_at": looked_at,
         "chosen": len(choice.frames),
-        "left_out": choice.left_out,
+        "left_out": choice.left_out | ({BLACK: video.black} if video.black else {}),
         "notes": notes,
     }
     return Chosen(run.inputs, choice.frames, counts)

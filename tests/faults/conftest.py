@@ -2,7 +2,7 @@
 
 import shutil
 import subprocess
-import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +21,9 @@ class Folder:
 
     photos: Path
     out: Path
-    appeared: int
+    start: Callable[..., "subprocess.CompletedProcess[str]"]
+    """Runs Python."""
+    appeared: int = 0
     """How many files of the run appeared, one after the other."""
 
     def result(self, out: Path) -> dict[str, bytes]:
@@ -33,8 +35,7 @@ class Folder:
     def run(self, out: Path, what: str = "kill", moment: str = "never") -> "subprocess.CompletedProcess[str]":
         """`sfm-app run` in a process of its own, disturbed at a moment."""
         script = Path(__file__).with_name("disturbed.py")
-        command = [sys.executable, str(script), what, moment, "run", str(self.photos), "-o", str(out), *QUICK]
-        return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+        return self.start(script, what, moment, "run", self.photos, "-o", out, *QUICK)
 
     def copied(self, place: Path) -> "Folder":
         """The same photos in a place where they may be spoilt."""
@@ -47,13 +48,14 @@ class Folder:
 
 
 @pytest.fixture(scope="session")
-def undisturbed(tmp_path_factory):
+def undisturbed(tmp_path_factory, as_ordinary_user):
     place = tmp_path_factory.mktemp("faults")
     views = arc(make_camera(480, 360), ArcOptions(photos=5, sweep_deg=40.0))
     write_photo_folder(place / "photos", build_scene(), views, PhotoOptions(supersampling=1))
-    done = Folder(place / "photos", place / "out", 0).run(place / "out")
+    folder = Folder(place / "photos", place / "out", as_ordinary_user)
+    done = folder.run(place / "out")
     assert done.returncode == 0, done.stderr
-    return Folder(place / "photos", place / "out", int(done.stdout.split()[-1]))
+    return replace(folder, appeared=int(done.stdout.split()[-1]))
 
 
 @pytest.fixture

@@ -1,9 +1,10 @@
 """Run the program and disturb it at a chosen moment: disturbed.py WHAT MOMENT ARGUMENTS.
 
-WHAT is "kill" (as by `kill -9`), "interrupt" (as by Ctrl-C), "out-gone", "photo-gone" or "photo-changed". MOMENT is
-"before:N" or "after:N" for the Nth file that appears (every file of a run appears by a rename), "features:MS",
-"matching:MS" or "undistorting:MS" for so many milliseconds after COLMAP has begun with that in a process of its own,
-"full:KB" for a disk that takes no file of more than so many kilobytes, or "never", which says how many files appeared.
+WHAT is "kill" (as by `kill -9`), "interrupt" (as by Ctrl-C), "out-gone", "out-closed" (nothing can be written there),
+"photo-gone" or "photo-changed". MOMENT is "before:N" or "after:N" for the Nth file that appears (every file of a run
+appears by a rename), "features:MS", "matching:MS" or "undistorting:MS" for so many milliseconds after COLMAP has begun
+with that in a process of its own, "full:KB" for a disk that takes no file of more than so many kilobytes, or "never",
+which says how many files appeared.
 """
 
 import itertools
@@ -39,6 +40,12 @@ def change(path: Path) -> None:
     path.write_bytes(data[: len(data) // 2])
 
 
+def close(out: Path) -> None:
+    """Let nobody write to a folder."""
+    for path in (out, *(below for below in out.rglob("*") if not below.is_symlink())):
+        path.chmod(0o500 if path.is_dir() else 0o400)
+
+
 def at_rename(when: str, number: int, disturb: Callable[[], None]) -> None:
     """Disturb at the Nth rename."""
     rename = Path.replace
@@ -70,10 +77,12 @@ def in_process(label: str, milliseconds: float, disturb: Callable[[], None]) -> 
 
 def prepare(what: str, moment: str, arguments: list[str]) -> None:
     """Have it happen."""
+    out = Path(arguments[arguments.index("-o") + 1])
     disturb = {
         "kill": die,
         "interrupt": lambda: os.kill(os.getpid(), signal.SIGINT),
-        "out-gone": lambda: shutil.rmtree(arguments[arguments.index("-o") + 1], ignore_errors=True),
+        "out-gone": lambda: shutil.rmtree(out, ignore_errors=True),
+        "out-closed": lambda: close(out),
         "photo-gone": lambda: photo(arguments).unlink(),
         "photo-changed": lambda: change(photo(arguments)),
     }[what]

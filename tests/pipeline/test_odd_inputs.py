@@ -206,10 +206,9 @@ def test_every_file_is_accounted_for(folder, tmp_path, case):
     assert sorted(tmp_path.iterdir()) == [tmp_path / "out", folder, tmp_path / "secret.jpg"]
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may read everything")
-def test_a_file_that_may_not_be_read(folder, tmp_path):
+def test_a_file_that_may_not_be_read(folder, tmp_path, as_ordinary_user):
     locked(folder)
-    result = call("run", folder, "-o", tmp_path / "out", "--until", "photos", "--json")
+    result = as_ordinary_user("-m", "sfm_app", "run", folder, "-o", tmp_path / "out", "--until", "photos", "--json")
 
     assert json.loads(result.stdout)["photos"]["unusable"] == {"x.jpg": "not readable: permission denied"}
 

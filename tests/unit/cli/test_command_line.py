@@ -1,5 +1,4 @@
 import json
-import os
 import subprocess
 import sys
 
@@ -81,16 +80,15 @@ def test_an_output_folder_that_cannot_be_made_ends_with_exit_code_3(folder, tmp_
     assert (result.exit_code, "cannot write to" in result.stderr) == (3, True)
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
-def test_a_read_only_output_folder_ends_with_exit_code_3(folder, tmp_path):
+def test_a_read_only_output_folder_ends_with_exit_code_3(folder, tmp_path, as_ordinary_user):
     for name in ("a.jpg", "b.jpg"):
         photo(folder / name)
     out = tmp_path / "locked"
     out.mkdir(mode=0o500)
 
-    result = call("run", folder, "-o", out, "-q")
+    result = as_ordinary_user("-m", "sfm_app", "run", folder, "-o", out, "-q")
 
-    assert (result.exit_code, "cannot write to" in result.stderr) == (3, True)
+    assert (result.returncode, "cannot write to" in result.stderr) == (3, True)
 
 
 @pytest.mark.parametrize(

@@ -58,7 +58,7 @@ def test_large_frames_are_looked_at_small_and_kept_whole(tmp_path):
         str(tmp_path / "a.avi"), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"MJPG"), 120.0, (960, 720)
     )
     for _ in range(9):
-        writer.write(np.zeros((720, 960, 3), np.uint8))
+        writer.write(np.full((720, 960, 3), 90, np.uint8))
     writer.release()
 
     with opened(tmp_path / "a.avi") as found:

@@ -34,7 +34,8 @@ def write(path, places):
     wall = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (HEIGHT, 400, 3)).astype(np.uint8), (0, 0), 1.5)
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"MJPG"), 30.0, SIZE)
     for at in places:
-        writer.write(np.ascontiguousarray(wall[:, at : at + WIDTH]))
+        black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        writer.write(black if at is None else np.ascontiguousarray(wall[:, at : at + WIDTH]))
     writer.release()
     return path
 
@@ -120,6 +121,24 @@ def test_a_video_that_is_cut_off_says_so(clip, run):
 def test_a_camera_that_does_not_move(tmp_path, run, places, says):
     with pytest.raises(InputError, match=says):
         frames_of(write(tmp_path / "still.avi", places), run)
+
+
+def test_frames_that_come_out_black_are_passed_over(tmp_path, run):
+    """So OpenCV gives interlaced ones."""
+    places = [at for place in range(0, 80, 4) for at in (None, place)]
+
+    names = frames_of(write(tmp_path / "clip.avi", places), run)
+
+    counts = run.counts["video"]
+    assert 9 <= len(names) <= 11
+    assert all(int(name.removesuffix(".jpg")[-6:]) % 2 for name in names)
+    assert counts["left_out"]["black"] == 20
+    assert counts["looked_at"] == 40 == len(names) + sum(counts["left_out"].values())
+
+
+def test_a_video_that_is_black_all_over_is_refused(tmp_path, run):
+    with pytest.raises(InputError, match="interlaced"):
+        frames_of(write(tmp_path / "clip.avi", [None] * 5), run)
 
 
 def test_frames_of_a_video_share_a_camera(clip, tmp_path):
