@@ -15,6 +15,7 @@ from PIL import Image, UnidentifiedImageError, features
 
 from sfm_app.photos.containers import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
 from sfm_app.photos.exif import EXIF_IFD, GPS_IFD, orientation, printable
+from sfm_app.photos.tiff import complaints
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 """What is always read."""
@@ -25,6 +26,7 @@ LARGE_PX = 50_000_000
 LEAST_BYTES_PER_PX = 0.02
 """Large photos have more, however hard they are compressed; an area of one colour has less."""
 MOST_FRAMES = 100
+DAMAGED = "truncated or damaged"
 ONE_AT_A_TIME = Lock()
 
 
@@ -66,7 +68,10 @@ def read_picture(path: Path) -> Picture:
             _refuse_bombs(image, path)
             frames = _frames_of(image)
             image.seek(0)
-            image.load()
+            with complaints() as wrong:
+                image.load()
+            if wrong:
+                raise UnreadableError(DAMAGED)
             return Picture(image, _exif_of(image), frames)
     except UnidentifiedImageError:
         raise UnreadableError(_no_photo(path)) from None
@@ -79,7 +84,7 @@ def read_picture(path: Path) -> Picture:
     except PermissionError:
         raise UnreadableError("not readable: permission denied") from None
     except Exception:  # whatever a decoder makes of damaged bytes
-        raise UnreadableError("truncated or damaged") from None
+        raise UnreadableError(DAMAGED) from None
 
 
 @contextmanager
@@ -182,8 +187,8 @@ def _no_photo(path: Path) -> str:
     if not head:
         return "empty"
     if head[4:8] == b"ftyp" and head[8:12] in HEIC_BRANDS:
-        return "truncated or damaged" if "HEIF" in formats() else "HEIC photos need `pip install 'sfm-app[heic]'`"
+        return DAMAGED if "HEIF" in formats() else "HEIC photos need `pip install 'sfm-app[heic]'`"
     if head[4:8] == b"ftyp" and head[8:12] in AVIF_BRANDS:
         needed = "AVIF photos need a newer Pillow: `pip install -U pillow`"
-        return "truncated or damaged" if "AVIF" in formats() else needed
+        return DAMAGED if "AVIF" in formats() else needed
     return f"a video; run it alone: sfm-app run {printable(path.name)}" if is_video(head) else "not a photo"

@@ -8,6 +8,7 @@ from PIL import Image, features
 
 from sfm_app.photos import UnreadableError, read_picture, upright
 from sfm_app.photos.decode import FORMATS
+from sfm_app.photos.tiff import PLACES
 
 BARS = np.repeat(np.arange(0, 256, 8, np.uint8)[None], 24, axis=0)
 COLORS = np.stack([BARS, BARS[:, ::-1], 255 - BARS // 2], axis=-1)
@@ -141,3 +142,19 @@ def test_damaged_exif_does_no_harm(tmp_path):
     picture = read_picture(tmp_path / "x.jpg")
     assert dict(picture.exif) == {}
     assert picture.image.size == (32, 24)
+
+
+@pytest.mark.parametrize("compression", ["group4", "jpeg"])
+@pytest.mark.skipif(not any(place.is_dir() for place in PLACES), reason="this Pillow has no libtiff of its own")
+def test_what_libtiff_prints_makes_a_file_a_damaged_one(tmp_path, capfd, compression):
+    noise = np.random.default_rng(0).integers(0, 255, (96, 128), np.uint8)
+    image = Image.fromarray(noise).convert("1" if compression == "group4" else "RGB")
+    image.save(tmp_path / "whole.tif", compression=compression)
+    data = bytearray((tmp_path / "whole.tif").read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 40] = b"\xff\x07" * 20
+    (tmp_path / "damaged.tif").write_bytes(data)
+
+    with pytest.raises(UnreadableError, match=r"^truncated or damaged$"):
+        read_picture(tmp_path / "damaged.tif")
+    assert read_picture(tmp_path / "whole.tif").image.size == (128, 96)
+    assert capfd.readouterr().err == ""
