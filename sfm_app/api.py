@@ -19,7 +19,8 @@ from sfm_app.progress import Progress, Silent
 from sfm_app.ransac import check_points
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Intrinsics, Rejected, Scene
-from sfm_app.workspace import Workspace, save_files
+from sfm_app.workspace import Workspace
+from sfm_app.written import save_files
 
 PathLike = str | os.PathLike[str]
 
@@ -65,7 +66,7 @@ def reconstruct(
     with opened_run(Path(out), settings or Settings(), progress) as run:
         run.plugins.depth_method(run.settings.depth.method)  # refused now, not when half of the work is done
         products = run_stages(Path(photos), run, first, last, wanted=("intrinsics", "scene", "files"))
-        manifest = run.workspace.manifest()
+        manifest = run.workspace.manifest.read()
         done = {name: manifest["stages"][name] for name in NAMES[: NAMES.index(last) + 1]}
         scene = products("scene") if "scene" in done else None
         return Run(

@@ -13,7 +13,8 @@ from sfm_app.plugins import Plugins
 from sfm_app.progress import Progress, Silent, track
 from sfm_app.settings import Settings
 from sfm_app.types import Model
-from sfm_app.workspace import Workspace, save_files
+from sfm_app.workspace import Workspace
+from sfm_app.written import save_files
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

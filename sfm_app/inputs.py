@@ -15,8 +15,8 @@ from sfm_app.errors import InputError
 from sfm_app.parallel import ordered_map
 from sfm_app.photos import head_of, is_video, place_of
 from sfm_app.stages.photos import files_of, mask_folder, masks_of
+from sfm_app.stored import fingerprint
 from sfm_app.types import PhotoSet
-from sfm_app.workspace import fingerprint
 
 Stamp = tuple[int, int]
 """Size in bytes, and time of the last change in nanoseconds."""
@@ -132,10 +132,10 @@ def why_again(name: str, settings: Sequence[str], inputs: str, run: RunContext) 
         inputs: its `stage_print`.
         run: the run.
     """
-    record = run.workspace.record(name)
+    record = run.workspace.manifest.record(name)
     if record is None:
         return ""
-    if spoilt := run.workspace.spoilt(record):
+    if spoilt := run.workspace.manifest.spoilt(record):
         return f"{spoilt[0]} is gone or was changed"
     if record.fingerprint == inputs:
         return None

@@ -17,6 +17,7 @@ from sfm_app.colmap.model import sparse_model
 from sfm_app.context import STANDARD_FORMATS, RunContext
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
 from sfm_app.inputs import OTHER_PHOTOS, Source, made_with, manifest_head, source_of, stage_print, why_again
+from sfm_app.manifest import StageRecord
 from sfm_app.plan import plan_within
 from sfm_app.stages.depth_maps import make_depth_maps
 from sfm_app.stages.files import NAME as MODEL
@@ -31,7 +32,7 @@ from sfm_app.stages.texture import TEXTURE, load_texture, make_texture
 from sfm_app.stages.view_graph import build_view_graph, load_view_graph
 from sfm_app.stored import seal
 from sfm_app.types import Model, PhotoSet
-from sfm_app.workspace import StageRecord, Workspace
+from sfm_app.workspace import Workspace
 
 logger = logging.getLogger("sfm_app")
 
@@ -128,10 +129,10 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
         InputError: the run has not come so far (says which stage is missing), or its files are gone or damaged.
     """
     place = run.workspace
-    if not place.manifest().get("stages"):
+    if not place.manifest.read().get("stages"):
         raise InputError(f"{place.root} holds no run", hint="name the folder that `sfm-app run PHOTOS -o OUT` wrote")
     for name in ("scene",) if points else STAGES[-1].takes:
-        if place.record(name) is None:
+        if place.manifest.record(name) is None:
             raise InputError(
                 f"{place.root} holds no {'points' if points else 'model'} yet: stage `{name}` is missing",
                 hint=_how_on(run),
@@ -144,7 +145,7 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
 
 def _how_on(run: RunContext) -> str:
     go_on = f"`sfm-app run PHOTOS -o {run.workspace.root}` goes on where it stopped"
-    return f"{go_on}; `--points` exports the points and cameras" if run.workspace.record("scene") else go_on
+    return f"{go_on}; `--points` exports the points and cameras" if run.workspace.manifest.record("scene") else go_on
 
 
 def loader(found: dict[str, Any], run: RunContext) -> Products:
@@ -167,7 +168,7 @@ def undamaged(name: str, run: RunContext) -> Iterator[None]:
         DamagedProductError: it is not as it was left, or cannot be read.
     """
     try:
-        record = run.workspace.record(name)
+        record = run.workspace.manifest.record(name)
         if record is None or record.seal != STAGES[NAMES.index(name)].seal(run.workspace):
             raise ValueError(f"the files of stage `{name}` are not as it left them")
         yield
@@ -269,7 +270,7 @@ def why(stage: Stage, prints: dict[str, str], first: str, run: RunContext) -> st
 
 def forget(name: str, run: RunContext) -> None:
     """Take a stage out of the manifest, and those that build on its files; nobody builds on those of the photos."""
-    run.workspace.forget((name,) if name == PHOTOS else NAMES[NAMES.index(name) :])
+    run.workspace.manifest.forget((name,) if name == PHOTOS else NAMES[NAMES.index(name) :])
 
 
 def photos_from(source: Path, run: RunContext) -> PhotoSet:
@@ -300,10 +301,10 @@ def make(stage: Stage, products: Products, inputs: tuple[Source, str], again: st
         disturbed(inputs[0], None if stage.name == PHOTOS else products(PHOTOS), run, by=err)
         raise
     seconds = round(time.perf_counter() - start, 2)
-    sizes = run.workspace.sizes(stage.files)
+    sizes = run.workspace.manifest.sizes(stage.files)
     used = made_with(stage.settings, run)
     record = StageRecord(inputs[1], seconds, run.counts, sizes, peak_memory_mb(), used, stage.seal(run.workspace))
-    run.workspace.finish(stage.name, record, manifest_head(run))
+    run.workspace.manifest.finish(stage.name, record, manifest_head(run))
     logger.info("%s took %.2f s", stage.name, seconds)
     run.progress.stage_done(seconds)
     return product

@@ -1,6 +1,7 @@
 """What lies on disk and may have been damaged since: hashes of it, and arrays read with limits."""
 
 import hashlib
+import json
 from collections.abc import Iterator
 from pathlib import Path, PurePath
 from typing import Any
@@ -44,6 +45,12 @@ def seal(root: Path, *names: str) -> str:
                 content = hashlib.file_digest(file, "blake2b").hexdigest()
             found.update(f"{path.relative_to(root).as_posix()!r} {content}\n".encode())
     return found.hexdigest()
+
+
+def fingerprint(*parts: Any) -> str:
+    """Hash of JSON-able parts, independent of the order of keys."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
+    return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def is_below(name: str) -> bool:

@@ -66,7 +66,7 @@ def measured(photos: PhotoSet, cache: Path, seed: int = 0) -> Measured:
     with opened_run(out, settings, None) as run:
         products = run_stages(photos.folder, run, last="view_graph")
         matches, views = products("match_graph"), products("view_graph")
-        seconds = run.workspace.manifest()["stages"]["match_graph"]["seconds"]
+        seconds = run.workspace.manifest.read()["stages"]["match_graph"]["seconds"]
     return Measured(photos, out, settings, matches, views, seconds)
 
 
@@ -75,7 +75,7 @@ def production(subject: Measured, overrides: Mapping[str, object] | None = None,
     settings = Settings.from_mapping(merged(subject.settings.model_dump(), overrides or {}))
     with opened_run(subject.out, settings, None) as run:
         found = run_stages(subject.photos.folder, run, first="intrinsics", last="intrinsics")("intrinsics")
-        seconds = run.workspace.manifest()["stages"]["intrinsics"]["seconds"]
+        seconds = run.workspace.manifest.read()["stages"]["intrinsics"]["seconds"]
     cameras = {Path(image.name).stem: camera_of(image, found) for image in subject.matches.images.values()}
     return Found(label, cameras, seconds, len(subject.views.fits))
 

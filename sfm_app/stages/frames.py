@@ -13,6 +13,7 @@ from sfm_app.errors import ConfigError, InputError
 from sfm_app.photos import Follower, UnreadableError, choose, head_of, is_video, opened
 from sfm_app.progress import track
 from sfm_app.settings import Settings
+from sfm_app.written import replacing
 
 HINT = "walk around while you film, slowly, and keep the thing in view"
 DAMAGED = "play it to see whether it is whole; save it as MP4 with H.264"
@@ -68,7 +69,7 @@ def photos_of(source: Path, run: RunContext) -> Iterator[Path]:
     if chosen is None:
         chosen = chosen_from(source, run)
         shutil.rmtree(run.workspace.frames, ignore_errors=True)
-        with run.workspace.replacing(run.workspace.frames_marker) as path:
+        with replacing(run.workspace.frames_marker) as path:
             path.write_text(json.dumps(asdict(chosen)), encoding="utf-8")
     write_frames(source, chosen.frames, run)
     run.record(video=chosen.counts)
@@ -131,7 +132,7 @@ def write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None
     try:
         with opened(source) as video:
             for frame, data in track(run.progress, video.jpegs(missing), "writing frames", len(missing)):
-                with run.workspace.replacing(places[frame]) as path:
+                with replacing(places[frame]) as path:
                     path.write_bytes(data)
                 written += 1
     except UnreadableError as err:

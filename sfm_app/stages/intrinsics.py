@@ -10,8 +10,10 @@ from sfm_app.colmap.database import cameras_seal, write_calibrations
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import of_fits, votes
 from sfm_app.selfcal import Camera, calibrate_photo_set, pair_weights
+from sfm_app.stored import fingerprint
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
-from sfm_app.workspace import Workspace, fingerprint
+from sfm_app.workspace import Workspace
+from sfm_app.written import replacing
 
 
 def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
@@ -34,7 +36,7 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
         photos={camera.name: len(camera.photos) for camera in cameras},
         identifiable=sum(camera.found.identifiable for camera in cameras),
     )
-    with run.workspace.replacing(run.workspace.calibration) as path:
+    with replacing(run.workspace.calibration) as path:
         path.write_text(json.dumps(intrinsics.to_dict(), indent=1) + "\n", encoding="utf-8")
     with backend("writing calibrations"):
         write_calibrations(run.workspace.database, matches, intrinsics)

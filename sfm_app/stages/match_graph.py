@@ -6,7 +6,7 @@ from sfm_app.colmap.features import find_and_match
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import NOTHING_MATCHED, why_no_scene
 from sfm_app.types import MatchGraph, PhotoSet
-from sfm_app.workspace import is_made_from
+from sfm_app.written import is_made_from
 
 
 def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:

@@ -28,7 +28,7 @@ from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View, region
 from sfm_app.stored import load_arrays, seal
 from sfm_app.types import Surface
-from sfm_app.workspace import is_made_from
+from sfm_app.written import is_made_from, replacing
 
 SURFACE = "surface.npz"
 WHOLE = "fused.txt"
@@ -62,7 +62,7 @@ def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surfac
     with run.step("simplifying"):
         surface = nonempty(make_manifold(simplified(detailed, options, dense_dir)), "the surface has no extent")
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
-    with run.workspace.replacing(dense_dir / SURFACE) as path:
+    with replacing(dense_dir / SURFACE) as path:
         np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
     return surface
 
@@ -94,7 +94,7 @@ def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray
     whole = dense_dir / WHOLE
     sealed = target.exists() and is_made_from(whole, seal(dense_dir, FUSED))
     if not sealed or target.stat().st_mtime_ns <= youngest:
-        with run.step("fusing depth maps"), run.workspace.replacing(target) as path:
+        with run.step("fusing depth maps"), replacing(target) as path:
             fuse(dense_dir, views, photos_needed(views, run), region(views), path, cache_gb(run.memory_mb))
         whole.write_text(seal(dense_dir, FUSED), encoding="utf-8")
     points, _ = read_fused(dense_dir)

@@ -34,6 +34,7 @@ from sfm_app.plan import megapixels_within
 from sfm_app.settings import PhotoSettings
 from sfm_app.stored import is_below, seal
 from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
+from sfm_app.written import replacing
 
 
 def read_photos(folder: Path, run: RunContext) -> PhotoSet:
@@ -160,7 +161,7 @@ def save_photo_set(photos: PhotoSet, run: RunContext) -> None:
     """Write photos.json, with hashes of the copies."""
     known = {"photos": [asdict(photo) for photo in photos.photos], "unusable": [asdict(p) for p in photos.unusable]}
     copies = {photo.name: _copy_seal(photo, run) for photo in photos.photos}
-    with run.workspace.replacing(run.workspace.photo_set) as path:
+    with replacing(run.workspace.photo_set) as path:
         path.write_text(json.dumps({**known, "copies": copies}, indent=1) + "\n", encoding="utf-8")
 
 

@@ -16,6 +16,7 @@ from sfm_app.reconstruction import Outcome, reconstruct
 from sfm_app.reconstruction.left_out import left_out, names_of
 from sfm_app.reconstruction.orientation import look_at_photos, orient
 from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
+from sfm_app.written import replacing
 
 POINTS = "points"
 """Name of the files with the points and cameras."""
@@ -137,13 +138,13 @@ def write_refined(scene: Scene, run: RunContext) -> None:
     path = run.workspace.calibration
     known = json.loads(path.read_text(encoding="utf-8"))
     known["refined"] = {name: camera.to_dict() for name, camera in scene.cameras.items()}
-    with run.workspace.replacing(path) as beside:
+    with replacing(path) as beside:
         beside.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
 
 
 def load_scene(photos: PhotoSet, intrinsics: Intrinsics, run: RunContext) -> Scene:
     """Read the model back; why photos were left out stands in the manifest."""
-    record = run.workspace.record("scene")
+    record = run.workspace.manifest.record("scene")
     names = {photo.name: intrinsics.name_of(photo) for photo in photos.photos}
     with backend("reading the sparse model"):
         counts = record.counts if record else {}

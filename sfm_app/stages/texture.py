@@ -14,10 +14,10 @@ from sfm_app.context import RunContext
 from sfm_app.meshing.occlusion import Occluders
 from sfm_app.photos import read_used, without_masked
 from sfm_app.settings import TextureSettings
-from sfm_app.stored import load_arrays
+from sfm_app.stored import fingerprint, load_arrays
 from sfm_app.texture import PhotoView, photo_view, texture_surface
 from sfm_app.types import Model, Scene, Surface, Texture
-from sfm_app.workspace import can_go_on, fingerprint, mark_unfinished, replacing
+from sfm_app.written import can_go_on, mark_unfinished, replacing
 
 TEXTURE = "texture.npz"
 PARTS = "texture_parts"
@@ -103,7 +103,7 @@ def save_texture(model: Model, run: RunContext) -> None:
     if texture is not None:
         stored |= {"uv": texture.uv, "page": texture.page}
         stored |= {f"page{number}": page for number, page in enumerate(texture.pages)}
-    with run.workspace.replacing(run.workspace.dense / TEXTURE) as path:
+    with replacing(run.workspace.dense / TEXTURE) as path:
         np.savez(path, **stored)
 
 

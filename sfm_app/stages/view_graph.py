@@ -17,7 +17,7 @@ from sfm_app.ransac.stationary import covers, find_stationary, fit_moving
 from sfm_app.settings import Settings
 from sfm_app.stored import load_arrays
 from sfm_app.types import EpipolarFit, MatchGraph, PairId, Rejected, ViewGraph
-from sfm_app.workspace import can_go_on, mark_unfinished, replacing
+from sfm_app.written import can_go_on, mark_unfinished, replacing
 
 BoolArray = NDArray[np.bool_]
 
@@ -61,7 +61,7 @@ def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
     )
     if not graph.fits:
         raise why_no_scene(matches, graph, run.settings.matching).error()
-    with run.workspace.replacing(run.workspace.view_graph) as path:
+    with replacing(run.workspace.view_graph) as path:
         np.savez_compressed(path, allow_pickle=False, **graph.to_arrays())
     with backend("writing epipolar geometries"):
         write_epipolar_fits(run.workspace.database, matches, graph.fits)

@@ -8,10 +8,10 @@ from itertools import islice
 import numpy as np
 import pytest
 
-import sfm_app
 from sfm_app.context import RunContext
 from sfm_app.errors import SfmError
 from sfm_app.inputs import why_again
+from sfm_app.manifest import StageRecord
 from sfm_app.pipeline import NAMES, STAGES, loader, stored_model
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings
@@ -75,7 +75,7 @@ def mutants(path, seeds, kinds=ANYTHING):
 
 def test_a_whole_run_breaks_no_seal(made, run):
     for stage in STAGES:
-        assert run.workspace.record(stage.name).seal == stage.seal(run.workspace)
+        assert run.workspace.manifest.record(stage.name).seal == stage.seal(run.workspace)
         assert not isinstance(load(made, run, stage.name), SfmError)
 
 
@@ -91,8 +91,8 @@ def test_damage_is_found_before_anything_is_read(made, run, file):
 @pytest.mark.parametrize("file", READ_BY_US)
 def test_damage_with_a_seal_is_refused_by_the_reader(made, run, file):
     stage = STAGES[NAMES.index(SEALED[file])]
-    manifest = run.workspace.manifest()
-    record = run.workspace.record(stage.name)
+    manifest = run.workspace.manifest.read()
+    record = run.workspace.manifest.record(stage.name)
     kinds = (text_values,) if file.endswith("json") else ANYTHING
     found = []
     try:
@@ -101,10 +101,10 @@ def test_damage_with_a_seal_is_refused_by_the_reader(made, run, file):
                 seal = stage.seal(run.workspace)
             except (ValueError, RecursionError):  # no JSON
                 continue
-            run.workspace.finish(stage.name, sfm_app.workspace.StageRecord(**{**_fields(record), "seal": seal}), {})
+            run.workspace.manifest.finish(stage.name, StageRecord(**{**_fields(record), "seal": seal}), {})
             found.append((how, load(made, run, stage.name)))
     finally:
-        run.workspace.write_manifest(manifest)
+        run.workspace.manifest.write(manifest)
     assert any(isinstance(product, SfmError) for _, product in found)
 
 
@@ -144,7 +144,7 @@ def test_strange_manifests_count_as_none(made, run, case):
             path.write_text(json.dumps(manifest))
         decide(made, run)
         if case != "one stage more" and case != "a megabyte":
-            assert not all(isinstance(run.workspace.record(name), sfm_app.workspace.StageRecord) for name in NAMES)
+            assert not all(isinstance(run.workspace.manifest.record(name), StageRecord) for name in NAMES)
     finally:
         path.write_bytes(whole)
 
@@ -217,12 +217,12 @@ def test_a_database_with_other_keypoints_is_made_again(kept):
 
 def forge(made, run, change):
     """Change photos.json, with a seal that fits."""
-    record, path = run.workspace.record("photos"), made.out / "photos.json"
+    record, path = run.workspace.manifest.record("photos"), made.out / "photos.json"
     values = json.loads(path.read_text())
     change(values)
     path.write_text(json.dumps(values))
     seal = STAGES[0].seal(run.workspace)
-    run.workspace.finish("photos", sfm_app.workspace.StageRecord(**{**_fields(record), "seal": seal}), {})
+    run.workspace.manifest.finish("photos", StageRecord(**{**_fields(record), "seal": seal}), {})
 
 
 @pytest.mark.parametrize("name", ["../../evil.jpg", "../evil.jpg", "{place}/evil.jpg", "a/../../evil.jpg", "", "\0"])

@@ -96,7 +96,7 @@ def test_a_photo_whose_mask_is_black_is_left_out_with_the_reason(folder, masks, 
 
 def test_what_is_changed_in_a_mask_is_seen(folder, masks, tmp_path):
     def stamp():
-        return Workspace(tmp_path / "out").record("photos").fingerprint
+        return Workspace(tmp_path / "out").manifest.record("photos").fingerprint
 
     read(folder, tmp_path / "out")
     before = stamp()

@@ -114,7 +114,7 @@ def test_a_run_that_stops_early_says_nothing_of_an_older_mesh(finished, rendered
 
     assert run.mesh_path is None and run.scene.points == whole.scene.points
     assert tuple(run.manifest["stages"]) == NAMES[: NAMES.index("scene") + 1]
-    assert tuple(Workspace(whole.out).manifest()["stages"]) == NAMES
+    assert tuple(Workspace(whole.out).manifest.read()["stages"]) == NAMES
 
 
 def test_a_changed_setting_redoes_only_what_it_touches(finished, rendered, tmp_path):
@@ -163,7 +163,7 @@ def test_a_run_killed_among_its_depth_maps_ends_with_the_same_bytes(finished, re
     assert stamps(maps, "*.photometric.bin").items() > matched.items()
     confirmed = stamps(maps, "*.geometric.bin")
     assert len(confirmed) == 2
-    assert "depth_maps" not in Workspace(out).manifest()["stages"]
+    assert "depth_maps" not in Workspace(out).manifest.read()["stages"]
     run = sfm_app.reconstruct(rendered[0], out, DRAFT)
 
     assert stamps(maps, "*.geometric.bin").items() > confirmed.items()

@@ -10,8 +10,9 @@ from click.testing import CliRunner
 import sfm_app
 from sfm_app.cli import main
 from sfm_app.formats import EXPORTERS
+from sfm_app.manifest import StageRecord
 from sfm_app.pipeline import NAMES, STAGES
-from sfm_app.workspace import StageRecord, Workspace
+from sfm_app.workspace import Workspace
 
 LAST = STAGES[NAMES.index(STAGES[-1].takes[-1])]
 """The stage whose product the files of the model hold."""
@@ -29,7 +30,7 @@ def finished(textured_ball, tmp_path):
         uv=texture.uv, page=texture.page, page0=texture.pages[0], page1=texture.pages[1],
     )  # fmt: skip
     for stage in NAMES[:-1]:
-        place.finish(stage, StageRecord("", 0.0, seal=LAST.seal(place)), {})
+        place.manifest.finish(stage, StageRecord("", 0.0, seal=LAST.seal(place)), {})
     return place.root
 
 
@@ -81,7 +82,7 @@ def test_formats_that_are_not_there_end_with_exit_code_2(finished, arguments, co
 
 def test_a_run_without_a_mesh_says_what_is_missing_and_what_to_do(tmp_path):
     place = Workspace(tmp_path / "out")
-    place.finish("scene", StageRecord("", 0.0), {})
+    place.manifest.finish("scene", StageRecord("", 0.0), {})
 
     result = call(place.root, "--format", "obj")
 
@@ -92,7 +93,7 @@ def test_a_run_without_a_mesh_says_what_is_missing_and_what_to_do(tmp_path):
 
 def test_a_run_without_a_scene_has_no_points_either(tmp_path):
     place = Workspace(tmp_path / "out")
-    place.finish("photos", StageRecord("", 0.0), {})
+    place.manifest.finish("photos", StageRecord("", 0.0), {})
 
     result = call(place.root, "--format", "ply", "--points")
 
@@ -132,7 +133,7 @@ def test_a_model_without_a_texture_has_the_colours_of_its_vertices(ball, finishe
         finished / LAST.files[0], vertices=ball.surface.vertices, faces=ball.surface.faces, colors=ball.surface.colors
     )
     place = Workspace(finished)
-    place.finish(LAST.name, StageRecord("", 0.0, seal=LAST.seal(place)), {})
+    place.manifest.finish(LAST.name, StageRecord("", 0.0, seal=LAST.seal(place)), {})
 
     (path,) = sfm_app.export_model(finished, "glb")
 

@@ -8,10 +8,11 @@ import pytest
 from sfm_app.context import RunContext
 from sfm_app.errors import InputError
 from sfm_app.inputs import made_with, manifest_head, source_of, stage_print, value_of, why_again
+from sfm_app.manifest import StageRecord
 from sfm_app.parallel import make_executor
 from sfm_app.settings import Settings
 from sfm_app.types import Photo, PhotoSet
-from sfm_app.workspace import StageRecord, Workspace
+from sfm_app.workspace import Workspace
 
 SETTINGS = ("matching", "photos.cameras", "seed")
 
@@ -41,8 +42,8 @@ def finished(run):
     (run.workspace.root / "x.txt").write_text("12")
     made_from = stage_print("match_graph", SETTINGS, ["abc"], run)
     used = made_with(SETTINGS, run)
-    record = StageRecord(made_from, 1.0, {}, run.workspace.sizes(("x.txt",)), made_with=used)
-    run.workspace.finish("match_graph", record, manifest_head(run))
+    record = StageRecord(made_from, 1.0, {}, run.workspace.manifest.sizes(("x.txt",)), made_with=used)
+    run.workspace.manifest.finish("match_graph", record, manifest_head(run))
 
 
 def why(run, inputs="abc"):

@@ -3,7 +3,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from sfm_app.stored import MOST_BYTES, is_below, load_arrays, seal
+from sfm_app.stored import MOST_BYTES, fingerprint, is_below, load_arrays, seal
 
 
 def test_arrays_come_back(tmp_path):
@@ -76,3 +76,8 @@ def test_what_is_gone_is_named(tmp_path):
 )
 def test_names_that_stay_below(name, below):
     assert is_below(name) == below
+
+
+def test_fingerprints_ignore_order_of_keys_only():
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
+    assert fingerprint([1, 2]) != fingerprint([2, 1])

@@ -17,7 +17,7 @@ from sfm_app.settings import DepthSettings, Settings
 from sfm_app.stages.depth_maps import make_depth_maps
 from sfm_app.stereo import DepthMap
 from sfm_app.types import Rejected
-from sfm_app.workspace import UNFINISHED
+from sfm_app.written import UNFINISHED
 
 
 @pytest.fixture

@@ -13,6 +13,7 @@ from sfm_app.colmap.model import part_of, photos_of
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.camera import camera_matrix
+from sfm_app.manifest import StageRecord
 from sfm_app.plugins import load_plugins
 from sfm_app.reconstruction import Outcome
 from sfm_app.reconstruction.attempts import Attempt
@@ -33,7 +34,7 @@ from sfm_app.types import (
     Scene,
     ViewGraph,
 )  # fmt: skip
-from sfm_app.workspace import StageRecord, Workspace
+from sfm_app.workspace import Workspace
 
 
 @pytest.fixture(scope="module")
@@ -115,7 +116,7 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
         assert (run.workspace.root / file).stat().st_size == size > 1000
 
     record = StageRecord("", 0.0, run.counts)
-    run.workspace.finish("scene", record, {})
+    run.workspace.manifest.finish("scene", record, {})
     photos = PhotoSet(run.workspace.root, tuple(Photo(text, 1024, 768, "one") for text in name.values()))
     again = scene.load_scene(photos, made.intrinsics, run)
     assert again.unregistered == found.unregistered and again.points == found.points
@@ -191,7 +192,7 @@ def test_refined_cameras_stand_beside_the_calibration_and_leave_it_valid(tmp_pat
     K = camera_matrix(800.0, 800.0, 320.0, 240.0)
     before = Intrinsics({"one": Calibration(K, 640, 480, "zero-curves", True)})
     place.calibration.write_text(json.dumps(before.to_dict()))
-    place.finish("intrinsics", StageRecord("abc", 1.0, {}, place.sizes(("calibration.json",))), {})
+    place.manifest.finish("intrinsics", StageRecord("abc", 1.0, {}, place.manifest.sizes(("calibration.json",))), {})
     camera = CameraModel("OPENCV", (800.0,) * 8, K, 640, 480, {"fx": 1.5, "cx": 2.5}, ("centre",))
 
     scene.write_refined(
@@ -202,7 +203,7 @@ def test_refined_cameras_stand_beside_the_calibration_and_leave_it_valid(tmp_pat
     assert found["refined"]["one"]["deviations"] == {"fx": 1.5, "cx": 2.5}
     assert (found["refined"]["one"]["K"], found["refined"]["one"]["determined"]) == (K.tolist(), ["centre"])
     assert Intrinsics.from_dict(found).to_dict() == before.to_dict()
-    assert not place.spoilt(place.record("intrinsics"))
+    assert not place.manifest.spoilt(place.manifest.record("intrinsics"))
 
 
 def test_what_is_known_of_refined_cameras_goes_by_their_names():

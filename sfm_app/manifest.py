@@ -1,0 +1,96 @@
+"""The manifest: which stages are finished, what each was made from, counted and wrote, and with what settings."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from sfm_app.stored import fingerprint
+from sfm_app.written import replacing
+
+MANIFEST = "manifest.json"
+DATABASE = "database.db"
+CALIBRATION = "calibration.json"
+SHARED = (DATABASE, CALIBRATION)
+"""Files that later stages add to."""
+CHECK = "check"
+"""In a record: hash of the rest. What was changed by hand, or is half of it, is no record."""
+MOST_BYTES = 64_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class StageRecord:
+    """What the manifest says about one finished stage."""
+
+    fingerprint: str
+    """Hash of everything that the stage's result depends on."""
+    seconds: float
+    counts: Mapping[str, Any] = field(default_factory=dict)
+    files: Mapping[str, int] = field(default_factory=dict)
+    """What the stage wrote, with the size in bytes; -1 for what later stages add to (folders, SHARED)."""
+    peak_mb: int | None = None
+    """Most memory that the process had held by the end of the stage, in MB; None where the system does not say."""
+    made_with: Mapping[str, Any] = field(default_factory=dict)
+    """The settings and versions that its result depends on."""
+    seal: str = ""
+    """Hash of what later runs read of it, so that damage is found before it is read."""
+
+
+class Manifest:
+    """`manifest.json` of an output folder, and the sizes of the files that it speaks of."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.path = root / MANIFEST
+
+    def read(self) -> dict[str, Any]:
+        """What was written last; empty when there is none or it cannot be read (then everything is redone)."""
+        try:
+            if self.path.stat().st_size > MOST_BYTES:
+                return {}
+            found = json.loads(self.path.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            return {}
+        return found if isinstance(found, dict) and isinstance(found.get("stages", {}), dict) else {}
+
+    def record(self, stage: str) -> StageRecord | None:
+        """The record of a finished stage, if the manifest has one, just as it was written."""
+        entry = self.read().get("stages", {}).get(stage)
+        try:
+            return StageRecord(**entry) if entry.pop(CHECK) == fingerprint(entry) else None
+        except (AttributeError, KeyError, TypeError, RecursionError):
+            return None
+
+    def spoilt(self, record: StageRecord) -> list[str]:
+        """Files of a finished stage that are gone or have another size."""
+        return [name for name, size in record.files.items() if _size(self.root / name) != size]
+
+    def forget(self, stages: tuple[str, ...]) -> None:
+        """Take stages out of the manifest before their files are touched, so that it is never ahead of the files."""
+        manifest = self.read()
+        known = manifest.get("stages", {})
+        if any(known.pop(stage, None) for stage in stages):
+            self.write(manifest)
+
+    def finish(self, stage: str, record: StageRecord, head: Mapping[str, Any]) -> None:
+        """Enter a finished stage; `head` (settings, versions, ...) replaces the rest of the manifest."""
+        entry = json.loads(json.dumps(asdict(record)))
+        stages = self.read().get("stages", {}) | {stage: {**entry, CHECK: fingerprint(entry)}}
+        self.write({**head, "stages": stages})
+
+    def write(self, manifest: Mapping[str, Any]) -> None:
+        """Replace the manifest as a whole."""
+        with replacing(self.path) as path:
+            path.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+
+    def sizes(self, files: tuple[str, ...]) -> dict[str, int]:
+        """Sizes of what a stage wrote, as its record holds them."""
+        found = {name: _size(self.root / name) for name in files}
+        return {name: size for name, size in found.items() if size is not None}
+
+
+def _size(path: Path) -> int | None:
+    if not path.exists():
+        return None
+    return -1 if path.is_dir() or path.name in SHARED else path.stat().st_size

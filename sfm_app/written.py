@@ -1,0 +1,63 @@
+"""Files that appear whole or not at all, and folders that a killed run can go on filling."""
+
+import contextlib
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+UNFINISHED = "unfinished.txt"
+"""In a folder while a stage fills it: what it is filled from. It says whether a killed run can go on there."""
+
+
+@contextlib.contextmanager
+def replacing(target: Path) -> Iterator[Path]:
+    """A path beside `target` to write to; it takes the target's place when the block ends without an error."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    beside = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
+    try:
+        yield beside
+        beside.replace(target)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def can_go_on(folder: Path, made_from: str) -> bool:
+    """Whether a killed run was filling this folder from the same inputs; if not, what is there is removed.
+
+    Args:
+        folder: may be missing.
+        made_from: fingerprint of the inputs.
+    """
+    if is_made_from(folder / UNFINISHED, made_from):
+        return True
+    shutil.rmtree(folder, ignore_errors=True)
+    return False
+
+
+def is_made_from(marker: Path, made_from: str) -> bool:
+    """Whether a file says so."""
+    try:
+        return marker.read_text(encoding="utf-8") == made_from
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def mark_unfinished(folder: Path, made_from: str) -> None:
+    """From now on a run that is killed can go on in this folder, which is made if it is missing."""
+    with replacing(folder / UNFINISHED) as path:
+        path.write_text(made_from, encoding="utf-8")
+
+
+def mark_finished(folder: Path) -> None:
+    """The folder is filled; the next time it is filled from nothing."""
+    (folder / UNFINISHED).unlink()
+
+
+def save_files(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:
+    """Write files, each complete or not at all, the first one last: it names the others."""
+    paths = tuple(folder / name for name in files)
+    for path, data in reversed(list(zip(paths, files.values(), strict=True))):
+        with replacing(path) as beside:
+            beside.write_bytes(data)
+    return paths
