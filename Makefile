@@ -14,7 +14,7 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
-# `kill -9` at many points of a run; ten minutes
+# kill -9, Ctrl-C, full disks and more at 88 points of a run
 faults: $(INSTALLED)
 	SFM_APP_FAULTS=1 $(BIN)/python -m pytest -n $(JOBS) tests/faults
 
