@@ -162,6 +162,12 @@ def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
             database.write_two_view_geometry(*pair, _posed_geometry(pose, matches.matches[pair]))
 
 
+def clear_geometries(path: Path) -> None:
+    """Remove all two-view geometries."""
+    with opened(path) as database:
+        database.clear_two_view_geometries()
+
+
 def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) -> None:
     """Replace all cameras by ours, each with its K and lens, and give every photo its camera.
 

@@ -53,11 +53,11 @@ def map_incrementally(
     return largest(models)
 
 
-def prepare_globally(database: Path, scratch: Path) -> None:
-    """Copy the database for `map_globally`: two mappers that open one file lock each other out.
+def copy_database(database: Path, scratch: Path) -> None:
+    """Copy the database for a mapper in a process of its own: two mappers that open one file lock each other out.
 
     Args:
-        database: photos, keypoints, two-view geometries with relative poses, K; nobody may have it open.
+        database: photos, keypoints, matches, two-view geometries, K; nobody may have it open.
         scratch: a folder of ours that is emptied first.
     """
     shutil.rmtree(scratch, ignore_errors=True)
@@ -73,7 +73,7 @@ def map_globally(photo_dir: Path, names: Sequence[str], scratch: Path, seed: int
     Args:
         photo_dir: COLMAP wants to know it.
         names: photos to place.
-        scratch: a folder of ours from `prepare_globally`; gone afterwards.
+        scratch: a folder of ours from `copy_database`; gone afterwards.
         seed: of COLMAP's own sampling.
         token: stops the mapping.
 
@@ -84,12 +84,26 @@ def map_globally(photo_dir: Path, names: Sequence[str], scratch: Path, seed: int
         BackendError: COLMAP failed.
     """
     task = {"scratch": str(scratch), "photos": str(photo_dir), "seed": seed, "names": list(names)}
+    return _map_apart("sfm_app.colmap.global_mapping", task, "mapping all photos at once", token)
+
+
+def map_as_colmap_does(photo_dir: Path, scratch: Path, seed: int, token: Any) -> Any | None:
+    """Verify the raw matches and map the photos by COLMAP's defaults, with the cameras of the database as first guess.
+
+    Nothing of ours but the matches and the guess enters; arguments, result and errors as `map_globally`.
+    """
+    task = {"scratch": str(scratch), "photos": str(photo_dir), "seed": seed}
+    return _map_apart("sfm_app.colmap.baseline_mapping", task, "mapping photos by its defaults", token)
+
+
+def _map_apart(module: str, task: dict[str, Any], doing: str, token: Any) -> Any | None:
+    scratch = Path(task["scratch"])
     try:
-        with started("sfm_app.colmap.global_mapping", task) as process:
+        with started(module, task) as process:
             while not process.ended(POLL_S):
                 if token.is_cancelled:
                     return None
-            process.check("mapping all photos at once")
+            process.check(doing)
         found = scratch / "model"
         return pycolmap.Reconstruction(found) if found.exists() else None
     finally:

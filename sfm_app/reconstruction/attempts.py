@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sfm_app.colmap.backend import backend, interruptible
-from sfm_app.colmap.mapping import map_globally, map_incrementally, prepare_globally
+from sfm_app.colmap.mapping import copy_database, map_globally, map_incrementally
 from sfm_app.colmap.model import model_from_seed
 from sfm_app.context import RunContext
 from sfm_app.errors import BackendError
@@ -98,7 +98,7 @@ def attempts(group: Group, run: RunContext) -> list[Attempt]:
     seeds = rank_seeds(group.matches, group.graph, group.intrinsics, group.photos, options.min_seed_angle_deg)
     seeds = seeds[: options.seed_pairs] if options.mapper != "global" or not at_once else []
     if at_once:
-        prepare_globally(run.workspace.database, run.workspace.root / GLOBAL_FOLDER)
+        copy_database(run.workspace.database, run.workspace.root / GLOBAL_FOLDER)
     with _mapping(group, run) as made:
         found = made(lambda token: _first_round(group, seeds[:1], at_once, run, token))
         for seed in seeds[1:]:
@@ -168,7 +168,7 @@ def _first_round(group: Group, seeds: Sequence[Candidate], at_once: bool, run: R
         placed = [pool.submit(_all_at_once, group, run, stop)] if at_once else []
         found = [future.result() for future in (*grown, *placed)]
     if stop.needless:
-        found[1:] = [Attempt("global", None, {}, "all at once: not needed") for _ in placed]
+        found[1:] = [no_model("global", "all at once: not needed") for _ in placed]
     return found
 
 
@@ -185,7 +185,7 @@ def _all_at_once(group: Group, run: RunContext, stop: Stop) -> Attempt:
         model = None if stop.is_cancelled else map_globally(run.workspace.photos, names, scratch, run.seed, stop)
     except BackendError as err:  # another mapper may do better
         logger.info("the global mapper failed: %s", err)
-        return Attempt("global", None, {}, f"all at once: failed, {err}")
+        return no_model("global", f"all at once: failed, {err}")
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     return _judged(group, "global", "all at once", model, run)
@@ -219,10 +219,29 @@ def well_known(camera: Calibration) -> bool:
     return camera.identifiable and spread <= WELL_KNOWN * camera.K[0, 0]
 
 
-def _judged(group: Group, mapper: str, how: str, model: Any, run: RunContext) -> Attempt:
+def judged(matches: MatchGraph, views: ViewGraph, made: tuple[str, str], model: Any, run: RunContext) -> Attempt:
+    """Count what a model explains.
+
+    Args:
+        matches: keypoints and raw matches.
+        views: fundamental matrices.
+        made: name of the mapper, and how it was used.
+        model: COLMAP's reconstruction; None where there is none.
+        run: the run.
+    """
+    mapper, how = made
     placed = int(model.num_reg_images()) if model is not None else 0
     note = f"{how}: {placed} photos"
     if placed < 2 or model.num_points3D() < run.settings.scene.min_points:
-        return Attempt(mapper, None, {}, note)
-    explained = explained_pairs(model, group.matches, group.views, run.settings.epipolar.max_error_px)
+        return no_model(mapper, note)
+    explained = explained_pairs(model, matches, views, run.settings.epipolar.max_error_px)
     return Attempt(mapper, model, explained, note)
+
+
+def no_model(mapper: str, note: str) -> Attempt:
+    """Return an attempt that gave nothing, and why."""
+    return Attempt(mapper, None, {}, note)
+
+
+def _judged(group: Group, mapper: str, how: str, model: Any, run: RunContext) -> Attempt:
+    return judged(group.matches, group.views, (mapper, how), model, run)

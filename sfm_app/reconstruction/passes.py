@@ -13,6 +13,7 @@ from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.reconstruction.attempts import Attempt, Group, attempts, better, why
 from sfm_app.reconstruction.joins import sound_parts
 from sfm_app.reconstruction.left_out import names_of
+from sfm_app.reconstruction.rivals import map_baseline, why_thin
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
 
 LEARNED_FROM = 3
@@ -37,6 +38,8 @@ class Outcome:
     cuts: tuple[str, ...] = ()
     """What was taken apart because matches contradict the join."""
     passes: int = 1
+    thin: str = ""
+    """Why a rival was tried; empty where the evidence was good."""
 
     @property
     def support(self) -> float:
@@ -47,18 +50,41 @@ class Outcome:
 def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:
     """Models of all photos that hang together; none where no pair grows into one.
 
-    Where cameras were guesses, or photos of the main group stayed out, the cameras that mapping found are taken for a
-    second pass: with them, relative poses are right that were not before. The better of both passes counts.
+    Where the evidence is thin, a rival is mapped beside it, and the model that explains more goes on. Where cameras
+    were guesses, or photos of the main group stayed out, the cameras that mapping found are taken for a second pass:
+    with them, relative poses are right that were not before. The best of all counts.
     """
     first = _pass(matches, views, intrinsics, run)
+    first = with_rival(first, matches, views, intrinsics, run)
     if not first.models or not worth_another(first, intrinsics, matches):
         return first
     learned = learned_intrinsics(first.models[0], intrinsics, matches)
-    second = replace(_pass(matches, views, learned, run), passes=2)
+    second = replace(_pass(matches, views, learned, run), passes=2, thin=first.thin)
+    second = replace(second, tried=first.tried + second.tried)
     if second.support > first.support:
         return second
     _enter(first.graph, intrinsics, matches, run)
     return first
+
+
+def with_rival(
+    outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
+) -> Outcome:
+    """The outcome, or, where it is thin and a rival explains more, that of the rival."""
+    main = outcome.models[0] if outcome.models else None
+    thin = why_thin(main, intrinsics, matches, views)
+    if not thin:
+        return outcome
+    rival = map_baseline(matches, views, intrinsics, run)
+    outcome = replace(outcome, thin=thin, tried=(*outcome.tried, rival.note))
+    both = [attempt for attempt in (main, rival) if attempt is not None]
+    if rival.model is None or better(both) is not rival:
+        return outcome
+    parts = taken_apart(rival)
+    taken = {photo for part in parts for photo in photos_of(part.model)}
+    others = [model for model in outcome.models if taken.isdisjoint(photos_of(model.model))]
+    models = sorted((*parts, *others), key=lambda attempt: (-attempt.photos, -attempt.support))
+    return replace(outcome, models=tuple(models), reason=why(rival, both, len(matches.images)))
 
 
 def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:

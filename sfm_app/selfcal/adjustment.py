@@ -125,6 +125,13 @@ class Matches:
         """(N, 4) of one pair."""
         return self.points[self.ends[pair] : self.ends[pair + 1]]
 
+    def chosen(self, which: IndexArray) -> "Matches":
+        """Keep these pairs only."""
+        if len(which) == len(self.cameras):
+            return self
+        inliers = [self.of_pair(pair) for pair in which]
+        return Matches(inliers, self.cameras[which], self.photos[which], self.unit_px, count=self.count)
+
     def thinned(self, most: int) -> "Matches":
         """The same with at most so many per pair."""
         inliers = [self.of_pair(pair) for pair in range(len(self.cameras))]

@@ -34,6 +34,10 @@ POSE_MATCHES = 30
 """Enough to tell which of the four poses of an E is the right one."""
 CHOICES = 3
 """Times the evidence is asked again after an adjustment."""
+JACKKNIFE_GROUPS = 8
+LEAST_PHOTOS, LEAST_LEFT = 6, 4.0
+"""Photos, and weight of the remaining pairs, below which leaving photos out says more about
+what is missing than about errors."""
 REFIT_REACH = 3.0
 """Scale of the robust refit of an F, in sigma."""
 
@@ -61,10 +65,16 @@ class Fit:
         return informed(self.matches, self.state)
 
     @property
+    def trust(self) -> FloatArray:
+        """(P,) what the say of each pair counts, as if the matches of one keypoint were worth what they are."""
+        return np.asarray(
+            self.matches.trust * self.state.weights / (self.state.scale * self.matches.redundancy), np.float64
+        )
+
+    @property
     def evidence(self) -> Evidence:
-        """What all pairs say, as if the matches of one keypoint were worth what they are."""
-        trust = self.matches.trust * self.state.weights / (self.state.scale * self.matches.redundancy)
-        H, g = self.matches.scattered(self.information, trust)
+        """What all pairs say."""
+        H, g = self.matches.scattered(self.information, self.trust)
         return Evidence(self.state.thetas, H, g, float(np.sum(self.state.weights)), self.usual)
 
     def cost(self, sigma: float, scale: float) -> float:
@@ -107,6 +117,37 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], usua
     held = fit.evidence.undetermined(fit.free)
     prior = usual.prior(fit.free, fit.state.thetas, held)
     return replace(fit, prior=prior, held=held, state=settled(matches, fit.state, prior, LAST_ROUNDS))
+
+
+def of_all_pairs(fit: Fit, matches: Matches, Fs: FloatArray) -> Fit:
+    """The same cameras with a pose for every pair, also for those that they were not adjusted to."""
+    if len(matches.cameras) == len(fit.matches.cameras):
+        return fit
+    state = replace(fit.state, poses=_poses(matches, Fs, fit.state.thetas), weights=np.ones(len(Fs)))
+    return replace(fit, matches=matches, state=state)
+
+
+def scatter_by_photos(fit: Fit) -> FloatArray:
+    """(5C,) standard deviations of the cameras by a jackknife over the photos; 0 where photos are too few to ask.
+
+    Neighbours in the list go together: what is wrong with one photo (blur, a moving shutter, a repeated wall) is often
+    wrong with the next. With each group left out the cameras take the step that the other pairs ask for; every pair
+    weighs what it weighs, or where right pairs are left out wrong ones would take their place.
+    """
+    photos, nothing = np.unique(fit.matches.photos), np.zeros(fit.state.thetas.size)
+    groups = np.array_split(photos, min(JACKKNIFE_GROUPS, len(photos)))
+    if len(photos) < LEAST_PHOTOS:
+        return nothing
+    information, trust, steps = fit.information, fit.trust, []
+    for group in groups:
+        left = ~np.isin(fit.matches.photos, group).any(axis=1)
+        if np.sum(fit.state.weights[left]) < LEAST_LEFT:
+            return nothing
+        H, g = fit.matches.scattered(information, np.where(left, trust, 0.0))
+        precision, away = fit.prior.precision.ravel(), (fit.prior.mean - fit.state.thetas).ravel()
+        steps.append(np.linalg.solve(H + np.diag(precision), g + precision * away))
+    spread = np.array(steps) - np.mean(steps, axis=0)
+    return np.asarray(np.sqrt((len(groups) - 1) / len(groups) * np.sum(spread**2, axis=0)), np.float64)
 
 
 def straight_fundamentals(fit: Fit) -> FloatArray:

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from sfm_app.selfcal.adjustment import ALONE
 from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, KAPPA, LOG_ASPECT, LOG_FOCAL
-from sfm_app.selfcal.refine import Fit
+from sfm_app.selfcal.refine import Fit, scatter_by_photos
 from sfm_app.selfcal.two_view_cost import CAMERA
 from sfm_app.types import PairId
 
@@ -17,9 +17,19 @@ AGREES = 0.5
 """A pair with a smaller weight in the fit is no key pair."""
 
 
-def covariance(fit: Fit, sides: FloatArray) -> FloatArray:
-    """(5C, 5C) covariance of all parameters, over all choices of what is free, with what no model holds added."""
+def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> FloatArray:
+    """(5C, 5C) covariance of all parameters, over all choices of what is free, with what no model holds added.
+
+    Args:
+        fit: cameras adjusted to matches.
+        sides: (C,) longer sides of the photos.
+        resampled: widen it where leaving photos out moves the cameras further than it says.
+    """
     found = fit.evidence.covariance(fit.free)
+    if resampled:
+        deviations = np.sqrt(np.diag(found))
+        wider = np.maximum(scatter_by_photos(fit) / deviations, 1.0)
+        found = found * np.outer(wider, wider)
     floor = np.tile(MODEL_ERROR, (len(sides), 1))
     floor[:, CENTRE_U : CENTRE_V + 1] *= sides[:, None]
     floor[:, KAPPA] /= np.exp(2.0 * fit.state.thetas[:, LOG_FOCAL])

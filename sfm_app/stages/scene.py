@@ -94,6 +94,7 @@ def how_it_was_made(outcome: Outcome) -> dict[str, Any]:
         "mapper_reason": outcome.reason,
         "tried": list(outcome.tried),
         "passes": outcome.passes,
+        "rival_tried_because": outcome.thin,
         "explained_matches": sum(pair.matches for pair in main.explained.values()),
         "contradicted_matches": sum(pair.contradicted for pair in main.explained.values()),
         "cut_apart": list(outcome.cuts),

@@ -64,7 +64,7 @@ def synthetic(tmp_path_factory):
 
 
 def mapped_globally(place, names, token=NEVER, seed=0):
-    mapping.prepare_globally(place / "database.db", place / ".global")
+    mapping.copy_database(place / "database.db", place / ".global")
     return mapping.map_globally(place, names, place / ".global", seed, token)
 
 

@@ -94,7 +94,7 @@ def try_out(run, cameras, monkeypatch):
         monkeypatch.setattr(module, "model_from_seed", lambda *arguments: arguments[1])
         monkeypatch.setattr(module, "map_incrementally", grow)
         monkeypatch.setattr(module, "map_globally", place)
-        monkeypatch.setattr(module, "prepare_globally", lambda *_: None)
+        monkeypatch.setattr(module, "copy_database", lambda *_: None)
         explained = {(0, 1): Explained(100, 100, contradicted)}
         monkeypatch.setattr(module, "explained_pairs", lambda *_: explained)
         return attempts(group, run(**scene)), calls

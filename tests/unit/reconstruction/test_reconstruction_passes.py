@@ -8,7 +8,9 @@ import pytest
 
 from sfm_app.colmap.database import opened
 from sfm_app.colmap.model import photos_of
+from sfm_app.errors import BackendError
 from sfm_app.reconstruction import passes as module
+from sfm_app.reconstruction import rivals
 from sfm_app.reconstruction.attempts import Attempt
 from sfm_app.reconstruction.passes import learned_intrinsics, reconstruct, taken_apart
 from sfm_app.reconstruction.support import Explained, explained_pairs
@@ -46,6 +48,7 @@ def mapped(monkeypatch, synthetic):
             return [Attempt("incremental", model, explained, f"{model.num_reg_images()} photos")]
 
         monkeypatch.setattr(module, "attempts", attempts)
+        monkeypatch.setattr(module, "map_baseline", lambda *_: Attempt("colmap", None, {}, "no rival"))
         return seen
 
     return make
@@ -123,8 +126,66 @@ def test_without_a_model_there_is_nothing_to_learn(synthetic, run, cameras, mapp
 
     found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
 
-    assert found.models == () and found.support == 0.0 and found.tried == ("nothing",)
+    assert found.models == () and found.support == 0.0 and found.tried == ("nothing", "no rival")
     assert len(seen) == 1
+
+
+def rival_of(monkeypatch, synthetic, model):
+    """Lets COLMAP's own pipeline find this model, and counts how often it is asked."""
+    asked = []
+
+    def map_baseline(matches, views, intrinsics, run):
+        asked.append(intrinsics)
+        return Attempt("colmap", model, explained_pairs(model, matches, views, 1.5), "the rival")
+
+    monkeypatch.setattr(module, "map_baseline", map_baseline)
+    return asked
+
+
+def test_a_rival_that_explains_more_goes_on(synthetic, run, cameras, mapped, monkeypatch):
+    mapped(without(with_camera(synthetic.copy(), TRUE), [6]), None)
+    asked = rival_of(monkeypatch, synthetic, with_camera(synthetic.copy(), TRUE))
+
+    found = outcome(synthetic, cameras(), run())
+
+    assert len(asked) == 1 and found.thin == "photos that match others have no place: 1"
+    assert (found.models[0].mapper, found.models[0].photos) == ("colmap", 6)
+    assert "the rival" in found.tried and found.reason.startswith("it places all 6 photos")
+
+
+def test_a_rival_that_explains_less_is_named_and_left(synthetic, run, cameras, mapped, monkeypatch):
+    mapped(with_camera(synthetic.copy(), TRUE), None)
+    asked = rival_of(monkeypatch, synthetic, without(with_camera(synthetic.copy(), TRUE), [5, 6]))
+
+    found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
+
+    assert len(asked) == 1 and found.thin == "the pairs do not determine a camera"
+    assert (found.models[0].mapper, found.models[0].photos) == ("incremental", 6)
+    assert "the rival" in found.tried
+
+
+def test_good_evidence_needs_no_rival(synthetic, run, cameras, mapped, monkeypatch):
+    mapped(with_camera(synthetic.copy(), TRUE))
+    asked = rival_of(monkeypatch, synthetic, synthetic.copy())
+
+    found = outcome(synthetic, cameras(), run())
+
+    assert asked == [] and found.thin == "" and found.models[0].photos == 6
+
+
+def test_a_rival_that_fails_costs_nothing(synthetic, run, cameras, mapped, monkeypatch):
+    mapped(with_camera(synthetic.copy(), TRUE), None)
+
+    def fail(*_):
+        raise BackendError("COLMAP failed")
+
+    monkeypatch.setattr(rivals, "map_as_colmap_does", fail)
+    monkeypatch.setattr(module, "map_baseline", rivals.map_baseline)
+
+    found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
+
+    assert found.models[0].photos == 6
+    assert any("as COLMAP does by itself: failed" in note for note in found.tried)
 
 
 def learned(model, synthetic, intrinsics):
@@ -250,7 +311,7 @@ def test_the_model_with_most_photos_is_the_main_one(synthetic, run, cameras, map
     found = reconstruct(*only(synthetic, *pairs), cameras(), run())
 
     assert [photos_of(attempt.model) for attempt in found.models] == [[4, 5, 6], [1, 2]]
-    assert found.tried == ("2 photos", "3 photos")
+    assert found.tried == ("2 photos", "3 photos", "no rival")
 
 
 def test_every_group_is_mapped_but_lesser_ones_of_two_photos(synthetic, run, cameras, mapped):

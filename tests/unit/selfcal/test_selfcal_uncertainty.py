@@ -1,11 +1,12 @@
 """Standard deviations against the scatter of repeated photos."""
 
 import numpy as np
+import pytest
 
 from sfm_app.selfcal.adjustment import Matches
 from sfm_app.selfcal.answers import calibration_of, parameters_of
 from sfm_app.selfcal.priors import Usual
-from sfm_app.selfcal.refine import refined
+from sfm_app.selfcal.refine import refined, scatter_by_photos
 from sfm_app.selfcal.uncertainty import covariance, key_pairs, spread_of
 
 SIDE = 1000.0
@@ -69,3 +70,19 @@ def test_pairs_that_say_most_come_first(shots):
     assert len(order) == len(set(order)) >= 7
     assert made.pairs.photos[3] not in order[:7]
     assert key_pairs(fit, ()) == ()
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_photos_that_disagree_widen_the_deviations(shots, seed):
+    said = {}
+    for name, focal in (("one", 1000.0), ("two", 1000 * np.exp(np.repeat([0.02, -0.02], 5)))):
+        fit = fitted(shots(10, seed, focal=focal).pairs)
+        said[name] = [np.sqrt(covariance(fit, np.ones(1), resampled=on)[0, 0]) for on in (False, True)]
+    assert 1.0 <= said["one"][1] / said["one"][0] < 1.1
+    assert 1.1 < said["two"][1] / said["two"][0] < 3
+    assert 0.005 < said["two"][1] < 0.03  # the focals lie 0.02 about their mean
+
+
+def test_few_photos_are_not_resampled(shots):
+    assert np.all(scatter_by_photos(fitted(shots(5, 1).pairs)) == 0)
+    assert np.all(scatter_by_photos(fitted(shots(8, 1).pairs))[:3] > 0)

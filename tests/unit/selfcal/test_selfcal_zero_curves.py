@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal import pair_weights
+from sfm_app.selfcal import pair_weights, zero_curves
 from sfm_app.selfcal.zero_curves import METHOD, calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import CameraPairs
@@ -183,3 +183,27 @@ def test_seed_changes_the_spread_only(views):
 def test_inlier_counts_make_weights(views):
     made = views(5)
     assert run(made, weights=pair_weights(np.full(10, 200))).identifiable
+
+
+def with_other_pairs(shots, seed):
+    """28 pairs of one camera among 378 of photos that have no camera in common, and the true K."""
+    right, focals = shots(8, seed, points=400), np.random.default_rng(seed + 100).normal(np.log(620), 0.3, 28)
+    wrong = shots(28, seed + 50, focal=np.exp(focals), centre=(0.5, 0.2), points=80, noise_px=2.0)
+    inliers = (*right.pairs.inliers, *wrong.pairs.inliers)
+    ids = (*right.pairs.photos, *((i + 8, j + 8) for i, j in wrong.pairs.photos))
+    Fs = np.concatenate([right.pairs.Fs, wrong.pairs.Fs])
+    return CameraPairs(Fs, pair_weights([len(x) for x in inliers]), right.pairs.size, ids, inliers), right.Ks[0]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_wrong_pairs_do_not_pull_a_camera_away_however_many_they_are(shots, seed, monkeypatch):
+    pairs, K = with_other_pairs(shots, seed)
+
+    found = calibrate(pairs, OPTIONS, 0)
+
+    assert found.identifiable, found.reason
+    scores = [abs((found.K - K)[place]) / found.spread[name] for place, name in (((0, 0), "fx"), ((1, 2), "cy"))]
+    assert max(scores) < 3 and found.spread["fx"] < 15
+    assert 0.95 < found.evidence["votes_kept"] < 1.05
+    monkeypatch.setattr(zero_curves, "KEPT", 0.0)
+    assert calibrate(pairs, OPTIONS, 0).evidence["votes_kept"] < 0.5  # what the adjustment to all of them comes to
