@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.essential import essential_from_fundamental, relative_pose
+from sfm_app.geometry.positive import lifted
 from sfm_app.ransac.refit import refine_sampson
 from sfm_app.selfcal.adjustment import (
     CONFLICT,
@@ -77,7 +78,7 @@ class Fit:
         state = reweighted(self.matches, replace(self.state, sigma=sigma))
         gains = informed(self.matches, state).gains / (scale * self.matches.redundancy)
         H = replace(self, state=state).evidence.H + np.diag(self.prior.precision.ravel())
-        volume = 0.5 * float(np.linalg.slogdet(H)[1] - np.sum(np.log(self.prior.precision)))
+        volume = 0.5 * float(np.linalg.slogdet(lifted(H))[1] - np.sum(np.log(self.prior.precision)))
         bounded = float(np.sum(gains / (1.0 + gains / CONFLICT)))
         return bounded + self.prior.cost(state.thetas) + volume - self.usual.log_odds(self.free)
 
