@@ -16,6 +16,7 @@ from sfm_app.colmap.mapping import map_globally, map_incrementally, prepare_glob
 from sfm_app.colmap.model import model_from_seed
 from sfm_app.context import RunContext
 from sfm_app.errors import BackendError
+from sfm_app.numerical import FAILURES, reason_of
 from sfm_app.reconstruction.left_out import names_of
 from sfm_app.reconstruction.seeds import Candidate, rank_seeds, seed_of
 from sfm_app.reconstruction.support import Explained, explained_pairs, support
@@ -192,10 +193,13 @@ def _all_at_once(group: Group, run: RunContext, stop: Stop) -> Attempt:
 
 
 def _from_seed(group: Group, seed: Candidate, run: RunContext, token: Any) -> list[Attempt]:
-    rows = group.matches.matches[seed.pair][seed.pose.inliers]
-    points = seed_of(group.matches, seed, group.intrinsics)
-    start = model_from_seed(run.workspace.database, seed.pair, rows, points)
     how = f"from {' + '.join(names_of(seed.pair, group.matches))}"
+    rows = group.matches.matches[seed.pair][seed.pose.inliers]
+    try:
+        points = seed_of(group.matches, seed, group.intrinsics)
+    except FAILURES as err:
+        return [Attempt("incremental", None, {}, f"{how}: no points, {reason_of(err)}")]
+    start = model_from_seed(run.workspace.database, seed.pair, rows, points)
     return [_judged(group, "incremental", how, _grown(group, start, run, token), run)]
 
 
@@ -224,5 +228,9 @@ def _judged(group: Group, mapper: str, how: str, model: Any, run: RunContext) ->
     note = f"{how}: {placed} photos"
     if placed < 2 or model.num_points3D() < run.settings.scene.min_points:
         return Attempt(mapper, None, {}, note)
-    explained = explained_pairs(model, group.matches, group.views, run.settings.epipolar.max_error_px)
+    try:
+        explained = explained_pairs(model, group.matches, group.views, run.settings.epipolar.max_error_px)
+    except FAILURES as err:
+        logger.info("a model could not be judged", exc_info=err)
+        return Attempt(mapper, None, {}, f"{note}, that could not be judged: {reason_of(err)}")
     return Attempt(mapper, model, explained, note)

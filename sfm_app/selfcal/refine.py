@@ -120,7 +120,8 @@ def straight_fundamentals(fit: Fit) -> FloatArray:
         inverses = [np.linalg.inv(camera_matrix_of(thetas[camera])) for camera in (first, second)]
         E = _essential(fit.state.poses[pair])
         start = inverses[1].T @ E @ inverses[0]
-        found[pair] = refine_sampson(np.asfortranarray(np.hstack(views)), start, scale=REFIT_REACH * fit.state.sigma)
+        refit = refine_sampson(np.asfortranarray(np.hstack(views)), start, scale=REFIT_REACH * fit.state.sigma)
+        found[pair] = refit if np.isfinite(refit).all() and refit.any() else start
     return found
 
 
