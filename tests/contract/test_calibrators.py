@@ -259,7 +259,7 @@ HOSTILE = {
     "the same photo throughout": lambda p: replace(p, Fs=np.tile(ROUND_THE_MIDDLE, (len(p.Fs), 1, 1)),
                                                    inliers=tuple(x[:, [0, 1, 0, 1]] for x in p.inliers)),
     "photos of one pair": lambda p: replace(p, photos=(p.photos[0],) * len(p.photos)),
-    "a view of a hundredth of a degree": lambda p: each(p, lambda x: np.tile([500, 375], 2) + 1e-4 * (x - [500, 375] * 2)),
+    "a view of a hundredth of a degree": lambda p: each(p, lambda x: 1e-4 * x + 0.9999 * np.tile([500, 375], 2)),
     "rank one and the rest": lambda p: replace(p, Fs=np.concatenate([np.ones((3, 3, 3)), p.Fs[3:]])),
     "all but the same weight": lambda p: replace(p, weights=np.geomspace(1e-300, 1.0, len(p.Fs))),
     "absurd claims": lambda p: replace(p, focal_hints_px=(1e-12, 1e12, 1e12)),
