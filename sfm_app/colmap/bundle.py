@@ -34,7 +34,7 @@ share of its standard deviation."""
 
 LEAST_LEFT = 0.1
 """Share of the points that an adjustment must leave: what drops more has gone astray, and is not taken. Chosen on no
-set; none of six that were run lost points to speak of."""
+set; none of six that were run fell below it."""
 
 FAR = 1.0
 """Beyond so many standard deviations a linear step does not arrive, and COLMAP's solver settles poses and points."""
