@@ -8,7 +8,8 @@
     │   └── DamagedProductError what a stage has left can no longer be read
     ├── ReconstructionError     the photos do not support a reconstruction       exit 4
     ├── BackendError            COLMAP failed; its own error is the cause        exit 5
-    └── PluginError             a plug-in is broken or clashes with another      exit 6
+    ├── PluginError             a plug-in is broken or clashes with another      exit 6
+    └── NumericalError          our own numbers failed: no inverse, no number    exit 7
 """
 
 from typing import ClassVar
@@ -77,3 +78,9 @@ class PluginError(SfmError):
     """A plug-in is broken, unknown or clashes with another."""
 
     exit_code = 6
+
+
+class NumericalError(SfmError):
+    """Our own numbers failed: a matrix without an inverse, a value that is no number."""
+
+    exit_code = 7

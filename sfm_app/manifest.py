@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sfm_app.numerical import json_text
 from sfm_app.stored import fingerprint
 from sfm_app.written import replacing
 
@@ -75,14 +76,14 @@ class Manifest:
 
     def finish(self, stage: str, record: StageRecord, head: Mapping[str, Any]) -> None:
         """Enter a finished stage; `head` (settings, versions, ...) replaces the rest of the manifest."""
-        entry = json.loads(json.dumps(asdict(record)))
+        entry = json.loads(json_text(asdict(record)))
         stages = self.read().get("stages", {}) | {stage: {**entry, CHECK: fingerprint(entry)}}
         self.write({**head, "stages": stages})
 
     def write(self, manifest: Mapping[str, Any]) -> None:
         """Replace the manifest as a whole."""
         with replacing(self.path) as path:
-            path.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+            path.write_text(json_text(manifest), encoding="utf-8")
 
     def sizes(self, files: tuple[str, ...]) -> dict[str, int]:
         """Sizes of what a stage wrote, as its record holds them."""

@@ -1,6 +1,5 @@
 """What a person sees: progress on stderr, results on stdout."""
 
-import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ from rich.progress import Progress as Bars
 from sfm_app.api import Run
 from sfm_app.cli.camera_text import intrinsics_lines, intrinsics_summary
 from sfm_app.cli.scene_text import scene_lines, scene_summary
+from sfm_app.numerical import json_text
 
 STAGE_TITLES = {
     "photos": "reading photos",
@@ -71,7 +71,7 @@ class Terminal:
 
 def print_json(value: Any) -> None:
     """One JSON document on stdout."""
-    sys.stdout.write(json.dumps(value, indent=1) + "\n")
+    sys.stdout.write(json_text(value))
 
 
 def print_lines(lines: list[str]) -> None:

@@ -22,7 +22,9 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
         scene: what the stage gave.
         counts: what it counted.
     """
-    kept = ("mapper", "mapper_reason", "pairs", "pairs_dropped", "cut_apart", "other_models", "orientation")
+    kept = (
+        "mapper", "mapper_reason", "pairs", "pairs_dropped", "cut_apart", "other_models", "adjustment", "orientation",
+    )  # fmt: skip
     cameras = {name: {**camera.to_dict(), "K": camera.K.round(3).tolist()} for name, camera in scene.cameras.items()}
     return {
         "registered": len(scene.registered),
@@ -69,11 +71,28 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
             f"beware: {100 * against / (explained + against):.0f} % of the matches between these photos contradict it; "
             "look for places that look alike"
         )
+    yield from _badly_adjusted(summary.get("adjustment", {}))
     orientation = summary.get("orientation", {})
-    if orientation:
-        sure = max(orientation["up_deviation_deg"], 0.1)
-        yield f"upright by {orientation['up']}, to about {sure:.1f} degrees; in {_unit(orientation)}"
+    if orientation.get("failed"):
+        yield f"it stands as mapping left it, neither upright nor in metres: {orientation['failed']}"
+    elif orientation:
+        deviation = orientation["up_deviation_deg"]
+        sure = f"to about {max(deviation, 0.1):.1f} degrees" if deviation is not None else "nobody knows how exactly"
+        yield f"upright by {orientation['up']}, {sure}; in {_unit(orientation)}"
         yield from _perhaps_not_upright(orientation)
+
+
+def _badly_adjusted(adjustment: Mapping[str, Any]) -> Iterator[str]:
+    """What the last adjustment could not do."""
+    if adjustment.get("failed"):
+        yield (
+            f"beware: the last adjustment failed ({adjustment['failed']}); cameras and poses are as mapping left them, "
+            "how far off they may be is unknown"
+        )
+    for number, reason in adjustment.get("failed_in_other_models", {}).items():
+        yield f"beware: the last adjustment of other_models/{number} failed ({reason})"
+    for name in adjustment.get("cameras_held", ()):
+        yield f"beware: these photos do not determine camera {name}; it stayed as mapping left it"
 
 
 def _perhaps_not_upright(orientation: Mapping[str, Any]) -> Iterator[str]:

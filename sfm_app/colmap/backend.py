@@ -3,6 +3,7 @@
 import contextlib
 import tempfile
 import threading
+import traceback
 import zlib  # before pycolmap, whose own deflate symbols otherwise break every later use of zlib in this process
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,9 +11,11 @@ from concurrent.futures import TimeoutError as NotYet
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import pycolmap
 
-from sfm_app.errors import BackendError, SfmError
+from sfm_app.errors import BackendError, NumericalError, SfmError
+from sfm_app.numerical import FAILURES, reason_of
 from sfm_app.progress import Progress
 
 __all__ = [
@@ -57,17 +60,36 @@ def versions() -> dict[str, str]:
 
 @contextlib.contextmanager
 def backend(doing: str) -> Iterator[None]:
-    """Turn whatever COLMAP raises into a BackendError that says what was being done."""
+    """Turn whatever COLMAP raises into a BackendError that says what was being done; an error of ours is not COLMAP's.
+
+    Raises:
+        BackendError: COLMAP failed.
+        NumericalError: NumPy failed, or our own computation did.
+    """
     try:
         yield
     except (SfmError, OSError):
         raise
     except Exception as err:
-        reason = str(err).strip().splitlines()
-        raise BackendError(
-            f"COLMAP failed while {doing}: {reason[-1] if reason else type(err).__name__}",
-            hint="run again with -v to see what COLMAP says",
-        ) from err
+        if not _is_ours(err):
+            hint = "run again with -v to see what COLMAP says"
+            raise BackendError(f"COLMAP failed while {doing}: {reason_of(err)}", hint) from err
+        if isinstance(err, FAILURES):
+            hint = "this is a bug; please report it with OUT/log.txt"
+            raise NumericalError(f"the computation failed while {doing}: {reason_of(err)}", hint) from err
+        raise
+
+
+def _is_ours(err: Exception) -> bool:
+    """Whether Python code other than that which calls COLMAP has raised an error; pycolmap itself has no frames."""
+    if isinstance(err, np.linalg.LinAlgError | ArithmeticError):
+        return True
+    frames = [frame for frame, _ in traceback.walk_tb(err.__traceback__)]
+    where = str(frames[-1].f_globals.get("__name__", ""))
+    if where.startswith(("sfm_app.colmap.", "pycolmap")):
+        return False
+    called = len(frames) > 2  # the first is that of `backend`, the second holds the block
+    return called and where.startswith(("sfm_app.", "numpy.", "scipy.", "cv2"))
 
 
 def check_written(*files: Path) -> None:

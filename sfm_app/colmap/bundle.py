@@ -1,5 +1,6 @@
 """The last adjustment: cameras, poses, points and tracks, until nothing changes."""
 
+import logging
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,10 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from sfm_app.colmap.backend import patiently, pycolmap
+from sfm_app.colmap.backend import backend, patiently, pycolmap
 from sfm_app.colmap.database import TWO_FOCALS, camera_params, opened
-from sfm_app.geometry.bundle import POSE, Bundle, Reduced, cost, moved, reduce
+from sfm_app.colmap.model import somewhere
+from sfm_app.errors import NumericalError
+from sfm_app.geometry.bundle import FX, FY, POSE, Bundle, Reduced, cost, lost_points, moved, reduce
+from sfm_app.numerical import FAILURES, finite_only, reason_of
 from sfm_app.selfcal.lens_evidence import PARTS, Estimate, Usual, estimate
+
+logger = logging.getLogger("sfm_app")
 
 PHOTOS_TO_ASK = 5
 """With fewer photos, what the camera model does not hold (a lens, a zoom) moves a camera more than the noise does; only
@@ -26,6 +32,10 @@ ROUNDS, CHANGED, STEP = 6, 0.0005, 0.2
 """At most so many rounds; fewer when less than this share of the observations changes, and no camera by more than this
 share of its standard deviation."""
 
+LEAST_LEFT = 0.1
+"""Share of the points that an adjustment must leave: what drops more has gone astray, and is not taken. Chosen on no
+set; none of six that were run fell below it."""
+
 FAR = 1.0
 """Beyond so many standard deviations a linear step does not arrive, and COLMAP's solver settles poses and points."""
 
@@ -39,6 +49,12 @@ class Adjusted:
     """By camera id, as in `CameraModel`."""
     determined: dict[int, tuple[str, ...]]
     """By camera id, as in `CameraModel`."""
+    trouble: str = ""
+    """Why there was no adjustment: the model is then as it was given, and nothing is known about deviations."""
+    held: tuple[int, ...] = ()
+    """Ids of cameras that ran away from the photos' say, and so stayed where they were."""
+    open_points: int = 0
+    """Points that their rays did not fix when the adjustment began."""
 
 
 def adjust(model: Any, database: Path) -> Adjusted:
@@ -47,23 +63,55 @@ def adjust(model: Any, database: Path) -> Adjusted:
     What the bundle says about the cameras, poses and points giving way, is weighed against what cameras usually are.
     The cameras make that step, poses and points follow (COLMAP's solver helps where the way is long), tracks are
     completed and cleaned, and all starts again.
+
+    Raises:
+        NumericalError: the photos do not bear it; the given model stays as it was.
     """
-    model = pycolmap.Reconstruction(model)
+    model, points = pycolmap.Reconstruction(model), model.num_points3D()
     for camera in model.cameras.values():
         _generalise(camera)
+    drop_endless(model)
     graph = _correspondences(model, database)
+    open_points = []
     for _ in range(ROUNDS):
         ids, bundle = read_bundle(model)
+        if not (np.isfinite(bundle.params).all() and (bundle.params[:, [FX, FY]] > 0).all()):
+            raise NumericalError("a camera has no focal length")
         reduced = reduce(bundle, LOSS_SCALE_PX)
+        open_points.append(reduced.open_points)
         found = estimate(bundle.params, reduced, usual_cameras(model, ids))
         write_bundle(model, ids, best_step(bundle, reduced, found))
         if found.step > FAR:
             solve(model)
         changed = improve_tracks(model, graph)
+        if model.num_points3D() <= LEAST_LEFT * points:
+            raise NumericalError(f"it left {model.num_points3D()} of {points} points")
         if found.step < STEP and changed < CHANGED * len(bundle.x):
             break
     model.update_point_3d_errors()
-    return Adjusted(model, *_summary(ids, found))
+    held = tuple(camera_id for camera_id, away in zip(ids, found.held, strict=True) if away)
+    return Adjusted(model, *_summary(ids, found), held=held, open_points=open_points[0])
+
+
+def adjusted_or_as_it_was(model: Any, database: Path) -> Adjusted:
+    """As `adjust`; where the numbers fail, the model as mapping left it, with the reason.
+
+    Raises:
+        BackendError: COLMAP failed.
+    """
+    try:
+        with backend("adjusting the bundle"):
+            return adjust(model, database)
+    except FAILURES as err:
+        logger.info("the last adjustment failed", exc_info=err)
+        nothing: dict[int, dict[str, float]] = {camera_id: {} for camera_id in used_cameras(model)}
+        return Adjusted(model, nothing, dict.fromkeys(nothing, ()), trouble=reason_of(err))
+
+
+def drop_endless(model: Any) -> None:
+    """Take away points that lie nowhere, in place."""
+    for point_id in [key for key, point in model.points3D.items() if not somewhere(point.xyz)]:
+        model.delete_point3D(point_id)
 
 
 def solve(model: Any) -> None:
@@ -112,18 +160,26 @@ def read_bundle(model: Any) -> tuple[list[int], Bundle]:
         camera=np.array([ids.index(image.camera_id) for image in images]),
         R=poses[:, :, :3],
         t=poses[:, :, 3],
-        X=np.array([model.points3D[point].xyz for point in points]),
+        X=np.array([model.points3D[point].xyz for point in points], np.float64).reshape(-1, 3),
         photo=np.repeat(np.arange(len(images)), [len(one) for one in seen]),
-        point=np.array([rows[keypoint.point3D_id] for one in seen for keypoint in one]),
-        x=np.array([keypoint.xy for one in seen for keypoint in one]),
+        point=np.array([rows[keypoint.point3D_id] for one in seen for keypoint in one], np.int64),
+        x=np.array([keypoint.xy for one in seen for keypoint in one], np.float64).reshape(-1, 2),
     )
 
 
 def best_step(bundle: Bundle, reduced: Reduced, found: Estimate) -> Bundle:
-    """The bundle with the estimated cameras; poses and points follow, where that is no worse than if they stayed."""
+    """The bundle with the estimated cameras; poses and points follow, where that is no worse than if they stayed.
+
+    A point that would end up behind a camera stays, too: along an open ray a linear step knows no end.
+    """
     nowhere = np.zeros((len(bundle.R), POSE)), np.zeros_like(bundle.X)
-    steps = (reduced.follow(found.params - bundle.params), nowhere)
-    return min((moved(bundle, found.params, *step) for step in steps), key=lambda one: cost(one, LOSS_SCALE_PX))
+    poses, points = reduced.follow(found.params - bundle.params)
+    tried = [moved(bundle, found.params, *nowhere)]
+    if np.isfinite(poses).all():
+        points[~np.isfinite(points).all(axis=1)] = 0.0
+        points[lost_points(moved(bundle, found.params, poses, points)) & ~lost_points(bundle)] = 0.0
+        tried.insert(0, moved(bundle, found.params, poses, points))
+    return min(tried, key=lambda one: cost(one, LOSS_SCALE_PX))
 
 
 def write_bundle(model: Any, ids: list[int], bundle: Bundle) -> None:
@@ -169,7 +225,7 @@ def _correspondences(model: Any, database: Path) -> Any:
 def _summary(ids: list[int], found: Estimate) -> tuple[dict[int, dict[str, float]], dict[int, tuple[str, ...]]]:
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
     deviations = {
-        camera_id: dict(zip(names, map(float, values), strict=True))
+        camera_id: finite_only(dict(zip(names, map(float, values), strict=True)))
         for camera_id, values in zip(ids, found.deviations, strict=True)
     }
     determined = {

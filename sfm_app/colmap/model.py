@@ -12,10 +12,20 @@ from sfm_app.colmap.backend import backend, patiently, pycolmap
 from sfm_app.colmap.database import opened
 from sfm_app.geometry.seed import TwoViewSeed
 from sfm_app.geometry.similarity import Similarity
+from sfm_app.numerical import finite_only
 from sfm_app.types import CameraModel, Frustum, Model, PairId, Scene, Surface
 
 CONFIRMED = 100
 """From so many points with three photos on, their box says how far the scene goes."""
+
+
+ENDLESS = 1e100
+"""Coordinates beyond this are no place, and squares of them no numbers."""
+
+
+def somewhere(xyz: NDArray[np.float64]) -> Any:
+    """Whether points (..., 3) lie anywhere: not at infinity, nor where distances are no numbers."""
+    return (np.abs(xyz) < ENDLESS).all(axis=-1)
 
 
 def model_from_seed(database: Path, pair: PairId, matches: NDArray[np.uint32], seed: TwoViewSeed) -> Any:
@@ -124,7 +134,7 @@ class SeenPoints:
 
 def seen_points(model: Any, most: int) -> SeenPoints:
     """The points of a model, or so many of them, drawn with a fixed seed."""
-    keys = sorted(model.points3D)
+    keys = [key for key in sorted(model.points3D) if somewhere(model.points3D[key].xyz)]
     chosen = np.sort(np.random.default_rng(0).permutation(len(keys))[:most])
     found = [model.points3D[keys[k]] for k in chosen]
     seen: dict[int, list[int]] = {image_id: [] for image_id in photos_of(model)}
@@ -146,7 +156,7 @@ def sparse_model(model_dir: Path) -> Model:
     """
     with backend("reading the sparse model"):
         model = pycolmap.Reconstruction(model_dir)
-    found = [model.points3D[key] for key in sorted(model.points3D)]
+    found = [model.points3D[key] for key in sorted(model.points3D) if somewhere(model.points3D[key].xyz)]
     places = np.array([point.xyz for point in found], np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in found], np.uint8).reshape(-1, 3)
     confirmed = np.array([point.track.length() > 2 for point in found], bool)
@@ -211,5 +221,5 @@ def read_scene(
 def _camera(camera: Any, refined: Mapping[str, Any]) -> CameraModel:
     K = np.asarray(camera.calibration_matrix(), np.float64)
     params = tuple(float(value) for value in camera.params)
-    deviations, determined = dict(refined.get("deviations", {})), tuple(refined.get("determined", ()))
+    deviations, determined = finite_only(refined.get("deviations", {})), tuple(refined.get("determined", ()))
     return CameraModel(camera.model.name, params, K, camera.width, camera.height, deviations, determined)

@@ -111,7 +111,7 @@ def vanishing_near(start: FloatArray, segments: Segments) -> Vanishing | None:
         start: (3,) unit vector.
         segments: of all photos.
     """
-    if len(segments) < LEAST_SEGMENTS:
+    if len(segments) < LEAST_SEGMENTS or not segments.lengths.sum() > 0.0:
         return None
     grid = cap(start, SEARCH_DEG, STEP_DEG)
     support = np.array([_support(direction, segments, WIDTHS_DEG[0]) for direction in grid])

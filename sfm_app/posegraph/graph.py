@@ -1,5 +1,6 @@
 """The pose graph: relative poses of pairs that agree with each other."""
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -7,11 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.groups import connected_groups
 from sfm_app.posegraph.guided import guided_pose
 from sfm_app.posegraph.pair_pose import Pair, estimated
 from sfm_app.posegraph.rotations import agreeing_loops, average_rotations
 from sfm_app.types import EpipolarFit, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
+
+logger = logging.getLogger("sfm_app")
 
 FloatArray = NDArray[np.float64]
 Map = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
@@ -27,6 +31,7 @@ ENOUGH = 100.0
 WEAK = 2.0
 """A pair with fewer than so many times the least inliers needs a loop of other pairs to bear it out."""
 CONTRADICTS, BEHIND, TOO_FEW = "contradicts other pairs", "points behind a camera", "too few matches fit the cameras"
+NO_NUMBERS = "its pose cannot be computed"
 UNCONFIRMED = "few matches, and no other pair bears it out"
 
 
@@ -59,8 +64,12 @@ def build_pose_graph(
         cameras = [intrinsics.camera(matches.images[photo]) for photo in pair]
         return Pair(matches.points(pair), cameras, options.max_error_px)
 
-    def from_fit(item: tuple[PairId, EpipolarFit]) -> RelativePose | None:
-        return estimated(pair_of(item[0]), item[1])
+    def from_fit(item: tuple[PairId, EpipolarFit]) -> RelativePose | str | None:
+        try:
+            return estimated(pair_of(item[0]), item[1])
+        except FAILURES as err:
+            logger.info("pair %s has no pose", item[0], exc_info=err)
+            return NO_NUMBERS
 
     found = dict(zip(views.fits, run_map(from_fit, list(views.fits.items()), "relative poses"), strict=True))
     poses, dropped = _plausible(found, options.min_inliers)
@@ -77,7 +86,10 @@ def build_pose_graph(
         seed = int(np.random.SeedSequence([options.seed, *pair]).generate_state(1)[0])
         known = pair_of(pair)
         R = rotations[pair[1]] @ rotations[pair[0]].T
-        return guided_pose(known, R, options.min_inliers, seed) if known.trusted else None
+        try:
+            return guided_pose(known, R, options.min_inliers, seed) if known.trusted else None
+        except FAILURES:  # the reason that it has no pose already stands
+            return None
 
     group = {photo: number for number, photos in enumerate(_groups(poses)) for photo in photos}
     left = [pair for pair in matches.matches if pair not in poses and group.get(pair[0], -1) == group.get(pair[1], -2)]
@@ -115,11 +127,13 @@ def unconfirmed(poses: Mapping[PairId, RelativePose], firm: float) -> list[PairI
 
 
 def _plausible(
-    found: Mapping[PairId, RelativePose | None], min_inliers: int
+    found: Mapping[PairId, RelativePose | str | None], min_inliers: int
 ) -> tuple[dict[PairId, RelativePose], dict[PairId, str]]:
     poses, dropped = {}, {}
     for pair, pose in found.items():
-        if pose is None or pose.inlier_count < min_inliers:
+        if isinstance(pose, str):
+            dropped[pair] = pose
+        elif pose is None or pose.inlier_count < min_inliers:
             dropped[pair] = TOO_FEW
         elif pose.in_front < LEAST_IN_FRONT and pose.kind != "rotation":
             dropped[pair] = BEHIND

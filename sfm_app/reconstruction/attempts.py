@@ -16,6 +16,7 @@ from sfm_app.colmap.mapping import copy_database, map_globally, map_incrementall
 from sfm_app.colmap.model import model_from_seed
 from sfm_app.context import RunContext
 from sfm_app.errors import BackendError
+from sfm_app.numerical import FAILURES, reason_of
 from sfm_app.reconstruction.left_out import names_of
 from sfm_app.reconstruction.seeds import Candidate, rank_seeds, seed_of
 from sfm_app.reconstruction.support import Explained, explained_pairs, support
@@ -192,10 +193,13 @@ def _all_at_once(group: Group, run: RunContext, stop: Stop) -> Attempt:
 
 
 def _from_seed(group: Group, seed: Candidate, run: RunContext, token: Any) -> list[Attempt]:
-    rows = group.matches.matches[seed.pair][seed.pose.inliers]
-    points = seed_of(group.matches, seed, group.intrinsics)
-    start = model_from_seed(run.workspace.database, seed.pair, rows, points)
     how = f"from {' + '.join(names_of(seed.pair, group.matches))}"
+    rows = group.matches.matches[seed.pair][seed.pose.inliers]
+    try:
+        points = seed_of(group.matches, seed, group.intrinsics)
+    except FAILURES as err:
+        return [Attempt("incremental", None, {}, f"{how}: no points, {reason_of(err)}")]
+    start = model_from_seed(run.workspace.database, seed.pair, rows, points)
     return [_judged(group, "incremental", how, _grown(group, start, run, token), run)]
 
 
@@ -234,7 +238,11 @@ def judged(matches: MatchGraph, views: ViewGraph, made: tuple[str, str], model: 
     note = f"{how}: {placed} photos"
     if placed < 2 or model.num_points3D() < run.settings.scene.min_points:
         return no_model(mapper, note)
-    explained = explained_pairs(model, matches, views, run.settings.epipolar.max_error_px)
+    try:
+        explained = explained_pairs(model, matches, views, run.settings.epipolar.max_error_px)
+    except FAILURES as err:
+        logger.info("a model could not be judged", exc_info=err)
+        return no_model(mapper, f"{note}, that could not be judged: {reason_of(err)}")
     return Attempt(mapper, model, explained, note)
 
 

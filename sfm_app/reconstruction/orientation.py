@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.model import focal_px, move, photos_of, posed_photos, seen_points, viewing_rays
+from sfm_app.colmap.model import focal_px, move, photos_of, posed_photos, seen_points, somewhere, viewing_rays
 from sfm_app.context import RunContext
+from sfm_app.errors import NumericalError
 from sfm_app.geometry.cues import small_picture
 from sfm_app.geometry.georeference import Georeference, NoGeoreference, georeference, position_at
 from sfm_app.geometry.segments import line_segments
@@ -21,7 +22,8 @@ from sfm_app.geometry.similarity import Similarity
 from sfm_app.geometry.standing import Scenery, odds
 from sfm_app.geometry.upright import LINES, Upright, facing, up_direction, viewer_frame
 from sfm_app.geometry.vanishing import Segments, joined, segment_planes
-from sfm_app.types import MatchGraph
+from sfm_app.numerical import FAILURES, reason_of
+from sfm_app.types import GpsPosition, MatchGraph
 
 logger = logging.getLogger("sfm_app")
 
@@ -59,6 +61,15 @@ def look_at_photos(models: Sequence[Any], matches: MatchGraph, run: RunContext) 
     return looks
 
 
+def orient_or_leave(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int | None = None) -> dict[str, Any]:
+    """As `orient`; where the numbers fail, the model stays as it is, and the entry says why."""
+    try:
+        return orient(model, matches, looks, turn_deg)
+    except FAILURES as err:
+        logger.info("the model could not be turned upright", exc_info=err)
+        return {"failed": reason_of(err), "unit": "that of mapping", "gps": "not used: it is not known which way is up"}
+
+
 def orient(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int | None = None) -> dict[str, Any]:
     """Move the model into the frame of glTF viewers: y up, seen from +z, centred, of size about 1 or in metres.
 
@@ -70,9 +81,15 @@ def orient(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int | None =
 
     Returns:
         How it was done, for the manifest.
+
+    Raises:
+        NumericalError: it has no points, or none of them lies anywhere.
     """
     with backend("reading the model"):
         poses, points = posed_photos(model)
+    points = points[somewhere(points)]
+    if not len(points):
+        raise NumericalError("it has no points")
     matrices = np.array(list(poses.values()))
     centres = -np.einsum("nij,ni->nj", matrices[:, :, :3], matrices[:, :, 3])
     turns = [matches.images[photo].turn_deg for photo in poses]
@@ -80,7 +97,7 @@ def orient(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int | None =
     found = {photo: looks[photo].result() for photo in poses if photo in looks}
     upright = up_direction(R, centres, scenery_of(model, found), lines_of(model, found), turn_deg)
     positions = [matches.images[key].gps for key in poses]
-    gps = georeference(centres, positions, upright.up, up_is_sure=upright.found_by == LINES)
+    gps = _georeference(centres, positions, upright)
     metres = None
     if isinstance(gps, Georeference):
         metres = gps.enu_from_world.scale
@@ -88,11 +105,31 @@ def orient(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int | None =
             upright = upright.turned_to(gps.enu_from_world.R[2], gps.up_deviation_deg)
     towards, front = facing(upright, R, points)
     viewer = viewer_frame(upright.up, towards, points, metres)
+    if not is_sound(viewer):
+        raise NumericalError("the frame of the viewer holds what is no number")
     with backend("turning the model upright"):
         move(model, viewer)
     entry = how_it_stands(upright, front) | where_it_stands(viewer, gps)
     logger.info("orientation: %s", entry)
     return entry
+
+
+def _georeference(
+    centres: FloatArray, positions: Sequence[GpsPosition | None], upright: Upright
+) -> Georeference | NoGeoreference:
+    try:
+        found = georeference(centres, positions, upright.up, up_is_sure=upright.found_by == LINES)
+    except FAILURES as err:
+        logger.info("the GPS positions could not be used", exc_info=err)
+        return NoGeoreference(f"the computation failed: {reason_of(err)}")
+    if not isinstance(found, Georeference) or is_sound(found.enu_from_world):
+        return found
+    return NoGeoreference("the positions give no scale")
+
+
+def is_sound(similarity: Similarity) -> bool:
+    """Whether a similarity takes numbers to numbers, and back."""
+    return bool(np.isfinite(similarity.R).all() and np.isfinite(similarity.t).all() and 0.0 < similarity.scale < np.inf)
 
 
 def turned(R: FloatArray, turn_deg: int) -> FloatArray:
@@ -138,7 +175,7 @@ def how_it_stands(upright: Upright, front: str) -> dict[str, Any]:
     standing = upright.standing
     return {
         "up": upright.found_by,
-        "up_deviation_deg": round(upright.deviation_deg, 3),
+        "up_deviation_deg": round(upright.deviation_deg, 3) if np.isfinite(upright.deviation_deg) else None,
         "off_camera_roll_deg": round(upright.off_roll_deg, 2),
         "camera_roll_spread_deg": round(upright.roll.spread_deg, 2),
         "photos_turned_deg": upright.roll.turn_deg,

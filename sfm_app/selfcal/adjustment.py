@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.pose_steps import POSE, moved
+from sfm_app.geometry.positive import solve_each
 from sfm_app.selfcal.two_view_cost import CAMERA, distances, pair_costs, pair_systems
 
 FloatArray = NDArray[np.float64]
@@ -198,7 +199,7 @@ def _system(matches: Matches, state: State) -> tuple[FloatArray, FloatArray]:
 
 def _information(system: tuple[FloatArray, FloatArray]) -> Information:
     H, g, _, _ = _reduced(*system, 0.0)
-    gains = 0.5 * np.einsum("pi,pi->p", g, np.linalg.solve(H + np.diag(np.tile(ALONE**-2.0, 2)), g[..., None])[..., 0])
+    gains = 0.5 * np.einsum("pi,pi->p", g, solve_each(H + np.diag(np.tile(ALONE**-2.0, 2)), g[..., None])[..., 0])
     return Information(H, g, gains)
 
 
@@ -243,7 +244,7 @@ def _tried(
     H, g = matches.scattered(Information(reduced, gradients, np.empty(0)), matches.trust * state.weights / state.scale)
     H += np.diag(prior.precision.ravel())
     g += (prior.precision * (prior.mean - state.thetas)).ravel()
-    step = np.linalg.solve(H + damping * np.diag(np.diag(H)), g).reshape(-1, CAMERA)
+    step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
     cameras = step[matches.cameras].reshape(-1, 2 * CAMERA)
     turns = own - (back @ cameras[..., None])[..., 0]
     poses = np.array([moved(pose, turn) for pose, turn in zip(state.poses, turns, strict=True)]).reshape(-1, 12)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.bundle import CAMERA, CX, CY, FX, FY, K1, K2, P1, P2, Reduced
-from sfm_app.geometry.positive import inverse_of_positive
+from sfm_app.geometry.positive import inverse_of_positive, inverses_of_positive
 from sfm_app.selfcal.priors import ASPECT, CENTRE, FREE_SHARE, LENS, NARROW, WIDE
 
 FloatArray = NDArray[np.float64]
@@ -53,6 +53,11 @@ FEW = 2.0
 """So much further off are cameras of few photos, whose misfit does not average out."""
 SWEEPS = 5
 """At most so many times all cameras are asked which of their parts are free."""
+LONGEST_STEP = 1.0
+"""Of log f in one step: a camera that wants more after mapping has placed the photos is not determined by them. Chosen
+on no set: it is more than the prior's standard deviation, and none of six sets that were run reached it."""
+FOCALS = (0.05, 100.0)
+"""In longer sides: a view of 169 degrees, and one of half a degree. What lies outside has run away."""
 MISFIT = 4.0
 """Errors of cameras, in what independent noise in the observations explains: lenses are not quite of the model's form,
 neighbouring observations err alike. Measured on photos with known cameras."""
@@ -101,6 +106,8 @@ class Estimate:
     """(C, 5) the parts about which the photos say more than the prior."""
     step: float
     """The largest change of a parameter, in standard deviations."""
+    held: BoolArray
+    """(C,) cameras that would have run away: they stay, and nothing about them counts as determined."""
 
 
 def estimate(params: FloatArray, reduced: Reduced, usual: Usual) -> Estimate:
@@ -120,8 +127,14 @@ def estimate(params: FloatArray, reduced: Reduced, usual: Usual) -> Estimate:
     step, own = _posterior(H, g, precision, away, changing)
     variances = np.sum(_product(T, covariance) * T, axis=1) + _product(T, soft - step) ** 2
     deviations = np.sqrt(variances).reshape(params.shape) * np.where(usual.asked.all(axis=1), 1.0, FEW)[:, None]
-    largest = float(np.max(np.abs(step[changing.ravel()]) / np.sqrt(np.diag(own)[changing.ravel()])))
-    return Estimate(_moved(params, step.reshape(params.shape)), deviations, free & determined, determined, largest)
+    largest = np.abs(step) / np.sqrt(np.diag(own), out=np.ones_like(step), where=changing.ravel())
+    moved, held = _moved(params, step.reshape(params.shape), usual.sides)
+    deviations[held] = np.maximum(deviations[held], _unknown(params, usual)[held])
+    determined[held] = False
+    return Estimate(
+        np.where(held[:, None], params, moved), deviations, free & determined, determined,
+        float(np.max(largest.reshape(params.shape)[~held], initial=0.0)), held,
+    )  # fmt: skip
 
 
 def spread(parts: BoolArray) -> BoolArray:
@@ -161,7 +174,7 @@ def _choose(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual) -> Boo
         step, covariance = _posterior(H, g, precision, away, everything)
         free = np.empty_like(before)
         for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
-            marginal = np.asarray(np.linalg.inv(covariance[np.ix_(own, own)]), np.float64)
+            marginal = inverses_of_positive(covariance[np.ix_(own, own)])
             own_H = marginal - np.diag(precision[camera])
             own_g = marginal @ step[own] - precision[camera] * away[camera]
             free[camera] = _best(own_H, own_g, away[camera], usual, camera)
@@ -175,7 +188,7 @@ def _best(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual, camera: 
     trials = np.array(sorted(product((False, True), repeat=len(PARTS)), key=sum))
     trials = trials[~np.any(trials & ~usual.asked[camera], axis=1)]
     precision = Usual(usual.centres, np.full(len(trials), usual.sides[camera]), trials).precision(trials)
-    covariance = np.linalg.inv(H + precision[:, :, None] * np.eye(CAMERA))
+    covariance = inverses_of_positive(H + precision[:, :, None] * np.eye(CAMERA))
     pull = g + precision * away
     share = np.array([part.share for part in PARTS])
     value = 0.5 * np.einsum("ti,tij,tj->t", pull, covariance, pull) - 0.5 * np.sum(precision * away**2, axis=1)
@@ -199,8 +212,19 @@ def _product(A: FloatArray, B: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ij,j...->i...", A, B), np.float64)
 
 
-def _moved(params: FloatArray, step: FloatArray) -> FloatArray:
+def _moved(params: FloatArray, step: FloatArray, sides: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """The cameras (C, 8) after a step, and (C,) which have run away with it."""
     moved = params + step
-    moved[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
-    moved[:, FY] = params[:, FY] * np.exp(step[:, LOG_FOCAL] + 0.5 * step[:, LOG_ASPECT])
-    return moved
+    with np.errstate(over="ignore", invalid="ignore"):
+        moved[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
+        moved[:, FY] = params[:, FY] * np.exp(step[:, LOG_FOCAL] + 0.5 * step[:, LOG_ASPECT])
+        focals = moved[:, [FX, FY]] / sides[:, None]
+    usual = np.isfinite(moved).all(axis=1) & np.all((focals > FOCALS[0]) & (focals < FOCALS[1]), axis=1)
+    return moved, ~usual | (np.abs(step[:, LOG_FOCAL]) > LONGEST_STEP)
+
+
+def _unknown(params: FloatArray, usual: Usual) -> FloatArray:
+    """(C, 8) standard deviations of cameras about which the photos say nothing."""
+    deviations = usual.precision(np.ones((len(params), len(PARTS)), np.bool_)) ** -0.5
+    deviations[:, [FX, FY]] = FOCAL_SPREAD * params[:, [FX, FY]]
+    return np.asarray(deviations, np.float64)

@@ -1,5 +1,6 @@
 """A set of photos: which of them are of one camera, and the K of every camera."""
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, count
@@ -7,6 +8,7 @@ from itertools import chain, count
 import numpy as np
 
 from sfm_app.geometry.camera import guessed_camera_matrix
+from sfm_app.numerical import FAILURES, reason_of
 from sfm_app.selfcal.answers import calibration_of, guessed, parameters_of
 from sfm_app.selfcal.inputs import prepare
 from sfm_app.selfcal.joint import Consensus
@@ -16,6 +18,8 @@ from sfm_app.selfcal.straight import without_lens
 from sfm_app.selfcal.zero_curves import METHOD
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs, PhotoPairs
+
+logger = logging.getLogger("sfm_app")
 
 CalibrateFunction = Callable[[CameraPairs, CalibrationSettings, int], Calibration]
 
@@ -54,12 +58,34 @@ def calibrate_photo_set(
     for photo, group in pairs.groups.items():
         groups.setdefault(group, []).append(photo)
     cameras = [
-        Camera(name, tuple(members), calibrate(pairs.among(members), options, seed)) for name, members in groups.items()
+        Camera(name, tuple(members), _alone(calibrate, pairs.among(members), options, seed))
+        for name, members in groups.items()
     ]
     if together:
-        cameras = _of_all_pairs(cameras, pairs, options) if split else _together(cameras, pairs, options)
+        cameras = _jointly(_of_all_pairs if split else _together, cameras, pairs, options)
     cameras = [replace(camera, found=_or_guess(camera, pairs)) for camera in cameras]
     return sorted(cameras, key=lambda camera: (-len(camera.photos), camera.name))
+
+
+def _alone(calibrate: CalibrateFunction, own: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
+    """What a calibrator makes of the pairs of one camera; a guess where its numbers fail."""
+    try:
+        return calibrate(own, options, seed)
+    except FAILURES as err:
+        logger.info("a camera could not be calibrated", exc_info=err)
+        return guessed(own.size, f"the computation failed: {reason_of(err)}", {"pairs": float(len(own.Fs))})
+
+
+def _jointly(
+    find: Callable[[Sequence[Camera], PhotoPairs, CalibrationSettings], list[Camera]],
+    cameras: list[Camera], pairs: PhotoPairs, options: CalibrationSettings,
+) -> list[Camera]:  # fmt: skip
+    """The cameras as all pairs have them; as each has them alone where the numbers fail."""
+    try:
+        return find(cameras, pairs, options)
+    except FAILURES as err:
+        logger.info("the cameras could not be compared", exc_info=err)
+        return cameras
 
 
 def _of_all_pairs(whole: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.positive import inverses_of_positive
 from sfm_app.selfcal.adjustment import Prior
 from sfm_app.selfcal.lens import CENTRE_U, KAPPA, LOG_ASPECT, LOG_FOCAL
 from sfm_app.selfcal.two_view_cost import CAMERA
@@ -121,7 +122,7 @@ class Evidence:
         prior = self.usual.prior(free, self.thetas)
         precision, away = prior.precision.ravel(), (prior.mean - self.thetas).ravel()
         share = spare(free, self.pairs)
-        covariance = np.asarray(np.linalg.inv(share * self.H + np.diag(precision)), np.float64)
+        covariance = inverses_of_positive(share * self.H + np.diag(precision))
         pull = share * self.g + precision * away
         step = covariance @ pull
         fit = 0.5 * float(pull @ step) - 0.5 * float(precision @ away**2)
@@ -187,7 +188,7 @@ class Evidence:
         """
         block = slice(CAMERA * camera, CAMERA * (camera + 1))
         prior, share = self.usual.prior(free, self.thetas), spare(free, self.pairs)
-        own = np.linalg.inv(covariance[block, block])
+        own = inverses_of_positive(covariance[block, block])
         H = own - np.diag(prior.precision[camera])
         g = own @ step[block] - prior.precision[camera] * (prior.mean - self.thetas)[camera]
         found = []
@@ -195,7 +196,7 @@ class Evidence:
             other = self.usual.prior(trial, self.thetas)
             precision, away = other.precision[camera], (other.mean - self.thetas)[camera]
             scale = spare(trial, self.pairs) / share
-            mine = np.asarray(np.linalg.inv(scale * H + np.diag(precision)), np.float64)
+            mine = inverses_of_positive(scale * H + np.diag(precision))
             pull = scale * g + precision * away
             value = 0.5 * float(pull @ mine @ pull) - 0.5 * float(precision @ away**2) + self.usual.log_odds(trial)
             value += 0.5 * float(np.sum(np.log(precision))) + 0.5 * float(np.linalg.slogdet(mine)[1])

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.essential import essential_from_fundamental, relative_pose
+from sfm_app.geometry.positive import lifted
 from sfm_app.ransac.refit import refine_sampson
 from sfm_app.selfcal.adjustment import (
     CONFLICT,
@@ -87,7 +88,7 @@ class Fit:
         state = reweighted(self.matches, replace(self.state, sigma=sigma))
         gains = informed(self.matches, state).gains / (scale * self.matches.redundancy)
         H = replace(self, state=state).evidence.H + np.diag(self.prior.precision.ravel())
-        volume = 0.5 * float(np.linalg.slogdet(H)[1] - np.sum(np.log(self.prior.precision)))
+        volume = 0.5 * float(np.linalg.slogdet(lifted(H))[1] - np.sum(np.log(self.prior.precision)))
         bounded = float(np.sum(gains / (1.0 + gains / CONFLICT)))
         return bounded + self.prior.cost(state.thetas) + volume - self.usual.log_odds(self.free)
 
@@ -160,7 +161,8 @@ def straight_fundamentals(fit: Fit) -> FloatArray:
         inverses = [np.linalg.inv(camera_matrix_of(thetas[camera])) for camera in (first, second)]
         E = _essential(fit.state.poses[pair])
         start = inverses[1].T @ E @ inverses[0]
-        found[pair] = refine_sampson(np.asfortranarray(np.hstack(views)), start, scale=REFIT_REACH * fit.state.sigma)
+        refit = refine_sampson(np.asfortranarray(np.hstack(views)), start, scale=REFIT_REACH * fit.state.sigma)
+        found[pair] = refit if np.isfinite(refit).all() and refit.any() else start
     return found
 
 

@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.positive import lifted
 from sfm_app.selfcal.adjustment import ALONE
 from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, KAPPA, LOG_ASPECT, LOG_FOCAL
 from sfm_app.selfcal.refine import Fit, scatter_by_photos
@@ -46,7 +47,7 @@ def spread_of(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, f
     slopes[1, [LOG_FOCAL, LOG_ASPECT]] = focal * half, 0.5 * focal * half
     slopes[2, CENTRE_U] = slopes[3, CENTRE_V] = unit_px
     slopes[4, [LOG_FOCAL, KAPPA]] = 2.0 * theta[KAPPA] * squared, squared
-    deviations = np.sqrt(np.diag(slopes @ cov @ slopes.T))
+    deviations = np.sqrt(np.maximum(np.diag(slopes @ cov @ slopes.T), 0.0))
     return dict(zip(("fx", "fy", "cx", "cy", "k1"), deviations.tolist(), strict=True))
 
 
@@ -55,7 +56,7 @@ def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:
     if not photos:
         return ()
     alone = np.tile(ALONE, 2)
-    news = np.linalg.slogdet(np.eye(2 * CAMERA) + alone[:, None] * fit.information.hessians * alone)[1]
+    news = np.linalg.slogdet(lifted(np.eye(2 * CAMERA) + alone[:, None] * fit.information.hessians * alone))[1]
     worth = fit.state.weights * news
     order = [pair for pair in np.argsort(-worth, kind="stable") if fit.state.weights[pair] >= AGREES]
     return tuple(photos[pair] for pair in order)

@@ -9,6 +9,7 @@ from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import cameras_seal, write_calibrations
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import of_fits, votes
+from sfm_app.numerical import json_text
 from sfm_app.selfcal import Camera, calibrate_photo_set, pair_weights
 from sfm_app.stored import fingerprint
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
@@ -37,7 +38,7 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
         identifiable=sum(camera.found.identifiable for camera in cameras),
     )
     with replacing(run.workspace.calibration) as path:
-        path.write_text(json.dumps(intrinsics.to_dict(), indent=1) + "\n", encoding="utf-8")
+        path.write_text(json_text(intrinsics.to_dict()), encoding="utf-8")
     with backend("writing calibrations"):
         write_calibrations(run.workspace.database, matches, intrinsics)
     return intrinsics

@@ -2,19 +2,20 @@
 
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sfm_app.colmap.backend import backend, check_written
-from sfm_app.colmap.bundle import Adjusted, adjust
+from sfm_app.colmap.bundle import Adjusted, adjusted_or_as_it_was
 from sfm_app.colmap.model import colour, photos_of, read_scene, sparse_model
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_depth, why_no_scene
+from sfm_app.numerical import json_text
 from sfm_app.reconstruction import Outcome, reconstruct
 from sfm_app.reconstruction.left_out import left_out, names_of
-from sfm_app.reconstruction.orientation import look_at_photos, orient
+from sfm_app.reconstruction.orientation import look_at_photos, orient_or_leave
 from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
 from sfm_app.written import replacing
 
@@ -30,14 +31,13 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
     """
     outcome = with_depth(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
     looks = look_at_photos([attempt.model for attempt in outcome.models], matches, run)
-    with backend("adjusting the bundle"):
-        adjusted = [adjust(attempt.model, run.workspace.database) for attempt in outcome.models]
+    adjusted = [adjusted_or_as_it_was(attempt.model, run.workspace.database) for attempt in outcome.models]
     models = [found.model for found in adjusted]
     with backend("reading colours"):
         for model in models:
             colour(model, run.workspace.photos, run.workers)
     turn_deg = None if run.settings.scene.turn_deg == "auto" else run.settings.scene.turn_deg
-    orientations = [orient(model, matches, looks, turn_deg) for model in models]
+    orientations = [orient_or_leave(model, matches, looks, turn_deg) for model in models]
     write_models(models, run)
     run.write_model(sparse_model(run.workspace.sparse), POINTS)
     members = [photos_of(model) for model in models]
@@ -55,6 +55,7 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         mean_reprojection_px=round(scene.mean_reprojection_px, 4),
         cameras={name: camera.to_dict() for name, camera in scene.cameras.items()},
         orientation=orientations[0],
+        adjustment=how_it_was_adjusted(adjusted, names),
         **how_it_was_made(outcome),
     )
     return scene
@@ -104,6 +105,19 @@ def how_it_was_made(outcome: Outcome) -> dict[str, Any]:
     }
 
 
+def how_it_was_adjusted(adjusted: Sequence[Adjusted], names: Mapping[str, str]) -> dict[str, Any]:
+    """What the manifest says about what the last adjustment could not do; empty where that is nothing."""
+    main, others = adjusted[0], adjusted[1:]
+    cameras = {image.camera_id: names[image.name] for image in main.model.images.values() if image.has_pose}
+    found = {
+        "failed": main.trouble,
+        "failed_in_other_models": {str(number): one.trouble for number, one in enumerate(others, 1) if one.trouble},
+        "cameras_held": [cameras[camera_id] for camera_id in main.held],
+        "points_left_open": main.open_points,
+    }
+    return {key: value for key, value in found.items() if value}
+
+
 def write_models(models: list[Any], run: RunContext) -> None:
     """Put the main model into OUT/sparse and the others into OUT/other_models/1, 2, ..., each as a whole."""
     place = run.workspace
@@ -140,7 +154,7 @@ def write_refined(scene: Scene, run: RunContext) -> None:
     known = json.loads(path.read_text(encoding="utf-8"))
     known["refined"] = {name: camera.to_dict() for name, camera in scene.cameras.items()}
     with replacing(path) as beside:
-        beside.write_text(json.dumps(known, indent=1) + "\n", encoding="utf-8")
+        beside.write_text(json_text(known), encoding="utf-8")
 
 
 def load_scene(photos: PhotoSet, intrinsics: Intrinsics, run: RunContext) -> Scene:

@@ -1,5 +1,6 @@
 """view_graph: MatchGraph -> ViewGraph."""
 
+import logging
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import write_epipolar_fits
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_scene
+from sfm_app.numerical import FAILURES
 from sfm_app.parallel import ordered_map
 from sfm_app.progress import track
 from sfm_app.ransac.stationary import covers, find_stationary, fit_moving
@@ -18,6 +20,8 @@ from sfm_app.settings import Settings
 from sfm_app.stored import load_arrays
 from sfm_app.types import EpipolarFit, MatchGraph, PairId, Rejected, ViewGraph
 from sfm_app.written import can_go_on, mark_unfinished, replacing
+
+logger = logging.getLogger("sfm_app")
 
 BoolArray = NDArray[np.bool_]
 
@@ -41,6 +45,13 @@ def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
     estimator = run.plugins.estimator(options.estimator)
 
     def fit_pair(pair: PairId) -> Fitted:
+        try:
+            return fit_numbers(pair)
+        except FAILURES as err:
+            logger.info("pair %s could not be fitted", pair, exc_info=err)
+            return Rejected("the computation failed"), 0
+
+    def fit_numbers(pair: PairId) -> Fitted:
         seed = int(np.random.SeedSequence([run.seed, *pair]).generate_state(1)[0])
         points, still = matches.points(pair), stationary_matches(matches, pair, run.settings)
         if not still.any():

@@ -9,6 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.numerical import FAILURES, reason_of
 from sfm_app.settings import DepthSettings
 from sfm_app.stereo.depth import DepthMap, Estimate, confirm_depths, match_depths
 from sfm_app.stereo.view import GreyImage, View
@@ -78,7 +79,10 @@ def _match(index: int, task: DepthTask) -> Rejected | None:
     if task.store.has(view, "photometric"):
         return None
     candidates = [task.views[other] for other in task.ranked[index]]
-    found = match_depths(view, candidates, task.store.photo, task.options.neighbours, task.options.consistency)
+    try:
+        found = match_depths(view, candidates, task.store.photo, task.options.neighbours, task.options.consistency)
+    except FAILURES as err:
+        return Rejected(f"the computation failed: {reason_of(err)}")
     if isinstance(found, Rejected):
         return found
     task.store.write_estimate(view, found)
@@ -96,7 +100,10 @@ def _confirm(index: int, task: DepthTask, usable: NDArray[np.bool_]) -> Rejected
     ]
     estimate, options = task.store.read_estimate(view), task.options
     photo = task.store.photo(view)
-    found = confirm_depths(view, photo, estimate, others, options.min_agreeing, options.consistency)
+    try:
+        found = confirm_depths(view, photo, estimate, others, options.min_agreeing, options.consistency)
+    except FAILURES as err:
+        return Rejected(f"the computation failed: {reason_of(err)}")
     if isinstance(found, Rejected):
         return found
     task.store.write_maps(view, found)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.numerical import finite_only
 from sfm_app.types.matches import MatchedImage, PairId
 from sfm_app.types.photos import Photo
 
@@ -51,9 +52,9 @@ class Calibration:
     def from_dict(cls, values: Mapping[str, Any]) -> "Calibration":
         """Back from `to_dict`."""
         pairs = tuple((int(first), int(second)) for first, second in values["key_pairs"])
-        return cls(
-            **{**values, "K": np.array(values["K"], np.float64), "held": tuple(values["held"]), "key_pairs": pairs}
-        )
+        tables = {name: finite_only(values[name]) for name in ("spread", "evidence")}
+        plain = {"K": np.array(values["K"], np.float64), "held": tuple(values["held"]), "key_pairs": pairs}
+        return cls(**{**values, **tables, **plain})
 
 
 @dataclass(frozen=True, slots=True)

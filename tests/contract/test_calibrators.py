@@ -11,10 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_app.plugins import load_plugins
-from sfm_app.selfcal import pair_weights
+from sfm_app.selfcal import calibrate_photo_set, pair_weights, photo_set, zero_curves
 from sfm_app.settings import CalibrationSettings
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
-from sfm_app.types import Calibration, CameraPairs
+from sfm_app.types import Calibration, CameraPairs, PhotoPairs
 
 CALIBRATORS = load_plugins().calibrators
 OPTIONS = CalibrationSettings()
@@ -226,6 +226,9 @@ def first(pairs, change):
     return replace(pairs, inliers=(change(pairs.inliers[0]), *pairs.inliers[1:]))
 
 
+ROUND_THE_MIDDLE = np.array([[0, -1, 375.0], [1, 0, -500], [-375, 500, 0]])
+"""F of a photo and itself, as a motion straight ahead would have it."""
+
 HOSTILE = {
     "seven inliers": lambda p: replace(each(p, lambda x: x[:7]), weights=pair_weights([7] * len(p.Fs))),
     "one inlier": lambda p: each(p, lambda x: x[:1]),
@@ -251,6 +254,14 @@ HOSTILE = {
     "rank one": lambda p: replace(p, Fs=np.tile(UNDETERMINED["rank one"], (2, 1, 1))),
     "photos unknown": lambda p: replace(p, photos=()),
     "hardly trusted": lambda p: replace(p, weights=np.full(len(p.Fs), 1e-200)),
+    "the same F throughout": lambda p: replace(p, Fs=np.repeat(p.Fs[:1], len(p.Fs), axis=0)),
+    "nearly the same F throughout": lambda p: replace(p, Fs=p.Fs[:1] + 1e-7 * np.abs(p.Fs[:1]).max() * p.Fs),
+    "the same photo throughout": lambda p: replace(p, Fs=np.tile(ROUND_THE_MIDDLE, (len(p.Fs), 1, 1)),
+                                                   inliers=tuple(x[:, [0, 1, 0, 1]] for x in p.inliers)),
+    "photos of one pair": lambda p: replace(p, photos=(p.photos[0],) * len(p.photos)),
+    "a view of a hundredth of a degree": lambda p: each(p, lambda x: 1e-4 * x + 0.9999 * np.tile([500, 375], 2)),
+    "rank one and the rest": lambda p: replace(p, Fs=np.concatenate([np.ones((3, 3, 3)), p.Fs[3:]])),
+    "all but the same weight": lambda p: replace(p, weights=np.geomspace(1e-300, 1.0, len(p.Fs))),
     "absurd claims": lambda p: replace(p, focal_hints_px=(1e-12, 1e12, 1e12)),
 }  # fmt: skip
 
@@ -312,3 +323,33 @@ def test_order_and_direction_of_pairs_with_matches_do_not_matter(calibrate):
     turned = replace(pairs, Fs=pairs.Fs[::-1], photos=pairs.photos[::-1], inliers=pairs.inliers[::-1])
     for same in (back, turned):
         np.testing.assert_allclose(calibrate(same, OPTIONS, 0).K, expected, rtol=2e-3, atol=0.5)
+
+
+GROUPINGS = {
+    "one": lambda _: "one",
+    "each its own": lambda photo: f"camera {photo}",
+    "two": lambda photo: "even" if photo % 2 == 0 else "odd",
+}
+
+
+@pytest.mark.parametrize("grouping", GROUPINGS)
+@pytest.mark.parametrize("case", HOSTILE)
+def test_hostile_sets_of_several_cameras_never_raise(case, grouping, monkeypatch):
+    """The safety net is taken away: what is fitted together may not fall into it either."""
+    monkeypatch.setattr(photo_set, "FAILURES", ())
+    pairs = HOSTILE[case](matched(1))
+    if not pairs.photos:
+        pytest.skip("a set knows its photos")
+    photos = range(1 + max(max(pair) for pair in pairs.photos))
+    given = PhotoPairs(
+        pairs.Fs, pairs.weights, pairs.photos, pairs.inliers,
+        sizes=dict.fromkeys(photos, SIZE), groups={photo: GROUPINGS[grouping](photo) for photo in photos},
+        focal_hints_px=dict.fromkeys(photos, pairs.focal_hints_px[0]) if pairs.focal_hints_px else {},
+    )  # fmt: skip
+
+    found = calibrate_photo_set(given, zero_curves.calibrate, OPTIONS, 0, together=True)
+
+    assert sorted(photo for camera in found for photo in camera.photos) == list(photos)
+    for camera in found:
+        assert is_well_formed(replace(camera.found, method="guess"))
+        assert camera.found.identifiable or camera.found.reason

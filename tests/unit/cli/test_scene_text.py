@@ -69,3 +69,23 @@ def test_a_model_that_may_stand_the_wrong_way_up_comes_with_a_remedy():
     lying = told(orientation=unsure | {"up_sign_odds": 70.0, "up_axis_odds": 1.5, "photos_turned_deg": 0})[0]
     assert "upside down" not in lying and "lie on its side" in lying and "scene.turn_deg=90 or 270" in lying
     assert "beware" not in told(orientation=unsure | {"up_sign_odds": 70.0})[0]
+
+
+def test_what_the_last_adjustment_could_not_do_is_said():
+    text, summary = told(
+        adjustment={"failed": "it left 3 of 900 points", "failed_in_other_models": {"2": "no"}, "cameras_held": ["one"]}
+    )
+
+    assert "beware: the last adjustment failed (it left 3 of 900 points); cameras and poses are as mapping left" in text
+    assert "the last adjustment of other_models/2 failed (no)" in text
+    assert "do not determine camera one; it stayed" in text
+    assert summary["adjustment"]["cameras_held"] == ["one"]
+    assert "beware" not in told(adjustment={"points_left_open": 3})[0]
+
+
+def test_a_model_that_could_not_be_turned_upright_says_so():
+    text, _ = told(orientation={"failed": "it has no points", "unit": "that of mapping", "gps": "not used"})
+
+    assert "stands as mapping left it, neither upright nor in metres: it has no points" in text
+    unsure, _ = told(orientation=COUNTS["orientation"] | {"up_deviation_deg": None})
+    assert "upright by vanishing lines, nobody knows how exactly" in unsure

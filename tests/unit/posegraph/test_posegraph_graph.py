@@ -8,7 +8,7 @@ from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
-from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, TOO_FEW
+from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, NO_NUMBERS, TOO_FEW
 from sfm_app.posegraph.groups import connected_groups
 from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchedImage, MatchGraph, Rejected, ViewGraph
 
@@ -230,3 +230,16 @@ def test_photos_that_hang_together(order):
     assert connected_groups(pairs) == [{1, 2, 3, 4}, {5, 6}, {8, 9}]
     assert connected_groups(pairs, range(1, 8)) == [{1, 2, 3, 4}, {5, 6}, {8, 9}, {7}]
     assert connected_groups([]) == []
+
+
+def test_a_pair_whose_inliers_lie_in_one_point_has_no_pose_and_the_others_have_theirs():
+    photos = Photos([[1, 2, 3]])
+    views = photos.views
+    photos.match((1, 2), np.random.default_rng(0).uniform(0, 700, (40, 2)), np.full((40, 2), 300.0))
+    fits = {**views.fits, (1, 2): EpipolarFit(np.diag([1.0, 1.0, 0.0]), np.ones(40, bool), np.ones(40), 1, 0.1)}
+    bent = Intrinsics({"one": Calibration(K, 1000, 750, "zero-curves", True, radial=-1e-3)})
+
+    graph = build_pose_graph(photos.matches, ViewGraph(fits, views.rejected), bent, OPTIONS, in_turn)
+
+    assert graph.dropped == {(1, 2): NO_NUMBERS}
+    assert sorted(graph.poses) == [(1, 3), (2, 3)] and graph.groups == ((1, 2, 3),)

@@ -1,4 +1,5 @@
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,7 +10,9 @@ import pytest
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.model import posed_photos
 from sfm_app.geometry.georeference import enu_m, position_at
-from sfm_app.reconstruction.orientation import look_at, look_at_photos, orient, turned
+from sfm_app.geometry.upright import up_direction
+from sfm_app.reconstruction import orientation
+from sfm_app.reconstruction.orientation import look_at, look_at_photos, orient, orient_or_leave, turned
 from sfm_app.synthetic.cameras import arc, make_camera
 from sfm_app.types import GpsPosition, MatchedImage, MatchGraph
 from sfm_app.workspace import Workspace
@@ -150,3 +153,50 @@ def test_a_photo_that_is_gone_tells_nothing(tmp_path):
     assert seen.lines == pytest.approx(np.array([[150, 0, 150, 200]]), abs=2)
     assert seen.picture.shape == (171, 256) and seen.picture[:, 200].min() > 190
     assert gone.lines.shape == (0, 4) and gone.picture is None
+
+
+def test_points_that_are_nowhere_do_not_keep_the_model_from_standing_upright(tmp_path):
+    _, model, matches, run = scene(tmp_path, lambda views: [None] * len(views.cam_from_world))
+    for xyz in ([np.inf, 0, 0], [np.nan] * 3, [1e200, 1e200, 0]):
+        model.add_point3D(np.array(xyz), pycolmap.Track(), np.zeros(3, np.uint8))
+
+    entry = orient(model, matches, look_at_photos([model], matches, run))
+    points = posed_photos(model)[1][:300]
+
+    assert entry["up"] == "camera roll"
+    assert np.percentile(np.linalg.norm(points, axis=1), 80) == pytest.approx(1, abs=1e-6)
+
+
+def test_a_model_without_points_stays_as_it_is_and_the_entry_says_why(tmp_path):
+    _, model, matches, run = scene(tmp_path, true_positions)
+    for key in list(model.points3D):
+        model.delete_point3D(key)
+    before = {key: pose.copy() for key, pose in posed_photos(model)[0].items()}
+
+    entry = orient_or_leave(model, matches, look_at_photos([model], matches, run))
+
+    assert entry["failed"] == "it has no points" and entry["unit"] == "that of mapping"
+    assert all(np.array_equal(pose, before[key]) for key, pose in posed_photos(model)[0].items())
+
+
+def test_gps_that_fails_leaves_the_model_upright_without_metres(tmp_path, monkeypatch):
+    def failing(*_, **__):
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    _, model, matches, run = scene(tmp_path, true_positions)
+    monkeypatch.setattr(orientation, "georeference", failing)
+
+    entry = orient_or_leave(model, matches, look_at_photos([model], matches, run))
+
+    assert entry["up"] == "camera roll" and entry["unit"] == "about the size of the scene"
+    assert entry["gps"] == "not used: the computation failed: Eigenvalues did not converge"
+
+
+def test_up_that_nobody_knows_how_exactly_is_null_and_no_infinity(tmp_path, monkeypatch):
+    def unsure(*args, **others):
+        return replace(up_direction(*args, **others), deviation_deg=np.inf)
+
+    _, model, matches, run = scene(tmp_path, lambda views: [None] * len(views.cam_from_world))
+    monkeypatch.setattr(orientation, "up_direction", unsure)
+
+    assert orient_or_leave(model, matches, look_at_photos([model], matches, run))["up_deviation_deg"] is None

@@ -1,5 +1,7 @@
 """What a bundle says about its cameras, on bundles whose poses and points are the true ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -157,3 +159,28 @@ def test_derivatives_are_those_of_differences():
         ]  # fmt: skip
         difference = (project(shifted[0])[0] - project(shifted[1])[0]) / (2 * h)
         assert by_point[:, :, k] == pytest.approx(difference, rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize("off", [-2.0, 30.0])
+def test_a_camera_that_runs_away_stays_and_is_not_determined(off):
+    bundle = seen(list(PLAIN))
+    start = np.array([PLAIN])
+    reduced = reduce(bundle, 1.0)
+    far = replace(reduced, g=reduced.H @ (900.0 * (off - 1.0) * np.eye(8)[0] + 900.0 * (off - 1.0) * np.eye(8)[1]))
+
+    held, found = estimate(start, far, asked(True)), estimate(start, reduced, asked(True))
+
+    assert held.held.tolist() == [True] and found.held.tolist() == [False]
+    assert np.array_equal(held.params, start) and not held.determined.any() and held.step == 0
+    assert np.all(held.deviations[0, :2] >= 0.7 * 900) and np.isfinite(held.deviations).all()
+    assert np.all(held.deviations[0, 2:4] >= 0.15 * 1000)
+
+
+def test_a_bundle_that_says_nothing_leaves_cameras_as_unsure_as_they_were_before():
+    bundle = seen(list(PLAIN), photos=1, points=3)
+
+    found = answer(bundle)
+
+    assert found.params[0] == pytest.approx(PLAIN, abs=1)
+    assert 0.5 * 900 < found.deviations[0, 0] < 1.5 * 900
+    assert not found.determined.any()

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.selfcal import calibrate_photo_set
+from sfm_app.selfcal import calibrate_photo_set, photo_set
 from sfm_app.selfcal.answers import guessed
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
@@ -137,3 +137,28 @@ def test_a_group_that_the_user_made_is_not_split(shots):
     }
     assert [len(camera.photos) for camera in by_split[True]] == [4, 4]
     assert [len(camera.photos) for camera in by_split[False]] == [8]
+
+
+@pytest.mark.parametrize("together", [True, False])
+@pytest.mark.parametrize("error", [np.linalg.LinAlgError("Singular matrix"), ZeroDivisionError("division by zero")])
+def test_a_calibrator_whose_numbers_fail_leaves_a_guess_with_the_reason(shots, together, error):
+    def failing(*_):
+        raise error
+
+    cameras = calibrate_photo_set(shots(4, 1).as_set(["one"] * 4), failing, OPTIONS, 0, together=together)
+
+    assert all(not camera.found.identifiable and camera.found.method == "guess" for camera in cameras)
+    assert str(error) in cameras[0].found.reason
+
+
+def test_cameras_that_cannot_be_compared_stay_what_they_are_alone(shots, monkeypatch):
+    def failing(*_):
+        raise np.linalg.LinAlgError("Singular matrix")
+
+    monkeypatch.setattr(photo_set, "calibrate_several", failing)
+    made = shots(6, 1).as_set(["one"] * 5 + ["two"])
+
+    found = {camera.name: camera.found for camera in cameras_of(made)}
+
+    assert found["one"].identifiable and found["one"].K[0, 0] == pytest.approx(1000, rel=0.03)
+    assert not found["two"].identifiable and found["two"].method == "guess"

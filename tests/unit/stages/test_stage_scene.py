@@ -7,6 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sfm_app.cli.scene_text import scene_lines
+from sfm_app.colmap import bundle
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import opened
 from sfm_app.colmap.model import part_of, photos_of
@@ -121,6 +123,27 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
     again = scene.load_scene(photos, made.intrinsics, run)
     assert again.unregistered == found.unregistered and again.points == found.points
     assert all(np.array_equal(again.cam_from_world[key], value) for key, value in found.cam_from_world.items())
+
+
+def test_a_model_that_cannot_be_adjusted_is_kept_as_mapping_left_it_and_the_run_says_so(synthetic, run, monkeypatch):
+    def failing(*_):
+        raise np.linalg.LinAlgError("Matrix is not positive definite")
+
+    true = synthetic[1]
+    made = outcome(attempt(part_of(true, (1, 2, 3, 4))), attempt(part_of(true, (5, 6, 7))))
+    monkeypatch.setattr(scene, "reconstruct", lambda *_: made)
+    monkeypatch.setattr(bundle, "reduce", failing)
+    matches, views = inputs(true)
+    run.workspace.calibration.write_text(json.dumps(made.intrinsics.to_dict()))
+
+    found = scene.reconstruct_scene(matches, views, made.intrinsics, run)
+
+    reason = "the computation failed while adjusting the bundle: Matrix is not positive definite"
+    assert run.counts["adjustment"] == {"failed": reason, "failed_in_other_models": {"1": reason}}
+    assert len(found.cam_from_world) == 4 and found.cameras["one"].params == (1280.0, 512.0, 384.0, 0.0)
+    assert (found.cameras["one"].deviations, found.cameras["one"].determined) == ({}, ())
+    assert json.loads(run.workspace.calibration.read_text(), parse_constant=pytest.fail)["refined"]["one"]
+    assert "the last adjustment failed" in "\n".join(scene_lines(found, run.counts))
 
 
 def test_without_a_model_the_error_says_what_was_seen_and_what_may_help(synthetic, run, monkeypatch):

@@ -89,3 +89,18 @@ def test_parts_come_back_as_they_were(build, tmp_path):
     assert [count for _, count in again.values()] == [3, 0]
     arrays = [view_graph.graph_of(parts).to_arrays() for parts in (found, again)]
     assert all(np.array_equal(arrays[0][name], arrays[1][name]) for name in arrays[0])
+
+
+def test_a_pair_on_which_an_estimator_fails_is_rejected_with_a_reason(build, monkeypatch):
+    def failing(x1, *_):
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    def failing_where_few(how, points, *rest):
+        return (failing if len(points[0]) < 100 else fit)(how, points, *rest)
+
+    fit = view_graph.fit_moving
+    monkeypatch.setattr(view_graph, "fit_moving", failing_where_few)
+
+    graph, counts = build(match_graph())
+
+    assert counts["rejected"] == {"the computation failed": 1} and list(graph.fits) == [(1, 2)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_app.settings import DepthSettings
-from sfm_app.stereo import DepthTask, make_on_cpu, rank_neighbours
+from sfm_app.stereo import DepthTask, make_on_cpu, method, rank_neighbours
 from sfm_app.types import Rejected
 
 
@@ -80,3 +80,20 @@ def test_a_photo_that_nothing_confirms_has_a_reason_and_no_map(plane, views, mak
     assert found == [None, None, None, Rejected("no photo shares enough points")]
     assert "stranger.jpg" not in store.estimates | store.maps
     assert all(0 < np.mean(maps.depth > 0) <= 1 for maps in store.maps.values())
+
+
+@pytest.mark.parametrize("step", ["match_depths", "confirm_depths"])
+def test_a_photo_whose_numbers_fail_has_a_reason_and_the_others_their_maps(plane, views, monkeypatch, step):
+    whole = getattr(method, step)
+
+    def failing(view, *rest):
+        if view.name == "2.jpg":
+            raise np.linalg.LinAlgError("Singular matrix")
+        return whole(view, *rest)
+
+    monkeypatch.setattr(method, step, failing)
+
+    found = make_on_cpu(task_for(views, Memory(plane)))
+
+    assert found[2] == Rejected("the computation failed: Singular matrix")
+    assert found[1] is None

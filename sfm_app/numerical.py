@@ -1,0 +1,38 @@
+"""What computations fail with, and values that are no numbers."""
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from sfm_app.errors import NumericalError
+
+FAILURES = (NumericalError, ArithmeticError, ValueError, IndexError)
+"""What our own computations raise on numbers that they were not made for: no inverse (NumPy's LinAlgError is a
+ValueError), a division by zero, the largest of nothing. Where a run can go on without the result, it does."""
+
+
+def reason_of(err: Exception) -> str:
+    """What an error says, in one line."""
+    lines = str(err).strip().splitlines()
+    return lines[-1] if lines else type(err).__name__
+
+
+def finite_only(values: Mapping[str, float | None]) -> dict[str, float]:
+    """The entries that are numbers."""
+    return {name: value for name, value in values.items() if value is not None and np.isfinite(value)}
+
+
+def json_text(value: Any) -> str:
+    """Plain values as JSON; what is infinite or no number becomes null, which every reader understands."""
+    return json.dumps(_plain(value), indent=1, allow_nan=False) + "\n"
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,114 @@
+"""The last adjustment on models that have gone astray: it goes on, and says what it could not do."""
+
+import numpy as np
+import pytest
+
+from sfm_app.colmap import bundle as module
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.bundle import adjust, adjusted_or_as_it_was
+from sfm_app.colmap.database import SQUARE_PIXELS
+from sfm_app.errors import BackendError, NumericalError
+
+START = (880.0, 500.0, 400.0, 0.0)
+
+
+@pytest.fixture
+def mapped(synthetic):
+    """Makes a model as mapping leaves it, and its database."""
+
+    def make(photos=6, start=START):
+        model, database = synthetic(photos=photos)
+        for point_id in [key for key, point in model.points3D.items() if point.track.length() < 2]:
+            model.delete_point3D(point_id)
+        for camera in model.cameras.values():
+            camera.model = getattr(pycolmap.CameraModelId, SQUARE_PIXELS)
+            camera.params = start
+        return model, database
+
+    return make
+
+
+def away(model, share, place):
+    """Put some points elsewhere."""
+    keys = sorted(model.points3D)
+    for key in keys[: max(1, int(share * len(keys)))]:
+        model.points3D[key].xyz = place(model.points3D[key].xyz)
+    return model
+
+
+ASTRAY = {
+    "a point at infinity": lambda model: away(model, 0, lambda xyz: 1e14 * xyz),
+    "a point that is nowhere": lambda model: away(model, 0, lambda _: np.array([np.inf, np.nan, 0.0])),
+    "a fifth of the points at infinity": lambda model: away(model, 0.2, lambda xyz: 1e13 * xyz),
+    "a point in a camera": lambda model: away(model, 0, lambda _: model.images[1].projection_center()),
+    "a fifth of the points in one place": lambda model: away(model, 0.2, lambda _: np.zeros(3)),
+}
+
+
+@pytest.mark.parametrize("case", ASTRAY)
+def test_points_that_have_gone_astray_do_not_end_it_and_the_camera_is_found(mapped, case):
+    model, database = mapped()
+
+    found = adjust(ASTRAY[case](model), database)
+
+    camera, deviations = found.model.cameras[1], found.deviations[1]
+    assert not found.trouble and not found.held
+    assert abs(camera.params[0] - 900) < 3 * deviations["fx"] and deviations["fx"] < 20
+    assert found.model.num_points3D() > 250
+    assert all(np.isfinite(point.xyz).all() for point in found.model.points3D.values())
+
+
+def test_photos_from_one_place_leave_numbers_or_the_model_as_it_was(mapped):
+    model, database = mapped()
+    for image in model.images.values():
+        pose = image.cam_from_world()
+        pose.translation = pose.rotation.matrix() @ (model.images[1].cam_from_world().inverse().translation * -1.0)
+        model.frames[image.frame_id].set_cam_from_world(image.camera_id, pose)
+
+    found = adjusted_or_as_it_was(model, database)
+
+    assert found.trouble or found.deviations[1]["fx"] > 1.0
+    assert np.isfinite(found.model.cameras[1].params).all()
+    assert all(np.isfinite(list(values.values())).all() for values in found.deviations.values())
+
+
+def test_a_model_that_loses_its_points_stays_as_mapping_left_it(mapped):
+    model, database = mapped()
+    for key, image in model.images.items():
+        pose = image.cam_from_world()
+        pose.rotation = pycolmap.Rotation3d(np.array([key, 1.0, -key, 2.0]) / np.hypot(np.sqrt(2) * key, np.sqrt(5)))
+        model.frames[image.frame_id].set_cam_from_world(image.camera_id, pose)
+
+    with pytest.raises(NumericalError, match=r"it left \d+ of \d+ points"):
+        adjust(model, database)
+    found = adjusted_or_as_it_was(model, database)
+
+    assert found.model is model and "points" in found.trouble
+    assert found.model.cameras[1].params.tolist() == list(START)
+    assert (found.deviations, found.determined) == ({1: {}}, {1: ()})
+
+
+def test_a_camera_without_a_focal_length_stays_as_mapping_left_it(mapped):
+    model, database = mapped(start=(np.nan, 500.0, 400.0, 0.0))
+
+    found = adjusted_or_as_it_was(model, database)
+
+    assert found.trouble == "a camera has no focal length" and found.model is model
+
+
+@pytest.mark.parametrize(
+    ("error", "expected"),
+    [(np.linalg.LinAlgError("Singular matrix"), None), (ZeroDivisionError("division by zero"), None),
+     (RuntimeError("out of memory"), BackendError)],
+)  # fmt: skip
+def test_what_fails_in_our_numbers_is_a_reason_and_what_fails_in_colmap_an_error(mapped, monkeypatch, error, expected):
+    def failing(*_):
+        raise error
+
+    model, database = mapped()
+    monkeypatch.setattr(module, "reduce" if expected is None else "_correspondences", failing)
+    if expected:
+        with pytest.raises(expected, match=str(error)):
+            adjusted_or_as_it_was(model, database)
+    else:
+        assert str(error) in adjusted_or_as_it_was(model, database).trouble

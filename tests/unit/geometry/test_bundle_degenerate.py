@@ -1,0 +1,113 @@
+"""Bundles that do not determine what is asked of them: every answer is a number, and what is open stays."""
+
+import numpy as np
+import pytest
+
+from sfm_app.geometry.bundle import LOST_PX, Bundle, cost, in_sight, lost_points, project, reduce
+
+CAMERA = np.array([[900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]])
+SCALE_PX = 0.5
+
+
+def rotations(count, step=0.15):
+    angles = step * (np.arange(count) - (count - 1) / 2)
+    c, s, o, i = np.cos(angles), np.sin(angles), np.zeros(count), np.ones(count)
+    return np.moveaxis(np.array([[c, o, s], [o, i, o], [-s, o, c]]), 2, 0)
+
+
+def bundle_of(X, R, centres, noise_px=0.3, seed=0):
+    """Every photo sees every point; as measured through the camera with noise."""
+    t = -np.einsum("nij,nj->ni", R, centres)
+    photo, point = (index.ravel() for index in np.indices((len(R), len(X))))
+    empty = Bundle(CAMERA, np.zeros(len(R), np.int64), R, t, X, photo, point, np.zeros((len(photo), 2)))
+    with np.errstate(all="ignore"):
+        seen = project(empty)[0]
+    x = np.where(np.isfinite(seen), seen, 500.0) + np.random.default_rng(seed).normal(0, noise_px, (len(photo), 2))
+    return Bundle(CAMERA, empty.camera, R, t, X, photo, point, x)
+
+
+def box(count=60, depth=5.0, seed=1):
+    return np.random.default_rng(seed).uniform([-1, -1, depth - 1], [1, 1, depth + 1], (count, 3))
+
+
+def ring(count):
+    R = rotations(count)
+    return R, -5.0 * R[:, 2] + [0, 0, 5.0]
+
+
+def walk(count):
+    return np.tile(np.eye(3), (count, 1, 1)), np.column_stack([0.3 * np.arange(count), np.zeros((count, 2))])
+
+
+SCENES = {
+    "one point at infinity": lambda: bundle_of(np.vstack([box(), [[1e12, 0, 1e13]]]), *ring(6)),
+    "half of them at infinity": lambda: bundle_of(np.vstack([box(), 1e12 * box()]), *walk(6)),
+    "all at infinity": lambda: bundle_of(1e13 * box(), *walk(6)),
+    "all photos from one place": lambda: bundle_of(box(), rotations(6), np.zeros((6, 3))),
+    "one photo twice": lambda: bundle_of(box(), np.tile(np.eye(3), (2, 1, 1)), np.zeros((2, 3))),
+    "two photos": lambda: bundle_of(box(), *ring(2)),
+    "three points": lambda: bundle_of(box(3), *ring(4)),
+    "all points in one place": lambda: bundle_of(np.tile(box(1), (40, 1)), *ring(6)),
+    "points on a line of sight": lambda: bundle_of(np.outer(np.arange(1, 30), [0, 0, 1.0]), *walk(4)),
+    "a point in a camera": lambda: bundle_of(np.vstack([box(), ring(6)[1][:1]]), *ring(6)),
+    "a point just before a camera": lambda: bundle_of(np.vstack([box(), [[0, 0, 1e-160]]]), *walk(4)),
+    "a point behind": lambda: bundle_of(np.vstack([box(), [[0, 0, -3.0]]]), *walk(4)),
+    "a point that is nowhere": lambda: bundle_of(np.vstack([box(), [[np.inf, 0, 1.0]], [[np.nan] * 3]]), *ring(6)),
+    "all behind": lambda: bundle_of(box() - [0, 0, 20], *walk(4)),
+    "no points": lambda: bundle_of(np.zeros((0, 3)), *ring(4)),
+    "one photo": lambda: bundle_of(box(), *ring(1)),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("scene", SCENES)
+def test_whatever_is_seen_the_answer_is_numbers(scene):
+    bundle = SCENES[scene]()
+
+    found = reduce(bundle, SCALE_PX)
+
+    assert all(np.isfinite(getattr(found, name)).all() for name in ("H", "g", "pose_step", "pose_give", "point_step"))
+    assert np.isfinite(found.point_give.data).all()
+    assert 0 < found.noise_px < 1
+    assert np.linalg.eigvalsh(found.H).min() >= -1e-9 * np.abs(found.H).max()
+    assert np.isfinite(cost(bundle, SCALE_PX))
+
+
+def test_a_point_at_infinity_still_says_how_the_cameras_are_turned_and_keeps_its_depth():
+    far = np.vstack([box(), [[1e11, 0, 1e12]]])
+    near, both = reduce(bundle_of(box(), *ring(6)), SCALE_PX), reduce(bundle_of(far, *walk(6)), SCALE_PX)
+
+    assert (near.open_points, near.lost) == (0, 0)
+    assert (both.open_points, both.lost) == (1, 0)
+    ray = far[-1] / np.linalg.norm(far[-1])
+    assert abs(both.point_step[-3:] @ ray) < 1e-3 * np.linalg.norm(far[-1])
+
+
+def test_points_of_which_nothing_is_open_count_as_before():
+    bundle = bundle_of(box(), *ring(6))
+    more = bundle_of(np.vstack([box(), [[0, 0, -50.0]]]), *ring(6))
+
+    found, other = reduce(bundle, SCALE_PX), reduce(more, SCALE_PX)
+
+    assert (other.lost, other.open_points) == (6, 1), "behind all six photos, it says nothing"
+    # noise differs, as observations come in another order
+    assert np.diag(other.H) == pytest.approx(np.diag(found.H), rel=0.05)
+    assert np.array_equal(other.point_step[-3:], np.zeros(3))
+
+
+def test_noise_is_the_usual_one_where_nothing_is_left_over_and_the_measured_one_elsewhere():
+    few, many = reduce(bundle_of(box(8), *ring(2)), SCALE_PX), reduce(bundle_of(box(200), *ring(6)), SCALE_PX)
+    perfect = reduce(bundle_of(box(8), *ring(2), noise_px=0.0), SCALE_PX)
+
+    assert 0.1 < few.noise_px < 0.5 and perfect.noise_px == pytest.approx(0.25)
+    assert many.noise_px == pytest.approx(0.27, abs=0.05)
+
+
+def test_what_cannot_be_seen_costs_more_than_what_is_off():
+    bundle = bundle_of(np.vstack([box(), [[0, 0, -3.0]]]), *walk(4))
+    off = bundle_of(box(), *walk(4))
+    off.x[:4] += 500.0
+
+    assert lost_points(bundle).nonzero()[0].tolist() == [60] and not lost_points(off).any()
+    assert np.count_nonzero(~in_sight(bundle, np.zeros_like(bundle.x))) == 4
+    assert cost(bundle, SCALE_PX) > 3 * SCALE_PX * LOST_PX > 10 * cost(off, SCALE_PX)
