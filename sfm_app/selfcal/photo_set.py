@@ -10,6 +10,7 @@ from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.selfcal.answers import calibration_of, guessed, parameters_of
 from sfm_app.selfcal.inputs import prepare
 from sfm_app.selfcal.joint import Consensus
+from sfm_app.selfcal.own_cameras import predicted
 from sfm_app.selfcal.several import CameraGroup, Tables, calibrate_several
 from sfm_app.selfcal.split import peaks_of, separated
 from sfm_app.selfcal.straight import without_lens
@@ -34,6 +35,8 @@ class Camera:
     name: str
     photos: tuple[int, ...]
     found: Calibration
+    family: int = -1
+    """Number of the group, where each of its photos was found to have a camera of its own."""
 
 
 def calibrate_photo_set(
@@ -57,21 +60,21 @@ def calibrate_photo_set(
         Camera(name, tuple(members), calibrate(pairs.among(members), options, seed)) for name, members in groups.items()
     ]
     if together:
-        cameras = _of_all_pairs(cameras, pairs, options) if split else _together(cameras, pairs, options)
+        cameras = _of_all_pairs(cameras, pairs, options, seed) if split else _together(cameras, pairs, options)
     cameras = [replace(camera, found=_or_guess(camera, pairs)) for camera in cameras]
     return sorted(cameras, key=lambda camera: (-len(camera.photos), camera.name))
 
 
-def _of_all_pairs(whole: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
+def _of_all_pairs(whole: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings, seed: int) -> list[Camera]:
     """Groups split where their photos disagree, and all cameras from all pairs.
 
     Parts of a group that turn out to have the same focal were one camera after all.
     """
-    parts = [_split(camera, pairs, options) for camera in whole]
+    parts = [_split(camera, number, pairs, options, seed) for number, camera in enumerate(whole)]
     found = _together(list(chain.from_iterable(parts)), pairs, options)
     focals = {camera.name: camera.found.focal_px for camera in found}
     kept = [
-        [camera] if _alike([focals[part.name] for part in split]) else split
+        [camera] if split[0].family < 0 and _alike([focals[part.name] for part in split]) else split
         for camera, split in zip(whole, parts, strict=True)
     ]
     if sum(map(len, kept)) == len(found):
@@ -84,8 +87,8 @@ def _alike(focals: Sequence[float]) -> bool:
     return bool(np.any(np.diff(np.sort(np.log(focals))) < ALIKE))
 
 
-def _split(camera: Camera, pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
-    """The camera, or the several that its photos are of."""
+def _split(camera: Camera, number: int, pairs: PhotoPairs, options: CalibrationSettings, seed: int) -> list[Camera]:
+    """The camera, the several that its photos are of, or one for each photo."""
     if len(camera.photos) < LEAST_TO_SPLIT:
         return [camera]
     own, found = pairs.among(camera.photos), camera.found
@@ -99,17 +102,20 @@ def _split(camera: Camera, pairs: PhotoPairs, options: CalibrationSettings) -> l
     if found.identifiable:
         starts.append(np.append(parameters_of(found, side)[:4], 0.0))
     tables = Tables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
-    thetas, labels = separated(tables, [own.photos[k] for k in ready.kept], starts)
+    photos = [own.photos[k] for k in ready.kept]
+    thetas, labels = separated(tables, photos, starts)
+    taken = set(pairs.groups.values())
+    names = chain([camera.name], (name for k in count(2) if (name := f"{camera.name} #{k}") not in taken))
+    if predicted(tables, photos, starts, labels, seed).each_its_own:
+        nothing = guessed(own.size, "", {})
+        return [Camera(next(names), (photo,), nothing, number) for photo in sorted(camera.photos)]
     if len(thetas) == 1:
         return [camera]
     parts = []
-    taken = set(pairs.groups.values())
-    names = (name for number in count(2) if (name := f"{camera.name} #{number}") not in taken)
-    for number, theta in enumerate(thetas):
-        photos = tuple(photo for photo in camera.photos if labels.get(photo, 0) == number)
+    for part, theta in enumerate(thetas):
+        members = tuple(photo for photo in camera.photos if labels.get(photo, 0) == part)
         theta[4] = found.radial / np.exp(2.0 * theta[0])
-        first = calibration_of(theta, own.size, found.method)
-        parts.append(Camera(camera.name if number == 0 else next(names), photos, first))
+        parts.append(Camera(next(names), members, calibration_of(theta, own.size, found.method)))
     return parts
 
 
@@ -126,6 +132,7 @@ def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: Calibration
             start=camera.found if camera.found.identifiable else None,
             known=camera.found.identifiable and bool(camera.found.evidence),
             hint_px=_claim(camera, pairs),
+            family=camera.family,
         )
         for camera in cameras
     ]
@@ -141,7 +148,7 @@ def _or_guess(camera: Camera, pairs: PhotoPairs) -> Calibration:
     claim = _claim(camera, pairs)
     size = pairs.sizes[camera.photos[0]]
     if not np.isfinite(claim):
-        return guessed(size, found.reason, found.evidence)
+        return found if camera.family >= 0 else guessed(size, found.reason, found.evidence)
     return replace(found, K=guessed_camera_matrix(size, claim), method="exif", radial=0.0, spread={}, held=())
 
 

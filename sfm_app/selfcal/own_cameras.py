@@ -1,0 +1,145 @@
+"""Whether photos of one size are of one camera: asked of pairs that nobody was fitted to.
+
+Photos from the web are brought to one size, and cropped; equal sizes are no proof. "Each photo its own camera" fits any
+pairs better than "one camera", wrong ones too, because it has a focal more per photo. So both are fitted to four fifths
+of the pairs, and the rest say which predicts them: wrong pairs are predicted by neither, and what a photo's other pairs
+say about its focal holds for the pair left out only where it is a focal of its own.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.selfcal.inputs import FloatArray
+from sfm_app.selfcal.lens import LOG_FOCAL
+from sfm_app.selfcal.priors import FOCAL_SPREAD, USUAL_FOCAL
+from sfm_app.selfcal.search import FOCAL_RANGE
+from sfm_app.selfcal.several import FOCALS, IndexArray, Tables, best_places
+from sfm_app.selfcal.tied import TIE
+from sfm_app.types import PairId
+
+LEAST_PHOTOS = 5
+"""Of fewer, a pair less leaves too little to say what focal a photo has."""
+SIGMA = 0.05
+"""Width of the votes, in units of r: neighbours on the grid of focals, 7 % apart, still vote for each other."""
+FOLDS = 5
+MOST_PAIRS = 1500
+"""Evenly chosen where there are more: tables of all focals of both photos take 13 kB a pair."""
+FITS = 0.88
+"""A camera that wins this share of all votes leaves nothing to be explained: of fountain-P11 and Herz-Jesus-P8 it wins
+0.94, of ten cameras brought to one size 0.68, of one camera with four pairs in ten wrong 0.5 to 0.7."""
+LEAST_GAIN = 0.05
+"""Share of all votes that cameras of their own must win on held pairs. One camera, with up to 40 % wrong pairs or two
+pixels of noise: at most 0.03 in 300 random scenes, and 0.01 on oats23; reichstag10 at one size 0.12 to 0.15."""
+CLEARLY = 2.5
+"""In standard deviations of that gain, pairs taken as independent. The same scenes: at most 1.6; reichstag10 3.6."""
+
+
+class Prediction(NamedTuple):
+    """What held pairs say about two hypotheses."""
+
+    shared: float
+    """Share of their votes for the cameras that were asked against: one for all, or few."""
+    own: float
+    """The same for a camera of each photo's own."""
+    deviations: float
+    """How many standard deviations lie between."""
+
+    @property
+    def each_its_own(self) -> bool:
+        """Whether every photo is taken for one of its own camera."""
+        return self.own - self.shared > LEAST_GAIN and self.deviations > CLEARLY
+
+
+def predicted(
+    tables: Tables, photos: Sequence[PairId], starts: Sequence[FloatArray], labels: Mapping[int, int], seed: int
+) -> Prediction:
+    """Few cameras and a camera for each photo, fitted to most pairs and compared on the others.
+
+    Args:
+        tables: the pairs, without lens, in longer sides about the middle; its members are not used.
+        photos: per pair its two photos.
+        starts: (5,) each, cameras whose centre and pixels may be those of the photos; the middle is tried besides.
+        labels: number of the camera by photo when there are few; all 0 when there is one.
+        seed: of the choice of the pairs held.
+    """
+    rows = np.linspace(0, len(photos) - 1, min(len(photos), MOST_PAIRS)).astype(np.int64)
+    everyone = sorted({photo for pair in photos for photo in pair})
+    if len(everyone) < LEAST_PHOTOS or not len(rows):
+        return Prediction(1.0, 1.0, 0.0)
+    number = {photo: k for k, photo in enumerate(everyone)}
+    members = np.array([[number[first], number[second]] for first, second in photos])[rows]
+    few = np.unique([labels.get(photo, 0) for photo in everyone], return_inverse=True)[1]
+    weight = float(np.sum(tables.weights[rows]))
+    grids = [_votes(tables, rows, theta) for theta in (*starts, np.zeros(5))]
+    pairs = [_Grid(votes, members) for votes in grids]
+    best = max(pairs, key=lambda grid: grid.total(grid.places(few, np.arange(len(rows)))[few]))
+    shared = best.total(best.places(few, np.arange(len(rows)))[few]) / weight
+    if shared > FITS:
+        return Prediction(shared, shared, 0.0)
+    each = np.arange(len(everyone))
+    tried = list({id(grid): grid for grid in (best, pairs[-1])}.values())
+    if max(grid.total(grid.places(each, np.arange(len(rows)))) for grid in tried) / weight - shared <= LEAST_GAIN:
+        return Prediction(shared, shared, 0.0)
+    fold = np.random.default_rng(seed).permutation(len(rows)) % FOLDS
+    held = best.held(few, fold)
+    own = max((grid.held(each, fold) for grid in tried), key=lambda votes: float(np.sum(votes)))
+    gain, noise = float(np.sum(own - held)), float(np.sqrt(np.sum((own - held) ** 2)))
+    return Prediction(float(np.sum(held)) / weight, float(np.sum(own)) / weight, gain / noise if noise > 0.0 else 0.0)
+
+
+class _Grid:
+    """Votes of pairs for the focals of their two photos.
+
+    Args:
+        votes: (P, G, G).
+        members: (P, 2) photos, counted from 0.
+    """
+
+    def __init__(self, votes: FloatArray, members: IndexArray) -> None:
+        self.votes, self.members = votes, members
+        self.grid = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
+
+    def places(self, cameras: IndexArray, rows: IndexArray) -> IndexArray:
+        """(C,) places on the grid on which these pairs agree, when photo k is of `cameras[k]`."""
+        one = np.einsum("pgg->g", self.votes[rows]) - 0.5 * ((self.grid - USUAL_FOCAL) / FOCAL_SPREAD) ** 2
+        usual = -0.5 * ((self.grid - self.grid[np.argmax(one)]) / TIE) ** 2
+        if np.max(cameras) == 0:
+            return np.array([np.argmax(one)])
+        own = np.tile(usual, (int(np.max(cameras)) + 1, 1))
+        between: dict[tuple[int, int], FloatArray] = {}
+        for row in rows:
+            i, j = (int(cameras[photo]) for photo in self.members[row])
+            table = self.votes[row]
+            if i == j:
+                own[i] += np.diag(table)
+            else:
+                key, table = ((i, j), table) if i < j else ((j, i), table.T)
+                between[key] = between.get(key, 0.0) + table
+        return best_places(own, between)
+
+    def given(self, places: IndexArray) -> FloatArray:
+        """(P,) votes when photo k has the focal at `places[k]`."""
+        first, second = places[self.members].T
+        return np.asarray(self.votes[np.arange(len(self.votes)), first, second], np.float64)
+
+    def total(self, places: IndexArray) -> float:
+        """The sum of them."""
+        return float(np.sum(self.given(places)))
+
+    def held(self, cameras: IndexArray, fold: NDArray[np.int64]) -> FloatArray:
+        """(P,) votes of every pair for cameras that the pairs of the other folds agree on."""
+        found = np.zeros(len(self.votes))
+        for number in range(FOLDS):
+            out = fold == number
+            found[out] = self.given(self.places(cameras, np.flatnonzero(~out))[cameras])[out]
+        return found
+
+
+def _votes(tables: Tables, rows: IndexArray, theta: FloatArray) -> FloatArray:
+    trials = np.repeat(theta[None], FOCALS, axis=0)
+    trials[:, LOG_FOCAL] = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
+    trials[:, -1] = 0.0
+    return np.array([tables.votes(int(row), trials, trials, SIGMA) for row in rows])
