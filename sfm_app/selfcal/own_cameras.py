@@ -30,11 +30,15 @@ MOST_PAIRS = 1500
 FITS = 0.88
 """A camera that wins this share of all votes leaves nothing to be explained: of fountain-P11 and Herz-Jesus-P8 it wins
 0.94, of ten cameras brought to one size 0.68, of one camera with four pairs in ten wrong 0.5 to 0.7."""
-LEAST_GAIN = 0.05
-"""Share of all votes that cameras of their own must win on held pairs. One camera, with up to 40 % wrong pairs or two
-pixels of noise: at most 0.03 in 300 random scenes, and 0.01 on oats23; reichstag10 at one size 0.12 to 0.15."""
-CLEARLY = 2.5
-"""In standard deviations of that gain, pairs taken as independent. The same scenes: at most 1.6; reichstag10 3.6."""
+LEAST_GAIN, LEAST_GAIN_OF_SEVERAL = 0.05, 0.02
+"""Share of all votes that cameras of their own must win on held pairs: against one camera, and against several, where
+it is certain already that the photos are not of one. One camera, with up to 40 % wrong pairs or two pixels of noise: at
+most 0.03 in 300 random scenes of eight photos and more, and 0.01 on oats23; reichstag10 at one size 0.12 to 0.15."""
+CLEARLY, FEW_PAIRS = 2.5, 10.0
+"""In standard deviations of that gain, pairs taken as independent, how much it must be; and what few pairs need more,
+divided by their number. The same scenes: at most 1.6, 3.0 with six photos; reichstag10 3.6."""
+LEAST_EACH = 3.0
+"""Photos that each of several cameras must have on average: more cameras than that are a sign of each its own."""
 
 
 class Prediction(NamedTuple):
@@ -46,11 +50,8 @@ class Prediction(NamedTuple):
     """The same for a camera of each photo's own."""
     deviations: float
     """How many standard deviations lie between."""
-
-    @property
-    def each_its_own(self) -> bool:
-        """Whether every photo is taken for one of its own camera."""
-        return self.own - self.shared > LEAST_GAIN and self.deviations > CLEARLY
+    each_its_own: bool
+    """Whether every photo is taken for one of its own camera."""
 
 
 def predicted(
@@ -67,27 +68,33 @@ def predicted(
     """
     rows = np.linspace(0, len(photos) - 1, min(len(photos), MOST_PAIRS)).astype(np.int64)
     everyone = sorted({photo for pair in photos for photo in pair})
-    if len(everyone) < LEAST_PHOTOS or not len(rows):
-        return Prediction(1.0, 1.0, 0.0)
+    if len(everyone) < LEAST_PHOTOS:
+        return Prediction(1.0, 1.0, 0.0, each_its_own=False)
     number = {photo: k for k, photo in enumerate(everyone)}
     members = np.array([[number[first], number[second]] for first, second in photos])[rows]
-    few = np.unique([labels.get(photo, 0) for photo in everyone], return_inverse=True)[1]
+    few, each = _numbered([labels.get(photo, 0) for photo in everyone]), np.arange(len(everyone))
+    least = LEAST_GAIN if np.max(few) == 0 else LEAST_GAIN_OF_SEVERAL
     weight = float(np.sum(tables.weights[rows]))
-    grids = [_votes(tables, rows, theta) for theta in (*starts, np.zeros(5))]
-    pairs = [_Grid(votes, members) for votes in grids]
-    best = max(pairs, key=lambda grid: grid.total(grid.places(few, np.arange(len(rows)))[few]))
-    shared = best.total(best.places(few, np.arange(len(rows)))[few]) / weight
-    if shared > FITS:
-        return Prediction(shared, shared, 0.0)
-    each = np.arange(len(everyone))
-    tried = list({id(grid): grid for grid in (best, pairs[-1])}.values())
-    if max(grid.total(grid.places(each, np.arange(len(rows)))) for grid in tried) / weight - shared <= LEAST_GAIN:
-        return Prediction(shared, shared, 0.0)
+    grids = [_Grid(_votes(tables, rows, theta), members) for theta in (*starts, np.zeros(5))]
+    best = max(grids, key=lambda grid: grid.fitted(few))
+    shared = best.fitted(few) / weight
+    tried = [best] if best is grids[-1] else [best, grids[-1]]
+    # what even the pairs that it was fitted to do not say, those held will not
+    if shared > FITS or max(grid.fitted(each) for grid in tried) / weight - shared <= least:
+        return Prediction(shared, shared, 0.0, each_its_own=False)
     fold = np.random.default_rng(seed).permutation(len(rows)) % FOLDS
     held = best.held(few, fold)
     own = max((grid.held(each, fold) for grid in tried), key=lambda votes: float(np.sum(votes)))
     gain, noise = float(np.sum(own - held)), float(np.sqrt(np.sum((own - held) ** 2)))
-    return Prediction(float(np.sum(held)) / weight, float(np.sum(own)) / weight, gain / noise if noise > 0.0 else 0.0)
+    deviations = gain / noise if noise > 0.0 else 0.0
+    clearly = gain > least * weight and deviations > CLEARLY + FEW_PAIRS / len(rows)
+    return Prediction(float(np.sum(held)) / weight, float(np.sum(own)) / weight, deviations, each_its_own=clearly)
+
+
+def _numbered(labels: Sequence[int]) -> IndexArray:
+    """(N,) cameras counted from 0; one for all where so many leave each with few photos."""
+    cameras = np.unique(labels, return_inverse=True)[1].astype(np.int64)
+    return cameras if (np.max(cameras) + 1) * LEAST_EACH <= len(cameras) else np.zeros_like(cameras)
 
 
 class _Grid:
@@ -125,9 +132,9 @@ class _Grid:
         first, second = places[self.members].T
         return np.asarray(self.votes[np.arange(len(self.votes)), first, second], np.float64)
 
-    def total(self, places: IndexArray) -> float:
-        """The sum of them."""
-        return float(np.sum(self.given(places)))
+    def fitted(self, cameras: IndexArray) -> float:
+        """The sum of them for cameras that all pairs agree on."""
+        return float(np.sum(self.given(self.places(cameras, np.arange(len(self.votes)))[cameras])))
 
     def held(self, cameras: IndexArray, fold: NDArray[np.int64]) -> FloatArray:
         """(P,) votes of every pair for cameras that the pairs of the other folds agree on."""
