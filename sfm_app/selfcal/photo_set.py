@@ -1,6 +1,6 @@
 """A set of photos: which of them are of one camera, and the K of every camera."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, count
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.selfcal.answers import calibration_of, guessed, parameters_of
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.inputs import FloatArray, prepare
 from sfm_app.selfcal.joint import Consensus
 from sfm_app.selfcal.own_cameras import predicted
 from sfm_app.selfcal.several import CameraGroup, Tables, calibrate_several
@@ -70,7 +70,13 @@ def _of_all_pairs(whole: Sequence[Camera], pairs: PhotoPairs, options: Calibrati
 
     Parts of a group that turn out to have the same focal were one camera after all.
     """
-    parts = [_split(camera, number, pairs, options, seed) for number, camera in enumerate(whole)]
+    unlike = _unlike_within_bars(whole, pairs, seed)
+    parts = [
+        _each_its_own(camera, len(whole) + unlike[camera.name], pairs)
+        if camera.name in unlike
+        else _split(camera, number, pairs, options, seed)
+        for number, camera in enumerate(whole)
+    ]
     found = _together(list(chain.from_iterable(parts)), pairs, options)
     focals = {camera.name: camera.found.focal_px for camera in found}
     kept = [
@@ -104,11 +110,9 @@ def _split(camera: Camera, number: int, pairs: PhotoPairs, options: CalibrationS
     tables = Tables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
     photos = [own.photos[k] for k in ready.kept]
     thetas, labels = separated(tables, photos, starts)
-    taken = set(pairs.groups.values())
-    names = chain([camera.name], (name for k in count(2) if (name := f"{camera.name} #{k}") not in taken))
     if predicted(tables, photos, starts, labels, seed).each_its_own:
-        nothing = guessed(own.size, "", {})
-        return [Camera(next(names), (photo,), nothing, number) for photo in sorted(camera.photos)]
+        return _each_its_own(camera, number, pairs)
+    names = _names(camera, pairs)
     if len(thetas) == 1:
         return [camera]
     parts = []
@@ -117,6 +121,48 @@ def _split(camera: Camera, number: int, pairs: PhotoPairs, options: CalibrationS
         theta[4] = found.radial / np.exp(2.0 * theta[0])
         parts.append(Camera(next(names), members, calibration_of(theta, own.size, found.method)))
     return parts
+
+
+def _names(camera: Camera, pairs: PhotoPairs) -> Iterator[str]:
+    """Names for what becomes of a group; the first keeps its own."""
+    taken = set(pairs.groups.values())
+    return chain([camera.name], (name for k in count(2) if (name := f"{camera.name} #{k}") not in taken))
+
+
+def _each_its_own(camera: Camera, family: int, pairs: PhotoPairs) -> list[Camera]:
+    """A camera, not known yet, for each photo of a group."""
+    nothing, names = guessed(pairs.sizes[camera.photos[0]], "", {}), _names(camera, pairs)
+    return [Camera(next(names), (photo,), nothing, family) for photo in sorted(camera.photos)]
+
+
+def _unlike_within_bars(whole: Sequence[Camera], pairs: PhotoPairs, seed: int) -> dict[str, int]:
+    """Groups that bars have brought to one size with others, and whose photos are each of a camera of its own.
+
+    By name; the number says which have one size.
+
+    Pictures of one shape are not of one camera either, when the others are not: all of one size are asked together.
+    """
+    found: dict[str, int] = {}
+    for number, size in enumerate(sorted(set(pairs.brought_to.values()))):
+        groups = [camera for camera in whole if pairs.brought_to.get(camera.photos[0]) == size]
+        labels = {photo: k for k, camera in enumerate(groups) for photo in camera.photos}
+        among = [k for k, pair in enumerate(pairs.photos) if labels.keys() >= set(pair)]
+        if len(groups) == 1 or not among:
+            continue
+        to_px = {photo: _in_sides(pairs.sizes[photo]) for photo in labels}
+        Fs = [to_px[second].T @ pairs.Fs[k] @ to_px[first] for k in among for first, second in (pairs.photos[k],)]
+        ready = prepare(CameraPairs.of(np.array(Fs), (1, 1), pairs.weights[among]), unit_px=1.0, origin_px=(0.0, 0.0))
+        tables = Tables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
+        photos = [pairs.photos[among[k]] for k in ready.kept]
+        if len(photos) and predicted(tables, photos, [], labels, seed).each_its_own:
+            found |= dict.fromkeys((camera.name for camera in groups), number)
+    return found
+
+
+def _in_sides(size: tuple[int, int]) -> FloatArray:
+    """(3, 3) from longer sides about the middle to pixels."""
+    side = float(max(size))
+    return np.array([[side, 0.0, size[0] / 2], [0.0, side, size[1] / 2], [0.0, 0.0, 1.0]])
 
 
 def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:

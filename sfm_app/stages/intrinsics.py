@@ -74,6 +74,7 @@ def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGrap
         sizes={image.id: image.shown[2:] if image.shown else (image.width, image.height) for image in images},
         groups={image.id: image.group for image in images},
         focal_hints_px={image.id: image.exif_focal_px * _share_shown(image) for image in images if image.exif_focal_px},
+        brought_to={image.id: (image.width, image.height) for image in images if image.shown},
     ).moved({photo: frame[:2] for photo, frame in shown.items()})
 
 

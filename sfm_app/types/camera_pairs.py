@@ -54,6 +54,9 @@ class PhotoPairs:
     """By photo the group that is thought to be one camera."""
     focal_hints_px: Mapping[int, float] = field(default_factory=dict)
     """Claimed focal (EXIF) by photo, where there is one."""
+    brought_to: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    """By photo the size that bars have brought it to, where there are any: `sizes` is then that of the picture within.
+    Groups that were brought to one size may be of as many cameras as photos."""
 
     def moved(self, corners: Mapping[int, tuple[int, int]]) -> "PhotoPairs":
         """The same in pixels counted from these corners (left, top), by photo; the sizes are taken as they are."""
