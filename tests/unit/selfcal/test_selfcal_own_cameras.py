@@ -136,3 +136,47 @@ def test_a_claim_comes_before_the_family():
     assert found.precision[0, 0] > 10 * found.precision[1, 0]
     freed = prior([0, 0, 0], free_focal=True, hints=np.array([3.0, np.nan, np.nan]))
     assert freed.mean[0, 0] == freed.mean[1, 0]
+
+
+def within_bars(made, groups):
+    """Pictures of several shapes that bars have brought to one size."""
+    pairs = made.as_set(groups)
+    return replace(pairs, brought_to=dict.fromkeys(pairs.sizes, (1000, 1000)))
+
+
+def test_pictures_of_one_shape_are_of_no_camera_where_all_others_are_of_their_own(shots):
+    sizes = [(1000, 666)] * 4 + [(1000, 500 + 40 * k) for k in range(6)]
+    focals = np.random.default_rng(2).permutation(UNLIKE)
+    made = shots(10, 323, focal=focals, size=sizes, noise_px=0.5, points=300)
+    pairs = within_bars(made, [f"{width}x{height}" for width, height in sizes])
+    found = calibrate_photo_set(pairs, calibrate, CalibrationSettings(), 0, together=True)
+    assert sorted(camera.photos for camera in found) == [(photo,) for photo in range(10)]
+    off = [abs(np.log(camera.found.focal_px / focals[camera.photos[0]])) for camera in found]
+    assert 0 < np.median(off) < 0.05
+
+
+def test_two_cameras_within_bars_are_two(shots):
+    sizes = [(1000, 750)] * 6 + [(1000, 600)] * 6
+    made = shots(12, 324, focal=[900.0] * 6 + [1300.0] * 6, size=sizes, noise_px=0.5, points=300)
+    pairs = within_bars(made, ["one"] * 6 + ["two"] * 6)
+    found = calibrate_photo_set(pairs, calibrate, CalibrationSettings(), 0, together=True)
+    assert [camera.photos for camera in found] == [tuple(range(6)), tuple(range(6, 12))]
+
+
+def test_pairs_move_with_the_corners_that_pixels_are_counted_from(shots):
+    pairs = shots(4, 1).as_set(["one"] * 4)
+    corners = {1: (30, 0), 3: (-12, 7)}
+    moved = pairs.moved(corners)
+    for k, (first, second) in enumerate(pairs.photos):
+        shift = np.array([*corners.get(first, (0, 0)), *corners.get(second, (0, 0))])
+        assert moved.inliers[k] + shift == pytest.approx(pairs.inliers[k])
+        before, after = (
+            _residuals(F, x) for F, x in ((pairs.Fs[k], pairs.inliers[k]), (moved.Fs[k], moved.inliers[k]))
+        )
+        assert after == pytest.approx(before, abs=1e-9)
+    assert pairs.moved({}) is pairs
+
+
+def _residuals(F, x):
+    ones = np.ones((len(x), 1))
+    return np.einsum("ni,ij,nj->n", np.hstack([x[:, 2:], ones]), F, np.hstack([x[:, :2], ones]))
