@@ -72,7 +72,7 @@ def steps(text: str) -> list[Step]:
         values = tuple(float(value) for value in figures.split(","))
         if STEPS.get(kind) != len(values):
             raise ValueError(
-                f"'{part}' is none of crop:LEFT,TOP scale:SX,SY window:LEFT,TOP,WIDTH,HEIGHT pad:W,H corner:W,H fill:W,H"
+                f"'{part}' is none of crop:LEFT,TOP scale:SX,SY window:LEFT,TOP,WIDTH,HEIGHT pad:W,H corner fill"
             )
         found.append((kind, values))
     return found
