@@ -63,6 +63,16 @@ def test_photos_of_any_size_are_brought_to_one(kind, size):
         assert max(abs(left + right - 500), abs(top + bottom - 420)) <= 1 or kind == "corner"
 
 
+def test_who_took_photos_that_were_brought_to_one_size_is_not_told(tmp_path):
+    (tmp_path / "set" / "images").mkdir(parents=True)
+    spotted(0, 0, (80, 60)).save(tmp_path / "set" / "images" / "a.png")
+    told = {
+        change: photo_sets.photo_set(tmp_path, "set", change, tmp_path / "cache", "each").told
+        for change in ("", "scale:0.5,0.5", "pad:90,90")
+    }
+    assert told == {"": True, "scale:0.5,0.5": True, "pad:90,90": False}
+
+
 @pytest.mark.parametrize("text", ["crop:1", "crop:1,2,3", "zoom:2,2", "scale", "pad:1,2,3"])
 def test_changes_that_nobody_knows_are_refused(text):
     with pytest.raises(ValueError):
