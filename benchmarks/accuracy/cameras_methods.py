@@ -47,7 +47,7 @@ def run(method: Method, photos: PhotoSet, out: Path) -> Row:
     """Run a method from nothing into OUT; seconds of its steps, peak memory, and why it failed where it did."""
     shutil.rmtree(out, ignore_errors=True)
     out.parent.mkdir(parents=True, exist_ok=True)
-    settings = merged({"photos": {"cameras": photos.cameras}}, method.settings)
+    settings = merged({"photos": {"cameras": photos.cameras if photos.told else "auto"}}, method.settings)
     cap = MatchSettings(**settings.get("matching", {})).max_image_size_px
     options = {"settings": settings, "cameras": photos.cameras, "max_image_size_px": cap}
     command = [sys.executable, cameras_run.__file__, method.kind, str(photos.folder), str(out), json.dumps(options)]

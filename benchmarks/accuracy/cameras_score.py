@@ -57,7 +57,7 @@ def true_photos(path: Path, change: Sequence[Step]) -> dict[str, TruePhoto]:
     images = json.loads(path.read_text(encoding="utf-8"))["images"] if path.exists() else []
     return {
         Path(entry["file"]).stem: TruePhoto(
-            changed_camera(np.array(entry["K"], np.float64), change),
+            changed_camera(np.array(entry["K"], np.float64), change, (entry["width"], entry["height"])),
             np.column_stack([np.array(entry["R"], np.float64), np.ravel(entry["t"])]),
             entry["width"],
         )

@@ -1,7 +1,9 @@
 """Photo sets for calibration: copies that tell nothing about the camera, changed as asked, and what is true of them.
 
 A change is written as steps joined by "+": ``crop:LEFT,TOP`` cuts columns and rows, ``scale:SX,SY`` resizes, and
-``window:LEFT,TOP,WIDTH,HEIGHT`` keeps a part.
+``window:LEFT,TOP,WIDTH,HEIGHT`` keeps a part. Three bring photos of any size to one, as services on the web do:
+``pad:W,H`` makes the photo fit and leaves black bars on both sides, ``corner:W,H`` puts it to the top left, and
+``fill:W,H`` makes it cover all and cuts off what is left over.
 """
 
 import json
@@ -17,8 +19,10 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 FORMATS = (".jpg", ".jpeg", ".png")
-STEPS = {"crop": 2, "scale": 2, "window": 4}
+STEPS = {"crop": 2, "scale": 2, "window": 4, "pad": 2, "corner": 2, "fill": 2}
 """Kinds of change, and how many figures each takes."""
+ONE_SIZE = ("pad", "corner", "fill")
+"""Those after which all photos have one size."""
 
 Step = tuple[str, tuple[float, ...]]
 
@@ -52,6 +56,8 @@ class PhotoSet:
     """By photo name without suffix; empty where nobody knows."""
     cameras: str = "auto"
     """Which photos share a camera, as in the setting `photos.cameras`."""
+    told: bool = True
+    """Whether the program gets to know that."""
 
 
 def steps(text: str) -> list[Step]:
@@ -65,32 +71,72 @@ def steps(text: str) -> list[Step]:
         kind, _, figures = part.partition(":")
         values = tuple(float(value) for value in figures.split(","))
         if STEPS.get(kind) != len(values):
-            raise ValueError(f"'{part}' is none of crop:LEFT,TOP scale:SX,SY window:LEFT,TOP,WIDTH,HEIGHT")
+            raise ValueError(
+                f"'{part}' is none of crop:LEFT,TOP scale:SX,SY window:LEFT,TOP,WIDTH,HEIGHT pad:W,H corner fill"
+            )
         found.append((kind, values))
     return found
+
+
+class Frame(NamedTuple):
+    """Where a photo that is brought to a size comes to lie."""
+
+    size: tuple[int, int]
+    """Of the photo, resized."""
+    left: int
+    top: int
+    """Of its first pixel; negative where it is cut off."""
+
+
+def framed(kind: str, size: tuple[int, int], wanted: Sequence[float]) -> Frame:
+    """The place of a photo of `size` in a frame of the `wanted` one; `kind` is one of `ONE_SIZE`."""
+    ratios = [side / own for side, own in zip(wanted, size, strict=True)]
+    factor = max(ratios) if kind == "fill" else min(ratios)
+    width, height = (round(factor * own) for own in size)
+    spare = (0, 0) if kind == "corner" else (round(wanted[0]) - width, round(wanted[1]) - height)
+    return Frame((width, height), spare[0] // 2, spare[1] // 2)
+
+
+def changed_size(size: tuple[int, int], step: Step) -> tuple[int, int]:
+    """Width and height of a photo after a step."""
+    kind, values = step
+    if kind == "scale":
+        return round(size[0] * values[0]), round(size[1] * values[1])
+    if kind == "crop":
+        return size[0] - round(values[0]), size[1] - round(values[1])
+    return round(values[-2]), round(values[-1])
 
 
 def changed_photo(image: Image.Image, change: Sequence[Step]) -> Image.Image:
     """The photo after the steps."""
     for kind, values in change:
+        after = changed_size(image.size, (kind, values))
         if kind == "scale":
-            size = round(image.width * values[0]), round(image.height * values[1])
-            image = image.resize(size, Image.Resampling.LANCZOS)
+            image = image.resize(after, Image.Resampling.LANCZOS)
+        elif kind in ONE_SIZE:
+            place = framed(kind, image.size, values)
+            frame = Image.new(image.mode, after)
+            frame.paste(image.resize(place.size, Image.Resampling.LANCZOS), (place.left, place.top))
+            image = frame
         else:
-            left, top = (round(value) for value in values[:2])
-            right, bottom = image.size if kind == "crop" else (round(left + values[2]), round(top + values[3]))
-            image = image.crop((left, top, right, bottom))
+            left, top = round(values[0]), round(values[1])
+            image = image.crop((left, top, left + after[0], top + after[1]))
     return image
 
 
-def changed_camera(K: NDArray[np.float64], change: Sequence[Step]) -> NDArray[np.float64]:
-    """The camera matrix after the same steps; pixel centres at +0.5, so that resizing multiplies."""
+def changed_camera(K: NDArray[np.float64], change: Sequence[Step], size: tuple[int, int]) -> NDArray[np.float64]:
+    """The camera matrix of a photo of `size` after these steps; pixel centres at +0.5, so that resizing multiplies."""
     K = K.copy()
     for kind, values in change:
         if kind == "scale":
             K[:2] *= np.array(values)[:, None]
+        elif kind in ONE_SIZE:
+            place = framed(kind, size, values)
+            K[:2] *= np.array([[own / before] for own, before in zip(place.size, size, strict=True)])
+            K[:2, 2] += place.left, place.top
         else:
             K[:2, 2] -= values[:2]
+        size = changed_size(size, (kind, values))
     return K
 
 
@@ -110,7 +156,7 @@ def photo_set(data: Path, name: str, change: str, cache: Path, cameras: str = "a
     if truth and cameras != "each":
         K = np.median([camera.K for camera in truth.values()], axis=0)
         truth = {photo: TrueCamera(K, camera.k1) for photo, camera in truth.items()}
-    return PhotoSet(title, folder, truth, cameras)
+    return PhotoSet(title, folder, truth, cameras, told=not any(kind in ONE_SIZE for kind, _ in todo))
 
 
 def save_plain(source: Path, target: Path, change: Sequence[Step]) -> None:
@@ -130,4 +176,5 @@ def _true_cameras(path: Path, change: Sequence[Step]) -> Iterator[tuple[str, Tru
     square = all(values[0] == values[1] for kind, values in change if kind == "scale")
     for entry in json.loads(path.read_text(encoding="utf-8"))["images"]:
         k1 = float(entry["dist"][0]) if square and entry.get("dist") else None
-        yield Path(entry["file"]).stem, TrueCamera(changed_camera(np.array(entry["K"], np.float64), change), k1)
+        K = changed_camera(np.array(entry["K"], np.float64), change, (entry["width"], entry["height"]))
+        yield Path(entry["file"]).stem, TrueCamera(K, k1)

@@ -1,13 +1,26 @@
 """What one file of the folder is: a usable photo, or why not."""
 
+from dataclasses import replace
 from pathlib import Path
 
-from sfm_app.photos.decode import LOSSY, MOST_FRAMES, Picture, UnreadableError, read_picture, room_for, upright
+from PIL import Image
+
+from sfm_app.photos.bars import shown_part
+from sfm_app.photos.decode import (
+    LOSSY,
+    MOST_FRAMES,
+    Picture,
+    UnreadableError,
+    read_picture,
+    room_for,
+    turned_back,
+    upright,
+)
 from sfm_app.photos.exif import camera_name, focal_px, gps_position, orientation, turn_deg
 from sfm_app.photos.files import place_of
 from sfm_app.photos.glance import Glance, glance
 from sfm_app.settings import PhotoSettings
-from sfm_app.types import Photo, UnusablePhoto
+from sfm_app.types import Frame, Photo, UnusablePhoto
 
 MEGA = 1_000_000
 LINKED = ("JPEG", "MPO", "PNG")
@@ -51,7 +64,18 @@ def described(name: str, picture: Picture, options: PhotoSettings) -> Glance | U
         turn_deg=turn,
         notes=tuple(notes),
     )
-    return glance(photo, upright(picture))
+    seen = upright(picture)
+    return glance(replace(photo, shown=_shown(seen, photo)), seen)
+
+
+def _shown(seen: Image.Image, photo: Photo) -> Frame | None:
+    """The picture within bars, in pixels of the photo as it is laid out."""
+    laid = turned_back(seen, photo.turn_deg)
+    found = shown_part(laid)
+    if found is None or laid.size == (photo.width, photo.height):
+        return found
+    x, y = photo.width / laid.width, photo.height / laid.height
+    return round(found[0] * x), round(found[1] * y), round(found[2] * x), round(found[3] * y)
 
 
 def scaled(size: tuple[int, int], most_px: float) -> tuple[int, int]:

@@ -1,7 +1,7 @@
 """A set of photos: which of them are of one camera, and the K of every camera."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, count
 
@@ -10,8 +10,9 @@ import numpy as np
 from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.numerical import FAILURES, reason_of
 from sfm_app.selfcal.answers import calibration_of, guessed, parameters_of
-from sfm_app.selfcal.inputs import prepare
+from sfm_app.selfcal.inputs import FloatArray, prepare
 from sfm_app.selfcal.joint import Consensus
+from sfm_app.selfcal.own_cameras import predicted
 from sfm_app.selfcal.several import CameraGroup, Tables, calibrate_several
 from sfm_app.selfcal.split import peaks_of, separated
 from sfm_app.selfcal.straight import without_lens
@@ -38,6 +39,8 @@ class Camera:
     name: str
     photos: tuple[int, ...]
     found: Calibration
+    family: int = -1
+    """Number of the group, where each of its photos was found to have a camera of its own."""
 
 
 def calibrate_photo_set(
@@ -62,7 +65,7 @@ def calibrate_photo_set(
         for name, members in groups.items()
     ]
     if together:
-        cameras = _jointly(_of_all_pairs if split else _together, cameras, pairs, options)
+        cameras = _jointly(cameras, pairs, options, seed, split=split)
     cameras = [replace(camera, found=_or_guess(camera, pairs)) for camera in cameras]
     return sorted(cameras, key=lambda camera: (-len(camera.photos), camera.name))
 
@@ -77,27 +80,32 @@ def _alone(calibrate: CalibrateFunction, own: CameraPairs, options: CalibrationS
 
 
 def _jointly(
-    find: Callable[[Sequence[Camera], PhotoPairs, CalibrationSettings], list[Camera]],
-    cameras: list[Camera], pairs: PhotoPairs, options: CalibrationSettings,
-) -> list[Camera]:  # fmt: skip
+    cameras: list[Camera], pairs: PhotoPairs, options: CalibrationSettings, seed: int, *, split: bool
+) -> list[Camera]:
     """The cameras as all pairs have them; as each has them alone where the numbers fail."""
     try:
-        return find(cameras, pairs, options)
+        return _of_all_pairs(cameras, pairs, options, seed) if split else _together(cameras, pairs, options)
     except FAILURES as err:
         logger.info("the cameras could not be compared", exc_info=err)
         return cameras
 
 
-def _of_all_pairs(whole: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
+def _of_all_pairs(whole: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings, seed: int) -> list[Camera]:
     """Groups split where their photos disagree, and all cameras from all pairs.
 
     Parts of a group that turn out to have the same focal were one camera after all.
     """
-    parts = [_split(camera, pairs, options) for camera in whole]
+    unlike = _unlike_within_bars(whole, pairs, seed)
+    parts = [
+        _each_its_own(camera, len(whole) + unlike[camera.name], pairs)
+        if camera.name in unlike
+        else _split(camera, number, pairs, options, seed)
+        for number, camera in enumerate(whole)
+    ]
     found = _together(list(chain.from_iterable(parts)), pairs, options)
     focals = {camera.name: camera.found.focal_px for camera in found}
     kept = [
-        [camera] if _alike([focals[part.name] for part in split]) else split
+        [camera] if split[0].family < 0 and _alike([focals[part.name] for part in split]) else split
         for camera, split in zip(whole, parts, strict=True)
     ]
     if sum(map(len, kept)) == len(found):
@@ -110,8 +118,8 @@ def _alike(focals: Sequence[float]) -> bool:
     return bool(np.any(np.diff(np.sort(np.log(focals))) < ALIKE))
 
 
-def _split(camera: Camera, pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
-    """The camera, or the several that its photos are of."""
+def _split(camera: Camera, number: int, pairs: PhotoPairs, options: CalibrationSettings, seed: int) -> list[Camera]:
+    """The camera, the several that its photos are of, or one for each photo."""
     if len(camera.photos) < LEAST_TO_SPLIT:
         return [camera]
     own, found = pairs.among(camera.photos), camera.found
@@ -125,18 +133,61 @@ def _split(camera: Camera, pairs: PhotoPairs, options: CalibrationSettings) -> l
     if found.identifiable:
         starts.append(np.append(parameters_of(found, side)[:4], 0.0))
     tables = Tables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
-    thetas, labels = separated(tables, [own.photos[k] for k in ready.kept], starts)
+    photos = [own.photos[k] for k in ready.kept]
+    thetas, labels = separated(tables, photos, starts)
+    if predicted(tables, photos, starts, labels, seed).each_its_own:
+        return _each_its_own(camera, number, pairs)
+    names = _names(camera, pairs)
     if len(thetas) == 1:
         return [camera]
     parts = []
-    taken = set(pairs.groups.values())
-    names = (name for number in count(2) if (name := f"{camera.name} #{number}") not in taken)
-    for number, theta in enumerate(thetas):
-        photos = tuple(photo for photo in camera.photos if labels.get(photo, 0) == number)
+    for part, theta in enumerate(thetas):
+        members = tuple(photo for photo in camera.photos if labels.get(photo, 0) == part)
         theta[4] = found.radial / np.exp(2.0 * theta[0])
-        first = calibration_of(theta, own.size, found.method)
-        parts.append(Camera(camera.name if number == 0 else next(names), photos, first))
+        parts.append(Camera(next(names), members, calibration_of(theta, own.size, found.method)))
     return parts
+
+
+def _names(camera: Camera, pairs: PhotoPairs) -> Iterator[str]:
+    """Names for what becomes of a group; the first keeps its own."""
+    taken = set(pairs.groups.values())
+    return chain([camera.name], (name for k in count(2) if (name := f"{camera.name} #{k}") not in taken))
+
+
+def _each_its_own(camera: Camera, family: int, pairs: PhotoPairs) -> list[Camera]:
+    """A camera, not known yet, for each photo of a group."""
+    nothing, names = guessed(pairs.sizes[camera.photos[0]], "", {}), _names(camera, pairs)
+    return [Camera(next(names), (photo,), nothing, family) for photo in sorted(camera.photos)]
+
+
+def _unlike_within_bars(whole: Sequence[Camera], pairs: PhotoPairs, seed: int) -> dict[str, int]:
+    """Groups that bars have brought to one size with others, and whose photos are each of a camera of its own.
+
+    By name; the number says which have one size.
+
+    Pictures of one shape are not of one camera either, when the others are not: all of one size are asked together.
+    """
+    found: dict[str, int] = {}
+    for number, size in enumerate(sorted(set(pairs.brought_to.values()))):
+        groups = [camera for camera in whole if pairs.brought_to.get(camera.photos[0]) == size]
+        labels = {photo: k for k, camera in enumerate(groups) for photo in camera.photos}
+        among = [k for k, pair in enumerate(pairs.photos) if labels.keys() >= set(pair)]
+        if len(groups) == 1 or not among:
+            continue
+        to_px = {photo: _in_sides(pairs.sizes[photo]) for photo in labels}
+        Fs = [to_px[second].T @ pairs.Fs[k] @ to_px[first] for k in among for first, second in (pairs.photos[k],)]
+        ready = prepare(CameraPairs.of(np.array(Fs), (1, 1), pairs.weights[among]), unit_px=1.0, origin_px=(0.0, 0.0))
+        tables = Tables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
+        photos = [pairs.photos[among[k]] for k in ready.kept]
+        if len(photos) and predicted(tables, photos, [], labels, seed).each_its_own:
+            found |= dict.fromkeys((camera.name for camera in groups), number)
+    return found
+
+
+def _in_sides(size: tuple[int, int]) -> FloatArray:
+    """(3, 3) from longer sides about the middle to pixels."""
+    side = float(max(size))
+    return np.array([[side, 0.0, size[0] / 2], [0.0, side, size[1] / 2], [0.0, 0.0, 1.0]])
 
 
 def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
@@ -152,6 +203,7 @@ def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: Calibration
             start=camera.found if camera.found.identifiable else None,
             known=camera.found.identifiable and bool(camera.found.evidence),
             hint_px=_claim(camera, pairs),
+            family=camera.family,
         )
         for camera in cameras
     ]
@@ -167,7 +219,7 @@ def _or_guess(camera: Camera, pairs: PhotoPairs) -> Calibration:
     claim = _claim(camera, pairs)
     size = pairs.sizes[camera.photos[0]]
     if not np.isfinite(claim):
-        return guessed(size, found.reason, found.evidence)
+        return found if camera.family >= 0 else guessed(size, found.reason, found.evidence)
     return replace(found, K=guessed_camera_matrix(size, claim), method="exif", radial=0.0, spread={}, held=())
 
 

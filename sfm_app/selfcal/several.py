@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.jit import kernel
 from sfm_app.selfcal import peak
 from sfm_app.selfcal.adjustment import Matches
@@ -21,6 +22,7 @@ from sfm_app.selfcal.lens import LOG_FOCAL, camera_of
 from sfm_app.selfcal.priors import FOCAL_SPREAD, HINT_SPREAD, USUAL_FOCAL, Usual
 from sfm_app.selfcal.refine import Fit, refined, straight_fundamentals
 from sfm_app.selfcal.search import FOCAL_RANGE, SIGMAS
+from sfm_app.selfcal.tied import Tied
 from sfm_app.selfcal.two_view_cost import CAMERA
 from sfm_app.selfcal.uncertainty import covariance, key_pairs, spread_of
 from sfm_app.settings import CalibrationSettings
@@ -47,6 +49,8 @@ class CameraGroup:
     """Whether its own pairs determine that."""
     hint_px: float = np.nan
     """Claimed focal."""
+    family: int = -1
+    """Number of the folder whose cameras are alike, though each photo has its own; -1: it stands alone."""
 
 
 def calibrate_several(
@@ -66,7 +70,8 @@ def calibrate_several(
     members = members[kept]
     sides = np.array([max(camera.size) / unit for camera in cameras])
     hints = np.array([camera.hint_px for camera in cameras]) / unit
-    usual = Usual(sides, hints, options.centre_sigma, options.lens)
+    families = np.array([camera.family for camera in cameras], np.int64)
+    usual = Tied(sides, hints, options.centre_sigma, options.lens, families)
     weights = pairs.weights[kept]
     thetas = np.array([_first(camera, side, unit) for camera, side in zip(cameras, sides, strict=True)])
     unknown = np.array([camera.start is None for camera in cameras])
@@ -226,10 +231,20 @@ def _judged(
     elif not camera.known and lead < MIN_LEAD:
         reason = "the pairs fit other focals as well or better"
     reason = reason or peak.objection(in_sides, spread, half)
+    if reason and camera.family >= 0:
+        # what the others are like is in it: better to start mapping from than the usual focal
+        return replace(guessed(camera.size, reason, evidence), K=_of_its_family(theta, camera.size, unit))
     if reason:
         return guessed(camera.size, reason, evidence)
     found = calibration_of(theta, camera.size, method, unit)
     return replace(found, spread=spread_of(theta, block, unit), evidence=evidence, held=fit.names_held(index))
+
+
+def _of_its_family(theta: FloatArray, size: tuple[int, int], unit: float) -> FloatArray:
+    """The usual camera matrix with the focal that is most likely, though uncertain."""
+    side = max(size)
+    low, high = np.array(FOCAL_RANGE) * side
+    return guessed_camera_matrix(size, float(np.clip(np.exp(theta[LOG_FOCAL]) * unit, low, high)))
 
 
 def _lead(index: int, thetas: FloatArray, tables: Tables) -> tuple[float, float]:

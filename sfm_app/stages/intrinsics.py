@@ -27,6 +27,7 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
     cameras = calibrate_photo_set(
         pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split
     )
+    cameras = [of_whole_photo(camera, matches.images[camera.photos[0]]) for camera in cameras]
     intrinsics = Intrinsics(
         cameras={camera.name: explained(camera, views) for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
@@ -52,8 +53,18 @@ def explained(camera: Camera, views: ViewGraph) -> Calibration:
     return replace(camera.found, reason=f"{camera.found.reason}; {of_fits(views, camera.photos).message}")
 
 
+def of_whole_photo(camera: Camera, image: MatchedImage) -> Camera:
+    """A camera in pixels of its photos, where it was found in those of the pictures within their bars."""
+    if image.shown is None:
+        return camera
+    K = camera.found.K.copy()
+    K[:2, 2] += image.shown[:2]
+    return replace(camera, found=replace(camera.found, K=K, width=image.width, height=image.height))
+
+
 def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> PhotoPairs:
-    """What is known about all pairs of these photos that are not degenerate."""
+    """What is known about all pairs of these photos that are not degenerate, in pixels of the pictures within bars."""
+    shown = {image.id: image.shown for image in images if image.shown}
     ids = {image.id for image in images}
     fits = {pair: fit for pair, fit in views.fits.items() if ids.issuperset(pair) and not fit.degeneracy}
     return PhotoPairs(
@@ -61,10 +72,16 @@ def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGrap
         weights=pair_weights(np.array([fit.inlier_count for fit in fits.values()], np.int64)),
         photos=tuple(fits),
         inliers=tuple(np.hstack(matches.points(pair))[fit.inliers] for pair, fit in fits.items()),
-        sizes={image.id: (image.width, image.height) for image in images},
+        sizes={image.id: image.shown[2:] if image.shown else (image.width, image.height) for image in images},
         groups={image.id: image.group for image in images},
-        focal_hints_px={image.id: image.exif_focal_px for image in images if image.exif_focal_px},
-    )
+        focal_hints_px={image.id: image.exif_focal_px * _share_shown(image) for image in images if image.exif_focal_px},
+        brought_to={image.id: (image.width, image.height) for image in images if image.shown},
+    ).moved({photo: frame[:2] for photo, frame in shown.items()})
+
+
+def _share_shown(image: MatchedImage) -> float:
+    """Longer side of the picture within bars over that of the photo, which EXIF's claim was reckoned with."""
+    return max(image.shown[2:]) / max(image.width, image.height) if image.shown else 1.0
 
 
 def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> CameraPairs:

@@ -189,8 +189,9 @@ def load_photo_set(folder: Path, run: RunContext) -> PhotoSet:
 
 
 def _photo(entry: Mapping[str, Any]) -> Photo:
-    gps = entry.get("gps")
-    return Photo(**{**entry, "gps": GpsPosition(**gps) if gps else None, "notes": tuple(entry.get("notes", ()))})
+    gps, shown = entry.get("gps"), entry.get("shown")
+    known = {"gps": GpsPosition(**gps) if gps else None, "shown": tuple(shown) if shown else None}
+    return Photo(**{**entry, **known, "notes": tuple(entry.get("notes", ()))})
 
 
 def too_few(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:

@@ -1,7 +1,7 @@
 """Pairs of photos with what is known about each: what calibrators work from."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,6 +54,20 @@ class PhotoPairs:
     """By photo the group that is thought to be one camera."""
     focal_hints_px: Mapping[int, float] = field(default_factory=dict)
     """Claimed focal (EXIF) by photo, where there is one."""
+    brought_to: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    """By photo the size that bars have brought it to, where there are any: `sizes` is then that of the picture within.
+    Groups that were brought to one size may be of as many cameras as photos."""
+
+    def moved(self, corners: Mapping[int, tuple[int, int]]) -> "PhotoPairs":
+        """The same in pixels counted from these corners (left, top), by photo; the sizes are taken as they are."""
+        if not corners:
+            return self
+        at = np.array([[corners.get(photo, (0, 0)) for photo in pair] for pair in self.photos]).reshape(-1, 2, 2)
+        moves = np.tile(np.eye(3), (len(at), 2, 1, 1))
+        moves[:, :, :2, 2] = at
+        Fs = moves[:, 1].transpose(0, 2, 1) @ self.Fs @ moves[:, 0]
+        inliers = tuple(x - corner.reshape(4) for x, corner in zip(self.inliers, at, strict=True))
+        return replace(self, Fs=Fs, inliers=inliers)
 
     def among(self, members: Collection[int]) -> CameraPairs:
         """The pairs within photos of one size."""

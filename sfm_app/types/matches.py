@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.types.photos import GpsPosition
+from sfm_app.types.photos import Frame, GpsPosition
 
 PairId = tuple[int, int]
 """(image id 1, image id 2) with id1 < id2, ids as in COLMAP's database."""
@@ -25,6 +25,8 @@ class MatchedImage:
     gps: GpsPosition | None = None
     turn_deg: int = 0
     """By how much it has to be turned clockwise to be upright, as far as EXIF and its shape say so."""
+    shown: Frame | None = None
+    """The picture within bars; None where all of it is picture."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+Frame = tuple[int, int, int, int]
+"""Left, top, width and height of a part of a photo, in pixels."""
+
 
 @dataclass(frozen=True, slots=True)
 class GpsPosition:
@@ -42,6 +45,8 @@ class Photo:
     """By how much it has to be turned clockwise to be upright: 0, 90, 180 or 270."""
     notes: tuple[str, ...] = ()
     """What people should know about how it is read."""
+    shown: Frame | None = None
+    """The picture within bars of one colour, as it is laid out; None where all of it is picture."""
     mask: str = ""
     """Path of its mask inside the folder of masks; empty where all of it may be used."""
 

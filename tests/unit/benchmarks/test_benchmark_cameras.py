@@ -105,7 +105,7 @@ def test_each_of_several_models_is_judged_by_its_own_photos():
 
 
 def test_truth_changes_with_the_photos(tmp_path):
-    entry = {"file": "a.jpg", "width": 800, "K": K.tolist(), "R": np.eye(3).tolist(), "t": [1, 2, 3]}
+    entry = {"file": "a.jpg", "width": 800, "height": 600, "K": K.tolist(), "R": np.eye(3).tolist(), "t": [1, 2, 3]}
     (tmp_path / "cameras.json").write_text(json.dumps({"images": [entry]}))
 
     photo = true_photos(tmp_path / "cameras.json", steps("window:100,50,512,512+scale:2,1"))["a"]

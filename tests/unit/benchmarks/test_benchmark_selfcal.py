@@ -21,7 +21,18 @@ def spotted(x, y, size=(800, 600)):
 
 
 @pytest.mark.parametrize(
-    "change", ["", "crop:46,20", "scale:0.75,0.5", "window:200,150,512,400", "crop:46,20+scale:0.5,1"]
+    "change",
+    [
+        "",
+        "crop:46,20",
+        "scale:0.75,0.5",
+        "window:200,150,512,400",
+        "crop:46,20+scale:0.5,1",
+        "pad:500,500",
+        "corner:400,900",
+        "fill:500,420",
+        "crop:100,0+pad:300,600+scale:2,1",
+    ],
 )
 def test_photo_and_camera_change_alike(change):
     todo = photo_sets.steps(change)
@@ -32,10 +43,37 @@ def test_photo_and_camera_change_alike(change):
 
     rows, columns = np.mgrid[: changed.shape[0], : changed.shape[1]] + 0.5
     centre = (columns * changed).sum() / changed.sum(), (rows * changed).sum() / changed.sum()
-    assert centre == pytest.approx((photo_sets.changed_camera(K, todo) @ direction)[:2], abs=0.05)
+    assert centre == pytest.approx((photo_sets.changed_camera(K, todo, (800, 600)) @ direction)[:2], abs=0.05)
 
 
-@pytest.mark.parametrize("text", ["crop:1", "crop:1,2,3", "zoom:2,2", "scale"])
+@pytest.mark.parametrize("size", [(800, 600), (600, 800), (333, 1000)])
+@pytest.mark.parametrize("kind", photo_sets.ONE_SIZE)
+def test_photos_of_any_size_are_brought_to_one(kind, size):
+    todo = photo_sets.steps(f"{kind}:500,420")
+    photo = photo_sets.changed_photo(Image.new("RGB", size, (255, 255, 255)), todo)
+    shown = np.argwhere(np.asarray(photo.convert("L")) > 128)
+    (top, left), (bottom, right) = shown.min(axis=0), shown.max(axis=0) + 1
+    assert photo.size == (500, 420)
+    if kind == "fill":
+        assert (left, top, right, bottom) == (0, 0, 500, 420)
+    else:
+        assert (right - left) / (bottom - top) == pytest.approx(size[0] / size[1], abs=0.01)
+        assert (right - left == 500) != (bottom - top == 420)
+        assert (left, top) == (0, 0) or kind == "pad"
+        assert max(abs(left + right - 500), abs(top + bottom - 420)) <= 1 or kind == "corner"
+
+
+def test_who_took_photos_that_were_brought_to_one_size_is_not_told(tmp_path):
+    (tmp_path / "set" / "images").mkdir(parents=True)
+    spotted(0, 0, (80, 60)).save(tmp_path / "set" / "images" / "a.png")
+    told = {
+        change: photo_sets.photo_set(tmp_path, "set", change, tmp_path / "cache", "each").told
+        for change in ("", "scale:0.5,0.5", "pad:90,90")
+    }
+    assert told == {"": True, "scale:0.5,0.5": True, "pad:90,90": False}
+
+
+@pytest.mark.parametrize("text", ["crop:1", "crop:1,2,3", "zoom:2,2", "scale", "pad:1,2,3"])
 def test_changes_that_nobody_knows_are_refused(text):
     with pytest.raises(ValueError):
         photo_sets.steps(text)

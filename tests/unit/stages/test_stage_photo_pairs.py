@@ -1,10 +1,13 @@
 """What calibrators get to know about a set of photos."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from sfm_app.selfcal import pair_weights
-from sfm_app.stages.intrinsics import camera_pairs, photo_pairs
+from sfm_app.selfcal import Camera, pair_weights
+from sfm_app.selfcal.answers import guessed
+from sfm_app.stages.intrinsics import camera_pairs, of_whole_photo, photo_pairs
 from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, Rejected, ViewGraph
 
 
@@ -58,3 +61,21 @@ def test_without_pairs_the_arrays_are_empty_and_the_claims_remain(chosen):
     assert (own.Fs.shape, own.weights.shape, own.photos, own.inliers) == ((0, 3, 3), (0,), (), ())
     assert own.size == (640, 480)
     assert own.focal_hints_px == ((600.0,) if 9 in chosen else ())
+
+
+def test_pixels_are_counted_within_bars_and_the_camera_is_that_of_the_whole_photo():
+    image = replace(IMAGES[7], shown=(0, 100, 800, 600))
+    images = {**IMAGES, 7: image}
+    pairs = photo_pairs(list(images.values()), replace(MATCHES, images=images), VIEWS)
+    plain = photo_pairs(list(IMAGES.values()), MATCHES, VIEWS)
+    assert (pairs.sizes[7], pairs.brought_to) == ((800, 600), {7: (1000, 750)})
+    assert pairs.focal_hints_px[7] == pytest.approx(720)  # 900 px were reckoned with a width of 1000
+    np.testing.assert_allclose(pairs.inliers[0], plain.inliers[0] - [0, 0, 0, 100])
+    np.testing.assert_array_equal(pairs.inliers[1], plain.inliers[1])
+
+    camera = of_whole_photo(Camera("big", (7,), guessed((800, 600), "", {})), image)
+
+    assert (camera.found.width, camera.found.height) == (1000, 750)
+    np.testing.assert_allclose(camera.found.K, [[960, 0, 400], [0, 960, 400], [0, 0, 1]])
+    whole = Camera("big", (2,), guessed((1000, 750), "", {}))
+    assert of_whole_photo(whole, IMAGES[2]) is whole

@@ -120,6 +120,17 @@ def test_photos_of_one_size_share_a_camera_unless_exif_tells_them_apart(folder, 
     ]
 
 
+def test_bars_around_a_picture_are_seen_and_read_back(folder, run):
+    within = np.zeros((240, 320, 3), np.uint8)
+    within[30:210] = np.random.default_rng(5).integers(60, 255, (180, 320, 3))
+    Image.fromarray(within).save(folder / "barred.png")
+    found = {photo.name: photo for photo in read_photos(folder, run).photos}
+    assert found["barred.png"].shown == (0, 30, 320, 180)
+    assert found["barred.png"].group == "320x180 in 320x240"
+    assert {photo.shown for name, photo in found.items() if name != "barred.png"} == {None}
+    assert {photo.name: photo for photo in load_photo_set(folder, run).photos} == found
+
+
 def test_exif_focal_is_read_as_a_hint_in_pixels(folder, run):
     exif = Image.Exif()
     exif.get_ifd(0x8769)[0xA405] = 27
