@@ -71,7 +71,7 @@ def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = Non
 
 
 def end_of(command: Sequence[str], limit_s: float | None = None) -> tuple[int | None, str]:
-    """Exit code of a command, None where it was ended after so many seconds, and its last line on stderr."""
+    """Exit code of a command, None where it was ended after so many seconds, and its error, or last line on stderr."""
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors, start_new_session=True)
         try:
@@ -83,7 +83,8 @@ def end_of(command: Sequence[str], limit_s: float | None = None) -> tuple[int | 
                 os.killpg(process.pid, signal.SIGKILL)  # its mappers have processes of their own
                 process.wait()
         errors.seek(0)
-        return code, (errors.read().strip().splitlines()[-1:] or ["no word"])[0]
+        lines = errors.read().strip().splitlines() or ["no word"]
+        return code, next((line for line in reversed(lines) if line.startswith("error: ")), lines[-1])
 
 
 def by_size(folder: Path) -> dict[tuple[int, int], list[Path]]:

@@ -80,7 +80,7 @@ def key_of(method: Method, photos: PhotoSet) -> str:
     package = Path(sfm_app.__file__).parent
     sources = sorted(package.rglob("*.py")) if method.kind == OURS else [Path(cameras_run.__file__)]
     found = hashlib.sha256(json.dumps([method.kind, method.settings, photos.cameras, versions()]).encode())
-    for path in [*sources, *sorted(photos.folder.glob("*.png"))]:
+    for path in [*sources, *sorted(photos.folder.glob("*.*g"))]:
         content = path.read_bytes() if path.suffix == ".py" else str(path.stat().st_size).encode()
         found.update(path.name.encode() + b"\0" + content)
     return found.hexdigest()[:16]
@@ -106,9 +106,14 @@ def kept(method: Method, photos: PhotoSet, out: Path, args: argparse.Namespace) 
 def run_anew(method: Method, photos: PhotoSet, out: Path, limit_s: float) -> Done:
     """Run a method and write down what it said."""
     done = Done(key_of(method, photos), run(method, photos, out, limit_s))
+    remember(out, done)
+    return done
+
+
+def remember(out: Path, done: Done) -> None:
+    """Write down in OUT that a run came to an end, and how."""
     out.mkdir(parents=True, exist_ok=True)
     (out / RECORD).write_text(json.dumps(done._asdict()), encoding="utf-8")
-    return done
 
 
 def score(method: Method, photos: PhotoSet, out: Path, data: Path, done: Done) -> tuple[Row, list[Row]]:

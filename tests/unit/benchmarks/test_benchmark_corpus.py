@@ -237,6 +237,8 @@ def test_what_takes_too_long_is_ended_with_all_that_it_started(tmp_path):
     time.sleep(2)
     assert not alive.exists()
     assert end_of([sys.executable, "-c", "import sys; sys.exit('no photos')"]) == (1, "no photos")
+    hinted = "import sys; sys.exit('error: no photos\\nhint: take some')"
+    assert end_of([sys.executable, "-c", hinted]) == (1, "error: no photos")
 
 
 def options(tmp_path, **changed):
