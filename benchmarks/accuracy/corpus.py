@@ -130,7 +130,7 @@ def score(method: Method, photos: PhotoSet, out: Path, data: Path, done: Done) -
         calibration = out / "calibration.json"
         if calibration.exists():
             row["cameras"] = len(json.loads(calibration.read_text(encoding="utf-8"))["cameras"])
-        row["made by"] = "this program" if done.key == key_of(method, photos) else "another program, or settings"
+        row["made by"] = None if done.key == key_of(method, photos) else "another program, or settings"
     stated = [{"photos": photos.name, "method": method.name} | one for one in stated]
     return {name: _finite(value) for name, value in row.items()}, stated
 

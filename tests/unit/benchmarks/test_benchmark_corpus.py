@@ -143,10 +143,13 @@ def test_worse_than_stock_is_said_by_how_much():
 
     assert behind({"registered": 18, "AUC@5": 0.5}, stock) == "registered 18, stock 24; AUC@5 0.5, stock 0.79"
     assert behind({"registered": 24, "AUC@5": 0.79}, stock) == ""
+    assert behind({"registered": 24, "AUC@5": 0.785}, stock, 0.01) == "" != behind({"registered": 24}, stock, 0.01)
+    assert behind({"registered": 23, "AUC@5": 0.9}, stock, 0.01) == "registered 23, stock 24"
 
 
 def run_row(**figures):
-    return {"photos": "fox50", "method": "sfm-app", "exit code": 0, "bar met": "yes", "behind stock": "", **figures}
+    fine = {"photos": "fox50", "method": "sfm-app", "exit code": 0, "bar met": "yes"}
+    return fine | {"behind stock": "", "clearly behind stock": ""} | figures
 
 
 def stated_row(in_sd, identifiable="no", error=0.1):
@@ -161,7 +164,7 @@ def test_one_parameter_of_twenty_may_be_off_and_no_exception_passes():
 
     assert [demand.met for demand in demands([run_row()], fine)] == [True] * 5
     broken = demands(
-        [run_row(**{"exit code": 1, "bar met": "no: x", "behind stock": "AUC@5"})],
+        [run_row(**{"exit code": 1, "bar met": "no: x", "clearly behind stock": "AUC@5"})],
         [*fine[1:], stated_row(9.0, "yes", 16.0)],
     )
     assert [demand.met for demand in broken] == [False] * 5
