@@ -2,8 +2,6 @@
 
 A change is written as steps joined by "+": ``crop:LEFT,TOP`` cuts columns and rows, ``scale:SX,SY`` resizes, and
 ``window:LEFT,TOP,WIDTH,HEIGHT`` keeps a part.
-
-``every:N`` is no change of pixels: it takes every Nth photo, by name.
 """
 
 import json
@@ -22,7 +20,6 @@ from PIL import Image, ImageOps
 FORMATS = (".jpg", ".jpeg", ".png")
 STEPS = {"crop": 2, "scale": 2, "window": 4}
 """Kinds of change, and how many figures each takes."""
-EVERY = "every:"
 
 Step = tuple[str, tuple[float, ...]]
 
@@ -35,6 +32,22 @@ def put(photo: Path, folder: Path) -> None:
             os.link(photo.resolve(), place)
         except OSError:
             shutil.copyfile(photo, place)
+
+
+EVERY = "every:"
+"""No change of pixels: ``every:N`` takes every Nth photo, by name."""
+
+
+def stride(text: str) -> int:
+    """Which of the photos a change takes: every so many, all (1) where it does not say.
+
+    Raises:
+        ValueError: that is no positive number.
+    """
+    found = [int(part.removeprefix(EVERY)) for part in text.split("+") if part.startswith(EVERY)]
+    if any(number < 1 for number in found):
+        raise ValueError(f"'{text}' takes every 0th photo")
+    return math.prod(found)
 
 
 class TrueCamera(NamedTuple):
@@ -72,18 +85,6 @@ def steps(text: str) -> list[Step]:
             raise ValueError(f"'{part}' is none of crop:LEFT,TOP scale:SX,SY window:LEFT,TOP,WIDTH,HEIGHT")
         found.append((kind, values))
     return found
-
-
-def stride(text: str) -> int:
-    """Which of the photos a change takes: every so many, all (1) where it does not say.
-
-    Raises:
-        ValueError: that is no positive number.
-    """
-    found = [int(part.removeprefix(EVERY)) for part in text.split("+") if part.startswith(EVERY)]
-    if any(number < 1 for number in found):
-        raise ValueError(f"'{text}' takes every 0th photo")
-    return math.prod(found)
 
 
 def changed_photo(image: Image.Image, change: Sequence[Step]) -> Image.Image:
