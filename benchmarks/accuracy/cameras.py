@@ -12,7 +12,7 @@ import argparse
 import json
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from cameras_methods import STOCK, Method, methods, run, taking_turns
 from cameras_report import draw, medians, page
 from cameras_run import OURS
 from cameras_score import (
+    TruePhoto,
     accuracy,
     before_adjustment,
     hashes,
@@ -74,9 +75,14 @@ def warm_up(sets: Sequence[PhotoSet], these: Sequence[Method], out: Path) -> Non
 def measure(photos: PhotoSet, truth_file: Path, method: Method, out: Path) -> Row:
     """One method, once, on one set."""
     said = run(method, photos, out)
-    truth = true_photos(truth_file, steps(photos.name.partition(" ")[2]))
+    return scored(said, photos, true_photos(truth_file, steps(photos.name.partition(" ")[2])), method, out)
+
+
+def scored(said: Row, photos: PhotoSet, truth: Mapping[str, TruePhoto], method: Method, out: Path) -> Row:
+    """The figures of a finished run; a truth of more photos than the set has is cut to those."""
+    truth = {name: true for name, true in truth.items() if (photos.folder / f"{name}.png").exists()}
     models = read_models(out)
-    row = {"photos": photos.name, "method": method.name, "failed": said["failed"]}
+    row = {"photos": photos.name, "method": method.name, "failed": said["failed"], "exit code": said["exit code"]}
     row |= accuracy(models, truth, _count(photos)) | times(said["seconds"], complete=not said["failed"])
     row |= {name: said[name] for name in ("wall seconds", "peak MB")}
     if method.kind == OURS:

@@ -1,9 +1,12 @@
 """The ways from photos to cameras, and how one of them is run: in a process of its own, see cameras_run.py."""
 
 import json
+import os
 import shutil
+import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,7 +15,8 @@ from typing import Any
 
 import cameras_run
 from cameras_run import GLOBAL, INCREMENTAL, OURS, RESULT
-from photo_sets import PhotoSet
+from photo_sets import PhotoSet, put
+from PIL import Image
 from report import Row
 
 from sfm_app.settings import MatchSettings, merged
@@ -43,18 +47,60 @@ def taking_turns(these: Sequence[Method], repetition: int) -> list[Method]:
     return [*these[first:], *these[:first]]
 
 
-def run(method: Method, photos: PhotoSet, out: Path) -> Row:
-    """Run a method from nothing into OUT; seconds of its steps, peak memory, and why it failed where it did."""
+def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = None) -> Row:
+    """Run a method from nothing into OUT; seconds of its steps, peak memory, and why it failed where it did.
+
+    What has not ended after `limit_s` is ended, with all that it has started.
+    """
     shutil.rmtree(out, ignore_errors=True)
     out.parent.mkdir(parents=True, exist_ok=True)
     settings = merged({"photos": {"cameras": photos.cameras if photos.told else "auto"}}, method.settings)
     cap = MatchSettings(**settings.get("matching", {})).max_image_size_px
     options = {"settings": settings, "cameras": photos.cameras, "max_image_size_px": cap}
-    command = [sys.executable, cameras_run.__file__, method.kind, str(photos.folder), str(out), json.dumps(options)]
+    folder = photos.folder
+    if method.kind in STOCK and photos.cameras != "each" and len(sizes := by_size(folder)) > 1:
+        folder, options["cameras"] = in_folders(sizes, folder.with_name(f"{folder.name}-by-size")), "folder"
+    command = [sys.executable, cameras_run.__file__, method.kind, str(folder), str(out), json.dumps(options)]
     start = time.perf_counter()
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    code, last = end_of(command, limit_s)
     said = {"wall seconds": round(time.perf_counter() - start, 2)}
     if (out / RESULT).exists():
         return said | json.loads((out / RESULT).read_text(encoding="utf-8"))
-    last = done.stderr.strip().splitlines()[-1:] or ["no word"]
-    return said | {"failed": f"exit code {done.returncode}: {last[0]}", "seconds": {}, "peak MB": None}
+    failed = f"not done after {limit_s:g} s" if code is None else f"exit code {code}: {last}"
+    return said | {"failed": failed, "exit code": code, "seconds": {}, "peak MB": None}
+
+
+def end_of(command: Sequence[str], limit_s: float | None = None) -> tuple[int | None, str]:
+    """Exit code of a command, None where it was ended after so many seconds, and its error, or last line on stderr."""
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=errors, start_new_session=True)
+        try:
+            code: int | None = process.wait(limit_s)
+        except subprocess.TimeoutExpired:
+            code = None
+        finally:
+            if process.poll() is None:  # too slow, or we are interrupted
+                os.killpg(process.pid, signal.SIGKILL)  # its mappers have processes of their own
+                process.wait()
+        errors.seek(0)
+        lines = errors.read().strip().splitlines() or ["no word"]
+        return code, next((line for line in reversed(lines) if line.startswith("error: ")), lines[-1])
+
+
+def by_size(folder: Path) -> dict[tuple[int, int], list[Path]]:
+    """The photos of a folder by width and height."""
+    found: dict[tuple[int, int], list[Path]] = {}
+    for path in sorted(folder.glob("*.png")):
+        with Image.open(path) as image:
+            found.setdefault(image.size, []).append(path)
+    return found
+
+
+def in_folders(sizes: Mapping[tuple[int, int], Sequence[Path]], into: Path) -> Path:
+    """A folder for each size: told of one camera for all, COLMAP leaves out photos that lie on their side."""
+    for (width, height), photos in sizes.items():
+        folder = into / f"{width}x{height}"
+        folder.mkdir(parents=True, exist_ok=True)
+        for photo in photos:
+            put(photo, folder)
+    return into

@@ -7,6 +7,7 @@ A change is written as steps joined by "+": ``crop:LEFT,TOP`` cuts columns and r
 """
 
 import json
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -35,6 +36,22 @@ def put(photo: Path, folder: Path) -> None:
             os.link(photo.resolve(), place)
         except OSError:
             shutil.copyfile(photo, place)
+
+
+EVERY = "every:"
+"""No change of pixels: ``every:N`` takes every Nth photo, by name."""
+
+
+def stride(text: str) -> int:
+    """Which of the photos a change takes: every so many, all (1) where it does not say.
+
+    Raises:
+        ValueError: that is no positive number.
+    """
+    found = [int(part.removeprefix(EVERY)) for part in text.split("+") if part.startswith(EVERY)]
+    if any(number < 1 for number in found):
+        raise ValueError(f"'{text}' takes every 0th photo")
+    return math.prod(found)
 
 
 class TrueCamera(NamedTuple):
@@ -67,7 +84,7 @@ def steps(text: str) -> list[Step]:
         ValueError: a kind is not known, or has another number of figures.
     """
     found = []
-    for part in filter(None, text.split("+")):
+    for part in (part for part in text.split("+") if part and not part.startswith(EVERY)):
         kind, _, figures = part.partition(":")
         values = tuple(float(value) for value in figures.split(","))
         if STEPS.get(kind) != len(values):
@@ -148,9 +165,10 @@ def photo_set(data: Path, name: str, change: str, cache: Path, cameras: str = "a
     todo = steps(change)
     title = f"{name} {change}".strip()
     folder = cache / "photos" / title.translate(str.maketrans(" :,", "_--"))
-    for source in sorted((data / name / "images").iterdir()):
+    sources = [path for path in sorted((data / name / "images").iterdir()) if path.suffix.lower() in FORMATS]
+    for source in sources[:: stride(change)]:
         target = folder / f"{source.stem}.png"
-        if source.suffix.lower() in FORMATS and not target.exists():
+        if not target.exists():
             save_plain(source, target, todo)
     truth = dict(_true_cameras(data / name / "cameras.json", todo))
     if truth and cameras != "each":

@@ -1,0 +1,290 @@
+"""Photo folders with random trouble: how people really take photos, with known truth.
+
+A seed decides everything: the scene, the walk, the cameras, and a few troubles at a time.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from sfm_app.errors import InputError
+from sfm_app.synthetic.bodies import SyntheticScene
+from sfm_app.synthetic.cameras import (
+    ArcOptions,
+    Camera,
+    Views,
+    arc,
+    axis_rotation,
+    camera_centre,
+    look_at,
+    make_camera,
+    orbit,
+    pixel_rays,
+)
+from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, develop
+from sfm_app.synthetic.render import PreparedScene, cast, prepare, render_scene
+from sfm_app.synthetic.strewn import faded, heap_of_things, moving_thing, panelled, twins, wall
+
+FloatArray = NDArray[np.float64]
+Random = np.random.Generator
+
+WALKS = ("walk", "forward", "sideways", "orbit", "wide steps")
+PLACES = ("things", "plane", "repeats", "look-alikes")
+OF_CAMERAS = ("two cameras", "zoom", "crop", "squeeze", "lens")
+OF_PHOTOS = ("motion blur", "defocus", "moving object", "few features")
+ORDINARY = ("walk", "things")
+"""No trouble."""
+KINDS = tuple(kind for kind in (*WALKS, *PLACES, *OF_CAMERAS, *OF_PHOTOS) if kind not in ORDINARY)
+"""All troubles by name."""
+SIZES = ((480, 320), (512, 384), (384, 512), (576, 384), (640, 480), (640, 400))
+PHOTOS = (6, 20)
+AIM = (0.0, 0.7, 0.0)
+"""What the walks look at: the middle of the things."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spoiling:
+    """What happens to single photos."""
+
+    blur_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """By photo name: length and direction (radians) of its motion blur."""
+    defocus_px: Mapping[str, float] = field(default_factory=dict)
+    """By photo name: standard deviation of its blur."""
+    thing: SyntheticScene | None = None
+    """Moves while the photos are taken."""
+    thing_at: Mapping[str, FloatArray] = field(default_factory=dict)
+    """By photo name: (3, 4) world_from_thing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TroubledFolder:
+    """A folder of photos that is to be rendered."""
+
+    seed: int
+    troubles: tuple[str, ...]
+    """Of `KINDS`, in their order; empty where nothing is wrong."""
+    scene: SyntheticScene
+    views: Views
+    options: PhotoOptions
+    spoiling: Spoiling
+
+
+def troubled_folder(seed: int) -> TroubledFolder:
+    """Draw a folder: same seed, same folder."""
+    rng = np.random.default_rng([seed, 29])
+    walk = str(rng.choice(WALKS, p=(0.4, 0.15, 0.15, 0.15, 0.15)))
+    place = str(rng.choice(PLACES, p=(0.55, 0.15, 0.15, 0.15)))
+    of_cameras = _some(OF_CAMERAS, (0.35, 0.45, 0.2), rng)
+    of_photos = _some(OF_PHOTOS, (0.4, 0.4, 0.2), rng)
+    drawn = {walk, place, *of_cameras, *of_photos}
+    scene = _scene(place, rng)
+    if "few features" in drawn:
+        scene = faded(scene, float(rng.uniform(0.1, 0.3)))
+    camera = _camera(drawn, rng)
+    views = _with_cameras(_walk(walk, place, camera, rng), drawn, rng)
+    options = PhotoOptions(
+        supersampling=1,
+        noise=float(rng.uniform(0.5, 3.0)),
+        blur_px=float(rng.uniform(0.4, 0.7)),
+        quality=int(rng.integers(75, 95)),
+        seed=seed,
+    )
+    return TroubledFolder(
+        seed=seed,
+        troubles=tuple(kind for kind in KINDS if kind in drawn),
+        scene=scene,
+        views=views,
+        options=options,
+        spoiling=_spoiling(drawn, views, rng),
+    )
+
+
+def write_troubled_folder(folder: Path, plan: TroubledFolder) -> Truth:
+    """Render one JPEG per view into `folder`, which is made where it is missing; the truth is not written.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    still, spoiling = prepare(plan.scene), plan.spoiling
+    moving = None if spoiling.thing is None else prepare(spoiling.thing)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for k, (name, pose) in enumerate(plan.views.cam_from_world.items()):
+            camera, over = plan.views.cameras[name], plan.options.supersampling
+            image = render_scene(still, camera, pose, over)
+            if moving is not None:
+                at = pose_after(pose, spoiling.thing_at[name])
+                image = in_front(image, (still, pose), (moving, at), camera, over)
+            image = smeared(image, *spoiling.blur_px.get(name, (0.0, 0.0)))
+            sharpness = replace(plan.options, blur_px=max(plan.options.blur_px, spoiling.defocus_px.get(name, 0.0)))
+            photo = develop(image, sharpness, np.random.default_rng([plan.seed, k, 31]))
+            Image.fromarray(photo).save(folder / name, format="JPEG", quality=plan.options.quality)
+    except OSError as err:
+        raise InputError(f"cannot write photos to {folder}: {err}", hint="choose another folder") from err
+    return Truth(dict(plan.views.cameras), dict(plan.views.cam_from_world), plan.scene.vertices, plan.scene.faces)
+
+
+def smeared(image: FloatArray, length_px: float, direction: float) -> FloatArray:
+    """The image (H, W, 3) of a camera that turned during the exposure: averaged along a line."""
+    if length_px < 1:
+        return image
+    steps = np.linspace(-0.5, 0.5, 2 * math.ceil(length_px) + 1) * length_px
+    x, y = steps * math.cos(direction), steps * math.sin(direction)
+    half = math.ceil(length_px / 2) + 1
+    weights = np.zeros((2 * half + 1, 2 * half + 1))
+    for column, row in zip(x, y, strict=True):
+        left, top = math.floor(column), math.floor(row)
+        for i, share_y in ((0, 1 - row + top), (1, row - top)):
+            for j, share_x in ((0, 1 - column + left), (1, column - left)):
+                weights[half + top + i, half + left + j] += share_x * share_y
+    blurred = cv2.filter2D(image, -1, weights / weights.sum(), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(blurred, dtype=np.float64)
+
+
+Seen = tuple[PreparedScene, FloatArray]
+"""A scene, and the pose (3, 4) of the camera in its frame."""
+
+
+def in_front(image: FloatArray, still: Seen, moving: Seen, camera: Camera, supersampling: int) -> FloatArray:
+    """The image of the still scene with what moves where that is nearer; it casts no shadow."""
+    depth = []
+    for scene, pose in (still, moving):
+        directions = pixel_rays(camera) @ pose[:, :3]
+        depth.append(cast(scene.rays, camera_centre(pose), directions)["t_hit"].reshape(image.shape[:2]))
+    nearer = depth[1] < depth[0]
+    if not nearer.any():
+        return image
+    return np.where(nearer[..., None], render_scene(moving[0], camera, moving[1], supersampling), image)
+
+
+def pose_after(cam_from_world: FloatArray, world_from_thing: FloatArray) -> FloatArray:
+    """(3, 4) pose of the camera in the frame of a thing."""
+    R, t = cam_from_world[:, :3], cam_from_world[:, 3]
+    return np.column_stack([R @ world_from_thing[:, :3], R @ world_from_thing[:, 3] + t])
+
+
+def _some(kinds: tuple[str, ...], shares: tuple[float, ...], rng: Random) -> list[str]:
+    """None, one, two, ... of the kinds, as probable as the shares say."""
+    return [str(kind) for kind in rng.choice(kinds, int(rng.choice(len(shares), p=shares)), replace=False)]
+
+
+def _scene(place: str, rng: Random) -> SyntheticScene:
+    if place == "plane":
+        return wall(rng)
+    things = heap_of_things(rng)
+    if place == "repeats":
+        things = (*things, *panelled(rng))
+    elif place == "look-alikes":
+        things = (*things, *twins(rng))
+    light = (float(rng.uniform(-0.6, 0.6)), 0.8, float(rng.uniform(0.3, 0.8)))
+    return SyntheticScene(place, things, to_light=light)
+
+
+def _camera(drawn: set[str], rng: Random) -> Camera:
+    """Of the folder; how far its centre lies off, how square its pixels are and how it bends is part of the trouble."""
+    width, height = (int(side) for side in rng.choice(SIZES))
+    longer = math.exp(rng.uniform(math.log(0.75), math.log(1.6)))
+    centre = 0.5 + rng.normal(0.0, 0.008, 2)
+    if "crop" in drawn:
+        centre = centre + rng.choice((-1.0, 1.0), 2) * rng.uniform(0.04, 0.16, 2)
+    aspect = float(rng.choice((0.75, 0.85, 1.2, 1.33))) if "squeeze" in drawn else 1.0
+    camera = make_camera(width, height, longer * max(width, height) / width, (centre[0], centre[1]), aspect)
+    # how far a corner of the photo is pushed; a phone's lens is corrected to about half a percent
+    bend = rng.choice((-1.0, 1.0)) * rng.uniform(0.03, 0.1) if "lens" in drawn else rng.normal(0.0, 0.003)
+    return bent(camera, float(bend))
+
+
+def bent(camera: Camera, bend: float) -> Camera:
+    """The camera with a lens that pushes the farthest corner outwards by this share of its distance."""
+    corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
+    seen = (corners - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
+    return replace(camera, radial=bend / float((seen**2).sum(axis=1).max()))
+
+
+def zoomed(camera: Camera, factor: float) -> Camera:
+    """The camera with a longer or shorter lens, which bends lines as before."""
+    K = camera.K.copy()
+    K[[0, 1], [0, 1]] *= factor
+    return replace(camera, K=K, radial=camera.radial * factor**2)
+
+
+def _walk(walk: str, place: str, camera: Camera, rng: Random) -> Views:
+    count = int(rng.integers(PHOTOS[0], PHOTOS[1] + 1))
+    longer = camera.K[0, 0] / max(camera.width, camera.height)
+    distance = 4.6 * max(1.0, longer) * float(rng.uniform(0.9, 1.2))
+    seed = int(rng.integers(1 << 30))
+    if walk == "orbit":
+        sweep = float(rng.uniform(40, 150 if place == "things" else 80))
+        return orbit(camera, count, sweep, distance, (AIM[0], AIM[1] + 0.4, AIM[2]))
+    if walk in ("forward", "sideways"):
+        return _straight_on(walk, camera, count, distance, rng)
+    wide = walk == "wide steps"
+    sweep = min(float(rng.uniform(18, 26) if wide else rng.uniform(5, 12)) * (count - 1), 150.0 if wide else 100.0)
+    path = ArcOptions(
+        photos=min(count, 8) if wide else count, sweep_deg=sweep, distance=(0.85 * distance, 1.2 * distance),
+        height=(0.7, 2.4), aim=AIM, aim_spread=0.35, roll_deg=10.0,
+    )  # fmt: skip
+    return arc(camera, path, seed)
+
+
+def _straight_on(walk: str, camera: Camera, count: int, distance: float, rng: Random) -> Views:
+    """A straight way with a straight look: ahead, as from a car, or to the side, as from a train."""
+    along = np.linspace(0.5, -0.5, count) + rng.normal(0.0, 0.1 / count, count)
+    way = np.zeros((count, 3))
+    if walk == "forward":
+        way[:, 2] = 1.3 * distance + 0.9 * distance * along
+    else:
+        way[:, 0], way[:, 2] = 3.2 * along, distance
+    way += np.array([0.0, 1.3, 0.0]) + rng.normal(0.0, 0.02, (count, 3))
+    aims = way + np.array([0.0, -0.1, -1.0]) + rng.normal(0.0, 0.02, (count, 3))
+    return Views.of(camera, [look_at(c, a, float(rng.normal(0.0, 1.0))) for c, a in zip(way, aims, strict=True)])
+
+
+def _with_cameras(views: Views, drawn: set[str], rng: Random) -> Views:
+    names = sorted(views.cameras)
+    if "two cameras" in drawn:
+        factor = float(rng.choice((0.65, 0.8, 1.25, 1.5)))
+        centre = rng.normal(0.0, 0.01, 2)
+        other = zoomed(views.cameras[names[0]], factor)
+        K = other.K.copy()
+        K[:2, 2] += centre * (other.width, other.height)
+        # in turn or one after the other: as two people, or as one with two cameras
+        turn = names[1::2] if rng.uniform() < 0.5 else names[: len(names) // 2]
+        views = views.taken_with(replace(other, K=K), turn)
+    if "zoom" in drawn:
+        reach = float(rng.uniform(0.1, 0.4))
+        for name in names:
+            views = views.taken_with(zoomed(views.cameras[name], math.exp(rng.uniform(-reach, reach))), [name])
+    return views
+
+
+def _spoiling(drawn: set[str], views: Views, rng: Random) -> Spoiling:
+    names = sorted(views.cameras)
+    spoilt = [name for name in names if rng.uniform() < 0.6]
+    blur = {name: (float(rng.uniform(2, 9)), float(rng.uniform(0, math.pi))) for name in spoilt}
+    defocus = {name: float(rng.uniform(1.0, 2.5)) for name in names if rng.uniform() < 0.6}
+    thing = moving_thing(rng)
+    return Spoiling(
+        blur_px=blur if "motion blur" in drawn else {},
+        defocus_px=defocus if "defocus" in drawn else {},
+        thing=SyntheticScene("thing", thing) if "moving object" in drawn else None,
+        thing_at=_wandering(names, rng),
+    )
+
+
+def _wandering(names: list[str], rng: Random) -> dict[str, FloatArray]:
+    """Somebody who walks about before the things, turning as they like: (3, 4) world_from_thing."""
+    place, angle = np.array([rng.uniform(-1.0, 1.0), 0.0, rng.uniform(1.0, 1.8)]), rng.uniform(0.0, 360.0)
+    found = {}
+    for name in names:
+        found[name] = np.column_stack([axis_rotation(np.array([0.0, 1.0, 0.0]), angle), place])
+        step = rng.normal(0.0, 0.35, 2)
+        place = np.clip(place + np.array([step[0], 0.0, 0.4 * step[1]]), [-1.6, 0.0, 0.8], [1.6, 0.0, 2.2])
+        angle += rng.normal(0.0, 25.0)
+    return found

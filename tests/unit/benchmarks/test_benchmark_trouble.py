@@ -1,0 +1,89 @@
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trouble
+from cameras_score import TruePhoto
+
+from sfm_app.geometry.camera import camera_matrix
+
+K = camera_matrix(600.0, 600.0, 320.0, 240.0)
+LONG = camera_matrix(660.0, 660.0, 320.0, 240.0)
+PHOTOS = {"a": TruePhoto(K, np.eye(3, 4), 640.0), "b": TruePhoto(LONG, np.eye(3, 4), 640.0)}
+
+
+def left_behind(folder, *, identifiable, sd):
+    document = {
+        "cameras": {"640x480": {"identifiable": identifiable, "K": K.tolist(), "spread": {}}},
+        "camera_of": {"a.jpg": "640x480", "b.jpg": "640x480"},
+        "refined": {"640x480": {"K": LONG.tolist(), "deviations": {"fx": sd, "fy": sd}}},
+    }
+    folder.mkdir(exist_ok=True)
+    (folder / "calibration.json").write_text(json.dumps(document))
+
+
+def test_each_photo_is_held_against_the_camera_that_took_it(tmp_path):
+    left_behind(tmp_path, identifiable=True, sd=1.0)
+
+    found = trouble.known_cameras(tmp_path, PHOTOS, "before")
+
+    assert (found["known"], found["wrong"]) == ("2/2", 1)
+    assert found["focal %"] == pytest.approx(100 * (1 - 600 / 660), abs=0.01)
+
+
+def test_what_is_called_a_guess_is_not_wrong(tmp_path):
+    left_behind(tmp_path, identifiable=False, sd=100.0)
+    truth = SimpleNamespace(
+        cameras={f"{name}.jpg": SimpleNamespace(K=photo.K, width=640) for name, photo in PHOTOS.items()},
+        cam_from_world={f"{name}.jpg": photo.pose for name, photo in PHOTOS.items()},
+    )
+
+    row = trouble.scored(tmp_path, truth)
+
+    assert (row["known"], row["focal %"], row["wrong"]) == ("0/2", None, 0)
+    assert (row["known after"], row["wrong after"], row["beyond 3 sd"]) == ("0/2", 0, 0)
+    assert (row["placed"], row["share placed"], row["models"]) == ("0/2", 0.0, 0)
+    left_behind(tmp_path, identifiable=False, sd=1.0)
+    row = trouble.scored(tmp_path, truth)
+    assert (row["known after"], row["wrong after"]) == ("2/2", 1)
+    assert (row["stated"], row["beyond 3 sd"], row["worst in sd"]) == (2, 2, 30.0)
+    assert trouble.scored(tmp_path / "nothing", truth)["known"] == "0/2"
+
+
+def folder_row(seed=1, troubles="plane, zoom", **figures):
+    fine = {
+        "seed": seed, "troubles": troubles, "exit code": 0, "last": "", "placed": "6/6", "share placed": 1.0,
+        "AUC@5": 0.8, "known": "6/6", "focal %": 0.5, "wrong": 0, "known after": "6/6", "focal % after": 0.4,
+        "wrong after": 0, "stated": 4, "beyond 3 sd": 0, "worst in sd": 1.0,
+    }  # fmt: skip
+    return fine | figures
+
+
+def met(rows):
+    return [demand["met"] for demand in trouble.demands(rows)]
+
+
+def test_one_wrong_camera_in_a_hundred_folders_passes_and_two_do_not():
+    fine = [folder_row(seed) for seed in range(98)]
+    one, two = folder_row(98, wrong=1), folder_row(99, wrong=1, **{"wrong after": 1})
+
+    assert met([*fine, one, folder_row(99)]) == ["yes"] * 4
+    assert met([*fine, one, two]) == ["yes", "no", "yes", "yes"]
+    assert trouble.demands([*fine, one, two])[1]["seeds"] == "98, 99"
+
+
+@pytest.mark.parametrize(("code", "fails"), [(0, False), (4, False), (1, True), (5, True), (None, True)])
+def test_only_a_scene_or_a_reason_why_there_is_none_is_expected(code, fails):
+    rows = [folder_row(**{"exit code": code, "last": "error: unexpected ValueError: x"})]
+
+    assert (met(rows)[0] == "no") is fails
+    assert ("unexpected ValueError" in trouble.page(rows)) is fails
+
+
+def test_every_trouble_has_a_line_of_its_own():
+    rows = [folder_row(), folder_row(2, troubles="zoom", wrong=1), folder_row(3, troubles="none")]
+
+    found = {row["trouble"]: (row["folders"], row["K wrong"]) for row in trouble.by_trouble(rows)}
+
+    assert found == {"all": (3, 1), "none": (1, 0), "plane": (1, 0), "zoom": (2, 1)}

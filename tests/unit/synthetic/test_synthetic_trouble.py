@@ -1,0 +1,167 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sfm_app.errors import InputError
+from sfm_app.synthetic.bodies import Body
+from sfm_app.synthetic.cameras import Views, camera_centre, make_camera, pixel_rays
+from sfm_app.synthetic.strewn import faded, moving_thing, twins
+from sfm_app.synthetic.trouble import (
+    KINDS,
+    PHOTOS,
+    bent,
+    pose_after,
+    smeared,
+    troubled_folder,
+    write_troubled_folder,
+    zoomed,
+)
+
+PLANS = [troubled_folder(seed) for seed in range(120)]
+
+
+def plan_with(*troubles):
+    return next(plan for plan in PLANS if set(troubles) <= set(plan.troubles))
+
+
+def small(plan, photos=2, width=96):
+    """The same folder with fewer and smaller photos, so that it is rendered at once."""
+    names = sorted(plan.views.cameras)[:photos]
+    cameras = {}
+    for name in names:
+        camera = plan.views.cameras[name]
+        shrink = width / camera.width
+        K = np.diag([shrink, shrink, 1.0]) @ camera.K
+        cameras[name] = replace(camera, K=K, width=width, height=round(shrink * camera.height))
+    return replace(plan, views=Views(cameras, {name: plan.views.cam_from_world[name] for name in names}))
+
+
+def written(plan, folder):
+    truth = write_troubled_folder(folder, plan)
+    photos = {}
+    for name in truth.cameras:
+        with Image.open(folder / name) as image:
+            photos[name] = np.asarray(image, dtype=np.float64)
+    return photos
+
+
+def test_a_seed_is_a_folder():
+    again = troubled_folder(17)
+
+    assert (again.troubles, again.options) == (PLANS[17].troubles, PLANS[17].options)
+    for name, pose in again.views.cam_from_world.items():
+        assert np.array_equal(pose, PLANS[17].views.cam_from_world[name])
+        assert np.array_equal(again.views.cameras[name].K, PLANS[17].views.cameras[name].K)
+    assert np.array_equal(again.scene.vertices, PLANS[17].scene.vertices)
+
+
+def test_every_trouble_comes_up_and_few_at_a_time():
+    met = {kind for plan in PLANS for kind in plan.troubles}
+
+    assert met == set(KINDS)
+    assert all(len(plan.troubles) <= 6 for plan in PLANS)
+    assert 1 <= sum(not plan.troubles for plan in PLANS) <= 12
+    assert all(PHOTOS[0] <= len(plan.views.cameras) <= PHOTOS[1] for plan in PLANS)
+
+
+def test_cameras_are_those_of_the_trouble():
+    for plan in PLANS:
+        focals = {round(camera.K[0, 0], 6) for camera in plan.views.cameras.values()}
+        first = plan.views.cameras["view_00.jpg"]
+        off = np.abs(first.K[:2, 2] / (first.width, first.height) - 0.5).max()
+        assert (len(focals) > 2) == ("zoom" in plan.troubles)
+        assert (len(focals) == 1) == (not {"zoom", "two cameras"} & set(plan.troubles))
+        assert (abs(first.K[1, 1] / first.K[0, 0] - 1) > 0.1) == ("squeeze" in plan.troubles)
+        assert off > 0.03 or "crop" not in plan.troubles
+        assert len({(camera.width, camera.height) for camera in plan.views.cameras.values()}) == 1
+        pixel_rays(first)  # a lens that folds raises
+
+
+def test_a_way_straight_ahead_and_one_to_the_side():
+    for walk, axis in (("forward", 2), ("sideways", 0)):
+        plan = plan_with(walk)
+        centres = np.array([camera_centre(pose) for pose in plan.views.cam_from_world.values()])
+        ahead = np.array([pose[2, :3] for pose in plan.views.cam_from_world.values()])
+        span = np.ptp(centres, axis=0)
+        assert span[axis] > 10 * np.delete(span, axis).max()
+        assert (ahead @ [0.0, 0.0, -1.0]).min() > 0.98
+
+
+def test_a_lens_pushes_the_farthest_corner_by_what_is_asked_and_zooming_keeps_the_bend():
+    camera = bent(make_camera(640, 480, 1.0, centre=(0.4, 0.55)), -0.08)
+    corner = np.array([640.0, 0.0])
+    seen = (corner - camera.K[:2, 2]) / camera.K[0, 0]
+
+    assert camera.radial * (seen @ seen) == pytest.approx(-0.08)
+    assert zoomed(camera, 2.0).radial == pytest.approx(4 * camera.radial)
+    assert zoomed(camera, 2.0).K[1, 1] == 2 * camera.K[1, 1] and zoomed(camera, 2.0).K[0, 2] == camera.K[0, 2]
+
+
+def test_motion_blur_smears_along_its_direction_and_keeps_the_light():
+    image = np.zeros((31, 31, 3))
+    image[15, 15] = 1.0
+
+    level = smeared(image, 8.0, 0.0)[..., 0]
+    rows, columns = np.mgrid[:31, :31] - 15
+    assert level.sum() == pytest.approx(1.0)
+    assert (level * columns**2).sum() == pytest.approx(8.0**2 / 12, rel=0.2)
+    assert (level * rows**2).sum() == pytest.approx(0.0, abs=1e-9)
+    assert np.array_equal(smeared(image, 0.0, 1.0), image)
+
+
+def test_equal_things_are_equal_stain_by_stain():
+    for body in twins(np.random.default_rng(5)):
+        half = len(body.shape.vertices) // 2
+        shift = body.shape.vertices[half:] - body.shape.vertices[:half]
+        assert np.allclose(shift, shift[0], atol=1e-9) and abs(shift[0, 0]) > 3
+        assert np.array_equal(body.shape.texture[half:], body.shape.texture[:half])
+
+
+def test_what_moves_is_seen_elsewhere_and_the_rest_stays(tmp_path):
+    plan = small(plan_with("moving object"), photos=1)
+    name = "view_00.jpg"
+    R, t = plan.views.cam_from_world[name][:, :3], plan.views.cam_from_world[name][:, 3]
+    ahead = camera_centre(plan.views.cam_from_world[name]) + 1.5 * R[2] - 0.4 * np.array([0.0, 1.0, 0.0])
+    still = replace(plan, spoiling=replace(plan.spoiling, thing=None, blur_px={}, defocus_px={}))
+    moving = replace(
+        plan,
+        spoiling=replace(
+            plan.spoiling, thing_at={name: np.column_stack([np.eye(3), ahead])}, blur_px={}, defocus_px={}
+        ),
+    )
+
+    without, there = written(still, tmp_path / "a")[name], written(moving, tmp_path / "b")[name]
+
+    changed = np.abs(without - there).max(axis=2) > 40
+    assert 0.02 < changed.mean() < 0.8
+    assert np.allclose(pose_after(np.column_stack([R, t]), moving.spoiling.thing_at[name])[:, 3], R @ ahead + t)
+
+
+def test_faded_scenes_show_less(tmp_path):
+    plan = small(plan_with("plane"), photos=1)
+    plan = replace(plan, spoiling=replace(plan.spoiling, blur_px={}, defocus_px={}, thing=None))
+    pale = replace(plan, scene=faded(plan.scene, 0.1))
+
+    rich, poor = (written(p, tmp_path / str(k))["view_00.jpg"] for k, p in enumerate((plan, pale)))
+
+    assert np.abs(np.diff(poor, axis=1)).mean() < 0.6 * np.abs(np.diff(rich, axis=1)).mean()
+
+
+def test_the_folder_is_rendered_alike_twice_and_a_thing_stands_on_its_foot(tmp_path):
+    plan = small(plan_with("motion blur"))
+    write_troubled_folder(tmp_path / "a", plan)
+    write_troubled_folder(tmp_path / "b", plan)
+
+    for path in (tmp_path / "a").iterdir():
+        assert path.read_bytes() == (tmp_path / "b" / path.name).read_bytes()
+    assert len(list((tmp_path / "a").iterdir())) == 2
+    bodies = moving_thing(np.random.default_rng(1))
+    assert all(isinstance(body, Body) for body in bodies) and min(b.shape.vertices[:, 1].min() for b in bodies) == 0.0
+
+
+def test_a_folder_that_cannot_be_written_is_said(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot write photos"):
+        write_troubled_folder(tmp_path / "file", small(PLANS[0], photos=1))
