@@ -70,6 +70,8 @@ class Reduced:
     """(3P, 6I + 8C) how much less they change per change of poses and cameras."""
     lost: int
     """Observations that say nothing: behind their camera, or where numbers end."""
+    scores: FloatArray
+    """(I, 8C) what the observations of each photo ask of the cameras, poses and points giving way; they add up to g."""
     open_points: int
     """Points that their rays do not fix: at infinity, or seen from one place only. They stay along what is open."""
 
@@ -150,6 +152,7 @@ def reduce(bundle: Bundle, scale_px: float) -> Reduced:
     spare = max(2 * int(np.count_nonzero(seen)) - int(np.sum(rank)) - len(free) - cameras, 0) + USUAL_COUNT
     pose_step, pose_give = np.zeros(poses), np.zeros((poses, cameras))
     pose_step[free], pose_give[free] = give[:, -1], give[:, :-1]
+    left_over = flat - J[:, :poses] @ pose_step - Jp @ (along - A[:, :poses] @ pose_step)
     unwhiten = _block_diagonal(whiten.transpose(0, 2, 1))
     return Reduced(
         H=H,
@@ -160,8 +163,29 @@ def reduce(bundle: Bundle, scale_px: float) -> Reduced:
         point_step=unwhiten @ along,
         point_give=unwhiten @ A,
         lost=len(seen) - int(np.count_nonzero(seen)),
+        scores=_scores((J, Jp, A), pose_give, left_over, np.repeat(bundle.photo, 2), len(bundle.R)),
         open_points=int(np.count_nonzero(rank < 3)),
     )
+
+
+def _scores(
+    system: tuple[sparse.csr_array, sparse.csr_array, sparse.csr_array],
+    pose_give: FloatArray, left_over: FloatArray, photo: NDArray[np.int64], photos: int,
+) -> FloatArray:  # fmt: skip
+    """(I, 8C) as in `Reduced`, from the derivatives by views and points, and what poses and points leave over (2N,).
+
+    One camera after the other, so that many cameras take no more memory than one.
+    """
+    J, Jp, A = system
+    cameras = pose_give.shape[1]
+    found = np.empty((photos, cameras))
+    for first in range(0, cameras, CAMERA):
+        block = slice(first, first + CAMERA)
+        follow = np.vstack([-pose_give[:, block], np.eye(cameras)[:, block]])
+        by_camera = J @ follow - Jp @ (A @ follow)
+        for column in range(CAMERA):
+            found[:, first + column] = np.bincount(photo, by_camera[:, column] * left_over, photos)
+    return found
 
 
 def moved(bundle: Bundle, params: FloatArray, poses: FloatArray, points: FloatArray) -> Bundle:

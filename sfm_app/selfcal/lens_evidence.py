@@ -113,7 +113,9 @@ class Estimate:
 def estimate(params: FloatArray, reduced: Reduced, usual: Usual) -> Estimate:
     """The most probable cameras, with the most probable choice of freed parts; undetermined parts stay.
 
-    The deviations are those of all parts, about the value that was chosen, even where that is the present one.
+    The deviations are those of all parts, about the value that was chosen, even where that is the present one, and over
+    all choices of freed parts. Where photos pull at the cameras in different directions (a zoom, a moving shutter,
+    look-alikes), they are at least as large as that scatter makes them (a sandwich with photos as clusters).
     """
     T = _by_logarithms(params)
     weight = (MISFIT * reduced.noise_px) ** -2.0
@@ -121,11 +123,15 @@ def estimate(params: FloatArray, reduced: Reduced, usual: Usual) -> Estimate:
     away = usual.away(params)
     free = _choose(H, g, away, usual)
     precision = usual.precision(free)
-    soft, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
+    _, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
     determined = usual.asked & _determined(covariance, precision)
     changing = spread(determined | (usual.asked & ~np.array([part.stays for part in PARTS])))
     step, own = _posterior(H, g, precision, away, changing)
-    variances = np.sum(_product(T, covariance) * T, axis=1) + _product(T, soft - step) ** 2
+    about = _about(step, H, g, away, usual, free)
+    photos = weight * _product(reduced.scores, T)
+    variances = np.maximum(
+        np.sum(_product(T, about) * T, axis=1), np.sum(_product(photos, _product(covariance, T.T)) ** 2, axis=0)
+    )
     deviations = np.sqrt(variances).reshape(params.shape) * np.where(usual.asked.all(axis=1), 1.0, FEW)[:, None]
     largest = np.abs(step) / np.sqrt(np.diag(own), out=np.ones_like(step), where=changing.ravel())
     moved, held = _moved(params, step.reshape(params.shape), usual.sides)
@@ -164,20 +170,15 @@ def _determined(covariance: FloatArray, precision: FloatArray) -> BoolArray:
 
 
 def _choose(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual) -> BoolArray:
-    """The most probable choice (C, 5) for each camera, the others as they were in the sweep before, until none changes.
-
-    What the photos and the other cameras say about one camera is its marginal posterior without its own prior.
-    """
+    """The most probable choice (C, 5) for each camera, the others as in the sweep before, until none changes."""
     free, everything = np.zeros((len(away), len(PARTS)), np.bool_), np.ones_like(away, np.bool_)
     for _ in range(SWEEPS):
         before, precision = free, usual.precision(free)
         step, covariance = _posterior(H, g, precision, away, everything)
         free = np.empty_like(before)
         for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
-            marginal = inverses_of_positive(covariance[np.ix_(own, own)])
-            own_H = marginal - np.diag(precision[camera])
-            own_g = marginal @ step[own] - precision[camera] * away[camera]
-            free[camera] = _best(own_H, own_g, away[camera], usual, camera)
+            said = _without_prior(covariance[np.ix_(own, own)], step[own], precision[camera], away[camera])
+            free[camera] = _best(*said, away[camera], usual, camera)
         if np.array_equal(free, before):
             break
     return free
@@ -187,14 +188,59 @@ def _best(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual, camera: 
     """The most probable choice (5,) for one camera; of equals the one that frees less."""
     trials = np.array(sorted(product((False, True), repeat=len(PARTS)), key=sum))
     trials = trials[~np.any(trials & ~usual.asked[camera], axis=1)]
-    precision = Usual(usual.centres, np.full(len(trials), usual.sides[camera]), trials).precision(trials)
+    value, _, _ = _alternatives(trials, H, g, away, usual.sides[camera])
+    return np.asarray(trials[np.argmax(value)], np.bool_)
+
+
+def _about(
+    step: FloatArray, H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual, free: BoolArray
+) -> FloatArray:
+    """(8C, 8C) mean square of the cameras about where a step leads, over all choices for each, the others as in `free`.
+
+    Also over choices that the photos were not asked about: what nobody asked is no better known for that.
+    """
+    precision = usual.precision(free)
+    mean, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
+    found = covariance + np.outer(mean - step, mean - step)
+    trials = np.array(list(product((False, True), repeat=len(PARTS))))
+    for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
+        block = np.ix_(own, own)
+        own_H, own_g = _without_prior(covariance[block], mean[own], precision[camera], away[camera])
+        value, steps, covariances = _alternatives(trials, own_H, own_g, away[camera], usual.sides[camera])
+        odds = np.exp(value - value.max())
+        odds /= odds.sum()
+        off = steps - step[own]
+        found[block] = np.einsum("t,tij->ij", odds, covariances) + np.einsum("t,ti,tj->ij", odds, off, off)
+    return found
+
+
+def _without_prior(
+    covariance: FloatArray, mean: FloatArray, precision: FloatArray, away: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """What the photos and the other cameras say about one camera: its marginal posterior without its own prior."""
+    marginal = inverses_of_positive(covariance)
+    return marginal - np.diag(precision), marginal @ mean - precision * away
+
+
+def _alternatives(
+    trials: BoolArray, H: FloatArray, g: FloatArray, away: FloatArray, side: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Log-probabilities (K,) of choices (K, 5) for one camera, mean steps (K, 8) and covariances (K, 8, 8).
+
+    Args:
+        trials: the choices.
+        H, g: what the photos say, without a prior.
+        away: from the camera to its usual values.
+        side: longer side of its photos.
+    """
+    precision = Usual(np.zeros((len(trials), 2)), np.full(len(trials), side), trials).precision(trials)
     covariance = inverses_of_positive(H + precision[:, :, None] * np.eye(CAMERA))
     pull = g + precision * away
     share = np.array([part.share for part in PARTS])
     value = 0.5 * np.einsum("ti,tij,tj->t", pull, covariance, pull) - 0.5 * np.sum(precision * away**2, axis=1)
     value += 0.5 * np.sum(np.log(precision), axis=1) + 0.5 * np.linalg.slogdet(covariance)[1]
     value += np.sum(np.log(np.where(trials, share, 1.0 - share)), axis=1)
-    return np.asarray(trials[np.argmax(value)], np.bool_)
+    return value, np.einsum("tij,tj->ti", covariance, pull), covariance
 
 
 def _by_logarithms(params: FloatArray) -> FloatArray:

@@ -114,7 +114,28 @@ def test_what_is_not_determined_stays_where_it_is_and_may_be_off():
 
     assert found.params[0, 2:4].tolist() == [498.0, 401.0]
     assert not found.determined[0, NAMES.index("centre")]
-    assert np.all((found.deviations[0, 2:4] > 6) & (found.deviations[0, 2:4] < 20))
+    # three photo sets of ten are cropped, by 15 % of the longer side
+    assert found.deviations[0, 2:4] == pytest.approx(np.sqrt(0.3) * 150, rel=0.1)
+
+
+def test_photos_that_pull_in_different_directions_widen_the_deviations():
+    true = [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]
+    stated = []
+    for zoom in (0.0, 0.05):
+        bundle = seen(
+            *([900.0 * (1 + zoom * (-1) ** k), 900.0 * (1 + zoom * (-1) ** k), *true[2:]] for k in range(8)), photos=1
+        )
+        one = replace(bundle, params=np.array([true]), camera=np.zeros_like(bundle.camera))
+        stated.append(answer(one).deviations[0, 0] / 900.0)
+    assert stated[0] < 0.004
+    assert 0.01 < stated[1] < 0.1
+
+
+def test_what_photos_ask_of_the_cameras_adds_up():
+    found = reduce(starting_at(seen(PLAIN), [905.0, 899.0, 503.0, 400.0, 0.01, 0.0, 0.0, 0.0]), 1.0)
+
+    assert found.scores.shape == (8, 8)
+    assert found.scores.sum(axis=0) == pytest.approx(found.g, rel=1e-6, abs=1e-6 * np.abs(found.g).max())
 
 
 def test_a_camera_of_few_photos_is_asked_for_focal_and_k1_only():
