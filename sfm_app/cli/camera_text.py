@@ -12,6 +12,10 @@ PHOTOS = 4
 """So many are named to people; --json has all."""
 
 
+SOURCES = {"exif": "EXIF's claim", "guess": "a guess", "estimate": "an estimate"}
+"""What a camera that the photos do not determine is instead, by its method."""
+
+
 def intrinsics_summary(intrinsics: Intrinsics) -> dict[str, Any]:
     """Calibrations, plain, for --json."""
     names = intrinsics.photos
@@ -35,7 +39,9 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
             more = f" and {len(mine) - PHOTOS} more" if len(mine) > PHOTOS else ""
             lines.append(f"            took {', '.join(mine[:PHOTOS])}{more}")
         if not camera.identifiable:
-            source = {"exif": "EXIF's claim", "guess": "a guess"}.get(camera.method, camera.method)
+            source = {"exif": "EXIF's claim", "guess": "a guess", "estimate": "an estimate"}.get(
+                camera.method, camera.method
+            )
             lines.append(f"            these photos do not determine it ({camera.reason}): {source}")
         across, down = field_of_view_deg(camera)
         lines.append(f"            sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom")

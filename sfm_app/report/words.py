@@ -4,7 +4,7 @@ import numpy as np
 
 from sfm_app.types import Calibration
 
-SOURCES = {"exif": "what the camera wrote into the files", "guess": "the usual guess"}
+SOURCES = {"exif": "what the camera wrote into the files", "guess": "the usual guess", "estimate": "an estimate"}
 HELD = {
     "centre": "optical centre near the middle of the photo",
     "aspect": "square pixels",

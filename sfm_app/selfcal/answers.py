@@ -1,6 +1,7 @@
 """What a calibrator hands back."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,8 @@ from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, KAPPA, LOG_ASPECT, LOG_FOCA
 from sfm_app.types import Calibration
 
 GUESS = "guess"
+ESTIMATE = "estimate"
+"""Method of a camera that the photos determine roughly."""
 
 
 def guessed(size: tuple[int, int], reason: str, evidence: Mapping[str, float]) -> Calibration:
@@ -27,6 +30,11 @@ def calibration_of(
     cx, cy = unit * theta[CENTRE_U] + size[0] / 2, unit * theta[CENTRE_V] + size[1] / 2
     K = camera_matrix(unit * focal / half, unit * focal * half, float(cx), float(cy))
     return Calibration(K, *size, method, identifiable=True, radial=float(theta[KAPPA]) * focal**2)
+
+
+def roughly(found: Calibration, reason: str) -> Calibration:
+    """The answer as an estimate that is not relied on, where there is a reason for that; else as it is."""
+    return replace(found, identifiable=False, method=ESTIMATE, reason=reason) if reason else found
 
 
 def parameters_of(found: Calibration, unit_px: float) -> NDArray[np.float64]:

@@ -27,6 +27,10 @@ ASPECT_GAIN = float(np.log(50))
 """Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square."""
 MAX_LOG_FOCAL_SPREAD = 0.1
 """Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess."""
+IDENTIFIED_LOG_FOCAL_SPREAD = 0.03
+"""Largest standard deviation of log f that counts as known: with a larger one more than one focal of ten is off by 5 %,
+and what is called identifiable should not be. Between this and the limit above the answer is an estimate: a better
+start than a guess, and no more."""
 EDGE = 1.02
 """A focal within this factor of an end of the range has run there."""
 
@@ -100,6 +104,12 @@ def _examined(consensus: Consensus, ends: list[Peak], profile: Profile, free: tu
     lead = value - max([best_rival(consensus, theta, free, SIGMAS, profile), *(peak.value for peak in far)])
     given = votes(consensus, theta, SIGMAS[-1])
     return Answer(theta, free, sigma, lead, given, gain, tuple(peak.theta for peak in far))
+
+
+def vagueness(log_focal_spread: float) -> str:
+    """Why an answer to which there is no objection is an estimate and not knowledge, or nothing."""
+    vague = log_focal_spread > IDENTIFIED_LOG_FOCAL_SPREAD
+    return f"the focal is uncertain by {100 * log_focal_spread:.0f} %" if vague else ""
 
 
 def objection(theta: FloatArray, log_focal_spread: float, half_size: tuple[float, float]) -> str:

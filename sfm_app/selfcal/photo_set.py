@@ -9,7 +9,7 @@ import numpy as np
 
 from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.numerical import FAILURES, reason_of
-from sfm_app.selfcal.answers import calibration_of, guessed, parameters_of
+from sfm_app.selfcal.answers import ESTIMATE, calibration_of, guessed, parameters_of
 from sfm_app.selfcal.inputs import FloatArray, prepare
 from sfm_app.selfcal.joint import Consensus
 from sfm_app.selfcal.own_cameras import predicted
@@ -214,7 +214,7 @@ def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: Calibration
 def _or_guess(camera: Camera, pairs: PhotoPairs) -> Calibration:
     """What was found; else the K that mapping starts from: EXIF's claim, or 1.2 x the longer side."""
     found = camera.found
-    if found.identifiable:
+    if found.identifiable or found.method == ESTIMATE:
         return found
     claim = _claim(camera, pairs)
     size = pairs.sizes[camera.photos[0]]

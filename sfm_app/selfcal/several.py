@@ -15,7 +15,7 @@ from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.jit import kernel
 from sfm_app.selfcal import peak
 from sfm_app.selfcal.adjustment import Matches
-from sfm_app.selfcal.answers import calibration_of, guessed, parameters_of
+from sfm_app.selfcal.answers import calibration_of, guessed, parameters_of, roughly
 from sfm_app.selfcal.evidence import MIN_LEAD, RIVAL_RATIO
 from sfm_app.selfcal.inputs import FloatArray, prepare
 from sfm_app.selfcal.lens import LOG_FOCAL, camera_of
@@ -237,7 +237,8 @@ def _judged(
     if reason:
         return guessed(camera.size, reason, evidence)
     found = calibration_of(theta, camera.size, method, unit)
-    return replace(found, spread=spread_of(theta, block, unit), evidence=evidence, held=fit.names_held(index))
+    found = replace(found, spread=spread_of(theta, block, unit), evidence=evidence, held=fit.names_held(index))
+    return roughly(found, peak.vagueness(spread))
 
 
 def _of_its_family(theta: FloatArray, size: tuple[int, int], unit: float) -> FloatArray:

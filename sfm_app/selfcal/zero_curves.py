@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sfm_app.selfcal import peak
 from sfm_app.selfcal.adjustment import Matches
-from sfm_app.selfcal.answers import calibration_of, guessed
+from sfm_app.selfcal.answers import calibration_of, guessed, roughly
 from sfm_app.selfcal.evidence import effective_count, spread_px
 from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
 from sfm_app.selfcal.joint import Consensus
@@ -82,7 +82,7 @@ def _from_fundamentals(pairs: CameraPairs, usable: Pairs, options: CalibrationSe
         return guessed(pairs.size, reason, evidence)
     spread = spread_px(scatter, side, effective_count(answer.votes), len(answer.free))
     found = calibration_of(np.append(answer.theta, 0.0), pairs.size, METHOD)
-    return replace(found, spread=spread, evidence=evidence)
+    return roughly(replace(found, spread=spread, evidence=evidence), peak.vagueness(log_focal_spread))
 
 
 def _from_matches(
@@ -94,30 +94,31 @@ def _from_matches(
     hint = float(np.median(pairs.focal_hints_px)) / side if pairs.focal_hints_px else np.nan
     usual = Usual(np.ones(1), np.array([hint]), sigma, options.lens)
     adjusted = _adjusted(pairs, usable, usual)
-    if adjusted.votes_kept < KEPT:
+    if adjusted.votes_kept < KEPT and len(adjusted.agreeing) >= MIN_PAIRS:
         again = _adjusted(pairs, usable, usual, adjusted)
         adjusted = max(adjusted, again, key=lambda one: one.votes_kept)
     fit, answer, judged = adjusted.fit, adjusted.answer, adjusted.consensus.pairs
     theta, cov = fit.state.thetas[0], covariance(fit, np.ones(1), resampled=True)
     evidence |= {**answer.evidence(judged.weights), **_figures(fit, side, float(np.sqrt(cov[LOG_FOCAL, LOG_FOCAL])))}
     evidence["votes_kept"] = adjusted.votes_kept
-    undecided = answer.contradicted(judged.weights)
-    reason = (
-        (undecided and (open_focal(fit) or undecided))
-        or _split(adjusted)
-        or peak.objection(theta, evidence["log_focal_spread"], _half(pairs.size))
-    )
+    undecided, split = answer.contradicted(judged.weights), _split(adjusted)
+    believed, spread = (answer.theta, 0.0) if split else (theta, evidence["log_focal_spread"])
+    reason = (undecided and (open_focal(fit) or undecided)) or peak.objection(believed, spread, _half(pairs.size))
     if reason:
         return guessed(pairs.size, reason, evidence)
+    if split:
+        agreed = calibration_of(np.append(answer.theta, theta[KAPPA]), pairs.size, METHOD)
+        return replace(roughly(agreed, split), evidence=evidence)
     found = calibration_of(theta, pairs.size, METHOD)
     photos = tuple(pairs.photos[k] for k in usable.kept[adjusted.listened]) if pairs.photos else ()
-    return replace(
+    found = replace(
         found,
         spread=spread_of(theta, cov, side),
         evidence=evidence,
         held=fit.names_held(0),
         key_pairs=key_pairs(fit, photos),
     )
+    return roughly(found, peak.vagueness(evidence["log_focal_spread"]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,7 +21,7 @@ class Calibration:
     width: int
     height: int
     method: str
-    """Calibrator, or where a guess came from ("exif", "guess")."""
+    """Calibrator, "estimate" where the photos determine K roughly, or where a guess came from ("exif", "guess")."""
     identifiable: bool
     """False when the fundamental matrices do not determine K; K is then a guess."""
     reason: str = ""

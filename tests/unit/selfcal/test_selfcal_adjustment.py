@@ -60,17 +60,21 @@ def test_finds_the_camera_as_well_as_it_says(shots, camera):
     assert not {freed[knob] for knob in CAMERAS[camera] if knob in freed} & set(found.held)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_finds_the_camera_of_the_thesis(seed):
-    # aspect 0.8 to 1.2, centre up to 0.1 off
+@pytest.mark.parametrize("seed", range(6))
+def test_finds_the_camera_of_the_thesis_or_says_that_its_pairs_and_their_matches_do_not_agree(seed):
+    # aspect 0.8 to 1.2, centre up to 0.1 off; the F's are exact, the matches are not
     tracks = make_tracks(TrackOptions(sigma_px=0.5), seed)
     inliers = tuple(np.hstack([view.x1, view.x2]) for view in tracks.pairs.values())
     pairs = CameraPairs(tracks.F, np.ones(10), tracks.size, tuple(tracks.pairs), inliers)
     found = calibrate(pairs, OPTIONS, 0)
-    assert found.identifiable, found.reason
-    assert 0 < scores(found, tracks.K[0], 0.0).max() < 3
-    # few pairs of an unusual camera may be taken for another one, but not with confidence
-    assert 0 < abs(found.K[0, 0] / tracks.K[0, 0, 0] - 1) < 0.03 + 2 * found.spread["fx"] / found.K[0, 0]
+    off = abs(found.K[0, 0] / tracks.K[0, 0, 0] - 1)
+    assert found.identifiable == (seed not in (0, 1)), found.reason
+    if found.identifiable:
+        assert 0 < scores(found, tracks.K[0], 0.0).max() < 3
+        assert 0 < off < 0.03
+    else:  # matches of ten pairs would have an unusual camera taken for a usual one, 6 % off; what the F's say is kept
+        assert "keeps" in found.reason and found.method == "estimate"
+        assert off < 0.002
 
 
 def test_exact_matches_give_the_exact_camera(shots):
