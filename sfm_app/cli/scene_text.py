@@ -1,6 +1,6 @@
 """What a run says about its scene: for people, and plain."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from sfm_app.cli.camera_text import k_text
@@ -31,7 +31,7 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
         "points": scene.points,
         "mean_reprojection_px": round(scene.mean_reprojection_px, 3),
         "cameras": cameras,
-    } | {key: counts[key] for key in kept if key in counts}
+    } | {key: counts[key] for key in (*kept, "look_alikes") if key in counts}
 
 
 def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
@@ -60,9 +60,14 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
             yield f"pairs of photos left out because they do not fit the others: {dropped}"
     for photos in summary.get("cut_apart", ()):
         yield f"cut apart, because more matches contradict the join than bear it out: {photos}"
+    for join in summary.get("look_alikes", ()):
+        here, there = (_some(names) for names in join["between"])
+        yield (
+            f"look-alikes told apart, {join['pairs']} pairs of photos: {here} | {there} "
+            f"({100 * join['missing']:.0f} % of what they would share in one place is missing)"
+        )
     for number, names in enumerate(summary.get("other_models", ()), start=1):
-        more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
-        yield f"another model of {len(names)} photos in other_models/{number}: {', '.join(names[:NAMES])}{more}"
+        yield f"another model of {len(names)} photos in other_models/{number}: {_some(names)}"
     explained, against = counts.get("explained_matches", 0), counts.get("contradicted_matches", 0)
     if against > CONTRADICTED * (explained + against):
         yield (
@@ -74,6 +79,11 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
         sure = max(orientation["up_deviation_deg"], 0.1)
         yield f"upright by {orientation['up']}, to about {sure:.1f} degrees; in {_unit(orientation)}"
         yield from _perhaps_not_upright(orientation)
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
+    return f"{', '.join(names[:NAMES])}{more}"
 
 
 def _perhaps_not_upright(orientation: Mapping[str, Any]) -> Iterator[str]:

@@ -19,6 +19,9 @@ from sfm_app.types import Calibration, MatchGraph, PairId, RelativePose
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
+Cameras = Mapping[int, Calibration]
+Poses = Mapping[PairId, RelativePose]
+Scales = dict[int, float]
 
 MOST_DEG, MOST_SCALE = 20.0, 1.5
 """From within such an angle, and so much nearer or farther, a point is found again. 30 degrees and 2 say the same on
@@ -55,9 +58,7 @@ class Depths:
         sight: their inliers.
     """
 
-    def __init__(
-        self, matches: MatchGraph, cameras: Mapping[int, Calibration], poses: Mapping[PairId, RelativePose], sight: Sight
-    ) -> None:
+    def __init__(self, matches: MatchGraph, cameras: Cameras, poses: Poses, sight: Sight) -> None:
         self.matches, self.cameras, self.poses, self.sight = matches, cameras, poses, sight
         self.rays: dict[int, FloatArray] = {}
 
@@ -83,8 +84,8 @@ class Depths:
         end = pair.index(photo)
         return Ends(rows[front, end], np.log(found[end][front]), weights[front])
 
-    def of_photo(self, photo: int, trusted: Iterable[int], doubted: Iterable[int]) -> tuple[FloatArray, dict[int, float]]:
-        """(K,) logarithms of depths from trusted pairs, NaN where there is none, and what brings them to the scale of each pair.
+    def of_photo(self, photo: int, trusted: Iterable[int], doubted: Iterable[int]) -> tuple[FloatArray, Scales]:
+        """(K,) logarithms of depths from trusted pairs, NaN where there is none; what adds up to the scale of each pair.
 
         Args:
             photo: whose keypoints.
@@ -92,7 +93,7 @@ class Depths:
             doubted: photos whose pairs with it get a scale only.
         """
         total = np.zeros((2, len(self.matches.keypoints[photo])))
-        scales: dict[int, float] = {}
+        scales: Scales = {}
         known = {other: self.ends(photo, other) for other in trusted}
         waiting = sorted(known, key=lambda other: (-float(known[other].weights.sum()), other))
         while waiting:
@@ -133,7 +134,7 @@ class Depths:
         size = np.array([image.width, image.height], np.float64)
         inside = (there[:, 2] > 0) & ((x > BORDER * size) & (x < (1.0 - BORDER) * size)).all(axis=1)
         alike = (smaller < MOST_SCALE) & (smaller > 1.0 / MOST_SCALE) & (cosines > np.cos(np.radians(MOST_DEG)))
-        return points[inside & alike]
+        return np.asarray(points[inside & alike], np.int64)
 
 
 def missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int], places: Depths) -> tuple[int, int]:

@@ -13,6 +13,7 @@ from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.reconstruction.attempts import Attempt, Group, attempts, better, why
 from sfm_app.reconstruction.joins import sound_parts
 from sfm_app.reconstruction.left_out import names_of
+from sfm_app.reconstruction.told_apart import with_earlier, without_look_alikes
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
 
 LEARNED_FROM = 3
@@ -54,7 +55,8 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
     if not first.models or not worth_another(first, intrinsics, matches):
         return first
     learned = learned_intrinsics(first.models[0], intrinsics, matches)
-    second = replace(_pass(matches, views, learned, run), passes=2)
+    second = replace(_pass(*without_look_alikes(matches, views, first.graph), learned, run), passes=2)
+    second = replace(second, graph=with_earlier(second.graph, first.graph))
     if second.support > first.support:
         return second
     _enter(first.graph, intrinsics, matches, run)
@@ -96,6 +98,7 @@ def _pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Ru
     options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
     graph = build_pose_graph(matches, views, intrinsics, options, run.map)
     _enter(graph, intrinsics, matches, run)
+    matches, views = without_look_alikes(matches, views, graph)
     models: list[Attempt] = []
     reasons: dict[str, str] = {}
     tried: list[str] = []

@@ -15,6 +15,7 @@ from sfm_app.diagnosis import why_no_depth, why_no_scene
 from sfm_app.reconstruction import Outcome, reconstruct
 from sfm_app.reconstruction.left_out import left_out, names_of
 from sfm_app.reconstruction.orientation import look_at_photos, orient
+from sfm_app.reconstruction.told_apart import in_words
 from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
 from sfm_app.written import replacing
 
@@ -56,6 +57,7 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         cameras={name: camera.to_dict() for name, camera in scene.cameras.items()},
         orientation=orientations[0],
         **how_it_was_made(outcome),
+        look_alikes=in_words(outcome.graph.look_alikes, matches),
     )
     return scene
 

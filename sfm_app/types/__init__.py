@@ -26,6 +26,7 @@ __all__ = [
     "Frustum",
     "GpsPosition",
     "Intrinsics",
+    "LookAlikes",
     "MatchGraph",
     "MatchedImage",
     "Model",

@@ -1,0 +1,55 @@
+"""Look-alikes that were told apart: what mapping gets to see of them, and what people do."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+from sfm_app.reconstruction.left_out import names_of
+from sfm_app.types import LookAlikes, MatchGraph, PairId, PoseGraph, ViewGraph
+
+
+def without_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph) -> tuple[MatchGraph, ViewGraph]:
+    """Matches and fundamental matrices without those of look-alikes: these speak neither for a model nor against it."""
+    gone = {pair for join in graph.look_alikes for pair in join.pairs}
+    if not gone:
+        return matches, views
+    kept = {pair: rows for pair, rows in matches.matches.items() if pair not in gone}
+    fits = {pair: fit for pair, fit in views.fits.items() if pair not in gone}
+    return replace(matches, matches=kept), replace(views, fits=fits)
+
+
+def with_earlier(graph: PoseGraph, earlier: PoseGraph) -> PoseGraph:
+    """A pose graph that knows, too, what an earlier one told apart for it."""
+    dropped = {pair: earlier.dropped[pair] for join in earlier.look_alikes for pair in join.pairs}
+    return replace(graph, dropped=dropped | dict(graph.dropped), look_alikes=earlier.look_alikes + graph.look_alikes)
+
+
+def in_words(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str, Any]]:
+    """What was told apart, for the manifest."""
+    return [
+        {
+            "pairs": len(join.pairs),
+            "between": [names_of(photos, matches) for photos in sides(join.pairs, matches)],
+            "missing": round(join.missing, 3),
+        }
+        for join in joins
+    ]
+
+
+def sides(pairs: Sequence[PairId], matches: MatchGraph) -> tuple[list[int], list[int]]:
+    """The photos of the two places: those of the pair with most matches are on different sides, and so on."""
+    counts = {pair: len(matches.matches[pair]) for pair in pairs}
+    here: set[int] = set()
+    there: set[int] = set()
+    waiting = sorted(pairs, key=lambda pair: (-counts[pair], pair))
+    while waiting:
+        known = here | there
+        a, b = next((pair for pair in waiting if not known.isdisjoint(pair)), waiting[0])
+        waiting.remove((a, b))
+        if a in there or b in here:
+            a, b = b, a
+        if a not in known:
+            here.add(a)
+        if b not in known:
+            there.add(b)
+    return sorted(here), sorted(there)
