@@ -11,6 +11,7 @@ NAMES = 4
 MAPPERS = {"incremental": "photo after photo", "global": "all at once"}
 CONTRADICTED = 0.1
 """From this share of the matches on, people are told."""
+SIMILAR = ("look_alikes", "perhaps_look_alikes", "jumps")
 UNSURE_ODDS = 10.0
 """Below these odds to one that up is up, too."""
 
@@ -31,7 +32,7 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
         "points": scene.points,
         "mean_reprojection_px": round(scene.mean_reprojection_px, 3),
         "cameras": cameras,
-    } | {key: counts[key] for key in (*kept, "look_alikes") if key in counts}
+    } | {key: counts[key] for key in (*kept, *SIMILAR) if key in counts}
 
 
 def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
@@ -60,12 +61,7 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
             yield f"pairs of photos left out because they do not fit the others: {dropped}"
     for photos in summary.get("cut_apart", ()):
         yield f"cut apart, because more matches contradict the join than bear it out: {photos}"
-    for join in summary.get("look_alikes", ()):
-        here, there = (_some(names) for names in join["between"])
-        yield (
-            f"look-alikes told apart, {join['pairs']} pairs of photos: {here} | {there} "
-            f"({100 * join['missing']:.0f} % of what they would share in one place is missing)"
-        )
+    yield from _similar(summary)
     for number, names in enumerate(summary.get("other_models", ()), start=1):
         yield f"another model of {len(names)} photos in other_models/{number}: {_some(names)}"
     explained, against = counts.get("explained_matches", 0), counts.get("contradicted_matches", 0)
@@ -79,6 +75,24 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
         sure = max(orientation["up_deviation_deg"], 0.1)
         yield f"upright by {orientation['up']}, to about {sure:.1f} degrees; in {_unit(orientation)}"
         yield from _perhaps_not_upright(orientation)
+
+
+def _similar(summary: Mapping[str, Any]) -> Iterator[str]:
+    """What looks alike, and where the model may be folded."""
+    for join in summary.get("look_alikes", ()):
+        here, there = (_some(names) for names in join["between"])
+        yield (
+            f"look-alikes told apart, {join['pairs']} pairs of photos: {here} | {there} "
+            f"({100 * join['missing']:.0f} % of what they would share in one place is missing)"
+        )
+    for join in summary.get("perhaps_look_alikes", ()):
+        here, there = (_some(names) for names in join["between"])
+        yield (
+            f"beware: a loop, or look-alikes: {join['pairs']} pairs take {here} and {there} for one place, "
+            "and the photos between them do not bear it out"
+        )
+    for before, after in summary.get("jumps", ()):
+        yield f"beware: from {before} to {after} is a jump, though they follow each other; in a video a sign of look-alikes"
 
 
 def _some(names: Sequence[str]) -> str:

@@ -1,7 +1,7 @@
 """The pose graph: relative poses of pairs that agree with each other."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -100,7 +100,9 @@ def build_pose_graph(
     for pair in unconfirmed(poses, WEAK * options.min_inliers):
         dropped[pair] = UNCONFIRMED
         del poses[pair]
-    return PoseGraph(poses, dropped, averaged(poses)[0], _groups(poses), apart.joins)
+    stayed = (replace(join, pairs=tuple(pair for pair in join.pairs if pair in poses)) for join in apart.doubtful)
+    doubtful = tuple(join for join in stayed if join.pairs)
+    return PoseGraph(poses, dropped, averaged(poses)[0], _groups(poses), apart.joins, doubtful)
 
 
 def averaged(poses: Mapping[PairId, RelativePose]) -> tuple[dict[int, FloatArray], dict[PairId, float]]:

@@ -15,7 +15,7 @@ tracks and ways of photos hang together. Both are needed: a wide step misses muc
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,8 @@ from sfm_app.types import Calibration, LookAlikes, MatchGraph, PairId, RelativeP
 
 IndexArray = NDArray[np.int64]
 
-LEAST_TRACKED = 30
-"""Matches with both ends on tracks, below which a pair is not asked."""
+LEAST_TRACKED, FEW_TRACKED = 30, 15
+"""Matches with both ends on tracks, below which a pair is not asked, and not even beside known look-alikes."""
 SAME_TRACK = 0.02
 """A pair with a smaller share of these on one track contradicts the backbone. On oats23 and books21 look-alikes have 0;
 of 1100 pairs of fountain-P11, Herz-Jesus-P8, castle-P19, temple16, kitti51 and dinoSparseRing none is below 0.1."""
@@ -55,10 +55,10 @@ class Tracks:
         tracked = (first >= 0) & (second >= 0)
         return int(np.count_nonzero(tracked & (first == second))), int(np.count_nonzero(tracked))
 
-    def contradict(self, pair: PairId, rows: IndexArray) -> bool:
-        """Whether a pair joins what the backbone keeps apart."""
+    def contradict(self, pair: PairId, rows: IndexArray, least: int = LEAST_TRACKED) -> bool:
+        """Whether a pair, with so many tracked matches, joins what the backbone keeps apart."""
         same, tracked = self.agreement(pair, rows)
-        return tracked >= LEAST_TRACKED and same <= SAME_TRACK * tracked
+        return tracked >= least and same <= SAME_TRACK * tracked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,11 +67,13 @@ class Apart:
 
     joins: tuple[LookAlikes, ...]
     """Every join of look-alikes."""
+    doubtful: tuple[LookAlikes, ...]
+    """Joins that are loops, as far as what is missing says anything."""
     tracks: Tracks
 
     def strange(self, pair: PairId, rows: IndexArray) -> bool:
         """Whether a pair that was found later joins look-alikes, too."""
-        return bool(self.joins) and self.tracks.contradict(pair, rows)
+        return bool(self.joins) and self.tracks.contradict(pair, rows, FEW_TRACKED)
 
 
 def tell_apart(matches: MatchGraph, poses: Mapping[PairId, RelativePose], cameras: Mapping[int, Calibration]) -> Apart:
@@ -87,11 +89,20 @@ def tell_apart(matches: MatchGraph, poses: Mapping[PairId, RelativePose], camera
     tracks = tracks_of(sight, best)
     doubted = [pair for pair, rows in sight.rows.items() if pair not in best and tracks.contradict(pair, rows)]
     if not doubted:
-        return Apart((), tracks)
+        return Apart((), (), tracks)
     trusted = best | {pair for pair, rows in sight.rows.items() if _firm(*tracks.agreement(pair, rows))}
     places = Depths(matches, cameras, poses, sight)
     judged = [_judged(join, trusted, places) for join in joins_of(doubted, trusted)]
-    return Apart(tuple(join for join in judged if join is not None), tracks)
+    joins = [join for join, alike in judged if alike]
+    doubtful = tuple(join for join, alike in judged if not alike)
+    left = poses.keys() - best - {pair for join in joins for pair in join.pairs}
+    weak = sorted(pair for pair in left if tracks.contradict(pair, sight.rows[pair], FEW_TRACKED))
+    close = {frozenset(pair) for pair in trusted}
+    for number, join in enumerate(joins):
+        also = [pair for pair in weak if any(_beside(pair, other, close) for other in join.pairs)]
+        weak = [pair for pair in weak if pair not in also]
+        joins[number] = replace(join, pairs=tuple(sorted((*join.pairs, *also))))
+    return Apart(tuple(joins), doubtful, tracks)
 
 
 def tracks_of(sight: Sight, pairs: Iterable[PairId]) -> Tracks:
@@ -135,13 +146,12 @@ def _firm(same: int, tracked: int) -> bool:
     return tracked > 0 and same >= FIRM * tracked
 
 
-def _judged(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> LookAlikes | None:
-    """A join of look-alikes; None where what is missing does not say so."""
+def _judged(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> tuple[LookAlikes, bool]:
+    """A join with what it misses, and whether that makes it one of look-alikes."""
     expected = missing = 0
     for photo in sorted({photo for pair in join for photo in pair}):
         friends, claimed = ({sum(pair) - photo for pair in pairs if photo in pair} for pairs in (trusted, join))
         wanted, lacking = missing_cells(photo, claimed, friends, places) if friends else (0, 0)
         expected, missing = expected + wanted, missing + lacking
-    if expected < LEAST_CELLS or missing <= MISSING * expected:
-        return None
-    return LookAlikes(join, missing / expected)
+    alike = expected >= LEAST_CELLS and missing > MISSING * expected
+    return LookAlikes(join, missing / max(expected, 1)), alike

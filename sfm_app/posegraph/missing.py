@@ -61,6 +61,7 @@ class Depths:
     def __init__(self, matches: MatchGraph, cameras: Cameras, poses: Poses, sight: Sight) -> None:
         self.matches, self.cameras, self.poses, self.sight = matches, cameras, poses, sight
         self.rays: dict[int, FloatArray] = {}
+        self.known: dict[tuple[int, int], Ends] = {}
 
     def rays_of(self, photo: int) -> FloatArray:
         """(K, 2) keypoints on the plane z = 1."""
@@ -71,6 +72,8 @@ class Depths:
 
     def ends(self, photo: int, other: int) -> Ends:
         """Depths of a photo's points from one pair."""
+        if (photo, other) in self.known:
+            return self.known[photo, other]
         pair = (min(photo, other), max(photo, other))
         pose, rows = self.poses[pair], self.sight.rows[pair]
         used = np.hstack([self.rays_of(one)[column] for one, column in zip(pair, rows.T, strict=True)])
@@ -81,11 +84,12 @@ class Depths:
         lengths = np.linalg.norm(h1, axis=1) * np.linalg.norm(h2, axis=1)
         sines = np.linalg.norm(np.cross(h1, h2), axis=1) / lengths
         weights = np.minimum(sines, WIDE_RAD) ** 2 + 1e-6
-        end = pair.index(photo)
-        return Ends(rows[front, end], np.log(found[end][front]), weights[front])
+        for end, names in enumerate((pair, pair[::-1])):
+            self.known[names] = Ends(rows[front, end], np.log(found[end][front]), weights[front])
+        return self.known[photo, other]
 
     def of_photo(self, photo: int, trusted: Iterable[int], doubted: Iterable[int]) -> tuple[FloatArray, Scales]:
-        """(K,) logarithms of depths from trusted pairs, NaN where there is none; what adds up to the scale of each pair.
+        """(K,) logarithms of depths from trusted pairs, NaN where there is none; what leads to the scale of each pair.
 
         Args:
             photo: whose keypoints.

@@ -4,8 +4,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
+from sfm_app.colmap.backend import backend
 from sfm_app.reconstruction.left_out import names_of
 from sfm_app.types import LookAlikes, MatchGraph, PairId, PoseGraph, ViewGraph
+
+LEAST_IN_ORDER = 10
+"""Photos, below which their order says nothing."""
+JUMP, MOST_JUMPS = 5.0, 0.1
+"""A step is a jump when it is so many times the median step; with a larger share of jumps the photos are in no order.
+Not chosen on any set; the usual order of castle-P19, fountain-P11, Herz-Jesus-P8, kitti51 and oats23 has no jump."""
 
 
 def without_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph) -> tuple[MatchGraph, ViewGraph]:
@@ -34,6 +43,20 @@ def in_words(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str,
         }
         for join in joins
     ]
+
+
+def jumps(model: Any) -> list[list[str]]:
+    """Photos that follow each other by name, but not along the way of all others: where a video may be folded.
+
+    Empty where the photos are not in order, so that many steps are long. That is no proof: videos are cut, too.
+    """
+    with backend("reading poses"):
+        placed = sorted((image.name, image.projection_center()) for image in model.images.values() if image.has_pose)
+    if len(placed) < LEAST_IN_ORDER:
+        return []
+    steps = np.linalg.norm(np.diff([centre for _, centre in placed], axis=0), axis=1)
+    long = np.flatnonzero(steps > JUMP * np.median(steps))
+    return [[placed[k][0], placed[k + 1][0]] for k in long] if len(long) <= MOST_JUMPS * len(steps) else []
 
 
 def sides(pairs: Sequence[PairId], matches: MatchGraph) -> tuple[list[int], list[int]]:

@@ -59,6 +59,8 @@ class PoseGraph:
     """Photos that hang together, the largest group first."""
     look_alikes: tuple[LookAlikes, ...] = ()
     """What was told apart; these pairs are among the dropped ones."""
+    doubtful: tuple[LookAlikes, ...] = ()
+    """Loops, or look-alikes: pairs that stayed, but which the photos between theirs do not bear out."""
 
     def group_of(self, photo: int) -> tuple[int, ...]:
         """All photos that hang together with this one; empty where none does."""
