@@ -40,7 +40,7 @@ FIRM = 0.1
 """From this share on a pair is borne out."""
 LOW, MISSING, MISSING_ALL_THE_SAME = 25.0, 0.2, 0.3
 """Such pairs join look-alikes when the quarter of the photos that miss least (percentile) lack a larger share of the
-cells expected; the second limit is for pairs that turn as the way between their photos does. 0.30 on oats23, 0.28 on books21;
+cells expected; the second limit is for pairs that turn as the way between them does. 0.30 on oats23, 0.28 on books21;
 0.12 where the video kitchen1000 (every 15th) closes a loop. Shares over all photos are no measure: 0.37, 0.33, 0.25."""
 TURNED_ALIKE_DEG = 3.0
 """Median angle between the rotations of such pairs and the way, below which they agree: 1 degree for that loop, 9 on
