@@ -1,6 +1,6 @@
 """What a run says about its scene: for people, and plain."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from sfm_app.cli.camera_text import k_text
@@ -11,6 +11,7 @@ NAMES = 4
 MAPPERS = {"incremental": "photo after photo", "global": "all at once"}
 CONTRADICTED = 0.1
 """From this share of the matches on, people are told."""
+SIMILAR = ("look_alikes", "perhaps_look_alikes", "jumps")
 UNSURE_ODDS = 10.0
 """Below these odds to one that up is up, too."""
 
@@ -33,7 +34,7 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
         "points": scene.points,
         "mean_reprojection_px": round(scene.mean_reprojection_px, 3),
         "cameras": cameras,
-    } | {key: counts[key] for key in kept if key in counts}
+    } | {key: counts[key] for key in (*kept, *SIMILAR) if key in counts}
 
 
 def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
@@ -62,9 +63,9 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
             yield f"pairs of photos left out because they do not fit the others: {dropped}"
     for photos in summary.get("cut_apart", ()):
         yield f"cut apart, because more matches contradict the join than bear it out: {photos}"
+    yield from _similar(summary)
     for number, names in enumerate(summary.get("other_models", ()), start=1):
-        more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
-        yield f"another model of {len(names)} photos in other_models/{number}: {', '.join(names[:NAMES])}{more}"
+        yield f"another model of {len(names)} photos in other_models/{number}: {_some(names)}"
     explained, against = counts.get("explained_matches", 0), counts.get("contradicted_matches", 0)
     if against > CONTRADICTED * (explained + against):
         yield (
@@ -93,6 +94,29 @@ def _badly_adjusted(adjustment: Mapping[str, Any]) -> Iterator[str]:
         yield f"beware: the last adjustment of other_models/{number} failed ({reason})"
     for name in adjustment.get("cameras_held", ()):
         yield f"beware: these photos do not determine camera {name}; it stayed as mapping left it"
+
+
+def _similar(summary: Mapping[str, Any]) -> Iterator[str]:
+    """What looks alike, and where the model may be folded."""
+    for join in summary.get("look_alikes", ()):
+        here, there = (_some(names) for names in join["between"])
+        yield (
+            f"look-alikes told apart, {join['pairs']} pairs of photos: {here} | {there} "
+            f"({100 * join['missing']:.0f} % of what they would share in one place is missing)"
+        )
+    for join in summary.get("perhaps_look_alikes", ()):
+        here, there = (_some(names) for names in join["between"])
+        yield (
+            f"beware: a loop, or look-alikes: {join['pairs']} pairs take {here} and {there} for one place, "
+            "and the photos between them do not bear it out"
+        )
+    for before, after in summary.get("jumps", ()):
+        yield f"beware: a jump from {before} to {after}, which follow each other: in a video a sign of look-alikes"
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
+    return f"{', '.join(names[:NAMES])}{more}"
 
 
 def _perhaps_not_upright(orientation: Mapping[str, Any]) -> Iterator[str]:

@@ -4,7 +4,7 @@ import contextlib
 import ctypes
 import hashlib
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -162,10 +162,12 @@ def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
             database.write_two_view_geometry(*pair, _posed_geometry(pose, matches.matches[pair]))
 
 
-def clear_geometries(path: Path) -> None:
-    """Remove all two-view geometries."""
+def keep_raw_matches(path: Path, pairs: Collection[PairId]) -> None:
+    """Remove all two-view geometries, and the matches of all other pairs."""
     with opened(path) as database:
         database.clear_two_view_geometries()
+        for pair in {_pair(pair_id) for pair_id in database.read_all_matches()[0]}.difference(pairs):
+            database.delete_matches(*pair)
 
 
 def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) -> None:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.groups import connected_groups
 from sfm_app.posegraph.guided import guided_pose
+from sfm_app.posegraph.look_alikes import tell_apart
 from sfm_app.posegraph.pair_pose import Pair, estimated
 from sfm_app.posegraph.rotations import agreeing_loops, average_rotations
 from sfm_app.types import EpipolarFit, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
@@ -33,6 +34,7 @@ WEAK = 2.0
 CONTRADICTS, BEHIND, TOO_FEW = "contradicts other pairs", "points behind a camera", "too few matches fit the cameras"
 NO_NUMBERS = "its pose cannot be computed"
 UNCONFIRMED = "few matches, and no other pair bears it out"
+LOOKS_ALIKE = "equal things in different places"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +75,11 @@ def build_pose_graph(
 
     found = dict(zip(views.fits, run_map(from_fit, list(views.fits.items()), "relative poses"), strict=True))
     poses, dropped = _plausible(found, options.min_inliers)
+    cameras = {photo: intrinsics.camera(image) for photo, image in matches.images.items()}
+    apart = tell_apart(matches, poses, cameras)
+    for pair in [pair for join in apart.joins for pair in join.pairs]:
+        dropped[pair] = LOOKS_ALIKE
+        del poses[pair]
     rotations, angles = averaged(poses)
     typical = SPREADS * float(np.median(list(angles.values()) or [0.0]))
     limits = {
@@ -92,16 +99,22 @@ def build_pose_graph(
             return None
 
     group = {photo: number for number, photos in enumerate(_groups(poses)) for photo in photos}
-    left = [pair for pair in matches.matches if pair not in poses and group.get(pair[0], -1) == group.get(pair[1], -2)]
+    left = [
+        pair
+        for pair in matches.matches
+        if pair not in poses and group.get(pair[0], -1) == group.get(pair[1], -2) and dropped.get(pair) != LOOKS_ALIKE
+    ]
     for pair, pose in zip(left, run_map(again, left, "pairs again"), strict=True):
-        if pose is not None:
+        if pose is not None and not apart.strange(pair, matches.matches[pair][pose.inliers]):
             poses[pair] = pose
             dropped.pop(pair, None)
     poses = dict(sorted(poses.items()))
     for pair in unconfirmed(poses, WEAK * options.min_inliers):
         dropped[pair] = UNCONFIRMED
         del poses[pair]
-    return PoseGraph(poses, dropped, averaged(poses)[0], _groups(poses))
+    stayed = (replace(join, pairs=tuple(pair for pair in join.pairs if pair in poses)) for join in apart.doubtful)
+    doubtful = tuple(join for join in stayed if join.pairs)
+    return PoseGraph(poses, dropped, averaged(poses)[0], _groups(poses), apart.joins, doubtful)
 
 
 def averaged(poses: Mapping[PairId, RelativePose]) -> tuple[dict[int, FloatArray], dict[PairId, float]]:

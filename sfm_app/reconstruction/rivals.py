@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from sfm_app.colmap.backend import backend, interruptible
-from sfm_app.colmap.database import clear_geometries, write_calibrations
+from sfm_app.colmap.database import keep_raw_matches, write_calibrations
 from sfm_app.colmap.mapping import copy_database, map_as_colmap_does
 from sfm_app.context import RunContext
 from sfm_app.errors import BackendError
@@ -58,14 +58,17 @@ def photos_in(fits: Mapping[PairId, EpipolarFit]) -> set[int]:
 
 
 def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Attempt:
-    """Map all photos as COLMAP does by itself, and judge the model like any other; without one where it fails."""
+    """Map all photos as COLMAP does by itself, and judge the model like any other; none where it fails.
+
+    Pairs that are not among the matches, such as those of look-alikes, are kept from it, too.
+    """
     scratch, found = run.workspace.root / FOLDER, []
     guess = guessed_intrinsics(intrinsics)
     try:
         with backend("mapping photos by its defaults"):
             copy_database(run.workspace.database, scratch)
             write_calibrations(scratch / "database.db", matches, guess)
-            clear_geometries(scratch / "database.db")
+            keep_raw_matches(scratch / "database.db", matches.matches)
             interruptible(
                 lambda token: found.append(map_as_colmap_does(run.workspace.photos, scratch, run.seed, token)),
                 lambda: None,

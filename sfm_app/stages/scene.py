@@ -16,6 +16,7 @@ from sfm_app.numerical import json_text
 from sfm_app.reconstruction import Outcome, reconstruct
 from sfm_app.reconstruction.left_out import left_out, names_of
 from sfm_app.reconstruction.orientation import look_at_photos, orient_or_leave
+from sfm_app.reconstruction.told_apart import in_words, jumps
 from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
 from sfm_app.written import replacing
 
@@ -57,6 +58,9 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
         orientation=orientations[0],
         adjustment=how_it_was_adjusted(adjusted, names),
         **how_it_was_made(outcome),
+        look_alikes=in_words(outcome.graph.look_alikes, matches),
+        perhaps_look_alikes=in_words(outcome.graph.doubtful, matches),
+        jumps=jumps(models[0]),
     )
     return scene
 

@@ -14,7 +14,7 @@ from sfm_app.types.epipolar import EpipolarFit, Rejected, ViewGraph
 from sfm_app.types.matches import MatchedImage, MatchGraph, PairId
 from sfm_app.types.model import Frustum, Model, Texture
 from sfm_app.types.photos import Frame, GpsPosition, Photo, PhotoSet, UnusablePhoto
-from sfm_app.types.pose_graph import PoseGraph, RelativePose
+from sfm_app.types.pose_graph import LookAlikes, PoseGraph, RelativePose
 from sfm_app.types.scene import CameraModel, Scene
 from sfm_app.types.surface import Surface
 
@@ -27,6 +27,7 @@ __all__ = [
     "Frustum",
     "GpsPosition",
     "Intrinsics",
+    "LookAlikes",
     "MatchGraph",
     "MatchedImage",
     "Model",

@@ -37,6 +37,15 @@ class RelativePose:
         return int(np.count_nonzero(self.inliers))
 
 
+@dataclass(frozen=True, slots=True)
+class LookAlikes:
+    """Pairs of photos that take equal things in two places for one thing."""
+
+    pairs: tuple[PairId, ...]
+    missing: float
+    """Share, 0 to 1, of what these pairs would have to show if the places were one, and do not."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseGraph:
     """Pairs whose relative poses agree with each other, and what happened to the others."""
@@ -48,6 +57,10 @@ class PoseGraph:
     """By photo: (3, 3) rotation from the world; every group of photos has a world of its own."""
     groups: tuple[tuple[int, ...], ...]
     """Photos that hang together, the largest group first."""
+    look_alikes: tuple[LookAlikes, ...] = ()
+    """What was told apart; these pairs are among the dropped ones."""
+    doubtful: tuple[LookAlikes, ...] = ()
+    """Loops, or look-alikes: pairs that stayed, but which the photos between theirs do not bear out."""
 
     def group_of(self, photo: int) -> tuple[int, ...]:
         """All photos that hang together with this one; empty where none does."""

@@ -89,3 +89,24 @@ def test_a_model_that_could_not_be_turned_upright_says_so():
     assert "stands as mapping left it, neither upright nor in metres: it has no points" in text
     unsure, _ = told(orientation=COUNTS["orientation"] | {"up_deviation_deg": None})
     assert "upright by vanishing lines, nobody knows how exactly" in unsure
+
+
+def test_look_alikes_are_named_and_so_is_what_may_be():
+    first, last = ["a.jpg", "b.jpg"], [f"z{n}.jpg" for n in range(5)]
+    join = {"pairs": 12, "between": [first, last], "missing": 0.374}
+
+    text, summary = told(look_alikes=[join])
+    assert (
+        "look-alikes told apart, 12 pairs of photos: a.jpg, b.jpg | z0.jpg, z1.jpg, z2.jpg, z3.jpg and 1 more (37 %"
+        in text
+    )
+    assert "beware" not in text and summary["look_alikes"] == [join]
+
+    text, _ = told(perhaps_look_alikes=[join])
+    assert (
+        "beware: a loop, or look-alikes: 12 pairs take a.jpg, b.jpg and z0.jpg, z1.jpg, z2.jpg, z3.jpg and 1 more for"
+        in text
+    )
+
+    text, _ = told(jumps=[["a.jpg", "b.jpg"]])
+    assert "beware: a jump from a.jpg to b.jpg, which follow each other" in text

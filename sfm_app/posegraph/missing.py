@@ -1,0 +1,185 @@
+"""Matches that are missing: what two photos would have in common if their relative pose were that of one place.
+
+A photo's points have depths from other pairs. Put into the scale of a pair, they land in its other photo, or outside.
+Where the photos stand close to each other, what lands inside must have matches there (Zach et al. 2010, Heinly et al.
+2014). One pair alone may miss much, since matching is blind at places; all pairs of a photo that claim the same join
+miss little together.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.camera import rays
+from sfm_app.posegraph.coverage import Sight
+from sfm_app.posegraph.pair_pose import depths
+from sfm_app.types import Calibration, MatchGraph, PairId, RelativePose
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+Cameras = Mapping[int, Calibration]
+Poses = Mapping[PairId, RelativePose]
+Scales = dict[int, float]
+
+MOST_DEG, MOST_SCALE = 20.0, 1.5
+"""From within such an angle, and so much nearer or farther, a point is found again. 30 degrees and 2 say the same on
+oats23 and books21."""
+BORDER = 0.05
+"""Of the width and height: what lands so near the border may be outside."""
+WIDE_RAD = 0.2
+"""Depths from wider angles count no more."""
+TOGETHER = 8
+"""Points that two pairs of a photo have in common: fewer do not tell their scales."""
+SOME = 2
+"""Points: a cell of a photo with fewer of them expects nothing."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ends:
+    """What the depths of a photo come from: one pair of it."""
+
+    rows: IndexArray
+    """(N,) keypoints of the photo."""
+    logs: FloatArray
+    """(N,) logarithms of their depths; the pair's baseline is 1."""
+    weights: FloatArray
+    """(N,) by the angles of their rays."""
+
+
+class Depths:
+    """Depths of keypoints in the scale of any pair of their photo.
+
+    Args:
+        matches: keypoints.
+        cameras: by photo.
+        poses: relative poses.
+        sight: their inliers.
+    """
+
+    def __init__(self, matches: MatchGraph, cameras: Cameras, poses: Poses, sight: Sight) -> None:
+        self.matches, self.cameras, self.poses, self.sight = matches, cameras, poses, sight
+        self.rays: dict[int, FloatArray] = {}
+        self.known: dict[tuple[int, int], Ends] = {}
+
+    def rays_of(self, photo: int) -> FloatArray:
+        """(K, 2) keypoints on the plane z = 1."""
+        if photo not in self.rays:
+            camera = self.cameras[photo]
+            self.rays[photo] = rays(self.matches.keypoints[photo], camera.K, camera.radial)
+        return self.rays[photo]
+
+    def ends(self, photo: int, other: int) -> Ends:
+        """Depths of a photo's points from one pair."""
+        if (photo, other) in self.known:
+            return self.known[photo, other]
+        pair = (min(photo, other), max(photo, other))
+        pose, rows = self.poses[pair], self.sight.rows[pair]
+        used = np.hstack([self.rays_of(one)[column] for one, column in zip(pair, rows.T, strict=True)])
+        found, front = depths(used, pose.R, pose.t), np.ones(len(rows), np.bool_)
+        for one in found:
+            front &= one > 0
+        h1, h2 = _homogeneous(used[:, :2]) @ pose.R.T, _homogeneous(used[:, 2:])
+        lengths = np.linalg.norm(h1, axis=1) * np.linalg.norm(h2, axis=1)
+        sines = np.linalg.norm(np.cross(h1, h2), axis=1) / lengths
+        weights = np.minimum(sines, WIDE_RAD) ** 2 + 1e-6
+        for end, names in enumerate((pair, pair[::-1])):
+            self.known[names] = Ends(rows[front, end], np.log(found[end][front]), weights[front])
+        return self.known[photo, other]
+
+    def of_photo(self, photo: int, trusted: Iterable[int], doubted: Iterable[int]) -> tuple[FloatArray, Scales]:
+        """(K,) logarithms of depths from trusted pairs, NaN where there is none; what leads to the scale of each pair.
+
+        Args:
+            photo: whose keypoints.
+            trusted: photos whose pairs with it say how deep its points lie.
+            doubted: photos whose pairs with it get a scale only.
+        """
+        total = np.zeros((2, len(self.matches.keypoints[photo])))
+        scales: Scales = {}
+        known = {other: self.ends(photo, other) for other in trusted}
+        waiting = sorted(known, key=lambda other: (-float(known[other].weights.sum()), other))
+        while waiting:
+            other = next((one for one in waiting if _in_common(known[one], total) >= TOGETHER), waiting[0])
+            if scales and _in_common(known[other], total) < TOGETHER:
+                break
+            waiting.remove(other)
+            end = known[other]
+            scales[other] = _scale(end, total) if scales else 0.0
+            np.add.at(total[0], end.rows, end.weights * (end.logs - scales[other]))
+            np.add.at(total[1], end.rows, end.weights)
+        for other in doubted:
+            end = self.ends(photo, other)
+            if _in_common(end, total) >= TOGETHER:
+                scales[other] = _scale(end, total)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(total[1] > 0, total[0] / total[1], np.nan), scales
+
+    def expected(self, photo: int, other: int, points: IndexArray, logs: FloatArray) -> IndexArray:
+        """Those of a photo's points that the other one must show, if their pair is right.
+
+        Args:
+            photo: whose points.
+            other: where they should be.
+            points: (N,) keypoints.
+            logs: (N,) logarithms of their depths in the scale of the pair.
+        """
+        R, t = _from_to(self.poses, photo, other)
+        rays_here = _homogeneous(self.rays_of(photo)[points])
+        z = np.exp(logs)
+        turned = rays_here @ R.T
+        there = turned * z[:, None] + t
+        image, here, camera = self.matches.images[other], self.cameras[photo], self.cameras[other]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            x = (there @ camera.K.T)[:, :2] / there[:, 2:]
+            smaller = there[:, 2] / z * here.K[0, 0] / camera.K[0, 0]
+            cosines = (turned * there).sum(1) / np.linalg.norm(turned, axis=1) / np.linalg.norm(there, axis=1)
+        size = np.array([image.width, image.height], np.float64)
+        inside = (there[:, 2] > 0) & ((x > BORDER * size) & (x < (1.0 - BORDER) * size)).all(axis=1)
+        alike = (smaller < MOST_SCALE) & (smaller > 1.0 / MOST_SCALE) & (cosines > np.cos(np.radians(MOST_DEG)))
+        return np.asarray(points[inside & alike], np.int64)
+
+
+def missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int], places: Depths) -> tuple[int, int]:
+    """Cells of a photo that pairs claim to be seen in other photos, and those of them where none has a match.
+
+    Args:
+        photo: whose cells.
+        joined: photos that the pairs in question join it to.
+        trusted: photos whose pairs with it are beyond doubt.
+        places: depths and poses.
+    """
+    sight, others = places.sight, sorted(joined)
+    logs, scales = places.of_photo(photo, sorted(trusted), others)
+    points = np.flatnonzero(~np.isnan(logs))
+    wanted, hit = np.zeros(len(logs), np.bool_), np.zeros(len(logs), np.bool_)
+    for other in others:
+        pair = (min(photo, other), max(photo, other))
+        hit[sight.rows[pair][:, pair.index(photo)]] = True
+        if other in scales:
+            wanted[places.expected(photo, other, points, logs[points] + scales[other])] = True
+    cells, counts = np.unique(sight.cells[photo][wanted], return_counts=True)
+    cells = cells[counts >= SOME]
+    return len(cells), int(np.count_nonzero(~np.isin(cells, sight.cells[photo][hit])))
+
+
+def _from_to(poses: Mapping[PairId, RelativePose], photo: int, other: int) -> tuple[FloatArray, FloatArray]:
+    if photo < other:
+        return poses[photo, other].R, poses[photo, other].t
+    pose = poses[other, photo]
+    return pose.R.T, -pose.R.T @ pose.t
+
+
+def _in_common(end: Ends, total: FloatArray) -> int:
+    return int(np.count_nonzero(total[1, end.rows] > 0))
+
+
+def _scale(end: Ends, total: FloatArray) -> float:
+    both = total[1, end.rows] > 0
+    rows = end.rows[both]
+    return float(np.median(end.logs[both] - total[0, rows] / total[1, rows]))
+
+
+def _homogeneous(x: FloatArray) -> FloatArray:
+    return np.column_stack([x, np.ones(len(x))])
