@@ -9,7 +9,7 @@ from sfm_app.geometry.camera import rays
 from sfm_app.geometry.epipolar import cross_matrix, eight_point
 from sfm_app.geometry.essential import decompose_essential, nearest_essential
 from sfm_app.posegraph.refine import SIGMAS_PX, pose_distances, refined
-from sfm_app.posegraph.starts import turned_starts
+from sfm_app.posegraph.starts import planar_starts, turned_starts
 from sfm_app.ransac.planes import OFF_PLANE, dominant_homography, transfer_distance
 from sfm_app.types import Calibration, EpipolarFit, RelativePose
 
@@ -105,18 +105,24 @@ def estimated(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
 def best_of_starts(pair: Pair, fit: EpipolarFit, start: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
     """The pose that the inliers of F fit best, of those that lie before both cameras.
 
-    That of F's own start stays unless another one is clearly better.
+    That of F's own start stays unless another one is clearly better and loses no inliers: of the two poses that a plane
+    allows, the wrong one loses what lies off the plane.
     """
     used, focals = pair.rays[fit.inliers], pair.focals
     best = refined(used, focals, *start)
-    lowest = pose_cost(used, focals, *best) if in_front(used, *best).mean() >= BEFORE_BOTH else np.inf
-    for other in turned_starts(used, pair.essential(fit)):
+    if not len(used):
+        return best
+    lowest, most = pose_cost(used, focals, *best), np.count_nonzero(pair.inliers(*best))
+    if in_front(used, *best).mean() < BEFORE_BOTH:
+        lowest, most = np.inf, 0
+    planar = planar_starts(used) if fit.degeneracy == "planar" else ()
+    for other in (*turned_starts(used, pair.essential(fit)), *planar):
         R, t = refined(used, focals, *other)
-        cost = pose_cost(used, focals, R, t)
-        if cost < (1.0 - BETTER) * lowest:
+        cost, count = pose_cost(used, focals, R, t), np.count_nonzero(pair.inliers(R, t))
+        if cost < (1.0 - BETTER) * lowest and count >= most:
             t = t if np.mean(in_front(used, R, t)) >= 0.5 else -t
             if in_front(used, R, t).mean() >= BEFORE_BOTH:
-                best, lowest = (R, t), cost
+                best, lowest, most = (R, t), cost, count
     return best
 
 

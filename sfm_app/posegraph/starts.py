@@ -7,15 +7,35 @@ fix everything except that turn, if camera 2 looks at what camera 1 looked at. S
 
 from collections.abc import Iterator
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 FloatArray = NDArray[np.float64]
 
+LEAST_PLANAR = 8
 TURNS_DEG = (-55.0, -30.0, -12.0, 12.0, 30.0, 55.0)
 """About the scene. On the 30 pairs of a long-lens orbit (dinoSparseRing, K given) these lead to the best pose that 24
 turns from -60 to 60 lead to; the choice rests on that set alone, and only adds starts elsewhere."""
+
+
+def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """R and t of the cameras that would see these matches if they lay on one plane: up to four.
+
+    Args:
+        used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
+    """
+    if len(used) < LEAST_PLANAR:
+        return
+    H, _ = cv2.findHomography(used[:, :2], used[:, 2:], 0)
+    if H is None or not np.isfinite(H).all() or abs(np.linalg.det(H)) < 1e-12:
+        return
+    _, rotations, steps, _ = cv2.decomposeHomographyMat(H, np.eye(3))
+    for R, t in zip(rotations, steps, strict=True):
+        length = float(np.linalg.norm(t))
+        if np.isfinite(R).all() and length > 1e-9:
+            yield np.asarray(R, np.float64), np.asarray(t, np.float64).ravel() / length
 
 
 def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
