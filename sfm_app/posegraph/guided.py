@@ -19,6 +19,7 @@ AS_MANY = 0.9
 """A pose whose rotation runs away is believed with the rotation of others, if it keeps that share of its inliers: a
 long lens does not say how far the camera has turned."""
 HELD_ROUNDS, HELD_SIGMA = 8, 0.2
+"""Least squares with new weights, so often; scale of the loss in thresholds."""
 NEAR = 3.0
 """While the rotation is that of others, matches count within this many thresholds."""
 LEAST_IN_FRONT, MOST_TURN_DEG = 0.95, 2.0

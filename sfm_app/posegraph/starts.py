@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 FloatArray = NDArray[np.float64]
 
 LEAST_PLANAR = 8
+"""Matches; a homography has eight parameters, two to a match, and half of them should be to spare."""
 TURNS_DEG = (-55.0, -30.0, -12.0, 12.0, 30.0, 55.0)
 """About the scene. On the 30 pairs of a long-lens orbit (dinoSparseRing, K given) these lead to the best pose that 24
 turns from -60 to 60 lead to; the choice rests on that set alone, and only adds starts elsewhere."""
@@ -28,7 +29,10 @@ def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
     """
     if len(used) < LEAST_PLANAR:
         return
-    H, _ = cv2.findHomography(used[:, :2], used[:, 2:], 0)
+    try:
+        H, _ = cv2.findHomography(used[:, :2], used[:, 2:], 0)
+    except cv2.error:
+        return
     if H is None or not np.isfinite(H).all() or abs(np.linalg.det(H)) < 1e-12:
         return
     _, rotations, steps, _ = cv2.decomposeHomographyMat(H, np.eye(3))

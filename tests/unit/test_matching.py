@@ -24,13 +24,13 @@ class Corners:
     def __init__(self, kill_after=99):
         self.seen, self.matched, self.kill_after = [], 0, kill_after
 
-    def find(self, picture, options):
+    def find(self, picture, _):
         height, width = picture.shape[:2]
         self.seen.append((width, height, tuple(picture[0, 0])))
         at = np.array([[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]]) * [width, height]
         return Features((width, height), at, {"number": np.arange(4)})
 
-    def match(self, first, second, options):
+    def match(self, first, second, _):
         self.matched += 1
         if self.matched > self.kill_after:
             raise KeyboardInterrupt
@@ -106,7 +106,7 @@ def test_pairs_without_a_match_are_in_no_graph_and_not_tried_again(filled):
 
 def test_a_photo_without_features_is_matched_with_nothing(filled):
     ways = Corners()
-    blind = FeatureMethod("blind", lambda picture, _: Features(SIZE, np.zeros((0, 2))), ways.match)
+    blind = FeatureMethod("blind", lambda *_: Features(SIZE, np.zeros((0, 2))), ways.match)
     graph = filled(blind)
     assert graph.matches == {}
     assert [points.shape for points in graph.keypoints.values()] == [(0, 2)] * 3
@@ -115,12 +115,12 @@ def test_a_photo_without_features_is_matched_with_nothing(filled):
 
 CORNERS = Corners()
 BROKEN_FINDS = {
-    "another size": lambda picture, _: Features((10, 10), np.zeros((1, 2))),
-    "outside": lambda picture, _: Features(SIZE, np.array([[201.0, 5.0]])),
-    "not a number": lambda picture, _: Features(SIZE, np.array([[np.nan, 5.0]])),
-    "three columns": lambda picture, _: Features(SIZE, np.zeros((1, 3))),
-    "too few values": lambda picture, _: Features(SIZE, np.zeros((2, 2)), {"descriptors": np.zeros((1, 5))}),
-    "raises": lambda picture, _: 1 / 0,
+    "another size": lambda *_: Features((10, 10), np.zeros((1, 2))),
+    "outside": lambda *_: Features(SIZE, np.array([[201.0, 5.0]])),
+    "not a number": lambda *_: Features(SIZE, np.array([[np.nan, 5.0]])),
+    "three columns": lambda *_: Features(SIZE, np.zeros((1, 3))),
+    "too few values": lambda *_: Features(SIZE, np.zeros((2, 2)), {"descriptors": np.zeros((1, 5))}),
+    "raises": lambda *_: 1 / 0,
 }
 BROKEN_MATCHES = {
     "twice": [[0, 1], [0, 2]],

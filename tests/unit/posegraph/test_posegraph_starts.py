@@ -9,7 +9,7 @@ from sfm_app.geometry.epipolar import cross_matrix, eight_point
 from sfm_app.posegraph.guided import held_direction
 from sfm_app.posegraph.pair_pose import Pair, estimated
 from sfm_app.posegraph.refine import refined
-from sfm_app.posegraph.starts import TURNS_DEG, turned_starts
+from sfm_app.posegraph.starts import TURNS_DEG, planar_starts, turned_starts
 from sfm_app.types import Calibration, EpipolarFit
 
 K = camera_matrix(3300.0, 3300.0, 320.0, 240.0)
@@ -49,20 +49,37 @@ def test_the_nearest_of_the_starts_is_near(turn_deg, roll_deg):
     assert max(found)[0] > 40.0
 
 
+@pytest.mark.parametrize("turned_deg", [-60.0, 90.0])
 @pytest.mark.parametrize("seed", range(4))
-def test_where_F_turns_the_camera_the_other_way_the_pair_is_posed_all_the_same(seed):
-    """Through a long lens a turn to the left and one to the right have nearly the same epipolar lines."""
+def test_where_F_turns_the_camera_elsewhere_the_pair_is_posed_all_the_same(seed, turned_deg):
+    """Through a long lens all turns about the same axis have nearly the same epipolar lines."""
     pair, _, R, t = orbit_pair(seed, 23.0)
-    back = Rotation.from_euler("zyx", [0.0, -23.0, -3.0], degrees=True).as_matrix()
-    E = cross_matrix(np.array([0.0, 0.0, 9.0]) - back @ [0.0, 0.0, 9.0]) @ back
+    wrong = Rotation.from_euler("zyx", [0.0, turned_deg, np.copysign(3.0, turned_deg)], degrees=True).as_matrix()
+    E = cross_matrix(np.array([0.0, 0.0, 9.0]) - wrong @ [0.0, 0.0, 9.0]) @ wrong
     fit = EpipolarFit(np.linalg.inv(K).T @ E @ np.linalg.inv(K), np.ones(150, bool), np.ones(150), 10, 0.5)
 
     alone = refined(pair.rays, pair.focals, *pair.start(fit))
     pose = estimated(pair, fit)
 
-    assert errors_deg(*alone, R, t)[0] > 15.0
-    assert 0.0 < errors_deg(pose.R, pose.t, R, t)[0] < 5.0
+    assert errors_deg(*alone, R, t)[0] > 20.0
+    assert 0.0 < errors_deg(pose.R, pose.t, R, t)[0] < 2.0
     assert pose.in_front == 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_one_of_the_poses_that_a_plane_allows_is_the_right_one(two_views, seed):
+    views = two_views(seed, scene="wall")
+    found = [views.errors_deg(*start).max() for start in planar_starts(views.rays)]
+
+    assert 2 <= len(found) <= 4
+    assert 0.0 < min(found) < 1.5
+    assert max(found) > 10.0
+
+
+def test_too_few_matches_and_those_on_a_line_have_no_plane():
+    line = np.column_stack([np.linspace(0, 1, 20)] * 4)
+    assert list(planar_starts(line[:7])) == []
+    assert all(np.isfinite(R).all() and np.isfinite(t).all() for R, t in planar_starts(line))
 
 
 def test_matches_without_extent_give_no_starts():
