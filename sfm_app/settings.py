@@ -47,14 +47,15 @@ class PhotoSettings(Section):
 
 
 class MatchSettings(Section):
-    """COLMAP's features and matches."""
+    """Features and matches."""
 
+    features: str = Field("sift", description="name of the way to find and match them (see `sfm-app plugins`)")
     max_image_size_px: int = Field(
         1600, ge=128, le=16384, description="longer side at which features are found, in pixels"
     )
     max_features: int = Field(8192, ge=100, le=100000, description="most features per photo")
     max_ratio: float = Field(
-        0.8, gt=0, le=1, description="nearest over second nearest descriptor distance; 1 switches it off"
+        0.8, gt=0, le=1, description="nearest over second nearest descriptor distance; 1 switches it off; SIFT's"
     )
 
 

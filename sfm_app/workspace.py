@@ -18,8 +18,8 @@ from sfm_app.written import UNFINISHED
 WRITTEN = ("photos", "frames", "masks", "sparse", "dense", "other_models", DATABASE, CALIBRATION)
 """What a run removes before it writes it."""
 LOCK, HOLDER = ".lock", ".held-by.txt"
-LOG, PARTS = "log.txt", "view_graph_parts"
-FOLLOWED = (*WRITTEN, LOCK, HOLDER, LOG, PARTS)
+LOG, PARTS, FEATURES = "log.txt", "view_graph_parts", "feature_parts"
+FOLLOWED = (*WRITTEN, LOCK, HOLDER, LOG, PARTS, FEATURES)
 """What a run writes to without replacing it: a link would lead it out of the folder."""
 PHOTO_SET, VIEW_GRAPH = "photos.json", "view_graph.npz"
 
@@ -84,6 +84,11 @@ class Workspace:
     def database_marker(self) -> Path:
         """Beside the database while it is filled: what it is filled from."""
         return self.root / f"database.{UNFINISHED}"
+
+    @property
+    def feature_parts(self) -> Path:
+        """Features of photos while they are found and matched."""
+        return self.root / FEATURES
 
     @property
     def view_graph_parts(self) -> Path:

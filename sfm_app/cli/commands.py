@@ -163,9 +163,10 @@ def config(**flags: Any) -> None:
 
 @main.command()
 def plugins() -> None:
-    """List estimators, calibrators, file formats and depth methods."""
+    """List features, estimators, calibrators, file formats and depth methods."""
     found = load_plugins()
     for title, parts in (
+        ("features", found.features),
         ("estimators", found.estimators),
         ("calibrators", found.calibrators),
         ("exporters", found.exporters),

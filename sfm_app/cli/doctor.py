@@ -63,6 +63,7 @@ def _plugins() -> str:
     return ", ".join(
         f"{len(parts)} {name}"
         for name, parts in (
+            ("ways to find features", found.features),
             ("estimators", found.estimators),
             ("calibrators", found.calibrators),
             ("formats", found.exporters),

@@ -17,7 +17,7 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 OWN_FLAGS = {
     "images": "photos", "masks": "photos", "cameras": "photos", "keep_all": "photos", "max_frames": "photos",
-    "estimator": "epipolar", "calibrator": "calibration",
+    "features": "matching", "estimator": "epipolar", "calibrator": "calibration",
     "mapper": "scene", "faces": "mesh", "unseen": "texture",
 }  # fmt: skip
 """Settings with a flag of their own, and their tables."""
@@ -41,6 +41,7 @@ def settings_options(command: Command) -> Command:
         click.option("--cameras", help="auto, single, folder or each: which photos share one.  [default: auto]"),
         click.option("--max-frames", type=int, help="Most frames of a video that are used.  [default: 100]"),
         click.option("--keep-all", is_flag=True, default=None, help="Use copies, blurred photos and screenshots, too."),
+        click.option("--features", help="Way to find and match features.  [default: sift]"),
         click.option("--estimator", help="Estimator of fundamental matrices.  [default: lev-ransac]"),
         click.option("--calibrator", help="Calibrator.  [default: zero-curves]"),
         click.option("--mapper", help="auto, incremental or global.  [default: auto]"),

@@ -142,8 +142,33 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
             found = np.asarray(database.read_keypoints(entry.image_id), np.float64)
             keypoints[entry.image_id] = found[:, :2].copy() if len(found) else np.zeros((0, 2))  # a white wall
         pair_ids, rows = database.read_all_matches()
-    matches = {_pair(pair_id): np.asarray(row, np.uint32) for pair_id, row in zip(pair_ids, rows, strict=True)}
+    matches = {_pair(key): np.asarray(row, np.uint32) for key, row in zip(pair_ids, rows, strict=True) if len(row)}
     return MatchGraph(images, keypoints, dict(sorted(matches.items())))
+
+
+def photo_names(path: Path) -> dict[int, str]:
+    """Names of all photos by their ids."""
+    with opened(path) as database:
+        return {entry.image_id: entry.name for entry in sorted(database.read_all_images(), key=lambda e: e.image_id)}
+
+
+def unmatched(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
+    """Those of the pairs that nobody has matched yet, with or without success."""
+    with opened(path) as database:
+        return [pair for pair in pairs if not database.exists_matches(*pair)]
+
+
+def write_keypoints(path: Path, photo: int, keypoints: NDArray[np.float32]) -> None:
+    """Enter the keypoints of a photo, or replace them."""
+    with opened(path) as database:
+        write = database.update_keypoints if database.exists_keypoints(photo) else database.write_keypoints
+        write(photo, np.ascontiguousarray(keypoints, np.float32))
+
+
+def write_matches(path: Path, pair: PairId, rows: NDArray[np.uint32]) -> None:
+    """Enter the matches of a pair that has none."""
+    with opened(path) as database:
+        database.write_matches(*pair, np.ascontiguousarray(rows, np.uint32))
 
 
 def write_epipolar_fits(path: Path, matches: MatchGraph, fits: Mapping[PairId, EpipolarFit]) -> None:

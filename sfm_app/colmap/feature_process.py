@@ -1,7 +1,9 @@
 """COLMAP's SIFT features and raw matches, on CPU, without its geometric verification; see `features.py`."""
 
 import math
-from collections.abc import Callable, Sequence
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +20,26 @@ def work(task: dict[str, Any]) -> None:
     reader = pycolmap.ImageReaderOptions()
     if task["masks"]:
         reader.mask_path = Path(task["masks"])
-    report(extraction=extract(database, photo_dir, names, reader, options, task["workers"]))
-    report(matching=match(database, len(names), options, task["workers"]))
+    extraction = extraction_options(options, task["sift"], task["workers"])
+    report(extraction=extract(database, photo_dir, names, reader, extraction))
+    pairs = None if task["pairs"] is None else [(int(a), int(b)) for a, b in task["pairs"]]
+    report(matching=match(database, len(names), options, task["workers"], pairs))
 
 
-def extract(
-    database: Path, photo_dir: Path, names: Sequence[str], reader: Any, options: MatchSettings, workers: int
-) -> dict[str, Any]:
-    """Find SIFT features of all photos."""
+def extraction_options(options: MatchSettings, sift: Mapping[str, Any], workers: int) -> Any:
+    """COLMAP's, with these options of its SIFT."""
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = options.max_image_size_px
     extraction.num_threads = workers
     extraction.use_gpu = False
     extraction.sift.max_num_features = options.max_features
+    for name, value in sift.items():
+        setattr(extraction.sift, name, value)
+    return extraction
+
+
+def extract(database: Path, photo_dir: Path, names: Sequence[str], reader: Any, extraction: Any) -> dict[str, Any]:
+    """Find SIFT features of all photos."""
 
     def call(token: Any) -> None:
         pycolmap.extract_features(
@@ -45,13 +54,18 @@ def extract(
     return plain(extraction.todict())
 
 
-def match(database: Path, photos: int, options: MatchSettings, workers: int) -> dict[str, Any]:
-    """Match every photo with every other."""
+def match(
+    database: Path, photos: int, options: MatchSettings, workers: int, pairs: Sequence[tuple[int, int]] | None
+) -> dict[str, Any]:
+    """Match these pairs of photos, or every photo with every other."""
     matching = pycolmap.FeatureMatchingOptions()
     matching.skip_geometric_verification = True
     matching.num_threads = workers
     matching.use_gpu = False
     matching.sift.max_ratio = options.max_ratio
+    if pairs is not None:
+        _match_pairs(database, matching, pairs)
+        return plain(matching.todict())
 
     def call(token: Any) -> None:
         pycolmap.match_exhaustive(
@@ -63,6 +77,34 @@ def match(database: Path, photos: int, options: MatchSettings, workers: int) -> 
 
     _counted(call, database, done, "matching", math.comb(photos, 2))
     return plain(matching.todict())
+
+
+def _match_pairs(database: Path, matching: Any, pairs: Sequence[tuple[int, int]]) -> None:
+    """Match these pairs in a copy where photos are named by their ids: COLMAP's lists end names at blanks."""
+    with tempfile.TemporaryDirectory(dir=database.parent, prefix=".matching") as folder:
+        copy, pairing = Path(folder) / database.name, pycolmap.ImportedPairingOptions()
+        shutil.copyfile(database, copy)
+        with opened(copy) as renamed:
+            renamed.clear_two_view_geometries()
+            renamed.clear_matches()
+            for image in renamed.read_all_images():
+                image.name = str(image.image_id)
+                renamed.update_image(image)
+        pairing.match_list_path = Path(folder) / "pairs.txt"
+        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="ascii")
+
+        def call(token: Any) -> None:
+            pycolmap.match_image_pairs(
+                copy, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu,
+                cancellation_token=token,
+            )  # fmt: skip
+
+        _counted(call, copy, lambda reader: int(reader.num_matched_image_pairs()), "matching", len(pairs))
+        with opened(copy) as found:
+            rows = {pair: found.read_matches(*pair) for pair in pairs}
+    with opened(database) as target:
+        for pair in (pair for pair in pairs if not target.exists_matches(*pair)):
+            target.write_matches(*pair, rows[pair])
 
 
 def _counted(call: Callable[[Any], None], database: Path, done: Callable[[Any], int], label: str, total: int) -> None:

@@ -1,17 +1,22 @@
 """SIFT features and raw matches of all photos: a process of its own fills the database."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from sfm_app.colmap.apart import relay, started
 from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
+from sfm_app.types import PairId
+
+USUAL: Mapping[str, Any] = MappingProxyType({})
+"""SIFT as COLMAP has it."""
 
 
 def find_and_match(
     database: Path, photo_dir: Path, names: Sequence[str], options: MatchSettings, workers: int, progress: Progress,
-    mask_dir: Path | None = None,
+    mask_dir: Path | None = None, sift: Mapping[str, Any] = USUAL, pairs: Sequence[PairId] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Find features of all photos and match every photo with every other; what is in the database stays.
 
@@ -23,6 +28,8 @@ def find_and_match(
         workers: threads.
         progress: shown progress.
         mask_dir: has a mask of every photo, `name.png`: no keypoints where it is black.
+        sift: options of COLMAP's SIFT that are not to be its defaults.
+        pairs: of photos that are matched, instead of all.
 
     Returns:
         The options in force, for the manifest.
@@ -37,6 +44,8 @@ def find_and_match(
         "names": list(names),
         "options": options.model_dump(),
         "workers": workers,
+        "sift": dict(sift),
+        "pairs": None if pairs is None else [list(pair) for pair in pairs],
     }
     with started("sfm_app.colmap.feature_process", task) as process:
         found = relay(process, progress)

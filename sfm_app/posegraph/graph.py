@@ -1,7 +1,7 @@
 """The pose graph: relative poses of pairs that agree with each other."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -29,6 +29,9 @@ AGREEMENT_DEG, GUESSED_DEG, SPREADS = 5.0, 15.0, 4.0
 as most pairs are."""
 ENOUGH = 100.0
 """From so many inliers on, more of them make a pair hardly more believable."""
+FLAT = 0.1
+"""How much a pair counts whose matches lie on a plane: two poses explain it, and equal panes in different places give
+such pairs by the dozen (kitchen25, where it was chosen)."""
 WEAK = 2.0
 """A pair with fewer than so many times the least inliers needs a loop of other pairs to bear it out."""
 CONTRADICTS, BEHIND, TOO_FEW = "contradicts other pairs", "points behind a camera", "too few matches fit the cameras"
@@ -80,7 +83,8 @@ def build_pose_graph(
     for pair in [pair for join in apart.joins for pair in join.pairs]:
         dropped[pair] = LOOKS_ALIKE
         del poses[pair]
-    rotations, angles = averaged(poses)
+    flat = {pair for pair, fit in views.fits.items() if fit.degeneracy}
+    rotations, angles = averaged(poses, flat)
     typical = SPREADS * float(np.median(list(angles.values()) or [0.0]))
     limits = {
         pair: max(typical, GUESSED_DEG if poses[pair].kind == "uncalibrated" else AGREEMENT_DEG) for pair in angles
@@ -117,9 +121,19 @@ def build_pose_graph(
     return PoseGraph(poses, dropped, averaged(poses)[0], _groups(poses), apart.joins, doubtful)
 
 
-def averaged(poses: Mapping[PairId, RelativePose]) -> tuple[dict[int, FloatArray], dict[PairId, float]]:
-    """Rotations of photos, and how far pairs are from them, with pairs counting by their inliers."""
-    weights = {pair: pose.inlier_count / (1.0 + pose.inlier_count / ENOUGH) for pair, pose in poses.items()}
+def averaged(
+    poses: Mapping[PairId, RelativePose], flat: Collection[PairId] = ()
+) -> tuple[dict[int, FloatArray], dict[PairId, float]]:
+    """Rotations of photos, and how far pairs are from them, with pairs counting by their inliers.
+
+    Args:
+        poses: of pairs.
+        flat: pairs whose matches lie on one plane, or otherwise leave F open: they count little.
+    """
+    weights = {
+        pair: pose.inlier_count / (1.0 + pose.inlier_count / ENOUGH) * (FLAT if pair in flat else 1.0)
+        for pair, pose in poses.items()
+    }
     return average_rotations({pair: pose.R for pair, pose in poses.items()}, weights)
 
 

@@ -15,6 +15,11 @@ from sfm_app.types import RelativePose
 FloatArray = NDArray[np.float64]
 
 SAMPLES = 200
+AS_MANY = 0.9
+"""A pose whose rotation runs away is believed with the rotation of others, if it keeps that share of its inliers: a
+long lens does not say how far the camera has turned."""
+HELD_ROUNDS, HELD_SIGMA = 8, 0.2
+"""Least squares with new weights, so often; scale of the loss in thresholds."""
 NEAR = 3.0
 """While the rotation is that of others, matches count within this many thresholds."""
 LEAST_IN_FRONT, MOST_TURN_DEG = 0.95, 2.0
@@ -38,13 +43,35 @@ def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> Relat
     near = pose_distances(pair.rays, pair.focals, R, t) <= NEAR * pair.max_error_px
     if np.count_nonzero(near) < min_inliers:
         return None
-    turned, t = refined(pair.rays[near], pair.focals, R, t)
-    inliers = pair.inliers(turned, t)
-    turn_deg = float(np.degrees(Rotation.from_matrix(R.T @ turned).magnitude()))
-    if np.count_nonzero(inliers) < min_inliers or turn_deg > MOST_TURN_DEG:
+    turned, moved = refined(pair.rays[near], pair.focals, R, t)
+    inliers = pair.inliers(turned, moved)
+    if np.count_nonzero(inliers) < min_inliers:
         return None
-    found = pair.pose(turned, t, inliers, guided=True)
+    if np.degrees(Rotation.from_matrix(R.T @ turned).magnitude()) > MOST_TURN_DEG:
+        free = np.count_nonzero(inliers)
+        turned, moved = R, held_direction(pair, R, t)
+        inliers = pair.inliers(turned, moved)
+        if np.count_nonzero(inliers) < max(min_inliers, AS_MANY * free):
+            return None
+    found = pair.pose(turned, moved, inliers, guided=True)
     return found if found.in_front >= LEAST_IN_FRONT and found.kind != "rotation" else None
+
+
+def held_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
+    """(3,) direction of translation near t that makes a robust sum of squared distances small, R held."""
+    h1 = np.column_stack([pair.rays[:, :2], np.ones(len(pair.rays))]) @ R.T
+    h2 = np.column_stack([pair.rays[:, 2:], np.ones(len(pair.rays))])
+    normals = np.cross(h1, h2)
+    best = t
+    for _ in range(HELD_ROUNDS):
+        distances = pose_distances(pair.rays, pair.focals, R, best) / (HELD_SIGMA * pair.max_error_px)
+        algebraic = np.abs(np.einsum("ni,i->n", normals, best))
+        # Sampson's distance is the algebraic one over its gradient, which hardly changes with t
+        gradients = np.where(distances > 0, algebraic / np.maximum(distances, 1e-12), 1.0)
+        weights = 1.0 / (np.maximum(gradients, 1e-12) ** 2 * (1.0 + distances**2))
+        _, axes = np.linalg.eigh(np.einsum("n,ni,nj->ij", weights, normals, normals))
+        best = axes[:, 0] * np.sign(axes[:, 0] @ t or 1.0)
+    return np.asarray(best, np.float64)
 
 
 def sampled_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> FloatArray | None:

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from sfm_app.geometry.camera import rays
 from sfm_app.geometry.epipolar import cross_matrix, eight_point
 from sfm_app.geometry.essential import decompose_essential, nearest_essential
-from sfm_app.posegraph.refine import pose_distances, refined
+from sfm_app.posegraph.refine import SIGMAS_PX, pose_distances, refined
+from sfm_app.posegraph.starts import planar_starts, turned_starts
 from sfm_app.ransac.planes import OFF_PLANE, dominant_homography, transfer_distance
 from sfm_app.types import Calibration, EpipolarFit, RelativePose
 
@@ -20,6 +21,9 @@ SAMPLE = 200
 """Points that choose among the four poses of an essential matrix."""
 LEAST = 8
 """Inliers, below which a pair says nothing about its pose."""
+BEFORE_BOTH, BETTER = 0.9, 0.01
+"""A pose from another start than F's own has that share of its inliers before both cameras, and costs less by that
+share."""
 ROTATION_ROUNDS, ROTATION_DEG = 10, 5.0
 """Rays of a wider angle than this are not explained by a rotation: the search for it is spared."""
 
@@ -44,14 +48,18 @@ class Pair:
 
     def start(self, fit: EpipolarFit) -> tuple[FloatArray, FloatArray]:
         """R and t as F and the cameras have them."""
-        first, second = self.cameras
-        inliers = self.rays[fit.inliers]
-        E = second.K.T @ fit.F @ first.K
-        if first.radial or second.radial:  # F knows no lens
-            E = eight_point(inliers[:, :2], inliers[:, 2:])
+        inliers, E = self.rays[fit.inliers], self.essential(fit)
         chosen = inliers[np.linspace(0, len(inliers) - 1, min(len(inliers), SAMPLE)).astype(np.int64)]
         poses = decompose_essential(nearest_essential(E))
         return max(poses, key=lambda pose: int(np.count_nonzero(in_front(chosen, *pose))))
+
+    def essential(self, fit: EpipolarFit) -> FloatArray:
+        """E as F and the cameras have it, with what noise has made of its singular values."""
+        first, second = self.cameras
+        if first.radial or second.radial:  # F knows no lens
+            inliers = self.rays[fit.inliers]
+            return eight_point(inliers[:, :2], inliers[:, 2:])
+        return second.K.T @ fit.F @ first.K
 
     def pose(self, R: FloatArray, t: FloatArray, inliers: NDArray[np.bool_], *, guided: bool = False) -> RelativePose:
         """A pose with what its inliers say about it."""
@@ -89,9 +97,38 @@ def estimated(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
     R, t = pair.start(fit)
     if not pair.trusted:
         return pair.pose(R, t, fit.inliers)
-    R, t = refined(pair.rays[fit.inliers], pair.focals, R, t)
+    R, t = best_of_starts(pair, fit, (R, t))
     inliers = pair.inliers(R, t)
     return pair.pose(R, t, inliers) if np.count_nonzero(inliers) >= LEAST else None
+
+
+def best_of_starts(pair: Pair, fit: EpipolarFit, start: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+    """The pose that the inliers of F fit best, of those that lie before both cameras.
+
+    That of F's own start stays unless another one is clearly better and loses no inliers: of the two poses that a plane
+    allows, the wrong one loses what lies off the plane.
+    """
+    used, focals = pair.rays[fit.inliers], pair.focals
+    best = refined(used, focals, *start)
+    if not len(used):
+        return best
+    lowest, most = pose_cost(used, focals, *best), int(np.count_nonzero(pair.inliers(*best)))
+    if in_front(used, *best).mean() < BEFORE_BOTH:
+        lowest, most = np.inf, 0
+    planar = planar_starts(used) if fit.degeneracy == "planar" else ()
+    for other in (*turned_starts(used, pair.essential(fit)), *planar):
+        R, t = refined(used, focals, *other)
+        cost, count = pose_cost(used, focals, R, t), int(np.count_nonzero(pair.inliers(R, t)))
+        if cost < (1.0 - BETTER) * lowest and count >= most:
+            t = t if np.mean(in_front(used, R, t)) >= 0.5 else -t
+            if in_front(used, R, t).mean() >= BEFORE_BOTH:
+                best, lowest, most = (R, t), cost, count
+    return best
+
+
+def pose_cost(used: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> float:
+    """What `refined` makes small in the end."""
+    return float(np.sum(np.log1p((pose_distances(used, focals, R, t) / SIGMAS_PX[-1]) ** 2)))
 
 
 def depths(used: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:

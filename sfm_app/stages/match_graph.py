@@ -2,15 +2,15 @@
 
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import create_database, is_sound, read_match_graph, remove_database
-from sfm_app.colmap.features import find_and_match
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import NOTHING_MATCHED, why_no_scene
+from sfm_app.matching import fill_database
 from sfm_app.types import MatchGraph, PhotoSet
 from sfm_app.written import is_made_from
 
 
 def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
-    """Find SIFT features and match every photo with every other, without geometric verification.
+    """Find features and match every photo with every other, without geometric verification.
 
     What a killed run has found of the same photos stays.
 
@@ -18,7 +18,6 @@ def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
         ReconstructionError: no two photos have matches.
     """
     place, options = run.workspace, run.settings.matching
-    names = [photo.name for photo in photos.photos]
     marker = place.database_marker
     if not (is_made_from(marker, run.inputs) and is_sound(place.database)):
         marker.unlink(missing_ok=True)
@@ -26,7 +25,7 @@ def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
         with backend("entering photos"):
             create_database(place.database, photos)
         marker.write_text(run.inputs, encoding="utf-8")
-    in_force = find_and_match(place.database, place.photos, names, options, run.workers, run.progress, run.mask_dir)
+    in_force = fill_database(run.plugins.feature_method(options.features), run)
     graph = load_match_graph(photos, run)
     run.record(
         keypoints={graph.images[key].name: len(points) for key, points in graph.keypoints.items()},

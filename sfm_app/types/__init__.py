@@ -11,6 +11,7 @@ Conventions, said once:
 from sfm_app.types.calibration import Calibration, Intrinsics
 from sfm_app.types.camera_pairs import CameraPairs, PhotoPairs
 from sfm_app.types.epipolar import EpipolarFit, Rejected, ViewGraph
+from sfm_app.types.features import Features
 from sfm_app.types.matches import MatchedImage, MatchGraph, PairId
 from sfm_app.types.model import Frustum, Model, Texture
 from sfm_app.types.photos import Frame, GpsPosition, Photo, PhotoSet, UnusablePhoto
@@ -23,6 +24,7 @@ __all__ = [
     "CameraModel",
     "CameraPairs",
     "EpipolarFit",
+    "Features",
     "Frame",
     "Frustum",
     "GpsPosition",

@@ -8,9 +8,18 @@ from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
-from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, NO_NUMBERS, TOO_FEW
+from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, NO_NUMBERS, TOO_FEW, averaged
 from sfm_app.posegraph.groups import connected_groups
-from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchedImage, MatchGraph, Rejected, ViewGraph
+from sfm_app.types import (
+    Calibration,
+    EpipolarFit,
+    Intrinsics,
+    MatchedImage,
+    MatchGraph,
+    Rejected,
+    RelativePose,
+    ViewGraph,
+)
 
 OPTIONS = PoseGraphOptions(max_error_px=1.5, min_inliers=16, seed=0)
 K = camera_matrix(900.0, 900.0, 500.0, 375.0)
@@ -243,3 +252,19 @@ def test_a_pair_whose_inliers_lie_in_one_point_has_no_pose_and_the_others_have_t
 
     assert graph.dropped == {(1, 2): NO_NUMBERS}
     assert sorted(graph.poses) == [(1, 3), (2, 3)] and graph.groups == ((1, 2, 3),)
+
+
+def test_pairs_on_a_plane_count_little_where_rotations_are_averaged():
+    """Three photos; the planar pair says that the second is turned by 40 degrees more than both others together say."""
+    turn = [Rotation.from_rotvec([0.0, np.radians(angle), 0.0]).as_matrix() for angle in (0.0, 10.0, 20.0)]
+    aside = Rotation.from_rotvec([0.0, np.radians(40.0), 0.0]).as_matrix()
+
+    def pose(R):
+        return RelativePose(R, np.array([1.0, 0.0, 0.0]), np.ones(60, bool), 10.0, 1.0, "calibrated", False)
+
+    poses = {(1, 2): pose(turn[1]), (2, 3): pose(turn[1]), (1, 3): pose(aside @ turn[2])}
+    off = averaged(poses, {(1, 3)})[1]
+    even = averaged(poses)[1]
+
+    assert off[1, 3] > 30.0 > 10.0 > max(off[1, 2], off[2, 3])
+    assert off[1, 3] >= even[1, 3]

