@@ -226,7 +226,7 @@ def _write_camera(database: Any, camera_id: int, calibration: Calibration) -> No
         width=calibration.width,
         height=calibration.height,
         params=camera_params(calibration.K, name, calibration.radial),
-        has_prior_focal_length=calibration.identifiable,
+        has_prior_focal_length=calibration.estimated,
     )
     if database.exists_camera(camera_id):
         database.update_camera(camera)

@@ -44,7 +44,7 @@ class Pair:
         self.rays = np.hstack([rays(x, c.K, c.radial) for x, c in zip(points, cameras, strict=True)])
         self.focals = np.concatenate([np.diag(camera.K)[:2] for camera in cameras])
         self.max_error_px = max_error_px
-        self.trusted = all(camera.identifiable or camera.method != "guess" for camera in cameras)
+        self.trusted = all(camera.estimated or camera.method == "exif" for camera in cameras)
 
     def start(self, fit: EpipolarFit) -> tuple[FloatArray, FloatArray]:
         """R and t as F and the cameras have them."""

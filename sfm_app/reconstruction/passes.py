@@ -122,7 +122,7 @@ def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGra
 
 
 def _far(before: Calibration, after: Calibration) -> bool:
-    return not before.identifiable or abs(float(np.log(after.focal_px / before.focal_px))) > MOVED
+    return not before.estimated or abs(float(np.log(after.focal_px / before.focal_px))) > MOVED
 
 
 def _pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:

@@ -40,7 +40,7 @@ def why_thin(model: Attempt | None, intrinsics: Intrinsics, matches: MatchGraph,
     if model is None:
         return "nothing was placed"
     refused = {intrinsics.name_of(image) for image in matches.images.values()} - {
-        name for name, camera in intrinsics.cameras.items() if camera.identifiable
+        name for name, camera in intrinsics.cameras.items() if camera.estimated
     }
     if refused:
         return "the pairs do not determine a camera"

@@ -31,10 +31,13 @@ FEW_PAIRS = 3
 """So many pairs fit almost any centre: without their matches it is held where uncropped photos have it."""
 UNCROPPED_SIGMA = 0.02
 """Standard deviation of the centre of such photos about the middle, in widths."""
-VOTES_SIGMA, KEPT = 0.01, 0.85
+VOTES_SIGMA, KEPT = 0.01, 0.8
 """A camera that keeps less than this share of the votes (of this width) that the peak of the consensus has follows
 matches that most pairs contradict. On fourteen sets and variants right adjustments keep 0.97 to 1, the one that many
 wrong F's pulled away (fox50) 0.35; without that set the bound would be the same."""
+ENOUGH_PAIRS = 6.0
+"""Effective pairs that must agree on the peak to contradict: twelve constraints on five parameters of a camera.
+With three pairs (merton1) the peak's centre is anywhere."""
 AGREES = 0.1
 """Pairs with r below this at the peak are then listened to, and no others; on the same sets 0.03 and 0.05 move no focal
 by more than 0.1 %."""
@@ -94,7 +97,7 @@ def _from_matches(
     hint = float(np.median(pairs.focal_hints_px)) / side if pairs.focal_hints_px else np.nan
     usual = Usual(np.ones(1), np.array([hint]), sigma, options.lens)
     adjusted = _adjusted(pairs, usable, usual)
-    if adjusted.votes_kept < KEPT and len(adjusted.agreeing) >= MIN_PAIRS:
+    if adjusted.contradicted:
         again = _adjusted(pairs, usable, usual, adjusted)
         adjusted = max(adjusted, again, key=lambda one: one.votes_kept)
     fit, answer, judged = adjusted.fit, adjusted.answer, adjusted.consensus.pairs
@@ -139,6 +142,11 @@ class _Adjusted:
         thetas = np.array([self.fit.state.thetas[0, :KAPPA], self.answer.theta])
         at_fit, at_peak = self.consensus.at(thetas, VOTES_SIGMA)
         return float(at_fit / at_peak) if at_peak > 0 else 0.0
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether enough pairs agree on another camera to say that this one is wrong: few fit almost any centre."""
+        return self.votes_kept < KEPT and effective_count(self.answer.votes) >= ENOUGH_PAIRS
 
     @property
     def agreeing(self) -> NDArray[np.int64]:
@@ -204,7 +212,7 @@ def _split(adjusted: _Adjusted) -> str:
     ratio = float(np.exp(abs(adjusted.fit.state.thetas[0, LOG_FOCAL] - adjusted.answer.theta[LOG_FOCAL])))
     if ratio >= ANOTHER_FOCAL:
         return f"the pairs agree on one focal and their matches on another, {ratio:.1f} times away"
-    if adjusted.votes_kept < KEPT:
+    if adjusted.contradicted:
         kept = 100 * adjusted.votes_kept
         return f"the pairs agree on one camera, of whose votes the one that their matches name keeps {kept:.0f} %"
     return ""

@@ -38,6 +38,11 @@ class Calibration:
     """Named figures that support K: pairs used, support at the peak, ..."""
 
     @property
+    def estimated(self) -> bool:
+        """Whether mapping may build on K: the photos determine it, or tell it roughly."""
+        return self.identifiable or self.method == "estimate"
+
+    @property
     def focal_px(self) -> float:
         """Geometric mean of fx and fy."""
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
