@@ -8,7 +8,7 @@ from sfm_app.types import Scene
 
 NAMES = 4
 """Photos of another model that are named."""
-MAPPERS = {"incremental": "photo after photo", "global": "all at once"}
+MAPPERS = {"incremental": "photo after photo", "global": "all at once", "colmap": "as COLMAP does by itself"}
 CONTRADICTED = 0.1
 """From this share of the matches on, people are told."""
 SIMILAR = ("look_alikes", "perhaps_look_alikes", "jumps")
@@ -59,6 +59,8 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
         dropped = sum(summary.get("pairs_dropped", {}).values())
         because = f": {counts['mapper_reason']}" if counts.get("mapper_reason") else ""
         yield f"mapped {MAPPERS[summary['mapper']]}{because}"
+        if counts.get("rival_tried_because"):
+            yield f"COLMAP's own way was tried beside ours: {counts['rival_tried_because']}"
         if dropped:
             yield f"pairs of photos left out because they do not fit the others: {dropped}"
     for photos in summary.get("cut_apart", ()):

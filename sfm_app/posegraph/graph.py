@@ -83,13 +83,8 @@ def build_pose_graph(
     for pair in [pair for join in apart.joins for pair in join.pairs]:
         dropped[pair] = LOOKS_ALIKE
         del poses[pair]
-    flat = {pair for pair, fit in views.fits.items() if fit.degeneracy}
-    rotations, angles = averaged(poses, flat)
-    typical = SPREADS * float(np.median(list(angles.values()) or [0.0]))
-    limits = {
-        pair: max(typical, GUESSED_DEG if poses[pair].kind == "uncalibrated" else AGREEMENT_DEG) for pair in angles
-    }
-    for pair in [pair for pair, angle in angles.items() if angle > limits[pair]]:
+    rotations, angles = averaged(poses, {pair for pair, fit in views.fits.items() if fit.degeneracy})
+    for pair in contradicting(poses, angles):
         dropped[pair] = CONTRADICTS
         del poses[pair]
 
@@ -119,6 +114,15 @@ def build_pose_graph(
     stayed = (replace(join, pairs=tuple(pair for pair in join.pairs if pair in poses)) for join in apart.doubtful)
     doubtful = tuple(join for join in stayed if join.pairs)
     return PoseGraph(poses, dropped, averaged(poses)[0], _groups(poses), apart.joins, doubtful)
+
+
+def contradicting(poses: Mapping[PairId, RelativePose], angles: Mapping[PairId, float]) -> list[PairId]:
+    """Pairs that are further from the rotations of their photos, in degrees, than they may be."""
+    typical = SPREADS * float(np.median(list(angles.values()) or [0.0]))
+    limits = {
+        pair: max(typical, GUESSED_DEG if poses[pair].kind == "uncalibrated" else AGREEMENT_DEG) for pair in angles
+    }
+    return [pair for pair, angle in angles.items() if angle > limits[pair]]
 
 
 def averaged(
