@@ -112,13 +112,13 @@ def best_of_starts(pair: Pair, fit: EpipolarFit, start: tuple[FloatArray, FloatA
     best = refined(used, focals, *start)
     if not len(used):
         return best
-    lowest, most = pose_cost(used, focals, *best), np.count_nonzero(pair.inliers(*best))
+    lowest, most = pose_cost(used, focals, *best), int(np.count_nonzero(pair.inliers(*best)))
     if in_front(used, *best).mean() < BEFORE_BOTH:
         lowest, most = np.inf, 0
     planar = planar_starts(used) if fit.degeneracy == "planar" else ()
     for other in (*turned_starts(used, pair.essential(fit)), *planar):
         R, t = refined(used, focals, *other)
-        cost, count = pose_cost(used, focals, R, t), np.count_nonzero(pair.inliers(R, t))
+        cost, count = pose_cost(used, focals, R, t), int(np.count_nonzero(pair.inliers(R, t)))
         if cost < (1.0 - BETTER) * lowest and count >= most:
             t = t if np.mean(in_front(used, R, t)) >= 0.5 else -t
             if in_front(used, R, t).mean() >= BEFORE_BOTH:
