@@ -18,8 +18,8 @@ from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGr
 LEARNED_FROM = 3
 """Photos: fewer do not teach a camera, and in fewer no other group is mapped beside the main one."""
 MOST_PASSES = 4
-"""Passes over all pairs. On dinoSparseRing with learned features the second teaches a focal of 3272 (true 3318); with it
-the third places all photos."""
+"""Passes over all pairs. On dinoSparseRing with learned features the second finds a focal of 3272 (true 3318), and the
+third places all photos with it."""
 MOVED = 0.01
 """A focal that mapping moved by more than this share is worth a second look at the pairs."""
 
