@@ -31,6 +31,8 @@ LONGEST_PX = 1024
 many matches."""
 MOST = 1024
 """Keypoints, the strongest: matching takes 2 to 4 s a pair on one core, with 2048 of them four times as long."""
+CONTRAST = 8
+"""Grey levels; in a picture with fewer the network finds its own padding."""
 NEAR, LEAST = 0.8, 20
 """Cosine between descriptors, and so many features that near to each other: with fewer, a pair is not worth the
 seconds. On dinoSparseRing all neighbours have 28 or more and half of all pairs fewer than 20; chosen there alone."""
@@ -41,6 +43,8 @@ def find(picture: NDArray[np.uint8], options: MatchSettings) -> Features:
     """Find features with ALIKED."""
     torch = _torch()
     height, width = picture.shape[:2]
+    if np.ptp(picture) < CONTRAST:
+        return Features((width, height), np.zeros((0, 2)), {"descriptors": np.zeros((0, 128), np.float32)})
     scale = LONGEST_PX / max(width, height)
     shown = cv2.resize(
         picture,

@@ -20,8 +20,8 @@ from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGr
 LEARNED_FROM = 3
 """Photos: fewer do not teach a camera, and in fewer no other group is mapped beside the main one."""
 MOST_PASSES = 4
-"""Passes over all pairs. On dinoSparseRing with learned features the second one's focal (3272; true 3318) is what the
-third needed to place all photos."""
+"""Passes over all pairs. On dinoSparseRing with learned features the second finds a focal of 3272 (true 3318), and the
+third places all photos with it."""
 MOVED = 0.01
 """A focal that mapping moved by more than this share is worth a second look at the pairs."""
 
