@@ -13,7 +13,7 @@ from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.reconstruction.attempts import Attempt, Group, attempts, better, why
 from sfm_app.reconstruction.joins import sound_parts
 from sfm_app.reconstruction.left_out import names_of
-from sfm_app.reconstruction.rivals import map_baseline, why_thin
+from sfm_app.reconstruction.rivals import guessed_intrinsics, leaves_many_out, map_baseline, why_thin
 from sfm_app.reconstruction.told_apart import with_earlier, without_look_alikes
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
 
@@ -22,6 +22,8 @@ LEARNED_FROM = 3
 MOST_PASSES = 4
 """Passes over all pairs. On dinoSparseRing with learned features the second finds a focal of 3272 (true 3318), and the
 third places all photos with it."""
+OTHER_FOCALS = (0.6, 2.4, 4.8)
+"""Guesses of the focal beside the usual one, in longer sides: steps of two from end to end of what cameras have."""
 MOVED = 0.01
 """A focal that mapping moved by more than this share is worth a second look at the pairs."""
 
@@ -61,6 +63,7 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
     best = _pass(matches, views, intrinsics, run)
     matches, views = without_look_alikes(matches, views, best.graph)
     best = with_rival(best, matches, views, intrinsics, run)
+    best = with_other_focals(best, matches, views, intrinsics, run)
     for number in range(2, MOST_PASSES + 1):
         if not best.models or not worth_another(best, best.intrinsics, matches):
             break
@@ -93,6 +96,18 @@ def with_rival(
     others = [model for model in outcome.models if taken.isdisjoint(photos_of(model.model))]
     models = sorted((*parts, *others), key=lambda attempt: (-attempt.photos, -attempt.support))
     return replace(outcome, models=tuple(models), reason=why(rival, both, len(matches.images)))
+
+
+def with_other_focals(
+    outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
+) -> Outcome:
+    """The outcome, or, where the guessed focal leaves many photos without a place, that of the best other guess."""
+    main = outcome.models[0] if outcome.models else None
+    for focal in OTHER_FOCALS if leaves_many_out(main, intrinsics, views) else ():
+        other = _pass(matches, views, guessed_intrinsics(intrinsics, focal), run)
+        tried = (*outcome.tried, *(f"{note} (focal {focal:g} longer sides)" for note in other.tried))
+        outcome = replace(other if other.support > outcome.support else outcome, thin=outcome.thin, tried=tried)
+    return outcome
 
 
 def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:

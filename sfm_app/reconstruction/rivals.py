@@ -23,6 +23,10 @@ logger = logging.getLogger("sfm_app")
 
 FOLDER = ".rival"
 MAPPER, HOW = "colmap", "as COLMAP does by itself"
+USUAL = 1.2
+"""The usual guess of a focal, in longer sides: COLMAP's."""
+LEFT_OUT, MANY = 0.25, 60
+"""Share of the photos without a place from which on other focals are tried, and photos from which on they are not."""
 CONTRADICTED = 0.05
 """Share of the inliers of fundamental matrices that contradict a model, from which on another may be better. Right
 models of the Strecha sets, cropped and squeezed, have 0.1 to 3 %."""
@@ -79,14 +83,27 @@ def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, 
     return judged(matches, views, (MAPPER, HOW), found[0], run)
 
 
-def guessed_intrinsics(intrinsics: Intrinsics) -> Intrinsics:
-    """Replace every camera by the usual guess; what EXIF claims stays."""
+def leaves_many_out(model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph) -> bool:
+    """Say whether a guess of the focal may be why photos that match others have no place.
+
+    Not asked where some camera is known, or where the photos are many: then a pass costs more than it promises.
+    """
+    connected = photos_in(views.fits)
+    known = any(camera.estimated or camera.method == "exif" for camera in intrinsics.cameras.values())
+    placed = model.photos if model is not None else 0
+    return not known and len(connected) <= MANY and len(connected) - placed > LEFT_OUT * len(connected)
+
+
+def guessed_intrinsics(intrinsics: Intrinsics, sides: float = USUAL) -> Intrinsics:
+    """Replace every camera by a guess of the focal, in longer sides; what EXIF claims stays."""
     cameras = {
-        name: camera if camera.method == "exif" else _guess(camera) for name, camera in intrinsics.cameras.items()
+        name: camera if camera.method == "exif" else _guess(camera, sides)
+        for name, camera in intrinsics.cameras.items()
     }
     return replace(intrinsics, cameras=cameras)
 
 
-def _guess(camera: Calibration) -> Calibration:
+def _guess(camera: Calibration, sides: float) -> Calibration:
     size = camera.width, camera.height
-    return Calibration(guessed_camera_matrix(size), *size, "guess", identifiable=False, reason=camera.reason)
+    K = guessed_camera_matrix(size, sides * max(size))
+    return Calibration(K, *size, "guess", identifiable=False, reason=camera.reason)

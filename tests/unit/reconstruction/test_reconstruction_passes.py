@@ -122,12 +122,12 @@ def test_a_second_pass_that_finds_nothing_leaves_the_first(synthetic, run, camer
 
 
 def test_without_a_model_there_is_nothing_to_learn(synthetic, run, cameras, mapped):
-    seen = mapped(None)
+    seen = mapped(None, None, None, None)
 
     found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
 
-    assert found.models == () and found.support == 0.0 and found.tried == ("nothing", "no rival")
-    assert len(seen) == 1
+    assert found.models == () and found.support == 0.0 and found.tried[:2] == ("nothing", "no rival")
+    assert len(seen) == 4 and len(found.tried) == 5  # the usual guess, and three others
 
 
 def rival_of(monkeypatch, synthetic, model):
@@ -171,6 +171,27 @@ def test_good_evidence_needs_no_rival(synthetic, run, cameras, mapped, monkeypat
     found = outcome(synthetic, cameras(), run())
 
     assert asked == [] and found.thin == "" and found.models[0].photos == 6
+
+
+def test_where_a_guess_leaves_many_photos_out_other_focals_are_tried(synthetic, run, cameras, mapped):
+    few = without(synthetic.copy(), [4, 5, 6])
+    seen = mapped(few, few, with_camera(synthetic.copy(), TRUE), None, None)
+
+    found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
+
+    focals = [intrinsics.main.focal_px / 1024 for _, intrinsics in seen]
+    assert focals[1:4] == pytest.approx([0.6, 2.4, 4.8])
+    assert focals[4:] == pytest.approx([FOCAL / 1024])  # what the best of them has found is gone on with
+    assert found.models[0].photos == 6
+    assert "6 photos (focal 2.4 longer sides)" in found.tried
+
+
+def test_no_other_focals_are_tried_where_one_is_known(synthetic, run, cameras, mapped):
+    seen = mapped(without(synthetic.copy(), [4, 5, 6]), None)
+
+    outcome(synthetic, cameras(), run())
+
+    assert all(intrinsics.main.focal_px == pytest.approx(FOCAL, rel=0.01) for _, intrinsics in seen)
 
 
 def test_a_rival_that_fails_costs_nothing(synthetic, run, cameras, mapped, monkeypatch):
