@@ -136,9 +136,9 @@ def scatter_by_photos(fit: Fit) -> FloatArray:
     weighs what it weighs, or where right pairs are left out wrong ones would take their place.
     """
     photos, nothing = np.unique(fit.matches.photos), np.zeros(fit.state.thetas.size)
-    groups = np.array_split(photos, min(JACKKNIFE_GROUPS, len(photos)))
     if len(photos) < LEAST_PHOTOS:
         return nothing
+    groups = np.array_split(photos, min(JACKKNIFE_GROUPS, len(photos)))
     information, trust, steps = fit.information, fit.trust, []
     for group in groups:
         left = ~np.isin(fit.matches.photos, group).any(axis=1)

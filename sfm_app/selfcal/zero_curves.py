@@ -146,7 +146,8 @@ class _Adjusted:
     @property
     def contradicted(self) -> bool:
         """Whether enough pairs agree on another camera to say that this one is wrong: few fit almost any centre."""
-        return self.votes_kept < KEPT and effective_count(self.answer.votes) >= ENOUGH_PAIRS
+        enough = min(effective_count(self.answer.votes), float(len(self.agreeing)))
+        return self.votes_kept < KEPT and enough >= ENOUGH_PAIRS
 
     @property
     def agreeing(self) -> NDArray[np.int64]:
