@@ -59,6 +59,22 @@ GROUPS: Mapping[str, Group] = {
         ("geometry.standing", "geometry.cues", "geometry.roll", "geometry.vanishing", "geometry.upright"),
         FIRST_EIGHT, "the rendered courtyard, statue, facade and corner", "geometry/standing.py",
     ),
+    "votes that a camera must keep, pairs that are listened to": Group(
+        ("selfcal.zero_curves",), (*FIRST_EIGHT, "fox50", "kitchen25", "oats23", "books21"), "",
+        "docs/algorithms.md, Wrong pairs in the majority; without fox50 the bound would be the same",
+    ),
+    "one camera, several, or each its own; bars": Group(
+        ("selfcal.own_cameras", "selfcal.tied", "photos.bars"), ("reichstag10",), "120 random scenes of cameras",
+        "docs/algorithms.md, Several cameras; the random scenes alone give the same thresholds",
+    ),
+    "look-alikes": Group(
+        ("posegraph.coverage", "posegraph.look_alikes", "posegraph.missing"), ("oats23", "books21", "kitchen1000"), "",
+        "docs/algorithms.md, Look-alikes; either of the first two finds the other, every 15th photo of the third",
+    ),
+    "starts of poses, pairs on a plane, passes, other focals": Group(
+        ("posegraph.starts", "posegraph.graph", "reconstruction.passes"), ("dinoSparseRing", "kitchen25"), "",
+        "docs/algorithms.md, From K to relative poses, Mapping; castle-P19, fountain-P11, temple16 as before",
+    ),
     "depth, surface, texture (no figure of this table)": Group(
         ("stereo", "meshing", "texture"), (*STRECHA, "temple16", "kermit11"), "the rendered statue, facade and corner",
         "docs/algorithms.md, Depth and surface; surface-fresh.md has other rendered scenes",
