@@ -1,7 +1,7 @@
 """The pose graph: relative poses of pairs that agree with each other."""
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -99,12 +99,7 @@ def build_pose_graph(
         except FAILURES:  # the reason that it has no pose already stands
             return None
 
-    group = {photo: number for number, photos in enumerate(_groups(poses)) for photo in photos}
-    left = [
-        pair
-        for pair in matches.matches
-        if pair not in poses and group.get(pair[0], -1) == group.get(pair[1], -2) and dropped.get(pair) != LOOKS_ALIKE
-    ]
+    left = [pair for pair in without_pose(matches.matches, poses) if dropped.get(pair) != LOOKS_ALIKE]
     for pair, pose in zip(left, run_map(again, left, "pairs again"), strict=True):
         if pose is not None and not apart.strange(pair, matches.matches[pair][pose.inliers]):
             poses[pair] = pose
@@ -116,6 +111,12 @@ def build_pose_graph(
     stayed = (replace(join, pairs=tuple(pair for pair in join.pairs if pair in poses)) for join in apart.doubtful)
     doubtful = tuple(join for join in stayed if join.pairs)
     return PoseGraph(poses, dropped, averaged(poses)[0], _groups(poses), apart.joins, doubtful)
+
+
+def without_pose(pairs: Iterable[PairId], poses: Mapping[PairId, RelativePose]) -> list[PairId]:
+    """Pairs that have no pose, of photos that those with one connect."""
+    group = {photo: number for number, photos in enumerate(_groups(poses)) for photo in photos}
+    return [pair for pair in pairs if pair not in poses and group.get(pair[0], -1) == group.get(pair[1], -2)]
 
 
 def contradicting(poses: Mapping[PairId, RelativePose], angles: Mapping[PairId, float]) -> list[PairId]:

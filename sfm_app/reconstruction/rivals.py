@@ -14,7 +14,7 @@ from sfm_app.colmap.database import keep_raw_matches, write_calibrations
 from sfm_app.colmap.mapping import copy_database, map_as_colmap_does
 from sfm_app.context import RunContext
 from sfm_app.errors import BackendError
-from sfm_app.geometry.camera import guessed_camera_matrix
+from sfm_app.geometry.camera import GUESSED_FOCAL, guessed_camera_matrix
 from sfm_app.reconstruction.attempts import Attempt, judged, no_model
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, ViewGraph
 from sfm_app.types.epipolar import EpipolarFit
@@ -23,8 +23,6 @@ logger = logging.getLogger("sfm_app")
 
 FOLDER = ".rival"
 MAPPER, HOW = "colmap", "as COLMAP does by itself"
-USUAL = 1.2
-"""The usual guess of a focal, in longer sides: COLMAP's."""
 LEFT_OUT, MANY = 0.25, 60
 """Share of the photos without a place from which on other focals are tried, and photos from which on they are not."""
 CONTRADICTED = 0.05
@@ -94,7 +92,7 @@ def leaves_many_out(model: Attempt | None, intrinsics: Intrinsics, views: ViewGr
     return not known and len(connected) <= MANY and len(connected) - placed > LEFT_OUT * len(connected)
 
 
-def guessed_intrinsics(intrinsics: Intrinsics, sides: float = USUAL) -> Intrinsics:
+def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> Intrinsics:
     """Replace every camera by a guess of the focal, in longer sides; what EXIF claims stays."""
     cameras = {
         name: camera if camera.method == "exif" else _guess(camera, sides)

@@ -170,7 +170,7 @@ def _adjusted(pairs: CameraPairs, usable: Pairs, usual: Usual, before: _Adjusted
     if fit.free[0, LENS]:
         straight = _in_pixels(straight_fundamentals(of_all_pairs(fit, matches, Fs)), pairs)
         consensus = Consensus(_prepared(CameraPairs(straight, usable.weights, pairs.size)), usual.centre_sigma)
-    if fit.free[0, LENS] or before is not None:
+    if fit.free[0, LENS] or (before is not None and before.fit.free[0, LENS]):
         answer = peak.found(consensus)
     if abs(answer.theta[LOG_FOCAL] - fit.state.thetas[0, LOG_FOCAL]) > ELSEWHERE:
         again = np.append(answer.theta, fit.state.thetas[0, KAPPA])
