@@ -33,14 +33,15 @@ KEPT = 32
 
 
 def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Any]:
-    """Find the features of all photos in the run's database and match these pairs, or every photo with every other.
+    """Find features of photos and match them, in the run's database.
 
     What a killed run has left in the database and in `feature_parts` stays as it is.
 
     Args:
         method: of finding and matching.
         run: its database knows the photos, which are laid out.
-        pairs: ids of photos, the smaller one first.
+        pairs: ids of photos that are matched, the smaller one first, and nothing is found in others; None: all photos,
+            every one with every other.
 
     Returns:
         What was in force, for the manifest.
@@ -51,6 +52,8 @@ def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId
     """
     place, options = run.workspace, run.settings.matching
     names = photo_names(place.database)
+    if pairs is not None:
+        names = {photo: names[photo] for photo in sorted({photo for pair in pairs for photo in pair})}
     if method.sift is not None:
         return find_and_match(
             place.database, place.photos, list(names.values()), options, run.workers, run.progress, run.mask_dir,

@@ -99,6 +99,9 @@ class SceneSettings(Section):
         2.0, gt=0, le=90, description="least median triangulation angle of a seed pair, in degrees"
     )
     min_points: int = Field(30, ge=6, le=10000, description="a model with fewer points counts as failed")
+    second_look: bool = Field(
+        True, description="seek finer features in photos that found no place, and in their neighbours, and map again"
+    )
     turn_deg: Literal["auto", 0, 90, 180, 270] = Field(
         "auto", description="by how much most photos have to be turned clockwise to be upright, in degrees"
     )

@@ -201,6 +201,27 @@ class Workspace:
             path.unlink(missing_ok=True)
 
 
+class Aside(Workspace):
+    """A folder within the output folder, for another hypothesis about the same photos.
+
+    Args:
+        of: whose photos and masks they are.
+        name: of the folder.
+    """
+
+    def __init__(self, of: Workspace, name: str) -> None:
+        super().__init__(of.root / name)
+        self.of = of
+
+    @property
+    def photos(self) -> Path:
+        return self.of.photos
+
+    @property
+    def masks(self) -> Path:
+        return self.of.masks
+
+
 def _cannot_write(folder: Path, err: OSError) -> InputError:
     return InputError(
         f"cannot write to {folder}: {err.strerror}",

@@ -11,11 +11,11 @@ from photo_sets import PhotoSet, TrueCamera
 
 import sfm_app
 from sfm_app.api import opened_run
+from sfm_app.calibrating import camera_pairs
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.pipeline import run_stages
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings, merged
-from sfm_app.stages.intrinsics import camera_pairs
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, ViewGraph
 from sfm_app.types.scene import CameraModel

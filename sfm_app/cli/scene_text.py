@@ -25,6 +25,7 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
     """
     kept = (
         "mapper", "mapper_reason", "pairs", "pairs_dropped", "cut_apart", "other_models", "adjustment", "orientation",
+        "second_look",
     )  # fmt: skip
     cameras = {name: {**camera.to_dict(), "K": camera.K.round(3).tolist()} for name, camera in scene.cameras.items()}
     return {
@@ -61,6 +62,7 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
         yield f"mapped {MAPPERS[summary['mapper']]}{because}"
         if counts.get("rival_tried_because"):
             yield f"COLMAP's own way was tried beside ours: {counts['rival_tried_because']}"
+        yield from _second_look(counts.get("second_look", {}))
         if dropped:
             yield f"pairs of photos left out because they do not fit the others: {dropped}"
     for photos in summary.get("cut_apart", ()):
@@ -83,6 +85,15 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
         sure = f"to about {max(deviation, 0.1):.1f} degrees" if deviation is not None else "nobody knows how exactly"
         yield f"upright by {orientation['up']}, {sure}; in {_unit(orientation)}"
         yield from _perhaps_not_upright(orientation)
+
+
+def _second_look(found: Mapping[str, Any]) -> Iterator[str]:
+    """What finer features have brought."""
+    if found:
+        before, after = found["placed"][0], found["placed"][-1]
+        brought = f"{after} photos placed instead of {before}" if found["taken"] else "no more photos placed"
+        failed = f" (it failed: {found['failed']})" if found.get("failed") else ""
+        yield f"finer features were sought for {len(found['photos'])} photos without a place: {brought}{failed}"
 
 
 def _badly_adjusted(adjustment: Mapping[str, Any]) -> Iterator[str]:

@@ -217,6 +217,7 @@ def _generalise(camera: Any) -> None:
 
 def _correspondences(model: Any, database: Path) -> Any:
     options = pycolmap.DatabaseCacheOptions()
+    options.load_all_images = True  # it would leave out those that no pair in the database connects
     options.image_names = {model.images[image_id].name for image_id in model.reg_image_ids()}
     with opened(database) as db:
         return pycolmap.DatabaseCache.create(db, options).correspondence_graph

@@ -3,6 +3,7 @@
 import contextlib
 import ctypes
 import hashlib
+import shutil
 import sqlite3
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -169,6 +170,36 @@ def write_matches(path: Path, pair: PairId, rows: NDArray[np.uint32]) -> None:
     """Enter the matches of a pair that has none."""
     with opened(path) as database:
         database.write_matches(*pair, np.ascontiguousarray(rows, np.uint32))
+
+
+def empty_copy(database: Path, target: Path) -> None:
+    """Copy a database with its photos and cameras, and nothing that was found in them."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    remove_database(target)
+    shutil.copyfile(database, target)
+    with opened(target) as copy:
+        for clear in (copy.clear_two_view_geometries, copy.clear_matches, copy.clear_descriptors, copy.clear_keypoints):
+            clear()
+
+
+def read_features(path: Path) -> tuple[dict[int, NDArray[np.float64]], dict[PairId, NDArray[np.uint32]]]:
+    """Keypoints (N, 2) of every photo that has some, and the raw matches of pairs."""
+    with opened(path) as database:
+        found = {image.image_id: database.read_keypoints(image.image_id) for image in database.read_all_images()}
+        pair_ids, rows = database.read_all_matches()
+    keypoints = {photo: np.asarray(x, np.float64)[:, :2].copy() for photo, x in sorted(found.items()) if len(x)}
+    return keypoints, {_pair(key): np.asarray(row, np.uint32) for key, row in zip(pair_ids, rows, strict=True)}
+
+
+def write_features(path: Path, matches: MatchGraph) -> None:
+    """Replace all keypoints and matches."""
+    for photo, keypoints in matches.keypoints.items():
+        write_keypoints(path, photo, keypoints.astype(np.float32))
+    with opened(path) as database:
+        database.clear_two_view_geometries()
+        database.clear_matches()
+    for pair, rows in matches.matches.items():
+        write_matches(path, pair, rows)
 
 
 def write_epipolar_fits(path: Path, matches: MatchGraph, fits: Mapping[PairId, EpipolarFit]) -> None:

@@ -41,6 +41,9 @@ def extraction_options(options: MatchSettings, sift: Mapping[str, Any], workers:
 def extract(database: Path, photo_dir: Path, names: Sequence[str], reader: Any, extraction: Any) -> dict[str, Any]:
     """Find SIFT features of all photos."""
 
+    with opened(database) as reader_of_ids:
+        ids = [image.image_id for image in reader_of_ids.read_all_images() if image.name in set(names)]
+
     def call(token: Any) -> None:
         pycolmap.extract_features(
             database, photo_dir, list(names), reader_options=reader, extraction_options=extraction,
@@ -48,7 +51,7 @@ def extract(database: Path, photo_dir: Path, names: Sequence[str], reader: Any, 
         )  # fmt: skip
 
     def done(reader: Any) -> int:
-        return sum(reader.exists_keypoints(image_id) for image_id in range(1, len(names) + 1))
+        return sum(reader.exists_keypoints(image_id) for image_id in ids)
 
     _counted(call, database, done, "features", len(names))
     return plain(extraction.todict())

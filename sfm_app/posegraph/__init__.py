@@ -5,6 +5,6 @@ photos at once and which pairs contradict them, `guided` gives those and the rej
 the others know, `graph` puts it together.
 """
 
-from sfm_app.posegraph.graph import PoseGraphOptions, build_pose_graph
+from sfm_app.posegraph.graph import PoseGraphOptions, build_pose_graph, with_model
 
-__all__ = ["PoseGraphOptions", "build_pose_graph"]
+__all__ = ["PoseGraphOptions", "build_pose_graph", "with_model"]

@@ -110,7 +110,17 @@ def build_pose_graph(
         del poses[pair]
     stayed = (replace(join, pairs=tuple(pair for pair in join.pairs if pair in poses)) for join in apart.doubtful)
     doubtful = tuple(join for join in stayed if join.pairs)
-    return PoseGraph(poses, dropped, averaged(poses)[0], _groups(poses), apart.joins, doubtful)
+    return PoseGraph(poses, dropped, _groups(poses), apart.joins, doubtful)
+
+
+def with_model(graph: PoseGraph, photos: Collection[int], poses: Mapping[PairId, RelativePose]) -> PoseGraph:
+    """The graph with the relative poses of a model instead of those that it had between the model's photos."""
+    kept = {pair: pose for pair, pose in graph.poses.items() if not (pair[0] in photos and pair[1] in photos)}
+    gone = sorted(graph.poses.keys() - kept.keys() - poses.keys())
+    dropped = dict(graph.dropped) | dict.fromkeys(gone, CONTRADICTS)
+    entered = dict(sorted((kept | dict(poses)).items()))
+    left = {pair: why for pair, why in dropped.items() if pair not in entered}
+    return replace(graph, poses=entered, dropped=left, groups=_groups(entered))
 
 
 def without_pose(pairs: Iterable[PairId], poses: Mapping[PairId, RelativePose]) -> list[PairId]:

@@ -2,9 +2,11 @@
 
 `passes` is the table of contents: map every group of photos, learn from the result, map again where that helps.
 `seeds` ranks pairs to start from, `attempts` runs COLMAP's two mappers, `support` judges what they made by the matches
-it explains, `joins` cuts what hangs together by contradictions only, `left_out` says why photos have no place.
+it explains, `joins` cuts what hangs together by contradictions only, `second_look`
+seeks finer features (`added_matches`) where photos found no place, `left_out` says why they have none.
 """
 
 from sfm_app.reconstruction.passes import Outcome, reconstruct
+from sfm_app.reconstruction.second_look import Found, clear, look_again
 
-__all__ = ["Outcome", "reconstruct"]
+__all__ = ["Found", "Outcome", "clear", "look_again", "reconstruct"]

@@ -9,11 +9,12 @@ from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import write_calibrations, write_pose_graph
 from sfm_app.colmap.model import cameras_of, part_of, photos_of
 from sfm_app.context import RunContext
-from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
+from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.reconstruction.attempts import Attempt, Group, attempts, better, why
 from sfm_app.reconstruction.joins import sound_parts
 from sfm_app.reconstruction.left_out import names_of
 from sfm_app.reconstruction.rivals import guessed_intrinsics, leaves_many_out, map_baseline, why_thin
+from sfm_app.reconstruction.support import model_poses
 from sfm_app.reconstruction.told_apart import with_earlier, without_look_alikes
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
 
@@ -86,6 +87,7 @@ def with_rival(
     thin = why_thin(main, intrinsics, matches, views)
     if not thin:
         return outcome
+    run.progress.say(f"COLMAP's own way is tried beside ours: {thin}")
     rival = map_baseline(matches, views, intrinsics, run)
     outcome = replace(outcome, thin=thin, tried=(*outcome.tried, rival.note))
     both = [attempt for attempt in (main, rival) if attempt is not None]
@@ -95,7 +97,9 @@ def with_rival(
     taken = {photo for part in parts for photo in photos_of(part.model)}
     others = [model for model in outcome.models if taken.isdisjoint(photos_of(model.model))]
     models = sorted((*parts, *others), key=lambda attempt: (-attempt.photos, -attempt.support))
-    return replace(outcome, models=tuple(models), reason=why(rival, both, len(matches.images)))
+    graph = _graph_of(models, outcome.graph, matches, run)
+    _enter(graph, intrinsics, matches, run)
+    return replace(outcome, models=tuple(models), graph=graph, reason=why(rival, both, len(matches.images)))
 
 
 def with_other_focals(
@@ -103,7 +107,10 @@ def with_other_focals(
 ) -> Outcome:
     """The outcome, or, where the guessed focal leaves many photos without a place, that of the best other guess."""
     main = outcome.models[0] if outcome.models else None
-    for focal in OTHER_FOCALS if leaves_many_out(main, intrinsics, views) else ():
+    if not leaves_many_out(main, intrinsics, views):
+        return outcome
+    run.progress.say("many photos have no place, and the focal length is a guess: other guesses are tried")
+    for focal in OTHER_FOCALS:
         other = _pass(matches, views, guessed_intrinsics(intrinsics, focal), run)
         tried = (*outcome.tried, *(f"{note} (focal {focal:g} longer sides)" for note in other.tried))
         outcome = replace(other if other.support > outcome.support else outcome, thin=outcome.thin, tried=tried)
@@ -180,6 +187,15 @@ def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
     members = set(photos)
     explained = {pair: found for pair, found in attempt.explained.items() if members.issuperset(pair)}
     return replace(attempt, model=part_of(attempt.model, photos), explained=explained)
+
+
+def _graph_of(models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph, run: RunContext) -> PoseGraph:
+    """The pose graph as models have it that were made without it: later steps complete their tracks along its pairs."""
+    epipolar = run.settings.epipolar
+    for attempt in models:
+        poses = model_poses(attempt.model, matches, epipolar.max_error_px, epipolar.min_inliers)
+        graph = with_model(graph, set(photos_of(attempt.model)), poses)
+    return graph
 
 
 def _enter(graph: PoseGraph, intrinsics: Intrinsics, matches: MatchGraph, run: RunContext) -> None:

@@ -4,7 +4,7 @@ Every pair of photos with a place is asked how many of its raw matches lie on th
 both cameras. Points, tracks and reprojection errors differ with the mapper; this does not.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.model import placed_views
-from sfm_app.posegraph.pair_pose import in_front
+from sfm_app.posegraph.pair_pose import in_front, ray_angles_deg
 from sfm_app.posegraph.refine import pose_distances
-from sfm_app.types import MatchGraph, PairId, ViewGraph
+from sfm_app.types import MatchGraph, PairId, RelativePose, ViewGraph
 
 FloatArray = NDArray[np.float64]
 
@@ -45,22 +45,60 @@ def explained_pairs(model: Any, matches: MatchGraph, views: ViewGraph, max_error
         views: fundamental matrices.
         max_error_px: largest Sampson distance of an inlier.
     """
-    placed, found = placed_views(model, matches.keypoints), {}
-    for pair in matches.matches:
+    found = {}
+    for pair, seen in _placed_pairs(model, matches):
+        right = seen.right(GENEROUS * max_error_px)
+        fit = views.fits.get(pair)
+        wrong = int(np.count_nonzero(fit.inliers & ~right)) if fit else 0
+        found[pair] = Explained(int(np.count_nonzero(right)), fit.inlier_count if fit else 0, wrong)
+    return found
+
+
+def model_poses(model: Any, matches: MatchGraph, max_error_px: float, least: int) -> dict[PairId, RelativePose]:
+    """Relative poses as a model has them, of all pairs of its photos with at least so many matches that lie right.
+
+    Args:
+        model, matches, max_error_px: as in `explained_pairs`.
+        least: a pair with fewer is left out.
+    """
+    found = {}
+    for pair, seen in _placed_pairs(model, matches):
+        right = seen.right(max_error_px)
+        if np.count_nonzero(right) >= least:
+            angle_deg = float(np.median(ray_angles_deg(seen.rays[right], seen.R)))
+            found[pair] = RelativePose(seen.R, seen.t, right, angle_deg=angle_deg, in_front=1.0, kind="calibrated")
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PlacedPair:
+    """The raw matches of two photos with a place."""
+
+    rays: FloatArray
+    """(M, 4) on the plane z = 1 of view 1 and of view 2."""
+    focals: FloatArray
+    """(4,)"""
+    R: FloatArray
+    t: FloatArray
+    """Of view 2 from view 1; t of length 1, or nothing."""
+
+    def right(self, max_error_px: float) -> NDArray[np.bool_]:
+        """(M,) which of them lie on their epipolar lines, before both cameras."""
+        distances = pose_distances(self.rays, self.focals, self.R, self.t)
+        return np.asarray((distances <= max_error_px) & in_front(self.rays, self.R, self.t), bool)
+
+
+def _placed_pairs(model: Any, matches: MatchGraph) -> Iterator[tuple[PairId, _PlacedPair]]:
+    placed = placed_views(model, matches.keypoints)
+    for pair, rows in matches.matches.items():
         if pair[0] not in placed or pair[1] not in placed:
             continue
         first, second = placed[pair[0]], placed[pair[1]]
         R = second.R @ first.R.T
         t = second.t - R @ first.t
-        rows = matches.matches[pair]
         rays = np.hstack([first.rays[rows[:, 0]], second.rays[rows[:, 1]]])
         focals = np.concatenate([first.focals, second.focals])
-        right = pose_distances(rays, focals, R, t / max(float(np.linalg.norm(t)), 1e-300)) <= GENEROUS * max_error_px
-        right &= in_front(rays, R, t)
-        fit = views.fits.get(pair)
-        wrong = int(np.count_nonzero(fit.inliers & ~right)) if fit else 0
-        found[pair] = Explained(int(np.count_nonzero(right)), fit.inlier_count if fit else 0, wrong)
-    return found
+        yield pair, _PlacedPair(rays, focals, R, t / max(float(np.linalg.norm(t)), 1e-300))
 
 
 def support(explained: Mapping[PairId, Explained]) -> float:

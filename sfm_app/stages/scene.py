@@ -13,7 +13,7 @@ from sfm_app.colmap.model import colour, photos_of, read_scene, sparse_model
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_depth, why_no_scene
 from sfm_app.numerical import json_text
-from sfm_app.reconstruction import Outcome, reconstruct
+from sfm_app.reconstruction import Found, Outcome, clear, look_again, reconstruct
 from sfm_app.reconstruction.left_out import left_out, names_of
 from sfm_app.reconstruction.orientation import look_at_photos, orient_or_leave
 from sfm_app.reconstruction.told_apart import in_words, jumps
@@ -30,9 +30,23 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
     Raises:
         ReconstructionError: no pair of photos grows into a model; says what was seen.
     """
-    outcome = with_depth(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
+    first = Found(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
+    try:
+        return adjusted_scene(look_again(first), run)
+    finally:
+        clear(run)
+
+
+def adjusted_scene(found: Found, run: RunContext) -> Scene:
+    """Adjust the models, put them upright, write them down and count them.
+
+    Raises:
+        ReconstructionError: no model holds depth.
+    """
+    matches, views, intrinsics = found.matches, found.views, found.intrinsics
+    outcome = with_depth(found.outcome, matches, views, intrinsics, run)
     looks = look_at_photos([attempt.model for attempt in outcome.models], matches, run)
-    adjusted = [adjusted_or_as_it_was(attempt.model, run.workspace.database) for attempt in outcome.models]
+    adjusted = [adjusted_or_as_it_was(attempt.model, found.run.workspace.database) for attempt in outcome.models]
     models = [found.model for found in adjusted]
     with backend("reading colours"):
         for model in models:

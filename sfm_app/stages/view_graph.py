@@ -1,67 +1,26 @@
 """view_graph: MatchGraph -> ViewGraph."""
 
-import logging
 import shutil
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import write_epipolar_fits
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_scene
-from sfm_app.numerical import FAILURES
-from sfm_app.parallel import ordered_map
-from sfm_app.progress import track
-from sfm_app.ransac.stationary import covers, find_stationary, fit_moving
-from sfm_app.settings import Settings
+from sfm_app.fitting import fit_pairs, graph_of
 from sfm_app.stored import load_arrays
-from sfm_app.types import EpipolarFit, MatchGraph, PairId, Rejected, ViewGraph
-from sfm_app.written import can_go_on, mark_unfinished, replacing
-
-logger = logging.getLogger("sfm_app")
-
-BoolArray = NDArray[np.bool_]
-
-
-Fitted = tuple[EpipolarFit | Rejected, int]
-"""What became of a pair, and how many of its matches stand still in the picture."""
-
-PART = 64
-"""Pairs that are kept together, so that a run that is killed has to do no more again."""
+from sfm_app.types import MatchGraph, ViewGraph
+from sfm_app.written import replacing
 
 
 def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
-    """Fit every pair on its own, seeded by the run's seed and its ids, and count why pairs fell.
-
-    A run that was killed goes on where it stopped.
+    """Fit every pair on its own, and count why pairs fell.
 
     Raises:
         ReconstructionError: no pair has a usable epipolar geometry.
     """
-    options = run.settings.epipolar
-    estimator = run.plugins.estimator(options.estimator)
-
-    def fit_pair(pair: PairId) -> Fitted:
-        try:
-            return fit_numbers(pair)
-        except FAILURES as err:
-            logger.info("pair %s could not be fitted", pair, exc_info=err)
-            return Rejected("the computation failed"), 0
-
-    def fit_numbers(pair: PairId) -> Fitted:
-        seed = int(np.random.SeedSequence([run.seed, *pair]).generate_state(1)[0])
-        points, still = matches.points(pair), stationary_matches(matches, pair, run.settings)
-        if not still.any():
-            return estimator.fit(*points, options, seed), 0
-        image = matches.images[pair[0]]
-        wide = covers(points[0][still], matches.keypoints[image.id], (image.width, image.height))
-        return fit_moving(estimator.fit, points, still, wide, options, seed), int(np.count_nonzero(still))
-
-    pairs = list(matches.matches)
-    found = in_parts(fit_pair, pairs, run)
+    found = fit_pairs(matches, list(matches.matches), run)
     graph = graph_of(found)
     run.record(
         kept=len(graph.fits),
@@ -78,62 +37,6 @@ def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
         write_epipolar_fits(run.workspace.database, matches, graph.fits)
     shutil.rmtree(run.workspace.view_graph_parts)
     return graph
-
-
-def graph_of(found: Mapping[PairId, Fitted]) -> ViewGraph:
-    """Pairs with a geometry, and those without."""
-    return ViewGraph(
-        fits={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, EpipolarFit)},
-        rejected={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, Rejected)},
-    )
-
-
-def in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run: RunContext) -> dict[PairId, Fitted]:
-    """What `fit_pair` makes of every pair, in their order; parts that are complete are kept as they come."""
-    folder = run.workspace.view_graph_parts
-    if not can_go_on(folder, run.inputs):
-        mark_unfinished(folder, run.inputs)
-    parts = {folder / f"{first:06d}.npz": pairs[first : first + PART] for first in range(0, len(pairs), PART)}
-    known = {path: read_part(path, part) for path, part in parts.items()}
-    left = [pair for path, part in parts.items() if known[path] is None for pair in part]
-    fitted = ordered_map(run.executor, fit_pair, left, ahead=2 * run.workers)
-    results = track(run.progress, fitted, "epipolar geometry", len(left))
-    found: dict[PairId, Fitted] = {}
-    for path, part in parts.items():
-        done = known[path]
-        if done is None:
-            done = dict(zip(part, results, strict=False))
-            write_part(path, done)
-        found |= done
-    return {pair: found[pair] for pair in pairs}
-
-
-def write_part(path: Path, found: Mapping[PairId, Fitted]) -> None:
-    """Keep some pairs."""
-    still = np.array([[*pair, count] for pair, (_, count) in found.items()], np.int64)
-    with replacing(path) as beside:
-        np.savez(beside, allow_pickle=False, still=still, **graph_of(found).to_arrays())
-
-
-def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, Fitted] | None:
-    """What `write_part` has kept; None where there is nothing, or nothing sound."""
-    try:
-        arrays = load_arrays(path)
-        graph = ViewGraph.from_arrays(arrays)
-        every: dict[PairId, EpipolarFit | Rejected] = {**graph.fits, **graph.rejected}
-        still = {(int(a), int(b)): int(count) for a, b, count in arrays["still"]}
-        return {pair: (every[pair], still[pair]) for pair in pairs}
-    except Exception:  # whatever decoders make of damaged bytes
-        return None
-
-
-def stationary_matches(matches: MatchGraph, pair: PairId, settings: Settings) -> BoolArray:
-    """Which matches of a pair stay in one place; none where the photos differ in size."""
-    first, second = (matches.images[key] for key in pair)
-    if (first.width, first.height) != (second.width, second.height):
-        return np.zeros(len(matches.matches[pair]), bool)
-    shrunk = max(first.width, first.height) / settings.matching.max_image_size_px
-    return find_stationary(*matches.points(pair), unit_px=max(1.0, shrunk))
 
 
 def load_view_graph(run: RunContext) -> ViewGraph:

@@ -53,8 +53,6 @@ class PoseGraph:
     poses: Mapping[PairId, RelativePose]
     dropped: Mapping[PairId, str]
     """Pairs with an epipolar geometry that were left out, with the reason."""
-    rotations: Mapping[int, FloatArray]
-    """By photo: (3, 3) rotation from the world; every group of photos has a world of its own."""
     groups: tuple[tuple[int, ...], ...]
     """Photos that hang together, the largest group first."""
     look_alikes: tuple[LookAlikes, ...] = ()

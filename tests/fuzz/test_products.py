@@ -275,7 +275,7 @@ def test_links_out_of_the_output_folder_are_refused(kept, name):
 
 
 def test_parts_of_a_killed_run_that_are_damaged_are_made_again(tmp_path):
-    from sfm_app.stages.view_graph import read_part, write_part
+    from sfm_app.fitting import read_part, write_part
     from sfm_app.types import EpipolarFit, Rejected
 
     fit = EpipolarFit(np.eye(3), np.ones(40, bool), np.ones(40), 7, 0.3)

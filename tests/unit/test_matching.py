@@ -79,10 +79,10 @@ def test_pictures_are_shrunk_and_keypoints_are_not(filled):
     np.testing.assert_array_equal(graph.keypoints[1], [[50, 25], [150, 25], [50, 75], [150, 75]])
 
 
-def test_no_more_pairs_than_asked_for(filled):
+def test_no_more_pairs_than_asked_for_and_no_photos_but_theirs(filled):
     ways = Corners()
     assert list(filled(ways.method, [(2, 3)]).matches) == [(2, 3)]
-    assert ways.matched == 1
+    assert ways.matched == 1 and len(ways.seen) == 2
 
 
 def test_a_killed_run_goes_on_where_it_stopped(filled):

@@ -55,6 +55,17 @@ def test_a_model_that_many_matches_contradict_comes_with_a_warning():
     assert "beware: 25 % of the matches between these photos contradict it" in text
 
 
+def test_what_finer_features_brought_is_said():
+    found = {"photos": ["x.jpg", "y.jpg"], "pairs": 9, "placed": [3, 5], "taken": True}
+
+    text, summary = told(second_look=found)
+    assert "finer features were sought for 2 photos without a place: 5 photos placed instead of 3\n" in text
+    assert summary["second_look"]["pairs"] == 9
+    failed = told(second_look={"photos": ["x.jpg"], "pairs": 9, "placed": [5], "taken": False, "failed": "no room"})[0]
+    assert "without a place: no more photos placed (it failed: no room)\n" in failed
+    assert "finer" not in told()[0]
+
+
 def test_metres_are_named():
     text, _ = told(orientation=COUNTS["orientation"] | {"unit": "metre"})
 

@@ -3,6 +3,7 @@
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.database import SQUARE_PIXELS
 
 WIDTH, HEIGHT = 1000, 800
 PLAIN = [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]
@@ -27,5 +28,21 @@ def synthetic(tmp_path_factory):
             noise.point2D_stddev = noise_px
             pycolmap.synthesize_noise(noise, model, database)
         return model, database_path
+
+    return make
+
+
+@pytest.fixture
+def mapped(synthetic):
+    """Makes a model as mapping leaves it: one focal, a centre that may be off; and its database."""
+
+    def make(true_params=PLAIN, noise_px=0.3, photos=8, cameras=1, start=(880.0, 500.0, 400.0, 0.0), seed=1):
+        model, database = synthetic(true_params, noise_px, photos, cameras, seed)
+        for point_id in [key for key, point in model.points3D.items() if point.track.length() < 2]:
+            model.delete_point3D(point_id)
+        for camera in model.cameras.values():
+            camera.model = getattr(pycolmap.CameraModelId, SQUARE_PIXELS)
+            camera.params = start
+        return model, database
 
     return make

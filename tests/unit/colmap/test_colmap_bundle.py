@@ -5,29 +5,13 @@ import pytest
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import LOSS_SCALE_PX, adjust, read_bundle, solve
-from sfm_app.colmap.database import SQUARE_PIXELS, camera_params
+from sfm_app.colmap.database import camera_params
 from sfm_app.geometry.bundle import reduce
 from sfm_app.geometry.camera import camera_matrix
 
 WIDTH, HEIGHT = 1000, 800
 PLAIN = [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
-
-
-@pytest.fixture
-def mapped(synthetic):
-    """Makes a model as mapping leaves it: one focal, a centre that may be off; and its database."""
-
-    def make(true_params=PLAIN, noise_px=0.3, photos=8, cameras=1, start=(880.0, 500.0, 400.0, 0.0), seed=1):
-        model, database = synthetic(true_params, noise_px, photos, cameras, seed)
-        for point_id in [key for key, point in model.points3D.items() if point.track.length() < 2]:
-            model.delete_point3D(point_id)
-        for camera in model.cameras.values():
-            camera.model = getattr(pycolmap.CameraModelId, SQUARE_PIXELS)
-            camera.params = start
-        return model, database
-
-    return make
 
 
 @pytest.mark.parametrize("radial", [0.0, -0.08])

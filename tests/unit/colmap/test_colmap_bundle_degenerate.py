@@ -6,26 +6,8 @@ import pytest
 from sfm_app.colmap import bundle as module
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import adjust, adjusted_or_as_it_was
-from sfm_app.colmap.database import SQUARE_PIXELS
+from sfm_app.colmap.database import opened
 from sfm_app.errors import BackendError, NumericalError
-
-START = (880.0, 500.0, 400.0, 0.0)
-
-
-@pytest.fixture
-def mapped(synthetic):
-    """Makes a model as mapping leaves it, and its database."""
-
-    def make(photos=6, start=START):
-        model, database = synthetic(photos=photos)
-        for point_id in [key for key, point in model.points3D.items() if point.track.length() < 2]:
-            model.delete_point3D(point_id)
-        for camera in model.cameras.values():
-            camera.model = getattr(pycolmap.CameraModelId, SQUARE_PIXELS)
-            camera.params = start
-        return model, database
-
-    return make
 
 
 def away(model, share, place):
@@ -58,6 +40,18 @@ def test_points_that_have_gone_astray_do_not_end_it_and_the_camera_is_found(mapp
     assert all(np.isfinite(point.xyz).all() for point in found.model.points3D.values())
 
 
+def test_a_photo_that_no_pair_in_the_database_connects_stays_in_the_model(mapped):
+    model, database = mapped(photos=6)
+    with opened(database) as known:
+        for other in range(2, 7):
+            known.delete_two_view_geometry(1, other)
+
+    found = adjust(model, database)
+
+    assert sorted(found.model.reg_image_ids()) == [1, 2, 3, 4, 5, 6]
+    assert abs(found.model.cameras[1].params[0] - 900) < 3 * found.deviations[1]["fx"]
+
+
 def test_photos_from_one_place_leave_numbers_or_the_model_as_it_was(mapped):
     model, database = mapped()
     for image in model.images.values():
@@ -84,7 +78,7 @@ def test_a_model_that_loses_its_points_stays_as_mapping_left_it(mapped):
     found = adjusted_or_as_it_was(model, database)
 
     assert found.model is model and "points" in found.trouble
-    assert found.model.cameras[1].params.tolist() == list(START)
+    assert found.model.cameras[1].params.tolist() == [880.0, 500.0, 400.0, 0.0]
     assert (found.deviations, found.determined) == ({1: {}}, {1: ()})
 
 

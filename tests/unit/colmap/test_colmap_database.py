@@ -88,7 +88,7 @@ def test_relative_poses_replace_the_two_view_geometries(stored, kind):
     inliers = np.arange(12) % 2 == 0
     pose = RelativePose(R, t, inliers, 9.0, 1.0, kind)
 
-    write_pose_graph(path, graph, PoseGraph({(1, 2): pose}, {(1, 3): "contradicts other pairs"}, {}, ()))
+    write_pose_graph(path, graph, PoseGraph({(1, 2): pose}, {(1, 3): "contradicts other pairs"}, ()))
 
     with opened(path) as database:
         geometry = database.read_two_view_geometry(1, 2)
@@ -99,7 +99,7 @@ def test_relative_poses_replace_the_two_view_geometries(stored, kind):
     np.testing.assert_allclose(np.einsum("ni,ij,nj->n", X @ R.T + t, geometry.E, X), 0, atol=1e-12)
     assert np.array_equal(geometry.inlier_matches, matches[inliers])
 
-    write_pose_graph(path, graph, PoseGraph({}, {}, {}, ()))
+    write_pose_graph(path, graph, PoseGraph({}, {}, ()))
     with opened(path) as database:
         assert database.num_verified_image_pairs() == 0
 

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import eight_point
-from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
+from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, NO_NUMBERS, TOO_FEW, averaged
 from sfm_app.posegraph.groups import connected_groups
 from sfm_app.types import (
@@ -16,6 +16,7 @@ from sfm_app.types import (
     Intrinsics,
     MatchedImage,
     MatchGraph,
+    PoseGraph,
     Rejected,
     RelativePose,
     ViewGraph,
@@ -113,7 +114,8 @@ def test_photos_of_one_place_hang_together():
 
     assert list(graph.poses) == list(combinations(SIX, 2)) and graph.dropped == {}
     assert graph.groups == (SIX,)
-    errors = [photos.error_deg(graph.rotations[j] @ graph.rotations[i].T, (i, j)) for i, j in graph.poses]
+    rotations = averaged(graph.poses)[0]
+    errors = [photos.error_deg(rotations[j] @ rotations[i].T, (i, j)) for i, j in graph.poses]
     assert 0.001 < max(errors) < 0.3
     assert not any(pose.guided for pose in graph.poses.values())
 
@@ -173,7 +175,7 @@ def test_two_places_are_two_groups_the_larger_one_first():
     assert graph.groups == ((3, 4, 5, 6), (1, 2, 9))
     assert (2, 3) not in graph.poses
     assert graph.group_of(9) == (1, 2, 9) and graph.group_of(7) == ()
-    np.testing.assert_allclose([graph.rotations[1], graph.rotations[3]], [np.eye(3)] * 2, atol=0.01)
+    np.testing.assert_allclose([averaged(graph.poses)[0][photo] for photo in (1, 3)], [np.eye(3)] * 2, atol=0.01)
 
 
 def test_where_cameras_are_guesses_pairs_keep_the_inliers_of_F():
@@ -268,3 +270,15 @@ def test_pairs_on_a_plane_count_little_where_rotations_are_averaged():
 
     assert off[1, 3] > 30.0 > 10.0 > max(off[1, 2], off[2, 3])
     assert off[1, 3] >= even[1, 3]
+
+
+def test_a_graph_takes_over_the_poses_of_a_model():
+    def pose(sign=1.0):
+        return RelativePose(sign * np.eye(3), np.eye(3)[0], np.ones(20, bool), 10.0, 1.0)
+
+    before = PoseGraph({(1, 2): pose(), (2, 3): pose(), (3, 4): pose()}, {(1, 3): TOO_FEW}, ((1, 2, 3, 4),))
+    after = with_model(before, {1, 2, 3}, {(1, 2): pose(-1.0), (1, 3): pose()})
+
+    assert list(after.poses) == [(1, 2), (1, 3), (3, 4)] and after.poses[1, 2].R[0, 0] == -1
+    assert after.dropped == {(2, 3): CONTRADICTS}
+    assert after.groups == ((1, 2, 3, 4),)

@@ -67,7 +67,7 @@ def try_out(run, cameras, monkeypatch):
             for key in range(1, count)
         }
         matches = MatchGraph(images, keypoints, dict.fromkeys(poses, rows))
-        group = Group(tuple(images), matches, ViewGraph({}, {}), PoseGraph(poses, {}, {}, ()), cameras())
+        group = Group(tuple(images), matches, ViewGraph({}, {}), PoseGraph(poses, {}, ()), cameras())
         done, calls = {"global": threading.Event(), "incremental": threading.Event()}, []
 
         def finish(mapper, result):

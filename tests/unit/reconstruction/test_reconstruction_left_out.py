@@ -25,7 +25,7 @@ def test_a_photo_without_features_says_so():
 
 
 def pose_graph(dropped=None, poses=None):
-    return PoseGraph(poses or {}, dropped or {}, {}, ())
+    return PoseGraph(poses or {}, dropped or {}, ())
 
 
 def test_every_photo_without_a_place_has_a_reason():

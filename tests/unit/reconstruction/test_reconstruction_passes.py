@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.database import opened
 from sfm_app.colmap.model import photos_of
 from sfm_app.errors import BackendError
@@ -153,6 +154,20 @@ def test_a_rival_that_explains_more_goes_on(synthetic, run, cameras, mapped, mon
     assert "the rival" in found.tried and found.reason.startswith("it places all 6 photos")
 
 
+def test_later_steps_know_the_pairs_of_a_rival_that_goes_on(synthetic, run, cameras, mapped, monkeypatch):
+    """Its photos need not be in our pose graph: tracks could not be completed, and COLMAP raised."""
+    views = replace(synthetic.views, fits={pair: fit for pair, fit in synthetic.views.fits.items() if 6 not in pair})
+    mapped(without(with_camera(synthetic.copy(), TRUE), [5, 6]), None)
+    rival_of(monkeypatch, synthetic, with_camera(synthetic.copy(), TRUE))
+    made = run()
+
+    found = reconstruct(synthetic.matches, views, cameras(), made)
+
+    assert found.models[0].photos == 6 and {(k, 6) for k in range(1, 6)} <= found.graph.poses.keys()
+    assert len(geometries_in(made.workspace.database)) == 15
+    assert photos_of(adjust(found.models[0].model, made.workspace.database).model) == [1, 2, 3, 4, 5, 6]
+
+
 def test_a_rival_that_explains_less_is_named_and_left(synthetic, run, cameras, mapped, monkeypatch):
     mapped(with_camera(synthetic.copy(), TRUE), None)
     asked = rival_of(monkeypatch, synthetic, without(with_camera(synthetic.copy(), TRUE), [5, 6]))
@@ -214,7 +229,7 @@ def learned(model, synthetic, intrinsics):
 
 
 def worth(model, synthetic, intrinsics, photos=6):
-    graph = PoseGraph({}, {}, {}, (tuple(range(1, photos + 1)),))
+    graph = PoseGraph({}, {}, (tuple(range(1, photos + 1)),))
     found = module.Outcome((Attempt("global", model, {}, ""),), graph, intrinsics, ())
     return module.worth_another(found, intrinsics, synthetic.matches)
 

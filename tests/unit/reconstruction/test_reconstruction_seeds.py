@@ -33,7 +33,7 @@ def seeded(matches, intrinsics):
     cameras = [intrinsics.camera(matches.images[key]) for key in (1, 2)]
     x1, x2 = matches.points((1, 2))
     fit = EpipolarFit(eight_point(x1, x2), np.ones(POINTS, bool), np.ones(POINTS), 10, 0.3)
-    graph = PoseGraph({(1, 2): estimated(Pair((x1, x2), cameras, 1.5), fit)}, {}, {}, ())
+    graph = PoseGraph({(1, 2): estimated(Pair((x1, x2), cameras, 1.5), fit)}, {}, ())
     [candidate] = rank_seeds(matches, graph, intrinsics, (1, 2), 2.0)
     return seed_of(matches, candidate, intrinsics)
 
@@ -76,7 +76,7 @@ def order(poses, camera=None, members=(1, 2, 3, 4), keypoints=None, least_deg=2.
     images, usual = photos()
     rows = np.tile(np.arange(400, dtype=np.uint32)[:, None], 2)
     matches = MatchGraph(images, usual | (keypoints or {}), dict.fromkeys(poses, rows))
-    graph = PoseGraph(poses, {}, {}, ())
+    graph = PoseGraph(poses, {}, ())
     found = rank_seeds(matches, graph, Intrinsics({"one": camera or known()}), members, least_deg)
     assert [candidate.score for candidate in found] == sorted((c.score for c in found), reverse=True)
     return [candidate.pair for candidate in found]

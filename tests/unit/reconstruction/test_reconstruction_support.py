@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.reconstruction.support import Explained, explained_pairs, support
+from sfm_app.reconstruction.support import Explained, explained_pairs, model_poses, support
 from sfm_app.types import MatchGraph, ViewGraph
 
 
@@ -86,3 +86,19 @@ def test_many_matches_of_one_pair_count_less_than_some_of_many():
     assert support(pairs(60, 60, 60)) > support(pairs(1000))
     assert support(pairs(60, 61)) > support(pairs(60, 60))
     assert support({}) == 0.0
+
+
+def test_relative_poses_of_a_model_are_those_of_its_photos_with_the_matches_that_lie_right(synthetic):
+    found = model_poses(synthetic.model, synthetic.matches, 1.5, 100)
+
+    first, second = (synthetic.model.images[photo].cam_from_world().matrix() for photo in (1, 2))
+    R = second[:, :3] @ first[:, :3].T
+    t = second[:, 3] - R @ first[:, 3]
+    assert list(found) == list(synthetic.matches.matches)
+    np.testing.assert_allclose(found[1, 2].R, R, atol=1e-12)
+    np.testing.assert_allclose(found[1, 2].t, t / np.linalg.norm(t), atol=1e-12)
+    assert all(pose.inliers[:100].mean() > 0.98 and pose.inliers[100:].mean() < 0.5 for pose in found.values())
+
+
+def test_pairs_of_a_model_that_share_little_have_no_relative_pose(synthetic):
+    assert model_poses(synthetic.model, synthetic.matches, 1.5, 121) == {}

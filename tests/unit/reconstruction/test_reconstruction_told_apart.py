@@ -21,7 +21,7 @@ def matches():
 
 
 def graph(*joins, dropped=None):
-    return PoseGraph({}, dropped or {}, {}, (), joins)
+    return PoseGraph({}, dropped or {}, (), joins)
 
 
 def test_matches_of_look_alikes_do_not_speak(matches):

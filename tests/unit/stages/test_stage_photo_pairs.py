@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm_app.calibrating import camera_pairs, of_whole_photo, photo_pairs
 from sfm_app.selfcal import Camera, pair_weights
 from sfm_app.selfcal.answers import guessed
-from sfm_app.stages.intrinsics import camera_pairs, of_whole_photo, photo_pairs
 from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, Rejected, ViewGraph
 
 

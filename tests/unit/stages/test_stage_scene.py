@@ -59,7 +59,8 @@ def synthetic(tmp_path_factory):
 def run(synthetic, tmp_path):
     """A run whose folder holds the database."""
     shutil.copyfile(synthetic[0], tmp_path / "database.db")
-    return RunContext(Settings(), Workspace(tmp_path), load_plugins(), ThreadPoolExecutor(1), 1)
+    settings = Settings.from_mapping({"scene": {"second_look": False}})
+    return RunContext(settings, Workspace(tmp_path), load_plugins(), ThreadPoolExecutor(1), 1)
 
 
 def attempt(model, explained=None):
@@ -70,7 +71,7 @@ def outcome(*attempts, graph=None, **others):
     cameras = Intrinsics({"one": Calibration(camera_matrix(1280, 1280, 512, 384), 1024, 768, "zero-curves", True)})
     return Outcome(
         attempts,
-        graph or PoseGraph({}, {}, {}, ()),
+        graph or PoseGraph({}, {}, ()),
         cameras,
         **{"tried": ("a", "b"), "reason": "it explains more", **others},
     )
@@ -91,7 +92,7 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
     main, other = part_of(true, (1, 2, 3, 4)), part_of(true, (5, 6, 7))
     for camera in main.cameras.values():
         camera.params = [1270.0, 512.0, 384.0, 0.0]
-    made = outcome(attempt(main), attempt(other), graph=PoseGraph({}, {(1, 8): "contradicts other pairs"}, {}, ()))
+    made = outcome(attempt(main), attempt(other), graph=PoseGraph({}, {(1, 8): "contradicts other pairs"}, ()))
     monkeypatch.setattr(scene, "reconstruct", lambda *_: made)
     matches, views = inputs(true)
     name = {key: image.name for key, image in matches.images.items()}
@@ -168,7 +169,7 @@ def test_how_it_was_made_counts_pairs_and_matches():
     model = SimpleNamespace(num_reg_images=lambda: 4)
 
     found = scene.how_it_was_made(
-        outcome(attempt(model, explained), graph=PoseGraph(poses, dropped, {}, ()), cuts=("c, d",), passes=2)
+        outcome(attempt(model, explained), graph=PoseGraph(poses, dropped, ()), cuts=("c, d",), passes=2)
     )
 
     assert found == {

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from sfm_app import fitting
 from sfm_app.context import RunContext
 from sfm_app.parallel import make_executor
 from sfm_app.plugins import load_plugins
@@ -55,8 +56,8 @@ def test_a_killed_run_goes_on_with_the_pair_that_it_had_come_to(build, tmp_path,
     matches = match_graph()
     build(matches)
     expected = (tmp_path / "view_graph.npz").read_bytes()
-    monkeypatch.setattr(view_graph, "PART", 1)
-    write, written = view_graph.write_part, []
+    monkeypatch.setattr(fitting, "PART", 1)
+    write, written = fitting.write_part, []
 
     def dies_at_the_second(path, found):
         if written:
@@ -65,11 +66,11 @@ def test_a_killed_run_goes_on_with_the_pair_that_it_had_come_to(build, tmp_path,
         write(path, found)
 
     with monkeypatch.context() as patch, pytest.raises(Killed):
-        patch.setattr(view_graph, "write_part", dies_at_the_second)
+        patch.setattr(fitting, "write_part", dies_at_the_second)
         build(matches)
     stamp = written[0].stat().st_mtime_ns
     parts = []
-    monkeypatch.setattr(view_graph, "write_part", lambda path, found: (parts.append(path), write(path, found)))
+    monkeypatch.setattr(fitting, "write_part", lambda path, found: (parts.append(path), write(path, found)))
     monkeypatch.setattr(view_graph.shutil, "rmtree", lambda _: parts.append(written[0].stat().st_mtime_ns))
     build(matches)
 
@@ -83,11 +84,11 @@ def test_parts_come_back_as_they_were(build, tmp_path):
         pair: (no, 0) for pair, no in graph.rejected.items()
     }
 
-    view_graph.write_part(tmp_path / "part.npz", found)
-    again = view_graph.read_part(tmp_path / "part.npz", list(found))
+    fitting.write_part(tmp_path / "part.npz", found)
+    again = fitting.read_part(tmp_path / "part.npz", list(found))
 
     assert [count for _, count in again.values()] == [3, 0]
-    arrays = [view_graph.graph_of(parts).to_arrays() for parts in (found, again)]
+    arrays = [fitting.graph_of(parts).to_arrays() for parts in (found, again)]
     assert all(np.array_equal(arrays[0][name], arrays[1][name]) for name in arrays[0])
 
 
@@ -98,8 +99,8 @@ def test_a_pair_on_which_an_estimator_fails_is_rejected_with_a_reason(build, mon
     def failing_where_few(how, points, *rest):
         return (failing if len(points[0]) < 100 else fit)(how, points, *rest)
 
-    fit = view_graph.fit_moving
-    monkeypatch.setattr(view_graph, "fit_moving", failing_where_few)
+    fit = fitting.fit_moving
+    monkeypatch.setattr(fitting, "fit_moving", failing_where_few)
 
     graph, counts = build(match_graph())
 

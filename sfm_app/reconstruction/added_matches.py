@@ -1,0 +1,61 @@
+"""Matches of two kinds of features of the same photos, put together."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sfm_app.types import MatchGraph, PairId
+
+FloatArray = NDArray[np.float64]
+Rows = NDArray[np.uint32]
+
+SAME_PX = 0.5
+"""Keypoints nearer than this are one, so that tracks go on from one kind to the other; what SIFT's own noise is."""
+
+
+def with_added(
+    matches: MatchGraph, keypoints: Mapping[int, FloatArray], added: Mapping[PairId, Rows]
+) -> tuple[MatchGraph, tuple[PairId, ...]]:
+    """Add keypoints and matches of another kind.
+
+    What is there keeps its place and number. Of the added matches only those enter whose keypoints have no match in the
+    other photo yet.
+
+    Args:
+        matches: what is there.
+        keypoints: (N, 2) pixels of the added ones, by photo.
+        added: (M, 2) rows of those.
+
+    Returns:
+        All together, and the pairs that have more than before.
+    """
+    every, numbers = dict(matches.keypoints), {}
+    for photo, found in keypoints.items():
+        every[photo], numbers[photo] = _merged(matches.keypoints[photo], found)
+    rows, changed = dict(matches.matches), []
+    for pair, new in added.items():
+        known = rows.get(pair, np.zeros((0, 2), np.uint32))
+        renamed = np.column_stack([numbers[photo][new[:, side]] for side, photo in enumerate(pair)])
+        together = _once(np.vstack([known, renamed.astype(np.uint32)]))
+        if len(together) > len(known):
+            rows[pair] = together
+            changed.append(pair)
+    return replace(matches, keypoints=every, matches=dict(sorted(rows.items()))), tuple(sorted(changed))
+
+
+def _merged(known: FloatArray, found: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+    """All keypoints of a photo, and the number of each one that was found."""
+    numbers = len(known) + np.arange(len(found))
+    if len(known) and len(found):
+        away, nearest = cKDTree(known).query(found)
+        numbers = np.where(away <= SAME_PX, nearest, numbers)
+    return np.vstack([known.reshape(-1, 2), found]), numbers.astype(np.int64)
+
+
+def _once(rows: Rows) -> Rows:
+    """Rows whose keypoints do not occur in an earlier row, in both photos."""
+    first = [np.isin(np.arange(len(rows)), np.unique(rows[:, side], return_index=True)[1]) for side in (0, 1)]
+    return rows[first[0] & first[1]]

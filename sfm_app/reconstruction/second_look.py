@@ -1,0 +1,158 @@
+"""A second look at photos without a place: finer features for them and their likely neighbours, then all over again.
+
+On plain things and over wide steps the usual features find little. Features that follow the shape of their surroundings
+(affine shape, domain-size pooling), fainter ones and looser matches find more there; for all photos they would cost too
+much, and where all photos have their place they add nothing.
+"""
+
+import shutil
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sfm_app.calibrating import find_intrinsics
+from sfm_app.colmap.backend import backend
+from sfm_app.colmap.database import empty_copy, read_features, write_features
+from sfm_app.colmap.model import photos_of
+from sfm_app.context import RunContext
+from sfm_app.errors import SfmError
+from sfm_app.fitting import fit_pairs, graph_of
+from sfm_app.matching import fill_database
+from sfm_app.plugins import SIFT_DSP
+from sfm_app.reconstruction.added_matches import with_added
+from sfm_app.reconstruction.attempts import Attempt, better, judged
+from sfm_app.reconstruction.left_out import names_of
+from sfm_app.reconstruction.passes import Outcome, reconstruct
+from sfm_app.types import Intrinsics, MatchGraph, PairId, ViewGraph
+from sfm_app.workspace import Aside
+from sfm_app.written import can_go_on, mark_unfinished
+
+FOLDER, FEATURES = ".second_look", "features"
+LOOSE_RATIO = 0.85
+"""Largest ratio of the distances to the best and the second best descriptor. Chosen on dinoSparseRing: of its weakest
+links 19, 22, 31 and 43 matches are right at 0.8 (of 33, 30, 39, 51), and 26, 29, 45 and 55 at 0.85 (of 58, 52, 81, 77):
+9 + 6 photos in two models become 15 in one."""
+ALL_PAIRS = 30
+"""Up to so many photos, those without a place are matched with all others."""
+NEIGHBOURS, IN_ORDER = 8, 2
+"""Else with so many that have most raw matches with them, and with so many before and after them by name."""
+MANY, FEW_LOST = 60, 0.05
+"""Of so many photos or more, a smaller share without a place is not worth mapping all again."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """Models, and what they were made of."""
+
+    outcome: Outcome
+    matches: MatchGraph
+    views: ViewGraph
+    intrinsics: Intrinsics
+    run: RunContext
+    """Its workspace holds the database of these matches."""
+
+
+def look_again(first: Found) -> Found:
+    """Look again at the photos that the main model does not hold; what was found first stays unless more find a place.
+
+    Whatever fails on the way costs nothing but the attempt. The caller removes what lies in `FOLDER`, by `clear`.
+    """
+    run, lost = first.run, lost_photos(first)
+    if not lost or run.settings.matching.features == SIFT_DSP or not run.settings.scene.second_look:
+        return first
+    pairs = pairs_to_see(lost, first.matches)
+    seen = sorted({photo for pair in pairs for photo in pair})
+    run.progress.say(f"{len(lost)} photos have no place: finer features are sought in {len(seen)}")
+    report: dict[str, Any] = {"photos": names_of(lost, first.matches), "pairs": len(pairs)}
+    try:
+        second = _seen_again(first, pairs, report)
+    except SfmError as err:  # what we have is not lost with it
+        report["failed"], second = str(err), None
+    placed = [_placed(one.outcome) for one in (first, second) if one is not None]
+    taken = second is not None and _is_better(second, first)
+    run.record(second_look=report | {"placed": placed, "taken": taken})
+    return second if second is not None and taken else first
+
+
+def clear(run: RunContext) -> None:
+    """Remove what a second look has left."""
+    shutil.rmtree(run.workspace.root / FOLDER, ignore_errors=True)
+
+
+def lost_photos(found: Found) -> list[int]:
+    """Photos that the main model does not hold; none where they are too few of too many."""
+    models, images = found.outcome.models, found.matches.images
+    placed = set(photos_of(models[0].model)) if models else set()
+    lost = sorted(images.keys() - placed)
+    return [] if len(images) >= MANY and len(lost) < FEW_LOST * len(images) else lost
+
+
+def pairs_to_see(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
+    """Pairs of lost photos with each other and with their likely neighbours."""
+    every = sorted(matches.images)
+    if len(every) <= ALL_PAIRS:
+        return [(a, b) for k, a in enumerate(every) for b in every[k + 1 :] if a in lost or b in lost]
+    matched: dict[int, Counter[int]] = {photo: Counter() for photo in every}
+    for (a, b), rows in matches.matches.items():
+        matched[a][b], matched[b][a] = len(rows), len(rows)
+    by_name = sorted(every, key=lambda photo: matches.images[photo].name)
+    place = {photo: k for k, photo in enumerate(by_name)}
+    pairs = set()
+    for photo in lost:
+        around = by_name[max(0, place[photo] - IN_ORDER) : place[photo] + IN_ORDER + 1]
+        likely = sorted(matched[photo], key=lambda other: (-matched[photo][other], other))[:NEIGHBOURS]
+        pairs |= {(min(photo, other), max(photo, other)) for other in (*around, *likely) if other != photo}
+    return sorted(pairs)
+
+
+def _seen_again(first: Found, pairs: Sequence[PairId], report: dict[str, Any]) -> Found | None:
+    """All steps from features to models once more; None where nothing new was found."""
+    run = _aside(first.run)
+    finer = replace(run, workspace=Aside(run.workspace, FEATURES))
+    with backend("looking for finer features"):
+        if not finer.workspace.database.exists():
+            empty_copy(first.run.workspace.database, finer.workspace.database)
+    fill_database(run.plugins.feature_method(SIFT_DSP), finer, pairs)
+    with backend("adding matches"):
+        matches, changed = with_added(first.matches, *read_features(finer.workspace.database))
+        if not changed:
+            return None
+        empty_copy(first.run.workspace.database, run.workspace.database)
+        write_features(run.workspace.database, matches)
+    fitted = graph_of(fit_pairs(matches, changed, run))
+    asked = set(changed)
+    kept = {pair: fit for pair, fit in first.views.fits.items() if pair not in asked}
+    refused = {pair: why for pair, why in first.views.rejected.items() if pair not in asked}
+    views = ViewGraph(dict(sorted((kept | dict(fitted.fits)).items())), refused | dict(fitted.rejected))
+    report |= {"pairs_with_more_matches": len(changed), "pairs_with_geometry": [len(first.views.fits), len(views.fits)]}
+    known = all(camera.estimated for camera in first.intrinsics.cameras.values())
+    intrinsics = first.intrinsics if known else find_intrinsics(matches, views, run)[0]
+    return Found(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
+
+
+def _aside(run: RunContext) -> RunContext:
+    """The run in a folder of its own, where what a killed run left is taken up again."""
+    place = Aside(run.workspace, FOLDER)
+    if not can_go_on(place.root, run.inputs):
+        mark_unfinished(place.root, run.inputs)
+    loose = run.settings.matching.model_copy(update={"max_ratio": max(LOOSE_RATIO, run.settings.matching.max_ratio)})
+    settings = run.settings.model_copy(update={"matching": loose})
+    return replace(run, workspace=place, settings=settings, counts={})
+
+
+def _placed(outcome: Outcome) -> int:
+    return outcome.models[0].photos if outcome.models else 0
+
+
+def _is_better(second: Found, first: Found) -> bool:
+    """Whether the second main model places more photos, and explains more of all matches that are known now."""
+    if not second.outcome.models or _placed(second.outcome) <= _placed(first.outcome):
+        return False
+    models = [_judged_by(second, found.outcome) for found in (first, second) if found.outcome.models]
+    return better(models) is models[-1]
+
+
+def _judged_by(found: Found, outcome: Outcome) -> Attempt:
+    main = outcome.models[0]
+    return judged(found.matches, found.views, (main.mapper, main.note), main.model, found.run)
