@@ -10,23 +10,15 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sfm_app.selfcal.focal_grid import FocalGrid, chosen_pairs
 from sfm_app.selfcal.inputs import FloatArray
-from sfm_app.selfcal.lens import LOG_FOCAL
-from sfm_app.selfcal.priors import FOCAL_SPREAD, USUAL_FOCAL
-from sfm_app.selfcal.search import FOCAL_RANGE
-from sfm_app.selfcal.several import FOCALS, IndexArray, Tables, best_places
-from sfm_app.selfcal.tied import TIE
+from sfm_app.selfcal.several import IndexArray, Tables
 from sfm_app.types import PairId
 
 LEAST_PHOTOS = 5
 """Of fewer, a pair less leaves too little to say what focal a photo has."""
-SIGMA = 0.05
-"""Width of the votes, in units of r: neighbours on the grid of focals, 7 % apart, still vote for each other."""
 FOLDS = 5
-MOST_PAIRS = 1500
-"""Evenly chosen where there are more: tables of all focals of both photos take 13 kB a pair."""
 FITS = 0.88
 """A camera that wins this share of all votes leaves nothing to be explained: of fountain-P11 and Herz-Jesus-P8 it wins
 0.94, of ten cameras brought to one size 0.68, of one camera with four pairs in ten wrong 0.5 to 0.7."""
@@ -68,7 +60,7 @@ def predicted(
         labels: number of the camera by photo when there are few; all 0 when there is one.
         seed: of the choice of the pairs held.
     """
-    rows = np.linspace(0, len(photos) - 1, min(len(photos), MOST_PAIRS)).astype(np.int64)
+    rows = chosen_pairs(len(photos))
     everyone = sorted({photo for pair in photos for photo in pair})
     if len(everyone) < LEAST_PHOTOS:
         return Prediction(1.0, 1.0, 0.0, each_its_own=False)
@@ -77,7 +69,7 @@ def predicted(
     few, each = _numbered([labels.get(photo, 0) for photo in everyone]), np.arange(len(everyone))
     least = LEAST_GAIN if np.max(few) == 0 else LEAST_GAIN_OF_SEVERAL
     weight = float(np.sum(tables.weights[rows]))
-    grids = [_Grid(_votes(tables, rows, theta), members) for theta in (*starts, np.zeros(5))]
+    grids = [FocalGrid(tables, rows, theta, members) for theta in (*starts, np.zeros(5))]
     best = max(grids, key=lambda grid: grid.fitted(few))
     shared = best.fitted(few) / weight
     tried = [best] if best is grids[-1] else [best, grids[-1]]
@@ -97,58 +89,3 @@ def _numbered(labels: Sequence[int]) -> IndexArray:
     """(N,) cameras counted from 0; one for all where so many leave each with few photos."""
     cameras = np.unique(labels, return_inverse=True)[1].astype(np.int64)
     return cameras if (np.max(cameras) + 1) * LEAST_EACH <= len(cameras) else np.zeros_like(cameras)
-
-
-class _Grid:
-    """Votes of pairs for the focals of their two photos.
-
-    Args:
-        votes: (P, G, G).
-        members: (P, 2) photos, counted from 0.
-    """
-
-    def __init__(self, votes: FloatArray, members: IndexArray) -> None:
-        self.votes, self.members = votes, members
-        self.grid = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
-
-    def places(self, cameras: IndexArray, rows: IndexArray) -> IndexArray:
-        """(C,) places on the grid on which these pairs agree, when photo k is of `cameras[k]`."""
-        one = np.einsum("pgg->g", self.votes[rows]) - 0.5 * ((self.grid - USUAL_FOCAL) / FOCAL_SPREAD) ** 2
-        usual = -0.5 * ((self.grid - self.grid[np.argmax(one)]) / TIE) ** 2
-        if np.max(cameras) == 0:
-            return np.array([np.argmax(one)])
-        own = np.tile(usual, (int(np.max(cameras)) + 1, 1))
-        between: dict[tuple[int, int], FloatArray] = {}
-        for row in rows:
-            i, j = (int(cameras[photo]) for photo in self.members[row])
-            table = self.votes[row]
-            if i == j:
-                own[i] += np.diag(table)
-            else:
-                key, table = ((i, j), table) if i < j else ((j, i), table.T)
-                between[key] = between.get(key, 0.0) + table
-        return best_places(own, between)
-
-    def given(self, places: IndexArray) -> FloatArray:
-        """(P,) votes when photo k has the focal at `places[k]`."""
-        first, second = places[self.members].T
-        return np.asarray(self.votes[np.arange(len(self.votes)), first, second], np.float64)
-
-    def fitted(self, cameras: IndexArray) -> float:
-        """The sum of them for cameras that all pairs agree on."""
-        return float(np.sum(self.given(self.places(cameras, np.arange(len(self.votes)))[cameras])))
-
-    def held(self, cameras: IndexArray, fold: NDArray[np.int64]) -> FloatArray:
-        """(P,) votes of every pair for cameras that the pairs of the other folds agree on."""
-        found = np.zeros(len(self.votes))
-        for number in range(FOLDS):
-            out = fold == number
-            found[out] = self.given(self.places(cameras, np.flatnonzero(~out))[cameras])[out]
-        return found
-
-
-def _votes(tables: Tables, rows: IndexArray, theta: FloatArray) -> FloatArray:
-    trials = np.repeat(theta[None], FOCALS, axis=0)
-    trials[:, LOG_FOCAL] = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
-    trials[:, -1] = 0.0
-    return np.array([tables.votes(int(row), trials, trials, SIGMA) for row in rows])

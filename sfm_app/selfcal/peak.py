@@ -31,6 +31,8 @@ IDENTIFIED_LOG_FOCAL_SPREAD = 0.03
 """Largest standard deviation of log f that counts as known: with a larger one more than one focal of ten is off by 5 %,
 and what is called identifiable should not be. Between this and the limit above the answer is an estimate: a better
 start than a guess, and no more."""
+IDENTIFIED_OF_MANY = 0.015
+"""The same where every photo has a focal of its own: the worst of them is further off than one."""
 EDGE = 1.02
 """A focal within this factor of an end of the range has run there."""
 
@@ -106,9 +108,9 @@ def _examined(consensus: Consensus, ends: list[Peak], profile: Profile, free: tu
     return Answer(theta, free, sigma, lead, given, gain, tuple(peak.theta for peak in far))
 
 
-def vagueness(log_focal_spread: float) -> str:
+def vagueness(log_focal_spread: float, *, one_of_many: bool = False) -> str:
     """Why an answer to which there is no objection is an estimate and not knowledge, or nothing."""
-    vague = log_focal_spread > IDENTIFIED_LOG_FOCAL_SPREAD
+    vague = log_focal_spread > (IDENTIFIED_OF_MANY if one_of_many else IDENTIFIED_LOG_FOCAL_SPREAD)
     return f"the focal is uncertain by {100 * log_focal_spread:.0f} %" if vague else ""
 
 

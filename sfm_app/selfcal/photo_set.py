@@ -1,7 +1,8 @@
 """A set of photos: which of them are of one camera, and the K of every camera."""
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, count
 
@@ -9,16 +10,17 @@ import numpy as np
 
 from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.numerical import FAILURES, reason_of
-from sfm_app.selfcal.answers import ESTIMATE, calibration_of, guessed, parameters_of
+from sfm_app.selfcal.answers import ESTIMATE, calibration_of, guessed, parameters_of, roughly
 from sfm_app.selfcal.inputs import FloatArray, prepare
 from sfm_app.selfcal.joint import Consensus
 from sfm_app.selfcal.own_cameras import predicted
 from sfm_app.selfcal.several import CameraGroup, Tables, calibrate_several
 from sfm_app.selfcal.split import peaks_of, separated
 from sfm_app.selfcal.straight import without_lens
+from sfm_app.selfcal.two_cameras import two_cameras
 from sfm_app.selfcal.zero_curves import METHOD
 from sfm_app.settings import CalibrationSettings
-from sfm_app.types import Calibration, CameraPairs, PhotoPairs
+from sfm_app.types import Calibration, CameraPairs, PairId, PhotoPairs
 
 logger = logging.getLogger("sfm_app")
 
@@ -28,6 +30,10 @@ LEAST_TO_SPLIT = 4
 """Photos of a group below which nobody can say who disagrees with whom."""
 ALIKE = 0.03
 """Parts of a group whose log f differ by less are one camera."""
+MANY, PERHAPS_ZOOM = 3, "photos of one size fall into {count} cameras, as those of a zoom do"
+"""From so many on, the border between two of them may be anywhere: none of them is relied on."""
+PERHAPS_TWO = "its photos may be of two cameras"
+NOBODYS = "no usable pair says which camera took its photos"
 BENT = 0.01
 """From this |k1| on, photos are straightened before they are asked whether they are of one camera."""
 
@@ -41,6 +47,8 @@ class Camera:
     found: Calibration
     family: int = -1
     """Number of the group, where each of its photos was found to have a camera of its own."""
+    of_parts: int = 1
+    """So many cameras was its group divided into."""
 
 
 def calibrate_photo_set(
@@ -103,9 +111,9 @@ def _of_all_pairs(whole: Sequence[Camera], pairs: PhotoPairs, options: Calibrati
         for number, camera in enumerate(whole)
     ]
     found = _together(list(chain.from_iterable(parts)), pairs, options)
-    focals = {camera.name: camera.found.focal_px for camera in found}
+    focals = {camera.name: camera.found.focal_px for camera in found if camera.found.estimated}
     kept = [
-        [camera] if split[0].family < 0 and _alike([focals[part.name] for part in split]) else split
+        [camera] if split[0].family < 0 and _alike([focals[p.name] for p in split if p.name in focals]) else split
         for camera, split in zip(whole, parts, strict=True)
     ]
     if sum(map(len, kept)) == len(found):
@@ -137,15 +145,38 @@ def _split(camera: Camera, number: int, pairs: PhotoPairs, options: CalibrationS
     thetas, labels = separated(tables, photos, starts)
     if predicted(tables, photos, starts, labels, seed).each_its_own:
         return _each_its_own(camera, number, pairs)
-    names = _names(camera, pairs)
     if len(thetas) == 1:
-        return [camera]
+        two = two_cameras(tables, photos, starts)
+        if two is None or not two.perhaps:
+            return [camera]
+        if not two.clearly:
+            return [replace(camera, found=roughly(found, PERHAPS_TWO) if found.identifiable else found)]
+        thetas, labels = two.cameras, two.labels
+    return _parts(camera, thetas, _borne_out(labels, photos), pairs)
+
+
+def _borne_out(labels: Mapping[int, int], photos: Sequence[PairId]) -> dict[int, int]:
+    """Labels of the photos that share a pair with another of their camera, and of those that are alone in it.
+
+    Of a pair between two cameras nobody knows which of the two photos is of which.
+    """
+    count = Counter(labels.values())
+    inside = {photo for pair in photos if labels[pair[0]] == labels[pair[1]] for photo in pair}
+    return {photo: label for photo, label in labels.items() if photo in inside or count[label] == 1}
+
+
+def _parts(camera: Camera, thetas: FloatArray, labels: Mapping[int, int], pairs: PhotoPairs) -> list[Camera]:
+    """The cameras that a group was divided into; photos that no pair gives to one of them are another, not known."""
+    names, size = _names(camera, pairs), pairs.sizes[camera.photos[0]]
     parts = []
     for part, theta in enumerate(thetas):
-        members = tuple(photo for photo in camera.photos if labels.get(photo, 0) == part)
-        theta[4] = found.radial / np.exp(2.0 * theta[0])
-        parts.append(Camera(next(names), members, calibration_of(theta, own.size, found.method)))
-    return parts
+        members = tuple(photo for photo in camera.photos if labels.get(photo) == part)
+        theta[4] = camera.found.radial / np.exp(2.0 * theta[0])
+        parts.append(
+            Camera(next(names), members, calibration_of(theta, size, camera.found.method), of_parts=len(thetas))
+        )
+    rest = tuple(photo for photo in camera.photos if photo not in labels)
+    return [*parts, Camera(next(names), rest, guessed(size, NOBODYS, {}), of_parts=len(thetas))] if rest else parts
 
 
 def _names(camera: Camera, pairs: PhotoPairs) -> Iterator[str]:
@@ -204,11 +235,18 @@ def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: Calibration
             known=camera.found.identifiable and bool(camera.found.evidence),
             hint_px=_claim(camera, pairs),
             family=camera.family,
+            divided=camera.of_parts > 1,
         )
         for camera in cameras
     ]
     answers = calibrate_several(asked, everything, members, options, METHOD)
-    return [replace(camera, found=answer) for camera, answer in zip(cameras, answers, strict=True)]
+    return [replace(one, found=_less_sure(one, answer)) for one, answer in zip(cameras, answers, strict=True)]
+
+
+def _less_sure(camera: Camera, found: Calibration) -> Calibration:
+    """The answer, as an estimate where the camera is one of many that photos of one size were divided into."""
+    many = found.identifiable and camera.of_parts >= MANY
+    return roughly(found, PERHAPS_ZOOM.format(count=camera.of_parts)) if many else found
 
 
 def _or_guess(camera: Camera, pairs: PhotoPairs) -> Calibration:

@@ -19,6 +19,7 @@ from sfm_app.selfcal.answers import calibration_of, guessed, parameters_of, roug
 from sfm_app.selfcal.evidence import MIN_LEAD, RIVAL_RATIO
 from sfm_app.selfcal.inputs import FloatArray, prepare
 from sfm_app.selfcal.lens import LOG_FOCAL, camera_of
+from sfm_app.selfcal.motion import open_focal
 from sfm_app.selfcal.priors import FOCAL_SPREAD, HINT_SPREAD, USUAL_FOCAL, Usual
 from sfm_app.selfcal.refine import Fit, refined, straight_fundamentals
 from sfm_app.selfcal.search import FOCAL_RANGE, SIGMAS
@@ -26,13 +27,15 @@ from sfm_app.selfcal.tied import Tied
 from sfm_app.selfcal.two_view_cost import CAMERA
 from sfm_app.selfcal.uncertainty import covariance, key_pairs, spread_of
 from sfm_app.settings import CalibrationSettings
-from sfm_app.types import Calibration, CameraPairs
+from sfm_app.types import Calibration, CameraPairs, PairId
 
 IndexArray = NDArray[np.int64]
 
 FOCALS = 41
 """Focals on the grid of a camera, each 7 % above the one before."""
 MESSAGE_ROUNDS, DAMPING = 30, 0.5
+FAIR_SHARE, NOT_ALL = 0.5, "not all of its photos bear it out"
+"""Share of its votes that every photo must give to a camera that photos of one size were divided into."""
 LEAST_PAIRS = 2
 """Pairs that a camera needs: two constraints find its focal, two more contradict a wrong one."""
 
@@ -51,6 +54,8 @@ class CameraGroup:
     """Claimed focal."""
     family: int = -1
     """Number of the folder whose cameras are alike, though each photo has its own; -1: it stands alone."""
+    divided: bool = False
+    """Whether it is one of several that photos of one size were divided into: then each of its photos is asked."""
 
 
 def calibrate_several(
@@ -82,12 +87,18 @@ def calibrate_several(
     straight = Tables(straight_fundamentals(fit), members, weights)
     best = key_pairs(fit, tuple(pairs.photos[k] for k in kept))
     of = {pairs.photos[k]: (int(first), int(second)) for k, (first, second) in zip(kept, members, strict=True)}
-    return [
+    shares = _least_shares(fit.state.thetas, straight, [pairs.photos[k] for k in kept])
+    motion = open_focal(fit)
+    found = [
         replace(
-            _judged(k, camera, fit, cov, straight, unit, method),
+            _judged(k, camera, fit, cov, straight, unit, method, motion if camera.family >= 0 else ""),
             key_pairs=tuple(pair for pair in best if of[pair] == (k, k)),
         )
         for k, camera in enumerate(cameras)
+    ]
+    return [
+        roughly(one, NOT_ALL) if one.identifiable and camera.divided and shares.get(k, 0.0) < FAIR_SHARE else one
+        for k, (one, camera) in enumerate(zip(found, cameras, strict=True))
     ]
 
 
@@ -103,11 +114,28 @@ class Tables:
     def __init__(self, Fs: FloatArray, members: IndexArray, weights: FloatArray) -> None:
         ones = CameraPairs.of(Fs, (1, 1), weights)
         ready = prepare(ones, unit_px=1.0, origin_px=(0.0, 0.0))
+        self.kept = ready.kept
         self.packed, self.members, self.weights = ready.packed, members[ready.kept], ready.weights
 
     def votes(self, pair: int, first: FloatArray, second: FloatArray, sigma: float) -> FloatArray:
         """(A, B) w exp(-r / sigma) for cameras (A, 5) of view 1 and (B, 5) of view 2."""
         return np.asarray(self.weights[pair] * np.exp(-_ratios(self.packed[pair], first, second) / sigma), np.float64)
+
+
+def _least_shares(thetas: FloatArray, tables: Tables, photos: Sequence[PairId]) -> dict[int, float]:
+    """By camera: the share of its votes that the photo with the smallest one gets, by all pairs of that photo."""
+    got: dict[tuple[int, int], float] = {}
+    most: dict[tuple[int, int], float] = {}
+    for k, (i, j) in enumerate(tables.members):
+        pair = photos[tables.kept[k]]
+        votes = float(tables.votes(k, thetas[i][None], thetas[j][None], SIGMAS[0])[0, 0])
+        for key in ((int(i), pair[0]), (int(j), pair[1])):
+            got[key] = got.get(key, 0.0) + votes
+            most[key] = most.get(key, 0.0) + float(tables.weights[k])
+    least: dict[int, float] = {}
+    for (camera, _), share in ((key, got[key] / most[key]) for key in got):
+        least[camera] = min(share, least.get(camera, 1.0))
+    return least
 
 
 def _in_units(
@@ -205,9 +233,9 @@ def _gain(places: IndexArray, own: FloatArray, between: dict[tuple[int, int], Fl
 
 
 def _judged(
-    index: int, camera: CameraGroup, fit: Fit, cov: FloatArray, straight: Tables, unit: float, method: str
+    index: int, camera: CameraGroup, fit: Fit, cov: FloatArray, straight: Tables, unit: float, method: str, motion: str
 ) -> Calibration:
-    """The answer for one camera, or why its pairs do not give one."""
+    """The answer for one camera, or why its pairs do not give one; `motion` says what leaves all focals open."""
     theta = fit.state.thetas[index]
     block = cov[CAMERA * index : CAMERA * (index + 1), CAMERA * index : CAMERA * (index + 1)]
     mine = np.flatnonzero((fit.matches.cameras == index).any(axis=1))
@@ -230,7 +258,7 @@ def _judged(
         reason = f"{len(mine)} usable pairs, {LEAST_PAIRS} are needed"
     elif not camera.known and lead < MIN_LEAD:
         reason = "the pairs fit other focals as well or better"
-    reason = reason or peak.objection(in_sides, spread, half)
+    reason = reason or motion or peak.objection(in_sides, spread, half)
     if reason and camera.family >= 0:
         # what the others are like is in it: better to start mapping from than the usual focal
         return replace(guessed(camera.size, reason, evidence), K=_of_its_family(theta, camera.size, unit))
@@ -238,7 +266,7 @@ def _judged(
         return guessed(camera.size, reason, evidence)
     found = calibration_of(theta, camera.size, method, unit)
     found = replace(found, spread=spread_of(theta, block, unit), evidence=evidence, held=fit.names_held(index))
-    return roughly(found, peak.vagueness(spread))
+    return roughly(found, peak.vagueness(spread, one_of_many=camera.family >= 0))
 
 
 def _of_its_family(theta: FloatArray, size: tuple[int, int], unit: float) -> FloatArray:

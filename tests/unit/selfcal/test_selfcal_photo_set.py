@@ -162,3 +162,44 @@ def test_cameras_that_cannot_be_compared_stay_what_they_are_alone(shots, monkeyp
 
     assert found["one"].identifiable and found["one"].K[0, 0] == pytest.approx(1000, rel=0.03)
     assert not found["two"].identifiable and found["two"].method == "guess"
+
+
+def of_two(shots, seed=2, most=4, focals=(1000.0, 1500.0)):
+    """Two cameras of one size, with pairs that join them."""
+    return shots(2 * most, seed, focal=[focals[0]] * most + [focals[1]] * most)
+
+
+def test_photos_that_no_pair_gives_to_one_of_two_cameras_are_not_known(shots):
+    made = of_two(shots)
+    pairs = made.as_set(["one"] * 8)
+    pairs = replace(pairs, sizes={**pairs.sizes, 8: pairs.sizes[0]}, groups={**pairs.groups, 8: "one"})
+
+    found = {camera.photos: camera.found for camera in cameras_of(pairs)}
+
+    assert found[0, 1, 2, 3].identifiable and found[4, 5, 6, 7].identifiable
+    assert (found[8,].identifiable, found[8,].method) == (False, "guess")
+
+
+def test_a_photo_whose_only_pair_leads_to_another_camera_is_not_known(shots):
+    """Either of the two may be the odd one."""
+    pairs = of_two(shots).as_set(["one"] * 8)
+    kept = [k for k, (a, b) in enumerate(pairs.photos) if 0 not in (a, b) or (a, b) == (0, 7)]
+    pairs = replace(
+        pairs, Fs=pairs.Fs[kept], weights=pairs.weights[kept], photos=tuple(pairs.photos[k] for k in kept),
+        inliers=tuple(pairs.inliers[k] for k in kept),
+    )  # fmt: skip
+
+    found = {camera.photos: camera.found for camera in cameras_of(pairs)}
+
+    assert found[1, 2, 3].identifiable and found[4, 5, 6, 7].identifiable
+    assert not found[0,].identifiable
+
+
+def test_cameras_that_a_zoom_seems_to_have_are_estimates(shots):
+    made = shots(12, 1, focal=[800.0] * 4 + [1100.0] * 4 + [1500.0] * 4, points=300)
+
+    found = cameras_of(made.as_set(["zoom"] * 12))
+
+    assert len(found) >= 3
+    assert all(camera.found.method == "estimate" for camera in found), [camera.found.reason for camera in found]
+    assert all("as those of a zoom do" in camera.found.reason for camera in found)
