@@ -67,6 +67,14 @@ GROUPS: Mapping[str, Group] = {
         ("selfcal.own_cameras", "selfcal.tied", "photos.bars"), ("reichstag10",), "120 random scenes of cameras",
         "docs/algorithms.md, Several cameras; the random scenes alone give the same thresholds",
     ),
+    "two cameras of one size": Group(
+        ("selfcal.two_cameras", "selfcal.focal_grid"), ("kitchen25",), "120 random scenes; trouble.py, seeds 0 to 64",
+        "docs/algorithms.md, Several cameras; the photo sets only checked it",
+    ),
+    "finer features, second look": Group(
+        ("reconstruction.second_look", "reconstruction.added_matches", "plugins"), ("dinoSparseRing",), "",
+        "docs/algorithms.md, Mapping; temple16, kermit11, castle-P19, fox50, kitti51, kitchen1000 thinned out checked it",
+    ),
     "look-alikes": Group(
         ("posegraph.coverage", "posegraph.look_alikes", "posegraph.missing"), ("oats23", "books21", "kitchen1000"), "",
         "docs/algorithms.md, Look-alikes; either of the first two finds the other, every 15th photo of the third",
