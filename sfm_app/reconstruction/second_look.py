@@ -126,9 +126,14 @@ def _seen_again(first: Found, pairs: Sequence[PairId], report: dict[str, Any]) -
     refused = {pair: why for pair, why in first.views.rejected.items() if pair not in asked}
     views = ViewGraph(dict(sorted((kept | dict(fitted.fits)).items())), refused | dict(fitted.rejected))
     report |= {"pairs_with_more_matches": len(changed), "pairs_with_geometry": [len(first.views.fits), len(views.fits)]}
-    known = all(camera.estimated for camera in first.intrinsics.cameras.values())
-    intrinsics = first.intrinsics if known else find_intrinsics(matches, views, run)[0]
+    intrinsics = first.intrinsics if _mostly_known(first) else find_intrinsics(matches, views, run)[0]
     return Found(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
+
+
+def _mostly_known(found: Found) -> bool:
+    """Whether at least half of the photos have a camera that pairs determine: more pairs then change little."""
+    images = found.matches.images.values()
+    return 2 * sum(found.intrinsics.camera(image).estimated for image in images) >= len(images)
 
 
 def _aside(run: RunContext) -> RunContext:

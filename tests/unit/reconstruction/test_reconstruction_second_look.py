@@ -88,6 +88,15 @@ def test_a_lost_photo_finds_its_place_by_finer_features(first, finer):
     assert (said["placed"], said["taken"], said["pairs_with_geometry"]) == ([5, 6], True, [10, 15])
 
 
+def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras, monkeypatch):
+    asked, anew = finer(), cameras(focal=1200.0)
+    monkeypatch.setattr(module, "find_intrinsics", lambda *_: (anew, ()))
+
+    look_again(replace(first, intrinsics=cameras(method="guess", identifiable=False)))
+
+    assert asked[1][2] is anew
+
+
 def test_what_was_found_first_stays_where_no_more_photos_find_a_place(first, finer):
     finer(places=5)
 
