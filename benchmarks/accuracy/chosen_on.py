@@ -73,7 +73,7 @@ GROUPS: Mapping[str, Group] = {
     ),
     "finer features, second look": Group(
         ("reconstruction.second_look", "reconstruction.added_matches", "plugins"), ("dinoSparseRing",), "",
-        "docs/algorithms.md, Mapping; temple16, kermit11, castle-P19, fox50, kitti51, kitchen1000 thinned out checked it",
+        "docs/algorithms.md, Mapping; six other sets, thinned out, only checked it",
     ),
     "look-alikes": Group(
         ("posegraph.coverage", "posegraph.look_alikes", "posegraph.missing"), ("oats23", "books21", "kitchen1000"), "",
