@@ -25,6 +25,9 @@ LOG_ASPECTS = tuple(np.linspace(-0.6, 0.6, 9))
 """log fy/fx on the grid: 0.55 to 1.8."""
 ASPECT_GAIN = float(np.log(50))
 """Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square."""
+PERHAPS_ASPECT_GAIN = float(np.log(50 * 0.05))
+"""Votes from which on square pixels are less than 95 % sure. Of 47 answers with square pixels on the photo sets and on
+folders 0 to 170 of `benchmarks/accuracy/trouble.py`, one had more (1.55), and its pixels were not square."""
 MAX_LOG_FOCAL_SPREAD = 0.1
 """Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess."""
 IDENTIFIED_LOG_FOCAL_SPREAD = 0.03
@@ -55,6 +58,12 @@ class Answer:
     """Votes that freeing fy/fx wins."""
     others: tuple[FloatArray, ...]
     """(4,) each: lower peaks, highest first."""
+
+    @property
+    def doubt_of_pixels(self) -> str:
+        """Why an answer with square pixels is an estimate, or nothing."""
+        doubtful = LOG_ASPECT not in self.free and self.gain >= PERHAPS_ASPECT_GAIN
+        return "its pixels may not be square" if doubtful else ""
 
     def evidence(self, weights: FloatArray) -> dict[str, float]:
         """Figures for people."""

@@ -65,6 +65,15 @@ def test_freeing_the_aspect_is_what_the_pairs_ask_for(views):
     assert 4 < found.evidence["aspect_gain"] < 15
 
 
+def test_pixels_that_may_not_be_square_are_not_claimed_to_be_known(views):
+    """Between clearly square and clearly not, K may be off by as much as they are."""
+    found = [run(views(4, seed, aspect=0.9)) for seed in range(8)]
+    held = [one for one in found if one.K[0, 0] == pytest.approx(one.K[1, 1]) and one.evidence["aspect_gain"] > 1.0]
+
+    assert len(held) >= 2 and not any(one.identifiable for one in held)
+    assert any(one.reason == "its pixels may not be square" for one in held)
+
+
 @pytest.mark.parametrize("count", [3, 5])
 def test_spread_is_the_size_of_the_error(views, count):
     scores = []
