@@ -18,8 +18,8 @@ from sfm_app.written import UNFINISHED
 WRITTEN = ("photos", "frames", "masks", "sparse", "dense", "other_models", DATABASE, CALIBRATION)
 """What a run removes before it writes it."""
 LOCK, HOLDER = ".lock", ".held-by.txt"
-LOG, PARTS, FEATURES = "log.txt", "view_graph_parts", "feature_parts"
-FOLLOWED = (*WRITTEN, LOCK, HOLDER, LOG, PARTS, FEATURES)
+LOG, PARTS, FEATURES, SECOND_LOOK = "log.txt", "view_graph_parts", "feature_parts", ".second_look"
+FOLLOWED = (*WRITTEN, LOCK, HOLDER, LOG, PARTS, FEATURES, SECOND_LOOK)
 """What a run writes to without replacing it: a link would lead it out of the folder."""
 PHOTO_SET, VIEW_GRAPH = "photos.json", "view_graph.npz"
 

@@ -25,10 +25,10 @@ from sfm_app.reconstruction.attempts import Attempt, better, judged
 from sfm_app.reconstruction.left_out import names_of
 from sfm_app.reconstruction.passes import Outcome, reconstruct
 from sfm_app.types import Intrinsics, MatchGraph, PairId, ViewGraph
-from sfm_app.workspace import Aside
+from sfm_app.workspace import SECOND_LOOK, Aside
 from sfm_app.written import can_go_on, mark_unfinished
 
-FOLDER, FEATURES = ".second_look", "features"
+FEATURES = "features"
 LOOSE_RATIO = 0.85
 """Largest ratio of the distances to the best and the second best descriptor. Chosen on dinoSparseRing: of its weakest
 links 19, 22, 31 and 43 matches are right at 0.8 (of 33, 30, 39, 51), and 26, 29, 45 and 55 at 0.85 (of 58, 52, 81, 77):
@@ -56,7 +56,7 @@ class Found:
 def look_again(first: Found) -> Found:
     """Look again at the photos that the main model does not hold; what was found first stays unless more find a place.
 
-    Whatever fails on the way costs nothing but the attempt. The caller removes what lies in `FOLDER`, by `clear`.
+    Whatever fails on the way costs nothing but the attempt. The caller removes what lies in `SECOND_LOOK`, by `clear`.
     """
     run, lost = first.run, lost_photos(first)
     if not lost or run.settings.matching.features == SIFT_DSP or not run.settings.scene.second_look:
@@ -77,7 +77,7 @@ def look_again(first: Found) -> Found:
 
 def clear(run: RunContext) -> None:
     """Remove what a second look has left."""
-    shutil.rmtree(run.workspace.root / FOLDER, ignore_errors=True)
+    shutil.rmtree(run.workspace.root / SECOND_LOOK, ignore_errors=True)
 
 
 def lost_photos(found: Found) -> list[int]:
@@ -138,7 +138,7 @@ def _mostly_known(found: Found) -> bool:
 
 def _aside(run: RunContext) -> RunContext:
     """The run in a folder of its own, where what a killed run left is taken up again."""
-    place = Aside(run.workspace, FOLDER)
+    place = Aside(run.workspace, SECOND_LOOK)
     if not can_go_on(place.root, run.inputs):
         mark_unfinished(place.root, run.inputs)
     loose = run.settings.matching.model_copy(update={"max_ratio": max(LOOSE_RATIO, run.settings.matching.max_ratio)})

@@ -13,10 +13,11 @@ from sfm_app.errors import BackendError
 from sfm_app.reconstruction import second_look as module
 from sfm_app.reconstruction.attempts import Attempt
 from sfm_app.reconstruction.passes import Outcome
-from sfm_app.reconstruction.second_look import FOLDER, LOOSE_RATIO, Found, clear, look_again, lost_photos, pairs_to_see
+from sfm_app.reconstruction.second_look import LOOSE_RATIO, Found, clear, look_again, lost_photos, pairs_to_see
 from sfm_app.reconstruction.support import explained_pairs
 from sfm_app.settings import Settings
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, ViewGraph
+from sfm_app.workspace import SECOND_LOOK
 
 LOST = 6
 
@@ -129,11 +130,11 @@ def test_nobody_looks_twice_where_that_is_not_wanted(first, finer, chosen):
 def test_nothing_is_left_behind(first, finer):
     finer()
     look_again(first)
-    assert (first.run.workspace.root / FOLDER).exists()
+    assert (first.run.workspace.root / SECOND_LOOK).exists()
 
     clear(first.run)
 
-    assert not (first.run.workspace.root / FOLDER).exists()
+    assert not (first.run.workspace.root / SECOND_LOOK).exists()
 
 
 def photos(count, matches=()):
