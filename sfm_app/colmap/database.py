@@ -162,8 +162,12 @@ def unmatched(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
 def write_keypoints(path: Path, photo: int, keypoints: NDArray[np.float32]) -> None:
     """Enter the keypoints of a photo, or replace them."""
     with opened(path) as database:
-        write = database.update_keypoints if database.exists_keypoints(photo) else database.write_keypoints
-        write(photo, np.ascontiguousarray(keypoints, np.float32))
+        _put_keypoints(database, photo, keypoints)
+
+
+def _put_keypoints(database: Any, photo: int, keypoints: NDArray[np.floating]) -> None:
+    write = database.update_keypoints if database.exists_keypoints(photo) else database.write_keypoints
+    write(photo, np.ascontiguousarray(keypoints, np.float32))
 
 
 def write_matches(path: Path, pair: PairId, rows: NDArray[np.uint32]) -> None:
@@ -193,13 +197,13 @@ def read_features(path: Path) -> tuple[dict[int, NDArray[np.float64]], dict[Pair
 
 def write_features(path: Path, matches: MatchGraph) -> None:
     """Replace all keypoints and matches."""
-    for photo, keypoints in matches.keypoints.items():
-        write_keypoints(path, photo, keypoints.astype(np.float32))
     with opened(path) as database:
         database.clear_two_view_geometries()
         database.clear_matches()
-    for pair, rows in matches.matches.items():
-        write_matches(path, pair, rows)
+        for photo, keypoints in matches.keypoints.items():
+            _put_keypoints(database, photo, keypoints)
+        for pair, rows in matches.matches.items():
+            database.write_matches(*pair, np.ascontiguousarray(rows, np.uint32))
 
 
 def write_epipolar_fits(path: Path, matches: MatchGraph, fits: Mapping[PairId, EpipolarFit]) -> None:

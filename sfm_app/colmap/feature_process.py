@@ -40,9 +40,9 @@ def extraction_options(options: MatchSettings, sift: Mapping[str, Any], workers:
 
 def extract(database: Path, photo_dir: Path, names: Sequence[str], reader: Any, extraction: Any) -> dict[str, Any]:
     """Find SIFT features of all photos."""
-
-    with opened(database) as reader_of_ids:
-        ids = [image.image_id for image in reader_of_ids.read_all_images() if image.name in set(names)]
+    wanted = set(names)
+    with opened(database) as before:
+        ids = [image.image_id for image in before.read_all_images() if image.name in wanted]
 
     def call(token: Any) -> None:
         pycolmap.extract_features(
