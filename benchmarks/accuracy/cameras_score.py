@@ -141,8 +141,7 @@ def before_adjustment(out: Path, truth: Mapping[str, TruePhoto]) -> Row:
 
 def stated_deviations(out: Path, model: Model, truth: Mapping[str, TruePhoto]) -> Row:
     """Standard deviations after bundle adjustment, and the errors counted in them; of several cameras the worst."""
-    _, camera_of = _calibration(out)
-    by_camera = _stated(out)
+    by_camera, camera_of = _stated(out)
     row: Row = {}
     for photo in sorted(set(model.K) & set(truth)):
         K, true = model.K[photo], truth[photo].K
@@ -163,11 +162,13 @@ def _place(K: NDArray[np.float64], name: str) -> float:
     return float(np.mean([K[place] for place in PLACES[name]]))
 
 
-def _stated(out: Path) -> dict[str, Mapping[str, float]]:
-    """By camera: what calibration.json says about the refined cameras."""
+def _stated(out: Path) -> tuple[dict[str, Mapping[str, float]], dict[str, str]]:
+    """What calibration.json says about the refined cameras by name, and names of cameras by photo without suffix."""
     path = out / "calibration.json"
-    refined = json.loads(path.read_text(encoding="utf-8")).get("refined", {}) if path.exists() else {}
-    return {name: camera["deviations"] for name, camera in refined.items()}
+    found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"camera_of": {}}
+    camera_of = found.get("refined_camera_of", found["camera_of"])
+    deviations = {name: camera["deviations"] for name, camera in found.get("refined", {}).items()}
+    return deviations, {Path(photo).stem: name for photo, name in camera_of.items()}
 
 
 def _calibration(out: Path) -> tuple[dict[str, Any], dict[str, str]]:

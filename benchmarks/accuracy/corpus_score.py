@@ -53,35 +53,45 @@ def parameters(out: Path, truth: Mapping[str, TruePhoto], doubt: Doubt) -> list[
     """
     path = out / "calibration.json"
     found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    photos_of: dict[str, list[str]] = {}
-    for photo, name in found.get("camera_of", {}).items():
-        if Path(photo).stem in truth:
-            photos_of.setdefault(name, []).append(Path(photo).stem)
     rows = []
-    for name, photos in photos_of.items():
-        true = np.median([truth[photo].K for photo in photos], axis=0)
-        width = float(np.median([truth[photo].width for photo in photos]))
-        for stage in _stages(name, found):
-            rows += [{"camera": name, "its photos": len(photos)} | row for row in _errors(stage, true, width, doubt)]
+    for stage in _stages(found):
+        photos = [Path(photo).stem for photo in stage.photos if Path(photo).stem in truth]
+        if photos:
+            true = np.median([truth[photo].K for photo in photos], axis=0)
+            width = float(np.median([truth[photo].width for photo in photos]))
+            about = {"camera": stage.camera, "its photos": len(photos)}
+            rows += [about | row for row in _errors(stage, true, width, doubt)]
     return rows
 
 
 class Stage(NamedTuple):
     """What is stated of a camera before or after bundle adjustment."""
 
+    camera: str
+    photos: tuple[str, ...]
     when: str
     K: NDArray[np.float64]
     deviations: Mapping[str, float]
     identifiable: bool
 
 
-def _stages(name: str, found: Mapping[str, Any]) -> Iterator[Stage]:
-    before, after = found["cameras"][name], found.get("refined", {}).get(name)
-    if before["identifiable"]:
-        yield Stage("before", np.array(before["K"]), before.get("spread", {}), identifiable=True)
-    if after is not None:
-        K, deviations = np.array(after["K"]), after.get("deviations", {})
-        yield Stage("after", K, deviations, identifiable=_claimed(K, deviations))
+def _stages(found: Mapping[str, Any]) -> Iterator[Stage]:
+    """Every camera before adjustment, and after it, where mapping may have divided it."""
+    camera_of = found.get("camera_of", {})
+    for name, photos in _members(camera_of).items():
+        before = found["cameras"][name]
+        if before["identifiable"]:
+            yield Stage(name, photos, "before", np.array(before["K"]), before.get("spread", {}), identifiable=True)
+    for name, photos in _members(found.get("refined_camera_of", camera_of)).items():
+        after = found.get("refined", {}).get(name)
+        if after is not None:
+            K, deviations = np.array(after["K"]), after.get("deviations", {})
+            yield Stage(name, photos, "after", K, deviations, identifiable=_claimed(K, deviations))
+
+
+def _members(camera_of: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    """Photos by camera."""
+    return {name: tuple(photo for photo in camera_of if camera_of[photo] == name) for name in camera_of.values()}
 
 
 def _claimed(K: NDArray[np.float64], deviations: Mapping[str, float]) -> bool:

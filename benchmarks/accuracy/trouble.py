@@ -119,9 +119,10 @@ def known_cameras(out: Path, photos: dict[str, TruePhoto], when: str, stated: Se
     else:
         sure = {row["camera"] for row in stated if row["identifiable"] == "yes"}
         suffix, cameras = " after", {n: c["K"] for n, c in found.get("refined", {}).items() if n in sure}
+    camera_of = found["camera_of"] if when == "before" else found.get("refined_camera_of", found["camera_of"])
     errors = [
         focal_error_percent(np.array(cameras[name]), photos[Path(photo).stem].K)
-        for photo, name in found["camera_of"].items()
+        for photo, name in camera_of.items()
         if name in cameras and Path(photo).stem in photos
     ]
     return {

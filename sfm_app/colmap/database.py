@@ -77,30 +77,13 @@ MATCHES = (
     "SELECT pair_id, rows, cols, data FROM matches ORDER BY pair_id",
 )
 """What stays as it is once the photos are matched."""
-CAMERAS = (
-    "SELECT * FROM cameras ORDER BY camera_id",
-    "SELECT image_id, camera_id FROM images ORDER BY image_id",
-    "SELECT * FROM rigs ORDER BY rig_id",
-    "SELECT * FROM frames ORDER BY frame_id",
-    "SELECT * FROM frame_data ORDER BY frame_id, data_id",
-)
-"""What stays as it is once the cameras are known."""
 
 
 def matches_seal(path: Path) -> str:
     """Hash of photos, keypoints and matches."""
-    return _seal(path, MATCHES)
-
-
-def cameras_seal(path: Path) -> str:
-    """Hash of the cameras, and of whose the photos are."""
-    return _seal(path, CAMERAS)
-
-
-def _seal(path: Path, queries: Sequence[str]) -> str:
     found = hashlib.blake2b(digest_size=16)
     with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as connection:
-        for query in queries:
+        for query in MATCHES:
             for row in connection.execute(query):
                 for value in row:
                     found.update(value if isinstance(value, bytes) else repr(value).encode())

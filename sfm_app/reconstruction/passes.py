@@ -13,6 +13,7 @@ from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.reconstruction.attempts import Attempt, Group, attempts, better, why
 from sfm_app.reconstruction.joins import sound_parts
 from sfm_app.reconstruction.left_out import names_of
+from sfm_app.reconstruction.one_camera_each import explains_more, may_have_one_each, with_one_each
 from sfm_app.reconstruction.rivals import guessed_intrinsics, leaves_many_out, map_baseline, why_thin
 from sfm_app.reconstruction.support import model_poses
 from sfm_app.reconstruction.told_apart import with_earlier, without_look_alikes
@@ -65,6 +66,7 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
     matches, views = without_look_alikes(matches, views, best.graph)
     best = with_rival(best, matches, views, intrinsics, run)
     best = with_other_focals(best, matches, views, intrinsics, run)
+    best = with_own_cameras(best, matches, views, intrinsics, run)
     for number in range(2, MOST_PASSES + 1):
         if not best.models or not worth_another(best, best.intrinsics, matches):
             break
@@ -114,7 +116,29 @@ def with_other_focals(
         other = _pass(matches, views, guessed_intrinsics(intrinsics, focal), run)
         tried = (*outcome.tried, *(f"{note} (focal {focal:g} longer sides)" for note in other.tried))
         outcome = replace(other if other.support > outcome.support else outcome, thin=outcome.thin, tried=tried)
+    if outcome.graph is not other.graph:
+        _enter(outcome.graph, outcome.intrinsics, matches, run)
     return outcome
+
+
+def with_own_cameras(
+    outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
+) -> Outcome:
+    """The outcome, or, where photos of one size explain more with a camera each, that."""
+    main = outcome.models[0] if outcome.models else None
+    if main is None or not may_have_one_each(main, run.settings):
+        return outcome
+    each = with_one_each(main, intrinsics, matches)
+    if each is None:
+        return outcome
+    run.progress.say("matches contradict one camera for all photos of a size: one for each is tried")
+    own = _pass(matches, views, each, run)
+    own = with_rival(own, matches, views, each, run)
+    tried = (*outcome.tried, *(f"{note} (a camera for each photo)" for note in own.tried))
+    if explains_more(own.models[0] if own.models else None, main):
+        return replace(own, thin=outcome.thin, tried=tried)
+    _enter(outcome.graph, outcome.intrinsics, matches, run)
+    return replace(outcome, tried=tried)
 
 
 def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:

@@ -4,7 +4,7 @@ import json
 
 from sfm_app.calibrating import find_intrinsics
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.database import cameras_seal, write_calibrations
+from sfm_app.colmap.database import write_calibrations
 from sfm_app.context import RunContext
 from sfm_app.numerical import json_text
 from sfm_app.stored import fingerprint
@@ -29,10 +29,14 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
 
 
 def intrinsics_seal(place: Workspace) -> str:
-    """Hash of what this stage left: calibration.json without what the scene adds, and the cameras of the database."""
+    """Hash of what this stage left: calibration.json without what the scene adds.
+
+    The cameras of the database are none of it: mapping enters those that it tries.
+    """
     known = json.loads(place.calibration.read_text(encoding="utf-8"))
-    known.pop("refined", None)
-    return fingerprint(known, cameras_seal(place.database))
+    for added in ("refined", "refined_camera_of"):
+        known.pop(added, None)
+    return fingerprint(known)
 
 
 def load_intrinsics(run: RunContext) -> Intrinsics:

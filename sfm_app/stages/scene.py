@@ -57,7 +57,7 @@ def adjusted_scene(found: Found, run: RunContext) -> Scene:
     run.write_model(sparse_model(run.workspace.sparse), POINTS)
     members = [photos_of(model) for model in models]
     reasons = left_out(set(members[0]), members[1:], matches, views, outcome.graph)
-    names = {image.name: intrinsics.name_of(image) for image in matches.images.values()}
+    names = {image.name: outcome.intrinsics.name_of(image) for image in matches.images.values()}
     scene = read_scene(run.workspace.sparse, names, reasons, refined_by_name(adjusted[0], names))
     write_refined(scene, run)
     run.record(
@@ -167,10 +167,11 @@ def refined_by_name(adjusted: Adjusted, names: Mapping[str, str]) -> dict[str, d
 
 
 def write_refined(scene: Scene, run: RunContext) -> None:
-    """Enter the refined cameras into calibration.json, beside what was found before."""
+    """Enter the refined cameras, and whose photos are whose, into calibration.json, beside what was found before."""
     path = run.workspace.calibration
     known = json.loads(path.read_text(encoding="utf-8"))
     known["refined"] = {name: camera.to_dict() for name, camera in scene.cameras.items()}
+    known["refined_camera_of"] = dict(scene.camera_of)
     with replacing(path) as beside:
         beside.write_text(json_text(known), encoding="utf-8")
 
@@ -178,7 +179,8 @@ def write_refined(scene: Scene, run: RunContext) -> None:
 def load_scene(photos: PhotoSet, intrinsics: Intrinsics, run: RunContext) -> Scene:
     """Read the model back; why photos were left out stands in the manifest."""
     record = run.workspace.manifest.record("scene")
-    names = {photo.name: intrinsics.name_of(photo) for photo in photos.photos}
+    known = json.loads(run.workspace.calibration.read_text(encoding="utf-8")).get("refined_camera_of", {})
+    names = {photo.name: known.get(photo.name, intrinsics.name_of(photo)) for photo in photos.photos}
     with backend("reading the sparse model"):
         counts = record.counts if record else {}
         return read_scene(run.workspace.sparse, names, counts.get("unregistered", {}), counts.get("cameras", {}))

@@ -1,6 +1,7 @@
 import json
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from itertools import combinations
 from types import SimpleNamespace
 
@@ -22,6 +23,7 @@ from sfm_app.reconstruction.attempts import Attempt
 from sfm_app.reconstruction.support import Explained
 from sfm_app.settings import Settings
 from sfm_app.stages import scene
+from sfm_app.stages.intrinsics import intrinsics_seal
 from sfm_app.types import (
     Calibration,
     CameraModel,
@@ -124,6 +126,27 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
     again = scene.load_scene(photos, made.intrinsics, run)
     assert again.unregistered == found.unregistered and again.points == found.points
     assert all(np.array_equal(again.cam_from_world[key], value) for key, value in found.cam_from_world.items())
+
+
+def test_cameras_that_mapping_divided_are_read_back_and_the_calibration_stays_sealed(synthetic, run, monkeypatch):
+    true = synthetic[1]
+    made = outcome(attempt(pycolmap.Reconstruction(true)))
+    matches, views = inputs(true)
+    one = made.intrinsics.cameras["one"]
+    last = matches.images[8].name
+    divided = Intrinsics({"one": one, "one #2": one}, {last: "one #2"})
+    monkeypatch.setattr(scene, "reconstruct", lambda *_: replace(made, intrinsics=divided))
+    run.workspace.calibration.write_text(json.dumps(made.intrinsics.to_dict()))
+    sealed = intrinsics_seal(run.workspace)
+
+    found = scene.reconstruct_scene(matches, views, made.intrinsics, run)
+
+    assert (found.camera_of[last], len(found.cameras)) == ("one #2", 2)
+    assert intrinsics_seal(run.workspace) == sealed
+    run.workspace.manifest.finish("scene", StageRecord("", 0.0, run.counts), {})
+    photos = PhotoSet(run.workspace.root, tuple(Photo(x.name, 1024, 768, "one") for x in matches.images.values()))
+    again = scene.load_scene(photos, made.intrinsics, run)
+    assert again.camera_of == found.camera_of and again.cameras.keys() == found.cameras.keys()
 
 
 def test_a_model_that_cannot_be_adjusted_is_kept_as_mapping_left_it_and_the_run_says_so(synthetic, run, monkeypatch):

@@ -1,0 +1,81 @@
+"""One camera for each photo, as a rival hypothesis: a zoom, or several devices, that no pair of photos gave away.
+
+Photos of one size are taken for one camera until their pairs contradict it. Pairs of a camera that moves forward or
+round one point never do. A model does: with one focal for all photos, matches that agree pair by pair do not lie right.
+"""
+
+from collections.abc import Collection, Iterable
+from dataclasses import replace
+
+from sfm_app.colmap.model import cameras_of, photos_of
+from sfm_app.geometry.camera import guessed_camera_matrix
+from sfm_app.reconstruction.attempts import CONTRADICTED, Attempt
+from sfm_app.settings import Settings
+from sfm_app.types import Calibration, Intrinsics, MatchedImage, MatchGraph
+
+LEAST, MOST = 5, 60
+"""Photos: of fewer, cameras of their own fit almost anything; of more, it costs more than it promises."""
+FEWER = 0.5
+"""Share of the contradicting matches that cameras of their own may leave, or they are not what was wrong. Chosen on
+folders 0 to 180 of `benchmarks/accuracy/trouble.py`."""
+
+
+def may_have_one_each(model: Attempt | None, settings: Settings) -> bool:
+    """Say whether photos of one size may have a camera each, as matches contradict the model.
+
+    Args:
+        model: the main one so far.
+        settings: who says which photos are of one camera is believed.
+    """
+    if model is None or not LEAST <= model.photos <= MOST or settings.photos.cameras != "auto":
+        return False
+    inliers = sum(pair.inliers for pair in model.explained.values())
+    against = sum(pair.contradicted for pair in model.explained.values())
+    return against > CONTRADICTED * inliers
+
+
+def with_one_each(model: Attempt, found: Intrinsics, matches: MatchGraph) -> Intrinsics | None:
+    """Give every photo of a camera that pairs do not determine one of its own; None where there is none to divide.
+
+    Its focal is as yet a guess: what mapping found for all of them together.
+    """
+    focals = {photo: float(K[0, 0] * K[1, 1]) ** 0.5 for photo, (K, _) in cameras_of(model.model).items()}
+    placed = photos_of(model.model)
+    usual = {found.name_of(matches.images[photo]): focals[photo] for photo in placed if photo in focals}
+    members: dict[str, list[MatchedImage]] = {}
+    for image in matches.images.values():
+        members.setdefault(found.name_of(image), []).append(image)
+    divided = [name for name, images in members.items() if len(images) > 1 and not found.cameras[name].identifiable]
+    if not divided:
+        return None
+    cameras, camera_of = dict(found.cameras), dict(found.camera_of)
+    for name in divided:
+        camera = cameras.pop(name)
+        names = _names(name, {*found.cameras, *cameras})
+        for image, own in zip(sorted(members[name], key=lambda image: image.name), names, strict=False):
+            cameras[own], camera_of[image.name] = _guess(camera, usual.get(name)), own
+    return replace(found, cameras=cameras, camera_of=camera_of)
+
+
+def explains_more(own: Attempt | None, shared: Attempt) -> bool:
+    """Say whether cameras of their own explain more matches, and why the others contradicted the shared one."""
+    if own is None or own.photos < shared.photos or own.support <= shared.support:
+        return False
+    against = [sum(pair.contradicted for pair in model.explained.values()) for model in (own, shared)]
+    return against[0] <= FEWER * against[1]
+
+
+def _names(name: str, taken: Collection[str]) -> Iterable[str]:
+    """The name itself, and others like it that nobody has."""
+    yield name
+    number = 2
+    while True:
+        if (other := f"{name} #{number}") not in taken:
+            yield other
+        number += 1
+
+
+def _guess(camera: Calibration, focal_px: float | None) -> Calibration:
+    size = camera.width, camera.height
+    K = guessed_camera_matrix(size, camera.focal_px if focal_px is None else focal_px)
+    return Calibration(K, *size, "guess", identifiable=False, reason="its photos may each be of another camera")

@@ -1,0 +1,128 @@
+"""A camera for each photo, as a rival; mappers find what the test says, models and database are real."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+
+from sfm_app.colmap.database import opened
+from sfm_app.reconstruction import passes as module
+from sfm_app.reconstruction.attempts import Attempt
+from sfm_app.reconstruction.one_camera_each import LEAST, explains_more, may_have_one_each, with_one_each
+from sfm_app.reconstruction.passes import reconstruct
+from sfm_app.reconstruction.support import Explained, explained_pairs
+from sfm_app.settings import Settings
+
+FOCAL = 1280.0
+AUTO = Settings()
+
+
+def attempt(model, contradicted, matches=100, inliers=100):
+    return Attempt("incremental", model, {(1, 2): Explained(matches, inliers, contradicted)}, "")
+
+
+def photos(number):
+    return SimpleNamespace(num_reg_images=lambda: number)
+
+
+@pytest.mark.parametrize(
+    ("number", "contradicted", "settings", "asked"),
+    [
+        (6, 2, AUTO, True),
+        (6, 1, AUTO, False),
+        (LEAST - 1, 2, AUTO, False),
+        (61, 2, AUTO, False),
+        (6, 2, Settings.from_mapping({"photos": {"cameras": "single"}}), False),
+    ],
+)
+def test_it_is_asked_where_matches_contradict_a_model_of_some_photos_that_nobody_grouped(
+    number, contradicted, settings, asked
+):
+    assert may_have_one_each(attempt(photos(number), contradicted), settings) is asked
+
+
+def test_without_a_model_it_is_not_asked():
+    assert not may_have_one_each(None, AUTO)
+
+
+def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(synthetic, cameras):
+    model = synthetic.copy()
+    model.cameras[1].params = [1111.0, 512.0, 384.0, 0.01]
+
+    found = with_one_each(attempt(model, 2), cameras(700.0, identifiable=False, method="guess"), synthetic.matches)
+
+    images = sorted(synthetic.matches.images.values(), key=lambda image: image.name)
+    assert [found.name_of(image) for image in images] == ["one", *(f"one #{k}" for k in range(2, 7))]
+    assert sorted(found.cameras) == sorted(found.camera_of.values())
+    assert all(camera.focal_px == pytest.approx(1111.0) and not camera.estimated for camera in found.cameras.values())
+
+
+def test_a_camera_that_pairs_determine_is_not_divided(synthetic, cameras):
+    assert with_one_each(attempt(synthetic.copy(), 2), cameras(), synthetic.matches) is None
+
+
+@pytest.mark.parametrize(
+    ("own", "better"),
+    [
+        (attempt(photos(6), 5, 110), True),
+        (attempt(photos(6), 6, 110), False),
+        (attempt(photos(6), 5, 100), False),
+        (attempt(photos(5), 5, 110), False),
+        (None, False),
+    ],
+)
+def test_it_is_taken_where_it_explains_more_and_contradictions_go(own, better):
+    assert explains_more(own, attempt(photos(6), 10)) is better
+
+
+@pytest.fixture
+def zoom(monkeypatch, synthetic):
+    """Mapping, where one camera for all photos leaves matches that a camera for each explains, or does not."""
+
+    def make(*, right):
+        asked = []
+
+        def attempts(group, run):
+            names = {group.intrinsics.name_of(image) for image in group.matches.images.values()}
+            asked.append(len(names))
+            model = synthetic.copy()
+            explained = explained_pairs(model, synthetic.matches, synthetic.views, 1.5)
+            if (len(names) > 1) is not right:
+                explained = {
+                    pair: replace(found, matches=found.matches - 10, contradicted=10)
+                    for pair, found in explained.items()
+                }
+            return [Attempt("incremental", model, explained, f"{len(names)} cameras")]
+
+        monkeypatch.setattr(module, "attempts", attempts)
+        monkeypatch.setattr(module, "map_baseline", lambda *_: Attempt("colmap", None, {}, "no rival"))
+        monkeypatch.setattr(module, "MOST_PASSES", 1)
+        return asked
+
+    return make
+
+
+def cameras_in(path):
+    with opened(path) as database:
+        return len(database.read_all_cameras())
+
+
+def test_photos_of_a_zoom_are_mapped_with_a_camera_each(synthetic, run, cameras, zoom):
+    asked = zoom(right=True)
+
+    found = reconstruct(synthetic.matches, synthetic.views, cameras(method="guess", identifiable=False), run())
+
+    assert asked == [1, 6]
+    assert len(found.intrinsics.cameras) == 6 and cameras_in(run().workspace.database) == 6
+    assert found.tried[-2:] == ("6 cameras (a camera for each photo)", "no rival (a camera for each photo)")
+
+
+def test_photos_of_one_camera_keep_it_and_so_does_the_database(synthetic, run, cameras, zoom, monkeypatch):
+    monkeypatch.setattr(module, "may_have_one_each", lambda *_: True)
+    asked = zoom(right=False)
+    guess = cameras(method="guess", identifiable=False)
+
+    found = reconstruct(synthetic.matches, synthetic.views, guess, run())
+
+    assert asked == [1, 6]
+    assert found.intrinsics is guess and cameras_in(run().workspace.database) == 1
