@@ -11,7 +11,11 @@ NAMES = 4
 MAPPERS = {"incremental": "photo after photo", "global": "all at once", "colmap": "as COLMAP does by itself"}
 CONTRADICTED = 0.1
 """From this share of the matches on, people are told."""
-SIMILAR = ("look_alikes", "perhaps_look_alikes", "jumps")
+ONE_EACH = {
+    "taken": "one camera for all photos of a size does not explain them: each has its own (a zoom, or several devices)",
+    "left": "a camera for each photo was tried, too, and explains no more",
+}
+DOUBTS = ("look_alikes", "perhaps_look_alikes", "jumps", "weakly_joined")
 UNSURE_ODDS = 10.0
 """Below these odds to one that up is up, too."""
 
@@ -35,7 +39,7 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
         "points": scene.points,
         "mean_reprojection_px": round(scene.mean_reprojection_px, 3),
         "cameras": cameras,
-    } | {key: counts[key] for key in (*kept, *SIMILAR) if key in counts}
+    } | {key: counts[key] for key in (*kept, *DOUBTS) if key in counts}
 
 
 def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
@@ -62,12 +66,14 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
         yield f"mapped {MAPPERS[summary['mapper']]}{because}"
         if counts.get("rival_tried_because"):
             yield f"COLMAP's own way was tried beside ours: {counts['rival_tried_because']}"
+        if counts.get("one_camera_each") in ONE_EACH:
+            yield ONE_EACH[counts["one_camera_each"]]
         yield from _second_look(counts.get("second_look", {}))
         if dropped:
             yield f"pairs of photos left out because they do not fit the others: {dropped}"
     for photos in summary.get("cut_apart", ()):
         yield f"cut apart, because more matches contradict the join than bear it out: {photos}"
-    yield from _similar(summary)
+    yield from _doubts(summary)
     for number, names in enumerate(summary.get("other_models", ()), start=1):
         yield f"another model of {len(names)} photos in other_models/{number}: {_some(names)}"
     explained, against = counts.get("explained_matches", 0), counts.get("contradicted_matches", 0)
@@ -109,8 +115,8 @@ def _badly_adjusted(adjustment: Mapping[str, Any]) -> Iterator[str]:
         yield f"beware: these photos do not determine camera {name}; it stayed as mapping left it"
 
 
-def _similar(summary: Mapping[str, Any]) -> Iterator[str]:
-    """What looks alike, and where the model may be folded."""
+def _doubts(summary: Mapping[str, Any]) -> Iterator[str]:
+    """What looks alike, where the model may be folded, and what parts of it have a size of their own."""
     for join in summary.get("look_alikes", ()):
         here, there = (_some(names) for names in join["between"])
         yield (
@@ -122,6 +128,11 @@ def _similar(summary: Mapping[str, Any]) -> Iterator[str]:
         yield (
             f"beware: a loop, or look-alikes: {join['pairs']} pairs take {here} and {there} for one place, "
             "and the photos between them do not bear it out"
+        )
+    for names in summary.get("weakly_joined", ()):
+        yield (
+            f"beware: hardly a point says how far {_some(names)} {'are' if len(names) > 1 else 'is'} from the rest; "
+            "photos between them help"
         )
     for before, after in summary.get("jumps", ()):
         yield f"beware: a jump from {before} to {after}, which follow each other: in a video a sign of look-alikes"

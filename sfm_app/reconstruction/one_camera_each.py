@@ -10,28 +10,29 @@ from dataclasses import replace
 from sfm_app.colmap.model import cameras_of, photos_of
 from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.reconstruction.attempts import CONTRADICTED, Attempt
+from sfm_app.reconstruction.rivals import leaves_many_out, photos_in
 from sfm_app.settings import Settings
-from sfm_app.types import Calibration, Intrinsics, MatchedImage, MatchGraph
+from sfm_app.types import Calibration, Intrinsics, MatchedImage, MatchGraph, ViewGraph
 
 LEAST, MOST = 5, 60
 """Photos: of fewer, cameras of their own fit almost anything; of more, it costs more than it promises."""
 FEWER = 0.5
-"""Share of the contradicting matches that cameras of their own may leave, or they are not what was wrong. Chosen on
+"""Share of the contradictions that cameras of their own may leave, or they are not what was wrong. Chosen on
 folders 0 to 180 of `benchmarks/accuracy/trouble.py`."""
 
 
-def may_have_one_each(model: Attempt | None, settings: Settings) -> bool:
-    """Say whether photos of one size may have a camera each, as matches contradict the model.
+def may_have_one_each(model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph, settings: Settings) -> bool:
+    """Say whether photos of one size may have a camera each: matches contradict the model, or many have no place in it.
 
     Args:
         model: the main one so far.
+        intrinsics: cameras from pairs.
+        views: fundamental matrices.
         settings: who says which photos are of one camera is believed.
     """
-    if model is None or not LEAST <= model.photos <= MOST or settings.photos.cameras != "auto":
+    if model is None or settings.photos.cameras != "auto" or not LEAST <= len(photos_in(views.fits)) <= MOST:
         return False
-    inliers = sum(pair.inliers for pair in model.explained.values())
-    against = sum(pair.contradicted for pair in model.explained.values())
-    return against > CONTRADICTED * inliers
+    return _share_against(model) > CONTRADICTED or leaves_many_out(model, intrinsics, views)
 
 
 def with_one_each(model: Attempt, found: Intrinsics, matches: MatchGraph) -> Intrinsics | None:
@@ -58,11 +59,16 @@ def with_one_each(model: Attempt, found: Intrinsics, matches: MatchGraph) -> Int
 
 
 def explains_more(own: Attempt | None, shared: Attempt) -> bool:
-    """Say whether cameras of their own explain more matches, and why the others contradicted the shared one."""
+    """Say whether cameras of their own explain more matches, and place more photos or take away what contradicts."""
     if own is None or own.photos < shared.photos or own.support <= shared.support:
         return False
-    against = [sum(pair.contradicted for pair in model.explained.values()) for model in (own, shared)]
-    return against[0] <= FEWER * against[1]
+    return own.photos > shared.photos or _share_against(own) <= FEWER * _share_against(shared)
+
+
+def _share_against(model: Attempt) -> float:
+    """Share of the inliers of fundamental matrices that contradict a model."""
+    inliers = sum(pair.inliers for pair in model.explained.values())
+    return sum(pair.contradicted for pair in model.explained.values()) / max(inliers, 1)
 
 
 def _names(name: str, taken: Collection[str]) -> Iterable[str]:

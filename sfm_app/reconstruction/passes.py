@@ -48,6 +48,8 @@ class Outcome:
     passes: int = 1
     thin: str = ""
     """Why a rival was tried; empty where the evidence was good."""
+    one_camera_each: str = ""
+    """Whether a camera for each photo was "taken" or "left" where one for all explains too little; empty: not tried."""
 
     @property
     def support(self) -> float:
@@ -76,7 +78,9 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
             _enter(best.graph, best.intrinsics, matches, run)
             break
         graph, tried = with_earlier(again.graph, best.graph), best.tried + again.tried
-        best = replace(again, passes=number, thin=best.thin, graph=graph, tried=tried)
+        best = replace(
+            again, passes=number, thin=best.thin, graph=graph, tried=tried, one_camera_each=best.one_camera_each
+        )
         matches, views = without_look_alikes(matches, views, best.graph)
     return best
 
@@ -126,19 +130,19 @@ def with_own_cameras(
 ) -> Outcome:
     """The outcome, or, where photos of one size explain more with a camera each, that."""
     main = outcome.models[0] if outcome.models else None
-    if main is None or not may_have_one_each(main, run.settings):
+    if main is None or not may_have_one_each(main, intrinsics, views, run.settings):
         return outcome
     each = with_one_each(main, intrinsics, matches)
     if each is None:
         return outcome
-    run.progress.say("matches contradict one camera for all photos of a size: one for each is tried")
+    run.progress.say("one camera for all photos of a size does not explain them: one for each is tried")
     own = _pass(matches, views, each, run)
     own = with_rival(own, matches, views, each, run)
     tried = (*outcome.tried, *(f"{note} (a camera for each photo)" for note in own.tried))
     if explains_more(own.models[0] if own.models else None, main):
-        return replace(own, thin=outcome.thin, tried=tried)
+        return replace(own, thin=outcome.thin, tried=tried, one_camera_each="taken")
     _enter(outcome.graph, outcome.intrinsics, matches, run)
-    return replace(outcome, tried=tried)
+    return replace(outcome, tried=tried, one_camera_each="left")
 
 
 def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:

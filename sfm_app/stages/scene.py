@@ -17,6 +17,7 @@ from sfm_app.reconstruction import Found, Outcome, clear, look_again, reconstruc
 from sfm_app.reconstruction.left_out import left_out, names_of
 from sfm_app.reconstruction.orientation import look_at_photos, orient_or_leave
 from sfm_app.reconstruction.told_apart import in_words, jumps
+from sfm_app.reconstruction.weak_links import weakly_joined
 from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
 from sfm_app.written import replacing
 
@@ -75,6 +76,7 @@ def adjusted_scene(found: Found, run: RunContext) -> Scene:
         look_alikes=in_words(outcome.graph.look_alikes, matches),
         perhaps_look_alikes=in_words(outcome.graph.doubtful, matches),
         jumps=jumps(models[0]),
+        weakly_joined=weakly_joined(models[0]),
     )
     return scene
 
@@ -113,6 +115,7 @@ def how_it_was_made(outcome: Outcome) -> dict[str, Any]:
         "mapper_reason": outcome.reason,
         "tried": list(outcome.tried),
         "passes": outcome.passes,
+        "one_camera_each": outcome.one_camera_each,
         "rival_tried_because": outcome.thin,
         "explained_matches": sum(pair.matches for pair in main.explained.values()),
         "contradicted_matches": sum(pair.contradicted for pair in main.explained.values()),

@@ -119,5 +119,15 @@ def test_look_alikes_are_named_and_so_is_what_may_be():
         in text
     )
 
+    text, summary = told(weakly_joined=[["a.jpg"], ["b.jpg", "c.jpg"]])
+    assert "beware: hardly a point says how far a.jpg is from the rest" in text and "b.jpg, c.jpg are from" in text
+    assert summary["weakly_joined"] == [["a.jpg"], ["b.jpg", "c.jpg"]]
+
     text, _ = told(jumps=[["a.jpg", "b.jpg"]])
     assert "beware: a jump from a.jpg to b.jpg, which follow each other" in text
+
+
+def test_a_camera_for_each_photo_is_named_where_it_was_tried():
+    assert "each has its own (a zoom, or several devices)" in told(one_camera_each="taken")[0]
+    assert "was tried, too, and explains no more" in told(one_camera_each="left")[0]
+    assert "each" not in told(one_camera_each="")[0]

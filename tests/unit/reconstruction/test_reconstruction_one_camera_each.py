@@ -12,6 +12,7 @@ from sfm_app.reconstruction.one_camera_each import LEAST, explains_more, may_hav
 from sfm_app.reconstruction.passes import reconstruct
 from sfm_app.reconstruction.support import Explained, explained_pairs
 from sfm_app.settings import Settings
+from sfm_app.types import ViewGraph
 
 FOCAL = 1280.0
 AUTO = Settings()
@@ -25,24 +26,32 @@ def photos(number):
     return SimpleNamespace(num_reg_images=lambda: number)
 
 
+def views(number):
+    fit = SimpleNamespace(degeneracy="")
+    return ViewGraph({(k, k + 1): fit for k in range(1, number)}, {})
+
+
 @pytest.mark.parametrize(
-    ("number", "contradicted", "settings", "asked"),
+    ("placed", "number", "contradicted", "settings", "asked"),
     [
-        (6, 2, AUTO, True),
-        (6, 1, AUTO, False),
-        (LEAST - 1, 2, AUTO, False),
-        (61, 2, AUTO, False),
-        (6, 2, Settings.from_mapping({"photos": {"cameras": "single"}}), False),
+        (6, 6, 2, AUTO, True),
+        (6, 6, 1, AUTO, False),
+        (4, 6, 0, AUTO, True),
+        (5, 6, 0, AUTO, False),
+        (LEAST - 1, LEAST - 1, 2, AUTO, False),
+        (61, 61, 2, AUTO, False),
+        (6, 6, 2, Settings.from_mapping({"photos": {"cameras": "single"}}), False),
     ],
 )
-def test_it_is_asked_where_matches_contradict_a_model_of_some_photos_that_nobody_grouped(
-    number, contradicted, settings, asked
+def test_it_is_asked_where_one_camera_does_not_explain_photos_that_nobody_grouped(
+    cameras, placed, number, contradicted, settings, asked
 ):
-    assert may_have_one_each(attempt(photos(number), contradicted), settings) is asked
+    guess = cameras(method="guess", identifiable=False)
+    assert may_have_one_each(attempt(photos(placed), contradicted), guess, views(number), settings) is asked
 
 
-def test_without_a_model_it_is_not_asked():
-    assert not may_have_one_each(None, AUTO)
+def test_without_a_model_it_is_not_asked(cameras):
+    assert not may_have_one_each(None, cameras(), views(6), AUTO)
 
 
 def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(synthetic, cameras):
@@ -68,6 +77,7 @@ def test_a_camera_that_pairs_determine_is_not_divided(synthetic, cameras):
         (attempt(photos(6), 6, 110), False),
         (attempt(photos(6), 5, 100), False),
         (attempt(photos(5), 5, 110), False),
+        (attempt(photos(7), 10, 110), True),
         (None, False),
     ],
 )
