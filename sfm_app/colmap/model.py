@@ -109,6 +109,45 @@ def part_of(model: Any, photos: Sequence[int]) -> Any:
     return part
 
 
+def both(database: Path, first: Any, second: Any, similarity: Similarity) -> Any:
+    """A model of the photos and points of two that share no photo.
+
+    Args:
+        database: holds photos, keypoints and two-view geometries.
+        first: stays where it is, and its cameras are taken where both have one.
+        second: likewise.
+        similarity: moves the second.
+    """
+    other = pycolmap.Reconstruction(second)
+    move(other, similarity)
+    options = pycolmap.DatabaseCacheOptions()
+    options.load_all_images = True  # also those that no pair in the database connects
+    with opened(database) as db:
+        cache = pycolmap.DatabaseCache.create(db, options)
+    model = pycolmap.Reconstruction()
+    model.load(cache)
+    for one in (other, pycolmap.Reconstruction(first)):
+        for image in _posed(one):
+            camera = model.cameras[image.camera_id]
+            camera.model, camera.params = one.cameras[image.camera_id].model, one.cameras[image.camera_id].params
+            frame = model.frames[model.images[image.image_id].frame_id]
+            frame.set_cam_from_world(image.camera_id, image.cam_from_world())
+            model.register_frame(frame.frame_id)
+        for key in sorted(one.points3D):
+            model.add_point3D(one.points3D[key].xyz, one.points3D[key].track, one.points3D[key].color)
+    model.tear_down()
+    return model
+
+
+def places_of_keypoints(model: Any) -> dict[tuple[int, int], tuple[int, NDArray[np.float64]]]:
+    """Number and place (3,) of the point that a keypoint is one of, by photo and row of the keypoint."""
+    return {
+        (element.image_id, element.point2D_idx): (key, np.asarray(point.xyz, np.float64))
+        for key, point in model.points3D.items()
+        for element in point.track.elements
+    }
+
+
 def _posed(model: Any) -> list[Any]:
     return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.image_id)
 

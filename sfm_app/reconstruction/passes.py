@@ -11,6 +11,7 @@ from sfm_app.colmap.model import cameras_of, part_of, photos_of
 from sfm_app.context import RunContext
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.reconstruction.attempts import Attempt, Group, attempts, better, why
+from sfm_app.reconstruction.joined import join_models
 from sfm_app.reconstruction.joins import sound_parts
 from sfm_app.reconstruction.left_out import names_of
 from sfm_app.reconstruction.one_camera_each import explains_more, may_have_one_each, with_one_each
@@ -82,7 +83,7 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
             again, passes=number, thin=best.thin, graph=graph, tried=tried, one_camera_each=best.one_camera_each
         )
         matches, views = without_look_alikes(matches, views, best.graph)
-    return best
+    return with_joined(best, matches, views, run)
 
 
 def with_rival(
@@ -143,6 +144,20 @@ def with_own_cameras(
         return replace(own, thin=outcome.thin, tried=tried, one_camera_each="taken")
     _enter(outcome.graph, outcome.intrinsics, matches, run)
     return replace(outcome, tried=tried, one_camera_each="left")
+
+
+def with_joined(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
+    """The outcome, its models joined where they share points."""
+    if len(outcome.models) < 2:
+        return outcome
+    models = join_models(outcome.models, matches, views, run)
+    if len(models) == len(outcome.models):
+        return outcome
+    run.progress.say(f"models were joined: {models[0].note}")
+    graph = _graph_of(models[:1], outcome.graph, matches, run)
+    _enter(graph, outcome.intrinsics, matches, run)
+    tried = (*outcome.tried, models[0].note)
+    return replace(outcome, models=models, graph=graph, tried=tried, reason=models[0].note)
 
 
 def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:

@@ -271,7 +271,9 @@ def _judged(
         reason = f"{len(mine)} usable pairs, {LEAST_PAIRS} are needed"
     elif not camera.known and lead < MIN_LEAD:
         reason = "the pairs fit other focals as well or better"
-    reason = reason or motion or peak.objection(in_sides, spread, half)
+    vague = peak.vagueness(spread, one_of_many=camera.family >= 0)
+    # a motion that leaves the focal open belies a small deviation, not a large one
+    reason = reason or (not (camera.divided and vague) and motion) or peak.objection(in_sides, spread, half)
     if reason and camera.family >= 0:
         # what the others are like is in it: better to start mapping from than the usual focal
         return replace(guessed(camera.size, reason, evidence), K=_of_its_family(theta, camera.size, unit))
@@ -279,7 +281,7 @@ def _judged(
         return guessed(camera.size, reason, evidence)
     found = calibration_of(theta, camera.size, method, unit)
     found = replace(found, spread=spread_of(theta, block, unit), evidence=evidence, held=fit.names_held(index))
-    return roughly(found, peak.vagueness(spread, one_of_many=camera.family >= 0))
+    return roughly(found, vague)
 
 
 def _of_its_family(theta: FloatArray, size: tuple[int, int], unit: float) -> FloatArray:
