@@ -75,6 +75,11 @@ GROUPS: Mapping[str, Group] = {
         ("reconstruction.second_look", "reconstruction.added_matches", "plugins"), ("dinoSparseRing",), "",
         "docs/algorithms.md, Mapping; six other sets, thinned out, only checked it",
     ),
+    "a camera for each photo in mapping, scale that hangs on few points": Group(
+        ("reconstruction.one_camera_each", "reconstruction.weak_links", "reconstruction.joined"),
+        ("temple16", "dinoSparseRing", "castle-P19"), "trouble.py, seeds 0 to 180 and 1000 to 1031",
+        "docs/algorithms.md, Mapping; the photo sets chose only when a scale is called open",
+    ),
     "look-alikes": Group(
         ("posegraph.coverage", "posegraph.look_alikes", "posegraph.missing"), ("oats23", "books21", "kitchen1000"), "",
         "docs/algorithms.md, Look-alikes; either of the first two finds the other, every 15th photo of the third",

@@ -13,6 +13,7 @@ CONTRADICTED = 0.1
 """From this share of the matches on, people are told."""
 ONE_EACH = {
     "taken": "one camera for all photos of a size does not explain them: each has its own (a zoom, or several devices)",
+    "two": "one camera for all photos of a size does not explain them, two do",
     "left": "a camera for each photo was tried, too, and explains no more",
 }
 DOUBTS = ("look_alikes", "perhaps_look_alikes", "jumps", "weakly_joined")

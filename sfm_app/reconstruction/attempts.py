@@ -145,15 +145,15 @@ def _mapping(group: Group, run: RunContext) -> Iterator[Callable[[Maker], list[A
 
     def made(make: Maker) -> list[Attempt]:
         found: list[Attempt] = []
-        interruptible(lambda token: found.extend(make(token)), lambda: None)
+        run.progress.start("mapping", max(len(group.photos) - 2, 1))
+        try:
+            interruptible(lambda token: found.extend(make(token)), lambda: None)
+        finally:
+            run.progress.finish()
         return found
 
-    run.progress.start("mapping", max(len(group.photos) - 2, 1))
-    try:
-        with backend("mapping photos"):
-            yield made
-    finally:
-        run.progress.finish()
+    with backend("mapping photos"):
+        yield made
 
 
 def _first_round(group: Group, seeds: Sequence[Candidate], at_once: bool, run: RunContext, token: Any) -> list[Attempt]:

@@ -14,7 +14,13 @@ from sfm_app.reconstruction.attempts import Attempt, Group, attempts, better, wh
 from sfm_app.reconstruction.joined import join_models
 from sfm_app.reconstruction.joins import sound_parts
 from sfm_app.reconstruction.left_out import names_of
-from sfm_app.reconstruction.one_camera_each import explains_more, may_have_one_each, with_one_each
+from sfm_app.reconstruction.one_camera_each import (
+    explains_as_much,
+    explains_more,
+    may_have_one_each,
+    with_one_each,
+    with_two,
+)
 from sfm_app.reconstruction.rivals import guessed_intrinsics, leaves_many_out, map_baseline, why_thin
 from sfm_app.reconstruction.support import model_poses
 from sfm_app.reconstruction.told_apart import with_earlier, without_look_alikes
@@ -50,7 +56,13 @@ class Outcome:
     thin: str = ""
     """Why a rival was tried; empty where the evidence was good."""
     one_camera_each: str = ""
-    """Whether a camera for each photo was "taken" or "left" where one for all explains too little; empty: not tried."""
+    """What came of a camera for each photo, where one for all explains too little: "taken", "left", or "two" cameras
+    that explain as much; empty: not tried."""
+
+    @property
+    def main(self) -> Attempt | None:
+        """The main model."""
+        return self.models[0] if self.models else None
 
     @property
     def support(self) -> float:
@@ -90,7 +102,7 @@ def with_rival(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
     """The outcome, or, where it is thin and a rival explains more, that of the rival."""
-    main = outcome.models[0] if outcome.models else None
+    main = outcome.main
     thin = why_thin(main, intrinsics, matches, views)
     if not thin:
         return outcome
@@ -113,7 +125,7 @@ def with_other_focals(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
     """The outcome, or, where the guessed focal leaves many photos without a place, that of the best other guess."""
-    main = outcome.models[0] if outcome.models else None
+    main = outcome.main
     if not leaves_many_out(main, intrinsics, views):
         return outcome
     run.progress.say("many photos have no place, and the focal length is a guess: other guesses are tried")
@@ -130,7 +142,7 @@ def with_own_cameras(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
     """The outcome, or, where photos of one size explain more with a camera each, that."""
-    main = outcome.models[0] if outcome.models else None
+    main = outcome.main
     if main is None or not may_have_one_each(main, intrinsics, views, run.settings):
         return outcome
     each = with_one_each(main, intrinsics, matches)
@@ -140,10 +152,27 @@ def with_own_cameras(
     own = _pass(matches, views, each, run)
     own = with_rival(own, matches, views, each, run)
     tried = (*outcome.tried, *(f"{note} (a camera for each photo)" for note in own.tried))
-    if explains_more(own.models[0] if own.models else None, main):
-        return replace(own, thin=outcome.thin, tried=tried, one_camera_each="taken")
-    _enter(outcome.graph, outcome.intrinsics, matches, run)
-    return replace(outcome, tried=tried, one_camera_each="left")
+    if not explains_more(own.main, main):
+        _enter(outcome.graph, outcome.intrinsics, matches, run)
+        return replace(outcome, tried=tried, one_camera_each="left")
+    return _with_two_cameras(
+        replace(own, thin=outcome.thin, tried=tried, one_camera_each="taken"), matches, views, each, run
+    )
+
+
+def _with_two_cameras(
+    own: Outcome, matches: MatchGraph, views: ViewGraph, each: Intrinsics, run: RunContext
+) -> Outcome:
+    """The outcome of a camera for each photo, or, where two explain as much, that of two."""
+    between = with_two(own.models[0], each, matches)
+    if between is None:
+        return own
+    two = _pass(matches, views, between, run)
+    tried = (*own.tried, *(f"{note} (two cameras)" for note in two.tried))
+    if explains_as_much(two.main, own.models[0]):
+        return replace(two, thin=own.thin, tried=tried, one_camera_each="two")
+    _enter(own.graph, own.intrinsics, matches, run)
+    return replace(own, tried=tried)
 
 
 def with_joined(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:

@@ -129,5 +129,6 @@ def test_look_alikes_are_named_and_so_is_what_may_be():
 
 def test_a_camera_for_each_photo_is_named_where_it_was_tried():
     assert "each has its own (a zoom, or several devices)" in told(one_camera_each="taken")[0]
+    assert "does not explain them, two do" in told(one_camera_each="two")[0]
     assert "was tried, too, and explains no more" in told(one_camera_each="left")[0]
     assert "each" not in told(one_camera_each="")[0]

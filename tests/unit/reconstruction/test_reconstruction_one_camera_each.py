@@ -6,9 +6,18 @@ from types import SimpleNamespace
 import pytest
 
 from sfm_app.colmap.database import opened
+from sfm_app.geometry.camera import camera_matrix
+from sfm_app.reconstruction import one_camera_each
 from sfm_app.reconstruction import passes as module
 from sfm_app.reconstruction.attempts import Attempt
-from sfm_app.reconstruction.one_camera_each import LEAST, explains_more, may_have_one_each, with_one_each
+from sfm_app.reconstruction.one_camera_each import (
+    LEAST,
+    explains_as_much,
+    explains_more,
+    may_have_one_each,
+    with_one_each,
+    with_two,
+)
 from sfm_app.reconstruction.passes import reconstruct
 from sfm_app.reconstruction.support import Explained, explained_pairs
 from sfm_app.settings import Settings
@@ -85,6 +94,48 @@ def test_it_is_taken_where_it_explains_more_and_contradictions_go(own, better):
     assert explains_more(own, attempt(photos(6), 10)) is better
 
 
+def each_of(synthetic, cameras, focals):
+    """A model whose photos have these focals, and its cameras."""
+    model = synthetic.copy()
+    each = with_one_each(attempt(model, 2), cameras(method="guess", identifiable=False), synthetic.matches)
+    found = {photo: (camera_matrix(focal, focal, 512, 384), 0.0) for photo, focal in enumerate(focals, start=1)}
+    return attempt(model, 0), each, found
+
+
+def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
+    model, each, found = each_of(synthetic, cameras, [1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0])
+    monkeypatch.setattr(one_camera_each, "cameras_of", lambda _: found)
+
+    two = with_two(model, each, synthetic.matches)
+
+    names = {photo: two.name_of(synthetic.matches.images[photo]) for photo in range(1, 7)}
+    assert len(two.cameras) == 2 and names[1] == names[3] == names[5] != names[2] == names[4] == names[6]
+    assert [two.cameras[names[photo]].focal_px for photo in (1, 2)] == pytest.approx([1000.0, 1300.0])
+    assert all(camera.identifiable and camera.method == "mapping" for camera in two.cameras.values())
+
+
+def test_a_single_photo_of_another_focal_is_no_second_camera(synthetic, cameras, monkeypatch):
+    model, each, found = each_of(synthetic, cameras, [1000.0, 1005.0, 1010.0, 1310.0, 990.0, 1001.0])
+    monkeypatch.setattr(one_camera_each, "cameras_of", lambda _: found)
+
+    assert with_two(model, each, synthetic.matches) is None
+
+
+@pytest.mark.parametrize(
+    ("two", "as_good"),
+    [
+        (attempt(photos(6), 0, 1000, 1000), True),
+        (attempt(photos(6), 2, 1000, 1000), True),
+        (attempt(photos(6), 3, 1000, 1000), False),
+        (attempt(photos(6), 0, 800, 1000), False),
+        (attempt(photos(5), 0, 1000, 1000), False),
+        (None, False),
+    ],
+)
+def test_two_cameras_are_taken_where_they_explain_as_much(two, as_good):
+    assert explains_as_much(two, attempt(photos(6), 0, 1000, 1000)) is as_good
+
+
 @pytest.fixture
 def zoom(monkeypatch, synthetic):
     """Mapping, where one camera for all photos leaves matches that a camera for each explains, or does not."""
@@ -106,6 +157,7 @@ def zoom(monkeypatch, synthetic):
 
         monkeypatch.setattr(module, "attempts", attempts)
         monkeypatch.setattr(module, "map_baseline", lambda *_: Attempt("colmap", None, {}, "no rival"))
+        monkeypatch.setattr(module, "with_two", lambda *_: None)
         monkeypatch.setattr(module, "MOST_PASSES", 1)
         return asked
 
