@@ -200,6 +200,7 @@ def test_how_it_was_made_counts_pairs_and_matches():
         "mapper_reason": "it explains more",
         "tried": ["a", "b"],
         "passes": 2,
+        "one_camera_each": "",
         "rival_tried_because": "",
         "explained_matches": 110,
         "contradicted_matches": 7,
