@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sfm_app.atomic_io import save_files
 from sfm_app.context import RunContext
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.parallel import make_executor, worker_count
@@ -20,7 +21,6 @@ from sfm_app.ransac import check_points
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Intrinsics, Rejected, Scene
 from sfm_app.workspace import Workspace
-from sfm_app.written import save_files
 
 PathLike = str | os.PathLike[str]
 

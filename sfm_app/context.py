@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
+from sfm_app.atomic_io import save_files
+from sfm_app.cost_estimate import SHARE_OF_MACHINE, machine_memory_mb
 from sfm_app.parallel import make_executor, ordered_map
-from sfm_app.plan import SHARE_OF_MACHINE, machine_memory_mb
 from sfm_app.plugins import Plugins
 from sfm_app.progress import Progress, Silent, track
 from sfm_app.settings import Settings
 from sfm_app.types import Model
 from sfm_app.workspace import Workspace
-from sfm_app.written import save_files
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -12,8 +12,8 @@ from typing import Literal
 
 from sfm_app.errors import ReconstructionError
 from sfm_app.posegraph.groups import connected_groups
-from sfm_app.ransac.stationary import ONLY_A_LOGO, SAME_PHOTO
-from sfm_app.ransac.verdict import matches_off_plane
+from sfm_app.ransac.degeneracy.watermark import ONLY_A_LOGO, SAME_PHOTO
+from sfm_app.ransac.estimate import matches_off_plane
 from sfm_app.settings import EpipolarSettings, MatchSettings
 from sfm_app.types import MatchedImage, MatchGraph, PairId, ViewGraph
 

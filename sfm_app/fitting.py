@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.atomic_io import can_go_on, mark_unfinished, replacing
 from sfm_app.context import RunContext
+from sfm_app.hashing import load_arrays
 from sfm_app.numerical import FAILURES
 from sfm_app.parallel import ordered_map
 from sfm_app.progress import track
-from sfm_app.ransac.stationary import covers, find_stationary, fit_moving
+from sfm_app.ransac.degeneracy.watermark import covers, find_stationary, fit_moving
 from sfm_app.settings import Settings
-from sfm_app.stored import load_arrays
 from sfm_app.types import EpipolarFit, MatchGraph, PairId, Rejected, ViewGraph
-from sfm_app.written import can_go_on, mark_unfinished, replacing
 
 logger = logging.getLogger("sfm_app")
 

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from sfm_app.atomic_io import replacing
+from sfm_app.hashing import fingerprint
 from sfm_app.numerical import json_text
-from sfm_app.stored import fingerprint
-from sfm_app.written import replacing
 
 MANIFEST = "manifest.json"
 DATABASE = "database.db"

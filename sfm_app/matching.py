@@ -14,19 +14,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.atomic_io import can_go_on, mark_unfinished, replacing
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import photo_names, unmatched, write_keypoints, write_matches
 from sfm_app.colmap.features import find_and_match
 from sfm_app.context import RunContext
 from sfm_app.errors import InputError, PluginError
+from sfm_app.hashing import load_arrays
 from sfm_app.parallel import ordered_map
 from sfm_app.photos.masks import read_used
 from sfm_app.plugins import FeatureMethod
 from sfm_app.progress import track
 from sfm_app.settings import MatchSettings
-from sfm_app.stored import load_arrays
 from sfm_app.types import Features, PairId
-from sfm_app.written import can_go_on, mark_unfinished, replacing
 
 KEPT = 32
 """Photos whose features are held in memory while pairs are matched; the others are read again."""

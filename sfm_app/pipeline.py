@@ -15,22 +15,22 @@ from sfm_app.colmap.database import matches_seal
 from sfm_app.colmap.dense import MAPS
 from sfm_app.colmap.model import sparse_model
 from sfm_app.context import STANDARD_FORMATS, RunContext
+from sfm_app.cost_estimate import plan_within
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
-from sfm_app.inputs import OTHER_PHOTOS, Source, made_with, manifest_head, source_of, stage_print, why_again
+from sfm_app.hashing import seal
 from sfm_app.manifest import StageRecord
-from sfm_app.plan import plan_within
 from sfm_app.stages.depth_maps import make_depth_maps
-from sfm_app.stages.files import NAME as MODEL
-from sfm_app.stages.files import load_files, write_files
-from sfm_app.stages.frames import folder_of, photos_of, settings_for
+from sfm_app.stages.export import NAME as MODEL
+from sfm_app.stages.export import load_files, write_files
 from sfm_app.stages.intrinsics import calibrate, intrinsics_seal, load_intrinsics
 from sfm_app.stages.match_graph import load_match_graph, match_photos
 from sfm_app.stages.mesh import SURFACE, load_surface, make_mesh
 from sfm_app.stages.photos import load_photo_set, read_photos
 from sfm_app.stages.scene import load_scene, reconstruct_scene
 from sfm_app.stages.texture import TEXTURE, load_texture, make_texture
+from sfm_app.stages.video_frames import folder_of, photos_of, settings_for
 from sfm_app.stages.view_graph import build_view_graph, load_view_graph
-from sfm_app.stored import seal
+from sfm_app.staleness import OTHER_PHOTOS, Source, made_with, manifest_head, source_of, stage_print, why_again
 from sfm_app.types import Model, PhotoSet
 from sfm_app.workspace import Workspace
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from sfm_app.atomic_io import UNFINISHED
 from sfm_app.errors import InputError
 from sfm_app.manifest import CALIBRATION, DATABASE, MANIFEST, Manifest
-from sfm_app.written import UNFINISHED
 
 WRITTEN = ("photos", "frames", "masks", "sparse", "dense", "other_models", DATABASE, CALIBRATION)
 """What a run removes before it writes it."""

@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from turns import Method
 
+from sfm_app.ransac.estimate import estimate
+from sfm_app.ransac.estimator_config import Recipe
 from sfm_app.ransac.lev_ransac import PRODUCTION
-from sfm_app.ransac.leverage import prior_validity
-from sfm_app.ransac.recipe import Recipe
-from sfm_app.ransac.refits import refit_sampson
-from sfm_app.ransac.scoring import msac
-from sfm_app.ransac.sprt import Sprt
-from sfm_app.ransac.verdict import estimate
-from sfm_app.ransac.verification import FullVerification
+from sfm_app.ransac.refine.final_refit import refit_sampson
+from sfm_app.ransac.scoring.leverage import prior_validity
+from sfm_app.ransac.scoring.robust_costs import msac
+from sfm_app.ransac.verification.pretests import FullVerification
+from sfm_app.ransac.verification.sprt import Sprt
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit
 

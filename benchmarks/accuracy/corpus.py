@@ -32,7 +32,7 @@ from photo_sets import FORMATS, PhotoSet, photo_set, steps
 from report import RESULTS, Row, document, write
 
 import sfm_app
-from sfm_app.inputs import versions
+from sfm_app.staleness import versions
 
 ABOUT = (
     "The same pixels for all: photos saved anew as PNG, upright, no EXIF; every run in a process of its own, once. "

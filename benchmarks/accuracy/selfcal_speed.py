@@ -13,7 +13,7 @@ from selfcal_methods import PRODUCTION, WITHOUT_MATCHES, Measured
 from sfm_app.calibrating import camera_pairs
 from sfm_app.plugins import load_plugins
 from sfm_app.selfcal.inputs import prepare
-from sfm_app.selfcal.zero_curves_thesis import algorithm_4
+from sfm_app.selfcal.thesis.zero_curves import algorithm_4
 from sfm_app.settings import Settings, merged
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import CameraPairs

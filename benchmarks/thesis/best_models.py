@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.ransac.leverage import cook_distances, leverages, mad_sigma, priors, studentised_residuals
-from sfm_app.ransac.minimal import MOST_MODELS, models_through
 from sfm_app.ransac.points import Matches, prepare
-from sfm_app.ransac.refit import fit_eight_point, refine_sampson
-from sfm_app.ransac.sampling import SAMPLE_SIZE, RandomState, draw_uniform, draw_weighted, random_state
-from sfm_app.ransac.scoring import squared_distances
-from sfm_app.ransac.stopping import trials_needed
+from sfm_app.ransac.refine.sampson_refit import fit_eight_point, refine_sampson
+from sfm_app.ransac.sampling.minimal_samples import SAMPLE_SIZE, RandomState, draw_uniform, draw_weighted, random_state
+from sfm_app.ransac.sampling.stopping import trials_needed
+from sfm_app.ransac.scoring.leverage import cook_distances, leverages, mad_sigma, priors, studentised_residuals
+from sfm_app.ransac.scoring.robust_costs import squared_distances
+from sfm_app.ransac.solvers.minimal import MOST_MODELS, models_through
 from sfm_app.settings import EpipolarSettings
 
 FloatArray = NDArray[np.float64]

@@ -11,8 +11,8 @@ from panels import Panel, draw, rows_of
 from sequences import ImageSequence
 from setups import REACH_PX
 
-from sfm_app.selfcal.constraint_forms import essential
-from sfm_app.selfcal.perturbation import error_discrepancies
+from sfm_app.selfcal.thesis.constraint_forms import essential
+from sfm_app.selfcal.thesis.perturbation import error_discrepancies
 
 OFF = np.linspace(-0.3, 0.3, 120)
 """Errors of the focal, as shares; 0, where all but the bound of a noisy F vanish, is not among them."""

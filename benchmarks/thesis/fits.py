@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 import sfm_app
 from sfm_app.ransac.points import prepare
-from sfm_app.ransac.refit import fit_eight_point
+from sfm_app.ransac.refine.sampson_refit import fit_eight_point
 from sfm_app.types.matches import PairId
 
 FloatArray = NDArray[np.float64]

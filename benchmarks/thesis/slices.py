@@ -10,9 +10,9 @@ from panels import Panel, draw, lowest, rounded, rows_of
 from sequences import ImageSequence
 from setups import NOISE_PX
 
-from sfm_app.selfcal.constraint_forms import Halves, essential, huang_faugeras
 from sfm_app.selfcal.inputs import prepare
-from sfm_app.selfcal.kruppa import kruppa_equations, kruppa_ratios
+from sfm_app.selfcal.thesis.constraint_forms import Halves, essential, huang_faugeras
+from sfm_app.selfcal.thesis.kruppa import kruppa_equations, kruppa_ratios
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import CameraPairs

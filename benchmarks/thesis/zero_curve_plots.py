@@ -16,9 +16,9 @@ from scipy.optimize import minimize
 from setups import HEAVY, NOISE_PX, REACH_PX
 from slices import parallel_pair
 
-from sfm_app.selfcal.consensus import meeting_point
-from sfm_app.selfcal.curves import centre_curves, degeneracy, focal_curves, usable
 from sfm_app.selfcal.inputs import Pairs, prepare
+from sfm_app.selfcal.thesis.curves import centre_curves, degeneracy, focal_curves, usable
+from sfm_app.selfcal.thesis.meeting_point import meeting_point
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks, pair_matches
 from sfm_app.types import CameraPairs
 

@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Any
 
-from sfm_app.colmap.apart import served
 from sfm_app.colmap.backend import check_written, pycolmap
 from sfm_app.colmap.mapping import largest
+from sfm_app.colmap.worker_process import served
 
 
 def work(task: dict[str, Any]) -> None:

@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.apart import finished
 from sfm_app.colmap.backend import backend, check_written, pycolmap
 from sfm_app.colmap.masks import used_pixels
+from sfm_app.colmap.worker_process import finished
+from sfm_app.hashing import is_below
 from sfm_app.progress import Progress
 from sfm_app.stereo import DepthMap, Estimate, Kind, View
-from sfm_app.stored import is_below
 
 DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
 MASKED = -1.0

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sfm_app.colmap.apart import Reported, report, served
 from sfm_app.colmap.backend import counted, plain, pycolmap
 from sfm_app.colmap.database import opened
+from sfm_app.colmap.worker_process import Reported, report, served
 from sfm_app.settings import MatchSettings
 
 

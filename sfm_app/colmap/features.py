@@ -5,7 +5,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from sfm_app.colmap.apart import relay, started
+from sfm_app.colmap.worker_process import relay, started
 from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sfm_app.colmap.apart import served
 from sfm_app.colmap.backend import check_written, pycolmap
 from sfm_app.colmap.mapping import largest
+from sfm_app.colmap.worker_process import served
 
 ADJUSTMENTS, GAIN = 2, 1e-3
 """Rounds of adjustment, and the share of its cost that a step must gain."""

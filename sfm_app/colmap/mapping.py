@@ -9,9 +9,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from sfm_app.colmap.apart import started
 from sfm_app.colmap.backend import check_written, pycolmap
 from sfm_app.colmap.database import SQUARE_PIXELS
+from sfm_app.colmap.worker_process import started
 
 LOCAL_GAIN, GLOBAL_GAIN, GLOBAL_REFINEMENT = 1e-3, 1e-4, 1.3
 """Share of its cost that a step of an adjustment must gain, or it was the last: of a few photos, of all. All are

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend, patiently, pycolmap
 from sfm_app.colmap.database import opened
-from sfm_app.geometry.seed import TwoViewSeed
 from sfm_app.geometry.similarity import Similarity
+from sfm_app.geometry.two_view_init import TwoViewSeed
 from sfm_app.numerical import finite_only
 from sfm_app.types import CameraModel, Frustum, Model, PairId, Scene, Surface
 

@@ -7,8 +7,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sfm_app.colmap.apart import finished
 from sfm_app.colmap.backend import backend
+from sfm_app.colmap.worker_process import finished
 from sfm_app.stereo import View
 from sfm_app.types import Surface
 

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from sfm_app.colmap.apart import served
 from sfm_app.colmap.backend import check_written, pycolmap
+from sfm_app.colmap.worker_process import served
 
 MAX_NORMAL_ERROR_DEG = 25.0
 BORDER_WEIGHT = 10.0

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from sfm_app.colmap.apart import Reported, served
 from sfm_app.colmap.backend import check_written, counted, pycolmap
+from sfm_app.colmap.worker_process import Reported, served
 
 JPEG_QUALITY = 98
 

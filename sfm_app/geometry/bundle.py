@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.positive import solve_positive, without_negative
+from sfm_app.geometry.spd_solve import solve_positive, without_negative
 
 FloatArray = NDArray[np.float64]
 

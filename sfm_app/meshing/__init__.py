@@ -1,9 +1,9 @@
 """From a raw surface to a clean mesh: what photos confirm, with smooth borders, as a manifold, coloured."""
 
-from sfm_app.meshing.borders import Support, bridge_gaps, cut, drop_doubtful, smooth_support, trim
-from sfm_app.meshing.clean import drop_islands, octree_depth
+from sfm_app.meshing.components import drop_islands, octree_depth
 from sfm_app.meshing.manifold import make_manifold
-from sfm_app.meshing.paint import Paint, sample_colors
+from sfm_app.meshing.trimming import Support, bridge_gaps, cut, drop_doubtful, smooth_support, trim
+from sfm_app.meshing.vertex_colors import Paint, sample_colors
 from sfm_app.meshing.visibility import CONFIRMED, EMPTY, SEEN_THROUGH, SILENT, Eye, judge
 
 __all__ = [

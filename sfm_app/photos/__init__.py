@@ -1,15 +1,11 @@
 """Folders of photos, and videos, as people have them: which files and frames are photos, and what is known."""
 
-from sfm_app.photos.choosing import choose
-from sfm_app.photos.containers import head_of, is_video
-from sfm_app.photos.copies import without_copies
+from sfm_app.photos.camera_groups import grouped
 from sfm_app.photos.decode import UnreadableError, read_picture, upright
-from sfm_app.photos.describe import read_photo
+from sfm_app.photos.duplicates import without_copies
+from sfm_app.photos.feature_tracking import Follower, Look
 from sfm_app.photos.files import list_files, place_of
-from sfm_app.photos.following import Follower, Look
-from sfm_app.photos.glance import Glance
-from sfm_app.photos.groups import grouped
-from sfm_app.photos.layout import lay_out, stored_names
+from sfm_app.photos.keyframe_selection import choose
 from sfm_app.photos.masks import (
     MASK_HINT,
     find_mask,
@@ -21,8 +17,12 @@ from sfm_app.photos.masks import (
     unused_masks,
     without_masked,
 )
-from sfm_app.photos.screening import screened
+from sfm_app.photos.probe import read_photo
+from sfm_app.photos.quality_filter import screened
+from sfm_app.photos.staging import lay_out, stored_names
+from sfm_app.photos.thumbnail_stats import Glance
 from sfm_app.photos.video import opened
+from sfm_app.photos.video_formats import head_of, is_video
 
 __all__ = [
     "MASK_HINT",

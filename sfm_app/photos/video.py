@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.photos.containers import head_of, is_video
 from sfm_app.photos.decode import UnreadableError
+from sfm_app.photos.video_formats import head_of, is_video
 
 Picture = NDArray[np.uint8]
 

@@ -10,7 +10,7 @@ from sfm_app.geometry.epipolar import cross_matrix, eight_point
 from sfm_app.geometry.essential import decompose_essential, nearest_essential
 from sfm_app.posegraph.refine import SIGMAS_PX, pose_distances, refined
 from sfm_app.posegraph.starts import planar_starts, turned_starts
-from sfm_app.ransac.planes import OFF_PLANE, dominant_homography, transfer_distance
+from sfm_app.ransac.degeneracy.dominant_plane import OFF_PLANE, dominant_homography, transfer_distance
 from sfm_app.types import Calibration, EpipolarFit, RelativePose
 
 FloatArray = NDArray[np.float64]

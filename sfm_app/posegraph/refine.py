@@ -7,7 +7,7 @@ to lie right, and structure that repeats. On real photos that alone halves the e
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.pose_steps import POSE, essential, moved
+from sfm_app.geometry.pose_manifold import POSE, essential, moved
 from sfm_app.jit import kernel
 
 FloatArray = NDArray[np.float64]

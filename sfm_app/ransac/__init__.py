@@ -14,10 +14,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.ransac.estimate import estimate_with, judge
+from sfm_app.ransac.estimator_configs import RECIPES, classical
 from sfm_app.ransac.lev_ransac import fit_lev_ransac
 from sfm_app.ransac.points import check_points
-from sfm_app.ransac.recipes import RECIPES, classical
-from sfm_app.ransac.verdict import estimate_with, judge
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 

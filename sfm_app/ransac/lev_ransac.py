@@ -10,14 +10,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.ransac.evidence import samples_to_wait
-from sfm_app.ransac.leverage import prior_validity
-from sfm_app.ransac.parallax import with_another_epipole
-from sfm_app.ransac.recipe import Recipe
-from sfm_app.ransac.refit import fit_algebraic, refine_mixture, refine_sampson
-from sfm_app.ransac.scoring import geman_mcclure, squared_distances
-from sfm_app.ransac.verdict import estimate
-from sfm_app.ransac.verification import BailOut
+from sfm_app.ransac.degeneracy.plane_and_parallax import with_another_epipole
+from sfm_app.ransac.estimate import estimate
+from sfm_app.ransac.estimator_config import Recipe
+from sfm_app.ransac.refine.sampson_refit import fit_algebraic, refine_mixture, refine_sampson
+from sfm_app.ransac.sampling.termination import samples_to_wait
+from sfm_app.ransac.scoring.leverage import prior_validity
+from sfm_app.ransac.scoring.robust_costs import geman_mcclure, squared_distances
+from sfm_app.ransac.verification.pretests import BailOut
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 

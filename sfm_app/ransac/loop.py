@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.ransac.best import Best
+from sfm_app.ransac.best_model import Best
+from sfm_app.ransac.estimator_config import Recipe
+from sfm_app.ransac.inner_loop import Draws, next_better
 from sfm_app.ransac.points import Matches
-from sfm_app.ransac.recipe import Recipe
-from sfm_app.ransac.sampling import random_state
-from sfm_app.ransac.scoring import squared_distances
-from sfm_app.ransac.search import Draws, next_better
-from sfm_app.ransac.stopping import have_converged
-from sfm_app.ransac.verification import OPEN
+from sfm_app.ransac.sampling.minimal_samples import random_state
+from sfm_app.ransac.sampling.stopping import have_converged
+from sfm_app.ransac.scoring.robust_costs import squared_distances
+from sfm_app.ransac.verification.pretests import OPEN
 from sfm_app.settings import EpipolarSettings
 
 FloatArray = NDArray[np.float64]

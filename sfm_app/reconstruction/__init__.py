@@ -6,7 +6,7 @@ it explains, `joins` cuts what hangs together by contradictions only, `second_lo
 seeks finer features (`added_matches`) where photos found no place, `left_out` says why they have none.
 """
 
-from sfm_app.reconstruction.passes import Outcome, reconstruct
+from sfm_app.reconstruction.mapping_passes import Outcome, reconstruct
 from sfm_app.reconstruction.second_look import Found, clear, look_again
 
 __all__ = ["Found", "Outcome", "clear", "look_again", "reconstruct"]

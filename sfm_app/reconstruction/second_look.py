@@ -11,6 +11,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from sfm_app.atomic_io import can_go_on, mark_unfinished
 from sfm_app.calibrating import find_intrinsics
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import empty_copy, read_features, write_features
@@ -21,12 +22,11 @@ from sfm_app.fitting import fit_pairs, graph_of
 from sfm_app.matching import fill_database
 from sfm_app.plugins import SIFT_DSP
 from sfm_app.reconstruction.added_matches import with_added
-from sfm_app.reconstruction.attempts import Attempt, better, judged
-from sfm_app.reconstruction.left_out import names_of
-from sfm_app.reconstruction.passes import Outcome, reconstruct
+from sfm_app.reconstruction.mapping_passes import Outcome, reconstruct
+from sfm_app.reconstruction.mapping_runs import Attempt, better, judged
+from sfm_app.reconstruction.unregistered import names_of
 from sfm_app.types import Intrinsics, MatchGraph, PairId, ViewGraph
 from sfm_app.workspace import SECOND_LOOK, Aside
-from sfm_app.written import can_go_on, mark_unfinished
 
 FEATURES = "features"
 LOOSE_RATIO = 0.85

@@ -14,10 +14,10 @@ import numpy as np
 from sfm_app.calibrating import camera_pairs
 from sfm_app.errors import ConfigError
 from sfm_app.report.words import centre_text, focal_text, held_text, lens_text, verdict
-from sfm_app.selfcal.curves import centre_curves, focal_curves
+from sfm_app.selfcal.consensus.consensus import Consensus
 from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
-from sfm_app.selfcal.joint import Consensus
-from sfm_app.selfcal.straight import without_lens
+from sfm_app.selfcal.thesis.curves import centre_curves, focal_curves
+from sfm_app.selfcal.undistort_pairs import without_lens
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchGraph, ViewGraph
 
 if TYPE_CHECKING:

@@ -1,16 +1,10 @@
 """Self-calibration: the camera matrix from fundamental matrices (thesis chapter 5)."""
 
-from sfm_app.selfcal import (
-    geometric,
-    huang_faugeras,
-    kruppa,
-    multi_start,
-    perturbation,
-    zero_curves,
-    zero_curves_thesis,
-)
+from sfm_app.selfcal import zero_curves
+from sfm_app.selfcal.cameras.photo_set import CalibrateFunction, Camera, calibrate_photo_set
 from sfm_app.selfcal.inputs import pair_weights
-from sfm_app.selfcal.photo_set import CalibrateFunction, Camera, calibrate_photo_set
+from sfm_app.selfcal.thesis import geometric, huang_faugeras, kruppa, multi_start, perturbation
+from sfm_app.selfcal.thesis import zero_curves as zero_curves_thesis
 
 __all__ = ["CALIBRATORS", "SEVERAL_CAMERAS", "CalibrateFunction", "Camera", "calibrate_photo_set", "pair_weights"]
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.bundle import CAMERA, CX, CY, FX, FY, K1, K2, P1, P2, Reduced
-from sfm_app.geometry.positive import inverse_of_positive, inverses_of_positive
-from sfm_app.selfcal.priors import ASPECT, CENTRE, FREE_SHARE, LENS, NARROW, WIDE
+from sfm_app.geometry.spd_solve import inverse_of_positive, inverses_of_positive
+from sfm_app.selfcal.adjustment.camera_priors import ASPECT, CENTRE, FREE_SHARE, LENS, NARROW, WIDE
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

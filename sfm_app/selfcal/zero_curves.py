@@ -10,17 +10,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.selfcal import peak
-from sfm_app.selfcal.adjustment import Matches
-from sfm_app.selfcal.answers import calibration_of, guessed, roughly
-from sfm_app.selfcal.evidence import effective_count, spread_px
+from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, of_all_pairs, refined, straight_fundamentals
+from sfm_app.selfcal.adjustment.camera_priors import LENS, USUAL_FOCAL, Usual
+from sfm_app.selfcal.adjustment.structureless_ba import Matches
+from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_of
+from sfm_app.selfcal.consensus import consensus_peak
+from sfm_app.selfcal.consensus.consensus import Consensus
+from sfm_app.selfcal.consensus.peak_evidence import effective_count, spread_px
+from sfm_app.selfcal.critical_motions import open_focal
 from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
-from sfm_app.selfcal.joint import Consensus
 from sfm_app.selfcal.lens import KAPPA, LOG_FOCAL
-from sfm_app.selfcal.motion import open_focal
-from sfm_app.selfcal.priors import LENS, USUAL_FOCAL, Usual
-from sfm_app.selfcal.refine import Fit, of_all_pairs, refined, straight_fundamentals
-from sfm_app.selfcal.uncertainty import covariance, key_pairs, spread_of
+from sfm_app.selfcal.results import calibration_of, guessed, roughly
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
@@ -76,16 +76,18 @@ def _from_fundamentals(pairs: CameraPairs, usable: Pairs, options: CalibrationSe
     side = float(max(pairs.size))
     centre_sigma = options.centre_sigma if len(usable) > FEW_PAIRS else min(options.centre_sigma, UNCROPPED_SIGMA)
     consensus = Consensus(usable, centre_sigma * pairs.size[0] / side)
-    answer = peak.found(consensus)
+    answer = consensus_peak.found(consensus)
     scatter = answer.scatter(consensus, seed)
     log_focal_spread = answer.deviation(scatter[:, LOG_FOCAL])
     evidence = {"pairs": float(len(usable)), **answer.evidence(usable.weights), "log_focal_spread": log_focal_spread}
-    reason = answer.contradicted(usable.weights) or peak.objection(answer.theta, log_focal_spread, _half(pairs.size))
+    reason = answer.contradicted(usable.weights) or consensus_peak.objection(
+        answer.theta, log_focal_spread, _half(pairs.size)
+    )
     if reason:
         return guessed(pairs.size, reason, evidence)
     spread = spread_px(scatter, side, effective_count(answer.votes), len(answer.free))
     found = calibration_of(np.append(answer.theta, 0.0), pairs.size, METHOD)
-    doubt = peak.vagueness(log_focal_spread) or answer.doubt_of_pixels
+    doubt = consensus_peak.vagueness(log_focal_spread) or answer.doubt_of_pixels
     return roughly(replace(found, spread=spread, evidence=evidence), doubt)
 
 
@@ -107,7 +109,9 @@ def _from_matches(
     evidence["votes_kept"] = adjusted.votes_kept
     undecided, split = answer.contradicted(judged.weights), _split(adjusted)
     believed, spread = (answer.theta, 0.0) if split else (theta, evidence["log_focal_spread"])
-    reason = (undecided and (open_focal(fit) or undecided)) or peak.objection(believed, spread, _half(pairs.size))
+    reason = (undecided and (open_focal(fit) or undecided)) or consensus_peak.objection(
+        believed, spread, _half(pairs.size)
+    )
     if reason:
         return guessed(pairs.size, reason, evidence)
     if split:
@@ -123,7 +127,7 @@ def _from_matches(
         key_pairs=key_pairs(fit, photos),
     )
     doubt = answer.doubt_of_pixels if "aspect" in found.held else ""
-    return roughly(found, peak.vagueness(evidence["log_focal_spread"]) or doubt)
+    return roughly(found, consensus_peak.vagueness(evidence["log_focal_spread"]) or doubt)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -135,7 +139,7 @@ class _Adjusted:
     """Which of the usable pairs it was adjusted to."""
     consensus: Consensus
     """Of all usable pairs, as the camera without its lens would have given them."""
-    answer: peak.Answer
+    answer: consensus_peak.Answer
     """Its peak."""
 
     @property
@@ -161,7 +165,7 @@ def _adjusted(pairs: CameraPairs, usable: Pairs, usual: Usual, before: _Adjusted
     """Adjust the camera to the matches of all pairs, or only of those that agree on the peak that `before` left."""
     matches, Fs = _in_sides(pairs, usable)
     if before is None:
-        first, listened = peak.found(Consensus(usable, usual.centre_sigma)), np.arange(len(usable))
+        first, listened = consensus_peak.found(Consensus(usable, usual.centre_sigma)), np.arange(len(usable))
         plain = np.array([USUAL_FOCAL, 0.0, 0.0, 0.0])
         starts = [np.append(theta, 0.0)[None] for theta in (first.theta, *first.others[:1], plain)]
     else:
@@ -173,7 +177,7 @@ def _adjusted(pairs: CameraPairs, usable: Pairs, usual: Usual, before: _Adjusted
         straight = _in_pixels(straight_fundamentals(of_all_pairs(fit, matches, Fs)), pairs)
         consensus = Consensus(_prepared(CameraPairs(straight, usable.weights, pairs.size)), usual.centre_sigma)
     if fit.free[0, LENS] or (before is not None and before.fit.free[0, LENS]):
-        answer = peak.found(consensus)
+        answer = consensus_peak.found(consensus)
     if abs(answer.theta[LOG_FOCAL] - fit.state.thetas[0, LOG_FOCAL]) > ELSEWHERE:
         again = np.append(answer.theta, fit.state.thetas[0, KAPPA])
         fit = refined(matches.chosen(listened), Fs[listened], [fit.state.thetas, again[None]], usual)

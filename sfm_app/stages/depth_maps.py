@@ -10,15 +10,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from sfm_app.atomic_io import can_go_on, mark_finished, mark_unfinished
 from sfm_app.colmap.dense import DenseStore, drop_estimates, hide_masked, read_depth, read_views, undistort
 from sfm_app.colmap.masks import mask_undistorter
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
+from sfm_app.hashing import fingerprint
 from sfm_app.settings import DepthSettings
 from sfm_app.stereo import DepthTask, View, rank_neighbours
-from sfm_app.stored import fingerprint
 from sfm_app.types import Rejected, Scene
-from sfm_app.written import can_go_on, mark_finished, mark_unfinished
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 

@@ -2,15 +2,15 @@
 
 import json
 
+from sfm_app.atomic_io import replacing
 from sfm_app.calibrating import find_intrinsics
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import write_calibrations
 from sfm_app.context import RunContext
+from sfm_app.hashing import fingerprint
 from sfm_app.numerical import json_text
-from sfm_app.stored import fingerprint
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, ViewGraph
 from sfm_app.workspace import Workspace
-from sfm_app.written import replacing
 
 
 def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:

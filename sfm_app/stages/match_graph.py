@@ -1,12 +1,12 @@
 """match_graph: PhotoSet -> MatchGraph."""
 
+from sfm_app.atomic_io import is_made_from
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import create_database, is_sound, read_match_graph, remove_database
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import NOTHING_MATCHED, why_no_scene
 from sfm_app.matching import fill_database
 from sfm_app.types import MatchGraph, PhotoSet
-from sfm_app.written import is_made_from
 
 
 def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:

@@ -5,11 +5,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.atomic_io import is_made_from, replacing
 from sfm_app.colmap.dense import map_file, read_color, read_depth, read_views
 from sfm_app.colmap.surface import FUSED, fuse, poisson, read_fused, simplify
 from sfm_app.context import RunContext
+from sfm_app.cost_estimate import cache_gb
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.triangles import median_edge, vertex_normals
+from sfm_app.hashing import load_arrays, seal
 from sfm_app.meshing import (
     Eye,
     Paint,
@@ -22,13 +25,10 @@ from sfm_app.meshing import (
     trim,
 )
 from sfm_app.parallel import ordered_map
-from sfm_app.plan import cache_gb
 from sfm_app.progress import track
 from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View, region
-from sfm_app.stored import load_arrays, seal
 from sfm_app.types import Surface
-from sfm_app.written import is_made_from, replacing
 
 SURFACE = "surface.npz"
 WHOLE = "fused.txt"

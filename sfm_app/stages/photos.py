@@ -10,8 +10,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from sfm_app.atomic_io import replacing
 from sfm_app.context import RunContext
+from sfm_app.cost_estimate import megapixels_within
 from sfm_app.errors import InputError
+from sfm_app.hashing import is_below, seal
 from sfm_app.photos import (
     MASK_HINT,
     Glance,
@@ -30,11 +33,8 @@ from sfm_app.photos import (
     unused_masks,
     without_copies,
 )
-from sfm_app.plan import megapixels_within
 from sfm_app.settings import PhotoSettings
-from sfm_app.stored import is_below, seal
 from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
-from sfm_app.written import replacing
 
 
 def read_photos(folder: Path, run: RunContext) -> PhotoSet:

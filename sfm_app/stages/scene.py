@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from sfm_app.atomic_io import replacing
 from sfm_app.colmap.backend import backend, check_written
 from sfm_app.colmap.bundle import Adjusted, adjusted_or_as_it_was
 from sfm_app.colmap.model import colour, photos_of, read_scene, sparse_model
@@ -14,12 +15,11 @@ from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_depth, why_no_scene
 from sfm_app.numerical import json_text
 from sfm_app.reconstruction import Found, Outcome, clear, look_again, reconstruct
-from sfm_app.reconstruction.left_out import left_out, names_of
-from sfm_app.reconstruction.orientation import look_at_photos, orient_or_leave
-from sfm_app.reconstruction.told_apart import in_words, jumps
-from sfm_app.reconstruction.weak_links import weakly_joined
+from sfm_app.reconstruction.align_upright import look_at_photos, orient_or_leave
+from sfm_app.reconstruction.look_alikes import in_words, jumps
+from sfm_app.reconstruction.unregistered import left_out, names_of
+from sfm_app.reconstruction.weak_scale import weakly_joined
 from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
-from sfm_app.written import replacing
 
 POINTS = "points"
 """Name of the files with the points and cameras."""

@@ -4,14 +4,14 @@ import shutil
 
 import numpy as np
 
+from sfm_app.atomic_io import replacing
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import write_epipolar_fits
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_scene
 from sfm_app.fitting import fit_pairs, graph_of
-from sfm_app.stored import load_arrays
+from sfm_app.hashing import load_arrays
 from sfm_app.types import MatchGraph, ViewGraph
-from sfm_app.written import replacing
 
 
 def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:

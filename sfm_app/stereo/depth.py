@@ -7,14 +7,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.stereo.blank_areas import without_surface
 from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses, without_specks
-from sfm_app.stereo.even_areas import bridge_even_areas
+from sfm_app.stereo.edge_fattening import rims, without_spill
 from sfm_app.stereo.matching import depths_from_disparities, disparities
 from sfm_app.stereo.normals import fit_planes, normals_of
-from sfm_app.stereo.outlines import rims, without_spill
 from sfm_app.stereo.patch_match import NO_MATCH, PlaneArray, improve_planes
+from sfm_app.stereo.planar_fill import bridge_even_areas
 from sfm_app.stereo.rectify import rectify
+from sfm_app.stereo.textureless import without_surface
 from sfm_app.stereo.view import DepthArray, GreyImage, View
 from sfm_app.types import Rejected
 

@@ -8,9 +8,9 @@ shadows, highlights and people who walk through count little.
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.positive import solve_positive
+from sfm_app.geometry.spd_solve import solve_positive
 from sfm_app.jit import kernel
-from sfm_app.texture.middle import median
+from sfm_app.texture.median import median
 
 FloatArray = NDArray[np.float64]
 

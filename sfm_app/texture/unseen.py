@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.texture.facets import Facets, at_vertices
-from sfm_app.texture.levelling import solve_ties
+from sfm_app.texture.seam_leveling import solve_ties
 
 FloatArray = NDArray[np.float64]
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.cli import main
-from sfm_app.colmap import apart
+from sfm_app.colmap import worker_process
 
 APPEARED = itertools.count(1)
 
@@ -64,15 +64,15 @@ def at_rename(when: str, number: int, disturb: Callable[[], None]) -> None:
 
 def in_process(label: str, milliseconds: float, disturb: Callable[[], None]) -> None:
     """Disturb so long after a process of COLMAP's has begun with a part of its work."""
-    messages = apart.Apart.messages
+    messages = worker_process.Apart.messages
 
-    def heard(process: apart.Apart) -> Iterator[dict[str, Any]]:
+    def heard(process: worker_process.Apart) -> Iterator[dict[str, Any]]:
         for message in messages(process):
             if message.get("start") == label:
                 threading.Timer(milliseconds / 1000, disturb).start()
             yield message
 
-    apart.Apart.messages = heard  # type: ignore[method-assign]
+    worker_process.Apart.messages = heard  # type: ignore[method-assign]
 
 
 def prepare(what: str, moment: str, arguments: list[str]) -> None:

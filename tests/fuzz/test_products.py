@@ -10,11 +10,11 @@ import pytest
 
 from sfm_app.context import RunContext
 from sfm_app.errors import SfmError
-from sfm_app.inputs import why_again
 from sfm_app.manifest import StageRecord
 from sfm_app.pipeline import NAMES, STAGES, loader, stored_model
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings
+from sfm_app.staleness import why_again
 from sfm_app.workspace import Workspace
 
 from .mutations import ANYTHING, damaged, text_values

@@ -21,7 +21,7 @@ from sfm_app.settings import Settings
 from sfm_app.stages.texture import PARTS, Files
 from sfm_app.synthetic.cameras import camera_centre
 from sfm_app.synthetic.compare import centre_error_percent, focal_error_percent, surface_error
-from sfm_app.texture import pages
+from sfm_app.texture import atlas
 from sfm_app.workspace import LOCK, Workspace
 
 DRAFT = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 480}})
@@ -174,15 +174,15 @@ def test_a_run_killed_in_its_texture_ends_with_the_same_bytes(finished, rendered
     whole, out = finished[0], tmp_path / "out"
     parts = out / "dense" / PARTS
     shutil.copytree(whole.out, out, symlinks=True)
-    monkeypatch.setattr(pages, "EVERY_S", -1.0)
-    monkeypatch.setattr(pages, "MOST_OF_THE_TIME", np.inf)
+    monkeypatch.setattr(atlas, "EVERY_S", -1.0)
+    monkeypatch.setattr(atlas, "MOST_OF_THE_TIME", np.inf)
 
     killed_at(4, monkeypatch, Files, "keep", rendered[0], out, DRAFT, first="texture")
     looks = stamps(parts, "look*.npz")
     assert len(looks) == 3
     killed_at(len(whole.scene.registered), monkeypatch, Files, "keep", rendered[0], out, DRAFT)
     assert stamps(parts, "look*.npz").items() > looks.items()
-    assert (parts / f"{pages.KEPT}.npz").exists()
+    assert (parts / f"{atlas.KEPT}.npz").exists()
     run = sfm_app.reconstruct(rendered[0], out, DRAFT)
 
     assert run.mesh_path.read_bytes() == whole.mesh_path.read_bytes()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.vanishing import Segments, joined, segment_planes
+from sfm_app.orientation.vanishing_points import Segments, joined, segment_planes
 from sfm_app.synthetic.cameras import axis_rotation, camera_centre, look_at
 
 FOCAL_PX = 1000.0

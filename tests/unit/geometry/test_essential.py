@@ -5,8 +5,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sfm_app.geometry.essential import decompose_essential, essential_from_fundamental, relative_pose
-from sfm_app.geometry.seed import two_view_seed
 from sfm_app.geometry.triangulation import triangulate, triangulation_angle_deg
+from sfm_app.geometry.two_view_init import two_view_seed
 
 angle = st.floats(-0.6, 0.6)
 component = st.floats(-1, 1)

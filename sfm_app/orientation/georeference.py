@@ -1,0 +1,224 @@
+"""Where on earth a reconstruction stands, and how large it is, from GPS positions of its photos."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.similarity import Similarity, robust_similarity
+from sfm_app.geometry.unit_vectors import basis_across
+from sfm_app.types import GpsPosition
+
+FloatArray = NDArray[np.float64]
+
+EQUATOR_M, FLATTENING = 6378137.0, 1.0 / 298.257223563
+"""WGS84."""
+
+GPS_M, GPS_SHARE = 10.0, 0.15
+"""Largest residual that passes for the error of consumer GPS: in metres, or as a share of how far the photos spread."""
+
+CHANCE = 1e-3
+"""Probability at most that positions which know nothing of the cameras fit as well."""
+
+SCALE_DEVIATION = 0.1
+"""Largest relative standard deviation of the scale."""
+
+LEAST_PHOTOS, AGREEING = 3, 0.6
+"""Distinct positions, and their share, that must agree."""
+
+UP_DEG = 2.0
+"""GPS that fixes up this well is believed where up is otherwise only guessed from the cameras' roll."""
+
+MAX_PAIRS = 500
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Georeference:
+    """The similarity from the reconstruction to metres on the ground."""
+
+    enu_from_world: Similarity
+    """To metres east, north and up of `origin`."""
+    origin: GpsPosition
+    """Where (0, 0, 0) of those metres is; without altitude, up counts from the cameras' median height."""
+    photos: int
+    """Distinct positions that agree."""
+    of: int
+    """Distinct positions there are."""
+    rms_m: float
+    """Root mean square residual of the agreeing positions along the ground."""
+    scale_deviation: float
+    """Relative standard deviation of the scale."""
+    up_deviation_deg: float | None = None
+    """Standard deviation of up where it is that of the positions, altitudes included; None where it was given."""
+
+    @property
+    def up_from_gps(self) -> bool:
+        """Whether the positions said which way is up."""
+        return self.up_deviation_deg is not None
+
+
+@dataclass(frozen=True, slots=True)
+class NoGeoreference:
+    """Why the positions are not used. Falsy, so that ``if found:`` reads well."""
+
+    reason: str
+
+    def __bool__(self) -> bool:
+        return False
+
+
+def georeference(
+    centres: FloatArray, positions: Sequence[GpsPosition | None], up: FloatArray, *, up_is_sure: bool = True
+) -> Georeference | NoGeoreference:
+    """Scale, heading and place from the positions of the photos, if these agree with the cameras.
+
+    GPS is off by 3 to 10 m along the ground and by twice that in height, so up stays as it is, and the positions are
+    used along the ground only: w = a z + b in complex numbers, by RANSAC over pairs, then least squares. Only where up
+    is unsure and the positions fix it well in space, theirs is taken.
+
+    Args:
+        centres: (N, 3) camera centres.
+        positions: per photo, None where there is none.
+        up: (3,) unit vector in the world.
+        up_is_sure: whether `up` rests on more than the cameras' roll.
+    """
+    known = [k for k, position in enumerate(positions) if position is not None]
+    given = [position for position in positions if position is not None]
+    if not given:
+        return NoGeoreference("the photos have no positions")
+    if len(set(given)) < LEAST_PHOTOS:
+        return NoGeoreference(f"{len(set(given))} different positions, {LEAST_PHOTOS} are needed")
+    origin = _middle(given)
+    enu, cameras = enu_m(given, origin), centres[known]
+    level = _along_ground(cameras, enu, up, origin)
+    if up_is_sure and level:
+        return level
+    other = _up_of(cameras, enu, given)
+    tilted = _along_ground(cameras, enu, other[0], origin) if other else level
+    return replace(tilted, up_deviation_deg=other[1]) if other and isinstance(tilted, Georeference) else level
+
+
+def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
+    """(N, 3) metres east, north and up of an origin; up is 0 where either altitude is unknown.
+
+    To the first order in the angles, with the ellipsoid's radii at the origin: 1 m off over 5 km.
+    """
+    meridian, parallel = _radii_m(origin)
+    turn = [(position.longitude_deg - origin.longitude_deg + 180.0) % 360.0 - 180.0 for position in positions]
+    east = parallel * np.radians(turn)
+    north = meridian * np.radians([position.latitude_deg - origin.latitude_deg for position in positions])
+    here = origin.altitude_m
+    above = [
+        0.0 if here is None or position.altitude_m is None else position.altitude_m - here for position in positions
+    ]
+    return np.column_stack([east, north, above])
+
+
+def position_at(enu: FloatArray, origin: GpsPosition) -> GpsPosition:
+    """The position so many metres (3,) east, north and up of an origin; `enu_m` backwards."""
+    meridian, parallel = _radii_m(origin)
+    longitude = (origin.longitude_deg + float(np.degrees(enu[0] / parallel)) + 180.0) % 360.0 - 180.0
+    altitude = None if origin.altitude_m is None else origin.altitude_m + float(enu[2])
+    return GpsPosition(origin.latitude_deg + float(np.degrees(enu[1] / meridian)), longitude, altitude)
+
+
+def _radii_m(origin: GpsPosition) -> tuple[float, float]:
+    """Radius of curvature along the meridian, and of the circle of latitude, both at the origin's altitude."""
+    latitude = np.radians(origin.latitude_deg)
+    squared = FLATTENING * (2.0 - FLATTENING)
+    across = EQUATOR_M / np.sqrt(1.0 - squared * np.sin(latitude) ** 2)
+    meridian = across * (1.0 - squared) / (1.0 - squared * np.sin(latitude) ** 2)
+    height = origin.altitude_m or 0.0
+    return float(meridian + height), float(max((across + height) * np.cos(latitude), 1.0))
+
+
+def _middle(positions: Sequence[GpsPosition]) -> GpsPosition:
+    """Median position; its altitude is the median of those that are known."""
+    first = positions[0].longitude_deg
+    turn = np.median([(position.longitude_deg - first + 180.0) % 360.0 - 180.0 for position in positions])
+    longitude = (first + float(turn) + 180.0) % 360.0 - 180.0
+    altitudes = [position.altitude_m for position in positions if position.altitude_m is not None]
+    latitude = float(np.median([position.latitude_deg for position in positions]))
+    return GpsPosition(latitude, longitude, float(np.median(altitudes)) if altitudes else None)
+
+
+def _along_ground(
+    cameras: FloatArray, enu: FloatArray, up: FloatArray, origin: GpsPosition
+) -> Georeference | NoGeoreference:
+    axes = basis_across(up)
+    z, w = _complex(cameras @ axes.T), _complex(enu)
+    spread = float(1.4826 * np.median(np.abs(w - (np.median(w.real) + 1j * np.median(w.imag)))))
+    limit = max(GPS_M, GPS_SHARE * spread)
+    agreeing = _agreeing(z, w, limit)
+    a, b = _line(z[agreeing], w[agreeing])
+    places = np.unique(np.round(enu[:, :2], 2), axis=0)
+    used = len(np.unique(np.round(enu[agreeing, :2], 2), axis=0))
+    if used < max(LEAST_PHOTOS, AGREEING * len(places)):
+        return NoGeoreference(f"only {used} of {len(places)} GPS positions agree with the cameras within {limit:.0f} m")
+    rms = float(np.sqrt(np.mean(np.abs(a * z[agreeing] + b - w[agreeing]) ** 2)))
+    extent = float(np.std(w[agreeing]))
+    unexplained = min((rms / extent) ** 2, 1.0) if extent > 0 else 1.0
+    deviation = np.sqrt(unexplained / max(1.0 - unexplained, 1e-12) / (2 * (used - 2)))
+    # for positions that know nothing of the cameras, `unexplained` has the distribution u^(n-2): Beta(n - 2, 1)
+    if unexplained ** (used - 2) > CHANCE or deviation > SCALE_DEVIATION:
+        return NoGeoreference(
+            f"{used} GPS positions that spread over {extent:.0f} m and miss the cameras by {rms:.1f} m fix no scale"
+        )
+    scale = float(np.abs(a))
+    turn = a / scale
+    R = np.array([[turn.real, -turn.imag, 0.0], [turn.imag, turn.real, 0.0], [0.0, 0.0, 1.0]]) @ np.stack([*axes, up])
+    height = float(np.median(enu[:, 2] - scale * cameras @ up))
+    fit = Similarity(scale, R, np.array([b.real, b.imag, height]))
+    return Georeference(fit, origin, used, len(places), rms, float(deviation))
+
+
+def _complex(points: FloatArray) -> NDArray[np.complex128]:
+    """Points (N, 2 or 3) along the ground as x + iy."""
+    return np.asarray(points[:, 0] + 1j * points[:, 1], np.complex128)
+
+
+def _agreeing(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float) -> NDArray[np.bool_]:
+    """Which positions agree with the pair that most agree with: least sum of squares, none above the limit's."""
+    pairs = np.array(list(combinations(range(len(z)), 2)), np.intp)
+    if len(pairs) > MAX_PAIRS:
+        pairs = np.random.default_rng(0).permutation(pairs)[:MAX_PAIRS]
+    best, least = np.ones(len(z), bool), np.inf
+    for pair in pairs:
+        if abs(w[pair[0]] - w[pair[1]]) < 1e-6 or z[pair[0]] == z[pair[1]]:
+            continue
+        a, b = _line(z[pair], w[pair])
+        distance = np.abs(a * z + b - w)
+        cost = float(np.minimum(distance, limit) @ np.minimum(distance, limit))
+        if cost < least:
+            best, least = distance < limit, cost
+    for _ in range(5):
+        a, b = _line(z[best], w[best])
+        after = np.abs(a * z + b - w) < limit
+        if after.sum() < 2 or (after == best).all():
+            break
+        best = after
+    return best
+
+
+def _line(z: NDArray[np.complex128], w: NDArray[np.complex128]) -> tuple[complex, complex]:
+    """a and b of w = a z + b with least squared error."""
+    around = z - z.mean()
+    a = complex(np.vdot(around, w - w.mean()) / max(float(np.vdot(around, around).real), 1e-300))
+    return a, complex(w.mean() - a * z.mean())
+
+
+def _up_of(cameras: FloatArray, enu: FloatArray, positions: Sequence[GpsPosition]) -> tuple[FloatArray, float] | None:
+    """Up (3,) in the world from positions in space, with its deviation; None where that is not within `UP_DEG`."""
+    if any(position.altitude_m is None for position in positions) or len(positions) < 5:
+        return None
+    try:
+        fit = robust_similarity(cameras, enu)
+    except ValueError:
+        return None
+    moved = fit(cameras)
+    narrow = np.sqrt(np.linalg.eigvalsh(np.cov(moved.T))[1])
+    residual = 1.4826 * np.median(np.linalg.norm(moved - enu, axis=1))
+    deviation_deg = float(np.degrees(residual / max(narrow * np.sqrt(len(moved)), 1e-12)))
+    return (np.asarray(fit.R[2]), deviation_deg) if deviation_deg < UP_DEG else None

@@ -1,0 +1,67 @@
+"""The plane that most points of a scene lie on, among those that lean as the one looked for."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.unit_vectors import along, axis_angle_deg, least_direction, unit
+
+FloatArray = NDArray[np.float64]
+
+TRIPLES, MOST_POINTS = 1000, 4000
+"""Samples of three points that are drawn, and points that they are judged by."""
+
+NEAR = 0.01
+"""Points within this share of the scene's size lie on the plane."""
+
+LEAST_SHARE = 0.15
+"""A plane needs this share of the points."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plane:
+    """Where many points lie."""
+
+    normal: FloatArray
+    """(3,) unit vector on the side of the axis that was asked about."""
+    share: float
+    """Of the points, 0 to 1."""
+    deviation_deg: float
+    """Standard deviation of the normal, as the points' scatter has it."""
+
+
+def dominant_plane(points: FloatArray, axis: FloatArray, between_deg: tuple[float, float]) -> Plane | None:
+    """The plane with most points whose normal is so far from an axis: floors (0, 25), walls (80, 90).
+
+    RANSAC with a fixed seed, then least squares on the points near the plane; None where no plane has enough of them.
+
+    Args:
+        points: (N, 3), of any scale.
+        axis: (3,) unit vector.
+        between_deg: least and largest angle between normal and axis, in degrees in [0, 90].
+    """
+    rng = np.random.default_rng(0)
+    cloud = points[rng.permutation(len(points))[:MOST_POINTS]]
+    if len(cloud) < 10:
+        return None
+    centre = np.median(cloud, axis=0)
+    reach = NEAR * float(np.percentile(np.linalg.norm(cloud - centre, axis=1), 80))
+    best, most = None, LEAST_SHARE * len(cloud)
+    for triple in rng.integers(0, len(cloud), (TRIPLES, 3)):
+        a, b, c = cloud[triple]
+        normal = unit(np.cross(b - a, c - a))
+        if not normal.any() or not between_deg[0] <= axis_angle_deg(normal, axis) <= between_deg[1]:
+            continue
+        near = np.abs(along(cloud - a, normal)) < reach
+        if np.count_nonzero(near) > most:
+            best, most = near, float(np.count_nonzero(near))
+    return None if best is None else _fitted(cloud[best], axis, float(best.mean()))
+
+
+def _fitted(points: FloatArray, axis: FloatArray, share: float) -> Plane:
+    spread = points - points.mean(axis=0)
+    scatter = np.einsum("ni,nj->ij", spread, spread)
+    small, middle, _ = np.linalg.eigvalsh(scatter)
+    deviation = np.degrees(np.arctan2(np.sqrt(small / len(points)), np.sqrt(max(middle, 1e-30))))
+    return Plane(least_direction(scatter, axis), share, float(deviation))

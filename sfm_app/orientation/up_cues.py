@@ -1,0 +1,188 @@
+"""What tells top from bottom in a scene whose vertical is known: each cue is a number, above 0 if `up` is up.
+
+All of them change sign with `up`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.unit_vectors import along, unit
+
+FloatArray = NDArray[np.float64]
+
+LEAST_POINTS = 10
+"""Points that a photo must see for its depths to count."""
+
+LITTLE_DEPTH = 0.05
+"""Spread of log depth below which it is the shape of a thing far away rather than the way to it."""
+
+NEIGHBOURS, AROUND = 12, 60
+"""Points that a piece of surface is laid through, and whose mean a normal and its brightness are compared with."""
+
+FLAT = 0.2
+"""Largest ratio of the two smaller variances of points on a piece of surface."""
+
+PICTURE_PX = 256
+"""Longer side of the small photos: wide enough for ledges and window sills, too small for texture."""
+
+BLUR_PX = 2.0
+"""Blur before slopes are taken."""
+
+BLACK, BROAD_PX, BORDER_PX = 20, 15, 6
+"""Areas so dark and so broad are a background without light, whose border is no ledge; and how wide that border is."""
+
+NO_CHANGE = 1e-6
+"""Root mean square of normals or log brightness below which they are all the same, and digits are all that is left."""
+
+EVEN, BLUR_SKY_PX, LEAST_SKY = 1.5, 1.0, 40
+"""Slope in grey levels per pixel below which a picture is even, its blur, and the darkest sky."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surfaces:
+    """Pieces of surface around points."""
+
+    normals: FloatArray
+    """(N, 3) unit vectors on the side of the cameras."""
+    bends: FloatArray
+    """(N, 3) what the normals differ by from those around."""
+    shades: FloatArray
+    """(N,) what log brightness differs by from that around."""
+
+
+def small_picture(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A grey photo, shrunk to `PICTURE_PX`."""
+    shrink = min(1.0, PICTURE_PX / max(grey.shape))
+    size = (max(1, round(grey.shape[1] * shrink)), max(1, round(grey.shape[0] * shrink)))
+    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def surfaces_of(
+    points: FloatArray, brightness: FloatArray, seen: Sequence[NDArray[np.int64]], centres: FloatArray
+) -> Surfaces:
+    """Planes through the neighbours of each point, where these lie on one.
+
+    Args:
+        points: (P, 3).
+        brightness: (P,) 0 to 255.
+        seen: per photo the points that it sees.
+        centres: (N, 3) camera centres of the photos.
+    """
+    from scipy.spatial import cKDTree
+
+    if len(points) < NEIGHBOURS:
+        return Surfaces(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    around = np.asarray(cKDTree(points).query(points, k=min(AROUND, len(points)))[1])
+    near = points[around[:, :NEIGHBOURS]]
+    near = near - near.mean(axis=1, keepdims=True)
+    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
+    towards = np.zeros_like(points)
+    for chosen, centre in zip(seen, centres, strict=True):
+        towards[chosen] += unit(centre - points[chosen])
+    normals = axes[:, :, 0]
+    normals = normals * np.where((normals * towards).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+    grey = np.log(10.0 + brightness)
+    bends, shades = normals - normals[around].mean(axis=1), grey - grey[around].mean(axis=1)
+    flat = (variances[:, 0] < FLAT * variances[:, 1]) & towards.any(axis=1)
+    return Surfaces(normals[flat], bends[flat], shades[flat])
+
+
+def low_is_near(
+    up: FloatArray,
+    rotations: FloatArray,
+    centres: FloatArray,
+    points: FloatArray,
+    seen: Sequence[NDArray[np.int64]],
+) -> float:
+    """Correlation of log depth with height in the photo, over the points that it sees; mean over the photos.
+
+    The ground comes nearer towards the lower border; facades seen from the street lean away. In [-1, 1].
+    """
+    found = []
+    for R, centre, chosen in zip(rotations, centres, seen, strict=True):
+        local = np.einsum("ij,nj->ni", R, points[chosen] - centre)
+        local = local[local[:, 2] > 0]
+        if len(local) < LEAST_POINTS:
+            continue
+        depth = np.log(local[:, 2])
+        depth = np.clip(depth, *np.percentile(depth, (2, 98)))
+        height = along(local[:, :2] / local[:, 2:], (R @ up)[:2])
+        depth, height = depth - depth.mean(), height - height.mean()
+        spread = (depth.std() + LITTLE_DEPTH) * height.std()
+        found.append(float((depth * height).mean() / spread) if spread > 0 else 0.0)
+    return float(np.mean(found)) if found else 0.0
+
+
+def tops_are_seen(up: FloatArray, surfaces: Surfaces) -> float:
+    """Mean upward component of the normals: free space and those who look are above floors, steps and sills.
+
+    In [-1, 1].
+    """
+    return float(along(surfaces.normals, up).mean()) if len(surfaces.normals) else 0.0
+
+
+def tops_are_bright(up: FloatArray, surfaces: Surfaces) -> float:
+    """Correlation of brightness with the upward component of the normal, both against what is around: light from above.
+
+    In [-1, 1].
+    """
+    if not len(surfaces.normals):
+        return 0.0
+    rise, shade = along(surfaces.bends, up), surfaces.shades
+    spreads = [float(np.sqrt((values**2).mean())) for values in (rise, shade)]
+    return float((rise * shade).mean() / (spreads[0] * spreads[1])) if min(spreads) > NO_CHANGE else 0.0
+
+
+def ledges_are_lit(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
+    """Share of the power of slopes of brightness along `up` that rise, less that which fall; mean over the photos.
+
+    Under ledges, eaves and things on the ground lies shadow with a sharp border to the lit top above it, and skylines
+    are brighter above; the ways back to light are gentle. Across, it is 0 within 0.06. In [-1, 1].
+    """
+    found = []
+    for R, picture in zip(rotations, pictures, strict=True):
+        if picture is None or min(picture.shape) < 3:
+            continue
+        grey = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), BLUR_PX)
+        slope = _slope(np.sqrt(grey), R @ up)[~_black_background(grey)[1:-1, 1:-1]]
+        power = (slope**2).sum()
+        found.append(float((slope * np.abs(slope)).sum() / power) if power > 0 else 0.0)
+    return float(np.mean(found)) if found else 0.0
+
+
+def sky_is_above(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
+    """Share of even and bright pixels at the upper border less that at the lower one; mean over the photos.
+
+    In [-1, 1].
+    """
+    found = []
+    for R, picture in zip(rotations, pictures, strict=True):
+        if picture is None or min(picture.shape) < 3:
+            continue
+        grey = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), BLUR_SKY_PX)
+        steep = np.hypot(_slope(grey, np.array([1.0, 0.0])), _slope(grey, np.array([0.0, 1.0])))
+        grey = grey[1:-1, 1:-1]
+        even = (steep < EVEN) & (grey > max(float(np.median(grey)), LEAST_SKY))
+        y, x = np.mgrid[: grey.shape[0], : grey.shape[1]] - 0.5 * (np.array(grey.shape)[:, None, None] - 1)
+        axis = R @ up
+        height = x * axis[0] + y * axis[1]
+        border = 0.5 * np.abs(height).max()
+        above, below = even[height > border], even[height < -border]
+        found.append(float(above.mean() - below.mean()) if above.size and below.size else 0.0)
+    return float(np.mean(found)) if found else 0.0
+
+
+def _black_background(grey: NDArray[np.float32]) -> NDArray[np.bool_]:
+    broad, border = (np.ones((width, width), np.uint8) for width in (BROAD_PX, 2 * BORDER_PX + 1))
+    black = cv2.morphologyEx((grey < BLACK).astype(np.uint8), cv2.MORPH_OPEN, broad)
+    return np.asarray(cv2.dilate(black, border) > 0)
+
+
+def _slope(grey: NDArray[np.float32], axis: FloatArray) -> NDArray[np.float32]:
+    """(H - 2, W - 2) derivative along an axis (x, y, ...) in the picture, in grey levels per pixel."""
+    down, right = grey[2:, 1:-1] - grey[:-2, 1:-1], grey[1:-1, 2:] - grey[1:-1, :-2]
+    return np.asarray(0.5 * (axis[0] * right + axis[1] * down), np.float32)

@@ -1,0 +1,65 @@
+"""Which photos share one camera."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import PurePosixPath
+
+from sfm_app.photos.letterbox import with_one_frame
+from sfm_app.types import Photo
+
+ON_END_DEG = 90
+"""What a photo on end is taken to be turned by where nobody knows. The other way round only mirrors the place of the
+optical centre, which lies near the middle."""
+
+
+def grouped(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
+    """Photos with their groups, in their order; those of one group share one camera.
+
+    COLMAP's cameras have one size. Photos taken on end are turned to lie as the others of their camera do; otherwise
+    photos of different sizes are never of one group, nor are pictures of different sizes within bars, where nobody has
+    said whose photos they are.
+
+    Args:
+        photos: with the camera that EXIF names as their group.
+        cameras: "auto": by EXIF; "single": one camera took all; "folder": one per folder; "each": one per photo.
+    """
+    sizes = Counter((_maker(photo, cameras), photo.width, photo.height) for photo in photos)
+    found = []
+    for photo in photos:
+        maker = _maker(photo, cameras)
+        here, across = (sizes[maker, *size] for size in ((photo.width, photo.height), (photo.height, photo.width)))
+        on_end = across > here or (across == here and photo.height > photo.width)
+        laid = _turned(photo) if across and on_end and not photo.turn_deg else photo
+        found.append(replace(laid, group=" ".join(filter(None, (f"{laid.width}x{laid.height}", maker)))))
+    yield from _within_bars(found) if cameras == "auto" else (replace(photo, shown=None) for photo in found)
+
+
+def _within_bars(photos: Sequence[Photo]) -> list[Photo]:
+    """The same with groups of their own for pictures of other sizes within bars."""
+    groups: dict[str, list[int]] = {}
+    for place, photo in enumerate(photos):
+        groups.setdefault(photo.group, []).append(place)
+    found = list(photos)
+    for places in groups.values():
+        for place, photo in zip(places, with_one_frame([photos[place] for place in places]), strict=True):
+            inside = f"{photo.shown[2]}x{photo.shown[3]} in " if photo.shown else ""
+            found[place] = replace(photo, group=inside + photo.group)
+    return found
+
+
+def _maker(photo: Photo, cameras: str) -> str:
+    return {
+        "auto": photo.group,
+        "single": "",
+        "folder": PurePosixPath(photo.path).parent.as_posix(),
+        "each": photo.path,
+    }[cameras]
+
+
+def _turned(photo: Photo) -> Photo:
+    shown = photo.shown
+    if shown is not None:
+        left, top, width, height = shown
+        shown = (top, photo.width - left - width, height, width)
+    return replace(photo, width=photo.height, height=photo.width, turn_deg=ON_END_DEG, needs_copy=True, shown=shown)

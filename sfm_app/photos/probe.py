@@ -1,0 +1,84 @@
+"""What one file of the folder is: a usable photo, or why not."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from PIL import Image
+
+from sfm_app.photos.decode import (
+    LOSSY,
+    MOST_FRAMES,
+    Picture,
+    UnreadableError,
+    read_picture,
+    room_for,
+    turned_back,
+    upright,
+)
+from sfm_app.photos.exif import camera_name, focal_px, gps_position, orientation, turn_deg
+from sfm_app.photos.files import place_of
+from sfm_app.photos.letterbox import shown_part
+from sfm_app.photos.thumbnail_stats import Glance, glance
+from sfm_app.settings import PhotoSettings
+from sfm_app.types import Frame, Photo, UnusablePhoto
+
+MEGA = 1_000_000
+LINKED = ("JPEG", "MPO", "PNG")
+"""Formats that COLMAP reads and writes as they are."""
+
+
+def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | UnusablePhoto:
+    """Decode one file to know that it is a whole photo, what camera took it, and what it looks like."""
+    place = place_of(folder, name)
+    if isinstance(place, str):
+        return UnusablePhoto(name, place)
+    try:
+        with room_for(place):
+            return described(name, read_picture(place), options)
+    except UnreadableError as err:
+        return UnusablePhoto(name, str(err))
+
+
+def described(name: str, picture: Picture, options: PhotoSettings) -> Glance | UnusablePhoto:
+    """What is known about a photo, and what it looks like."""
+    image, exif = picture.image, picture.exif
+    turn = turn_deg(exif)
+    size = image.size[::-1] if orientation(exif) >= 5 and not turn else image.size
+    if min(size) < options.min_side_px:
+        return UnusablePhoto(name, f"smaller than {options.min_side_px} px")
+    width, height = scaled(size, options.max_megapixels * MEGA)
+    many = f"its {picture.frames}" if picture.frames <= MOST_FRAMES else f"more than {MOST_FRAMES}"
+    notes = [f"the first of {many} pictures"] if picture.frames > 1 else []
+    if (width, height) != size:
+        notes.append(f"scaled down from {size[0]} x {size[1]} to {width} x {height} pixels")
+    eight_bit = image.mode in ("RGB", "L") and "transparency" not in image.info
+    photo = Photo(
+        name=name,
+        width=width,
+        height=height,
+        group=camera_name(exif),
+        exif_focal_px=focal_px(exif, max(width, height)),
+        needs_copy=not (image.format in LINKED and eight_bit and orientation(exif) == 1 and (width, height) == size),
+        gps=gps_position(exif),
+        lossy=image.format in LOSSY,
+        turn_deg=turn,
+        notes=tuple(notes),
+    )
+    seen = upright(picture)
+    return glance(replace(photo, shown=_shown(seen, photo)), seen)
+
+
+def _shown(seen: Image.Image, photo: Photo) -> Frame | None:
+    """The picture within bars, in pixels of the photo as it is laid out."""
+    laid = turned_back(seen, photo.turn_deg)
+    found = shown_part(laid)
+    if found is None or laid.size == (photo.width, photo.height):
+        return found
+    x, y = photo.width / laid.width, photo.height / laid.height
+    return round(found[0] * x), round(found[1] * y), round(found[2] * x), round(found[3] * y)
+
+
+def scaled(size: tuple[int, int], most_px: float) -> tuple[int, int]:
+    """Width and height of a picture with not more pixels than that."""
+    share = min(1.0, (most_px / (size[0] * size[1])) ** 0.5)
+    return max(1, int(size[0] * share)), max(1, int(size[1] * share))

@@ -1,0 +1,84 @@
+"""The best model of a search, and what the next one has to beat."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.ransac.estimator_config import Recipe
+from sfm_app.ransac.scoring.robust_costs import penalty, squared_distances
+from sfm_app.ransac.verification.pretests import LENIENCE, OPEN
+
+FloatArray = NDArray[np.float64]
+
+
+class Best:
+    """The best model so far.
+
+    Algorithm 1 starts with Q* = 0 in print; as a penalty that is to fall it has to start at infinity.
+    """
+
+    f: FloatArray
+    """(9,) entries of F, norm 1."""
+    to_beat: FloatArray
+    """(2,) penalties that models of samples have to stay below, by kind (see `search.next_better`)."""
+    samples: FloatArray
+    """(2, 9) the models that hold these penalties."""
+
+    def __init__(self, points: FloatArray, threshold: float, recipe: Recipe) -> None:
+        self._points, self._threshold, self._recipe = points, threshold, recipe
+        self.measure = recipe.score(points, threshold, None)
+        self._fine = None if recipe.fine_score is None else recipe.fine_score(points, threshold, None)
+        self.f, self._lowest = np.zeros(9), math.inf
+        self.to_beat, self.samples = np.full(2, math.inf), np.zeros((2, 9))
+
+    def __bool__(self) -> bool:
+        """Whether there is one yet."""
+        return self._lowest < math.inf
+
+    def inlier_share(self) -> float:
+        """Of all matches, those within the threshold."""
+        return float(np.mean(squared_distances(self._points, self.f) <= self._threshold**2))
+
+    def meets(self, kind: int) -> bool:
+        """There is a new best sample of that kind; whether the best model has changed."""
+        if self._fine is None:
+            self._replace(self.samples[kind].copy(), float(self.to_beat[kind]))
+            return True
+        if not self.challenged_by(self.samples[kind].reshape(3, 3)):
+            return False
+        # what the others have to come up to is another model now
+        count = len(self._points)
+        self.to_beat[1] = count * self.measure.worst - LENIENCE * (count * self.measure.worst - self.to_beat[0])
+        return True
+
+    def _replace(self, model: FloatArray, found: float) -> None:
+        """The model of a sample, or what local optimisation makes of it, is the best model."""
+        self.f, self._lowest = model, found
+        if self._recipe.improve is not None:
+            improved = self._improved(model.reshape(3, 3))
+            score = penalty(self._points, 0, improved, self.measure, math.inf, OPEN)
+            if score < found:
+                self.f, self._lowest = improved, score
+        self._measure_anew()
+        self.to_beat[:] = self._lowest
+
+    def challenged_by(self, F: FloatArray) -> bool:
+        """Whether F (3, 3), locally optimised, is the best model by the finer penalty."""
+        improved = self._improved(F)
+        score = penalty(self._points, 0, improved, self._fine or self.measure, self._lowest, OPEN)
+        if score < self._lowest:
+            self.f, self._lowest = improved, score
+            return True
+        return False
+
+    def _improved(self, F: FloatArray) -> FloatArray:
+        if self._recipe.improve is not None:
+            F = self._recipe.improve(self._points, F, self._threshold)
+        return np.asarray(np.ascontiguousarray(F).reshape(9) / np.linalg.norm(F))
+
+    def _measure_anew(self) -> None:
+        """MLESAC's function changes with the best model; the thesis names the flaw of comparing across the change."""
+        renewed = self._recipe.score(self._points, self._threshold, self.f)
+        if renewed != self.measure:
+            self.measure, self._lowest = renewed, penalty(self._points, 0, self.f, renewed, math.inf, OPEN)

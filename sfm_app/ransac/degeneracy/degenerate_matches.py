@@ -1,0 +1,124 @@
+"""Matches that do not determine F: all on one line of a photo, on one plane, or taken without moving the camera.
+
+Matches on a line of one view leave two parameters of F free, on a line of both views four. Any so many other matches
+fix them, mismatches too: what counts is matches off the line, more of them than accident gives. In the same way what
+tells a real epipole is matches off the dominant plane (see `planes`).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.ransac.degeneracy.dominant_plane import OFF_PLANE, dominant_homography, transfer_distance
+from sfm_app.ransac.sampling.minimal_samples import uniform
+from sfm_app.ransac.verification.a_contrario import MOST_FALSE_ALARMS, accidental_share, false_alarms
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+_LINE_SAMPLE, _PARALLAX_SAMPLE = 4, 2
+"""Matches that fix what a line, or a plane, leaves free of F."""
+_OFF_LINE = 2.0
+"""A match is off the line when that misses it by more than this many thresholds."""
+_LINES, _MOST_SCORED = 16, 300
+"""A line that matters holds most of the inliers: few samples will find it."""
+_EXTENT = (0.01, 0.99)
+"""Where the points of a view begin and end, a few absurd ones aside."""
+_FOCALS = np.geomspace(0.4, 6.0, 60)
+"""Focal lengths that are tried for a rotation, in sides of the box around the points."""
+_PARALLAX_OF_A_MOTION = 0.05
+"""Share of the inliers off the plane below which a rotation stays one. Mismatches on rows of bricks have a vanishing
+point in common: they agree with an epipole there far more often than accident has it."""
+_ROTATION_TOLERANCE = 0.05
+"""A rotation stretches nothing; a homography that stretches less than this, for some focal length, counts as one."""
+
+
+def find_degeneracy(
+    points: FloatArray, F: FloatArray, inliers: BoolArray, wrong: FloatArray, threshold: float, centres: FloatArray
+) -> str:
+    """What leaves F undetermined.
+
+    Args:
+        points: (N, 4) matches in random order.
+        F: (3, 3) the model.
+        inliers: (N,) at least 3 of them.
+        wrong: (M,) squared distances of mismatches to F, from `chance.squared_mismatches`.
+        threshold: largest distance of an inlier.
+        centres: (4,) the origin of `points` in a frame that both views share, in the same units.
+
+    Returns:
+        "collinear" where all matches lie on one line of a photo, or in one place (but for a few that may be accident),
+        "rotation" where the camera only turned, "planar" where all matches lie on one plane (or too close to one to
+        tell), "" where F is determined.
+    """
+    chance = accidental_share(wrong, threshold)
+    for view in range(2):
+        off_line = off_dominant_line(points, inliers, view, _OFF_LINE * threshold)
+        if _may_be_accident(off_line, inliers, _LINE_SAMPLE, chance):
+            return "collinear"
+    H = dominant_homography(np.asfortranarray(points[inliers]), F, threshold)
+    off_plane = transfer_distance(H, points) > OFF_PLANE * threshold
+    planar = _may_be_accident(off_plane, inliers, _PARALLAX_SAMPLE, chance)
+    parallax = np.count_nonzero(off_plane & inliers) / np.count_nonzero(inliers)
+    if (planar or parallax < _PARALLAX_OF_A_MOTION) and is_rotation(H, points, centres):
+        return "rotation"
+    return "planar" if planar else ""
+
+
+def _may_be_accident(off: BoolArray, inliers: BoolArray, sample_size: int, chance: float) -> bool:
+    """Whether so many of the matches `off` a line or plane would agree with some F if all of these were wrong."""
+    agreeing = int(np.count_nonzero(off & inliers))
+    return false_alarms(int(np.count_nonzero(off)), agreeing, sample_size, chance) > MOST_FALSE_ALARMS
+
+
+def off_dominant_line(points: FloatArray, inliers: BoolArray, view: int, width: float) -> BoolArray:
+    """Which matches lie further than `width` from the line that holds the most inliers of a view.
+
+    Args:
+        points: (N, 4) matches in random order.
+        inliers: (N,) at least one of them.
+        view: 0 or 1.
+        width: in the units of `points`.
+
+    Returns:
+        (N,)
+    """
+    x, y = points[:, 2 * view], points[:, 2 * view + 1]
+    a, b, c = _dominant_line(x[inliers], y[inliers], width)
+    return np.asarray(np.abs(a * x + b * y + c) > width)
+
+
+@kernel
+def _dominant_line(x: FloatArray, y: FloatArray, width: float) -> tuple[float, float, float]:
+    """The line a x + b y + c = 0, a^2 + b^2 = 1, that passes most of the first points, through two of all."""
+    count, most, best, state = x.shape[0], -1, (1.0, 0.0, 0.0), np.empty(1, dtype=np.uint64)
+    state[0] = count
+    for _ in range(_LINES):
+        i, j = int(uniform(state) * count), int(uniform(state) * count)
+        a, b = y[i] - y[j], x[j] - x[i]
+        norm = np.sqrt(a * a + b * b)
+        a, b = (a / norm, b / norm) if norm > 0.0 else (1.0, 0.0)  # of two points in one place any line will do
+        c, on_line = -(a * x[i] + b * y[i]), 0
+        for n in range(min(count, _MOST_SCORED)):
+            on_line += abs(a * x[n] + b * y[n] + c) <= width
+        if on_line > most:
+            most, best = on_line, (a, b, c)
+    return best
+
+
+def is_rotation(H: FloatArray, points: FloatArray, centres: FloatArray) -> bool:
+    """Whether H = K R K^-1 for one focal length and an optical centre in the middle of where both views have points."""
+    placed = points + centres
+    low, high = np.quantile(np.vstack([placed[:, :2], placed[:, 2:]]), _EXTENT, axis=0)
+    middle, side = (low + high) / 2, float((high - low).max())
+    to1, to2 = _shift(middle - centres[:2]), _shift(centres[2:] - middle)
+    for focal in _FOCALS * side:
+        K = np.diag([focal, focal, 1.0])
+        stretch = np.linalg.svd(np.linalg.inv(K) @ to2 @ H @ to1 @ K, compute_uv=False)
+        if stretch[0] <= (1 + _ROTATION_TOLERANCE) * stretch[2]:
+            return True
+    return False
+
+
+def _shift(by: FloatArray) -> FloatArray:
+    return np.array([[1, 0, by[0]], [0, 1, by[1]], [0, 0, 1]], dtype=np.float64)

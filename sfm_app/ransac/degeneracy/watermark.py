@@ -1,0 +1,101 @@
+"""Matches that stay in place while the scene moves: logos, time stamps, dust, or one photo twice.
+
+A logo agrees with F = [t]x for any t, so that enough of its matches make the camera stand still. What tells it from a
+scene whose image happens to stay in place, such as a thing that the photographer kept in the middle, is its peak:
+displacements of a scene vary smoothly with depth and place, and reach 0 no more often than anything near 0.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.ransac.scoring.robust_costs import squared_distances
+from sfm_app.settings import EpipolarSettings
+from sfm_app.types import EpipolarFit, Rejected
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+Fit = Callable[[FloatArray, FloatArray, EpipolarSettings, int], EpipolarFit | Rejected]
+
+SAME_PHOTO = "the same photo twice, or nearly"
+ONLY_A_LOGO = "nothing in common but a logo or time stamp"
+
+PEAK, STATIONARY, AROUND = 1.0, 2.0, 4.0
+"""Displacements at the peak, those taken for stationary, and those compared with, in steps of the keypoints' noise."""
+LEAST = 8
+"""Fewer matches at the peak are left to the estimator."""
+MOST_LOST = 0.2
+"""Share of the matches, the stationary or the others, that may be taken from the scene together with a logo."""
+CELLS, WIDE = 8, 0.25
+"""Cells of the photo along each side, and the share of those with keypoints that a logo does not reach."""
+EXPLAINED = 0.9
+"""Share of the stationary matches that a motion without rotation explains."""
+
+
+def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> BoolArray:
+    """Which matches stay where they are, although the others move or nothing moves at all.
+
+    The displacements of a scene are spread along a curve or over an area around 0: within four steps there are at least
+    three times as many more as within one. Matches count as stationary where the peak holds more than that, and where
+    hardly any of the scene is lost with them: frames of a video in which all move by a few pixels keep theirs.
+
+    Args:
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels in a photo of the same size.
+        unit_px: what keypoints are exact to, generously; more than 1 where they were found in a smaller image.
+
+    Returns:
+        (N,); all False where there is no such peak.
+    """
+    squared = np.square(x2 - x1).sum(axis=1) / unit_px**2
+    peak, held, reached = (int(np.count_nonzero(squared <= steps**2)) for steps in (PEAK, STATIONARY, AROUND))
+    ring = reached - peak
+    # a scene on a line through 0 has a third of the ring in every step
+    lost = ring * STATIONARY / (AROUND - PEAK)
+    is_peak = peak >= max(LEAST, ring) and lost <= MOST_LOST * max(held, len(x1) - held)
+    return squared <= STATIONARY**2 if is_peak else np.zeros(len(x1), bool)
+
+
+def covers(points: FloatArray, keypoints: FloatArray, size: tuple[int, int]) -> bool:
+    """Whether points (N, 2) lie all over what a photo of `size` (width, height) shows, its keypoints (M, 2)."""
+    return len(_cells(points, size)) > WIDE * len(_cells(keypoints, size))
+
+
+def fit_moving(
+    fit: Fit, points: tuple[FloatArray, FloatArray], stationary: BoolArray, wide: bool, options: EpipolarSettings,
+    seed: int,
+) -> EpipolarFit | Rejected:  # fmt: skip
+    """Epipolar geometry of the matches that move; the stationary ones are no inliers and have no prior.
+
+    Where the camera moved without turning, far things stay in place, too: stationary matches all over the photo that
+    the geometry of the others explains are of the scene, and all matches are fitted together.
+
+    Args:
+        fit: the estimator.
+        points: x1, x2, each (N, 2) pixels.
+        stationary: (N,) from `find_stationary`.
+        wide: whether these lie all over the photo, see `covers`.
+        options: of the estimator.
+        seed: likewise.
+
+    Returns:
+        A fit whose inliers and priors are (N,), or why there is none: of matches that do not move alone, what they are.
+    """
+    x1, x2 = points
+    found = fit(x1[~stationary], x2[~stationary], options, seed)
+    if not isinstance(found, EpipolarFit):
+        return Rejected(SAME_PHOTO if wide else ONLY_A_LOGO)
+    if wide and not found.degeneracy:
+        still = np.asfortranarray(np.hstack([x1[stationary], x2[stationary]]))
+        agreeing = squared_distances(still, np.ascontiguousarray(found.F).reshape(9)) <= options.max_error_px**2
+        if agreeing.mean() >= EXPLAINED:
+            return fit(x1, x2, options, seed)
+    inliers, priors = np.zeros(len(x1), bool), np.zeros(len(x1))
+    inliers[~stationary], priors[~stationary] = found.inliers, found.priors
+    return EpipolarFit(found.F, inliers, priors, found.trials, found.rms_px, found.degeneracy)
+
+
+def _cells(points: FloatArray, size: tuple[int, int]) -> NDArray[np.int64]:
+    columns, rows = (points / size * CELLS).astype(np.int64).clip(0, CELLS - 1).T
+    return np.unique(CELLS * rows + columns)

@@ -1,0 +1,177 @@
+"""From the best model of a search to the answer: a fit with its evidence, or a rejection with its reason."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sfm_app.geometry.epipolar import nearest_rank_two
+from sfm_app.ransac.degeneracy.degenerate_matches import find_degeneracy
+from sfm_app.ransac.degeneracy.dominant_plane import OFF_PLANE, dominant_homography, transfer_distance
+from sfm_app.ransac.estimator_config import Recipe
+from sfm_app.ransac.loop import search
+from sfm_app.ransac.points import Matches, check_points, prepare
+from sfm_app.ransac.refine.final_refit import last_fit
+from sfm_app.ransac.scoring.leverage import prior_validity
+from sfm_app.ransac.scoring.robust_costs import squared_distances
+from sfm_app.ransac.verification.a_contrario import MOST_FALSE_ALARMS, false_alarms_of, squared_mismatches
+from sfm_app.settings import EpipolarSettings
+from sfm_app.types import EpipolarFit, Rejected
+
+FloatArray = NDArray[np.float64]
+Find = Callable[[FloatArray, FloatArray, EpipolarSettings, int], tuple[ArrayLike, int] | None]
+"""(x1, x2, options, seed) -> F and how many samples were drawn, or None: a search from outside, for `estimate_with`."""
+
+TOO_FEW_MATCHES = "too few matches"
+NO_MODEL = "no model found"
+TOO_FEW_INLIERS = "too few inliers"
+CHANCE = "inliers no better than chance"
+REASONS = (TOO_FEW_MATCHES, NO_MODEL, TOO_FEW_INLIERS, CHANCE)
+"""Why a pair is rejected, in the order of the checks."""
+
+
+def estimate(
+    x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int, recipe: Recipe
+) -> EpipolarFit | Rejected:
+    """One fundamental matrix from matches of which many may be wrong.
+
+    Args:
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
+        options: threshold, confidence, most samples, fewest inliers.
+        seed: same seed, same bytes.
+        recipe: the estimator.
+
+    Raises:
+        ValueError: the points are not as above (see `check_points`).
+    """
+    first, second = check_points(x1, x2)
+    matches = prepare(first, second, seed)
+    if len(matches.points) < options.min_inliers:
+        return Rejected(TOO_FEW_MATCHES)
+    found = search(matches, options, seed, recipe)
+    if found is None:
+        return Rejected(NO_MODEL)
+    threshold = options.max_error_px / matches.unit_px
+    F = last_fit(options.refit, recipe.finish)(matches.points, found.F, threshold)
+    if not np.isfinite(F).all():
+        return Rejected(NO_MODEL)
+    return _judge(first, second, matches, F, found.trials, options)
+
+
+def estimate_with(
+    find: Find, x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int
+) -> EpipolarFit | Rejected:
+    """Hold an estimator from outside to what the built-in ones promise: the way to write a plug-in.
+
+    Args:
+        find: gets the distinct matches, at least `options.min_inliers`, as contiguous (M, 2) pixels about the middle of
+            each view, in an order that depends on the seed. Its F may have any scale; it is brought to rank 2, and its
+            inliers, priors, degeneracy and chance are worked out as for any other. It should not raise on data.
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
+        options: as in `estimate`.
+        seed: same seed, same bytes, as far as `find` keeps to it.
+
+    Raises:
+        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+    """
+    first, second = check_points(x1, x2)
+    matches = prepare(first, second, seed)
+    if len(matches.points) < options.min_inliers:
+        return Rejected(TOO_FEW_MATCHES)
+    px1, px2 = (np.ascontiguousarray(side) * matches.unit_px for side in np.hsplit(matches.points, 2))
+    found = find(px1, px2, options, seed)
+    if found is None:
+        return Rejected(NO_MODEL)
+    F, trials = found
+    return _judge_any(first, second, matches, _in_frame(F, matches.unit_px, np.zeros(4)), trials, options)
+
+
+def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> EpipolarFit | Rejected:
+    """What matches say about a fundamental matrix, wherever it comes from.
+
+    Args:
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
+        F: (3, 3) of any scale, x2' F x1 = 0 in pixels.
+        options: threshold and fewest inliers.
+
+    Returns:
+        The fit, its `trials` 1, or why F is not to be trusted.
+
+    Raises:
+        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+    """
+    first, second = check_points(x1, x2)
+    matches = prepare(first, second, seed=0)
+    if len(matches.points) < options.min_inliers:
+        return Rejected(TOO_FEW_MATCHES)
+    return _judge_any(first, second, matches, _in_frame(F, matches.unit_px, matches.centre), 1, options)
+
+
+def matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> int:
+    """How many distinct inliers of F show parallax: those off the plane that holds most of them.
+
+    Args:
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
+        F: (3, 3) of rank 2, at least 3 inliers.
+        options: the threshold.
+
+    Raises:
+        ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
+    """
+    matches = prepare(*check_points(x1, x2), seed=0)
+    threshold = options.max_error_px / matches.unit_px
+    in_frame = _in_frame(F, matches.unit_px, matches.centre)
+    f = np.ascontiguousarray(in_frame / np.linalg.norm(in_frame))
+    agreeing = np.asfortranarray(matches.points[squared_distances(matches.points, f.reshape(9)) <= threshold**2])
+    H = dominant_homography(agreeing, f, threshold)
+    return int(np.count_nonzero(transfer_distance(H, agreeing) > OFF_PLANE * threshold))
+
+
+def _in_frame(F: ArrayLike, unit_px: float, centre: FloatArray) -> FloatArray:
+    """F of pixels as F of points that are centred and in units; the inverse of `Matches.to_pixels`."""
+    pixels = np.asarray(F, dtype=np.float64)
+    if pixels.shape != (3, 3):
+        raise ValueError(f"F must have shape (3, 3), got {pixels.shape}")
+    to1, to2 = (np.array([[unit_px, 0, x], [0, unit_px, y], [0, 0, 1]]) for x, y in (centre[:2], centre[2:]))
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is rejected
+        return np.asarray(to2.T @ pixels @ to1)
+
+
+def _judge_any(
+    x1: FloatArray, x2: FloatArray, matches: Matches, F: FloatArray, trials: int, options: EpipolarSettings
+) -> EpipolarFit | Rejected:
+    """`_judge` for an F that need not be finite, of rank 2 or of a sensible scale."""
+    largest = np.abs(F).max()
+    if not (np.isfinite(largest) and largest > 0) or np.linalg.matrix_rank(F / largest) < 2:
+        return Rejected(NO_MODEL)
+    return _judge(x1, x2, matches, nearest_rank_two(F / largest), trials, options)
+
+
+def _judge(
+    x1: FloatArray, x2: FloatArray, matches: Matches, F: FloatArray, trials: int, options: EpipolarSettings
+) -> EpipolarFit | Rejected:
+    points, threshold = matches.points, options.max_error_px / matches.unit_px
+    f = np.ascontiguousarray(F / np.linalg.norm(F)).reshape(9)
+    squared = squared_distances(points, f)
+    inliers = squared <= threshold * threshold
+    if np.count_nonzero(inliers) < options.min_inliers:
+        return Rejected(TOO_FEW_INLIERS)
+    wrong = squared_mismatches(points, f)
+    if false_alarms_of(squared, wrong, threshold) > MOST_FALSE_ALARMS:
+        return Rejected(CHANCE)
+    F_px = matches.to_pixels(F)
+    squared_px = squared_distances(np.asfortranarray(np.hstack([x1, x2])), F_px.reshape(9))
+    accepted = squared_px <= options.max_error_px**2
+    return EpipolarFit(
+        F=F_px,
+        inliers=accepted,
+        priors=prior_validity(points, f, threshold, sigma_from_inliers=True)[matches.rows],
+        trials=trials,
+        rms_px=math.sqrt(float(squared_px[accepted].mean())),
+        degeneracy=find_degeneracy(points, F, inliers, wrong, threshold, matches.centre / matches.unit_px),
+    )

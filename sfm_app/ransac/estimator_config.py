@@ -1,0 +1,60 @@
+"""What an estimator is made of: sampler, solver, score, verifier, stopping rule, final fit."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.ransac.sampling.minimal_samples import SAMPLE_SIZE, RandomState
+from sfm_app.ransac.scoring.robust_costs import Measure, Score
+from sfm_app.ransac.verification.pretests import FullVerification, Gate, Verifier
+
+FloatArray = NDArray[np.float64]
+
+Refine = Callable[[FloatArray, FloatArray, float], FloatArray]
+"""(points, F, threshold) -> a better F."""
+Recover = Callable[[FloatArray, FloatArray, float, Measure, Gate, RandomState], FloatArray | None]
+"""(points, F, threshold, measure, gate, random generator) -> another F that the samples may have missed, or None."""
+Validity = Callable[[FloatArray, FloatArray, float], FloatArray]
+"""(points, f, threshold) -> p(v_i), (N,) >= 0, at least one of them > 0."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recipe:
+    """What sets one estimator apart from the next: sampler, solver, score, verifier, stopping rule, final fit."""
+
+    score: Score
+    """The penalty that the best model has least of (see `scoring` and `mixture`)."""
+    finish: Refine
+    """The final fit, from the best model of the loop."""
+    sample_size: int = SAMPLE_SIZE
+    """7: all models through seven matches; 8: the linear one through eight."""
+    validity: Validity | None = None
+    """Priors from a new best model; None samples uniformly throughout."""
+    guided_share: float = 1.0
+    """Share of the samples that are drawn by the priors."""
+    rest_share: float = 0.0
+    """Share of the samples that are drawn from what the best model leaves unexplained, once there are priors."""
+    batch: int = 1
+    """Samples between two looks at whether one of them was better."""
+    guided_after: float = 0.0
+    """Share of the trials before the first priors."""
+    verifier: Callable[[int, int], Verifier] = FullVerification
+    """(number of matches, sample size) -> the test of hypotheses before they are scored in full."""
+    assumed_share: float | None = None
+    """Inliers that the number of trials is made for (3.19); None: those of the best model."""
+    least_trials: int = 0
+    """Samples that are drawn even if fewer would do by 3.19, and before `patience` is asked."""
+    stop_on_convergence: bool = False
+    """End when the priors have converged (thesis 4.18)."""
+    patience: Callable[[FloatArray, FloatArray, float], float] | None = None
+    """(points, F, threshold) -> samples without a better model that end the search (see `evidence`)."""
+    improve: Refine | None = None
+    """Local optimisation of every new best model of a sample."""
+    fine_score: Score | None = None
+    """The penalty by which improved models compete, apart from those of samples; None: all compete by `score`."""
+    recover: Recover | None = None
+    """A last attempt from the best model, by means other than samples of matches."""
+    oriented: bool = False
+    """Drop models that put a sampled point behind a camera before they are scored."""

@@ -1,0 +1,99 @@
+"""The estimators of thesis chapter 4, each as the parts it is made of.
+
+All of them are the same loop with another sampler, solver, score, verifier or stopping rule; where a part is not
+named it is the plain one (see `loop.Recipe`). The threshold T is `max_error_px`; the thesis takes 1.96 px for a noise
+of 1 px.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache, partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.ransac.estimate import estimate
+from sfm_app.ransac.estimator_config import Recipe
+from sfm_app.ransac.refine.final_refit import refit_sampson
+from sfm_app.ransac.scoring.leverage import MAD_TO_SIGMA, prior_validity
+from sfm_app.ransac.scoring.mlesac import mlesac
+from sfm_app.ransac.scoring.res_ransac import residual_validity
+from sfm_app.ransac.scoring.robust_costs import lmeds, msac, msac_linear, ransac, squared_distances
+from sfm_app.ransac.verification.pretests import RandomisedTdd
+from sfm_app.ransac.verification.sprt import Sprt
+from sfm_app.settings import EpipolarSettings
+from sfm_app.types import EpipolarFit, Rejected
+
+FloatArray = NDArray[np.float64]
+
+_LMEDS_SIGMAS = 2.5
+
+
+def refit_to_median(points: FloatArray, F: FloatArray, _threshold: float) -> FloatArray:
+    """The same on the matches within 2.5 robust standard deviations: LMedS knows the scale by itself."""
+    squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
+    return refit_sampson(points, F, _LMEDS_SIGMAS * median_sigma(squared))
+
+
+def median_sigma(squared: FloatArray) -> float:
+    """Standard deviation of the inliers from the median of the squared distances (Rousseeuw and Leroy 1987).
+
+    The factor 1 + 5 / (n - p) makes up for the p = 7 matches that a minimal model meets exactly.
+    """
+    return MAD_TO_SIGMA * (1 + 5 / max(len(squared) - 7, 1)) * math.sqrt(float(np.median(squared)))
+
+
+RANSAC = Recipe(score=ransac, finish=refit_sampson)
+LEV_RANSAC = replace(
+    RANSAC,
+    score=msac_linear,
+    validity=partial(prior_validity, sigma_from_inliers=False),
+    stop_on_convergence=True,
+)
+
+RECIPES: Mapping[str, tuple[Recipe, str]] = {
+    "lev-ransac-thesis": (LEV_RANSAC, "Algorithm 1 of the thesis to the letter"),
+    "lev-ransac-sprt": (
+        replace(LEV_RANSAC, verifier=Sprt),
+        "lev-ransac-thesis with Wald's sequential test of hypotheses",
+    ),
+    "lev-ransac-tdd": (
+        replace(LEV_RANSAC, verifier=RandomisedTdd),
+        "lev-ransac-thesis with the T(1,1) test of hypotheses",
+    ),
+    "res-ransac": (
+        replace(RANSAC, score=mlesac, validity=residual_validity, guided_after=0.1),
+        "MLESAC with samples guided by the residuals of the best model",
+    ),
+    "mlesac": (replace(RANSAC, score=mlesac), "likelihood of Gaussian inliers and uniform outliers"),
+    "msac": (replace(RANSAC, score=msac), "uniform samples, truncated squared error"),
+    "ransac": (RANSAC, "uniform samples, number of outliers"),
+    "ransac-sprt": (replace(RANSAC, verifier=Sprt), "ransac with Wald's sequential test of hypotheses"),
+    "ransac-tdd": (replace(RANSAC, verifier=RandomisedTdd), "ransac with the T(1,1) test of hypotheses"),
+    "lmeds": (
+        replace(RANSAC, score=lmeds, assumed_share=0.5, finish=refit_to_median),
+        "least median of squares, for up to half outliers",
+    ),
+}
+"""Name, recipe, and one line about it."""
+
+
+class Classical:
+    """The estimator of that name, as a function. See `estimate`."""
+
+    def __init__(self, name: str) -> None:
+        self.__name__ = name
+
+    def __call__(self, x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
+        return estimate(x1, x2, options, seed, RECIPES[self.__name__][0])
+
+    def __reduce__(self) -> tuple[Callable[[str], "Classical"], tuple[str]]:
+        """Pickle by name, as functions do: workers get the one that they have themselves."""
+        return classical, (self.__name__,)
+
+
+@cache
+def classical(name: str) -> Classical:
+    """The one estimator of that name in `RECIPES`."""
+    return Classical(name)

@@ -1,0 +1,93 @@
+"""The inner loop: draw, solve and score until something better than the best turns up."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.ransac.sampling.minimal_samples import RandomState, draw_uniform, draw_weighted, uniform
+from sfm_app.ransac.scoring.robust_costs import Measure, penalty
+from sfm_app.ransac.solvers.minimal import MOST_MODELS, is_oriented, models_through
+from sfm_app.ransac.verification.pretests import Gate
+
+FloatArray = NDArray[np.float64]
+
+
+class Draws(NamedTuple):
+    """How hypotheses are made."""
+
+    sample_size: int
+    """7 or 8, see `minimal`."""
+    oriented: bool
+    """Whether models that put a sampled point behind a camera are dropped."""
+    batch: int
+    """Samples between two looks at whether one of them was better."""
+    guided_share: float
+    """Share of the samples that are drawn by the priors."""
+    priors: FloatArray
+    """(N,) running sum of the priors p(v_i)."""
+    rest_share: float
+    """Share of those that are drawn from the rest: what the best model leaves unexplained. The others are uniform."""
+    rest: FloatArray
+    """(N,) running count of the matches in the rest."""
+
+
+@kernel
+def next_better(
+    points: FloatArray,
+    draws: Draws,
+    measure: Measure,
+    gates: tuple[Gate, Gate],
+    to_beat: FloatArray,
+    limit: int,
+    state: RandomState,
+    best: FloatArray,
+) -> int:
+    """Draw samples until one of its models has a smaller penalty than the best of its kind.
+
+    Samples that owe nothing to the priors are a kind of their own. A second motion, or what a wrong model took for
+    outliers, would never be found in competition with samples that the priors have made nearly perfect.
+
+    Args:
+        points: (N, 4) matches in random order, N >= the sample size; twice over, (2 N, 4), for a gate with a random
+            start, so that any N rows on end are all of them.
+        draws: how samples are drawn and models made.
+        measure: the penalty.
+        gates: the tests that a model has to pass, by the kind of its sample: 0, or 1 for those besides the priors.
+        to_beat: (2,) smallest penalty so far of each kind; lowered.
+        limit: most samples.
+        state: random generator.
+        best: (2, 9) set to the better models.
+
+    Returns:
+        Number of samples drawn.
+    """
+    guided, count = draws.guided_share, draws.priors.shape[0]
+    guided_or_rest = guided + draws.rest_share if draws.rest[-1] >= draws.sample_size else guided
+    sample = np.empty(draws.sample_size, dtype=np.int64)
+    models = np.empty((MOST_MODELS, 9))
+    better = False
+    for trial in range(1, limit + 1):
+        lot = uniform(state) if 0.0 < guided < 1.0 else 0.0
+        kind, drawn = 0, False
+        if lot < guided:
+            drawn = draw_weighted(state, draws.priors, sample)
+        elif guided > 0.0:
+            kind = 1
+            drawn = lot < guided_or_rest and draw_weighted(state, draws.rest, sample)
+        if not drawn:
+            draw_uniform(state, count, sample)
+        gate = gates[kind]
+        for k in range(models_through(points, sample, models)):
+            if draws.oriented and not is_oriented(points, sample, models[k]):
+                continue
+            start = int(uniform(state) * count) if gate.random_start else 0
+            found = penalty(points, start, models[k], measure, to_beat[kind], gate)
+            if found < to_beat[kind]:
+                to_beat[kind], better = found, True
+                for j in range(9):
+                    best[kind, j] = models[k, j]
+        if better and trial % draws.batch == 0:
+            return trial
+    return limit

@@ -1,0 +1,59 @@
+"""The last fit: the estimator's own, or after it one that the settings name (thesis 4.3).
+
+The three are least squares on the inliers of the given model: of the algebraic distance, and from there of the Sampson
+or the reprojection distance. With fewer than eight inliers the model stays as it is.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.ransac.refine.gold_standard import refine_reprojection
+from sfm_app.ransac.refine.sampson_refit import fit_eight_point, refine_sampson
+from sfm_app.ransac.scoring.robust_costs import squared_distances
+
+FloatArray = NDArray[np.float64]
+Refit = Callable[[FloatArray, FloatArray, float], FloatArray]
+"""(points, F, threshold) -> the final F."""
+
+
+def refit_eight_point(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+    """8-point algorithm (thesis 4.3.2)."""
+    inliers = _inliers(points, F, threshold)
+    return F if len(inliers) < 8 else fit_eight_point(inliers, np.ones(len(inliers)))
+
+
+def refit_sampson(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+    """Least squares on the Sampson distance (thesis 4.2)."""
+    inliers = _inliers(points, F, threshold)
+    return refine_sampson(inliers, refit_eight_point(points, F, threshold)) if len(inliers) >= 8 else F
+
+
+def refit_reprojection(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+    """Least squares on the reprojection distance (thesis 4.3), from the least squares on its first order."""
+    inliers = _inliers(points, F, threshold)
+    return F if len(inliers) < 8 else refine_reprojection(inliers, refit_sampson(points, F, threshold))
+
+
+REFITS: dict[str, Refit] = {
+    "eight-point": refit_eight_point,
+    "sampson": refit_sampson,
+    "reprojection": refit_reprojection,
+}
+"""What `EpipolarSettings.refit` may name besides "auto"."""
+
+
+def last_fit(name: str, own: Refit) -> Refit:
+    """The estimator's own fit, and unless the name is "auto" the fit of that name to its inliers.
+
+    The own fit comes first in any case: its inliers are better than those of the best sample.
+    """
+    if name == "auto":
+        return own
+    return lambda points, F, threshold: REFITS[name](points, own(points, F, threshold), threshold)
+
+
+def _inliers(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+    chosen = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
+    return np.asfortranarray(points[chosen])

@@ -1,0 +1,360 @@
+"""Non-linear refinement of F on the Sampson distance, over its seven degrees of freedom.
+
+F = U diag(1, s, 0) V' with rotations U and V: three parameters each and s, rank 2 at every step and no spare scale
+(Bartoli and Sturm 2004). U turns to U exp([a]x), V to V exp([b]x).
+
+All fits are reweighted least squares: weigh the matches by their distances, take one Levenberg-Marquardt step that
+lowers sum_i w_i r_i^2, weigh again. For a cost that is a concave function of r^2, as all robust ones are, such a step
+lowers the cost itself as well.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel, summing_kernel
+from sfm_app.ransac.scoring.leverage import mad_sigma
+from sfm_app.ransac.scoring.robust_costs import FIRST, distances_of_block, squared_distances
+from sfm_app.ransac.solvers.design_matrix import LANES, add_products, gather, mirror, weighted_gram
+from sfm_app.ransac.solvers.eigenvalues import symmetric_eigen
+
+FloatArray = NDArray[np.float64]
+
+_FIRST_DAMPING, _SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-12, 1e12
+_ENOUGH = 1e-9
+"""Relative decrease of the cost under which the search ends."""
+_ENOUGH_LIKELIHOOD = 1e-4
+_NEGLIGIBLE = 1e-3
+"""Weight below which a match is left out of a step."""
+_LEAST_SIGMA = 0.02
+"""In thresholds: matches that are nearly perfect must not shut out all others."""
+_MOST_SHARE = 0.999
+
+
+def refine_sampson(
+    points: FloatArray, F: FloatArray, *, scale: float = np.inf, most_steps: int = 20, enough: float = _ENOUGH
+) -> FloatArray:
+    """Move F towards a minimum of sum_i r_i^2 / (1 + r_i^2 / c^2) (Geman and McClure 1987).
+
+    Args:
+        points: (N, 4) matches.
+        F: (3, 3) start.
+        scale: c, in the units of `points`; inf for least squares.
+        most_steps: most Levenberg-Marquardt steps.
+        enough: relative decrease of the cost under which to stop.
+
+    Returns:
+        (3, 3), rank 2, its largest singular value 1.
+    """
+    law = np.array([scale**-2, 0.0, 0.0, 0.0])
+    return _reweighted(points, *factors(F), law, most_steps, enough, np.empty((10, 10)))
+
+
+def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach: float, most_steps: int) -> FloatArray:
+    """Maximum likelihood of F, the inliers' sigma and their share, by expectation maximisation (thesis 3.5 and 4.6).
+
+    Among the matches within `reach` thresholds, distances of inliers are those of a Gaussian about 0, all others are
+    spread evenly. The weight of a match is the probability that it is an inlier. sigma is at most one threshold.
+
+    Args:
+        points: (N, 4) matches.
+        F: (3, 3) start, near enough for its inliers to tell sigma.
+        threshold: largest distance of an inlier.
+        reach: thresholds within which matches count, > 1.
+        most_steps: most steps.
+
+    Returns:
+        (3, 3), rank 2, its largest singular value 1.
+    """
+    U, s, V = factors(F)
+    squared = squared_distances(points, _compose(U, s, V))
+    inside = squared[squared <= threshold * threshold]
+    sigma = mad_sigma(np.sqrt(inside)) if len(inside) else threshold
+    law = np.array([0.0, (reach * threshold) ** 2, threshold**2, min(sigma, threshold) ** 2])
+    return _reweighted(points, U, s, V, law, most_steps, _ENOUGH_LIKELIHOOD, np.empty((10, 10)))
+
+
+def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """8-point algorithm (thesis 4.3.2) on matches that are well scaled already.
+
+    Args:
+        points: (N, 4), of magnitude about 1.
+        weights: (N,) >= 0, how much each squared algebraic error counts; at least eight positive ones.
+
+    Returns:
+        (3, 3), rank 2.
+    """
+    U, s, V = factors(fit_algebraic(points, weights))
+    return _compose(U, s, V).reshape(3, 3)
+
+
+def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """The first half of `fit_eight_point`: (3, 3) of norm 1 with the least algebraic error, of any rank."""
+    _, vectors = np.linalg.eigh(weighted_gram(points, weights))
+    return np.ascontiguousarray(vectors[:, 0]).reshape(3, 3)
+
+
+@kernel
+def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+    """Rotations U and V and the number s of the nearest rank 2 matrix U diag(1, s, 0) V', up to its scale."""
+    gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                gram[i, j] += F[k, i] * F[k, j]
+    symmetric_eigen(gram, values, vectors)
+    U, V = np.empty((3, 3)), np.empty((3, 3))
+    for k in range(2):
+        for i in range(3):
+            V[i, k] = vectors[i, 2 - k]
+        for i in range(3):
+            U[i, k] = F[i, 0] * V[0, k] + F[i, 1] * V[1, k] + F[i, 2] * V[2, k]
+    first = _normalise(U, FIRST)
+    _turn_away(U)  # what rounding left where s is small
+    second = _normalise(U, 1)
+    if not second > 1e-12 * first:  # rank 1: any direction will do
+        least = 0
+        for i in range(1, 3):
+            least = i if abs(U[i, 0]) < abs(U[least, 0]) else least
+        for i in range(3):
+            U[i, 1] = 1.0 if i == least else 0.0
+        _turn_away(U)
+        _normalise(U, 1)
+    for i in range(3):  # the third columns meet the singular value 0: they make rotations of both
+        j, k = (i + 1) % 3, (i + 2) % 3
+        U[i, 2] = U[j, 0] * U[k, 1] - U[k, 0] * U[j, 1]
+        V[i, 2] = V[j, 0] * V[k, 1] - V[k, 0] * V[j, 1]
+    return U, second / first, V
+
+
+@kernel
+def _normalise(U: FloatArray, k: int) -> float:
+    """Column k over its length; the length."""
+    length = np.sqrt(U[0, k] * U[0, k] + U[1, k] * U[1, k] + U[2, k] * U[2, k])
+    for i in range(3):
+        U[i, k] /= length
+    return float(length)
+
+
+@kernel
+def _turn_away(U: FloatArray) -> None:
+    """Make the second column perpendicular to the first, a unit vector."""
+    dot = U[0, 0] * U[0, 1] + U[1, 0] * U[1, 1] + U[2, 0] * U[2, 1]
+    for i in range(3):
+        U[i, 1] -= dot * U[i, 0]
+
+
+@kernel
+def _reweighted(
+    points: FloatArray, U: FloatArray, s: float, V: FloatArray, law: FloatArray, most_steps: int, enough: float,
+    gram: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """The loop of all fits; `law` says how matches are weighed: 1 / c^2, 0, 0, 0 for a robust cost, or else 0, the
+    squares of the reach, of the largest sigma and of the first sigma for a mixture. `gram` (10, 10) is for work: the
+    compiler would spell out all sums of a matrix whose size it knows.
+    """
+    count = points.shape[0]
+    weights, squared, trial = np.empty(count), np.empty(count), np.empty(count)
+    normal, right, step = np.empty((7, 7)), np.empty(7), np.empty(7)
+    f = _compose(U, s, V)
+    distances_of_block(points, f, FIRST, squared)
+    damping, mixture, share = _FIRST_DAMPING, law[1] > 0.0, 0.9
+    variance = law[3]
+    for n in range(most_steps):
+        if mixture:
+            variance, share = _weigh_by_mixture(squared, law, variance, share, 6 if n == 0 else 1, weights)
+        else:
+            _weigh_robustly(squared, law[0], weights)
+        cost = new_cost = _weighted_sum(squared, weights)
+        _normal_equations(points, f, weights, U, s, V, gram, normal, right)
+        improved = False
+        while not improved and damping < _LARGEST_DAMPING:
+            if _solve(normal, right, damping, step):
+                U_new, V_new, s_new = _turned(U, step[0:3]), _turned(V, step[3:6]), s + step[6]
+                new = _compose(U_new, s_new, V_new)
+                distances_of_block(points, new, FIRST, trial)
+                new_cost = _weighted_sum(trial, weights)
+                improved = new_cost < cost
+            damping = max(damping * 0.1, _SMALLEST_DAMPING) if improved else damping * 10.0
+        if not improved:
+            break
+        U, V, s, f = U_new, V_new, s_new, new
+        squared, trial = trial, squared
+        if cost - new_cost <= enough * cost:
+            break
+    return f.reshape(3, 3)
+
+
+@kernel
+def _weigh_robustly(squared: FloatArray, softness: float, weights: FloatArray) -> None:
+    """d/d(r^2) of r^2 / (1 + softness r^2)."""
+    for i in range(squared.shape[0]):
+        root = 1.0 / (1.0 + softness * squared[i])
+        weights[i] = root * root if root * root > _NEGLIGIBLE else 0.0
+
+
+@kernel
+def _weigh_by_mixture(
+    squared: FloatArray, law: FloatArray, variance: float, share: float, rounds: int, weights: FloatArray
+) -> tuple[float, float]:
+    """Probability of each match to be an inlier; the inliers' variance and share that follow from these."""
+    reach, largest = law[1], law[2]
+    for _ in range(rounds):
+        inlier, outlier = share * np.sqrt(2.0 / (np.pi * variance)), (1.0 - share) / np.sqrt(reach)
+        near, total, moment = 0, 0.0, 0.0
+        for i in range(squared.shape[0]):
+            weights[i] = 0.0
+            if squared[i] < reach:
+                near += 1
+                density = inlier * np.exp(-squared[i] / (2.0 * variance))
+                weight = density / (density + outlier)
+                total += weight
+                moment += weight * squared[i]
+                weights[i] = weight if weight > _NEGLIGIBLE else 0.0
+        variance = moment / max(total - 7.0, 1.0)  # seven parameters of F are fitted to the same matches
+        variance = min(max(variance, _LEAST_SIGMA * _LEAST_SIGMA * largest), largest)
+        share = min(max(total / max(near, 1), 1.0 - _MOST_SHARE), _MOST_SHARE)
+    return variance, share
+
+
+@summing_kernel
+def _weighted_sum(squared: FloatArray, weights: FloatArray) -> float:
+    total = 0.0
+    for i in range(squared.shape[0]):
+        total += weights[i] * squared[i] if weights[i] > 0.0 else 0.0
+    return total
+
+
+@kernel
+def _normal_equations(
+    points: FloatArray, f: FloatArray, weights: FloatArray, U: FloatArray, s: float, V: FloatArray,
+    gram: FloatArray, normal: FloatArray, right: FloatArray,
+) -> None:  # fmt: skip
+    """Weighted J'J and -J'r over the seven parameters."""
+    size = gram.shape[0]
+    for j in range(size):
+        for k in range(size):
+            gram[j, k] = 0.0
+    block, rows = np.empty((5, LANES)), np.empty((size, LANES))
+    start = FIRST
+    while start < points.shape[0]:
+        count, start = gather(points, weights, start, block)
+        _derivatives(block, count, f, rows)
+        add_products(rows, count, gram)
+    mirror(gram)
+    basis = np.empty((7, 9))
+    _tangent(U, s, V, basis)
+    _project(gram, basis, normal, right)
+
+
+@kernel
+def _derivatives(block: FloatArray, count: int, f: FloatArray, rows: FloatArray) -> None:
+    """dr / dF (9 rows) and r (the last row) of the matches of a block, times sqrt(weight).
+
+    r = n / g with n = x2' F x1 and g the norm of its gradient: dr = dn / g - r dg / g.
+    """
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
+    for n in range(count):
+        x1, y1, x2, y2 = block[0, n], block[1, n], block[2, n], block[3, n]
+        ax, ay, az = f0 * x1 + f1 * y1 + f2, f3 * x1 + f4 * y1 + f5, f6 * x1 + f7 * y1 + f8
+        bx, by = f0 * x2 + f3 * y2 + f6, f1 * x2 + f4 * y2 + f7
+        inverse = 1.0 / np.sqrt(ax * ax + ay * ay + bx * bx + by * by)
+        residual = (x2 * ax + y2 * ay + az) * inverse
+        shrink, scale = residual * inverse, inverse * block[4, n]
+        rows[0, n] = (x2 * x1 - shrink * (ax * x1 + bx * x2)) * scale
+        rows[1, n] = (x2 * y1 - shrink * (ax * y1 + by * x2)) * scale
+        rows[2, n] = (x2 - shrink * ax) * scale
+        rows[3, n] = (y2 * x1 - shrink * (ay * x1 + bx * y2)) * scale
+        rows[4, n] = (y2 * y1 - shrink * (ay * y1 + by * y2)) * scale
+        rows[5, n] = (y2 - shrink * ay) * scale
+        rows[6, n] = (x1 - shrink * bx) * scale
+        rows[7, n] = (y1 - shrink * by) * scale
+        rows[8, n] = scale
+        rows[9, n] = residual * block[4, n]
+
+
+@kernel
+def _compose(U: FloatArray, s: float, V: FloatArray) -> FloatArray:
+    f = np.empty(9)
+    for i in range(3):
+        for j in range(3):
+            f[3 * i + j] = U[i, 0] * V[j, 0] + s * U[i, 1] * V[j, 1]
+    return f
+
+
+@kernel
+def _tangent(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
+    """dF over the seven parameters, one row each: U [e_k]x S V', -U S [e_k]x V', u2 v2'."""
+    for i in range(3):
+        for j in range(3):
+            k = 3 * i + j
+            basis[0, k] = U[i, 2] * s * V[j, 1]
+            basis[1, k] = -U[i, 2] * V[j, 0]
+            basis[2, k] = U[i, 1] * V[j, 0] - U[i, 0] * s * V[j, 1]
+            basis[3, k] = s * U[i, 1] * V[j, 2]
+            basis[4, k] = -U[i, 0] * V[j, 2]
+            basis[5, k] = U[i, 0] * V[j, 1] - s * U[i, 1] * V[j, 0]
+            basis[6, k] = U[i, 1] * V[j, 1]
+
+
+@kernel
+def _project(gram: FloatArray, basis: FloatArray, normal: FloatArray, right: FloatArray) -> None:
+    """Normal equations over the seven parameters from those over the nine entries, whose gradient is the last row."""
+    part = np.empty(9)
+    for p in range(7):
+        right[p] = 0.0
+        for j in range(9):
+            right[p] -= basis[p, j] * gram[9, j]
+            part[j] = 0.0
+            for k in range(9):
+                part[j] += gram[j, k] * basis[p, k]
+        for q in range(7):
+            normal[p, q] = 0.0
+            for j in range(9):
+                normal[p, q] += part[j] * basis[q, j]
+
+
+@kernel
+def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArray) -> bool:
+    """Cholesky solution of (normal + damping diag(normal)) step = right; False if that is not positive definite."""
+    lower = normal.copy()
+    largest = 0.0
+    for j in range(7):
+        largest = max(largest, normal[j, j])
+    for j in range(7):
+        lower[j, j] += damping * max(normal[j, j], 1e-9 * largest)
+    for j in range(7):
+        for k in range(j):
+            for n in range(k):
+                lower[j, k] -= lower[j, n] * lower[k, n]
+            lower[j, k] /= lower[k, k]
+            lower[j, j] -= lower[j, k] * lower[j, k]
+        if not lower[j, j] > 0.0:
+            return False
+        lower[j, j] = np.sqrt(lower[j, j])
+    for j in range(7):
+        step[j] = right[j]
+        for k in range(j):
+            step[j] -= lower[j, k] * step[k]
+        step[j] /= lower[j, j]
+    for j in range(6, -1, -1):
+        for k in range(j + 1, 7):
+            step[j] -= lower[k, j] * step[k]
+        step[j] /= lower[j, j]
+    return True
+
+
+@kernel
+def _turned(R: FloatArray, w: FloatArray) -> FloatArray:
+    """R exp([w]x), by Rodrigues."""
+    angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    a = np.sin(angle) / angle if angle > 1e-8 else 1.0
+    b = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-8 else 0.5
+    turned = np.empty((3, 3))
+    for i in range(3):
+        # row r of R times exp([w]x) = r - a (w x r) + b w x (w x r), because r [w]x = -(w x r)
+        x, y, z = R[i, 0], R[i, 1], R[i, 2]
+        cx, cy, cz = w[1] * z - w[2] * y, w[2] * x - w[0] * z, w[0] * y - w[1] * x
+        turned[i, 0] = x - a * cx + b * (w[1] * cz - w[2] * cy)
+        turned[i, 1] = y - a * cy + b * (w[2] * cx - w[0] * cz)
+        turned[i, 2] = z - a * cz + b * (w[0] * cy - w[1] * cx)
+    return turned

@@ -1,0 +1,53 @@
+"""How well the matches off the dominant plane bear a model out, and how long to wait for a better one."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.ransac.degeneracy.dominant_plane import OFF_PLANE, dominant_homography, transfer_distance
+from sfm_app.ransac.scoring.robust_costs import squared_distances
+from sfm_app.ransac.verification.a_contrario import (
+    MOST_FALSE_ALARMS,
+    accidental_share,
+    false_alarms_of,
+    squared_mismatches,
+)
+
+FloatArray = NDArray[np.float64]
+
+_SURE = 1400.0
+"""z of a model that no further sample could shake."""
+_MOST = 3000.0
+_LEAST_IN_DOUBT = 250.0
+"""A quarter of them are samples of the rest; a motion that holds two thirds of it is in one of 17 of these."""
+_LEAST_INLIERS = 8
+
+
+def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> float:
+    """Samples without a better model after which to believe this one.
+
+    Wrong models live on one plane, or on repeated structure, and have little else for them. The inliers off the
+    dominant plane are counted in standard deviations z over what accident gives: right models of real photos have z of
+    40 to 300, wrong ones mostly less than 40. The patience is 3000 samples up to z = 26 and falls as 1 / z^2. Where
+    most matches are not explained, another motion may hold them, and has to be given a chance to be sampled.
+
+    Args:
+        points: (N, 4) distinct matches in random order, N >= 7.
+        F: (3, 3).
+        threshold: largest distance of an inlier.
+
+    Returns:
+        The number; inf where even the support as a whole may be luck.
+    """
+    squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
+    inliers, wrong = squared <= threshold * threshold, squared_mismatches(points, np.ascontiguousarray(F).reshape(9))
+    if np.count_nonzero(inliers) < _LEAST_INLIERS or false_alarms_of(squared, wrong, threshold) > MOST_FALSE_ALARMS:
+        return math.inf
+    H = dominant_homography(np.asfortranarray(points[inliers]), F, threshold)
+    off_plane = transfer_distance(H, points) > OFF_PLANE * threshold
+    count, agreeing = np.count_nonzero(off_plane), np.count_nonzero(off_plane & inliers)
+    chance = accidental_share(wrong, threshold)
+    z = (agreeing - count * chance) / math.sqrt(count * chance * (1 - chance) + 1)
+    least = _LEAST_IN_DOUBT if 2 * np.count_nonzero(inliers) < len(points) else 0.0
+    return max(min((_SURE / max(z, 1.0)) ** 2, _MOST), least)

@@ -1,0 +1,153 @@
+"""Regression diagnostics of the fundamental matrix (thesis 3.3.4 and 4.7.2): leverages, Cook's distances, priors.
+
+F is the unit vector f with A f = 0, where row i of the design matrix A is x2 (x) x1. Near a given f the unit vector
+moves in the eight directions perpendicular to it, so that this is a regression with p = 8 parameters, and the hat
+matrix is that of A restricted to them. With all nine directions the ninth would divide by what is zero but for the
+noise.
+
+Leverage and Cook's distance do not change when each view is shifted and scaled, because this maps the rows of A
+linearly (and A f is small): one well-scaled frame (`points.Matches`) gives what Hartley's normalisation gives.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.ransac.scoring.robust_costs import select, squared_distances
+from sfm_app.ransac.solvers.design_matrix import quadratic_forms, weighted_gram
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+PARAMETERS = 8
+_LEAST_VARIANCE = 1e-24
+"""Of residuals in units of the points' spread: perfect matches are left with the rounding of their coordinates."""
+_LEAST_FREEDOM = 2.0**-52
+"""Of 1 - h."""
+_LEAST_SUPPORT = 1e-14
+"""Of a direction, over that of the best supported one."""
+_FAR = 700.0
+"""Exponent from which the exponential is 0 for all purposes."""
+MAD_TO_SIGMA = 1.4826
+"""Median absolute deviation to standard deviation, for a Gaussian."""
+
+
+def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArray:
+    """Leverage h_ii of every match in a regression on the fitted ones plus itself (thesis 3.11).
+
+    For a fitted match that is the diagonal of the hat matrix. For any other the textbook formula would exceed 1; what
+    counts is how much it would pull if it were fitted as well, which is g / (1 + g) with g = a_i' (A_in' A_in)^-1 a_i.
+
+    Args:
+        points: (N, 4) matches, of magnitude about 1.
+        f: (9,) the model, of norm 1.
+        fitted: (N,) the matches that the model rests on.
+
+    Returns:
+        (N,) in [0, 1].
+    """
+    tangent = _perpendicular(f)
+    within = tangent.T @ weighted_gram(points, fitted.astype(np.float64)) @ tangent
+    values, vectors = np.linalg.eigh(within)
+    # a direction without support: whatever lies in it has leverage 1
+    floor = max(values[-1], 2.0**-1000) * _LEAST_SUPPORT
+    forms = quadratic_forms(points, tangent @ (vectors / np.sqrt(np.maximum(values, floor))))
+    return _of_forms(forms, fitted)
+
+
+@kernel
+def _of_forms(forms: FloatArray, fitted: BoolArray) -> FloatArray:
+    """h for those fitted, g / (1 + g) for the others; without support g may be inf."""
+    leverage = np.empty(forms.shape[0])
+    for i in range(forms.shape[0]):
+        leverage[i] = min(forms[i], 1.0) if fitted[i] else 1.0 / (1.0 + 1.0 / forms[i])
+    return leverage
+
+
+@kernel
+def _perpendicular(f: FloatArray) -> FloatArray:
+    """(9, 8) orthonormal directions perpendicular to a unit vector: a reflection takes it and them to the axes."""
+    last = f[8] + 1.0 if f[8] >= 0.0 else f[8] - 1.0
+    basis = np.zeros((9, PARAMETERS))
+    for k in range(PARAMETERS):
+        basis[k, k] = 1.0
+        for j in range(9):
+            basis[j, k] -= (f[j] if j < 8 else last) * f[k] / abs(last)
+    return basis
+
+
+@kernel
+def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: BoolArray) -> FloatArray:
+    """Residuals over their standard deviation (thesis 3.14 and 3.15, the variance taken from the fitted matches).
+
+    Args:
+        residuals: (N,) distances to the model.
+        leverage: (N,) from `leverages`.
+        fitted: (N,) the matches that the model rests on.
+    """
+    count, total, moment = 0, 0.0, 0.0
+    for i in range(residuals.shape[0]):
+        if fitted[i]:
+            count += 1
+            total += residuals[i]
+    mean = total / max(count, 1)
+    for i in range(residuals.shape[0]):
+        if fitted[i]:
+            moment += (residuals[i] - mean) ** 2
+    variance = max(moment / max(count - PARAMETERS, 1), _LEAST_VARIANCE)
+    studentised = np.empty(residuals.shape[0])
+    for i in range(residuals.shape[0]):
+        studentised[i] = residuals[i] / np.sqrt(variance * max(1.0 - leverage[i], _LEAST_FREEDOM))
+    return studentised
+
+
+@kernel
+def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
+    """How far the fit would move without each match (thesis 3.16 and 4.17; the square of d_i is missing in print)."""
+    distances = np.empty(studentised.shape[0])
+    for i in range(studentised.shape[0]):
+        odds = leverage[i] / max(1.0 - leverage[i], _LEAST_FREEDOM)
+        distances[i] = studentised[i] * studentised[i] / PARAMETERS * odds
+    return distances
+
+
+@kernel
+def priors(distances: FloatArray, sigma: float) -> FloatArray:
+    """p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels)."""
+    least, probable = np.inf, np.empty(distances.shape[0])
+    for i in range(distances.shape[0]):
+        least = min(least, distances[i])
+    for i in range(distances.shape[0]):
+        if sigma > 0.0:
+            # less the smallest exponent, which makes the largest value 1
+            exponent = (distances[i] - least) / sigma * ((distances[i] + least) / sigma) / 2.0
+            probable[i] = np.exp(-exponent) if exponent < _FAR else 0.0
+        else:
+            probable[i] = 1.0 if distances[i] <= least else 0.0
+    return probable
+
+
+@kernel
+def mad_sigma(distances: FloatArray) -> float:
+    """Standard deviation about zero from the median absolute deviation (thesis 4.7.3)."""
+    count = distances.shape[0]
+    deviations = np.empty(count)
+    for i in range(count):
+        deviations[i] = abs(distances[i])
+    return MAD_TO_SIGMA * select(deviations, count // 2) if count > 0 else 0.0
+
+
+def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma_from_inliers: bool) -> FloatArray:
+    """p(v_i) of every match from its influence on the model f (thesis 4.7.2 and 4.7.3).
+
+    Args:
+        points: (N, 4) matches.
+        f: (9,) the best model so far, of norm 1.
+        threshold: largest distance of an inlier; the inliers are the fitted matches.
+        sigma_from_inliers: take sigma from the inliers' Cook's distances; otherwise from all, as in the thesis.
+    """
+    squared = squared_distances(points, f)
+    fitted = squared <= threshold * threshold
+    leverage = leverages(points, f, fitted)
+    distances = cook_distances(studentised_residuals(np.sqrt(squared), leverage, fitted), leverage)
+    return priors(distances, mad_sigma(distances[fitted] if sigma_from_inliers else distances))

@@ -1,0 +1,217 @@
+"""How well F explains all matches: penalties on the Sampson distance, with early exits (thesis 4.4.1).
+
+A penalty is to be made small. A score is a function (points, threshold, best model or None) -> `Measure`, asked
+again at every new best model; only that of MLESAC changes during the search.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.ransac.verification.pretests import BLOCK, Gate
+
+FloatArray = NDArray[np.float64]
+
+FIRST = cast("int", np.int64(0))
+"""Where blocks begin. A plain 0 is a type of its own to numba, and kernels are compiled for it once more."""
+
+RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS, GEMAN_MCCLURE = range(6)
+
+
+_FEW = 16
+"""Matches whose distances are taken at once where the gate looks often."""
+
+
+class Measure(NamedTuple):
+    """A penalty as the inner loop counts it."""
+
+    kind: int
+    limit: float
+    """Largest squared distance of an inlier."""
+    reach: float
+    """Squared distance beyond which every match costs `worst`."""
+    worst: float
+    precision: float = 0.0
+    """MLESAC: 1 / (2 sigma^2). Geman-McClure: 1 / c^2."""
+    odds: float = 0.0
+    """MLESAC: density of the outliers over that of the inliers at distance 0."""
+
+
+Score = Callable[[FloatArray, float, FloatArray | None], Measure]
+
+
+def ransac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Measure:
+    """1 for every match beyond the threshold, else 0 (thesis 3.20, 4.4)."""
+    return Measure(RANSAC, threshold * threshold, threshold * threshold, 1.0)
+
+
+def msac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Measure:
+    """The squared distance, at most the squared threshold (Torr and Zisserman 2000)."""
+    return Measure(MSAC, threshold * threshold, threshold * threshold, threshold * threshold)
+
+
+def msac_linear(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Measure:
+    """The distance, at most the threshold (thesis 4.5 as printed)."""
+    return Measure(MSAC_LINEAR, threshold * threshold, threshold * threshold, threshold)
+
+
+def lmeds(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Measure:
+    """The median of the squared distances (Rousseeuw 1984; thesis 4.4.1); the threshold only counts inliers."""
+    return Measure(LMEDS, threshold * threshold, np.inf, np.inf)
+
+
+def geman_mcclure(_points: FloatArray, threshold: float, _best: FloatArray | None, *, scale: float) -> Measure:
+    """r^2 / (r^2 + c^2), c being `scale` thresholds: no edge, and close matches count most (Geman and McClure 1987)."""
+    return Measure(GEMAN_MCCLURE, threshold * threshold, np.inf, 1.0, (scale * threshold) ** -2)
+
+
+@kernel
+def squared_sampson(f: FloatArray, x1: float, y1: float, x2: float, y2: float) -> float:
+    """Squared Sampson distance (thesis 4.2) of one match to f, the nine entries of F by rows."""
+    ax, ay, az = f[0] * x1 + f[1] * y1 + f[2], f[3] * x1 + f[4] * y1 + f[5], f[6] * x1 + f[7] * y1 + f[8]
+    bx, by = f[0] * x2 + f[3] * y2 + f[6], f[1] * x2 + f[4] * y2 + f[7]
+    algebraic = x2 * ax + y2 * ay + az
+    gradient = ax * ax + ay * ay + bx * bx + by * by
+    return algebraic * algebraic / gradient if gradient > 0.0 else np.inf
+
+
+@kernel
+def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
+    """(N,) squared Sampson distances of all matches (N, 4)."""
+    squared = np.empty(points.shape[0])
+    distances_of_block(points, f, FIRST, squared)
+    return squared
+
+
+@kernel
+def distances_of_block(points: FloatArray, f: FloatArray, start: int, squared: FloatArray) -> None:
+    """The squared Sampson distances of as many matches as `squared` has room for, from row `start` on."""
+    f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
+    for i in range(squared.shape[0]):  # spelt out: several matches at once in the lanes of the processor
+        x1, y1, x2, y2 = points[start + i, 0], points[start + i, 1], points[start + i, 2], points[start + i, 3]
+        ax, ay, az = f0 * x1 + f1 * y1 + f2, f3 * x1 + f4 * y1 + f5, f6 * x1 + f7 * y1 + f8
+        bx, by = f0 * x2 + f3 * y2 + f6, f1 * x2 + f4 * y2 + f7
+        algebraic = x2 * ax + y2 * ay + az
+        gradient = ax * ax + ay * ay + bx * bx + by * by
+        squared[i] = algebraic * algebraic / gradient if gradient > 0.0 else np.inf
+
+
+@kernel
+def _cost(measure: Measure, squared: float) -> float:
+    """Penalty of one match."""
+    if measure.kind == GEMAN_MCCLURE:
+        return 1.0 - 1.0 / (1.0 + measure.precision * squared)
+    if not squared <= measure.reach:
+        return measure.worst
+    if measure.kind == MSAC:
+        return squared
+    if measure.kind == RANSAC:
+        return 0.0
+    if measure.kind == MSAC_LINEAR:
+        return float(np.sqrt(squared))
+    return float(np.log((1.0 + measure.odds) / (np.exp(-measure.precision * squared) + measure.odds)))
+
+
+@kernel
+def penalty(points: FloatArray, start: int, f: FloatArray, measure: Measure, to_beat: float, gate: Gate) -> float:
+    """Penalty of all matches, or inf as soon as f cannot stay below `to_beat` or is turned away at the gate.
+
+    Args:
+        points: (N, 4), in random order; (2 N, 4), the matches twice over, for a gate with a random start.
+        start: the match to begin with.
+        f: (9,) entries of F.
+        measure: which penalty. The gate is open for the median: it is counted another way.
+        to_beat: best penalty so far; inf for a full count.
+        gate: how many inliers f must show on the way.
+    """
+    if measure.kind == LMEDS:
+        return _median_of_squares(points, f, to_beat)
+    total, inliers, done = 0.0, 0, 0
+    count = points.shape[0] // 2 if gate.random_start else points.shape[0]
+    squared = np.empty(BLOCK)
+    while done < count:
+        often = gate.stride < BLOCK and done < gate.stride * gate.least_inliers.shape[0]
+        size = min(_FEW if often else BLOCK, count - done)
+        distances_of_block(points, f, start + done, squared[:size])
+        if often:  # the gate looks after every few matches, and most models end at the first looks
+            for i in range(size):
+                inliers += squared[i] <= measure.limit
+                total += _cost(measure, squared[i])
+                if not _passes(gate, done + i + 1, inliers):
+                    return np.inf
+        else:
+            more, cost = _add_up(squared[:size], measure)
+            inliers += more
+            total += cost
+            if not _passes(gate, done + size, inliers):
+                return np.inf
+        if total >= to_beat:
+            return np.inf
+        done += size
+    return total
+
+
+@kernel
+def _passes(gate: Gate, done: int, inliers: int) -> bool:
+    """Whether the gate lets a model go on that has so many inliers among the first matches; it keeps the books."""
+    looks = done // gate.stride
+    if done % gate.stride != 0 or looks > gate.least_inliers.shape[0] or inliers >= gate.least_inliers[looks - 1]:
+        return True
+    gate.rejected[0] += done
+    gate.rejected[1] += inliers
+    return False
+
+
+@kernel
+def _add_up(squared: FloatArray, measure: Measure) -> tuple[int, float]:
+    """Inliers among the given matches, and the sum of their penalties."""
+    total, inliers = 0.0, 0
+    for i in range(squared.shape[0]):
+        inliers += squared[i] <= measure.limit
+    if measure.kind == GEMAN_MCCLURE:  # without a branch inside: several at once
+        for i in range(squared.shape[0]):
+            total += 1.0 - 1.0 / (1.0 + measure.precision * squared[i])
+    else:
+        for i in range(squared.shape[0]):
+            total += _cost(measure, squared[i])
+    return inliers, total
+
+
+@kernel
+def _median_of_squares(points: FloatArray, f: FloatArray, to_beat: float) -> float:
+    """The (N // 2 + 1)th smallest squared distance, or inf once too many matches lie too far for it to be smaller."""
+    count = points.shape[0]
+    squared = np.empty(count)
+    may_miss = count - count // 2 - 1
+    for i in range(count):
+        squared[i] = squared_sampson(f, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
+        may_miss -= squared[i] >= to_beat
+        if may_miss < 0:
+            return np.inf
+    return select(squared, count // 2)
+
+
+@kernel
+def select(values: FloatArray, rank: int) -> float:
+    """The value that sorting would put at `rank`, by Hoare's quickselect; reorders `values`."""
+    low, high = 0, values.shape[0] - 1
+    while low < high:
+        pivot, i, j = values[(low + high) // 2], low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while pivot < values[j]:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        if rank <= j:
+            high = j
+        elif rank >= i:
+            low = i
+        else:
+            return float(values[rank])
+    return float(values[rank])

@@ -1,0 +1,118 @@
+"""Whether a model's support could be luck (a-contrario reasoning: Moisan and Stival 2004)."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.jit import kernel
+from sfm_app.ransac.sampling.minimal_samples import SAMPLE_SIZE
+from sfm_app.ransac.scoring.robust_costs import squared_distances, squared_sampson
+from sfm_app.ransac.solvers.minimal import MOST_MODELS
+
+FloatArray = NDArray[np.float64]
+
+MOST_FALSE_ALARMS = 1e-2
+"""Support counts as real when less than this many models with as much of it are expected in random matches."""
+
+_FRACTIONS = (1.0, 0.5, 0.25)
+"""Support is judged at these fractions of the threshold: precise inliers are stronger evidence."""
+_MISMATCHES = 8000
+_MOST = 1e300
+
+
+def false_alarms_of(squared: FloatArray, wrong: FloatArray, threshold: float) -> float:
+    """How many models with as much support are expected among random matches of the same points.
+
+    Args:
+        squared: (N,) squared distances of the matches to the model.
+        wrong: (M,) those of mismatches, from `squared_mismatches`.
+        threshold: largest distance of an inlier.
+    """
+    tried = []
+    for fraction in _FRACTIONS:
+        inliers = int(np.count_nonzero(squared <= (fraction * threshold) ** 2))
+        chance = accidental_share(wrong, fraction * threshold)
+        tried.append(false_alarms(len(squared), inliers, SAMPLE_SIZE, chance))
+    return min(_MOST, len(_FRACTIONS) * MOST_MODELS * min(tried))
+
+
+def is_credible(points: FloatArray, f: FloatArray, threshold: float) -> bool:
+    """Whether the support of f is more than luck.
+
+    Args:
+        points: (N, 4) distinct matches in random order, N >= 2.
+        f: (9,) model.
+        threshold: largest distance of an inlier.
+    """
+    wrong = squared_mismatches(points, f)
+    return false_alarms_of(squared_distances(points, f), wrong, threshold) <= MOST_FALSE_ALARMS
+
+
+def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> float:
+    """Expected number of minimal samples whose model has so many inliers, if every match is wrong.
+
+    Each of the C(count, s) samples agrees with itself, and with each of the other matches by accident, so that the
+    expectation is C(count, s) P(Binomial(count - s, chance) >= inliers - s).
+
+    Args:
+        count: all matches.
+        inliers: those that agree with the model.
+        sample_size: s, the matches that determine a model.
+        chance: probability that a wrong match agrees with a model, in (0, 1).
+
+    Returns:
+        An upper bound of the number, at most 1e300.
+    """
+    if inliers <= sample_size:
+        return _MOST
+    logarithm = _log_choose(count, sample_size) + log_binomial_tail(count - sample_size, inliers - sample_size, chance)
+    return min(_MOST, math.exp(min(logarithm, 700.0)))
+
+
+def squared_mismatches(points: FloatArray, f: FloatArray) -> FloatArray:
+    """(M,) squared Sampson distances of deliberate mismatches: points of view 1 with the partners of some others.
+
+    Args:
+        points: (N, 4) distinct matches in random order, N >= 2.
+        f: (9,) model.
+    """
+    return _shifted(points, f, min(len(points) - 1, max(1, _MISMATCHES // len(points))))
+
+
+@kernel
+def _shifted(points: FloatArray, f: FloatArray, shifts: int) -> FloatArray:
+    count = points.shape[0]
+    wrong = np.empty(shifts * count)
+    for shift in range(shifts):
+        for i in range(count):
+            partner = (i + shift + 1) % count
+            wrong[shift * count + i] = squared_sampson(
+                f, points[i, 0], points[i, 1], points[partner, 2], points[partner, 3]
+            )
+    return wrong
+
+
+def accidental_share(wrong: FloatArray, threshold: float) -> float:
+    """Probability that a wrong match agrees with a model, in (0, 1), from the squared distances of mismatches.
+
+    Measured, not modelled: it knows the extent of the photos, where their points cluster, and where the epipoles are.
+    """
+    return (int(np.count_nonzero(wrong <= threshold * threshold)) + 1.0) / (len(wrong) + 2.0)
+
+
+def log_binomial_tail(count: int, least: int, chance: float) -> float:
+    """Upper bound of log P(Binomial(count, chance) >= least), for a chance in (0, 1) (Chernoff 1952)."""
+    share = least / count
+    if share <= chance:
+        return 0.0
+    if share > 1:
+        return -math.inf
+    divergence = share * math.log(share / chance)
+    if share < 1:
+        divergence += (1 - share) * math.log((1 - share) / (1 - chance))
+    return -count * divergence
+
+
+def _log_choose(n: int, k: int) -> float:
+    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1)

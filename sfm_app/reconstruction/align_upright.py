@@ -1,0 +1,207 @@
+"""How the finished scene is put before the viewer: upright, centred, and in metres where GPS says how large it is."""
+
+import logging
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.colmap.backend import backend
+from sfm_app.colmap.model import focal_px, move, photos_of, posed_photos, seen_points, somewhere, viewing_rays
+from sfm_app.context import RunContext
+from sfm_app.errors import NumericalError
+from sfm_app.geometry.similarity import Similarity
+from sfm_app.numerical import FAILURES, reason_of
+from sfm_app.orientation.georeference import Georeference, NoGeoreference, georeference, position_at
+from sfm_app.orientation.gravity import LINES, Upright, facing, up_direction, viewer_frame
+from sfm_app.orientation.line_segments import line_segments
+from sfm_app.orientation.up_cues import small_picture
+from sfm_app.orientation.up_direction import Scenery, odds
+from sfm_app.orientation.vanishing_points import Segments, joined, segment_planes
+from sfm_app.types import GpsPosition, MatchGraph
+
+logger = logging.getLogger("sfm_app")
+
+FloatArray = NDArray[np.float64]
+
+LOOKED_AT = 10
+"""Photos that are looked at, spread over the set."""
+
+SCENERY_POINTS = 8000
+"""Points that say which way up they are; more say no more."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Look:
+    """What one photo tells about how it was held."""
+
+    lines: FloatArray
+    """(N, 4) line segments in its pixels."""
+    picture: NDArray[np.uint8] | None
+    """The photo itself, grey and small; None where it could not be read."""
+
+
+Looks = Mapping[int, "Future[Look]"]
+"""By photo, when it has been looked at."""
+
+
+def look_at_photos(models: Sequence[Any], matches: MatchGraph, run: RunContext) -> Looks:
+    """Begin to look at some photos of every model; the caller goes on meanwhile."""
+    looks = {}
+    for model in models:
+        posed = photos_of(model)
+        for k in np.unique(np.linspace(0, len(posed) - 1, LOOKED_AT).astype(int)):
+            image = matches.images[posed[k]]
+            looks[posed[k]] = run.executor.submit(look_at, run.workspace.photos / image.name, image.turn_deg)
+    return looks
+
+
+def orient_or_leave(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int | None = None) -> dict[str, Any]:
+    """As `orient`; where the numbers fail, the model stays as it is, and the entry says why."""
+    try:
+        return orient(model, matches, looks, turn_deg)
+    except FAILURES as err:
+        logger.info("the model could not be turned upright", exc_info=err)
+        return {"failed": reason_of(err), "unit": "that of mapping", "gps": "not used: it is not known which way is up"}
+
+
+def orient(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int | None = None) -> dict[str, Any]:
+    """Move the model into the frame of glTF viewers: y up, seen from +z, centred, of size about 1 or in metres.
+
+    Args:
+        model: COLMAP's model, coloured; changed in place.
+        matches: knows the photos' names and GPS positions.
+        looks: at photos.
+        turn_deg: by how much the photos have to be turned clockwise to stand upright; None where nobody knows.
+
+    Returns:
+        How it was done, for the manifest.
+
+    Raises:
+        NumericalError: it has no points, or none of them lies anywhere.
+    """
+    with backend("reading the model"):
+        poses, points = posed_photos(model)
+    points = points[somewhere(points)]
+    if not len(points):
+        raise NumericalError("it has no points")
+    matrices = np.array(list(poses.values()))
+    centres = -np.einsum("nij,ni->nj", matrices[:, :, :3], matrices[:, :, 3])
+    turns = [matches.images[photo].turn_deg for photo in poses]
+    R = np.array([turned(rotation, turn) for rotation, turn in zip(matrices[:, :, :3], turns, strict=True)])
+    found = {photo: looks[photo].result() for photo in poses if photo in looks}
+    upright = up_direction(R, centres, scenery_of(model, found), lines_of(model, found), turn_deg)
+    positions = [matches.images[key].gps for key in poses]
+    gps = _georeference(centres, positions, upright)
+    metres = None
+    if isinstance(gps, Georeference):
+        metres = gps.enu_from_world.scale
+        if gps.up_deviation_deg is not None:
+            upright = upright.turned_to(gps.enu_from_world.R[2], gps.up_deviation_deg)
+    towards, front = facing(upright, R, points)
+    viewer = viewer_frame(upright.up, towards, points, metres)
+    if not is_sound(viewer):
+        raise NumericalError("the frame of the viewer holds what is no number")
+    with backend("turning the model upright"):
+        move(model, viewer)
+    entry = how_it_stands(upright, front) | where_it_stands(viewer, gps)
+    logger.info("orientation: %s", entry)
+    return entry
+
+
+def _georeference(
+    centres: FloatArray, positions: Sequence[GpsPosition | None], upright: Upright
+) -> Georeference | NoGeoreference:
+    try:
+        found = georeference(centres, positions, upright.up, up_is_sure=upright.found_by == LINES)
+    except FAILURES as err:
+        logger.info("the GPS positions could not be used", exc_info=err)
+        return NoGeoreference(f"the computation failed: {reason_of(err)}")
+    if not isinstance(found, Georeference) or is_sound(found.enu_from_world):
+        return found
+    return NoGeoreference("the positions give no scale")
+
+
+def is_sound(similarity: Similarity) -> bool:
+    """Whether a similarity takes numbers to numbers, and back."""
+    return bool(np.isfinite(similarity.R).all() and np.isfinite(similarity.t).all() and 0.0 < similarity.scale < np.inf)
+
+
+def turned(R: FloatArray, turn_deg: int) -> FloatArray:
+    """(3, 3) cam_from_world of a photo once it is turned clockwise by a multiple of 90 degrees."""
+    cosine, sine = round(np.cos(np.radians(turn_deg))), round(np.sin(np.radians(turn_deg)))
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ R
+
+
+def lines_of(model: Any, looks: Mapping[int, Look]) -> Segments:
+    """Line segments, in the world, of the photos of a model."""
+    with backend("looking along lines in the photos"):
+        return joined([_in_world(model, photo, look.lines) for photo, look in looks.items()])
+
+
+def scenery_of(model: Any, looks: Mapping[int, Look]) -> Scenery:
+    """What a model and its photos show."""
+    with backend("reading the points"):
+        shown = seen_points(model, SCENERY_POINTS)
+    pictures = tuple(looks[photo].picture if photo in looks else None for photo in photos_of(model))
+    return Scenery(shown.points, shown.colors.mean(axis=1), shown.seen, pictures)
+
+
+def look_at(path: Path, turn_deg: int = 0) -> Look:
+    """Lines of a photo, and its brightness once it is upright; nothing where OpenCV cannot read it."""
+    try:
+        data = np.fromfile(path, np.uint8)  # OpenCV does not open names beyond ASCII on every system
+    except OSError:
+        data = np.zeros(0, np.uint8)
+    read = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+    if read is None:
+        return Look(np.zeros((0, 4)), None)
+    grey = np.asarray(read, np.uint8)
+    return Look(line_segments(grey), np.rot90(small_picture(grey), -turn_deg // 90))
+
+
+def _in_world(model: Any, image_id: int, lines: FloatArray) -> Segments:
+    first, second = (viewing_rays(model, image_id, lines[:, ends]) for ends in (slice(0, 2), slice(2, 4)))
+    return segment_planes(first, second, image_id, focal_px(model, image_id))
+
+
+def how_it_stands(upright: Upright, front: str) -> dict[str, Any]:
+    """Up and front, for the manifest."""
+    standing = upright.standing
+    return {
+        "up": upright.found_by,
+        "up_deviation_deg": round(upright.deviation_deg, 3) if np.isfinite(upright.deviation_deg) else None,
+        "off_camera_roll_deg": round(upright.off_roll_deg, 2),
+        "camera_roll_spread_deg": round(upright.roll.spread_deg, 2),
+        "photos_turned_deg": upright.roll.turn_deg,
+        "up_sign_odds": odds(standing.not_upside_down),
+        "up_axis_odds": odds(standing.not_on_its_side),
+        "up_evidence_nats": {name: round(nats, 1) for name, nats in standing.evidence.items()},
+        "front": front,
+    }
+
+
+def where_it_stands(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Any]:
+    """Unit and place of the model that `viewer` has moved, for the manifest."""
+    if isinstance(gps, NoGeoreference):
+        return {"unit": "about the size of the scene", "gps": f"not used: {gps.reason}"}
+    enu_from_model = gps.enu_from_world.after(viewer.inverse())
+    origin = position_at(enu_from_model.t, gps.origin)
+    east, north, _ = -enu_from_model.R[:, 2]
+    return {
+        "unit": "metre",
+        "gps": f"{gps.photos} of {gps.of} positions agree",
+        "georeference": {
+            "latitude_deg": round(origin.latitude_deg, 8),
+            "longitude_deg": round(origin.longitude_deg, 8),
+            "altitude_m": None if origin.altitude_m is None else round(origin.altitude_m, 2),
+            "heading_deg": round(float(np.degrees(np.arctan2(east, north))) % 360.0, 3),
+            "scale_deviation_percent": round(100 * gps.scale_deviation, 2),
+            "residual_m": round(gps.rms_m, 2),
+        },
+    }

@@ -1,0 +1,107 @@
+"""Rival hypotheses: what else is tried where the evidence for a model is thin, so that the better one counts.
+
+A camera that the pairs do not determine, photos left out, matches that contradict: each says that another beginning may
+explain more. The rival is COLMAP's own pipeline, from the usual guess of the camera and its own verification of the
+matches. It knows nothing of our fundamental matrices, cameras and poses, and so shares none of their mistakes.
+"""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import replace
+
+from sfm_app.colmap.backend import backend, interruptible
+from sfm_app.colmap.database import keep_raw_matches, write_calibrations
+from sfm_app.colmap.mapping import copy_database, map_as_colmap_does
+from sfm_app.context import RunContext
+from sfm_app.errors import BackendError
+from sfm_app.geometry.camera import GUESSED_FOCAL, guessed_camera_matrix
+from sfm_app.reconstruction.mapping_runs import Attempt, judged, no_model
+from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, ViewGraph
+from sfm_app.types.epipolar import EpipolarFit
+
+logger = logging.getLogger("sfm_app")
+
+FOLDER = ".rival"
+MAPPER, HOW = "colmap", "as COLMAP does by itself"
+LEFT_OUT, MANY = 0.25, 60
+"""Share of the photos without a place from which on other focals are tried, and photos from which on they are not."""
+CONTRADICTED = 0.05
+"""Share of the inliers of fundamental matrices that contradict a model, from which on another may be better. Right
+models of the Strecha sets, cropped and squeezed, have 0.1 to 3 %."""
+
+
+def why_thin(model: Attempt | None, intrinsics: Intrinsics, matches: MatchGraph, views: ViewGraph) -> str:
+    """Say why another hypothesis is worth trying, in a few words; empty where the evidence is good.
+
+    Args:
+        model: the main one so far.
+        intrinsics: cameras from pairs.
+        matches: all photos.
+        views: fundamental matrices.
+    """
+    if model is None:
+        return "nothing was placed"
+    refused = {intrinsics.name_of(image) for image in matches.images.values()} - {
+        name for name, camera in intrinsics.cameras.items() if camera.estimated
+    }
+    if refused:
+        return "the pairs do not determine a camera"
+    connected = photos_in(views.fits)
+    if model.photos < len(connected):
+        return f"photos that match others have no place: {len(connected) - model.photos}"
+    inliers = sum(pair.inliers for pair in model.explained.values())
+    against = sum(pair.contradicted for pair in model.explained.values())
+    return f"{100 * against / inliers:.0f} % of the matches contradict it" if against > CONTRADICTED * inliers else ""
+
+
+def photos_in(fits: Mapping[PairId, EpipolarFit]) -> set[int]:
+    """Collect the photos of pairs whose geometry is not degenerate."""
+    return {photo for pair, fit in fits.items() if not fit.degeneracy for photo in pair}
+
+
+def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Attempt:
+    """Map all photos as COLMAP does by itself, and judge the model like any other; none where it fails.
+
+    Pairs that are not among the matches, such as those of look-alikes, are kept from it, too.
+    """
+    scratch, found = run.workspace.root / FOLDER, []
+    guess = guessed_intrinsics(intrinsics)
+    try:
+        with backend("mapping photos by its defaults"):
+            copy_database(run.workspace.database, scratch)
+            write_calibrations(scratch / "database.db", matches, guess)
+            keep_raw_matches(scratch / "database.db", matches.matches)
+            interruptible(
+                lambda token: found.append(map_as_colmap_does(run.workspace.photos, scratch, run.seed, token)),
+                lambda: None,
+            )
+    except BackendError as err:  # what we have is not lost with it
+        logger.info("the rival failed: %s", err)
+        return no_model(MAPPER, f"{HOW}: failed, {err}")
+    return judged(matches, views, (MAPPER, HOW), found[0], run)
+
+
+def leaves_many_out(model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph) -> bool:
+    """Say whether a guess of the focal may be why photos that match others have no place.
+
+    Not asked where some camera is known, or where the photos are many: then a pass costs more than it promises.
+    """
+    connected = photos_in(views.fits)
+    known = any(camera.estimated or camera.method == "exif" for camera in intrinsics.cameras.values())
+    placed = model.photos if model is not None else 0
+    return not known and len(connected) <= MANY and len(connected) - placed > LEFT_OUT * len(connected)
+
+
+def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> Intrinsics:
+    """Replace every camera by a guess of the focal, in longer sides; what EXIF claims stays."""
+    cameras = {
+        name: camera if camera.method == "exif" else _guess(camera, sides)
+        for name, camera in intrinsics.cameras.items()
+    }
+    return replace(intrinsics, cameras=cameras)
+
+
+def _guess(camera: Calibration, sides: float) -> Calibration:
+    size = camera.width, camera.height
+    K = guessed_camera_matrix(size, sides * max(size))
+    return Calibration(K, *size, "guess", identifiable=False, reason=camera.reason)

@@ -1,0 +1,130 @@
+"""One camera for each photo, as a rival hypothesis: a zoom, or several devices, that no pair of photos gave away.
+
+Photos of one size are taken for one camera until their pairs contradict it. Pairs of a camera that moves forward or
+round one point never do. A model does: with one focal for all photos, matches that agree pair by pair do not lie right.
+"""
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_app.colmap.model import cameras_of, photos_of
+from sfm_app.geometry.camera import guessed_camera_matrix
+from sfm_app.reconstruction.baseline import leaves_many_out, photos_in
+from sfm_app.reconstruction.mapping_runs import CONTRADICTED, EQUAL, Attempt
+from sfm_app.settings import Settings
+from sfm_app.types import Calibration, Intrinsics, MatchedImage, MatchGraph, ViewGraph
+
+LEAST, MOST = 5, 60
+"""Photos: of fewer, cameras of their own fit almost anything; of more, it costs more than it promises."""
+FEWER = 0.5
+"""Share of the contradictions that cameras of their own may leave, or they are not what was wrong. Chosen on
+folders 0 to 180 of `benchmarks/accuracy/trouble.py`."""
+AS_GOOD = 0.002
+"""So much larger a share may contradict two cameras for all photos; right ones leave up to so much, see above."""
+
+
+def may_have_one_each(model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph, settings: Settings) -> bool:
+    """Say whether photos of one size may have a camera each: matches contradict the model, or many have no place in it.
+
+    Args:
+        model: the main one so far.
+        intrinsics: cameras from pairs.
+        views: fundamental matrices.
+        settings: who says which photos are of one camera is believed.
+    """
+    if model is None or settings.photos.cameras != "auto" or not LEAST <= len(photos_in(views.fits)) <= MOST:
+        return False
+    return _share_against(model) > CONTRADICTED or leaves_many_out(model, intrinsics, views)
+
+
+def with_one_each(model: Attempt, found: Intrinsics, matches: MatchGraph) -> Intrinsics | None:
+    """Give every photo of a camera that pairs do not determine one of its own; None where there is none to divide.
+
+    Its focal is as yet a guess: what mapping found for all of them together.
+    """
+    focals = {photo: float(K[0, 0] * K[1, 1]) ** 0.5 for photo, (K, _) in cameras_of(model.model).items()}
+    placed = photos_of(model.model)
+    usual = {found.name_of(matches.images[photo]): focals[photo] for photo in placed if photo in focals}
+    members: dict[str, list[MatchedImage]] = {}
+    for image in matches.images.values():
+        members.setdefault(found.name_of(image), []).append(image)
+    divided = [name for name, images in members.items() if len(images) > 1 and not found.cameras[name].identifiable]
+    if not divided:
+        return None
+    cameras, camera_of = dict(found.cameras), dict(found.camera_of)
+    for name in divided:
+        camera = cameras.pop(name)
+        names = _names(name, {*found.cameras, *cameras})
+        for image, own in zip(sorted(members[name], key=lambda image: image.name), names, strict=False):
+            cameras[own], camera_of[image.name] = _guess(camera, usual.get(name)), own
+    return replace(found, cameras=cameras, camera_of=camera_of)
+
+
+def with_two(model: Attempt, each: Intrinsics, matches: MatchGraph) -> Intrinsics | None:
+    """Give photos of one size that have a camera each two cameras between them; None where there is nothing to divide.
+
+    What mapping found of their focals is divided where it leaves the widest gap, a size at a time.
+    """
+    of_size: dict[tuple[int, int], dict[str, float]] = {}
+    for photo, (K, _) in cameras_of(model.model).items():
+        name = each.name_of(matches.images[photo])
+        if not each.cameras[name].identifiable:
+            size = each.cameras[name].width, each.cameras[name].height
+            of_size.setdefault(size, {})[name] = float(K[0, 0] * K[1, 1]) ** 0.5
+    cameras = dict(each.cameras)
+    instead: dict[str, str] = {}
+    for size, focals in of_size.items():
+        for group in _divided(focals):
+            K = guessed_camera_matrix(size, float(np.median([focals[name] for name in group])))
+            cameras[group[0]] = replace(cameras[group[0]], K=K, identifiable=True, reason="", method="mapping")
+            instead |= dict.fromkeys(group[1:], group[0])
+    camera_of = {photo: instead.get(name, name) for photo, name in each.camera_of.items()}
+    used = {name: camera for name, camera in cameras.items() if name not in instead}
+    return replace(each, cameras=used, camera_of=camera_of) if instead else None
+
+
+def explains_as_much(two: Attempt | None, own: Attempt) -> bool:
+    """Say whether two cameras do as well as one for each photo."""
+    if two is None or two.photos < own.photos or two.support < (1.0 - EQUAL) * own.support:
+        return False
+    return _share_against(two) <= _share_against(own) + AS_GOOD
+
+
+def explains_more(own: Attempt | None, shared: Attempt) -> bool:
+    """Say whether cameras of their own explain more matches, and place more photos or take away what contradicts."""
+    if own is None or own.photos < shared.photos or own.support <= shared.support:
+        return False
+    return own.photos > shared.photos or _share_against(own) <= FEWER * _share_against(shared)
+
+
+def _share_against(model: Attempt) -> float:
+    """Share of the inliers of fundamental matrices that contradict a model."""
+    inliers = sum(pair.inliers for pair in model.explained.values())
+    return sum(pair.contradicted for pair in model.explained.values()) / max(inliers, 1)
+
+
+def _divided(focals: Mapping[str, float]) -> list[list[str]]:
+    """Names in two parts, divided at the widest gap between focals; nothing where that leaves one alone."""
+    names = sorted(focals, key=lambda name: (focals[name], name))
+    if len(names) < LEAST:
+        return []
+    gap = int(np.argmax(np.diff(np.log([focals[name] for name in names])))) + 1
+    return [names[:gap], names[gap:]] if 2 <= gap <= len(names) - 2 else []
+
+
+def _names(name: str, taken: Collection[str]) -> Iterable[str]:
+    """The name itself, and others like it that nobody has."""
+    yield name
+    number = 2
+    while True:
+        if (other := f"{name} #{number}") not in taken:
+            yield other
+        number += 1
+
+
+def _guess(camera: Calibration, focal_px: float | None) -> Calibration:
+    size = camera.width, camera.height
+    K = guessed_camera_matrix(size, camera.focal_px if focal_px is None else focal_px)
+    return Calibration(K, *size, "guess", identifiable=False, reason="its photos may each be of another camera")

@@ -1,0 +1,70 @@
+"""Pairs of photos that a mapping can start from, best first."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_app.geometry.camera import rays
+from sfm_app.geometry.epipolar import cross_matrix
+from sfm_app.geometry.two_view_init import GOOD_ANGLE_DEG, TwoViewSeed, two_view_seed
+from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose
+
+DISSENT = 0.1
+"""What counts of a seed whose pair contradicts the camera matrix that other pairs agree on."""
+FLAT = 0.5
+"""What counts of one whose points lie on a plane, or whose camera moved along its axis: its pose is less certain."""
+FORWARD = 0.95
+"""Share of the translation along the camera's axis that counts as such."""
+GRID = 8
+"""Photos are looked at in so many cells across and down: points everywhere make a better start than a clump."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A pair of photos that mapping may start from."""
+
+    pair: PairId
+    pose: RelativePose
+    score: float
+
+
+def rank_seeds(
+    matches: MatchGraph, graph: PoseGraph, intrinsics: Intrinsics, photos: Sequence[int], min_angle_deg: float
+) -> list[Candidate]:
+    """Pairs within a group of photos: many points all over the photos, under a wide angle, in accord with K."""
+    members, found = set(photos), []
+    for pair, pose in graph.poses.items():
+        if members.issuperset(pair) and pose.kind != "rotation" and pose.angle_deg >= min_angle_deg:
+            cameras = [intrinsics.camera(matches.images[photo]) for photo in pair]
+            worth = coverage(matches, pair, pose) * agreement(pair, cameras)
+            worth *= FLAT if pose.kind == "planar" or abs(pose.t[2]) > FORWARD else 1.0
+            score = pose.inlier_count * min(pose.angle_deg / GOOD_ANGLE_DEG, 1.0) * pose.in_front**4 * worth
+            found.append(Candidate(pair, pose, score))
+    return sorted(found, key=lambda candidate: (-candidate.score, candidate.pair))
+
+
+def seed_of(matches: MatchGraph, candidate: Candidate, intrinsics: Intrinsics) -> TwoViewSeed:
+    """The points of a candidate, triangulated."""
+    pose, cameras = candidate.pose, [intrinsics.camera(matches.images[photo]) for photo in candidate.pair]
+    points = matches.points(candidate.pair)
+    x1, x2 = (rays(x[pose.inliers], camera.K, camera.radial) for x, camera in zip(points, cameras, strict=True))
+    return two_view_seed(cross_matrix(pose.t) @ pose.R, x1, x2)
+
+
+def agreement(pair: PairId, cameras: Sequence[Calibration]) -> float:
+    """1 for a pair that agrees with the camera its consensus found, little for one that does not."""
+    first, second = cameras
+    unknown = first is not second or not first.key_pairs
+    return 1.0 if unknown or pair in first.key_pairs else DISSENT
+
+
+def coverage(matches: MatchGraph, pair: PairId, pose: RelativePose) -> float:
+    """Share of the cells of both photos that hold an inlier, as far as these are enough to fill them; 0 to 1."""
+    shares = []
+    for photo, x in zip(pair, matches.points(pair), strict=True):
+        image = matches.images[photo]
+        cells = (x[pose.inliers] / [image.width, image.height] * GRID).astype(np.int64).clip(0, GRID - 1)
+        filled = len(np.unique(cells[:, 0] * GRID + cells[:, 1]))
+        shares.append(filled / min(GRID * GRID, max(pose.inlier_count, 1)))
+    return float(np.sqrt(shares[0] * shares[1]))

@@ -1,0 +1,276 @@
+"""Map every group of photos; learn cameras from the model, and map again where that may help."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm_app.colmap.backend import backend
+from sfm_app.colmap.database import write_calibrations, write_pose_graph
+from sfm_app.colmap.model import cameras_of, part_of, photos_of
+from sfm_app.context import RunContext
+from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
+from sfm_app.reconstruction.baseline import guessed_intrinsics, leaves_many_out, map_baseline, why_thin
+from sfm_app.reconstruction.camera_per_photo import (
+    explains_as_much,
+    explains_more,
+    may_have_one_each,
+    with_one_each,
+    with_two,
+)
+from sfm_app.reconstruction.look_alikes import with_earlier, without_look_alikes
+from sfm_app.reconstruction.mapping_runs import Attempt, Group, attempts, better, why
+from sfm_app.reconstruction.model_merge import join_models
+from sfm_app.reconstruction.model_split import sound_parts
+from sfm_app.reconstruction.support import model_poses
+from sfm_app.reconstruction.unregistered import names_of
+from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
+
+LEARNED_FROM = 3
+"""Photos: fewer do not teach a camera, and in fewer no other group is mapped beside the main one."""
+MOST_PASSES = 4
+"""Passes over all pairs. On dinoSparseRing with learned features the second finds a focal of 3272 (true 3318), and the
+third places all photos with it."""
+OTHER_FOCALS = (0.6, 2.4, 4.8)
+"""Guesses of the focal beside the usual one, in longer sides: steps of two from end to end of what cameras have."""
+MOVED = 0.01
+"""A focal that mapping moved by more than this share is worth a second look at the pairs."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """Models of all groups, before the last adjustment."""
+
+    models: tuple[Attempt, ...]
+    """The main one first."""
+    graph: PoseGraph
+    intrinsics: Intrinsics
+    """As the mapping had them."""
+    tried: tuple[str, ...]
+    """Every attempt, for people."""
+    reason: str = ""
+    """Why the main model's mapper was chosen."""
+    cuts: tuple[str, ...] = ()
+    """What was taken apart because matches contradict the join."""
+    passes: int = 1
+    thin: str = ""
+    """Why a rival was tried; empty where the evidence was good."""
+    one_camera_each: str = ""
+    """What came of a camera for each photo, where one for all explains too little: "taken", "left", or "two" cameras
+    that explain as much; empty: not tried."""
+
+    @property
+    def main(self) -> Attempt | None:
+        """The main model."""
+        return self.models[0] if self.models else None
+
+    @property
+    def support(self) -> float:
+        """Of the main model; 0 without one."""
+        return self.models[0].support if self.models else 0.0
+
+
+def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:
+    """Models of all photos that hang together; none where no pair grows into one.
+
+    Where the evidence is thin, a rival is mapped beside it, and the model that explains more goes on. Where cameras
+    were guesses, or photos of the main group stayed out, the cameras that mapping found are taken for a second pass:
+    with them, relative poses are right that were not before. So it goes on while the passes get better.
+    """
+    best = _pass(matches, views, intrinsics, run)
+    matches, views = without_look_alikes(matches, views, best.graph)
+    best = with_rival(best, matches, views, intrinsics, run)
+    best = with_other_focals(best, matches, views, intrinsics, run)
+    best = with_own_cameras(best, matches, views, intrinsics, run)
+    for number in range(2, MOST_PASSES + 1):
+        if not best.models or not worth_another(best, best.intrinsics, matches):
+            break
+        learned = learned_intrinsics(best.models[0], best.intrinsics, matches)
+        again = _pass(matches, views, learned, run)
+        if again.support <= best.support:
+            _enter(best.graph, best.intrinsics, matches, run)
+            break
+        graph, tried = with_earlier(again.graph, best.graph), best.tried + again.tried
+        best = replace(
+            again, passes=number, thin=best.thin, graph=graph, tried=tried, one_camera_each=best.one_camera_each
+        )
+        matches, views = without_look_alikes(matches, views, best.graph)
+    return with_joined(best, matches, views, run)
+
+
+def with_rival(
+    outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
+) -> Outcome:
+    """The outcome, or, where it is thin and a rival explains more, that of the rival."""
+    main = outcome.main
+    thin = why_thin(main, intrinsics, matches, views)
+    if not thin:
+        return outcome
+    run.progress.say(f"COLMAP's own way is tried beside ours: {thin}")
+    rival = map_baseline(matches, views, intrinsics, run)
+    outcome = replace(outcome, thin=thin, tried=(*outcome.tried, rival.note))
+    both = [attempt for attempt in (main, rival) if attempt is not None]
+    if rival.model is None or better(both) is not rival:
+        return outcome
+    parts = taken_apart(rival)
+    taken = {photo for part in parts for photo in photos_of(part.model)}
+    others = [model for model in outcome.models if taken.isdisjoint(photos_of(model.model))]
+    models = sorted((*parts, *others), key=lambda attempt: (-attempt.photos, -attempt.support))
+    graph = _graph_of(models, outcome.graph, matches, run)
+    _enter(graph, intrinsics, matches, run)
+    return replace(outcome, models=tuple(models), graph=graph, reason=why(rival, both, len(matches.images)))
+
+
+def with_other_focals(
+    outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
+) -> Outcome:
+    """The outcome, or, where the guessed focal leaves many photos without a place, that of the best other guess."""
+    main = outcome.main
+    if not leaves_many_out(main, intrinsics, views):
+        return outcome
+    run.progress.say("many photos have no place, and the focal length is a guess: other guesses are tried")
+    for focal in OTHER_FOCALS:
+        other = _pass(matches, views, guessed_intrinsics(intrinsics, focal), run)
+        tried = (*outcome.tried, *(f"{note} (focal {focal:g} longer sides)" for note in other.tried))
+        outcome = replace(other if other.support > outcome.support else outcome, thin=outcome.thin, tried=tried)
+    if outcome.graph is not other.graph:
+        _enter(outcome.graph, outcome.intrinsics, matches, run)
+    return outcome
+
+
+def with_own_cameras(
+    outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
+) -> Outcome:
+    """The outcome, or, where photos of one size explain more with a camera each, that."""
+    main = outcome.main
+    if main is None or not may_have_one_each(main, intrinsics, views, run.settings):
+        return outcome
+    each = with_one_each(main, intrinsics, matches)
+    if each is None:
+        return outcome
+    run.progress.say("one camera for all photos of a size does not explain them: one for each is tried")
+    own = _pass(matches, views, each, run)
+    own = with_rival(own, matches, views, each, run)
+    tried = (*outcome.tried, *(f"{note} (a camera for each photo)" for note in own.tried))
+    if not explains_more(own.main, main):
+        _enter(outcome.graph, outcome.intrinsics, matches, run)
+        return replace(outcome, tried=tried, one_camera_each="left")
+    return _with_two_cameras(
+        replace(own, thin=outcome.thin, tried=tried, one_camera_each="taken"), matches, views, each, run
+    )
+
+
+def _with_two_cameras(
+    own: Outcome, matches: MatchGraph, views: ViewGraph, each: Intrinsics, run: RunContext
+) -> Outcome:
+    """The outcome of a camera for each photo, or, where two explain as much, that of two."""
+    between = with_two(own.models[0], each, matches)
+    if between is None:
+        return own
+    two = _pass(matches, views, between, run)
+    tried = (*own.tried, *(f"{note} (two cameras)" for note in two.tried))
+    if explains_as_much(two.main, own.models[0]):
+        return replace(two, thin=own.thin, tried=tried, one_camera_each="two")
+    _enter(own.graph, own.intrinsics, matches, run)
+    return replace(own, tried=tried)
+
+
+def with_joined(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
+    """The outcome, its models joined where they share points."""
+    if len(outcome.models) < 2:
+        return outcome
+    models = join_models(outcome.models, matches, views, run)
+    if len(models) == len(outcome.models):
+        return outcome
+    run.progress.say(f"models were joined: {models[0].note}")
+    graph = _graph_of(models[:1], outcome.graph, matches, run)
+    _enter(graph, outcome.intrinsics, matches, run)
+    tried = (*outcome.tried, models[0].note)
+    return replace(outcome, models=models, graph=graph, tried=tried, reason=models[0].note)
+
+
+def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
+    """Whether the cameras that mapping found may show more: they are news, or photos of the main group stayed out."""
+    main = outcome.models[0]
+    placed = photos_of(main.model)
+    if len(placed) < LEARNED_FROM:
+        return False
+    learned = learned_intrinsics(main, intrinsics, matches)
+    used = {intrinsics.name_of(matches.images[photo]) for photo in placed}
+    news = any(_far(intrinsics.cameras[name], learned.cameras[name]) for name in used)
+    anywhere = {photo for model in outcome.models for photo in photos_of(model.model)}
+    return news or not anywhere.issuperset(outcome.graph.group_of(placed[0]))
+
+
+def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGraph) -> Intrinsics:
+    """The cameras as a model has them."""
+    with backend("reading cameras"):
+        found = cameras_of(model.model)
+    cameras = dict(intrinsics.cameras)
+    for photo, (K, radial) in found.items():
+        name = intrinsics.name_of(matches.images[photo])
+        cameras[name] = replace(
+            intrinsics.cameras[name], K=K, radial=radial, identifiable=True, reason="", method="mapping"
+        )
+    return replace(intrinsics, cameras=cameras)
+
+
+def _far(before: Calibration, after: Calibration) -> bool:
+    return not before.estimated or abs(float(np.log(after.focal_px / before.focal_px))) > MOVED
+
+
+def _pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:
+    epipolar = run.settings.epipolar
+    options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
+    graph = build_pose_graph(matches, views, intrinsics, options, run.map)
+    _enter(graph, intrinsics, matches, run)
+    matches, views = without_look_alikes(matches, views, graph)
+    models: list[Attempt] = []
+    reasons: dict[str, str] = {}
+    tried: list[str] = []
+    cuts: list[str] = []
+    for number, photos in enumerate(graph.groups):
+        if number and len(photos) < LEARNED_FROM:
+            continue
+        found = attempts(Group(photos, matches, views, graph, intrinsics), run)
+        tried += [attempt.note for attempt in found]
+        best = better(found)
+        if best is not None:
+            reasons[best.note] = why(best, found, len(photos))
+            parts = taken_apart(best)
+            models += parts
+            cuts += [", ".join(names_of(sorted(photos_of(part.model)), matches)) for part in parts if len(parts) > 1]
+    models.sort(key=lambda attempt: (-attempt.photos, -attempt.support))
+    reason = reasons[models[0].note] if models else ""
+    return Outcome(tuple(models), graph, intrinsics, tuple(tried), reason, tuple(cuts))
+
+
+def taken_apart(attempt: Attempt) -> list[Attempt]:
+    """A model as it is, or the parts of it that more matches join than contradict; lonely photos are left out."""
+    parts = sound_parts(attempt.explained, photos_of(attempt.model))
+    if len(parts) == 1:
+        return [attempt]
+    kept = [part for number, part in enumerate(parts) if len(part) >= (2 if number == 0 else LEARNED_FROM)]
+    with backend("taking a model apart"):
+        return [_part(attempt, part) for part in kept]
+
+
+def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
+    members = set(photos)
+    explained = {pair: found for pair, found in attempt.explained.items() if members.issuperset(pair)}
+    return replace(attempt, model=part_of(attempt.model, photos), explained=explained)
+
+
+def _graph_of(models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph, run: RunContext) -> PoseGraph:
+    """The pose graph as models have it that were made without it: later steps complete their tracks along its pairs."""
+    epipolar = run.settings.epipolar
+    for attempt in models:
+        poses = model_poses(attempt.model, matches, epipolar.max_error_px, epipolar.min_inliers)
+        graph = with_model(graph, set(photos_of(attempt.model)), poses)
+    return graph
+
+
+def _enter(graph: PoseGraph, intrinsics: Intrinsics, matches: MatchGraph, run: RunContext) -> None:
+    with backend("writing relative poses"):
+        write_calibrations(run.workspace.database, matches, intrinsics)
+        write_pose_graph(run.workspace.database, matches, graph)

@@ -1,0 +1,255 @@
+"""COLMAP's two mappers on one group of photos, side by side, and the better of what they made."""
+
+import contextlib
+import logging
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from sfm_app.colmap.backend import backend, interruptible
+from sfm_app.colmap.mapping import copy_database, map_globally, map_incrementally
+from sfm_app.colmap.model import model_from_seed
+from sfm_app.context import RunContext
+from sfm_app.errors import BackendError
+from sfm_app.numerical import FAILURES, reason_of
+from sfm_app.reconstruction.initial_pairs import Candidate, rank_seeds, seed_of
+from sfm_app.reconstruction.support import Explained, explained_pairs, support
+from sfm_app.reconstruction.unregistered import names_of
+from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph, ViewGraph
+
+logger = logging.getLogger("sfm_app")
+
+ENOUGH = 0.9
+"""A model with this share of its group ends the search for a better seed."""
+CONFIRMED = 0.5
+"""So does this share when two seeds agree on how many photos can be placed."""
+LEAST_GLOBAL = 3
+"""Photos: of two, positions have no scale to agree on."""
+EQUAL = 0.01
+"""Models that explain as many matches but for this share count as equal; of them, the one with most points is taken."""
+CONTRADICTED = 0.01
+"""Share of the inliers of fundamental matrices that may contradict a model which leaves nothing to be wished for."""
+WELL_KNOWN = 0.01
+"""Relative deviation of a focal that mapping leaves alone."""
+GLOBAL_FOLDER = ".global"
+
+Maker = Callable[[Any], "list[Attempt]"]
+"""What makes models until a token stops it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Group:
+    """Photos that hang together, and all that is known about them."""
+
+    photos: Sequence[int]
+    matches: MatchGraph
+    views: ViewGraph
+    graph: PoseGraph
+    intrinsics: Intrinsics
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempt:
+    """What a mapper made of a group, and what it explains."""
+
+    mapper: str
+    model: Any
+    """COLMAP's reconstruction; None where there is none, or one with too few points."""
+    explained: dict[PairId, Explained]
+    note: str
+    """For people: how it was made, and how many photos it holds."""
+
+    @property
+    def photos(self) -> int:
+        """Photos with a pose."""
+        return int(self.model.num_reg_images()) if self.model is not None else 0
+
+    @property
+    def support(self) -> float:
+        """See `support.support`."""
+        return support(self.explained)
+
+
+class Stop:
+    """Stops a mapper when the whole run is stopped, or when its model is no longer needed."""
+
+    def __init__(self, token: Any) -> None:
+        self.token, self.needless = token, False
+
+    @property
+    def is_cancelled(self) -> bool:
+        """Whether to stop."""
+        return self.needless or bool(self.token.is_cancelled)
+
+
+def attempts(group: Group, run: RunContext) -> list[Attempt]:
+    """What the mappers of the settings make of a group.
+
+    Photo by photo from the best seed and all at once, side by side; where neither places most photos, from the next
+    seeds. What is tried never depends on which mapper is done first: a model photo by photo that leaves nothing to be
+    wished for makes the other one needless, whether or not it is there.
+    """
+    options = run.settings.scene
+    at_once = options.mapper != "incremental" and len(group.photos) >= LEAST_GLOBAL
+    seeds = rank_seeds(group.matches, group.graph, group.intrinsics, group.photos, options.min_seed_angle_deg)
+    seeds = seeds[: options.seed_pairs] if options.mapper != "global" or not at_once else []
+    if at_once:
+        copy_database(run.workspace.database, run.workspace.root / GLOBAL_FOLDER)
+    with _mapping(group, run) as made:
+        found = made(lambda token: _first_round(group, seeds[:1], at_once, run, token))
+        for seed in seeds[1:]:
+            if _settled(found, len(group.photos)):
+                break
+            found += made(partial(_from_seed, group, seed, run))
+        best = better(found)
+        if best is not None and best.mapper == "global" and best.photos < len(group.photos):
+            found += made(partial(_completed, group, best, run))
+    return found
+
+
+def better(found: Sequence[Attempt]) -> Attempt | None:
+    """The attempt that explains most matches; of equal ones, the one with most photos and points."""
+    models = [attempt for attempt in found if attempt.model is not None]
+    most = max((attempt.support for attempt in models), default=0.0)
+    equal = [attempt for attempt in models if attempt.support >= (1.0 - EQUAL) * most]
+    return max(equal, key=lambda attempt: (attempt.photos, attempt.model.num_points3D()), default=None)
+
+
+def why(best: Attempt, found: Sequence[Attempt], photos: int) -> str:
+    """Why this attempt of several was taken, in a few words."""
+    if flawless(best, photos):
+        return f"it places all {photos} photos and next to nothing contradicts it"
+    others = [attempt for attempt in found if attempt is not best and attempt.model is not None]
+    if not others:
+        return "nothing else gave a model"
+    rival = max(others, key=lambda attempt: attempt.support)
+    counts = [sum(pair.matches for pair in attempt.explained.values()) for attempt in (best, rival)]
+    return f"it explains {counts[0]} matches with {best.photos} photos, the next best {counts[1]} with {rival.photos}"
+
+
+def flawless(attempt: Attempt, photos: int) -> bool:
+    """Whether a model holds all photos and next to nothing contradicts it."""
+    inliers = sum(pair.inliers for pair in attempt.explained.values())
+    against = sum(pair.contradicted for pair in attempt.explained.values())
+    return attempt.photos == photos and against <= CONTRADICTED * inliers
+
+
+@contextlib.contextmanager
+def _mapping(group: Group, run: RunContext) -> Iterator[Callable[[Maker], list[Attempt]]]:
+    """What makes attempts in a thread that Ctrl-C can stop."""
+
+    def made(make: Maker) -> list[Attempt]:
+        found: list[Attempt] = []
+        run.progress.start("mapping", max(len(group.photos) - 2, 1))
+        try:
+            interruptible(lambda token: found.extend(make(token)), lambda: None)
+        finally:
+            run.progress.finish()
+        return found
+
+    with backend("mapping photos"):
+        yield made
+
+
+def _first_round(group: Group, seeds: Sequence[Candidate], at_once: bool, run: RunContext, token: Any) -> list[Attempt]:
+    stop = Stop(token)
+
+    def photo_by_photo(seed: Candidate) -> Attempt:
+        (attempt,) = _from_seed(group, seed, run, token)
+        stop.needless = flawless(attempt, len(group.photos))
+        return attempt
+
+    with ThreadPoolExecutor(min(run.workers, 2), thread_name_prefix="mapper") as pool:
+        grown = [pool.submit(photo_by_photo, seed) for seed in seeds]
+        placed = [pool.submit(_all_at_once, group, run, stop)] if at_once else []
+        found = [future.result() for future in (*grown, *placed)]
+    if stop.needless:
+        found[1:] = [no_model("global", "all at once: not needed") for _ in placed]
+    return found
+
+
+def _settled(found: Sequence[Attempt], photos: int) -> bool:
+    """Whether another seed is unlikely to give more."""
+    counts = [attempt.photos for attempt in found if attempt.photos]
+    most = max(counts, default=0)
+    return most >= ENOUGH * photos or (counts.count(most) > 1 and most >= CONFIRMED * photos)
+
+
+def _all_at_once(group: Group, run: RunContext, stop: Stop) -> Attempt:
+    names, scratch = names_of(group.photos, group.matches), run.workspace.root / GLOBAL_FOLDER
+    try:
+        model = None if stop.is_cancelled else map_globally(run.workspace.photos, names, scratch, run.seed, stop)
+    except BackendError as err:  # another mapper may do better
+        logger.info("the global mapper failed: %s", err)
+        return no_model("global", f"all at once: failed, {err}")
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    return _judged(group, "global", "all at once", model, run)
+
+
+def _from_seed(group: Group, seed: Candidate, run: RunContext, token: Any) -> list[Attempt]:
+    how = f"from {' + '.join(names_of(seed.pair, group.matches))}"
+    rows = group.matches.matches[seed.pair][seed.pose.inliers]
+    try:
+        points = seed_of(group.matches, seed, group.intrinsics)
+    except FAILURES as err:
+        return [Attempt("incremental", None, {}, f"{how}: no points, {reason_of(err)}")]
+    start = model_from_seed(run.workspace.database, seed.pair, rows, points)
+    return [_judged(group, "incremental", how, _grown(group, start, run, token), run)]
+
+
+def _completed(group: Group, best: Attempt, run: RunContext, token: Any) -> list[Attempt]:
+    """Photos that the global mapper left out may fit into what it made."""
+    model = _grown(group, best.model, run, token)
+    return [_judged(group, "incremental", "what was left out, photo by photo", model, run)]
+
+
+def _grown(group: Group, start: Any, run: RunContext, token: Any) -> Any:
+    place = run.workspace
+    return map_incrementally(
+        place.database, place.photos, start, place.root / ".mapping", run.seed, run.progress.advance, token,
+        known=all(well_known(group.intrinsics.camera(group.matches.images[photo])) for photo in group.photos),
+    )  # fmt: skip
+
+
+def well_known(camera: Calibration) -> bool:
+    """Whether a focal is known too well for the first few photos of a mapping to improve it."""
+    spread = camera.spread.get("fx", np.inf)
+    return camera.identifiable and spread <= WELL_KNOWN * camera.K[0, 0]
+
+
+def judged(matches: MatchGraph, views: ViewGraph, made: tuple[str, str], model: Any, run: RunContext) -> Attempt:
+    """Count what a model explains.
+
+    Args:
+        matches: keypoints and raw matches.
+        views: fundamental matrices.
+        made: name of the mapper, and how it was used.
+        model: COLMAP's reconstruction; None where there is none.
+        run: the run.
+    """
+    mapper, how = made
+    placed = int(model.num_reg_images()) if model is not None else 0
+    note = f"{how}: {placed} photos"
+    if placed < 2 or model.num_points3D() < run.settings.scene.min_points:
+        return no_model(mapper, note)
+    try:
+        explained = explained_pairs(model, matches, views, run.settings.epipolar.max_error_px)
+    except FAILURES as err:
+        logger.info("a model could not be judged", exc_info=err)
+        return no_model(mapper, f"{note}, that could not be judged: {reason_of(err)}")
+    return Attempt(mapper, model, explained, note)
+
+
+def no_model(mapper: str, note: str) -> Attempt:
+    """Return an attempt that gave nothing, and why."""
+    return Attempt(mapper, None, {}, note)
+
+
+def _judged(group: Group, mapper: str, how: str, model: Any, run: RunContext) -> Attempt:
+    return judged(group.matches, group.views, (mapper, how), model, run)

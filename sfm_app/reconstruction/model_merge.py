@@ -1,0 +1,97 @@
+"""Models that see the same points, joined by a similarity.
+
+Mapping ends where the next photo shares too little with the photos before it. Two models that grew from either end may
+still share points: matches between their photos, of which each model knows the place. Three of them say how large one
+model is in the other's unit and where it stands; the others, and the pairs between them, say whether it is so.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.colmap.backend import backend
+from sfm_app.colmap.bundle import adjusted_or_as_it_was
+from sfm_app.colmap.model import both, photos_of, places_of_keypoints
+from sfm_app.context import RunContext
+from sfm_app.geometry.similarity import robust_similarity
+from sfm_app.reconstruction.mapping_runs import Attempt, judged
+from sfm_app.reconstruction.model_split import sound_parts
+from sfm_app.types import MatchGraph, ViewGraph
+
+FloatArray = NDArray[np.float64]
+
+LEAST_SHARED = 8
+"""Points that both models know, below which nothing is joined: three fix a similarity, twice as many may be wrong."""
+
+
+def join_models(
+    models: tuple[Attempt, ...], matches: MatchGraph, views: ViewGraph, run: RunContext
+) -> tuple[Attempt, ...]:
+    """Join what can be joined to the first model; the others stay as they are.
+
+    Args:
+        models: the main one first; no two hold the same photo.
+        matches: keypoints and raw matches.
+        views: fundamental matrices; their inliers are the points that models may share.
+        run: the run.
+    """
+    main, others = models[0], list(models[1:])
+    waiting = list(others)
+    while waiting:
+        other = waiting.pop(0)
+        together = _together(main, other, matches, views, run)
+        if together is not None:
+            main = together
+            others.remove(other)
+            waiting = list(others)
+    return (main, *others)
+
+
+def _together(
+    first: Attempt, second: Attempt, matches: MatchGraph, views: ViewGraph, run: RunContext
+) -> Attempt | None:
+    """Both models as one; None where they share too little, or matches contradict it."""
+    shared = shared_points(first.model, second.model, matches, views)
+    if len(shared) < LEAST_SHARED:
+        return None
+    try:
+        similarity = robust_similarity(shared[:, 3:], shared[:, :3])
+    except ValueError:  # on a line
+        return None
+    database: Path = run.workspace.database
+    with backend("joining two models"):
+        model = both(database, first.model, second.model, similarity)
+    model = adjusted_or_as_it_was(model, database).model
+    how = f"{first.photos} and {second.photos} photos joined by {len(shared)} points"
+    found = judged(matches, views, (first.mapper, how), model, run)
+    if found.photos < first.photos + second.photos or found.support <= first.support + second.support:
+        return None
+    one = len(sound_parts(found.explained, photos_of(found.model))) == 1
+    return replace(found, note=how) if one else None
+
+
+def shared_points(first: Any, second: Any, matches: MatchGraph, views: ViewGraph) -> FloatArray:
+    """(N, 6) points that both models know, as the first and as the second has them; each but once."""
+    here, there = places_of_keypoints(first), places_of_keypoints(second)
+    found = {}
+    for a, b in _between(views, {photo for photo, _ in here}, {photo for photo, _ in there}):
+        pair = min(a, b), max(a, b)
+        for row in matches.matches[pair][views.fits[pair].inliers]:
+            row_of = dict(zip(pair, map(int, row), strict=True))
+            one, other = here.get((a, row_of[a])), there.get((b, row_of[b]))
+            if one is not None and other is not None:
+                found[one[0]] = np.concatenate([one[1], other[1]])
+    return np.array([found[key] for key in sorted(found)]).reshape(-1, 6)
+
+
+def _between(views: ViewGraph, here: set[int], there: set[int]) -> Iterator[tuple[int, int]]:
+    """Pairs with geometry between two sets of photos, the photo of the first set first."""
+    for a, b in views.fits:
+        if a in here and b in there:
+            yield a, b
+        elif b in here and a in there:
+            yield b, a

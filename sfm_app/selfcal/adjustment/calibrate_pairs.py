@@ -1,0 +1,205 @@
+"""From first ideas of the cameras to what their matches say: adjust, ask what the evidence frees, adjust again."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.essential import essential_from_fundamental, relative_pose
+from sfm_app.geometry.spd_solve import lifted
+from sfm_app.ransac.refine.sampson_refit import refine_sampson
+from sfm_app.selfcal.adjustment.camera_priors import ASPECT, NAMES, Evidence, Usual
+from sfm_app.selfcal.adjustment.structureless_ba import (
+    CONFLICT,
+    Information,
+    Matches,
+    Prior,
+    State,
+    evenly,
+    informed,
+    reweighted,
+    settled,
+)
+from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL
+from sfm_app.selfcal.undistort_pairs import straight_points
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+FEW_MATCHES = 100
+"""Of one pair, until the cameras have nearly arrived."""
+FIRST_ROUNDS, LAST_ROUNDS = 8, 12
+"""Before starts are compared, and with all matches."""
+POSE_MATCHES = 30
+"""Enough to tell which of the four poses of an E is the right one."""
+CHOICES = 3
+"""Times the evidence is asked again after an adjustment."""
+JACKKNIFE_GROUPS = 8
+LEAST_PHOTOS, LEAST_LEFT = 6, 4.0
+"""Photos, and weight of the remaining pairs, below which leaving photos out says more about
+what is missing than about errors."""
+REFIT_REACH = 3.0
+"""Scale of the robust refit of an F, in sigma."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """Cameras adjusted to their matches."""
+
+    matches: Matches
+    state: State
+    free: BoolArray
+    """(C, 4) which parameters the evidence freed, see `priors`."""
+    prior: Prior
+    usual: Usual
+    held: BoolArray | None = None
+    """(C, 4) what stays at its usual value, because the pairs do not determine it."""
+
+    def names_held(self, camera: int) -> tuple[str, ...]:
+        """The same by name, for one camera."""
+        return tuple(name for place, name in enumerate(NAMES) if self.held is not None and self.held[camera, place])
+
+    @property
+    def information(self) -> Information:
+        """What each pair says."""
+        return informed(self.matches, self.state)
+
+    @property
+    def trust(self) -> FloatArray:
+        """(P,) what the say of each pair counts, as if the matches of one keypoint were worth what they are."""
+        return np.asarray(
+            self.matches.trust * self.state.weights / (self.state.scale * self.matches.redundancy), np.float64
+        )
+
+    @property
+    def evidence(self) -> Evidence:
+        """What all pairs say."""
+        H, g = self.matches.scattered(self.information, self.trust)
+        return Evidence(self.state.thetas, H, g, float(np.sum(self.state.weights)), self.usual)
+
+    def cost(self, sigma: float, scale: float) -> float:
+        """Negative log-probability by which fits from different starts compete, the pairs' say bounded.
+
+        Args:
+            sigma: of a distance; with its own, larger one a wrong fit would be lenient with itself.
+            scale: of the disagreement; likewise.
+        """
+        state = reweighted(self.matches, replace(self.state, sigma=sigma))
+        gains = informed(self.matches, state).gains / (scale * self.matches.redundancy)
+        H = replace(self, state=state).evidence.H + np.diag(self.prior.precision.ravel())
+        volume = 0.5 * float(np.linalg.slogdet(lifted(H))[1] - np.sum(np.log(self.prior.precision)))
+        bounded = float(np.sum(gains / (1.0 + gains / CONFLICT)))
+        return bounded + self.prior.cost(state.thetas) + volume - self.usual.log_odds(self.free)
+
+
+def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], usual: Usual) -> Fit:
+    """The best of the fits that begin at `starts`, the most likely first, with the pixels square and not.
+
+    Args:
+        matches: inliers about the middle of the photos.
+        Fs: (P, 3, 3) in the same frame and units; begin the poses.
+        starts: (C, 5) each, first ideas of the cameras.
+        usual: what is known before.
+    """
+    few = matches.thinned(FEW_MATCHES)
+    best = _best([_begun(few, Fs, thetas, usual, square=True) for thetas in starts])
+    others = [_begun(few, Fs, thetas, usual, square=False) for thetas in (best.state.thetas, starts[0])]
+    fit = _best([best, *others])
+    state = settled(few, fit.state, fit.prior)
+    fit = replace(fit, matches=matches, state=settled(matches, state, fit.prior, LAST_ROUNDS))
+    for _ in range(CHOICES):
+        free = fit.evidence.best(fit.free)
+        if np.array_equal(free, fit.free):
+            break
+        prior = usual.prior(free, fit.state.thetas)
+        state = settled(few, fit.state, prior)
+        fit = Fit(matches, settled(matches, state, prior, LAST_ROUNDS), free, prior, usual)
+    held = fit.evidence.undetermined(fit.free)
+    prior = usual.prior(fit.free, fit.state.thetas, held)
+    return replace(fit, prior=prior, held=held, state=settled(matches, fit.state, prior, LAST_ROUNDS))
+
+
+def of_all_pairs(fit: Fit, matches: Matches, Fs: FloatArray) -> Fit:
+    """The same cameras with a pose for every pair, also for those that they were not adjusted to."""
+    if len(matches.cameras) == len(fit.matches.cameras):
+        return fit
+    state = replace(fit.state, poses=_poses(matches, Fs, fit.state.thetas), weights=np.ones(len(Fs)))
+    return replace(fit, matches=matches, state=state)
+
+
+def scatter_by_photos(fit: Fit) -> FloatArray:
+    """(5C,) standard deviations of the cameras by a jackknife over the photos; 0 where photos are too few to ask.
+
+    Neighbours in the list go together: what is wrong with one photo (blur, a moving shutter, a repeated wall) is often
+    wrong with the next. With each group left out the cameras take the step that the other pairs ask for; every pair
+    weighs what it weighs, or where right pairs are left out wrong ones would take their place.
+    """
+    photos, nothing = np.unique(fit.matches.photos), np.zeros(fit.state.thetas.size)
+    if len(photos) < LEAST_PHOTOS:
+        return nothing
+    groups = np.array_split(photos, min(JACKKNIFE_GROUPS, len(photos)))
+    information, trust, steps = fit.information, fit.trust, []
+    for group in groups:
+        left = ~np.isin(fit.matches.photos, group).any(axis=1)
+        if np.sum(fit.state.weights[left]) < LEAST_LEFT:
+            return nothing
+        H, g = fit.matches.scattered(information, np.where(left, trust, 0.0))
+        precision, away = fit.prior.precision.ravel(), (fit.prior.mean - fit.state.thetas).ravel()
+        steps.append(np.linalg.solve(H + np.diag(precision), g + precision * away))
+    spread = np.array(steps) - np.mean(steps, axis=0)
+    return np.asarray(np.sqrt((len(groups) - 1) / len(groups) * np.sum(spread**2, axis=0)), np.float64)
+
+
+def straight_fundamentals(fit: Fit) -> FloatArray:
+    """(P, 3, 3) F's of the photos as they were without a lens: refitted to the matches, free of any K."""
+    thetas, cameras = fit.state.thetas, fit.matches.cameras
+    found = np.empty((len(cameras), 3, 3))
+    for pair, (first, second) in enumerate(cameras):
+        x = fit.matches.of_pair(pair)
+        views = (straight_points(x[:, :2], thetas[first]), straight_points(x[:, 2:], thetas[second]))
+        inverses = [np.linalg.inv(camera_matrix_of(thetas[camera])) for camera in (first, second)]
+        E = _essential(fit.state.poses[pair])
+        start = inverses[1].T @ E @ inverses[0]
+        refit = refine_sampson(np.asfortranarray(np.hstack(views)), start, scale=REFIT_REACH * fit.state.sigma)
+        found[pair] = refit if np.isfinite(refit).all() and refit.any() else start
+    return found
+
+
+def camera_matrix_of(theta: FloatArray) -> FloatArray:
+    """(3, 3) camera matrix of the parameters (5,), in their units about the middle."""
+    f, half = np.exp(theta[LOG_FOCAL]), np.exp(0.5 * theta[LOG_ASPECT])
+    return np.array([[f / half, 0.0, theta[CENTRE_U]], [0.0, f * half, theta[CENTRE_V]], [0.0, 0.0, 1.0]])
+
+
+def _best(fits: Sequence[Fit]) -> Fit:
+    sigma, scale = (min(getattr(fit.state, name) for fit in fits) for name in ("sigma", "scale"))
+    return min(fits, key=lambda fit: fit.cost(sigma, scale))
+
+
+def _begun(few: Matches, Fs: FloatArray, thetas: FloatArray, usual: Usual, *, square: bool) -> Fit:
+    free = np.ones((len(thetas), len(NAMES)), np.bool_)
+    free[:, ASPECT] = not square
+    prior = usual.prior(free, thetas)
+    state = State(thetas, _poses(few, Fs, thetas), np.ones(len(Fs)), few.least_sigma)
+    state = settled(few, replace(state, sigma=few.noise(state)), prior, FIRST_ROUNDS)
+    return Fit(few, state, free, prior, usual)
+
+
+def _poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatArray:
+    poses = np.empty((len(Fs), 12))
+    for pair, (first, second) in enumerate(few.cameras):
+        K1, K2 = camera_matrix_of(thetas[first]), camera_matrix_of(thetas[second])
+        x = evenly(few.of_pair(pair), POSE_MATCHES)
+        rays = [
+            (straight_points(points, thetas[camera]) - K[:2, 2]) / K[[0, 1], [0, 1]]
+            for points, camera, K in ((x[:, :2], first, K1), (x[:, 2:], second, K2))
+        ]
+        R, t, _, _ = relative_pose(essential_from_fundamental(Fs[pair], K1, K2), *rays)
+        poses[pair] = np.concatenate([R.ravel(), t / np.linalg.norm(t)])
+    return poses
+
+
+def _essential(pose: FloatArray) -> FloatArray:
+    R, t = pose[:9].reshape(3, 3), pose[9:]
+    return np.asarray(np.cross(t, R, axisb=0, axisc=0), np.float64)

@@ -1,0 +1,213 @@
+"""What is believed about a camera before a photo is seen, and how far the pairs may change that.
+
+Most photos are uncropped, their pixels square, their lens nearly straight; some are not. So centre, aspect and lens
+each have two priors: a narrow one about the usual value, and a wide one. A parameter is freed only where the evidence
+for the wide prior (the marginal likelihood, by Laplace's approximation) outweighs how rare such photos are; otherwise
+it stays near its usual value. A focal that EXIF claims is one more narrow prior, which loses against pairs that
+contradict it.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.spd_solve import inverses_of_positive
+from sfm_app.selfcal.adjustment.structureless_ba import Prior
+from sfm_app.selfcal.adjustment.two_view_cost import CAMERA
+from sfm_app.selfcal.lens import CENTRE_U, KAPPA, LOG_ASPECT, LOG_FOCAL
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+CENTRE, ASPECT, LENS, FOCAL = range(4)
+"""Places in `free`: what may be freed from its usual value."""
+NAMES = ("centre", "aspect", "k1", "focal")
+USUAL_FOCAL, FOCAL_SPREAD = np.log(1.2), 0.7
+"""Mean and standard deviation of log f, f in longer sides, where nobody claims one."""
+HINT_SPREAD = 0.05
+"""Of a claimed focal: EXIF rounds millimetres, and the sensor's size to 35 mm."""
+NARROW = {CENTRE: 0.012, ASPECT: 0.002, LENS: 0.005}
+"""Standard deviations about the usual value: of the centre in longer sides, of log fy/fx, of k1."""
+WIDE = {CENTRE: 0.15, ASPECT: 0.25, LENS: 0.2}
+COLUMNS = {CENTRE: [CENTRE_U, CENTRE_U + 1], ASPECT: [LOG_ASPECT], LENS: [KAPPA]}
+"""Places in the parameters of a camera."""
+UNDETERMINED = 0.5
+"""A parameter whose narrow prior the pairs do not make narrower than this stays at its usual value."""
+STAYS = 1e-3
+"""What then becomes of that prior's deviation."""
+LEAST_SPARE = 0.25
+"""Share of the constraints that must be left to contradict the cameras, or nothing more is freed."""
+STRAIGHT = 1e-6
+"""The same of k1 where nobody wants to know about it."""
+FREE_SHARE = {CENTRE: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
+"""Share of photo sets in which the wide prior is the right one; for FOCAL, in which a claim is wrong."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Usual:
+    """What is known about the cameras, one row each."""
+
+    sides: FloatArray
+    """(C,) longer side of the photos, in the units of the matches."""
+    hints: FloatArray
+    """(C,) claimed focal in the same units, NaN where nobody claims one."""
+    centre_sigma: float = WIDE[CENTRE]
+    """Wide prior on the centre, in longer sides."""
+    lens: bool = True
+    """False: every lens is taken as straight."""
+
+    def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
+        """The prior when `free` (C, 4) says what is freed and `held` (C, 4) what stays at its usual value.
+
+        `thetas` (C, 5) turn k1 into kappa.
+        """
+        mean, deviation = np.zeros((len(self.sides), CAMERA)), np.empty((len(self.sides), CAMERA))
+        hinted = ~free[:, FOCAL] & np.isfinite(self.hints)
+        with np.errstate(invalid="ignore"):
+            mean[:, LOG_FOCAL] = np.where(hinted, np.log(self.hints), USUAL_FOCAL + np.log(self.sides))
+        deviation[:, LOG_FOCAL] = np.where(hinted, HINT_SPREAD, FOCAL_SPREAD)
+        wide = self.centre_sigma
+        deviation[:, CENTRE_U : CENTRE_U + 2] = (np.where(free[:, CENTRE], wide, NARROW[CENTRE]) * self.sides)[:, None]
+        deviation[:, LOG_ASPECT] = np.where(free[:, ASPECT], WIDE[ASPECT], NARROW[ASPECT])
+        k1 = np.where(free[:, LENS], WIDE[LENS], NARROW[LENS]) if self.lens else STRAIGHT
+        deviation[:, KAPPA] = k1 / np.exp(2.0 * thetas[:, LOG_FOCAL])
+        if held is not None:
+            for place, columns in COLUMNS.items():
+                for column in columns:
+                    deviation[held[:, place], column] *= STAYS
+        return Prior(mean, deviation**-2.0)
+
+    def log_odds(self, free: BoolArray) -> float:
+        """Log-probability of a choice, before the pairs are asked."""
+        total = 0.0
+        for place, share in FREE_SHARE.items():
+            counts = np.isfinite(self.hints) if place == FOCAL else np.ones(len(self.sides), np.bool_)
+            freed = share if place != LENS or self.lens else STRAIGHT
+            total += float(np.sum(np.log(np.where(free[counts, place], freed, 1.0 - freed))))
+        return total
+
+
+class Alternative(NamedTuple):
+    """One choice for one camera."""
+
+    free: BoolArray
+    """(C, 4) of all cameras."""
+    value: float
+    """Log-probability, up to a constant."""
+    step: FloatArray
+    """(5,) mean step of this camera."""
+    covariance: FloatArray
+    """(5, 5) of this camera."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What all pairs together say about a step d of the cameras from `thetas`: -g'd + d'Hd / 2."""
+
+    thetas: FloatArray
+    """(C, 5) parameters of the cameras."""
+    H: FloatArray
+    """(5C, 5C) Hessian of the negative log-likelihood."""
+    g: FloatArray
+    """(5C,) its negative gradient."""
+    pairs: float
+    """Effective number of pairs behind it."""
+    usual: Usual
+
+    def posterior(self, free: BoolArray) -> tuple[float, FloatArray, FloatArray]:
+        """Log-probability of a choice of freed parameters, up to a constant; mean step and covariance under it."""
+        prior = self.usual.prior(free, self.thetas)
+        precision, away = prior.precision.ravel(), (prior.mean - self.thetas).ravel()
+        share = spare(free, self.pairs)
+        covariance = inverses_of_positive(share * self.H + np.diag(precision))
+        pull = share * self.g + precision * away
+        step = covariance @ pull
+        fit = 0.5 * float(pull @ step) - 0.5 * float(precision @ away**2)
+        volume = 0.5 * float(np.sum(np.log(precision))) + 0.5 * float(np.linalg.slogdet(covariance)[1])
+        return fit + volume + self.usual.log_odds(free), step, covariance
+
+    def choices(self, free: BoolArray, camera: int) -> list[BoolArray]:
+        """All choices for one camera, the others as in `free` (C, 4); those that free less come first.
+
+        What would leave hardly a constraint to contradict it is no choice: three pairs fit almost any centre.
+        """
+        trials: list[BoolArray] = []
+        for switches in sorted(product((False, True), repeat=free.shape[1]), key=sum):
+            trial = free.copy()
+            trial[camera] = switches
+            if not trials or spare(trial, self.pairs) >= LEAST_SPARE:
+                trials.append(trial)
+        return trials
+
+    def best(self, free: BoolArray) -> BoolArray:
+        """The most probable choice: one camera after the other, the rest as they are, until none changes."""
+        while True:
+            before = free
+            for camera in range(len(free)):
+                _, step, covariance = self.posterior(free)
+                found = self.alternatives(free, camera, step, covariance)
+                free = max(found, key=lambda alternative: alternative.value).free
+            if np.array_equal(free, before):
+                return free
+
+    def undetermined(self, free: BoolArray) -> BoolArray:
+        """(C, 4) what is not freed, about which the pairs say hardly more than the prior, and nothing against it."""
+        prior = self.usual.prior(free, self.thetas)
+        before = prior.precision**-0.5
+        after = np.sqrt(np.diag(self.posterior(free)[2])).reshape(before.shape)
+        vague, near = after > UNDETERMINED * before, np.abs(self.thetas - prior.mean) < after
+        found = np.zeros_like(free)
+        for place, columns in COLUMNS.items():
+            found[:, place] = ~free[:, place] & vague[:, columns].any(axis=1) & near[:, columns].all(axis=1)
+        return found
+
+    def covariance(self, free: BoolArray) -> FloatArray:
+        """(5C, 5C) of the cameras about `thetas`, over all choices: what is nearly free is nearly as uncertain."""
+        _, step, covariance = self.posterior(free)
+        total = covariance.copy()
+        for camera in range(len(free)):
+            found = self.alternatives(free, camera, step, covariance)
+            odds = np.exp(np.array([one.value for one in found]) - max(one.value for one in found))
+            block = slice(CAMERA * camera, CAMERA * (camera + 1))
+            total[block, block] = sum(
+                share * (one.covariance + np.outer(one.step, one.step))
+                for share, one in zip(odds / odds.sum(), found, strict=True)
+            )
+        return total
+
+    def alternatives(
+        self, free: BoolArray, camera: int, step: FloatArray, covariance: FloatArray
+    ) -> list["Alternative"]:
+        """All choices for one camera, the others as in `free`, whose posterior has this mean step and covariance.
+
+        What the pairs and the other cameras say about this one is its marginal posterior without its prior: five
+        parameters, whatever the number of cameras.
+        """
+        block = slice(CAMERA * camera, CAMERA * (camera + 1))
+        prior, share = self.usual.prior(free, self.thetas), spare(free, self.pairs)
+        own = inverses_of_positive(covariance[block, block])
+        H = own - np.diag(prior.precision[camera])
+        g = own @ step[block] - prior.precision[camera] * (prior.mean - self.thetas)[camera]
+        found = []
+        for trial in self.choices(free, camera):
+            other = self.usual.prior(trial, self.thetas)
+            precision, away = other.precision[camera], (other.mean - self.thetas)[camera]
+            scale = spare(trial, self.pairs) / share
+            mine = inverses_of_positive(scale * H + np.diag(precision))
+            pull = scale * g + precision * away
+            value = 0.5 * float(pull @ mine @ pull) - 0.5 * float(precision @ away**2) + self.usual.log_odds(trial)
+            value += 0.5 * float(np.sum(np.log(precision))) + 0.5 * float(np.linalg.slogdet(mine)[1])
+            found.append(Alternative(trial, value, mine @ pull, mine))
+        return found
+
+
+def spare(free: BoolArray, pairs: float) -> float:
+    """Share of the constraints that is left to contradict the cameras, in [0.1, 1].
+
+    A pair gives two. The fewer are left, the less the pairs' scatter about the fit says about their errors.
+    """
+    sought = len(free) + 2 * np.count_nonzero(free[:, CENTRE]) + np.count_nonzero(free[:, [ASPECT, LENS]])
+    return max(1.0 - sought / max(2.0 * pairs, 1e-9), 0.1)

@@ -1,0 +1,251 @@
+"""Cameras and relative poses of all pairs adjusted to their matches at once: bundle adjustment without points.
+
+Every pair has its own relative pose, which is eliminated (Schur complement): what is left of a pair is what it says
+about the cameras, one Hessian and one gradient. A pair whose matches are right but whose geometry is not (repeated
+facades, another camera, a zoom) pulls at the cameras far harder than its noise allows; it is recognised by that and
+weighs less.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.pose_manifold import POSE, moved
+from sfm_app.geometry.spd_solve import solve_each
+from sfm_app.selfcal.adjustment.two_view_cost import CAMERA, distances, pair_costs, pair_systems
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+MOST_MATCHES = 1000
+"""Of one pair; more of them are not independent, and would let one pair outvote all others."""
+CONFLICT = 3.0
+"""A pair that would gain this much log-likelihood from cameras of its own is worth a quarter (chi^2 = 6 of 2)."""
+ALONE = np.array([0.3, 0.15, 0.15, 0.2, 0.2])
+"""How far such cameras of its own may lie away: standard deviations of log f, u, v, log a, kappa."""
+LOWER_QUARTILE = 0.288
+"""Of that gain, where two degrees of freedom are noise (chi^2 / 2)."""
+LEAST_SIGMA_PX = 0.1
+FEW_PHOTOS, CAUTION = 5, 0.25
+"""A camera of fewer photos answers to what no model holds (a lens, a wall that is not quite still) with a focal and a
+centre of its own: what its pairs say counts as if their noise were twice as large."""
+ROUNDS = 25
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e8
+ARRIVED = 2e-5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prior:
+    """Independent normal priors on the parameters of all cameras."""
+
+    mean: FloatArray
+    """(C, 5)."""
+    precision: FloatArray
+    """(C, 5), 1 / variance, > 0."""
+
+    def cost(self, thetas: FloatArray) -> float:
+        """Negative log-density, without its constant."""
+        return 0.5 * float(np.sum(self.precision * (thetas - self.mean) ** 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """Where the adjustment stands."""
+
+    thetas: FloatArray
+    """(C, 5) parameters of the cameras, see `lens`."""
+    poses: FloatArray
+    """(P, 12), see `pose_steps.essential`."""
+    weights: FloatArray
+    """(P,) in [0, 1]: how well a pair agrees with the others."""
+    sigma: float
+    """Standard deviation of a Sampson distance."""
+    scale: float = 1.0
+    """How many times larger the pairs' disagreement is than their noise explains, >= 1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Information:
+    """What each pair says about the cameras once its pose is eliminated."""
+
+    hessians: FloatArray
+    """(P, 10, 10) of camera 1 and camera 2; in the first five rows and columns where both are the same camera."""
+    gradients: FloatArray
+    """(P, 10) negative gradients."""
+    gains: FloatArray
+    """(P,) log-likelihood that a pair would gain from cameras of its own."""
+
+
+class Matches:
+    """Inliers of pairs, laid end to end.
+
+    Args:
+        inliers: per pair (N, 4), about the middle of the photos, in longer sides of the largest.
+        cameras: (P, 2) numbers of the cameras, counted from 0.
+        photos: (P, 2) numbers of the photos.
+        unit_px: length of that unit, in pixels.
+        most: of one pair; evenly chosen where there are more.
+        count: number of cameras.
+    """
+
+    def __init__(
+        self, inliers: Sequence[FloatArray], cameras: IndexArray, photos: IndexArray, unit_px: float,
+        most: int = MOST_MATCHES, count: int = 1,
+    ) -> None:  # fmt: skip
+        # what lies outside of the photos is no match, and would overflow
+        kept = [evenly(x[np.all(np.abs(x) <= 1.0, axis=1)], most) for x in inliers]
+        self.unit_px = unit_px
+        self.points = np.ascontiguousarray(np.concatenate([*kept, np.empty((0, 4))]))
+        self.ends = np.concatenate([[0], np.cumsum([len(x) for x in kept])]).astype(np.int64)
+        self.cameras = np.ascontiguousarray(cameras, dtype=np.int64)
+        self.photos = np.asarray(photos, dtype=np.int64)
+        self.count = count
+        self.least_sigma = LEAST_SIGMA_PX / unit_px
+        taken = [len(np.unique(self.photos[self.cameras == camera])) for camera in range(count)]
+        few = np.array(taken, np.int64) < FEW_PHOTOS
+        self.trust = np.where(few[self.cameras].any(axis=1), CAUTION, 1.0)
+
+    @cached_property
+    def redundancy(self) -> float:
+        """Matches over independent errors, >= 1.
+
+        One keypoint in m photos gives m (m - 1) / 2 matches, but 2 m - 3 independent errors. How many matches there are
+        per keypoint says what m is.
+        """
+        if len(self.points) == 0:
+            return 1.0
+        photos = self.photos.repeat(np.diff(self.ends), axis=0)
+        views = [np.column_stack([photos[:, view], self.points[:, 2 * view : 2 * view + 2]]) for view in range(2)]
+        each = 2 * len(self.points) / len(np.unique(np.concatenate(views), axis=0))
+        return max(1.0, 0.5 * each * (each + 1.0) / (2.0 * each - 1.0))
+
+    def of_pair(self, pair: int) -> FloatArray:
+        """(N, 4) of one pair."""
+        return self.points[self.ends[pair] : self.ends[pair + 1]]
+
+    def chosen(self, which: IndexArray) -> "Matches":
+        """Keep these pairs only."""
+        if len(which) == len(self.cameras):
+            return self
+        inliers = [self.of_pair(pair) for pair in which]
+        return Matches(inliers, self.cameras[which], self.photos[which], self.unit_px, count=self.count)
+
+    def thinned(self, most: int) -> "Matches":
+        """The same with at most so many per pair."""
+        inliers = [self.of_pair(pair) for pair in range(len(self.cameras))]
+        return Matches(inliers, self.cameras, self.photos, self.unit_px, most, self.count)
+
+    def costs(self, state: State) -> FloatArray:
+        """(P,) robust costs."""
+        return np.asarray(
+            pair_costs(self.points, self.ends, state.thetas, self.cameras, state.poses, state.sigma), np.float64
+        )
+
+    def noise(self, state: State) -> float:
+        """Standard deviation of the distances of the pairs that agree, from their median.
+
+        A pose takes five of a pair's degrees of freedom: the distances of few matches are smaller than their errors.
+        """
+        counts = np.diff(self.ends)
+        found = np.abs(distances(self.points, self.ends, state.thetas, self.cameras, state.poses))
+        found *= np.repeat(np.sqrt(counts / np.maximum(counts - POSE, 1)), counts)
+        agreeing = np.repeat(state.weights > 0.5, counts)
+        return max(1.4826 * float(np.median(found[agreeing])) if agreeing.any() else 0.0, self.least_sigma)
+
+    def scattered(self, information: Information, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Sum over the pairs, times `factors` (P,): (5C, 5C) and (5C,) in the parameters of all cameras."""
+        rows = (CAMERA * self.cameras[:, :, None] + np.arange(CAMERA)).reshape(-1, 2 * CAMERA)
+        H, b = np.zeros((CAMERA * self.count,) * 2), np.zeros(CAMERA * self.count)
+        np.add.at(H, (rows[:, :, None], rows[:, None, :]), factors[:, None, None] * information.hessians)
+        np.add.at(b, rows, factors[:, None] * information.gradients)
+        return H, b
+
+
+def evenly(rows: FloatArray, most: int) -> FloatArray:
+    """At most so many rows, evenly chosen."""
+    return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
+
+
+def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) -> State:
+    """Weigh the pairs anew and take a step of Levenberg and Marquardt, until the cameras stand still."""
+    damping = FIRST_DAMPING
+    for _ in range(rounds):
+        system = _system(matches, state)
+        state = _weighed(state, system)
+        trial, damping = _stepped(matches, state, prior, system, damping)
+        moved_by = np.max(np.abs(trial.thetas - state.thetas), initial=0.0)
+        state = replace(trial, sigma=matches.noise(trial))
+        if moved_by < ARRIVED:
+            break
+    return reweighted(matches, state)
+
+
+def reweighted(matches: Matches, state: State) -> State:
+    """Weigh every pair by what it would gain from cameras of its own."""
+    return _weighed(state, _system(matches, state))
+
+
+def informed(matches: Matches, state: State) -> Information:
+    """Eliminate the poses."""
+    return _information(_system(matches, state))
+
+
+def _system(matches: Matches, state: State) -> tuple[FloatArray, FloatArray]:
+    return pair_systems(matches.points, matches.ends, state.thetas, matches.cameras, state.poses, state.sigma)
+
+
+def _information(system: tuple[FloatArray, FloatArray]) -> Information:
+    H, g, _, _ = _reduced(*system, 0.0)
+    gains = 0.5 * np.einsum("pi,pi->p", g, solve_each(H + np.diag(np.tile(ALONE**-2.0, 2)), g[..., None])[..., 0])
+    return Information(H, g, gains)
+
+
+def _weighed(state: State, system: tuple[FloatArray, FloatArray]) -> State:
+    gains = _information(system).gains
+    scale = max(1.0, float(np.quantile(gains, 0.25)) / LOWER_QUARTILE) if len(gains) else 1.0
+    return replace(state, weights=(1.0 + gains / (CONFLICT * scale)) ** -2, scale=scale)
+
+
+def _reduced(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Schur complement of the poses; also what gives their steps: V^-1 W' and V^-1 b_pose."""
+    n = 2 * CAMERA
+    V = A[:, n:, n:].copy()
+    diagonal = np.arange(V.shape[-1])
+    # few or degenerate matches leave a pose open: what is added must count beside the largest entry
+    least = 1e-9 + 1e-12 * np.max(V[:, diagonal, diagonal], axis=1, keepdims=True)
+    V[:, diagonal, diagonal] += damping * V[:, diagonal, diagonal] + least
+    back, own = np.split(np.linalg.solve(V, np.concatenate([A[:, n:, :n], b[:, n:, None]], axis=2)), [n], axis=2)
+    H = A[:, :n, :n] - A[:, :n, n:] @ back
+    g = b[:, :n] - (A[:, :n, n:] @ own)[..., 0]
+    return H, g, back, own[..., 0]
+
+
+def _stepped(
+    matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
+) -> tuple[State, float]:
+    """One step that lowers the cost, damped as far as that needs, and the damping for the next."""
+    factors = matches.trust * state.weights / state.scale
+    cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
+    while damping < MOST_DAMPING:
+        trial = _tried(matches, state, prior, system, damping)
+        if float(factors @ matches.costs(trial)) + prior.cost(trial.thetas) <= cost:
+            return trial, max(0.1 * damping, LEAST_DAMPING)
+        damping *= 10.0
+    return state, damping
+
+
+def _tried(
+    matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
+) -> State:
+    reduced, gradients, back, own = _reduced(*system, damping)
+    H, g = matches.scattered(Information(reduced, gradients, np.empty(0)), matches.trust * state.weights / state.scale)
+    H += np.diag(prior.precision.ravel())
+    g += (prior.precision * (prior.mean - state.thetas)).ravel()
+    step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
+    cameras = step[matches.cameras].reshape(-1, 2 * CAMERA)
+    turns = own - (back @ cameras[..., None])[..., 0]
+    poses = np.array([moved(pose, turn) for pose, turn in zip(state.poses, turns, strict=True)]).reshape(-1, 12)
+    return replace(state, thetas=state.thetas + step, poses=poses)

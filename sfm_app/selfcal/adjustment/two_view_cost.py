@@ -1,0 +1,154 @@
+"""What the matches of pairs of photos say about their cameras: Sampson distances of E = [t]x R, and derivatives.
+
+A pair has fifteen parameters: five of each camera (`lens`), and the five of its relative pose. The distance of a match
+is Sampson's in pixels of the photo as it is, so that a lens which is undone does not change what a pixel is worth::
+
+    r = C / |dC/d(x1, y1, x2, y2)|,      C = q2' E q1,      q = ray of a pixel
+
+Matches that fit badly are worth less: r^2 / (1 + r^2 / c^2) with c = 3 sigma (Geman and McClure 1987).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.pose_manifold import POSE, essential, moved
+from sfm_app.jit import kernel
+from sfm_app.selfcal.lens import camera_of, ray
+
+FloatArray = NDArray[np.float64]
+IndexArray = NDArray[np.int64]
+
+CAMERA = 5
+"""Parameters of one camera."""
+PAIR = 2 * CAMERA + POSE
+REACH = 3.0
+"""c, in sigma."""
+HOPELESS = 1e60
+"""Squared distances in sigma^2, or derivatives, above this are no numbers any more."""
+_STEP = 1e-6
+
+
+@kernel
+def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
+    l0 = E[0, 0] * p[0] + E[0, 1] * p[1] + E[0, 2]
+    l1 = E[1, 0] * p[0] + E[1, 1] * p[1] + E[1, 2]
+    l2 = E[2, 0] * p[0] + E[2, 1] * p[1] + E[2, 2]
+    k0 = E[0, 0] * q[0] + E[1, 0] * q[1] + E[2, 0]
+    k1 = E[0, 1] * q[0] + E[1, 1] * q[1] + E[2, 1]
+    g0, g1 = p[2] * k0 + p[4] * k1, p[3] * k0 + p[5] * k1
+    h0, h1 = q[2] * l0 + q[4] * l1, q[3] * l0 + q[5] * l1
+    return float((q[0] * l0 + q[1] * l1 + l2) / np.sqrt(g0 * g0 + g1 * g1 + h0 * h0 + h1 * h1 + 1e-300))
+
+
+@kernel
+def distances(
+    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray
+) -> FloatArray:
+    """(M,) Sampson distances with sign, in the units of the matches.
+
+    Args:
+        matches: (M, 4) of all pairs, one after the other.
+        ends: (P + 1,) where each pair begins, and the end of the last.
+        thetas: (C, 5) parameters of the cameras.
+        cameras: (P, 2) camera of view 1 and of view 2.
+        poses: (P, 12), see `essential`.
+    """
+    E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
+    p, q = np.empty(7), np.empty(7)
+    found = np.empty(len(matches))
+    for k in range(len(poses)):
+        essential(poses[k], E)
+        camera_of(thetas[cameras[k, 0]], first)
+        camera_of(thetas[cameras[k, 1]], second)
+        for i in range(ends[k], ends[k + 1]):
+            ray(matches[i, 0], matches[i, 1], first, -1.0, p)
+            ray(matches[i, 2], matches[i, 3], second, -1.0, q)
+            found[i] = _distance(p, q, E)
+    return found
+
+
+@kernel
+def pair_costs(
+    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
+) -> FloatArray:
+    """(P,) half the sum over the matches of a pair of their robust squared distances, in sigma^2.
+
+    Arguments as in `distances`; sigma is the standard deviation of one.
+    """
+    found = distances(matches, ends, thetas, cameras, poses)
+    costs = np.zeros(len(poses))
+    for k in range(len(poses)):
+        for i in range(ends[k], ends[k + 1]):
+            r2 = (found[i] / sigma) ** 2
+            costs[k] += 0.5 * r2 / (1.0 + r2 / REACH**2) if r2 < HOPELESS else 0.5 * REACH**2
+    return costs
+
+
+@kernel
+def pair_systems(
+    matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
+) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Newton systems of all pairs in their fifteen parameters: camera 1, camera 2, pose.
+
+    Arguments as in `distances`; sigma is the standard deviation of one.
+
+    Returns:
+        (P, 15, 15) approximate Hessians of the costs and (P, 15) their negative gradients; where both views are of one
+        camera, all that concerns it stands in the first five rows and columns.
+    """
+    A, b = np.zeros((len(poses), PAIR, PAIR)), np.zeros((len(poses), PAIR))
+    # index 0 is the point itself, 1 to 5 one parameter moved
+    lenses, Es = np.empty((2, 1 + CAMERA, 5)), np.empty((1 + POSE, 3, 3))
+    rays, J = np.empty((2, 1 + CAMERA, 7)), np.empty(PAIR)
+    step = np.zeros(POSE)
+    for k in range(len(poses)):
+        shared = cameras[k, 0] == cameras[k, 1]
+        J[:] = 0.0
+        essential(poses[k], Es[0])
+        for j in range(POSE):
+            step[j] = _STEP
+            essential(moved(poses[k], step), Es[1 + j])
+            step[j] = 0.0
+        for view in range(2):
+            theta = thetas[cameras[k, view]].copy()
+            camera_of(theta, lenses[view, 0])
+            for j in range(CAMERA):
+                kept = theta[j]
+                theta[j] = kept + _STEP
+                camera_of(theta, lenses[view, 1 + j])
+                theta[j] = kept
+        for i in range(ends[k], ends[k + 1]):
+            for view in range(2):
+                x, y, guess = matches[i, 2 * view], matches[i, 2 * view + 1], -1.0
+                for j in range(1 + CAMERA):
+                    ray(x, y, lenses[view, j], guess, rays[view, j])
+                    guess = rays[view, 0, 6]
+            r = _distance(rays[0, 0], rays[1, 0], Es[0]) / sigma
+            for j in range(CAMERA):
+                if shared:
+                    J[j] = (_distance(rays[0, 1 + j], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
+                else:
+                    J[j] = (_distance(rays[0, 1 + j], rays[1, 0], Es[0]) / sigma - r) / _STEP
+                    J[CAMERA + j] = (_distance(rays[0, 0], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
+            for j in range(POSE):
+                J[2 * CAMERA + j] = (_distance(rays[0, 0], rays[1, 0], Es[1 + j]) / sigma - r) / _STEP
+            # at an epipole the distance has no gradient to be divided by
+            total = r * r
+            for j in range(PAIR):
+                total += abs(J[j])
+            if total < HOPELESS:
+                _add(A[k], b[k], J, r, (1.0 + r * r / REACH**2) ** -2)
+    for k in range(len(poses)):
+        for i in range(PAIR):
+            for j in range(i):
+                A[k, j, i] = A[k, i, j]
+    return A, b
+
+
+@kernel
+def _add(A: FloatArray, b: FloatArray, J: FloatArray, r: float, weight: float) -> None:
+    for i in range(PAIR):
+        scaled = weight * J[i]
+        b[i] -= scaled * r
+        for j in range(i + 1):
+            A[i, j] += scaled * J[j]

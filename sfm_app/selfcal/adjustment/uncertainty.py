@@ -1,0 +1,62 @@
+"""How far a fit may be trusted: covariances, standard deviations in pixels, and which pairs say most."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.spd_solve import lifted
+from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, scatter_by_photos
+from sfm_app.selfcal.adjustment.structureless_ba import ALONE
+from sfm_app.selfcal.adjustment.two_view_cost import CAMERA
+from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, KAPPA, LOG_ASPECT, LOG_FOCAL
+from sfm_app.types import PairId
+
+FloatArray = NDArray[np.float64]
+
+MODEL_ERROR = np.array([1e-3, 1e-3, 1e-3, 1e-3, 3e-3])
+"""Standard deviations of what no lens model holds: of log f, u, v in longer sides, log a, and k1."""
+AGREES = 0.5
+"""A pair with a smaller weight in the fit is no key pair."""
+
+
+def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> FloatArray:
+    """(5C, 5C) covariance of all parameters, over all choices of what is free, with what no model holds added.
+
+    Args:
+        fit: cameras adjusted to matches.
+        sides: (C,) longer sides of the photos.
+        resampled: widen it where leaving photos out moves the cameras further than it says.
+    """
+    found = fit.evidence.covariance(fit.free)
+    if resampled:
+        deviations = np.sqrt(np.diag(found))
+        wider = np.maximum(scatter_by_photos(fit) / deviations, 1.0)
+        found = found * np.outer(wider, wider)
+    floor = np.tile(MODEL_ERROR, (len(sides), 1))
+    floor[:, CENTRE_U : CENTRE_V + 1] *= sides[:, None]
+    floor[:, KAPPA] /= np.exp(2.0 * fit.state.thetas[:, LOG_FOCAL])
+    return np.asarray(found + np.diag(floor.ravel() ** 2), np.float64)
+
+
+def spread_of(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, float]:
+    """Standard deviations of fx, fy, cx, cy in pixels and of k1, from the covariance (5, 5) of one camera."""
+    focal, squared = float(np.exp(theta[LOG_FOCAL])) * unit_px, float(np.exp(2.0 * theta[LOG_FOCAL]))
+    half = float(np.exp(0.5 * theta[LOG_ASPECT]))
+    # rows: how fx, fy, cx, cy, k1 change with log f, u, v, log a, kappa
+    slopes = np.zeros((CAMERA, CAMERA))
+    slopes[0, [LOG_FOCAL, LOG_ASPECT]] = focal / half, -0.5 * focal / half
+    slopes[1, [LOG_FOCAL, LOG_ASPECT]] = focal * half, 0.5 * focal * half
+    slopes[2, CENTRE_U] = slopes[3, CENTRE_V] = unit_px
+    slopes[4, [LOG_FOCAL, KAPPA]] = 2.0 * theta[KAPPA] * squared, squared
+    deviations = np.sqrt(np.maximum(np.diag(slopes @ cov @ slopes.T), 0.0))
+    return dict(zip(("fx", "fy", "cx", "cy", "k1"), deviations.tolist(), strict=True))
+
+
+def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:
+    """Pairs that agree with the cameras, those that say most about them first: views that differ in more than place."""
+    if not photos:
+        return ()
+    alone = np.tile(ALONE, 2)
+    news = np.linalg.slogdet(lifted(np.eye(2 * CAMERA) + alone[:, None] * fit.information.hessians * alone))[1]
+    worth = fit.state.weights * news
+    order = [pair for pair in np.argsort(-worth, kind="stable") if fit.state.weights[pair] >= AGREES]
+    return tuple(photos[pair] for pair in order)

@@ -1,0 +1,155 @@
+"""Photos that were thought to be of one camera but are of several: a zoom, or mixed devices without EXIF.
+
+Several cameras are several peaks of the consensus (thesis Figure 5.15, left undone there). The photos whose pairs agree
+on a peak are one camera; each other photo is asked, by its pairs with those, which focal it has. Where photos clearly
+name another one, every photo takes the camera with which its pairs agree best.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.selfcal.cameras.multi_camera import Tables
+from sfm_app.selfcal.consensus import consensus_peak
+from sfm_app.selfcal.consensus.consensus import Consensus
+from sfm_app.selfcal.inputs import FloatArray
+from sfm_app.selfcal.lens import LOG_FOCAL
+from sfm_app.types import PairId
+
+SIGMA = 0.03
+"""Width of the votes, in units of r: 3 % of focal still agree, 10 % do not."""
+FAIR_SHARE = 0.5
+"""Share of its votes that a photo must get to belong to a peak, or to name a focal."""
+OTHER_FOCAL = 0.05
+"""A difference in log f from which on it is another camera."""
+CLEARLY = 0.25
+"""Share of a photo's votes by which another focal must beat that of the peak."""
+LEAST_GAIN = 0.25
+"""The same of the photos of all other cameras together, for a split to be worth it."""
+REACH, TRIALS = 1.1, 111
+"""Focals that a photo is asked about: up to three times longer or shorter."""
+MOST_PEAKS = 4
+ROUNDS = 10
+
+
+def separated(
+    tables: Tables, photos: Sequence[PairId], starts: Sequence[FloatArray]
+) -> tuple[FloatArray, dict[int, int]]:
+    """Cameras among photos that share all but the focal, and which photo is of which.
+
+    Args:
+        tables: the pairs, without lens, in longer sides about the middle; its members are not used.
+        photos: per pair its two photos.
+        starts: (5,) each, cameras that may be those of many pairs.
+
+    Returns:
+        (C, 5) cameras, and the number of the camera by photo; one camera where the photos do not disagree.
+    """
+    everyone = sorted({photo for pair in photos for photo in pair})
+    pairs = _Pairs(tables, photos)
+    _, theta, core = max((pairs.core(theta, everyone) for theta in starts), key=lambda found: found[0])
+    one = theta[None]
+    named = [focal for photo in everyone if photo not in core for focal in pairs.named(photo, theta, core)]
+    focals = _clustered(named)
+    if not focals:
+        return one, dict.fromkeys(everyone, 0)
+    cameras = np.repeat(one, 1 + len(focals), axis=0)
+    cameras[1:, LOG_FOCAL] += focals
+    labels = pairs.labelled(cameras, everyone, core)
+    gain = pairs.total(cameras, labels) - max(
+        pairs.total(cameras, dict.fromkeys(everyone, k)) for k in range(len(cameras))
+    )
+    if gain <= LEAST_GAIN * pairs.at_stake({photo for photo, label in labels.items() if label != 0}):
+        return one, dict.fromkeys(everyone, 0)
+    used = sorted(set(labels.values()))
+    return cameras[used], {photo: used.index(label) for photo, label in labels.items()}
+
+
+def peaks_of(consensus: Consensus) -> list[FloatArray]:
+    """(5,) each: the peaks of the consensus as cameras without lens, highest first."""
+    answer = consensus_peak.found(consensus)
+    return [np.append(theta, 0.0) for theta in (answer.theta, *answer.others)][:MOST_PEAKS]
+
+
+class _Pairs:
+    """Votes of pairs of photos for cameras."""
+
+    def __init__(self, tables: Tables, photos: Sequence[PairId]) -> None:
+        self.tables, self.photos = tables, photos
+
+    def core(self, theta: FloatArray, everyone: Sequence[int]) -> tuple[float, FloatArray, set[int]]:
+        """Votes beyond the fair share of the photos that agree on a camera, the camera, and those photos."""
+        beyond = [
+            float(self.tables.votes(k, theta[None], theta[None], SIGMA)[0, 0] - FAIR_SHARE * self.tables.weights[k])
+            for k in range(len(self.photos))
+        ]
+        core = set(everyone)
+        while len(core) > 2:
+            worth = dict.fromkeys(core, 0.0)
+            for (first, second), value in zip(self.photos, beyond, strict=True):
+                if first in core and second in core:
+                    worth[first] += value
+                    worth[second] += value
+            worst = min(core, key=lambda photo: (worth[photo], photo))
+            if worth[worst] >= 0:
+                break
+            core.remove(worst)
+        inside = [value for pair, value in zip(self.photos, beyond, strict=True) if core.issuperset(pair)]
+        return float(sum(inside)), theta, core
+
+    def named(self, photo: int, theta: FloatArray, core: set[int]) -> list[float]:
+        """The focal that a photo's pairs with the core clearly name instead, as a step in log f; or nothing."""
+        steps = np.linspace(-REACH, REACH, TRIALS)
+        trials = np.repeat(theta[None], TRIALS, axis=0)
+        trials[:, LOG_FOCAL] += steps
+        votes, most = np.zeros(TRIALS), 0.0
+        for k, (first, second) in enumerate(self.photos):
+            if first == photo and second in core:
+                votes += self.tables.votes(k, trials, theta[None], SIGMA)[:, 0]
+            elif second == photo and first in core:
+                votes += self.tables.votes(k, theta[None], trials, SIGMA)[0]
+            else:
+                continue
+            most += self.tables.weights[k]
+        best = int(np.argmax(votes))
+        clear = votes[best] - votes[TRIALS // 2] > CLEARLY * most and votes[best] >= FAIR_SHARE * most
+        return [float(steps[best])] if clear and abs(steps[best]) > OTHER_FOCAL else []
+
+    def labelled(self, cameras: FloatArray, everyone: Sequence[int], core: set[int]) -> dict[int, int]:
+        """Every photo with the camera for which its pairs vote most, the others as they are, until none changes."""
+        labels = {photo: 0 if photo in core else -1 for photo in everyone}
+        for _ in range(ROUNDS):
+            before = dict(labels)
+            for photo in everyone:
+                votes = np.zeros(len(cameras))
+                for k, (first, second) in enumerate(self.photos):
+                    if first == photo and labels[second] >= 0:
+                        votes += self.tables.votes(k, cameras, cameras[labels[second]][None], SIGMA)[:, 0]
+                    elif second == photo and labels[first] >= 0:
+                        votes += self.tables.votes(k, cameras[labels[first]][None], cameras, SIGMA)[0]
+                labels[photo] = int(np.argmax(votes))
+            if labels == before:
+                break
+        return labels
+
+    def at_stake(self, asked: set[int]) -> float:
+        """Most votes that the pairs of some photos can give."""
+        touched = [bool(asked.intersection(pair)) for pair in self.photos]
+        return float(np.sum(self.tables.weights[touched]))
+
+    def total(self, cameras: FloatArray, labels: dict[int, int]) -> float:
+        """Votes of all pairs."""
+        return float(
+            sum(
+                self.tables.votes(k, cameras[labels[first]][None], cameras[labels[second]][None], SIGMA)[0, 0]
+                for k, (first, second) in enumerate(self.photos)
+            )
+        )
+
+
+def _clustered(steps: Sequence[float]) -> list[float]:
+    """Medians of the runs of values that lie within `OTHER_FOCAL` of the one before."""
+    ordered: NDArray[np.float64] = np.sort(np.array(steps))
+    cuts = np.flatnonzero(np.diff(ordered) > OTHER_FOCAL) + 1
+    return [float(np.median(run)) for run in np.split(ordered, cuts) if len(run)]

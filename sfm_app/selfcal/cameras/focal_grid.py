@@ -1,0 +1,77 @@
+"""Votes of pairs for the focals of their two photos, on one grid for all of them."""
+
+import numpy as np
+
+from sfm_app.selfcal.adjustment.camera_priors import FOCAL_SPREAD, USUAL_FOCAL
+from sfm_app.selfcal.adjustment.tied_priors import TIE
+from sfm_app.selfcal.cameras.multi_camera import FOCALS, IndexArray, Tables, best_places
+from sfm_app.selfcal.consensus.peak_search import FOCAL_RANGE
+from sfm_app.selfcal.inputs import FloatArray
+from sfm_app.selfcal.lens import LOG_FOCAL
+
+SIGMA = 0.05
+"""Width of the votes, in units of r: neighbours on the grid of focals, 7 % apart, still vote for each other."""
+MOST_PAIRS = 1500
+"""Evenly chosen where there are more: tables of all focals of both photos take 13 kB a pair."""
+
+
+def chosen_pairs(count: int) -> IndexArray:
+    """Which of so many pairs are asked."""
+    return np.linspace(0, count - 1, min(count, MOST_PAIRS)).astype(np.int64)
+
+
+class FocalGrid:
+    """Votes of pairs for the focals of their two photos.
+
+    Args:
+        tables: the pairs, without lens.
+        rows: (P,) which of them.
+        theta: (5,) the camera whose centre and pixels are those of all photos.
+        members: (P, 2) photos, counted from 0.
+    """
+
+    def __init__(self, tables: Tables, rows: IndexArray, theta: FloatArray, members: IndexArray) -> None:
+        self.votes, self.members = _votes(tables, rows, theta), members
+        self.grid = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
+
+    def places(self, cameras: IndexArray, rows: IndexArray) -> IndexArray:
+        """(C,) places on the grid on which these pairs agree, when photo k is of `cameras[k]`."""
+        one = np.einsum("pgg->g", self.votes[rows]) - 0.5 * ((self.grid - USUAL_FOCAL) / FOCAL_SPREAD) ** 2
+        usual = -0.5 * ((self.grid - self.grid[np.argmax(one)]) / TIE) ** 2
+        if np.max(cameras) == 0:
+            return np.array([np.argmax(one)])
+        own = np.tile(usual, (int(np.max(cameras)) + 1, 1))
+        between: dict[tuple[int, int], FloatArray] = {}
+        for row in rows:
+            i, j = (int(cameras[photo]) for photo in self.members[row])
+            table = self.votes[row]
+            if i == j:
+                own[i] += np.diag(table)
+            else:
+                key, table = ((i, j), table) if i < j else ((j, i), table.T)
+                between[key] = between.get(key, 0.0) + table
+        return best_places(own, between)
+
+    def given(self, places: IndexArray) -> FloatArray:
+        """(P,) votes when photo k has the focal at `places[k]`."""
+        first, second = places[self.members].T
+        return np.asarray(self.votes[np.arange(len(self.votes)), first, second], np.float64)
+
+    def fitted(self, cameras: IndexArray) -> float:
+        """The sum of them for cameras that all pairs agree on."""
+        return float(np.sum(self.given(self.places(cameras, np.arange(len(self.votes)))[cameras])))
+
+    def held(self, cameras: IndexArray, fold: IndexArray) -> FloatArray:
+        """(P,) votes of every pair for cameras that the pairs of the other folds agree on."""
+        found = np.zeros(len(self.votes))
+        for number in np.unique(fold):
+            out = fold == number
+            found[out] = self.given(self.places(cameras, np.flatnonzero(~out))[cameras])[out]
+        return found
+
+
+def _votes(tables: Tables, rows: IndexArray, theta: FloatArray) -> FloatArray:
+    trials = np.repeat(theta[None], FOCALS, axis=0)
+    trials[:, LOG_FOCAL] = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
+    trials[:, -1] = 0.0
+    return np.array([tables.votes(int(row), trials, trials, SIGMA) for row in rows])

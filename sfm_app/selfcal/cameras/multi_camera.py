@@ -1,0 +1,342 @@
+"""Several cameras in one set of photos: one K each, from the pairs within cameras and between them.
+
+A camera that its own pairs determine is known. The focals of the others are found together, on a grid, as the choice
+that most pairs agree on (max-sum message passing; E = K2'F K1 has two equal singular values for the right two focals),
+and then everything is adjusted to the matches at once.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.camera import guessed_camera_matrix
+from sfm_app.jit import kernel
+from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, refined, straight_fundamentals
+from sfm_app.selfcal.adjustment.camera_priors import FOCAL_SPREAD, HINT_SPREAD, USUAL_FOCAL, Usual
+from sfm_app.selfcal.adjustment.structureless_ba import Matches
+from sfm_app.selfcal.adjustment.tied_priors import Tied
+from sfm_app.selfcal.adjustment.two_view_cost import CAMERA
+from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_of
+from sfm_app.selfcal.consensus import consensus_peak
+from sfm_app.selfcal.consensus.peak_evidence import MIN_LEAD, RIVAL_RATIO
+from sfm_app.selfcal.consensus.peak_search import FOCAL_RANGE, SIGMAS
+from sfm_app.selfcal.critical_motions import open_focal
+from sfm_app.selfcal.inputs import FloatArray, prepare
+from sfm_app.selfcal.lens import LOG_FOCAL, camera_of
+from sfm_app.selfcal.results import calibration_of, guessed, parameters_of, roughly
+from sfm_app.settings import CalibrationSettings
+from sfm_app.types import Calibration, CameraPairs, PairId
+
+IndexArray = NDArray[np.int64]
+
+FOCALS = 41
+"""Focals on the grid of a camera, each 7 % above the one before."""
+MESSAGE_ROUNDS, DAMPING = 30, 0.5
+FAIR_SHARE, BORNE_OUT, NOT_ALL = 0.5, 0.8, "not all of its photos bear it out"
+"""Shares of their votes that every photo, and all together, must give to a camera that photos of one size were divided
+into. Chosen on folders 0 to 179 and 1000 to 1020 of `benchmarks/accuracy/trouble.py`: two cameras get 0.86 to 0.93
+(0.57 and 0.69 with a moving object), those of a zoom and those over 5 % off 0.44 to 0.76."""
+LEAST_PAIRS = 2
+"""Pairs that a camera needs: two constraints find its focal, two more contradict a wrong one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraGroup:
+    """One camera of several."""
+
+    size: tuple[int, int]
+    """(width, height) of its photos in pixels."""
+    start: Calibration | None = None
+    """What its own pairs say, or a photo of it."""
+    known: bool = False
+    """Whether its own pairs determine that."""
+    hint_px: float = np.nan
+    """Claimed focal."""
+    family: int = -1
+    """Number of the folder whose cameras are alike, though each photo has its own; -1: it stands alone."""
+    divided: bool = False
+    """Whether it is one of several that photos of one size were divided into: then each of its photos is asked."""
+
+    @property
+    def whole(self) -> bool:
+        """Whether its own pairs were asked about it, all of them and no others."""
+        return self.family < 0 and not self.divided
+
+
+def calibrate_several(
+    cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, options: CalibrationSettings, method: str
+) -> list[Calibration]:
+    """One calibration per camera, in their order; each is identifiable or a guess with the reason.
+
+    Args:
+        cameras: sizes, and what is known.
+        pairs: all pairs, within and between cameras, with inliers; the size is not used.
+        members: (P, 2) number of the camera that took view 1, view 2.
+        options: whether to look for a lens.
+        method: name that goes into the answers.
+    """
+    unit = float(max(max(camera.size) for camera in cameras))
+    kept, Fs, matches = _in_units(cameras, pairs, members, unit)
+    members = members[kept]
+    sides = np.array([max(camera.size) / unit for camera in cameras])
+    hints = np.array([camera.hint_px for camera in cameras]) / unit
+    families = np.array([camera.family for camera in cameras], np.int64)
+    usual = Tied(sides, hints, options.centre_sigma, options.lens, families)
+    weights = pairs.weights[kept]
+    thetas = np.array([_first(camera, side, unit) for camera, side in zip(cameras, sides, strict=True)])
+    unknown = np.array([camera.start is None for camera in cameras])
+    if unknown.any():
+        thetas = _with_focals(thetas, unknown, Tables(Fs, members, weights), usual)
+    fit = refined(matches, Fs, [thetas], usual)
+    cov = covariance(fit, sides)
+    straight = Tables(straight_fundamentals(fit), members, weights)
+    best = key_pairs(fit, tuple(pairs.photos[k] for k in kept))
+    of = {pairs.photos[k]: (int(first), int(second)) for k, (first, second) in zip(kept, members, strict=True)}
+    shares = _least_shares(fit.state.thetas, straight, [pairs.photos[k] for k in kept])
+    motion = open_focal(fit)
+    found = [
+        replace(
+            _judged(k, camera, fit, cov, straight, unit, method, "" if camera.whole else motion),
+            key_pairs=tuple(pair for pair in best if of[pair] == (k, k)),
+        )
+        for k, camera in enumerate(cameras)
+    ]
+    return [
+        _borne_out(one, shares.get(k, 0.0)) if one.identifiable and camera.divided else one
+        for k, (one, camera) in enumerate(zip(found, cameras, strict=True))
+    ]
+
+
+def _borne_out(found: Calibration, least: float) -> Calibration:
+    """The answer, as an estimate where its photos, one of them at `least`, give it too few of their votes."""
+    doubtful = least < FAIR_SHARE or found.evidence["support"] < BORNE_OUT
+    return roughly(found, NOT_ALL if doubtful else "")
+
+
+class Tables:
+    """How well pairs agree, focal by focal of their two cameras.
+
+    Args:
+        Fs: (P, 3, 3) in one unit about the middle of each photo.
+        members: (P, 2) cameras.
+        weights: (P,).
+    """
+
+    def __init__(self, Fs: FloatArray, members: IndexArray, weights: FloatArray) -> None:
+        ones = CameraPairs.of(Fs, (1, 1), weights)
+        ready = prepare(ones, unit_px=1.0, origin_px=(0.0, 0.0))
+        self.kept = ready.kept
+        self.packed, self.members, self.weights = ready.packed, members[ready.kept], ready.weights
+
+    def votes(self, pair: int, first: FloatArray, second: FloatArray, sigma: float) -> FloatArray:
+        """(A, B) w exp(-r / sigma) for cameras (A, 5) of view 1 and (B, 5) of view 2."""
+        return np.asarray(self.weights[pair] * np.exp(-_ratios(self.packed[pair], first, second) / sigma), np.float64)
+
+
+def _least_shares(thetas: FloatArray, tables: Tables, photos: Sequence[PairId]) -> dict[int, float]:
+    """By camera: the share of its votes that the photo with the smallest one gets, by all pairs of that photo."""
+    got: dict[tuple[int, int], float] = {}
+    most: dict[tuple[int, int], float] = {}
+    for k, (i, j) in enumerate(tables.members):
+        pair = photos[tables.kept[k]]
+        votes = float(tables.votes(k, thetas[i][None], thetas[j][None], SIGMAS[0])[0, 0])
+        for key in ((int(i), pair[0]), (int(j), pair[1])):
+            got[key] = got.get(key, 0.0) + votes
+            most[key] = most.get(key, 0.0) + float(tables.weights[k])
+    least: dict[int, float] = {}
+    for (camera, _), share in ((key, got[key] / most[key]) for key in got):
+        least[camera] = min(share, least.get(camera, 1.0))
+    return least
+
+
+def _in_units(
+    cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, unit: float
+) -> tuple[IndexArray, FloatArray, Matches]:
+    """Usable pairs, their F's and inliers in units about the middle of each photo."""
+    ready = prepare(pairs, unit_px=unit, origin_px=(0.0, 0.0))
+    middles = np.array([camera.size for camera in cameras]) / (2.0 * unit)
+    used = members[ready.kept]
+    moves = np.tile(np.eye(3), (len(cameras), 1, 1))
+    moves[:, :2, 2] = middles
+    Fs = moves[used[:, 1]].transpose(0, 2, 1) @ ready.F @ moves[used[:, 0]]
+    inliers = [
+        np.asarray(pairs.inliers[k], np.float64) / unit - np.concatenate([middles[i], middles[j]])
+        for k, (i, j) in zip(ready.kept, used, strict=True)
+    ]
+    photos = np.array([pairs.photos[k] for k in ready.kept]).reshape(-1, 2)
+    return ready.kept, Fs, Matches(inliers, used, photos, unit, count=len(cameras))
+
+
+def _first(camera: CameraGroup, side: float, unit: float) -> FloatArray:
+    if camera.start is not None:
+        return parameters_of(camera.start, unit)
+    return np.array([USUAL_FOCAL + np.log(side), 0.0, 0.0, 0.0, 0.0])
+
+
+def _with_focals(thetas: FloatArray, unknown: NDArray[np.bool_], tables: Tables, usual: Usual) -> FloatArray:
+    """The unknown focals on which most pairs agree."""
+    grid = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
+    trials = np.repeat(thetas[:, None], FOCALS, axis=1)
+    trials[unknown, :, LOG_FOCAL] = grid + np.log(usual.sides[unknown])[:, None]
+    own = -0.5 * ((trials[..., LOG_FOCAL] - np.log(usual.sides)[:, None] - USUAL_FOCAL) / FOCAL_SPREAD) ** 2
+    hinted = np.isfinite(usual.hints)
+    off = (trials[hinted, :, LOG_FOCAL] - np.log(usual.hints[hinted])[:, None]) / HINT_SPREAD
+    own[hinted] += np.exp(-0.5 * off**2)
+    between: dict[tuple[int, int], FloatArray] = {}
+    for pair, (i, j) in enumerate(tables.members):
+        table = tables.votes(pair, trials[i], trials[j], SIGMAS[0])
+        if i == j:
+            own[i] += np.diag(table)
+        else:
+            key, table = ((i, j), table) if i < j else ((j, i), table.T)
+            between[key] = between.get(key, 0.0) + table
+    places = best_places(own, between)
+    chosen = thetas.copy()
+    chosen[:, LOG_FOCAL] = trials[np.arange(len(thetas)), places, LOG_FOCAL]
+    return chosen
+
+
+def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> IndexArray:
+    """Which place on its grid every camera takes, so that the sum over cameras and over pairs of cameras is large.
+
+    Damped max-sum message passing (Pearl 1988; exact on trees), then one camera after the other while that helps; the
+    same from what each camera wants by itself, which loops of messages do not always outdo.
+
+    Args:
+        own: (C, G) what each camera gains by itself.
+        between: (G, G) what two cameras i < j gain together, by (i, j).
+    """
+    tables = {(i, j): table for (i, j), table in between.items()} | {(j, i): t.T for (i, j), t in between.items()}
+    messages = {edge: np.zeros(own.shape[1]) for edge in tables}
+    for _ in range(MESSAGE_ROUNDS):
+        belief = own.copy()
+        for (_, to), message in messages.items():
+            belief[to] += message
+        for (source, to), table in tables.items():
+            new = np.max((belief[source] - messages[to, source])[:, None] + table, axis=0)
+            messages[source, to] = DAMPING * messages[source, to] + (1.0 - DAMPING) * (new - np.max(new))
+    belief = own.copy()
+    for (_, to), message in messages.items():
+        belief[to] += message
+    ends = [_one_by_one(np.argmax(start, axis=1), own, tables) for start in (belief, own)]
+    return max(ends, key=lambda places: _gain(places, own, between))
+
+
+def _one_by_one(places: IndexArray, own: FloatArray, tables: dict[tuple[int, int], FloatArray]) -> IndexArray:
+    """Every camera in turn takes its best place, the others as they are, until none changes."""
+    places = places.astype(np.int64)
+    for _ in range(MESSAGE_ROUNDS):
+        before = places.copy()
+        for camera in range(len(places)):
+            value = own[camera].copy()
+            for (source, to), table in tables.items():
+                if to == camera:
+                    value += table[places[source]]
+            places[camera] = int(np.argmax(value))
+        if np.array_equal(places, before):
+            break
+    return places
+
+
+def _gain(places: IndexArray, own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> float:
+    shared = sum(float(table[places[i], places[j]]) for (i, j), table in between.items())
+    return float(np.sum(own[np.arange(len(places)), places])) + shared
+
+
+def _judged(
+    index: int, camera: CameraGroup, fit: Fit, cov: FloatArray, straight: Tables, unit: float, method: str, motion: str
+) -> Calibration:
+    """The answer for one camera, or why its pairs do not give one; `motion` says what leaves all focals open."""
+    theta = fit.state.thetas[index]
+    block = cov[CAMERA * index : CAMERA * (index + 1), CAMERA * index : CAMERA * (index + 1)]
+    mine = np.flatnonzero((fit.matches.cameras == index).any(axis=1))
+    lead, support = _lead(index, fit.state.thetas, straight)
+    side = max(camera.size) / unit
+    in_sides = theta - np.array([np.log(side), 0.0, 0.0, 0.0, 0.0])
+    in_sides[1:3] /= side
+    spread = float(np.sqrt(block[LOG_FOCAL, LOG_FOCAL]))
+    evidence = {
+        "pairs": float(len(mine)),
+        "support": support,
+        "lead": lead,
+        "log_focal_spread": spread,
+        "noise_px": fit.state.sigma * unit,
+        "weight": float(np.sum(fit.state.weights[mine])),
+    }
+    half = (0.5 * camera.size[0] / max(camera.size), 0.5 * camera.size[1] / max(camera.size))
+    reason = ""
+    if len(mine) < LEAST_PAIRS:
+        reason = f"{len(mine)} usable pairs, {LEAST_PAIRS} are needed"
+    elif not camera.known and lead < MIN_LEAD:
+        reason = "the pairs fit other focals as well or better"
+    vague = consensus_peak.vagueness(spread, one_of_many=camera.family >= 0)
+    # a motion that leaves the focal open belies a small deviation, not a large one
+    reason = reason or (not (camera.divided and vague) and motion) or consensus_peak.objection(in_sides, spread, half)
+    if reason and camera.family >= 0:
+        # what the others are like is in it: better to start mapping from than the usual focal
+        return replace(guessed(camera.size, reason, evidence), K=_of_its_family(theta, camera.size, unit))
+    if reason:
+        return guessed(camera.size, reason, evidence)
+    found = calibration_of(theta, camera.size, method, unit)
+    found = replace(found, spread=spread_of(theta, block, unit), evidence=evidence, held=fit.names_held(index))
+    return roughly(found, vague)
+
+
+def _of_its_family(theta: FloatArray, size: tuple[int, int], unit: float) -> FloatArray:
+    """The usual camera matrix with the focal that is most likely, though uncertain."""
+    side = max(size)
+    low, high = np.array(FOCAL_RANGE) * side
+    return guessed_camera_matrix(size, float(np.clip(np.exp(theta[LOG_FOCAL]) * unit, low, high)))
+
+
+def _lead(index: int, thetas: FloatArray, tables: Tables) -> tuple[float, float]:
+    """Votes by which a camera's focal leads all others, the other cameras as they are; and its share of the votes."""
+    offsets = np.concatenate([[0.0], np.linspace(-1.5, 1.5, 61)])
+    trials = np.repeat(thetas[None, index], len(offsets), axis=0)
+    trials[:, LOG_FOCAL] += offsets
+    total, most = np.zeros(len(offsets)), 0.0
+    for pair, (i, j) in enumerate(tables.members):
+        if index not in (i, j):
+            continue
+        most += tables.weights[pair]
+        if i == j:
+            total += np.diag(tables.votes(pair, trials, trials, SIGMAS[-1]))
+        elif i == index:
+            total += tables.votes(pair, trials, thetas[j][None], SIGMAS[-1])[:, 0]
+        else:
+            total += tables.votes(pair, thetas[i][None], trials, SIGMAS[-1])[0]
+    rivals = total[np.abs(offsets) > np.log(RIVAL_RATIO)]
+    return float(total[0] - np.max(rivals)), float(total[0] / most) if most > 0 else 0.0
+
+
+@kernel
+def _ratios(pair: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
+    """(A, B) r = (s1 - s2) / (s1 + s2) of E = K2'F K1, for cameras (A, 5) and (B, 5), lenses aside.
+
+    As `constraints.singular_value_ratio`, with two cameras.
+    """
+    k1, k2, G = np.empty(5), np.empty(5), np.empty((3, 3))
+    found = np.empty((len(first), len(second)))
+    for i in range(len(first)):
+        camera_of(first[i], k1)
+        for row in range(3):
+            a, b, c = pair[3 * row], pair[3 * row + 1], pair[3 * row + 2]
+            G[row, 0], G[row, 1], G[row, 2] = a * k1[0], b * k1[1], a * k1[2] + b * k1[3] + c
+        n1 = _minor(pair[9], pair[10], pair[11], k1)
+        for j in range(len(second)):
+            camera_of(second[j], k2)
+            square = 0.0
+            for column in range(3):
+                p, q = G[0, column], G[1, column]
+                square += (k2[0] * p) ** 2 + (k2[1] * q) ** 2 + (k2[2] * p + k2[3] * q + G[2, column]) ** 2
+            twice = 2.0 * pair[15] * np.sqrt(n1 * _minor(pair[12], pair[13], pair[14], k2))
+            found[i, j] = np.sqrt(max(square - twice, 0.0) / (square + twice)) if square + twice > 0.0 else 1.0
+    return found
+
+
+@kernel
+def _minor(x: float, y: float, w: float, k: FloatArray) -> float:
+    """|adj(K) e|^2."""
+    return float((k[1] * (x - k[2] * w)) ** 2 + (k[0] * (y - k[3] * w)) ** 2 + (k[0] * k[1] * w) ** 2)

@@ -1,0 +1,266 @@
+"""A set of photos: which of them are of one camera, and the K of every camera."""
+
+import logging
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, count
+
+import numpy as np
+
+from sfm_app.geometry.camera import guessed_camera_matrix
+from sfm_app.numerical import FAILURES, reason_of
+from sfm_app.selfcal.cameras.camera_per_photo import predicted
+from sfm_app.selfcal.cameras.camera_split import peaks_of, separated
+from sfm_app.selfcal.cameras.multi_camera import CameraGroup, Tables, calibrate_several
+from sfm_app.selfcal.cameras.two_cameras import two_cameras
+from sfm_app.selfcal.consensus.consensus import Consensus
+from sfm_app.selfcal.inputs import FloatArray, prepare
+from sfm_app.selfcal.results import ESTIMATE, calibration_of, guessed, parameters_of, roughly
+from sfm_app.selfcal.undistort_pairs import without_lens
+from sfm_app.selfcal.zero_curves import METHOD
+from sfm_app.settings import CalibrationSettings
+from sfm_app.types import Calibration, CameraPairs, PairId, PhotoPairs
+
+logger = logging.getLogger("sfm_app")
+
+CalibrateFunction = Callable[[CameraPairs, CalibrationSettings, int], Calibration]
+
+LEAST_TO_SPLIT = 4
+"""Photos of a group below which nobody can say who disagrees with whom."""
+ALIKE = 0.03
+"""Parts of a group whose log f differ by less are one camera."""
+MANY, PERHAPS_ZOOM = 3, "photos of one size fall into {count} cameras, as those of a zoom do"
+"""From so many on, the border between two of them may be anywhere: none of them is relied on."""
+PERHAPS_TWO = "its photos may be of two cameras"
+NOBODYS = "no usable pair says which camera took its photos"
+BENT = 0.01
+"""From this |k1| on, photos are straightened before they are asked whether they are of one camera."""
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """One camera of the set."""
+
+    name: str
+    photos: tuple[int, ...]
+    found: Calibration
+    family: int = -1
+    """Number of the group, where each of its photos was found to have a camera of its own."""
+    of_parts: int = 1
+    """So many cameras was its group divided into."""
+
+
+def calibrate_photo_set(
+    pairs: PhotoPairs, calibrate: CalibrateFunction, options: CalibrationSettings, seed: int, *,
+    together: bool, split: bool = True,
+) -> list[Camera]:  # fmt: skip
+    """Every camera of a set of photos, the one with most photos first.
+
+    Args:
+        pairs: all pairs that are not degenerate.
+        calibrate: finds one camera from its own pairs.
+        options: handed to it.
+        seed: likewise.
+        together: also use the pairs between cameras.
+        split: then also split groups whose photos disagree.
+    """
+    groups: dict[str, list[int]] = {}
+    for photo, group in pairs.groups.items():
+        groups.setdefault(group, []).append(photo)
+    cameras = [
+        Camera(name, tuple(members), _alone(calibrate, pairs.among(members), options, seed))
+        for name, members in groups.items()
+    ]
+    if together:
+        cameras = _jointly(cameras, pairs, options, seed, split=split)
+    cameras = [replace(camera, found=_or_guess(camera, pairs)) for camera in cameras]
+    return sorted(cameras, key=lambda camera: (-len(camera.photos), camera.name))
+
+
+def _alone(calibrate: CalibrateFunction, own: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
+    """What a calibrator makes of the pairs of one camera; a guess where its numbers fail."""
+    try:
+        return calibrate(own, options, seed)
+    except FAILURES as err:
+        logger.info("a camera could not be calibrated", exc_info=err)
+        return guessed(own.size, f"the computation failed: {reason_of(err)}", {"pairs": float(len(own.Fs))})
+
+
+def _jointly(
+    cameras: list[Camera], pairs: PhotoPairs, options: CalibrationSettings, seed: int, *, split: bool
+) -> list[Camera]:
+    """The cameras as all pairs have them; as each has them alone where the numbers fail."""
+    try:
+        return _of_all_pairs(cameras, pairs, options, seed) if split else _together(cameras, pairs, options)
+    except FAILURES as err:
+        logger.info("the cameras could not be compared", exc_info=err)
+        return cameras
+
+
+def _of_all_pairs(whole: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings, seed: int) -> list[Camera]:
+    """Groups split where their photos disagree, and all cameras from all pairs.
+
+    Parts of a group that turn out to have the same focal were one camera after all.
+    """
+    unlike = _unlike_within_bars(whole, pairs, seed)
+    parts = [
+        _each_its_own(camera, len(whole) + unlike[camera.name], pairs)
+        if camera.name in unlike
+        else _split(camera, number, pairs, options, seed)
+        for number, camera in enumerate(whole)
+    ]
+    found = _together(list(chain.from_iterable(parts)), pairs, options)
+    focals = {camera.name: camera.found.focal_px for camera in found if camera.found.estimated}
+    kept = [
+        [camera] if split[0].family < 0 and _alike([focals[p.name] for p in split if p.name in focals]) else split
+        for camera, split in zip(whole, parts, strict=True)
+    ]
+    if sum(map(len, kept)) == len(found):
+        return found
+    return _together(list(chain.from_iterable(kept)), pairs, options)
+
+
+def _alike(focals: Sequence[float]) -> bool:
+    """Whether two of them are the same."""
+    return bool(np.any(np.diff(np.sort(np.log(focals))) < ALIKE))
+
+
+def _split(camera: Camera, number: int, pairs: PhotoPairs, options: CalibrationSettings, seed: int) -> list[Camera]:
+    """The camera, the several that its photos are of, or one for each photo."""
+    if len(camera.photos) < LEAST_TO_SPLIT:
+        return [camera]
+    own, found = pairs.among(camera.photos), camera.found
+    side = float(max(own.size))
+    if abs(found.radial) > BENT:
+        own = without_lens(own, found)
+    ready = prepare(own, unit_px=side, origin_px=(own.size[0] / 2, own.size[1] / 2))
+    if len(ready) == 0:
+        return [camera]
+    starts = peaks_of(Consensus(ready, options.centre_sigma * own.size[0] / side))
+    if found.identifiable:
+        starts.append(np.append(parameters_of(found, side)[:4], 0.0))
+    tables = Tables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
+    photos = [own.photos[k] for k in ready.kept]
+    thetas, labels = separated(tables, photos, starts)
+    if predicted(tables, photos, starts, labels, seed).each_its_own:
+        return _each_its_own(camera, number, pairs)
+    if len(thetas) == 1:
+        two = two_cameras(tables, photos, starts)
+        if two is None or not two.perhaps:
+            return [camera]
+        if not two.clearly:
+            return [replace(camera, found=roughly(found, PERHAPS_TWO) if found.identifiable else found)]
+        thetas, labels = two.cameras, two.labels
+    return _parts(camera, thetas, _borne_out(labels, photos), pairs)
+
+
+def _borne_out(labels: Mapping[int, int], photos: Sequence[PairId]) -> dict[int, int]:
+    """Labels of the photos that share a pair with another of their camera, and of those that are alone in it.
+
+    Of a pair between two cameras nobody knows which of the two photos is of which.
+    """
+    count = Counter(labels.values())
+    inside = {photo for pair in photos if labels[pair[0]] == labels[pair[1]] for photo in pair}
+    return {photo: label for photo, label in labels.items() if photo in inside or count[label] == 1}
+
+
+def _parts(camera: Camera, thetas: FloatArray, labels: Mapping[int, int], pairs: PhotoPairs) -> list[Camera]:
+    """The cameras that a group was divided into; photos that no pair gives to one of them are another, not known."""
+    names, size = _names(camera, pairs), pairs.sizes[camera.photos[0]]
+    parts = []
+    for part, theta in enumerate(thetas):
+        members = tuple(photo for photo in camera.photos if labels.get(photo) == part)
+        theta[4] = camera.found.radial / np.exp(2.0 * theta[0])
+        parts.append(
+            Camera(next(names), members, calibration_of(theta, size, camera.found.method), of_parts=len(thetas))
+        )
+    rest = tuple(photo for photo in camera.photos if photo not in labels)
+    return [*parts, Camera(next(names), rest, guessed(size, NOBODYS, {}), of_parts=len(thetas))] if rest else parts
+
+
+def _names(camera: Camera, pairs: PhotoPairs) -> Iterator[str]:
+    """Names for what becomes of a group; the first keeps its own."""
+    taken = set(pairs.groups.values())
+    return chain([camera.name], (name for k in count(2) if (name := f"{camera.name} #{k}") not in taken))
+
+
+def _each_its_own(camera: Camera, family: int, pairs: PhotoPairs) -> list[Camera]:
+    """A camera, not known yet, for each photo of a group."""
+    nothing, names = guessed(pairs.sizes[camera.photos[0]], "", {}), _names(camera, pairs)
+    return [Camera(next(names), (photo,), nothing, family) for photo in sorted(camera.photos)]
+
+
+def _unlike_within_bars(whole: Sequence[Camera], pairs: PhotoPairs, seed: int) -> dict[str, int]:
+    """Groups that bars have brought to one size with others, and whose photos are each of a camera of its own.
+
+    By name; the number says which have one size.
+
+    Pictures of one shape are not of one camera either, when the others are not: all of one size are asked together.
+    """
+    found: dict[str, int] = {}
+    for number, size in enumerate(sorted(set(pairs.brought_to.values()))):
+        groups = [camera for camera in whole if pairs.brought_to.get(camera.photos[0]) == size]
+        labels = {photo: k for k, camera in enumerate(groups) for photo in camera.photos}
+        among = [k for k, pair in enumerate(pairs.photos) if labels.keys() >= set(pair)]
+        if len(groups) == 1 or not among:
+            continue
+        to_px = {photo: _in_sides(pairs.sizes[photo]) for photo in labels}
+        Fs = [to_px[second].T @ pairs.Fs[k] @ to_px[first] for k in among for first, second in (pairs.photos[k],)]
+        ready = prepare(CameraPairs.of(np.array(Fs), (1, 1), pairs.weights[among]), unit_px=1.0, origin_px=(0.0, 0.0))
+        tables = Tables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
+        photos = [pairs.photos[among[k]] for k in ready.kept]
+        if len(photos) and predicted(tables, photos, [], labels, seed).each_its_own:
+            found |= dict.fromkeys((camera.name for camera in groups), number)
+    return found
+
+
+def _in_sides(size: tuple[int, int]) -> FloatArray:
+    """(3, 3) from longer sides about the middle to pixels."""
+    side = float(max(size))
+    return np.array([[side, 0.0, size[0] / 2], [0.0, side, size[1] / 2], [0.0, 0.0, 1.0]])
+
+
+def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
+    """All cameras from all pairs at once; one camera is what its own pairs say."""
+    if len(cameras) <= 1:
+        return list(cameras)
+    number = {photo: k for k, camera in enumerate(cameras) for photo in camera.photos}
+    everything = CameraPairs(pairs.Fs, pairs.weights, (1, 1), pairs.photos, pairs.inliers)
+    members = np.array([[number[first], number[second]] for first, second in pairs.photos]).reshape(-1, 2)
+    asked = [
+        CameraGroup(
+            size=pairs.sizes[camera.photos[0]],
+            start=camera.found if camera.found.identifiable else None,
+            known=camera.found.identifiable and bool(camera.found.evidence),
+            hint_px=_claim(camera, pairs),
+            family=camera.family,
+            divided=camera.of_parts > 1,
+        )
+        for camera in cameras
+    ]
+    answers = calibrate_several(asked, everything, members, options, METHOD)
+    return [replace(one, found=_less_sure(one, answer)) for one, answer in zip(cameras, answers, strict=True)]
+
+
+def _less_sure(camera: Camera, found: Calibration) -> Calibration:
+    """The answer, as an estimate where the camera is one of many that photos of one size were divided into."""
+    many = found.identifiable and camera.of_parts >= MANY
+    return roughly(found, PERHAPS_ZOOM.format(count=camera.of_parts)) if many else found
+
+
+def _or_guess(camera: Camera, pairs: PhotoPairs) -> Calibration:
+    """What was found; else the K that mapping starts from: EXIF's claim, or 1.2 x the longer side."""
+    found = camera.found
+    if found.identifiable or found.method == ESTIMATE:
+        return found
+    claim = _claim(camera, pairs)
+    size = pairs.sizes[camera.photos[0]]
+    if not np.isfinite(claim):
+        return found if camera.family >= 0 else guessed(size, found.reason, found.evidence)
+    return replace(found, K=guessed_camera_matrix(size, claim), method="exif", radial=0.0, spread={}, held=())
+
+
+def _claim(camera: Camera, pairs: PhotoPairs) -> float:
+    claims = [pairs.focal_hints_px[photo] for photo in camera.photos if photo in pairs.focal_hints_px]
+    return float(np.median(claims)) if claims else float("nan")

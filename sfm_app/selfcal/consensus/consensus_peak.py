@@ -1,0 +1,141 @@
+"""The K that most pairs agree on: the highest peak of the joint consensus, and what speaks for and against it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_app.selfcal.consensus.consensus import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, Consensus
+from sfm_app.selfcal.consensus.peak_evidence import (
+    RIVAL_RATIO,
+    best_rival,
+    deviation,
+    disagreement,
+    effective_count,
+    indecision,
+    own_sigma,
+    resampled,
+    votes,
+)
+from sfm_app.selfcal.consensus.peak_search import FOCAL_RANGE, SIGMAS, Peak, Profile, peaks, scan
+from sfm_app.selfcal.inputs import FloatArray
+
+SQUARE_PIXELS = (LOG_FOCAL, CENTRE_U, CENTRE_V)
+ANY_PIXELS = (*SQUARE_PIXELS, LOG_ASPECT)
+LOG_ASPECTS = tuple(np.linspace(-0.6, 0.6, 9))
+"""log fy/fx on the grid: 0.55 to 1.8."""
+ASPECT_GAIN = float(np.log(50))
+"""Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square."""
+PERHAPS_ASPECT_GAIN = float(np.log(50 * 0.05))
+"""Votes from which on square pixels are less than 95 % sure. Of 47 answers with square pixels on the photo sets and on
+folders 0 to 170 of `benchmarks/accuracy/trouble.py`, one had more (1.55), and its pixels were not square."""
+MAX_LOG_FOCAL_SPREAD = 0.1
+"""Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess."""
+IDENTIFIED_LOG_FOCAL_SPREAD = 0.03
+"""Largest standard deviation of log f that counts as known: with a larger one more than one focal of ten is off by 5 %,
+and what is called identifiable should not be. Between this and the limit above the answer is an estimate: a better
+start than a guess, and no more."""
+IDENTIFIED_OF_MANY = 0.015
+"""The same where every photo has a focal of its own: the worst of them is further off than one."""
+EDGE = 1.02
+"""A focal within this factor of an end of the range has run there."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """A peak with everything that a verdict needs."""
+
+    theta: FloatArray
+    """(4,) log f, u, v, log a."""
+    free: tuple[int, ...]
+    """Places in theta that were sought."""
+    sigma: float
+    """Width of the consensus that suits its own pairs."""
+    lead: float
+    """Votes by which it leads every other focal."""
+    votes: FloatArray
+    """(P,) what each pair gives."""
+    gain: float
+    """Votes that freeing fy/fx wins."""
+    others: tuple[FloatArray, ...]
+    """(4,) each: lower peaks, highest first."""
+
+    @property
+    def doubt_of_pixels(self) -> str:
+        """Why an answer with square pixels is an estimate, or nothing."""
+        doubtful = LOG_ASPECT not in self.free and self.gain >= PERHAPS_ASPECT_GAIN
+        return "its pixels may not be square" if doubtful else ""
+
+    def evidence(self, weights: FloatArray) -> dict[str, float]:
+        """Figures for people."""
+        mass = float(np.sum(self.votes))
+        return {
+            "support": mass / float(np.sum(weights)),
+            "agreeing_pairs": effective_count(self.votes),
+            "lead": self.lead,
+            "lead_share": self.lead / mass if mass > 0 else 0.0,
+            "sigma": self.sigma,
+            "aspect_gain": self.gain,
+        }
+
+    def contradicted(self, weights: FloatArray) -> str:
+        """Why the pairs, of these weights (P,), do not make a camera, or nothing."""
+        return disagreement(self.votes, weights) or indecision(self.lead, self.votes)
+
+    def scatter(self, consensus: Consensus, seed: int) -> FloatArray:
+        """(B, 4) the peak under resampled pairs, see `evidence.resampled`."""
+        return resampled(consensus, self.theta, self.free, self.sigma, seed)
+
+    def deviation(self, values: FloatArray) -> float:
+        """Standard deviation of an entry of theta from its resampled `values` (B,)."""
+        return deviation(values, effective_count(self.votes), len(self.free))
+
+
+def found(consensus: Consensus) -> Answer:
+    """The answer with square pixels, or, where the pairs clearly ask for it, with any."""
+    profile = scan(consensus, (0.0,))
+    square = peaks(consensus, profile, SQUARE_PIXELS)
+    free_profile = scan(consensus, LOG_ASPECTS)
+    free = peaks(consensus, free_profile, ANY_PIXELS)
+    # both are measured with the width that suits the freer one, or a wrong square answer would choose a lenient width
+    sigmas = (own_sigma(consensus, free[0].theta),)
+    theta, value = consensus.climb(square[0].theta, SQUARE_PIXELS, sigmas)
+    gain = max(consensus.climb(start, ANY_PIXELS, sigmas)[1] for start in (theta, free[0].theta)) - value
+    if gain >= ASPECT_GAIN:
+        return _examined(consensus, free, free_profile, ANY_PIXELS, gain)
+    return _examined(consensus, square, profile, SQUARE_PIXELS, gain)
+
+
+def _examined(consensus: Consensus, ends: list[Peak], profile: Profile, free: tuple[int, ...], gain: float) -> Answer:
+    """Refine the highest peak to the width that its own pairs ask for, and collect what speaks for it."""
+    best = ends[0]
+    sigma = own_sigma(consensus, best.theta)
+    theta, _ = consensus.climb(best.theta, free, (sigma,))
+    value = float(consensus.at(theta[None, :], SIGMAS[-1])[0])
+    far = [peak for peak in ends[1:] if abs(peak.theta[LOG_FOCAL] - theta[LOG_FOCAL]) > np.log(RIVAL_RATIO)]
+    lead = value - max([best_rival(consensus, theta, free, SIGMAS, profile), *(peak.value for peak in far)])
+    given = votes(consensus, theta, SIGMAS[-1])
+    return Answer(theta, free, sigma, lead, given, gain, tuple(peak.theta for peak in far))
+
+
+def vagueness(log_focal_spread: float, *, one_of_many: bool = False) -> str:
+    """Why an answer to which there is no objection is an estimate and not knowledge, or nothing."""
+    vague = log_focal_spread > (IDENTIFIED_OF_MANY if one_of_many else IDENTIFIED_LOG_FOCAL_SPREAD)
+    return f"the focal is uncertain by {100 * log_focal_spread:.0f} %" if vague else ""
+
+
+def objection(theta: FloatArray, log_focal_spread: float, half_size: tuple[float, float]) -> str:
+    """Why an answer that the pairs agree on is not to be trusted, or nothing.
+
+    Args:
+        theta: log f, u, v, ... in longer sides from the middle.
+        log_focal_spread: standard deviation of log f.
+        half_size: half of the photo's width and height in longer sides.
+    """
+    focal, (low, high) = float(np.exp(theta[LOG_FOCAL])), FOCAL_RANGE
+    if not low * EDGE < focal < high / EDGE:
+        return f"the focal runs to the end of the range, {focal:.2f} longer sides"
+    if np.any(np.abs(theta[CENTRE_U : CENTRE_V + 1]) > half_size):
+        return "the optical centre runs out of the photo"
+    if log_focal_spread > MAX_LOG_FOCAL_SPREAD:
+        return f"the focal is uncertain by {100 * log_focal_spread:.0f} %"
+    return ""

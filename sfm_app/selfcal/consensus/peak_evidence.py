@@ -1,0 +1,122 @@
+"""What speaks for a peak of the joint consensus: how many pairs, against which rivals, how stable."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sfm_app.selfcal.consensus.consensus import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, Consensus
+from sfm_app.selfcal.consensus.peak_search import SIGMAS, Profile
+from sfm_app.selfcal.inputs import FloatArray
+
+OWN_SIGMA_RANGE = (0.005, 0.02)
+"""The last width of the consensus follows the data within these bounds, in units of r."""
+OWN_SIGMA_FACTOR = 1.5
+"""In medians of r: half of the agreeing pairs then speak with more than half their weight."""
+MIN_AGREEING = 2.25
+"""Effective number of pairs that must agree; three parameters satisfy one and a half pairs whatever these say."""
+MIN_SUPPORT = 0.12
+"""Share of the votes that K must win; many pairs without any common K give up to 0.06."""
+RIVAL_RATIO = 1.25
+"""A K with a focal this many times longer or shorter is another answer."""
+MIN_LEAD = 0.5
+"""Votes by which K must lead every other focal."""
+MIN_LEAD_SHARE = 0.03
+"""The same as a share of the votes for K: many pairs that hardly tell focals apart do not add up to knowledge."""
+RESAMPLES = 25
+STABLE_SIGMA = 0.01
+"""Resampled fits use at least this width: below it they snap to single pairs."""
+
+
+def own_sigma(consensus: Consensus, theta: FloatArray) -> float:
+    """The width that fits the scatter of the agreeing pairs: 1.5 times the weighted median of their r."""
+    r = consensus.ratios(theta)
+    agreeing = r < SIGMAS[0]
+    if not np.any(agreeing):
+        return OWN_SIGMA_RANGE[1]
+    order = np.argsort(r[agreeing], kind="stable")
+    mass = np.cumsum(consensus.weights[agreeing][order])
+    median = r[agreeing][order][np.searchsorted(mass, 0.5 * mass[-1])]
+    return float(np.clip(OWN_SIGMA_FACTOR * median, *OWN_SIGMA_RANGE))
+
+
+def votes(consensus: Consensus, theta: FloatArray, sigma: float) -> FloatArray:
+    """(P,) what each pair gives to K: w_i exp(-r_i / sigma)."""
+    return np.asarray(consensus.weights * np.exp(-consensus.ratios(theta) / sigma))
+
+
+def effective_count(votes: FloatArray) -> float:
+    """How many equal votes weigh the same (Kish's effective sample size); 0 where nobody votes."""
+    total, squares = float(np.sum(votes)), float(np.sum(votes**2))
+    return total * total / squares if squares > 0 else 0.0
+
+
+def disagreement(given: FloatArray, weights: FloatArray) -> str:
+    """Why votes (P,) out of `weights` (P,) do not make a camera, or nothing."""
+    count, support = effective_count(given), float(np.sum(given) / np.sum(weights))
+    if count >= MIN_AGREEING and support >= MIN_SUPPORT:
+        return ""
+    return f"the pairs do not agree on a camera: {100 * support:.0f} % of the votes, worth {count:.1f} pairs"
+
+
+def indecision(lead: float, given: FloatArray) -> str:
+    """Why a lead over the best rival is not enough beside the votes (P,) for K, or nothing."""
+    if lead >= max(MIN_LEAD, MIN_LEAD_SHARE * float(np.sum(given))):
+        return ""
+    return "the pairs fit other focals as well or better (too little rotation, parallel axes, or an orbit)"
+
+
+def best_rival(
+    consensus: Consensus,
+    theta: FloatArray,
+    free: Sequence[int],
+    sigmas: Sequence[float],
+    profile: Profile | None = None,
+) -> float:
+    """The highest value, at the last sigma, of a focal `RIVAL_RATIO` away with everything else adapted to it.
+
+    It is climbed to from `theta` and, where a profile is given, from the best cell of the grid for that focal. Where
+    the consensus does not depend on the focal (orbits, parallel axes) it equals the value at theta.
+    """
+    adapted = [index for index in free if index != LOG_FOCAL]
+    values = []
+    for log_focal in theta[LOG_FOCAL] + np.log(RIVAL_RATIO) * np.array([-1.0, 1.0]):
+        starts = [theta.copy()]
+        if profile is not None:
+            starts.append(profile.thetas[np.argmin(np.abs(profile.thetas[:, LOG_FOCAL] - log_focal))].copy())
+        for start in starts:
+            start[LOG_FOCAL] = log_focal
+            values.append(consensus.climb(start, adapted, sigmas)[1])
+    return max(values)
+
+
+def resampled(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigma: float, seed: int) -> FloatArray:
+    """(RESAMPLES, 4) the peak under randomly reweighted pairs: the Bayesian bootstrap (Rubin 1981).
+
+    Weights instead of draws, because three pairs drawn with replacement are often one pair three times.
+    """
+    rng = np.random.default_rng(seed)
+    weights = consensus.weights
+    found = []
+    for _ in range(RESAMPLES):
+        drawn = weights * rng.exponential(size=len(weights))
+        again = consensus.weighted(drawn * (np.sum(weights) / np.sum(drawn)))
+        found.append(again.climb(theta, free, (max(sigma, STABLE_SIGMA),))[0])
+    return np.array(found)
+
+
+def deviation(values: FloatArray, count: float, parameters: int) -> float:
+    """Standard deviation over resampled peaks of what `count` effective pairs say about one of `parameters` unknowns.
+
+    A pair gives two constraints. With three pairs and three unknowns half of the scatter has gone into the fit, and the
+    resampled peaks scatter too little by the same share: the usual correction for degrees of freedom.
+    """
+    spare = max(count - 0.5 * parameters, 0.5)
+    return float(np.std(values, ddof=1) * np.sqrt(max(count, 1.0) / spare))
+
+
+def spread_px(thetas: FloatArray, unit_px: float, count: float, parameters: int) -> dict[str, float]:
+    """Standard deviations of fx, fy, cx, cy, in pixels; see `deviation`."""
+    focal, half = np.exp(thetas[:, LOG_FOCAL]) * unit_px, np.exp(0.5 * thetas[:, LOG_ASPECT])
+    columns = {"fx": focal / half, "fy": focal * half}
+    columns |= {"cx": thetas[:, CENTRE_U] * unit_px, "cy": thetas[:, CENTRE_V] * unit_px}
+    return {name: deviation(column, count, parameters) for name, column in columns.items()}

@@ -1,0 +1,54 @@
+"""Weights from the epipolar residuals (Mendonca and Cipolla 1999): the thesis's "Geometric" method (5.3)."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_app.geometry.distances import sampson_distance
+from sfm_app.selfcal.inputs import FloatArray, Pairs, checked
+from sfm_app.selfcal.thesis.least_squares import fitted
+from sfm_app.selfcal.thesis.verdict import Camera, answered
+from sfm_app.settings import CalibrationSettings
+from sfm_app.types import Calibration, CameraPairs
+
+METHOD = "geometric"
+LEAST_RESIDUAL_PX = 1e-3
+"""Exact matches are trusted this far, not infinitely."""
+
+
+def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
+    """Minimise (5.8) from K_init with each pair weighted by the inverse of its mean epipolar residual.
+
+    Args:
+        pairs: F's and inliers; without inliers the given weights stand in.
+        options: unused.
+        seed: unused, nothing is drawn at random.
+
+    Returns:
+        As `selfcal.verdict.answered`, which also says what is raised.
+    """
+    del options, seed
+    return answered(METHOD, replace(pairs, weights=residual_weights(pairs)) if pairs.inliers else pairs, _found)
+
+
+def residual_weights(pairs: CameraPairs) -> FloatArray:
+    """(P,) 1 / mean Sampson distance of a pair's inliers, with mean 1 over the pairs that take part.
+
+    Pairs of weight 0 keep it; a pair without inliers, or with infinite distances, gets it.
+
+    Raises:
+        ValueError: malformed input, see `selfcal.inputs.prepare`.
+    """
+    checked(pairs)
+    residuals = [
+        float(np.mean(sampson_distance(F, matches[:, :2], matches[:, 2:]))) if len(matches) else np.inf
+        for F, matches in zip(pairs.Fs, pairs.inliers, strict=True)
+    ]
+    weights = np.where(pairs.weights > 0, 1.0 / np.maximum(residuals, LEAST_RESIDUAL_PX), 0.0)
+    total = np.sum(weights)
+    return np.asarray(weights * np.count_nonzero(weights) / total if total > 0 else weights)
+
+
+def _found(pairs: Pairs, tall: float, evidence: dict[str, float]) -> Camera:
+    del evidence
+    return fitted(pairs, Camera.initial(tall), pairs.weights)

@@ -1,0 +1,92 @@
+"""Least squares over (fx, fy, u, v): what all methods of the thesis but Zero Curves rest on (5.6, 5.7)."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.selfcal.inputs import FloatArray, Pairs
+from sfm_app.selfcal.thesis.constraint_forms import Halves, huang_faugeras_equations
+from sfm_app.selfcal.thesis.verdict import Camera
+
+Equations = Callable[[Halves, FloatArray], FloatArray]
+"""Halves (..., P) and cameras (..., 1, 4) in, (..., P, m) equations out."""
+FIRST_DAMPING = 1e-2
+DAMPING_RANGE = (1e-9, 1e9)
+MOST_STEPS = 60
+LONGEST_STEP = 0.5
+"""In any parameter, of which the focals are taken as logarithms."""
+DIFFERENCE = 1e-7
+FINISHED = 1e-9
+"""A step that lowers the sum by a smaller share has arrived."""
+
+
+class Minima(NamedTuple):
+    """Where the searches ended."""
+
+    cameras: FloatArray
+    """(B, 4) fx, fy, u, v."""
+    sums: FloatArray
+    """(B,) weighted sums of squares there."""
+
+
+def fitted(pairs: Pairs, start: Camera, weights: FloatArray, equations: Equations = huang_faugeras_equations) -> Camera:
+    """The local minimum of sum_i w_i |equations_i|^2 / sum_i w_i that is reached from `start`, over all pairs."""
+    found = minima(Halves.of(pairs.F)[np.arange(len(pairs))[None]], weights[None], np.array([start]), equations)
+    return Camera(*(float(value) for value in found.cameras[0]))
+
+
+def minima(
+    halves: Halves, weights: FloatArray, starts: FloatArray, equations: Equations = huang_faugeras_equations
+) -> Minima:
+    """Levenberg-Marquardt from many starts at once, each on pairs of its own.
+
+    Thesis (5.8) sums the terms; Levenberg-Marquardt, which the thesis minimises it with, sums their squares.
+
+    Args:
+        halves: (B, P) pairs.
+        weights: (B, P) >= 0, their scale does not matter.
+        starts: (B, 4) fx, fy, u, v, with focals > 0.
+    """
+    scale = np.sqrt(weights / np.sum(weights, axis=1, keepdims=True))[..., None]
+
+    def residuals(thetas: FloatArray, rows: NDArray[np.int64]) -> FloatArray:
+        values = scale[rows] * equations(halves[rows], _cameras(thetas)[:, None])
+        return np.asarray(values.reshape(len(thetas), -1))
+
+    thetas = np.column_stack([np.log(starts[:, :2]), starts[:, 2:]])
+    searching = np.arange(len(thetas))
+    sums = np.sum(residuals(thetas, searching) ** 2, axis=1)
+    damping = np.full(len(thetas), FIRST_DAMPING)
+    for _ in range(MOST_STEPS):
+        trial = thetas[searching] + _step(partial(residuals, rows=searching), thetas[searching], damping[searching])
+        before, after = sums[searching], np.sum(residuals(trial, searching) ** 2, axis=1)
+        better = after < before
+        thetas[searching[better]], sums[searching[better]] = trial[better], after[better]
+        damping[searching] = np.clip(damping[searching] * np.where(better, 0.1, 10.0), *DAMPING_RANGE)
+        arrived = np.where(better, before - after <= FINISHED * before, damping[searching] == DAMPING_RANGE[1])
+        searching = searching[~arrived]
+        if not len(searching):
+            break
+    return Minima(_cameras(thetas), sums)
+
+
+def _step(residuals: Callable[[FloatArray], FloatArray], thetas: FloatArray, damping: FloatArray) -> FloatArray:
+    """(B, 4) damped Gauss-Newton steps, with Marquardt's scaling."""
+    here = residuals(thetas)
+    moved = (residuals(thetas + DIFFERENCE * axis) for axis in np.eye(4))
+    J = np.stack([(there - here) / DIFFERENCE for there in moved], axis=-1)
+    normal = np.swapaxes(J, 1, 2) @ J
+    gradient = np.einsum("bmk,bm->bk", J, here)
+    diagonal = np.einsum("bkk->bk", normal)
+    # lifted a little even where no equation depends on a parameter, which then stays
+    least = np.finfo(np.float64).eps * (1.0 + np.max(diagonal, axis=1, keepdims=True))
+    lifted = normal + (damping[:, None] * diagonal + least)[:, :, None] * np.eye(4)
+    steps = np.linalg.solve(lifted, -gradient[..., None])[..., 0]
+    return np.asarray(np.clip(steps, -LONGEST_STEP, LONGEST_STEP))
+
+
+def _cameras(thetas: FloatArray) -> FloatArray:
+    return np.column_stack([np.exp(thetas[:, :2]), thetas[:, 2:]])

@@ -1,0 +1,78 @@
+"""Algorithm 2 of the thesis: least squares on random triples of pairs, from random cameras (5.6)."""
+
+from functools import partial
+from math import ceil, comb, log
+
+import numpy as np
+
+from sfm_app.selfcal.inputs import Pairs
+from sfm_app.selfcal.thesis.constraint_forms import Halves
+from sfm_app.selfcal.thesis.kruppa import focals_of
+from sfm_app.selfcal.thesis.least_squares import minima
+from sfm_app.selfcal.thesis.verdict import Camera, answered
+from sfm_app.settings import CalibrationSettings
+from sfm_app.types import Calibration, CameraPairs
+
+METHOD = "multi-start"
+SAMPLE = 3
+"""Pairs in a minimal set."""
+CONFIDENCE = 0.95
+MOST_STARTS = 4000
+"""MaxIter grows with the cube of the number of pairs; from 21 pairs on it is cut here."""
+FOCAL_RANGE = (0.1, 3.0)
+"""Focals that count, in image widths: thesis (5.29) ends at 3."""
+USUAL_FOCAL = (1.0, 0.5)
+"""Mean and standard deviation in image widths where no pair has a focal of its own."""
+
+
+def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
+    """The best of many least-squares solutions on three pairs each (thesis Algorithm 2).
+
+    Args:
+        pairs: F's and weights; the weights count in the distribution of the focal and in the residual.
+        options: unused.
+        seed: of the triples and the starts.
+
+    Returns:
+        As `selfcal.verdict.answered`, which also says what is raised.
+    """
+    del options
+    return answered(METHOD, pairs, partial(algorithm_2, seed=seed), SAMPLE)
+
+
+def algorithm_2(pairs: Pairs, tall: float, evidence: dict[str, float], seed: int) -> Camera:
+    """The algorithm itself, for an image of width 1 and height `tall`; `evidence` gets the distribution and MaxIter.
+
+    Residual(s) is that of the triple: the thesis writes that other pairs play no part, and that this costs accuracy.
+    """
+    rng = np.random.default_rng(seed)
+    count = number_of_starts(len(pairs))
+    mean, deviation = focal_distribution(pairs, tall)
+    evidence |= {"starts": float(count), "focal_mean": mean, "focal_deviation": deviation}
+    focal = np.clip(rng.normal(mean, deviation, count), *FOCAL_RANGE)
+    centre = rng.normal([0.5, 0.5 * tall], [1 / 6, tall / 6], (count, 2))
+    starts = np.column_stack([focal, focal, centre])
+    # sorted by a property that neither scale nor direction nor place changes: the order of the pairs has no effect
+    halves = Halves.of(pairs.F)[np.argsort(pairs.product, kind="stable")]
+    triples = np.argsort(rng.random((count, len(pairs))), axis=1)[:, :SAMPLE]
+    found = minima(halves[triples], np.ones(triples.shape), starts)
+    return Camera(*(float(value) for value in found.cameras[np.argmin(found.sums)]))
+
+
+def number_of_starts(pairs: int) -> int:
+    """MaxIter of thesis 5.6.3: any one triple of the pairs is drawn with a probability of 0.95.
+
+    N in its formula counts fundamental matrices ("every arrangement of three"), not frames as N in (5.14) does.
+    """
+    triples = comb(pairs, SAMPLE)
+    return 1 if triples == 1 else min(MOST_STARTS, ceil(log(1 - CONFIDENCE) / log(1 - 1 / triples)))
+
+
+def focal_distribution(pairs: Pairs, tall: float) -> tuple[float, float]:
+    """Thesis (5.12), (5.13): weighted mean and standard deviation of the pairs' own focals, in image widths."""
+    focals = focals_of(pairs, (0.5, 0.5 * tall))
+    known = (focals > FOCAL_RANGE[0]) & (focals < FOCAL_RANGE[1])
+    if not np.any(known):
+        return USUAL_FOCAL
+    mean = float(np.average(focals[known], weights=pairs.weights[known]))
+    return mean, float(np.sqrt(np.average((focals[known] - mean) ** 2, weights=pairs.weights[known])))

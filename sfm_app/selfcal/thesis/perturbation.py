@@ -1,0 +1,70 @@
+"""Algorithm 3 of the thesis: pairs that err more than an error of K explains lose their weight (5.7)."""
+
+import numpy as np
+
+from sfm_app.selfcal.inputs import FloatArray, Pairs
+from sfm_app.selfcal.thesis.constraint_forms import essential
+from sfm_app.selfcal.thesis.least_squares import fitted
+from sfm_app.selfcal.thesis.verdict import Camera, answered
+from sfm_app.settings import CalibrationSettings
+from sfm_app.types import Calibration, CameraPairs
+
+METHOD = "perturbation"
+MOST_ITERATIONS = 4
+TOLERANCE = 1e-6
+"""T of Algorithm 3: a change of K, in image widths, that ends the iterations."""
+NORMAL_MAD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+
+def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
+    """Minimise (5.8) again and again, with weights from the error discrepancy (thesis Algorithm 3).
+
+    Args:
+        pairs: F's; weights tell which pairs take part (> 0), and count in the verdict only.
+        options: unused.
+        seed: unused, nothing is drawn at random.
+
+    Returns:
+        As `selfcal.verdict.answered`, which also says what is raised.
+    """
+    del options, seed
+    return answered(METHOD, pairs, algorithm_3)
+
+
+def algorithm_3(pairs: Pairs, tall: float, evidence: dict[str, float]) -> Camera:
+    """The algorithm itself, from K_init; `evidence` gets the number of iterations and the effective number of pairs."""
+    camera, weights = Camera.initial(tall), np.ones(len(pairs))
+    for iteration in range(1, MOST_ITERATIONS + 1):
+        before, camera = camera, fitted(pairs, camera, weights)
+        evidence |= {"iterations": float(iteration), "weighted_pairs": float(np.sum(weights) ** 2 / np.sum(weights**2))}
+        if np.linalg.norm(camera.K - before.K) <= TOLERANCE:
+            break
+        weights = discrepancy_weights(error_discrepancies(pairs.F, camera.K, camera.K - before.K))
+    return camera
+
+
+def error_discrepancies(F: FloatArray, K: FloatArray, change: FloatArray) -> FloatArray:
+    """Thesis (5.23): ((s1 - s2) / (2 |D|))^2, how far E = K'FK is off beyond what an error `change` of K explains.
+
+    |D| is the spectral norm of the part of E's error that K alone causes. (5.22) prints two transposes in the wrong
+    place; the expansion of (K + dK)' F (K + dK) gives D = dK'FK + K'F dK + dK'F dK.
+
+    Args:
+        F: (P, 3, 3) any scale.
+        K: (3, 3) latest estimate.
+        change: (3, 3) its change since the one before, not zero.
+    """
+    s = np.linalg.svd(essential(F, K), compute_uv=False)
+    D = change.T @ F @ K + K.T @ F @ change + change.T @ F @ change
+    bound = 2 * np.linalg.norm(D, ord=2, axis=(1, 2))
+    return np.asarray(((s[:, 0] - s[:, 1]) / np.maximum(bound, np.finfo(np.float64).tiny)) ** 2)
+
+
+def discrepancy_weights(discrepancies: FloatArray) -> FloatArray:
+    """Thesis (5.24): exp(-ED / (1.4826 MAD)); equal weights where the discrepancies do not scatter."""
+    scale = NORMAL_MAD * float(np.median(np.abs(discrepancies - np.median(discrepancies))))
+    if scale == 0:
+        return np.ones(len(discrepancies))
+    # the smallest discrepancy is common to all and says nothing about any: without it all weights may underflow
+    return np.asarray(np.exp(-(discrepancies - np.min(discrepancies)) / scale))

@@ -1,0 +1,91 @@
+"""What every literal method of the thesis shares: its frame, and the verdict on its answer.
+
+The verdict is not the thesis's: an answer counts as known where the pairs satisfy the constraint there, and do not
+satisfy it as well at other focals.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_app.geometry.camera import camera_matrix
+from sfm_app.selfcal.consensus.consensus import Consensus
+from sfm_app.selfcal.consensus.peak_evidence import best_rival, disagreement, indecision, votes
+from sfm_app.selfcal.consensus.peak_search import SIGMAS
+from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
+from sfm_app.selfcal.results import guessed
+from sfm_app.types import Calibration, CameraPairs
+
+MIN_PAIRS = 3
+"""Four unknowns and two constraints a pair; with two pairs nothing is left to contradict a wrong K."""
+
+
+class Camera(NamedTuple):
+    """The four parameters of K that the thesis seeks, in image widths from the top left corner."""
+
+    fx: float
+    fy: float
+    u: float
+    v: float
+
+    @classmethod
+    def initial(cls, tall: float) -> "Camera":
+        """K_init of thesis 5.7.2 for an image of width 1 and height `tall`: 53 degrees (not 90, as it says) across."""
+        return cls(1.0, 1.0, 0.5, 0.5 * tall)
+
+    @property
+    def K(self) -> FloatArray:
+        """(3, 3) camera matrix."""
+        return camera_matrix(*self)
+
+
+Find = Callable[[Pairs, float, dict[str, float]], Camera | str]
+"""A method: pairs in image widths, height over width, and a table for its figures; K, or why there is none."""
+
+
+def answered(method: str, pairs: CameraPairs, find: Find, sample: int = 0) -> Calibration:
+    """Run a method and judge what it finds.
+
+    Args:
+        method: its name.
+        pairs: what it works from.
+        find: what it does.
+        sample: pairs that it picks out and fits alone. They agree with the answer whatever that is worth, so that the
+            others must.
+
+    Returns:
+        K with ``identifiable=True``, or a guess and the reason. `evidence` has what the method answered in both cases,
+        as fx_px, fy_px, cx_px and cy_px.
+
+    Raises:
+        ValueError: malformed input, see `selfcal.inputs.prepare`.
+    """
+    width, height = size = pairs.size
+    usable = prepare(pairs, unit_px=width, origin_px=(0.0, 0.0))
+    evidence = {"pairs": float(len(usable))}
+    if len(usable) < MIN_PAIRS:
+        return guessed(size, f"{len(usable)} usable pairs, {MIN_PAIRS} are needed", evidence)
+    found = find(usable, height / width, evidence)
+    if isinstance(found, str):
+        return guessed(size, found, evidence)
+    in_px = [float(width * value) for value in found]
+    evidence |= dict(zip(("fx_px", "fy_px", "cx_px", "cy_px"), in_px, strict=True))
+    reason = _objection(found, usable, sample, evidence)
+    if reason:
+        return guessed(size, reason, evidence)
+    return Calibration(camera_matrix(*in_px), width, height, method, identifiable=True, evidence=evidence)
+
+
+def _objection(found: Camera, pairs: Pairs, sample: int, evidence: dict[str, float]) -> str:
+    """Why the answer is not to be trusted, or nothing; adds support and lead to the evidence."""
+    theta = np.array([0.5 * np.log(found.fx * found.fy), found.u, found.v, np.log(found.fy / found.fx)])
+    # the wider sigma: these answers are no maxima of the consensus, and must not be held against the last per cent
+    consensus, sigmas = Consensus(pairs, np.inf), SIGMAS[:1]
+    given = votes(consensus, theta, sigmas[-1])
+    lead = float(np.sum(given)) - best_rival(consensus, theta, range(4), sigmas)
+    evidence |= {"support": float(np.sum(given) / np.sum(pairs.weights)), "lead": lead}
+    if len(pairs) <= sample:
+        return f"{sample} pairs were fitted, and no others are there to confirm it"
+    others = np.argsort(given, kind="stable")[: len(pairs) - sample]
+    return disagreement(given[others], pairs.weights[others]) or indecision(lead, given)

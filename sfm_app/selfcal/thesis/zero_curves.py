@@ -1,0 +1,58 @@
+"""Algorithm 4 of the thesis to the letter: zero curves in (fx, fy), their meeting point, then the same in (u, v)."""
+
+from functools import partial
+
+import numpy as np
+
+from sfm_app.selfcal.inputs import Pairs
+from sfm_app.selfcal.thesis.curves import centre_curves, focal_curves, usable
+from sfm_app.selfcal.thesis.meeting_point import meeting_point
+from sfm_app.selfcal.thesis.verdict import Camera, answered
+from sfm_app.settings import CalibrationSettings
+from sfm_app.types import Calibration, CameraPairs
+
+METHOD = "zero-curves-thesis"
+FOCAL_RANGE = 3.0
+"""Focals are sought up to this many image widths (thesis 5.29)."""
+SIGMA_SHARE = 0.1
+"""sigma of rho, as a share of the range that is searched (thesis 5.8.4)."""
+
+
+def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
+    """Find K where the zero curves of all pairs meet (thesis Algorithm 4).
+
+    The thesis gives every pair the same say: weights tell which pairs take part (> 0), and count in the verdict only.
+
+    Args:
+        pairs: F's and weights.
+        options: `samples` along each curve.
+        seed: unused, nothing is drawn at random.
+
+    Returns:
+        As `selfcal.verdict.answered`, which also says what is raised.
+    """
+    del seed
+    return answered(METHOD, pairs, partial(algorithm_4, samples=options.samples))
+
+
+def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: int) -> Camera | str:
+    """The algorithm itself, for an image of width 1 and height `tall`; the reason where too few curves are usable.
+
+    Fills `evidence` with the number of curves and their support at the meeting points.
+    """
+    sweep = np.arange(1, samples + 1) / samples
+    fx = FOCAL_RANGE * sweep
+    curves = usable(focal_curves(pairs, fx, (0.5, 0.5 * tall)), FOCAL_RANGE)
+    evidence["focal_curves"] = float(len(curves))
+    focal = meeting_point(curves, FOCAL_RANGE, SIGMA_SHARE * FOCAL_RANGE)
+    if focal is None:
+        return f"{len(curves)} of {len(pairs)} pairs have a usable focal curve, 2 are needed"
+    evidence["focal_support"] = focal.support
+
+    curves = usable(centre_curves(pairs, sweep, (fx[focal.sample], focal.value)), tall)
+    evidence["centre_curves"] = float(len(curves))
+    centre = meeting_point(curves, tall, SIGMA_SHARE * tall)
+    if centre is None:
+        return f"{len(curves)} of {len(pairs)} pairs have a usable centre curve, 2 are needed"
+    evidence["centre_support"] = centre.support
+    return Camera(float(fx[focal.sample]), focal.value, float(sweep[centre.sample]), centre.value)

@@ -1,0 +1,36 @@
+"""Pairs as a camera without its lens would have given them: only there do zero curves meet."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_app.ransac.refine.sampson_refit import refine_sampson
+from sfm_app.selfcal.inputs import FloatArray
+from sfm_app.selfcal.lens import straightened
+from sfm_app.selfcal.results import parameters_of
+from sfm_app.types import Calibration, CameraPairs
+
+REACH_PX = 3.0
+"""Scale of the robust refit of an F."""
+
+
+def without_lens(pairs: CameraPairs, camera: Calibration) -> CameraPairs:
+    """The inliers straightened and every F fitted to them anew; the pairs themselves where no lens is known."""
+    if camera.radial == 0.0 or not pairs.inliers:
+        return pairs
+    side, middle = float(max(pairs.size)), np.array(pairs.size) / 2
+    theta = parameters_of(camera, side)
+    to_sides = np.array([[1 / side, 0, -middle[0] / side], [0, 1 / side, -middle[1] / side], [0, 0, 1]])
+    back = np.linalg.inv(to_sides)
+    Fs, inliers = np.empty_like(pairs.Fs), []
+    for k, seen in enumerate(pairs.inliers):
+        views = [straight_points((np.asarray(seen)[:, i : i + 2] - middle) / side, theta) for i in (0, 2)]
+        points = np.asfortranarray(np.hstack(views))
+        Fs[k] = to_sides.T @ refine_sampson(points, back.T @ pairs.Fs[k] @ back, scale=REACH_PX / side) @ to_sides
+        inliers.append(points * side + np.tile(middle, 2))
+    return replace(pairs, Fs=Fs, inliers=tuple(inliers))
+
+
+def straight_points(points: FloatArray, theta: FloatArray) -> FloatArray:
+    """(N, 2) points without the lens of the camera theta (5,), in the same units about the middle."""
+    return np.asarray(straightened(np.ascontiguousarray(points, np.float64), theta), np.float64)

@@ -1,0 +1,147 @@
+"""A video becomes a folder of photos: OUT/frames."""
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from sfm_app.atomic_io import replacing
+from sfm_app.context import RunContext
+from sfm_app.errors import ConfigError, InputError
+from sfm_app.photos import Follower, UnreadableError, choose, head_of, is_video, opened
+from sfm_app.progress import track
+from sfm_app.settings import Settings
+
+HINT = "walk around while you film, slowly, and keep the thing in view"
+DAMAGED = "play it to see whether it is whole; save it as MP4 with H.264"
+INTERLACED = "save it deinterlaced (progressive), as MP4 with H.264"
+BLACK = "black"
+LONGEST_STEM = 40
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """What is known once the frames of a video are chosen."""
+
+    made_from: str
+    """Fingerprint of the inputs."""
+    frames: tuple[int, ...]
+    """Their numbers."""
+    counts: Mapping[str, Any]
+    """For the manifest."""
+
+
+def settings_for(source: Path, settings: Settings) -> Settings:
+    """The settings for a folder or a video: frames of one video share a camera, unless the user says otherwise.
+
+    Raises:
+        ConfigError: they do not go with a video.
+    """
+    if not is_video(head_of(source)):
+        return settings
+    if settings.photos.images:
+        raise ConfigError("--images lists photos of a folder, not frames of a video", hint="leave --images out")
+    cameras = "single" if settings.photos.cameras == "auto" else settings.photos.cameras
+    return settings.model_copy(update={"photos": settings.photos.model_copy(update={"cameras": cameras})})
+
+
+def folder_of(source: Path, run: RunContext) -> Path:
+    """Where the photos lie."""
+    return run.workspace.frames if is_video(head_of(source)) else source
+
+
+@contextmanager
+def photos_of(source: Path, run: RunContext) -> Iterator[Path]:
+    """The folder of photos: the source itself, or the chosen frames of a video.
+
+    A run that is killed before the block ends without an error does not choose again.
+
+    Raises:
+        InputError: the video cannot be read, or shows too little.
+    """
+    if not is_video(head_of(source)):
+        yield source
+        return
+    chosen = kept(run)
+    if chosen is None:
+        chosen = chosen_from(source, run)
+        shutil.rmtree(run.workspace.frames, ignore_errors=True)
+        with replacing(run.workspace.frames_marker) as path:
+            path.write_text(json.dumps(asdict(chosen)), encoding="utf-8")
+    write_frames(source, chosen.frames, run)
+    run.record(video=chosen.counts)
+    yield run.workspace.frames
+    run.workspace.frames_marker.unlink()
+
+
+def kept(run: RunContext) -> Chosen | None:
+    """What a killed run had chosen from the same inputs."""
+    try:
+        found = json.loads(run.workspace.frames_marker.read_text(encoding="utf-8"))
+        chosen = Chosen(found["made_from"], tuple(map(int, found["frames"])), dict(found["counts"]))
+    except (OSError, ValueError, TypeError, LookupError):
+        return None
+    return chosen if chosen.made_from == run.inputs else None
+
+
+def chosen_from(source: Path, run: RunContext) -> Chosen:
+    """Look at the whole video and choose."""
+    most = run.settings.photos.max_frames
+    try:
+        with opened(source) as video:
+            follower = Follower()
+            pictures = track(run.progress, video.small_frames(), "looking at frames", video.looks)
+            looks = [follower.look(number, small) for number, small in pictures]
+    except UnreadableError as err:
+        raise InputError(f"cannot read {source}: {err}", hint=DAMAGED) from err
+    looked_at, notes = len(looks) + video.black, []
+    if video.black and not looks:
+        raise InputError(f"cannot read {source}: all frames come out black, as interlaced ones do", hint=INTERLACED)
+    if video.cut_short:
+        looks = looks[:-1]  # it may be half a picture
+        notes = [f"the file is cut off or damaged after {video.seconds:.1f} s; what comes before is used"]
+    if not looks:
+        raise InputError(f"cannot read {source}: no frame can be decoded", hint=DAMAGED)
+    choice = choose(looks, most)
+    if len(choice.frames) < 2:
+        why = "the camera does not move" if follower.seen else "there is hardly any texture to follow"
+        raise InputError(f"{why} in {source}: {video.frames} frames, and all show one view", hint=HINT)
+    counts = {
+        "frames": video.frames,
+        "seconds": round(video.seconds, 2),
+        "looked_at": looked_at,
+        "chosen": len(choice.frames),
+        "left_out": choice.left_out | ({BLACK: video.black} if video.black else {}),
+        "notes": notes,
+    }
+    return Chosen(run.inputs, choice.frames, counts)
+
+
+def write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None:
+    """Write the frames that are not there yet."""
+    for half in run.workspace.frames.glob(".*"):  # of a run that was killed while it wrote
+        half.unlink()
+    places = {frame: run.workspace.frames / f"{stem_of(source)}_{frame:06d}.jpg" for frame in frames}
+    missing = [frame for frame, place in places.items() if not place.exists()]
+    if not missing:
+        return
+    written = 0
+    try:
+        with opened(source) as video:
+            for frame, data in track(run.progress, video.jpegs(missing), "writing frames", len(missing)):
+                with replacing(places[frame]) as path:
+                    path.write_bytes(data)
+                written += 1
+    except UnreadableError as err:
+        raise InputError(f"cannot read {source}: {err}", hint=DAMAGED) from err
+    if written < len(missing):
+        raise InputError(f"{source} has changed while it was read", hint="run again when it is as it shall be")
+
+
+def stem_of(source: Path) -> str:
+    """What the frames of a video are named by: short, visible, and printable."""
+    printable = "".join(c if c.isprintable() else "_" for c in source.stem)
+    return printable.lstrip(".")[:LONGEST_STEM] or "frame"

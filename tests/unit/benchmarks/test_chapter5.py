@@ -1,0 +1,275 @@
+"""The parts of the chapter 5 benchmark that do not take minutes."""
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import contests
+import numpy as np
+import pytest
+import setups
+import sweep_claims
+import tables
+from bounds import full_bound, gap, reduced_bound
+from chapter5 import IN_ORDER, MOST, PARTS, most_of
+from contests import CAP_PERCENT, NON_ROBUST, PRODUCTION, Attempt, answer_of, contest, e_centre, e_focal, summary
+from fits import Fit, fit_to_all, robust_fits, with_outlying
+from lab import Lab
+from panels import Panel, lowest, rows_of
+from sequences import ImageSequence, camera_matrix_of, corner_sequence, fundamental_of
+from setups import Trial
+from slices import SCALES, focal_slice
+from sweep_claims import CLAIMS, Said, claims_of, holds
+from sweeps import FIGURES
+from zero_curve_plots import SIGMA, support
+
+from sfm_app.geometry.camera import camera_matrix
+from sfm_app.geometry.distances import sampson_distance
+from sfm_app.selfcal.thesis.constraint_forms import essential
+from sfm_app.synthetic.cameras import axis_rotation
+from sfm_app.synthetic.correspondences import TrackOptions, make_tracks, pair_matches
+from sfm_app.types import Calibration
+
+K = camera_matrix(800.0, 900.0, 250.0, 200.0)
+
+
+@pytest.fixture(scope="module")
+def tracks():
+    return make_tracks(TrackOptions(sigma_px=0.2), seed=0)
+
+
+def test_a_projection_matrix_falls_apart_into_K_and_the_rest():
+    R = axis_rotation(np.array([0.6, 0.0, 0.8]), 160.0)
+    P = -3.0 * K @ np.column_stack([R, [0.3, -2.0, 5.0]])
+
+    assert np.allclose(camera_matrix_of(P), K)
+
+
+def test_the_fundamental_matrix_of_two_cameras_joins_their_images():
+    P1 = K @ np.eye(3, 4)
+    P2 = K @ np.column_stack([axis_rotation(np.array([0.0, 1.0, 0.0]), 10.0), [1.0, 0.2, 0.1]])
+    X = np.random.default_rng(0).uniform([-1, -1, 4, 1], [1, 1, 6, 1], (20, 4))
+    x1, x2 = ((X @ P.T)[:, :2] / (X @ P.T)[:, 2:] for P in (P1, P2))
+
+    assert sampson_distance(fundamental_of(P1, P2), x1, x2).max() < 1e-9
+    assert sampson_distance(fundamental_of(P2, P1), x1, x2).max() > 1.0, "the direction matters"
+
+
+def test_a_sequence_of_corners_has_the_pairs_that_share_enough(tmp_path, monkeypatch):
+    folder = tmp_path / "vgg-corners" / "Merton-College-I"
+    folder.mkdir(parents=True)
+    rng = np.random.default_rng(1)
+    for view in range(3):
+        np.savetxt(folder / f"{view + 1:03d}.corners", rng.uniform(0, 700, (40, 2)))
+        pose = np.column_stack([axis_rotation(np.array([0.0, 1.0, 0.0]), 9.0 * view), [0.1 * view, 0, 0.0]])
+        np.savetxt(folder / f"{view + 1:03d}.P", K @ pose)
+    seen = [f"{k} {39 - k if k < 25 else '*'} {k if k < 12 else '*'}" for k in range(40)]
+    (folder / "nview-corners").write_text("\n".join(seen) + "\n")
+
+    found = corner_sequence(tmp_path, "Merton1")
+
+    assert list(found.matches) == [(0, 1)] and found.matches[0, 1].shape == (25, 4), "12 corners make no pair"
+    assert np.array_equal(found.matches[0, 1][3, 2:], np.loadtxt(folder / "002.corners")[36])
+    assert np.allclose(found.K, K) and found.size == (1024, 768)
+    assert found.first(2).matches.keys() == found.matches.keys() and not found.first(1).matches
+
+
+def test_outliers_spoil_a_fit_to_all_and_no_robust_one(tracks):
+    pair, share = (0, 1), {(0, 1): 0.3}
+    spoilt = dict(pair_matches(tracks, share, seed=2))
+    exact = tracks.pairs[pair]
+
+    def error(F):
+        return sampson_distance(F, exact.exact_x1, exact.exact_x2).mean()
+
+    clean = robust_fits(dict(pair_matches(tracks)), seed=0)
+    assert error(clean[pair].F) < 0.3 and error(robust_fits({pair: spoilt[pair]}, seed=0)[pair].F) < 0.3
+    assert error(fit_to_all(spoilt[pair]).F) > 2.0 > 0.3 > error(fit_to_all(np.hstack([exact.x1, exact.x2])).F)
+    mixed = with_outlying(clean, {pair: spoilt[pair]})
+    assert [name for name in mixed if mixed[name] is not clean[name]] == [pair]
+    assert len(mixed[pair].matches) == 200 and list(mixed) == list(clean)
+
+
+@pytest.mark.parametrize("experiment", [setups.matching_outliers, setups.outlying_matrices])
+def test_a_seed_keeps_its_clean_matrices_over_all_levels(experiment):
+    trials = list(experiment(3))
+    first = trials[0]
+
+    assert [trial.x for trial in trials] == sorted({trial.x for trial in trials})
+    for trial in trials:
+        same = [name for name in first.fits if trial.fits[name] is first.fits[name]]
+        assert len(same) >= (8 if experiment is setups.matching_outliers else 10 - trial.x)
+        assert np.array_equal(trial.K, first.K)
+
+
+def test_the_longer_focal_is_the_last_frames(tracks):
+    trials = list(setups.focal_deviation(0))
+    assert [round(trial.x) for trial in trials] == [0, 10, 20, 30, 40, 50]
+    assert all(np.array_equal(trial.K, tracks.K[0]) for trial in trials[:2])
+
+
+def test_raw_matches_replace_as_many_matrices_as_asked(tracks):
+    spoilt = dict(pair_matches(tracks, dict.fromkeys(tracks.pairs, 0.2), seed=1))
+    sequence = ImageSequence("none", tracks.size, tracks.K, spoilt, {})
+
+    counts = [sum(len(fit.matches) == 200 for fit in t.fits.values()) for t in setups.raw_pairs(sequence, 0)]
+
+    assert counts == [0, 3, 6, 9, 10]
+
+
+def test_errors_are_those_of_section_5_5_3():
+    found = camera_matrix(880.0, 900.0, 200.0, 220.0)
+    assert e_focal(found, K) == pytest.approx(5.0) and e_centre(found, K) == pytest.approx(15.0)
+    assert e_focal(K, K) == e_centre(K, K) == 0.0
+
+
+def calibration(method, identifiable, **evidence):
+    return Calibration(np.eye(3), 10, 10, method, identifiable, evidence=evidence)
+
+
+def test_doubt_is_an_answer_of_the_program_alone():
+    told = {"fx_px": 1.0, "fy_px": 2.0, "cx_px": 3.0, "cy_px": 4.0}
+
+    assert answer_of(PRODUCTION, calibration("guess", False, **told)) is None
+    assert answer_of(NON_ROBUST, calibration("guess", False, **told)).tolist() == [[1, 0, 3], [0, 2, 4], [0, 0, 1]]
+    assert answer_of(NON_ROBUST, calibration("guess", False)) is None
+    assert answer_of(PRODUCTION, calibration(PRODUCTION, True, **told)).tolist() == np.eye(3).tolist()
+
+
+def test_a_summary_says_how_many_answered_and_caps_the_rest():
+    far = camera_matrix(9e6, 900.0, 250.0, 200.0)
+    found = summary("m", 2.0, [Attempt("m", 2.0, A, K, ms) for A, ms in ((K, 1.0), (far, 3.0), (None, 8.0))])
+
+    assert (found["tests"], found["answered"], found["ms"]) == (3, pytest.approx(2 / 3), 3.0)
+    assert (found["e_focal"], found["e_focal median"], found["e_OC"]) == (CAP_PERCENT / 2, CAP_PERCENT / 2, 0.0)
+    nothing = summary("m", 2.0, [Attempt("m", 2.0, None, K, 1.0)])
+    assert nothing["answered"] == 0.0 and nothing["e_focal"] is None
+
+
+def two_levels(seed, tracks):
+    fits = {pair: Fit(view.F, np.hstack([view.x1, view.x2])) for pair, view in tracks.pairs.items()}
+    for x in (0.0, 1.0):
+        yield Trial(x + 0 * seed, fits, tracks.size, tracks.K[0])
+
+
+def test_a_contest_has_a_row_per_method_and_level_and_its_own_number_of_tests(tracks):
+    with ThreadPoolExecutor(1) as pool:
+        rows = contest(partial(two_levels, tracks=tracks), {NON_ROBUST: 2, "kruppa": 1}, 0, pool, "two levels")
+
+    assert [(row["method"], row["x"], row["tests"]) for row in rows] == [
+        (NON_ROBUST, 0.0, 2), (NON_ROBUST, 1.0, 2), ("kruppa", 0.0, 1), ("kruppa", 1.0, 1),
+    ]  # fmt: skip
+    assert all(row["e_focal"] < 0.1 and row["answered"] == 1.0 for row in rows), "the matrices are exact"
+
+
+@pytest.mark.parametrize(
+    ("said", "own", "others", "expected"),
+    [
+        (Said("", "", "below", "a", ("b",)), [1, 5], [[2, 4]], [True, False]),
+        (Said("", "", "below", "a", ("b", "c")), [1], [[2], [0.5]], [False]),
+        (Said("", "", "below", "a", ("b",), limit=10), [1, 1], [[11, 9]], [True, False]),
+        (Said("", "", "under", "a", limit=5), [4, 6, float("nan")], [], [True, False, False]),
+        (Said("", "", "over", "a", limit=5), [4, 6], [], [False, True]),
+        (Said("", "", "steady", "a"), [2, 4, 3], [], [True]),
+        (Said("", "", "steady", "a"), [2, 4.1], [], [False]),
+        (Said("", "", "rising", "a"), [2, 1, 5], [], [True]),
+        (Said("", "", "falling", "a"), [2, 3], [], [False]),
+    ],
+)
+def test_sentences_are_judged(said, own, others, expected):
+    assert holds(said, own, others) == expected
+
+
+def test_an_unknown_kind_of_sentence_is_no_claim():
+    with pytest.raises(ValueError, match="no such kind"):
+        holds(Said("", "", "better", "a"), [1.0])
+
+
+def test_every_sentence_is_about_a_plot_that_shows_its_methods():
+    plots = {plot.part: plot for several in FIGURES.values() for plot in several}
+    for said in CLAIMS:
+        assert {said.method, *said.others} <= set(plots[said.part].methods), said.says
+        assert said.column == plots[said.part].column, said.says
+        assert hasattr(setups, plots[said.part].experiment)
+
+
+def test_claims_take_their_levels_and_say_what_is_missing():
+    rows = [
+        {"method": name, "x": x, "e_focal": x + k} for k, name in enumerate(sweep_claims.BUT_RMS) for x in (0, 1, 2)
+    ]
+    found = claims_of({"5.10b": rows})
+    assert [claim.verdict for claim in found] == ["holds"] and found[0].numbers.startswith(
+        "at 1, 2: perturbation 1, 2 %"
+    )
+    assert claims_of({"5.6b": rows})[0].verdict == "not measured"
+
+
+def table_row(sequence, method, e, answered=1.0):
+    given = {"e_focal": e, "e_OC": e, "e_focal median": e, "answered": answered, "method": method, "tests": 1}
+    return {"sequence": sequence, **tables.with_printed(sequence, given)}
+
+
+def test_the_printed_means_are_those_of_the_thesis():
+    rows = [table_row(name, method, 2.0) for name in tables.PRINTED_E_FOCAL for method in contests.METHODS]
+    found = {row["method"]: row for row in tables.means(rows)}
+
+    assert found[contests.ZERO_CURVES]["thesis"] == pytest.approx(15.82, abs=0.005)
+    assert found["the best of the thesis's on each"]["thesis"] == pytest.approx(7.5, abs=0.005)
+    assert found[PRODUCTION]["thesis"] is None and found[PRODUCTION]["here"] == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(
+    ("e", "corridor", "answered", "verdicts"),
+    [
+        (2.9, 30.0, 1.0, ["holds", "holds"]),
+        (3.1, 34.0, 1.0, ["does not hold"] * 2),
+        (None, None, 0.0, ["does not hold", "holds"]),
+    ],
+)
+def test_the_target_is_judged(e, corridor, answered, verdicts):
+    rows = [table_row(name, PRODUCTION, e, answered) for name in tables.TARGET]
+    rows.append(table_row("Corridor", PRODUCTION, corridor, answered))
+    assert [claim.verdict for claim in tables.claims(rows) if claim.figure == "target"] == verdicts
+
+
+def test_bounds_hold_and_the_reduced_one_ignores_the_error_of_F(tracks):
+    F = tracks.F[0] / np.linalg.norm(tracks.F[0], ord=2)
+    true_K, rng = tracks.K[0], np.random.default_rng(3)
+    change = true_K @ np.diag([1.1, 1.1, 1.0]) - true_K
+    noisy = F + 1e-4 * rng.normal(size=(3, 3))
+
+    for rough in (F, noisy):
+        assert float(gap(essential(rough, true_K + change))) <= full_bound(F, rough, true_K, change)
+    assert reduced_bound(F, true_K, change) == pytest.approx(full_bound(F, F, true_K, change))
+    assert reduced_bound(noisy, true_K, 0 * change) == 0.0 < full_bound(F, noisy, true_K, 0 * change)
+
+
+def test_the_objective_of_exact_matrices_is_lowest_at_the_true_focal(tracks):
+    panel = Panel("exact", tracks.K[0][0, 0] * SCALES, {"all": focal_slice(tracks.F, tracks.K[0])})
+    assert lowest(panel, "all") == pytest.approx(tracks.K[0][0, 0])
+    assert len(rows_of([panel])) == len(SCALES)
+
+
+def test_support_is_highest_where_curves_meet():
+    x = np.linspace(-1.0, 1.0, 21)
+    scores = support(np.array([1 + x, 1 - x, 1 + 0.5 * x, np.full(21, 2.5)]))
+
+    assert scores.argmax(axis=1)[:3].tolist() == [10, 10, 10]
+    assert scores[0, 10] == pytest.approx(2 + np.exp(-1.5 / SIGMA))
+
+
+def test_every_figure_of_the_issue_is_drawn():
+    asked = {f"5.{n}" for n in (1, 2, 3, 5, 6, 9, 10, 11, 12, *range(14, 23))} | {"5.7-5.8", "tables"}
+    assert asked <= set(PARTS) == set(IN_ORDER) and IN_ORDER[0] == "5.1" and IN_ORDER[-1] == "tables"
+
+
+def test_slow_methods_have_fewer_tests(tmp_path, tracks, monkeypatch):
+    monkeypatch.setattr(setups, "two_levels", partial(two_levels, tracks=tracks), raising=False)
+    setups.two_levels.__name__ = "two_levels"
+    with ThreadPoolExecutor(1) as pool:
+        lab = Lab(tmp_path, tmp_path, tmp_path, [NON_ROBUST, "kruppa"], 2, 1, {"kruppa": 1}, 0, pool)
+        rows = lab.contest(setups.two_levels)
+        assert lab.contest(setups.two_levels) is rows, "an experiment is run once"
+
+    assert {row["method"]: row["tests"] for row in rows} == {NON_ROBUST: 2, "kruppa": 1}
+    assert lab.fewer == "at most 1 of `kruppa`"
+    assert most_of("kruppa=3") == ("kruppa", 3) and dict(MOST).keys() <= set(contests.METHODS)

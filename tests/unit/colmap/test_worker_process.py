@@ -1,0 +1,133 @@
+"""Parts of COLMAP in processes of their own: what they say, how they fail, and that they end."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sfm_app.colmap.worker_process import relay, started
+from sfm_app.errors import BackendError
+
+CHILD = """
+import os, signal, sys, time
+from sfm_app.colmap.apart import Reported, report, served
+
+def work(task):
+    {work}
+
+served(work)
+"""
+
+
+@pytest.fixture
+def child(tmp_path, monkeypatch):
+    """A module that does something in a process of its own, by its name."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+
+    def make(work):
+        (tmp_path / "some_child.py").write_text(CHILD.format(work=work))
+        return "some_child"
+
+    return make
+
+
+def call(module, **task):
+    with started(module, task) as process:
+        found = list(process.messages())
+        process.check("working")
+    return found
+
+
+def test_a_process_gets_its_task_and_says_what_it_found(child):
+    assert call(child("report(twice=2 * task['number'])"), number=21) == [{"twice": 42}]
+
+
+def test_what_libraries_print_is_no_report(child):
+    assert call(child("print('hello'); os.system('echo hello'); report(end=True)")) == [{"end": True}]
+
+
+def test_nothing_is_imported_from_the_current_folder(child, tmp_path, monkeypatch):
+    for name in ("json", "zlib", "numpy", "pycolmap"):
+        (tmp_path / "here").mkdir(exist_ok=True)
+        (tmp_path / "here" / f"{name}.py").write_text("raise SystemExit('got in')")
+    monkeypatch.chdir(tmp_path / "here")
+
+    assert call(child("report(well=True)")) == [{"well": True}]
+
+
+def test_progress_comes_through(child):
+    class Seen(list):
+        def start(self, label, total):
+            self.append((label, total))
+
+        def advance(self, steps=1):
+            self.append(steps)
+
+        def finish(self):
+            self.append("end")
+
+    seen = Seen()
+    module = child("bar = Reported(); bar.start('photos', 7); bar.advance(3); bar.finish(); report(a=1); report(b=2)")
+
+    with started(module, {}) as process:
+        found = relay(process, seen)
+
+    assert (seen[:3], found) == ([("photos", 7), 3, "end"], {"a": 1, "b": 2})
+
+
+@pytest.mark.parametrize(
+    ("work", "message"),
+    [
+        ("raise ValueError('first line\\nat last')", "COLMAP failed while working: at last"),
+        ("sys.stderr.write('x' * 1_000_000); sys.stderr.write('\\nthe end'); sys.exit(3)", "working: the end"),
+        ("os.abort()", r"COLMAP failed while working: it crashed \(SIGABRT\)"),
+        ("os._exit(7)", "COLMAP failed while working: it ended with 7"),
+        ("os.kill(os.getpid(), signal.SIGKILL)", "ended from outside while working: perhaps the memory was full"),
+    ],
+)
+def test_a_process_that_fails_is_an_error_with_its_last_line(child, work, message):
+    with pytest.raises(BackendError, match=message):
+        call(child(work))
+
+
+def test_a_process_is_ended_with_the_block(child):
+    with started(child("report(begun=True); time.sleep(600)"), {}) as process:
+        next(process.messages())
+        assert not process.ended(0.0)
+
+    assert process.process.returncode == -signal.SIGKILL
+
+
+def test_a_process_ends_when_the_one_that_started_it_is_killed(child):
+    parent = (
+        "import sys; from sfm_app.colmap.apart import started\n"
+        "with started(sys.argv[1], {}) as process:\n"
+        "    for message in process.messages(): print(message['me'], flush=True)"
+    )
+    command = [sys.executable, "-c", parent, child("report(me=os.getpid()); time.sleep(600)")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        orphan = int(process.stdout.readline())
+        process.kill()
+
+    assert ends(orphan, 10.0)
+
+
+def ends(process, seconds):
+    """Whether a process is gone, or only waits to be buried, within that time."""
+    until = time.monotonic() + seconds
+    while time.monotonic() < until:
+        try:
+            os.kill(process, 0)
+            state = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()[0]
+        except ProcessLookupError:
+            return True
+        except OSError:  # no Linux
+            state = ""
+        if state == "Z":
+            return True
+        time.sleep(0.05)
+    return False

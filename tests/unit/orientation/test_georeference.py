@@ -1,0 +1,118 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sfm_app.orientation.georeference import enu_m, georeference, position_at
+from sfm_app.types import GpsPosition
+
+ORIGIN = GpsPosition(48.2, 16.37, 180.0)
+METRES = 12.5
+
+
+def walk(count, radius_m, noise_m, seed=0, altitude_noise_m=None):
+    """Camera centres along an arc, in an unknown frame with an unknown unit, and the positions a phone notes there.
+
+    Returns:
+        Centres (N, 3), positions, up (3,) in the unknown frame, true metres (N, 3) east, north, up of `ORIGIN`.
+    """
+    rng = np.random.default_rng(seed)
+    angles = np.linspace(0, 2.5, count)
+    enu = np.column_stack([radius_m * np.cos(angles), radius_m * np.sin(angles), 1.5 + 0.2 * rng.normal(size=count)])
+    noise = rng.normal(size=(count, 3)) * [noise_m, noise_m, altitude_noise_m or 2 * noise_m]
+    R = Rotation.random(random_state=seed).as_matrix()
+    return enu @ R.T / METRES + [3, -2, 5], [position_at(row, ORIGIN) for row in enu + noise], R[:, 2], enu
+
+
+def test_metres_on_the_ellipsoid_and_back():
+    here = GpsPosition(60.0, 179.9999, 100.0)
+
+    enu = enu_m([GpsPosition(60.0, -179.9999, 90.0), GpsPosition(60.001, 179.9999, None)], here)
+
+    assert enu[0] == pytest.approx([0.0002 * 55800.0, 0, -10], abs=0.02), "a degree of longitude at 60 N is 55.80 km"
+    assert enu[1] == pytest.approx([0, 111.41, 0], abs=0.02), "a degree of latitude at 60 N is 111.41 km"
+    there = position_at(enu[0], here)
+    assert (there.latitude_deg, there.longitude_deg) == pytest.approx((60.0, -179.9999), abs=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_scale_heading_and_place(seed):
+    centres, positions, up, enu = walk(12, 60.0, 3.0, seed)
+
+    found = georeference(centres, positions, up)
+
+    assert found and (found.photos, found.of) == (12, 12)
+    assert found.enu_from_world.scale == pytest.approx(METRES, rel=4 * found.scale_deviation)
+    assert 0.005 < found.scale_deviation < 0.03
+    assert 1.5 < found.rms_m < 6
+    assert np.allclose(found.enu_from_world.R @ up, [0, 0, 1])
+    moved = found.enu_from_world(centres)
+    places = enu_m([position_at(row, found.origin) for row in moved], ORIGIN)
+    assert 0.1 < np.linalg.norm((places - enu)[:, :2], axis=1).max() < 8
+    assert found.up_deviation_deg is None
+
+
+def test_a_third_of_the_positions_may_be_wrong():
+    centres, positions, up, _ = walk(12, 60.0, 3.0)
+    for k in (0, 5, 6, 11):
+        positions[k] = replace(positions[k], latitude_deg=positions[k].latitude_deg + 0.002 * (k - 5.5))
+    positions[3] = None
+
+    found = georeference(centres, positions, up)
+
+    assert found and (found.photos, found.of) == (7, 11)
+    assert found.enu_from_world.scale == pytest.approx(METRES, rel=0.06)
+
+
+def test_three_exact_positions_are_enough_two_are_not():
+    centres, positions, up, _ = walk(3, 60.0, 0.02)
+
+    assert georeference(centres, positions, up).enu_from_world.scale == pytest.approx(METRES, rel=0.005)
+    two = georeference(centres, [positions[0], positions[1], positions[1]], up)
+    assert not two and "2 different positions" in two.reason
+
+
+def test_no_positions():
+    found = georeference(np.zeros((4, 3)), [None] * 4, np.array([0.0, 1.0, 0.0]))
+
+    assert not found and found.reason == "the photos have no positions"
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_photos_from_one_spot_have_no_scale(seed):
+    centres, positions, up, _ = walk(12, 1.5, 4.0, seed)
+
+    found = georeference(centres, positions, up)
+
+    assert not found and "fix no scale" in found.reason
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_positions_of_other_photos_do_not_agree(seed):
+    centres, positions, up, _ = walk(12, 60.0, 3.0, seed)
+
+    swapped = [positions[k] for k in np.random.default_rng(seed).permutation(12)]
+
+    assert not georeference(centres, swapped, up)
+
+
+def test_a_mirrored_walk_does_not_agree():
+    centres, positions, up, _ = walk(12, 60.0, 3.0)
+
+    assert not georeference(centres, positions, -up), "upside down, the walk turns the other way"
+
+
+def test_a_drone_says_where_up_is_when_its_cameras_do_not():
+    rng = np.random.default_rng(0)
+    enu = np.column_stack([rng.uniform(-100, 100, (20, 2)), rng.uniform(55, 65, 20)])
+    positions = [position_at(row + rng.normal(scale=1.0, size=3), ORIGIN) for row in enu]
+    wrong = np.array([0.0, 1.0, 0.0])
+
+    found = georeference(enu / METRES, positions, wrong, up_is_sure=False)
+
+    assert found.enu_from_world.R[2] == pytest.approx([0, 0, 1], abs=0.02)
+    assert 0.1 < found.up_deviation_deg < 1.0
+    assert found.enu_from_world.scale == pytest.approx(METRES, rel=0.02)
+    flat = [replace(position, altitude_m=None) for position in positions]
+    assert not georeference(enu / METRES, flat, wrong, up_is_sure=False)

@@ -1,0 +1,188 @@
+import numpy as np
+import pytest
+
+from sfm_app.geometry.unit_vectors import axis_angle_deg
+from sfm_app.orientation.gravity import CAMERAS, GROUND, LINES, ROLL, WALL, facing, up_direction, viewer_frame
+from sfm_app.orientation.ground_plane import dominant_plane
+from sfm_app.orientation.up_direction import Scenery
+from sfm_app.orientation.vanishing_points import joined, vanishing_near
+
+HAND_HELD = (1.0, -2.0, 0.5, 1.5, -1.0, 2.0, -0.5, -1.5)
+
+
+def error_deg(found, true):
+    """Angle between directions, their sign included."""
+    return float(np.degrees(np.arccos(np.clip(found @ true, -1, 1))))
+
+
+def shown(scene, points=None):
+    """Points that all photos see, without light; no pictures."""
+    points, photos = scene.points if points is None else points, len(scene.rotations)
+    return Scenery(points, np.full(len(points), 100.0), (np.arange(len(points)),) * photos, (None,) * photos)
+
+
+def found_up(scene, segments=None, points=None, turn_deg=None):
+    segments = scene.segments if segments is None else segments
+    return up_direction(scene.rotations, scene.centres, shown(scene, points), segments, turn_deg)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_vertical_edges_say_where_up_is_better_than_the_cameras(build_house, seed):
+    scene = build_house(HAND_HELD, aim_y=3.5, seed=seed)
+
+    upright = found_up(scene)
+
+    assert upright.found_by == LINES
+    assert error_deg(upright.up, scene.up) < 0.1 < 0.3 < error_deg(upright.roll.up, scene.up) < 12
+    assert upright.off_roll_deg == pytest.approx(error_deg(upright.roll.up, upright.up), abs=1e-6)
+    assert 0.001 < upright.deviation_deg < 0.2
+
+
+def test_without_lines_it_is_the_direction_that_the_cameras_are_level_to(build_house):
+    scene = build_house(HAND_HELD, sweep_deg=120.0)
+
+    upright = found_up(scene, joined([]))
+
+    assert upright.found_by == ROLL
+    assert error_deg(upright.up, scene.up) < 2 < upright.deviation_deg * 3
+    assert 0.5 < upright.roll.spread_deg < 3
+
+
+def test_clutter_does_not_pass_for_vertical_edges(build_house):
+    scene = build_house(HAND_HELD, lines=(0, 0), clutter=400)
+
+    assert found_up(scene).found_by == ROLL
+
+
+@pytest.mark.parametrize("turn_deg", [90, -90])
+def test_a_set_that_is_turned_as_a_whole(build_house, turn_deg):
+    upright_set = build_house(HAND_HELD, sweep_deg=90.0)
+    turned = build_house([roll + turn_deg for roll in HAND_HELD], sweep_deg=90.0)
+
+    found = found_up(turned)
+
+    assert found_up(upright_set).roll.turn_deg == 0
+    assert found.roll.turn_deg in (90, 270)
+    assert axis_angle_deg(found.up, turned.up) < 0.2
+
+
+def test_single_photos_that_are_turned_or_wild_are_outvoted(build_house):
+    rolls = list(HAND_HELD)
+    rolls[1] += 90
+    rolls[4] += 35
+    scene = build_house(rolls)
+
+    upright = found_up(scene)
+
+    assert error_deg(upright.up, scene.up) < 0.2
+    assert error_deg(upright.roll.up, scene.up) < 4
+    mean = np.mean([-R[1] for R in scene.rotations], axis=0)
+    assert error_deg(mean / np.linalg.norm(mean), scene.up) > 10
+
+
+@pytest.mark.parametrize("turn_deg", [90, -90])
+def test_what_is_near_is_down(build_house, turn_deg):
+    scene = build_house([roll + turn_deg for roll in HAND_HELD], sweep_deg=90.0)
+    floor = np.random.default_rng(3).uniform([-4, 0, -4], [4, 0, 4], (300, 3)) @ scene.turned.T
+
+    for ground, up in ((floor, scene.up), (floor + 4.0 * scene.up, -scene.up)):
+        upright = found_up(scene, joined([]), np.concatenate([scene.points, ground]))
+        assert error_deg(upright.up, up) < 8
+        assert 3 < upright.standing.not_upside_down < 7
+
+
+@pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])
+def test_who_knows_how_the_photos_are_turned_is_believed(build_house, turn_deg):
+    scene = build_house(HAND_HELD, sweep_deg=90.0)
+
+    upright = found_up(scene, turn_deg=turn_deg)
+
+    assert upright.roll.turn_deg == turn_deg and upright.standing.least_nats == np.inf
+    # what has to be turned clockwise to be upright has its top on the left
+    top = {0: [0, -1], 90: [-1, 0], 180: [0, 1], 270: [1, 0]}[turn_deg]
+    assert (scene.rotations @ upright.up)[:, :2].mean(axis=0) == pytest.approx(top, abs=0.15)
+
+
+def test_cameras_that_nobody_held_level_stand_on_the_ground(build_house):
+    scene = build_house([28, -24, 15, -31, 22, -12, 30, -26])
+    rng = np.random.default_rng(3)
+    floor = rng.uniform([-4, -0.01, -4], [4, 0.01, 4], (300, 3)) @ scene.turned.T
+    standing = np.concatenate([scene.points, floor])
+
+    upright = found_up(scene, joined([]), standing)
+
+    assert upright.found_by == GROUND
+    assert error_deg(upright.up, scene.up) < 1
+
+
+@pytest.mark.parametrize("level_deg", [20.0, -15.0, 0.0])
+def test_the_front_faces_the_viewer(build_house, level_deg):
+    scene = build_house(HAND_HELD, level_deg=level_deg)
+    upright = found_up(scene)
+
+    towards, found_by = facing(upright, scene.rotations, scene.points)
+
+    assert found_by == LINES
+    assert error_deg(towards, scene.front) == pytest.approx(abs(level_deg), abs=0.3)
+    assert abs(towards @ upright.up) < 1e-9
+
+
+def test_a_view_across_a_corner_stays_one(build_house):
+    scene = build_house(HAND_HELD, level_deg=44.0)
+
+    towards, found_by = facing(found_up(scene), scene.rotations, scene.points)
+
+    assert found_by == CAMERAS
+    assert error_deg(towards, scene.front) < 6
+
+
+def test_a_wall_of_points_is_a_front_too(build_house):
+    scene = build_house(HAND_HELD)
+    rng = np.random.default_rng(4)
+    flat = rng.uniform([-3, 0, -0.01], [3, 3, 0.01], (300, 3))
+    wall = flat @ np.array([[np.cos(0.2), 0, -np.sin(0.2)], [0, 1, 0], [np.sin(0.2), 0, np.cos(0.2)]]) @ scene.turned.T
+
+    towards, found_by = facing(found_up(scene, joined([])), scene.rotations, wall)
+
+    assert found_by == WALL
+    assert error_deg(towards, scene.front) == pytest.approx(np.degrees(0.2), abs=3)
+
+
+def test_the_viewer_sees_the_scene_upright_centred_and_of_size_one(build_house):
+    scene = build_house(HAND_HELD)
+    seen = viewer_frame(scene.up, scene.front, scene.points)
+    metric = viewer_frame(scene.up, scene.front, scene.points, metres=2.5)
+
+    assert np.allclose(seen.R @ scene.up, [0, 1, 0]) and np.allclose(seen.R @ scene.front, [0, 0, 1])
+    assert np.linalg.det(seen.R) == pytest.approx(1)
+    assert np.allclose(np.median(scene.points @ seen.R.T * seen.scale + seen.t, axis=0), 0, atol=0.2)
+    assert np.percentile(np.linalg.norm(seen(scene.points), axis=1), 80) == pytest.approx(1, abs=1e-6)
+    assert metric.scale == 2.5
+
+
+def test_neither_where_points_crowd_nor_far_ones_move_the_middle_of_the_scene():
+    rng = np.random.default_rng(5)
+    even, crowd = rng.uniform(-1, 1, (4000, 3)), rng.uniform([0.5, -1, -1], [1, 1, 1], (2500, 3))
+    far = np.tile([400.0, 0.0, 0.0], (60, 1))
+    seen = viewer_frame(np.array([0.0, 1, 0]), np.array([0.0, 0, 1]), np.concatenate([even, crowd, far]))
+
+    middle = seen(np.zeros((1, 3)))[0] / seen.scale
+
+    assert -0.25 < middle[0] < -0.1  # the median lies at 0.47
+    assert np.abs(middle[1:]).max() < 0.05
+
+
+def test_no_plane_where_points_fill_space():
+    cloud = np.random.default_rng(0).normal(size=(2000, 3))
+
+    assert dominant_plane(cloud, np.array([0.0, 1.0, 0.0]), (0.0, 20.0)) is None
+    assert dominant_plane(cloud[:5], np.array([0.0, 1.0, 0.0]), (0.0, 90.0)) is None
+
+
+def test_a_few_segments_are_no_direction(build_house):
+    scene = build_house(HAND_HELD)
+    few = np.zeros(len(scene.segments), bool)
+    few[:11] = True
+
+    assert vanishing_near(scene.up, scene.segments.take(few)) is None
+    assert vanishing_near(scene.up, scene.segments).share == pytest.approx(0.4, abs=0.15)

@@ -1,0 +1,235 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm_app.orientation.camera_roll import TURNED, ups_from_roll
+from sfm_app.orientation.up_cues import (
+    ledges_are_lit,
+    low_is_near,
+    sky_is_above,
+    small_picture,
+    surfaces_of,
+    tops_are_bright,
+    tops_are_seen,
+)
+from sfm_app.orientation.up_direction import CUES, MOST, Cue, Scenery, odds, stand
+from sfm_app.synthetic.cameras import axis_rotation, camera_centre, look_at, pixel_rays
+from sfm_app.synthetic.render import GAMMA, cast, prepare, render_scene
+from sfm_app.synthetic.scenes import build_scene, scene_views
+
+UP = np.array([0.0, 1.0, 0.0])
+VIEW_AXIS = np.array([0.0, 0.0, 1.0])
+
+
+def stripes(rows):
+    """A picture (H, 120) with these grey levels, row by row, and a little texture."""
+    texture = np.random.default_rng(0).normal(scale=1.0, size=(len(rows), 120))
+    return np.clip(np.asarray(rows)[:, None] + texture, 0, 255).astype(np.uint8)
+
+
+def ledge_rows(count=4):
+    """Ledges from above: a lit top, a sharp border to the shadow under it, and slowly back to light."""
+    return np.tile(np.linspace(60.0, 200.0, 40)[::-1], count)[::-1]
+
+
+def terrain(light, seed=0):
+    """Points (P, 3) of a bumpy ground, lit from a direction, of patchy colour; seen from above."""
+    rng = np.random.default_rng(seed)
+    x, z = rng.uniform(-3, 3, (2, 4000))
+    y = 0.4 * np.sin(3 * x) + 0.4 * np.cos(3 * z)
+    normals = np.column_stack([-1.2 * np.cos(3 * x), np.ones_like(x), 1.2 * np.sin(3 * z)])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    colour = rng.uniform(0.7, 1.3, len(x))
+    return np.column_stack([x, y, z]), 120 * colour * (1.0 + 0.8 * normals @ light)
+
+
+def turned_by(turn_deg, rotations, scenery):
+    """The same photos, turned counter-clockwise: they have to be turned back clockwise."""
+    turn = axis_rotation(VIEW_AXIS, -turn_deg)
+    pictures = tuple(None if p is None else np.ascontiguousarray(np.rot90(p, turn_deg // 90)) for p in scenery.pictures)
+    return turn @ rotations, replace(scenery, pictures=pictures)
+
+
+@pytest.fixture(scope="module", params=["corner", "facade"])
+def rendered(request):
+    """Six small photos of a rendered scene with y up, as rotations, centres and what they show."""
+    scene, views = prepare(build_scene(request.param)), scene_views(request.param)
+    rotations, centres, points, brightness, seen, pictures = [], [], [], [], [], []
+    for name in sorted(views.cam_from_world)[::2][:6]:
+        camera, pose = views.cameras[name], views.cam_from_world[name]
+        shrink = 192 / camera.width
+        K = np.diag([shrink, shrink, 1.0]) @ camera.K
+        camera = replace(camera, K=K, width=192, height=round(shrink * camera.height))
+        image = 255 * np.clip(render_scene(scene, camera, pose, supersampling=1), 0, 1) ** (1 / GAMMA)
+        grey = image.mean(axis=2).astype(np.uint8)
+        directions = pixel_rays(camera) @ pose[:, :3]
+        depth = cast(scene.rays, camera_centre(pose), directions)["t_hit"].astype(np.float64)
+        known = np.isfinite(depth) & (np.arange(depth.size) % 53 == 0)
+        seen.append(np.arange(np.count_nonzero(known)) + sum(map(len, points)))
+        points.append(camera_centre(pose) + directions[known] * depth[known, None])
+        brightness.append(grey.ravel()[known].astype(float))
+        rotations.append(pose[:, :3])
+        centres.append(camera_centre(pose))
+        pictures.append(grey)
+    scenery = Scenery(np.concatenate(points), np.concatenate(brightness), tuple(seen), tuple(pictures))
+    return np.array(rotations), np.array(centres), scenery
+
+
+@pytest.mark.parametrize("turn_deg", [0, 180])
+def test_rendered_photos_stand_upright_whichever_way_they_were_held(rendered, turn_deg):
+    rotations, centres, scenery = rendered
+    R, shown = turned_by(turn_deg, rotations, scenery)
+
+    standing = stand(ups_from_roll(R, centres), R, centres, shown)
+
+    assert standing.roll.turn_deg == turn_deg
+    assert standing.roll.up @ UP > np.cos(np.radians(20))
+    # upside down, the habit of holding cameras upright speaks against what the scene shows
+    habit = TURNED[turn_deg // 90]
+    assert standing.not_upside_down == pytest.approx(sum(standing.evidence.values()) + TURNED[2] - 2 * habit, abs=1e-6)
+    assert 2 < standing.least_nats < 20
+
+
+@pytest.mark.parametrize("turn_deg", [90, 270])
+def test_photos_on_their_side_of_a_walk_around_something(build_house, turn_deg):
+    """The axis is plain from the walk; the floor tells which side is down."""
+    house = build_house((1.0, -2.0, 0.5, 1.5, -1.0, 2.0), sweep_deg=120.0)
+    floor = np.random.default_rng(3).uniform([-4, 0, -4], [4, 0, 4], (300, 3)) @ house.turned.T
+    points = np.concatenate([house.points, floor])
+    scenery = Scenery(points, np.full(len(points), 100.0), (np.arange(len(points)),) * 6, (None,) * 6)
+    R, shown = turned_by(turn_deg, house.rotations, scenery)
+
+    standing = stand(ups_from_roll(R, house.centres), R, house.centres, shown)
+
+    assert standing.roll.turn_deg == turn_deg
+    assert standing.roll.up @ house.up > np.cos(np.radians(20))
+    assert standing.evidence["tops are bright"] == standing.evidence["sky is above"] == 0.0
+
+
+def test_no_single_cue_turns_photos_that_are_held_upright(build_house):
+    """A ceiling and no floor: what is high is near, and nothing else is known."""
+    house = build_house((1.0, -2.0, 0.5, 1.5, -1.0, 2.0))
+    ceiling = np.random.default_rng(3).uniform([-4, 4, -4], [4, 4, 9], (900, 3)) @ house.turned.T
+    scenery = Scenery(ceiling, np.full(900, 100.0), (np.arange(900),) * 6, (None,) * 6)
+
+    standing = stand(ups_from_roll(house.rotations, house.centres), house.rotations, house.centres, scenery)
+
+    assert standing.roll.turn_deg == 0 and standing.roll.up @ house.up > 0.9
+    assert standing.evidence["low is near"] == -MOST and standing.evidence["tops are seen"] == -MOST
+    assert 0 <= standing.not_upside_down < 0.1, "it is as likely as not, and says so"
+
+
+def test_without_scenery_cameras_are_held_upright(build_house):
+    house = build_house((1.0, -2.0, 0.5, 1.5), sweep_deg=90.0)
+    nothing = Scenery(np.zeros((0, 3)), np.zeros(0), (np.zeros(0, np.int64),) * 4, (None,) * 4)
+
+    standing = stand(ups_from_roll(house.rotations, house.centres), house.rotations, house.centres, nothing)
+
+    assert standing.roll.turn_deg == 0 and not any(standing.evidence.values())
+    assert standing.not_upside_down == pytest.approx(TURNED[2])
+
+
+def test_opposite_turns_have_opposite_directions(build_house):
+    house = build_house((1.0, 88.0, 0.5, 31.0, -1.0, 2.0))
+
+    rolls = ups_from_roll(house.rotations, house.centres)
+
+    assert [roll.turn_deg for roll in rolls] == [0, 90, 180, 270]
+    for roll, opposite in zip(rolls[:2], rolls[2:], strict=True):
+        assert roll.up == pytest.approx(-opposite.up)
+
+
+@pytest.mark.parametrize("turn_deg", [0, 90])
+def test_three_steps_along_a_wall_are_level(build_house, turn_deg):
+    """Nothing but the walk tells which of the two verticals it is."""
+    house = build_house((turn_deg + 1.0, turn_deg - 2.0, turn_deg + 0.5), sweep_deg=15.0, lines=(0, 0))
+    nothing = Scenery(np.zeros((0, 3)), np.zeros(0), (np.zeros(0, np.int64),) * 3, (None,) * 3)
+
+    standing = stand(ups_from_roll(house.rotations, house.centres), house.rotations, house.centres, nothing)
+
+    assert abs(standing.roll.up @ house.up) > 0.98
+    assert 0.2 < standing.not_on_its_side < 8
+
+
+def test_ledges_are_lit_from_above():
+    upright, sideways = look_at(np.array([0, 0, 5.0]), np.zeros(3))[:, :3], stripes(ledge_rows()).T
+    found = ledges_are_lit(UP, [upright], [stripes(ledge_rows())])
+
+    assert 0.4 < found < 1
+    assert ledges_are_lit(-UP, [upright], [stripes(ledge_rows())]) == pytest.approx(-found)
+    assert ledges_are_lit(UP, [upright], [stripes(ledge_rows()[::-1])]) == pytest.approx(-found, abs=0.05)
+    assert abs(ledges_are_lit(UP, [upright], [sideways])) < 0.1
+    assert ledges_are_lit(UP, [upright], [None]) == 0.0
+
+
+def test_the_border_of_a_black_background_is_no_ledge():
+    upright = look_at(np.array([0, 0, 5.0]), np.zeros(3))[:, :3]
+    below = 80 + ledge_rows(3) / 3
+    grey, black = (stripes(np.concatenate([np.full(60, level), below])) for level in (30.0, 0.0))
+
+    assert ledges_are_lit(UP, [upright], [grey]) < -0.3 < 0.3 < ledges_are_lit(UP, [upright], [black])
+
+
+def test_the_sky_is_even_and_bright():
+    upright = look_at(np.array([0, 0, 5.0]), np.zeros(3))[:, :3]
+    picture = stripes(np.repeat([200.0, 90.0], [40, 60]))
+    picture[40:] = np.random.default_rng(1).integers(20, 160, picture[40:].shape)
+
+    assert 0.7 < sky_is_above(UP, [upright], [picture]) <= 1
+    assert sky_is_above(-UP, [upright], [picture]) == pytest.approx(-sky_is_above(UP, [upright], [picture]))
+    assert sky_is_above(UP, [upright], [255 - picture]) < 0.1, "even and dark is a shadow"
+    assert abs(sky_is_above(UP, [upright], [np.full((90, 120), 230, np.uint8)])) < 0.1, "and even all over is a wall"
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_light_from_above_and_from_below(side):
+    points, brightness = terrain(side * UP)
+    above = surfaces_of(points, brightness, [np.arange(len(points))], np.array([[0.0, 6.0, 0.0]]))
+
+    assert 0.15 < side * tops_are_bright(UP, above) < 0.8
+    assert tops_are_bright(-UP, above) == pytest.approx(-tops_are_bright(UP, above))
+    assert 0.5 < tops_are_seen(UP, above) < 0.9
+    plain = surfaces_of(points, np.full(len(points), 77.7), [np.arange(len(points))], np.array([[0.0, 6.0, 0.0]]))
+    assert tops_are_bright(UP, plain) == 0.0
+
+
+def test_what_no_photo_sees_says_nothing():
+    points, brightness = terrain(UP)
+    unseen = surfaces_of(points, brightness, [np.zeros(0, np.int64)], np.array([[0.0, 6.0, 0.0]]))
+
+    assert len(unseen.normals) == 0
+    assert tops_are_seen(UP, unseen) == tops_are_bright(UP, unseen) == 0.0
+
+
+def test_low_is_near_on_the_ground_and_not_on_a_distant_thing():
+    rng = np.random.default_rng(0)
+    pose = look_at(np.array([0, 1.6, 8.0]), np.array([0, 1.0, 0]))
+    places = pose[None, :, :3], camera_centre(pose)[None]
+    ground = rng.uniform([-4, 0, -9], [4, 0, 6], (500, 3))
+    far = rng.uniform([-0.01, 0.99, -0.01], [0.01, 1.01, 0.01], (500, 3))
+    tilted = far + 0.5 * np.outer(far[:, 1] - 1.0, [0, 0, -1])
+
+    assert 0.5 < low_is_near(UP, *places, ground, [np.arange(500)]) < 1
+    assert 0 < low_is_near(UP, *places, tilted, [np.arange(500)]) < 0.05
+    assert low_is_near(UP, *places, ground, [np.arange(5)]) == 0.0
+
+
+def test_nats_grow_with_the_cue_and_with_the_points_and_end():
+    cue = Cue(0.1, 0.1, noise=4.0)
+
+    assert cue.nats(0.05, 10**9) == pytest.approx(1.0) and cue.nats(-0.05, 10**9) == pytest.approx(-1.0)
+    assert 0.1 < cue.nats(0.05, 100) < 0.25
+    assert cue.nats(5.0, 100) == MOST
+    assert all(0 < CUES[name].mean < 0.5 and 0.05 < CUES[name].deviation < 0.5 for name in CUES)
+
+
+def test_odds_are_rounded_and_end():
+    assert odds(0.0) == 1.0
+    assert odds(np.log(123.4)) == 120.0
+    assert 1e6 < odds(np.inf) < 1.3e6
+
+
+def test_a_small_picture_keeps_its_shape():
+    assert small_picture(np.zeros((1000, 1500), np.uint8)).shape == (171, 256)
+    assert small_picture(np.zeros((40, 90), np.uint8)).shape == (40, 90)

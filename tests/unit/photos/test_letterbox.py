@@ -1,0 +1,105 @@
+"""Bars of one colour around pictures, and which photos share a camera by them."""
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sfm_app.photos.camera_groups import grouped
+from sfm_app.photos.letterbox import shown_part, with_one_frame
+from sfm_app.types import Photo
+
+
+def textured(width, height, seed=0):
+    """A picture without any line of one colour."""
+    rng = np.random.default_rng(seed)
+    coarse = Image.fromarray(rng.integers(30, 230, (height // 16 + 2, width // 16 + 2, 3)).astype(np.uint8))
+    return coarse.resize((width, height), Image.Resampling.BICUBIC)
+
+
+def barred(size, frame, colour=(0, 0, 0), seed=0):
+    whole = Image.new("RGB", size, colour)
+    whole.paste(textured(frame[2], frame[3], seed), frame[:2])
+    return whole
+
+
+def as_jpeg(picture, quality=80):
+    kept = io.BytesIO()
+    picture.save(kept, "JPEG", quality=quality)
+    return Image.open(kept)
+
+
+def photo(name="a.jpg", shown=None, size=(600, 400), group=""):
+    return Photo(name, *size, group, shown=shown)
+
+
+@pytest.mark.parametrize("colour", [(0, 0, 0), (255, 255, 255), (20, 40, 60)])
+@pytest.mark.parametrize("frame", [(0, 50, 600, 300), (80, 0, 440, 400), (0, 0, 600, 310), (0, 0, 450, 400),
+                                   (30, 20, 500, 350)])  # fmt: skip
+def test_pictures_within_bars_are_found(frame, colour):
+    picture = barred((600, 400), frame, colour)
+    assert shown_part(picture) == frame
+    rung = shown_part(as_jpeg(picture))
+    assert rung is not None
+    edges = np.array([[x, y, x + w, y + h] for x, y, w, h in (frame, rung)])
+    assert np.max(np.abs(edges[0] - edges[1])) <= 2
+
+
+def test_pictures_without_bars_have_none():
+    for seed in range(5):
+        assert shown_part(textured(320, 240, seed)) is None
+        assert shown_part(as_jpeg(textured(320, 240, seed), 40)) is None
+
+
+def test_a_thing_on_a_plain_ground_has_no_bars():
+    pixels = np.zeros((240, 320, 3), np.uint8)
+    rows, columns = np.mgrid[:240, :320]
+    pixels[(rows - 120) ** 2 + (columns - 160) ** 2 < 80**2] = 200
+    assert shown_part(Image.fromarray(pixels)) is None
+    assert shown_part(Image.new("RGB", (320, 240), (7, 7, 7))) is None
+
+
+def test_a_sky_of_one_colour_above_a_level_horizon_is_no_bar():
+    assert shown_part(barred((320, 240), (0, 100, 320, 140), (235, 235, 235))) is None
+
+
+def test_frames_that_nearly_agree_become_one():
+    frames = [(0, 50, 600, 300), (0, 51, 600, 299), (0, 50, 600, 301), (0, 90, 600, 220)]
+    found = [one.shown for one in with_one_frame([photo(shown=frame) for frame in frames])]
+    assert found == [(0, 50, 600, 300)] * 3 + [(0, 90, 600, 220)]
+
+
+def test_bars_that_are_not_seen_are_those_of_the_others():
+    shown = [(0, 50, 600, 300), (0, 50, 600, 300), None]
+    assert [one.shown for one in with_one_frame([photo(shown=frame) for frame in shown])] == [(0, 50, 600, 300)] * 3
+    few = [(0, 50, 600, 300), None, None]  # a wall before an empty ground, perhaps
+    assert [one.shown for one in with_one_frame([photo(shown=frame) for frame in few])] == [None] * 3
+    half = [(0, 50, 600, 300), None]
+    assert [one.shown for one in with_one_frame([photo(shown=frame) for frame in half])] == [(0, 50, 600, 300)] * 2
+    mixed = [(0, 50, 600, 300), (0, 90, 600, 220), None]
+    assert [one.shown for one in with_one_frame([photo(shown=frame) for frame in mixed])] == mixed
+
+
+def test_pictures_of_other_sizes_are_of_other_groups():
+    photos = [photo("a", (0, 50, 600, 300)), photo("b"), photo("c", (0, 52, 600, 298)), photo("d", (90, 0, 420, 400))]
+    assert [one.group for one in grouped(photos, "auto")] == [
+        "600x299 in 600x400", "600x400", "600x299 in 600x400", "420x400 in 600x400",
+    ]  # fmt: skip
+    assert [one.name for one in grouped(photos, "auto")] == ["a", "b", "c", "d"]
+
+
+@pytest.mark.parametrize("cameras", ["single", "each"])
+def test_who_says_whose_photos_they_are_is_believed(cameras):
+    found = list(grouped([photo("a", (0, 50, 600, 300)), photo("b", (0, 90, 600, 220))], cameras))
+    assert [one.shown for one in found] == [None, None]
+    assert len({one.group for one in found}) == (1 if cameras == "single" else 2)
+
+
+def test_bars_turn_with_a_photo_that_is_turned():
+    lying = [photo(f"{k}", (0, 50, 600, 300)) for k in range(3)]
+    on_end = photo("on end", (50, 10, 300, 580), size=(400, 600))
+    *_, turned = grouped([*lying, on_end], "auto")
+    assert (turned.width, turned.height, turned.turn_deg) == (600, 400, 90)
+    # its right becomes the top
+    assert turned.shown == (10, 50, 580, 300)

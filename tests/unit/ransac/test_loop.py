@@ -1,0 +1,343 @@
+"""The loop apart from its parts: trial counts, stopping rules, what is handed to whom."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import sfm_app.ransac.loop as loop
+from sfm_app.ransac.estimator_config import Recipe
+from sfm_app.ransac.inner_loop import Draws, next_better
+from sfm_app.ransac.loop import search
+from sfm_app.ransac.points import prepare
+from sfm_app.ransac.sampling.minimal_samples import random_state
+from sfm_app.ransac.scoring.mlesac import mlesac
+from sfm_app.ransac.scoring.robust_costs import msac, squared_distances
+from sfm_app.ransac.verification.pretests import OPEN, FullVerification, RandomisedTdd
+from sfm_app.settings import EpipolarSettings
+from sfm_app.synthetic.correspondences import PairOptions, make_pair
+
+
+def always(value):
+    """A part of a recipe that answers every call with the same."""
+    return lambda *_: value
+
+
+PLAIN = Recipe(score=msac, finish=lambda _points, F, _threshold: F)
+
+
+def scene(outliers=0.3, seed=0, points=300):
+    pair = make_pair(PairOptions(points=points, outliers=outliers), seed)
+    return prepare(pair.x1, pair.x2, seed)
+
+
+def options(**values):
+    return EpipolarSettings(max_error_px=3.0, **values)
+
+
+@pytest.mark.parametrize("trials", [1, 2, 17])
+def test_no_more_samples_than_allowed(trials):
+    found = search(scene(outliers=0.8), options(max_trials=trials), 0, PLAIN)
+    assert found is None or found.trials <= trials
+    assert trials < 17 or found.trials == trials
+
+
+def test_clean_matches_need_few_samples():
+    pair = make_pair(PairOptions(points=300, sigma_px=0.01), 1)
+    assert search(prepare(pair.x1, pair.x2, 0), options(), 0, PLAIN).trials < 10
+
+
+def test_half_outliers_need_what_the_formula_says():
+    # 3.19 with a share of 0.5 and confidence 0.9999 asks for 1174 samples; a model of 7 noisy points sees fewer inliers
+    trials = [search(scene(0.5, seed), options(), seed, PLAIN).trials for seed in range(5)]
+    assert 400 < np.median(trials) < 20000
+
+
+def test_fewer_matches_than_a_sample():
+    assert search(scene(points=8), options(), 0, PLAIN) is not None
+    m = scene(points=8)
+    assert search(replace(m, points=m.points[:6]), options(), 0, PLAIN) is None
+
+
+def test_same_seed_same_bits_and_another_seed_other_samples():
+    m = scene(0.4)
+    first, again, other = (search(m, options(max_trials=50), seed, PLAIN) for seed in (1, 1, 2))
+    assert first.F.tobytes() == again.F.tobytes()
+    assert first.F.tobytes() != other.F.tobytes()
+
+
+def test_converged_priors_end_the_search():
+    flat = replace(PLAIN, validity=always(np.ones(300)), stop_on_convergence=True)
+    patient = replace(flat, stop_on_convergence=False)
+    m = scene(0.5)
+    assert search(m, options(), 0, flat).trials < search(m, options(), 0, patient).trials
+
+
+def test_patience_ends_the_search():
+    m = scene(0.6)
+    limited = search(m, options(), 0, replace(PLAIN, patience=always(5), least_trials=5)).trials
+    assert limited < search(m, options(), 0, PLAIN).trials
+
+
+def test_priors_guide_the_samples():
+    pair = make_pair(PairOptions(points=300, outliers=0.6), 3)
+    m = prepare(pair.x1, pair.x2, 0)
+    good = np.empty(300)
+    good[m.rows] = pair.is_inlier
+    told = replace(PLAIN, validity=always(good))
+
+    guided, blind = (search(m, options(max_trials=150), 0, recipe) for recipe in (told, PLAIN))
+
+    def support(found):
+        return np.count_nonzero(squared_distances(m.points, found.F.reshape(9)) < (3 / m.unit_px) ** 2)
+
+    assert support(guided) > support(blind) + 10
+
+
+def test_local_optimisation_is_kept_only_if_better():
+    m = scene(0.3)
+    truth = search(m, options(), 5, PLAIN)
+    told = replace(PLAIN, improve=always(truth.F))
+    misled = replace(PLAIN, improve=always(np.eye(3)))
+
+    assert search(m, options(), 0, told).trials <= search(m, options(), 0, PLAIN).trials
+    assert search(m, options(), 0, misled).F.tobytes() == search(m, options(), 0, PLAIN).F.tobytes()
+
+
+def draw(points, draws, to_beat, best, limit=25, gates=(OPEN, OPEN), seed=0):
+    return next_better(points, draws, msac(points, 0.01, None), gates, to_beat, limit, random_state(seed), best)
+
+
+def blind(count, batch=1):
+    """Uniform samples only."""
+    return Draws(7, False, batch, 0.0, np.cumsum(np.ones(count)), 0.0, np.zeros(1))
+
+
+def test_next_better_leaves_the_best_alone_when_nothing_is_better():
+    m, best, to_beat = scene(), np.full((2, 9), 7.0), np.full(2, 1e-12)
+    assert draw(m.points, blind(300), to_beat, best) == 25
+    assert (best == 7).all()
+    assert (to_beat == 1e-12).all()
+
+
+@pytest.mark.parametrize(("batch", "limit", "drawn"), [(1, 25, 1), (4, 25, 4), (32, 100, 32), (32, 20, 20)])
+def test_a_batch_is_drawn_to_its_end_and_its_best_model_returned(batch, limit, drawn):
+    m, best, to_beat = scene(), np.zeros((2, 9)), np.full(2, np.inf)
+    assert draw(m.points, blind(300, batch), to_beat, best, limit) == drawn
+    one_by_one, lowest, state = np.zeros((2, 9)), np.full(2, np.inf), random_state(0)
+    left = drawn
+    while left:
+        left -= next_better(
+            m.points, blind(300), msac(m.points, 0.01, None), (OPEN, OPEN), lowest, left, state, one_by_one
+        )
+    np.testing.assert_array_equal(best, one_by_one)
+    np.testing.assert_array_equal(to_beat, lowest)
+
+
+def test_samples_besides_the_priors_compete_with_each_other_only():
+    pair = make_pair(PairOptions(points=300, outliers=0.5, sigma_px=0.0), 3)
+    points = prepare(pair.x1, pair.x2, 0)
+    rest = np.zeros(300)
+    rest[points.rows[pair.is_inlier]] = 1.0
+    draws = blind(300)._replace(rest_share=1.0, rest=np.cumsum(rest), guided_share=1e-9)
+    best, to_beat = np.zeros((2, 9)), np.array([1e-12, np.inf])  # no sample of all matches can win
+
+    assert draw(points.points, draws, to_beat, best) < 25
+
+    assert (best[0] == 0).all()
+    assert to_beat[0] == 1e-12
+    exact = squared_distances(points.points, best[1])[rest > 0]
+    assert np.median(exact) < 1e-12
+    # fewer matches than a sample are no rest: uniform samples take their place, and their kind once there are priors
+    few = draws._replace(rest=np.cumsum(np.arange(300) < 6).astype(np.float64))
+    for guided_share, kind in ((1e-9, 1), (0.0, 0)):
+        best, to_beat = np.zeros((2, 9)), np.full(2, np.inf)
+        draw(points.points, few._replace(guided_share=guided_share), to_beat, best)
+        assert to_beat[kind] < np.inf == to_beat[1 - kind]
+
+
+class Script:
+    """In place of the inner loop: draws all it may, but after the given trials has a model of the given penalty."""
+
+    def __init__(self, model, *better):
+        self.model, self.better, self.trials, self.calls = model, list(better), 0, []
+
+    def __call__(self, _points, draws, _measure, _gates, to_beat, limit, _state, best):
+        self.calls.append((limit, draws.guided_share, to_beat[0]))
+        if self.better and self.better[0][0] <= self.trials + limit:
+            at, score = self.better.pop(0)
+            drawn, self.trials = at - self.trials, at
+            best[0], to_beat[0] = self.model, score
+            return drawn
+        self.trials += limit
+        return limit
+
+
+@pytest.fixture
+def scripted(monkeypatch):
+    """Run a recipe on a scene whose true model the script hands out."""
+    pair = make_pair(PairOptions(points=300, outliers=0.5, sigma_px=0.1), 0)
+    m = prepare(pair.x1, pair.x2, 0)
+    truth = search(m, options(), 0, PLAIN).F.reshape(9)
+
+    def run(recipe, *better, model=truth, **values):
+        script = Script(model, *better)
+        monkeypatch.setattr(loop, "next_better", script)
+        return search(m, options(**values), 0, recipe), script.calls
+
+    return run
+
+
+def test_a_search_ends_when_319_says_so(scripted):
+    found, calls = scripted(PLAIN, (10, 1.0))
+    seen = np.log(1 - options().confidence) / np.log1p(-(0.5**7))
+    assert found.trials == pytest.approx(seen, rel=0.25)  # a few outliers lie on their lines
+    assert [c[0] for c in calls] == [20000, found.trials - 10]
+
+
+def test_assumed_shares_fix_the_trials(scripted):
+    fixed = replace(PLAIN, assumed_share=0.5)
+    assert scripted(fixed, (10, 1.0))[0].trials == 1175
+    assert scripted(fixed, (10, 1.0), max_trials=100)[0].trials == 100
+    assert scripted(replace(fixed, sample_size=8), (10, 1.0))[0].trials == 2354
+
+
+def test_least_trials_are_drawn_even_if_fewer_would_do(scripted):
+    eager = replace(PLAIN, assumed_share=0.9)  # 3.19 asks for 15
+    assert scripted(eager, (3, 1.0))[0].trials == 15
+    found, calls = scripted(replace(eager, least_trials=40), (3, 2.0), (30, 1.0))
+    assert found.trials == 40
+    assert [c[0] for c in calls] == [40, 37, 10]
+    assert scripted(replace(eager, least_trials=40), (3, 1.0), max_trials=25)[0].trials == 25
+    assert scripted(replace(PLAIN, assumed_share=0.5, least_trials=40), (3, 1.0))[0].trials == 1175
+
+
+def test_a_last_attempt_may_beat_the_best_model_and_else_is_dropped(scripted):
+    seen, wrong = [], np.eye(3) / np.sqrt(3)
+
+    def recover(points, F, threshold, measure, gate, state):
+        seen.append((F.copy(), measure, gate))
+        return seen[0][0] if len(seen) == 2 else wrong
+
+    found, _ = scripted(replace(PLAIN, recover=recover), (1, 1e-9), max_trials=10)
+    truth = seen[0][0]
+    np.testing.assert_array_equal(found.F, truth)
+    found, _ = scripted(replace(PLAIN, recover=recover), (1, 290.0), model=wrong.reshape(9), max_trials=10)
+    np.testing.assert_allclose(found.F, truth, atol=1e-15)
+    assert seen[1][2] is OPEN
+    assert scripted(replace(PLAIN, recover=recover), max_trials=10)[0] is None
+    assert len(seen) == 2
+
+
+def test_patience_is_counted_from_the_last_better_model(scripted):
+    found, calls = scripted(replace(PLAIN, patience=always(50), least_trials=50), (30, 2.0), (70, 1.0))
+    assert found.trials == 120
+    assert [c[0] for c in calls] == [50, 50, 50]
+
+
+def test_patience_without_a_credible_model_goes_on(scripted):
+    waiting = replace(PLAIN, patience=always(50), least_trials=50)
+    nothing, calls = scripted(waiting, max_trials=170)
+    assert nothing is None
+    assert [c[0] for c in calls] == [50, 50, 50, 20]
+    endless = replace(waiting, patience=always(np.inf))
+    luck = np.ones(9) / 3
+    assert scripted(endless, (1, 1.0), model=luck, max_trials=170)[0].trials == 170
+
+
+def test_patience_is_asked_about_the_best_model_after_the_least_trials(scripted):
+    asked = []
+
+    def patience(points, F, threshold):
+        asked.append(F.copy())
+        return 70.0
+
+    recipe = replace(PLAIN, patience=patience, least_trials=50)
+    found, calls = scripted(recipe, (10, 2.0), (100, 1.0))
+    # idle for 50 after the 10th: 20 more; the 100th comes too late
+    assert found.trials == 80
+    assert [c[0] for c in calls] == [50, 50, 20]
+    np.testing.assert_array_equal(asked, [found.F, found.F])
+
+
+@pytest.mark.parametrize(("improved", "met"), [([0], [0]), ([1], [1]), ([0, 1], [0, 1]), ([], [])])
+def test_only_kinds_of_samples_that_improved_are_met(monkeypatch, improved, met):
+    seen, m = [], scene()
+
+    def script(_points, _draws, _measure, _gates, to_beat, limit, _state, best):
+        if not seen:
+            best[improved], to_beat[improved] = np.ones(9) / 3, 1.0
+        return limit
+
+    def meets(best, kind):
+        seen.append(kind)
+        assert best.samples[kind].any()
+        best.to_beat[:] = 0.5  # as a new best model does: the bar of the other kind falls too
+        return True
+
+    monkeypatch.setattr(loop, "next_better", script)
+    monkeypatch.setattr(loop.Best, "meets", meets)
+    search(m, options(max_trials=120), 0, replace(PLAIN, least_trials=50, patience=always(200)))
+    assert seen == met
+
+
+def test_first_priors_come_at_their_share_of_the_trials(scripted):
+    seen = []
+
+    def validity(_points, best, _threshold):
+        seen.append(best.copy())
+        return np.ones(300)
+
+    recipe = replace(PLAIN, assumed_share=0.5, validity=validity, guided_after=0.1)
+    _, calls = scripted(recipe, (10, 3.0), (60, 2.0), (200, 1.0), (300, 0.5))
+
+    # a tenth of 1175 is 118: until then no priors, then those of the best model, then those of every new one
+    assert [(c[0], c[1]) for c in calls] == [(118, 0), (108, 0), (58, 0), (1057, 1), (975, 1), (875, 1)]
+    assert len(seen) == 3
+    _, calls = scripted(recipe, (400, 3.0))
+    assert [(c[0], c[1]) for c in calls] == [(118, 0), (1057, 0), (775, 1)]
+
+
+def test_a_renewed_measure_scores_the_best_model_anew(scripted):
+    # the script says 1e6; what the next models have to beat is counted with the share of inliers that the best one has
+    _, calls = scripted(replace(PLAIN, score=mlesac, assumed_share=0.5), (10, 1e6))
+    assert calls[0][2] == np.inf
+    assert 500 < calls[1][2] < 1200
+
+
+def test_tests_are_reviewed_and_told_of_every_trial_and_model(scripted):
+    told = []
+
+    class Nosy(FullVerification):
+        review = 40
+
+        def learn(self, trials):
+            told.append(trials)
+
+        def expect(self, share):
+            told.append(round(share, 1))
+
+    scripted(replace(PLAIN, verifier=Nosy), (50, 1.0), max_trials=100)
+    assert told == [40, 10, 0.5, 40, 10]
+
+
+def test_an_outlier_in_front_does_not_spoil_a_randomised_test():
+    pair = make_pair(PairOptions(points=300, outliers=0.3, sigma_px=0.1), 2)
+    m = prepare(pair.x1, pair.x2, 0)
+    inlier = np.empty(300, dtype=bool)
+    inlier[m.rows] = pair.is_inlier
+    spoilt = replace(m, points=np.asfortranarray(m.points[np.argsort(inlier)]))  # all outliers come first
+
+    found = search(spoilt, options(), 0, replace(PLAIN, verifier=RandomisedTdd))
+
+    near = squared_distances(spoilt.points, found.F.reshape(9)) < (3 / m.unit_px) ** 2
+    assert near[np.sort(inlier)].mean() > 0.9
+
+
+def test_samples_of_eight_find_the_truth_too():
+    m = scene(0.3)
+    seven, eight = (search(m, options(), 0, replace(PLAIN, sample_size=n)) for n in (7, 8))
+    near = [np.mean(squared_distances(m.points, h.F.reshape(9)) < (3 / m.unit_px) ** 2) for h in (seven, eight)]
+    assert min(near) > 0.5
+    assert eight.trials > seven.trials
+    assert search(replace(m, points=m.points[:7].copy()), options(), 0, replace(PLAIN, sample_size=8)) is None

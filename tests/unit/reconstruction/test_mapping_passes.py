@@ -1,0 +1,362 @@
+"""Passes, with mappers that find what the test says; pose graph, models and database are real."""
+
+import contextlib
+import sqlite3
+from dataclasses import replace
+
+import pytest
+
+from sfm_app.colmap.bundle import adjust
+from sfm_app.colmap.database import opened
+from sfm_app.colmap.model import photos_of
+from sfm_app.errors import BackendError
+from sfm_app.reconstruction import baseline
+from sfm_app.reconstruction import mapping_passes as module
+from sfm_app.reconstruction.mapping_passes import learned_intrinsics, reconstruct, taken_apart
+from sfm_app.reconstruction.mapping_runs import Attempt
+from sfm_app.reconstruction.support import Explained, explained_pairs
+from sfm_app.types import PoseGraph
+
+FOCAL = 1280.0
+TRUE = [FOCAL, 512.0, 384.0, 0.0]
+
+
+def with_camera(model, params):
+    for camera in model.cameras.values():
+        camera.params = params
+    return model
+
+
+def without(model, photos):
+    for photo in photos:
+        model.deregister_frame(model.images[photo].frame_id)
+    return model
+
+
+@pytest.fixture
+def mapped(monkeypatch, synthetic):
+    """Makes mappers that find these models one after the other, and lists what cameras they were given."""
+
+    def make(*models):
+        seen, left = [], list(models)
+
+        def attempts(group, run):
+            seen.append((group.photos, group.intrinsics))
+            model = left.pop(0)
+            if model is None:
+                return [Attempt("incremental", None, {}, "nothing")]
+            explained = explained_pairs(model, synthetic.matches, synthetic.views, 1.5)
+            return [Attempt("incremental", model, explained, f"{model.num_reg_images()} photos")]
+
+        monkeypatch.setattr(module, "attempts", attempts)
+        monkeypatch.setattr(module, "map_baseline", lambda *_: Attempt("colmap", None, {}, "no rival"))
+        return seen
+
+    return make
+
+
+def outcome(synthetic, intrinsics, run):
+    return reconstruct(synthetic.matches, synthetic.views, intrinsics, run)
+
+
+def focals_in(path):
+    with opened(path) as database:
+        return [camera.params[0] for camera in database.read_all_cameras()]
+
+
+def geometries_in(path):
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        return database.execute("SELECT * FROM two_view_geometries ORDER BY pair_id").fetchall()
+
+
+def test_a_camera_that_was_known_and_stayed_is_not_looked_at_twice(synthetic, run, cameras, mapped):
+    seen = mapped(with_camera(synthetic.copy(), [FOCAL * 1.009, 512.0, 384.0, 0.01]))
+
+    found = outcome(synthetic, cameras(), run())
+
+    assert len(seen) == 1 and found.passes == 1
+    assert found.tried == ("6 photos",) and found.cuts == ()
+    assert found.graph.groups == ((1, 2, 3, 4, 5, 6),) and seen[0][0] == (1, 2, 3, 4, 5, 6)
+    assert focals_in(run().workspace.database) == [FOCAL]
+
+
+@pytest.mark.parametrize(
+    "camera", [{"method": "guess", "identifiable": False}, {"focal": FOCAL * 1.011}, {"focal": FOCAL / 1.011}]
+)
+def test_a_camera_that_was_a_guess_or_moved_is_mapped_with_again(synthetic, run, cameras, mapped, camera):
+    seen = mapped(without(with_camera(synthetic.copy(), TRUE), [6]), with_camera(synthetic.copy(), TRUE))
+
+    found = outcome(synthetic, cameras(**camera), run())
+
+    assert found.passes == 2 and found.models[0].photos == 6
+    assert len(seen) == 2
+    learned = seen[1][1].main
+    assert (learned.focal_px, learned.identifiable, learned.method) == (FOCAL, True, "mapping")
+    assert found.intrinsics is seen[1][1]
+    assert focals_in(run().workspace.database) == [FOCAL]
+    assert {pose.kind for pose in found.graph.poses.values()} == {"calibrated"}
+
+
+def test_a_second_pass_that_explains_less_is_thrown_away_with_all_that_it_wrote(synthetic, run, cameras, mapped):
+    guess = cameras(FOCAL * 1.1, method="guess", identifiable=False)
+    place = run().workspace
+    mapped(without(synthetic.copy(), [4, 5, 6]))
+    module._pass(synthetic.matches, synthetic.views, guess, run())
+    first = geometries_in(place.database)
+
+    seen = mapped(with_camera(synthetic.copy(), TRUE), without(with_camera(synthetic.copy(), TRUE), [5, 6]))
+    found = outcome(synthetic, guess, run())
+
+    assert len(seen) == 2
+    assert found.passes == 1 and found.models[0].photos == 6 and found.intrinsics is guess
+    assert focals_in(place.database) == [pytest.approx(FOCAL * 1.1)]
+    assert geometries_in(place.database) == first
+    assert {pose.kind for pose in found.graph.poses.values()} == {"uncalibrated"}
+
+
+def test_a_second_pass_that_finds_nothing_leaves_the_first(synthetic, run, cameras, mapped):
+    mapped(with_camera(synthetic.copy(), TRUE), None)
+
+    found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
+
+    assert (found.passes, found.models[0].photos) == (1, 6)
+
+
+def test_without_a_model_there_is_nothing_to_learn(synthetic, run, cameras, mapped):
+    seen = mapped(None, None, None, None)
+
+    found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
+
+    assert found.models == () and found.support == 0.0 and found.tried[:2] == ("nothing", "no rival")
+    assert len(seen) == 4 and len(found.tried) == 5  # the usual guess, and three others
+
+
+def rival_of(monkeypatch, synthetic, model):
+    """Lets COLMAP's own pipeline find this model, and counts how often it is asked."""
+    asked = []
+
+    def map_baseline(matches, views, intrinsics, run):
+        asked.append(intrinsics)
+        return Attempt("colmap", model, explained_pairs(model, matches, views, 1.5), "the rival")
+
+    monkeypatch.setattr(module, "map_baseline", map_baseline)
+    return asked
+
+
+def test_a_rival_that_explains_more_goes_on(synthetic, run, cameras, mapped, monkeypatch):
+    mapped(without(with_camera(synthetic.copy(), TRUE), [6]), None)
+    asked = rival_of(monkeypatch, synthetic, with_camera(synthetic.copy(), TRUE))
+
+    found = outcome(synthetic, cameras(), run())
+
+    assert len(asked) == 1 and found.thin == "photos that match others have no place: 1"
+    assert (found.models[0].mapper, found.models[0].photos) == ("colmap", 6)
+    assert "the rival" in found.tried and found.reason.startswith("it places all 6 photos")
+
+
+def test_later_steps_know_the_pairs_of_a_rival_that_goes_on(synthetic, run, cameras, mapped, monkeypatch):
+    """Its photos need not be in our pose graph: tracks could not be completed, and COLMAP raised."""
+    views = replace(synthetic.views, fits={pair: fit for pair, fit in synthetic.views.fits.items() if 6 not in pair})
+    mapped(without(with_camera(synthetic.copy(), TRUE), [5, 6]), None)
+    rival_of(monkeypatch, synthetic, with_camera(synthetic.copy(), TRUE))
+    made = run()
+
+    found = reconstruct(synthetic.matches, views, cameras(), made)
+
+    assert found.models[0].photos == 6 and {(k, 6) for k in range(1, 6)} <= found.graph.poses.keys()
+    assert len(geometries_in(made.workspace.database)) == 15
+    assert photos_of(adjust(found.models[0].model, made.workspace.database).model) == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_rival_that_explains_less_is_named_and_left(synthetic, run, cameras, mapped, monkeypatch):
+    mapped(with_camera(synthetic.copy(), TRUE), None)
+    asked = rival_of(monkeypatch, synthetic, without(with_camera(synthetic.copy(), TRUE), [5, 6]))
+
+    found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
+
+    assert len(asked) == 1 and found.thin == "the pairs do not determine a camera"
+    assert (found.models[0].mapper, found.models[0].photos) == ("incremental", 6)
+    assert "the rival" in found.tried
+
+
+def test_good_evidence_needs_no_rival(synthetic, run, cameras, mapped, monkeypatch):
+    mapped(with_camera(synthetic.copy(), TRUE))
+    asked = rival_of(monkeypatch, synthetic, synthetic.copy())
+
+    found = outcome(synthetic, cameras(), run())
+
+    assert asked == [] and found.thin == "" and found.models[0].photos == 6
+
+
+def test_where_a_guess_leaves_many_photos_out_other_focals_are_tried(synthetic, run, cameras, mapped):
+    few = without(synthetic.copy(), [4, 5, 6])
+    seen = mapped(few, few, with_camera(synthetic.copy(), TRUE), None, None)
+
+    found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
+
+    focals = [intrinsics.main.focal_px / 1024 for _, intrinsics in seen]
+    assert focals[1:4] == pytest.approx([0.6, 2.4, 4.8])
+    assert focals[4:] == pytest.approx([FOCAL / 1024])  # what the best of them has found is gone on with
+    assert found.models[0].photos == 6
+    assert "6 photos (focal 2.4 longer sides)" in found.tried
+
+
+def test_no_other_focals_are_tried_where_one_is_known(synthetic, run, cameras, mapped):
+    seen = mapped(without(synthetic.copy(), [4, 5, 6]), None)
+
+    outcome(synthetic, cameras(), run())
+
+    assert all(intrinsics.main.focal_px == pytest.approx(FOCAL, rel=0.01) for _, intrinsics in seen)
+
+
+def test_a_rival_that_fails_costs_nothing(synthetic, run, cameras, mapped, monkeypatch):
+    mapped(with_camera(synthetic.copy(), TRUE), None)
+
+    def fail(*_):
+        raise BackendError("COLMAP failed")
+
+    monkeypatch.setattr(baseline, "map_as_colmap_does", fail)
+    monkeypatch.setattr(module, "map_baseline", baseline.map_baseline)
+
+    found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
+
+    assert found.models[0].photos == 6
+    assert any("as COLMAP does by itself: failed" in note for note in found.tried)
+
+
+def learned(model, synthetic, intrinsics):
+    return learned_intrinsics(Attempt("global", model, {}, ""), intrinsics, synthetic.matches)
+
+
+def worth(model, synthetic, intrinsics, photos=6):
+    graph = PoseGraph({}, {}, (tuple(range(1, photos + 1)),))
+    found = module.Outcome((Attempt("global", model, {}, ""),), graph, intrinsics, ())
+    return module.worth_another(found, intrinsics, synthetic.matches)
+
+
+def test_two_photos_teach_no_camera(synthetic, cameras):
+    guess = cameras(method="guess", identifiable=False)
+
+    assert not worth(without(synthetic.copy(), [3, 4, 5, 6]), synthetic, guess)
+    assert worth(without(synthetic.copy(), [4, 5, 6]), synthetic, guess)
+
+
+def test_photos_of_the_main_group_that_stayed_out_are_worth_another_pass(synthetic, cameras):
+    known = cameras(FOCAL)
+
+    assert not worth(with_camera(synthetic.copy(), TRUE), synthetic, known)
+    assert worth(without(with_camera(synthetic.copy(), TRUE), [6]), synthetic, known)
+    assert not worth(without(with_camera(synthetic.copy(), TRUE), [6]), synthetic, known, photos=5)
+
+
+def test_what_is_learned_is_focal_centre_and_lens(synthetic, cameras):
+    guess = cameras(FOCAL * 1.2, method="guess", identifiable=False, reason="an orbit", held=("centre",))
+    model = with_camera(synthetic.copy(), [1300.0, 500.0, 390.0, -0.07])
+
+    found = learned(model, synthetic, guess).main
+
+    assert found.K.tolist() == [[1300.0, 0, 500.0], [0, 1300.0, 390.0], [0, 0, 1]]
+    assert (found.radial, found.reason, found.held) == (-0.07, "", ("centre",))
+
+
+def test_a_camera_of_no_photo_in_the_model_stays_what_it_was(synthetic, cameras):
+    two = replace(cameras(900.0, method="guess", identifiable=False).main)
+    intrinsics = replace(
+        cameras(FOCAL * 1.1), cameras={**cameras(FOCAL * 1.1).cameras, "two": two},
+        camera_of={synthetic.matches.images[6].name: "two"},
+    )  # fmt: skip
+
+    found = learned(without(with_camera(synthetic.copy(), TRUE), [6]), synthetic, intrinsics)
+
+    assert found.cameras["two"] is two
+    assert found.cameras["one"].focal_px == FOCAL
+
+
+def joined(inside, between):
+    """What a model of photos 1 to 3 and 4 to 6 explains within and between these."""
+    pairs = {(a, b): inside for part in ((1, 2, 3), (4, 5, 6)) for a in part for b in part if a < b}
+    return pairs | {(3, 4): Explained(40, 30, 0), (2, 5): between, (1, 6): between}
+
+
+GOOD, AGAINST, FOR = Explained(100, 100, 0), Explained(5, 60, 55), Explained(30, 30, 0)
+
+
+def test_a_model_whose_join_is_contradicted_gives_its_parts(synthetic):
+    attempt = Attempt("global", synthetic.copy(), joined(GOOD, AGAINST), "how")
+
+    first, second = taken_apart(attempt)
+
+    assert [photos_of(part.model) for part in (first, second)] == [[1, 2, 3], [4, 5, 6]]
+    assert set(first.explained) == {(1, 2), (1, 3), (2, 3)} and set(second.explained) == {(4, 5), (4, 6), (5, 6)}
+    assert (first.mapper, first.note) == ("global", "how")
+    assert attempt.photos == 6  # the model itself is as it was
+    assert 90 < first.model.num_points3D() <= 100
+
+
+def test_a_model_whose_join_holds_stays_as_it_is(synthetic):
+    attempt = Attempt("global", synthetic.copy(), joined(GOOD, FOR), "how")
+
+    assert taken_apart(attempt) == [attempt]
+
+
+def test_lonely_photos_and_lesser_pairs_are_left_out(synthetic):
+    pairs = {(1, 2): GOOD, (1, 3): GOOD, (4, 5): GOOD}
+
+    [part] = taken_apart(Attempt("global", synthetic.copy(), pairs, "how"))
+
+    assert photos_of(part.model) == [1, 2, 3]
+
+
+def test_the_parts_of_a_cut_model_are_models_of_their_own_and_named(synthetic, run, cameras, mapped, monkeypatch):
+    mapped(synthetic.copy())
+    monkeypatch.setattr(module, "join_models", lambda models, *_: models)  # what contradicts is made up
+    cut = joined(GOOD, AGAINST)
+    del cut[5, 6]
+    attempts = module.attempts
+    monkeypatch.setattr(
+        module, "attempts", lambda group, run: [replace(found, explained=cut) for found in attempts(group, run)]
+    )
+
+    found = outcome(synthetic, cameras(), run())
+
+    assert [photos_of(part.model) for part in found.models] == [[1, 2, 3], [4, 5, 6]]
+    assert found.cuts == tuple(
+        ", ".join(synthetic.matches.images[key].name for key in part) for part in ((1, 2, 3), (4, 5, 6))
+    )
+    assert found.support == found.models[0].support == pytest.approx(150)
+
+
+def only(synthetic, *pairs):
+    """Matches and F's of these pairs alone."""
+    matches = replace(synthetic.matches, matches={pair: synthetic.matches.matches[pair] for pair in pairs})
+    return matches, replace(synthetic.views, fits={pair: synthetic.views.fits[pair] for pair in pairs})
+
+
+def test_a_group_of_two_photos_is_mapped_when_there_is_no_other(synthetic, run, cameras, mapped):
+    seen = mapped(without(synthetic.copy(), [1, 2, 4, 6]))
+
+    found = reconstruct(*only(synthetic, (3, 5)), cameras(), run())
+
+    assert [photos for photos, _ in seen] == [(3, 5)]
+    assert photos_of(found.models[0].model) == [3, 5]
+
+
+def test_the_model_with_most_photos_is_the_main_one(synthetic, run, cameras, mapped):
+    pairs = [(1, 2), (1, 3), (2, 3), (4, 5), (4, 6), (5, 6)]
+    mapped(without(synthetic.copy(), [3, 4, 5, 6]), without(synthetic.copy(), [1, 2, 3]))
+
+    found = reconstruct(*only(synthetic, *pairs), cameras(), run())
+
+    assert [photos_of(attempt.model) for attempt in found.models] == [[4, 5, 6], [1, 2]]
+    assert found.tried == ("2 photos", "3 photos", "no rival")
+
+
+def test_every_group_is_mapped_but_lesser_ones_of_two_photos(synthetic, run, cameras, mapped):
+    matches, views = only(synthetic, (1, 2), (3, 4), (3, 5), (4, 5))
+    seen = mapped(without(synthetic.copy(), [1, 2, 6]))
+
+    found = reconstruct(matches, views, cameras(), run())
+
+    assert found.graph.groups == ((3, 4, 5), (1, 2))
+    assert [photos for photos, _ in seen] == [(3, 4, 5)]
+    assert photos_of(found.models[0].model) == [3, 4, 5]

@@ -1,0 +1,165 @@
+"""The second look, with features and mappers that find what the test says; databases and geometries are real."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm_app.api import opened_run
+from sfm_app.colmap.database import read_features, write_keypoints, write_matches
+from sfm_app.colmap.model import photos_of
+from sfm_app.errors import BackendError
+from sfm_app.reconstruction import second_look as module
+from sfm_app.reconstruction.mapping_passes import Outcome
+from sfm_app.reconstruction.mapping_runs import Attempt
+from sfm_app.reconstruction.second_look import LOOSE_RATIO, Found, clear, look_again, lost_photos, pairs_to_see
+from sfm_app.reconstruction.support import explained_pairs
+from sfm_app.settings import Settings
+from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, ViewGraph
+from sfm_app.workspace import SECOND_LOOK
+
+LOST = 6
+
+
+def outcome_of(synthetic, matches, views, placed):
+    """A model that holds the first so many photos."""
+    model = synthetic.copy()
+    for photo in range(placed + 1, 7):
+        model.deregister_frame(model.images[photo].frame_id)
+    attempt = Attempt("incremental", model, explained_pairs(model, matches, views, 1.5), f"{placed} photos")
+    return Outcome((attempt,), PoseGraph({}, {}, ()), None, ())
+
+
+@pytest.fixture
+def first(synthetic, cameras, tmp_path):
+    """Five of six photos placed; nothing is known of the matches of the last."""
+    matches = replace(
+        synthetic.matches, matches={pair: rows for pair, rows in synthetic.matches.matches.items() if LOST not in pair}
+    )
+    views = ViewGraph({pair: fit for pair, fit in synthetic.views.fits.items() if LOST not in pair}, {})
+    with opened_run(tmp_path / "out", Settings.from_mapping({"workers": 1}), None) as run:
+        run.workspace.root.mkdir(parents=True)
+        shutil.copyfile(synthetic.database, run.workspace.database)
+        run.inputs = "these"
+        yield Found(outcome_of(synthetic, matches, views, 5), matches, views, cameras(), run)
+
+
+@pytest.fixture
+def finer(monkeypatch, synthetic):
+    """Lets finer features be those that COLMAP has made; what is asked for is noted. `places` of six find a place."""
+
+    def make(places=6, failing=None):
+        asked = []
+
+        def fill_database(method, run, pairs):
+            asked.append((method.name, pairs, run.settings.matching.max_ratio))
+            if failing:
+                raise failing
+            for photo in sorted({photo for pair in pairs for photo in pair}):
+                write_keypoints(run.workspace.database, photo, synthetic.matches.keypoints[photo].astype(np.float32))
+            for pair in pairs:
+                write_matches(run.workspace.database, pair, synthetic.matches.matches[pair])
+
+        def reconstruct(matches, views, intrinsics, run):
+            asked.append((matches, views, intrinsics, read_features(run.workspace.database)))
+            return outcome_of(synthetic, matches, views, places)
+
+        monkeypatch.setattr(module, "fill_database", fill_database)
+        monkeypatch.setattr(module, "reconstruct", reconstruct)
+        return asked
+
+    return make
+
+
+def test_a_lost_photo_finds_its_place_by_finer_features(first, finer):
+    asked = finer()
+
+    found = look_again(first)
+
+    assert asked[0] == ("sift-dsp", [(k, LOST) for k in range(1, LOST)], LOOSE_RATIO)
+    matches, views, intrinsics, (keypoints, rows) = asked[1]
+    assert intrinsics is first.intrinsics  # it was known
+    assert all((k, LOST) in views.fits and len(rows[k, LOST]) >= 100 for k in range(1, LOST))
+    assert all(views.fits[pair] is fit for pair, fit in first.views.fits.items())
+    assert {k: len(x) for k, x in keypoints.items()} == {k: len(x) for k, x in matches.keypoints.items()}
+    assert photos_of(found.outcome.models[0].model) == [1, 2, 3, 4, 5, 6]
+    assert found.run.workspace.database != first.run.workspace.database
+    said = first.run.counts["second_look"]
+    assert (said["placed"], said["taken"], said["pairs_with_geometry"]) == ([5, 6], True, [10, 15])
+
+
+def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras, monkeypatch):
+    asked, anew = finer(), cameras(focal=1200.0)
+    monkeypatch.setattr(module, "find_intrinsics", lambda *_: (anew, ()))
+
+    look_again(replace(first, intrinsics=cameras(method="guess", identifiable=False)))
+
+    assert asked[1][2] is anew
+
+
+def test_what_was_found_first_stays_where_no_more_photos_find_a_place(first, finer):
+    finer(places=5)
+
+    assert look_again(first) is first
+    assert first.run.counts["second_look"]["taken"] is False
+
+
+def test_a_second_look_that_fails_costs_nothing(first, finer):
+    finer(failing=BackendError("the disk is full"))
+
+    assert look_again(first) is first
+    assert first.run.counts["second_look"]["failed"] == "the disk is full"
+
+
+def test_nobody_looks_twice_where_all_photos_have_a_place(first, finer, synthetic):
+    asked = finer()
+    whole = replace(first, outcome=outcome_of(synthetic, first.matches, first.views, 6))
+
+    assert look_again(whole) is whole and asked == [] and "second_look" not in first.run.counts
+
+
+@pytest.mark.parametrize("chosen", [{"scene": {"second_look": False}}, {"matching": {"features": "sift-dsp"}}])
+def test_nobody_looks_twice_where_that_is_not_wanted(first, finer, chosen):
+    asked = finer()
+    unasked = replace(first, run=replace(first.run, settings=Settings.from_mapping(chosen)))
+
+    assert look_again(unasked) is unasked and asked == []
+
+
+def test_nothing_is_left_behind(first, finer):
+    finer()
+    look_again(first)
+    assert (first.run.workspace.root / SECOND_LOOK).exists()
+
+    clear(first.run)
+
+    assert not (first.run.workspace.root / SECOND_LOOK).exists()
+
+
+def photos(count, matches=()):
+    images = {k: MatchedImage(k, f"{k:03d}.jpg", "one", 640, 480) for k in range(1, count + 1)}
+    rows = {pair: np.zeros((number, 2), np.uint32) for pair, number in matches}
+    return MatchGraph(images, {}, rows)
+
+
+def test_in_small_sets_a_lost_photo_is_matched_with_all_others():
+    assert pairs_to_see([2], photos(4)) == [(1, 2), (2, 3), (2, 4)]
+
+
+def test_in_large_sets_it_is_matched_with_its_neighbours():
+    graph = photos(100, [((50, k), 100 + k) for k in range(80, 100)] + [((10, 50), 500)])
+
+    found = pairs_to_see([50], graph)
+
+    near = {(48, 50), (49, 50), (50, 51), (50, 52)}
+    likely = {(10, 50)} | {(50, k) for k in range(93, 100)}
+    assert found == sorted(near | likely)
+
+
+@pytest.mark.parametrize(("count", "lost", "seen"), [(59, 1, 1), (100, 4, 0), (100, 5, 5)])
+def test_few_lost_photos_of_many_are_left(monkeypatch, count, lost, seen):
+    monkeypatch.setattr(module, "photos_of", lambda _: range(1, count - lost + 1))
+    outcome = Outcome((Attempt("incremental", object(), {}, ""),), PoseGraph({}, {}, ()), None, ())
+
+    assert len(lost_photos(Found(outcome, photos(count), ViewGraph({}, {}), None, None))) == seen

@@ -1,0 +1,168 @@
+"""What is freed, and what is believed in the end."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm_app.selfcal.adjustment.camera_priors import (
+    ASPECT,
+    CENTRE,
+    FOCAL,
+    HINT_SPREAD,
+    LENS,
+    WIDE,
+    Evidence,
+    Usual,
+    spare,
+)
+from sfm_app.selfcal.zero_curves import calibrate
+from sfm_app.settings import CalibrationSettings
+
+OPTIONS = CalibrationSettings()
+NOTHING = np.zeros((1, 4), np.bool_)
+NO_CLAIM = np.array([np.nan])
+
+
+def freed(*places):
+    free = NOTHING.copy()
+    free[0, list(places)] = True
+    return free
+
+
+def evidence(deviations, offset=(0.0,) * 5, claim=NO_CLAIM, theta=(0.0,) * 5, pairs=1e6):
+    """Pairs that say theta + offset, with these standard deviations."""
+    H = np.diag(np.asarray(deviations, float) ** -2.0)
+    return Evidence(np.array([theta]), H, H @ np.asarray(offset), pairs, Usual(np.ones(1), claim))
+
+
+SURE = [1e-3] * 5
+
+
+@pytest.mark.parametrize(
+    ("offset", "place"), [((0, 0.05, 0, 0, 0), CENTRE), ((0, 0, 0, 0.1, 0), ASPECT), ((0, 0, 0, 0, 0.08), LENS)]
+)
+def test_what_sure_pairs_contradict_is_freed_and_nothing_else(offset, place):
+    np.testing.assert_array_equal(evidence(SURE, offset).best(NOTHING), freed(place))
+
+
+def test_usual_cameras_stay_usual():
+    for deviation in (1e-3, 0.01, 0.1, 1.0):
+        np.testing.assert_array_equal(evidence([deviation] * 5).best(freed(CENTRE, ASPECT, LENS)), NOTHING)
+
+
+def test_unsure_pairs_free_nothing():
+    found = evidence([0.1] * 5, (0, 0.05, 0, 0.1, 0.08))
+    np.testing.assert_array_equal(found.best(NOTHING), NOTHING)
+
+
+def test_the_log_evidence_is_the_integral():
+    # over log f and u, the other parameters known
+    found = evidence([0.05, 0.02, 1e-8, 1e-8, 1e-8], (0.1, 0.04, 0, 0, 0), theta=(0.3, 0.01, 0, 0, 0))
+    f, u = np.meshgrid(np.linspace(-1, 1, 801), np.linspace(-0.4, 0.4, 801), indexing="ij")
+    values = []
+    for free in (NOTHING, freed(CENTRE)):
+        prior = found.usual.prior(free, found.thetas)
+        likelihood = found.g[0] * f + found.g[1] * u - 0.5 * (found.H[0, 0] * f**2 + found.H[1, 1] * u**2)
+        belief = sum(
+            0.5 * np.log(prior.precision[0, k] / (2 * np.pi))
+            - 0.5 * prior.precision[0, k] * (found.thetas[0, k] + d - prior.mean[0, k]) ** 2
+            for k, d in ((0, f), (1, u))
+        )
+        integral = np.sum(np.exp(likelihood + belief)) * (f[1, 0] - f[0, 0]) * (u[0, 1] - u[0, 0])
+        # the second centre parameter is known to be 0: its prior density there is the rest
+        rest = 0.5 * np.log(prior.precision[0, 2])
+        values.append(np.log(integral) + rest + found.usual.log_odds(free))
+    posteriors = [found.posterior(free)[0] for free in (NOTHING, freed(CENTRE))]
+    assert posteriors[1] - posteriors[0] == pytest.approx(values[1] - values[0], abs=1e-3)
+    assert abs(values[1] - values[0]) > 0.5
+
+
+def test_mean_step_and_covariance_are_those_of_two_measurements():
+    found = evidence([0.1, 0.3, 0.3, 0.3, 0.3], (0.2, 0, 0, 0, 0))
+    prior = found.usual.prior(NOTHING, found.thetas)
+    _, step, covariance = found.posterior(NOTHING)
+    weights = np.array([100.0, prior.precision[0, 0]])
+    share = spare(NOTHING, 1e6)
+    weights[0] *= share
+    assert step[0] == pytest.approx(weights @ [0.2, prior.mean[0, 0]] / weights.sum())
+    assert covariance[0, 0] == pytest.approx(1 / weights.sum())
+
+
+def test_a_claim_counts_where_pairs_are_weak_and_loses_against_strong_ones():
+    claim = np.array([1.0])
+    weak, strong = evidence([0.3] * 5, (0.1, 0, 0, 0, 0), claim), evidence(SURE, (0.3, 0, 0, 0, 0), claim)
+
+    assert not weak.best(NOTHING)[0, FOCAL]
+    assert abs(weak.posterior(NOTHING)[1][0]) < 0.01
+    assert 0.8 * HINT_SPREAD < np.sqrt(weak.covariance(NOTHING)[0, 0]) < 0.3
+    assert strong.best(NOTHING)[0, FOCAL]
+    assert strong.posterior(strong.best(NOTHING))[1][0] == pytest.approx(0.3, abs=1e-3)
+
+
+def test_where_nobody_claims_a_focal_none_is_freed():
+    found = evidence(SURE)
+    assert found.posterior(freed(FOCAL))[0] == pytest.approx(found.posterior(NOTHING)[0])
+    assert not found.best(NOTHING)[0, FOCAL]
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.015, 0.022, 0.03, 0.1])
+def test_the_covariance_covers_all_choices(offset):
+    found = evidence([0.02, 0.01, 0.01, 0.01, 0.02], (0, offset, 0, 0, 0))
+    H = found.H.copy()
+    H[0, 1] = H[1, 0] = 0.5 * np.sqrt(H[0, 0] * H[1, 1])
+    found = replace(found, H=H)
+    best = found.best(NOTHING)
+    mixed = found.covariance(best)
+
+    np.testing.assert_allclose(mixed, mixed.T, rtol=1e-9)
+    assert np.linalg.eigvalsh(mixed).min() > 0
+    widest = found.posterior(freed(CENTRE, ASPECT, LENS))[2]
+    assert np.all(np.diag(mixed) >= 0.5 * np.diag(found.posterior(best)[2]))
+    assert mixed[3, 3] < widest[3, 3]
+
+
+def test_what_is_nearly_free_is_nearly_as_uncertain():
+    at = [np.sqrt(evidence([0.02] * 5, (0, u, 0, 0, 0)).covariance(NOTHING)[1, 1]) for u in (0.0, 0.04, 0.06)]
+    assert at[0] < 0.016 < at[1] < 0.05
+    assert at[1] > 1.1 * at[0]
+
+
+def test_few_pairs_say_less_than_their_scatter():
+    free = freed(CENTRE, ASPECT, LENS)
+    assert spare(free, 1e9) == pytest.approx(1.0)
+    assert spare(NOTHING, 3.0) == pytest.approx(1 - 1 / 6)
+    assert spare(free, 5.0) == pytest.approx(0.5)
+    assert spare(free, 0.0) == spare(free, 1.0) == 0.1
+
+
+def test_every_camera_has_its_own_choice():
+    H = np.diag([1e6] * 10)
+    g = H @ [0, 0, 0, 0, 0, 0, 0, 0, 0.1, 0]
+    both = Evidence(np.zeros((2, 5)), H, g, 1e6, Usual(np.ones(2), np.full(2, np.nan)))
+    np.testing.assert_array_equal(both.best(np.zeros((2, 4), np.bool_)), np.vstack([NOTHING, freed(ASPECT)]))
+
+
+def test_k1_is_held_in_focal_lengths():
+    usual = Usual(np.ones(1), NO_CLAIM)
+    for log_focal in (-0.5, 0.0, 0.8):
+        precision = usual.prior(freed(LENS), np.array([[log_focal, 0, 0, 0, 0]])).precision[0, 4]
+        assert precision**-0.5 * np.exp(2 * log_focal) == pytest.approx(WIDE[LENS])
+
+
+@pytest.mark.parametrize("claim", [500.0, 850.0, 1180.0, 4000.0])
+def test_a_wrong_claim_does_not_move_the_answer(shots, claim):
+    made = shots(6, 3)
+    found = calibrate(replace(made.pairs, focal_hints_px=(claim,) * 6), OPTIONS, 0)
+    assert found.identifiable, found.reason
+    assert 0 < abs(found.K[0, 0] - 1000) < 3 * found.spread["fx"] < 20
+
+
+def test_a_right_claim_helps_weak_pairs(shots):
+    spreads = []
+    for claims in ((), (1005.0,)):
+        made = shots(4, 0, motion=shots.level, points=80, noise_px=1.0, hints=claims)
+        found = calibrate(made.pairs, OPTIONS, 0)
+        spreads.append(found.evidence["log_focal_spread"])
+    assert spreads[1] < 0.8 * spreads[0]
+    assert spreads[1] < 0.08

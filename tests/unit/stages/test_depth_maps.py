@@ -1,0 +1,173 @@
+"""The depth stage: which method, what is kept of a killed run, what the manifest says."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm_app.atomic_io import UNFINISHED
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.dense import MASKED, DenseStore, read_depth, read_views
+from sfm_app.errors import ConfigError, ReconstructionError
+from sfm_app.photos import save_used
+from sfm_app.plugins import DepthMethod, hookimpl, load_plugins
+from sfm_app.progress import Silent
+from sfm_app.settings import DepthSettings, Settings
+from sfm_app.stages.depth_maps import make_depth_maps
+from sfm_app.stereo import DepthMap
+from sfm_app.types import Rejected
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Three photos in a row and their model; `photo_dir` and `dense_dir` beside it."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=80, height=60, params=[70, 70, 40, 30])
+    model.add_camera_with_trivial_rig(camera)
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "sparse").mkdir()
+    for index in (1, 2, 3):
+        cv2.imwrite(str(tmp_path / "photos" / f"{index}.png"), np.full((60, 80, 3), 100, np.uint8))
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.eye(3)), np.array([-0.3 * index, 0, 0]))
+        model.add_image_with_trivial_frame(pycolmap.Image(image_id=index, name=f"{index}.png", camera_id=1), pose)
+    model.write(tmp_path / "sparse")
+    names = ("1.png", "2.png", "3.png")
+    return SimpleNamespace(
+        model_dir=tmp_path / "sparse", registered=names, photo_dir=tmp_path / "photos", dense_dir=tmp_path / "dense"
+    )
+
+
+class Method:
+    """A way to make depth maps that can be killed, and notes for which photos it was asked."""
+
+    def __init__(self, kill_at="", reject=()):
+        self.asked, self.kill_at, self.reject = [], kill_at, reject
+
+    def make(self, task):
+        found = []
+        for view in task.views:
+            if view.name == self.kill_at:
+                raise KeyboardInterrupt
+            if not task.store.has(view, "geometric") and view.name not in self.reject:
+                self.asked.append(view.name)
+                depth = np.zeros((view.height, view.width), np.float32)
+                depth[: view.height // 2] = 3.0
+                task.store.write_maps(view, DepthMap(depth, np.zeros((*depth.shape, 3), np.float32)))
+            found.append(Rejected("too dark") if view.name in self.reject else None)
+        return found
+
+    @property
+    def plugins(self):
+        @hookimpl
+        def sfm_depth_methods():
+            return [DepthMethod("ours", self.make), DepthMethod("gone", self.make, unavailable=lambda: "no such chip")]
+
+        return load_plugins([SimpleNamespace(sfm_depth_methods=sfm_depth_methods)], installed=False)
+
+
+def run_stage(scene, ways, inputs="", mask_dir=None, **settings):
+    counts = {}
+    options = DepthSettings(**{"method": "ours", **settings})
+    run = SimpleNamespace(
+        plugins=ways.plugins, record=lambda **more: counts.update(more), map=one_by_one, inputs=inputs,
+        settings=Settings(depth=options), workers=2, progress=Silent(), mask_dir=mask_dir,
+    )  # fmt: skip
+    assert make_depth_maps(scene, scene.photo_dir, scene.dense_dir, options, run) == scene.dense_dir
+    return counts
+
+
+def one_by_one(function, items, label):
+    return [function(item) for item in items]
+
+
+def kill_at(scene, name, **options):
+    with pytest.raises(KeyboardInterrupt):
+        run_stage(scene, Method(kill_at=name), **options)
+
+
+def test_the_manifest_says_what_was_done(scene):
+    counts = run_stage(scene, Method(reject=("2.png",)), method="auto")
+
+    assert counts == {
+        "method": "ours", "method_reason": "installed and able to run here", "depth_maps": 2,
+        "rejected": {"too dark": 1}, "coverage": {"1.png": 0.5, "3.png": 0.5},
+    }  # fmt: skip
+
+
+def test_a_killed_run_keeps_what_it_made(scene):
+    kill_at(scene, "3.png")
+    assert (scene.dense_dir / UNFINISHED).exists()
+    method = Method()
+
+    run_stage(scene, method)
+
+    assert method.asked == ["3.png"]
+    assert not (scene.dense_dir / UNFINISHED).exists()
+
+
+def test_a_finished_stage_is_done_anew_when_it_is_run_again(scene):
+    run_stage(scene, Method())
+    method = Method()
+
+    run_stage(scene, method)
+
+    assert method.asked == ["1.png", "2.png", "3.png"]
+
+
+@pytest.mark.parametrize("change", ["inputs", "model"])
+def test_nothing_is_kept_that_was_made_from_something_else(scene, change):
+    kill_at(scene, "3.png")
+    if change == "model":
+        model = pycolmap.Reconstruction(scene.model_dir)
+        model.cameras[1].params = [71, 71, 40, 30]
+        model.write(scene.model_dir)
+    method = Method()
+
+    run_stage(scene, method, inputs="others" if change == "inputs" else "")
+
+    assert method.asked == ["1.png", "2.png", "3.png"]
+
+
+def test_what_is_masked_has_no_depth_whatever_method_made_it(scene, tmp_path):
+    """Also in maps that a killed run left before they were masked."""
+    used = np.ones((60, 80), bool)
+    used[:, :40] = False
+    for name in scene.registered:
+        save_used(tmp_path / "masks", name, used if name == "1.png" else used | True)
+    kill_at(scene, "3.png", mask_dir=tmp_path / "masks")
+
+    counts = run_stage(scene, Method(), mask_dir=tmp_path / "masks")
+
+    view = read_views(scene.dense_dir)[0]
+    depth = read_depth(scene.dense_dir, view, "geometric")
+    assert (depth[:, :40] == MASKED).all()
+    assert (depth[:30, 43:] == 3).all()
+    assert counts["coverage"]["1.png"] == pytest.approx(0.25, abs=0.03)
+    assert counts["coverage"]["2.png"] == counts["coverage"]["3.png"] == 0.5
+
+
+def test_estimates_are_removed_at_the_end(scene):
+    kill_at(scene, "1.png")
+    leftover = scene.dense_dir / "stereo" / "depth_maps" / "1.png.photometric.bin"
+    leftover.write_bytes(b"estimate")
+
+    run_stage(scene, Method())
+
+    assert not leftover.exists()
+    views = read_views(scene.dense_dir)
+    assert all(DenseStore(scene.dense_dir).has(view, "geometric") for view in views)
+
+
+def test_no_map_at_all_is_an_error_with_the_reason(scene):
+    with pytest.raises(ReconstructionError, match="none of 3 photos gets a depth map: too dark"):
+        run_stage(scene, Method(reject=scene.registered))
+
+
+def test_a_method_that_cannot_run_is_an_error_before_anything_is_touched(scene):
+    with pytest.raises(ConfigError, match="'gone' cannot run here: no such chip"):
+        run_stage(scene, Method(), method="gone")
+    with pytest.raises(ConfigError, match="no depth method is named 'sgm'"):
+        run_stage(scene, Method(), method="sgm")
+    assert not Path(scene.dense_dir).exists()

@@ -1,0 +1,273 @@
+import json
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import combinations
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sfm_app.cli.scene_text import scene_lines
+from sfm_app.colmap import bundle
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.database import opened
+from sfm_app.colmap.model import part_of, photos_of
+from sfm_app.context import RunContext
+from sfm_app.errors import ReconstructionError
+from sfm_app.geometry.camera import camera_matrix
+from sfm_app.manifest import StageRecord
+from sfm_app.plugins import load_plugins
+from sfm_app.reconstruction import Outcome
+from sfm_app.reconstruction.mapping_runs import Attempt
+from sfm_app.reconstruction.support import Explained
+from sfm_app.settings import Settings
+from sfm_app.stages import scene
+from sfm_app.stages.intrinsics import intrinsics_seal
+from sfm_app.types import (
+    Calibration,
+    CameraModel,
+    EpipolarFit,
+    Intrinsics,
+    MatchedImage,
+    MatchGraph,
+    Photo,
+    PhotoSet,
+    PoseGraph,
+    RelativePose,
+    Scene,
+    ViewGraph,
+)  # fmt: skip
+from sfm_app.workspace import Workspace
+
+
+@pytest.fixture(scope="module")
+def synthetic(tmp_path_factory):
+    """Eight photos of COLMAP's making: their database and the true model."""
+    place = tmp_path_factory.mktemp("synthetic")
+    pycolmap.set_random_seed(1)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 1, 8
+    options.num_points3D, options.camera_params = 100, [1280.0, 512.0, 384.0, 0.0]
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev = 0.2
+    with opened(place / "database.db") as database:
+        model = pycolmap.synthesize_dataset(options, database)
+        pycolmap.synthesize_noise(noise, model, database)
+    return place / "database.db", model
+
+
+@pytest.fixture
+def run(synthetic, tmp_path):
+    """A run whose folder holds the database."""
+    shutil.copyfile(synthetic[0], tmp_path / "database.db")
+    settings = Settings.from_mapping({"scene": {"second_look": False}})
+    return RunContext(settings, Workspace(tmp_path), load_plugins(), ThreadPoolExecutor(1), 1)
+
+
+def attempt(model, explained=None):
+    return Attempt("global", model, explained or {}, "all at once")
+
+
+def outcome(*attempts, graph=None, **others):
+    cameras = Intrinsics({"one": Calibration(camera_matrix(1280, 1280, 512, 384), 1024, 768, "zero-curves", True)})
+    return Outcome(
+        attempts,
+        graph or PoseGraph({}, {}, ()),
+        cameras,
+        **{"tried": ("a", "b"), "reason": "it explains more", **others},
+    )
+
+
+def pose(kind, guided=False):
+    return RelativePose(np.eye(3), np.eye(3)[0], np.ones(20, bool), 10.0, 1.0, kind, guided)
+
+
+def inputs(model, fits=((1, 8),)):
+    images = {key: MatchedImage(key, model.images[key].name, "one", 1024, 768) for key in sorted(model.images)}
+    fit = EpipolarFit(np.eye(3), np.ones(20, bool), np.ones(20), 10, 0.3)
+    return MatchGraph(images, dict.fromkeys(images, np.ones((20, 2))), {}), ViewGraph(dict.fromkeys(fits, fit), {})
+
+
+def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthetic, run, monkeypatch):
+    true = synthetic[1]
+    main, other = part_of(true, (1, 2, 3, 4)), part_of(true, (5, 6, 7))
+    for camera in main.cameras.values():
+        camera.params = [1270.0, 512.0, 384.0, 0.0]
+    made = outcome(attempt(main), attempt(other), graph=PoseGraph({}, {(1, 8): "contradicts other pairs"}, ()))
+    monkeypatch.setattr(scene, "reconstruct", lambda *_: made)
+    matches, views = inputs(true)
+    name = {key: image.name for key, image in matches.images.items()}
+
+    run.workspace.calibration.write_text(json.dumps(made.intrinsics.to_dict()))
+
+    found = scene.reconstruct_scene(matches, views, made.intrinsics, run)
+
+    assert sorted(found.cam_from_world) == [name[key] for key in (1, 2, 3, 4)]
+    assert found.cameras["one"].K[0, 0] == pytest.approx(1280, rel=0.003)
+    assert 0.1 < found.mean_reprojection_px < 0.5
+    assert found.unregistered == {
+        **{name[key]: "belongs to another model, of 3 photos" for key in (5, 6, 7)},
+        name[8]: "could not be placed: 20 inliers with the nearest photo that was, "
+        "but that pair was dropped: contradicts other pairs",
+    }
+    assert run.counts["registered"] == 4 and run.counts["of"] == 8
+    assert run.counts["other_models"] == [[name[key] for key in (5, 6, 7)]]
+    assert run.counts["pairs_dropped"] == {"contradicts other pairs": 1}
+    assert photos_of(pycolmap.Reconstruction(run.workspace.other_models / "1")) == [5, 6, 7]
+
+    assert list(run.counts["bytes"]) == ["points.ply", "points.glb"]
+    for file, size in run.counts["bytes"].items():
+        assert (run.workspace.root / file).stat().st_size == size > 1000
+
+    record = StageRecord("", 0.0, run.counts)
+    run.workspace.manifest.finish("scene", record, {})
+    photos = PhotoSet(run.workspace.root, tuple(Photo(text, 1024, 768, "one") for text in name.values()))
+    again = scene.load_scene(photos, made.intrinsics, run)
+    assert again.unregistered == found.unregistered and again.points == found.points
+    assert all(np.array_equal(again.cam_from_world[key], value) for key, value in found.cam_from_world.items())
+
+
+def test_cameras_that_mapping_divided_are_read_back_and_the_calibration_stays_sealed(synthetic, run, monkeypatch):
+    true = synthetic[1]
+    made = outcome(attempt(pycolmap.Reconstruction(true)))
+    matches, views = inputs(true)
+    one = made.intrinsics.cameras["one"]
+    last = matches.images[8].name
+    divided = Intrinsics({"one": one, "one #2": one}, {last: "one #2"})
+    monkeypatch.setattr(scene, "reconstruct", lambda *_: replace(made, intrinsics=divided))
+    run.workspace.calibration.write_text(json.dumps(made.intrinsics.to_dict()))
+    sealed = intrinsics_seal(run.workspace)
+
+    found = scene.reconstruct_scene(matches, views, made.intrinsics, run)
+
+    assert (found.camera_of[last], len(found.cameras)) == ("one #2", 2)
+    assert intrinsics_seal(run.workspace) == sealed
+    run.workspace.manifest.finish("scene", StageRecord("", 0.0, run.counts), {})
+    photos = PhotoSet(run.workspace.root, tuple(Photo(x.name, 1024, 768, "one") for x in matches.images.values()))
+    again = scene.load_scene(photos, made.intrinsics, run)
+    assert again.camera_of == found.camera_of and again.cameras.keys() == found.cameras.keys()
+
+
+def test_a_model_that_cannot_be_adjusted_is_kept_as_mapping_left_it_and_the_run_says_so(synthetic, run, monkeypatch):
+    def failing(*_):
+        raise np.linalg.LinAlgError("Matrix is not positive definite")
+
+    true = synthetic[1]
+    made = outcome(attempt(part_of(true, (1, 2, 3, 4))), attempt(part_of(true, (5, 6, 7))))
+    monkeypatch.setattr(scene, "reconstruct", lambda *_: made)
+    monkeypatch.setattr(bundle, "reduce", failing)
+    matches, views = inputs(true)
+    run.workspace.calibration.write_text(json.dumps(made.intrinsics.to_dict()))
+
+    found = scene.reconstruct_scene(matches, views, made.intrinsics, run)
+
+    reason = "the computation failed while adjusting the bundle: Matrix is not positive definite"
+    assert run.counts["adjustment"] == {"failed": reason, "failed_in_other_models": {"1": reason}}
+    assert len(found.cam_from_world) == 4 and found.cameras["one"].params == (1280.0, 512.0, 384.0, 0.0)
+    assert (found.cameras["one"].deviations, found.cameras["one"].determined) == ({}, ())
+    assert json.loads(run.workspace.calibration.read_text(), parse_constant=pytest.fail)["refined"]["one"]
+    assert "the last adjustment failed" in "\n".join(scene_lines(found, run.counts))
+
+
+def test_without_a_model_the_error_says_what_was_seen_and_what_may_help(synthetic, run, monkeypatch):
+    monkeypatch.setattr(scene, "reconstruct", lambda *_: outcome(tried=("all at once: 0 photos",)))
+    matches, views = inputs(synthetic[1])
+
+    with pytest.raises(ReconstructionError, match=r"1 pairs with 20 to 20 inliers\); all at once: 0 photos") as caught:
+        scene.reconstruct_scene(matches, views, outcome().intrinsics, run)
+
+    assert "overlap" in caught.value.hint
+    assert not run.workspace.sparse.exists() and run.counts == {}
+
+
+def test_how_it_was_made_counts_pairs_and_matches():
+    kinds = ["calibrated", "planar", "calibrated", "rotation"]
+    poses = {
+        pair: pose(kind, guided=kind == "planar")
+        for pair, kind in zip(combinations(range(4), 2), kinds, strict=False)
+    }  # fmt: skip
+    dropped = {(1, 3): "contradicts other pairs", (2, 3): "contradicts other pairs", (1, 2): "points behind a camera"}
+    explained = {(0, 1): Explained(50, 40, 3), (0, 2): Explained(60, 50, 4)}
+    model = SimpleNamespace(num_reg_images=lambda: 4)
+
+    found = scene.how_it_was_made(
+        outcome(attempt(model, explained), graph=PoseGraph(poses, dropped, ()), cuts=("c, d",), passes=2)
+    )
+
+    assert found == {
+        "mapper": "global",
+        "mapper_reason": "it explains more",
+        "tried": ["a", "b"],
+        "passes": 2,
+        "one_camera_each": "",
+        "rival_tried_because": "",
+        "explained_matches": 110,
+        "contradicted_matches": 7,
+        "cut_apart": ["c, d"],
+        "pairs": {"calibrated": 2, "planar": 1, "rotation": 1, "found with the help of others": 1},
+        "pairs_dropped": {"contradicts other pairs": 2, "points behind a camera": 1},
+    }
+
+
+def files(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_models_are_written_as_a_whole_and_nothing_of_an_earlier_run_is_left(synthetic, run):
+    place = run.workspace
+    parts = [part_of(synthetic[1], photos) for photos in ((1, 2, 3, 4), (5, 6), (7, 8))]
+    for folder in (place.sparse, place.other_models / "7", place.root / ".sparse"):
+        folder.mkdir(parents=True)
+        (folder / "old.bin").write_bytes(b"old")
+
+    scene.write_models(parts, run)
+
+    written = files(place.sparse)
+    assert "images.bin" in written and "old.bin" not in written
+    assert sorted(path.name for path in place.other_models.iterdir()) == ["1", "2"]
+    assert sorted(path.name for path in place.root.iterdir()) == ["database.db", "other_models", "sparse"]
+    found = [place.sparse, place.other_models / "1", place.other_models / "2"]
+    assert [photos_of(pycolmap.Reconstruction(folder)) for folder in found] == [[1, 2, 3, 4], [5, 6], [7, 8]]
+
+    scene.write_models(parts[1:2], run)
+
+    assert photos_of(pycolmap.Reconstruction(place.sparse)) == [5, 6]
+    assert not place.other_models.exists()
+
+
+def test_refined_cameras_stand_beside_the_calibration_and_leave_it_valid(tmp_path):
+    place = Workspace(tmp_path)
+    K = camera_matrix(800.0, 800.0, 320.0, 240.0)
+    before = Intrinsics({"one": Calibration(K, 640, 480, "zero-curves", True)})
+    place.calibration.write_text(json.dumps(before.to_dict()))
+    place.manifest.finish("intrinsics", StageRecord("abc", 1.0, {}, place.manifest.sizes(("calibration.json",))), {})
+    camera = CameraModel("OPENCV", (800.0,) * 8, K, 640, 480, {"fx": 1.5, "cx": 2.5}, ("centre",))
+
+    scene.write_refined(
+        Scene(tmp_path, {}, {}, {"one": camera}, 10, 20, 0.3), SimpleNamespace(workspace=place)
+    )  # fmt: skip
+
+    found = json.loads(place.calibration.read_text())
+    assert found["refined"]["one"]["deviations"] == {"fx": 1.5, "cx": 2.5}
+    assert (found["refined"]["one"]["K"], found["refined"]["one"]["determined"]) == (K.tolist(), ["centre"])
+    assert Intrinsics.from_dict(found).to_dict() == before.to_dict()
+    assert not place.manifest.spoilt(place.manifest.record("intrinsics"))
+
+
+def test_what_is_known_of_refined_cameras_goes_by_their_names():
+    images = {
+        key: SimpleNamespace(name=f"{key}.jpg", camera_id=7 if key < 3 else 8, has_pose=key != 4) for key in range(1, 5)
+    }
+    adjusted = SimpleNamespace(
+        model=SimpleNamespace(images=images),
+        deviations={7: {"fx": 1.0}, 8: {"fx": 2.0}},
+        determined={7: ("k1",), 8: ()},
+    )
+
+    found = scene.refined_by_name(adjusted, {"1.jpg": "a", "2.jpg": "a", "3.jpg": "b", "4.jpg": "c"})
+
+    assert found == {
+        "a": {"deviations": {"fx": 1.0}, "determined": ("k1",)},
+        "b": {"deviations": {"fx": 2.0}, "determined": ()},
+    }

@@ -1,0 +1,163 @@
+import json
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from sfm_app.context import RunContext
+from sfm_app.errors import ConfigError, InputError
+from sfm_app.parallel import make_executor
+from sfm_app.plugins import load_plugins
+from sfm_app.settings import Settings
+from sfm_app.stages.video_frames import photos_of, settings_for, stem_of
+from sfm_app.workspace import Workspace
+
+SIZE = WIDTH, HEIGHT = 160, 96
+
+
+@pytest.fixture
+def run(tmp_path):
+    workspace = Workspace(tmp_path / "out")
+    workspace.create()
+    with make_executor(1) as executor:
+        yield RunContext(Settings(), workspace, load_plugins(installed=False), executor, 1, inputs="one")
+
+
+@pytest.fixture
+def clip(tmp_path):
+    """Twenty frames of a wall that slides by, half a step each."""
+    return write(tmp_path / "clip.avi", range(0, 80, 4))
+
+
+def write(path, places):
+    wall = cv2.GaussianBlur(np.random.default_rng(1).integers(0, 255, (HEIGHT, 400, 3)).astype(np.uint8), (0, 0), 1.5)
+    writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*"MJPG"), 30.0, SIZE)
+    for at in places:
+        black = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        writer.write(black if at is None else np.ascontiguousarray(wall[:, at : at + WIDTH]))
+    writer.release()
+    return path
+
+
+def frames_of(source, run):
+    with photos_of(source, run) as folder:
+        return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_video_becomes_a_folder_of_frames(clip, run):
+    names = frames_of(clip, run)
+
+    counts = run.counts["video"]
+    assert 9 <= len(names) <= 11
+    assert all(name.startswith("clip_0000") and name.endswith(".jpg") for name in names)
+    with Image.open(run.workspace.frames / names[0]) as frame:
+        assert frame.size == SIZE
+    assert counts["frames"] == counts["looked_at"] == 20
+    assert counts["chosen"] == len(names) == 20 - sum(counts["left_out"].values())
+    assert counts["seconds"] == pytest.approx(19 / 30, abs=0.05)
+    assert not run.workspace.frames_marker.exists()
+
+
+def test_a_folder_is_its_own(tmp_path, run):
+    with photos_of(tmp_path, run) as folder:
+        assert folder == tmp_path
+    assert "video" not in run.counts and not run.workspace.frames.exists()
+
+
+class KilledError(Exception):
+    pass
+
+
+def killed(source, run):
+    with pytest.raises(KilledError), photos_of(source, run):
+        raise KilledError
+
+
+def test_a_killed_run_does_not_choose_again(clip, run):
+    killed(clip, run)
+    marker = json.loads(run.workspace.frames_marker.read_text())
+    marker["frames"] = marker["frames"][:3]  # nobody would choose so
+    run.workspace.frames_marker.write_text(json.dumps(marker))
+    first, second = sorted(run.workspace.frames.iterdir())[:2]
+    second.unlink()
+    second.with_name(f".{second.stem}.123.jpg").write_bytes(b"half")
+    stamp = first.stat().st_mtime_ns
+
+    killed(clip, run)
+
+    assert len(json.loads(run.workspace.frames_marker.read_text())["frames"]) == 3
+    assert not list(run.workspace.frames.glob(".*"))
+    assert second.exists() and first.stat().st_mtime_ns == stamp
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", '{"made_from": "one"}', '{"made_from": "one", "frames": 3, "counts": 0}']
+)
+def test_a_marker_that_cannot_be_read_counts_as_none(clip, run, text):
+    run.workspace.frames_marker.write_text(text)
+
+    assert len(frames_of(clip, run)) >= 9
+
+
+def test_other_inputs_choose_anew(clip, tmp_path, run):
+    killed(clip, run)
+    run.inputs = "another"
+
+    assert len(frames_of(write(clip, range(0, 40, 4)), run)) <= 6
+
+
+def test_a_video_that_is_cut_off_says_so(clip, run):
+    data = clip.read_bytes()
+    clip.write_bytes(data[: len(data) * 7 // 10])
+
+    names = frames_of(clip, run)
+
+    assert 5 <= len(names) <= 8
+    assert "cut off" in run.counts["video"]["notes"][0]
+
+
+@pytest.mark.parametrize(("places", "says"), [([5] * 9, "does not move"), ([9], "does not move")])
+def test_a_camera_that_does_not_move(tmp_path, run, places, says):
+    with pytest.raises(InputError, match=says):
+        frames_of(write(tmp_path / "still.avi", places), run)
+
+
+def test_frames_that_come_out_black_are_passed_over(tmp_path, run):
+    """So OpenCV gives interlaced ones."""
+    places = [at for place in range(0, 80, 4) for at in (None, place)]
+
+    names = frames_of(write(tmp_path / "clip.avi", places), run)
+
+    counts = run.counts["video"]
+    assert 9 <= len(names) <= 11
+    assert all(int(name.removesuffix(".jpg")[-6:]) % 2 for name in names)
+    assert counts["left_out"]["black"] == 20
+    assert counts["looked_at"] == 40 == len(names) + sum(counts["left_out"].values())
+
+
+def test_a_video_that_is_black_all_over_is_refused(tmp_path, run):
+    with pytest.raises(InputError, match="interlaced"):
+        frames_of(write(tmp_path / "clip.avi", [None] * 5), run)
+
+
+def test_frames_of_a_video_share_a_camera(clip, tmp_path):
+    assert settings_for(clip, Settings()).photos.cameras == "single"
+    assert settings_for(clip, Settings.from_mapping({"photos": {"cameras": "each"}})).photos.cameras == "each"
+    assert settings_for(tmp_path, Settings()).photos.cameras == "auto"
+    with pytest.raises(ConfigError, match="--images"):
+        settings_for(clip, Settings.from_mapping({"photos": {"images": "list.txt"}}))
+
+
+@pytest.mark.parametrize(
+    ("name", "stem"),
+    [
+        ("a b.mp4", "a b"),
+        (".clip.mp4", "clip"),
+        ("..mp4", "frame"),
+        ("x\ny\udcff.mp4", "x_y_"),
+        ("x" * 200 + ".mp4", "x" * 40),
+    ],
+)
+def test_frames_have_names_that_can_be_used(tmp_path, name, stem):
+    assert stem_of(tmp_path / name) == stem

@@ -1,0 +1,83 @@
+import zipfile
+
+import numpy as np
+import pytest
+
+from sfm_app.hashing import MOST_BYTES, fingerprint, is_below, load_arrays, seal
+
+
+def test_arrays_come_back(tmp_path):
+    np.savez_compressed(tmp_path / "x.npz", a=np.arange(5), b=np.array(["x", "yz"]), c=np.zeros(10_000_000, bool))
+
+    found = load_arrays(tmp_path / "x.npz")
+
+    assert sorted(found) == ["a", "b", "c"]
+    assert found["a"].tolist() == list(range(5)) and found["b"].tolist() == ["x", "yz"]
+
+
+def test_objects_are_refused(tmp_path):
+    np.savez(tmp_path / "x.npz", a=np.array([{"an": "object"}], object))
+
+    with pytest.raises(ValueError, match="allow_pickle"):
+        load_arrays(tmp_path / "x.npz")
+
+
+def test_a_bomb_is_refused_before_it_goes_off(tmp_path):
+    chunk = bytes(2**24)
+    with (
+        zipfile.ZipFile(tmp_path / "x.npz", "w", zipfile.ZIP_DEFLATED, compresslevel=1) as file,
+        file.open("a.npy", "w") as member,
+    ):
+        for _ in range(MOST_BYTES // len(chunk) + 1):
+            member.write(chunk)
+
+    with pytest.raises(ValueError, match="holds 10"):
+        load_arrays(tmp_path / "x.npz")
+
+
+@pytest.mark.parametrize("change", ["other bytes", "another name", "one more", "a link"])
+def test_the_seal_of_a_folder_is_of_its_names_and_bytes(tmp_path, change):
+    folder = tmp_path / "in"
+    (folder / "deep").mkdir(parents=True)
+    (folder / "a.bin").write_bytes(b"1234")
+    (folder / "deep" / "b.bin").write_bytes(b"5678")
+    before = seal(tmp_path, "in")
+    assert seal(tmp_path, "in") == before
+    path = folder / "deep" / "b.bin"
+    if change == "other bytes":
+        path.write_bytes(b"5679")
+    elif change == "another name":
+        path.rename(folder / "b.bin")
+    elif change == "one more":
+        (folder / "c.bin").touch()
+    else:
+        path.rename(tmp_path / "b.bin")
+        path.symlink_to(tmp_path / "b.bin")
+
+    assert seal(tmp_path, "in") != before
+
+
+def test_what_is_gone_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"x\.bin"):
+        seal(tmp_path, "x.bin")
+
+
+@pytest.mark.parametrize(
+    ("name", "below"),
+    [
+        ("a.jpg", True),
+        ("a/b.jpg", True),
+        ("a..b", True),
+        ("../a", False),
+        ("a/../b", False),
+        ("/a", False),
+        ("", False),
+    ],
+)
+def test_names_that_stay_below(name, below):
+    assert is_below(name) == below
+
+
+def test_fingerprints_ignore_order_of_keys_only():
+    assert fingerprint({"a": 1, "b": 2}) == fingerprint({"b": 2, "a": 1})
+    assert fingerprint([1, 2]) != fingerprint([2, 1])
