@@ -14,7 +14,7 @@ from sfm_app.colmap.model import somewhere
 from sfm_app.errors import NumericalError
 from sfm_app.geometry.bundle import FX, FY, POSE, Bundle, Reduced, cost, lost_points, moved, reduce
 from sfm_app.numerical import FAILURES, finite_only, reason_of
-from sfm_app.selfcal.lens_evidence import PARTS, Estimate, Usual, estimate
+from sfm_app.selfcal.lens_evidence import PARTS, CameraPriors, Estimate, estimate
 
 logger = logging.getLogger("sfm_app")
 
@@ -193,13 +193,13 @@ def write_bundle(model: Any, ids: list[int], bundle: Bundle) -> None:
         model.points3D[point].xyz = xyz
 
 
-def usual_cameras(model: Any, ids: list[int]) -> Usual:
+def usual_cameras(model: Any, ids: list[int]) -> CameraPriors:
     """What is believed about cameras before the bundle is asked."""
     used = used_cameras(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
     many = np.array([used[camera_id] >= PHOTOS_TO_ASK for camera_id in ids])
     asked = many[:, None] | np.array([part.name == "k1" for part in PARTS])
-    return Usual(sizes / 2, sizes.max(axis=1), asked)
+    return CameraPriors(sizes / 2, sizes.max(axis=1), asked)
 
 
 def used_cameras(model: Any) -> Counter[int]:

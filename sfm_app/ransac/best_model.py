@@ -27,7 +27,7 @@ class Best:
 
     def __init__(self, points: FloatArray, threshold: float, recipe: Recipe) -> None:
         self._points, self._threshold, self._recipe = points, threshold, recipe
-        self.measure = recipe.score(points, threshold, None)
+        self.loss = recipe.score(points, threshold, None)
         self._fine = None if recipe.fine_score is None else recipe.fine_score(points, threshold, None)
         self.f, self._lowest = np.zeros(9), math.inf
         self.to_beat, self.samples = np.full(2, math.inf), np.zeros((2, 9))
@@ -49,7 +49,7 @@ class Best:
             return False
         # what the others have to come up to is another model now
         count = len(self._points)
-        self.to_beat[1] = count * self.measure.worst - LENIENCE * (count * self.measure.worst - self.to_beat[0])
+        self.to_beat[1] = count * self.loss.worst - LENIENCE * (count * self.loss.worst - self.to_beat[0])
         return True
 
     def _replace(self, model: FloatArray, found: float) -> None:
@@ -57,7 +57,7 @@ class Best:
         self.f, self._lowest = model, found
         if self._recipe.improve is not None:
             improved = self._improved(model.reshape(3, 3))
-            score = penalty(self._points, 0, improved, self.measure, math.inf, OPEN)
+            score = penalty(self._points, 0, improved, self.loss, math.inf, OPEN)
             if score < found:
                 self.f, self._lowest = improved, score
         self._measure_anew()
@@ -66,7 +66,7 @@ class Best:
     def challenged_by(self, F: FloatArray) -> bool:
         """Whether F (3, 3), locally optimised, is the best model by the finer penalty."""
         improved = self._improved(F)
-        score = penalty(self._points, 0, improved, self._fine or self.measure, self._lowest, OPEN)
+        score = penalty(self._points, 0, improved, self._fine or self.loss, self._lowest, OPEN)
         if score < self._lowest:
             self.f, self._lowest = improved, score
             return True
@@ -80,5 +80,5 @@ class Best:
     def _measure_anew(self) -> None:
         """MLESAC's function changes with the best model; the thesis names the flaw of comparing across the change."""
         renewed = self._recipe.score(self._points, self._threshold, self.f)
-        if renewed != self.measure:
-            self.measure, self._lowest = renewed, penalty(self._points, 0, self.f, renewed, math.inf, OPEN)
+        if renewed != self.loss:
+            self.loss, self._lowest = renewed, penalty(self._points, 0, self.f, renewed, math.inf, OPEN)

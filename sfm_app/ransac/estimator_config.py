@@ -7,15 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.ransac.sampling.minimal_samples import SAMPLE_SIZE, RandomState
-from sfm_app.ransac.scoring.robust_costs import Measure, Score
-from sfm_app.ransac.verification.pretests import FullVerification, Gate, Verifier
+from sfm_app.ransac.scoring.robust_costs import Loss, Score
+from sfm_app.ransac.verification.pretests import FullVerification, PreTest, Verifier
 
 FloatArray = NDArray[np.float64]
 
 Refine = Callable[[FloatArray, FloatArray, float], FloatArray]
 """(points, F, threshold) -> a better F."""
-Recover = Callable[[FloatArray, FloatArray, float, Measure, Gate, RandomState], FloatArray | None]
-"""(points, F, threshold, measure, gate, random generator) -> another F that the samples may have missed, or None."""
+Recover = Callable[[FloatArray, FloatArray, float, Loss, PreTest, RandomState], FloatArray | None]
+"""(points, F, threshold, loss, pre-test, random generator) -> another F that the samples may have missed, or None."""
 Validity = Callable[[FloatArray, FloatArray, float], FloatArray]
 """(points, f, threshold) -> p(v_i), (N,) >= 0, at least one of them > 0."""
 

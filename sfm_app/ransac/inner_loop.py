@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.ransac.sampling.minimal_samples import RandomState, draw_uniform, draw_weighted, uniform
-from sfm_app.ransac.scoring.robust_costs import Measure, penalty
+from sfm_app.ransac.scoring.robust_costs import Loss, penalty
 from sfm_app.ransac.solvers.minimal import MOST_MODELS, is_oriented, models_through
-from sfm_app.ransac.verification.pretests import Gate
+from sfm_app.ransac.verification.pretests import PreTest
 
 FloatArray = NDArray[np.float64]
 
@@ -37,8 +37,8 @@ class Draws(NamedTuple):
 def next_better(
     points: FloatArray,
     draws: Draws,
-    measure: Measure,
-    gates: tuple[Gate, Gate],
+    loss: Loss,
+    pretests: tuple[PreTest, PreTest],
     to_beat: FloatArray,
     limit: int,
     state: RandomState,
@@ -50,11 +50,11 @@ def next_better(
     outliers, would never be found in competition with samples that the priors have made nearly perfect.
 
     Args:
-        points: (N, 4) matches in random order, N >= the sample size; twice over, (2 N, 4), for a gate with a random
+        points: (N, 4) matches in random order, N >= the sample size; twice over, (2 N, 4), for a pre-test with a random
             start, so that any N rows on end are all of them.
         draws: how samples are drawn and models made.
         measure: the penalty.
-        gates: the tests that a model has to pass, by the kind of its sample: 0, or 1 for those besides the priors.
+        pretests: the tests that a model has to pass, by the kind of its sample: 0, or 1 for those besides the priors.
         to_beat: (2,) smallest penalty so far of each kind; lowered.
         limit: most samples.
         state: random generator.
@@ -78,12 +78,12 @@ def next_better(
             drawn = lot < guided_or_rest and draw_weighted(state, draws.rest, sample)
         if not drawn:
             draw_uniform(state, count, sample)
-        gate = gates[kind]
+        pretest = pretests[kind]
         for k in range(models_through(points, sample, models)):
             if draws.oriented and not is_oriented(points, sample, models[k]):
                 continue
-            start = int(uniform(state) * count) if gate.random_start else 0
-            found = penalty(points, start, models[k], measure, to_beat[kind], gate)
+            start = int(uniform(state) * count) if pretest.random_start else 0
+            found = penalty(points, start, models[k], loss, to_beat[kind], pretest)
             if found < to_beat[kind]:
                 to_beat[kind], better = found, True
                 for j in range(9):

@@ -59,7 +59,7 @@ class _Search:
         no_rest = np.zeros(1)
         equal = np.cumsum(self.priors)
         self.draws = Draws(recipe.sample_size, recipe.oriented, recipe.batch, 0.0, equal, 0.0, no_rest)
-        twice = self.test.gate.random_start
+        twice = self.test.pretest.random_start
         self.circle = np.asfortranarray(np.vstack([self.points] * 2)) if twice else self.points
         self.trials, self.idle, self.has_priors = 0, 0, False
         self.patience = recipe.least_trials if recipe.patience is not None else math.inf
@@ -82,7 +82,7 @@ class _Search:
         if self.trials < self.first_priors:
             left = min(left, self.first_priors - self.trials)
         best, before = self.best, self.best.to_beat.copy()
-        parts = self.draws, best.measure, (self.test.gate, self.test.lenient)
+        parts = self.draws, best.loss, (self.test.pretest, self.test.lenient)
         drawn = next_better(self.circle, *parts, best.to_beat, int(left), self.state, best.samples)
         self.trials += drawn
         self.idle += drawn
@@ -134,8 +134,8 @@ class _Search:
     def _recover(self) -> None:
         if self.recipe.recover is None:
             return
-        gate = OPEN if self.test.gate.random_start else self.test.gate
+        pretest = OPEN if self.test.pretest.random_start else self.test.pretest
         F = self.best.f.reshape(3, 3)
-        another = self.recipe.recover(self.points, F, self.threshold, self.best.measure, gate, self.state)
+        another = self.recipe.recover(self.points, F, self.threshold, self.best.loss, pretest, self.state)
         if another is not None:
             self.best.challenged_by(another)

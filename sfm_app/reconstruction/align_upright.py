@@ -46,11 +46,11 @@ class Look:
     """The photo itself, grey and small; None where it could not be read."""
 
 
-Looks = Mapping[int, "Future[Look]"]
+PhotoLooks = Mapping[int, "Future[Look]"]
 """By photo, when it has been looked at."""
 
 
-def look_at_photos(models: Sequence[Any], matches: MatchGraph, run: RunContext) -> Looks:
+def look_at_photos(models: Sequence[Any], matches: MatchGraph, run: RunContext) -> PhotoLooks:
     """Begin to look at some photos of every model; the caller goes on meanwhile."""
     looks = {}
     for model in models:
@@ -61,7 +61,7 @@ def look_at_photos(models: Sequence[Any], matches: MatchGraph, run: RunContext) 
     return looks
 
 
-def orient_or_leave(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int | None = None) -> dict[str, Any]:
+def orient_or_leave(model: Any, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | None = None) -> dict[str, Any]:
     """As `orient`; where the numbers fail, the model stays as it is, and the entry says why."""
     try:
         return orient(model, matches, looks, turn_deg)
@@ -70,7 +70,7 @@ def orient_or_leave(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int
         return {"failed": reason_of(err), "unit": "that of mapping", "gps": "not used: it is not known which way is up"}
 
 
-def orient(model: Any, matches: MatchGraph, looks: Looks, turn_deg: int | None = None) -> dict[str, Any]:
+def orient(model: Any, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | None = None) -> dict[str, Any]:
     """Move the model into the frame of glTF viewers: y up, seen from +z, centred, of size about 1 or in metres.
 
     Args:

@@ -64,7 +64,7 @@ neighbouring observations err alike. Measured on photos with known cameras."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Usual:
+class CameraPriors:
     """What is believed about the cameras before the bundle is asked, one row each."""
 
     centres: FloatArray
@@ -110,7 +110,7 @@ class Estimate:
     """(C,) cameras that would have run away: they stay, and nothing about them counts as determined."""
 
 
-def estimate(params: FloatArray, reduced: Reduced, usual: Usual) -> Estimate:
+def estimate(params: FloatArray, reduced: Reduced, priors: CameraPriors) -> Estimate:
     """The most probable cameras, with the most probable choice of freed parts; undetermined parts stay.
 
     The deviations are those of all parts, about the value that was chosen, even where that is the present one, and over
@@ -120,22 +120,22 @@ def estimate(params: FloatArray, reduced: Reduced, usual: Usual) -> Estimate:
     T = _by_logarithms(params)
     weight = (MISFIT * reduced.noise_px) ** -2.0
     H, g = weight * _product(T.T, _product(reduced.H, T)), weight * _product(T.T, reduced.g)
-    away = usual.away(params)
-    free = _choose(H, g, away, usual)
-    precision = usual.precision(free)
+    away = priors.away(params)
+    free = _choose(H, g, away, priors)
+    precision = priors.precision(free)
     _, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
-    determined = usual.asked & _determined(covariance, precision)
-    changing = spread(determined | (usual.asked & ~np.array([part.stays for part in PARTS])))
+    determined = priors.asked & _determined(covariance, precision)
+    changing = spread(determined | (priors.asked & ~np.array([part.stays for part in PARTS])))
     step, own = _posterior(H, g, precision, away, changing)
-    about = _about(step, H, g, away, usual, free)
+    about = _about(step, H, g, away, priors, free)
     photos = weight * _product(reduced.scores, T)
     variances = np.maximum(
         np.sum(_product(T, about) * T, axis=1), np.sum(_product(photos, _product(covariance, T.T)) ** 2, axis=0)
     )
-    deviations = np.sqrt(variances).reshape(params.shape) * np.where(usual.asked.all(axis=1), 1.0, FEW)[:, None]
+    deviations = np.sqrt(variances).reshape(params.shape) * np.where(priors.asked.all(axis=1), 1.0, FEW)[:, None]
     largest = np.abs(step) / np.sqrt(np.diag(own), out=np.ones_like(step), where=changing.ravel())
-    moved, held = _moved(params, step.reshape(params.shape), usual.sides)
-    deviations[held] = np.maximum(deviations[held], _unknown(params, usual)[held])
+    moved, held = _moved(params, step.reshape(params.shape), priors.sides)
+    deviations[held] = np.maximum(deviations[held], _unknown(params, priors)[held])
     determined[held] = False
     return Estimate(
         np.where(held[:, None], params, moved), deviations, free & determined, determined,
@@ -169,44 +169,44 @@ def _determined(covariance: FloatArray, precision: FloatArray) -> BoolArray:
     return np.stack([narrower[:, list(part.places)].all(axis=1) for part in PARTS], axis=1)
 
 
-def _choose(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual) -> BoolArray:
+def _choose(H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors) -> BoolArray:
     """The most probable choice (C, 5) for each camera, the others as in the sweep before, until none changes."""
     free, everything = np.zeros((len(away), len(PARTS)), np.bool_), np.ones_like(away, np.bool_)
     for _ in range(SWEEPS):
-        before, precision = free, usual.precision(free)
+        before, precision = free, priors.precision(free)
         step, covariance = _posterior(H, g, precision, away, everything)
         free = np.empty_like(before)
         for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
             said = _without_prior(covariance[np.ix_(own, own)], step[own], precision[camera], away[camera])
-            free[camera] = _best(*said, away[camera], usual, camera)
+            free[camera] = _best(*said, away[camera], priors, camera)
         if np.array_equal(free, before):
             break
     return free
 
 
-def _best(H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual, camera: int) -> BoolArray:
+def _best(H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors, camera: int) -> BoolArray:
     """The most probable choice (5,) for one camera; of equals the one that frees less."""
     trials = np.array(sorted(product((False, True), repeat=len(PARTS)), key=sum))
-    trials = trials[~np.any(trials & ~usual.asked[camera], axis=1)]
-    value, _, _ = _alternatives(trials, H, g, away, usual.sides[camera])
+    trials = trials[~np.any(trials & ~priors.asked[camera], axis=1)]
+    value, _, _ = _alternatives(trials, H, g, away, priors.sides[camera])
     return np.asarray(trials[np.argmax(value)], np.bool_)
 
 
 def _about(
-    step: FloatArray, H: FloatArray, g: FloatArray, away: FloatArray, usual: Usual, free: BoolArray
+    step: FloatArray, H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors, free: BoolArray
 ) -> FloatArray:
     """(8C, 8C) mean square of the cameras about where a step leads, over all choices for each, the others as in `free`.
 
     Also over choices that the photos were not asked about: what nobody asked is no better known for that.
     """
-    precision = usual.precision(free)
+    precision = priors.precision(free)
     mean, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
     found = covariance + np.outer(mean - step, mean - step)
     trials = np.array(list(product((False, True), repeat=len(PARTS))))
     for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
         block = np.ix_(own, own)
         own_H, own_g = _without_prior(covariance[block], mean[own], precision[camera], away[camera])
-        value, steps, covariances = _alternatives(trials, own_H, own_g, away[camera], usual.sides[camera])
+        value, steps, covariances = _alternatives(trials, own_H, own_g, away[camera], priors.sides[camera])
         odds = np.exp(value - value.max())
         odds /= odds.sum()
         off = steps - step[own]
@@ -233,7 +233,7 @@ def _alternatives(
         away: from the camera to its usual values.
         side: longer side of its photos.
     """
-    precision = Usual(np.zeros((len(trials), 2)), np.full(len(trials), side), trials).precision(trials)
+    precision = CameraPriors(np.zeros((len(trials), 2)), np.full(len(trials), side), trials).precision(trials)
     covariance = inverses_of_positive(H + precision[:, :, None] * np.eye(CAMERA))
     pull = g + precision * away
     share = np.array([part.share for part in PARTS])
@@ -265,12 +265,12 @@ def _moved(params: FloatArray, step: FloatArray, sides: FloatArray) -> tuple[Flo
         moved[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
         moved[:, FY] = params[:, FY] * np.exp(step[:, LOG_FOCAL] + 0.5 * step[:, LOG_ASPECT])
         focals = moved[:, [FX, FY]] / sides[:, None]
-    usual = np.isfinite(moved).all(axis=1) & np.all((focals > FOCALS[0]) & (focals < FOCALS[1]), axis=1)
-    return moved, ~usual | (np.abs(step[:, LOG_FOCAL]) > LONGEST_STEP)
+    priors = np.isfinite(moved).all(axis=1) & np.all((focals > FOCALS[0]) & (focals < FOCALS[1]), axis=1)
+    return moved, ~priors | (np.abs(step[:, LOG_FOCAL]) > LONGEST_STEP)
 
 
-def _unknown(params: FloatArray, usual: Usual) -> FloatArray:
+def _unknown(params: FloatArray, priors: CameraPriors) -> FloatArray:
     """(C, 8) standard deviations of cameras about which the photos say nothing."""
-    deviations = usual.precision(np.ones((len(params), len(PARTS)), np.bool_)) ** -0.5
+    deviations = priors.precision(np.ones((len(params), len(PARTS)), np.bool_)) ** -0.5
     deviations[:, [FX, FY]] = FOCAL_SPREAD * params[:, [FX, FY]]
     return np.asarray(deviations, np.float64)

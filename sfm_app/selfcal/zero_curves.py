@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, of_all_pairs, refined, straight_fundamentals
-from sfm_app.selfcal.adjustment.camera_priors import LENS, USUAL_FOCAL, Usual
+from sfm_app.selfcal.adjustment.camera_priors import LENS, USUAL_FOCAL, CameraPriors
 from sfm_app.selfcal.adjustment.structureless_ba import Matches
 from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_of
 from sfm_app.selfcal.consensus import consensus_peak
@@ -98,10 +98,10 @@ def _from_matches(
     side = float(max(pairs.size))
     sigma = options.centre_sigma * pairs.size[0] / side
     hint = float(np.median(pairs.focal_hints_px)) / side if pairs.focal_hints_px else np.nan
-    usual = Usual(np.ones(1), np.array([hint]), sigma, options.lens)
-    adjusted = _adjusted(pairs, usable, usual)
+    priors = CameraPriors(np.ones(1), np.array([hint]), sigma, options.lens)
+    adjusted = _adjusted(pairs, usable, priors)
     if adjusted.contradicted:
-        again = _adjusted(pairs, usable, usual, adjusted)
+        again = _adjusted(pairs, usable, priors, adjusted)
         adjusted = max(adjusted, again, key=lambda one: one.votes_kept)
     fit, answer, judged = adjusted.fit, adjusted.answer, adjusted.consensus.pairs
     theta, cov = fit.state.thetas[0], covariance(fit, np.ones(1), resampled=True)
@@ -161,26 +161,26 @@ class _Adjusted:
         return np.flatnonzero(self.consensus.ratios(self.answer.theta) < AGREES)
 
 
-def _adjusted(pairs: CameraPairs, usable: Pairs, usual: Usual, before: _Adjusted | None = None) -> _Adjusted:
+def _adjusted(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _Adjusted | None = None) -> _Adjusted:
     """Adjust the camera to the matches of all pairs, or only of those that agree on the peak that `before` left."""
     matches, Fs = _in_sides(pairs, usable)
     if before is None:
-        first, listened = consensus_peak.found(Consensus(usable, usual.centre_sigma)), np.arange(len(usable))
+        first, listened = consensus_peak.found(Consensus(usable, priors.centre_sigma)), np.arange(len(usable))
         plain = np.array([USUAL_FOCAL, 0.0, 0.0, 0.0])
         starts = [np.append(theta, 0.0)[None] for theta in (first.theta, *first.others[:1], plain)]
     else:
         first, listened = before.answer, before.agreeing
         starts = [np.append(first.theta, before.fit.state.thetas[0, KAPPA])[None]]
-    fit = refined(matches.chosen(listened), Fs[listened], starts, usual)
-    consensus, answer = Consensus(usable, usual.centre_sigma), first
+    fit = refined(matches.chosen(listened), Fs[listened], starts, priors)
+    consensus, answer = Consensus(usable, priors.centre_sigma), first
     if fit.free[0, LENS]:
         straight = _in_pixels(straight_fundamentals(of_all_pairs(fit, matches, Fs)), pairs)
-        consensus = Consensus(_prepared(CameraPairs(straight, usable.weights, pairs.size)), usual.centre_sigma)
+        consensus = Consensus(_prepared(CameraPairs(straight, usable.weights, pairs.size)), priors.centre_sigma)
     if fit.free[0, LENS] or (before is not None and before.fit.free[0, LENS]):
         answer = consensus_peak.found(consensus)
     if abs(answer.theta[LOG_FOCAL] - fit.state.thetas[0, LOG_FOCAL]) > ELSEWHERE:
         again = np.append(answer.theta, fit.state.thetas[0, KAPPA])
-        fit = refined(matches.chosen(listened), Fs[listened], [fit.state.thetas, again[None]], usual)
+        fit = refined(matches.chosen(listened), Fs[listened], [fit.state.thetas, again[None]], priors)
     return _Adjusted(fit, listened, consensus, answer)
 
 

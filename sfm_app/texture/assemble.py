@@ -32,7 +32,7 @@ Spread = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looks:
+class FaceViews:
     """What the photos show of the triangles."""
 
     worth: NDArray[np.float32]
@@ -123,7 +123,7 @@ def texture_surface(
     return _finish(plan, canvases), _figures(plan, views, looks.rejected, int(unseen.sum()))
 
 
-def _look_at_all(views: Sequence[PhotoView], mesh: Facets, store: Store, hidden: Hidden, spread: Spread) -> Looks:
+def _look_at_all(views: Sequence[PhotoView], mesh: Facets, store: Store, hidden: Hidden, spread: Spread) -> FaceViews:
     shape = (len(views), len(mesh.faces))
     worth, colors = np.zeros(shape, np.float32), np.zeros((*shape, 3), np.uint8)
     sharpness = np.zeros(len(views))
@@ -136,7 +136,7 @@ def _look_at_all(views: Sequence[PhotoView], mesh: Facets, store: Store, hidden:
         return None
 
     rejected = spread(look_at, range(len(views)), "looking at the surface")
-    return Looks(worth, colors, sharpness, rejected)
+    return FaceViews(worth, colors, sharpness, rejected)
 
 
 def _look_at(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: Hidden) -> Look | Rejected:
@@ -152,7 +152,7 @@ def _look_at(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: Hid
     return found
 
 
-def _believe(looks: Looks, mesh: Facets) -> Seen:
+def _believe(looks: FaceViews, mesh: Facets) -> Seen:
     """Even out what the photos say, in place, and mark what only one of them says."""
     worth, colors = looks.worth, looks.colors
     read = looks.sharpness > 0

@@ -12,7 +12,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "architecture.md"
 
 
 def rooms():
-    """The text of every room on the map by its path, such as "ransac/scoring"; of modules without a room by their own."""
+    """The text of every room on the map, by its path such as "ransac/scoring"."""
     tree = PAGE.read_text(encoding="utf-8").split("```\nsfm_app/\n")[1].split("```")[0]
     found, above = {}, ""
     for line in tree.split("\ntests/")[0].splitlines():

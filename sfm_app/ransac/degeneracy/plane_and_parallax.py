@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.ransac.degeneracy.dominant_plane import OFF_PLANE, dominant_homography, transfer_distance
 from sfm_app.ransac.sampling.minimal_samples import RandomState, uniform
-from sfm_app.ransac.scoring.robust_costs import FIRST, Measure, penalty, squared_distances
-from sfm_app.ransac.verification.pretests import Gate
+from sfm_app.ransac.scoring.robust_costs import FIRST, Loss, penalty, squared_distances
+from sfm_app.ransac.verification.pretests import PreTest
 
 FloatArray = NDArray[np.float64]
 
@@ -21,7 +21,7 @@ _MOST_INLIERS = 300
 
 
 def with_another_epipole(
-    points: FloatArray, F: FloatArray, threshold: float, measure: Measure, gate: Gate, state: RandomState
+    points: FloatArray, F: FloatArray, threshold: float, loss: Loss, pretest: PreTest, state: RandomState
 ) -> FloatArray | None:
     """The best model that shares the dominant plane of F's inliers; None without a plane and two matches off it.
 
@@ -30,7 +30,7 @@ def with_another_epipole(
         F: (3, 3).
         threshold: largest distance of an inlier.
         measure: the penalty.
-        gate: the test that a model has to pass; not one with a random start.
+        pretest: the test that a model has to pass; not one with a random start.
         state: random generator.
     """
     inliers = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold
@@ -42,13 +42,13 @@ def with_another_epipole(
     if len(off_plane) < 2:
         return None
     best = np.empty(9)
-    found = _best_epipole(points, H, off_plane, measure, gate, state, best)
+    found = _best_epipole(points, H, off_plane, loss, pretest, state, best)
     return best.reshape(3, 3) if np.isfinite(found) else None
 
 
 @kernel
 def _best_epipole(
-    points: FloatArray, H: FloatArray, off_plane: NDArray[np.int64], measure: Measure, gate: Gate, state: RandomState,
+    points: FloatArray, H: FloatArray, off_plane: NDArray[np.int64], loss: Loss, pretest: PreTest, state: RandomState,
     best: FloatArray,
 ) -> float:  # fmt: skip
     lowest, line, f = np.inf, np.empty((2, 3)), np.empty(9)
@@ -75,7 +75,7 @@ def _best_epipole(
             continue
         for c in range(9):
             f[c] /= np.sqrt(squared)
-        score = penalty(points, FIRST, f, measure, lowest, gate)
+        score = penalty(points, FIRST, f, loss, lowest, pretest)
         if score < lowest:
             lowest = score
             for c in range(9):

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.ransac.scoring.robust_costs import MLESAC, Measure, squared_distances
+from sfm_app.ransac.scoring.robust_costs import MLESAC, Loss, squared_distances
 
 FloatArray = NDArray[np.float64]
 
@@ -24,13 +24,13 @@ _MOST_STEPS = 100
 _SETTLED = 1e-5
 
 
-def mlesac(points: FloatArray, threshold: float, best: FloatArray | None) -> Measure:
+def mlesac(points: FloatArray, threshold: float, best: FloatArray | None) -> Loss:
     """The penalty above, with the share gamma of inliers that the best model shows, one half before there is one."""
     sigma, width = threshold / SIGMAS, window(points)
     gamma = 0.5 if best is None else inlier_share(squared_distances(points, best), sigma, width)
     odds = (1 - gamma) / gamma * sigma * math.sqrt(2 * math.pi) / width
     reach = -math.log(_NEGLIGIBLE * min(odds, 1.0)) * 2 * sigma * sigma
-    return Measure(MLESAC, threshold * threshold, reach, math.log((1 + odds) / odds), 1 / (2 * sigma * sigma), odds)
+    return Loss(MLESAC, threshold * threshold, reach, math.log((1 + odds) / odds), 1 / (2 * sigma * sigma), odds)
 
 
 def window(points: FloatArray) -> float:

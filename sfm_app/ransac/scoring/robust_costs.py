@@ -1,6 +1,6 @@
 """How well F explains all matches: penalties on the Sampson distance, with early exits (thesis 4.4.1).
 
-A penalty is to be made small. A score is a function (points, threshold, best model or None) -> `Measure`, asked
+A penalty is to be made small. A score is a function (points, threshold, best model or None) -> `Loss`, asked
 again at every new best model; only that of MLESAC changes during the search.
 """
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.ransac.verification.pretests import BLOCK, Gate
+from sfm_app.ransac.verification.pretests import BLOCK, PreTest
 
 FloatArray = NDArray[np.float64]
 
@@ -22,10 +22,10 @@ RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS, GEMAN_MCCLURE = range(6)
 
 
 _FEW = 16
-"""Matches whose distances are taken at once where the gate looks often."""
+"""Matches whose distances are taken at once where the pre-test looks often."""
 
 
-class Measure(NamedTuple):
+class Loss(NamedTuple):
     """A penalty as the inner loop counts it."""
 
     kind: int
@@ -40,32 +40,32 @@ class Measure(NamedTuple):
     """MLESAC: density of the outliers over that of the inliers at distance 0."""
 
 
-Score = Callable[[FloatArray, float, FloatArray | None], Measure]
+Score = Callable[[FloatArray, float, FloatArray | None], Loss]
 
 
-def ransac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Measure:
+def ransac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
     """1 for every match beyond the threshold, else 0 (thesis 3.20, 4.4)."""
-    return Measure(RANSAC, threshold * threshold, threshold * threshold, 1.0)
+    return Loss(RANSAC, threshold * threshold, threshold * threshold, 1.0)
 
 
-def msac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Measure:
+def msac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
     """The squared distance, at most the squared threshold (Torr and Zisserman 2000)."""
-    return Measure(MSAC, threshold * threshold, threshold * threshold, threshold * threshold)
+    return Loss(MSAC, threshold * threshold, threshold * threshold, threshold * threshold)
 
 
-def msac_linear(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Measure:
+def msac_linear(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
     """The distance, at most the threshold (thesis 4.5 as printed)."""
-    return Measure(MSAC_LINEAR, threshold * threshold, threshold * threshold, threshold)
+    return Loss(MSAC_LINEAR, threshold * threshold, threshold * threshold, threshold)
 
 
-def lmeds(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Measure:
+def lmeds(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
     """The median of the squared distances (Rousseeuw 1984; thesis 4.4.1); the threshold only counts inliers."""
-    return Measure(LMEDS, threshold * threshold, np.inf, np.inf)
+    return Loss(LMEDS, threshold * threshold, np.inf, np.inf)
 
 
-def geman_mcclure(_points: FloatArray, threshold: float, _best: FloatArray | None, *, scale: float) -> Measure:
+def geman_mcclure(_points: FloatArray, threshold: float, _best: FloatArray | None, *, scale: float) -> Loss:
     """r^2 / (r^2 + c^2), c being `scale` thresholds: no edge, and close matches count most (Geman and McClure 1987)."""
-    return Measure(GEMAN_MCCLURE, threshold * threshold, np.inf, 1.0, (scale * threshold) ** -2)
+    return Loss(GEMAN_MCCLURE, threshold * threshold, np.inf, 1.0, (scale * threshold) ** -2)
 
 
 @kernel
@@ -100,53 +100,53 @@ def distances_of_block(points: FloatArray, f: FloatArray, start: int, squared: F
 
 
 @kernel
-def _cost(measure: Measure, squared: float) -> float:
+def _cost(loss: Loss, squared: float) -> float:
     """Penalty of one match."""
-    if measure.kind == GEMAN_MCCLURE:
-        return 1.0 - 1.0 / (1.0 + measure.precision * squared)
-    if not squared <= measure.reach:
-        return measure.worst
-    if measure.kind == MSAC:
+    if loss.kind == GEMAN_MCCLURE:
+        return 1.0 - 1.0 / (1.0 + loss.precision * squared)
+    if not squared <= loss.reach:
+        return loss.worst
+    if loss.kind == MSAC:
         return squared
-    if measure.kind == RANSAC:
+    if loss.kind == RANSAC:
         return 0.0
-    if measure.kind == MSAC_LINEAR:
+    if loss.kind == MSAC_LINEAR:
         return float(np.sqrt(squared))
-    return float(np.log((1.0 + measure.odds) / (np.exp(-measure.precision * squared) + measure.odds)))
+    return float(np.log((1.0 + loss.odds) / (np.exp(-loss.precision * squared) + loss.odds)))
 
 
 @kernel
-def penalty(points: FloatArray, start: int, f: FloatArray, measure: Measure, to_beat: float, gate: Gate) -> float:
-    """Penalty of all matches, or inf as soon as f cannot stay below `to_beat` or is turned away at the gate.
+def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: float, pretest: PreTest) -> float:
+    """Penalty of all matches, or inf as soon as f cannot stay below `to_beat` or fails the pre-test.
 
     Args:
-        points: (N, 4), in random order; (2 N, 4), the matches twice over, for a gate with a random start.
+        points: (N, 4), in random order; (2 N, 4), the matches twice over, for a pre-test with a random start.
         start: the match to begin with.
         f: (9,) entries of F.
-        measure: which penalty. The gate is open for the median: it is counted another way.
+        loss: which penalty. The pre-test passes all for the median: it is counted another way.
         to_beat: best penalty so far; inf for a full count.
-        gate: how many inliers f must show on the way.
+        pretest: how many inliers f must show on the way.
     """
-    if measure.kind == LMEDS:
+    if loss.kind == LMEDS:
         return _median_of_squares(points, f, to_beat)
     total, inliers, done = 0.0, 0, 0
-    count = points.shape[0] // 2 if gate.random_start else points.shape[0]
+    count = points.shape[0] // 2 if pretest.random_start else points.shape[0]
     squared = np.empty(BLOCK)
     while done < count:
-        often = gate.stride < BLOCK and done < gate.stride * gate.least_inliers.shape[0]
+        often = pretest.stride < BLOCK and done < pretest.stride * pretest.least_inliers.shape[0]
         size = min(_FEW if often else BLOCK, count - done)
         distances_of_block(points, f, start + done, squared[:size])
-        if often:  # the gate looks after every few matches, and most models end at the first looks
+        if often:  # the pre-test looks after every few matches, and most models end at the first looks
             for i in range(size):
-                inliers += squared[i] <= measure.limit
-                total += _cost(measure, squared[i])
-                if not _passes(gate, done + i + 1, inliers):
+                inliers += squared[i] <= loss.limit
+                total += _cost(loss, squared[i])
+                if not _passes(pretest, done + i + 1, inliers):
                     return np.inf
         else:
-            more, cost = _add_up(squared[:size], measure)
+            more, cost = _add_up(squared[:size], loss)
             inliers += more
             total += cost
-            if not _passes(gate, done + size, inliers):
+            if not _passes(pretest, done + size, inliers):
                 return np.inf
         if total >= to_beat:
             return np.inf
@@ -155,28 +155,32 @@ def penalty(points: FloatArray, start: int, f: FloatArray, measure: Measure, to_
 
 
 @kernel
-def _passes(gate: Gate, done: int, inliers: int) -> bool:
-    """Whether the gate lets a model go on that has so many inliers among the first matches; it keeps the books."""
-    looks = done // gate.stride
-    if done % gate.stride != 0 or looks > gate.least_inliers.shape[0] or inliers >= gate.least_inliers[looks - 1]:
+def _passes(pretest: PreTest, done: int, inliers: int) -> bool:
+    """Say whether a model with so many inliers among the first matches goes on, and count it."""
+    looks = done // pretest.stride
+    if (
+        done % pretest.stride != 0
+        or looks > pretest.least_inliers.shape[0]
+        or inliers >= pretest.least_inliers[looks - 1]
+    ):
         return True
-    gate.rejected[0] += done
-    gate.rejected[1] += inliers
+    pretest.rejected[0] += done
+    pretest.rejected[1] += inliers
     return False
 
 
 @kernel
-def _add_up(squared: FloatArray, measure: Measure) -> tuple[int, float]:
+def _add_up(squared: FloatArray, loss: Loss) -> tuple[int, float]:
     """Inliers among the given matches, and the sum of their penalties."""
     total, inliers = 0.0, 0
     for i in range(squared.shape[0]):
-        inliers += squared[i] <= measure.limit
-    if measure.kind == GEMAN_MCCLURE:  # without a branch inside: several at once
+        inliers += squared[i] <= loss.limit
+    if loss.kind == GEMAN_MCCLURE:  # without a branch inside: several at once
         for i in range(squared.shape[0]):
-            total += 1.0 - 1.0 / (1.0 + measure.precision * squared[i])
+            total += 1.0 - 1.0 / (1.0 + loss.precision * squared[i])
     else:
         for i in range(squared.shape[0]):
-            total += _cost(measure, squared[i])
+            total += _cost(loss, squared[i])
     return inliers, total
 
 

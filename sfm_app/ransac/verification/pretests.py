@@ -27,7 +27,7 @@ LENIENCE = 0.5
 _BAIL_OUT_SIGMAS = 3.0
 
 
-class Gate(NamedTuple):
+class PreTest(NamedTuple):
     """A test as the inner loop runs it."""
 
     least_inliers: IntArray
@@ -38,26 +38,26 @@ class Gate(NamedTuple):
     """(2,) matches checked on rejected hypotheses, and how many of them were inliers; the loop adds to it."""
 
 
-def gate(least_inliers: IntArray, stride: int, *, random_start: bool) -> Gate:
-    """A gate with empty books."""
-    return Gate(least_inliers, stride, random_start, np.zeros(2, dtype=np.int64))
+def pretest(least_inliers: IntArray, stride: int, *, random_start: bool) -> PreTest:
+    """Make a pre-test that has counted nothing."""
+    return PreTest(least_inliers, stride, random_start, np.zeros(2, dtype=np.int64))
 
 
-OPEN = gate(np.zeros(0, dtype=np.int64), BLOCK, random_start=False)
+OPEN = pretest(np.zeros(0, dtype=np.int64), BLOCK, random_start=False)
 """No test: every hypothesis is scored in full, or until it cannot win."""
 
 
 class Verifier(Protocol):
     """A test, what it learns during a search, and the trials that its mistakes cost."""
 
-    gate: Gate
-    lenient: Gate
+    pretest: PreTest
+    lenient: PreTest
     """For models of samples that owe nothing to the priors."""
     review: int
     """Most trials between two calls of `learn`."""
 
     def learn(self, trials: int) -> None:
-        """So many more samples were drawn, and checked at the gate."""
+        """Count samples that were drawn and tested."""
 
     def expect(self, share: float) -> None:
         """The best model has this share of inliers."""
@@ -73,7 +73,7 @@ class FullVerification:
 
     def __init__(self, count: int, sample_size: int) -> None:
         self.count, self.sample_size = count, sample_size
-        self.gate = self.lenient = OPEN
+        self.pretest = self.lenient = OPEN
 
     def learn(self, trials: int) -> None: ...
 
@@ -88,8 +88,8 @@ class BailOut(FullVerification):
 
     def expect(self, share: float) -> None:
         least = bail_out_table(self.count, share)
-        self.gate = gate(least, BLOCK, random_start=False)
-        self.lenient = gate((LENIENCE * least).astype(np.int64), BLOCK, random_start=False)
+        self.pretest = pretest(least, BLOCK, random_start=False)
+        self.lenient = pretest((LENIENCE * least).astype(np.int64), BLOCK, random_start=False)
 
 
 class RandomisedTdd(FullVerification):
@@ -102,7 +102,7 @@ class RandomisedTdd(FullVerification):
 
     def __init__(self, count: int, sample_size: int) -> None:
         super().__init__(count, sample_size)
-        self.gate = self.lenient = gate(np.arange(1, self.d + 1), 1, random_start=True)
+        self.pretest = self.lenient = pretest(np.arange(1, self.d + 1), 1, random_start=True)
 
     def trials_needed(self, share: float, confidence: float) -> float:
         return trials_needed(share ** (self.sample_size + self.d), confidence)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.ransac.sampling.stopping import trials_needed
-from sfm_app.ransac.verification.pretests import Gate
+from sfm_app.ransac.verification.pretests import PreTest
 
 IntArray = NDArray[np.int64]
 
@@ -114,7 +114,7 @@ class Sprt:
 
     def _begin(self, epsilon: float, delta: float) -> None:
         self._test, self._trials = design(epsilon, delta, self._sample_size), 0
-        self.gate = self.lenient = Gate(self._test.least_inliers(self._count), 1, True, self._rejected)
+        self.pretest = self.lenient = PreTest(self._test.least_inliers(self._count), 1, True, self._rejected)
 
     def _renew(self, epsilon: float) -> None:
         self._past.append((self._test, self._trials))

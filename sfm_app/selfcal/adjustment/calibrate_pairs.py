@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sfm_app.geometry.essential import essential_from_fundamental, relative_pose
 from sfm_app.geometry.spd_solve import lifted
 from sfm_app.ransac.refine.sampson_refit import refine_sampson
-from sfm_app.selfcal.adjustment.camera_priors import ASPECT, NAMES, Evidence, Usual
+from sfm_app.selfcal.adjustment.camera_priors import ASPECT, NAMES, CameraPriors, Evidence
 from sfm_app.selfcal.adjustment.structureless_ba import (
     CONFLICT,
     Information,
@@ -52,7 +52,7 @@ class Fit:
     free: BoolArray
     """(C, 4) which parameters the evidence freed, see `priors`."""
     prior: Prior
-    usual: Usual
+    priors: CameraPriors
     held: BoolArray | None = None
     """(C, 4) what stays at its usual value, because the pairs do not determine it."""
 
@@ -76,7 +76,7 @@ class Fit:
     def evidence(self) -> Evidence:
         """What all pairs say."""
         H, g = self.matches.scattered(self.information, self.trust)
-        return Evidence(self.state.thetas, H, g, float(np.sum(self.state.weights)), self.usual)
+        return Evidence(self.state.thetas, H, g, float(np.sum(self.state.weights)), self.priors)
 
     def cost(self, sigma: float, scale: float) -> float:
         """Negative log-probability by which fits from different starts compete, the pairs' say bounded.
@@ -90,10 +90,10 @@ class Fit:
         H = replace(self, state=state).evidence.H + np.diag(self.prior.precision.ravel())
         volume = 0.5 * float(np.linalg.slogdet(lifted(H))[1] - np.sum(np.log(self.prior.precision)))
         bounded = float(np.sum(gains / (1.0 + gains / CONFLICT)))
-        return bounded + self.prior.cost(state.thetas) + volume - self.usual.log_odds(self.free)
+        return bounded + self.prior.cost(state.thetas) + volume - self.priors.log_odds(self.free)
 
 
-def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], usual: Usual) -> Fit:
+def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], priors: CameraPriors) -> Fit:
     """The best of the fits that begin at `starts`, the most likely first, with the pixels square and not.
 
     Args:
@@ -103,8 +103,8 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], usua
         usual: what is known before.
     """
     few = matches.thinned(FEW_MATCHES)
-    best = _best([_begun(few, Fs, thetas, usual, square=True) for thetas in starts])
-    others = [_begun(few, Fs, thetas, usual, square=False) for thetas in (best.state.thetas, starts[0])]
+    best = _best([_begun(few, Fs, thetas, priors, square=True) for thetas in starts])
+    others = [_begun(few, Fs, thetas, priors, square=False) for thetas in (best.state.thetas, starts[0])]
     fit = _best([best, *others])
     state = settled(few, fit.state, fit.prior)
     fit = replace(fit, matches=matches, state=settled(matches, state, fit.prior, LAST_ROUNDS))
@@ -112,11 +112,11 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], usua
         free = fit.evidence.best(fit.free)
         if np.array_equal(free, fit.free):
             break
-        prior = usual.prior(free, fit.state.thetas)
+        prior = priors.prior(free, fit.state.thetas)
         state = settled(few, fit.state, prior)
-        fit = Fit(matches, settled(matches, state, prior, LAST_ROUNDS), free, prior, usual)
+        fit = Fit(matches, settled(matches, state, prior, LAST_ROUNDS), free, prior, priors)
     held = fit.evidence.undetermined(fit.free)
-    prior = usual.prior(fit.free, fit.state.thetas, held)
+    prior = priors.prior(fit.free, fit.state.thetas, held)
     return replace(fit, prior=prior, held=held, state=settled(matches, fit.state, prior, LAST_ROUNDS))
 
 
@@ -177,13 +177,13 @@ def _best(fits: Sequence[Fit]) -> Fit:
     return min(fits, key=lambda fit: fit.cost(sigma, scale))
 
 
-def _begun(few: Matches, Fs: FloatArray, thetas: FloatArray, usual: Usual, *, square: bool) -> Fit:
+def _begun(few: Matches, Fs: FloatArray, thetas: FloatArray, priors: CameraPriors, *, square: bool) -> Fit:
     free = np.ones((len(thetas), len(NAMES)), np.bool_)
     free[:, ASPECT] = not square
-    prior = usual.prior(free, thetas)
+    prior = priors.prior(free, thetas)
     state = State(thetas, _poses(few, Fs, thetas), np.ones(len(Fs)), few.least_sigma)
     state = settled(few, replace(state, sigma=few.noise(state)), prior, FIRST_ROUNDS)
-    return Fit(few, state, free, prior, usual)
+    return Fit(few, state, free, prior, priors)
 
 
 def _poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatArray:

@@ -47,7 +47,7 @@ FREE_SHARE = {CENTRE: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Usual:
+class CameraPriors:
     """What is known about the cameras, one row each."""
 
     sides: FloatArray
@@ -115,11 +115,11 @@ class Evidence:
     """(5C,) its negative gradient."""
     pairs: float
     """Effective number of pairs behind it."""
-    usual: Usual
+    priors: CameraPriors
 
     def posterior(self, free: BoolArray) -> tuple[float, FloatArray, FloatArray]:
         """Log-probability of a choice of freed parameters, up to a constant; mean step and covariance under it."""
-        prior = self.usual.prior(free, self.thetas)
+        prior = self.priors.prior(free, self.thetas)
         precision, away = prior.precision.ravel(), (prior.mean - self.thetas).ravel()
         share = spare(free, self.pairs)
         covariance = inverses_of_positive(share * self.H + np.diag(precision))
@@ -127,7 +127,7 @@ class Evidence:
         step = covariance @ pull
         fit = 0.5 * float(pull @ step) - 0.5 * float(precision @ away**2)
         volume = 0.5 * float(np.sum(np.log(precision))) + 0.5 * float(np.linalg.slogdet(covariance)[1])
-        return fit + volume + self.usual.log_odds(free), step, covariance
+        return fit + volume + self.priors.log_odds(free), step, covariance
 
     def choices(self, free: BoolArray, camera: int) -> list[BoolArray]:
         """All choices for one camera, the others as in `free` (C, 4); those that free less come first.
@@ -155,7 +155,7 @@ class Evidence:
 
     def undetermined(self, free: BoolArray) -> BoolArray:
         """(C, 4) what is not freed, about which the pairs say hardly more than the prior, and nothing against it."""
-        prior = self.usual.prior(free, self.thetas)
+        prior = self.priors.prior(free, self.thetas)
         before = prior.precision**-0.5
         after = np.sqrt(np.diag(self.posterior(free)[2])).reshape(before.shape)
         vague, near = after > UNDETERMINED * before, np.abs(self.thetas - prior.mean) < after
@@ -187,18 +187,18 @@ class Evidence:
         parameters, whatever the number of cameras.
         """
         block = slice(CAMERA * camera, CAMERA * (camera + 1))
-        prior, share = self.usual.prior(free, self.thetas), spare(free, self.pairs)
+        prior, share = self.priors.prior(free, self.thetas), spare(free, self.pairs)
         own = inverses_of_positive(covariance[block, block])
         H = own - np.diag(prior.precision[camera])
         g = own @ step[block] - prior.precision[camera] * (prior.mean - self.thetas)[camera]
         found = []
         for trial in self.choices(free, camera):
-            other = self.usual.prior(trial, self.thetas)
+            other = self.priors.prior(trial, self.thetas)
             precision, away = other.precision[camera], (other.mean - self.thetas)[camera]
             scale = spare(trial, self.pairs) / share
             mine = inverses_of_positive(scale * H + np.diag(precision))
             pull = scale * g + precision * away
-            value = 0.5 * float(pull @ mine @ pull) - 0.5 * float(precision @ away**2) + self.usual.log_odds(trial)
+            value = 0.5 * float(pull @ mine @ pull) - 0.5 * float(precision @ away**2) + self.priors.log_odds(trial)
             value += 0.5 * float(np.sum(np.log(precision))) + 0.5 * float(np.linalg.slogdet(mine)[1])
             found.append(Alternative(trial, value, mine @ pull, mine))
         return found

@@ -5,7 +5,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.selfcal.adjustment.camera_priors import FOCAL, FOCAL_SPREAD, USUAL_FOCAL, BoolArray, FloatArray, Usual
+from sfm_app.selfcal.adjustment.camera_priors import (
+    FOCAL,
+    FOCAL_SPREAD,
+    USUAL_FOCAL,
+    BoolArray,
+    CameraPriors,
+    FloatArray,
+)
 from sfm_app.selfcal.adjustment.structureless_ba import Prior
 from sfm_app.selfcal.lens import LOG_FOCAL
 
@@ -17,25 +24,25 @@ LEAST = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tied(Usual):
-    """`Usual`, with focals that scatter about a mean of their own: a hierarchical prior, the mean where it is best."""
+class Tied(CameraPriors):
+    """Priors whose focals scatter about a mean of their own: hierarchical, with the mean where it is best."""
 
     families: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     """(C,) number of the family of a camera; -1: it is of none."""
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
-        """As `Usual.prior`; the mean of a family is that of its cameras in `thetas`, drawn towards the usual focal."""
-        plain = Usual.prior(self, free, thetas, held)
+        """Give the prior; the mean of a family is that of its cameras in `thetas`, drawn towards the usual focal."""
+        plain = CameraPriors.prior(self, free, thetas, held)
         mean, precision = plain.mean.copy(), plain.precision.copy()
         claimed = ~free[:, FOCAL] & np.isfinite(self.hints)
         for family in np.unique(self.families[self.families >= 0]):
             members = np.flatnonzero(self.families == family)
             if len(members) < LEAST:
                 continue
-            usual = USUAL_FOCAL + np.log(self.sides[members])
+            priors = USUAL_FOCAL + np.log(self.sides[members])
             weight = len(members) / TIE**2
-            away = np.sum(thetas[members, LOG_FOCAL] - usual) / TIE**2 / (weight + FOCAL_SPREAD**-2)
+            away = np.sum(thetas[members, LOG_FOCAL] - priors) / TIE**2 / (weight + FOCAL_SPREAD**-2)
             asked = ~claimed[members]
-            mean[members[asked], LOG_FOCAL] = (usual + away)[asked]
+            mean[members[asked], LOG_FOCAL] = (priors + away)[asked]
             precision[members[asked], LOG_FOCAL] = TIE**-2
         return Prior(mean, precision)

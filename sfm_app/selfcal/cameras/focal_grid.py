@@ -37,10 +37,10 @@ class FocalGrid:
     def places(self, cameras: IndexArray, rows: IndexArray) -> IndexArray:
         """(C,) places on the grid on which these pairs agree, when photo k is of `cameras[k]`."""
         one = np.einsum("pgg->g", self.votes[rows]) - 0.5 * ((self.grid - USUAL_FOCAL) / FOCAL_SPREAD) ** 2
-        usual = -0.5 * ((self.grid - self.grid[np.argmax(one)]) / TIE) ** 2
+        priors = -0.5 * ((self.grid - self.grid[np.argmax(one)]) / TIE) ** 2
         if np.max(cameras) == 0:
             return np.array([np.argmax(one)])
-        own = np.tile(usual, (int(np.max(cameras)) + 1, 1))
+        own = np.tile(priors, (int(np.max(cameras)) + 1, 1))
         between: dict[tuple[int, int], FloatArray] = {}
         for row in rows:
             i, j = (int(cameras[photo]) for photo in self.members[row])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.jit import kernel
 from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, refined, straight_fundamentals
-from sfm_app.selfcal.adjustment.camera_priors import FOCAL_SPREAD, HINT_SPREAD, USUAL_FOCAL, Usual
+from sfm_app.selfcal.adjustment.camera_priors import FOCAL_SPREAD, HINT_SPREAD, USUAL_FOCAL, CameraPriors
 from sfm_app.selfcal.adjustment.structureless_ba import Matches
 from sfm_app.selfcal.adjustment.tied_priors import Tied
 from sfm_app.selfcal.adjustment.two_view_cost import CAMERA
@@ -83,13 +83,13 @@ def calibrate_several(
     sides = np.array([max(camera.size) / unit for camera in cameras])
     hints = np.array([camera.hint_px for camera in cameras]) / unit
     families = np.array([camera.family for camera in cameras], np.int64)
-    usual = Tied(sides, hints, options.centre_sigma, options.lens, families)
+    priors = Tied(sides, hints, options.centre_sigma, options.lens, families)
     weights = pairs.weights[kept]
     thetas = np.array([_first(camera, side, unit) for camera, side in zip(cameras, sides, strict=True)])
     unknown = np.array([camera.start is None for camera in cameras])
     if unknown.any():
-        thetas = _with_focals(thetas, unknown, Tables(Fs, members, weights), usual)
-    fit = refined(matches, Fs, [thetas], usual)
+        thetas = _with_focals(thetas, unknown, Tables(Fs, members, weights), priors)
+    fit = refined(matches, Fs, [thetas], priors)
     cov = covariance(fit, sides)
     straight = Tables(straight_fundamentals(fit), members, weights)
     best = key_pairs(fit, tuple(pairs.photos[k] for k in kept))
@@ -175,14 +175,14 @@ def _first(camera: CameraGroup, side: float, unit: float) -> FloatArray:
     return np.array([USUAL_FOCAL + np.log(side), 0.0, 0.0, 0.0, 0.0])
 
 
-def _with_focals(thetas: FloatArray, unknown: NDArray[np.bool_], tables: Tables, usual: Usual) -> FloatArray:
+def _with_focals(thetas: FloatArray, unknown: NDArray[np.bool_], tables: Tables, priors: CameraPriors) -> FloatArray:
     """The unknown focals on which most pairs agree."""
     grid = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
     trials = np.repeat(thetas[:, None], FOCALS, axis=1)
-    trials[unknown, :, LOG_FOCAL] = grid + np.log(usual.sides[unknown])[:, None]
-    own = -0.5 * ((trials[..., LOG_FOCAL] - np.log(usual.sides)[:, None] - USUAL_FOCAL) / FOCAL_SPREAD) ** 2
-    hinted = np.isfinite(usual.hints)
-    off = (trials[hinted, :, LOG_FOCAL] - np.log(usual.hints[hinted])[:, None]) / HINT_SPREAD
+    trials[unknown, :, LOG_FOCAL] = grid + np.log(priors.sides[unknown])[:, None]
+    own = -0.5 * ((trials[..., LOG_FOCAL] - np.log(priors.sides)[:, None] - USUAL_FOCAL) / FOCAL_SPREAD) ** 2
+    hinted = np.isfinite(priors.hints)
+    off = (trials[hinted, :, LOG_FOCAL] - np.log(priors.hints[hinted])[:, None]) / HINT_SPREAD
     own[hinted] += np.exp(-0.5 * off**2)
     between: dict[tuple[int, int], FloatArray] = {}
     for pair, (i, j) in enumerate(tables.members):

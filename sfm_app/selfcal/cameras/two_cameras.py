@@ -73,13 +73,13 @@ def two_cameras(tables: Tables, photos: Sequence[PairId], starts: Sequence[Float
     grids = [FocalGrid(tables, rows, theta, members) for theta in starts]
     shared = [np.einsum("pgg->g", grid.votes) for grid in grids]
     best = int(np.argmax([np.max(votes) for votes in shared]))
-    grid, usual = grids[best], int(np.argmax(shared[best]))
+    grid, priors = grids[best], int(np.argmax(shared[best]))
     division = _Division(grid, len(everyone))
     tried = [
-        division.settled(np.array([usual, other]), start)
+        division.settled(np.array([priors, other]), start)
         for other in range(FOCALS)
-        if abs(other - usual) >= APART
-        for start in division.starts(usual, other)
+        if abs(other - priors) >= APART
+        for start in division.starts(priors, other)
     ]
     places, labels = max(tried, key=lambda found: division.total(*found))
     places, labels = division.refined(places, labels)
@@ -87,7 +87,7 @@ def two_cameras(tables: Tables, photos: Sequence[PairId], starts: Sequence[Float
         return None
     if np.count_nonzero(labels) > len(labels) / 2:
         places, labels = places[::-1], 1 - labels
-    gains = division.each(places, labels) - grid.votes[:, usual, usual]
+    gains = division.each(places, labels) - grid.votes[:, priors, priors]
     smaller = labels[members].astype(bool)
     theta = np.repeat(np.asarray(starts[best], np.float64)[None], 2, axis=0)
     theta[:, LOG_FOCAL] = grid.grid[places]
@@ -115,9 +115,9 @@ class _Division:
         self.rows = np.arange(len(grid.votes))
         self.of = [np.flatnonzero((grid.members == photo).any(axis=1)) for photo in range(photos)]
 
-    def starts(self, usual: int, other: int) -> tuple[IndexArray, IndexArray]:
+    def starts(self, priors: int, other: int) -> tuple[IndexArray, IndexArray]:
         """(N,) all with the usual focal; and each with what its pairs want, when both photos of a pair take it."""
-        wants = self.votes[:, other, other] - self.votes[:, usual, usual]
+        wants = self.votes[:, other, other] - self.votes[:, priors, priors]
         wanted = np.array([np.sum(wants[rows]) for rows in self.of])
         return np.zeros(self.photos, np.int64), (wanted > 0).astype(np.int64)
 

@@ -10,7 +10,7 @@ FACING = np.array([[0.0, 0.0, -1.0]])
 
 @pytest.fixture
 def eye():
-    """Looks along +z at a wall 10 away, that is empty on the right and 5 away at the bottom."""
+    """FaceViews along +z at a wall 10 away, that is empty on the right and 5 away at the bottom."""
     depth = np.full((60, 80), 10.0, np.float32)
     depth[:, 60:] = 0
     depth[40:] = 5

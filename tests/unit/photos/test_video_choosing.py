@@ -37,7 +37,7 @@ def looks_at(frames):
 
 @pytest.fixture(scope="module")
 def slide(wall):
-    """Looks at 600 pixels of the way, three for each frame."""
+    """FaceViews at 600 pixels of the way, three for each frame."""
     return looks_at(film(wall, np.arange(0, 600, 3.0)))
 
 

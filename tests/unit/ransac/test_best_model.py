@@ -99,7 +99,7 @@ def test_with_two_scores_samples_compete_with_samples_and_improved_models_with_e
 def test_a_model_of_the_rest_needs_half_the_support_of_the_best_sample_once_the_rest_is_another():
     answers = iter([BAD, ROUGH, GOOD])
     best = best_of(replace(TWO, improve=lambda *_: next(answers)))
-    nothing = len(POINTS) * best.measure.worst
+    nothing = len(POINTS) * best.loss.worst
 
     assert meet(best, ROUGH, TWO.score)
     assert nothing - best.to_beat[1] == pytest.approx((nothing - score_of(ROUGH, TWO.score)) / 2)
@@ -139,5 +139,5 @@ def test_a_score_that_changes_with_the_best_model_is_taken_anew():
     meet(best, ROUGH, ransac)
     assert len(seen) == 2
     assert seen[0] is None
-    assert best.measure == msac(POINTS, THRESHOLD, None)
+    assert best.loss == msac(POINTS, THRESHOLD, None)
     assert best.to_beat.tolist() == [score_of(ROUGH, msac)] * 2

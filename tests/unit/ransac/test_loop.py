@@ -104,8 +104,8 @@ def test_local_optimisation_is_kept_only_if_better():
     assert search(m, options(), 0, misled).F.tobytes() == search(m, options(), 0, PLAIN).F.tobytes()
 
 
-def draw(points, draws, to_beat, best, limit=25, gates=(OPEN, OPEN), seed=0):
-    return next_better(points, draws, msac(points, 0.01, None), gates, to_beat, limit, random_state(seed), best)
+def draw(points, draws, to_beat, best, limit=25, pretests=(OPEN, OPEN), seed=0):
+    return next_better(points, draws, msac(points, 0.01, None), pretests, to_beat, limit, random_state(seed), best)
 
 
 def blind(count, batch=1):
@@ -215,8 +215,8 @@ def test_least_trials_are_drawn_even_if_fewer_would_do(scripted):
 def test_a_last_attempt_may_beat_the_best_model_and_else_is_dropped(scripted):
     seen, wrong = [], np.eye(3) / np.sqrt(3)
 
-    def recover(points, F, threshold, measure, gate, state):
-        seen.append((F.copy(), measure, gate))
+    def recover(points, F, threshold, loss, pretest, state):
+        seen.append((F.copy(), loss, pretest))
         return seen[0][0] if len(seen) == 2 else wrong
 
     found, _ = scripted(replace(PLAIN, recover=recover), (1, 1e-9), max_trials=10)

@@ -39,8 +39,8 @@ def wrong_epipole(H, seed):
     return F / np.linalg.norm(F)
 
 
-def found_from(points, F, gate=OPEN, seed=0):
-    return with_another_epipole(points, F, THRESHOLD, SCORE(points, THRESHOLD, None), gate, random_state(seed))
+def found_from(points, F, pretest=OPEN, seed=0):
+    return with_another_epipole(points, F, THRESHOLD, SCORE(points, THRESHOLD, None), pretest, random_state(seed))
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -53,8 +53,8 @@ def test_the_right_epipole_is_found(seed):
 
     residuals = np.sqrt(squared_distances(points, found.reshape(9)))
     assert np.mean(residuals[off] < THRESHOLD) > 0.8
-    measure = SCORE(points, THRESHOLD, None)
-    scores = [penalty(points, 0, F.reshape(9), measure, np.inf, OPEN) for F in (found, start)]
+    loss = SCORE(points, THRESHOLD, None)
+    scores = [penalty(points, 0, F.reshape(9), loss, np.inf, OPEN) for F in (found, start)]
     assert scores[0] < scores[1] - 0.5 * off.sum()
     assert np.linalg.norm(found) == pytest.approx(1)
     assert np.linalg.svd(found, compute_uv=False)[2] < 1e-12

@@ -61,8 +61,8 @@ def test_each_is_best_at_its_own_distance_on_the_same_inliers(seed):
     fits = {name: refit(m.points, start, threshold) for name, refit in REFITS.items()}
 
     views = inliers[:, :2], inliers[:, 2:]
-    for measure, best in ((sampson_distance, "sampson"), (reprojection_distance, "reprojection")):
-        costs = {name: (measure(F, *views) ** 2).sum() for name, F in fits.items()}
+    for loss, best in ((sampson_distance, "sampson"), (reprojection_distance, "reprojection")):
+        costs = {name: (loss(F, *views) ** 2).sum() for name, F in fits.items()}
         assert min(costs, key=costs.__getitem__) == best, costs
 
 

@@ -18,7 +18,7 @@ from sfm_app.ransac.scoring.robust_costs import (
     squared_distances,
     squared_sampson,
 )
-from sfm_app.ransac.verification.pretests import BLOCK, OPEN, gate
+from sfm_app.ransac.verification.pretests import BLOCK, OPEN, pretest
 
 SOFT = partial(geman_mcclure, scale=0.25)
 SHIFT = cross_matrix([1.0, 0, 0]).reshape(9)
@@ -58,11 +58,11 @@ def test_penalties_by_hand(score, expected):
 @pytest.mark.parametrize("score", [ransac, msac, msac_linear, lmeds, SOFT])
 def test_a_score_that_cannot_win_is_left(score):
     points = matches_off_by(*np.linspace(0, 4, 1000))
-    measure = score(points, 2.0, None)
-    full = penalty(points, 0, SHIFT, measure, np.inf, OPEN)
+    loss = score(points, 2.0, None)
+    full = penalty(points, 0, SHIFT, loss, np.inf, OPEN)
 
-    assert penalty(points, 0, SHIFT, measure, full * 1.001, OPEN) == full
-    assert penalty(points, 0, SHIFT, measure, full, OPEN) == np.inf
+    assert penalty(points, 0, SHIFT, loss, full * 1.001, OPEN) == full
+    assert penalty(points, 0, SHIFT, loss, full, OPEN) == np.inf
 
 
 def test_a_match_at_the_threshold_is_an_inlier():
@@ -75,25 +75,25 @@ def test_a_match_at_the_threshold_is_an_inlier():
 
 def test_the_gate_turns_away_what_lacks_inliers_and_keeps_books():
     points = matches_off_by(*[9.0] * BLOCK, *[0.0] * 10 * BLOCK)
-    measure = msac(points, 2.0, None)
-    lenient, strict = (gate(np.array([least]), BLOCK, random_start=False) for least in (0, 1))
+    loss = msac(points, 2.0, None)
+    lenient, strict = (pretest(np.array([least]), BLOCK, random_start=False) for least in (0, 1))
 
-    assert penalty(points, 0, SHIFT, measure, np.inf, lenient) == 4 * BLOCK
-    assert penalty(points, 0, SHIFT, measure, np.inf, strict) == np.inf
+    assert penalty(points, 0, SHIFT, loss, np.inf, lenient) == 4 * BLOCK
+    assert penalty(points, 0, SHIFT, loss, np.inf, strict) == np.inf
     assert lenient.rejected.tolist() == [0, 0]
     assert strict.rejected.tolist() == [BLOCK, 0]
 
 
 def test_a_gate_asks_after_its_own_stride():
     points = matches_off_by(0, 0, 9, 0, 0, 0)
-    measure = msac(points, 2.0, None)
+    loss = msac(points, 2.0, None)
     for least, passes in [
         ([1, 2, 2], True),
         ([1, 2, 3], False),
         ([1, 2, 2, 3, 4, 5], True),
         ([0, 0, 0, 0, 0, 6], False),
     ]:
-        turned = penalty(points, 0, SHIFT, measure, np.inf, gate(np.array(least), 1, random_start=False))
+        turned = penalty(points, 0, SHIFT, loss, np.inf, pretest(np.array(least), 1, random_start=False))
         assert (turned < np.inf) == passes
 
 
@@ -109,7 +109,7 @@ def test_a_soft_penalty_still_counts_inliers_for_the_gate():
     points = matches_off_by(*[1.9, 2.1] * BLOCK)
     for least, passes in ((BLOCK // 2, True), (BLOCK // 2 + 1, False)):
         found = penalty(
-            points, 0, SHIFT, SOFT(points, 2.0, None), np.inf, gate(np.array([least]), BLOCK, random_start=False)
+            points, 0, SHIFT, SOFT(points, 2.0, None), np.inf, pretest(np.array([least]), BLOCK, random_start=False)
         )
         assert (found < np.inf) == passes
 
@@ -125,8 +125,8 @@ def test_a_match_at_infinity_costs_the_most():
 def test_a_random_start_counts_every_match_once(start):
     points = matches_off_by(*np.linspace(0, 3, 10))
     circle = np.asfortranarray(np.vstack([points, points]))
-    measure = msac(points, 2.0, None)
-    everywhere = gate(np.zeros(1, dtype=np.int64), 1, random_start=True)
-    assert penalty(circle, start, SHIFT, measure, np.inf, everywhere) == pytest.approx(
-        penalty(points, 0, SHIFT, measure, np.inf, OPEN)
+    loss = msac(points, 2.0, None)
+    everywhere = pretest(np.zeros(1, dtype=np.int64), 1, random_start=True)
+    assert penalty(circle, start, SHIFT, loss, np.inf, everywhere) == pytest.approx(
+        penalty(points, 0, SHIFT, loss, np.inf, OPEN)
     )

@@ -8,7 +8,14 @@ import pytest
 from sfm_app.geometry.epipolar import cross_matrix
 from sfm_app.ransac.sampling.stopping import trials_needed
 from sfm_app.ransac.scoring.robust_costs import msac, penalty
-from sfm_app.ransac.verification.pretests import BLOCK, BailOut, FullVerification, Gate, RandomisedTdd, bail_out_table
+from sfm_app.ransac.verification.pretests import (
+    BLOCK,
+    BailOut,
+    FullVerification,
+    PreTest,
+    RandomisedTdd,
+    bail_out_table,
+)
 
 SHIFT = cross_matrix([1.0, 0, 0]).reshape(9)
 
@@ -20,11 +27,11 @@ def matches_of(inlier):
     return np.asfortranarray(np.vstack([points, points]))
 
 
-def passes(gate: Gate, inlier) -> np.ndarray:
+def passes(pretest: PreTest, inlier) -> np.ndarray:
     """For every match to begin with, whether the model passes."""
     circle, count = matches_of(inlier), len(inlier)
-    measure = msac(circle, 1.0, None)
-    return np.array([penalty(circle, k, SHIFT, measure, np.inf, gate) < np.inf for k in range(count)])
+    loss = msac(circle, 1.0, None)
+    return np.array([penalty(circle, k, SHIFT, loss, np.inf, pretest) < np.inf for k in range(count)])
 
 
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
@@ -34,19 +41,19 @@ def test_a_good_model_passes_tdd_with_probability_share_to_the_d(share, d):
     inlier = rng.permutation(count) < share * count
     test = type("Tdd", (RandomisedTdd,), {"d": d})(count, 7)
 
-    rate = passes(test.gate, inlier).mean()
+    rate = passes(test.pretest, inlier).mean()
 
     assert rate == pytest.approx(share) if d == 1 else rate == pytest.approx(share**d, abs=0.02)
-    assert test.gate.random_start
-    assert test.gate.rejected[0] >= (1 - rate) * count
+    assert test.pretest.random_start
+    assert test.pretest.rejected[0] >= (1 - rate) * count
     # 3.19 with that probability: one more match per d that has to be an inlier by luck
     assert test.trials_needed(share, 0.99) == pytest.approx(trials_needed(share ** (7 + d), 0.99))
 
 
 def test_tdd_beginning_at_its_own_match_reaches_the_stated_confidence():
     rng, share, runs, count = np.random.default_rng(3), 0.7, 4000, 500
-    gate = RandomisedTdd(count, 7).gate
-    pass_rate = passes(gate, rng.permutation(count) < share * count).mean()
+    pretest = RandomisedTdd(count, 7).pretest
+    pass_rate = passes(pretest, rng.permutation(count) < share * count).mean()
     trials = math.ceil(RandomisedTdd(count, 7).trials_needed(share, 0.9))
     plain = math.ceil(FullVerification(count, 7).trials_needed(share, 0.9))
 
@@ -60,7 +67,7 @@ def test_tdd_beginning_at_its_own_match_reaches_the_stated_confidence():
 
 def test_full_verification_has_no_test_and_plain_trials():
     test = FullVerification(100, 8)
-    assert len(test.gate.least_inliers) == 0
+    assert len(test.pretest.least_inliers) == 0
     assert test.trials_needed(0.5, 0.99) == pytest.approx(trials_needed(0.5**8, 0.99))
     test.expect(0.3)
     test.learn(10)
@@ -69,10 +76,10 @@ def test_full_verification_has_no_test_and_plain_trials():
 
 def test_bail_out_learns_from_the_best_model():
     test = BailOut(20 * BLOCK, 7)
-    assert len(test.gate.least_inliers) == 0
+    assert len(test.pretest.least_inliers) == 0
     test.expect(0.5)
-    np.testing.assert_array_equal(test.gate.least_inliers, bail_out_table(20 * BLOCK, 0.5))
-    assert (test.gate.stride, test.gate.random_start) == (BLOCK, False)
+    np.testing.assert_array_equal(test.pretest.least_inliers, bail_out_table(20 * BLOCK, 0.5))
+    assert (test.pretest.stride, test.pretest.random_start) == (BLOCK, False)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])

@@ -85,20 +85,20 @@ def test_perfect_and_hopeless_shares_are_no_trouble():
 def test_delta_follows_the_rejected_models_and_the_gate_follows_delta():
     test = Sprt(COUNT, 7)
     test.expect(0.6)
-    before = test.gate
+    before = test.pretest
     test.learn(100)
-    assert test.gate is before  # nothing was rejected: nothing learnt
+    assert test.pretest is before  # nothing was rejected: nothing learnt
 
     before.rejected[:] = 10_000, 1_500
     test.learn(100)
 
     expected = (1_500 + 100 * FIRST_DELTA) / 10_100
-    np.testing.assert_array_equal(test.gate.least_inliers, design(0.6, expected, 7).least_inliers(COUNT))
-    assert test.gate.rejected is before.rejected
+    np.testing.assert_array_equal(test.pretest.least_inliers, design(0.6, expected, 7).least_inliers(COUNT))
+    assert test.pretest.rejected is before.rejected
     before.rejected[:] = 10_000, 1_510
-    kept = test.gate
+    kept = test.pretest
     test.learn(100)
-    assert test.gate is kept
+    assert test.pretest is kept
 
 
 def test_trials_reach_the_confidence_though_good_models_fall():

@@ -12,8 +12,8 @@ from sfm_app.selfcal.adjustment.camera_priors import (
     HINT_SPREAD,
     LENS,
     WIDE,
+    CameraPriors,
     Evidence,
-    Usual,
     spare,
 )
 from sfm_app.selfcal.zero_curves import calibrate
@@ -33,7 +33,7 @@ def freed(*places):
 def evidence(deviations, offset=(0.0,) * 5, claim=NO_CLAIM, theta=(0.0,) * 5, pairs=1e6):
     """Pairs that say theta + offset, with these standard deviations."""
     H = np.diag(np.asarray(deviations, float) ** -2.0)
-    return Evidence(np.array([theta]), H, H @ np.asarray(offset), pairs, Usual(np.ones(1), claim))
+    return Evidence(np.array([theta]), H, H @ np.asarray(offset), pairs, CameraPriors(np.ones(1), claim))
 
 
 SURE = [1e-3] * 5
@@ -62,7 +62,7 @@ def test_the_log_evidence_is_the_integral():
     f, u = np.meshgrid(np.linspace(-1, 1, 801), np.linspace(-0.4, 0.4, 801), indexing="ij")
     values = []
     for free in (NOTHING, freed(CENTRE)):
-        prior = found.usual.prior(free, found.thetas)
+        prior = found.priors.prior(free, found.thetas)
         likelihood = found.g[0] * f + found.g[1] * u - 0.5 * (found.H[0, 0] * f**2 + found.H[1, 1] * u**2)
         belief = sum(
             0.5 * np.log(prior.precision[0, k] / (2 * np.pi))
@@ -72,7 +72,7 @@ def test_the_log_evidence_is_the_integral():
         integral = np.sum(np.exp(likelihood + belief)) * (f[1, 0] - f[0, 0]) * (u[0, 1] - u[0, 0])
         # the second centre parameter is known to be 0: its prior density there is the rest
         rest = 0.5 * np.log(prior.precision[0, 2])
-        values.append(np.log(integral) + rest + found.usual.log_odds(free))
+        values.append(np.log(integral) + rest + found.priors.log_odds(free))
     posteriors = [found.posterior(free)[0] for free in (NOTHING, freed(CENTRE))]
     assert posteriors[1] - posteriors[0] == pytest.approx(values[1] - values[0], abs=1e-3)
     assert abs(values[1] - values[0]) > 0.5
@@ -80,7 +80,7 @@ def test_the_log_evidence_is_the_integral():
 
 def test_mean_step_and_covariance_are_those_of_two_measurements():
     found = evidence([0.1, 0.3, 0.3, 0.3, 0.3], (0.2, 0, 0, 0, 0))
-    prior = found.usual.prior(NOTHING, found.thetas)
+    prior = found.priors.prior(NOTHING, found.thetas)
     _, step, covariance = found.posterior(NOTHING)
     weights = np.array([100.0, prior.precision[0, 0]])
     share = spare(NOTHING, 1e6)
@@ -139,14 +139,14 @@ def test_few_pairs_say_less_than_their_scatter():
 def test_every_camera_has_its_own_choice():
     H = np.diag([1e6] * 10)
     g = H @ [0, 0, 0, 0, 0, 0, 0, 0, 0.1, 0]
-    both = Evidence(np.zeros((2, 5)), H, g, 1e6, Usual(np.ones(2), np.full(2, np.nan)))
+    both = Evidence(np.zeros((2, 5)), H, g, 1e6, CameraPriors(np.ones(2), np.full(2, np.nan)))
     np.testing.assert_array_equal(both.best(np.zeros((2, 4), np.bool_)), np.vstack([NOTHING, freed(ASPECT)]))
 
 
 def test_k1_is_held_in_focal_lengths():
-    usual = Usual(np.ones(1), NO_CLAIM)
+    priors = CameraPriors(np.ones(1), NO_CLAIM)
     for log_focal in (-0.5, 0.0, 0.8):
-        precision = usual.prior(freed(LENS), np.array([[log_focal, 0, 0, 0, 0]])).precision[0, 4]
+        precision = priors.prior(freed(LENS), np.array([[log_focal, 0, 0, 0, 0]])).precision[0, 4]
         assert precision**-0.5 * np.exp(2 * log_focal) == pytest.approx(WIDE[LENS])
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_app.selfcal.adjustment.calibrate_pairs import refined
-from sfm_app.selfcal.adjustment.camera_priors import Usual
+from sfm_app.selfcal.adjustment.camera_priors import CameraPriors
 from sfm_app.selfcal.adjustment.structureless_ba import (
     MOST_MATCHES,
     Matches,
@@ -35,7 +35,7 @@ def laid_out(pairs, **options):
 
 
 def fitted(pairs, start=(0.0, 0.0, 0.0, 0.0, 0.0)):
-    return refined(*laid_out(pairs), [np.array([start])], Usual(np.ones(1), np.array([np.nan])))
+    return refined(*laid_out(pairs), [np.array([start])], CameraPriors(np.ones(1), np.array([np.nan])))
 
 
 def scores(found, K, k1):
@@ -159,7 +159,7 @@ def test_noise_of_few_matches_is_not_underestimated(shots):
         made = shots(6, seed, points=250).pairs
         few = replace(made, inliers=tuple(evenly(x, 16) for x in made.inliers))
         matches, Fs = laid_out(few)
-        fit = refined(matches, Fs, [np.zeros((1, 5))], Usual(np.ones(1), np.array([np.nan])))
+        fit = refined(matches, Fs, [np.zeros((1, 5))], CameraPriors(np.ones(1), np.array([np.nan])))
         ratios.append(fit.state.sigma * SIDE / 0.5)
     assert 0.72 < np.mean(ratios) < 1.1
 

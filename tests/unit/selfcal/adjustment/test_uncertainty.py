@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.selfcal.adjustment.calibrate_pairs import refined, scatter_by_photos
-from sfm_app.selfcal.adjustment.camera_priors import Usual
+from sfm_app.selfcal.adjustment.camera_priors import CameraPriors
 from sfm_app.selfcal.adjustment.structureless_ba import Matches
 from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_of
 from sfm_app.selfcal.results import calibration_of, parameters_of
@@ -16,8 +16,8 @@ TO_SIDES = np.array([[SIDE, 0, 500], [0, SIDE, 375], [0, 0, 1]])
 def fitted(pairs):
     inliers = [(x - [500, 375, 500, 375]) / SIDE for x in pairs.inliers]
     matches = Matches(inliers, np.zeros((len(inliers), 2), np.int64), np.array(pairs.photos), SIDE)
-    usual = Usual(np.ones(1), np.array([np.nan]))
-    return refined(matches, TO_SIDES.T @ pairs.Fs @ TO_SIDES, [np.zeros((1, 5))], usual)
+    priors = CameraPriors(np.ones(1), np.array([np.nan]))
+    return refined(matches, TO_SIDES.T @ pairs.Fs @ TO_SIDES, [np.zeros((1, 5))], priors)
 
 
 def test_standard_deviations_are_those_of_repeated_photos(shots):

@@ -123,10 +123,10 @@ def test_a_photo_about_which_nobody_says_anything_follows_the_others(shots):
 def prior(families, free_focal=False, hints=None, focals=(1.0, 2.0, 4.0)):
     thetas = np.zeros((3, 5))
     thetas[:, 0] = np.log(focals)
-    usual = Tied(np.ones(3), np.full(3, np.nan) if hints is None else hints, families=np.array(families))
+    priors = Tied(np.ones(3), np.full(3, np.nan) if hints is None else hints, families=np.array(families))
     free = np.zeros((3, 4), np.bool_)
     free[:, 3] = free_focal
-    return usual.prior(free, thetas)
+    return priors.prior(free, thetas)
 
 
 def test_focals_of_a_family_scatter_about_their_mean():
