@@ -202,7 +202,7 @@ def calibrate_fundamentals(
 
 @contextmanager
 def opened_run(out: Path, settings: Settings, progress: Progress | None) -> Iterator[RunContext]:
-    """A run with its workers, which end with it."""
+    """Provide a run with its workers, which end with it."""
     plugins = load_plugins(installed=settings.plugins)
     plugins.estimator(settings.epipolar.estimator)  # unknown names are refused before any work is done
     plugins.calibrator(settings.calibration.calibrator)

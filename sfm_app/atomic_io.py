@@ -12,7 +12,7 @@ UNFINISHED = "unfinished.txt"
 
 @contextlib.contextmanager
 def replacing(target: Path) -> Iterator[Path]:
-    """A path beside `target` to write to; it takes the target's place when the block ends without an error."""
+    """Provide a path beside `target` to write to; it takes the target's place when the block ends without an error."""
     target.parent.mkdir(parents=True, exist_ok=True)
     beside = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
     try:
@@ -23,7 +23,7 @@ def replacing(target: Path) -> Iterator[Path]:
 
 
 def can_go_on(folder: Path, made_from: str) -> bool:
-    """Whether a killed run was filling this folder from the same inputs; if not, what is there is removed.
+    """Return whether a killed run was filling this folder from the same inputs; if not, what is there is removed.
 
     Args:
         folder: may be missing.
@@ -36,7 +36,7 @@ def can_go_on(folder: Path, made_from: str) -> bool:
 
 
 def is_made_from(marker: Path, made_from: str) -> bool:
-    """Whether a file says so."""
+    """Return whether a file says so."""
     try:
         return marker.read_text(encoding="utf-8") == made_from
     except (OSError, UnicodeDecodeError):
@@ -44,13 +44,13 @@ def is_made_from(marker: Path, made_from: str) -> bool:
 
 
 def mark_unfinished(folder: Path, made_from: str) -> None:
-    """From now on a run that is killed can go on in this folder, which is made if it is missing."""
+    """Mark a folder, made if it is missing, as one in which a killed run can go on."""
     with replacing(folder / UNFINISHED) as path:
         path.write_text(made_from, encoding="utf-8")
 
 
 def mark_finished(folder: Path) -> None:
-    """The folder is filled; the next time it is filled from nothing."""
+    """Mark a folder as complete; the next run fills it anew."""
     (folder / UNFINISHED).unlink()
 
 

@@ -31,7 +31,7 @@ def find_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> t
 
 
 def explained(camera: Camera, views: ViewGraph) -> Calibration:
-    """What was found; where that is nothing, with what the pairs are that could not be asked."""
+    """Return what was found; where that is nothing, with what the pairs are that could not be asked."""
     kinds = votes(views, camera.photos)
     if camera.found.identifiable or not kinds.total() > kinds[""]:
         return camera.found
@@ -39,7 +39,7 @@ def explained(camera: Camera, views: ViewGraph) -> Calibration:
 
 
 def of_whole_photo(camera: Camera, image: MatchedImage) -> Camera:
-    """A camera in pixels of its photos, where it was found in those of the pictures within their bars."""
+    """Return a camera in pixels of its photos, where it was found in those of the pictures within their bars."""
     if image.shown is None:
         return camera
     K = camera.found.K.copy()
@@ -48,7 +48,9 @@ def of_whole_photo(camera: Camera, image: MatchedImage) -> Camera:
 
 
 def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> PhotoPairs:
-    """What is known about all pairs of these photos that are not degenerate, in pixels of the pictures within bars."""
+    """Return what is known about all pairs of these photos that are not degenerate, in pixels of the pictures within
+    bars.
+    """
     shown = {image.id: image.shown for image in images if image.shown}
     ids = {image.id for image in images}
     fits = {pair: fit for pair, fit in views.fits.items() if ids.issuperset(pair) and not fit.degeneracy}
@@ -65,10 +67,10 @@ def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGrap
 
 
 def _share_shown(image: MatchedImage) -> float:
-    """Longer side of the picture within bars over that of the photo, which EXIF's claim was reckoned with."""
+    """Return longer side of the picture within bars over that of the photo, which EXIF's claim was reckoned with."""
     return max(image.shown[2:]) / max(image.width, image.height) if image.shown else 1.0
 
 
 def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> CameraPairs:
-    """What a calibrator gets to know about the photos of one camera."""
+    """Return what a calibrator gets to know about the photos of one camera."""
     return photo_pairs(images, matches, views).among([image.id for image in images])

@@ -50,7 +50,7 @@ class RunContext:
 
     @contextmanager
     def with_workers(self, workers: int) -> Iterator[None]:
-        """So many workers instead of what the settings say."""
+        """Use so many workers instead of what the settings say."""
         before = self.workers, self.executor
         with make_executor(workers) as executor:
             self.workers, self.executor = workers, executor
@@ -65,7 +65,7 @@ class RunContext:
         return self.workspace.masks if self.settings.photos.masks else None
 
     def map(self, function: Callable[[Item], Result], items: Sequence[Item], label: str) -> list[Result]:
-        """Results in the order of the items, computed in parallel, with a progress bar."""
+        """Return results in the order of the items, computed in parallel, with a progress bar."""
         results = ordered_map(self.executor, function, items, ahead=2 * self.workers)
         return list(track(self.progress, results, label, len(items)))
 
@@ -79,7 +79,7 @@ class RunContext:
         self.counts |= counts
 
     def model_paths(self, name: str) -> tuple[Path, ...]:
-        """Where a model of this name lies in the output folder."""
+        """Return where a model of this name is in the output folder."""
         return tuple(self.workspace.root / f"{name}.{suffix}" for suffix in STANDARD_FORMATS)
 
     def write_model(self, model: Model, name: str) -> tuple[Path, ...]:

@@ -36,15 +36,15 @@ class Plan:
     """Most memory at any moment, by stage."""
 
     def minutes(self, stages: Iterable[str]) -> float:
-        """How long these stages take."""
+        """Return how long these stages take."""
         return sum(self.core_seconds[name] / (1 if name in ALONE else self.workers) for name in stages) / 60
 
     def peak_mb(self, stages: Iterable[str]) -> float:
-        """Most memory that these stages hold."""
+        """Return the most memory that these stages hold."""
         return max((self.memory_mb[name] for name in stages), default=0.0)
 
     def text(self, stages: Iterable[str]) -> str:
-        """For people."""
+        """Describe the plan for people."""
         names = list(stages)
         minutes, gigabytes = self.minutes(names), self.peak_mb(names) / 1000
         how_long = f"{_rounded(minutes)} minutes" if minutes >= 1.5 else "a minute or two"
@@ -53,12 +53,12 @@ class Plan:
 
 
 def megapixels_within(limit_mb: float) -> float:
-    """How large a photo may be that is painted with by one worker."""
+    """Return how large a photo may be that is painted with by one worker."""
     return max(2.0, (limit_mb - 1650) / 8)
 
 
 def cache_gb(limit_mb: float) -> float:
-    """What fusion may keep of depth maps; the points and the surface want memory, too.
+    """Return what fusion may keep of depth maps; the points and the surface want memory, too.
 
     It takes what it needs, 28 MB per megapixel of depth maps. Where that is more than it may keep, it reads all maps
     again and again: 200 photos were not done after half an hour with 2 GB.
@@ -67,7 +67,7 @@ def cache_gb(limit_mb: float) -> float:
 
 
 def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float = math.inf) -> Plan:
-    """Expected costs of all stages behind the photos.
+    """Estimate the costs of all stages behind the photos.
 
     Args:
         photos: that are used.
@@ -112,14 +112,17 @@ def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb:
 def plan_within(
     photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float, stages: Iterable[str]
 ) -> Plan:
-    """The plan with the most workers, up to so many, that holds no more memory; with one where that is too much."""
+    """Return the plan with the most workers, up to so many, that holds no more memory.
+
+    With one where that is too much.
+    """
     chosen, names = list(photos), list(stages)
     plans = (plan_of(chosen, settings, number, limit_mb) for number in range(workers, 0, -1))
     return next((plan for plan in plans if plan.peak_mb(names) <= limit_mb), plan_of(chosen, settings, 1, limit_mb))
 
 
 def machine_memory_mb() -> float:
-    """What this machine, or the container that this is, has; infinite where the system does not say."""
+    """Return what this machine, or the container that this is, has; infinite where the system does not say."""
     found = [math.inf]
     for path, unit in (("/proc/meminfo", 1 / 1000), ("/sys/fs/cgroup/memory.max", 1 / MEGA)):
         try:
@@ -132,12 +135,12 @@ def machine_memory_mb() -> float:
 
 
 def _megapixels(size: tuple[int, int], longest: int) -> float:
-    """Of a photo that is scaled down to that longer side."""
+    """Return the megapixels of a photo that is scaled down to that longer side."""
     scale = min(1.0, longest / max(size))
     return size[0] * size[1] * scale**2 / MEGA
 
 
 def _rounded(minutes: float) -> int:
-    """To one digit, or two that say something."""
+    """Round to one digit, or to two that say something."""
     step = 1 if minutes < 10 else 5 if minutes < 60 else 10
     return max(1, round(minutes / step) * step)

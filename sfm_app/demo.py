@@ -59,7 +59,7 @@ class DemoResult:
     files: list[str]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return plain values for JSON."""
         return asdict(self)
 
 
@@ -83,7 +83,7 @@ def run_demo(out: Path, settings: Settings, progress: Progress) -> DemoResult:
 
 
 def render_photos(out: Path, progress: Progress) -> Truth:
-    """The photo folder and its truth beside it; kept when they are there already."""
+    """Return the photo folder and its truth beside it; kept when they are there already."""
     views = arc(make_camera(*SIZE))
     names = set(views.cam_from_world)
     if (out / "truth.json").exists() and {path.name for path in (out / "photos").glob("*.jpg")} == names:
@@ -122,7 +122,7 @@ def compared(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[
 
 
 def draw(model: Model, scene: Scene, out: Path) -> None:
-    """OUT/model.png: a photo and the model from where it was taken; below, the model from beside and its bare shape."""
+    """Draw OUT/model.png: a photo and the model from where it was taken; below, the model from beside and its back."""
     names = sorted(scene.cam_from_world)
     name = names[len(names) // 2]
     found = scene.cameras[scene.camera_of[name]]
@@ -132,7 +132,7 @@ def draw(model: Model, scene: Scene, out: Path) -> None:
 
 
 def demo_lines(result: DemoResult) -> list[str]:
-    """The result for people."""
+    """Return the result for people."""
     pages = " and ".join(f"{width} x {height}" for width, height in result.pages_px)
     return [
         f"true camera     {k_text(result.true_K)}",
@@ -151,5 +151,5 @@ def demo_lines(result: DemoResult) -> list[str]:
 
 
 def k_text(K: list[list[float]]) -> str:
-    """A camera matrix in one line."""
+    """Return a camera matrix in one line."""
     return f"fx {K[0][0]:8.2f}  fy {K[1][1]:8.2f}  cx {K[0][2]:7.2f}  cy {K[1][2]:7.2f}"

@@ -67,12 +67,12 @@ class Diagnosis:
         return HINTS[self.cause]
 
     def error(self, details: str = "") -> ReconstructionError:
-        """As the error that ends the run."""
+        """Make the error that ends the run."""
         return ReconstructionError(f"{self.message}; {details}" if details else self.message, hint=self.hint)
 
 
 def why_no_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) -> Diagnosis:
-    """The main reason why photos cannot be reconstructed.
+    """Return the main reason why photos cannot be reconstructed.
 
     Args:
         matches: all photos and their matches.
@@ -100,7 +100,7 @@ def why_no_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) 
 def why_no_depth(
     matches: MatchGraph, views: ViewGraph, photos: Collection[int], options: EpipolarSettings, *, camera_known: bool
 ) -> Diagnosis | None:
-    """Why a model of these photos could be wrong without showing it; None where they hold depth.
+    """Return why a model of these photos could be wrong without showing it; None where they hold depth.
 
     Pairs without parallax fit any epipole, and with a wrong K a rotation looks like parallax. A plane leaves F open but
     not E: where the camera is known, or photos enough to find it from the plane, it can be reconstructed.
@@ -125,7 +125,7 @@ def why_no_depth(
 
 
 def votes(views: ViewGraph, photos: Collection[int]) -> Counter[str]:
-    """Inliers of the pairs among some photos by what leaves their F open, "" where nothing does."""
+    """Return inliers of the pairs among some photos by what leaves their F open, "" where nothing does."""
     found: Counter[str] = Counter()
     for pair in _among(views, photos):
         found[views.fits[pair].degeneracy] += views.fits[pair].inlier_count
@@ -133,7 +133,7 @@ def votes(views: ViewGraph, photos: Collection[int]) -> Counter[str]:
 
 
 def of_fits(views: ViewGraph, photos: Collection[int]) -> Diagnosis:
-    """What the pairs among some photos, at least one of them, have against a reconstruction."""
+    """Return what the pairs among some photos, at least one of them, have against a reconstruction."""
     kinds, pairs = votes(views, photos), _among(views, photos)
     if kinds[""] < kinds.total() / 2:
         kind = max(DEGENERATE, key=lambda kind: kinds[kind])

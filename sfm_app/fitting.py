@@ -57,7 +57,7 @@ def fit_pairs(matches: MatchGraph, pairs: Sequence[PairId], run: RunContext) -> 
 
 
 def graph_of(found: Mapping[PairId, Fitted]) -> ViewGraph:
-    """Pairs with a geometry, and those without."""
+    """Return pairs with a geometry, and those without."""
     return ViewGraph(
         fits={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, EpipolarFit)},
         rejected={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, Rejected)},
@@ -65,7 +65,7 @@ def graph_of(found: Mapping[PairId, Fitted]) -> ViewGraph:
 
 
 def in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run: RunContext) -> dict[PairId, Fitted]:
-    """What `fit_pair` makes of every pair, in their order; parts that are complete are kept as they come."""
+    """Return what `fit_pair` makes of every pair, in their order; parts that are complete are kept as they come."""
     folder = run.workspace.view_graph_parts
     if not can_go_on(folder, run.inputs):
         mark_unfinished(folder, run.inputs)
@@ -92,7 +92,7 @@ def write_part(path: Path, found: Mapping[PairId, Fitted]) -> None:
 
 
 def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, Fitted] | None:
-    """What `write_part` has kept; None where there is nothing, or nothing sound."""
+    """Return what `write_part` has kept; None where there is nothing, or nothing sound."""
     try:
         arrays = load_arrays(path)
         graph = ViewGraph.from_arrays(arrays)
@@ -104,7 +104,7 @@ def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, Fitted] | Non
 
 
 def stationary_matches(matches: MatchGraph, pair: PairId, settings: Settings) -> BoolArray:
-    """Which matches of a pair stay in one place; none where the photos differ in size."""
+    """Return which matches of a pair stay in one place; none where the photos differ in size."""
     first, second = (matches.images[key] for key in pair)
     if (first.width, first.height) != (second.width, second.height):
         return np.zeros(len(matches.matches[pair]), bool)

@@ -15,7 +15,7 @@ MOST_BYTES, MOST_INFLATED = 1_000_000_000, 200
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz file; no objects, which would be code.
+    """Return the arrays of an .npz file; no objects, which would be code.
 
     Raises:
         OSError: it cannot be read.
@@ -33,7 +33,7 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def seal(root: Path, *names: str) -> str:
-    """Hash of the names and bytes of files and of what lies in folders, links left out.
+    """Return hash of the names and bytes of files and of what lies in folders, links left out.
 
     Raises:
         FileNotFoundError: one of them is gone.
@@ -48,13 +48,15 @@ def seal(root: Path, *names: str) -> str:
 
 
 def fingerprint(*parts: Any) -> str:
-    """Hash of JSON-able parts, independent of the order of keys."""
+    """Return hash of JSON-able parts, independent of the order of keys."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def is_below(name: str) -> bool:
-    """Whether a name leads to a place below the folder that it is joined to, as far as one can tell from the name."""
+    """Return whether a name leads to a place below the folder that it is joined to, as far as one can tell from the
+    name.
+    """
     path = PurePath(name)
     return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
 

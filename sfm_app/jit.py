@@ -18,7 +18,7 @@ def kernel(function: Function) -> Function:
 
 
 def summing_kernel(function: Function) -> Function:
-    """A kernel whose sums may run in several lanes: some times faster, the same bytes on one kind of processor.
+    """Return a kernel whose sums may run in several lanes: some times faster, the same bytes on one kind of processor.
 
     Nothing else is relaxed: no assumptions about infinities or NaN, no approximate division.
     """

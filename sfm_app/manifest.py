@@ -46,7 +46,7 @@ class Manifest:
         self.path = root / MANIFEST
 
     def read(self) -> dict[str, Any]:
-        """What was written last; empty when there is none or it cannot be read (then everything is redone)."""
+        """Return what was written last; empty when there is none or it cannot be read (then everything is redone)."""
         try:
             if self.path.stat().st_size > MOST_BYTES:
                 return {}
@@ -56,7 +56,7 @@ class Manifest:
         return found if isinstance(found, dict) and isinstance(found.get("stages", {}), dict) else {}
 
     def record(self, stage: str) -> StageRecord | None:
-        """The record of a finished stage, if the manifest has one, just as it was written."""
+        """Return the record of a finished stage, if the manifest has one, just as it was written."""
         entry = self.read().get("stages", {}).get(stage)
         try:
             return StageRecord(**entry) if entry.pop(CHECK) == fingerprint(entry) else None
@@ -64,7 +64,7 @@ class Manifest:
             return None
 
     def spoilt(self, record: StageRecord) -> list[str]:
-        """Files of a finished stage that are gone or have another size."""
+        """Return files of a finished stage that are gone or have another size."""
         return [name for name, size in record.files.items() if _size(self.root / name) != size]
 
     def forget(self, stages: tuple[str, ...]) -> None:
@@ -86,7 +86,7 @@ class Manifest:
             path.write_text(json_text(manifest), encoding="utf-8")
 
     def sizes(self, files: tuple[str, ...]) -> dict[str, int]:
-        """Sizes of what a stage wrote, as its record holds them."""
+        """Return sizes of what a stage wrote, as its record holds them."""
         found = {name: _size(self.root / name) for name in files}
         return {name: size for name, size in found.items() if size is not None}
 

@@ -68,7 +68,7 @@ def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId
 
 
 def pairs_of(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
-    """Every photo with every other, the smaller id first."""
+    """Return every photo with every other, the smaller id first."""
     ids = sorted(photos)
     return [(first, second) for place, first in enumerate(ids) for second in ids[place + 1 :]]
 
@@ -98,7 +98,7 @@ def _find(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> N
 def found_in(
     method: FeatureMethod, name: str, run: RunContext
 ) -> tuple[Features, NDArray[np.float64], tuple[int, int]]:
-    """What a method finds in one photo, by how much its keypoints have to be scaled, and the photo's size."""
+    """Return what a method finds in one photo, by how much its keypoints have to be scaled, and the photo's size."""
     options = run.settings.matching
     pixels = read_pixels(run.workspace.photos / name)
     height, width = pixels.shape[:2]
@@ -113,7 +113,7 @@ def found_in(
 
 
 def read_pixels(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB of a photo as it is laid out.
+    """Return (H, W, 3) RGB of a photo as it is laid out.
 
     Raises:
         InputError: it cannot be read any more.
@@ -135,7 +135,7 @@ def _asked(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options:
 
 
 def _checked(method: FeatureMethod, name: str, size: tuple[int, int], features: Features) -> Features:
-    """The features, if they can be those of a picture of this size."""
+    """Return the features, if they can be those of a picture of this size."""
     points = np.asarray(features.keypoints, np.float64)
     if features.size != size:
         raise _broken(method, f"say that {name} has {features.size} pixels instead of {size}")
@@ -168,7 +168,7 @@ def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> N
 def matches_between(
     method: FeatureMethod, pair: tuple[Features, Features], options: MatchSettings
 ) -> NDArray[np.uint32]:
-    """(M, 2) rows of two photos' features that a method takes for the same; none where a photo has none."""
+    """Return (M, 2) rows of two photos' features that a method takes for the same; none where a photo has none."""
     if method.match is None:
         raise PluginError(f"the features '{method.name}' have no `match`")
     if not len(pair[0]) or not len(pair[1]):
@@ -188,7 +188,7 @@ def matches_between(
 
 
 def part_of(photo: int, run: RunContext) -> Path:
-    """Where the features of a photo lie until all are matched."""
+    """Return where the features of a photo are kept until all are matched."""
     return run.workspace.feature_parts / f"{photo:06d}.npz"
 
 

@@ -15,18 +15,18 @@ ValueError), a division by zero, the largest of nothing. Where a run can go on w
 
 
 def reason_of(err: Exception) -> str:
-    """What an error says, in one line."""
+    """Return what an error says, in one line."""
     lines = str(err).strip().splitlines()
     return lines[-1] if lines else type(err).__name__
 
 
 def finite_only(values: Mapping[str, float | None]) -> dict[str, float]:
-    """The entries that are numbers."""
+    """Return the entries that are numbers."""
     return {name: value for name, value in values.items() if value is not None and np.isfinite(value)}
 
 
 def json_text(value: Any) -> str:
-    """Plain values as JSON; what is infinite or no number becomes null, which every reader understands."""
+    """Return plain values as JSON; what is infinite or no number becomes null, which every reader understands."""
     return json.dumps(_plain(value), indent=1, allow_nan=False) + "\n"
 
 

@@ -10,21 +10,21 @@ Result = TypeVar("Result")
 
 
 def worker_count(wanted: int) -> int:
-    """How many workers `wanted` stands for; 0 is one per core that this process may use."""
+    """Return how many workers `wanted` stands for; 0 is one per core that this process may use."""
     if wanted > 0:
         return wanted
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def make_executor(workers: int) -> Executor:
-    """Threads: the heavy work (numba kernels, OpenCV, COLMAP) releases the GIL, and nothing has to be pickled."""
+    """Give threads: the heavy work (numba kernels, OpenCV, COLMAP) releases the GIL, and nothing has to be pickled."""
     return ThreadPoolExecutor(max_workers=workers, thread_name_prefix="sfm")
 
 
 def ordered_map(
     executor: Executor, function: Callable[[Item], Result], items: Iterable[Item], ahead: int
 ) -> Iterator[Result]:
-    """Results in the order of the items, with at most `ahead` items under way, so that memory stays bounded.
+    """Yield results in the order of the items, with at most `ahead` items under way, so that memory stays bounded.
 
     When the caller stops early or an item fails, what has not begun is cancelled.
     """

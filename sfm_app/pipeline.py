@@ -123,7 +123,7 @@ PHOTOS = NAMES[0]
 
 
 def stored_model(run: RunContext, *, points: bool = False) -> Model:
-    """The finished model, or the points and cameras, that a run left behind; nothing is computed.
+    """Return the finished model, or the points and cameras, that a run left behind; nothing is computed.
 
     Raises:
         InputError: the run has not come so far (says which stage is missing), or its files are gone or damaged.
@@ -149,7 +149,7 @@ def _how_on(run: RunContext) -> str:
 
 
 def loader(found: dict[str, Any], run: RunContext) -> Products:
-    """Gives what is in `found`, and loads what is not."""
+    """Make what gives products that were found, and loads the others."""
 
     def products(name: str) -> Any:
         if name not in found:
@@ -210,7 +210,7 @@ def run_stages(
 
 
 def _through(source: Source, run: RunContext, ends: tuple[str, str], wanted: Sequence[str]) -> Products:
-    """As `run_stages`, once."""
+    """Run the stages once, as `run_stages` does."""
     first, last = ends
     found: dict[str, Any] = {"source": source.place}
     prints: dict[str, str] = {"source": source.print}
@@ -262,7 +262,7 @@ def planned(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> Iterator
 
 
 def why(stage: Stage, prints: dict[str, str], first: str, run: RunContext) -> str | None:
-    """As `why_again`; enters what the stage depends on in `prints`."""
+    """Say why a stage is done again, as `why_again`; enters what the stage depends on in `prints`."""
     prints[stage.name] = stage_print(stage.name, stage.settings, [prints[name] for name in stage.takes], run)
     again = why_again(stage.name, stage.settings, prints[stage.name], run)
     return "as asked" if again is None and stage.name == first else again
@@ -274,7 +274,7 @@ def forget(name: str, run: RunContext) -> None:
 
 
 def photos_from(source: Path, run: RunContext) -> PhotoSet:
-    """The photos of a folder, or the frames of a video."""
+    """Return the photos of a folder, or the frames of a video."""
     with photos_of(source, run) as folder:
         return read_photos(folder, run)
 
@@ -335,7 +335,7 @@ def disturbed(source: Source, photos: PhotoSet | None, run: RunContext, by: Exce
 
 
 def peak_memory_mb() -> int | None:
-    """Most memory that this process has held; None where the system is not Linux."""
+    """Return the most memory that this process has held; None where the system is not Linux."""
     status = Path("/proc/self/status")
     found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text(encoding="utf-8")) if status.exists() else None
     return int(found[1]) // 1024 if found else None

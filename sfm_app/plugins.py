@@ -166,23 +166,23 @@ class Hooks:
 
     @hookspec
     def sfm_estimators(self) -> Iterable[Estimator]:  # type: ignore[empty-body]
-        """Estimators of fundamental matrices."""
+        """Return estimators of fundamental matrices."""
 
     @hookspec
     def sfm_calibrators(self) -> Iterable[Calibrator]:  # type: ignore[empty-body]
-        """Calibrators."""
+        """Return calibrators."""
 
     @hookspec
     def sfm_features(self) -> Iterable[FeatureMethod]:  # type: ignore[empty-body]
-        """Ways to find features and to match them."""
+        """Return ways to find features and to match them."""
 
     @hookspec
     def sfm_exporters(self) -> Iterable[Exporter]:  # type: ignore[empty-body]
-        """File formats for models."""
+        """Return file formats for models."""
 
     @hookspec
     def sfm_depth_methods(self) -> Iterable[DepthMethod]:  # type: ignore[empty-body]
-        """Ways to make depth maps."""
+        """Return ways to make depth maps."""
 
 
 class BuiltIns:
@@ -226,19 +226,19 @@ class Plugins:
     features: Mapping[str, FeatureMethod]
 
     def estimator(self, name: str) -> Estimator:
-        """The estimator of that name; ConfigError names the known ones."""
+        """Return the estimator of that name; ConfigError names the known ones."""
         return _named(self.estimators, name, "estimator")
 
     def calibrator(self, name: str) -> Calibrator:
-        """The calibrator of that name; ConfigError names the known ones."""
+        """Return the calibrator of that name; ConfigError names the known ones."""
         return _named(self.calibrators, name, "calibrator")
 
     def exporter(self, name: str) -> Exporter:
-        """The file format of that name; ConfigError names the known ones."""
+        """Return the file format of that name; ConfigError names the known ones."""
         return _named(self.exporters, name, "file format")
 
     def feature_method(self, name: str) -> FeatureMethod:
-        """The way to find features of that name; ConfigError where there is none, or it cannot run here."""
+        """Return the way to find features of that name; ConfigError where there is none, or it cannot run here."""
         method = _named(self.features, name, "way to find features")
         if reason := method.unavailable():
             hint = f"'{SIFT}' runs everywhere"
@@ -246,7 +246,7 @@ class Plugins:
         return method
 
     def depth_method(self, name: str) -> tuple[DepthMethod, str]:
-        """The way to make depth maps of that name, or with "auto" the best that runs here; and why this one.
+        """Return the way to make depth maps of that name, or with "auto" the best that runs here; and why this one.
 
         Raises:
             ConfigError: no method has that name, or it cannot run on this machine.
@@ -283,7 +283,7 @@ def load_plugins(modules: Sequence[ModuleType | object] = (), *, installed: bool
 
 @cache
 def installed_plugins() -> Plugins:
-    """The built-ins and every installed plug-in, as they were at the first call; errors as in `load_plugins`."""
+    """Return the built-ins and every installed plug-in, as they were at the first call; errors as in `load_plugins`."""
     return _load((), installed=True)
 
 

@@ -10,22 +10,22 @@ class Progress(Protocol):
     """What a display of progress has to offer; the command line has one on stderr, a library call none."""
 
     def stage(self, name: str, note: str = "") -> None:
-        """A stage begins (note empty) or was skipped, with the reason as note."""
+        """Announce a stage that begins (note empty), or was skipped, with the reason as note."""
 
     def stage_done(self, seconds: float) -> None:
-        """The stage that began last is over, after so long."""
+        """Announce the end of the stage that began last, after so many seconds."""
 
     def say(self, text: str) -> None:
-        """Something that people should know before they wait."""
+        """Say something that people should know before they wait."""
 
     def start(self, label: str, total: int) -> None:
-        """Work of `total` steps begins."""
+        """Start work of `total` steps."""
 
     def advance(self, steps: int = 1) -> None:
-        """That many more steps are done."""
+        """Count so many more steps as done."""
 
     def finish(self) -> None:
-        """The work begun last is over."""
+        """Finish the work that was started last."""
 
 
 class Silent:

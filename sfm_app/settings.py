@@ -193,7 +193,7 @@ class Settings(Section):
         return cls.from_mapping(merged(read_toml(path), overrides or {}), where=str(path))
 
     def to_toml(self) -> str:
-        """Every setting with its help as a comment; `from_toml` reads it back."""
+        """Return every setting with its help as a comment; `from_toml` reads it back."""
         return "\n".join(_toml_lines(self)) + "\n"
 
 
@@ -232,7 +232,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def merged(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested mappings laid over each other; `high` wins."""
+    """Return nested mappings laid over each other; `high` wins."""
     result = dict(low)
     for key, value in high.items():
         below = result.get(key)

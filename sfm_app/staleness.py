@@ -44,7 +44,7 @@ class Source:
         return fingerprint(str(self.place.resolve()), self.files, self.masks)
 
     def content(self, photos: PhotoSet) -> str:
-        """Hash of what stages take from the photos that are used; other files of the folder do not matter.
+        """Return hash of what stages take from the photos that are used; other files of the folder do not matter.
 
         Camera groups do not, either: features and matches are the same whoever took the photos.
         """
@@ -86,7 +86,7 @@ def source_of(place: Path, run: RunContext) -> Source:
 
 
 def _stamp(path: Path) -> Stamp | None:
-    """Size and time of a file; None where there is none."""
+    """Return size and time of a file; None where there is none."""
     try:
         found = path.stat()
     except (OSError, ValueError):
@@ -95,7 +95,7 @@ def _stamp(path: Path) -> Stamp | None:
 
 
 def _contents(folder: Path, names: Sequence[str], run: RunContext) -> dict[str, str]:
-    """Hashes of files in a folder by name; instead of a hash, why a file is not read."""
+    """Return hashes of files in a folder by name; instead of a hash, why a file is not read."""
 
     def digest_of(name: str) -> str:
         place = place_of(folder, name)
@@ -105,7 +105,7 @@ def _contents(folder: Path, names: Sequence[str], run: RunContext) -> dict[str, 
 
 
 def digest(file: Path) -> str:
-    """Hash of the bytes of a file."""
+    """Return hash of the bytes of a file."""
     try:
         with file.open("rb") as opened:
             return hashlib.file_digest(opened, "blake2b").hexdigest()
@@ -114,17 +114,17 @@ def digest(file: Path) -> str:
 
 
 def stage_print(name: str, settings: Sequence[str], inputs: Sequence[str], run: RunContext) -> str:
-    """Hash of everything that a stage's result depends on: its inputs, its settings, the versions."""
+    """Return hash of everything that a stage's result depends on: its inputs, its settings, the versions."""
     return fingerprint(name, made_with(settings, run), inputs)
 
 
 def made_with(settings: Sequence[str], run: RunContext) -> dict[str, Any]:
-    """The values of these settings, and the versions of what computes the result."""
+    """Return the values of these settings, and the versions of what computes the result."""
     return {"settings": {key: value_of(run.settings.model_dump(), key) for key in settings}, "versions": versions()}
 
 
 def why_again(name: str, settings: Sequence[str], inputs: str, run: RunContext) -> str | None:
-    """Why a stage has to be done; empty where it never was, None where it is up to date.
+    """Return why a stage has to be done; empty where it never was, None where it is up to date.
 
     Args:
         name: of the stage.
@@ -145,7 +145,7 @@ def why_again(name: str, settings: Sequence[str], inputs: str, run: RunContext) 
 
 
 def _changes(before: Any, now: Mapping[str, Any], name: str = "") -> Iterator[str]:
-    """Values that are others now, by their dotted names."""
+    """Yield values that are others now, by their dotted names."""
     for key, new in now.items():
         old = before.get(key) if isinstance(before, Mapping) else None
         inner = f"{name}.{key}".removeprefix(".").removeprefix("settings.").removeprefix("versions.")
@@ -156,18 +156,18 @@ def _changes(before: Any, now: Mapping[str, Any], name: str = "") -> Iterator[st
 
 
 def value_of(values: Any, key: str) -> Any:
-    """A value of nested mappings by its dotted name; None where there is none."""
+    """Return a value of nested mappings by its dotted name; None where there is none."""
     for name in key.split("."):
         values = values.get(name) if isinstance(values, Mapping) else None
     return values
 
 
 def manifest_head(run: RunContext) -> dict[str, Any]:
-    """What the manifest says besides the stages."""
+    """Return what the manifest says besides the stages."""
     return {"program": "sfm-app", "versions": versions(), "settings": run.settings.model_dump()}
 
 
 def versions() -> dict[str, str]:
-    """Versions of what computes the result."""
+    """Return versions of what computes the result."""
     parts = ("sfm-app", "numpy", "numba", "opencv-contrib-python-headless", "open3d")
     return {name: version(name) for name in parts} | colmap_versions()

@@ -130,7 +130,7 @@ class Workspace:
             raise _cannot_write(self.root, err) from err
 
     def _links(self) -> Iterator[Path]:
-        """Links that no run has made; those of the photos are replaced when they are laid out."""
+        """Yield links that no run has made; those of the photos are replaced when they are laid out."""
         for path in (self.root / name for name in FOLLOWED):
             if path.is_symlink():
                 yield path

@@ -17,7 +17,7 @@ SOURCES = {"exif": "EXIF's claim", "guess": "a guess", "estimate": "an estimate"
 
 
 def intrinsics_summary(intrinsics: Intrinsics) -> dict[str, Any]:
-    """Calibrations, plain, for --json."""
+    """Return calibrations, plain, for --json."""
     names = intrinsics.photos
     cameras = {
         name: {"field_of_view_deg": [round(angle, 2) for angle in field_of_view_deg(camera)], **camera.to_dict()}
@@ -29,7 +29,7 @@ def intrinsics_summary(intrinsics: Intrinsics) -> dict[str, Any]:
 
 
 def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
-    """Calibrations, for people."""
+    """Return calibrations, for people."""
     many = len(intrinsics.cameras) > 1
     lines = []
     for name, camera in intrinsics.cameras.items():
@@ -54,7 +54,7 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
 
 
 def k_text(K: Any, spread: Mapping[str, float] = MappingProxyType({})) -> str:
-    """Focals and centre in pixels, with standard deviations where there are some."""
+    """Return focals and centre in pixels, with standard deviations where there are some."""
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     parts = (
         f"{name} {value:.1f}" + (f" +- {spread[name]:.1f}" if name in spread else "") for name, value in values.items()

@@ -63,7 +63,7 @@ class Commands(click.Group):
 
 
 def told(err: OSError) -> tuple[str, str]:
-    """What the system has refused, and what to do about it."""
+    """Return what the system has refused, and what to do about it."""
     if err.errno in FULL:
         return f"the disk is full ({err.strerror})", "make room; the same command goes on where this one stopped"
     where = err.filename or "a file of this run"

@@ -70,22 +70,22 @@ class Terminal:
 
 
 def print_json(value: Any) -> None:
-    """One JSON document on stdout."""
+    """Print one JSON document on stdout."""
     sys.stdout.write(json_text(value))
 
 
 def print_lines(lines: list[str]) -> None:
-    """Lines on stdout."""
+    """Print lines on stdout."""
     sys.stdout.write("\n".join(map(shown, lines)) + "\n")
 
 
 def shown(text: str) -> str:
-    """A text in which names of files cannot move the cursor, nor break the line."""
+    """Return a text in which names of files cannot move the cursor, nor break the line."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def run_summary(run: Run) -> dict[str, Any]:
-    """The figures of a run, plain, for --json."""
+    """Return the figures of a run, plain, for --json."""
     stages = run.manifest.get("stages", {})
     counts = {name: stage["counts"] for name, stage in stages.items()}
     photos = counts.get("photos", {})
@@ -109,7 +109,7 @@ def run_summary(run: Run) -> dict[str, Any]:
 
 
 def run_lines(run: Run) -> list[str]:
-    """The figures of a run, for people."""
+    """Return the figures of a run, for people."""
     summary = run_summary(run)
     lines = list(video_lines(summary["video"])) if "video" in summary else []
     lines.append(f"photos      {summary['photos']['usable']} usable")
@@ -140,7 +140,7 @@ def run_lines(run: Run) -> list[str]:
 
 
 def video_lines(video: Mapping[str, Any]) -> Iterator[str]:
-    """Which frames were chosen, and why the others were not."""
+    """Yield which frames were chosen, and why the others were not."""
     others = ", ".join(f"{count} {reason}" for reason, count in video["left_out"].items())
     more = f"; not chosen: {others}" if others else ""
     yield f"video       {video['frames']} frames, {video['chosen']} chosen{more}"
@@ -148,7 +148,7 @@ def video_lines(video: Mapping[str, Any]) -> Iterator[str]:
 
 
 def photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
-    """What was left out, reason by reason, and what people should know about the others."""
+    """Yield what was left out, reason by reason, and what people should know about the others."""
     by_reason: dict[str, list[str]] = {}
     for name, reason in photos["unusable"].items():
         by_reason.setdefault(reason, []).append(name)
@@ -159,43 +159,43 @@ def photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
 
 
 def mask_lines(masks: Mapping[str, Any], photos: int) -> Iterator[str]:
-    """How many photos have a mask, and which files are of none of them."""
+    """Yield how many photos have a mask, and which files are of none of them."""
     yield f"masks       {masks['photos']} of {photos} photos"
     if masks["unused"]:
         yield f"            of no photo that is used: {some(masks['unused'])}"
 
 
 def some(names: Sequence[str]) -> str:
-    """The first few names, and how many more there are."""
+    """Return the first few names, and how many more there are."""
     more = f" and {len(names) - NAMED} more (all of them in manifest.json)" if len(names) > NAMED else ""
     return f"{', '.join(names[:NAMED])}{more}"
 
 
 def texture_text(mesh: Mapping[str, Any]) -> str:
-    """The pages of texture, where there are some."""
+    """Return the pages of texture, where there are some."""
     pages = " and ".join(f"{width} x {height}" for width, height in mesh.get("pages_px", ()))
     return f", texture {pages} px, JPEG of quality {mesh['jpeg_quality']}" if pages else ""
 
 
 def written(run: Run, stage: str) -> list[Path]:
-    """The model files that a stage wrote and that are still there, the one to open first."""
+    """Return the model files that a stage wrote and that are still there, the one to open first."""
     names = run.manifest.get("stages", {}).get(stage, {}).get("counts", {}).get("bytes", {})
     return [run.out / name for name in reversed(names) if (run.out / name).exists()]
 
 
 def file_lines(paths: Sequence[Path]) -> list[str]:
-    """Files with their sizes."""
+    """Return files with their sizes."""
     return [f"{path}  {size_text(path.stat().st_size)}" for path in paths]
 
 
 def size_text(size: int) -> str:
-    """Bytes as people read them."""
+    """Return bytes as people read them."""
     if size < KILOBYTE:
         return f"{size} bytes"
     return f"{size / MEGABYTE:.1f} MB" if size >= MEGABYTE else f"{size / KILOBYTE:.0f} kB"
 
 
 def table(rows: Mapping[str, str]) -> list[str]:
-    """Two columns."""
+    """Return two columns."""
     width = max(map(len, rows), default=0)
     return [f"{name:{width}}  {text}" for name, text in rows.items()]

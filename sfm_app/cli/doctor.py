@@ -16,7 +16,7 @@ ENOUGH_DISK = 2 * GIGABYTE
 
 
 def examine() -> dict[str, str]:
-    """One line per thing looked at."""
+    """Return one line per thing looked at."""
     disk = shutil.disk_usage(Path.cwd()).free
     return {
         "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",

@@ -24,7 +24,7 @@ OWN_FLAGS = {
 
 
 def settings_options(command: Command) -> Command:
-    """From --config to -v: all that changes settings."""
+    """Add the options that change settings, from --config to -v."""
     options = (
         click.option(
             "--config", type=click.Path(path_type=Path), help="Settings file (TOML); `sfm-app config` prints one."
@@ -57,13 +57,13 @@ def settings_options(command: Command) -> Command:
 
 
 def output_options(command: Command) -> Command:
-    """--json and -q."""
+    """Return --json and -q."""
     command = click.option("-q", "--quiet", is_flag=True, help="No progress.")(command)
     return click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")(command)
 
 
 def settings_from(flags: Mapping[str, Any]) -> Settings:
-    """Settings from the shared options; flags win over the file."""
+    """Return settings from the shared options; flags win over the file."""
     show_log(flags["verbose"])
     overrides: dict[str, Any] = {key: flags[key] for key in ("seed", "workers", "quality") if flags[key] is not None}
     if flags["max_memory"] is not None:
@@ -81,7 +81,7 @@ def settings_from(flags: Mapping[str, Any]) -> Settings:
 
 
 def assigned(text: str) -> dict[str, Any]:
-    """TABLE.KEY=VALUE as nested settings; ConfigError where it is something else."""
+    """Return TABLE.KEY=VALUE as nested settings; ConfigError where it is something else."""
     name, equals, value = text.partition("=")
     if not equals:
         raise ConfigError(f"--set {text}: no '=' in it", hint="write --set depth.neighbours=6")

@@ -22,7 +22,7 @@ UNSURE_ODDS = 10.0
 
 
 def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
-    """The scene, plain, for --json.
+    """Return the scene, plain, for --json.
 
     Args:
         scene: what the stage gave.
@@ -44,7 +44,7 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
-    """The scene, for people; arguments as in `scene_summary`."""
+    """Yield the scene, for people; arguments as in `scene_summary`."""
     summary = scene_summary(scene, counts)
     yield (
         f"scene       {summary['registered']} of {summary['of']} photos placed, {scene.points} points, "
@@ -95,7 +95,7 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
 
 
 def _second_look(found: Mapping[str, Any]) -> Iterator[str]:
-    """What finer features have brought."""
+    """Yield what finer features have brought."""
     if found:
         before, after = found["placed"][0], found["placed"][-1]
         brought = f"{after} photos placed instead of {before}" if found["taken"] else "no more photos placed"
@@ -104,7 +104,7 @@ def _second_look(found: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _badly_adjusted(adjustment: Mapping[str, Any]) -> Iterator[str]:
-    """What the last adjustment could not do."""
+    """Yield what the last adjustment could not do."""
     if adjustment.get("failed"):
         yield (
             f"beware: the last adjustment failed ({adjustment['failed']}); cameras and poses are as mapping left them, "
@@ -117,7 +117,7 @@ def _badly_adjusted(adjustment: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _doubts(summary: Mapping[str, Any]) -> Iterator[str]:
-    """What looks alike, where the model may be folded, and what parts of it have a size of their own."""
+    """Yield what looks alike, where the model may be folded, and what parts of it have a size of their own."""
     for join in summary.get("look_alikes", ()):
         here, there = (_some(names) for names in join["between"])
         yield (
@@ -145,7 +145,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _perhaps_not_upright(orientation: Mapping[str, Any]) -> Iterator[str]:
-    """What to do if the model stands the wrong way up, where that is well possible."""
+    """Yield what to do if the model stands the wrong way up, where that is well possible."""
     mistakes = {"up_sign_odds": ("stand upside down", (180,)), "up_axis_odds": ("lie on its side", (90, 270))}
     for key, (what, turns) in mistakes.items():
         odds = orientation.get(key, UNSURE_ODDS)

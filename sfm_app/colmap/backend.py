@@ -44,17 +44,17 @@ def show_log(level: int) -> None:
 
 
 def log_level() -> int:
-    """What `show_log` has set last."""
+    """Return what `show_log` has set last."""
     return LEVELS.index(pycolmap.logging.minloglevel)
 
 
 def has_cuda() -> bool:
-    """Whether this pycolmap can use a GPU."""
+    """Return whether this pycolmap can use a GPU."""
     return bool(pycolmap.has_cuda)
 
 
 def versions() -> dict[str, str]:
-    """What the manifest notes about COLMAP."""
+    """Return what the manifest notes about COLMAP."""
     return {"pycolmap": pycolmap.__version__, "colmap": pycolmap.COLMAP_version.split(" ")[-1]}
 
 
@@ -81,7 +81,10 @@ def backend(doing: str) -> Iterator[None]:
 
 
 def _is_ours(err: Exception) -> bool:
-    """Whether Python code other than that which calls COLMAP has raised an error; pycolmap itself has no frames."""
+    """Return whether Python code other than that which calls COLMAP has raised an error.
+
+    Pycolmap itself has no frames.
+    """
     if isinstance(err, np.linalg.LinAlgError | ArithmeticError):
         return True
     frames = [frame for frame, _ in traceback.walk_tb(err.__traceback__)]
@@ -126,7 +129,7 @@ def patiently(call: Callable[[], Result]) -> Result:
 
 
 def left_running() -> bool:
-    """Whether a call of COLMAP is still at work: then a program must end without waiting for it."""
+    """Return whether a call of COLMAP is still at work: then a program must end without waiting for it."""
     return any(thread.name == LEFT for thread in threading.enumerate())
 
 
@@ -155,7 +158,7 @@ def counted(
     total: int,
     progress: Progress,
 ) -> None:
-    """The same, with a bar: `done` says how many of `total` steps are behind."""
+    """Run as `interruptible` does, with a bar: `done` says how many of `total` steps are finished."""
     seen = 0
 
     def poll() -> None:
@@ -171,7 +174,7 @@ def counted(
 
 
 def plain(options: dict[str, Any]) -> dict[str, Any]:
-    """COLMAP's options as JSON can hold them: the manifest records all that are in force."""
+    """Return COLMAP's options as JSON can hold them: the manifest records all that are in force."""
     return {str(key): _plain(value) for key, value in options.items()}
 
 

@@ -94,7 +94,7 @@ def adjust(model: Any, database: Path) -> Adjusted:
 
 
 def adjusted_or_as_it_was(model: Any, database: Path) -> Adjusted:
-    """As `adjust`; where the numbers fail, the model as mapping left it, with the reason.
+    """Adjust a model; where the numbers fail, return it as mapping left it, with the reason.
 
     Raises:
         BackendError: COLMAP failed.
@@ -149,7 +149,7 @@ def improve_tracks(model: Any, graph: Any) -> int:
 
 
 def read_bundle(model: Any) -> tuple[list[int], Bundle]:
-    """The ids of the cameras in use, and the model as arrays."""
+    """Return the ids of the cameras in use, and the model as arrays."""
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
     ids, points = sorted(used_cameras(model)), sorted(model.points3D)
     rows = {point: row for row, point in enumerate(points)}
@@ -168,7 +168,9 @@ def read_bundle(model: Any) -> tuple[list[int], Bundle]:
 
 
 def best_step(bundle: Bundle, reduced: Reduced, found: Estimate) -> Bundle:
-    """The bundle with the estimated cameras; poses and points follow, where that is no worse than if they stayed.
+    """Return the bundle with the estimated cameras.
+
+    Poses and points follow, where that is no worse than if they stayed.
 
     A point that would end up behind a camera stays, too: along an open ray a linear step knows no end.
     """
@@ -194,7 +196,7 @@ def write_bundle(model: Any, ids: list[int], bundle: Bundle) -> None:
 
 
 def usual_cameras(model: Any, ids: list[int]) -> CameraPriors:
-    """What is believed about cameras before the bundle is asked."""
+    """Return what is believed about cameras before the bundle is asked."""
     used = used_cameras(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
     many = np.array([used[camera_id] >= PHOTOS_TO_ASK for camera_id in ids])
@@ -203,7 +205,7 @@ def usual_cameras(model: Any, ids: list[int]) -> CameraPriors:
 
 
 def used_cameras(model: Any) -> Counter[int]:
-    """How many photos with a pose each camera took, by its id."""
+    """Return how many photos with a pose each camera took, by its id."""
     return Counter(model.images[image_id].camera_id for image_id in sorted(model.reg_image_ids()))
 
 

@@ -47,7 +47,7 @@ SQUARE_WITHIN = 0.005
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """The database, closed whatever happens."""
+    """Provide the database, closed whatever happens."""
     database = pycolmap.Database.open(path)
     try:
         yield database
@@ -60,7 +60,7 @@ def opened(path: Path) -> Iterator[Any]:
 
 
 def is_sound(path: Path) -> bool:
-    """Whether SQLite finds nothing torn in a database; what a killed run left half done it takes back."""
+    """Return whether SQLite finds nothing torn in a database; what a killed run left half done it takes back."""
     if not path.is_file():
         return False
     try:
@@ -80,7 +80,7 @@ MATCHES = (
 
 
 def matches_seal(path: Path) -> str:
-    """Hash of photos, keypoints and matches."""
+    """Return hash of photos, keypoints and matches."""
     found = hashlib.blake2b(digest_size=16)
     with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as connection:
         for query in MATCHES:
@@ -113,7 +113,7 @@ def create_database(path: Path, photos: PhotoSet) -> None:
 
 
 def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
-    """Keypoints and raw matches of every photo in the database."""
+    """Return keypoints and raw matches of every photo in the database."""
     by_name = {photo.name: photo for photo in photos.photos}
     with opened(path) as database:
         images, keypoints = {}, {}
@@ -131,13 +131,13 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
 
 
 def photo_names(path: Path) -> dict[int, str]:
-    """Names of all photos by their ids."""
+    """Return names of all photos by their ids."""
     with opened(path) as database:
         return {entry.image_id: entry.name for entry in sorted(database.read_all_images(), key=lambda e: e.image_id)}
 
 
 def unmatched(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
-    """Those of the pairs that nobody has matched yet, with or without success."""
+    """Return those of the pairs that nobody has matched yet, with or without success."""
     with opened(path) as database:
         return [pair for pair in pairs if not database.exists_matches(*pair)]
 
@@ -170,7 +170,7 @@ def empty_copy(database: Path, target: Path) -> None:
 
 
 def read_features(path: Path) -> tuple[dict[int, NDArray[np.float64]], dict[PairId, NDArray[np.uint32]]]:
-    """Keypoints (N, 2) of every photo that has some, and the raw matches of pairs."""
+    """Return keypoints (N, 2) of every photo that has some, and the raw matches of pairs."""
     with opened(path) as database:
         found = {image.image_id: database.read_keypoints(image.image_id) for image in database.read_all_images()}
         pair_ids, rows = database.read_all_matches()
@@ -236,7 +236,7 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
 
 
 def _write_camera(database: Any, camera_id: int, calibration: Calibration) -> None:
-    """A camera, new or in the place of another, and the rig of one sensor that COLMAP wants around it."""
+    """Write a camera, new or in the place of another, and the rig of one sensor that COLMAP wants around it."""
     name = camera_model(calibration)
     camera = pycolmap.Camera(
         camera_id=camera_id,
@@ -256,21 +256,21 @@ def _write_camera(database: Any, camera_id: int, calibration: Calibration) -> No
 
 
 def _write_frame(database: Any, image: Any) -> None:
-    """The frame of one photo that COLMAP wants around it."""
+    """Write the frame of one photo that COLMAP wants around it."""
     frame = pycolmap.Frame(frame_id=image.image_id, rig_id=image.camera_id)
     frame.add_data_id(image.data_id)
     database.write_frame(frame, use_frame_id=True)
 
 
 def camera_model(calibration: Calibration) -> str:
-    """COLMAP's name of the smallest camera model that holds what is known."""
+    """Return COLMAP's name of the smallest camera model that holds what is known."""
     K = calibration.K
     square = "aspect" in calibration.held or abs(K[1, 1] / K[0, 0] - 1.0) < SQUARE_WITHIN
     return SQUARE_PIXELS if square else TWO_FOCALS
 
 
 def camera_params(K: NDArray[np.float64], camera_model: str, radial: float = 0.0) -> list[float]:
-    """COLMAP's parameters for a camera matrix and a first radial term."""
+    """Return COLMAP's parameters for a camera matrix and a first radial term."""
     fx, fy, cx, cy = (float(K[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
     if camera_model == SQUARE_PIXELS:
         return [(fx * fy) ** 0.5, cx, cy, radial]

@@ -38,7 +38,7 @@ def undistort(
 
 
 def read_views(dense_dir: Path) -> list[View]:
-    """The undistorted views with the sparse points that they observe, by name."""
+    """Return the undistorted views with the sparse points that they observe, by name."""
     with backend("reading the undistorted model"):
         model = pycolmap.Reconstruction(dense_dir / "sparse")
         images = sorted(model.images.values(), key=lambda image: image.name)
@@ -66,20 +66,20 @@ def _view(model: "pycolmap.Reconstruction", image: "pycolmap.Image") -> View:
 
 
 def read_grey(dense_dir: Path, view: View) -> NDArray[np.uint8]:
-    """The undistorted photo of a view, (H, W)."""
+    """Return the undistorted photo of a view, (H, W)."""
     # imdecode, because OpenCV does not open names beyond ASCII on every system
     image = cv2.imdecode(np.fromfile(dense_dir / "images" / view.name, np.uint8), cv2.IMREAD_GRAYSCALE)
     return np.asarray(image, np.uint8)
 
 
 def read_color(dense_dir: Path, view: View) -> NDArray[np.uint8]:
-    """The undistorted photo of a view, (H, W, 3) RGB."""
+    """Return the undistorted photo of a view, (H, W, 3) RGB."""
     image = cv2.imdecode(np.fromfile(dense_dir / "images" / view.name, np.uint8), cv2.IMREAD_COLOR_RGB)
     return np.asarray(image, np.uint8)
 
 
 def map_file(dense_dir: Path, view: View) -> Path:
-    """Where the confirmed depths of a view lie, if it has any."""
+    """Return where the confirmed depths of a view are, if it has any."""
     return _map_path(dense_dir, "depth_maps", view, "geometric")
 
 
@@ -161,7 +161,7 @@ def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind = "geometric"
 
 @contextmanager
 def _whole(target: Path) -> Iterator[Path]:
-    """A path beside `target`, which it becomes when everything is written."""
+    """Provide a path beside `target`, which it becomes when everything is written."""
     target.parent.mkdir(parents=True, exist_ok=True)
     beside = target.with_name(f".{target.name}")
     yield beside

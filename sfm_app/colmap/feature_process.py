@@ -27,7 +27,7 @@ def work(task: dict[str, Any]) -> None:
 
 
 def extraction_options(options: MatchSettings, sift: Mapping[str, Any], workers: int) -> Any:
-    """COLMAP's, with these options of its SIFT."""
+    """Return COLMAP's, with these options of its SIFT."""
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = options.max_image_size_px
     extraction.num_threads = workers

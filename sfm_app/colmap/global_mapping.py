@@ -25,7 +25,10 @@ def work(task: dict[str, Any]) -> None:
 
 
 def global_options(seed: int, names: Sequence[str]) -> Any:
-    """COLMAP's defaults, on our relative poses as they are; adjusted roughly, because the last adjustment is ours."""
+    """Return COLMAP's defaults, on our relative poses as they are.
+
+    Adjusted roughly, because the last adjustment is ours.
+    """
     options = pycolmap.GlobalPipelineOptions()
     options.image_names = list(names)
     options.min_model_size = 2

@@ -111,7 +111,7 @@ def _map_apart(module: str, task: dict[str, Any], doing: str, token: Any) -> Any
 
 
 def incremental_options(seed: int, *, known: bool = False) -> Any:
-    """COLMAP's defaults, except that small photo sets count and only the model at hand is grown.
+    """Return COLMAP's defaults, except that small photo sets count and only the model at hand is grown.
 
     Adjustments stop when they gain little, and cameras that are `known` stay as they are: the last adjustment is ours.
     """
@@ -131,7 +131,7 @@ def incremental_options(seed: int, *, known: bool = False) -> Any:
 
 
 def _lens_to_be_found(camera: Any) -> bool:
-    """Whether mapping is to seek the lens: a known one stays until the last adjustment, which frees it.
+    """Return whether mapping is to seek the lens: a known one stays until the last adjustment, which frees it.
 
     On the first few photos even one distortion term moves more than the noise does, and four run wild.
     """
@@ -139,5 +139,5 @@ def _lens_to_be_found(camera: Any) -> bool:
 
 
 def largest(models: dict[int, Any]) -> Any | None:
-    """The model with most photos; None of none."""
+    """Return the model with most photos; None of none."""
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)

@@ -21,7 +21,7 @@ BoolImage = NDArray[np.bool_]
 
 
 def mask_undistorter(model_dir: Path, mask_dir: Path, dense_dir: Path) -> Callable[[View], None]:
-    """A function that writes the mask of an undistorted photo.
+    """Return a function that writes the mask of an undistorted photo.
 
     Args:
         model_dir: model with the photos' lenses.
@@ -40,13 +40,13 @@ def mask_undistorter(model_dir: Path, mask_dir: Path, dense_dir: Path) -> Callab
 
 
 def used_pixels(dense_dir: Path, view: View) -> BoolImage | None:
-    """(H, W) which pixels of an undistorted photo may be used; None where no masks are given."""
+    """Return (H, W) which pixels of an undistorted photo may be used; None where no masks are given."""
     place = dense_dir / MASKS
     return read_used(place, view.name) if mask_place(place, view.name).exists() else None
 
 
 def _undistorted(used: BoolImage, camera: "pycolmap.Camera", view: View) -> BoolImage:
-    """A pixel is used where all is that it shows in part."""
+    """Return a pixel is used where all is that it shows in part."""
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(view.K).T
     with backend(f"undistorting the mask of {view.name}"):
@@ -59,6 +59,6 @@ def _undistorted(used: BoolImage, camera: "pycolmap.Camera", view: View) -> Bool
 
 
 def _shrunk(used: BoolImage, reach: int) -> BoolImage:
-    """Without the pixels that have an unused one so near."""
+    """Return the mask without pixels that are so near to an unused one."""
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray(cv2.erode(used.view(np.uint8), square)) > 0

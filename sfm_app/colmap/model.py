@@ -24,12 +24,12 @@ ENDLESS = 1e100
 
 
 def somewhere(xyz: NDArray[np.float64]) -> Any:
-    """Whether points (..., 3) lie anywhere: not at infinity, nor where distances are no numbers."""
+    """Return whether points (..., 3) lie anywhere: not at infinity, nor where distances are no numbers."""
     return (np.abs(xyz) < ENDLESS).all(axis=-1)
 
 
 def model_from_seed(database: Path, pair: PairId, matches: NDArray[np.uint32], seed: TwoViewSeed) -> Any:
-    """A reconstruction of two photos with our pose and our points.
+    """Return a reconstruction of two photos with our pose and our points.
 
     Args:
         database: holds photos, keypoints and two-view geometries.
@@ -69,7 +69,7 @@ class PlacedView:
 
 
 def placed_views(model: Any, keypoints: Mapping[int, NDArray[np.float64]]) -> dict[int, PlacedView]:
-    """All photos of a model that have a pose, by id."""
+    """Return all photos of a model that have a pose, by id."""
     found = {}
     for image in _posed(model):
         camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
@@ -80,12 +80,12 @@ def placed_views(model: Any, keypoints: Mapping[int, NDArray[np.float64]]) -> di
 
 
 def photos_of(model: Any) -> list[int]:
-    """Ids of the photos of a model that have a pose, in order."""
+    """Return ids of the photos of a model that have a pose, in order."""
     return [image.image_id for image in _posed(model)]
 
 
 def cameras_of(model: Any) -> dict[int, tuple[NDArray[np.float64], float]]:
-    """By photo with a pose: K (3, 3) and the first radial term of its camera."""
+    """Return K (3, 3) and the first radial term of the camera, by photo with a pose."""
     found = {}
     for image in _posed(model):
         camera = model.cameras[image.camera_id]
@@ -100,7 +100,7 @@ def colour(model: Any, photo_dir: Path, workers: int) -> None:
 
 
 def part_of(model: Any, photos: Sequence[int]) -> Any:
-    """A copy of a model with these photos only, and the points that at least two of them see."""
+    """Return a copy of a model with these photos only, and the points that at least two of them see."""
     part, members = pycolmap.Reconstruction(model), set(photos)
     for image in _posed(model):
         if image.image_id not in members:
@@ -110,7 +110,7 @@ def part_of(model: Any, photos: Sequence[int]) -> Any:
 
 
 def both(database: Path, first: Any, second: Any, similarity: Similarity) -> Any:
-    """A model of the photos and points of two that share no photo.
+    """Return a model of the photos and points of two that share no photo.
 
     Args:
         database: holds photos, keypoints and two-view geometries.
@@ -140,7 +140,7 @@ def both(database: Path, first: Any, second: Any, similarity: Similarity) -> Any
 
 
 def places_of_keypoints(model: Any) -> dict[tuple[int, int], tuple[int, NDArray[np.float64]]]:
-    """Number and place (3,) of the point that a keypoint is one of, by photo and row of the keypoint."""
+    """Return number and place (3,) of the point that a keypoint is one of, by photo and row of the keypoint."""
     return {
         (element.image_id, element.point2D_idx): (key, np.asarray(point.xyz, np.float64))
         for key, point in model.points3D.items()
@@ -153,7 +153,7 @@ def _posed(model: Any) -> list[Any]:
 
 
 def posed_photos(model: Any) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.float64]]:
-    """(3, 4) cam_from_world by id of the photos that have a pose, in order of ids, and the points (P, 3)."""
+    """Return (3, 4) cam_from_world by id of the photos that have a pose, in order of ids, and the points (P, 3)."""
     poses = {image.image_id: np.asarray(image.cam_from_world().matrix(), np.float64) for image in _posed(model)}
     points = np.array([model.points3D[key].xyz for key in sorted(model.points3D)]).reshape(-1, 3)
     return poses, points
@@ -172,7 +172,7 @@ class SeenPoints:
 
 
 def seen_points(model: Any, most: int) -> SeenPoints:
-    """The points of a model, or so many of them, drawn with a fixed seed."""
+    """Return the points of a model, or so many of them, drawn with a fixed seed."""
     keys = [key for key in sorted(model.points3D) if somewhere(model.points3D[key].xyz)]
     chosen = np.sort(np.random.default_rng(0).permutation(len(keys))[:most])
     found = [model.points3D[keys[k]] for k in chosen]
@@ -188,7 +188,7 @@ def seen_points(model: Any, most: int) -> SeenPoints:
 
 
 def sparse_model(model_dir: Path) -> Model:
-    """The coloured points of a model on disk, and its photos where they were taken, in order of ids.
+    """Return the coloured points of a model on disk, and its photos where they were taken, in order of ids.
 
     Points that two photos see have no third one to confirm them, and the wrong ones among them lie far out, where they
     make the scene a dot in its viewer: outside the box of the confirmed points they are left out.
@@ -213,7 +213,7 @@ def _frustum(image: Any, camera: Any) -> Frustum:
 
 
 def viewing_rays(model: Any, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Directions (N, 3) in the world, of any length, that pixels (N, 2) of a photo see."""
+    """Return directions (N, 3) in the world, of any length, that pixels (N, 2) of a photo see."""
     image = model.images[image_id]
     plane = np.asarray(model.cameras[image.camera_id].cam_from_img(x), np.float64).reshape(-1, 2)
     R = image.cam_from_world().matrix()[:, :3]
@@ -221,7 +221,7 @@ def viewing_rays(model: Any, image_id: int, x: NDArray[np.float64]) -> NDArray[n
 
 
 def focal_px(model: Any, image_id: int) -> float:
-    """Focal length of the camera that took a photo, in pixels."""
+    """Return focal length of the camera that took a photo, in pixels."""
     return float(model.cameras[model.images[image_id].camera_id].mean_focal_length())
 
 
@@ -234,7 +234,7 @@ def move(model: Any, similarity: Similarity) -> None:
 def read_scene(
     model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str], refined: Mapping[str, Mapping[str, Any]]
 ) -> Scene:
-    """What the rest of the program needs to know about a model on disk.
+    """Return what the rest of the program needs to know about a model on disk.
 
     Args:
         model_dir: COLMAP's model.

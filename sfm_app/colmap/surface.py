@@ -43,7 +43,7 @@ def fuse(
 
 
 def read_fused(dense_dir: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Fused points (N, 3) and their unit normals (N, 3), which point to the photos that see them."""
+    """Read fused points (N, 3) and their unit normals (N, 3), which point to the photos that see them."""
     with backend("reading the fused points"):
         vertex = trimesh.load(dense_dir / FUSED).metadata["_ply_raw"]["vertex"]["data"]
         points, normals = (np.stack([vertex[c] for c in names], axis=1) for names in ("xyz", ("nx", "ny", "nz")))
@@ -51,7 +51,7 @@ def read_fused(dense_dir: Path) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def poisson(dense_dir: Path, depth: int) -> Surface:
-    """Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points, with their colours.
+    """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points, with their colours.
 
     Args:
         dense_dir: dense workspace.
@@ -87,7 +87,10 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
 
 
 def _mean_colors(surface: Surface, vertices: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """(V, 3) mean colour of the old vertices to which each new one (V, 3) is nearest; pycolmap 4.2 reads no colours."""
+    """Return (V, 3) mean colour of the old vertices to which each new one (V, 3) is nearest.
+
+    Pycolmap 4.2 reads no colours.
+    """
     from scipy.spatial import cKDTree
 
     _, at = cKDTree(vertices).query(surface.vertices)

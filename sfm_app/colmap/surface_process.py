@@ -24,7 +24,7 @@ def work(task: dict[str, Any]) -> None:
 
 
 def fuse(task: dict[str, Any]) -> None:
-    """Depth maps of a dense workspace to points."""
+    """Fuse the depth maps of a dense workspace into points."""
     options = pycolmap.StereoFusionOptions()
     options.min_num_pixels = task["min_views"]
     # The depths have been checked already; normals from disparities are noisier than those of COLMAP's PatchMatch.
@@ -37,7 +37,7 @@ def fuse(task: dict[str, Any]) -> None:
 
 
 def poisson(task: dict[str, Any]) -> None:
-    """Points to a closed surface."""
+    """Span a closed surface over points."""
     options = pycolmap.PoissonMeshingOptions()
     options.depth, options.trim = task["depth"], 0.0
     options.num_threads = 1
@@ -45,7 +45,7 @@ def poisson(task: dict[str, Any]) -> None:
 
 
 def simplify(task: dict[str, Any]) -> None:
-    """A surface to one of fewer triangles."""
+    """Simplify a surface to fewer triangles."""
     options = pycolmap.MeshSimplificationOptions()
     options.target_face_ratio, options.max_error = task["share"], task["max_error"] ** 2
     options.boundary_weight = BORDER_WEIGHT

@@ -31,13 +31,13 @@ class Apart:
         self.process, self._said = process, said
 
     def messages(self) -> Iterator[dict[str, Any]]:
-        """What it reports, until it ends."""
+        """Yield what it reports, until it ends."""
         for line in self.process.stdout or ():
             if line.endswith("\n"):  # else it was killed as it spoke
                 yield json.loads(line)
 
     def ended(self, wait_s: float) -> bool:
-        """Whether it has ended, or does so within that time."""
+        """Return whether it has ended, or does so within that time."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(wait_s)
         return self.process.poll() is not None
@@ -65,7 +65,7 @@ class Apart:
 
 @contextlib.contextmanager
 def started(module: str, task: Mapping[str, Any]) -> Iterator[Apart]:
-    """A module of ours at work on a task; ended with the block, if it still runs.
+    """Provide a module of ours at work on a task; ended with the block, if it still runs.
 
     Args:
         module: calls `served`.
@@ -90,7 +90,7 @@ def started(module: str, task: Mapping[str, Any]) -> Iterator[Apart]:
 
 
 def finished(module: str, task: Mapping[str, Any], doing: str, progress: Progress | None = None) -> dict[str, Any]:
-    """A module of ours to its end; what it has reported comes back.
+    """Return a module of ours to its end; what it has reported comes back.
 
     Args:
         module: calls `served`.
@@ -108,7 +108,7 @@ def finished(module: str, task: Mapping[str, Any], doing: str, progress: Progres
 
 
 def served(work: Callable[[dict[str, Any]], None]) -> None:
-    """In the process: do the task, and end when the one that started it does."""
+    """Do the task in the worker process, and end when its parent does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one that started it
     os.dup2(sys.stdout.fileno(), REPORTS)
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints is no report
@@ -128,7 +128,7 @@ def served(work: Callable[[dict[str, Any]], None]) -> None:
 
 
 def report(**message: Any) -> None:
-    """In the process: say something to the one that started it."""
+    """Send a message from the worker process to its parent."""
     os.write(REPORTS, f"{json.dumps(message)}\n".encode())
 
 

@@ -23,7 +23,10 @@ def check(model: Model) -> None:
 
 
 def unit_normals(surface: Surface) -> NDArray[np.float64]:
-    """(V, 3) normals of length 1 also where triangles without area leave a corner without one: glTF asks for it."""
+    """Return (V, 3) normals of length 1 also where triangles without area leave a corner without one.
+
+    GlTF asks for it.
+    """
     normals = vertex_normals(surface.vertices, surface.faces)
     normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 1.0, 0.0)
     return normals

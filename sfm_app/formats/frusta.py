@@ -22,7 +22,7 @@ LEAST_SHARE, MOST_SHARE = 0.01, 0.1
 
 
 def camera_lines(model: Model) -> tuple[FloatArray, IndexArray]:
-    """The cameras of a model as wire frames: corners (5 C, 3), and lines (8 C, 2) between them."""
+    """Return the cameras of a model as wire frames: corners (5 C, 3), and lines (8 C, 2) between them."""
     cameras = model.cameras
     if not cameras:
         return np.zeros((0, 3)), np.zeros((0, 2), np.int64)
@@ -33,7 +33,7 @@ def camera_lines(model: Model) -> tuple[FloatArray, IndexArray]:
 
 
 def camera_dots(model: Model) -> tuple[FloatArray, NDArray[np.uint8]]:
-    """The cameras of a model as dotted wire frames: places (D, 3) and colours (D, 3)."""
+    """Return the cameras of a model as dotted wire frames: places (D, 3) and colours (D, 3)."""
     corners, lines = camera_lines(model)
     along = np.linspace(0.0, 1.0, DOTS, endpoint=False)[:, None, None]
     dots = ((1 - along) * corners[lines[:, 0]] + along * corners[lines[:, 1]]).reshape(-1, 3)
@@ -41,17 +41,19 @@ def camera_dots(model: Model) -> tuple[FloatArray, NDArray[np.uint8]]:
 
 
 def painted(count: int) -> NDArray[np.uint8]:
-    """The cameras' colour for so many vertices."""
+    """Return the cameras' colour for so many vertices."""
     return np.tile(np.array(CAMERA_COLOR, np.uint8), (count, 1))
 
 
 def centre(camera: Frustum) -> FloatArray:
-    """Where a camera stands: (3,)."""
+    """Return where a camera stands: (3,)."""
     return np.asarray(-camera.cam_from_world[:, :3].T @ camera.cam_from_world[:, 3])
 
 
 def frustum_corners(camera: Frustum, depth: float) -> FloatArray:
-    """(5, 3) the camera's centre and, at this depth, the corners of its picture from the top left one on, clockwise."""
+    """Return (5, 3) the camera's centre and, at this depth, the corners of its picture from the top left one on,
+    clockwise.
+    """
     pixels = [(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]
     rays = np.linalg.solve(camera.K, np.column_stack([np.array(pixels, np.float64), np.ones(4)]).T).T
     seen = np.concatenate([np.zeros((1, 3)), depth * rays])
@@ -59,7 +61,10 @@ def frustum_corners(camera: Frustum, depth: float) -> FloatArray:
 
 
 def frustum_depth(centres: FloatArray, points: FloatArray) -> float:
-    """How deep the frusta are drawn: a third of the usual distance between neighbouring cameras, within bounds."""
+    """Return how deep the frusta are drawn.
+
+    A third of the usual distance between neighbouring cameras, within bounds.
+    """
     size = max(scene_size(centres), scene_size(points)) or 1.0
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     np.fill_diagonal(apart, np.inf)
@@ -68,13 +73,13 @@ def frustum_depth(centres: FloatArray, points: FloatArray) -> float:
 
 
 def scene_size(points: FloatArray) -> float:
-    """Diagonal of the box that holds nine of ten coordinates along each axis."""
+    """Return diagonal of the box that holds nine of ten coordinates along each axis."""
     low, high = np.percentile(points, [5, 95], axis=0)
     return float(np.linalg.norm(high - low))
 
 
 def with_cameras(model: Model) -> tuple[FloatArray, NDArray[np.uint8], IndexArray]:
-    """The vertices of a model and behind them the corners of its cameras, their colours, and the cameras' lines."""
+    """Return vertices of a model and behind them the corners of its cameras, their colours, and the cameras' lines."""
     corners, lines = camera_lines(model)
     surface = model.surface
     colors = np.concatenate([surface.colors, painted(len(corners))])

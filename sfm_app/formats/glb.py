@@ -28,7 +28,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
-    """Triangles with their texture or with a colour per vertex; else points; and the cameras, if there are any.
+    """Return triangles with their texture or with a colour per vertex; else points; and the cameras, if there are any.
 
     Args:
         model: what to write.
@@ -55,7 +55,7 @@ def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
 
 
 def textured(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
-    """One primitive and one material per page."""
+    """Return one primitive and one material per page."""
     surface, normals = model.surface, unit_normals(model.surface)
     sampler = glb.add("samplers", {"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED})
     primitives = []
@@ -74,7 +74,7 @@ def textured(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
 
 
 def coloured(glb: Glb, model: Model) -> dict[str, Any]:
-    """Triangles, or points where there are none, with a colour per vertex."""
+    """Return triangles, or points where there are none, with a colour per vertex."""
     surface = model.surface
     normals = unit_normals(surface) if len(surface.faces) else None
     attributes = shape(glb, surface.vertices, normals) | {"COLOR_0": glb.add_vertices(linear_colors(surface.colors))}
@@ -85,13 +85,13 @@ def coloured(glb: Glb, model: Model) -> dict[str, Any]:
 
 
 def shape(glb: Glb, vertices: NDArray[np.float64], normals: NDArray[np.float64] | None) -> dict[str, int]:
-    """Where vertices lie and where they face."""
+    """Add where vertices are and where they face."""
     attributes = {"POSITION": glb.add_vertices(vertices.astype(np.float32), bounds=True)}
     return attributes if normals is None else attributes | {"NORMAL": glb.add_vertices(normals.astype(np.float32))}
 
 
 def photographed(glb: Glb, name: str, **base: Any) -> int:
-    """A material that shows its colours as they are; both sides, since an open surface has no inside to hide."""
+    """Return a material that shows its colours as they are; both sides, since an open surface has no inside to hide."""
     return glb.add(
         "materials",
         {
@@ -104,7 +104,7 @@ def photographed(glb: Glb, name: str, **base: Any) -> int:
 
 
 def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Linear light in [0, 1] of 8-bit sRGB colours, same shape (IEC 61966-2-1).
+    """Return linear light in [0, 1] of 8-bit sRGB colours, same shape (IEC 61966-2-1).
 
     glTF multiplies colours of vertices into the light as they are, so they have to be linear, while photos are sRGB.
     Floats: 8 linear bits show steps in the shadows, and not every reader knows 16.
@@ -115,7 +115,10 @@ def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def cameras(glb: Glb, model: Model) -> list[int]:
-    """The cameras twice: as lines that every viewer draws, and as glTF's cameras, to look through; numbers of nodes."""
+    """Return the cameras twice: as lines that every viewer draws, and as glTF's cameras, to look through.
+
+    Numbers of nodes.
+    """
     corners, lines = camera_lines(model)
     color = linear_colors(np.array(CAMERA_COLOR, np.uint8))
     material = photographed(glb, "cameras", baseColorFactor=[*(round(float(part), 6) for part in color), 1.0])
@@ -132,7 +135,7 @@ def cameras(glb: Glb, model: Model) -> list[int]:
 
 
 def camera_node(glb: Glb, camera: Frustum, near: float) -> dict[str, Any]:
-    """A camera of glTF where the photo was taken; its centre is in the middle, as glTF knows no other."""
+    """Return a camera of glTF where the photo was taken; its centre is in the middle, as glTF knows no other."""
     lens = {
         "yfov": float(2 * np.arctan(camera.height / (2 * camera.K[1, 1]))),
         "aspectRatio": float(camera.width / camera.K[0, 0] * camera.K[1, 1] / camera.height),

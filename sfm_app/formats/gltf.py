@@ -39,14 +39,17 @@ class Glb:
         return view
 
     def add_vertices(self, values: NDArray[np.float32], *, bounds: bool = False) -> int:
-        """An attribute of vertices (N, 2 or 3), with its bounds if glTF asks for them; gives the accessor's number."""
+        """Return an attribute of vertices (N, 2 or 3), with its bounds if glTF asks for them.
+
+        Gives the accessor's number.
+        """
         entry = self._accessor(values, VERTICES)
         if bounds:
             entry |= {"min": values.min(axis=0).tolist(), "max": values.max(axis=0).tolist()}
         return self.add("accessors", entry)
 
     def add_indices(self, values: NDArray[np.int64], vertices: int) -> int:
-        """Numbers of vertices, as small as fits; gives the accessor's number."""
+        """Return numbers of vertices, as small as fits; gives the accessor's number."""
         small = values.ravel().astype(np.uint16 if vertices <= RESTART else np.uint32)
         return self.add("accessors", self._accessor(small, INDICES))
 
@@ -58,7 +61,7 @@ class Glb:
         return {"bufferView": view, "componentType": kind, "count": len(values), "type": SHAPES[width]}
 
     def to_bytes(self) -> bytes:
-        """The whole file."""
+        """Return the whole file."""
         tree = {**self.tree, "buffers": [{"byteLength": self._length}]}
         text = json.dumps(tree, separators=(",", ":"), ensure_ascii=False, allow_nan=False).encode()
         text += b" " * (-len(text) % 4)

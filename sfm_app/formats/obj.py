@@ -25,7 +25,9 @@ MATERIAL = "newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 0\n"
 
 
 def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
-    """Triangles with normals and their texture or a colour per vertex; else points; and cameras, if any, as lines.
+    """Return triangles with normals and their texture or a colour per vertex.
+
+    Else points; and cameras, if any, as lines.
 
     Args:
         model: what to write.
@@ -57,7 +59,7 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
 
 
 def vertex_lines(model: Model, *, with_colors: bool) -> Iterator[str]:
-    """Vertices, with colours behind the coordinates as MeshLab began it, normals, points and lines."""
+    """Yield vertices, with colours behind the coordinates as MeshLab began it, normals, points and lines."""
     vertices, colors, lines = with_cameras(model)
     place = f"%.{decimals(model.surface.vertices)}f"
     values, form = [vertices], [place] * 3
@@ -72,7 +74,7 @@ def vertex_lines(model: Model, *, with_colors: bool) -> Iterator[str]:
 
 
 def textured_lines(model: Model, texture: Texture, pages: list[int]) -> Iterator[str]:
-    """Places in the texture, each once, and the triangles page by page."""
+    """Yield places in the texture, each once, and the triangles page by page."""
     steps = np.round(10**DIGITS * texture.uv.reshape(-1, 2).astype(np.float64)).astype(np.int64)
     steps[:, 1] = 10**DIGITS - steps[:, 1]  # 0 is at the bottom in OBJ
     keys, numbers = np.unique(steps @ np.array([ACROSS, 1]), return_inverse=True)
@@ -86,11 +88,11 @@ def textured_lines(model: Model, texture: Texture, pages: list[int]) -> Iterator
 
 
 def rows(form: str, values: NDArray[np.generic]) -> str:
-    """Every row of an array (N, C) as text; one format for many is ten times faster than one per row."""
+    """Return every row of an array (N, C) as text; one format for many is ten times faster than one per row."""
     parts = (values[start : start + CHUNK] for start in range(0, len(values), CHUNK))
     return "".join(form * len(part) % tuple(part.ravel().tolist()) for part in parts)
 
 
 def decimals(vertices: NDArray[np.float64]) -> int:
-    """Decimals that give `DIGITS` digits of the size of the model."""
+    """Return decimals that give `DIGITS` digits of the size of the model."""
     return max(0, DIGITS - int(np.floor(np.log10(scene_size(vertices) or 1.0))))

@@ -12,7 +12,7 @@ JPEG_QUALITY = 90
 
 
 def jpeg(page: NDArray[np.uint8]) -> bytes:
-    """A page of texture (H, W, 3) as JPEG, with colours as sharp as brightness.
+    """Return a page of texture (H, W, 3) as JPEG, with colours as sharp as brightness.
 
     JPEG's usual half resolution for colours smears them across the borders of charts: on the page of a brick wall it
     costs 3 dB, and files of the same size are 1.5 dB nearer to the page with full resolution and less quality.
@@ -25,7 +25,7 @@ def jpeg(page: NDArray[np.uint8]) -> bytes:
 
 
 def split_corners(faces: IndexArray, uv: NDArray[np.float32]) -> tuple[IndexArray, NDArray[np.float32], IndexArray]:
-    """One vertex per place on the surface and in the texture: those on borders of charts become several.
+    """Return one vertex per place on the surface and in the texture: those on borders of charts become several.
 
     Args:
         faces: (T, 3) vertex indices.
@@ -46,5 +46,5 @@ def split_corners(faces: IndexArray, uv: NDArray[np.float32]) -> tuple[IndexArra
 
 
 def pages_in_use(pages: NDArray[np.int32]) -> list[int]:
-    """Numbers of the pages that triangles lie on, in order."""
+    """Return numbers of the pages that triangles lie on, in order."""
     return [int(page) for page in np.unique(pages)]

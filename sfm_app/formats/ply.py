@@ -19,7 +19,7 @@ Columns = list[NDArray[Any]]
 
 
 def write_ply(model: Model, name: str) -> Mapping[str, bytes]:
-    """Triangles with normals and a colour per vertex; or points, and behind them the cameras as dotted frusta.
+    """Return triangles with normals and a colour per vertex; or points, and behind them the cameras as dotted frusta.
 
     Dots, because readers differ in what they make of a file with points and edges or points and triangles, and some
     then show no points at all. A cloud of coloured points is the same for everyone.
@@ -47,14 +47,14 @@ def write_ply(model: Model, name: str) -> Mapping[str, bytes]:
 
 
 def triangles(faces: NDArray[np.int64]) -> NDArray[np.void]:
-    """Rows of three numbers of vertices."""
+    """Return rows of three numbers of vertices."""
     rows = np.empty(len(faces), [("count", "u1"), ("vertex_indices", "<i4", 3)])
     rows["count"], rows["vertex_indices"] = 3, faces
     return rows
 
 
 def table(kinds: list[tuple[str, str]], columns: Columns) -> NDArray[np.void]:
-    """Rows of named columns."""
+    """Return rows of named columns."""
     rows = np.empty(len(columns[0]), kinds)
     values = [column[:, i] for column in columns for i in range(column.shape[1])]
     for (key, _), column in zip(kinds, values, strict=True):
@@ -63,7 +63,7 @@ def table(kinds: list[tuple[str, str]], columns: Columns) -> NDArray[np.void]:
 
 
 def header(elements: Mapping[str, NDArray[np.void]]) -> str:
-    """What the rows of each element hold."""
+    """Return what the rows of each element hold."""
     lines = ["ply", "format binary_little_endian 1.0", "comment sfm_app"]
     for element, rows in elements.items():
         lines.append(f"element {element} {len(rows)}")

@@ -76,14 +76,14 @@ class Reduced:
     """Points that their rays do not fix: at infinity, or seen from one place only. They stay along what is open."""
 
     def follow(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Changes of poses (I, 6) and points (P, 3) that go best with a change of the cameras (C, 8)."""
+        """Return changes of poses (I, 6) and points (P, 3) that go best with a change of the cameras (C, 8)."""
         poses = self.pose_step - np.einsum("ij,j->i", self.pose_give, cameras.ravel())
         points = self.point_step - self.point_give @ np.concatenate([poses, cameras.ravel()])
         return poses.reshape(-1, POSE), points.reshape(-1, 3)
 
 
 def project(bundle: Bundle) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Predictions (N, 2), and their derivatives by camera (N, 2, 8), pose (N, 2, 6) and point (N, 2, 3).
+    """Return predictions (N, 2), and their derivatives by camera (N, 2, 8), pose (N, 2, 6) and point (N, 2, 3).
 
     Poses change by a rotation vector about the world's axes turned into the camera, and by a shift of t.
     """
@@ -172,7 +172,7 @@ def _scores(
     system: tuple[sparse.csr_array, sparse.csr_array, sparse.csr_array],
     pose_give: FloatArray, left_over: FloatArray, photo: NDArray[np.int64], photos: int,
 ) -> FloatArray:  # fmt: skip
-    """(I, 8C) as in `Reduced`, from the derivatives by views and points, and what poses and points leave over (2N,).
+    """Give (I, 8C) as in `Reduced`, from derivatives by views and points, and what poses and points leave over (2N,).
 
     One camera after the other, so that many cameras take no more memory than one.
     """
@@ -189,13 +189,13 @@ def _scores(
 
 
 def moved(bundle: Bundle, params: FloatArray, poses: FloatArray, points: FloatArray) -> Bundle:
-    """The bundle with other cameras (C, 8), and with changed poses (I, 6) and points (P, 3)."""
+    """Return the bundle with other cameras (C, 8), and with changed poses (I, 6) and points (P, 3)."""
     R = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ bundle.R
     return replace(bundle, params=params, R=R, t=bundle.t + poses[:, 3:], X=bundle.X + points)
 
 
 def cost(bundle: Bundle, scale_px: float) -> float:
-    """Half the sum of the loss of `reduce`; what is lost counts as LOST_PX off."""
+    """Return half the sum of the loss of `reduce`; what is lost counts as LOST_PX off."""
     with np.errstate(all="ignore"):
         r = bundle.x - project(bundle)[0]
         squares = np.einsum("ni,ni->n", r, r)
@@ -204,21 +204,23 @@ def cost(bundle: Bundle, scale_px: float) -> float:
 
 
 def in_sight(bundle: Bundle, r: FloatArray) -> NDArray[np.bool_]:
-    """(N,) which observations, with residuals r (N, 2), are of points before their camera, and not hopelessly off."""
+    """Return (N,) which observations, with residuals r (N, 2), are of points before their camera, and not hopelessly
+    off.
+    """
     with np.errstate(all="ignore"):
         depth = np.einsum("nj,nj->n", bundle.R[bundle.photo, 2], bundle.X[bundle.point]) + bundle.t[bundle.photo, 2]
         return np.asarray((depth > 0.0) & (np.abs(r) < LOST_PX).all(axis=1), np.bool_)
 
 
 def lost_points(bundle: Bundle) -> NDArray[np.bool_]:
-    """(P,) which points have an observation that is not in sight."""
+    """Return (P,) which points have an observation that is not in sight."""
     with np.errstate(all="ignore"):
         r = bundle.x - project(bundle)[0]
     return np.bincount(bundle.point[~in_sight(bundle, r)], minlength=len(bundle.X)) > 0
 
 
 def _linearised(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Weighted residuals (N, 2), derivatives by view (N, 2, 14) and by point (N, 2, 3), and which observations count.
+    """Return weighted residuals (N, 2), derivatives by view (N, 2, 14) and point (N, 2, 3), and what counts.
 
     The rest are 0: a point behind its camera, or in the plane of it, would pull at all that is near.
     """
@@ -233,7 +235,7 @@ def _linearised(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray
 
 
 def _whiten(by_point: FloatArray, point: NDArray[np.int64], points: int) -> tuple[FloatArray, NDArray[np.int64]]:
-    """(P, 3, 3) W such that the derivatives by W^-T X are orthonormal over the observations of a point, and its rank.
+    """Give (P, 3, 3) W such that derivatives by W^-T X are orthonormal over the observations of a point, and its rank.
 
     Along directions that the observations leave open, W is 0: nothing depends on them.
     """
@@ -261,14 +263,16 @@ def _whiten(by_point: FloatArray, point: NDArray[np.int64], points: int) -> tupl
 
 
 def _block_diagonal(blocks: FloatArray) -> sparse.csr_array:
-    """(3P, 3P) from (P, 3, 3)."""
+    """Return (3P, 3P) from (P, 3, 3)."""
     P = len(blocks)
     columns = np.repeat(3 * np.arange(P)[:, None] + np.arange(3), 3, axis=0)
     return sparse.csr_array((blocks.ravel(), columns.ravel(), 3 * np.arange(3 * P + 1)), shape=(3 * P, 3 * P))
 
 
 def _gauge(bundle: Bundle) -> NDArray[np.int64]:
-    """Columns of the poses that are free when the first photo stays, and the distance to the photo farthest from it."""
+    """Return columns of the poses that are free when the first photo stays, and the distance to the photo farthest from
+    it.
+    """
     centres = -np.einsum("nji,nj->ni", bundle.R, bundle.t)
     far = int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))
     relative = bundle.R[far] @ (centres[0] - centres[far])
@@ -277,7 +281,7 @@ def _gauge(bundle: Bundle) -> NDArray[np.int64]:
 
 
 def _sparse(blocks: FloatArray, columns: NDArray[np.int64], width: int) -> sparse.csr_array:
-    """(2N, width) from (N, 2, k) blocks that stand in the same k columns (N, k) of two rows each."""
+    """Return (2N, width) from (N, 2, k) blocks that stand in the same k columns (N, k) of two rows each."""
     N, _, k = blocks.shape
     places = np.repeat(columns, 2, axis=0).ravel()
     return sparse.csr_array((blocks.ravel(), places, k * np.arange(2 * N + 1)), shape=(2 * N, width))

@@ -11,12 +11,12 @@ NEWTON_STEPS, LEAST_SLOPE = 10, 0.2
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
-    """(3, 3) camera matrix without skew, in the unit of its arguments."""
+    """Return (3, 3) camera matrix without skew, in the unit of its arguments."""
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) -> NDArray[np.float64]:
-    """(3, 3): square pixels, the optical centre in the middle, and the given focal or the usual guess.
+    """Return (3, 3): square pixels, the optical centre in the middle, and the given focal or the usual guess.
 
     Args:
         size: (width, height) in pixels.
@@ -27,7 +27,7 @@ def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) 
 
 
 def rays(x: NDArray[np.float64], K: NDArray[np.float64], radial: float = 0.0) -> NDArray[np.float64]:
-    """(N, 2) points of the plane z = 1 that pixels see through a lens x_d = x_u (1 + radial r_u^2).
+    """Return (N, 2) points of the plane z = 1 that pixels see through a lens x_d = x_u (1 + radial r_u^2).
 
     Newton's search from the distorted radius. A barrel lens folds where r (1 + radial r^2) stops growing with r; what
     lies beyond is taken to lie there.

@@ -19,7 +19,7 @@ _MOST_STEPS = 100
 
 
 def algebraic_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
-    """|x2' F x1| with F of Frobenius norm 1 and points (x, y, 1): |A b| per match (thesis 2.28 and 4.2).
+    """Return |x2' F x1| with F of Frobenius norm 1 and points (x, y, 1): |A b| per match (thesis 2.28 and 4.2).
 
     Unlike the others it has no unit, and it changes with the origin and the scale of the coordinates: give it points
     and F in the frame that is meant, such as that of `hartley_normalisation`.
@@ -34,7 +34,7 @@ def algebraic_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray
 
 
 def symmetric_epipolar_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
-    """Root mean square of a match's distances to its two epipolar lines (HZ 11.10, thesis 4.1).
+    """Return root mean square of a match's distances to its two epipolar lines (HZ 11.10, thesis 4.1).
 
     Args and errors as in `sampson_distance`.
 
@@ -48,7 +48,7 @@ def symmetric_epipolar_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> F
 
 
 def sampson_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
-    """First-order distance of each match to the epipolar constraint (HZ 11.9 and thesis 4.2, before squaring)::
+    """Return first-order distance of each match to the epipolar constraint (HZ 11.9 and thesis 4.2, before squaring)::
 
         |x2' F x1| / sqrt((F x1)_1^2 + (F x1)_2^2 + (F' x2)_1^2 + (F' x2)_2^2)
 
@@ -69,7 +69,7 @@ def sampson_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
 
 
 def reprojection_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
-    """Distance of each match in 4D to the nearest exact one: sqrt(d(x1, P1 X)^2 + d(x2, P2 X)^2), least over X.
+    """Return distance of each match in 4D to the nearest exact one: sqrt(d(x1, P1 X)^2 + d(x2, P2 X)^2), least over X.
 
     With P1, P2 the `canonical_cameras` of F that is the term of thesis 4.3 before squaring; every other pair of cameras
     with this F gives the same (HZ 12.5). The global minimum, see `nearest_exact_matches`.
@@ -83,7 +83,9 @@ def reprojection_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatAr
 
 
 def nearest_exact_matches(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """The matches nearest to the given ones that fulfil x2' F x1 = 0: optimal triangulation in the images (HZ 12.5).
+    """Return the matches nearest to the given ones that fulfil x2' F x1 = 0.
+
+    Optimal triangulation in the images (HZ 12.5).
 
     Args and errors as in `sampson_distance`.
 
@@ -95,7 +97,7 @@ def nearest_exact_matches(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> tuple[F
 
 
 def _shortest_moves(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
-    """(N, 4) shortest z = (dx1, dx2) with q(z) = c + g'z + z'Az/2 = 0, the epipolar constraint after the move.
+    """Return (N, 4) shortest z = (dx1, dx2) with q(z) = c + g'z + z'Az/2 = 0, the epipolar constraint after the move.
 
     A quadratic form under one quadratic constraint has no duality gap (More 1993): the global minimum is
     z = -k (I + k A)^-1 g with the k that solves phi(k) = q(z(k)) = 0 where I + k A is still positive definite. There
@@ -125,7 +127,7 @@ def _shortest_moves(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
 
 
 def _multiplier(c: FloatArray, g: FloatArray, d: FloatArray, a: float) -> FloatArray:
-    """(N,) root of phi between 0 and 1/a."""
+    """Return (N,) root of phi between 0 and 1/a."""
     low, high = np.zeros(len(c)), np.full(len(c), (1.0 - 4.0 * _EPS) / max(a, _TINY))
     k = low.copy()
     for _ in range(_MOST_STEPS):
@@ -147,7 +149,7 @@ def _phi(c: FloatArray, g: FloatArray, d: FloatArray, k: FloatArray) -> FloatArr
 
 
 def _constraint(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Algebraic error x2' F x1 and the epipolar lines in view 1 and view 2."""
+    """Return algebraic error x2' F x1 and the epipolar lines in view 1 and view 2."""
     matrix = np.asarray(F, dtype=np.float64)
     if matrix.shape != (3, 3):
         raise ValueError(f"F must have shape (3, 3), got {matrix.shape}")

@@ -10,7 +10,7 @@ FloatArray = NDArray[np.float64]
 
 
 def homogeneous(x: ArrayLike) -> FloatArray:
-    """(N, 2) points as (N, 3) with a last coordinate of 1; ValueError for any other shape."""
+    """Return (N, 2) points as (N, 3) with a last coordinate of 1; ValueError for any other shape."""
     points = np.asarray(x, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
         raise ValueError(f"points must have shape (N, 2), got {points.shape}")
@@ -18,7 +18,7 @@ def homogeneous(x: ArrayLike) -> FloatArray:
 
 
 def homogeneous_pair(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Both views of N matches as (N, 3); ValueError for other shapes, and where the rows do not pair up."""
+    """Return both views of N matches as (N, 3); ValueError for other shapes, and where the rows do not pair up."""
     h1, h2 = homogeneous(x1), homogeneous(x2)
     if len(h1) != len(h2):
         raise ValueError(f"x1 and x2 must pair up, got {len(h1)} and {len(h2)} points")
@@ -26,7 +26,7 @@ def homogeneous_pair(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArr
 
 
 def hartley_normalisation(x: ArrayLike) -> FloatArray:
-    """The (3, 3) similarity that puts the centroid at 0 and the mean distance from it at sqrt(2).
+    """Return the (3, 3) similarity that puts the centroid at 0 and the mean distance from it at sqrt(2).
 
     Raises:
         ValueError: no points, or all of them coincide.
@@ -43,7 +43,7 @@ def hartley_normalisation(x: ArrayLike) -> FloatArray:
 
 
 def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) -> FloatArray:
-    """Normalised 8-point algorithm (thesis 4.3.2): algebraic least squares, then the nearest matrix of rank 2.
+    """Return normalised 8-point algorithm (thesis 4.3.2): algebraic least squares, then the nearest matrix of rank 2.
 
     Args:
         x1: (N, 2) pixels, N >= 8.
@@ -70,14 +70,14 @@ def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) 
 
 
 def nearest_rank_two(F: ArrayLike) -> FloatArray:
-    """The matrix of rank 2 that is nearest to F in the Frobenius norm (thesis 4.2)."""
+    """Return the matrix of rank 2 that is nearest to F in the Frobenius norm (thesis 4.2)."""
     U, s, Vt = np.linalg.svd(np.asarray(F, dtype=np.float64))
     rank_two: FloatArray = (U[:, :2] * s[:2]) @ Vt[:2]
     return rank_two
 
 
 def unit_norm(F: ArrayLike) -> FloatArray:
-    """F with Frobenius norm 1 and its entry of largest magnitude positive.
+    """Return F with Frobenius norm 1 and its entry of largest magnitude positive.
 
     Raises:
         ValueError: F is zero or not finite.
@@ -91,13 +91,13 @@ def unit_norm(F: ArrayLike) -> FloatArray:
 
 
 def epipoles(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Homogeneous unit vectors e1, e2 with F e1 = 0 and F' e2 = 0: each camera centre seen by the other."""
+    """Return homogeneous unit vectors e1, e2 with F e1 = 0 and F' e2 = 0: each camera centre seen by the other."""
     U, _, Vt = np.linalg.svd(np.asarray(F, dtype=np.float64))
     return Vt[2], U[:, 2]
 
 
 def canonical_cameras(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Two cameras with this F, P1 = [I|0] and P2 = [[e2]x F + e2 v' | e2] (thesis 2.34 with lambda = 1, HZ 9.10).
+    """Give two cameras with this F, P1 = [I|0] and P2 = [[e2]x F + e2 v' | e2] (thesis 2.34 with lambda = 1, HZ 9.10).
 
     v is free: it says which plane of the scene lies at infinity. With F of norm 1, singular values s1 >= s2, and
     v = sqrt(s1 s2) e1 the left 3 x 3 of P2 has the singular values s1, sqrt(s1 s2), s2: invertible, and as well
@@ -120,13 +120,13 @@ def canonical_cameras(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
 
 
 def cross_matrix(v: ArrayLike) -> FloatArray:
-    """The (3, 3) matrix [v]x with [v]x w = v x w."""
+    """Return the (3, 3) matrix [v]x with [v]x w = v x w."""
     a, b, c = np.asarray(v, dtype=np.float64)
     return np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
 
 
 def fundamental_from_pose(K1: ArrayLike, K2: ArrayLike, R: ArrayLike, t: ArrayLike) -> FloatArray:
-    """F of two cameras with x1 ~ K1 X and x2 ~ K2 (R X + t) (HZ 9.12), Frobenius norm 1.
+    """Return F of two cameras with x1 ~ K1 X and x2 ~ K2 (R X + t) (HZ 9.12), Frobenius norm 1.
 
     Raises:
         ValueError: t is zero: without a baseline there is no epipolar geometry.

@@ -9,7 +9,7 @@ Array = NDArray[np.float64]
 
 
 def essential_from_fundamental(F: Array, K1: Array, K2: Array) -> Array:
-    """The essential matrix nearest to K2' F K1 (thesis Eq. 5.7; Eq. 2.30 inverts K by misprint).
+    """Return the essential matrix nearest to K2' F K1 (thesis Eq. 5.7; Eq. 2.30 inverts K by misprint).
 
     Args:
         F: (3, 3), any scale, x2' F x1 = 0 in pixels.
@@ -23,7 +23,7 @@ def essential_from_fundamental(F: Array, K1: Array, K2: Array) -> Array:
 
 
 def nearest_essential(E: Array) -> Array:
-    """The essential matrix nearest to E (3, 3), with singular values (1, 1, 0).
+    """Return the essential matrix nearest to E (3, 3), with singular values (1, 1, 0).
 
     Noise leaves E with unequal singular values; the nearest essential matrix in the Frobenius norm has their mean twice
     and a zero (Hartley & Zisserman, 2nd ed., section 11.7.3). Its scale is then set to 1.
@@ -34,7 +34,7 @@ def nearest_essential(E: Array) -> Array:
 
 
 def decompose_essential(E: Array) -> list[tuple[Array, Array]]:
-    """The four poses (R, t) of view 2 from view 1 that E allows (thesis Eq. 2.32 with its signs set right).
+    """Return the four poses (R, t) of view 2 from view 1 that E allows (thesis Eq. 2.32 with its signs set right).
 
     The thesis's U W V' is a rotation only if det(U) det(V) = 1, which an SVD does not promise: both are turned into
     rotations first. t has length 1; the scale is not observable.
@@ -48,7 +48,7 @@ def decompose_essential(E: Array) -> list[tuple[Array, Array]]:
 
 
 def relative_pose(E: Array, x1: Array, x2: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """The one of the four poses that has most points before both cameras.
+    """Return the one of the four poses that has most points before both cameras.
 
     Args:
         E: (3, 3) essential matrix.

@@ -26,16 +26,16 @@ class Similarity:
         return np.asarray(self.scale * points @ self.R.T + self.t)
 
     def after(self, first: "Similarity") -> "Similarity":
-        """The similarity that does `first`, then this one."""
+        """Return the similarity that does `first`, then this one."""
         return Similarity(self.scale * first.scale, self.R @ first.R, self.scale * self.R @ first.t + self.t)
 
     def inverse(self) -> "Similarity":
-        """The similarity that undoes this one."""
+        """Return the similarity that undoes this one."""
         return Similarity(1.0 / self.scale, self.R.T, -self.R.T @ self.t / self.scale)
 
 
 def umeyama(a: FloatArray, b: FloatArray) -> Similarity:
-    """The similarity that takes points a (N, 3) to b (N, 3) with least squared error (Umeyama 1991); N >= 3."""
+    """Return the similarity that takes points a (N, 3) to b (N, 3) with least squared error (Umeyama 1991); N >= 3."""
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
     u, s, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -45,7 +45,7 @@ def umeyama(a: FloatArray, b: FloatArray) -> Similarity:
 
 
 def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
-    """The similarity that takes most of the points a (N, 3) to b (N, 3), not led astray by wrong ones.
+    """Return the similarity that takes most of the points a (N, 3) to b (N, 3), not led astray by wrong ones.
 
     Least median of squares over triples, then Umeyama on the points that agree with the best triple (Rousseeuw 1984;
     the threshold is 2.5 robust standard deviations).

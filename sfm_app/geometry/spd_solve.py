@@ -19,7 +19,7 @@ NO_NUMBER = "a matrix holds what is no number", "this is a bug; please report it
 
 
 def lifted(S: FloatArray, least: float = LEAST, to: float = LEAST) -> FloatArray:
-    """The same matrices where they are positive; where one is not, its eigenvalues below `least` become `to`.
+    """Lift eigenvalues below `least` to `to`; positive matrices stay as they are.
 
     Eigenvalues are those of the matrix scaled to a unit diagonal, so that units do not matter. Where they become LEAST
     the inverse says that nothing is known along such a direction; where 1, a solution hardly moves along it.
@@ -46,7 +46,7 @@ def lifted(S: FloatArray, least: float = LEAST, to: float = LEAST) -> FloatArray
 
 
 def solve_positive(S: FloatArray, B: FloatArray) -> FloatArray:
-    """S^-1 B by Gauss and Jordan's elimination in small blocks, without pivots.
+    """Return S^-1 B by Gauss and Jordan's elimination in small blocks, without pivots.
 
     Along what S does not determine, the answer stays near 0.
 
@@ -61,7 +61,7 @@ def solve_positive(S: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def inverse_of_positive(S: FloatArray) -> FloatArray:
-    """S^-1 of a symmetric (n, n), positive definite but for rounding; symmetric again, with a positive diagonal.
+    """Return S^-1 of a symmetric (n, n), positive definite but for rounding; symmetric again, with a positive diagonal.
 
     Raises:
         NumericalError: S holds what is no number.
@@ -71,7 +71,7 @@ def inverse_of_positive(S: FloatArray) -> FloatArray:
 
 
 def inverses_of_positive(S: FloatArray) -> FloatArray:
-    """The same for many small ones (..., n, n).
+    """Invert many small positive matrices (..., n, n).
 
     Raises:
         NumericalError: S holds what is no number.
@@ -80,12 +80,12 @@ def inverses_of_positive(S: FloatArray) -> FloatArray:
 
 
 def solve_each(S: FloatArray, B: FloatArray) -> FloatArray:
-    """S^-1 B of many small systems (..., n, n) and (..., n, k); see `solve_positive`."""
+    """Return S^-1 B of many small systems (..., n, n) and (..., n, k); see `solve_positive`."""
     return np.asarray(np.linalg.solve(lifted(S, OPEN, 1.0), B), np.float64)
 
 
 def without_negative(S: FloatArray, before: FloatArray) -> FloatArray:
-    """The nearest S (n, n) that knows nothing along directions where rounding has left less than nothing.
+    """Return the nearest S (n, n) that knows nothing along directions where rounding has left less than nothing.
 
     Args:
         S: what elimination has left.
@@ -115,7 +115,9 @@ def _eliminated(S: FloatArray, B: FloatArray, least: float, to: float) -> FloatA
 
 
 def _pivot(block: FloatArray, before: FloatArray, least: float, to: float) -> FloatArray:
-    """The block, lifted where elimination has left nothing but rounding of what stood there `before` (n,), squared."""
+    """Return the block, lifted where elimination has left nothing but rounding of what stood there `before` (n,),
+    squared.
+    """
     if not np.isfinite(block).all():
         raise NumericalError(*NO_NUMBER)
     scale = before[:, None] * before

@@ -10,7 +10,7 @@ IndexArray = NDArray[np.int64]
 
 
 def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """(V, 3) unit normals, each the mean over the triangles at the vertex by their area; 0 where there are none.
+    """Return (V, 3) unit normals, each the mean over the triangles at the vertex by their area; 0 where there are none.
 
     Args:
         vertices: (V, 3).
@@ -25,7 +25,7 @@ def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
 
 
 def edges_of(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
-    """Every edge once, (E, 2) with the lower vertex first, and (T, 3) the edges ab, bc, ca of each triangle."""
+    """Return every edge once, (E, 2) with the lower vertex first, and (T, 3) the edges ab, bc, ca of each triangle."""
     ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     size = int(faces.max(initial=0)) + 1
     keys, at = np.unique(ends[:, 0] * size + ends[:, 1], return_inverse=True)
@@ -33,19 +33,19 @@ def edges_of(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
 
 
 def areas(vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """(T,) areas of the triangles."""
+    """Return (T,) areas of the triangles."""
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.asarray(0.5 * np.linalg.norm(across, axis=1))
 
 
 def median_edge(vertices: FloatArray, faces: IndexArray) -> float:
-    """Median length of the edges."""
+    """Return median length of the edges."""
     edges, _ = edges_of(faces)
     return float(np.median(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)))
 
 
 def select_faces(surface: Surface, keep: NDArray[np.bool_]) -> Surface:
-    """The marked triangles (T,) with the vertices that they use, in the old order."""
+    """Return the marked triangles (T,) with the vertices that they use, in the old order."""
     used, faces = np.unique(surface.faces[keep], return_inverse=True)
     return Surface(surface.vertices[used], faces.reshape(-1, 3).astype(np.int64), surface.colors[used])

@@ -7,7 +7,7 @@ Array = NDArray[np.float64]
 
 
 def triangulate(P1: Array, P2: Array, x1: Array, x2: Array) -> Array:
-    """Linear triangulation (thesis Eq. 2.33): the null vector of x x PX = 0 in both views.
+    """Return linear triangulation (thesis Eq. 2.33): the null vector of x x PX = 0 in both views.
 
     Args:
         P1: (3, 4) projection matrix of view 1.
@@ -29,7 +29,10 @@ def triangulate(P1: Array, P2: Array, x1: Array, x2: Array) -> Array:
 
 
 def triangulation_angle_deg(X: Array, centre1: Array, centre2: Array) -> Array:
-    """Angle at which the two rays to each point meet: X (N, 3), camera centres (3,); (N,) degrees in [0, 180]."""
+    """Return angle at which the two rays to each point meet: X (N, 3), camera centres (3,).
+
+    (N,) degrees in [0, 180].
+    """
     ray1, ray2 = X - centre1, X - centre2
     with np.errstate(invalid="ignore"):
         cosine = (ray1 * ray2).sum(axis=1) / (np.linalg.norm(ray1, axis=1) * np.linalg.norm(ray2, axis=1))

@@ -7,14 +7,14 @@ FloatArray = NDArray[np.float64]
 
 
 def unit(vectors: ArrayLike) -> FloatArray:
-    """Vectors (..., 3) with length 1; those of length 0 stay 0."""
+    """Return vectors (..., 3) with length 1; those of length 0 stay 0."""
     values = np.asarray(vectors, np.float64)
     length = np.linalg.norm(values, axis=-1, keepdims=True)
     return np.asarray(np.divide(values, length, out=np.zeros_like(values), where=length > 0), np.float64)
 
 
 def axis_angle_deg(first: ArrayLike, second: ArrayLike) -> FloatArray:
-    """Angle between the lines along vectors (..., 3), whichever way they point; degrees in [0, 90]."""
+    """Return angle between the lines along vectors (..., 3), whichever way they point; degrees in [0, 90]."""
     a, b = unit(first), unit(second)
     # the cross product keeps its digits where the arc cosine loses them
     sine = np.linalg.norm(np.cross(a, b), axis=-1)
@@ -22,24 +22,24 @@ def axis_angle_deg(first: ArrayLike, second: ArrayLike) -> FloatArray:
 
 
 def along(vectors: FloatArray, axis: FloatArray) -> FloatArray:
-    """Components (N,) of vectors (N, 3) along an axis (3,); not by BLAS, whose digits depend on its threads."""
+    """Return components (N,) of vectors (N, 3) along an axis (3,); not by BLAS, whose digits depend on its threads."""
     return np.asarray(np.einsum("ni,i->n", vectors, axis))
 
 
 def across(vector: ArrayLike, axis: FloatArray) -> FloatArray:
-    """What of vectors (..., 3) is at right angles to a unit axis (3,)."""
+    """Return what of vectors (..., 3) is at right angles to a unit axis (3,)."""
     values = np.asarray(vector, np.float64)
     return np.asarray(values - (values @ axis)[..., None] * axis)
 
 
 def basis_across(axis: FloatArray) -> FloatArray:
-    """(2, 3) rows e1, e2 with e1 x e2 = axis, a unit vector (3,)."""
+    """Return (2, 3) rows e1, e2 with e1 x e2 = axis, a unit vector (3,)."""
     least = np.eye(3)[int(np.argmin(np.abs(axis)))]
     e1 = unit(across(least, axis))
     return np.stack([e1, np.cross(axis, e1)])
 
 
 def least_direction(matrix: FloatArray, like: FloatArray) -> FloatArray:
-    """Eigenvector (3,) of the smallest eigenvalue of a symmetric (3, 3), on the side of `like`."""
+    """Return eigenvector (3,) of the smallest eigenvalue of a symmetric (3, 3), on the side of `like`."""
     found: FloatArray = np.linalg.eigh(matrix)[1][:, 0]
     return found if found @ like >= 0 else -found

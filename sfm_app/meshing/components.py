@@ -16,7 +16,7 @@ MARGIN = 1.1
 
 
 def octree_depth(points: NDArray[np.float64], most: int) -> int:
-    """Greatest depth, at most `most`, at which the cells of Poisson's octree that hold points (N, 3) share them out.
+    """Give greatest depth, at most `most`, at which cells of Poisson's octree that hold points (N, 3) share them out.
 
     Finer cells, most of them with one point or none, would only model the noise, at four times the triangles per level.
     """

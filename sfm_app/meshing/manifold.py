@@ -11,7 +11,7 @@ MIN_HEIGHT = 1e-7
 
 
 def make_manifold(surface: Surface) -> Surface:
-    """The surface as an oriented manifold.
+    """Return the surface as an oriented manifold.
 
     Every edge then has one triangle, or two that run along it in opposite directions; those at a vertex form one fan.
 
@@ -28,7 +28,7 @@ def make_manifold(surface: Surface) -> Surface:
 
 
 def _proper(surface: Surface) -> NDArray[np.bool_]:
-    """(T,) triangles that are finite and have a height, each set of corners once."""
+    """Return (T,) triangles that are finite and have a height, each set of corners once."""
     corners = surface.vertices[surface.faces]
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     area = areas(surface.vertices, surface.faces)
@@ -41,7 +41,7 @@ def _proper(surface: Surface) -> NDArray[np.bool_]:
 
 
 def _crowded(surface: Surface) -> NDArray[np.bool_]:
-    """(T,) the smallest triangle at every edge that has too many, or two with the same direction."""
+    """Return (T,) the smallest triangle at every edge that has too many, or two with the same direction."""
     edges, edge_of = edges_of(surface.faces)
     forward = surface.faces < np.roll(surface.faces, -1, axis=1)
     uses = np.stack([np.bincount(edge_of[way], minlength=len(edges)) for way in (forward, ~forward)])

@@ -21,7 +21,7 @@ class Occluders:
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces.astype(np.uint32)))
 
     def hidden(self, centre: NDArray[np.float64], slack: float, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """(N,) whether a triangle lies between a point and the camera.
+        """Return (N,) whether a triangle lies between a point and the camera.
 
         Args:
             centre: (3,) of the camera.

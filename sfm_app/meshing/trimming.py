@@ -39,7 +39,7 @@ class Support:
 
     @classmethod
     def none(cls, count: int) -> "Support":
-        """No photo yet for `count` vertices."""
+        """Make the arrays of `count` vertices that no photo sees yet."""
         return cls(*(np.zeros(count, np.int32) for _ in range(3)))
 
     def add(self, verdict: NDArray[np.uint8]) -> None:
@@ -76,7 +76,7 @@ def trim(surface: Surface, support: Support, max_gap: float, least: float) -> Su
 
 
 def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], max_width: float) -> FloatArray:
-    """Support the unsupported patches that are small and not mostly seen through.
+    """Return support the unsupported patches that are small and not mostly seen through.
 
     Args:
         surface: closed or open.
@@ -124,7 +124,7 @@ def drop_doubtful(surface: Surface, support: FloatArray, confirmed: NDArray[np.i
 
 
 def smooth_support(surface: Surface, support: FloatArray, steps: int) -> FloatArray:
-    """(V,) support after `steps` averages over the vertex and its neighbours: the border loses its fringe."""
+    """Return (V,) support after `steps` averages over the vertex and its neighbours: the border loses its fringe."""
     edges, _ = edges_of(surface.faces)
     graph = _graph(edges, len(support))
     neighbours = np.maximum(np.bincount(edges.ravel(), minlength=len(support)), 1)
@@ -142,7 +142,9 @@ def _graph(edges: IndexArray, size: int, weights: FloatArray | None = None) -> A
 
 
 def cut(surface: Surface, support: FloatArray) -> Surface:
-    """The part of a surface where the support, linear along the edges, is positive; triangles on the border are split.
+    """Return the part of a surface where the support, linear along the edges, is positive.
+
+    Triangles on the border are split.
 
     Args:
         surface: any.
@@ -165,7 +167,10 @@ def cut(surface: Surface, support: FloatArray) -> Surface:
 
 
 def _split(faces: IndexArray, middle: IndexArray, inside: NDArray[np.bool_]) -> IndexArray:
-    """Triangles whose corners are inside, and what is left of those with one or two; `middle` (T, 3) on ab, bc, ca."""
+    """Return triangles whose corners are inside, and what is left of those with one or two.
+
+    `middle` (T, 3) on ab, bc, ca.
+    """
     parts = [faces[inside.all(axis=1)]]
     count = inside.sum(axis=1)
     for corner in range(3):

@@ -23,7 +23,7 @@ class Paint:
 
     @classmethod
     def none(cls, count: int) -> "Paint":
-        """No colour yet for `count` vertices."""
+        """Make the arrays of `count` vertices without a color yet."""
         return cls(np.zeros((count, 3), np.float32), np.zeros(count, np.float32))
 
     def add(self, other: "Paint") -> None:
@@ -32,7 +32,7 @@ class Paint:
         self.weight += other.weight
 
     def over(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(V, 3) the mean of the photos; vertices that no photo shows keep what they have in `colors`."""
+        """Return (V, 3) the mean of the photos; vertices that no photo shows keep what they have in `colors`."""
         mean = self.total / np.maximum(self.weight, np.finfo(np.float32).tiny)[:, None]
         return np.where(self.weight[:, None] > 0, np.rint(mean), colors).astype(np.uint8)
 
@@ -40,7 +40,9 @@ class Paint:
 def sample_colors(
     points: FloatArray, normals: FloatArray, verdict: NDArray[np.uint8], eye: Eye, image: ColorImage
 ) -> Paint:
-    """What one photo adds: its colours where it confirms the points, weighted by the pixels that a patch there gets.
+    """Return what one photo adds.
+
+    Its colours where it confirms the points, weighted by the pixels that a patch there gets.
 
     Args:
         points: (N, 3).

@@ -50,7 +50,7 @@ class Eye:
 
 
 def judge(points: FloatArray, normals: FloatArray, eye: Eye, tolerance: float) -> NDArray[np.uint8]:
-    """Per point (N, 3) with its unit normal (N, 3): CONFIRMED, SEEN_THROUGH, EMPTY or SILENT.
+    """Judge points (N, 3) with unit normals (N, 3): CONFIRMED, SEEN_THROUGH, EMPTY or SILENT.
 
     A point is confirmed where the depths around it reach its own within the relative tolerance and it faces the photo;
     it is seen through where all of them lie well behind it. The map is empty where it faces the photo and there are no

@@ -55,7 +55,7 @@ class Roll:
 
 
 def ups_from_roll(rotations: FloatArray, centres: FloatArray) -> tuple[Roll, ...]:
-    """For photos turned by 0, 90, 180, 270 degrees: the direction for which they are held most nearly level.
+    """Return, for photos turned by 0, 90, 180, 270 degrees, the direction for which they are held most nearly level.
 
     Roll alone does not tell portrait photos of a wall from landscape photos of the same wall lying on its side, so
     two weaker signs join in: people look about horizontally, and they walk rather than climb. Of the directions that
@@ -80,13 +80,13 @@ def _best(turn: int, proposals: FloatArray, rotations: FloatArray, centres: Floa
 
 
 def _up_axes(rotations: FloatArray) -> FloatArray:
-    """(4, N, 3) what is up in each photo if it is upright once turned by 0, 90, 180, 270 degrees clockwise."""
+    """Return (4, N, 3) what is up in each photo if it is upright once turned by 0, 90, 180, 270 degrees clockwise."""
     x, y = rotations[:, 0], rotations[:, 1]
     return np.stack([-y, -x, y, x])
 
 
 def _proposals(rotations: FloatArray) -> list[FloatArray]:
-    """Per turn of the set the mean of its photos' up directions, and some of them alone."""
+    """Return, per turn of the set, the mean of its photos' up directions, and some of them alone."""
     axes = _up_axes(rotations)
     chosen = np.unique(np.linspace(0, len(rotations) - 1, 12).astype(int))
     return [
@@ -96,14 +96,14 @@ def _proposals(rotations: FloatArray) -> list[FloatArray]:
 
 
 def _tilts(up: FloatArray, rotations: FloatArray) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
-    """Per photo its turn (0 to 3) and the sines of roll and pitch against `up`."""
+    """Return, per photo, its turn (0 to 3) and the sines of roll and pitch against `up`."""
     turns = np.argmax(_up_axes(rotations) @ up, axis=0)
     level = np.where((turns % 2 == 0)[:, None], rotations[:, 0], rotations[:, 1])
     return turns, level @ up, rotations[:, 2] @ up
 
 
 def _cost(up: FloatArray, turn: int, rotations: FloatArray, roll_deg: float) -> float:
-    """-log likelihood of the poses if the set as a whole is turned by `turn` quarters."""
+    """Return -log likelihood of the poses if the set as a whole is turned by `turn` quarters."""
     turns, roll, pitch = _tilts(up, rotations)
     sideways = np.minimum(_squares(roll, roll_deg), MOST)
     along_view = np.minimum(_squares(pitch, PITCH_DEG), np.where(pitch < 0, MOST_DOWN, MOST))
@@ -112,14 +112,14 @@ def _cost(up: FloatArray, turn: int, rotations: FloatArray, roll_deg: float) -> 
 
 
 def _climbing(up: FloatArray, centres: FloatArray) -> float:
-    """-log likelihood of how much of the cameras' spread is height: Cauchy, since a few do climb."""
+    """Return -log likelihood of how much of the cameras' spread is height: Cauchy, since a few do climb."""
     spread = centres - centres.mean(axis=0)
     total = float((spread**2).sum())
     return float(np.log1p(((spread @ up) ** 2).sum() / (total * CLIMB**2))) if total > 0 else 0.0
 
 
 def _refined(up: FloatArray, rotations: FloatArray, roll_deg: float) -> FloatArray:
-    """Least squares of roll and pitch with Welsch's weights on each photo, from `up` on."""
+    """Return least squares of roll and pitch with Welsch's weights on each photo, from `up` on."""
     for _ in range(STEPS):
         before = up
         up = least_direction(_normal_matrix(up, rotations, roll_deg), up)
@@ -129,7 +129,7 @@ def _refined(up: FloatArray, rotations: FloatArray, roll_deg: float) -> FloatArr
 
 
 def _normal_matrix(up: FloatArray, rotations: FloatArray, roll_deg: float) -> FloatArray:
-    """(3, 3) information about up: sum of the axes' a a' that should be level, over their variances."""
+    """Return (3, 3) information about up: sum of the axes' a a' that should be level, over their variances."""
     turns, roll, pitch = _tilts(up, rotations)
     level = np.where((turns % 2 == 0)[:, None], rotations[:, 0], rotations[:, 1])
     matrix = np.zeros((3, 3))
@@ -140,7 +140,7 @@ def _normal_matrix(up: FloatArray, rotations: FloatArray, roll_deg: float) -> Fl
 
 
 def _uncertainty(up: FloatArray, rotations: FloatArray, roll_deg: float) -> tuple[float, float]:
-    """Robust spread of the roll in degrees, and the standard deviation of `up`."""
+    """Return robust spread of the roll in degrees, and the standard deviation of `up`."""
     _, roll, _ = _tilts(up, rotations)
     spread = float(1.4826 * np.median(np.degrees(np.abs(np.arcsin(np.clip(roll, -1.0, 1.0))))))
     information = np.linalg.eigvalsh(_normal_matrix(up, rotations, roll_deg))[1]  # of the less certain of two tilts

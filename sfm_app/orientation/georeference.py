@@ -72,7 +72,7 @@ class NoGeoreference:
 def georeference(
     centres: FloatArray, positions: Sequence[GpsPosition | None], up: FloatArray, *, up_is_sure: bool = True
 ) -> Georeference | NoGeoreference:
-    """Scale, heading and place from the positions of the photos, if these agree with the cameras.
+    """Find scale, heading and place from the positions of the photos, if these agree with the cameras.
 
     GPS is off by 3 to 10 m along the ground and by twice that in height, so up stays as it is, and the positions are
     used along the ground only: w = a z + b in complex numbers, by RANSAC over pairs, then least squares. Only where up
@@ -101,7 +101,7 @@ def georeference(
 
 
 def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
-    """(N, 3) metres east, north and up of an origin; up is 0 where either altitude is unknown.
+    """Return (N, 3) metres east, north and up of an origin; up is 0 where either altitude is unknown.
 
     To the first order in the angles, with the ellipsoid's radii at the origin: 1 m off over 5 km.
     """
@@ -117,7 +117,7 @@ def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
 
 
 def position_at(enu: FloatArray, origin: GpsPosition) -> GpsPosition:
-    """The position so many metres (3,) east, north and up of an origin; `enu_m` backwards."""
+    """Return the position so many metres (3,) east, north and up of an origin; `enu_m` backwards."""
     meridian, parallel = _radii_m(origin)
     longitude = (origin.longitude_deg + float(np.degrees(enu[0] / parallel)) + 180.0) % 360.0 - 180.0
     altitude = None if origin.altitude_m is None else origin.altitude_m + float(enu[2])
@@ -125,7 +125,7 @@ def position_at(enu: FloatArray, origin: GpsPosition) -> GpsPosition:
 
 
 def _radii_m(origin: GpsPosition) -> tuple[float, float]:
-    """Radius of curvature along the meridian, and of the circle of latitude, both at the origin's altitude."""
+    """Return radius of curvature along the meridian, and of the circle of latitude, both at the origin's altitude."""
     latitude = np.radians(origin.latitude_deg)
     squared = FLATTENING * (2.0 - FLATTENING)
     across = EQUATOR_M / np.sqrt(1.0 - squared * np.sin(latitude) ** 2)
@@ -135,7 +135,7 @@ def _radii_m(origin: GpsPosition) -> tuple[float, float]:
 
 
 def _middle(positions: Sequence[GpsPosition]) -> GpsPosition:
-    """Median position; its altitude is the median of those that are known."""
+    """Return median position; its altitude is the median of those that are known."""
     first = positions[0].longitude_deg
     turn = np.median([(position.longitude_deg - first + 180.0) % 360.0 - 180.0 for position in positions])
     longitude = (first + float(turn) + 180.0) % 360.0 - 180.0
@@ -175,12 +175,12 @@ def _along_ground(
 
 
 def _complex(points: FloatArray) -> NDArray[np.complex128]:
-    """Points (N, 2 or 3) along the ground as x + iy."""
+    """Return points (N, 2 or 3) along the ground as x + iy."""
     return np.asarray(points[:, 0] + 1j * points[:, 1], np.complex128)
 
 
 def _agreeing(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float) -> NDArray[np.bool_]:
-    """Which positions agree with the pair that most agree with: least sum of squares, none above the limit's."""
+    """Return which positions agree with the pair that most agree with: least sum of squares, none above the limit's."""
     pairs = np.array(list(combinations(range(len(z)), 2)), np.intp)
     if len(pairs) > MAX_PAIRS:
         pairs = np.random.default_rng(0).permutation(pairs)[:MAX_PAIRS]
@@ -203,14 +203,14 @@ def _agreeing(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float
 
 
 def _line(z: NDArray[np.complex128], w: NDArray[np.complex128]) -> tuple[complex, complex]:
-    """a and b of w = a z + b with least squared error."""
+    """Return a and b of w = a z + b with least squared error."""
     around = z - z.mean()
     a = complex(np.vdot(around, w - w.mean()) / max(float(np.vdot(around, around).real), 1e-300))
     return a, complex(w.mean() - a * z.mean())
 
 
 def _up_of(cameras: FloatArray, enu: FloatArray, positions: Sequence[GpsPosition]) -> tuple[FloatArray, float] | None:
-    """Up (3,) in the world from positions in space, with its deviation; None where that is not within `UP_DEG`."""
+    """Find up (3,) in the world from positions in space, and its deviation; None where that is not within `UP_DEG`."""
     if any(position.altitude_m is None for position in positions) or len(positions) < 5:
         return None
     try:

@@ -56,7 +56,7 @@ class Upright:
         return float(axis_angle_deg(self.up, self.roll.up))
 
     def turned_to(self, up: FloatArray, deviation_deg: float) -> "Upright":
-        """The same, with up as GPS has it: heights know their sign."""
+        """Return the same, with up as GPS has it: heights know their sign."""
         sure = Standing(self.roll, self.standing.evidence, np.inf, np.inf)
         return replace(self, up=up, level=None, found_by=GPS, deviation_deg=deviation_deg, standing=sure)
 
@@ -64,7 +64,7 @@ class Upright:
 def up_direction(
     rotations: FloatArray, centres: FloatArray, scenery: Scenery, segments: Segments, turn_deg: int | None = None
 ) -> Upright:
-    """Up from the vertical lines of the scene near where the cameras' roll has it; else from roll, or from the ground.
+    """Find up from the vertical lines of the scene near where the cameras' roll has it; else from roll or the ground.
 
     Args:
         rotations: (N, 3, 3) cam_from_world of the photos, N >= 1.
@@ -96,7 +96,7 @@ def up_direction(
 
 
 def facing(upright: Upright, rotations: FloatArray, points: FloatArray) -> tuple[FloatArray, str]:
-    """The horizontal direction (3,) that should point to the viewer, and what says so: `LINES`, `WALL` or `CAMERAS`.
+    """Return horizontal direction (3,) that should point to the viewer, and what says so: `LINES`, `WALL` or `CAMERAS`.
 
     Towards the cameras; where lines or walls have a main direction near that, exactly along it.
     """
@@ -116,7 +116,7 @@ def facing(upright: Upright, rotations: FloatArray, points: FloatArray) -> tuple
 
 
 def viewer_frame(up: FloatArray, towards: FloatArray, points: FloatArray, metres: float | None = None) -> Similarity:
-    """The similarity into the frame of glTF viewers: y up, z to the viewer, the points about 0.
+    """Return the similarity into the frame of glTF viewers: y up, z to the viewer, the points about 0.
 
     Args:
         up: (3,) unit vector in the world.

@@ -32,7 +32,7 @@ class Plane:
 
 
 def dominant_plane(points: FloatArray, axis: FloatArray, between_deg: tuple[float, float]) -> Plane | None:
-    """The plane with most points whose normal is so far from an axis: floors (0, 25), walls (80, 90).
+    """Return the plane with most points whose normal is so far from an axis: floors (0, 25), walls (80, 90).
 
     RANSAC with a fixed seed, then least squares on the points near the plane; None where no plane has enough of them.
 

@@ -12,7 +12,7 @@ SHORTEST, MOST_SEGMENTS = 0.025, 400
 
 
 def line_segments(grey: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Segments of a grey photo (H, W): (N, 4) x1, y1, x2, y2 in its pixels, longest first.
+    """Return segments of a grey photo (H, W): (N, 4) x1, y1, x2, y2 in its pixels, longest first.
 
     LSD (von Gioi, Jakubowicz, Morel and Randall 2010).
     """

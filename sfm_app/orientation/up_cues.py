@@ -55,7 +55,7 @@ class Surfaces:
 
 
 def small_picture(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A grey photo, shrunk to `PICTURE_PX`."""
+    """Return a grey photo, shrunk to `PICTURE_PX`."""
     shrink = min(1.0, PICTURE_PX / max(grey.shape))
     size = (max(1, round(grey.shape[1] * shrink)), max(1, round(grey.shape[0] * shrink)))
     return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -64,7 +64,7 @@ def small_picture(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def surfaces_of(
     points: FloatArray, brightness: FloatArray, seen: Sequence[NDArray[np.int64]], centres: FloatArray
 ) -> Surfaces:
-    """Planes through the neighbours of each point, where these lie on one.
+    """Return planes through the neighbours of each point, where these lie on one.
 
     Args:
         points: (P, 3).
@@ -98,7 +98,7 @@ def low_is_near(
     points: FloatArray,
     seen: Sequence[NDArray[np.int64]],
 ) -> float:
-    """Correlation of log depth with height in the photo, over the points that it sees; mean over the photos.
+    """Return correlation of log depth with height in the photo, over the points that it sees; mean over the photos.
 
     The ground comes nearer towards the lower border; facades seen from the street lean away. In [-1, 1].
     """
@@ -118,7 +118,7 @@ def low_is_near(
 
 
 def tops_are_seen(up: FloatArray, surfaces: Surfaces) -> float:
-    """Mean upward component of the normals: free space and those who look are above floors, steps and sills.
+    """Return mean upward component of the normals: free space and those who look are above floors, steps and sills.
 
     In [-1, 1].
     """
@@ -126,7 +126,9 @@ def tops_are_seen(up: FloatArray, surfaces: Surfaces) -> float:
 
 
 def tops_are_bright(up: FloatArray, surfaces: Surfaces) -> float:
-    """Correlation of brightness with the upward component of the normal, both against what is around: light from above.
+    """Return correlation of brightness with the upward component of the normal, both against what is around.
+
+    Light from above.
 
     In [-1, 1].
     """
@@ -138,7 +140,9 @@ def tops_are_bright(up: FloatArray, surfaces: Surfaces) -> float:
 
 
 def ledges_are_lit(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
-    """Share of the power of slopes of brightness along `up` that rise, less that which fall; mean over the photos.
+    """Return share of the power of slopes of brightness along `up` that rise, less that which fall.
+
+    Mean over the photos.
 
     Under ledges, eaves and things on the ground lies shadow with a sharp border to the lit top above it, and skylines
     are brighter above; the ways back to light are gentle. Across, it is 0 within 0.06. In [-1, 1].
@@ -155,7 +159,7 @@ def ledges_are_lit(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDA
 
 
 def sky_is_above(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
-    """Share of even and bright pixels at the upper border less that at the lower one; mean over the photos.
+    """Return share of even and bright pixels at the upper border less that at the lower one; mean over the photos.
 
     In [-1, 1].
     """
@@ -183,6 +187,6 @@ def _black_background(grey: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _slope(grey: NDArray[np.float32], axis: FloatArray) -> NDArray[np.float32]:
-    """(H - 2, W - 2) derivative along an axis (x, y, ...) in the picture, in grey levels per pixel."""
+    """Return (H - 2, W - 2) derivative along an axis (x, y, ...) in the picture, in grey levels per pixel."""
     down, right = grey[2:, 1:-1] - grey[:-2, 1:-1], grey[1:-1, 2:] - grey[1:-1, :-2]
     return np.asarray(0.5 * (axis[0] * right + axis[1] * down), np.float32)

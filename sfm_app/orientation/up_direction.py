@@ -45,7 +45,7 @@ class Cue:
     """Its variance within a scene, times the number of points."""
 
     def nats(self, value: float, points: int) -> float:
-        """Log odds of up against down: both are normal, with opposite means."""
+        """Return log odds of up against down: both are normal, with opposite means."""
         variance = self.deviation**2 + self.noise / max(points, 1)
         return float(np.clip(2.0 * self.mean * value / variance, -MOST, MOST))
 
@@ -95,7 +95,7 @@ class Standing:
 
 
 def stand(rolls: Sequence[Roll], rotations: FloatArray, centres: FloatArray, scenery: Scenery) -> Standing:
-    """First the vertical, from how the cameras are held and the ledges; then which end of it is up.
+    """Return first the vertical, from how the cameras are held and the ledges; then which end of it is up.
 
     Args:
         rolls: what the cameras say if most photos are turned by 0, 90, 180, 270 degrees; opposites share a vertical.
@@ -126,5 +126,5 @@ def stand(rolls: Sequence[Roll], rotations: FloatArray, centres: FloatArray, sce
 
 
 def odds(nats: float) -> float:
-    """Log odds as odds to one, with two digits."""
+    """Return log odds as odds to one, with two digits."""
     return float(f"{np.exp(min(nats, HIGHEST_NATS)):.2g}")

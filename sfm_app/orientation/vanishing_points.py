@@ -50,7 +50,7 @@ class Segments:
         return len(self.normals)
 
     def take(self, chosen: NDArray[np.bool_]) -> "Segments":
-        """Some of them."""
+        """Return some of them."""
         return Segments(self.normals[chosen], self.middles[chosen], self.lengths[chosen], self.photos[chosen])
 
 
@@ -69,7 +69,7 @@ class Vanishing:
 
 
 def segment_planes(first: FloatArray, second: FloatArray, photo: int, scale_px: float) -> Segments:
-    """Segments of one photo from the rays (N, 3), in the world, to their two ends.
+    """Return segments of one photo from the rays (N, 3), in the world, to their two ends.
 
     Args:
         first: (N, 3) directions from the camera centre to one end of each.
@@ -84,7 +84,7 @@ def segment_planes(first: FloatArray, second: FloatArray, photo: int, scale_px: 
 
 
 def joined(parts: list[Segments]) -> Segments:
-    """All segments of several photos."""
+    """Return all segments of several photos."""
     if not parts:
         return Segments(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
     return Segments(
@@ -96,14 +96,17 @@ def joined(parts: list[Segments]) -> Segments:
 
 
 def misses_deg(direction: FloatArray, segments: Segments) -> FloatArray:
-    """(N,) angle in the photo between each segment and the line from its middle to the vanishing point; [0, 90]."""
+    """Return (N,) angle in the photo between each segment and the line from its middle to the vanishing point.
+
+    [0, 90].
+    """
     sine = np.abs(along(segments.normals, direction))
     away = np.linalg.norm(np.cross(segments.middles, direction), axis=1)
     return np.asarray(np.degrees(np.arcsin(np.clip(sine / np.maximum(away, 1e-9), 0.0, 1.0))), np.float64)
 
 
 def vanishing_near(start: FloatArray, segments: Segments) -> Vanishing | None:
-    """The direction within `SEARCH_DEG` of `start` that most segments run along; None where none stands out.
+    """Return the direction within `SEARCH_DEG` of `start` that most segments run along; None where none stands out.
 
     An exhaustive search on a grid, then Welsch's weights around the best of it, ever narrower.
 
@@ -121,7 +124,9 @@ def vanishing_near(start: FloatArray, segments: Segments) -> Vanishing | None:
 
 
 def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
-    """The horizontal direction (3,) that most segments run along, with those at right angles to it; None as above.
+    """Return the horizontal direction (3,) that most segments run along, with those at right angles to it.
+
+    None as above.
 
     Segments on the horizon fit all horizontal directions, and vertical ones are no witnesses: both stay out.
     """
@@ -143,7 +148,7 @@ def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
 
 
 def square_frame(up: FloatArray, level: FloatArray, segments: Segments) -> tuple[FloatArray, float]:
-    """Three directions at right angles near up, level and up x level that the segments run along most exactly.
+    """Return three directions at right angles near up, level and up x level that the segments run along most exactly.
 
     Horizontal edges say as much about up as vertical ones, and columns taper where cornices do not. Gauss-Newton on
     the rotation with Welsch's weights: a rotation by w moves the miss n'd of a segment along d by n'(w x d).
@@ -171,7 +176,7 @@ def square_frame(up: FloatArray, level: FloatArray, segments: Segments) -> tuple
 
 
 def _rotation_equations(frame: FloatArray, segments: Segments, width_deg: float) -> tuple[FloatArray, FloatArray]:
-    """Per photo (P, 3, 3) and (P, 3): normal equations of the rotation vector."""
+    """Return the normal equations of the rotation vector, per photo (P, 3, 3) and (P, 3)."""
     misses = np.array([misses_deg(axis, segments) for axis in frame])
     axes = frame[np.argmin(misses, axis=0)]
     away = np.maximum(np.linalg.norm(np.cross(segments.middles, axes), axis=1), LEAST_SINE)
@@ -184,7 +189,7 @@ def _rotation_equations(frame: FloatArray, segments: Segments, width_deg: float)
 
 
 def refined(direction: FloatArray, segments: Segments) -> FloatArray:
-    """The nearby direction that makes the weighted squares of the misses least."""
+    """Return the nearby direction that makes the weighted squares of the misses least."""
     for width_deg in WIDTHS_DEG:
         for _ in range(10):
             before = direction
@@ -195,7 +200,7 @@ def refined(direction: FloatArray, segments: Segments) -> FloatArray:
 
 
 def cap(axis: FloatArray, radius_deg: float, step_deg: float) -> FloatArray:
-    """(N, 3) unit vectors evenly spread around an axis (3,), up to an angle from it."""
+    """Return (N, 3) unit vectors evenly spread around an axis (3,), up to an angle from it."""
     e1, e2 = basis_across(axis)
     found = [axis[None]]
     for polar in np.radians(np.arange(step_deg, radius_deg + 1e-9, step_deg)):
@@ -211,7 +216,7 @@ def _support(direction: FloatArray, segments: Segments, width_deg: float) -> flo
 
 
 def _matrices(direction: FloatArray, segments: Segments, width_deg: float) -> FloatArray:
-    """(P, 3, 3) per photo the sum of n n' of its segments, weighted for least squares of the misses."""
+    """Return (P, 3, 3) per photo the sum of n n' of its segments, weighted for least squares of the misses."""
     away = np.maximum(np.linalg.norm(np.cross(segments.middles, direction), axis=1), LEAST_SINE)
     weights = segments.lengths * np.exp(-0.5 * (misses_deg(direction, segments) / width_deg) ** 2) / away**2
     n = segments.normals
@@ -219,14 +224,14 @@ def _matrices(direction: FloatArray, segments: Segments, width_deg: float) -> Fl
 
 
 def _per_photo(segments: Segments, values: FloatArray) -> FloatArray:
-    """Sums of values (N, ...) over the segments of each photo."""
+    """Return sums of values (N, ...) over the segments of each photo."""
     sums = np.zeros((int(segments.photos.max(initial=-1)) + 1, *values.shape[1:]))
     np.add.at(sums, segments.photos, values)
     return sums
 
 
 def _judged(found: FloatArray, tried: FloatArray, support: FloatArray, segments: Segments) -> Vanishing | None:
-    """The direction with what speaks for it, if it stands out from those that were tried far from it."""
+    """Return the direction with what speaks for it, if it stands out from those that were tried far from it."""
     running = misses_deg(found, segments) < WIDTHS_DEG[0]
     share = float(segments.lengths[running].sum() / segments.lengths.sum())
     away = axis_angle_deg(tried, found) > APART_DEG
@@ -245,6 +250,6 @@ def _direction_deviation_deg(found: FloatArray, segments: Segments) -> float:
 
 
 def _jackknife(moves: FloatArray) -> float:
-    """Standard deviation from how far the answer moves without each photo: those of one photo err together."""
+    """Return standard deviation from how far the answer moves without each photo: those of one photo err together."""
     n = len(moves)
     return float(np.sqrt((n - 1) / n * (moves**2).sum())) if n > 1 else float("inf")

@@ -14,7 +14,7 @@ optical centre, which lies near the middle."""
 
 
 def grouped(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
-    """Photos with their groups, in their order; those of one group share one camera.
+    """Yield photos with their groups, in their order; those of one group share one camera.
 
     COLMAP's cameras have one size. Photos taken on end are turned to lie as the others of their camera do; otherwise
     photos of different sizes are never of one group, nor are pictures of different sizes within bars, where nobody has
@@ -36,7 +36,7 @@ def grouped(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
 
 
 def _within_bars(photos: Sequence[Photo]) -> list[Photo]:
-    """The same with groups of their own for pictures of other sizes within bars."""
+    """Give pictures of other sizes within bars groups of their own."""
     groups: dict[str, list[int]] = {}
     for place, photo in enumerate(photos):
         groups.setdefault(photo.group, []).append(place)

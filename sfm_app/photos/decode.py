@@ -36,7 +36,7 @@ class UnreadableError(Exception):
 
 @cache
 def formats() -> tuple[str, ...]:
-    """What can be read here: HEIC needs the extra, AVIF a Pillow that was built with it."""
+    """Return what can be read here: HEIC needs the extra, AVIF a Pillow that was built with it."""
     found = FORMATS + (("AVIF",) if features.check("avif") else ())
     try:
         importlib.import_module("pillow_heif").register_heif_opener()
@@ -89,7 +89,7 @@ def read_picture(path: Path) -> Picture:
 
 @contextmanager
 def room_for(path: Path) -> Iterator[None]:
-    """Large photos are dealt with one at a time: each takes ten bytes per pixel and more."""
+    """Provide large photos are dealt with one at a time: each takes ten bytes per pixel and more."""
     try:
         with Image.open(path, formats=formats()) as image:
             pixels = image.width * image.height
@@ -100,14 +100,14 @@ def room_for(path: Path) -> Iterator[None]:
 
 
 def _refuse_bombs(image: Image.Image, path: Path) -> None:
-    """Pillow refuses what is larger still."""
+    """Let Pillow refuse what is larger still."""
     pixels = image.width * image.height
     if pixels > LARGE_PX and path.stat().st_size < LEAST_BYTES_PER_PX * pixels:
         raise UnreadableError("too many pixels for a file of its size")
 
 
 def _frames_of(image: Image.Image) -> int:
-    """How many pictures a file holds, or MOST_FRAMES + 1; the others of an MPO are previews."""
+    """Return how many pictures a file holds, or MOST_FRAMES + 1; the others of an MPO are previews."""
     if image.format == "MPO":
         return 1
     if image.format != "TIFF":
@@ -131,17 +131,17 @@ def _exif_of(image: Image.Image) -> Image.Exif:
 
 
 def upright(picture: Picture) -> Image.Image:
-    """The picture upright by EXIF, in RGB or grey of 8 bits, what is transparent on white."""
+    """Return the picture upright by EXIF, in RGB or grey of 8 bits, what is transparent on white."""
     return turned_upright(_eight_bit(picture.image), orientation(picture.exif))
 
 
 def turned_upright(image: Image.Image, turned: int) -> Image.Image:
-    """The image after its EXIF orientation is undone."""
+    """Return the image after its EXIF orientation is undone."""
     return image.transpose(ORIENTATIONS[turned]) if turned in ORIENTATIONS else image
 
 
 def turned_back(upright: Image.Image, turn_deg: int) -> Image.Image:
-    """What has to be turned clockwise by so much to be upright."""
+    """Return what has to be turned clockwise by so much to be upright."""
     return upright.transpose(TURNS[turn_deg]) if turn_deg else upright
 
 
@@ -170,7 +170,7 @@ def _eight_bit(image: Image.Image) -> Image.Image:
 
 
 def _levels(deep: NDArray[Any]) -> NDArray[np.uint8]:
-    """Grey of 16 bits, or of what range ever, in 256 levels."""
+    """Return grey of 16 bits, or of what range ever, in 256 levels."""
     values = np.nan_to_num(deep.astype(np.float64))
     low, high = values.min(), values.max()
     if deep.dtype.kind in "iu" and low >= 0 and high <= 65535:

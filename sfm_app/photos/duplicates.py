@@ -15,7 +15,7 @@ LEAST_CONTRAST = 4.0
 
 
 def without_copies(glances: Sequence[Glance]) -> tuple[list[Photo], list[UnusablePhoto]]:
-    """The photos, of every picture the largest, of those with a mask where there are any; and the copies.
+    """Return the photos, of every picture the largest, of those with a mask where there are any; and the copies.
 
     Both in the order given.
     """

@@ -17,13 +17,16 @@ LOWEST_M, HIGHEST_M = -1000.0, 20_000.0
 
 
 def orientation(exif: Image.Exif) -> int:
-    """1 to 8: how the pixels have to be turned and mirrored to stand upright; 1 where they are, or where unknown."""
+    """Return 1 to 8: how the pixels have to be turned and mirrored to stand upright.
+
+    1 where they are, or where unknown.
+    """
     value = exif.get(ORIENTATION, 1)
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
 def turn_deg(exif: Image.Exif) -> int:
-    """By how much a camera that was held so has to be turned clockwise: 0 where the picture is mirrored, too."""
+    """Return by how much a camera that was held so has to be turned clockwise: 0 where the picture is mirrored, too."""
     return {3: 180, 6: 90, 8: 270}.get(orientation(exif), 0)
 
 
@@ -35,7 +38,7 @@ def camera_name(exif: Image.Exif) -> str:
 
 
 def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
-    """Focal length in pixels by the one for 35 mm film; None where it is missing or cannot be true."""
+    """Return focal length in pixels by the one for 35 mm film; None where it is missing or cannot be true."""
     try:
         focal = float(exif.get_ifd(EXIF_IFD).get(FOCAL_35MM)) * longer_side / FULL_FRAME_WIDTH_MM  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError):
@@ -44,7 +47,7 @@ def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
 
 
 def gps_position(exif: Image.Exif) -> GpsPosition | None:
-    """The position; None where it is missing or cannot be true.
+    """Return the position; None where it is missing or cannot be true.
 
     Cameras without a fix write zeros: latitude and longitude 0 is open sea, and counts as missing.
     """
@@ -57,13 +60,13 @@ def gps_position(exif: Image.Exif) -> GpsPosition | None:
 
 
 def printable(value: object) -> str:
-    """A value as a text without control characters; empty for None."""
+    """Return a value as a text without control characters; empty for None."""
     text = "" if value is None else str(value)
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 
 def _zoom(value: Any) -> str | None:
-    """Digital zoom crops the picture: another camera. 0 and 1 say that it was not used."""
+    """Return digital zoom crops the picture: another camera. 0 and 1 say that it was not used."""
     try:
         return None if float(value) in (0.0, 1.0) else f"x{float(value):g}"
     except (TypeError, ValueError, ZeroDivisionError):
@@ -71,7 +74,7 @@ def _zoom(value: Any) -> str | None:
 
 
 def _degrees(parts: Any, reference: Any, sides: str, largest: float) -> float | None:
-    """Signed degrees from EXIF's degrees, minutes and seconds and the letter of the side."""
+    """Return signed degrees from EXIF's degrees, minutes and seconds and the letter of the side."""
     try:
         degrees, minutes, seconds = (float(part) for part in parts)
         side = sides.index(str(reference).strip("\0 ").upper()[:1] or "?")

@@ -62,7 +62,7 @@ class Follower:
         self._recent: deque[float] = deque(maxlen=RECENT)
 
     def look(self, frame: int, grey: Picture) -> Look:
-        """The next frame; all are of one size."""
+        """Return the next frame; all are of one size."""
         sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
         self._recent.append(sharpness)
         if self._reference is None or len(self._corners) < FEWEST:
@@ -87,7 +87,7 @@ class Follower:
         self.seen = self.seen or len(self._corners) >= FEWEST
 
     def _follow(self, reference: Picture, grey: Picture) -> tuple[float, float]:
-        """By how many longer sides the median corner has moved, and the share of the corners that is found again."""
+        """Return by how many longer sides the median corner moved, and the share of the corners that is found again."""
         there, found = _tracked(reference, grey, self._corners, self._last)
         back, found_back = _tracked(grey, reference, there, self._corners)
         off = np.linalg.norm(back - self._corners, axis=2)[:, 0]
@@ -102,7 +102,7 @@ class Follower:
 
 
 def _tracked(before: Picture, after: Picture, points: FloatArray, guess: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Where points (N, 1, 2) of one picture are in another, and which of them were found."""
+    """Find where points (N, 1, 2) of one picture are in another, and which of them were found."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, points, guess.copy(),
         winSize=(WINDOW_PX, WINDOW_PX), maxLevel=LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,

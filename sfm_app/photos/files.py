@@ -12,7 +12,7 @@ VIDEOS = "MP4, MOV, MKV, WebM, AVI and MPEG are read: copy the file again, or sa
 
 
 def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: Sequence[Path] = ()) -> list[str]:
-    """Names of all files below the folder, with forward slashes, sorted.
+    """Return names of all files below the folder, with forward slashes, sorted.
 
     Hidden folders and links to folders are not entered and count as one file. The output folder is left out.
 
@@ -38,7 +38,7 @@ def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: S
 
 
 def _no_folder(path: Path) -> InputError:
-    """What is said of a path that is neither a folder nor a video."""
+    """Return what is said of a path that is neither a folder nor a video."""
     if not path.exists():
         what = "file" if path.suffix.lower() in ENDINGS else "folder"
         return InputError(f"no such {what}: {path}", hint=f"{HINT}, or a video")
@@ -50,7 +50,7 @@ def _no_folder(path: Path) -> InputError:
 
 
 def place_of(folder: Path, name: str) -> Path | str:
-    """Where a file really lies, links followed, or why it is not opened."""
+    """Return where a file really is, links followed, or why it is not opened."""
     root, place = folder.resolve(), folder / name
     if Path(name).name.startswith("."):
         return "hidden"

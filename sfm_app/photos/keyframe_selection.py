@@ -27,7 +27,7 @@ class Choice:
 
 
 def choose(looks: Sequence[Look], most: int) -> Choice:
-    """One frame per step of the way; steps are longer where that would be more than `most` frames.
+    """Return one frame per step of the way; steps are longer where that would be more than `most` frames.
 
     Args:
         looks: of all frames that were looked at, in their order.
@@ -53,7 +53,7 @@ def choose(looks: Sequence[Look], most: int) -> Choice:
 
 
 def sharpest(way: FloatArray, sharpness: FloatArray, spacing: float) -> tuple[list[int], set[int]]:
-    """The sharpest frame around every multiple of a spacing, and all those that it was chosen from.
+    """Return the sharpest frame around every multiple of a spacing, and all those that it was chosen from.
 
     Args:
         way: (N,) steps.
@@ -83,7 +83,7 @@ def _best(sharpness: FloatArray, frames: NDArray[np.int64]) -> int:
 
 
 def _around(way: FloatArray, moment: int, target: float, reach: float, first: int) -> NDArray[np.int64]:
-    """Frames about a moment, one after the other, whose way lies within reach of the target."""
+    """Return frames about a moment, one after the other, whose way lies within reach of the target."""
     outside = np.abs(way - target) > reach
     outside[:first] = True
     before = np.flatnonzero(outside[:moment])

@@ -32,7 +32,7 @@ SAME_PX, SAME_SHARE = 4.0, 0.01
 
 
 def shown_part(picture: Image.Image) -> Frame | None:
-    """The picture within bars; None where there are none.
+    """Return the picture within bars; None where there are none.
 
     A bar above without one below is not believed: it may be a sky of one colour above a level horizon.
     """
@@ -49,7 +49,7 @@ def shown_part(picture: Image.Image) -> Frame | None:
 
 
 def with_one_frame(photos: Sequence[Photo]) -> Iterator[Photo]:
-    """Photos of one size with the pictures within them made equal where they nearly are.
+    """Yield photos of one size with the pictures within them made equal where they nearly are.
 
     Where all bars that are seen are alike, photos whose bars are not seen (a sky of their colour) have them, too. Bars
     around fewer than half of the photos are not believed: a wall before an empty ground ends at straight edges, too.
@@ -83,7 +83,7 @@ def _edges(frame: Frame) -> NDArray[np.int64]:
 
 
 def _bar(lines: NDArray[np.uint8]) -> int:
-    """How many of the first lines (N, M, 3) are a bar."""
+    """Return how many of the first lines (N, M, 3) are a bar."""
     colour = np.median(lines[0], axis=0).astype(np.int16)
     most = int(MOST_SHARE * len(lines))
     first = next((k for k in range(most) if _share(lines[k], colour, ALIKE) > STRAY), 0)
@@ -95,5 +95,5 @@ def _bar(lines: NDArray[np.uint8]) -> int:
 
 
 def _share(line: NDArray[np.uint8], colour: NDArray[np.int16], levels: int) -> float:
-    """Share of a line (M, 3) that differs from a colour by more."""
+    """Return share of a line (M, 3) that differs from a colour by more."""
     return float(np.mean(np.max(np.abs(line.astype(np.int16) - colour), axis=1) > levels))

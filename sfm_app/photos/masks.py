@@ -31,7 +31,7 @@ BoolImage = NDArray[np.bool_]
 
 
 def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
-    """Names of all files below the folder of masks, as `list_files` has them, without photos and output.
+    """Return names of all files below the folder of masks, as `list_files` has them, without photos and output.
 
     Raises:
         InputError: there is no such folder, or it is that of the photos.
@@ -45,7 +45,7 @@ def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
 
 
 def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
-    """The photo with its mask, if it has one; unusable where all of it is masked.
+    """Return the photo with its mask, if it has one; unusable where all of it is masked.
 
     Raises:
         InputError: the mask cannot be used; says why.
@@ -61,7 +61,7 @@ def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
 
 
 def unused_masks(names: Sequence[str], photos: Sequence[Photo]) -> list[str]:
-    """Which files of the folder of masks are the mask of no photo; hidden ones are nobody's."""
+    """Return which files of the folder of masks are the mask of no photo; hidden ones are nobody's."""
     used = {photo.mask for photo in photos}
     return [name for name in names if name not in used and not PurePosixPath(name).name.startswith(".")]
 
@@ -80,7 +80,7 @@ def lay_out_mask(photo: Photo, folder: Path, masks: Path, target: Path) -> None:
 
 
 def mask_place(target: Path, name: str) -> Path:
-    """Where the mask of the photo that goes by this name is laid out."""
+    """Return where the mask of the photo of this name is staged."""
     return target / f"{name}{ENDING}"
 
 
@@ -92,13 +92,13 @@ def save_used(target: Path, name: str, used: BoolImage) -> None:
 
 
 def read_used(target: Path, name: str) -> BoolImage:
-    """(H, W) what `save_used` wrote; OSError where it cannot be read."""
+    """Return (H, W) what `save_used` wrote; OSError where it cannot be read."""
     with Image.open(mask_place(target, name)) as image:
         return np.asarray(image) > 0
 
 
 def without_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uint8]:
-    """A photo (H, W, 3) whose masked pixels take the colour of the nearest one that may be used.
+    """Return a photo (H, W, 3) whose masked pixels take the colour of the nearest one that may be used.
 
     Then neither interpolation nor a smaller size brings back what is masked.
     """
@@ -113,7 +113,7 @@ def without_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uin
 
 
 def _fitted(photo: Photo, folder: Path, masks: Path) -> BoolImage:
-    """(H, W) which pixels of the photo, as it is laid out, its mask leaves."""
+    """Return (H, W) which pixels of the photo, as it is laid out, its mask leaves."""
     try:
         place = place_of(masks, photo.mask)
         if isinstance(place, str):
@@ -130,7 +130,7 @@ def _fitted(photo: Photo, folder: Path, masks: Path) -> BoolImage:
 
 
 def _turned_like(photo: Photo, size: tuple[int, int], mask: Image.Image, folder: Path) -> Image.Image:
-    """A mask that fits the photo as its file has it, before EXIF turns it."""
+    """Return a mask that fits the photo as its file has it, before EXIF turns it."""
     if _alike(mask.size[::-1], size):
         source = place_of(folder, photo.path)
         turned = orientation(read_picture(source).exif) if isinstance(source, Path) else 1
@@ -141,12 +141,12 @@ def _turned_like(photo: Photo, size: tuple[int, int], mask: Image.Image, folder:
 
 
 def _alike(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes have the same shape, to within a pixel of the smaller one."""
+    """Return whether two sizes have the same shape, to within a pixel of the smaller one."""
     return abs(one[0] * other[1] - one[1] * other[0]) <= max(*one, *other)
 
 
 def _black_and_white(image: Image.Image) -> Image.Image:
-    """White where any channel is not black and the picture not transparent."""
+    """Return white where any channel is not black and the picture not transparent."""
     if image.mode.startswith("I") or image.mode == "F":
         used = np.asarray(image) != 0
     elif image.mode in ("1", "L") and "transparency" not in image.info:

@@ -40,7 +40,7 @@ def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | U
 
 
 def described(name: str, picture: Picture, options: PhotoSettings) -> Glance | UnusablePhoto:
-    """What is known about a photo, and what it looks like."""
+    """Return what is known about a photo, and what it looks like."""
     image, exif = picture.image, picture.exif
     turn = turn_deg(exif)
     size = image.size[::-1] if orientation(exif) >= 5 and not turn else image.size
@@ -69,7 +69,7 @@ def described(name: str, picture: Picture, options: PhotoSettings) -> Glance | U
 
 
 def _shown(seen: Image.Image, photo: Photo) -> Frame | None:
-    """The picture within bars, in pixels of the photo as it is laid out."""
+    """Return the picture within bars, in pixels of the photo as it is laid out."""
     laid = turned_back(seen, photo.turn_deg)
     found = shown_part(laid)
     if found is None or laid.size == (photo.width, photo.height):
@@ -79,6 +79,6 @@ def _shown(seen: Image.Image, photo: Photo) -> Frame | None:
 
 
 def scaled(size: tuple[int, int], most_px: float) -> tuple[int, int]:
-    """Width and height of a picture with not more pixels than that."""
+    """Return width and height of a picture with not more pixels than that."""
     share = min(1.0, (most_px / (size[0] * size[1])) ** 0.5)
     return max(1, int(size[0] * share)), max(1, int(size[1] * share))

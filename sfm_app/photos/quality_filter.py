@@ -18,7 +18,7 @@ ODD = 0.2
 
 
 def screened(glances: Sequence[Glance]) -> tuple[list[Glance], list[UnusablePhoto]]:
-    """What is of use, and what is not; both in the order given."""
+    """Return what is of use, and what is not; both in the order given."""
     most = float(np.median([glance.blur for glance in glances])) if glances else 0.0
     sizes = Counter(_size(glance.photo) for glance in glances)
     photographic = np.mean([glance.flat < FLAT for glance in glances]) > 0.5 if glances else False
@@ -34,5 +34,5 @@ def screened(glances: Sequence[Glance]) -> tuple[list[Glance], list[UnusablePhot
 
 
 def _size(photo: Photo) -> tuple[int, int]:
-    """Whichever way the camera was held."""
+    """Return whichever way the camera was held."""
     return min(photo.width, photo.height), max(photo.width, photo.height)

@@ -19,7 +19,7 @@ JPEG_QUALITY = 95
 
 
 def stored_names(photos: Iterable[Photo]) -> Iterator[Photo]:
-    """Photos with the names that they go by: COLMAP writes them into databases and lists, a line each.
+    """Yield photos with the names that they go by: COLMAP writes them into databases and lists, a line each.
 
     A name keeps what can be printed and an ending that COLMAP knows; it stays as it is where it can.
     """
@@ -68,7 +68,7 @@ def _copy(photo: Photo, source: Path, place: Path) -> None:
 
 
 def _link(source: Path, place: Path, *, relative: bool) -> None:
-    """Frames lie in the output folder and move with it; photos of the user stay where they are."""
+    """Link a photo: frames are in the output folder and move with it, the user's photos stay where they are."""
     try:
         place.symlink_to(os.path.relpath(source, place.parent.resolve()) if relative else source)
     except OSError:  # Windows without the right to link, some network drives

@@ -43,12 +43,15 @@ def glance(photo: Photo, upright: Image.Image) -> Glance:
 
 
 def small_picture(grey: Image.Image) -> NDArray[np.float32]:
-    """What is compared to find copies."""
+    """Return what is compared to find copies."""
     return np.asarray(grey.resize((SIDE_PX, SIDE_PX), Image.Resampling.LANCZOS, reducing_gap=6.0), np.float32)
 
 
 def blur_of(grey: Image.Image) -> float:
-    """How much of their slope edges keep when they are blurred once more, in [0, 1]; the worse of both directions."""
+    """Return how much of their slope edges keep when they are blurred once more, in [0, 1].
+
+    The worse of both directions.
+    """
     grey = grey.copy()
     grey.thumbnail((LOOKED_AT_PX, LOOKED_AT_PX), Image.Resampling.BOX)
     fine = cv2.GaussianBlur(np.asarray(grey, np.float32), (0, 0), NOISE_PX)
@@ -60,7 +63,7 @@ def blur_of(grey: Image.Image) -> float:
 
 
 def flat_share(picture: Image.Image) -> float:
-    """Share of the picture, in small squares, that has one colour."""
+    """Return share of the picture, in small squares, that has one colour."""
     grey = np.asarray(picture)
     height, width = (side // BLOCK_PX * BLOCK_PX for side in grey.shape)
     squares = grey[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX)

@@ -20,7 +20,10 @@ _heard = threading.local()
 
 @contextmanager
 def complaints() -> Iterator[list[str]]:
-    """A list that takes what libtiff calls an error while this thread decodes; nothing where Pillow has no own copy."""
+    """Provide a list that takes what libtiff calls an error while this thread decodes.
+
+    Nothing where Pillow has no own copy.
+    """
     _listen()
     _heard.errors = []
     try:

@@ -33,7 +33,7 @@ FFMPEG = {
 
 @contextmanager
 def opened(path: Path) -> Iterator["Video"]:
-    """A video, open for one reading; what FFmpeg has to say about it is not shown.
+    """Provide a video, open for one reading; what FFmpeg has to say about it is not shown.
 
     Raises:
         UnreadableError: it is none, or nothing in it can be read.
@@ -90,7 +90,7 @@ class Video:
         return self.seconds + 2 / self.rate < CUT_SHORT * self.claimed / self.rate
 
     def small_frames(self) -> Iterator[tuple[int, Picture]]:
-        """Small grey pictures of the frames that are looked at, with their numbers."""
+        """Yield small grey pictures of the frames that are looked at, with their numbers."""
         size: tuple[int, int] | None = None
         for number in self._grabbed():
             if number % self.stride:
@@ -107,7 +107,7 @@ class Video:
             yield number, _grey(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
     def jpegs(self, numbers: Sequence[int]) -> Iterator[tuple[int, bytes]]:
-        """Frames at full size as JPEG, with their numbers, in rising order; fewer where the file has changed."""
+        """Yield frames at full size as JPEG, with their numbers, in rising order; fewer where the file has changed."""
         wanted = set(numbers)
         for number in self._grabbed():
             if number in wanted:
@@ -119,7 +119,7 @@ class Video:
                 return
 
     def _grabbed(self) -> Iterator[int]:
-        """Numbers of the frames, one after the other; each may be retrieved while it is the last one."""
+        """Yield numbers of the frames, one after the other; each may be retrieved while it is the last one."""
         while self._capture.grab():
             self.frames += 1
             self.seconds = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
@@ -132,7 +132,7 @@ def _grey(picture: NDArray[np.uint8]) -> Picture:
 
 @contextmanager
 def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """These variables are set, and afterwards as they were."""
+    """Set these variables, and restore them afterwards."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:

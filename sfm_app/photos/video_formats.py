@@ -15,7 +15,7 @@ ATOMS = (b"moov", b"mdat", b"wide", b"free", b"skip")
 
 
 def head_of(path: Path) -> bytes:
-    """The first bytes of a regular file; none where it cannot be read."""
+    """Return the first bytes of a regular file; none where it cannot be read."""
     try:
         if not path.is_file():  # pipes would never end
             return b""
@@ -26,7 +26,7 @@ def head_of(path: Path) -> bytes:
 
 
 def is_video(head: bytes) -> bool:
-    """Whether a file begins like MP4, QuickTime, Matroska, WebM, AVI or MPEG."""
+    """Return whether a file begins like MP4, QuickTime, Matroska, WebM, AVI or MPEG."""
     if head[4:8] == b"ftyp":
         return head[8:12] not in OTHER_BRANDS
     return (
@@ -40,5 +40,5 @@ def is_video(head: bytes) -> bool:
 
 
 def _packets(head: bytes, first: int, length: int) -> bool:
-    """Whether the packets of an MPEG transport stream begin where they should."""
+    """Return whether the packets of an MPEG transport stream begin where they should."""
     return len(head) == HEAD_BYTES and all(head[k] == 0x47 for k in range(first, HEAD_BYTES, length))

@@ -37,7 +37,7 @@ class Sight:
 
 
 def sight_of(matches: MatchGraph, poses: Mapping[PairId, RelativePose]) -> Sight:
-    """Inliers of all pairs, counted by keypoint, and the cells of all keypoints."""
+    """Return inliers of all pairs, counted by keypoint, and the cells of all keypoints."""
     rows = {pair: matches.matches[pair][pose.inliers].astype(np.int64) for pair, pose in poses.items()}
     photos = sorted({photo for pair in poses for photo in pair})
     seen = {photo: np.zeros(len(matches.keypoints[photo]), np.int64) for photo in photos}
@@ -48,14 +48,14 @@ def sight_of(matches: MatchGraph, poses: Mapping[PairId, RelativePose]) -> Sight
 
 
 def cells_of(matches: MatchGraph, photo: int) -> IndexArray:
-    """(K,) numbers of the cells in which the keypoints of a photo lie."""
+    """Return (K,) numbers of the cells in which the keypoints of a photo lie."""
     image = matches.images[photo]
     columns, lines = (matches.keypoints[photo] // (max(image.width, image.height) / CELLS)).astype(np.int64).T
     return np.asarray(lines * (CELLS + 1) + columns, np.int64)
 
 
 def coverages(sight: Sight) -> dict[PairId, float]:
-    """Which share of the cells with something known a pair covers, mean over its two photos, 0 to 1."""
+    """Return which share of the cells with something known a pair covers, mean over its two photos, 0 to 1."""
     found = {}
     for pair, rows in sight.rows.items():
         shares = []
@@ -71,7 +71,7 @@ def coverages(sight: Sight) -> dict[PairId, float]:
 
 
 def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
-    """Pairs of the tree of greatest coverage, and those that are nearly as good as the way along it."""
+    """Return pairs of the tree of greatest coverage, and those that are nearly as good as the way along it."""
     near: dict[int, list[tuple[int, float]]] = {photo: [] for pair in covered for photo in pair}
     group = {photo: photo for photo in near}
     for a, b in sorted(covered, key=lambda pair: (-covered[pair], pair)):
@@ -91,7 +91,7 @@ def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
 
 
 def _widest(root: int, near: Mapping[int, list[tuple[int, float]]]) -> dict[int, float]:
-    """By photo the weakest coverage on the way from the root along the tree."""
+    """Return, by photo, the weakest coverage on the way from the root along the tree."""
     found, waiting = {root: np.inf}, [root]
     while waiting:
         photo = waiting.pop()

@@ -57,7 +57,7 @@ class PoseGraphOptions:
 def build_pose_graph(
     matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, options: PoseGraphOptions, run_map: Map
 ) -> PoseGraph:
-    """Relative poses of all pairs, without those that contradict the others, with those that the others bear out.
+    """Give relative poses of all pairs, without those that contradict the others, with those that the others bear out.
 
     Args:
         matches: keypoints and raw matches.
@@ -114,7 +114,7 @@ def build_pose_graph(
 
 
 def with_model(graph: PoseGraph, photos: Collection[int], poses: Mapping[PairId, RelativePose]) -> PoseGraph:
-    """The graph with the relative poses of a model instead of those that it had between the model's photos."""
+    """Return the graph with the relative poses of a model instead of those that it had between the model's photos."""
     kept = {pair: pose for pair, pose in graph.poses.items() if not (pair[0] in photos and pair[1] in photos)}
     gone = sorted(graph.poses.keys() - kept.keys() - poses.keys())
     dropped = dict(graph.dropped) | dict.fromkeys(gone, CONTRADICTS)
@@ -124,13 +124,13 @@ def with_model(graph: PoseGraph, photos: Collection[int], poses: Mapping[PairId,
 
 
 def without_pose(pairs: Iterable[PairId], poses: Mapping[PairId, RelativePose]) -> list[PairId]:
-    """Pairs that have no pose, of photos that those with one connect."""
+    """Return pairs that have no pose, of photos that those with one connect."""
     group = {photo: number for number, photos in enumerate(_groups(poses)) for photo in photos}
     return [pair for pair in pairs if pair not in poses and group.get(pair[0], -1) == group.get(pair[1], -2)]
 
 
 def contradicting(poses: Mapping[PairId, RelativePose], angles: Mapping[PairId, float]) -> list[PairId]:
-    """Pairs that are further from the rotations of their photos, in degrees, than they may be."""
+    """Return pairs that are further from the rotations of their photos, in degrees, than they may be."""
     typical = SPREADS * float(np.median(list(angles.values()) or [0.0]))
     limits = {
         pair: max(typical, GUESSED_DEG if poses[pair].kind == "uncalibrated" else AGREEMENT_DEG) for pair in angles
@@ -141,7 +141,7 @@ def contradicting(poses: Mapping[PairId, RelativePose], angles: Mapping[PairId, 
 def averaged(
     poses: Mapping[PairId, RelativePose], flat: Collection[PairId] = ()
 ) -> tuple[dict[int, FloatArray], dict[PairId, float]]:
-    """Rotations of photos, and how far pairs are from them, with pairs counting by their inliers.
+    """Return rotations of photos, and how far pairs are from them, with pairs counting by their inliers.
 
     Args:
         poses: of pairs.
@@ -155,7 +155,7 @@ def averaged(
 
 
 def unconfirmed(poses: Mapping[PairId, RelativePose], firm: float) -> list[PairId]:
-    """Pairs with fewer than `firm` inliers that no loop of three photos bears out.
+    """Return pairs with fewer than `firm` inliers that no loop of three photos bears out.
 
     With these a place that only looks like another is joined to it, and no other pair is there to contradict.
     """

@@ -6,7 +6,7 @@ from sfm_app.types import PairId
 
 
 def connected_groups(pairs: Iterable[PairId], photos: Iterable[int] = ()) -> list[set[int]]:
-    """Photos that hang together through pairs, the largest group first.
+    """Return photos that hang together through pairs, the largest group first.
 
     Args:
         pairs: what joins photos.

@@ -27,7 +27,7 @@ LEAST_IN_FRONT, MOST_TURN_DEG = 0.95, 2.0
 
 
 def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> RelativePose | None:
-    """The pose of a pair whose rotation is known; None where its matches do not bear it out.
+    """Return the pose of a pair whose rotation is known; None where its matches do not bear it out.
 
     Args:
         pair: matches and cameras.
@@ -58,14 +58,14 @@ def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> Relat
 
 
 def epipolar_normals(pair: Pair, R: FloatArray) -> FloatArray:
-    """(N, 3) what the direction of translation is at right angles to, for each match, R given."""
+    """Return (N, 3) what the direction of translation is at right angles to, for each match, R given."""
     h1 = np.column_stack([pair.rays[:, :2], np.ones(len(pair.rays))]) @ R.T
     h2 = np.column_stack([pair.rays[:, 2:], np.ones(len(pair.rays))])
     return np.asarray(np.cross(h1, h2), np.float64)
 
 
 def held_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
-    """(3,) direction of translation near t that makes a robust sum of squared distances small, R held."""
+    """Return (3,) direction of translation near t that makes a robust sum of squared distances small, R held."""
     normals = epipolar_normals(pair, R)
     best = t
     for _ in range(HELD_ROUNDS):
@@ -80,7 +80,10 @@ def held_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
 
 
 def sampled_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> FloatArray | None:
-    """(3,) direction of translation that most matches agree with, R given: the best of many through two matches."""
+    """Return (3,) direction of translation that most matches agree with, R given.
+
+    The best of many through two matches.
+    """
     normals = epipolar_normals(pair, R)
     picks = rng.integers(len(normals), size=(SAMPLES, 2))
     found = np.cross(normals[picks[:, 0]], normals[picks[:, 1]])

@@ -57,13 +57,13 @@ class Tracks:
     """By photo (K,) the track of each keypoint; -1 where no pair of the backbone has it."""
 
     def agreement(self, pair: PairId, rows: IndexArray) -> tuple[int, int]:
-        """Of matches of a pair: how many have both ends on the same track, and how many on any."""
+        """Count the matches of a pair that have both ends on the same track, and those with both on any."""
         first, second = (self.names[photo][column] for photo, column in zip(pair, rows.T, strict=True))
         tracked = (first >= 0) & (second >= 0)
         return int(np.count_nonzero(tracked & (first == second))), int(np.count_nonzero(tracked))
 
     def contradict(self, pair: PairId, rows: IndexArray, least: int = LEAST_TRACKED) -> bool:
-        """Whether a pair, with so many tracked matches, joins what the backbone keeps apart."""
+        """Return whether a pair, with so many tracked matches, joins what the backbone keeps apart."""
         same, tracked = self.agreement(pair, rows)
         return tracked >= least and same <= SAME_TRACK * tracked
 
@@ -79,7 +79,7 @@ class Apart:
     tracks: Tracks
 
     def strange(self, pair: PairId, rows: IndexArray) -> bool:
-        """Whether a pair that was found later joins look-alikes, too."""
+        """Return whether a pair that was found later joins look-alikes, too."""
         return bool(self.joins) and self.tracks.contradict(pair, rows, FEW_TRACKED)
 
 
@@ -128,7 +128,10 @@ def tracks_of(sight: Sight, pairs: Iterable[PairId]) -> Tracks:
 
 
 def joins_of(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple[PairId, ...]]:
-    """Doubted pairs that claim the same: both their ends are the same photo, or photos that a trusted pair joins."""
+    """Group doubted pairs that claim the same.
+
+    Both their ends are the same photo, or photos that a trusted pair joins.
+    """
     close = {frozenset(pair) for pair in trusted}
     waiting, found = sorted(doubted), []
     while waiting:
@@ -154,7 +157,7 @@ def _firm(same: int, tracked: int) -> bool:
 
 
 def _judged(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> tuple[LookAlikes, str]:
-    """A join with what it misses, and whether it is one of look-alikes, a loop, or either."""
+    """Return a join with what it misses, and whether it is one of look-alikes, a loop, or either."""
     counts = []
     for photo in sorted({photo for pair in join for photo in pair}):
         friends, claimed = ({sum(pair) - photo for pair in pairs if photo in pair} for pairs in (trusted, join))
@@ -170,7 +173,7 @@ def _judged(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> t
 
 
 def _turned_deg(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> float:
-    """Median angle between the rotations of pairs and those along the trusted ones."""
+    """Return median angle between the rotations of pairs and those along the trusted ones."""
     poses = {pair: places.poses[pair] for pair in sorted(trusted)}
     weights = {pair: float(pose.inlier_count) for pair, pose in poses.items()}
     turns, _ = average_rotations({pair: pose.R for pair, pose in poses.items()}, weights)

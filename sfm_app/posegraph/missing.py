@@ -64,14 +64,14 @@ class Depths:
         self.known: dict[tuple[int, int], Ends] = {}
 
     def rays_of(self, photo: int) -> FloatArray:
-        """(K, 2) keypoints on the plane z = 1."""
+        """Return (K, 2) keypoints on the plane z = 1."""
         if photo not in self.rays:
             camera = self.cameras[photo]
             self.rays[photo] = rays(self.matches.keypoints[photo], camera.K, camera.radial)
         return self.rays[photo]
 
     def ends(self, photo: int, other: int) -> Ends:
-        """Depths of a photo's points from one pair."""
+        """Return depths of a photo's points from one pair."""
         if (photo, other) in self.known:
             return self.known[photo, other]
         pair = (min(photo, other), max(photo, other))
@@ -89,7 +89,9 @@ class Depths:
         return self.known[photo, other]
 
     def of_photo(self, photo: int, trusted: Iterable[int], doubted: Iterable[int]) -> tuple[FloatArray, Scales]:
-        """(K,) logarithms of depths from trusted pairs, NaN where there is none; what leads to the scale of each pair.
+        """Return (K,) logarithms of depths from trusted pairs, NaN where there is none.
+
+        What leads to the scale of each pair.
 
         Args:
             photo: whose keypoints.
@@ -117,7 +119,7 @@ class Depths:
             return np.where(total[1] > 0, total[0] / total[1], np.nan), scales
 
     def expected(self, photo: int, other: int, points: IndexArray, logs: FloatArray) -> IndexArray:
-        """Those of a photo's points that the other one must show, if their pair is right.
+        """Return those of a photo's points that the other one must show, if their pair is right.
 
         Args:
             photo: whose points.
@@ -142,7 +144,7 @@ class Depths:
 
 
 def missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int], places: Depths) -> tuple[int, int]:
-    """Cells of a photo that pairs claim to be seen in other photos, and those of them where none has a match.
+    """Return cells of a photo that pairs claim to be seen in other photos, and those of them where none has a match.
 
     Args:
         photo: whose cells.

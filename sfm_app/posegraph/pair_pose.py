@@ -47,14 +47,14 @@ class Pair:
         self.trusted = all(camera.estimated or camera.method == "exif" for camera in cameras)
 
     def start(self, fit: EpipolarFit) -> tuple[FloatArray, FloatArray]:
-        """R and t as F and the cameras have them."""
+        """Return R and t as F and the cameras have them."""
         inliers, E = self.rays[fit.inliers], self.essential(fit)
         chosen = inliers[np.linspace(0, len(inliers) - 1, min(len(inliers), SAMPLE)).astype(np.int64)]
         poses = decompose_essential(nearest_essential(E))
         return max(poses, key=lambda pose: int(np.count_nonzero(in_front(chosen, *pose))))
 
     def essential(self, fit: EpipolarFit) -> FloatArray:
-        """E as F and the cameras have it, with what noise has made of its singular values."""
+        """Return E as F and the cameras have it, with what noise has made of its singular values."""
         first, second = self.cameras
         if first.radial or second.radial:  # F knows no lens
             inliers = self.rays[fit.inliers]
@@ -62,7 +62,7 @@ class Pair:
         return second.K.T @ fit.F @ first.K
 
     def pose(self, R: FloatArray, t: FloatArray, inliers: NDArray[np.bool_], *, guided: bool = False) -> RelativePose:
-        """A pose with what its inliers say about it."""
+        """Return a pose with what its inliers say about it."""
         used = self.rays[inliers]
         front = in_front(used, R, t)
         angle_deg = float(np.median(ray_angles_deg(used[front], R))) if front.any() else 0.0
@@ -75,11 +75,11 @@ class Pair:
         )  # fmt: skip
 
     def inliers(self, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
-        """(M,) which matches lie within the threshold of a pose."""
+        """Return (M,) which matches lie within the threshold of a pose."""
         return pose_distances(self.rays, self.focals, R, t) <= self.max_error_px
 
     def kind(self, used: FloatArray, R: FloatArray, t: FloatArray, angle_deg: float) -> str:
-        """What the inliers of a pose are of: see `RelativePose.kind`."""
+        """Return what the inliers of a pose are of: see `RelativePose.kind`."""
         unit = float(self.focals.mean())
         within = OFF_PLANE * self.max_error_px
         if angle_deg < ROTATION_DEG and np.mean(turn_distances(used, self.focals, R) <= within) >= MANY:
@@ -90,7 +90,7 @@ class Pair:
 
 
 def estimated(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
-    """The relative pose behind a fundamental matrix; None where too few matches agree with any.
+    """Return the relative pose behind a fundamental matrix; None where too few matches agree with any.
 
     Where a camera is a guess, E is wrong by as much as the guess, and the inliers of F stay what they are.
     """
@@ -103,7 +103,7 @@ def estimated(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
 
 
 def best_of_starts(pair: Pair, fit: EpipolarFit, start: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """The pose that the inliers of F fit best, of those that lie before both cameras.
+    """Return the pose that the inliers of F fit best, of those that lie before both cameras.
 
     That of F's own start stays unless another one is clearly better and loses no inliers: of the two poses that a plane
     allows, the wrong one loses what lies off the plane.
@@ -127,12 +127,12 @@ def best_of_starts(pair: Pair, fit: EpipolarFit, start: tuple[FloatArray, FloatA
 
 
 def pose_cost(used: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> float:
-    """What `refined` makes small in the end."""
+    """Return what `refined` makes small in the end."""
     return float(np.sum(np.log1p((pose_distances(used, focals, R, t) / SIGMAS_PX[-1]) ** 2)))
 
 
 def depths(used: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """(N,) depths along the rays of view 1 and view 2 of the points where they pass each other closest.
+    """Return (N,) depths along the rays of view 1 and view 2 of the points where they pass each other closest.
 
     Args:
         used: (N, 4) points of the plane z = 1, view 1 and view 2.
@@ -148,20 +148,20 @@ def depths(used: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, 
 
 
 def in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
-    """(N,) which points lie before both cameras; arguments as in `depths`."""
+    """Return (N,) which points lie before both cameras; arguments as in `depths`."""
     first, second = depths(used, R, t)
     return (first > 0) & (second > 0)
 
 
 def ray_angles_deg(used: FloatArray, R: FloatArray) -> FloatArray:
-    """(N,) degrees between the two rays of each match: the triangulation angles, where t fits."""
+    """Return (N,) degrees between the two rays of each match: the triangulation angles, where t fits."""
     h1, h2 = _homogeneous(used[:, :2]) @ R.T, _homogeneous(used[:, 2:])
     sine = np.linalg.norm(np.cross(h1, h2), axis=1)
     return np.asarray(np.degrees(np.arctan2(sine, (h1 * h2).sum(axis=1))), np.float64)
 
 
 def turn_distances(used: FloatArray, focals: FloatArray, R: FloatArray) -> FloatArray:
-    """(N,) pixels in view 2 between matches and what the rotation nearest to R that explains most of them predicts.
+    """Give (N,) pixels in view 2 between matches and what rotation nearest to R that explains most of them predicts.
 
     Rays are turned onto their partners (Kabsch), those that fit counting most.
     """

@@ -21,7 +21,7 @@ _STEP = 1e-6
 
 
 def refined(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The pose near (R, t) that makes a robust sum of squared Sampson distances small (Levenberg and Marquardt).
+    """Return the pose near (R, t) that makes a robust sum of squared Sampson distances small (Levenberg and Marquardt).
 
     Args:
         rays: (N, 4) matches as points of the plane z = 1, view 1 and view 2.
@@ -36,7 +36,7 @@ def refined(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) 
 
 
 def pose_distances(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
-    """(N,) Sampson distances in pixels, >= 0, of matches to a relative pose; arguments as in `refined`."""
+    """Return (N,) Sampson distances in pixels, >= 0, of matches to a relative pose; arguments as in `refined`."""
     pose = np.concatenate([R.ravel(), t])
     return np.abs(_distances(rays, focals, pose))
 
@@ -72,7 +72,7 @@ def _cost(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) 
 
 @kernel
 def _system(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
-    """(5, 5) approximate Hessian and (5,) negative gradient of half the cost."""
+    """Return (5, 5) approximate Hessian and (5,) negative gradient of half the cost."""
     Es, J, step = np.empty((1 + POSE, 3, 3)), np.empty(POSE), np.zeros(POSE)
     A, b = np.zeros((POSE, POSE)), np.zeros(POSE)
     essential(pose, Es[0])

@@ -29,7 +29,7 @@ LEAST_ANGLE, ARRIVED = 1e-3, 1e-7
 def average_rotations(
     relative: Mapping[PairId, FloatArray], weights: Mapping[PairId, float]
 ) -> tuple[dict[int, FloatArray], dict[PairId, float]]:
-    """Rotations of all photos, and how far each pair is from them.
+    """Return rotations of all photos, and how far each pair is from them.
 
     Args:
         relative: by pair (3, 3), the rotation of photo 2 from photo 1.
@@ -62,7 +62,7 @@ def average_rotations(
 
 
 def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
-    """(E,) in (0, 1]: which share of the loops of three through each pair agrees; 1 where there is no loop.
+    """Return (E,) in (0, 1]: which share of the loops of three through each pair agrees; 1 where there is no loop.
 
     Args:
         edges: (E, 2) numbers of photos, the smaller first.
@@ -80,7 +80,7 @@ def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) ->
 
 
 def agreeing_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArray[np.bool_]]:
-    """(L, 3) numbers of the edges of every loop of three photos, and (L,) whether their rotations agree."""
+    """Return (L, 3) numbers of the edges of every loop of three photos, and (L,) whether their rotations agree."""
     loops = np.array(list(_loops(edges.tolist())), np.int64).reshape(-1, 3)
     if not len(loops):
         return loops, np.zeros(0, np.bool_)
@@ -90,7 +90,7 @@ def agreeing_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, ND
 
 
 def _loops(edges: Sequence[Sequence[int]]) -> Iterator[tuple[int, int, int]]:
-    """Numbers of the edges a-b, b-c and a-c of every three photos a < b < c that all meet."""
+    """Yield numbers of the edges a-b, b-c and a-c of every three photos a < b < c that all meet."""
     number = {(a, b): k for k, (a, b) in enumerate(edges)}
     after: dict[int, list[int]] = {}
     for a, b in number:
@@ -100,7 +100,7 @@ def _loops(edges: Sequence[Sequence[int]]) -> Iterator[tuple[int, int, int]]:
 
 
 def _along_tree(count: int, edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
-    """(count, 3, 3) rotations that the strongest edges give, from the first photo of every group on."""
+    """Return (count, 3, 3) rotations that the strongest edges give, from the first photo of every group on."""
     group, near = list(range(count)), [[] for _ in range(count)]  # type: ignore[var-annotated]
     for k in np.argsort(-strengths, kind="stable"):
         a, b = edges[k].tolist()
@@ -124,13 +124,13 @@ def _along_tree(count: int, edges: IndexArray, turns: FloatArray, strengths: Flo
 
 
 def _left_over(rotations: FloatArray, edges: IndexArray, turns: FloatArray) -> FloatArray:
-    """(E, 3) rotation vectors of R_j' R_ij R_i."""
+    """Return (E, 3) rotation vectors of R_j' R_ij R_i."""
     around = np.einsum("nji,njk,nkl->nil", rotations[edges[:, 1]], turns, rotations[edges[:, 0]])
     return np.asarray(Rotation.from_matrix(around).as_rotvec(), np.float64)
 
 
 def _steps(count: int, edges: IndexArray, left: FloatArray, factors: FloatArray) -> FloatArray:
-    """(count, 3) weighted least squares of step_j - step_i = left over; the free turn of each group stays 0."""
+    """Return (count, 3) weighted least squares of step_j - step_i = left over; the free turn of each group stays 0."""
     i, j = edges.T
     L, b = 1e-9 * factors.max() * np.eye(count), np.zeros((count, 3))
     np.add.at(L, (i, i), factors)

@@ -22,7 +22,7 @@ turns from -60 to 60 lead to; the choice rests on that set alone, and only adds 
 
 
 def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """R and t of the cameras that would see these matches if they lay on one plane: up to four.
+    """Yield R and t of the cameras that would see these matches if they lay on one plane: up to four.
 
     Args:
         used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
@@ -43,7 +43,7 @@ def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
 
 
 def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """R and t, for every turn, of a camera that has turned about the middle of the scene.
+    """Yield R and t, for every turn, of a camera that has turned about the middle of the scene.
 
     Args:
         used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.

@@ -33,15 +33,15 @@ class Best:
         self.to_beat, self.samples = np.full(2, math.inf), np.zeros((2, 9))
 
     def __bool__(self) -> bool:
-        """Whether there is one yet."""
+        """Return whether there is one yet."""
         return self._lowest < math.inf
 
     def inlier_share(self) -> float:
-        """Of all matches, those within the threshold."""
+        """Return the share of all matches that are within the threshold."""
         return float(np.mean(squared_distances(self._points, self.f) <= self._threshold**2))
 
     def meets(self, kind: int) -> bool:
-        """There is a new best sample of that kind; whether the best model has changed."""
+        """Update the best model; return whether it changed."""
         if self._fine is None:
             self._replace(self.samples[kind].copy(), float(self.to_beat[kind]))
             return True
@@ -53,7 +53,7 @@ class Best:
         return True
 
     def _replace(self, model: FloatArray, found: float) -> None:
-        """The model of a sample, or what local optimisation makes of it, is the best model."""
+        """Replace the best model by that of a sample, or by what local optimisation makes of it."""
         self.f, self._lowest = model, found
         if self._recipe.improve is not None:
             improved = self._improved(model.reshape(3, 3))
@@ -64,7 +64,7 @@ class Best:
         self.to_beat[:] = self._lowest
 
     def challenged_by(self, F: FloatArray) -> bool:
-        """Whether F (3, 3), locally optimised, is the best model by the finer penalty."""
+        """Return whether F (3, 3), locally optimised, is the best model by the finer penalty."""
         improved = self._improved(F)
         score = penalty(self._points, 0, improved, self._fine or self.loss, self._lowest, OPEN)
         if score < self._lowest:
@@ -78,7 +78,10 @@ class Best:
         return np.asarray(np.ascontiguousarray(F).reshape(9) / np.linalg.norm(F))
 
     def _measure_anew(self) -> None:
-        """MLESAC's function changes with the best model; the thesis names the flaw of comparing across the change."""
+        """Score anew: MLESAC's function changes with the best model.
+
+        The thesis names the flaw of comparing across the change.
+        """
         renewed = self._recipe.score(self._points, self._threshold, self.f)
         if renewed != self.loss:
             self.loss, self._lowest = renewed, penalty(self._points, 0, self.f, renewed, math.inf, OPEN)

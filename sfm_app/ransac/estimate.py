@@ -34,7 +34,7 @@ REASONS = (TOO_FEW_MATCHES, NO_MODEL, TOO_FEW_INLIERS, CHANCE)
 def estimate(
     x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int, recipe: Recipe
 ) -> EpipolarFit | Rejected:
-    """One fundamental matrix from matches of which many may be wrong.
+    """Return one fundamental matrix from matches of which many may be wrong.
 
     Args:
         x1: (N, 2) pixels.
@@ -90,7 +90,7 @@ def estimate_with(
 
 
 def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> EpipolarFit | Rejected:
-    """What matches say about a fundamental matrix, wherever it comes from.
+    """Return what matches say about a fundamental matrix, wherever it comes from.
 
     Args:
         x1: (N, 2) pixels.
@@ -112,7 +112,7 @@ def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings)
 
 
 def matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> int:
-    """How many distinct inliers of F show parallax: those off the plane that holds most of them.
+    """Return how many distinct inliers of F show parallax: those off the plane that holds most of them.
 
     Args:
         x1: (N, 2) pixels.
@@ -133,7 +133,7 @@ def matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: Epipo
 
 
 def _in_frame(F: ArrayLike, unit_px: float, centre: FloatArray) -> FloatArray:
-    """F of pixels as F of points that are centred and in units; the inverse of `Matches.to_pixels`."""
+    """Return F of pixels as F of points that are centred and in units; the inverse of `Matches.to_pixels`."""
     pixels = np.asarray(F, dtype=np.float64)
     if pixels.shape != (3, 3):
         raise ValueError(f"F must have shape (3, 3), got {pixels.shape}")
@@ -145,7 +145,7 @@ def _in_frame(F: ArrayLike, unit_px: float, centre: FloatArray) -> FloatArray:
 def _judge_any(
     x1: FloatArray, x2: FloatArray, matches: Matches, F: FloatArray, trials: int, options: EpipolarSettings
 ) -> EpipolarFit | Rejected:
-    """`_judge` for an F that need not be finite, of rank 2 or of a sensible scale."""
+    """Return `_judge` for an F that need not be finite, of rank 2 or of a sensible scale."""
     largest = np.abs(F).max()
     if not (np.isfinite(largest) and largest > 0) or np.linalg.matrix_rank(F / largest) < 2:
         return Rejected(NO_MODEL)

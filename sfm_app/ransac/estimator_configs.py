@@ -31,13 +31,13 @@ _LMEDS_SIGMAS = 2.5
 
 
 def refit_to_median(points: FloatArray, F: FloatArray, _threshold: float) -> FloatArray:
-    """The same on the matches within 2.5 robust standard deviations: LMedS knows the scale by itself."""
+    """Refit to the matches within 2.5 robust standard deviations: LMedS knows the scale by itself."""
     squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
     return refit_sampson(points, F, _LMEDS_SIGMAS * median_sigma(squared))
 
 
 def median_sigma(squared: FloatArray) -> float:
-    """Standard deviation of the inliers from the median of the squared distances (Rousseeuw and Leroy 1987).
+    """Return standard deviation of the inliers from the median of the squared distances (Rousseeuw and Leroy 1987).
 
     The factor 1 + 5 / (n - p) makes up for the p = 7 matches that a minimal model meets exactly.
     """
@@ -95,5 +95,5 @@ class Classical:
 
 @cache
 def classical(name: str) -> Classical:
-    """The one estimator of that name in `RECIPES`."""
+    """Return the one estimator of that name in `RECIPES`."""
     return Classical(name)

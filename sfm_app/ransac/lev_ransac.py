@@ -32,7 +32,7 @@ _REACH, _FINAL_STEPS = 3.0, 12
 
 
 def optimise_locally(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """8-point fit to the matches within twice the threshold, then Sampson steps, coarse and fine, on all around.
+    """Fit by 8 points to the matches within twice the threshold, then Sampson steps, coarse and fine, on all around.
 
     A model through seven noisy matches misses many true ones by more than the threshold; from the wider set it reaches
     them (Chum, Matas and Kittler 2003).
@@ -47,7 +47,7 @@ def optimise_locally(points: FloatArray, F: FloatArray, threshold: float) -> Flo
 
 
 def refit_to_all(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Maximum likelihood on all matches within three thresholds, whose noise it measures."""
+    """Return maximum likelihood on all matches within three thresholds, whose noise it measures."""
     return refine_mixture(points, F, threshold=threshold, reach=_REACH, most_steps=_FINAL_STEPS)
 
 
@@ -69,5 +69,5 @@ PRODUCTION = Recipe(
 
 
 def fit_lev_ransac(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-    """The production estimator. See `estimate`."""
+    """Return the production estimator. See `estimate`."""
     return estimate(x1, x2, options, seed, PRODUCTION)

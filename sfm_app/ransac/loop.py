@@ -77,7 +77,7 @@ class _Search:
         return Hypothesis(self.best.f.reshape(3, 3), self.trials)
 
     def _draw(self) -> bool:
-        """Samples until one is better or something else has to be decided; whether there is a new best model."""
+        """Return samples until one is better or something else has to be decided; whether there is a new best model."""
         left = min(self.limit - self.trials, self.test.review, self.patience - self.idle)
         if self.trials < self.first_priors:
             left = min(left, self.first_priors - self.trials)
@@ -104,7 +104,7 @@ class _Search:
         self.first_priors = math.ceil(self.recipe.guided_after * self.limit)
 
     def _guide(self, better: bool) -> bool:
-        """Priors from a new best model; whether they say that the search is over."""
+        """Return priors from a new best model; whether they say that the search is over."""
         recipe = self.recipe
         if recipe.validity is None or not self.best or self.trials < self.first_priors:
             return False
@@ -119,7 +119,7 @@ class _Search:
         return recipe.stop_on_convergence and have_converged(before, self.priors)
 
     def _has_waited_enough(self) -> bool:
-        """Whether the best model has stood for as many samples as its evidence calls for."""
+        """Return whether the best model has stood for as many samples as its evidence calls for."""
         if self.recipe.patience is None or self.idle < self.patience:
             return False
         if not self.best:

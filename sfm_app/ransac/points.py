@@ -16,7 +16,7 @@ _MOST, _MOST_TO_RMS = 0.9, 1.56
 
 
 def check_points(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Matched points as contiguous float64 arrays.
+    """Return matched points as contiguous float64 arrays.
 
     Args:
         x1: (N, 2) pixels, any real number type; N may be 0.
@@ -67,7 +67,7 @@ class Matches:
     """(4,) pixels x1, y1, x2, y2 of the origin of `points`."""
 
     def to_pixels(self, F: FloatArray) -> FloatArray:
-        """F of `points` as F of pixels, Frobenius norm 1."""
+        """Return F of `points` as F of pixels, Frobenius norm 1."""
         return unit_norm(self._transform(self.centre[2:]).T @ F @ self._transform(self.centre[:2]))
 
     def _transform(self, centre: FloatArray) -> FloatArray:
@@ -97,7 +97,10 @@ def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
 
 
 def _frame(points: FloatArray) -> tuple[FloatArray, float]:
-    """Origin (4,) and unit in which most coordinates are of magnitude 1: a few absurd matches do not move them."""
+    """Return origin (4,) and unit in which most coordinates are of magnitude 1.
+
+    A few absurd matches do not move them.
+    """
     if not len(points):
         return np.zeros(4), 1.0
     middle, deviations = len(points) // 2, np.empty_like(points)

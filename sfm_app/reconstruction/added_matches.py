@@ -47,7 +47,7 @@ def with_added(
 
 
 def _merged(known: FloatArray, found: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
-    """All keypoints of a photo, and the number of each one that was found."""
+    """Return all keypoints of a photo, and the number of each one that was found."""
     numbers = len(known) + np.arange(len(found))
     if len(known) and len(found):
         away, nearest = cKDTree(known).query(found)
@@ -56,6 +56,6 @@ def _merged(known: FloatArray, found: FloatArray) -> tuple[FloatArray, NDArray[n
 
 
 def _once(rows: Rows) -> Rows:
-    """Rows whose keypoints do not occur in an earlier row, in both photos."""
+    """Return rows whose keypoints do not occur in an earlier row, in both photos."""
     first = [np.isin(np.arange(len(rows)), np.unique(rows[:, side], return_index=True)[1]) for side in (0, 1)]
     return rows[first[0] & first[1]]

@@ -62,7 +62,7 @@ def look_at_photos(models: Sequence[Any], matches: MatchGraph, run: RunContext) 
 
 
 def orient_or_leave(model: Any, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | None = None) -> dict[str, Any]:
-    """As `orient`; where the numbers fail, the model stays as it is, and the entry says why."""
+    """Put the model upright; where the numbers fail, leave it as it is, and say why."""
     try:
         return orient(model, matches, looks, turn_deg)
     except FAILURES as err:
@@ -128,24 +128,24 @@ def _georeference(
 
 
 def is_sound(similarity: Similarity) -> bool:
-    """Whether a similarity takes numbers to numbers, and back."""
+    """Return whether a similarity takes numbers to numbers, and back."""
     return bool(np.isfinite(similarity.R).all() and np.isfinite(similarity.t).all() and 0.0 < similarity.scale < np.inf)
 
 
 def turned(R: FloatArray, turn_deg: int) -> FloatArray:
-    """(3, 3) cam_from_world of a photo once it is turned clockwise by a multiple of 90 degrees."""
+    """Return (3, 3) cam_from_world of a photo once it is turned clockwise by a multiple of 90 degrees."""
     cosine, sine = round(np.cos(np.radians(turn_deg))), round(np.sin(np.radians(turn_deg)))
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ R
 
 
 def lines_of(model: Any, looks: Mapping[int, Look]) -> Segments:
-    """Line segments, in the world, of the photos of a model."""
+    """Return line segments, in the world, of the photos of a model."""
     with backend("looking along lines in the photos"):
         return joined([_in_world(model, photo, look.lines) for photo, look in looks.items()])
 
 
 def scenery_of(model: Any, looks: Mapping[int, Look]) -> Scenery:
-    """What a model and its photos show."""
+    """Return what a model and its photos show."""
     with backend("reading the points"):
         shown = seen_points(model, SCENERY_POINTS)
     pictures = tuple(looks[photo].picture if photo in looks else None for photo in photos_of(model))
@@ -153,7 +153,7 @@ def scenery_of(model: Any, looks: Mapping[int, Look]) -> Scenery:
 
 
 def look_at(path: Path, turn_deg: int = 0) -> Look:
-    """Lines of a photo, and its brightness once it is upright; nothing where OpenCV cannot read it."""
+    """Return lines of a photo, and its brightness once it is upright; nothing where OpenCV cannot read it."""
     try:
         data = np.fromfile(path, np.uint8)  # OpenCV does not open names beyond ASCII on every system
     except OSError:
@@ -171,7 +171,7 @@ def _in_world(model: Any, image_id: int, lines: FloatArray) -> Segments:
 
 
 def how_it_stands(upright: Upright, front: str) -> dict[str, Any]:
-    """Up and front, for the manifest."""
+    """Return up and front, for the manifest."""
     standing = upright.standing
     return {
         "up": upright.found_by,
@@ -187,7 +187,7 @@ def how_it_stands(upright: Upright, front: str) -> dict[str, Any]:
 
 
 def where_it_stands(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Any]:
-    """Unit and place of the model that `viewer` has moved, for the manifest."""
+    """Return unit and place of the model that `viewer` has moved, for the manifest."""
     if isinstance(gps, NoGeoreference):
         return {"unit": "about the size of the scene", "gps": f"not used: {gps.reason}"}
     enu_from_model = gps.enu_from_world.after(viewer.inverse())

@@ -100,13 +100,13 @@ def explains_more(own: Attempt | None, shared: Attempt) -> bool:
 
 
 def _share_against(model: Attempt) -> float:
-    """Share of the inliers of fundamental matrices that contradict a model."""
+    """Return share of the inliers of fundamental matrices that contradict a model."""
     inliers = sum(pair.inliers for pair in model.explained.values())
     return sum(pair.contradicted for pair in model.explained.values()) / max(inliers, 1)
 
 
 def _divided(focals: Mapping[str, float]) -> list[list[str]]:
-    """Names in two parts, divided at the widest gap between focals; nothing where that leaves one alone."""
+    """Return names in two parts, divided at the widest gap between focals; nothing where that leaves one alone."""
     names = sorted(focals, key=lambda name: (focals[name], name))
     if len(names) < LEAST:
         return []
@@ -115,7 +115,7 @@ def _divided(focals: Mapping[str, float]) -> list[list[str]]:
 
 
 def _names(name: str, taken: Collection[str]) -> Iterable[str]:
-    """The name itself, and others like it that nobody has."""
+    """Yield the name itself, and others like it that nobody has."""
     yield name
     number = 2
     while True:

@@ -32,7 +32,7 @@ class Candidate:
 def rank_seeds(
     matches: MatchGraph, graph: PoseGraph, intrinsics: Intrinsics, photos: Sequence[int], min_angle_deg: float
 ) -> list[Candidate]:
-    """Pairs within a group of photos: many points all over the photos, under a wide angle, in accord with K."""
+    """Return pairs within a group of photos: many points all over the photos, under a wide angle, in accord with K."""
     members, found = set(photos), []
     for pair, pose in graph.poses.items():
         if members.issuperset(pair) and pose.kind != "rotation" and pose.angle_deg >= min_angle_deg:
@@ -45,7 +45,7 @@ def rank_seeds(
 
 
 def seed_of(matches: MatchGraph, candidate: Candidate, intrinsics: Intrinsics) -> TwoViewSeed:
-    """The points of a candidate, triangulated."""
+    """Return the points of a candidate, triangulated."""
     pose, cameras = candidate.pose, [intrinsics.camera(matches.images[photo]) for photo in candidate.pair]
     points = matches.points(candidate.pair)
     x1, x2 = (rays(x[pose.inliers], camera.K, camera.radial) for x, camera in zip(points, cameras, strict=True))
@@ -53,14 +53,14 @@ def seed_of(matches: MatchGraph, candidate: Candidate, intrinsics: Intrinsics) -
 
 
 def agreement(pair: PairId, cameras: Sequence[Calibration]) -> float:
-    """1 for a pair that agrees with the camera its consensus found, little for one that does not."""
+    """Return 1 for a pair that agrees with the camera its consensus found, little for one that does not."""
     first, second = cameras
     unknown = first is not second or not first.key_pairs
     return 1.0 if unknown or pair in first.key_pairs else DISSENT
 
 
 def coverage(matches: MatchGraph, pair: PairId, pose: RelativePose) -> float:
-    """Share of the cells of both photos that hold an inlier, as far as these are enough to fill them; 0 to 1."""
+    """Return share of the cells of both photos that hold an inlier, as far as these are enough to fill them; 0 to 1."""
     shares = []
     for photo, x in zip(pair, matches.points(pair), strict=True):
         image = matches.images[photo]

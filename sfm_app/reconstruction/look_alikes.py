@@ -18,7 +18,10 @@ Not chosen on any set; the usual order of castle-P19, fountain-P11, Herz-Jesus-P
 
 
 def without_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph) -> tuple[MatchGraph, ViewGraph]:
-    """Matches and fundamental matrices without those of look-alikes: these speak neither for a model nor against it."""
+    """Return matches and fundamental matrices without those of look-alikes.
+
+    These speak neither for a model nor against it.
+    """
     gone = {pair for join in graph.look_alikes for pair in join.pairs}
     if not gone:
         return matches, views
@@ -28,13 +31,13 @@ def without_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph)
 
 
 def with_earlier(graph: PoseGraph, earlier: PoseGraph) -> PoseGraph:
-    """A pose graph that knows, too, what an earlier one told apart for it."""
+    """Return a pose graph that knows, too, what an earlier one told apart for it."""
     dropped = {pair: earlier.dropped[pair] for join in earlier.look_alikes for pair in join.pairs}
     return replace(graph, dropped=dropped | dict(graph.dropped), look_alikes=earlier.look_alikes + graph.look_alikes)
 
 
 def in_words(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str, Any]]:
-    """What was told apart, for the manifest."""
+    """Return what was told apart, for the manifest."""
     return [
         {
             "pairs": len(join.pairs),
@@ -46,7 +49,7 @@ def in_words(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str,
 
 
 def jumps(model: Any) -> list[list[str]]:
-    """Photos that follow each other by name, but not along the way of all others: where a video may be folded.
+    """Return photos that follow each other by name, but not along the way of all others: where a video may be folded.
 
     Empty where the photos are not in order, so that many steps are long. That is no proof: videos are cut, too.
     """
@@ -60,7 +63,7 @@ def jumps(model: Any) -> list[list[str]]:
 
 
 def sides(pairs: Sequence[PairId], matches: MatchGraph) -> tuple[list[int], list[int]]:
-    """The photos of the two places: those of the pair with most matches are on different sides, and so on."""
+    """Return the photos of the two places: those of the pair with most matches are on different sides, and so on."""
     counts = {pair: len(matches.matches[pair]) for pair in pairs}
     here: set[int] = set()
     there: set[int] = set()

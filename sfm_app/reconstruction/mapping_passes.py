@@ -71,7 +71,7 @@ class Outcome:
 
 
 def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:
-    """Models of all photos that hang together; none where no pair grows into one.
+    """Return models of all photos that hang together; none where no pair grows into one.
 
     Where the evidence is thin, a rival is mapped beside it, and the model that explains more goes on. Where cameras
     were guesses, or photos of the main group stayed out, the cameras that mapping found are taken for a second pass:
@@ -101,7 +101,7 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
 def with_rival(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """The outcome, or, where it is thin and a rival explains more, that of the rival."""
+    """Return the outcome, or, where it is thin and a rival explains more, that of the rival."""
     main = outcome.main
     thin = why_thin(main, intrinsics, matches, views)
     if not thin:
@@ -124,7 +124,7 @@ def with_rival(
 def with_other_focals(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """The outcome, or, where the guessed focal leaves many photos without a place, that of the best other guess."""
+    """Return outcome, or, where the guessed focal leaves many photos without a place, that of the best other guess."""
     main = outcome.main
     if not leaves_many_out(main, intrinsics, views):
         return outcome
@@ -141,7 +141,7 @@ def with_other_focals(
 def with_own_cameras(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """The outcome, or, where photos of one size explain more with a camera each, that."""
+    """Return the outcome, or, where photos of one size explain more with a camera each, that."""
     main = outcome.main
     if main is None or not may_have_one_each(main, intrinsics, views, run.settings):
         return outcome
@@ -163,7 +163,7 @@ def with_own_cameras(
 def _with_two_cameras(
     own: Outcome, matches: MatchGraph, views: ViewGraph, each: Intrinsics, run: RunContext
 ) -> Outcome:
-    """The outcome of a camera for each photo, or, where two explain as much, that of two."""
+    """Return the outcome of a camera for each photo, or, where two explain as much, that of two."""
     between = with_two(own.models[0], each, matches)
     if between is None:
         return own
@@ -176,7 +176,7 @@ def _with_two_cameras(
 
 
 def with_joined(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
-    """The outcome, its models joined where they share points."""
+    """Return the outcome, its models joined where they share points."""
     if len(outcome.models) < 2:
         return outcome
     models = join_models(outcome.models, matches, views, run)
@@ -190,7 +190,10 @@ def with_joined(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: Ru
 
 
 def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
-    """Whether the cameras that mapping found may show more: they are news, or photos of the main group stayed out."""
+    """Return whether the cameras that mapping found may show more.
+
+    They are news, or photos of the main group stayed out.
+    """
     main = outcome.models[0]
     placed = photos_of(main.model)
     if len(placed) < LEARNED_FROM:
@@ -203,7 +206,7 @@ def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph)
 
 
 def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGraph) -> Intrinsics:
-    """The cameras as a model has them."""
+    """Return the cameras as a model has them."""
     with backend("reading cameras"):
         found = cameras_of(model.model)
     cameras = dict(intrinsics.cameras)
@@ -246,7 +249,10 @@ def _pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Ru
 
 
 def taken_apart(attempt: Attempt) -> list[Attempt]:
-    """A model as it is, or the parts of it that more matches join than contradict; lonely photos are left out."""
+    """Return a model as it is, or the parts of it that more matches join than contradict.
+
+    Lonely photos are left out.
+    """
     parts = sound_parts(attempt.explained, photos_of(attempt.model))
     if len(parts) == 1:
         return [attempt]
@@ -262,7 +268,10 @@ def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
 
 
 def _graph_of(models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph, run: RunContext) -> PoseGraph:
-    """The pose graph as models have it that were made without it: later steps complete their tracks along its pairs."""
+    """Return the pose graph as models have it that were made without it.
+
+    Later steps complete their tracks along its pairs.
+    """
     epipolar = run.settings.epipolar
     for attempt in models:
         poses = model_poses(attempt.model, matches, epipolar.max_error_px, epipolar.min_inliers)

@@ -88,7 +88,7 @@ class Stop:
 
 
 def attempts(group: Group, run: RunContext) -> list[Attempt]:
-    """What the mappers of the settings make of a group.
+    """Return what the mappers of the settings make of a group.
 
     Photo by photo from the best seed and all at once, side by side; where neither places most photos, from the next
     seeds. What is tried never depends on which mapper is done first: a model photo by photo that leaves nothing to be
@@ -113,7 +113,7 @@ def attempts(group: Group, run: RunContext) -> list[Attempt]:
 
 
 def better(found: Sequence[Attempt]) -> Attempt | None:
-    """The attempt that explains most matches; of equal ones, the one with most photos and points."""
+    """Return the attempt that explains most matches; of equal ones, the one with most photos and points."""
     models = [attempt for attempt in found if attempt.model is not None]
     most = max((attempt.support for attempt in models), default=0.0)
     equal = [attempt for attempt in models if attempt.support >= (1.0 - EQUAL) * most]
@@ -121,7 +121,7 @@ def better(found: Sequence[Attempt]) -> Attempt | None:
 
 
 def why(best: Attempt, found: Sequence[Attempt], photos: int) -> str:
-    """Why this attempt of several was taken, in a few words."""
+    """Return why this attempt of several was taken, in a few words."""
     if flawless(best, photos):
         return f"it places all {photos} photos and next to nothing contradicts it"
     others = [attempt for attempt in found if attempt is not best and attempt.model is not None]
@@ -133,7 +133,7 @@ def why(best: Attempt, found: Sequence[Attempt], photos: int) -> str:
 
 
 def flawless(attempt: Attempt, photos: int) -> bool:
-    """Whether a model holds all photos and next to nothing contradicts it."""
+    """Return whether a model holds all photos and next to nothing contradicts it."""
     inliers = sum(pair.inliers for pair in attempt.explained.values())
     against = sum(pair.contradicted for pair in attempt.explained.values())
     return attempt.photos == photos and against <= CONTRADICTED * inliers
@@ -141,7 +141,7 @@ def flawless(attempt: Attempt, photos: int) -> bool:
 
 @contextlib.contextmanager
 def _mapping(group: Group, run: RunContext) -> Iterator[Callable[[Maker], list[Attempt]]]:
-    """What makes attempts in a thread that Ctrl-C can stop."""
+    """Provide what makes attempts in a thread that Ctrl-C can stop."""
 
     def made(make: Maker) -> list[Attempt]:
         found: list[Attempt] = []
@@ -174,7 +174,7 @@ def _first_round(group: Group, seeds: Sequence[Candidate], at_once: bool, run: R
 
 
 def _settled(found: Sequence[Attempt], photos: int) -> bool:
-    """Whether another seed is unlikely to give more."""
+    """Return whether another seed is unlikely to give more."""
     counts = [attempt.photos for attempt in found if attempt.photos]
     most = max(counts, default=0)
     return most >= ENOUGH * photos or (counts.count(most) > 1 and most >= CONFIRMED * photos)
@@ -204,7 +204,7 @@ def _from_seed(group: Group, seed: Candidate, run: RunContext, token: Any) -> li
 
 
 def _completed(group: Group, best: Attempt, run: RunContext, token: Any) -> list[Attempt]:
-    """Photos that the global mapper left out may fit into what it made."""
+    """Return photos that the global mapper left out may fit into what it made."""
     model = _grown(group, best.model, run, token)
     return [_judged(group, "incremental", "what was left out, photo by photo", model, run)]
 
@@ -218,7 +218,7 @@ def _grown(group: Group, start: Any, run: RunContext, token: Any) -> Any:
 
 
 def well_known(camera: Calibration) -> bool:
-    """Whether a focal is known too well for the first few photos of a mapping to improve it."""
+    """Return whether a focal is known too well for the first few photos of a mapping to improve it."""
     spread = camera.spread.get("fx", np.inf)
     return camera.identifiable and spread <= WELL_KNOWN * camera.K[0, 0]
 

@@ -54,7 +54,7 @@ def join_models(
 def _together(
     first: Attempt, second: Attempt, matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> Attempt | None:
-    """Both models as one; None where they share too little, or matches contradict it."""
+    """Join both models; None where they share too little, or matches contradict it."""
     shared = shared_points(first.model, second.model, matches, views)
     if len(shared) < LEAST_SHARED:
         return None
@@ -75,7 +75,7 @@ def _together(
 
 
 def shared_points(first: Any, second: Any, matches: MatchGraph, views: ViewGraph) -> FloatArray:
-    """(N, 6) points that both models know, as the first and as the second has them; each but once."""
+    """Return (N, 6) points that both models know, as the first and as the second has them; each but once."""
     here, there = places_of_keypoints(first), places_of_keypoints(second)
     found = {}
     for a, b in _between(views, {photo for photo, _ in here}, {photo for photo, _ in there}):
@@ -89,7 +89,7 @@ def shared_points(first: Any, second: Any, matches: MatchGraph, views: ViewGraph
 
 
 def _between(views: ViewGraph, here: set[int], there: set[int]) -> Iterator[tuple[int, int]]:
-    """Pairs with geometry between two sets of photos, the photo of the first set first."""
+    """Yield pairs with geometry between two sets of photos, the photo of the first set first."""
     for a, b in views.fits:
         if a in here and b in there:
             yield a, b

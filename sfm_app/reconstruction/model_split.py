@@ -14,7 +14,7 @@ LEAST_MATCHES = 16
 
 
 def sound_parts(explained: Mapping[PairId, Explained], photos: Iterable[int]) -> list[tuple[int, ...]]:
-    """Photos in parts that more matches join than contradict, largest part first.
+    """Return photos in parts that more matches join than contradict, largest part first.
 
     Pairs are taken strongest first; two parts become one when the matches between them that the model explains
     outnumber the inliers of fundamental matrices between them that it does not.

@@ -81,7 +81,7 @@ def clear(run: RunContext) -> None:
 
 
 def lost_photos(found: Found) -> list[int]:
-    """Photos that the main model does not hold; none where they are too few of too many."""
+    """Return photos that the main model does not hold; none where they are too few of too many."""
     models, images = found.outcome.models, found.matches.images
     placed = set(photos_of(models[0].model)) if models else set()
     lost = sorted(images.keys() - placed)
@@ -89,7 +89,7 @@ def lost_photos(found: Found) -> list[int]:
 
 
 def pairs_to_see(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
-    """Pairs of lost photos with each other and with their likely neighbours."""
+    """Return pairs of lost photos with each other and with their likely neighbours."""
     every = sorted(matches.images)
     if len(every) <= ALL_PAIRS:
         return [(a, b) for k, a in enumerate(every) for b in every[k + 1 :] if a in lost or b in lost]
@@ -107,7 +107,7 @@ def pairs_to_see(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
 
 
 def _seen_again(first: Found, pairs: Sequence[PairId], report: dict[str, Any]) -> Found | None:
-    """All steps from features to models once more; None where nothing new was found."""
+    """Return all steps from features to models once more; None where nothing new was found."""
     run = _aside(first.run)
     finer = replace(run, workspace=Aside(run.workspace, FEATURES))
     with backend("looking for finer features"):
@@ -131,13 +131,13 @@ def _seen_again(first: Found, pairs: Sequence[PairId], report: dict[str, Any]) -
 
 
 def _mostly_known(found: Found) -> bool:
-    """Whether at least half of the photos have a camera that pairs determine: more pairs then change little."""
+    """Return whether at least half of the photos have a camera that pairs determine: more pairs then change little."""
     images = found.matches.images.values()
     return 2 * sum(found.intrinsics.camera(image).estimated for image in images) >= len(images)
 
 
 def _aside(run: RunContext) -> RunContext:
-    """The run in a folder of its own, where what a killed run left is taken up again."""
+    """Return the run in a folder of its own, where what a killed run left is taken up again."""
     place = Aside(run.workspace, SECOND_LOOK)
     if not can_go_on(place.root, run.inputs):
         mark_unfinished(place.root, run.inputs)
@@ -151,7 +151,7 @@ def _placed(outcome: Outcome) -> int:
 
 
 def _is_better(second: Found, first: Found) -> bool:
-    """Whether the second main model places more photos, and explains more of all matches that are known now."""
+    """Return whether the second main model places more photos, and explains more of all matches that are known now."""
     if not second.outcome.models or _placed(second.outcome) <= _placed(first.outcome):
         return False
     models = [_judged_by(second, found.outcome) for found in (first, second) if found.outcome.models]

@@ -37,7 +37,7 @@ class Explained:
 
 
 def explained_pairs(model: Any, matches: MatchGraph, views: ViewGraph, max_error_px: float) -> dict[PairId, Explained]:
-    """What a model makes of every pair of its photos.
+    """Return what a model makes of every pair of its photos.
 
     Args:
         model: COLMAP's reconstruction.
@@ -55,7 +55,7 @@ def explained_pairs(model: Any, matches: MatchGraph, views: ViewGraph, max_error
 
 
 def model_poses(model: Any, matches: MatchGraph, max_error_px: float, least: int) -> dict[PairId, RelativePose]:
-    """Relative poses as a model has them, of all pairs of its photos with at least so many matches that lie right.
+    """Give relative poses as a model has them, of all pairs of its photos with at least so many matches that lie right.
 
     Args:
         model, matches, max_error_px: as in `explained_pairs`.
@@ -83,7 +83,7 @@ class _PlacedPair:
     """Of view 2 from view 1; t of length 1, or nothing."""
 
     def right(self, max_error_px: float) -> NDArray[np.bool_]:
-        """(M,) which of them lie on their epipolar lines, before both cameras."""
+        """Return (M,) which of them lie on their epipolar lines, before both cameras."""
         distances = pose_distances(self.rays, self.focals, self.R, self.t)
         return np.asarray((distances <= max_error_px) & in_front(self.rays, self.R, self.t), bool)
 
@@ -102,6 +102,9 @@ def _placed_pairs(model: Any, matches: MatchGraph) -> Iterator[tuple[PairId, _Pl
 
 
 def support(explained: Mapping[PairId, Explained]) -> float:
-    """One figure for a model: matches that it explains, pairs with many of them counting little more than others."""
+    """Return one figure for a model.
+
+    Matches that it explains, pairs with many of them counting little more than others.
+    """
     counts = np.array([pair.matches for pair in explained.values()], np.float64)
     return float(np.sum(counts / (1.0 + counts / ENOUGH)))

@@ -8,7 +8,7 @@ from sfm_app.types import MatchGraph, PoseGraph, ViewGraph
 def left_out(
     posed: set[int], others: Sequence[Sequence[int]], matches: MatchGraph, views: ViewGraph, graph: PoseGraph
 ) -> dict[str, str]:
-    """The reason for every photo that the main model does not hold, by name.
+    """Return the reason for every photo that the main model does not hold, by name.
 
     Args:
         posed: photos of the main model.
@@ -50,5 +50,5 @@ def _edges(photo: int, views: ViewGraph) -> Iterator[tuple[int, int]]:
 
 
 def names_of(photos: Sequence[int], matches: MatchGraph) -> list[str]:
-    """Names of photos."""
+    """Return names of photos."""
     return [matches.images[photo].name for photo in photos]

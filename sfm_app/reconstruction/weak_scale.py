@@ -18,7 +18,7 @@ off) and dinoSparseRing (2) have less; right models of castle-P19 and temple16 h
 
 
 def weakly_joined(model: Any) -> list[list[str]]:
-    """Names of photos, part by part, whose distance from the first part of a model hangs on fewer than `LEAST` points.
+    """Give names of photos, part by part, whose distance from first part of a model hangs on fewer than `LEAST` points.
 
     Photos join one after the other, each time the one that sees most points which two of those before it see.
     """
@@ -36,7 +36,7 @@ def weakly_joined(model: Any) -> list[list[str]]:
 
 
 def _seen(tracks: list[set[int]], photos: list[int]) -> csr_array:
-    """(N, P) 1 where a point is seen by a photo."""
+    """Return (N, P) 1 where a point is seen by a photo."""
     place = {photo: k for k, photo in enumerate(photos)}
     columns = [place[photo] for track in tracks for photo in sorted(track)]
     ends = np.cumsum([0, *map(len, tracks)])
@@ -44,7 +44,7 @@ def _seen(tracks: list[set[int]], photos: list[int]) -> csr_array:
 
 
 def _joining(seen: csr_array) -> list[tuple[int, int]]:
-    """Photos from the third on as they join, each with the points by which it does."""
+    """Return photos from the third on as they join, each with the points by which it does."""
     points, photos = seen.shape
     if photos < 3 or points == 0:
         return []

@@ -69,13 +69,13 @@ class Plane(NamedTuple):
 
 
 def check_figure(path: Path) -> None:
-    """ConfigError unless the name ends as one of the formats that can be written."""
+    """Raise ConfigError unless the name ends as one of the formats that can be written."""
     if path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"figure {path.name}: cannot write '{path.suffix}'", hint=f"use {', '.join(SUFFIXES)}")
 
 
 def draw_intrinsics(path: Path, matches: MatchGraph, views: ViewGraph, found: Intrinsics) -> None:
-    """`draw_calibration` of the cameras of a run, those with most pairs of their own first."""
+    """Draw the cameras of a run, those with most pairs of their own first; see `draw_calibration`."""
     images = list(matches.images.values())
     groups = {name: [image for image in images if found.name_of(image) == name] for name in found.cameras}
     panels = [Panel(n, c, camera_pairs(groups[n], matches, views)) for n, c in found.cameras.items() if groups[n]]
@@ -105,13 +105,13 @@ def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
 
 
 def in_words(camera: Calibration) -> str:
-    """What was found, a line for each thing."""
+    """Return what was found, a line for each thing."""
     texts = (verdict(camera), focal_text(camera), centre_text(camera), lens_text(camera), held_text(camera))
     return "\n".join(fill(text, 150) for text in texts if text).replace("+-", "±")
 
 
 def draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
-    """Both planes of one camera."""
+    """Draw both planes of one camera."""
     camera = panel.camera
     straight = without_lens(panel.pairs, camera)
     pairs = prepare(straight, unit_px=_unit(camera), origin_px=(camera.width / 2, camera.height / 2))
@@ -124,7 +124,7 @@ def draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
 
 
 def focal_plane(camera: Calibration, pairs: Pairs) -> Plane:
-    """fx and fy, with the optical centre where it was found."""
+    """Return fx and fy, with the optical centre where it was found."""
     unit, (low, high) = _unit(camera), FOCALS_SHOWN
     (fx, _, cx), (_, fy, cy), _ = camera.K
     centre = ((cx - camera.width / 2) / unit, (cy - camera.height / 2) / unit)
@@ -142,7 +142,7 @@ def focal_plane(camera: Calibration, pairs: Pairs) -> Plane:
 
 
 def centre_plane(camera: Calibration, pairs: Pairs) -> Plane:
-    """cx and cy over the whole photo, with the focals as found."""
+    """Return cx and cy over the whole photo, with the focals as found."""
     unit, u0, v0 = _unit(camera), camera.width / 2, camera.height / 2
     focals = (camera.K[0, 0] / unit, camera.K[1, 1] / unit)
     return Plane(
@@ -157,7 +157,7 @@ def centre_plane(camera: Calibration, pairs: Pairs) -> Plane:
 
 
 def draw_plane(axes: "Axes", plane: Plane, camera: Calibration, pairs: Pairs) -> None:
-    """Votes, curves and K in one plane."""
+    """Draw votes, curves and K in one plane."""
     shades = votes(plane, camera, pairs)
     axes.imshow(shades, extent=plane.extent, origin="lower", cmap="inferno", vmin=0, vmax=1, interpolation="bilinear")
     draw_curves(axes, plane, plane.extent, SAMPLES)
@@ -170,7 +170,7 @@ def draw_plane(axes: "Axes", plane: Plane, camera: Calibration, pairs: Pairs) ->
 
 
 def draw_curves(axes: "Axes", plane: Plane, extent: tuple[float, float, float, float], samples: int) -> None:
-    """The part of all curves that lies in `extent`; the more there are, the fainter."""
+    """Draw the part of all curves that is in `extent`; the more there are, the fainter."""
     left, right, bottom, top = extent
     x = _steps(left, right, samples)
     y = _unbroken(plane.curves(x), min(bottom, top), max(bottom, top))
@@ -179,7 +179,7 @@ def draw_curves(axes: "Axes", plane: Plane, extent: tuple[float, float, float, f
 
 
 def enlarge(axes: "Axes", plane: Plane, camera: Calibration) -> None:
-    """The ellipse, in a window of its own where it would be too small to see."""
+    """Draw the ellipse in a window of its own where it would be too small to see."""
     from matplotlib.patches import Ellipse
 
     (x, y), (dx, dy) = plane.found, (DEVIATIONS * value for value in plane.spread)
@@ -205,7 +205,7 @@ def enlarge(axes: "Axes", plane: Plane, camera: Calibration) -> None:
 
 
 def votes(plane: Plane, camera: Calibration, pairs: Pairs) -> FloatArray:
-    """(CELLS, CELLS) share of the votes at every point of the plane; rows go from its bottom to its top."""
+    """Return (CELLS, CELLS) share of the votes at every point of the plane; rows go from its bottom to its top."""
     left, right, bottom, top = plane.extent
     grid = [values.ravel() for values in np.meshgrid(_steps(left, right, CELLS), _steps(bottom, top, CELLS))]
     fixed = {"fx": camera.K[0, 0], "fy": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2]}
@@ -233,7 +233,7 @@ def _steps(start: float, stop: float, count: int) -> FloatArray:
 
 
 def _unbroken(curves: FloatArray, low: float, high: float) -> FloatArray:
-    """Curves without what lies outside of the range, and without the jumps from one root to another."""
+    """Return curves without what lies outside of the range, and without the jumps from one root to another."""
     inside = np.where((curves > low) & (curves < high), curves, np.nan)
     jumps = np.abs(np.diff(inside, axis=1)) > JUMP * (high - low)
     inside[:, 1:][jumps] = np.nan

@@ -14,7 +14,7 @@ HELD = {
 
 
 def field_of_view_deg(camera: Calibration) -> tuple[float, float]:
-    """How much the camera sees from left to right and from top to bottom, in degrees; the lens is left out."""
+    """Return how much the camera sees from left to right and from top to bottom, in degrees; the lens is left out."""
     (fx, _, cx), (_, fy, cy), _ = camera.K
     across = np.arctan2([cx, camera.width - cx], fx)
     down = np.arctan2([cy, camera.height - cy], fy)
@@ -22,7 +22,7 @@ def field_of_view_deg(camera: Calibration) -> tuple[float, float]:
 
 
 def verdict(camera: Calibration) -> str:
-    """Whether K is known, and if not, why, and what it is instead."""
+    """Return whether K is known, and if not, why, and what it is instead."""
     if camera.identifiable:
         return "Known: the photos agree on this camera."
     source = SOURCES.get(camera.method, camera.method)
@@ -30,7 +30,7 @@ def verdict(camera: Calibration) -> str:
 
 
 def focal_text(camera: Calibration) -> str:
-    """Focal length and field of view."""
+    """Return focal length and field of view."""
     across, down = field_of_view_deg(camera)
     focal = f"Focal length {camera.focal_px:.0f} px{_deviation(camera, 'fx')}"
     tall = camera.K[0, 0] / camera.K[1, 1]
@@ -41,7 +41,7 @@ def focal_text(camera: Calibration) -> str:
 
 
 def centre_text(camera: Calibration) -> str:
-    """Where the optical centre lies, from the middle of the photo."""
+    """Say where the optical centre is, from the middle of the photo."""
     right, below = camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2
     if max(abs(right), abs(below)) < 0.5:
         return "Optical centre in the middle of the photo."
@@ -51,7 +51,7 @@ def centre_text(camera: Calibration) -> str:
 
 
 def lens_text(camera: Calibration) -> str:
-    """The radial term, or nothing where none was found for certain."""
+    """Return the radial term, or nothing where none was found for certain."""
     if camera.radial == 0.0 or "k1" in camera.held:
         return ""
     shape = "outwards (barrel)" if camera.radial < 0 else "inwards (pincushion)"
@@ -60,7 +60,7 @@ def lens_text(camera: Calibration) -> str:
 
 
 def held_text(camera: Calibration) -> str:
-    """What is taken to be as usual, or nothing."""
+    """Return what is taken to be as usual, or nothing."""
     if not camera.held or not camera.identifiable:
         return ""
     return "Taken to be as usual, as far as the photos allow: " + ", ".join(HELD.get(n, n) for n in camera.held) + "."

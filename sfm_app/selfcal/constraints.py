@@ -26,7 +26,7 @@ VANISHED = 1e-12
 
 @kernel
 def singular_value_ratio(pair: FloatArray, fx: float, fy: float, u: float, v: float) -> float:
-    """r = (s1 - s2) / (s1 + s2) of E = K'FK, in [0, 1]; 0 where K satisfies the constraint.
+    """Return r = (s1 - s2) / (s1 + s2) of E = K'FK, in [0, 1]; 0 where K satisfies the constraint.
 
     Unlike thesis (5.8) it is bounded, symmetric in the two views, and free of the scale of F.
 
@@ -52,7 +52,7 @@ def singular_value_ratio(pair: FloatArray, fx: float, fy: float, u: float, v: fl
 
 
 def focal_polynomials(pairs: Pairs, fx: FloatArray, centre: tuple[float, float]) -> FloatArray:
-    """Thesis (5.27): a^2 - 4p as a quartic in fy^2, for every pair and every swept fx, with the centre fixed.
+    """Return thesis (5.27): a^2 - 4p as a quartic in fy^2, for every pair and every swept fx, with the centre fixed.
 
     Returns:
         (P, S, 5) coefficients, lowest power first; all zero where the constraint holds for any fy.
@@ -75,7 +75,7 @@ def focal_polynomials(pairs: Pairs, fx: FloatArray, centre: tuple[float, float])
 
 
 def centre_polynomials(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
-    """Thesis (5.28): a^2 - 4p as an octic in v, for every pair and every swept u, with both focals fixed.
+    """Return thesis (5.28): a^2 - 4p as an octic in v, for every pair and every swept u, with both focals fixed.
 
     Returns:
         (P, S, 9) coefficients, lowest power first; all zero where the constraint holds for any v.
@@ -104,7 +104,7 @@ def centre_polynomials(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) 
 
 
 def _epipole_polynomial(e: FloatArray, t: FloatArray, x: float, y: float) -> FloatArray:
-    """|adj(K) e|^2 as a quadratic in v."""
+    """Return |adj(K) e|^2 as a quadratic in v."""
     fixed = y * (e[..., 0] - t * e[..., 2]) ** 2 + x * y * e[..., 2] ** 2
     one = np.ones_like(fixed)
     line = _stack(e[..., 1] * one, -e[..., 2] * one)

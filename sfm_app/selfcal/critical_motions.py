@@ -13,7 +13,7 @@ ISOSCELES = 0.1
 
 
 def open_focal(fit: Fit) -> str:
-    """What the relative poses of the pairs have in common, for people; nothing where that is no known motion.
+    """Return what the relative poses of the pairs have in common, for people; nothing where that is no known motion.
 
     Parallel axes, and axes that meet at one distance from both cameras (an isosceles triangle, as on an orbit), are the
     two for which one pair says nothing about the focal (Sturm 1999).

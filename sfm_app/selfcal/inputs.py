@@ -40,7 +40,7 @@ class Pairs:
 
 
 def pair_weights(inlier_counts: ArrayLike) -> FloatArray:
-    """How far fundamental matrices with that many inliers are trusted: min(1, n / 300)."""
+    """Return how far fundamental matrices with that many inliers are trusted: min(1, n / 300)."""
     counts = np.asarray(inlier_counts, dtype=np.float64)
     return np.minimum(1.0, counts / FULL_WEIGHT_INLIERS)
 
@@ -78,7 +78,7 @@ def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float
 
 
 def checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-    """Matrices (Q, 3, 3) and weights (Q,) of the pairs with a weight, and which of the given these are.
+    """Return matrices (Q, 3, 3) and weights (Q,) of the pairs with a weight, and which of the given these are.
 
     Raises:
         ValueError: as `prepare`.
@@ -113,7 +113,7 @@ def checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.int6
 
 
 def _distinct(scaled: FloatArray) -> NDArray[np.int64]:
-    """Indices of the first of all matrices that agree to 9 digits up to sign and transposition."""
+    """Return indices of the first of all matrices that agree to 9 digits up to sign and transposition."""
     seen: dict[bytes, int] = {}
     for index, F in enumerate(scaled):
         keys = [(np.round(sign * G, 9) + 0.0).tobytes() for sign in (1, -1) for G in (F, F.T)]

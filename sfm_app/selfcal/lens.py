@@ -22,7 +22,7 @@ NEWTON_STEPS = 20
 
 @kernel
 def camera_of(theta: FloatArray, camera: FloatArray) -> None:
-    """fx, fy, u, v, k1 of the parameters (5,), into `camera` (5,)."""
+    """Write fx, fy, u, v, k1 of the parameters (5,) into `camera` (5,)."""
     f, half = np.exp(theta[0]), np.exp(0.5 * theta[3])
     camera[0], camera[1], camera[2], camera[3] = f / half, f * half, theta[1], theta[2]
     camera[4] = theta[4] * f * f
@@ -30,7 +30,7 @@ def camera_of(theta: FloatArray, camera: FloatArray) -> None:
 
 @kernel
 def undone(radius: float, k1: float, guess: float) -> float:
-    """r_u of the distorted radius r_d, in focal lengths, by Newton from a guess."""
+    """Return r_u of the distorted radius r_d, in focal lengths, by Newton from a guess."""
     if k1 == 0.0 or radius < 1e-9:
         return radius
     if k1 < 0.0:
@@ -50,7 +50,7 @@ def undone(radius: float, k1: float, guess: float) -> float:
 
 @kernel
 def ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -> None:
-    """The point (a, b) of the plane z = 1 that pixel (x, y) sees, into `out` (7,): a, b, its derivatives, r_u.
+    """Write the point (a, b) of the plane z = 1 that pixel (x, y) sees, into `out` (7,): a, b, its derivatives, r_u.
 
     `guess` is r_u of a camera nearby, or negative.
     """
@@ -71,7 +71,7 @@ def ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -
 
 @kernel
 def straightened(points: FloatArray, theta: FloatArray) -> FloatArray:
-    """(N, 2) where points (N, 2) would lie without the lens, in the units of the points."""
+    """Return (N, 2) where points (N, 2) would lie without the lens, in the units of the points."""
     camera, out, straight = np.empty(5), np.empty(7), np.empty_like(points)
     camera_of(theta, camera)
     for i in range(len(points)):

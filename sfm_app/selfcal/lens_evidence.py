@@ -75,7 +75,7 @@ class CameraPriors:
     """(C, 5) whether the photos are asked about a part, in the order of PARTS; else it stays as it is."""
 
     def precision(self, free: BoolArray) -> FloatArray:
-        """(C, 8) of the prior when `free` (C, 5) says what has the wide one."""
+        """Return (C, 8) of the prior when `free` (C, 5) says what has the wide one."""
         deviation = np.full((len(free), CAMERA), FOCAL_SPREAD)
         for k, part in enumerate(PARTS):
             unit = self.sides if part.name == "centre" else np.ones(len(free))
@@ -84,7 +84,10 @@ class CameraPriors:
         return np.asarray(deviation**-2.0, np.float64)
 
     def away(self, params: FloatArray) -> FloatArray:
-        """(C, 8) from the cameras to their usual values; none for the focal, nor for what the photos are not asked."""
+        """Return (C, 8) from the cameras to their usual values.
+
+        None for the focal, nor for what the photos are not asked.
+        """
         away = np.zeros_like(params)
         away[:, [CX, CY]] = self.centres - params[:, [CX, CY]]
         away[:, LOG_ASPECT] = np.log(params[:, FX] / params[:, FY])
@@ -111,7 +114,7 @@ class Estimate:
 
 
 def estimate(params: FloatArray, reduced: Reduced, priors: CameraPriors) -> Estimate:
-    """The most probable cameras, with the most probable choice of freed parts; undetermined parts stay.
+    """Return the most probable cameras, with the most probable choice of freed parts; undetermined parts stay.
 
     The deviations are those of all parts, about the value that was chosen, even where that is the present one, and over
     all choices of freed parts. Where photos pull at the cameras in different directions (a zoom, a moving shutter,
@@ -144,7 +147,7 @@ def estimate(params: FloatArray, reduced: Reduced, priors: CameraPriors) -> Esti
 
 
 def spread(parts: BoolArray) -> BoolArray:
-    """(C, 8) the parameters of some parts (C, 5), and of the focal."""
+    """Return (C, 8) the parameters of some parts (C, 5), and of the focal."""
     chosen = np.ones((len(parts), CAMERA), np.bool_)
     for k, part in enumerate(PARTS):
         chosen[:, list(part.places)] = parts[:, [k]]
@@ -154,7 +157,7 @@ def spread(parts: BoolArray) -> BoolArray:
 def _posterior(
     H: FloatArray, g: FloatArray, precision: FloatArray, away: FloatArray, changing: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean step (8C,) and covariance (8C, 8C) of what is changing (C, 8); 0 elsewhere."""
+    """Return mean step (8C,) and covariance (8C, 8C) of what is changing (C, 8); 0 elsewhere."""
     places = np.flatnonzero(changing)
     step, covariance = np.zeros(len(g)), np.zeros_like(H)
     block = np.ix_(places, places)
@@ -164,13 +167,13 @@ def _posterior(
 
 
 def _determined(covariance: FloatArray, precision: FloatArray) -> BoolArray:
-    """(C, 5) as in `Estimate`."""
+    """Return (C, 5) as in `Estimate`."""
     narrower = np.sqrt(np.diag(covariance)).reshape(precision.shape) < UNDETERMINED * precision**-0.5
     return np.stack([narrower[:, list(part.places)].all(axis=1) for part in PARTS], axis=1)
 
 
 def _choose(H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors) -> BoolArray:
-    """The most probable choice (C, 5) for each camera, the others as in the sweep before, until none changes."""
+    """Return the most probable choice (C, 5) for each camera, the others as in the sweep before, until none changes."""
     free, everything = np.zeros((len(away), len(PARTS)), np.bool_), np.ones_like(away, np.bool_)
     for _ in range(SWEEPS):
         before, precision = free, priors.precision(free)
@@ -185,7 +188,7 @@ def _choose(H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors
 
 
 def _best(H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors, camera: int) -> BoolArray:
-    """The most probable choice (5,) for one camera; of equals the one that frees less."""
+    """Return the most probable choice (5,) for one camera; of equals the one that frees less."""
     trials = np.array(sorted(product((False, True), repeat=len(PARTS)), key=sum))
     trials = trials[~np.any(trials & ~priors.asked[camera], axis=1)]
     value, _, _ = _alternatives(trials, H, g, away, priors.sides[camera])
@@ -195,7 +198,7 @@ def _best(H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors, 
 def _about(
     step: FloatArray, H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors, free: BoolArray
 ) -> FloatArray:
-    """(8C, 8C) mean square of the cameras about where a step leads, over all choices for each, the others as in `free`.
+    """Return (8C, 8C) mean squares of the cameras about a step, over all choices for each, the others as in `free`.
 
     Also over choices that the photos were not asked about: what nobody asked is no better known for that.
     """
@@ -217,7 +220,10 @@ def _about(
 def _without_prior(
     covariance: FloatArray, mean: FloatArray, precision: FloatArray, away: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """What the photos and the other cameras say about one camera: its marginal posterior without its own prior."""
+    """Return what the photos and the other cameras say about one camera.
+
+    Its marginal posterior without its own prior.
+    """
     marginal = inverses_of_positive(covariance)
     return marginal - np.diag(precision), marginal @ mean - precision * away
 
@@ -225,7 +231,7 @@ def _without_prior(
 def _alternatives(
     trials: BoolArray, H: FloatArray, g: FloatArray, away: FloatArray, side: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Log-probabilities (K,) of choices (K, 5) for one camera, mean steps (K, 8) and covariances (K, 8, 8).
+    """Return log-probabilities (K,) of choices (K, 5) for one camera, mean steps (K, 8) and covariances (K, 8, 8).
 
     Args:
         trials: the choices.
@@ -244,7 +250,7 @@ def _alternatives(
 
 
 def _by_logarithms(params: FloatArray) -> FloatArray:
-    """(8C, 8C) derivatives of the parameters by those with log f and log fy/fx in place of fx and fy."""
+    """Return (8C, 8C) derivatives of the parameters by those with log f and log fy/fx in place of fx and fy."""
     T = np.eye(params.size)
     for camera, values in enumerate(params):
         x, y = CAMERA * camera + FX, CAMERA * camera + FY
@@ -254,12 +260,12 @@ def _by_logarithms(params: FloatArray) -> FloatArray:
 
 
 def _product(A: FloatArray, B: FloatArray) -> FloatArray:
-    """A B without BLAS, whose sums depend on its threads."""
+    """Return a B without BLAS, whose sums depend on its threads."""
     return np.asarray(np.einsum("ij,j...->i...", A, B), np.float64)
 
 
 def _moved(params: FloatArray, step: FloatArray, sides: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """The cameras (C, 8) after a step, and (C,) which have run away with it."""
+    """Return the cameras (C, 8) after a step, and (C,) which have run away with it."""
     moved = params + step
     with np.errstate(over="ignore", invalid="ignore"):
         moved[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
@@ -270,7 +276,7 @@ def _moved(params: FloatArray, step: FloatArray, sides: FloatArray) -> tuple[Flo
 
 
 def _unknown(params: FloatArray, priors: CameraPriors) -> FloatArray:
-    """(C, 8) standard deviations of cameras about which the photos say nothing."""
+    """Return (C, 8) standard deviations of cameras about which the photos say nothing."""
     deviations = priors.precision(np.ones((len(params), len(PARTS)), np.bool_)) ** -0.5
     deviations[:, [FX, FY]] = FOCAL_SPREAD * params[:, [FX, FY]]
     return np.asarray(deviations, np.float64)

@@ -16,7 +16,7 @@ ESTIMATE = "estimate"
 
 
 def guessed(size: tuple[int, int], reason: str, evidence: Mapping[str, float]) -> Calibration:
-    """The usual guess with the reason why nothing better is known."""
+    """Return the usual guess with the reason why nothing better is known."""
     K = guessed_camera_matrix(size)
     return Calibration(K, *size, GUESS, identifiable=False, reason=reason, evidence=dict(evidence))
 
@@ -24,7 +24,7 @@ def guessed(size: tuple[int, int], reason: str, evidence: Mapping[str, float]) -
 def calibration_of(
     theta: NDArray[np.float64], size: tuple[int, int], method: str, unit_px: float | None = None
 ) -> Calibration:
-    """An answer from the parameters (5,) of `lens`, about the middle, in units of the longer side unless told."""
+    """Return answer from the parameters (5,) of `lens`, about the middle, in units of the longer side unless told."""
     unit = float(max(size)) if unit_px is None else unit_px
     focal, half = float(np.exp(theta[LOG_FOCAL])), float(np.exp(0.5 * theta[LOG_ASPECT]))
     cx, cy = unit * theta[CENTRE_U] + size[0] / 2, unit * theta[CENTRE_V] + size[1] / 2
@@ -33,12 +33,12 @@ def calibration_of(
 
 
 def roughly(found: Calibration, reason: str) -> Calibration:
-    """The answer as an estimate that is not relied on, where there is a reason for that; else as it is."""
+    """Return the answer as an estimate that is not relied on, where there is a reason for that; else as it is."""
     return replace(found, identifiable=False, method=ESTIMATE, reason=reason) if reason else found
 
 
 def parameters_of(found: Calibration, unit_px: float) -> NDArray[np.float64]:
-    """Back from `calibration_of`: (5,)."""
+    """Return the parameters (5,) that `calibration_of` was made from."""
     focal = found.focal_px / unit_px
     u, v = (found.K[0, 2] - found.width / 2) / unit_px, (found.K[1, 2] - found.height / 2) / unit_px
     return np.array([np.log(focal), u, v, np.log(found.K[1, 1] / found.K[0, 0]), found.radial / focal**2])

@@ -15,7 +15,7 @@ REACH_PX = 3.0
 
 
 def without_lens(pairs: CameraPairs, camera: Calibration) -> CameraPairs:
-    """The inliers straightened and every F fitted to them anew; the pairs themselves where no lens is known."""
+    """Return the inliers straightened and every F fitted to them anew; the pairs themselves where no lens is known."""
     if camera.radial == 0.0 or not pairs.inliers:
         return pairs
     side, middle = float(max(pairs.size)), np.array(pairs.size) / 2
@@ -32,5 +32,5 @@ def without_lens(pairs: CameraPairs, camera: Calibration) -> CameraPairs:
 
 
 def straight_points(points: FloatArray, theta: FloatArray) -> FloatArray:
-    """(N, 2) points without the lens of the camera theta (5,), in the same units about the middle."""
+    """Return (N, 2) points without the lens of the camera theta (5,), in the same units about the middle."""
     return np.asarray(straightened(np.ascontiguousarray(points, np.float64), theta), np.float64)

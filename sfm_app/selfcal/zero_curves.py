@@ -72,7 +72,7 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 
 
 def _from_fundamentals(pairs: CameraPairs, usable: Pairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """The peak of the consensus, when the matrices are all that is known."""
+    """Return the peak of the consensus, when the matrices are all that is known."""
     side = float(max(pairs.size))
     centre_sigma = options.centre_sigma if len(usable) > FEW_PAIRS else min(options.centre_sigma, UNCROPPED_SIGMA)
     consensus = Consensus(usable, centre_sigma * pairs.size[0] / side)
@@ -94,7 +94,10 @@ def _from_fundamentals(pairs: CameraPairs, usable: Pairs, options: CalibrationSe
 def _from_matches(
     pairs: CameraPairs, usable: Pairs, options: CalibrationSettings, evidence: dict[str, float]
 ) -> Calibration:
-    """The consensus finds where to begin; the matches say the rest; a consensus without the lens has the last word."""
+    """Return the consensus finds where to begin; the matches say the rest.
+
+    A consensus without the lens has the last word.
+    """
     side = float(max(pairs.size))
     sigma = options.centre_sigma * pairs.size[0] / side
     hint = float(np.median(pairs.focal_hints_px)) / side if pairs.focal_hints_px else np.nan
@@ -190,7 +193,7 @@ def _prepared(pairs: CameraPairs) -> Pairs:
 
 
 def _in_sides(pairs: CameraPairs, usable: Pairs) -> tuple[Matches, FloatArray]:
-    """Inliers and F's of the usable pairs in longer sides about the middle."""
+    """Return inliers and F's of the usable pairs in longer sides about the middle."""
     side = float(max(pairs.size))
     middle = np.tile(np.array(pairs.size) / 2, 2)
     inliers = [(np.asarray(pairs.inliers[k], np.float64) - middle) / side for k in usable.kept]

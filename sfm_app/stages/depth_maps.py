@@ -85,7 +85,7 @@ def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | No
 
 @contextmanager
 def single_threaded_opencv() -> Iterator[None]:
-    """One OpenCV thread per worker: the photos are what runs in parallel."""
+    """Provide one OpenCV thread per worker: the photos are what runs in parallel."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

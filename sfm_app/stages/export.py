@@ -19,5 +19,5 @@ def write_files(model: Model, run: RunContext) -> tuple[Path, ...]:
 
 
 def load_files(run: RunContext) -> tuple[Path, ...]:
-    """Paths of the files that are there."""
+    """Return paths of the files that are there."""
     return run.model_paths(NAME)

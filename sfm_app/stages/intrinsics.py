@@ -29,7 +29,7 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
 
 
 def intrinsics_seal(place: Workspace) -> str:
-    """Hash of what this stage left: calibration.json without what the scene adds.
+    """Return hash of what this stage left: calibration.json without what the scene adds.
 
     The cameras of the database are none of it: mapping enters those that it tries.
     """

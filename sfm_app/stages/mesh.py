@@ -68,7 +68,7 @@ def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surfac
 
 
 def nonempty(surface: Surface, otherwise: str) -> Surface:
-    """The surface, which has triangles.
+    """Return the surface, which has triangles.
 
     Raises:
         ReconstructionError: it has none.
@@ -79,13 +79,13 @@ def nonempty(surface: Surface, otherwise: str) -> Surface:
 
 
 def load_surface(dense_dir: Path) -> Surface:
-    """The surface that `make_mesh` left in a dense workspace."""
+    """Return the surface that `make_mesh` left in a dense workspace."""
     stored = load_arrays(dense_dir / SURFACE)
     return Surface(stored["vertices"], stored["faces"], stored["colors"])
 
 
 def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.float64]:
-    """(N, 3) points of all depth maps together, fused anew only where a depth map, or their folder, is younger."""
+    """Give (N, 3) points of all depth maps together, fused anew only where a depth map, or their folder, is younger."""
     if not views:
         raise ReconstructionError("no photo has a depth map", hint=HINT)
     target = dense_dir / FUSED
@@ -107,12 +107,12 @@ def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray
 
 
 def photos_needed(views: list[View], run: RunContext) -> int:
-    """How many photos have to see a fused point."""
+    """Return how many photos have to see a fused point."""
     return min(1 + run.settings.depth.min_agreeing, len(views))
 
 
 def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> tuple[Surface, Support]:
-    """The surface in the colours of the photos, and what they say about each of its vertices."""
+    """Return the surface in the colours of the photos, and what they say about each of its vertices."""
     normals = vertex_normals(surface.vertices, surface.faces)
     tolerance = run.settings.depth.consistency
 
@@ -130,7 +130,7 @@ def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunCont
 
 
 def simplified(surface: Surface, options: MeshSettings, dense_dir: Path) -> Surface:
-    """As few triangles as the error allows, and no more than asked for."""
+    """Simplify to as few triangles as the error allows, and no more than asked for."""
     simple = surface
     if options.max_error:
         edge = median_edge(surface.vertices, surface.faces)

@@ -70,7 +70,7 @@ def read_photos(folder: Path, run: RunContext) -> PhotoSet:
 
 
 def within_memory(run: RunContext) -> PhotoSettings:
-    """The settings for photos; where the user allows only so much memory, larger ones are scaled down."""
+    """Return the settings for photos; where the user allows only so much memory, larger ones are scaled down."""
     options = run.settings.photos
     if not run.settings.max_memory_gb:
         return options
@@ -79,7 +79,7 @@ def within_memory(run: RunContext) -> PhotoSettings:
 
 
 def chosen(glances: list[Glance], *, keep_all: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
-    """The photos that are worth their time, and the others."""
+    """Return the photos that are worth their time, and the others."""
     if keep_all:
         return [glance.photo for glance in glances], []
     useful, useless = screened(glances)
@@ -88,7 +88,7 @@ def chosen(glances: list[Glance], *, keep_all: bool) -> tuple[list[Photo], list[
 
 
 def files_of(folder: Path, run: RunContext) -> list[str]:
-    """Names of all files that a run has to account for.
+    """Return names of all files that a run has to account for.
 
     Raises:
         InputError: the folder is missing or unreadable.
@@ -100,12 +100,12 @@ def files_of(folder: Path, run: RunContext) -> list[str]:
 
 
 def mask_folder(run: RunContext) -> Path | None:
-    """The folder of masks; None where none is given."""
+    """Return the folder of masks; None where none is given."""
     return Path(run.settings.photos.masks) if run.settings.photos.masks else None
 
 
 def masks_of(folder: Path, run: RunContext) -> list[str]:
-    """Names of all files in the folder of masks; none where no masks are given.
+    """Return names of all files in the folder of masks; none where no masks are given.
 
     Raises:
         InputError: it is missing or unreadable, holds the photos themselves, or the run would write over it.
@@ -118,7 +118,7 @@ def masks_of(folder: Path, run: RunContext) -> list[str]:
 
 
 def masked(glances: list[Glance], folder: Path, run: RunContext) -> tuple[list[Glance], list[UnusablePhoto]]:
-    """The photos with their masks, and those of which nothing is left.
+    """Return the photos with their masks, and those of which nothing is left.
 
     Raises:
         InputError: a mask cannot be used, or no photo has one.
@@ -166,7 +166,7 @@ def save_photo_set(photos: PhotoSet, run: RunContext) -> None:
 
 
 def _copy_seal(photo: Photo, run: RunContext) -> str | None:
-    """Hash of the bytes of a copy; None where a link leads to the photo, or where nothing is."""
+    """Return hash of the bytes of a copy; None where a link leads to the photo, or where nothing is."""
     place = run.workspace.photos / photo.name
     return seal(run.workspace.photos, photo.name) if place.is_file() and not place.is_symlink() else None
 
@@ -195,7 +195,7 @@ def _photo(entry: Mapping[str, Any]) -> Photo:
 
 
 def too_few(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:
-    """Why there is nothing to reconstruct, in one line."""
+    """Return why there is nothing to reconstruct, in one line."""
     reasons = Counter("copies of another" if "same picture" in photo.reason else photo.reason for photo in unusable)
     seen = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
     number = "no usable photo" if usable == 0 else "only one usable photo"

@@ -84,7 +84,7 @@ def adjusted_scene(found: Found, run: RunContext) -> Scene:
 def with_depth(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """Without the models of photos that hold no depth: these could be anything.
+    """Drop the models of photos that hold no depth: these could be anything.
 
     Raises:
         ReconstructionError: no model is left; says what was seen.
@@ -106,7 +106,7 @@ def with_depth(
 
 
 def how_it_was_made(outcome: Outcome) -> dict[str, Any]:
-    """What the manifest says about relative poses and mapping."""
+    """Return what the manifest says about relative poses and mapping."""
     poses, main = outcome.graph.poses.values(), outcome.models[0]
     dropped = list(outcome.graph.dropped.values())
     kinds = [pose.kind for pose in poses]
@@ -127,7 +127,7 @@ def how_it_was_made(outcome: Outcome) -> dict[str, Any]:
 
 
 def how_it_was_adjusted(adjusted: Sequence[Adjusted], names: Mapping[str, str]) -> dict[str, Any]:
-    """What the manifest says about what the last adjustment could not do; empty where that is nothing."""
+    """Return what the manifest says about what the last adjustment could not do; empty where that is nothing."""
     main, others = adjusted[0], adjusted[1:]
     cameras = {image.camera_id: names[image.name] for image in main.model.images.values() if image.has_pose}
     found = {
@@ -161,7 +161,7 @@ def write_model(model: Any, target: Path) -> None:
 
 
 def refined_by_name(adjusted: Adjusted, names: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """What is known about the refined cameras besides COLMAP's model, by name of the camera."""
+    """Return what is known about the refined cameras besides COLMAP's model, by name of the camera."""
     cameras = {names[image.name]: image.camera_id for image in adjusted.model.images.values() if image.has_pose}
     return {
         name: {"deviations": adjusted.deviations[camera_id], "determined": adjusted.determined[camera_id]}

@@ -70,7 +70,7 @@ class Files:
 
 
 def digest(surface: Surface) -> str:
-    """Hash of vertices, triangles and colours."""
+    """Return hash of vertices, triangles and colours."""
     found = blake2b()
     for part in (surface.vertices, surface.faces, surface.colors):
         found.update(part.tobytes())
@@ -78,12 +78,12 @@ def digest(surface: Surface) -> str:
 
 
 def photo_views(scene: Scene) -> list[PhotoView]:
-    """The registered photos as the texture sees them."""
+    """Return the registered photos as the texture sees them."""
     return [photo_view(name, scene.cameras[scene.camera_of[name]], pose) for name, pose in scene.cam_from_world.items()]
 
 
 def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
-    """(height, width, 3) RGB of a photo at the size of the view; smaller ones are averaged, not picked.
+    """Return (height, width, 3) RGB of a photo at the size of the view; smaller ones are averaged, not picked.
 
     Where a mask says which pixels may be used, nothing is seen of the others.
     """
@@ -108,7 +108,7 @@ def save_texture(model: Model, run: RunContext) -> None:
 
 
 def load_texture(dense_dir: Path) -> Model:
-    """The model that `make_texture` left in a dense workspace."""
+    """Return the model that `make_texture` left in a dense workspace."""
     stored = load_arrays(dense_dir / TEXTURE)
     surface = Surface(stored["vertices"], stored["faces"], stored["colors"])
     if "uv" not in stored:

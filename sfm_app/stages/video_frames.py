@@ -35,7 +35,7 @@ class Chosen:
 
 
 def settings_for(source: Path, settings: Settings) -> Settings:
-    """The settings for a folder or a video: frames of one video share a camera, unless the user says otherwise.
+    """Return the settings for a folder or a video: frames of one video share a camera, unless the user says otherwise.
 
     Raises:
         ConfigError: they do not go with a video.
@@ -49,13 +49,13 @@ def settings_for(source: Path, settings: Settings) -> Settings:
 
 
 def folder_of(source: Path, run: RunContext) -> Path:
-    """Where the photos lie."""
+    """Return where the photos are."""
     return run.workspace.frames if is_video(head_of(source)) else source
 
 
 @contextmanager
 def photos_of(source: Path, run: RunContext) -> Iterator[Path]:
-    """The folder of photos: the source itself, or the chosen frames of a video.
+    """Provide the folder of photos: the source itself, or the chosen frames of a video.
 
     A run that is killed before the block ends without an error does not choose again.
 
@@ -78,7 +78,7 @@ def photos_of(source: Path, run: RunContext) -> Iterator[Path]:
 
 
 def kept(run: RunContext) -> Chosen | None:
-    """What a killed run had chosen from the same inputs."""
+    """Return what a killed run had chosen from the same inputs."""
     try:
         found = json.loads(run.workspace.frames_marker.read_text(encoding="utf-8"))
         chosen = Chosen(found["made_from"], tuple(map(int, found["frames"])), dict(found["counts"]))
@@ -142,6 +142,6 @@ def write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None
 
 
 def stem_of(source: Path) -> str:
-    """What the frames of a video are named by: short, visible, and printable."""
+    """Return what the frames of a video are named by: short, visible, and printable."""
     printable = "".join(c if c.isprintable() else "_" for c in source.stem)
     return printable.lstrip(".")[:LONGEST_STEM] or "frame"

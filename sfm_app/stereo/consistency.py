@@ -18,7 +18,7 @@ LEVELS = 16
 def merge_hypotheses(
     depths: NDArray[np.float32], parallaxes: NDArray[np.float32], tolerance: float
 ) -> tuple[DepthArray, NDArray[np.uint8]]:
-    """One depth per pixel from those that the neighbours gave.
+    """Return one depth per pixel from those that the neighbours gave.
 
     The depth with the heaviest company within the tolerance wins; the company is averaged. A depth weighs the square of
     its parallax, which is inversely proportional to its variance.
@@ -70,7 +70,7 @@ def _merge(
 def count_agreeing(
     view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
 ) -> NDArray[np.uint8]:
-    """How many other depth maps confirm each depth of a view, (H, W).
+    """Return how many other depth maps confirm each depth of a view, (H, W).
 
     A map confirms a depth when the point, seen from there, has a depth within the relative tolerance of the map's.
     """
@@ -84,7 +84,7 @@ def count_agreeing(
 
 
 def without_specks(depth: DepthArray, tolerance: float) -> DepthArray:
-    """The depth map without small patches in which depths differ by less than the tolerance from pixel to pixel."""
+    """Return depth map without small patches in which depths differ by less than the tolerance from pixel to pixel."""
     known = depth > 0
     if not known.any():
         return depth

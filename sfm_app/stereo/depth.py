@@ -89,20 +89,20 @@ def match_depths(
 
 
 def clipped(image: GreyImage) -> NDArray[np.bool_]:
-    """(H, W) whether a photo is black or blown out at a pixel and around it."""
+    """Return (H, W) whether a photo is black or blown out at a pixel and around it."""
     around = cv2.blur(image, (3, 3))
     return np.asarray((around <= CLIPPED_GREY) | (around >= 255 - CLIPPED_GREY))
 
 
 def _started(depth: DepthArray) -> PlaneArray:
-    """Planes at the depths themselves, with the slopes of what is around them."""
+    """Return planes at the depths themselves, with the slopes of what is around them."""
     planes = fit_planes(depth)
     planes[..., 0] = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
     return planes
 
 
 def _sampled(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) -> Estimate:
-    """Depths and confidences where a view wants them in its pixels."""
+    """Return depths and confidences where a view wants them in its pixels."""
     shift = np.float32(sample_px - 0.5)
     inverse = planes[..., 0] + shift * (planes[..., 1] + planes[..., 2])
     known = (planes[..., 0] > 0) & (inverse > 0) & (cost < NO_MATCH)

@@ -23,7 +23,7 @@ ANY_GREY = 0.5 * np.log(2.0 * np.pi) - np.log(256.0)
 
 
 def without_spill(depth: DepthArray, image: GreyImage) -> DepthArray:
-    """The depth map without rims that look like the empty side, not like the surface that they continue.
+    """Return the depth map without rims that look like the empty side, not like the surface that they continue.
 
     Skies and plain backgrounds have no depth of their own, but a window of correlation that reaches a thing in front
     of them finds that thing's: a seam as wide as half the window, in every photo alike, so that no check between photos
@@ -44,7 +44,7 @@ def without_spill(depth: DepthArray, image: GreyImage) -> DepthArray:
 
 
 def rims(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(H, W) the pixels with a depth that lie within `REACH_PX` of an empty place broader than two rims."""
+    """Return (H, W) the pixels with a depth that lie within `REACH_PX` of an empty place broader than two rims."""
     away = cv2.distanceTransform(1 - _broad(~known).view(np.uint8), cv2.DIST_L2, 3)
     return np.asarray(known & (away <= REACH_PX))
 
@@ -55,7 +55,10 @@ def _broad(empty: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _log_likelihood(grey: NDArray[np.float32], among: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """(H, W) of each pixel's grey among the marked pixels around it; nan, which compares as false, if there are few."""
+    """Return (H, W) of each pixel's grey among the marked pixels around it.
+
+    Nan, which compares as false, if there are few.
+    """
     side = (SURROUNDINGS_PX, SURROUNDINGS_PX)
     marked = among.astype(np.float32)
     count = cv2.blur(marked, side)

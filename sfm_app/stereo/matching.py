@@ -15,7 +15,7 @@ MIN_PARALLAX_PX = 1.0
 
 
 def disparities(left: GreyImage, right: GreyImage, count: int) -> NDArray[np.float32]:
-    """Semi-global matching (Hirschmueller, PAMI 2008; OpenCV's block variant) in [0, count), to sub-pixels.
+    """Return semi-global matching (Hirschmueller, PAMI 2008; OpenCV's block variant) in [0, count), to sub-pixels.
 
     Returns:
         (H, W) disparity of the left image in pixels; -1 where left and right disagree by more than a pixel, where a
@@ -111,7 +111,7 @@ def _lift(
 
 @kernel
 def _interpolated(disparity: NDArray[np.float32], u: float, v: float) -> float:
-    """Bilinear where the surface is continuous, else the nearest value; -1 where there is none."""
+    """Return bilinear where the surface is continuous, else the nearest value; -1 where there is none."""
     height, width = disparity.shape
     i, j = int(np.floor(v)), int(np.floor(u))
     if i < 0 or j < 0 or i + 1 >= height or j + 1 >= width:

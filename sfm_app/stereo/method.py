@@ -23,13 +23,13 @@ class DepthStore(Protocol):
     """Where photos come from and maps go; a map appears complete or not at all."""
 
     def photo(self, view: View, /) -> GreyImage:
-        """The photo without distortion, (H, W)."""
+        """Return the photo without distortion, (H, W)."""
 
     def has(self, view: View, kind: Kind, /) -> bool:
-        """Whether a map is there."""
+        """Return whether a map is there."""
 
     def read_estimate(self, view: View, /) -> Estimate:
-        """The photometric map."""
+        """Return the photometric map."""
 
     def write_estimate(self, view: View, estimate: Estimate, /) -> None:
         """Keep the photometric map."""

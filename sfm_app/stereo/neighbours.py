@@ -13,7 +13,7 @@ BEST_ANGLE_DEG = 8.0
 
 
 def rank_neighbours(views: Sequence[View], count: int) -> list[list[int]]:
-    """For every view the indices of the views that serve it best, best first, at most `count`.
+    """Return, for every view, the indices of the views that serve it best, best first, at most `count`.
 
     Greedy coverage: the next neighbour is the one that adds most to the sparse points of the view. A point adds its
     weight (triangulation angle, difference in scale), up to halved for each time that it is covered already, so that
@@ -43,7 +43,10 @@ def _rank(view: View, views: Sequence[View], count: int) -> list[int]:
 
 
 def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
-    """(N,) in [0, 1]: how well world points (N, 3) can be matched between two views, from their angle and scale."""
+    """Return (N,) in [0, 1].
+
+    How well world points (N, 3) can be matched between two views, from their angle and scale.
+    """
     angle_deg = triangulation_angles_deg(view.center, other.center, points)
     spread_deg = np.where(angle_deg < BEST_ANGLE_DEG, BEST_ANGLE_DEG / 3, 1.25 * BEST_ANGLE_DEG)
     weight = np.exp(-0.5 * ((angle_deg - BEST_ANGLE_DEG) / spread_deg) ** 2)
@@ -54,7 +57,7 @@ def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
 
 
 def triangulation_angles_deg(center1: FloatArray, center2: FloatArray, points: FloatArray) -> NDArray[np.float64]:
-    """(N,) angles in degrees under which points (N, 3) see two centres (3,)."""
+    """Return (N,) angles in degrees under which points (N, 3) see two centres (3,)."""
     ray1, ray2 = points - center1, points - center2
     # atan2 keeps small angles exact, where arccos of a rounded cosine does not
     sine = np.linalg.norm(np.cross(ray1, ray2), axis=1)

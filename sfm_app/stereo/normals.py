@@ -17,7 +17,7 @@ MIN_WEIGHT = 0.25
 
 
 def fit_planes(depth: DepthArray) -> PlaneArray:
-    """Plane through the surroundings of every pixel, by least squares.
+    """Return plane through the surroundings of every pixel, by least squares.
 
     A plane n'X = 1 has the inverse depth n'x at the ray x = K^-1 (u, v, 1), which is linear in n and in the noise.
 
@@ -32,7 +32,7 @@ def fit_planes(depth: DepthArray) -> PlaneArray:
 
 
 def normals_of(planes: PlaneArray, view: View) -> NDArray[np.float32]:
-    """(H, W, 3) unit normals in the camera frame that point to the camera; 0 where the inverse depth is 0."""
+    """Return (H, W, 3) unit normals in the camera frame that point to the camera; 0 where the inverse depth is 0."""
     q, qu, qv = (planes[..., k].astype(np.float64) for k in range(3))
     row, col = np.indices(q.shape) + view.sample_px
     # n'K^-1 (u, v, 1) = q + qu (u - u0) + qv (v - v0) for all u, v
@@ -54,7 +54,7 @@ def _fit(depth: DepthArray, window: FloatArray, planes: PlaneArray) -> None:
 
 @kernel
 def _slopes(depth: DepthArray, row: int, col: int, window: FloatArray) -> tuple[float, float, float]:
-    """Weighted fit of the inverse depth g0 + gu du + gv dv, (du, dv) in pixels from (col, row); g0 = 0: none."""
+    """Return weighted fit of the inverse depth g0 + gu du + gv dv, (du, dv) in pixels from (col, row); g0 = 0: none."""
     height, width = depth.shape
     z = depth[row, col]
     n, su, sv, suu, suv, svv, q, qu, qv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

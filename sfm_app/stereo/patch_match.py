@@ -144,7 +144,7 @@ def _read_window(
 
 @kernel
 def _inverse_depth_per_px(row: int, col: int, q: float, projections: FloatArray) -> float:
-    """Change of the inverse depth that moves the pixel by one pixel in the neighbour where it moves most."""
+    """Return the change of the inverse depth that moves the pixel by one pixel in the neighbour where it moves most."""
     most = 1e-12
     x, y = col + 0.5, row + 0.5
     for k in range(len(projections)):
@@ -214,7 +214,7 @@ def _cost(row: int, col: int, plane: FloatArray, window: Any, others: Any, costs
 
 @kernel
 def _correlation(stack: NDArray[np.float32], start: int, stride: int, affine: Any, window: Any) -> float:
-    """Weighted normalised cross-correlation of a window and its image; noise on both sides lowers it."""
+    """Return weighted normalised cross-correlation of a window and its image; noise on both sides lowers it."""
     weights, greys, mean, variance = window
     u, v = np.float32(affine[0]), np.float32(affine[1])
     uu, uv, vu, vv = np.float32(affine[2]), np.float32(affine[3]), np.float32(affine[4]), np.float32(affine[5])

@@ -79,7 +79,7 @@ def _bridge(depth: DepthArray, area: NDArray[np.bool_], tolerance: float) -> Non
 
 
 def _consensus_plane(A: FloatArray, inverse: FloatArray, tolerance: float) -> FloatArray:
-    """Inverse depth as a linear function of column and row, (3,): the one that most pixels agree with."""
+    """Return inverse depth as a linear function of column and row, (3,): the one that most pixels agree with."""
     rng = np.random.default_rng(0)
     some = rng.integers(0, len(A), SAMPLED_PIXELS)
     best, most = np.array([np.median(inverse), 0.0, 0.0]), 0
@@ -99,7 +99,7 @@ def _consensus_plane(A: FloatArray, inverse: FloatArray, tolerance: float) -> Fl
 
 
 def _bend(row: NDArray[np.int64], col: NDArray[np.int64], residual: FloatArray, shape: tuple[int, ...]) -> float:
-    """Root mean square of the mean residuals of cells."""
+    """Return root mean square of the mean residuals of cells."""
     cell = row * CELLS // shape[0] * CELLS + col * CELLS // shape[1]
     count = np.bincount(cell, minlength=CELLS**2)
     full = count >= CELL_PIXELS

@@ -49,7 +49,7 @@ class Rectification:
     disparities: int
 
     def warp(self, reference: GreyImage, neighbour: GreyImage, views: tuple[View, View]) -> tuple[GreyImage, GreyImage]:
-        """Both photos on the canvas, black where they have no pixels; the photos may be smaller than their views."""
+        """Warp both photos to the canvas, black where they have no pixels; photos may be smaller than their views."""
         left = self._warp(reference, views[0], 0.0)
         return left, self._warp(neighbour, views[1], self.offset_px)
 
@@ -123,12 +123,12 @@ def _rectified_rotation(reference: View, neighbour: View) -> FloatArray | None:
 
 
 def _directions(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Angle theta from the x axis and phi about it, from the z axis, of rays (N, 3)."""
+    """Return angle theta from the x axis and phi about it, from the z axis, of rays (N, 3)."""
     return np.arctan2(np.hypot(rays[:, 1], rays[:, 2]), rays[:, 0]), np.arctan2(rays[:, 1], rays[:, 2])
 
 
 def _triangulation_angles(reference: View, neighbour: View, rotation: FloatArray) -> FloatArray:
-    """(N,) angles, in radians, under which the reference's sparse points in front of both see the baseline."""
+    """Return (N,) angles, in radians, under which the reference's sparse points in front of both see the baseline."""
     ahead = (reference.depths > 0) & (reference.points @ neighbour.R[2] + neighbour.t[2] > 0)
     points = reference.points[ahead]
     return np.asarray(
@@ -138,7 +138,7 @@ def _triangulation_angles(reference: View, neighbour: View, rotation: FloatArray
 
 
 def _angle_range(angles: FloatArray, room: float) -> tuple[float, float]:
-    """Largest and smallest triangulation angle of the surface; sparse points rarely reach its ends.
+    """Return largest and smallest triangulation angle of the surface; sparse points rarely reach its ends.
 
     Least of all the near one: pavements at one's feet have few features. It is sought as far as `room`, what can be
     searched without making the photos smaller, allows.
@@ -150,7 +150,7 @@ def _angle_range(angles: FloatArray, room: float) -> tuple[float, float]:
 
 
 def _bounds(rotation: FloatArray, view: View) -> FloatArray:
-    """Lowest and highest theta and phi, (2, 2), in a photo; all of phi where it shows an end of the baseline."""
+    """Return lowest and highest theta and phi, (2, 2), in a photo; all of phi where it shows an end of the baseline."""
     s, e = np.linspace(0, 1, BORDER_SAMPLES), np.ones(BORDER_SAMPLES)
     border = np.concatenate([np.stack(side, -1) for side in ((s, 0 * e), (s, e), (0 * e, s), (e, s))])
     pixels = np.column_stack([border * [view.width, view.height], np.ones(len(border))])

@@ -17,7 +17,7 @@ MIN_SHARE = 0.03
 
 
 def without_surface(confidence: NDArray[np.float32], confirmed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(H, W) the blank areas next to nothing of which is confirmed.
+    """Return (H, W) the blank areas next to nothing of which is confirmed.
 
     Args:
         confidence: (H, W) in [0, 1], 0 where there is no depth.

@@ -58,7 +58,10 @@ class View:
 
 
 def region(views: Sequence[View], margin: float = 0.2) -> FloatArray:
-    """Box (2, 3) around the sparse points: lowest and highest coordinates, without the strays, widened by a share."""
+    """Return box (2, 3) around the sparse points.
+
+    Lowest and highest coordinates, without the strays, widened by a share.
+    """
     points = np.concatenate([view.points for view in views])
     low, high = np.percentile(points, [1, 99], axis=0)
     return np.stack([low - margin * (high - low).max(), high + margin * (high - low).max()])

@@ -38,12 +38,12 @@ class Views:
 
     @classmethod
     def of(cls, camera: Camera, poses: Sequence[FloatArray]) -> "Views":
-        """One camera at poses (3, 4), the photos named view_00.jpg and so on."""
+        """Return one camera at poses (3, 4), the photos named view_00.jpg and so on."""
         named = {f"view_{k:02d}.jpg": pose for k, pose in enumerate(poses)}
         return cls(dict.fromkeys(named, camera), named)
 
     def taken_with(self, camera: Camera, photos: Collection[str]) -> "Views":
-        """The same views, these photos taken with another camera.
+        """Return the same views, these photos taken with another camera.
 
         Raises:
             ConfigError: a photo is not among the views.
@@ -102,7 +102,7 @@ def make_camera(
     aspect: float = 1.0,
     radial: float = 0.0,
 ) -> Camera:
-    """A camera about which a guess goes wrong: its optical centre is not the middle of the photo.
+    """Return a camera about which a guess goes wrong: its optical centre is not the middle of the photo.
 
     Args:
         width: pixels, >= 16.
@@ -122,7 +122,7 @@ def make_camera(
 
 
 def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Views:
-    """Hand-held photos along an arc in front of the scene (towards +z, y up), named view_00.jpg and so on."""
+    """Return hand-held photos along an arc in front of the scene (towards +z, y up), named view_00.jpg and so on."""
     options = options or ArcOptions()
     rng = np.random.default_rng([seed, 11])
     count = options.photos
@@ -164,7 +164,7 @@ class PastOptions:
 
 
 def past(camera: Camera, options: PastOptions | None = None, seed: int = 0) -> Views:
-    """Hand-held photos along a wall in the plane z = 0, from left to right, named view_00.jpg and so on."""
+    """Return hand-held photos along a wall in the plane z = 0, from left to right, named view_00.jpg and so on."""
     options = options or PastOptions()
     rng = np.random.default_rng([seed, 13])
     count = options.photos
@@ -183,7 +183,7 @@ def orbit(
     distance: float = 5.6,
     aim: tuple[float, float, float] = (0.0, 1.3, -0.2),
 ) -> Views:
-    """Upright photos evenly spread on a level circle, all looking at its centre: they leave the focal undetermined.
+    """Place upright photos evenly on a level circle, all looking at its centre: they leave the focal undetermined.
 
     Any two of the optical axes meet at the same distance from both cameras (isosceles), and then one F says nothing
     about the focal length (Sturm 2001); K is the same for all photos.
@@ -210,7 +210,7 @@ def orbit(
 def panorama(
     camera: Camera, photos: int = 6, step_deg: float = 12.0, centre: tuple[float, float, float] = (0.0, 1.5, 4.5)
 ) -> Views:
-    """Photos from one spot, turned from left to right, each a little up or down and rolled: they hold no depth.
+    """Return photos from one spot, turned from left to right, each a little up or down and rolled: they hold no depth.
 
     Args:
         camera: takes all photos.
@@ -225,7 +225,7 @@ def panorama(
 
 
 def look_at(centre: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> FloatArray:
-    """(3, 4) cam_from_world of a camera at `centre` (3,) that looks at `aim` (3,), world y up.
+    """Return (3, 4) cam_from_world of a camera at `centre` (3,) that looks at `aim` (3,), world y up.
 
     Raises:
         ValueError: the camera looks straight up or down, so that its roll is undefined.
@@ -240,12 +240,12 @@ def look_at(centre: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> Float
 
 
 def camera_centre(cam_from_world: FloatArray) -> FloatArray:
-    """(3,) position in the world of a camera with the (3, 4) pose [R | t]."""
+    """Return (3,) position in the world of a camera with the (3, 4) pose [R | t]."""
     return np.asarray(-cam_from_world[:, :3].T @ cam_from_world[:, 3])
 
 
 def axis_rotation(axis: FloatArray, angle_deg: float) -> FloatArray:
-    """(3, 3) rotation about a unit axis (3,), right-handed (Rodrigues)."""
+    """Return (3, 3) rotation about a unit axis (3,), right-handed (Rodrigues)."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     angle = math.radians(angle_deg)
@@ -253,7 +253,7 @@ def axis_rotation(axis: FloatArray, angle_deg: float) -> FloatArray:
 
 
 def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> FloatArray:
-    """Directions of view in the camera frame, row by row.
+    """Return directions of view in the camera frame, row by row.
 
     Args:
         camera: its lens distortion is undone exactly.
@@ -273,7 +273,7 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
 
 
 def _undistorted_over_distorted(distorted: FloatArray, k1: float) -> FloatArray:
-    """r / d where r (1 + k1 r^2) = d, on the branch through the centre."""
+    """Return r / d where r (1 + k1 r^2) = d, on the branch through the centre."""
     # for k1 < 0 the left side rises up to r^2 = -1 / (3 k1), where it is 2 r / 3, and then falls
     if k1 < 0 and distorted.max(initial=0.0) >= 2.0 / 3.0 / math.sqrt(-3.0 * k1):
         raise ConfigError(f"synthetic camera: a radial distortion of {k1:g} folds within the photo")

@@ -21,7 +21,7 @@ SAMPLES = 20_000
 
 
 def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
-    """e_focal of thesis section 5.5.3: mean error of fx and fy in percent of the truth.
+    """Return e_focal of thesis section 5.5.3: mean error of fx and fy in percent of the truth.
 
     Args:
         K: (3, 3) that was found.
@@ -36,7 +36,10 @@ def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
 
 
 def centre_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
-    """e_OC of thesis section 5.5.3: mean error of the optical centre's x and y in percent of the truth; as above."""
+    """Return e_OC of thesis section 5.5.3: mean error of the optical centre's x and y in percent of the truth.
+
+    As above.
+    """
     true = truth.cameras[photo].K if photo else truth.K
     return float(50.0 * sum(abs(K[i, 2] / true[i, 2] - 1.0) for i in (0, 1)))
 
@@ -48,7 +51,7 @@ def surface_error(
     truth: Truth,
     samples: int = SAMPLES,
 ) -> float:
-    """Median distance of a reconstructed surface to the true one, as a share of the scene's size.
+    """Return median distance of a reconstructed surface to the true one, as a share of the scene's size.
 
     The reconstruction is moved onto the truth by the similarity between the camera centres. The scene's size is the
     diagonal of the bounding box of the true surface that the photos see. The median says nothing about what is
@@ -74,7 +77,7 @@ def surface_accuracy(
     truth: Truth,
     tolerance: float = 0.005,
 ) -> float:
-    """Share of a reconstructed surface, by area, that lies within `tolerance` scene sizes of the true one.
+    """Return share of a reconstructed surface, by area, that lies within `tolerance` scene sizes of the true one.
 
     Arguments and errors as for `surface_error`.
     """
@@ -88,7 +91,7 @@ def surface_coverage(
     truth: Truth,
     tolerance: float = 0.01,
 ) -> float:
-    """Share of what the photos see of the true surface that has reconstructed surface within `tolerance` scene sizes.
+    """Give share of what photos see of the true surface that has reconstructed surface within `tolerance` scene sizes.
 
     Weighted as the photos see it: evenly over their pixels. Arguments and errors as for `surface_error`.
     """
@@ -99,12 +102,12 @@ def surface_coverage(
 
 
 def scene_size(truth: Truth) -> float:
-    """Diagonal of the bounding box of the true surface that the photos see, in scene units."""
+    """Return diagonal of the bounding box of the true surface that the photos see, in scene units."""
     return float(np.linalg.norm(np.ptp(seen_points(truth), axis=0)))
 
 
 def seen_points(truth: Truth) -> FloatArray:
-    """(N, 3) points where an even grid of rays through all photos meets the true surface."""
+    """Return (N, 3) points where an even grid of rays through all photos meets the true surface."""
     caster = ray_caster(truth.vertices, truth.faces)
     found = []
     for name, pose in truth.cam_from_world.items():
@@ -116,7 +119,7 @@ def seen_points(truth: Truth) -> FloatArray:
 
 
 def align_centres(centres: Mapping[str, FloatArray], truth: Truth) -> Similarity:
-    """The similarity that takes found camera centres to the true ones, not led astray by wrong photos.
+    """Return the similarity that takes found camera centres to the true ones, not led astray by wrong photos.
 
     Raises:
         ValueError: fewer than 3 common photos, or all centres lie on a line.
@@ -131,7 +134,7 @@ def align_centres(centres: Mapping[str, FloatArray], truth: Truth) -> Similarity
 
 
 def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0) -> FloatArray:
-    """(count, 3) points spread evenly over the triangles.
+    """Return (count, 3) points spread evenly over the triangles.
 
     Raises:
         ValueError: the surface has no area.
@@ -142,7 +145,7 @@ def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: in
 def sample_triangles(
     vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0
 ) -> tuple[FloatArray, IndexArray]:
-    """As `sample_surface`, with the triangle (count,) of each point."""
+    """Sample a surface as `sample_surface` does, with the triangle (count,) of each point."""
     area = _area(vertices, faces)
     if not area.sum() > 0:
         raise ValueError("the surface has no area")
@@ -157,7 +160,7 @@ def sample_triangles(
 
 
 def surface_distances(points: FloatArray, vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """(N,) distance of points (N, 3) to the nearest place on the triangles; in single precision."""
+    """Return (N,) distance of points (N, 3) to the nearest place on the triangles; in single precision."""
     queries = load_open3d().core.Tensor(points.astype(np.float32))
     return np.asarray(ray_caster(vertices, faces).compute_distance(queries).numpy(), dtype=np.float64)
 
@@ -169,7 +172,7 @@ def _distances_to_truth(
     truth: Truth,
     samples: int = SAMPLES,
 ) -> FloatArray:
-    """(samples,) distances of places spread evenly over a reconstructed surface to the true one, in scene sizes."""
+    """Give (samples,) distances of places spread evenly over a reconstructed surface to true one, in scene sizes."""
     points = sample_surface(align_centres(centres, truth)(vertices), faces, samples)
     return surface_distances(points, truth.vertices, truth.faces) / scene_size(truth)
 

@@ -40,14 +40,14 @@ TURN_DEG, MIDDLE = -45.0, (0.0, 0.0, -1.9)
 
 
 def corner() -> SyntheticScene:
-    """The scene; light falls in over the photographer's shoulder."""
+    """Return the scene; light falls in over the photographer's shoulder."""
     bodies = [*_walls(), *_shelf(), *_pictures(), *_table(), *_armchair(), *_things()]
     placed = tuple(replace(body, shape=body.shape.moved(MIDDLE, turn_deg=TURN_DEG)) for body in bodies)
     return SyntheticScene("corner", placed, to_light=(-0.25, 0.8, 0.75), sun=0.55, sky=0.75)
 
 
 def corner_views(camera: Camera, seed: int = 0) -> Views:
-    """14 hand-held photos from the other half of the room."""
+    """Return 14 hand-held photos from the other half of the room."""
     walk = ArcOptions(
         photos=14, sweep_deg=70.0, distance=(1.9, 2.9), height=(1.0, 1.9), aim=(0.0, 0.95, -0.9), aim_spread=0.3,
         roll_deg=4.0,
@@ -67,7 +67,7 @@ def _walls() -> list[Body]:
 
 
 def _shelf() -> list[Body]:
-    """Books against the papered wall."""
+    """Return books against the papered wall."""
     rng = np.random.default_rng(17)
     boards = [box(0.28, 0.03, 1.0).moved((0.15, y, 2.2)) for y in (0.02, 0.42, 0.82, 1.22)]
     boards += [box(0.28, 1.25, 0.03).moved((0.15, 0.0, z)) for z in (1.7, 2.7)]
@@ -104,7 +104,7 @@ def _pictures() -> list[Body]:
 
 
 def _table() -> list[Body]:
-    """In front of the plain wall, which shows above and beside it."""
+    """Make a table before the plain wall, which shows above and beside it."""
     legs = [box(0.05, 0.6, 0.05).moved((1.35 + x, 0.0, 0.45 + z)) for x in (-0.4, 0.4) for z in (-0.22, 0.22)]
     top = box(0.95, 0.04, 0.56, spacing=0.06).moved((1.35, 0.6, 0.45))
     lamp = revolved(np.array([[0.1, 0.0], [0.1, 0.02], [0.02, 0.04], [0.02, 0.3], [0.0, 0.3]]), segments=40, sharp=True)

@@ -170,7 +170,7 @@ class Tracks:
 
 
 def make_pair(options: PairOptions, seed: int) -> TwoViews:
-    """A random convergent camera pair and its matches, as in thesis section 4.8.
+    """Return a random convergent camera pair and its matches, as in thesis section 4.8.
 
     Both images get Gaussian noise; then a uniform value is added to the outliers in image 2. The outliers stand at
     random rows.
@@ -196,7 +196,7 @@ def make_pair(options: PairOptions, seed: int) -> TwoViews:
 
 
 def make_tracks(options: TrackOptions, seed: int) -> Tracks:
-    """Random cameras of one random K around a common pose, and points that all of them see, as in thesis section 5.5.3.
+    """Draw cameras of one random K around a common pose, and points that all of them see, as in thesis 5.5.3.
 
     The thesis speaks of perturbed locations; the orientations are perturbed too, since cameras that only shift
     leave K undetermined.
@@ -222,7 +222,9 @@ def pair_matches(
     outlier_range_px: float = 256.0,
     seed: int = 0,
 ) -> Iterator[tuple[tuple[int, int], FloatArray]]:
-    """The matches of every pair of cameras, with outliers in chosen pairs: one set of tracks under several corruptions.
+    """Yield the matches of every pair of cameras, with outliers in chosen pairs.
+
+    One set of tracks under several corruptions.
 
     Args:
         tracks: their noise is kept; outliers that they hold already are not.
@@ -245,7 +247,7 @@ def pair_matches(
 
 
 def random_rotation(rng: np.random.Generator, max_angle_deg: float) -> FloatArray:
-    """(3, 3) rotation about a uniformly random axis by a uniformly random angle up to the given one."""
+    """Return (3, 3) rotation about a uniformly random axis by a uniformly random angle up to the given one."""
     return axis_rotation(_direction(rng), rng.uniform(0.0, max_angle_deg))
 
 

@@ -39,7 +39,7 @@ PEDESTAL_TOP_Y = 1.36
 
 
 def courtyard() -> SyntheticScene:
-    """The scene; photos from about 5 units away on the side of +z show it best."""
+    """Return the scene; photos from about 5 units away on the side of +z show it best."""
     floor = Body(ground((-5.2, 5.2), (-3.0, 7.0), unevenness=0.02), PAVING)
     bodies = [floor, *_back_wall(), *_arcade(), *_side_walls(), *_pedestal(), *_amphora(), *_leaning_things()]
     return SyntheticScene("courtyard", (*bodies, *_round_things()))

@@ -37,7 +37,7 @@ FLOORS = ((0.0, 0.75, 2.45, 2.9), (2.9, 3.6, 5.2, 5.9))
 
 
 def facade() -> SyntheticScene:
-    """The scene; photos from 5 to 7 units in front of it show it best."""
+    """Return the scene; photos from 5 to 7 units in front of it show it best."""
     bodies = [
         Body(ground((-4.8, 4.8), (-0.6, 2.2), unevenness=0.012), replace(PAVING, scale=0.4)),
         Body(_wall(0), ASHLAR),
@@ -49,12 +49,12 @@ def facade() -> SyntheticScene:
 
 
 def facade_views(camera: Camera, seed: int = 0) -> Views:
-    """12 hand-held photos along the street."""
+    """Return 12 hand-held photos along the street."""
     return past(camera, PastOptions(length=8.5, distance=(6.6, 8.4), height=(1.3, 2.6), aim=(2.5, 3.5)), seed)
 
 
 def _wall(floor: int) -> Shape:
-    """The wall of a floor around its openings."""
+    """Return the wall of a floor around its openings."""
     foot, sill, lintel, top = FLOORS[floor]
     low = [(-WIDTH / 2, WIDTH / 2, lintel, top)]
     edges = [-WIDTH / 2, *(x + side * OPENING / 2 for x in AXES for side in (-1, 1)), WIDTH / 2]
@@ -68,7 +68,7 @@ def _wall(floor: int) -> Shape:
 
 
 def _windows() -> list[Body]:
-    """Panes, bars and sills; what hangs in and beside each differs, as people do."""
+    """Return panes, bars and sills; what hangs in and beside each differs, as people do."""
     bodies = []
     for floor, (foot, sill, lintel, _) in enumerate(FLOORS):
         for k, x in enumerate(AXES):
@@ -117,7 +117,7 @@ def _pane(x: float, bottom: float, top: float, curtain: int) -> list[Body]:
 
 
 def _courses() -> list[Body]:
-    """Bands along the whole front."""
+    """Return bands along the whole front."""
     top = FLOORS[1][3]
     plinth = assembled([box(3.85, 0.4, 0.14).moved((side * 2.575, -0.02, 0.05)) for side in (-1.0, 1.0)])
     brackets = [box(0.14, 0.2, 0.3).moved((x, top - 0.14, 0.12)) for x in np.linspace(-4.3, 4.3, 22)]
@@ -158,7 +158,7 @@ def _portal() -> list[Body]:
 
 
 def _balcony() -> list[Body]:
-    """On the portal."""
+    """Make the balcony on the portal."""
     y = 2.6
     baluster = revolved(
         np.array(

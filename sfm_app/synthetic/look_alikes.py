@@ -64,7 +64,7 @@ class LookAlikeScene:
 
 
 def gathered(unique: Things, repeated: Sequence[tuple[Things, Sequence[Placement]]], pillar: float = 0.0) -> Place:
-    """A place.
+    """Return a place.
 
     Args:
         unique: points and their normals, (N, 3) each, that are there once.
@@ -128,7 +128,7 @@ def matched(place: Place, views: Sequence[Placement], seed: int = 0) -> LookAlik
 
 
 def _photographed(place: Place, view: Placement, rng: np.random.Generator) -> tuple[IndexArray, FloatArray]:
-    """Numbers of the points that a photo shows, and where."""
+    """Return numbers of the points that a photo shows, and where."""
     R, t = view
     Y = place.X @ R.T + t
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -146,7 +146,10 @@ def _photographed(place: Place, view: Placement, rng: np.random.Generator) -> tu
 
 
 def _hidden(X: FloatArray, centre: FloatArray, radius: float) -> NDArray[np.bool_]:
-    """(N,) whether the way from the camera to a point runs through the cylinder; its own surface is not hidden."""
+    """Return (N,) whether the way from the camera to a point runs through the cylinder.
+
+    Its own surface is not hidden.
+    """
     ground, start = X[:, [0, 2]], centre[[0, 2]]
     way = ground - start
     nearest = np.clip(-(way @ start) / (way**2).sum(1), 0.0, 1.0)
@@ -155,7 +158,7 @@ def _hidden(X: FloatArray, centre: FloatArray, radius: float) -> NDArray[np.bool
 
 
 def _rows(place: Place, seen: Sequence[IndexArray], views: Sequence[Placement], rng: np.random.Generator) -> IndexArray:
-    """(M, 2) keypoints that look the same, once in either photo, and are seen from about the same side."""
+    """Return (M, 2) keypoints that look the same, once in either photo, and are seen from about the same side."""
     looks = [place.looks[one] for one in seen]
     common, *ends = np.intersect1d(looks[0], looks[1], return_indices=True)
     once = [np.bincount(one, minlength=int(place.looks.max()) + 1)[common] == 1 for one in looks]
@@ -174,7 +177,7 @@ def _rows(place: Place, seen: Sequence[IndexArray], views: Sequence[Placement], 
 
 
 def _relative(views: Sequence[Placement], stands: Sequence[Placement], inliers: NDArray[np.bool_]) -> RelativePose:
-    """The pose of view 2 from view 1, with what stands here taken for what stands there."""
+    """Return the pose of view 2 from view 1, with what stands here taken for what stands there."""
     (R1, t1), (R2, t2) = ((R @ S, R @ s + t) for (R, t), (S, s) in zip(views, stands, strict=True))
     R = R2 @ R1.T
     t = t2 - R @ t1

@@ -46,7 +46,7 @@ class Picture:
     """(H, W) where the model is seen."""
 
     def on(self, background: tuple[int, int, int] = (255, 255, 255)) -> Colors:
-        """(H, W, 3) with a colour where nothing is seen."""
+        """Return (H, W, 3) with a colour where nothing is seen."""
         return np.where(self.covered[..., None], self.colors, np.array(background, np.uint8))
 
 
@@ -57,7 +57,9 @@ def prepare_model(model: Model) -> PreparedModel:
 
 
 def render_model(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
-    """The model with its own colours, without light: the texture, or the colours of the vertices where there is none.
+    """Return the model with its own colours, without light.
+
+    The texture, or the colours of the vertices where there is none.
 
     Both sides of a triangle are seen. A pixel shows the model at its centre, so that a texture much finer than the
     pixels flickers.
@@ -72,7 +74,7 @@ def render_model(model: Model | PreparedModel, camera: Camera, cam_from_world: F
 
 
 def view_along(model: Model | PreparedModel, origin: FloatArray, directions: FloatArray) -> Picture:
-    """As `render_model`, for any lens: rays from origin (3,) along directions (H, W, 3) of any length."""
+    """Render as `render_model` does, for any lens: rays from origin (3,) along directions (H, W, 3) of any length."""
     prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
     shape = directions.shape[:2]
     if prepared.rays is None:
@@ -88,7 +90,9 @@ def view_along(model: Model | PreparedModel, origin: FloatArray, directions: Flo
 
 
 def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
-    """The bare shape in grey, each triangle lit by itself, so that every bump shows; reddish where seen from inside.
+    """Return the bare shape in grey, each triangle lit by itself, so that every bump shows.
+
+    Reddish where seen from inside.
 
     Arguments as for `render_model`.
     """
@@ -109,7 +113,7 @@ def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: F
 
 
 def beside_photo(photo: Colors, model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Colors:
-    """A photo and the model from its camera; below, the model from beside and there its bare shape.
+    """Return a photo and the model from its camera; below, the model from beside and there its bare shape.
 
     Args:
         photo: (h, w, 3) RGB; brought to the camera's size.
@@ -135,7 +139,7 @@ def beside_photo(photo: Colors, model: Model | PreparedModel, camera: Camera, ca
 
 
 def walked_around(pose: FloatArray, surface: Surface, angle_deg: float) -> FloatArray:
-    """The pose of somebody who walked around what a camera looks at, in a frame with y up."""
+    """Return the pose of somebody who walked around what a camera looks at, in a frame with y up."""
     R, t = pose[:, :3], pose[:, 3]
     depth = float(np.median(surface.vertices @ R[2] + t[2]))
     middle = R.T @ (np.array([0.0, 0.0, depth]) - t)
@@ -150,7 +154,7 @@ def _from_vertices(surface: Surface, face: NDArray[np.int64], weights: FloatArra
 
 
 def _from_pages(texture: Texture, face: NDArray[np.int64], weights: FloatArray) -> Colors:
-    """Bilinear look-up; texel centres at +0.5, the border repeated."""
+    """Return bilinear look-up; texel centres at +0.5, the border repeated."""
     place = np.einsum("hwk,hwkc->hwc", weights, texture.uv[face].astype(np.float64))
     page_of = texture.page[face]
     found = np.zeros((*face.shape, 3), np.uint8)

@@ -60,7 +60,7 @@ def prepare(scene: SyntheticScene) -> PreparedScene:
 def render_scene(
     scene: PreparedScene, camera: Camera, cam_from_world: FloatArray, supersampling: int = 2
 ) -> FloatArray:
-    """What the camera sees before blur, noise and gamma.
+    """Return what the camera sees before blur, noise and gamma.
 
     Args:
         scene: from `prepare`.
@@ -91,7 +91,7 @@ def render_scene(
 
 
 def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
-    """Open3D's RaycastingScene of one mesh; it works in single precision."""
+    """Return open3D's RaycastingScene of one mesh; it works in single precision."""
     open3d = load_open3d()
     caster = open3d.t.geometry.RaycastingScene()
     tensor = open3d.core.Tensor
@@ -100,7 +100,10 @@ def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
 
 
 def cast(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, NDArray[Any]]:
-    """First hits of rays from `origin` (3,) or (N, 3) along `directions` (N, 3), by Open3D's names; t_hit inf: none."""
+    """Return first hits of rays from `origin` (3,) or (N, 3) along `directions` (N, 3), by Open3D's names.
+
+    T_hit inf: none.
+    """
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3] = origin
     rays[:, 3:] = directions
@@ -111,7 +114,7 @@ def cast(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, N
 def _lit(
     scene: PreparedScene, centre: FloatArray, directions: FloatArray, hits: dict[str, NDArray[Any]]
 ) -> NDArray[np.bool_]:
-    """Whether the sun reaches each hit; only asked where the surface faces the sun."""
+    """Return whether the sun reaches each hit; only asked where the surface faces the sun."""
     sun = scene.lights[0]
     lit = hits["primitive_normals"] @ sun.astype(np.float32) > 0
     asked = np.flatnonzero(lit)
@@ -124,7 +127,7 @@ def _lit(
 
 
 def _openness(caster: Any, vertices: FloatArray, normals: FloatArray) -> FloatArray:
-    """Share of cosine-distributed rays (Fibonacci spiral) that leave a vertex without hitting anything near."""
+    """Return share of cosine-distributed rays (Fibonacci spiral) that leave a vertex without hitting anything near."""
     k = np.arange(AMBIENT_RAYS) + 0.5
     radius = np.sqrt(k / AMBIENT_RAYS)
     angle = k * np.pi * (3.0 - np.sqrt(5.0))

@@ -28,7 +28,7 @@ Item = TypeVar("Item")
 
 
 def build_scene(name: str = "courtyard") -> SyntheticScene:
-    """The scene of that name.
+    """Return the scene of that name.
 
     Raises:
         ConfigError: there is none; names the known ones.
@@ -37,7 +37,7 @@ def build_scene(name: str = "courtyard") -> SyntheticScene:
 
 
 def scene_views(name: str = "courtyard", seed: int = 0) -> Views:
-    """The photos of the walk through that scene.
+    """Return the photos of the walk through that scene.
 
     Raises:
         ConfigError: there is none; names the known ones.

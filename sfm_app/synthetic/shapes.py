@@ -35,7 +35,7 @@ class Shape:
 
 
 def box(width: float, height: float, depth: float, spacing: float = 0.15) -> Shape:
-    """A box centred in x and z that stands on y = 0, its sides cut into squares of about `spacing`."""
+    """Return a box centred in x and z that stands on y = 0, its sides cut into squares of about `spacing`."""
     size = np.array([width, height, depth])
     parts = []
     for axis in range(3):
@@ -58,7 +58,7 @@ def revolved(
     sharp: bool = False,
     flutes: tuple[int, float] = (0, 0.0),
 ) -> Shape:
-    """A profile turned about the y axis.
+    """Return a profile turned about the y axis.
 
     Args:
         profile: (P, 2) radius and height; outside lies to the right of the way from the first to the last point
@@ -73,14 +73,14 @@ def revolved(
 
 
 def torus(radius: float, tube: float, span_deg: float = 360.0) -> Shape:
-    """A ring of round section about the y axis, centred at the origin."""
+    """Return a ring of round section about the y axis, centred at the origin."""
     angle = np.linspace(0.0, 2.0 * math.pi, 25)
     section = np.column_stack([radius + tube * np.cos(angle), tube * np.sin(angle)])
     return revolved(section, segments=max(8, round(span_deg / 5.0)), span_deg=span_deg)
 
 
 def arch(radius: float, thickness: float, depth: float) -> Shape:
-    """Half a ring of square section standing on y = 0 across x, its back at z = 0."""
+    """Make half a ring of square section standing on y = 0 across x, its back at z = 0."""
     inner, outer = radius, radius + thickness
     section = np.array([[inner, 0.0], [outer, 0.0], [outer, depth], [inner, depth], [inner, 0.0]])
     lying = revolved(section, segments=40, span_deg=180.0, sharp=True)
@@ -91,7 +91,7 @@ def arch(radius: float, thickness: float, depth: float) -> Shape:
 
 
 def ball(radius: float, segments: int = 96, bumps: float = 0.0, seed: int = 0) -> Shape:
-    """A sphere around the origin; `bumps` is the depth of random dents as a share of the radius."""
+    """Return a sphere around the origin; `bumps` is the depth of random dents as a share of the radius."""
     angle = np.linspace(-0.5, 0.5, segments // 2 + 1) * math.pi
     round_ball = _turned(np.column_stack([np.cos(angle), np.sin(angle)]), segments, 360.0, (0, 0.0))
     dents = waves(round_ball[0], seed)
@@ -99,7 +99,7 @@ def ball(radius: float, segments: int = 96, bumps: float = 0.0, seed: int = 0) -
 
 
 def waves(points: FloatArray, seed: int) -> FloatArray:
-    """Smooth noise of unit variance at points (N, 3): cosines of 24 directions, 0.7 to 3 units long."""
+    """Return smooth noise of unit variance at points (N, 3): cosines of 24 directions, 0.7 to 3 units long."""
     rng = np.random.default_rng([seed, 7])
     vectors = rng.normal(size=(24, 3)) * np.linspace(2.0, 9.0, 24)[:, None]
     found = np.cos(points @ vectors.T + rng.uniform(0.0, 2.0 * math.pi, 24)).sum(axis=1) / math.sqrt(12.0)
@@ -113,7 +113,9 @@ def carved(
     rows: int = 220,
     segments: int = 240,
 ) -> Shape:
-    """The outside of a body around the y axis, closed at the top and the bottom: what a sculptor can carve all round.
+    """Return the outside of a body around the y axis, closed at the top and the bottom.
+
+    What a sculptor can carve all round.
 
     Args:
         field: positive inside the body at points (N, 3).
@@ -133,7 +135,7 @@ def carved(
 
 
 def assembled(parts: Sequence[Shape]) -> Shape:
-    """One body made of several; its texture runs on from part to part."""
+    """Return one body made of several; its texture runs on from part to part."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
@@ -141,7 +143,7 @@ def assembled(parts: Sequence[Shape]) -> Shape:
 
 
 def ground(x: tuple[float, float], z: tuple[float, float], unevenness: float, spacing: float = 0.1) -> Shape:
-    """An uneven floor around y = 0, its heights within about +-unevenness."""
+    """Return an uneven floor around y = 0, its heights within about +-unevenness."""
     xs, zs = (np.linspace(a, b, 1 + max(1, round((b - a) / spacing))) for a, b in (x, z))
     grid, faces = _grid(zs, xs)
     height = np.sin(1.3 * grid[:, 1] + 0.7) * np.sin(1.7 * grid[:, 0] + 2.1) + 0.5 * np.sin(3.1 * grid.sum(axis=1))
@@ -162,7 +164,7 @@ def _turned(
 
 
 def _strips(segments: int, rows: int, count: int) -> IndexArray:
-    """Triangles between `segments` pairs of neighbours among `count` columns of `rows` vertices; the last meets the
+    """Give triangles between `segments` pairs of neighbours among `count` columns of `rows` vertices; last meets the
     first where there are as many."""
     ring = np.arange(segments)[:, None] * rows + np.arange(rows - 1)
     step = (ring + rows) % (count * rows)
@@ -173,7 +175,10 @@ def _strips(segments: int, rows: int, count: int) -> IndexArray:
 def _outermost(
     field: Callable[[FloatArray], FloatArray], ways: FloatArray, level: float, reach: float, steps: int = 32
 ) -> FloatArray:
-    """Distance (N,) at which rays from outside along -`ways` (N, 3) enter the body at a level; 0 where they miss."""
+    """Return distance (N,) at which rays from outside along -`ways` (N, 3) enter the body at a level.
+
+    0 where they miss.
+    """
 
     def inside(radius: FloatArray) -> NDArray[np.bool_]:
         points = ways[:, None] * radius[..., None] + np.array([0.0, level, 0.0])

@@ -8,12 +8,12 @@ from sfm_app.synthetic.shapes import ball, box, ground
 
 
 def poster() -> SyntheticScene:
-    """A flat wall of veined marble across the view, facing +z."""
+    """Return a flat wall of veined marble across the view, facing +z."""
     return SyntheticScene("poster", (Body(box(9.0, 6.0, 0.1).moved((0.0, -1.5, -0.1)), MARBLE),))
 
 
 def heap() -> SyntheticScene:
-    """Boxes and balls strewn over leaves."""
+    """Return boxes and balls strewn over leaves."""
     rng = np.random.default_rng(3)
     materials = (WOOD, MARBLE, PAINT, TERRACOTTA, GREEN_MARBLE, LEAVES)
     bodies = [Body(ground((-4.0, 4.0), (-3.0, 5.0), unevenness=0.05), LEAVES)]

@@ -50,12 +50,12 @@ HAIR = slice(-2, None)
 
 
 def statue() -> SyntheticScene:
-    """The scene: the bust looks towards +z; its terrace is small, so that the scene is about as large as it."""
+    """Return the scene: the bust looks towards +z; its terrace is small, so that the scene is about as large as it."""
     return SyntheticScene("statue", (*_terrace(), *_plinth(), *_bust()), to_light=(0.5, 0.75, 0.42), sky=0.6)
 
 
 def statue_views(camera: Camera, seed: int = 0, photos: int = 22) -> Views:
-    """Hand-held photos all round."""
+    """Return hand-held photos all round."""
     walk = ArcOptions(
         photos=photos, sweep_deg=344.0, distance=(3.3, 4.3), height=(1.0, 2.9), aim=(0.0, 1.2, 0.0), aim_spread=0.2,
         roll_deg=5.0,
@@ -65,12 +65,15 @@ def statue_views(camera: Camera, seed: int = 0, photos: int = 22) -> Views:
 
 @cache
 def bust() -> Shape:
-    """The stone itself, standing on y = 0."""
+    """Return the stone itself, standing on y = 0."""
     return carved(bust_field, (0.02, 1.24), reach=0.62)
 
 
 def bust_field(points: FloatArray) -> FloatArray:
-    """Positive inside: blobs that run together (Blinn, ACM TOG 1982), with curls in the hair and folds in the cloth."""
+    """Return positive inside.
+
+    Blobs that run together (Blinn, ACM TOG 1982), with curls in the hair and folds in the cloth.
+    """
     middles, axes, weights = BLOBS[:, :3], BLOBS[:, 3:6], BLOBS[:, 6]
     # the squared distances to all middles, in half axes, as products of matrices
     squares = points**2 @ axes.T**-2.0 - 2.0 * points @ (middles / axes**2).T + ((middles / axes) ** 2).sum(axis=1)

@@ -36,14 +36,14 @@ class Material:
     """Strength of the fine grain, 0..1."""
 
     def row(self, seed: int) -> FloatArray:
-        """(13,) numbers for the kernels: pattern, scale, contrast, seed, then three linear RGB colours."""
+        """Return (13,) numbers for the kernels: pattern, scale, contrast, seed, then three linear RGB colours."""
         colors = [(np.array(c) / 255.0) ** 2.2 for c in (self.base, self.second, self.joint)]
         return np.concatenate([[PATTERNS.index(self.pattern), self.scale, self.contrast, seed], *colors])
 
 
 @kernel
 def lattice(ix: int, iy: int, iz: int, seed: int) -> float:
-    """A number in [0, 1) that belongs to a lattice point; wraps after 2^32."""
+    """Return a number in [0, 1) that belongs to a lattice point; wraps after 2^32."""
     h = uint32(ix) * uint32(0x8DA6B343) ^ uint32(iy) * uint32(0xD8163841)
     h = uint32(h ^ uint32(iz) * uint32(0xCB1AB31F) ^ uint32(seed) * uint32(0x165667B1))
     h = uint32((h ^ (h >> uint32(15))) * uint32(0x2C1B3C6D))
@@ -54,7 +54,7 @@ def lattice(ix: int, iy: int, iz: int, seed: int) -> float:
 
 @kernel
 def value_noise(x: float, y: float, z: float, seed: int) -> float:
-    """Smooth noise in [-1, 1) on the unit lattice (Perlin's interpolation of lattice values)."""
+    """Return smooth noise in [-1, 1) on the unit lattice (Perlin's interpolation of lattice values)."""
     fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
     ix, iy, iz = int(fx), int(fy), int(fz)
     u, v, w = x - fx, y - fy, z - fz
@@ -69,7 +69,7 @@ def value_noise(x: float, y: float, z: float, seed: int) -> float:
 
 @kernel
 def octaves(p: tuple[float, float, float], size: float, gain: float, footprint: float, seed: int) -> float:
-    """Noise summed over halving sizes, from `size` down to the size of a pixel; about -1..1.
+    """Return noise summed over halving sizes, from `size` down to the size of a pixel; about -1..1.
 
     `footprint` is the pixel's size on the surface; octaves fade out between twice that size and that size.
     """
@@ -87,7 +87,10 @@ def octaves(p: tuple[float, float, float], size: float, gain: float, footprint: 
 
 @kernel
 def cells(a: float, b: float, seed: int) -> tuple[float, float]:
-    """Random cells in the plane: distance to the border of the cell, in cells, and a number in [0, 1) that names it."""
+    """Return random cells in the plane.
+
+    Distance to the border of the cell, in cells, and a number in [0, 1) that names it.
+    """
     ia, ib = math.floor(a), math.floor(b)
     first, second, name = 9.0, 9.0, 0.0
     for i in range(ia - 1, ia + 2):
@@ -104,7 +107,7 @@ def cells(a: float, b: float, seed: int) -> tuple[float, float]:
 
 @kernel
 def bricks(a: float, b: float, seed: int) -> tuple[float, float]:
-    """Bricks twice as long as high, in running bond: as `cells`, in brick heights."""
+    """Return bricks twice as long as high, in running bond: as `cells`, in brick heights."""
     row = math.floor(b)
     a = 0.5 * a + 0.5 * (row % 2.0)
     column = math.floor(a)
@@ -114,7 +117,7 @@ def bricks(a: float, b: float, seed: int) -> tuple[float, float]:
 
 @kernel
 def ramp(x: float, low: float, high: float) -> float:
-    """0 below `low`, 1 above `high`, straight between."""
+    """Return 0 below `low`, 1 above `high`, straight between."""
     return min(1.0, max(0.0, (x - low) / (high - low)))
 
 
@@ -122,7 +125,10 @@ def ramp(x: float, low: float, high: float) -> float:
 def tiles(
     kind: int, p: tuple[float, float, float], n: tuple[float, float, float], scale: float, seed: int
 ) -> tuple[float, float]:
-    """Bricks on upright walls (1), slabs on the ground (2), leaves along the axis they face most (6): as `cells`."""
+    """Return bricks on upright walls (1), slabs on the ground (2), leaves along the axis they face most (6).
+
+    As `cells`.
+    """
     if kind == 6:
         if abs(n[1]) >= max(abs(n[0]), abs(n[2])):
             return cells(p[0] / scale, p[2] / scale, seed)
@@ -136,7 +142,10 @@ def tiles(
 
 @kernel
 def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
-    """Greek pottery: share of the second colour (glaze), share of the thin lines; bands by height, figures by angle."""
+    """Return Greek pottery: share of the second colour (glaze), share of the thin lines.
+
+    Bands by height, figures by angle.
+    """
     band = p[1] / scale
     row = math.floor(band)
     inside = band - row
@@ -160,7 +169,7 @@ def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
 def mixture(
     row: NDArray[np.float64], p: tuple[float, float, float], n: tuple[float, float, float], footprint: float
 ) -> tuple[float, float, float]:
-    """Share of the second colour, share of the joint colour, and brightness (about 1) at a place of a body.
+    """Return share of the second colour, share of the joint colour, and brightness (about 1) at a place of a body.
 
     `row` is `Material.row()`, `p` the place and `n` the unit normal on the body before it was moved.
     """

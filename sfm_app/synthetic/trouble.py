@@ -131,7 +131,7 @@ def write_troubled_folder(folder: Path, plan: TroubledFolder) -> Truth:
 
 
 def smeared(image: FloatArray, length_px: float, direction: float) -> FloatArray:
-    """The image (H, W, 3) of a camera that turned during the exposure: averaged along a line."""
+    """Return the image (H, W, 3) of a camera that turned during the exposure: averaged along a line."""
     if length_px < 1:
         return image
     steps = np.linspace(-0.5, 0.5, 2 * math.ceil(length_px) + 1) * length_px
@@ -152,7 +152,7 @@ Seen = tuple[PreparedScene, FloatArray]
 
 
 def in_front(image: FloatArray, still: Seen, moving: Seen, camera: Camera, supersampling: int) -> FloatArray:
-    """The image of the still scene with what moves where that is nearer; it casts no shadow."""
+    """Return the image of the still scene with what moves where that is nearer; it casts no shadow."""
     depth = []
     for scene, pose in (still, moving):
         directions = pixel_rays(camera) @ pose[:, :3]
@@ -164,13 +164,13 @@ def in_front(image: FloatArray, still: Seen, moving: Seen, camera: Camera, super
 
 
 def pose_after(cam_from_world: FloatArray, world_from_thing: FloatArray) -> FloatArray:
-    """(3, 4) pose of the camera in the frame of a thing."""
+    """Return (3, 4) pose of the camera in the frame of a thing."""
     R, t = cam_from_world[:, :3], cam_from_world[:, 3]
     return np.column_stack([R @ world_from_thing[:, :3], R @ world_from_thing[:, 3] + t])
 
 
 def _some(kinds: tuple[str, ...], shares: tuple[float, ...], rng: Random) -> list[str]:
-    """None, one, two, ... of the kinds, as probable as the shares say."""
+    """Draw none, one, two, ... of the kinds, as probable as the shares say."""
     return [str(kind) for kind in rng.choice(kinds, int(rng.choice(len(shares), p=shares)), replace=False)]
 
 
@@ -187,7 +187,7 @@ def _scene(place: str, rng: Random) -> SyntheticScene:
 
 
 def _camera(drawn: set[str], rng: Random) -> Camera:
-    """Of the folder; how far its centre lies off, how square its pixels are and how it bends is part of the trouble."""
+    """Draw the camera of a folder; its centre, pixels and lens may be part of the trouble."""
     width, height = (int(side) for side in rng.choice(SIZES))
     longer = math.exp(rng.uniform(math.log(0.75), math.log(1.6)))
     centre = 0.5 + rng.normal(0.0, 0.008, 2)
@@ -201,14 +201,14 @@ def _camera(drawn: set[str], rng: Random) -> Camera:
 
 
 def bent(camera: Camera, bend: float) -> Camera:
-    """The camera with a lens that pushes the farthest corner outwards by this share of its distance."""
+    """Return the camera with a lens that pushes the farthest corner outwards by this share of its distance."""
     corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
     seen = (corners - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
     return replace(camera, radial=bend / float((seen**2).sum(axis=1).max()))
 
 
 def zoomed(camera: Camera, factor: float) -> Camera:
-    """The camera with a longer or shorter lens, which bends lines as before."""
+    """Return the camera with a longer or shorter lens, which bends lines as before."""
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= factor
     return replace(camera, K=K, radial=camera.radial * factor**2)
@@ -234,7 +234,7 @@ def _walk(walk: str, place: str, camera: Camera, rng: Random) -> Views:
 
 
 def _straight_on(walk: str, camera: Camera, count: int, distance: float, rng: Random) -> Views:
-    """A straight way with a straight look: ahead, as from a car, or to the side, as from a train."""
+    """Return a straight way with a straight look: ahead, as from a car, or to the side, as from a train."""
     along = np.linspace(0.5, -0.5, count) + rng.normal(0.0, 0.1 / count, count)
     way = np.zeros((count, 3))
     if walk == "forward":
@@ -279,7 +279,7 @@ def _spoiling(drawn: set[str], views: Views, rng: Random) -> Spoiling:
 
 
 def _wandering(names: list[str], rng: Random) -> dict[str, FloatArray]:
-    """Somebody who walks about before the things, turning as they like: (3, 4) world_from_thing."""
+    """Let somebody walk about before the things, turning as they like: (3, 4) world_from_thing."""
     place, angle = np.array([rng.uniform(-1.0, 1.0), 0.0, rng.uniform(1.0, 1.8)]), rng.uniform(0.0, 360.0)
     found = {}
     for name in names:

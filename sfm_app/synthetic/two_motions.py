@@ -34,7 +34,7 @@ class TwoMotions:
 
 
 def make_two_motions(options: PairOptions, moving: float, seed: int) -> TwoMotions:
-    """A pair as from `make_pair`, with an object that has its own rigid motion.
+    """Return a pair as from `make_pair`, with an object that has its own rigid motion.
 
     Args:
         options: the pair; `points` counts all matches and `outliers` is a share of all.
@@ -73,7 +73,7 @@ def make_two_motions(options: PairOptions, moving: float, seed: int) -> TwoMotio
 def _moving_object(
     still: TwoViews, options: PairOptions, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Exact points of a ball with its own motion in both images, and its fundamental matrix."""
+    """Return exact points of a ball with its own motion in both images, and its fundamental matrix."""
     size = np.array([options.width, options.height])
     for _ in range(MAX_SETUPS):
         pixel = np.append(rng.uniform(size=2) * size, 1.0)

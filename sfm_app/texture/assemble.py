@@ -202,7 +202,7 @@ def _paint_photo(photo: int, plan: Plan, views: Sequence[PhotoView], store: Stor
 
 
 def _shares(photo: int, plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Triangles that a photo counts for, and its weight and offsets (N, 3, 4) at their corners."""
+    """Return triangles that a photo counts for, and its weight and offsets (N, 3, 4) at their corners."""
     mesh, part = plan.mesh, plan.blend.of(photo)
     weight = np.zeros(len(mesh.vertices), np.float32)
     offset = np.zeros((len(mesh.vertices), 3), np.float32)
@@ -258,7 +258,7 @@ def _finish(plan: Plan, canvases: Sequence[Canvas]) -> Model:
 def _figures(
     plan: Plan, views: Sequence[PhotoView], rejected: Sequence[Rejected | None], unseen: int
 ) -> dict[str, Any]:
-    """What the manifest says."""
+    """Return what the manifest says."""
     covered = sum(width * height for width, height in plan.layout.sizes)
     return {
         "charts": len(plan.charts.photo),

@@ -21,7 +21,7 @@ class Pages:
     """Canvases with the sums of the photos; these are whole numbers, so the order of the photos does not matter."""
 
     def __init__(self, canvases: Sequence[Canvas], photos: int, store: Store) -> None:
-        """Empty canvases are filled with what a killed run has kept."""
+        """Fill empty canvases with what a killed run has kept."""
         self.canvases, self.has = canvases, np.zeros(photos, np.bool_)
         self._store, self._lock = store, Lock()
         kept = store.recall(KEPT)
@@ -33,7 +33,7 @@ class Pages:
 
     @contextmanager
     def painting(self, photo: int) -> Iterator[Sequence[Canvas]]:
-        """The canvases, for one photo at a time; afterwards they have it."""
+        """Provide the canvases, for one photo at a time; afterwards they have it."""
         with self._lock:
             yield self.canvases
             self.has[photo] = True

@@ -34,7 +34,7 @@ class Blend:
     """(N, 3) grey levels that the photo gets there after its gain."""
 
     def of(self, photo: int) -> slice:
-        """Rows of a photo."""
+        """Return rows of a photo."""
         return slice(int(self.starts[photo]), int(self.starts[photo + 1]))
 
 
@@ -67,7 +67,7 @@ def blend_weights(chosen: IntArray, usable: NDArray[np.bool_], mesh: Facets) -> 
 
 
 def _spread(share: FloatArray, edges: NDArray[np.int64], degree: NDArray[np.int64]) -> FloatArray:
-    """Half of the own value, half of the mean of the vertices beside."""
+    """Mix half of the own value with half of the mean of the vertices beside."""
     one, other = edges[:, 0], edges[:, 1]
     around = np.bincount(one, share[other], len(share)) + np.bincount(other, share[one], len(share))
     return np.asarray(0.5 * share + 0.5 * around / degree, np.float64)

@@ -37,7 +37,7 @@ class Charts:
 
 
 def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: float) -> Charts:
-    """Charts from one photo per triangle.
+    """Return charts from one photo per triangle.
 
     Args:
         chosen: (T,) photo of each triangle, -1 for none.
@@ -62,7 +62,7 @@ def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: fl
 
 
 def folds(of: IntArray, count: int, corners: FloatArray) -> NDArray[np.bool_]:
-    """(T,) triangles that cover others of the same chart.
+    """Return (T,) triangles that cover others of the same chart.
 
     Args:
         of: (T,) chart of each triangle, -1 for none.
@@ -108,7 +108,7 @@ def _find_folds(
 
 
 def components(group: NDArray[np.int64], neighbours: IntArray) -> tuple[IntArray, int]:
-    """Connected triangles of equal group: (T,) number of the component, -1 where the group is -1, and their count."""
+    """Find connected triangles of equal group: (T,) number of component, -1 where the group is -1, and their count."""
     of = np.full(len(group), NONE, np.int32)
     return of, _flood(group, neighbours, of)
 
@@ -176,7 +176,7 @@ def _absorb(
     neighbours: IntArray,
     chosen: IntArray,
 ) -> int:
-    """Small components take the neighbouring photo with the longest common border; how many did."""
+    """Return small components take the neighbouring photo with the longest common border; how many did."""
     absorbed = 0
     border = np.zeros(len(usable), np.int64)
     for c in range(len(sizes)):

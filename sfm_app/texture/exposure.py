@@ -26,7 +26,7 @@ PRIOR = 0.01
 
 
 def photo_gains(colors: NDArray[np.uint8], seen: NDArray[np.bool_]) -> FloatArray:
-    """Gain of every photo and channel; their geometric mean is 1.
+    """Return gain of every photo and channel; their geometric mean is 1.
 
     Args:
         colors: (P, T, 3) RGB of the triangles in the photos.
@@ -62,7 +62,7 @@ def _log_gains(logs: FloatArray, usable: NDArray[np.bool_]) -> FloatArray:
 def _add_equations(
     logs: FloatArray, usable: NDArray[np.bool_], gains: FloatArray, normal: FloatArray, right: FloatArray
 ) -> None:
-    """Normal equations of the gains at the present weights, with the colour of each triangle eliminated."""
+    """Add the normal equations of the gains at the present weights, with the color of each triangle eliminated."""
     photos = logs.shape[1]
     weight, level = np.empty(photos), np.empty(photos)
     for f in range(len(logs)):

@@ -52,6 +52,6 @@ def facets(surface: Surface) -> Facets:
 
 
 def at_vertices(values: FloatArray, faces: NDArray[np.int64], size: int) -> FloatArray:
-    """(V,) sum over the corners of triangles of one value per triangle (T,) or per corner (T, 3)."""
+    """Return (V,) sum over the corners of triangles of one value per triangle (T,) or per corner (T, 3)."""
     per_corner = np.broadcast_to(values[:, None] if values.ndim == 1 else values, faces.shape)
     return np.asarray(np.bincount(faces.ravel(), per_corner.ravel(), size), np.float64)

@@ -8,7 +8,10 @@ from sfm_app.jit import kernel
 
 @kernel
 def median(values: NDArray[np.float64], count: int) -> float:
-    """Of the first `count` >= 1 values, which it sorts in place; NumPy's sort takes seconds to compile."""
+    """Return the median of the first `count` >= 1 values, which it sorts in place.
+
+    NumPy's sort takes seconds to compile.
+    """
     for k in range(1, count):
         value, at = values[k], k
         while at > 0 and values[at - 1] > value:

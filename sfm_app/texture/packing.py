@@ -65,7 +65,7 @@ def pack(charts: Charts, blocks: IntArray, max_page_px: int, max_pages: int) -> 
 
 
 def _area(charts: Charts) -> float:
-    """Square pixels under all charts."""
+    """Return the square pixels under all charts."""
     a, b, c = (charts.corners[:, k] for k in range(3))
     turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     return float(np.sum(np.abs(turn[charts.of != NONE])) / 2)
@@ -101,7 +101,9 @@ def _try_to_pack(
 def _profiles(
     charts: Charts, scale: float
 ) -> tuple[IntArray, IntArray, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Origin in texels (C, 2), size in cells (C, 2), start of each chart's columns (C + 1,), and the two profiles."""
+    """Return origin in texels (C, 2), size in cells (C, 2), start of each chart's columns (C + 1,), and the two
+    profiles.
+    """
     count = len(charts.photo)
     drawn = np.flatnonzero(charts.of != NONE)
     of, corners = charts.of[drawn], charts.corners[drawn] * scale

@@ -35,7 +35,7 @@ class Canvas:
 
 
 def canvas(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatArray) -> Canvas:
-    """An empty page whose texels have owners.
+    """Return an empty page whose texels have owners.
 
     Args:
         size: (width, height).
@@ -67,7 +67,7 @@ def _own(triangles: NDArray[np.int64], corners: FloatArray, reach: float, owner:
 
 @kernel
 def _distance(corner: FloatArray, x: float, y: float) -> float:
-    """From a point to a triangle; 0 inside."""
+    """Return the distance from a point to a triangle; 0 inside."""
     turn = (corner[1, 0] - corner[0, 0]) * (corner[2, 1] - corner[0, 1])
     turn -= (corner[1, 1] - corner[0, 1]) * (corner[2, 0] - corner[0, 0])
     sign = 1.0 if turn >= 0.0 else -1.0
@@ -167,7 +167,7 @@ def _add(
 
 @kernel
 def _set_insets(corner: FloatArray, rim: NDArray[np.bool_], double_area: float, least: FloatArray) -> None:
-    """Least barycentric coordinates of a triangle's texels: away from rims, anything elsewhere."""
+    """Set the least barycentric coordinates of a triangle's texels: away from rims, anything elsewhere."""
     for k in range(3):
         a, b = (k + 1) % 3, (k + 2) % 3
         length = np.hypot(corner[b, 0] - corner[a, 0], corner[b, 1] - corner[a, 1])
@@ -188,14 +188,14 @@ def _keep_off(part: FloatArray, least: FloatArray) -> None:
 
 
 def finished(page: Canvas) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """The page as 8-bit RGB, black where nobody owns it, and where it is owned."""
+    """Return the page as 8-bit RGB, black where nobody owns it, and where it is owned."""
     levels = page.total + FINE // 2
     levels //= FINE  # in place: a page has as many as two hundred megabytes of sums
     return np.clip(levels, 0, 255, out=levels).astype(np.uint8), page.owner != NONE
 
 
 def fill_background(page: NDArray[np.uint8], painted: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Texels that nobody owns take the mean colour of what is painted in the smallest block around them.
+    """Return texels that nobody owns take the mean colour of what is painted in the smallest block around them.
 
     Blocks are those of mip maps, so a page made smaller by a viewer keeps its colours up to the rim of the charts.
     """

@@ -25,7 +25,7 @@ ROUNDS = 4
 def strangers(
     colors: NDArray[np.uint8], gains: NDArray[np.float64], seen: NDArray[np.bool_], neighbours: IntArray
 ) -> NDArray[np.bool_]:
-    """Which photos show something else at which triangles.
+    """Return which photos show something else at which triangles.
 
     Args:
         colors: (P, T, 3) RGB of the triangles in the photos.
@@ -57,7 +57,7 @@ def _deviations(
     seen: NDArray[np.bool_],
     score: NDArray[np.float32],
 ) -> None:
-    """Largest deviation over the channels from the median photo, over the usual deviation."""
+    """Write the largest deviation over the channels from the median photo, over the usual deviation."""
     photos, triangles = seen.shape
     level, far = np.empty(photos), np.empty(photos)
     for f in range(triangles):
@@ -92,7 +92,7 @@ def _deviations(
 def _average(
     before: NDArray[np.float32], seen: NDArray[np.bool_], neighbours: IntArray, after: NDArray[np.float32]
 ) -> None:
-    """Mean over each triangle and its neighbours that the photo sees."""
+    """Average over each triangle and its neighbours that the photo sees."""
     for f in range(len(before)):
         if not seen[f]:
             continue
@@ -107,7 +107,7 @@ def _average(
 
 @kernel
 def _mark(score: NDArray[np.float32], seen: NDArray[np.bool_], neighbours: IntArray, found: NDArray[np.bool_]) -> None:
-    """Triangles that deviate, and those beside them, which a stranger may cover in part."""
+    """Mark triangles that deviate, and those beside them, which a stranger may cover in part."""
     for f in range(len(score)):
         if not seen[f]:
             continue
@@ -120,7 +120,7 @@ def _mark(score: NDArray[np.float32], seen: NDArray[np.bool_], neighbours: IntAr
 
 @kernel
 def _spare_the_last(found: NDArray[np.bool_], seen: NDArray[np.bool_]) -> None:
-    """Where hardly any photo would be left, the photos agree on nothing: none is the stranger."""
+    """Keep all photos where hardly any would be left: they agree on nothing, and none is the stranger."""
     for f in range(found.shape[1]):
         left = total = 0
         for p in range(len(found)):

@@ -20,7 +20,7 @@ ENOUGH = 1e-2
 
 
 def level(blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets) -> Blend:
-    """The blend with the offsets that least squares give it.
+    """Return the blend with the offsets that least squares give it.
 
     Args:
         blend: weights of the photos at the vertices.
@@ -43,7 +43,7 @@ def level(blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: ND
 def solve_ties(
     one: NDArray[np.int64], other: NDArray[np.int64], weights: FloatArray, hold: float | FloatArray, right: FloatArray
 ) -> FloatArray:
-    """(N, C) x with (graph Laplacian + hold) x = right, by conjugate gradients.
+    """Return (N, C) x with (graph Laplacian + hold) x = right, by conjugate gradients.
 
     Args:
         one: (E,) node at one end of each tie.
@@ -84,7 +84,9 @@ def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
 def _gaps(
     blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
-    """Where two photos meet at a vertex: node, the vertex's heaviest node, and how much brighter (M, 3) that one is.
+    """Find where two photos meet at a vertex.
+
+    Node, the vertex's heaviest node, and how much brighter (M, 3) that one is.
 
     Compared are the triangles at the vertex that both photos may be used for; nodes without any are left out.
     """
@@ -110,7 +112,7 @@ def _gaps(
 
 
 def _meetings(blend: Blend, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Every node beside the heaviest one of its vertex, and that one."""
+    """Return every node beside the heaviest one of its vertex, and that one."""
     order = np.lexsort((-blend.weight, blend.vertex))
     heads = np.full(size, -1, np.int64)
     ranked = blend.vertex[order]
@@ -121,7 +123,7 @@ def _meetings(blend: Blend, size: int) -> tuple[NDArray[np.int64], NDArray[np.in
 
 
 def _ties(blend: Blend, mesh: Facets) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs of nodes of one photo at the two ends of an edge."""
+    """Return pairs of nodes of one photo at the two ends of an edge."""
     start, end = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     node = np.full(len(mesh.vertices), -1, np.int64)
     for photo in range(len(blend.starts) - 1):

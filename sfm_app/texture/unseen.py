@@ -18,7 +18,7 @@ HOLD = 1e-4
 
 
 def vertex_colors(mesh: Facets, seen: NDArray[np.bool_], corner_colors: FloatArray) -> FloatArray:
-    """Colours of all vertices, spread from the triangles that photos see over those that none does.
+    """Return colours of all vertices, spread from the triangles that photos see over those that none does.
 
     Args:
         mesh: the surface; its colours stay where nothing seen is connected.
@@ -53,7 +53,7 @@ def vertex_colors(mesh: Facets, seen: NDArray[np.bool_], corner_colors: FloatArr
 
 
 def block_sizes(triangles: int) -> NDArray[np.int32]:
-    """(B, 2) width and height in texels of the rectangles that hold a square for each of so many triangles."""
+    """Return (B, 2) width and height in texels of the rectangles that hold a square for each of so many triangles."""
     sizes = []
     for start in range(0, triangles, BLOCK * BLOCK):
         count = min(triangles - start, BLOCK * BLOCK)
@@ -63,7 +63,7 @@ def block_sizes(triangles: int) -> NDArray[np.int32]:
 
 
 def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int) -> NDArray[np.int64]:
-    """(N, 3) page, x and y of the square of each triangle, row by row through the blocks."""
+    """Return (N, 3) page, x and y of the square of each triangle, row by row through the blocks."""
     found: list[NDArray[np.int64]] = []
     for number, ((page, left, top), (width, _)) in enumerate(zip(places, sizes, strict=True)):
         count = min(triangles - number * BLOCK * BLOCK, BLOCK * BLOCK)
@@ -73,7 +73,7 @@ def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int)
 
 
 def along_a_curve(points: FloatArray) -> NDArray[np.int64]:
-    """Order (N,) of points (N, 3) in which most have those near them beside them (Morton 1966).
+    """Return order (N,) of points (N, 3) in which most have those near them beside them (Morton 1966).
 
     Squares beside each other then have like colours, and lossy compression of the page does little harm.
     """
@@ -88,7 +88,7 @@ def along_a_curve(points: FloatArray) -> NDArray[np.int64]:
 
 
 def square_texels(corner_colors: FloatArray) -> NDArray[np.uint8]:
-    """(N, 2, 2, 3) texels whose bilinear interpolation gives colours (N, 3, 3) at the corners.
+    """Return (N, 2, 2, 3) texels whose bilinear interpolation gives colours (N, 3, 3) at the corners.
 
     The first corner lies on the top-left texel's centre, the second on the right one's, the third on the lower one's.
     """

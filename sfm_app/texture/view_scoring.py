@@ -76,7 +76,7 @@ def look(
 def _blocked(
     candidates: NDArray[np.int64], mesh: Facets, hidden: Callable[[FloatArray], NDArray[np.bool_]]
 ) -> NDArray[np.bool_]:
-    """Which of the triangles (N,) are hidden, at the centre or at two corners."""
+    """Return which of the triangles (N,) are hidden, at the centre or at two corners."""
     corners = mesh.faces[candidates]
     covered = np.zeros(len(mesh.vertices), np.bool_)
     covered[corners] = True
@@ -89,7 +89,7 @@ def _blocked(
 
 
 def sharpness(photo: NDArray[np.uint8], used: NDArray[np.bool_] | None = None) -> float:
-    """Ratio of the energies of the Laplacian at full and at half size, where the photo may be used; >= 0."""
+    """Return ratio of the energies of the Laplacian at full and at half size, where the photo may be used; >= 0."""
     grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
     half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     fine, coarse = (_energy(part, used) for part in (grey, half))
@@ -106,7 +106,7 @@ def _energy(grey: NDArray[np.uint8], used: NDArray[np.bool_] | None) -> float:
 
 
 def sharpness_factors(sharpness_of: NDArray[np.float64]) -> FloatArray:
-    """(P,) factors for the worth of each photo, 1 for a photo as sharp as the median one."""
+    """Return (P,) factors for the worth of each photo, 1 for a photo as sharp as the median one."""
     middle = float(np.median(sharpness_of)) if len(sharpness_of) else 0.0
     relative = sharpness_of / middle if middle > 0 else np.ones(len(sharpness_of))
     return np.asarray(np.clip(relative, *SHARPNESS_RANGE), np.float64)
@@ -121,7 +121,7 @@ def _measure(
     worth: NDArray[np.float32],
     color: NDArray[np.uint8],
 ) -> None:
-    """Area in pixels times cosine, and mean colour, of the triangles that face the camera within the photo."""
+    """Write area in pixels times cosine, and mean colour, of the triangles that face the camera within the photo."""
     height, width = photo.shape[0], photo.shape[1]
     x, y, corner = np.empty(4), np.empty(4), np.empty((4, 3))
     for f in range(len(faces)):
@@ -189,7 +189,7 @@ def _drop_masked(
 
 @kernel
 def _span(corner: FloatArray, top: float, bottom: float) -> tuple[float, float]:
-    """Least and greatest x of a triangle (3, 2) between two heights; empty (inf, -inf) where it is not there."""
+    """Return least and greatest x of a triangle (3, 2) between two heights; empty (inf, -inf) where it is not there."""
     left, right = np.inf, -np.inf
     for k in range(3):
         ax, ay, bx, by = corner[k, 0], corner[k, 1], corner[(k + 1) % 3, 0], corner[(k + 1) % 3, 1]
@@ -208,7 +208,7 @@ def _span(corner: FloatArray, top: float, bottom: float) -> tuple[float, float]:
 
 @kernel
 def _cosine(camera: FloatArray, corner: FloatArray) -> float:
-    """Between the triangle's normal and the way from its centre to the camera."""
+    """Return between the triangle's normal and the way from its centre to the camera."""
     ax, ay, az = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     bx, by, bz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx

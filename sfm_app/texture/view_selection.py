@@ -24,7 +24,7 @@ TINY = 1e-30
 
 
 def choose_photos(worth: NDArray[np.float32], mesh: Facets) -> IntArray:
-    """The photo that colours each triangle.
+    """Return the photo that colours each triangle.
 
     Args:
         worth: (P, T) of each photo for each triangle, at most 0 where it must not be used.
@@ -54,7 +54,7 @@ def choose_photos(worth: NDArray[np.float32], mesh: Facets) -> IntArray:
 
 
 def _relative_size(mesh: Facets) -> FloatArray:
-    """(T,) square root of the area of a triangle over that of one with three usual edges."""
+    """Return (T,) square root of the area of a triangle over that of one with three usual edges."""
     corners = mesh.vertices[mesh.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     usual = np.sqrt(3.0) / 4.0 * max(mesh.spacing, 1e-300) ** 2
@@ -62,21 +62,21 @@ def _relative_size(mesh: Facets) -> FloatArray:
 
 
 def _edge_prices(mesh: Facets) -> NDArray[np.float32]:
-    """(T, 3) length of the edges from corner k to k + 1 in usual edges."""
+    """Return (T, 3) length of the edges from corner k to k + 1 in usual edges."""
     corners = mesh.vertices[mesh.faces]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     return np.asarray(lengths / max(mesh.spacing, 1e-300), np.float32)
 
 
 def _places_at_neighbours(neighbours: IntArray) -> IntArray:
-    """(T, 3) at which place of its neighbour's row a triangle stands."""
+    """Return (T, 3) at which place of its neighbour's row a triangle stands."""
     own = np.arange(len(neighbours))[:, None, None]
     return np.asarray(np.argmax(neighbours[neighbours] == own, axis=2), np.int32)
 
 
 @kernel
 def _keep_best(worth: NDArray[np.float32], labels: IntArray, values: NDArray[np.float32]) -> None:
-    """The photos of most worth for each triangle, best first; equals in their order."""
+    """Keep the photos of most worth for each triangle, best first; equals in their order."""
     photos, triangles = worth.shape
     kept = labels.shape[1]
     for p in range(photos):
@@ -100,7 +100,7 @@ def _pass_messages(
     messages: NDArray[np.float32],
     forward: bool,
 ) -> None:
-    """One sweep; messages[f, k] is what neighbour k of f says about the labels of f."""
+    """Pass messages once; messages[f, k] is what neighbour k of f says about the labels of f."""
     triangles, kept = labels.shape
     belief = np.empty(kept)
     for step in range(triangles):
@@ -141,7 +141,7 @@ def _decode(
     messages: NDArray[np.float32],
     chosen: IntArray,
 ) -> None:
-    """Label after label, given those before and what the messages say about those behind."""
+    """Choose label after label, given those before and what the messages say about those behind."""
     for f in range(len(labels)):
         least = np.inf
         for m in range(labels.shape[1]):

@@ -40,14 +40,14 @@ class PhotoView:
         return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3], np.float64)
 
     def scaled(self, width: int, height: int) -> "PhotoView":
-        """The same view in a photo of another size."""
+        """Return the same view in a photo of another size."""
         sx, sy = width / self.width, height / self.height
         fx, fy, cx, cy, *rest = self.lens
         return replace(self, lens=(fx * sx, fy * sy, cx * sx, cy * sy, *rest), width=width, height=height)
 
 
 def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> PhotoView:
-    """The view of a registered photo.
+    """Return the view of a registered photo.
 
     Raises:
         ReconstructionError: the camera has another model than OPENCV, to which every run adjusts its cameras.
@@ -59,7 +59,10 @@ def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> Ph
 
 @kernel
 def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Pixel of a world point, and its depth: 0 where the point is behind the camera or beyond what the lens maps."""
+    """Return pixel of a world point, and its depth.
+
+    0 where the point is behind the camera or beyond what the lens maps.
+    """
     depth = camera[16] * x + camera[17] * y + camera[18] * z + camera[19]
     if depth <= 0.0:
         return 0.0, 0.0, 0.0
@@ -77,7 +80,7 @@ def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, fl
 
 @kernel
 def sample(photo: NDArray[np.uint8], x: float, y: float, channel: int) -> float:
-    """Bilinear value at a pixel position; the border's value beyond the border."""
+    """Return bilinear value at a pixel position; the border's value beyond the border."""
     height, width = photo.shape[0], photo.shape[1]
     x = min(max(x - 0.5, 0.0), width - 1.0)
     y = min(max(y - 0.5, 0.0), height - 1.0)

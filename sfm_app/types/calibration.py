@@ -48,14 +48,14 @@ class Calibration:
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return plain values for JSON."""
         plain = {field.name: getattr(self, field.name) for field in fields(self)}
         tables = {"K": self.K.tolist(), "spread": dict(self.spread), "evidence": dict(self.evidence)}
         return plain | tables | {"held": list(self.held), "key_pairs": [list(pair) for pair in self.key_pairs]}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Calibration":
-        """Back from `to_dict`."""
+        """Rebuild from `to_dict`."""
         pairs = tuple((int(first), int(second)) for first, second in values["key_pairs"])
         tables = {name: finite_only(values[name]) for name in ("spread", "evidence")}
         plain = {"K": np.array(values["K"], np.float64), "held": tuple(values["held"]), "key_pairs": pairs}
@@ -74,11 +74,11 @@ class Intrinsics:
     """Name of the photo by the id that pairs use."""
 
     def name_of(self, photo: Photo | MatchedImage) -> str:
-        """Name of the camera that took a photo."""
+        """Return the name of the camera that took a photo."""
         return self.camera_of.get(photo.name, photo.group)
 
     def camera(self, photo: Photo | MatchedImage) -> Calibration:
-        """The camera that took a photo."""
+        """Return the camera that took a photo."""
         return self.cameras[self.name_of(photo)]
 
     @property
@@ -97,13 +97,13 @@ class Intrinsics:
         return self.main.identifiable
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return plain values for JSON."""
         cameras = {name: camera.to_dict() for name, camera in self.cameras.items()}
         photos = {str(key): name for key, name in self.photos.items()}
         return {"cameras": cameras, "camera_of": dict(self.camera_of), "photos": photos}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Intrinsics":
-        """Back from `to_dict`."""
+        """Rebuild from `to_dict`."""
         cameras = {name: Calibration.from_dict(camera) for name, camera in values["cameras"].items()}
         return cls(cameras, dict(values["camera_of"]), {int(key): name for key, name in values["photos"].items()})

@@ -31,7 +31,7 @@ class CameraPairs:
 
     @classmethod
     def of(cls, Fs: ArrayLike, size: tuple[int, int], weights: ArrayLike | None = None) -> "CameraPairs":
-        """From matrices alone, all trusted alike unless `weights` (P,) says otherwise."""
+        """Make pairs from matrices alone, all trusted alike unless `weights` (P,) says otherwise."""
         matrices = np.asarray(Fs, np.float64)
         return cls(matrices, np.ones(len(matrices)) if weights is None else np.asarray(weights, np.float64), size)
 
@@ -59,7 +59,10 @@ class PhotoPairs:
     Groups that were brought to one size may be of as many cameras as photos."""
 
     def moved(self, corners: Mapping[int, tuple[int, int]]) -> "PhotoPairs":
-        """The same in pixels counted from these corners (left, top), by photo; the sizes are taken as they are."""
+        """Return the same in pixels counted from these corners (left, top), by photo.
+
+        The sizes are taken as they are.
+        """
         if not corners:
             return self
         at = np.array([[corners.get(photo, (0, 0)) for photo in pair] for pair in self.photos]).reshape(-1, 2, 2)
@@ -70,7 +73,7 @@ class PhotoPairs:
         return replace(self, Fs=Fs, inliers=inliers)
 
     def among(self, members: Collection[int]) -> CameraPairs:
-        """The pairs within photos of one size."""
+        """Return the pairs within photos of one size."""
         wanted = set(members)
         kept = [k for k, pair in enumerate(self.photos) if wanted.issuperset(pair)]
         return CameraPairs(

@@ -57,7 +57,7 @@ class ViewGraph:
         return dict(Counter(r.reason for r in self.rejected.values()).most_common())
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """As plain arrays for an .npz file; rows of matches are laid end to end."""
+        """Return plain arrays for an .npz file; rows of matches are laid end to end."""
         fits = list(self.fits.values())
         return {
             "pairs": np.array(list(self.fits), np.uint32).reshape(-1, 2),
@@ -74,7 +74,7 @@ class ViewGraph:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> "ViewGraph":
-        """Back from `to_arrays`."""
+        """Rebuild from `to_arrays`."""
         cuts = np.cumsum(arrays["match_counts"])
         columns = (
             arrays["F"],

@@ -23,5 +23,5 @@ class Features:
         return len(self.keypoints)
 
     def only(self, rows: NDArray[Any]) -> "Features":
-        """Those of these rows."""
+        """Return those of these rows."""
         return Features(self.size, self.keypoints[rows], {name: value[rows] for name, value in self.values.items()})

@@ -40,6 +40,6 @@ class MatchGraph:
     """Per pair: (M, 2) keypoint indices in image 1 and image 2."""
 
     def points(self, pair: PairId) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The matched points of one pair: x1, x2, each (M, 2) pixels."""
+        """Return the matched points of one pair: x1, x2, each (M, 2) pixels."""
         rows = self.matches[pair]
         return self.keypoints[pair[0]][rows[:, 0]], self.keypoints[pair[1]][rows[:, 1]]

@@ -61,5 +61,5 @@ class PoseGraph:
     """Loops, or look-alikes: pairs that stayed, but which the photos between theirs do not bear out."""
 
     def group_of(self, photo: int) -> tuple[int, ...]:
-        """All photos that hang together with this one; empty where none does."""
+        """Return all photos that hang together with this one; empty where none does."""
         return next((group for group in self.groups if photo in group), ())

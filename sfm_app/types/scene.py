@@ -26,7 +26,7 @@ class CameraModel:
     """What the photos determine besides the focal: "centre", "aspect", "k1", ...; the rest stayed as it was."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON."""
+        """Return plain values for JSON."""
         plain = {field.name: getattr(self, field.name) for field in fields(self)}
         return plain | {"K": self.K.tolist(), "params": list(self.params), "determined": list(self.determined)}
 

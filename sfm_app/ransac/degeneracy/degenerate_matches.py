@@ -36,7 +36,7 @@ _ROTATION_TOLERANCE = 0.05
 def find_degeneracy(
     points: FloatArray, F: FloatArray, inliers: BoolArray, wrong: FloatArray, threshold: float, centres: FloatArray
 ) -> str:
-    """What leaves F undetermined.
+    """Return what leaves F undetermined.
 
     Args:
         points: (N, 4) matches in random order.
@@ -66,13 +66,13 @@ def find_degeneracy(
 
 
 def _may_be_accident(off: BoolArray, inliers: BoolArray, sample_size: int, chance: float) -> bool:
-    """Whether so many of the matches `off` a line or plane would agree with some F if all of these were wrong."""
+    """Give whether so many of the matches `off` a line or plane would agree with some F if all of these were wrong."""
     agreeing = int(np.count_nonzero(off & inliers))
     return false_alarms(int(np.count_nonzero(off)), agreeing, sample_size, chance) > MOST_FALSE_ALARMS
 
 
 def off_dominant_line(points: FloatArray, inliers: BoolArray, view: int, width: float) -> BoolArray:
-    """Which matches lie further than `width` from the line that holds the most inliers of a view.
+    """Return which matches lie further than `width` from the line that holds the most inliers of a view.
 
     Args:
         points: (N, 4) matches in random order.
@@ -90,7 +90,7 @@ def off_dominant_line(points: FloatArray, inliers: BoolArray, view: int, width: 
 
 @kernel
 def _dominant_line(x: FloatArray, y: FloatArray, width: float) -> tuple[float, float, float]:
-    """The line a x + b y + c = 0, a^2 + b^2 = 1, that passes most of the first points, through two of all."""
+    """Return the line a x + b y + c = 0, a^2 + b^2 = 1, that passes most of the first points, through two of all."""
     count, most, best, state = x.shape[0], -1, (1.0, 0.0, 0.0), np.empty(1, dtype=np.uint64)
     state[0] = count
     for _ in range(_LINES):
@@ -107,7 +107,9 @@ def _dominant_line(x: FloatArray, y: FloatArray, width: float) -> tuple[float, f
 
 
 def is_rotation(H: FloatArray, points: FloatArray, centres: FloatArray) -> bool:
-    """Whether H = K R K^-1 for one focal length and an optical centre in the middle of where both views have points."""
+    """Return whether H = K R K^-1 for one focal length and an optical centre in the middle of where both views have
+    points.
+    """
     placed = points + centres
     low, high = np.quantile(np.vstack([placed[:, :2], placed[:, 2:]]), _EXTENT, axis=0)
     middle, side = (low + high) / 2, float((high - low).max())

@@ -25,7 +25,7 @@ _LEAST_SUPPORT = 1e-12
 
 @kernel
 def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """The homography of the plane that holds the most matches, among those compatible with F.
+    """Return the homography of the plane that holds the most matches, among those compatible with F.
 
     They are H = A - e2 v' with A = [e2]x F and v' x1 = b for every match on the plane, where
     b = (x2 x A x1)'(x2 x e2) / |x2 x e2|^2 (Hartley and Zisserman, Result 13.6): a linear regression, three parameters.
@@ -63,7 +63,7 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
 
 @kernel
 def _homography(A: FloatArray, e2: FloatArray, v: FloatArray) -> FloatArray:
-    """A - e2 v'."""
+    """Return a - e2 v'."""
     H = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -73,7 +73,7 @@ def _homography(A: FloatArray, e2: FloatArray, v: FloatArray) -> FloatArray:
 
 @kernel
 def _plane_equations(points: FloatArray, A: FloatArray, e2: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """b of every match, and |x2 x e2|^2, the weight of its equation v' x1 = b."""
+    """Return b of every match, and |x2 x e2|^2, the weight of its equation v' x1 = b."""
     b, weights = np.empty(points.shape[0]), np.empty(points.shape[0])
     for i in range(points.shape[0]):
         x1, y1, x2, y2 = points[i, 0], points[i, 1], points[i, 2], points[i, 3]
@@ -88,7 +88,10 @@ def _plane_equations(points: FloatArray, A: FloatArray, e2: FloatArray) -> tuple
 
 @kernel
 def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray, plane: FloatArray) -> bool:
-    """Weighted least squares of v' x1 = b into `plane` (3,); False, and nothing changed, for points on one line."""
+    """Return weighted least squares of v' x1 = b into `plane` (3,).
+
+    False, and nothing changed, for points on one line.
+    """
     gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
     right, row = np.zeros(3), np.ones(3)
     for i in range(points.shape[0]):
@@ -113,7 +116,7 @@ def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray, plane: Fl
 
 @kernel
 def _sampled_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatArray, limit: float) -> FloatArray:
-    """The v through three matches, v' x1 = b, whose H maps most of the first ones to within sqrt(limit)."""
+    """Return the v through three matches, v' x1 = b, whose H maps most of the first ones to within sqrt(limit)."""
     count, most, state = min(points.shape[0], _MOST_SCORED), -1, np.empty(1, dtype=np.uint64)
     best, corner, v = np.zeros(3), np.empty(3, dtype=np.int64), np.empty(3)
     state[0] = count
@@ -148,7 +151,7 @@ def _sampled_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatAr
 
 
 def transfer_distance(H: FloatArray, points: FloatArray) -> FloatArray:
-    """(N,) |x2 - H x1| / sqrt(2): about the distance of the match (x1, x2) in 4D to those that fit H exactly."""
+    """Return (N,) |x2 - H x1| / sqrt(2): about the distance of the match (x1, x2) in 4D to those that fit H exactly."""
     return np.sqrt(_squared_transfer(points, H))
 
 

@@ -23,7 +23,7 @@ _MOST_INLIERS = 300
 def with_another_epipole(
     points: FloatArray, F: FloatArray, threshold: float, loss: Loss, pretest: PreTest, state: RandomState
 ) -> FloatArray | None:
-    """The best model that shares the dominant plane of F's inliers; None without a plane and two matches off it.
+    """Return the best model that shares the dominant plane of F's inliers; None without a plane and two matches off it.
 
     Args:
         points: (N, 4) in random order.

@@ -34,7 +34,7 @@ EXPLAINED = 0.9
 
 
 def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> BoolArray:
-    """Which matches stay where they are, although the others move or nothing moves at all.
+    """Return which matches stay where they are, although the others move or nothing moves at all.
 
     The displacements of a scene are spread along a curve or over an area around 0: within four steps there are at least
     three times as many more as within one. Matches count as stationary where the peak holds more than that, and where
@@ -58,7 +58,7 @@ def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> Boo
 
 
 def covers(points: FloatArray, keypoints: FloatArray, size: tuple[int, int]) -> bool:
-    """Whether points (N, 2) lie all over what a photo of `size` (width, height) shows, its keypoints (M, 2)."""
+    """Return whether points (N, 2) lie all over what a photo of `size` (width, height) shows, its keypoints (M, 2)."""
     return len(_cells(points, size)) > WIDE * len(_cells(keypoints, size))
 
 
@@ -66,7 +66,7 @@ def fit_moving(
     fit: Fit, points: tuple[FloatArray, FloatArray], stationary: BoolArray, wide: bool, options: EpipolarSettings,
     seed: int,
 ) -> EpipolarFit | Rejected:  # fmt: skip
-    """Epipolar geometry of the matches that move; the stationary ones are no inliers and have no prior.
+    """Return epipolar geometry of the matches that move; the stationary ones are no inliers and have no prior.
 
     Where the camera moved without turning, far things stay in place, too: stationary matches all over the photo that
     the geometry of the others explains are of the scene, and all matches are fitted together.

@@ -19,19 +19,19 @@ Refit = Callable[[FloatArray, FloatArray, float], FloatArray]
 
 
 def refit_eight_point(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """8-point algorithm (thesis 4.3.2)."""
+    """Apply the 8-point algorithm (thesis 4.3.2)."""
     inliers = _inliers(points, F, threshold)
     return F if len(inliers) < 8 else fit_eight_point(inliers, np.ones(len(inliers)))
 
 
 def refit_sampson(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Least squares on the Sampson distance (thesis 4.2)."""
+    """Minimise the Sampson distance (thesis 4.2)."""
     inliers = _inliers(points, F, threshold)
     return refine_sampson(inliers, refit_eight_point(points, F, threshold)) if len(inliers) >= 8 else F
 
 
 def refit_reprojection(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Least squares on the reprojection distance (thesis 4.3), from the least squares on its first order."""
+    """Minimise the reprojection distance (thesis 4.3), from the least squares on its first order."""
     inliers = _inliers(points, F, threshold)
     return F if len(inliers) < 8 else refine_reprojection(inliers, refit_sampson(points, F, threshold))
 
@@ -45,7 +45,7 @@ REFITS: dict[str, Refit] = {
 
 
 def last_fit(name: str, own: Refit) -> Refit:
-    """The estimator's own fit, and unless the name is "auto" the fit of that name to its inliers.
+    """Return the estimator's own fit, and unless the name is "auto" the fit of that name to its inliers.
 
     The own fit comes first in any case: its inliers are better than those of the best sample.
     """

@@ -66,7 +66,7 @@ def refine_reprojection(
 
 
 def _moves(points: FloatArray, F: FloatArray) -> FloatArray:
-    """(N, 4) from every match to the nearest exact one, where its best point reprojects."""
+    """Return (N, 4) from every match to the nearest exact one, where its best point reprojects."""
     return np.hstack(nearest_exact_matches(F, points[:, :2], points[:, 2:])) - points
 
 
@@ -76,7 +76,7 @@ def _cost(moves: FloatArray, softness: float) -> float:
 
 
 def _tangent(F: FloatArray) -> FloatArray:
-    """(7, 9) orthonormal directions in which F, of norm 1, stays of rank 2 and of norm 1 to first order."""
+    """Return (7, 9) orthonormal directions in which F, of norm 1, stays of rank 2 and of norm 1 to first order."""
     U, _, Vt = np.linalg.svd(F)
     basis: FloatArray = np.linalg.svd(np.stack([np.outer(U[:, 2], Vt[2]).ravel(), F.ravel()]))[2][2:]
     return basis
@@ -85,7 +85,7 @@ def _tangent(F: FloatArray) -> FloatArray:
 def _normal_equations(
     points: FloatArray, F: FloatArray, moves: FloatArray, softness: float, basis: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Weighted J'J (7, 7) and -J'r (7,) over the directions of `basis`, the points eliminated."""
+    """Return weighted J'J (7, 7) and -J'r (7,) over the directions of `basis`, the points eliminated."""
     exact1, exact2 = homogeneous(points[:, :2] + moves[:, :2]), homogeneous(points[:, 2:] + moves[:, 2:])
     gradient = np.hstack([(exact2 @ F)[:, :2], (exact1 @ F.T)[:, :2]])
     length = np.linalg.norm(gradient, axis=1)

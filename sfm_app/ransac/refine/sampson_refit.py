@@ -50,7 +50,7 @@ def refine_sampson(
 
 
 def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach: float, most_steps: int) -> FloatArray:
-    """Maximum likelihood of F, the inliers' sigma and their share, by expectation maximisation (thesis 3.5 and 4.6).
+    """Give maximum likelihood of F, inliers' sigma and their share, by expectation maximisation (thesis 3.5 and 4.6).
 
     Among the matches within `reach` thresholds, distances of inliers are those of a Gaussian about 0, all others are
     spread evenly. The weight of a match is the probability that it is an inlier. sigma is at most one threshold.
@@ -74,7 +74,7 @@ def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach
 
 
 def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """8-point algorithm (thesis 4.3.2) on matches that are well scaled already.
+    """Apply the 8-point algorithm (thesis 4.3.2) on matches that are well scaled already.
 
     Args:
         points: (N, 4), of magnitude about 1.
@@ -88,14 +88,14 @@ def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """The first half of `fit_eight_point`: (3, 3) of norm 1 with the least algebraic error, of any rank."""
+    """Return the first half of `fit_eight_point`: (3, 3) of norm 1 with the least algebraic error, of any rank."""
     _, vectors = np.linalg.eigh(weighted_gram(points, weights))
     return np.ascontiguousarray(vectors[:, 0]).reshape(3, 3)
 
 
 @kernel
 def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
-    """Rotations U and V and the number s of the nearest rank 2 matrix U diag(1, s, 0) V', up to its scale."""
+    """Return rotations U and V and the number s of the nearest rank 2 matrix U diag(1, s, 0) V', up to its scale."""
     gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -128,7 +128,7 @@ def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
 
 @kernel
 def _normalise(U: FloatArray, k: int) -> float:
-    """Column k over its length; the length."""
+    """Return column k over its length; the length."""
     length = np.sqrt(U[0, k] * U[0, k] + U[1, k] * U[1, k] + U[2, k] * U[2, k])
     for i in range(3):
         U[i, k] /= length
@@ -148,7 +148,7 @@ def _reweighted(
     points: FloatArray, U: FloatArray, s: float, V: FloatArray, law: FloatArray, most_steps: int, enough: float,
     gram: FloatArray,
 ) -> FloatArray:  # fmt: skip
-    """The loop of all fits; `law` says how matches are weighed: 1 / c^2, 0, 0, 0 for a robust cost, or else 0, the
+    """Return loop of all fits; `law` says how matches are weighed: 1 / c^2, 0, 0, 0 for a robust cost, or else 0, the
     squares of the reach, of the largest sigma and of the first sigma for a mixture. `gram` (10, 10) is for work: the
     compiler would spell out all sums of a matrix whose size it knows.
     """
@@ -186,7 +186,7 @@ def _reweighted(
 
 @kernel
 def _weigh_robustly(squared: FloatArray, softness: float, weights: FloatArray) -> None:
-    """d/d(r^2) of r^2 / (1 + softness r^2)."""
+    """Weigh matches by d/d(r^2) of r^2 / (1 + softness r^2)."""
     for i in range(squared.shape[0]):
         root = 1.0 / (1.0 + softness * squared[i])
         weights[i] = root * root if root * root > _NEGLIGIBLE else 0.0
@@ -196,7 +196,7 @@ def _weigh_robustly(squared: FloatArray, softness: float, weights: FloatArray) -
 def _weigh_by_mixture(
     squared: FloatArray, law: FloatArray, variance: float, share: float, rounds: int, weights: FloatArray
 ) -> tuple[float, float]:
-    """Probability of each match to be an inlier; the inliers' variance and share that follow from these."""
+    """Return probability of each match to be an inlier; the inliers' variance and share that follow from these."""
     reach, largest = law[1], law[2]
     for _ in range(rounds):
         inlier, outlier = share * np.sqrt(2.0 / (np.pi * variance)), (1.0 - share) / np.sqrt(reach)
@@ -229,7 +229,7 @@ def _normal_equations(
     points: FloatArray, f: FloatArray, weights: FloatArray, U: FloatArray, s: float, V: FloatArray,
     gram: FloatArray, normal: FloatArray, right: FloatArray,
 ) -> None:  # fmt: skip
-    """Weighted J'J and -J'r over the seven parameters."""
+    """Sum up weighted J'J and -J'r over the seven parameters."""
     size = gram.shape[0]
     for j in range(size):
         for k in range(size):
@@ -248,7 +248,7 @@ def _normal_equations(
 
 @kernel
 def _derivatives(block: FloatArray, count: int, f: FloatArray, rows: FloatArray) -> None:
-    """dr / dF (9 rows) and r (the last row) of the matches of a block, times sqrt(weight).
+    """Write dr / dF (9 rows) and r (the last row) of the matches of a block, times sqrt(weight).
 
     r = n / g with n = x2' F x1 and g the norm of its gradient: dr = dn / g - r dg / g.
     """
@@ -283,7 +283,7 @@ def _compose(U: FloatArray, s: float, V: FloatArray) -> FloatArray:
 
 @kernel
 def _tangent(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
-    """dF over the seven parameters, one row each: U [e_k]x S V', -U S [e_k]x V', u2 v2'."""
+    """Write dF over the seven parameters, one row each: U [e_k]x S V', -U S [e_k]x V', u2 v2'."""
     for i in range(3):
         for j in range(3):
             k = 3 * i + j
@@ -298,7 +298,7 @@ def _tangent(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
 
 @kernel
 def _project(gram: FloatArray, basis: FloatArray, normal: FloatArray, right: FloatArray) -> None:
-    """Normal equations over the seven parameters from those over the nine entries, whose gradient is the last row."""
+    """Project normal equations over the nine entries, whose gradient is the last row, to the seven parameters."""
     part = np.empty(9)
     for p in range(7):
         right[p] = 0.0
@@ -315,7 +315,10 @@ def _project(gram: FloatArray, basis: FloatArray, normal: FloatArray, right: Flo
 
 @kernel
 def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArray) -> bool:
-    """Cholesky solution of (normal + damping diag(normal)) step = right; False if that is not positive definite."""
+    """Return Cholesky solution of (normal + damping diag(normal)) step = right.
+
+    False if that is not positive definite.
+    """
     lower = normal.copy()
     largest = 0.0
     for j in range(7):
@@ -345,7 +348,7 @@ def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArr
 
 @kernel
 def _turned(R: FloatArray, w: FloatArray) -> FloatArray:
-    """R exp([w]x), by Rodrigues."""
+    """Return R exp([w]x), by Rodrigues."""
     angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     a = np.sin(angle) / angle if angle > 1e-8 else 1.0
     b = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-8 else 0.5

@@ -24,13 +24,13 @@ _MOST_REDRAWS = 100
 
 
 def random_state(seed: int) -> RandomState:
-    """(1,) state of the generator for any integer seed."""
+    """Return (1,) state of the generator for any integer seed."""
     return np.array([seed % 2**64], dtype=np.uint64)
 
 
 @kernel
 def uniform(state: RandomState) -> float:
-    """The next number in [0, 1)."""
+    """Return the next number in [0, 1)."""
     state[0] += _STEP
     z = state[0]
     z = (z ^ (z >> _S30)) * _MIX1

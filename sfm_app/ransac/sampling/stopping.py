@@ -10,7 +10,7 @@ CONVERGED = 0.05
 
 
 def trials_needed(success: float, confidence: float, log_missed: float = 0.0) -> float:
-    """Samples of which at least one succeeds with the wanted probability (thesis 3.19); inf if none can.
+    """Return samples of which at least one succeeds with the wanted probability (thesis 3.19); inf if none can.
 
     Args:
         success: probability of one sample to be clean, share^m, and to pass the test of its models.
@@ -26,7 +26,7 @@ def trials_needed(success: float, confidence: float, log_missed: float = 0.0) ->
 
 
 def have_converged(before: NDArray[np.float64], after: NDArray[np.float64], limit: float = CONVERGED) -> bool:
-    """Whether the priors, each normalised to sum 1, moved less than `limit` in sum (thesis 4.18).
+    """Return whether the priors, each normalised to sum 1, moved less than `limit` in sum (thesis 4.18).
 
     The printed sum grows with the number of matches; as probabilities that sum to 1 it lies in [0, 2] for any number.
     """

@@ -25,7 +25,7 @@ _LEAST_INLIERS = 8
 
 
 def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> float:
-    """Samples without a better model after which to believe this one.
+    """Return samples without a better model after which to believe this one.
 
     Wrong models live on one plane, or on repeated structure, and have little else for them. The inliers off the
     dominant plane are counted in standard deviations z over what accident gives: right models of real photos have z of

@@ -33,7 +33,7 @@ MAD_TO_SIGMA = 1.4826
 
 
 def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArray:
-    """Leverage h_ii of every match in a regression on the fitted ones plus itself (thesis 3.11).
+    """Return leverage h_ii of every match in a regression on the fitted ones plus itself (thesis 3.11).
 
     For a fitted match that is the diagonal of the hat matrix. For any other the textbook formula would exceed 1; what
     counts is how much it would pull if it were fitted as well, which is g / (1 + g) with g = a_i' (A_in' A_in)^-1 a_i.
@@ -57,7 +57,7 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
 
 @kernel
 def _of_forms(forms: FloatArray, fitted: BoolArray) -> FloatArray:
-    """h for those fitted, g / (1 + g) for the others; without support g may be inf."""
+    """Return h for those fitted, g / (1 + g) for the others; without support g may be inf."""
     leverage = np.empty(forms.shape[0])
     for i in range(forms.shape[0]):
         leverage[i] = min(forms[i], 1.0) if fitted[i] else 1.0 / (1.0 + 1.0 / forms[i])
@@ -66,7 +66,10 @@ def _of_forms(forms: FloatArray, fitted: BoolArray) -> FloatArray:
 
 @kernel
 def _perpendicular(f: FloatArray) -> FloatArray:
-    """(9, 8) orthonormal directions perpendicular to a unit vector: a reflection takes it and them to the axes."""
+    """Return (9, 8) orthonormal directions perpendicular to a unit vector.
+
+    A reflection takes it and them to the axes.
+    """
     last = f[8] + 1.0 if f[8] >= 0.0 else f[8] - 1.0
     basis = np.zeros((9, PARAMETERS))
     for k in range(PARAMETERS):
@@ -78,7 +81,7 @@ def _perpendicular(f: FloatArray) -> FloatArray:
 
 @kernel
 def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: BoolArray) -> FloatArray:
-    """Residuals over their standard deviation (thesis 3.14 and 3.15, the variance taken from the fitted matches).
+    """Give residuals over their standard deviation (thesis 3.14 and 3.15, the variance taken from the fitted matches).
 
     Args:
         residuals: (N,) distances to the model.
@@ -103,7 +106,10 @@ def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: B
 
 @kernel
 def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
-    """How far the fit would move without each match (thesis 3.16 and 4.17; the square of d_i is missing in print)."""
+    """Return how far the fit would move without each match (thesis 3.16 and 4.17.
+
+    The square of d_i is missing in print).
+    """
     distances = np.empty(studentised.shape[0])
     for i in range(studentised.shape[0]):
         odds = leverage[i] / max(1.0 - leverage[i], _LEAST_FREEDOM)
@@ -113,7 +119,7 @@ def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
 
 @kernel
 def priors(distances: FloatArray, sigma: float) -> FloatArray:
-    """p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels)."""
+    """Return p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels)."""
     least, probable = np.inf, np.empty(distances.shape[0])
     for i in range(distances.shape[0]):
         least = min(least, distances[i])
@@ -129,7 +135,7 @@ def priors(distances: FloatArray, sigma: float) -> FloatArray:
 
 @kernel
 def mad_sigma(distances: FloatArray) -> float:
-    """Standard deviation about zero from the median absolute deviation (thesis 4.7.3)."""
+    """Return standard deviation about zero from the median absolute deviation (thesis 4.7.3)."""
     count = distances.shape[0]
     deviations = np.empty(count)
     for i in range(count):
@@ -138,7 +144,7 @@ def mad_sigma(distances: FloatArray) -> float:
 
 
 def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma_from_inliers: bool) -> FloatArray:
-    """p(v_i) of every match from its influence on the model f (thesis 4.7.2 and 4.7.3).
+    """Return p(v_i) of every match from its influence on the model f (thesis 4.7.2 and 4.7.3).
 
     Args:
         points: (N, 4) matches.

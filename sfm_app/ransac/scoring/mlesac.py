@@ -25,7 +25,7 @@ _SETTLED = 1e-5
 
 
 def mlesac(points: FloatArray, threshold: float, best: FloatArray | None) -> Loss:
-    """The penalty above, with the share gamma of inliers that the best model shows, one half before there is one."""
+    """Return penalty above, with the share gamma of inliers that the best model shows, one half before there is one."""
     sigma, width = threshold / SIGMAS, window(points)
     gamma = 0.5 if best is None else inlier_share(squared_distances(points, best), sigma, width)
     odds = (1 - gamma) / gamma * sigma * math.sqrt(2 * math.pi) / width
@@ -34,13 +34,13 @@ def mlesac(points: FloatArray, threshold: float, best: FloatArray | None) -> Los
 
 
 def window(points: FloatArray) -> float:
-    """Range w of an outlier's signed distance: the diagonal of a view's matches, the mean of both."""
+    """Return range w of an outlier's signed distance: the diagonal of a view's matches, the mean of both."""
     extent = np.ptp(points, axis=0)
     return max(float(np.hypot(extent[[0, 2]], extent[[1, 3]]).mean()), np.finfo(float).tiny)
 
 
 def inlier_share(squared: FloatArray, sigma: float, width: float) -> float:
-    """gamma = p(v) of the mixture by expectation maximisation, for given sigma and w.
+    """Return gamma = p(v) of the mixture by expectation maximisation, for given sigma and w.
 
     Args:
         squared: (N,) squared distances to the model.

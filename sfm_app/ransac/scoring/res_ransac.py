@@ -16,12 +16,12 @@ BINS = 100
 
 
 def residual_validity(points: FloatArray, f: FloatArray, _threshold: float) -> FloatArray:
-    """p(v_i) of every match (N, 4) from its Sampson distance to the best model f (9,)."""
+    """Return p(v_i) of every match (N, 4) from its Sampson distance to the best model f (9,)."""
     return validity_of(np.sqrt(squared_distances(points, f)))
 
 
 def validity_of(residuals: FloatArray) -> FloatArray:
-    """p(v_i | r_i) of 4.10 to 4.15.
+    """Return p(v_i | r_i) of 4.10 to 4.15.
 
     The bins are a hundredth of the median wide, and the last one takes everything beyond: there p(0 <= r <= r_i) is 1
     and p(v) is 0, so that only the better half of the matches is drawn from.

@@ -44,33 +44,36 @@ Score = Callable[[FloatArray, float, FloatArray | None], Loss]
 
 
 def ransac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """1 for every match beyond the threshold, else 0 (thesis 3.20, 4.4)."""
+    """Return 1 for every match beyond the threshold, else 0 (thesis 3.20, 4.4)."""
     return Loss(RANSAC, threshold * threshold, threshold * threshold, 1.0)
 
 
 def msac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """The squared distance, at most the squared threshold (Torr and Zisserman 2000)."""
+    """Return the squared distance, at most the squared threshold (Torr and Zisserman 2000)."""
     return Loss(MSAC, threshold * threshold, threshold * threshold, threshold * threshold)
 
 
 def msac_linear(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """The distance, at most the threshold (thesis 4.5 as printed)."""
+    """Return the distance, at most the threshold (thesis 4.5 as printed)."""
     return Loss(MSAC_LINEAR, threshold * threshold, threshold * threshold, threshold)
 
 
 def lmeds(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """The median of the squared distances (Rousseeuw 1984; thesis 4.4.1); the threshold only counts inliers."""
+    """Return the median of the squared distances (Rousseeuw 1984; thesis 4.4.1); the threshold only counts inliers."""
     return Loss(LMEDS, threshold * threshold, np.inf, np.inf)
 
 
 def geman_mcclure(_points: FloatArray, threshold: float, _best: FloatArray | None, *, scale: float) -> Loss:
-    """r^2 / (r^2 + c^2), c being `scale` thresholds: no edge, and close matches count most (Geman and McClure 1987)."""
+    """Return r^2 / (r^2 + c^2), c being `scale` thresholds.
+
+    No edge, and close matches count most (Geman and McClure 1987).
+    """
     return Loss(GEMAN_MCCLURE, threshold * threshold, np.inf, 1.0, (scale * threshold) ** -2)
 
 
 @kernel
 def squared_sampson(f: FloatArray, x1: float, y1: float, x2: float, y2: float) -> float:
-    """Squared Sampson distance (thesis 4.2) of one match to f, the nine entries of F by rows."""
+    """Return squared Sampson distance (thesis 4.2) of one match to f, the nine entries of F by rows."""
     ax, ay, az = f[0] * x1 + f[1] * y1 + f[2], f[3] * x1 + f[4] * y1 + f[5], f[6] * x1 + f[7] * y1 + f[8]
     bx, by = f[0] * x2 + f[3] * y2 + f[6], f[1] * x2 + f[4] * y2 + f[7]
     algebraic = x2 * ax + y2 * ay + az
@@ -80,7 +83,7 @@ def squared_sampson(f: FloatArray, x1: float, y1: float, x2: float, y2: float) -
 
 @kernel
 def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
-    """(N,) squared Sampson distances of all matches (N, 4)."""
+    """Return (N,) squared Sampson distances of all matches (N, 4)."""
     squared = np.empty(points.shape[0])
     distances_of_block(points, f, FIRST, squared)
     return squared
@@ -88,7 +91,7 @@ def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
 
 @kernel
 def distances_of_block(points: FloatArray, f: FloatArray, start: int, squared: FloatArray) -> None:
-    """The squared Sampson distances of as many matches as `squared` has room for, from row `start` on."""
+    """Write the squared Sampson distances of as many matches as `squared` has room for, from row `start` on."""
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
     for i in range(squared.shape[0]):  # spelt out: several matches at once in the lanes of the processor
         x1, y1, x2, y2 = points[start + i, 0], points[start + i, 1], points[start + i, 2], points[start + i, 3]
@@ -101,7 +104,7 @@ def distances_of_block(points: FloatArray, f: FloatArray, start: int, squared: F
 
 @kernel
 def _cost(loss: Loss, squared: float) -> float:
-    """Penalty of one match."""
+    """Return penalty of one match."""
     if loss.kind == GEMAN_MCCLURE:
         return 1.0 - 1.0 / (1.0 + loss.precision * squared)
     if not squared <= loss.reach:
@@ -117,7 +120,7 @@ def _cost(loss: Loss, squared: float) -> float:
 
 @kernel
 def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: float, pretest: PreTest) -> float:
-    """Penalty of all matches, or inf as soon as f cannot stay below `to_beat` or fails the pre-test.
+    """Return penalty of all matches, or inf as soon as f cannot stay below `to_beat` or fails the pre-test.
 
     Args:
         points: (N, 4), in random order; (2 N, 4), the matches twice over, for a pre-test with a random start.
@@ -171,7 +174,7 @@ def _passes(pretest: PreTest, done: int, inliers: int) -> bool:
 
 @kernel
 def _add_up(squared: FloatArray, loss: Loss) -> tuple[int, float]:
-    """Inliers among the given matches, and the sum of their penalties."""
+    """Return inliers among the given matches, and the sum of their penalties."""
     total, inliers = 0.0, 0
     for i in range(squared.shape[0]):
         inliers += squared[i] <= loss.limit
@@ -186,7 +189,9 @@ def _add_up(squared: FloatArray, loss: Loss) -> tuple[int, float]:
 
 @kernel
 def _median_of_squares(points: FloatArray, f: FloatArray, to_beat: float) -> float:
-    """The (N // 2 + 1)th smallest squared distance, or inf once too many matches lie too far for it to be smaller."""
+    """Return the (N // 2 + 1)th smallest squared distance, or inf once too many matches lie too far for it to be
+    smaller.
+    """
     count = points.shape[0]
     squared = np.empty(count)
     may_miss = count - count // 2 - 1
@@ -200,7 +205,7 @@ def _median_of_squares(points: FloatArray, f: FloatArray, to_beat: float) -> flo
 
 @kernel
 def select(values: FloatArray, rank: int) -> float:
-    """The value that sorting would put at `rank`, by Hoare's quickselect; reorders `values`."""
+    """Return the value that sorting would put at `rank`, by Hoare's quickselect; reorders `values`."""
     low, high = 0, values.shape[0] - 1
     while low < high:
         pivot, i, j = values[(low + high) // 2], low, high

@@ -18,7 +18,7 @@ LANES = 64
 
 @kernel
 def design_row(point: FloatArray, row: FloatArray) -> None:
-    """x2 (x) x1 into `row` (9,): the coefficients of the entries of F, by rows, in x2' F x1 = 0."""
+    """Write x2 (x) x1 into `row` (9,): the coefficients of the entries of F, by rows, in x2' F x1 = 0."""
     for i in range(3):
         from2 = point[2 + i] if i < 2 else 1.0
         row[3 * i] = from2 * point[0]
@@ -28,7 +28,7 @@ def design_row(point: FloatArray, row: FloatArray) -> None:
 
 @kernel
 def gather(points: FloatArray, weights: FloatArray, start: int, block: FloatArray) -> tuple[int, int]:
-    """The next matches of positive weight, from row `start` on, as columns x1, y1, x2, y2, sqrt(weight) of `block`.
+    """Return next matches of positive weight, from row `start` on, as columns x1, y1, x2, y2, sqrt(weight) of `block`.
 
     Returns:
         Number of columns filled, and the row to go on from.
@@ -46,7 +46,7 @@ def gather(points: FloatArray, weights: FloatArray, start: int, block: FloatArra
 
 @kernel
 def design_columns(block: FloatArray, count: int, rows: FloatArray) -> None:
-    """The rows of A for the matches of a block (see `gather`), times sqrt(weight), as columns (9, LANES)."""
+    """Write the rows of A for the matches of a block (see `gather`), times sqrt(weight), as columns (9, LANES)."""
     for n in range(count):
         x1, y1, x2, y2, root = block[0, n], block[1, n], block[2, n], block[3, n], block[4, n]
         rows[0, n], rows[1, n], rows[2, n] = x2 * x1 * root, x2 * y1 * root, x2 * root
@@ -74,7 +74,7 @@ def mirror(gram: FloatArray) -> None:
 
 
 def weighted_gram(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """(9, 9) matrix A' W A of the matches (N, 4), with weights (N,) >= 0."""
+    """Return (9, 9) matrix A' W A of the matches (N, 4), with weights (N,) >= 0."""
     gram = np.zeros((9, 9))
     _add_gram(points, weights, gram)
     return gram
@@ -94,7 +94,7 @@ def _add_gram(points: FloatArray, weights: FloatArray, gram: FloatArray) -> None
 
 @kernel
 def quadratic_forms(points: FloatArray, whitening: FloatArray) -> FloatArray:
-    """(N,) squared lengths of the rows of A after `whitening` (9, p)."""
+    """Return (N,) squared lengths of the rows of A after `whitening` (9, p)."""
     count = points.shape[0]
     forms, ones = np.zeros(count), np.ones(count)
     block, rows, dots = np.empty((5, LANES)), np.empty((9, LANES)), np.empty(LANES)

@@ -14,7 +14,7 @@ _SETTLED = 1e-32
 
 @kernel
 def symmetric_eigen(matrix: FloatArray, values: FloatArray, vectors: FloatArray) -> None:
-    """Eigenvalues in rising order and their unit vectors, by Jacobi's rotations.
+    """Write eigenvalues in rising order and their unit vectors, by Jacobi's rotations.
 
     Args:
         matrix: (n, n) symmetric; destroyed.

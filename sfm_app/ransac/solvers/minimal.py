@@ -17,7 +17,7 @@ _SQUARINGS = 6
 
 @kernel
 def models_through(points: FloatArray, sample: IntArray, models: FloatArray) -> int:
-    """F from a minimal sample: all those through seven matches, or the linear one through eight.
+    """Return F from a minimal sample: all those through seven matches, or the linear one through eight.
 
     Seven constraints leave F = a + z b; one more settles z: det F = 0, a cubic with one or three real roots, or an
     eighth match. The linear model is then moved to the nearest one of rank 2, and with noise misses its own sample.
@@ -40,7 +40,7 @@ def models_through(points: FloatArray, sample: IntArray, models: FloatArray) -> 
 
 @kernel
 def _of_rank_two(basis: FloatArray, models: FloatArray) -> int:
-    """Those of the pencil a + z b whose determinant vanishes."""
+    """Return those of the pencil a + z b whose determinant vanishes."""
     a, b = basis[0], basis[1]
     c0, c1, c2, c3 = _det(a), _mixed_det(a, b), _mixed_det(b, a), _det(b)
     if abs(c3) < abs(c0):  # the larger end leads, so that no root runs off to infinity
@@ -58,7 +58,7 @@ def _of_rank_two(basis: FloatArray, models: FloatArray) -> int:
 
 @kernel
 def _through_eighth(point: FloatArray, basis: FloatArray, model: FloatArray) -> int:
-    """The one of the pencil that meets `point` (4,), less what stands in the way of rank 2: F - F v v'."""
+    """Return the one of the pencil that meets `point` (4,), less what stands in the way of rank 2: F - F v v'."""
     row, v = np.empty(9), np.empty(3)
     design_row(point, row)
     a, b = 0.0, 0.0
@@ -82,7 +82,7 @@ def _through_eighth(point: FloatArray, basis: FloatArray, model: FloatArray) -> 
 
 @kernel
 def _weakest_direction(f: FloatArray, v: FloatArray) -> bool:
-    """The right singular vector of F's smallest singular value into v (3,); False for a rank below 2.
+    """Return the right singular vector of F's smallest singular value into v (3,); False for a rank below 2.
 
     The cofactors C of F have the same singular vectors with the values s2 s3, s1 s3, s1 s2, so that the vector wanted
     leads in C'C, and the more so each time that is squared.
@@ -121,7 +121,7 @@ def _dot3(a: FloatArray, b: FloatArray) -> float:
 
 @kernel
 def is_oriented(points: FloatArray, sample: IntArray, f: FloatArray) -> bool:
-    """Whether the sampled matches can all lie in front of both cameras of f (Chum, Werner and Matas 2004).
+    """Return whether the sampled matches can all lie in front of both cameras of f (Chum, Werner and Matas 2004).
 
     For such points e2 x x2 and F x1, the same line up to scale, point the same way for all matches or opposite for all.
     Wrong models rarely pass, and need not be scored.
@@ -149,7 +149,7 @@ def is_oriented(points: FloatArray, sample: IntArray, f: FloatArray) -> bool:
 
 @kernel
 def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArray) -> int:
-    """Real roots of c0 + c1 z + c2 z^2 + c3 z^3 into `roots` (3,); 1 or 3 of them, or 0 if c3 is 0."""
+    """Return real roots of c0 + c1 z + c2 z^2 + c3 z^3 into `roots` (3,); 1 or 3 of them, or 0 if c3 is 0."""
     if c3 == 0.0:
         return 0
     a, b, c = c2 / c3, c1 / c3, c0 / c3
@@ -178,7 +178,7 @@ def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArr
 
 @kernel
 def _null_space(points: FloatArray, sample: IntArray, basis: FloatArray) -> bool:
-    """Two orthonormal vectors perpendicular to the first seven design rows of the sample, by elimination.
+    """Return two orthonormal vectors perpendicular to the first seven design rows of the sample, by elimination.
 
     Complete pivoting makes it as exact as reflections would be, in half the time. False where the rows depend on each
     other.
@@ -251,7 +251,7 @@ def _det(m: FloatArray) -> float:
 
 @kernel
 def _mixed_det(m: FloatArray, n: FloatArray) -> float:
-    """The part of det(m + z n) that is linear in z: the cofactors of m times the entries of n."""
+    """Return the part of det(m + z n) that is linear in z: the cofactors of m times the entries of n."""
     return float(
         n[0] * (m[4] * m[8] - m[5] * m[7])
         - n[1] * (m[3] * m[8] - m[5] * m[6])

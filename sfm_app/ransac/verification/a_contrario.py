@@ -22,7 +22,7 @@ _MOST = 1e300
 
 
 def false_alarms_of(squared: FloatArray, wrong: FloatArray, threshold: float) -> float:
-    """How many models with as much support are expected among random matches of the same points.
+    """Return how many models with as much support are expected among random matches of the same points.
 
     Args:
         squared: (N,) squared distances of the matches to the model.
@@ -38,7 +38,7 @@ def false_alarms_of(squared: FloatArray, wrong: FloatArray, threshold: float) ->
 
 
 def is_credible(points: FloatArray, f: FloatArray, threshold: float) -> bool:
-    """Whether the support of f is more than luck.
+    """Return whether the support of f is more than luck.
 
     Args:
         points: (N, 4) distinct matches in random order, N >= 2.
@@ -50,7 +50,7 @@ def is_credible(points: FloatArray, f: FloatArray, threshold: float) -> bool:
 
 
 def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> float:
-    """Expected number of minimal samples whose model has so many inliers, if every match is wrong.
+    """Return the expected number of minimal samples whose model has so many inliers, if every match is wrong.
 
     Each of the C(count, s) samples agrees with itself, and with each of the other matches by accident, so that the
     expectation is C(count, s) P(Binomial(count - s, chance) >= inliers - s).
@@ -71,7 +71,9 @@ def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> f
 
 
 def squared_mismatches(points: FloatArray, f: FloatArray) -> FloatArray:
-    """(M,) squared Sampson distances of deliberate mismatches: points of view 1 with the partners of some others.
+    """Return (M,) squared Sampson distances of deliberate mismatches.
+
+    Points of view 1 with the partners of some others.
 
     Args:
         points: (N, 4) distinct matches in random order, N >= 2.
@@ -94,7 +96,7 @@ def _shifted(points: FloatArray, f: FloatArray, shifts: int) -> FloatArray:
 
 
 def accidental_share(wrong: FloatArray, threshold: float) -> float:
-    """Probability that a wrong match agrees with a model, in (0, 1), from the squared distances of mismatches.
+    """Return probability that a wrong match agrees with a model, in (0, 1), from the squared distances of mismatches.
 
     Measured, not modelled: it knows the extent of the photos, where their points cluster, and where the epipoles are.
     """
@@ -102,7 +104,7 @@ def accidental_share(wrong: FloatArray, threshold: float) -> float:
 
 
 def log_binomial_tail(count: int, least: int, chance: float) -> float:
-    """Upper bound of log P(Binomial(count, chance) >= least), for a chance in (0, 1) (Chernoff 1952)."""
+    """Return upper bound of log P(Binomial(count, chance) >= least), for a chance in (0, 1) (Chernoff 1952)."""
     share = least / count
     if share <= chance:
         return 0.0

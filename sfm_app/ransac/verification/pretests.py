@@ -60,10 +60,10 @@ class Verifier(Protocol):
         """Count samples that were drawn and tested."""
 
     def expect(self, share: float) -> None:
-        """The best model has this share of inliers."""
+        """Expect this share of inliers, that of the best model."""
 
     def trials_needed(self, share: float, confidence: float) -> float:
-        """Samples, those already drawn included, that hold with this probability a clean one which passes."""
+        """Return samples, those already drawn included, that hold with this probability a clean one which passes."""
 
 
 class FullVerification:
@@ -109,7 +109,7 @@ class RandomisedTdd(FullVerification):
 
 
 def bail_out_table(count: int, inlier_share: float) -> IntArray:
-    """How many inliers a hypothesis must show after each block to be worth finishing.
+    """Return how many inliers a hypothesis must show after each block to be worth finishing.
 
     A hypothesis as good as the best one has a share `inlier_share` of inliers; in the first m of N matches their
     number is hypergeometric, and falls short of the figures given here about once in a thousand times.

@@ -44,7 +44,7 @@ class SequentialTest:
     """log A; inf where good and bad models look too alike to tell."""
 
     def least_inliers(self, count: int) -> IntArray:
-        """(count,) inliers below which the ratio exceeds A after 1, 2, ... matches."""
+        """Return (count,) inliers below which the ratio exceeds A after 1, 2, ... matches."""
         if math.isinf(self.log_threshold):
             return np.zeros(0, dtype=np.int64)
         hit, miss = self._steps()
@@ -54,19 +54,19 @@ class SequentialTest:
         return least
 
     def pass_rate(self, share: float) -> float:
-        """Least probability that a good model passes whose true share of inliers is this one: 1 - A^-h."""
+        """Return least probability that a good model passes whose true share of inliers is this one: 1 - A^-h."""
         if math.isinf(self.log_threshold):
             return 1.0
         return -math.expm1(-self.log_threshold * _exponent(*self._steps(), min(share, _MOST_EPSILON)))
 
     def _steps(self) -> tuple[float, float]:
-        """What an inlier and an outlier add to the logarithm of the ratio."""
+        """Return what an inlier and an outlier add to the logarithm of the ratio."""
         return math.log(self.delta / self.epsilon), math.log((1 - self.delta) / (1 - self.epsilon))
 
 
 @lru_cache(maxsize=1024)  # asked over and over for the same share
 def _exponent(hit: float, miss: float, share: float) -> float:
-    """The h > 0 with E[ratio^h] = 1 for matches of which `share` are inliers; 1 for the share of the design.
+    """Return the h > 0 with E[ratio^h] = 1 for matches of which `share` are inliers; 1 for the share of the design.
 
     0 if the ratio does not fall on average: such a model is sure to be rejected in the end.
     """
@@ -85,7 +85,7 @@ def _exponent(hit: float, miss: float, share: float) -> float:
 
 
 def design(epsilon: float, delta: float, sample_size: int) -> SequentialTest:
-    """The fastest test for these probabilities: A = t_M C / m_S + 1 + log A.
+    """Return the fastest test for these probabilities: A = t_M C / m_S + 1 + log A.
 
     A larger A wastes matches on bad models, a smaller one wastes samples because good models fall.
     """
@@ -121,7 +121,9 @@ class Sprt:
         self._begin(epsilon, self._delta())
 
     def _delta(self) -> float:
-        """Share of inliers among the matches that were checked on rejected models, and in what was assumed at first."""
+        """Return share of inliers among the matches that were checked on rejected models, and in what was assumed at
+        first.
+        """
         checked, inliers = self._rejected
         return float((inliers + FIRST_DELTA * _PRIOR_WEIGHT) / (checked + _PRIOR_WEIGHT))
 
@@ -134,7 +136,7 @@ class Sprt:
         self._renew(share)
 
     def trials_needed(self, share: float, confidence: float) -> float:
-        """3.19 over all tests that were in use: each left a clean sample standing with its own probability."""
+        """Return 3.19 over all tests that were in use: each left a clean sample standing with its own probability."""
         clean = share**self._sample_size
         missed, drawn = 0.0, 0  # log-probability that all samples so far were unclean, or clean but rejected
         for test, trials in self._past:

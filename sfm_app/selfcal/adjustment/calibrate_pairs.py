@@ -57,7 +57,7 @@ class Fit:
     """(C, 4) what stays at its usual value, because the pairs do not determine it."""
 
     def names_held(self, camera: int) -> tuple[str, ...]:
-        """The same by name, for one camera."""
+        """Return what one camera holds, by name."""
         return tuple(name for place, name in enumerate(NAMES) if self.held is not None and self.held[camera, place])
 
     @property
@@ -79,7 +79,7 @@ class Fit:
         return Evidence(self.state.thetas, H, g, float(np.sum(self.state.weights)), self.priors)
 
     def cost(self, sigma: float, scale: float) -> float:
-        """Negative log-probability by which fits from different starts compete, the pairs' say bounded.
+        """Return negative log-probability by which fits from different starts compete, the pairs' say bounded.
 
         Args:
             sigma: of a distance; with its own, larger one a wrong fit would be lenient with itself.
@@ -94,7 +94,7 @@ class Fit:
 
 
 def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], priors: CameraPriors) -> Fit:
-    """The best of the fits that begin at `starts`, the most likely first, with the pixels square and not.
+    """Return the best of the fits that begin at `starts`, the most likely first, with the pixels square and not.
 
     Args:
         matches: inliers about the middle of the photos.
@@ -121,7 +121,7 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], prio
 
 
 def of_all_pairs(fit: Fit, matches: Matches, Fs: FloatArray) -> Fit:
-    """The same cameras with a pose for every pair, also for those that they were not adjusted to."""
+    """Return the same cameras with a pose for every pair, also for those that they were not adjusted to."""
     if len(matches.cameras) == len(fit.matches.cameras):
         return fit
     state = replace(fit.state, poses=_poses(matches, Fs, fit.state.thetas), weights=np.ones(len(Fs)))
@@ -129,7 +129,9 @@ def of_all_pairs(fit: Fit, matches: Matches, Fs: FloatArray) -> Fit:
 
 
 def scatter_by_photos(fit: Fit) -> FloatArray:
-    """(5C,) standard deviations of the cameras by a jackknife over the photos; 0 where photos are too few to ask.
+    """Return (5C,) standard deviations of the cameras by a jackknife over the photos.
+
+    0 where photos are too few to ask.
 
     Neighbours in the list go together: what is wrong with one photo (blur, a moving shutter, a repeated wall) is often
     wrong with the next. With each group left out the cameras take the step that the other pairs ask for; every pair
@@ -152,7 +154,7 @@ def scatter_by_photos(fit: Fit) -> FloatArray:
 
 
 def straight_fundamentals(fit: Fit) -> FloatArray:
-    """(P, 3, 3) F's of the photos as they were without a lens: refitted to the matches, free of any K."""
+    """Return (P, 3, 3) F's of the photos as they were without a lens: refitted to the matches, free of any K."""
     thetas, cameras = fit.state.thetas, fit.matches.cameras
     found = np.empty((len(cameras), 3, 3))
     for pair, (first, second) in enumerate(cameras):
@@ -167,7 +169,7 @@ def straight_fundamentals(fit: Fit) -> FloatArray:
 
 
 def camera_matrix_of(theta: FloatArray) -> FloatArray:
-    """(3, 3) camera matrix of the parameters (5,), in their units about the middle."""
+    """Return (3, 3) camera matrix of the parameters (5,), in their units about the middle."""
     f, half = np.exp(theta[LOG_FOCAL]), np.exp(0.5 * theta[LOG_ASPECT])
     return np.array([[f / half, 0.0, theta[CENTRE_U]], [0.0, f * half, theta[CENTRE_V]], [0.0, 0.0, 1.0]])
 

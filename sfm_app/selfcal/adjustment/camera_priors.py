@@ -60,7 +60,7 @@ class CameraPriors:
     """False: every lens is taken as straight."""
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
-        """The prior when `free` (C, 4) says what is freed and `held` (C, 4) what stays at its usual value.
+        """Return the prior when `free` (C, 4) says what is freed and `held` (C, 4) what stays at its usual value.
 
         `thetas` (C, 5) turn k1 into kappa.
         """
@@ -81,7 +81,7 @@ class CameraPriors:
         return Prior(mean, deviation**-2.0)
 
     def log_odds(self, free: BoolArray) -> float:
-        """Log-probability of a choice, before the pairs are asked."""
+        """Return log-probability of a choice, before the pairs are asked."""
         total = 0.0
         for place, share in FREE_SHARE.items():
             counts = np.isfinite(self.hints) if place == FOCAL else np.ones(len(self.sides), np.bool_)
@@ -118,7 +118,10 @@ class Evidence:
     priors: CameraPriors
 
     def posterior(self, free: BoolArray) -> tuple[float, FloatArray, FloatArray]:
-        """Log-probability of a choice of freed parameters, up to a constant; mean step and covariance under it."""
+        """Return log-probability of a choice of freed parameters, up to a constant.
+
+        Mean step and covariance under it.
+        """
         prior = self.priors.prior(free, self.thetas)
         precision, away = prior.precision.ravel(), (prior.mean - self.thetas).ravel()
         share = spare(free, self.pairs)
@@ -130,7 +133,7 @@ class Evidence:
         return fit + volume + self.priors.log_odds(free), step, covariance
 
     def choices(self, free: BoolArray, camera: int) -> list[BoolArray]:
-        """All choices for one camera, the others as in `free` (C, 4); those that free less come first.
+        """Return all choices for one camera, the others as in `free` (C, 4); those that free less come first.
 
         What would leave hardly a constraint to contradict it is no choice: three pairs fit almost any centre.
         """
@@ -143,7 +146,7 @@ class Evidence:
         return trials
 
     def best(self, free: BoolArray) -> BoolArray:
-        """The most probable choice: one camera after the other, the rest as they are, until none changes."""
+        """Return the most probable choice: one camera after the other, the rest as they are, until none changes."""
         while True:
             before = free
             for camera in range(len(free)):
@@ -154,7 +157,9 @@ class Evidence:
                 return free
 
     def undetermined(self, free: BoolArray) -> BoolArray:
-        """(C, 4) what is not freed, about which the pairs say hardly more than the prior, and nothing against it."""
+        """Return (C, 4) what is not freed, about which the pairs say hardly more than the prior, and nothing against
+        it.
+        """
         prior = self.priors.prior(free, self.thetas)
         before = prior.precision**-0.5
         after = np.sqrt(np.diag(self.posterior(free)[2])).reshape(before.shape)
@@ -165,7 +170,10 @@ class Evidence:
         return found
 
     def covariance(self, free: BoolArray) -> FloatArray:
-        """(5C, 5C) of the cameras about `thetas`, over all choices: what is nearly free is nearly as uncertain."""
+        """Return (5C, 5C) of the cameras about `thetas`, over all choices.
+
+        What is nearly free is nearly as uncertain.
+        """
         _, step, covariance = self.posterior(free)
         total = covariance.copy()
         for camera in range(len(free)):
@@ -181,7 +189,7 @@ class Evidence:
     def alternatives(
         self, free: BoolArray, camera: int, step: FloatArray, covariance: FloatArray
     ) -> list["Alternative"]:
-        """All choices for one camera, the others as in `free`, whose posterior has this mean step and covariance.
+        """Give all choices for one camera, the others as in `free`, whose posterior has this mean step and covariance.
 
         What the pairs and the other cameras say about this one is its marginal posterior without its prior: five
         parameters, whatever the number of cameras.
@@ -205,7 +213,7 @@ class Evidence:
 
 
 def spare(free: BoolArray, pairs: float) -> float:
-    """Share of the constraints that is left to contradict the cameras, in [0.1, 1].
+    """Return share of the constraints that is left to contradict the cameras, in [0.1, 1].
 
     A pair gives two. The fewer are left, the less the pairs' scatter about the fit says about their errors.
     """

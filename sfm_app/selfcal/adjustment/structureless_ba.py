@@ -47,7 +47,7 @@ class Prior:
     """(C, 5), 1 / variance, > 0."""
 
     def cost(self, thetas: FloatArray) -> float:
-        """Negative log-density, without its constant."""
+        """Return negative log-density, without its constant."""
         return 0.5 * float(np.sum(self.precision * (thetas - self.mean) ** 2))
 
 
@@ -123,7 +123,7 @@ class Matches:
         return max(1.0, 0.5 * each * (each + 1.0) / (2.0 * each - 1.0))
 
     def of_pair(self, pair: int) -> FloatArray:
-        """(N, 4) of one pair."""
+        """Return (N, 4) of one pair."""
         return self.points[self.ends[pair] : self.ends[pair + 1]]
 
     def chosen(self, which: IndexArray) -> "Matches":
@@ -134,18 +134,18 @@ class Matches:
         return Matches(inliers, self.cameras[which], self.photos[which], self.unit_px, count=self.count)
 
     def thinned(self, most: int) -> "Matches":
-        """The same with at most so many per pair."""
+        """Return the same with at most so many matches per pair."""
         inliers = [self.of_pair(pair) for pair in range(len(self.cameras))]
         return Matches(inliers, self.cameras, self.photos, self.unit_px, most, self.count)
 
     def costs(self, state: State) -> FloatArray:
-        """(P,) robust costs."""
+        """Return (P,) robust costs."""
         return np.asarray(
             pair_costs(self.points, self.ends, state.thetas, self.cameras, state.poses, state.sigma), np.float64
         )
 
     def noise(self, state: State) -> float:
-        """Standard deviation of the distances of the pairs that agree, from their median.
+        """Return standard deviation of the distances of the pairs that agree, from their median.
 
         A pose takes five of a pair's degrees of freedom: the distances of few matches are smaller than their errors.
         """
@@ -165,7 +165,7 @@ class Matches:
 
 
 def evenly(rows: FloatArray, most: int) -> FloatArray:
-    """At most so many rows, evenly chosen."""
+    """Return at most so many rows, evenly chosen."""
     return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
 
 
@@ -210,7 +210,7 @@ def _weighed(state: State, system: tuple[FloatArray, FloatArray]) -> State:
 
 
 def _reduced(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Schur complement of the poses; also what gives their steps: V^-1 W' and V^-1 b_pose."""
+    """Return Schur complement of the poses; also what gives their steps: V^-1 W' and V^-1 b_pose."""
     n = 2 * CAMERA
     V = A[:, n:, n:].copy()
     diagonal = np.arange(V.shape[-1])
@@ -226,7 +226,7 @@ def _reduced(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, 
 def _stepped(
     matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
 ) -> tuple[State, float]:
-    """One step that lowers the cost, damped as far as that needs, and the damping for the next."""
+    """Return one step that lowers the cost, damped as far as that needs, and the damping for the next."""
     factors = matches.trust * state.weights / state.scale
     cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
     while damping < MOST_DAMPING:

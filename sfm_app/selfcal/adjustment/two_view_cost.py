@@ -44,7 +44,7 @@ def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
 def distances(
     matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray
 ) -> FloatArray:
-    """(M,) Sampson distances with sign, in the units of the matches.
+    """Return (M,) Sampson distances with sign, in the units of the matches.
 
     Args:
         matches: (M, 4) of all pairs, one after the other.
@@ -71,7 +71,7 @@ def distances(
 def pair_costs(
     matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
 ) -> FloatArray:
-    """(P,) half the sum over the matches of a pair of their robust squared distances, in sigma^2.
+    """Return (P,) half the sum over the matches of a pair of their robust squared distances, in sigma^2.
 
     Arguments as in `distances`; sigma is the standard deviation of one.
     """
@@ -88,7 +88,7 @@ def pair_costs(
 def pair_systems(
     matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray, sigma: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Gauss-Newton systems of all pairs in their fifteen parameters: camera 1, camera 2, pose.
+    """Return Gauss-Newton systems of all pairs in their fifteen parameters: camera 1, camera 2, pose.
 
     Arguments as in `distances`; sigma is the standard deviation of one.
 

@@ -19,7 +19,7 @@ AGREES = 0.5
 
 
 def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> FloatArray:
-    """(5C, 5C) covariance of all parameters, over all choices of what is free, with what no model holds added.
+    """Return (5C, 5C) covariance of all parameters, over all choices of what is free, with what no model holds added.
 
     Args:
         fit: cameras adjusted to matches.
@@ -38,7 +38,7 @@ def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> Float
 
 
 def spread_of(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, float]:
-    """Standard deviations of fx, fy, cx, cy in pixels and of k1, from the covariance (5, 5) of one camera."""
+    """Return standard deviations of fx, fy, cx, cy in pixels and of k1, from the covariance (5, 5) of one camera."""
     focal, squared = float(np.exp(theta[LOG_FOCAL])) * unit_px, float(np.exp(2.0 * theta[LOG_FOCAL]))
     half = float(np.exp(0.5 * theta[LOG_ASPECT]))
     # rows: how fx, fy, cx, cy, k1 change with log f, u, v, log a, kappa
@@ -52,7 +52,10 @@ def spread_of(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, f
 
 
 def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:
-    """Pairs that agree with the cameras, those that say most about them first: views that differ in more than place."""
+    """Return pairs that agree with the cameras, those that say most about them first.
+
+    Views that differ in more than place.
+    """
     if not photos:
         return ()
     alone = np.tile(ALONE, 2)

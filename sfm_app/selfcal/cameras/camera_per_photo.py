@@ -51,7 +51,7 @@ class Prediction(NamedTuple):
 def predicted(
     tables: Tables, photos: Sequence[PairId], starts: Sequence[FloatArray], labels: Mapping[int, int], seed: int
 ) -> Prediction:
-    """Few cameras and a camera for each photo, fitted to most pairs and compared on the others.
+    """Return few cameras and a camera for each photo, fitted to most pairs and compared on the others.
 
     Args:
         tables: the pairs, without lens, in longer sides about the middle; its members are not used.
@@ -86,6 +86,6 @@ def predicted(
 
 
 def _numbered(labels: Sequence[int]) -> IndexArray:
-    """(N,) cameras counted from 0; one for all where so many leave each with few photos."""
+    """Return (N,) cameras counted from 0; one for all where so many leave each with few photos."""
     cameras = np.unique(labels, return_inverse=True)[1].astype(np.int64)
     return cameras if (np.max(cameras) + 1) * LEAST_EACH <= len(cameras) else np.zeros_like(cameras)

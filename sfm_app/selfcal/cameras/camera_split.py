@@ -36,7 +36,7 @@ ROUNDS = 10
 def separated(
     tables: Tables, photos: Sequence[PairId], starts: Sequence[FloatArray]
 ) -> tuple[FloatArray, dict[int, int]]:
-    """Cameras among photos that share all but the focal, and which photo is of which.
+    """Return cameras among photos that share all but the focal, and which photo is of which.
 
     Args:
         tables: the pairs, without lens, in longer sides about the middle; its members are not used.
@@ -67,7 +67,7 @@ def separated(
 
 
 def peaks_of(consensus: Consensus) -> list[FloatArray]:
-    """(5,) each: the peaks of the consensus as cameras without lens, highest first."""
+    """Return (5,) each: the peaks of the consensus as cameras without lens, highest first."""
     answer = consensus_peak.found(consensus)
     return [np.append(theta, 0.0) for theta in (answer.theta, *answer.others)][:MOST_PEAKS]
 
@@ -79,7 +79,7 @@ class _Pairs:
         self.tables, self.photos = tables, photos
 
     def core(self, theta: FloatArray, everyone: Sequence[int]) -> tuple[float, FloatArray, set[int]]:
-        """Votes beyond the fair share of the photos that agree on a camera, the camera, and those photos."""
+        """Return votes beyond the fair share of the photos that agree on a camera, the camera, and those photos."""
         beyond = [
             float(self.tables.votes(k, theta[None], theta[None], SIGMA)[0, 0] - FAIR_SHARE * self.tables.weights[k])
             for k in range(len(self.photos))
@@ -99,7 +99,7 @@ class _Pairs:
         return float(sum(inside)), theta, core
 
     def named(self, photo: int, theta: FloatArray, core: set[int]) -> list[float]:
-        """The focal that a photo's pairs with the core clearly name instead, as a step in log f; or nothing."""
+        """Return the focal that a photo's pairs with the core clearly name instead, as a step in log f; or nothing."""
         steps = np.linspace(-REACH, REACH, TRIALS)
         trials = np.repeat(theta[None], TRIALS, axis=0)
         trials[:, LOG_FOCAL] += steps
@@ -117,7 +117,7 @@ class _Pairs:
         return [float(steps[best])] if clear and abs(steps[best]) > OTHER_FOCAL else []
 
     def labelled(self, cameras: FloatArray, everyone: Sequence[int], core: set[int]) -> dict[int, int]:
-        """Every photo with the camera for which its pairs vote most, the others as they are, until none changes."""
+        """Give every photo with camera for which its pairs vote most, the others as they are, until none changes."""
         labels = {photo: 0 if photo in core else -1 for photo in everyone}
         for _ in range(ROUNDS):
             before = dict(labels)
@@ -134,12 +134,12 @@ class _Pairs:
         return labels
 
     def at_stake(self, asked: set[int]) -> float:
-        """Most votes that the pairs of some photos can give."""
+        """Return the most votes that the pairs of some photos can give."""
         touched = [bool(asked.intersection(pair)) for pair in self.photos]
         return float(np.sum(self.tables.weights[touched]))
 
     def total(self, cameras: FloatArray, labels: dict[int, int]) -> float:
-        """Votes of all pairs."""
+        """Return votes of all pairs."""
         return float(
             sum(
                 self.tables.votes(k, cameras[labels[first]][None], cameras[labels[second]][None], SIGMA)[0, 0]
@@ -149,7 +149,7 @@ class _Pairs:
 
 
 def _clustered(steps: Sequence[float]) -> list[float]:
-    """Medians of the runs of values that lie within `OTHER_FOCAL` of the one before."""
+    """Return medians of the runs of values that lie within `OTHER_FOCAL` of the one before."""
     ordered: NDArray[np.float64] = np.sort(np.array(steps))
     cuts = np.flatnonzero(np.diff(ordered) > OTHER_FOCAL) + 1
     return [float(np.median(run)) for run in np.split(ordered, cuts) if len(run)]

@@ -16,7 +16,7 @@ MOST_PAIRS = 1500
 
 
 def chosen_pairs(count: int) -> IndexArray:
-    """Which of so many pairs are asked."""
+    """Return which of so many pairs are asked."""
     return np.linspace(0, count - 1, min(count, MOST_PAIRS)).astype(np.int64)
 
 
@@ -35,7 +35,7 @@ class FocalGrid:
         self.grid = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
 
     def places(self, cameras: IndexArray, rows: IndexArray) -> IndexArray:
-        """(C,) places on the grid on which these pairs agree, when photo k is of `cameras[k]`."""
+        """Return (C,) places on the grid on which these pairs agree, when photo k is of `cameras[k]`."""
         one = np.einsum("pgg->g", self.votes[rows]) - 0.5 * ((self.grid - USUAL_FOCAL) / FOCAL_SPREAD) ** 2
         priors = -0.5 * ((self.grid - self.grid[np.argmax(one)]) / TIE) ** 2
         if np.max(cameras) == 0:
@@ -53,16 +53,16 @@ class FocalGrid:
         return best_places(own, between)
 
     def given(self, places: IndexArray) -> FloatArray:
-        """(P,) votes when photo k has the focal at `places[k]`."""
+        """Return (P,) votes when photo k has the focal at `places[k]`."""
         first, second = places[self.members].T
         return np.asarray(self.votes[np.arange(len(self.votes)), first, second], np.float64)
 
     def fitted(self, cameras: IndexArray) -> float:
-        """The sum of them for cameras that all pairs agree on."""
+        """Return the sum of them for cameras that all pairs agree on."""
         return float(np.sum(self.given(self.places(cameras, np.arange(len(self.votes)))[cameras])))
 
     def held(self, cameras: IndexArray, fold: IndexArray) -> FloatArray:
-        """(P,) votes of every pair for cameras that the pairs of the other folds agree on."""
+        """Return (P,) votes of every pair for cameras that the pairs of the other folds agree on."""
         found = np.zeros(len(self.votes))
         for number in np.unique(fold):
             out = fold == number

@@ -68,7 +68,7 @@ class CameraGroup:
 def calibrate_several(
     cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, options: CalibrationSettings, method: str
 ) -> list[Calibration]:
-    """One calibration per camera, in their order; each is identifiable or a guess with the reason.
+    """Return one calibration per camera, in their order; each is identifiable or a guess with the reason.
 
     Args:
         cameras: sizes, and what is known.
@@ -110,7 +110,7 @@ def calibrate_several(
 
 
 def _borne_out(found: Calibration, least: float) -> Calibration:
-    """The answer, as an estimate where its photos, one of them at `least`, give it too few of their votes."""
+    """Return the answer, as an estimate where its photos, one of them at `least`, give it too few of their votes."""
     doubtful = least < FAIR_SHARE or found.evidence["support"] < BORNE_OUT
     return roughly(found, NOT_ALL if doubtful else "")
 
@@ -131,12 +131,12 @@ class Tables:
         self.packed, self.members, self.weights = ready.packed, members[ready.kept], ready.weights
 
     def votes(self, pair: int, first: FloatArray, second: FloatArray, sigma: float) -> FloatArray:
-        """(A, B) w exp(-r / sigma) for cameras (A, 5) of view 1 and (B, 5) of view 2."""
+        """Return (A, B) w exp(-r / sigma) for cameras (A, 5) of view 1 and (B, 5) of view 2."""
         return np.asarray(self.weights[pair] * np.exp(-_ratios(self.packed[pair], first, second) / sigma), np.float64)
 
 
 def _least_shares(thetas: FloatArray, tables: Tables, photos: Sequence[PairId]) -> dict[int, float]:
-    """By camera: the share of its votes that the photo with the smallest one gets, by all pairs of that photo."""
+    """Return, by camera, the smallest share of its votes that one of its photos gets, by all pairs of that photo."""
     got: dict[tuple[int, int], float] = {}
     most: dict[tuple[int, int], float] = {}
     for k, (i, j) in enumerate(tables.members):
@@ -154,7 +154,7 @@ def _least_shares(thetas: FloatArray, tables: Tables, photos: Sequence[PairId]) 
 def _in_units(
     cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, unit: float
 ) -> tuple[IndexArray, FloatArray, Matches]:
-    """Usable pairs, their F's and inliers in units about the middle of each photo."""
+    """Return usable pairs, their F's and inliers in units about the middle of each photo."""
     ready = prepare(pairs, unit_px=unit, origin_px=(0.0, 0.0))
     middles = np.array([camera.size for camera in cameras]) / (2.0 * unit)
     used = members[ready.kept]
@@ -176,7 +176,7 @@ def _first(camera: CameraGroup, side: float, unit: float) -> FloatArray:
 
 
 def _with_focals(thetas: FloatArray, unknown: NDArray[np.bool_], tables: Tables, priors: CameraPriors) -> FloatArray:
-    """The unknown focals on which most pairs agree."""
+    """Return the unknown focals on which most pairs agree."""
     grid = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
     trials = np.repeat(thetas[:, None], FOCALS, axis=1)
     trials[unknown, :, LOG_FOCAL] = grid + np.log(priors.sides[unknown])[:, None]
@@ -199,7 +199,7 @@ def _with_focals(thetas: FloatArray, unknown: NDArray[np.bool_], tables: Tables,
 
 
 def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> IndexArray:
-    """Which place on its grid every camera takes, so that the sum over cameras and over pairs of cameras is large.
+    """Give which place on its grid every camera takes, so that the sum over cameras and over pairs of cameras is large.
 
     Damped max-sum message passing (Pearl 1988; exact on trees), then one camera after the other while that helps; the
     same from what each camera wants by itself, which loops of messages do not always outdo.
@@ -225,7 +225,7 @@ def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> 
 
 
 def _one_by_one(places: IndexArray, own: FloatArray, tables: dict[tuple[int, int], FloatArray]) -> IndexArray:
-    """Every camera in turn takes its best place, the others as they are, until none changes."""
+    """Return every camera in turn takes its best place, the others as they are, until none changes."""
     places = places.astype(np.int64)
     for _ in range(MESSAGE_ROUNDS):
         before = places.copy()
@@ -248,7 +248,7 @@ def _gain(places: IndexArray, own: FloatArray, between: dict[tuple[int, int], Fl
 def _judged(
     index: int, camera: CameraGroup, fit: Fit, cov: FloatArray, straight: Tables, unit: float, method: str, motion: str
 ) -> Calibration:
-    """The answer for one camera, or why its pairs do not give one; `motion` says what leaves all focals open."""
+    """Return the answer for one camera, or why its pairs do not give one; `motion` says what leaves all focals open."""
     theta = fit.state.thetas[index]
     block = cov[CAMERA * index : CAMERA * (index + 1), CAMERA * index : CAMERA * (index + 1)]
     mine = np.flatnonzero((fit.matches.cameras == index).any(axis=1))
@@ -285,14 +285,17 @@ def _judged(
 
 
 def _of_its_family(theta: FloatArray, size: tuple[int, int], unit: float) -> FloatArray:
-    """The usual camera matrix with the focal that is most likely, though uncertain."""
+    """Return the usual camera matrix with the focal that is most likely, though uncertain."""
     side = max(size)
     low, high = np.array(FOCAL_RANGE) * side
     return guessed_camera_matrix(size, float(np.clip(np.exp(theta[LOG_FOCAL]) * unit, low, high)))
 
 
 def _lead(index: int, thetas: FloatArray, tables: Tables) -> tuple[float, float]:
-    """Votes by which a camera's focal leads all others, the other cameras as they are; and its share of the votes."""
+    """Return votes by which a camera's focal leads all others, the other cameras as they are.
+
+    And its share of the votes.
+    """
     offsets = np.concatenate([[0.0], np.linspace(-1.5, 1.5, 61)])
     trials = np.repeat(thetas[None, index], len(offsets), axis=0)
     trials[:, LOG_FOCAL] += offsets
@@ -313,7 +316,7 @@ def _lead(index: int, thetas: FloatArray, tables: Tables) -> tuple[float, float]
 
 @kernel
 def _ratios(pair: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """(A, B) r = (s1 - s2) / (s1 + s2) of E = K2'F K1, for cameras (A, 5) and (B, 5), lenses aside.
+    """Return (A, B) r = (s1 - s2) / (s1 + s2) of E = K2'F K1, for cameras (A, 5) and (B, 5), lenses aside.
 
     As `constraints.singular_value_ratio`, with two cameras.
     """
@@ -338,5 +341,5 @@ def _ratios(pair: FloatArray, first: FloatArray, second: FloatArray) -> FloatArr
 
 @kernel
 def _minor(x: float, y: float, w: float, k: FloatArray) -> float:
-    """|adj(K) e|^2."""
+    """Return |adj(K) e|^2."""
     return float((k[1] * (x - k[2] * w)) ** 2 + (k[0] * (y - k[3] * w)) ** 2 + (k[0] * k[1] * w) ** 2)

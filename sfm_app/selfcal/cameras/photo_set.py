@@ -55,7 +55,7 @@ def calibrate_photo_set(
     pairs: PhotoPairs, calibrate: CalibrateFunction, options: CalibrationSettings, seed: int, *,
     together: bool, split: bool = True,
 ) -> list[Camera]:  # fmt: skip
-    """Every camera of a set of photos, the one with most photos first.
+    """Return every camera of a set of photos, the one with most photos first.
 
     Args:
         pairs: all pairs that are not degenerate.
@@ -79,7 +79,7 @@ def calibrate_photo_set(
 
 
 def _alone(calibrate: CalibrateFunction, own: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """What a calibrator makes of the pairs of one camera; a guess where its numbers fail."""
+    """Return what a calibrator makes of the pairs of one camera; a guess where its numbers fail."""
     try:
         return calibrate(own, options, seed)
     except FAILURES as err:
@@ -90,7 +90,7 @@ def _alone(calibrate: CalibrateFunction, own: CameraPairs, options: CalibrationS
 def _jointly(
     cameras: list[Camera], pairs: PhotoPairs, options: CalibrationSettings, seed: int, *, split: bool
 ) -> list[Camera]:
-    """The cameras as all pairs have them; as each has them alone where the numbers fail."""
+    """Return the cameras as all pairs have them; as each has them alone where the numbers fail."""
     try:
         return _of_all_pairs(cameras, pairs, options, seed) if split else _together(cameras, pairs, options)
     except FAILURES as err:
@@ -99,7 +99,7 @@ def _jointly(
 
 
 def _of_all_pairs(whole: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings, seed: int) -> list[Camera]:
-    """Groups split where their photos disagree, and all cameras from all pairs.
+    """Return groups split where their photos disagree, and all cameras from all pairs.
 
     Parts of a group that turn out to have the same focal were one camera after all.
     """
@@ -122,12 +122,12 @@ def _of_all_pairs(whole: Sequence[Camera], pairs: PhotoPairs, options: Calibrati
 
 
 def _alike(focals: Sequence[float]) -> bool:
-    """Whether two of them are the same."""
+    """Return whether two of them are the same."""
     return bool(np.any(np.diff(np.sort(np.log(focals))) < ALIKE))
 
 
 def _split(camera: Camera, number: int, pairs: PhotoPairs, options: CalibrationSettings, seed: int) -> list[Camera]:
-    """The camera, the several that its photos are of, or one for each photo."""
+    """Return the camera, the several that its photos are of, or one for each photo."""
     if len(camera.photos) < LEAST_TO_SPLIT:
         return [camera]
     own, found = pairs.among(camera.photos), camera.found
@@ -156,7 +156,7 @@ def _split(camera: Camera, number: int, pairs: PhotoPairs, options: CalibrationS
 
 
 def _borne_out(labels: Mapping[int, int], photos: Sequence[PairId]) -> dict[int, int]:
-    """Labels of the photos that share a pair with another of their camera, and of those that are alone in it.
+    """Return labels of the photos that share a pair with another of their camera, and of those that are alone in it.
 
     Of a pair between two cameras nobody knows which of the two photos is of which.
     """
@@ -166,7 +166,10 @@ def _borne_out(labels: Mapping[int, int], photos: Sequence[PairId]) -> dict[int,
 
 
 def _parts(camera: Camera, thetas: FloatArray, labels: Mapping[int, int], pairs: PhotoPairs) -> list[Camera]:
-    """The cameras that a group was divided into; photos that no pair gives to one of them are another, not known."""
+    """Return the cameras that a group was divided into.
+
+    Photos that no pair gives to one of them are another, not known.
+    """
     names, size = _names(camera, pairs), pairs.sizes[camera.photos[0]]
     parts = []
     for part, theta in enumerate(thetas):
@@ -180,19 +183,19 @@ def _parts(camera: Camera, thetas: FloatArray, labels: Mapping[int, int], pairs:
 
 
 def _names(camera: Camera, pairs: PhotoPairs) -> Iterator[str]:
-    """Names for what becomes of a group; the first keeps its own."""
+    """Return names for what becomes of a group; the first keeps its own."""
     taken = set(pairs.groups.values())
     return chain([camera.name], (name for k in count(2) if (name := f"{camera.name} #{k}") not in taken))
 
 
 def _each_its_own(camera: Camera, family: int, pairs: PhotoPairs) -> list[Camera]:
-    """A camera, not known yet, for each photo of a group."""
+    """Return a camera, not known yet, for each photo of a group."""
     nothing, names = guessed(pairs.sizes[camera.photos[0]], "", {}), _names(camera, pairs)
     return [Camera(next(names), (photo,), nothing, family) for photo in sorted(camera.photos)]
 
 
 def _unlike_within_bars(whole: Sequence[Camera], pairs: PhotoPairs, seed: int) -> dict[str, int]:
-    """Groups that bars have brought to one size with others, and whose photos are each of a camera of its own.
+    """Return groups that bars have brought to one size with others, and whose photos are each of a camera of its own.
 
     By name; the number says which have one size.
 
@@ -216,13 +219,13 @@ def _unlike_within_bars(whole: Sequence[Camera], pairs: PhotoPairs, seed: int) -
 
 
 def _in_sides(size: tuple[int, int]) -> FloatArray:
-    """(3, 3) from longer sides about the middle to pixels."""
+    """Return (3, 3) from longer sides about the middle to pixels."""
     side = float(max(size))
     return np.array([[side, 0.0, size[0] / 2], [0.0, side, size[1] / 2], [0.0, 0.0, 1.0]])
 
 
 def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
-    """All cameras from all pairs at once; one camera is what its own pairs say."""
+    """Return all cameras from all pairs at once; one camera is what its own pairs say."""
     if len(cameras) <= 1:
         return list(cameras)
     number = {photo: k for k, camera in enumerate(cameras) for photo in camera.photos}
@@ -244,13 +247,13 @@ def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: Calibration
 
 
 def _less_sure(camera: Camera, found: Calibration) -> Calibration:
-    """The answer, as an estimate where the camera is one of many that photos of one size were divided into."""
+    """Return the answer, as an estimate where the camera is one of many that photos of one size were divided into."""
     many = found.identifiable and camera.of_parts >= MANY
     return roughly(found, PERHAPS_ZOOM.format(count=camera.of_parts)) if many else found
 
 
 def _or_guess(camera: Camera, pairs: PhotoPairs) -> Calibration:
-    """What was found; else the K that mapping starts from: EXIF's claim, or 1.2 x the longer side."""
+    """Return what was found; else the K that mapping starts from: EXIF's claim, or 1.2 x the longer side."""
     found = camera.found
     if found.identifiable or found.method == ESTIMATE:
         return found

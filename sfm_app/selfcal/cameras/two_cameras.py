@@ -116,13 +116,16 @@ class _Division:
         self.of = [np.flatnonzero((grid.members == photo).any(axis=1)) for photo in range(photos)]
 
     def starts(self, priors: int, other: int) -> tuple[IndexArray, IndexArray]:
-        """(N,) all with the usual focal; and each with what its pairs want, when both photos of a pair take it."""
+        """Return (N,) all with the usual focal.
+
+        And each with what its pairs want, when both photos of a pair take it.
+        """
         wants = self.votes[:, other, other] - self.votes[:, priors, priors]
         wanted = np.array([np.sum(wants[rows]) for rows in self.of])
         return np.zeros(self.photos, np.int64), (wanted > 0).astype(np.int64)
 
     def settled(self, places: IndexArray, labels: IndexArray) -> tuple[IndexArray, IndexArray]:
-        """Every photo in turn takes the camera for which its pairs vote most, until none changes."""
+        """Return every photo in turn takes the camera for which its pairs vote most, until none changes."""
         labels = labels.copy()
         for _ in range(ROUNDS):
             changed = False
@@ -141,16 +144,16 @@ class _Division:
         return float(np.sum(self.votes[rows, places[mine[:, 0]], places[mine[:, 1]]]))
 
     def each(self, places: IndexArray, labels: IndexArray) -> FloatArray:
-        """(P,) votes of the pairs."""
+        """Return (P,) votes of the pairs."""
         first, second = places[labels][self.members].T
         return np.asarray(self.votes[self.rows, first, second], np.float64)
 
     def total(self, places: IndexArray, labels: IndexArray) -> float:
-        """Their sum."""
+        """Return the sum of the votes."""
         return float(np.sum(self.each(places, labels)))
 
     def refined(self, places: IndexArray, labels: IndexArray) -> tuple[IndexArray, IndexArray]:
-        """Both focals where the pairs want them, and every photo with its camera, until none changes."""
+        """Move both focals where the pairs want them, and every photo to its camera, until none changes."""
         for _ in range(ROUNDS):
             near = [np.arange(max(0, place - NEAR), min(FOCALS, place + NEAR + 1)) for place in places]
             tried = [np.array([first, second]) for first in near[0] for second in near[1]]

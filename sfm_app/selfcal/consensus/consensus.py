@@ -43,19 +43,19 @@ class Consensus:
         self._packed = pairs.packed
 
     def weighted(self, weights: FloatArray) -> "Consensus":
-        """The same pairs with other weights (P,)."""
+        """Return the same pairs with other weights (P,)."""
         return Consensus(self.pairs, self.centre_sigma, weights)
 
     def at(self, thetas: FloatArray, sigma: float) -> FloatArray:
-        """(N,) supports plus log-priors at the rows of `thetas` (N, 4)."""
+        """Return (N,) supports plus log-priors at the rows of `thetas` (N, 4)."""
         return np.asarray(_values(self._packed, self.weights, self.centre_sigma, thetas, sigma))
 
     def ratios(self, theta: FloatArray) -> FloatArray:
-        """(P,) r_i at theta."""
+        """Return (P,) r_i at theta."""
         return np.asarray(_ratios(self._packed, theta))
 
     def climb(self, start: FloatArray, free: Sequence[int], sigmas: Sequence[float]) -> tuple[FloatArray, float]:
-        """The local maximum reached from `start` by moving the entries `free` of theta, through falling sigmas.
+        """Return the local maximum reached from `start` by moving the entries `free` of theta, through falling sigmas.
 
         Nelder-Mead, because the consensus has a cusp wherever a pair is satisfied exactly. For every sigma it runs a
         second time, from the end of the first with a tenth of its steps: a simplex can stall on a ridge.
@@ -84,7 +84,7 @@ def _ratios(packed: FloatArray, theta: FloatArray) -> FloatArray:
 
 @kernel
 def _value(packed: FloatArray, weights: FloatArray, centre_sigma: float, theta: FloatArray, sigma: float) -> float:
-    """sum_i w_i exp(-r_i / sigma) plus the log-prior of the centre."""
+    """Return sum_i w_i exp(-r_i / sigma) plus the log-prior of the centre."""
     fx, fy = np.exp(theta[0] - 0.5 * theta[3]), np.exp(theta[0] + 0.5 * theta[3])
     value = -0.5 * (theta[1] ** 2 + theta[2] ** 2) / centre_sigma**2
     for i in range(len(packed)):
@@ -106,7 +106,7 @@ def _values(
 def _climbed(
     packed: FloatArray, weights: FloatArray, centre_sigma: float, simplex: FloatArray, sigma: float
 ) -> tuple[FloatArray, float]:
-    """Nelder and Mead (1965) upwards from a simplex (n + 1, 4), with their coefficients 1, 2, 1/2, 1/2."""
+    """Return Nelder and Mead (1965) upwards from a simplex (n + 1, 4), with their coefficients 1, 2, 1/2, 1/2."""
     count = len(simplex)
     values = _values(packed, weights, centre_sigma, simplex, sigma)
     for _ in range(MOST_STEPS):
@@ -138,7 +138,7 @@ def _climbed(
 
 @kernel
 def _sort(simplex: FloatArray, values: FloatArray) -> None:
-    """Highest first, in place; equal values keep their order. Loops compile in a tenth of the time of argsort."""
+    """Sort in place, highest first; equal values keep their order. Loops compile in a tenth of the time of argsort."""
     for k in range(1, len(values)):
         row, value = simplex[k].copy(), values[k]
         i = k
@@ -152,7 +152,7 @@ def _sort(simplex: FloatArray, values: FloatArray) -> None:
 
 @kernel
 def _moved(simplex: FloatArray, factor: float) -> FloatArray:
-    """The last corner mirrored at the middle of the others, `factor` times as far behind it as it was before it."""
+    """Return last corner mirrored at the middle of the others, `factor` times as far behind it as it was before it."""
     trial = np.empty(4)
     for column in range(4):
         middle = 0.0

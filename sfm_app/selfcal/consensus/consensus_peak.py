@@ -66,7 +66,7 @@ class Answer:
         return "its pixels may not be square" if doubtful else ""
 
     def evidence(self, weights: FloatArray) -> dict[str, float]:
-        """Figures for people."""
+        """Return figures for people."""
         mass = float(np.sum(self.votes))
         return {
             "support": mass / float(np.sum(weights)),
@@ -78,20 +78,20 @@ class Answer:
         }
 
     def contradicted(self, weights: FloatArray) -> str:
-        """Why the pairs, of these weights (P,), do not make a camera, or nothing."""
+        """Return why the pairs, of these weights (P,), do not make a camera, or nothing."""
         return disagreement(self.votes, weights) or indecision(self.lead, self.votes)
 
     def scatter(self, consensus: Consensus, seed: int) -> FloatArray:
-        """(B, 4) the peak under resampled pairs, see `evidence.resampled`."""
+        """Return (B, 4) the peak under resampled pairs, see `evidence.resampled`."""
         return resampled(consensus, self.theta, self.free, self.sigma, seed)
 
     def deviation(self, values: FloatArray) -> float:
-        """Standard deviation of an entry of theta from its resampled `values` (B,)."""
+        """Return standard deviation of an entry of theta from its resampled `values` (B,)."""
         return deviation(values, effective_count(self.votes), len(self.free))
 
 
 def found(consensus: Consensus) -> Answer:
-    """The answer with square pixels, or, where the pairs clearly ask for it, with any."""
+    """Return the answer with square pixels, or, where the pairs clearly ask for it, with any."""
     profile = scan(consensus, (0.0,))
     square = peaks(consensus, profile, SQUARE_PIXELS)
     free_profile = scan(consensus, LOG_ASPECTS)
@@ -118,13 +118,13 @@ def _examined(consensus: Consensus, ends: list[Peak], profile: Profile, free: tu
 
 
 def vagueness(log_focal_spread: float, *, one_of_many: bool = False) -> str:
-    """Why an answer to which there is no objection is an estimate and not knowledge, or nothing."""
+    """Return why an answer to which there is no objection is an estimate and not knowledge, or nothing."""
     vague = log_focal_spread > (IDENTIFIED_OF_MANY if one_of_many else IDENTIFIED_LOG_FOCAL_SPREAD)
     return f"the focal is uncertain by {100 * log_focal_spread:.0f} %" if vague else ""
 
 
 def objection(theta: FloatArray, log_focal_spread: float, half_size: tuple[float, float]) -> str:
-    """Why an answer that the pairs agree on is not to be trusted, or nothing.
+    """Return why an answer that the pairs agree on is not to be trusted, or nothing.
 
     Args:
         theta: log f, u, v, ... in longer sides from the middle.

@@ -28,7 +28,7 @@ STABLE_SIGMA = 0.01
 
 
 def own_sigma(consensus: Consensus, theta: FloatArray) -> float:
-    """The width that fits the scatter of the agreeing pairs: 1.5 times the weighted median of their r."""
+    """Return the width that fits the scatter of the agreeing pairs: 1.5 times the weighted median of their r."""
     r = consensus.ratios(theta)
     agreeing = r < SIGMAS[0]
     if not np.any(agreeing):
@@ -40,18 +40,18 @@ def own_sigma(consensus: Consensus, theta: FloatArray) -> float:
 
 
 def votes(consensus: Consensus, theta: FloatArray, sigma: float) -> FloatArray:
-    """(P,) what each pair gives to K: w_i exp(-r_i / sigma)."""
+    """Return (P,) what each pair gives to K: w_i exp(-r_i / sigma)."""
     return np.asarray(consensus.weights * np.exp(-consensus.ratios(theta) / sigma))
 
 
 def effective_count(votes: FloatArray) -> float:
-    """How many equal votes weigh the same (Kish's effective sample size); 0 where nobody votes."""
+    """Return how many equal votes weigh the same (Kish's effective sample size); 0 where nobody votes."""
     total, squares = float(np.sum(votes)), float(np.sum(votes**2))
     return total * total / squares if squares > 0 else 0.0
 
 
 def disagreement(given: FloatArray, weights: FloatArray) -> str:
-    """Why votes (P,) out of `weights` (P,) do not make a camera, or nothing."""
+    """Return why votes (P,) out of `weights` (P,) do not make a camera, or nothing."""
     count, support = effective_count(given), float(np.sum(given) / np.sum(weights))
     if count >= MIN_AGREEING and support >= MIN_SUPPORT:
         return ""
@@ -59,7 +59,7 @@ def disagreement(given: FloatArray, weights: FloatArray) -> str:
 
 
 def indecision(lead: float, given: FloatArray) -> str:
-    """Why a lead over the best rival is not enough beside the votes (P,) for K, or nothing."""
+    """Return why a lead over the best rival is not enough beside the votes (P,) for K, or nothing."""
     if lead >= max(MIN_LEAD, MIN_LEAD_SHARE * float(np.sum(given))):
         return ""
     return "the pairs fit other focals as well or better (too little rotation, parallel axes, or an orbit)"
@@ -72,7 +72,7 @@ def best_rival(
     sigmas: Sequence[float],
     profile: Profile | None = None,
 ) -> float:
-    """The highest value, at the last sigma, of a focal `RIVAL_RATIO` away with everything else adapted to it.
+    """Return the highest value, at the last sigma, of a focal `RIVAL_RATIO` away with everything else adapted to it.
 
     It is climbed to from `theta` and, where a profile is given, from the best cell of the grid for that focal. Where
     the consensus does not depend on the focal (orbits, parallel axes) it equals the value at theta.
@@ -90,7 +90,7 @@ def best_rival(
 
 
 def resampled(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigma: float, seed: int) -> FloatArray:
-    """(RESAMPLES, 4) the peak under randomly reweighted pairs: the Bayesian bootstrap (Rubin 1981).
+    """Return (RESAMPLES, 4) the peak under randomly reweighted pairs: the Bayesian bootstrap (Rubin 1981).
 
     Weights instead of draws, because three pairs drawn with replacement are often one pair three times.
     """
@@ -105,7 +105,7 @@ def resampled(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigm
 
 
 def deviation(values: FloatArray, count: float, parameters: int) -> float:
-    """Standard deviation over resampled peaks of what `count` effective pairs say about one of `parameters` unknowns.
+    """Return the deviation over resampled peaks of what `count` effective pairs say about one of `parameters` unknowns.
 
     A pair gives two constraints. With three pairs and three unknowns half of the scatter has gone into the fit, and the
     resampled peaks scatter too little by the same share: the usual correction for degrees of freedom.
@@ -115,7 +115,7 @@ def deviation(values: FloatArray, count: float, parameters: int) -> float:
 
 
 def spread_px(thetas: FloatArray, unit_px: float, count: float, parameters: int) -> dict[str, float]:
-    """Standard deviations of fx, fy, cx, cy, in pixels; see `deviation`."""
+    """Return standard deviations of fx, fy, cx, cy, in pixels; see `deviation`."""
     focal, half = np.exp(thetas[:, LOG_FOCAL]) * unit_px, np.exp(0.5 * thetas[:, LOG_ASPECT])
     columns = {"fx": focal / half, "fy": focal * half}
     columns |= {"cx": thetas[:, CENTRE_U] * unit_px, "cy": thetas[:, CENTRE_V] * unit_px}

@@ -51,7 +51,7 @@ def scan(consensus: Consensus, log_aspects: Sequence[float]) -> Profile:
 
 
 def peaks(consensus: Consensus, profile: Profile, free: Sequence[int]) -> list[Peak]:
-    """Where the best local maxima of the profile lead to, highest first."""
+    """Return where the best local maxima of the profile lead to, highest first."""
     padded = np.concatenate([[-np.inf], profile.values, [-np.inf]])
     is_top = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
     tops = np.flatnonzero(is_top)

@@ -24,32 +24,32 @@ LEAST_COMPLEMENT = 1e-6
 
 
 def essential(F: FloatArray, K: FloatArray) -> FloatArray:
-    """(..., 3, 3) E = K'FK (thesis 5.7)."""
+    """Return (..., 3, 3) E = K'FK (thesis 5.7)."""
     return np.asarray(K.T @ F @ K)
 
 
 def huang_faugeras(E: FloatArray) -> FloatArray:
-    """(...,) the terms (s1 - s2) / s2 of thesis (5.8) for E (..., 3, 3); inf for rank 1."""
+    """Return (...,) the terms (s1 - s2) / s2 of thesis (5.8) for E (..., 3, 3); inf for rank 1."""
     s = np.linalg.svd(E, compute_uv=False)
     infinite = np.full(s.shape[:-1], np.inf)
     return np.asarray(np.divide(s[..., 0] - s[..., 1], s[..., 1], out=infinite, where=s[..., 1] > 0))
 
 
 def frobenius_form(E: FloatArray) -> FloatArray:
-    """(...,) |2 EE'E - tr(EE') E| / |E|^3 of thesis (5.9), in Frobenius norms."""
+    """Return (...,) |2 EE'E - tr(EE') E| / |E|^3 of thesis (5.9), in Frobenius norms."""
     S = E @ np.swapaxes(E, -1, -2)
     trace = np.trace(S, axis1=-2, axis2=-1)
     return np.asarray(np.linalg.norm(2 * S @ E - trace[..., None, None] * E, axis=(-2, -1)) / trace**1.5)
 
 
 def polynomial_form(E: FloatArray) -> FloatArray:
-    """(...,) 2 tr((EE')^2) / tr(EE')^2 - 1 of thesis (5.25)."""
+    """Return (...,) 2 tr((EE')^2) / tr(EE')^2 - 1 of thesis (5.25)."""
     S = E @ np.swapaxes(E, -1, -2)
     return np.asarray(2 * np.sum(S * S, axis=(-2, -1)) / np.trace(S, axis1=-2, axis2=-1) ** 2 - 1.0)
 
 
 def trivedi(E: FloatArray) -> FloatArray:
-    """(..., 3) the terms 4 S_ij^2 - (tr S - 2 S_ii)(tr S - 2 S_jj) of thesis (5.11), over tr(S)^2, with S = EE'.
+    """Return (..., 3) the terms 4 S_ij^2 - (tr S - 2 S_ii)(tr S - 2 S_jj) of thesis (5.11), over tr(S)^2, with S = EE'.
 
     For ij = 12, 13, 23: with i = j, which (5.11) does not exclude, the term is tr S (4 S_ii - tr S), and vanishes for
     no particular camera.
@@ -78,22 +78,22 @@ class Halves:
 
     @classmethod
     def of(cls, F: FloatArray) -> "Halves":
-        """(P, ...) of matrices (P, 3, 3) of rank 2, brought to Frobenius norm 1."""
+        """Return (P, ...) of matrices (P, 3, 3) of rank 2, brought to Frobenius norm 1."""
         U, s, Vt = np.linalg.svd(F)
         s = s[:, :2] / np.linalg.norm(s[:, :2], axis=1, keepdims=True)
         return cls(np.swapaxes(U, 1, 2)[:, :2], Vt[:, :2], s)
 
     def __getitem__(self, rows: NDArray[np.int64]) -> "Halves":
-        """Those of the given indices, which may have any shape."""
+        """Return those of the given indices, which may have any shape."""
         return Halves(self.U[rows], self.V[rows], self.s[rows])
 
     def grams(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """(..., 3), (..., 3) entries 11, 12, 22 of A and B for cameras (..., 4) of fx, fy, u, v."""
+        """Return (..., 3), (..., 3) entries 11, 12, 22 of A and B for cameras (..., 4) of fx, fy, u, v."""
         return _gram(self.U, cameras), _gram(self.V, cameras)
 
 
 def equations(halves: Halves, cameras: FloatArray) -> FloatArray:
-    """Two smooth equations for every pair whose norm is r = (s1 - s2) / (s1 + s2) of E.
+    """Return two smooth equations for every pair whose norm is r = (s1 - s2) / (s1 + s2) of E.
 
     A 2 x 2 matrix is the sum of a similarity (a, -d; d, a) and a reflected one (b, c; c, -b); its singular values are
     the sum and the difference of their sizes. M has a positive determinant, so the similarity is the larger one, and
@@ -116,7 +116,7 @@ def equations(halves: Halves, cameras: FloatArray) -> FloatArray:
 
 
 def huang_faugeras_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
-    """(..., 2) as `equations`, lengthened so that the norm is (s1 - s2) / s2 = 2 r / (1 - r), the term of (5.8)."""
+    """Give (..., 2) as `equations`, lengthened so that norm is (s1 - s2) / s2 = 2 r / (1 - r), the term of (5.8)."""
     g = equations(halves, cameras)
     r = np.linalg.norm(g, axis=-1, keepdims=True)
     return np.asarray(2 * g / np.maximum(1.0 - r, LEAST_COMPLEMENT))

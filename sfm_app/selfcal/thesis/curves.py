@@ -13,7 +13,7 @@ MAX_OUT_OF_RANGE = 0.5
 
 
 def focal_curves(pairs: Pairs, fx: FloatArray, centre: tuple[float, float]) -> FloatArray:
-    """Z^f of thesis (5.29), (5.31): fy at every swept fx.
+    """Return Z^f of thesis (5.29), (5.31): fy at every swept fx.
 
     Returns:
         (P, S) fy; 0 where no root has a non-zero real part. Not clipped to a range: `degeneracy` wants to see it.
@@ -27,22 +27,22 @@ def focal_curves(pairs: Pairs, fx: FloatArray, centre: tuple[float, float]) -> F
 
 
 def centre_curves(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
-    """Z^oc of thesis (5.30): v at every swept u; as `focal_curves`."""
+    """Return Z^oc of thesis (5.30): v at every swept u; as `focal_curves`."""
     return _chosen(swept_roots(centre_polynomials(pairs, u, focal)))
 
 
 def degeneracy(curves: FloatArray, upper: float) -> FloatArray:
-    """Thesis (5.35): per curve, the share of its samples that lie out of (0, upper)."""
+    """Return thesis (5.35): per curve, the share of its samples that lie out of (0, upper)."""
     return np.asarray(np.mean((curves <= ROOT_IS_ZERO) | (curves >= upper), axis=1))
 
 
 def usable(curves: FloatArray, upper: float) -> FloatArray:
-    """The curves that are not degenerate."""
+    """Return the curves that are not degenerate."""
     return curves[degeneracy(curves, upper) <= MAX_OUT_OF_RANGE]
 
 
 def _chosen(roots: ComplexArray) -> FloatArray:
-    """Per sample the real part of the root with non-zero real part and the smallest imaginary part."""
+    """Return, per sample, the real part of the root with non-zero real part and the smallest imaginary part."""
     imaginary = np.where(np.abs(roots.real) > ROOT_IS_ZERO, np.abs(roots.imag), np.inf)
     best = np.argmin(imaginary, axis=-1)[..., None]
     value = np.take_along_axis(roots.real, best, axis=-1)[..., 0]

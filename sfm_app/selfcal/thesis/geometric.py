@@ -32,7 +32,7 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 
 
 def residual_weights(pairs: CameraPairs) -> FloatArray:
-    """(P,) 1 / mean Sampson distance of a pair's inliers, with mean 1 over the pairs that take part.
+    """Return (P,) 1 / mean Sampson distance of a pair's inliers, with mean 1 over the pairs that take part.
 
     Pairs of weight 0 keep it; a pair without inliers, or with infinite distances, gets it.
 

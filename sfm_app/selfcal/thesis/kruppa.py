@@ -24,7 +24,7 @@ VANISHED = 1e-9
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Least squares over the Kruppa equations of all pairs, from the median of their focal-only solutions.
+    """Return least squares over the Kruppa equations of all pairs, from the median of their focal-only solutions.
 
     Args:
         pairs: F's and weights.
@@ -49,13 +49,16 @@ def _found(pairs: Pairs, tall: float, evidence: dict[str, float]) -> Camera:
 
 
 def kruppa_ratios(halves: Halves, cameras: FloatArray) -> FloatArray:
-    """(..., 3) the ratios a^2 B11 / A22, -ab B12 / A12, b^2 B22 / A11: equal for the right camera; NaN for 0 / 0."""
+    """Return (..., 3) the ratios a^2 B11 / A22, -ab B12 / A12, b^2 B22 / A11: equal for the right camera.
+
+    NaN for 0 / 0.
+    """
     left, right = _sides(halves, cameras)
     return np.asarray(np.divide(left, right, out=np.full(left.shape, np.nan), where=right != 0))
 
 
 def kruppa_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
-    """The three equations between the ratios, multiplied out and divided by the sizes of both sides.
+    """Return the three equations between the ratios, multiplied out and divided by the sizes of both sides.
 
     They are the cross product of unit vectors: the norm is the sine of the angle between the two sides of (5.5).
 
@@ -77,7 +80,7 @@ def _sides(halves: Halves, cameras: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def focals_of(pairs: Pairs, centre: tuple[float, float]) -> FloatArray:
-    """The focal that each pair asks for if the pixels are square and the centre is known (Sturm 2001).
+    """Return the focal that each pair asks for if the pixels are square and the centre is known (Sturm 2001).
 
     The equations that hold with the off-diagonal entries are linear in f^2 once the trivial root f = 1 is divided out;
     they fail where the optical axes lie in one plane. The third is quadratic. Of the solutions of both that one is
@@ -98,7 +101,7 @@ def focals_of(pairs: Pairs, centre: tuple[float, float]) -> FloatArray:
 
 
 def _common_root(linear: FloatArray) -> FloatArray:
-    """(P,) least-squares roots of two lines each; NaN where both slopes vanish."""
+    """Return (P,) least-squares roots of two lines each; NaN where both slopes vanish."""
     slopes, roots = linear[:, :, 1], np.full(len(linear), np.nan)
     known = np.max(np.abs(slopes), axis=1) > VANISHED
     roots[known] = -np.sum(linear[:, :, 0] * slopes, axis=1)[known] / np.sum(slopes**2, axis=1)[known]
@@ -106,7 +109,7 @@ def _common_root(linear: FloatArray) -> FloatArray:
 
 
 def _roots(quadratic: FloatArray) -> FloatArray:
-    """(P, 2) real roots, NaN where there are fewer or the polynomial vanishes."""
+    """Return (P, 2) real roots, NaN where there are fewer or the polynomial vanishes."""
     found = np.full((len(quadratic), 2), np.nan)
     for row, coefficients in zip(found, quadratic, strict=True):
         size = np.max(np.abs(coefficients))
@@ -119,7 +122,7 @@ def _roots(quadratic: FloatArray) -> FloatArray:
 
 
 def _focal_polynomials(halves: Halves) -> tuple[FloatArray, FloatArray]:
-    """(P, 2, 2) linear and (P, 3) quadratic equations in f^2, lowest power first.
+    """Return (P, 2, 2) linear and (P, 3) quadratic equations in f^2, lowest power first.
 
     With C = diag(f^2, f^2, 1) and third entries p_i of u_i, q_i of v_i: A_ij = f^2 (delta_ij - p_i p_j) + p_i p_j.
     """

@@ -33,7 +33,7 @@ class Minima(NamedTuple):
 
 
 def fitted(pairs: Pairs, start: Camera, weights: FloatArray, equations: Equations = huang_faugeras_equations) -> Camera:
-    """The local minimum of sum_i w_i |equations_i|^2 / sum_i w_i that is reached from `start`, over all pairs."""
+    """Return local minimum of sum_i w_i |equations_i|^2 / sum_i w_i that is reached from `start`, over all pairs."""
     found = minima(Halves.of(pairs.F)[np.arange(len(pairs))[None]], weights[None], np.array([start]), equations)
     return Camera(*(float(value) for value in found.cameras[0]))
 
@@ -41,7 +41,7 @@ def fitted(pairs: Pairs, start: Camera, weights: FloatArray, equations: Equation
 def minima(
     halves: Halves, weights: FloatArray, starts: FloatArray, equations: Equations = huang_faugeras_equations
 ) -> Minima:
-    """Levenberg-Marquardt from many starts at once, each on pairs of its own.
+    """Return Levenberg-Marquardt from many starts at once, each on pairs of its own.
 
     Thesis (5.8) sums the terms; Levenberg-Marquardt, which the thesis minimises it with, sums their squares.
 
@@ -74,7 +74,7 @@ def minima(
 
 
 def _step(residuals: Callable[[FloatArray], FloatArray], thetas: FloatArray, damping: FloatArray) -> FloatArray:
-    """(B, 4) damped Gauss-Newton steps, with Marquardt's scaling."""
+    """Return (B, 4) damped Gauss-Newton steps, with Marquardt's scaling."""
     here = residuals(thetas)
     moved = (residuals(thetas + DIFFERENCE * axis) for axis in np.eye(4))
     J = np.stack([(there - here) / DIFFERENCE for there in moved], axis=-1)

@@ -25,7 +25,9 @@ class Meeting(NamedTuple):
 
 
 def meeting_point(curves: FloatArray, upper: float, sigma: float) -> Meeting | None:
-    """Thesis (5.33), with its argmin corrected to argmax: the sample with the most consensus among the other curves.
+    """Return thesis (5.33), with its argmin corrected to argmax.
+
+    The sample with the most consensus among the other curves.
 
     Distance as in (5.34), the difference at the same sample of the sweep; rho(d) = exp(-d / sigma).
 
@@ -45,7 +47,7 @@ def meeting_point(curves: FloatArray, upper: float, sigma: float) -> Meeting | N
 
 
 def meeting_points(curves: FloatArray, sweep: FloatArray, limits: tuple[float, float], sigma: float) -> list[Meeting]:
-    """All well-separated peaks of the support along the sweep: the cameras in a set of several (Figure 5.15).
+    """Return all well-separated peaks of the support along the sweep: the cameras in a set of several (Figure 5.15).
 
     A peak is higher than its neighbours along the sweep, `SEPARATION` away from higher peaks, and has `LEAST_SHARE` of
     the highest one's support.
@@ -76,7 +78,7 @@ def meeting_points(curves: FloatArray, sweep: FloatArray, limits: tuple[float, f
 
 
 def _supports(curves: FloatArray, limits: tuple[float, float], sigma: float) -> FloatArray:
-    """(C, S) mean of rho over the other curves; -1 where the value is not between the limits."""
+    """Return (C, S) mean of rho over the other curves; -1 where the value is not between the limits."""
     scores = _scores(np.ascontiguousarray(curves), sigma) / (len(curves) - 1)
     return np.where((curves > limits[0]) & (curves < limits[1]), scores, -1.0)
 

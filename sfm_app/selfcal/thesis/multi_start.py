@@ -26,7 +26,7 @@ USUAL_FOCAL = (1.0, 0.5)
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """The best of many least-squares solutions on three pairs each (thesis Algorithm 2).
+    """Return the best of many least-squares solutions on three pairs each (thesis Algorithm 2).
 
     Args:
         pairs: F's and weights; the weights count in the distribution of the focal and in the residual.
@@ -41,7 +41,9 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 
 
 def algorithm_2(pairs: Pairs, tall: float, evidence: dict[str, float], seed: int) -> Camera:
-    """The algorithm itself, for an image of width 1 and height `tall`; `evidence` gets the distribution and MaxIter.
+    """Return the algorithm itself, for an image of width 1 and height `tall`.
+
+    `evidence` gets the distribution and MaxIter.
 
     Residual(s) is that of the triple: the thesis writes that other pairs play no part, and that this costs accuracy.
     """
@@ -60,7 +62,7 @@ def algorithm_2(pairs: Pairs, tall: float, evidence: dict[str, float], seed: int
 
 
 def number_of_starts(pairs: int) -> int:
-    """MaxIter of thesis 5.6.3: any one triple of the pairs is drawn with a probability of 0.95.
+    """Return MaxIter of thesis 5.6.3: any one triple of the pairs is drawn with a probability of 0.95.
 
     N in its formula counts fundamental matrices ("every arrangement of three"), not frames as N in (5.14) does.
     """
@@ -69,7 +71,7 @@ def number_of_starts(pairs: int) -> int:
 
 
 def focal_distribution(pairs: Pairs, tall: float) -> tuple[float, float]:
-    """Thesis (5.12), (5.13): weighted mean and standard deviation of the pairs' own focals, in image widths."""
+    """Return thesis (5.12), (5.13): weighted mean and standard deviation of the pairs' own focals, in image widths."""
     focals = focals_of(pairs, (0.5, 0.5 * tall))
     known = (focals > FOCAL_RANGE[0]) & (focals < FOCAL_RANGE[1])
     if not np.any(known):

@@ -33,7 +33,10 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 
 
 def algorithm_3(pairs: Pairs, tall: float, evidence: dict[str, float]) -> Camera:
-    """The algorithm itself, from K_init; `evidence` gets the number of iterations and the effective number of pairs."""
+    """Return the algorithm itself, from K_init.
+
+    `evidence` gets the number of iterations and the effective number of pairs.
+    """
     camera, weights = Camera.initial(tall), np.ones(len(pairs))
     for iteration in range(1, MOST_ITERATIONS + 1):
         before, camera = camera, fitted(pairs, camera, weights)
@@ -45,7 +48,7 @@ def algorithm_3(pairs: Pairs, tall: float, evidence: dict[str, float]) -> Camera
 
 
 def error_discrepancies(F: FloatArray, K: FloatArray, change: FloatArray) -> FloatArray:
-    """Thesis (5.23): ((s1 - s2) / (2 |D|))^2, how far E = K'FK is off beyond what an error `change` of K explains.
+    """Give thesis (5.23): ((s1 - s2) / (2 |D|))^2, how far E = K'FK is off beyond what an error `change` of K explains.
 
     |D| is the spectral norm of the part of E's error that K alone causes. (5.22) prints two transposes in the wrong
     place; the expansion of (K + dK)' F (K + dK) gives D = dK'FK + K'F dK + dK'F dK.
@@ -62,7 +65,7 @@ def error_discrepancies(F: FloatArray, K: FloatArray, change: FloatArray) -> Flo
 
 
 def discrepancy_weights(discrepancies: FloatArray) -> FloatArray:
-    """Thesis (5.24): exp(-ED / (1.4826 MAD)); equal weights where the discrepancies do not scatter."""
+    """Return thesis (5.24): exp(-ED / (1.4826 MAD)); equal weights where the discrepancies do not scatter."""
     scale = NORMAL_MAD * float(np.median(np.abs(discrepancies - np.median(discrepancies))))
     if scale == 0:
         return np.ones(len(discrepancies))

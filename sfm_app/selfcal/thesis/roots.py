@@ -20,7 +20,7 @@ _NO_STEP = 1e-15
 
 
 def companion_roots(coefficients: FloatArray) -> ComplexArray:
-    """All roots of real polynomials as the eigenvalues of their companion matrices.
+    """Return all roots of real polynomials as the eigenvalues of their companion matrices.
 
     Args:
         coefficients: (..., n + 1), lowest power first.
@@ -39,7 +39,9 @@ def companion_roots(coefficients: FloatArray) -> ComplexArray:
 
 
 def swept_roots(coefficients: FloatArray) -> ComplexArray:
-    """`companion_roots` of polynomials that change little from one to the next along the second axis; far quicker.
+    """Return `companion_roots` of polynomials that change little from one to the next along the second axis.
+
+    Far quicker.
 
     Aberth's iteration (Math. Comp. 27, 1973) carries all roots of one polynomial to those of the next. Where it does
     not settle, and for multiple roots, which it blurs more, the eigenvalues have the word.
@@ -62,7 +64,7 @@ def swept_roots(coefficients: FloatArray) -> ComplexArray:
 
 
 def _monic(coefficients: FloatArray) -> FloatArray:
-    """Divided by the leading coefficient, for which one that is missing gets the smallest that counts."""
+    """Divide by the leading coefficient; one that is missing gets the smallest that counts."""
     size = np.max(np.abs(coefficients), axis=-1, keepdims=True)
     scaled = coefficients / np.where(size == 0, 1.0, size)
     smallest = np.finfo(np.float64).eps
@@ -126,6 +128,6 @@ def _settle(monic: FloatArray, roots: ComplexArray) -> bool:
 
 @kernel
 def _inverse(z: complex) -> complex:
-    """1 / z; infinite or no number, but no exception, at 0."""
+    """Return 1 / z; infinite or no number, but no exception, at 0."""
     square = z.real * z.real + z.imag * z.imag
     return complex(z.real / square, -z.imag / square)

@@ -31,7 +31,10 @@ class Camera(NamedTuple):
 
     @classmethod
     def initial(cls, tall: float) -> "Camera":
-        """K_init of thesis 5.7.2 for an image of width 1 and height `tall`: 53 degrees (not 90, as it says) across."""
+        """Return K_init of thesis 5.7.2 for an image of width 1 and height `tall`.
+
+        53 degrees (not 90, as it says) across.
+        """
         return cls(1.0, 1.0, 0.5, 0.5 * tall)
 
     @property
@@ -78,7 +81,7 @@ def answered(method: str, pairs: CameraPairs, find: Find, sample: int = 0) -> Ca
 
 
 def _objection(found: Camera, pairs: Pairs, sample: int, evidence: dict[str, float]) -> str:
-    """Why the answer is not to be trusted, or nothing; adds support and lead to the evidence."""
+    """Return why the answer is not to be trusted, or nothing; adds support and lead to the evidence."""
     theta = np.array([0.5 * np.log(found.fx * found.fy), found.u, found.v, np.log(found.fy / found.fx)])
     # the wider sigma: these answers are no maxima of the consensus, and must not be held against the last per cent
     consensus, sigmas = Consensus(pairs, np.inf), SIGMAS[:1]

@@ -36,7 +36,9 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 
 
 def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: int) -> Camera | str:
-    """The algorithm itself, for an image of width 1 and height `tall`; the reason where too few curves are usable.
+    """Return the algorithm itself, for an image of width 1 and height `tall`.
+
+    The reason where too few curves are usable.
 
     Fills `evidence` with the number of curves and their support at the meeting points.
     """

@@ -1,0 +1,35 @@
+"""Docstrings of functions begin with what they do: a verb, then its object."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+import sfm_app
+
+PACKAGE = Path(sfm_app.__file__).parent
+VERBS = """
+    Add Adjust Announce Apply Average Begin Blur Bring Build Change Check Choose Claim Collapse Collect Compile
+    Compute Continue Copy Count Decode Decompose Describe Divide Do Draw Drop Eliminate Enter Estimate Even Expect
+    Fill Find Finish Fit Fuse Give Go Group Hold Import Improve Invert Join Judge Keep Lay Leave Let Lift Link List
+    Look Make Map Mark Match Measure Minimise Mix Move Note Paint Pass Photograph Pickle Place Prepare Print Project
+    Provide Put Raise Read Rebuild Reconstruct Refine Refit Refuse Register Remove Render Replace Return Round Run
+    Sample Say Score Send Set Show Simplify Sort Span Spread Start Sum Swap Take Tilt Turn Undistort Update Use
+    Verify Wait Warp Weigh Widen Write Yield
+""".split()
+"""A new verb is entered here; a noun, a participle or a fragment is not."""
+
+
+def first_words(path):
+    """The first words of docstrings by function, nested ones too; properties are named like what they give."""
+    found = {}
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        text = ast.get_docstring(node) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) else None
+        if text and not any("property" in ast.dump(decorator) for decorator in node.decorator_list):
+            found[f"{node.name}, line {node.lineno}"] = text.split()[0].rstrip(",.:;")
+    return found
+
+
+@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_the_first_word_is_a_verb(path):
+    assert {name: word for name, word in first_words(path).items() if word not in VERBS} == {}
