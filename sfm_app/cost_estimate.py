@@ -91,7 +91,7 @@ def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb:
             "view_graph": 0.04 * pairs * features / 8192,
             "intrinsics": 0.03 * pairs,
             "scene": 2.0 * count,
-            "depth_maps": 3.0 * sum(mapped) * settings.depth.neighbours,
+            "depth_maps": 3.0 * sum(mapped) * settings.depth.neighbors,
             "mesh": 15 + 2.0 * sum(mapped),
             "texture": 0.1 * sum(width * height for width, height in sizes) / MEGA,
             "files": 1.0,

@@ -13,9 +13,9 @@ from sfm_app.errors import InputError
 from sfm_app.progress import Progress
 from sfm_app.settings import Settings
 from sfm_app.stages.texture import load_texture
-from sfm_app.synthetic.cameras import Camera, arc, camera_centre, make_camera
+from sfm_app.synthetic.cameras import Camera, arc, camera_center, make_camera
 from sfm_app.synthetic.compare import (
-    centre_error_percent,
+    center_error_percent,
     focal_error_percent,
     surface_accuracy,
     surface_coverage,
@@ -43,8 +43,8 @@ class DemoResult:
     refined_K: list[list[float]]
     focal_error_percent: float
     refined_focal_error_percent: float
-    centre_error_percent: float
-    refined_centre_error_percent: float
+    center_error_percent: float
+    refined_center_error_percent: float
     surface_error_percent: float
     """Median distance of the mesh to the true surface, in percent of the scene's size."""
     surface_accuracy_percent: float
@@ -97,9 +97,9 @@ def compared(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[
     """Set what was found beside what is true."""
     refined = next(iter(scene.cameras.values())).K
     found = run.calibration.K if run.calibration else refined
-    centres = {name: camera_centre(pose) for name, pose in scene.cam_from_world.items()}
+    centers = {name: camera_center(pose) for name, pose in scene.cam_from_world.items()}
     surface, pages = model.surface, model.texture.pages if model.texture else ()
-    found_surface = surface.vertices, surface.faces, centres, truth
+    found_surface = surface.vertices, surface.faces, centers, truth
     return DemoResult(
         photos=len(truth.cam_from_world),
         registered=len(scene.registered),
@@ -108,8 +108,8 @@ def compared(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[
         refined_K=refined.tolist(),
         focal_error_percent=round(focal_error_percent(found, truth), 3),
         refined_focal_error_percent=round(focal_error_percent(refined, truth), 3),
-        centre_error_percent=round(centre_error_percent(found, truth), 3),
-        refined_centre_error_percent=round(centre_error_percent(refined, truth), 3),
+        center_error_percent=round(center_error_percent(found, truth), 3),
+        refined_center_error_percent=round(center_error_percent(refined, truth), 3),
         surface_error_percent=round(100 * surface_error(*found_surface), 3),
         surface_accuracy_percent=round(100 * surface_accuracy(*found_surface), 1),
         surface_coverage_percent=round(100 * surface_coverage(*found_surface), 1),
@@ -137,9 +137,9 @@ def demo_lines(result: DemoResult) -> list[str]:
     return [
         f"true camera     {k_text(result.true_K)}",
         f"found           {k_text(result.found_K)}   focal {result.focal_error_percent} % off, "
-        f"centre {result.centre_error_percent} % off, from the photos alone",
+        f"center {result.center_error_percent} % off, from the photos alone",
         f"refined         {k_text(result.refined_K)}   focal {result.refined_focal_error_percent} % off, "
-        f"centre {result.refined_centre_error_percent} % off, after bundle adjustment",
+        f"center {result.refined_center_error_percent} % off, after bundle adjustment",
         f"photos placed   {result.registered} of {result.photos}",
         f"mesh            {result.triangles} triangles; half of it lies within {result.surface_error_percent} % of the "
         f"scene's size of the true surface, {result.surface_accuracy_percent} % within 0.5 %; "

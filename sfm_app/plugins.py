@@ -29,7 +29,7 @@ AUTO, CPU = "auto", "cpu"
 SIFT, SIFT_DSP = "sift", "sift-dsp"
 SIFT_DSP_SUMMARY = "COLMAP's SIFT, slower: affine shape, domain-size pooling, fainter features; for plain things"
 SIFT_DSP_OPTIONS = {"estimate_affine_shape": True, "domain_size_pooling": True, "peak_threshold": 0.0007}
-"""A tenth of COLMAP's contrast. Chosen on dinoSparseRing, where half of all neighbours have no match with COLMAP's own:
+"""A tenth of COLMAP's contrast. Chosen on dinoSparseRing, where half of all neighbors have no match with COLMAP's own:
 raw matches of the five weakest links of its ring are 0 0 16 0 19 with `sift`, 19 0 32 35 65 with 0.002, 28 27 42 49 97
 with 0.001, 36 31 40 51 109 with 0.0005, which takes twice as long as 0.001."""
 hookspec = pluggy.HookspecMarker(GROUP)
@@ -95,7 +95,7 @@ class Calibrator:
 class WriteModel(Protocol):
     """Makes model files, by their names: first the one to open, `name` with the format as suffix, then those beside it.
 
-    Takes a surface with a texture (pages of pictures), a surface with a colour per vertex, or points and cameras; the
+    Takes a surface with a texture (pages of pictures), a surface with a color per vertex, or points and cameras; the
     same model gives the same bytes. ReconstructionError where the model is empty.
     """
 

@@ -79,11 +79,11 @@ class CalibrationSettings(Section):
     calibrator: str = Field("zero-curves", description="name of the calibrator (see `sfm-app plugins`)")
     samples: int = Field(100, ge=10, le=10000, description="samples along one zero curve")
     lens: bool = Field(True, description="look for the radial distortion of the lens")
-    centre_sigma: float = Field(
+    center_sigma: float = Field(
         0.15,
         gt=0,
         le=10,
-        description="soft prior: standard deviation of the optical centre about the middle, in widths",
+        description="soft prior: standard deviation of the optical center about the middle, in widths",
     )
 
 
@@ -100,7 +100,7 @@ class SceneSettings(Section):
     )
     min_points: int = Field(30, ge=6, le=10000, description="a model with fewer points counts as failed")
     second_look: bool = Field(
-        True, description="seek finer features in photos that found no place, and in their neighbours, and map again"
+        True, description="seek finer features in photos that found no place, and in their neighbors, and map again"
     )
     turn_deg: Literal["auto", 0, 90, 180, 270] = Field(
         "auto", description="by how much most photos have to be turned clockwise to be upright, in degrees"
@@ -115,7 +115,7 @@ class DepthSettings(Section):
         description="name of the method (see `sfm-app plugins`); auto: on the GPU where one can be used, else cpu",
     )
     max_image_size_px: int = Field(1000, ge=64, le=16384, description="longer side of the depth maps, in pixels")
-    neighbours: int = Field(4, ge=1, le=20, description="photos that each photo is matched with")
+    neighbors: int = Field(4, ge=1, le=20, description="photos that each photo is matched with")
     consistency: float = Field(
         0.01, gt=0, le=1, description="largest relative depth difference between photos that agree"
     )
@@ -200,14 +200,14 @@ class Settings(Section):
 QUALITY_PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "matching": {"max_image_size_px": 1000, "max_features": 4096},
-        "depth": {"max_image_size_px": 640, "neighbours": 3},
+        "depth": {"max_image_size_px": 640, "neighbors": 3},
         "mesh": {"poisson_depth": 10, "faces": 50_000},
         "texture": {"max_page_px": 2048, "max_pages": 1},
     },
     "normal": {},
     "high": {
         "matching": {"max_image_size_px": 3200, "max_features": 16384},
-        "depth": {"max_image_size_px": 2000, "neighbours": 6},
+        "depth": {"max_image_size_px": 2000, "neighbors": 6},
         "mesh": {"poisson_depth": 13, "faces": 1_000_000},
         "texture": {"max_page_px": 8192},
     },

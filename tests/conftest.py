@@ -40,7 +40,7 @@ def unrelated(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def ball() -> Model:
-    """A unit ball with a colour per vertex that says where the vertex is."""
+    """A unit ball with a color per vertex that says where the vertex is."""
     mesh = trimesh.creation.icosphere(subdivisions=2)
     vertices = np.array(mesh.vertices, np.float64)
     colors = np.clip(128 + 120 * vertices, 0, 255).astype(np.uint8)

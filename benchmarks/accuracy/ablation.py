@@ -32,7 +32,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "2000 idle samples for any evidence": {"patience": lambda *_: 2000.0},
     "one score, coarse": {"fine_score": None},
     "one score, truncated squares": {"fine_score": None, "score": msac},
-    "no local optimisation": {"improve": None, "fine_score": None},
+    "no local optimization": {"improve": None, "fine_score": None},
     "no plane and parallax": {"recover": None},
     "no orientation test": {"oriented": False},
     "no bail-out": {"verifier": FullVerification},

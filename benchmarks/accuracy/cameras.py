@@ -44,8 +44,8 @@ FEW = 6
 ABOUT = (
     "The same pixels for all: photos saved anew as PNG, upright, without EXIF. Every run in a process of its own, "
     "methods taking turns, kernels compiled before; medians over the repetitions. e_focal, e_OC: mean errors of fx and "
-    "fy, and of cx and cy (thesis 5.5.3); e_OC_w: distance of the optical centres as a share of the unchanged photo's "
-    "width; centre rms: of camera centres after a similarity, in percent of their mean distance from their mean; AUC: "
+    "fy, and of cx and cy (thesis 5.5.3); e_OC_w: distance of the optical centers as a share of the unchanged photo's "
+    "width; center rms: of camera centers after a similarity, in percent of their mean distance from their mean; AUC: "
     "area under the recall of the larger of rotation and translation error over all pairs of photos, 180 degrees for a "
     "pair with a photo left out; every photo is compared with its own K. AUC@5 of each model: over its own photos, "
     "where there are several. Seconds: from the photos to the final cameras; COLMAP verifies pairs while matching, we "

@@ -32,9 +32,9 @@ HONEST = most("worst in sd", 3.0)
 NO_SLOWER = most("/ incremental", 1.0)
 SHARP = (most("e_focal %", 0.3), most("e_OC %", 0.5))
 BARS: Mapping[str, tuple[Bar, ...]] = {
-    "fountain-P11": (least("AUC@1", 0.84), most("centre rms %", 0.08), *SHARP, HONEST, NO_SLOWER),
-    "Herz-Jesus-P8": (least("AUC@1", 0.82), most("centre rms %", 0.10), *SHARP, HONEST, NO_SLOWER),
-    "castle-P19": (least("AUC@1", 0.48), most("centre rms %", 0.70), HONEST, NO_SLOWER),
+    "fountain-P11": (least("AUC@1", 0.84), most("center rms %", 0.08), *SHARP, HONEST, NO_SLOWER),
+    "Herz-Jesus-P8": (least("AUC@1", 0.82), most("center rms %", 0.10), *SHARP, HONEST, NO_SLOWER),
+    "castle-P19": (least("AUC@1", 0.48), most("center rms %", 0.70), HONEST, NO_SLOWER),
     "fountain-P11 crop:460,200": (least("AUC@1", 0.80), HONEST),
     "castle-P19 crop:460,200": (least("AUC@5", 0.52), HONEST),
     "fountain-P11 scale:0.75,1": (least("AUC@1", 0.82), HONEST),

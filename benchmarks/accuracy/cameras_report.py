@@ -13,7 +13,7 @@ from figures import pyplot, save
 from report import Row, table
 
 ACCURACY = (
-    "photos", "method", "placed", "models", "e_focal %", "e_OC %", "e_OC_w %", "centre rms %", "AUC@1", "AUC@3",
+    "photos", "method", "placed", "models", "e_focal %", "e_OC %", "e_OC_w %", "center rms %", "AUC@1", "AUC@3",
     "AUC@5", "AUC@10", "AUC@5 of each model", "points", "observations", "reprojection px", "bar met", "failed",
 )  # fmt: skip
 TIME = (

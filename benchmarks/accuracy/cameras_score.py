@@ -13,8 +13,8 @@ from report import Row
 from score import (
     Pose,
     area_under_recall,
-    centre_error_percent,
-    centre_shift_percent,
+    center_error_percent,
+    center_shift_percent,
     focal_error_percent,
     pose_errors_deg,
     position_rms_percent,
@@ -103,7 +103,7 @@ def accuracy(models: Sequence[Model], truth: Mapping[str, TruePhoto], photos: in
         return row
     poses = {name: photo.pose for name, photo in truth.items()}
     row |= camera_errors(best.K, truth)
-    row["centre rms %"] = _rounded(position_rms_percent(best.poses, poses))
+    row["center rms %"] = _rounded(position_rms_percent(best.poses, poses))
     errors = pose_errors_deg(best.poses, poses)
     row |= {f"AUC@{limit}": round(area_under_recall(errors, limit), 4) for limit in LIMITS_DEG}
     alone = [within(model, poses) for model in models]
@@ -123,8 +123,8 @@ def camera_errors(K: Mapping[str, NDArray[np.float64]], truth: Mapping[str, True
         return dict.fromkeys(("e_focal %", "e_OC %", "e_OC_w %"))
     return {
         "e_focal %": round(float(np.mean([focal_error_percent(K[name], truth[name].K) for name in common])), 3),
-        "e_OC %": round(float(np.mean([centre_error_percent(K[name], truth[name].K) for name in common])), 3),
-        "e_OC_w %": round(float(np.mean([centre_shift_percent(K[n], truth[n].K, truth[n].width) for n in common])), 3),
+        "e_OC %": round(float(np.mean([center_error_percent(K[name], truth[name].K) for name in common])), 3),
+        "e_OC_w %": round(float(np.mean([center_shift_percent(K[n], truth[n].K, truth[n].width) for n in common])), 3),
     }
 
 

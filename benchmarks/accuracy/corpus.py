@@ -39,9 +39,9 @@ ABOUT = (
     "Stock is pycolmap's default but for a seed, our cap on the image size, and which photos share a camera, which it "
     "is told. AUC: area under the recall of the larger of rotation and translation error over all pairs of photos, 180 "
     "degrees for a pair with a photo left out. axis, distance: rank correlation of the photos' order with their place "
-    "along the main axis, and of |i - j| with the distance between centres; jumps: steps over five usual ones. Centre "
+    "along the main axis, and of |i - j| with the distance between centers; jumps: steps over five usual ones. Center "
     "cm: against a camera beside ours, after fitting the offset. Before and after: bundle adjustment; %: of the true "
-    "focal, of the width for the centre, the worst of several cameras; in sd: in stated standard deviations. Cameras "
+    "focal, of the width for the center, the worst of several cameras; in sd: in stated standard deviations. Cameras "
     "that are called guesses are not counted before. The truth's own doubt: see DOUBTS in corpus_score.py. Exit codes "
     "are those of the command: 0, 4 where the photos do not support a scene, none where it ran out of time."
 )
@@ -145,7 +145,7 @@ def line(row: Row) -> str:
     return f"{row['photos']}: {row['method']}: {', '.join(figures)}"
 
 
-SHOWN = ("models", "AUC@1", "AUC@5", "axis", "distance", "median centre cm", "K known", "exit code", "wall seconds",
+SHOWN = ("models", "AUC@1", "AUC@5", "axis", "distance", "median center cm", "K known", "exit code", "wall seconds",
          "failed")  # fmt: skip
 
 

@@ -12,7 +12,7 @@ WHOLE = most("models", 1)
 UNFOLDED = most("folded without a word", 0)
 SEEN_LATER: Mapping[str, tuple[Bar, ...]] = {
     "fox50": (
-        least("registered", 50), most("claimed focal %", 1.5), most("claimed centre %", 2.0), least("AUC@1", 0.47),
+        least("registered", 50), most("claimed focal %", 1.5), most("claimed center %", 2.0), least("AUC@1", 0.47),
         least("AUC@5", 0.90),
     ),
     "oats23": (UNFOLDED,),
@@ -20,7 +20,7 @@ SEEN_LATER: Mapping[str, tuple[Bar, ...]] = {
     "dinoSparseRing": (least("registered", 14),),
     "kitchen25": (least("registered", 24), least("registered", INCREMENTAL)),
     "kitti51": (least("AUC@5", INCREMENTAL), most("focal of 3 % or 3 sd", 1.0)),
-    "kitchen1000 every:5": (least("registered", 200), most("median centre cm", 2.4), WHOLE),
+    "kitchen1000 every:5": (least("registered", 200), most("median center cm", 2.4), WHOLE),
     "castle-P19": (WHOLE,),
     "temple16": (WHOLE,),
     "fountain-P11": (WHOLE,),

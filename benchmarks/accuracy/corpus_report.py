@@ -11,7 +11,7 @@ from report import Row, table
 
 RUNS = (
     "photos", "method", "placed", "models", "AUC@1", "AUC@5", "axis", "distance", "jumps", "axis of the worst part",
-    "distance of the worst part", "warned of folds", "median centre cm", "90 % centre cm", "reprojection px", "K known",
+    "distance of the worst part", "warned of folds", "median center cm", "90 % center cm", "reprojection px", "K known",
     "cameras", "exit code", "total", "/ incremental", "bar met", "behind stock", "made by", "failed",
 )  # fmt: skip
 BEFORE = (

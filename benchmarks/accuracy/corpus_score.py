@@ -32,7 +32,7 @@ class Doubt(NamedTuple):
     """How far the truth itself may be off, as its source says: one standard deviation, in percent."""
 
     focal: float
-    centre: float
+    center: float
     """Of the width."""
 
 
@@ -42,7 +42,7 @@ DOUBTS: Mapping[str, Doubt] = {
     "merton1": Doubt(1.7, 0.9),
     "reichstag10": Doubt(1.5, 2.0),
 }
-"""COLMAP models (their centre held, or known to a percent), and three views whose K differ by a few percent."""
+"""COLMAP models (their center held, or known to a percent), and three views whose K differ by a few percent."""
 
 
 def parameters(out: Path, truth: Mapping[str, TruePhoto], doubt: Doubt) -> list[Row]:
@@ -106,7 +106,7 @@ def _errors(stage: Stage, true: NDArray[np.float64], width: float, doubt: Doubt)
         focal = name in ("fx", "fy")
         whole = float(true[place]) if focal else width
         error, sd = abs(float(stage.K[place] - true[place])), stage.deviations.get(name, stage.deviations.get("f"))
-        unsure = (doubt.focal if focal else doubt.centre) / 100 * whole
+        unsure = (doubt.focal if focal else doubt.center) / 100 * whole
         known = sd is not None and math.isfinite(sd) and sd > 0
         yield {
             "when": stage.when,
@@ -155,7 +155,7 @@ def claims(rows: Sequence[Row]) -> Row:
     after = [row for row in rows if row["when"] == "after" and row["parameter"] in ("fx", "fy")]
     row: Row = {
         "claimed focal %": max((one["error %"] for one in before if one["parameter"] in ("fx", "fy")), default=0.0),
-        "claimed centre %": max((one["error %"] for one in before if one["parameter"] in ("cx", "cy")), default=0.0),
+        "claimed center %": max((one["error %"] for one in before if one["parameter"] in ("cx", "cy")), default=0.0),
     }
     if after:
         shares = [min(one["error %"] / FAR_PERCENT, (one["in sd"] or math.inf) / FAR_SD) for one in after]
@@ -185,8 +185,8 @@ def of_offset(models: Sequence[Model], truth: Mapping[str, TruePhoto]) -> Row:
     if found is None:
         return {}
     return {
-        "median centre cm": round(100 * float(np.median(found.centre)), 2),
-        "90 % centre cm": round(100 * float(np.percentile(found.centre, 90)), 2),
+        "median center cm": round(100 * float(np.median(found.center)), 2),
+        "90 % center cm": round(100 * float(np.percentile(found.center, 90)), 2),
         "median rotation deg": round(float(np.median(found.rotation_deg)), 2),
     }
 

@@ -40,7 +40,7 @@ def curves(
 ) -> None:
     """One line per name, bolder for those in `heavy`; markers shrink from line to line, so that none hides another.
 
-    Names in `order` keep their colour and marker from figure to figure, whichever of them are drawn.
+    Names in `order` keep their color and marker from figure to figure, whichever of them are drawn.
     """
     places = {name: n for n, name in enumerate(dict.fromkeys([*order, *lines]))}
     for name, y in lines.items():
@@ -56,9 +56,9 @@ def label(axes: Any, x: str, y: str, title: str = "", *, log: bool = False) -> N
         axes.set_yscale("log")
         low, high = axes.get_ylim()
         if low > 1e-4 and high < 1e5:
-            labelled = "25" if high / low < 100 else ""
+            labeled = "25" if high / low < 100 else ""
             axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-            axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in labelled else "")
+            axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in labeled else "")
 
 
 def legend_beside(figure: Any, axes: Any) -> None:

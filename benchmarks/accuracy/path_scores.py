@@ -24,7 +24,7 @@ class Order(NamedTuple):
     axis: float
     """Rank correlation of the photos' order by name with their place along the main axis; for straight walks."""
     distance: float
-    """Rank correlation of |i - j| with the distance between the centres i and j; for walks that bend, too."""
+    """Rank correlation of |i - j| with the distance between the centers i and j; for walks that bend, too."""
     jumps: int
     """Steps between photos that follow each other that are much longer than usual."""
 
@@ -33,15 +33,15 @@ def order_scores(poses: Mapping[str, Pose]) -> Order | None:
     """The order of a model's photos; None with fewer than three, or where all stand in one place."""
     if len(poses) < 3:
         return None
-    centres = _centres([poses[name] for name in sorted(poses)])
-    if np.ptp(centres, axis=0).max() == 0:
+    centers = _centers([poses[name] for name in sorted(poses)])
+    if np.ptp(centers, axis=0).max() == 0:
         return None
-    main = np.linalg.svd(centres - centres.mean(0), full_matrices=False)[2][0]
-    i, j = np.triu_indices(len(centres), 1)
-    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    main = np.linalg.svd(centers - centers.mean(0), full_matrices=False)[2][0]
+    i, j = np.triu_indices(len(centers), 1)
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     return Order(
-        abs(float(spearmanr(np.arange(len(centres)), centres @ main).statistic)),
-        float(spearmanr(j - i, np.linalg.norm(centres[i] - centres[j], axis=1)).statistic),
+        abs(float(spearmanr(np.arange(len(centers)), centers @ main).statistic)),
+        float(spearmanr(j - i, np.linalg.norm(centers[i] - centers[j], axis=1)).statistic),
         int(np.count_nonzero(steps > LONG_STEPS * np.median(steps))),
     )
 
@@ -49,7 +49,7 @@ def order_scores(poses: Mapping[str, Pose]) -> Order | None:
 class Offset(NamedTuple):
     """What remains between a model and the poses of a camera that was fixed beside ours."""
 
-    centre: NDArray[np.float64]
+    center: NDArray[np.float64]
     """By photo, in units of the truth."""
     rotation_deg: NDArray[np.float64]
     shift: float
@@ -68,7 +68,7 @@ def offset_errors(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> Offse
         return None
     ours, true = [found[name] for name in names], [truth[name] for name in names]
     Ra, Rb = (np.array([pose[:, :3] for pose in poses]) for poses in (ours, true))
-    Ca, Cb = _centres(ours), _centres(true)
+    Ca, Cb = _centers(ours), _centers(true)
     start = umeyama(Ca, Cb)
 
     def rest(p: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -76,20 +76,20 @@ def offset_errors(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> Offse
         turned = np.einsum("ij,njk,lk->nil", turn, Ra, world)
         rotation = Rotation.from_matrix(np.einsum("nij,nkj->nik", turned, Rb)).as_rotvec()
         beside = np.einsum("nji,j->ni", Rb, p[10:13])
-        centre = np.exp(p[6]) * np.einsum("ij,nj->ni", world, Ca) + p[7:10] + beside - Cb
-        return np.concatenate([rotation.ravel(), centre.ravel()])
+        center = np.exp(p[6]) * np.einsum("ij,nj->ni", world, Ca) + p[7:10] + beside - Cb
+        return np.concatenate([rotation.ravel(), center.ravel()])
 
     world = Rotation.from_matrix(start.R).as_rotvec()
     first = np.concatenate([np.zeros(3), world, [np.log(start.scale)], start.t, np.zeros(3)])
     fit = least_squares(rest, first, loss="soft_l1", f_scale=SOFT)
-    rotation, centre = np.linalg.norm(rest(fit.x).reshape(2, -1, 3), axis=2)
+    rotation, center = np.linalg.norm(rest(fit.x).reshape(2, -1, 3), axis=2)
     return Offset(
-        centre,
+        center,
         np.degrees(rotation),
         float(np.linalg.norm(fit.x[10:13])),
         float(np.degrees(np.linalg.norm(fit.x[:3]))),
     )
 
 
-def _centres(poses: Sequence[Pose]) -> NDArray[np.float64]:
+def _centers(poses: Sequence[Pose]) -> NDArray[np.float64]:
     return np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses])

@@ -142,7 +142,7 @@ def changed_photo(image: Image.Image, change: Sequence[Step]) -> Image.Image:
 
 
 def changed_camera(K: NDArray[np.float64], change: Sequence[Step], size: tuple[int, int]) -> NDArray[np.float64]:
-    """The camera matrix of a photo of `size` after these steps; pixel centres at +0.5, so that resizing multiplies."""
+    """The camera matrix of a photo of `size` after these steps; pixel centers at +0.5, so that resizing multiplies."""
     K = K.copy()
     for kind, values in change:
         if kind == "scale":

@@ -87,13 +87,13 @@ def focal_error_percent(found: NDArray[np.float64], truth: NDArray[np.float64]) 
     return float(50 * (abs(found[0, 0] / truth[0, 0] - 1) + abs(found[1, 1] / truth[1, 1] - 1)))
 
 
-def centre_error_percent(found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
+def center_error_percent(found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
     """e_OC of the thesis: mean error of cx and cy, in percent of the true ones."""
     return float(50 * (abs(found[0, 2] / truth[0, 2] - 1) + abs(found[1, 2] / truth[1, 2] - 1)))
 
 
-def centre_shift_percent(found: NDArray[np.float64], truth: NDArray[np.float64], width: float) -> float:
-    """Distance of the optical centres as a share of a width, which does not depend on where the centre lies."""
+def center_shift_percent(found: NDArray[np.float64], truth: NDArray[np.float64], width: float) -> float:
+    """Distance of the optical centers as a share of a width, which does not depend on where the center lies."""
     return float(100 * np.linalg.norm(found[:2, 2] - truth[:2, 2]) / width)
 
 

@@ -80,7 +80,7 @@ def calibrated(photos: PhotoSet, args: argparse.Namespace) -> list[Row]:
 def tables(rows: list[Row]) -> str:
     """The methods beside each other, then everything about each."""
     parts = []
-    for column in ("known", "e_focal %", "centre % of width", "fy/fx %"):
+    for column in ("known", "e_focal %", "center % of width", "fy/fx %"):
         beside: dict[str, Row] = {}
         for line in rows:
             beside.setdefault(line["photos"], {"photos": line["photos"]})[line["method"]] = line[column]

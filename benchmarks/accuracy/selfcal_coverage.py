@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from report import Row
 from score import focal_error_percent
-from selfcal_score import INSIDE, PLACES, centre_error_percent, deviations
+from selfcal_score import INSIDE, PLACES, center_error_percent, deviations
 
 from sfm_app.plugins import load_plugins
 from sfm_app.selfcal import pair_weights
@@ -45,7 +45,7 @@ def drawn(seed: int) -> TrackOptions:
         height=768,
         focal_px=(700.0, 2000.0),
         aspect=(1.0, 1.0) if rng.uniform() < SQUARE_SHARE else ASPECT,
-        centre_offset=0.1,
+        center_offset=0.1,
     )
 
 
@@ -78,7 +78,7 @@ def trial(seed: int, settings: Settings) -> Trial:
         "sigma px": round(options.sigma_px, 3), "fy/fx": round(float(K[1, 1] / K[0, 0]), 3),
         "known": found.identifiable,
         "e_focal %": round(focal_error_percent(found.K, K), 3),
-        "centre % of width": round(centre_error_percent(found, K), 3),
+        "center % of width": round(center_error_percent(found, K), 3),
         "k1": round(found.radial, 4), "held": " ".join(found.held),
     }  # fmt: skip
     away = deviations(found, K) if found.identifiable else {}
@@ -118,7 +118,7 @@ def summary(trials: Sequence[Trial]) -> list[Row]:
 def _figures(trials: Sequence[Trial]) -> Row:
     rows = [trial.row for trial in trials if trial.found.identifiable]
     line: Row = {"trials": len(trials), "answered %": round(100 * len(rows) / len(trials), 1)}
-    for name in ("e_focal %", "centre % of width"):
+    for name in ("e_focal %", "center % of width"):
         for label, share in (("median", 0.5), ("p95", 0.95)):
             line[f"{label} {name}"] = round(float(np.quantile([row[name] for row in rows], share)), 3) if rows else None
     for limit in (1.0, INSIDE):

@@ -39,7 +39,7 @@ def row(photos: str, found: Found, truth: Mapping[str, TrueCamera]) -> Row:
 
 
 COLUMNS = (
-    "e_focal %", "worst e_focal %", "centre % of width", "fy/fx %", "k1 error", "sd of f %",
+    "e_focal %", "worst e_focal %", "center % of width", "fy/fx %", "k1 error", "sd of f %",
     "fx sd", "fy sd", "cx sd", "cy sd", "in 3 sd",
 )  # fmt: skip
 """What needs the truth. "fx sd" is the error of fx in its own standard deviations, and so on."""
@@ -51,8 +51,8 @@ def deviations(camera: Calibration, K: NDArray[np.float64]) -> dict[str, float]:
     return {name: float(abs(camera.K[PLACES[name]] - K[PLACES[name]]) / sd) for name, sd in stated.items()}
 
 
-def centre_error_percent(camera: Calibration, K: NDArray[np.float64]) -> float:
-    """Distance of the optical centres as a share of the width."""
+def center_error_percent(camera: Calibration, K: NDArray[np.float64]) -> float:
+    """Distance of the optical centers as a share of the width."""
     return float(100 * np.linalg.norm(camera.K[:2, 2] - K[:2, 2]) / camera.width)
 
 
@@ -69,7 +69,7 @@ def _errors(cameras: Sequence[Calibration], truth: Sequence[TrueCamera]) -> Row:
     line: Row = {
         "e_focal %": _rounded(focal),
         "worst e_focal %": _rounded([max(focal)]) if len({true.K.tobytes() for true in truth}) > 1 else None,
-        "centre % of width": _rounded([centre_error_percent(camera, true.K) for camera, true in both]),
+        "center % of width": _rounded([center_error_percent(camera, true.K) for camera, true in both]),
         "fy/fx %": _rounded([aspect_error_percent(camera, true.K) for camera, true in both]),
         "k1 error": _rounded([abs(camera.radial - true.k1) for camera, true in both if true.k1 is not None], 4),
         "sd of f %": _rounded([100 * c.spread["fx"] / c.K[0, 0] for c in cameras if c.spread.get("fx")]),

@@ -28,7 +28,7 @@ from sfm_app.settings import Settings, merged
 from sfm_app.synthetic.pictures import prepare_model
 
 ABOUT = (
-    "Photos only, through the whole program. Rendered scenes: the mesh is moved onto the truth by the camera centres; "
+    "Photos only, through the whole program. Rendered scenes: the mesh is moved onto the truth by the camera centers; "
     "accuracy: share of its area within 0.5 % of the scene's size of the true surface (size: diagonal of the box "
     "around all that the photos see); completeness: share of the area of the true surface that two photos see (in the "
     "photo, not hidden, at less than 80 degrees) with mesh within 1 %; F: harmonic mean; median: of the distances, in "

@@ -51,12 +51,12 @@ def files(out: Path) -> Row:
 
 def against_truth(surface: Surface, out: Path, truth: Truth) -> Row:
     """Ours, and the best of what the sparse points give."""
-    centres = {name: image.projection_center() for name, image in placed_photos(out).items()}
+    centers = {name: image.projection_center() for name, image in placed_photos(out).items()}
     seen = seen_places(truth)
-    row = truth_scores(surface, centres, truth, seen)
-    row["completeness of 3 photos %"] = truth_scores(surface, centres, truth, seen_places(truth, 3))["completeness %"]
+    row = truth_scores(surface, centers, truth, seen)
+    row["completeness of 3 photos %"] = truth_scores(surface, centers, truth, seen_places(truth, 3))["completeness %"]
     rivals = [
-        truth_scores(found, centres, truth, seen) | {"trim": trim}
+        truth_scores(found, centers, truth, seen) | {"trim": trim}
         for trim, found in sparse_surfaces(out / "sparse")
         if len(found.faces)
     ]

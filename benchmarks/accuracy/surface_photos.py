@@ -18,7 +18,7 @@ from sfm_app.synthetic.pictures import Picture, PreparedModel, view_along
 Pixels = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
 BLACK = 32
-"""Grey level below which a pixel of a photo on black shows nothing."""
+"""Gray level below which a pixel of a photo on black shows nothing."""
 LEAST_PIXELS = 1000
 """Covered pixels that a photo's likeness is judged by."""
 
@@ -30,7 +30,7 @@ class PlacedPhoto:
     name: str
     pixels: Pixels
     """(H, W, 3) RGB."""
-    centre: FloatArray
+    center: FloatArray
     """(3,) of the camera."""
     rays: FloatArray
     """(H, W, 3) directions in the world that the pixels see."""
@@ -70,7 +70,7 @@ def placed_photo(out: Path, name: str) -> PlacedPhoto:
 
 def rendered(model: PreparedModel, photo: PlacedPhoto) -> Picture:
     """The model as that photo's camera sees it."""
-    return view_along(model, photo.centre, photo.rays)
+    return view_along(model, photo.center, photo.rays)
 
 
 def likeness(picture: Picture, photo: Pixels) -> Likeness:
@@ -84,7 +84,7 @@ def likeness(picture: Picture, photo: Pixels) -> Likeness:
 
 
 def psnr_db(rendering: Pixels, photo: Pixels) -> float:
-    """Peak signal-to-noise ratio of colours (N, 3) after a gain and an offset per channel took out the exposure."""
+    """Peak signal-to-noise ratio of colors (N, 3) after a gain and an offset per channel took out the exposure."""
     squares = []
     for a, b in zip(rendering.T.astype(np.float64), photo.T.astype(np.float64), strict=True):
         spread = a.var()

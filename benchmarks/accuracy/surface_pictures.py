@@ -15,7 +15,7 @@ Pixels = NDArray[np.uint8]
 TALL_PX, WIDE_PX = 800, 1000
 """Largest height and width of one picture; a page has two by two of them."""
 COLORS, PALETTE_PIXELS = 256, 20_000
-"""Of a page, which keeps PNGs small, and the pixels that its colours are chosen by."""
+"""Of a page, which keeps PNGs small, and the pixels that its colors are chosen by."""
 WIDTHS_PX, BYTES = (1600, 1400, 1200, 1000, 800), 600_000
 """Of a page."""
 
@@ -33,7 +33,7 @@ def model_page(out: Path, name: str, model: PreparedModel) -> Pixels:
 
 
 def save_page(page: Pixels, path: Path) -> None:
-    """A PNG of at most `WIDTHS_PX[0]` and `BYTES`, in few colours; narrower where it would be larger."""
+    """A PNG of at most `WIDTHS_PX[0]` and `BYTES`, in few colors; narrower where it would be larger."""
     path.parent.mkdir(parents=True, exist_ok=True)
     palette = Image.new("P", (1, 1))
     palette.putpalette(palette_of(page).tobytes())
@@ -48,12 +48,12 @@ def save_page(page: Pixels, path: Path) -> None:
 
 
 def palette_of(page: Pixels) -> Pixels:
-    """(COLORS, 3) that stand for the colours of a page: white, and k-means of some of its pixels that are not."""
+    """(COLORS, 3) that stand for the colors of a page: white, and k-means of some of its pixels that are not."""
     pixels = page[page.min(axis=2) < 255]
     if not len(pixels):
         return np.full((COLORS, 3), 255, np.uint8)
     some = pixels[np.random.default_rng(0).integers(0, len(pixels), PALETTE_PIXELS)].astype(np.float32)
     cv2.setRNGSeed(0)
     criteria = (cv2.TERM_CRITERIA_MAX_ITER, 10, 0.0)
-    _, _, centres = cv2.kmeans(some, COLORS - 1, None, criteria, 1, cv2.KMEANS_PP_CENTERS)
-    return np.append(np.round(np.clip(centres, 0, 255)).astype(np.uint8), np.full((1, 3), 255, np.uint8), axis=0)
+    _, _, centers = cv2.kmeans(some, COLORS - 1, None, criteria, 1, cv2.KMEANS_PP_CENTERS)
+    return np.append(np.round(np.clip(centers, 0, 255)).astype(np.uint8), np.full((1, 3), 255, np.uint8), axis=0)

@@ -13,7 +13,7 @@ from sfm_app.meshing.open3d import load_open3d
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
-NEIGHBOURS = 16
+NEIGHBORS = 16
 """Points that a normal is fitted to."""
 DEPTH = 10
 """Of the octree; the points are too few for COLMAP's 13, which gives the same surface later."""
@@ -41,14 +41,14 @@ def sparse_surfaces(model_dir: Path) -> Iterator[tuple[float, Surface]]:
 
 
 def oriented_points(model: "pycolmap.Reconstruction") -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
-    """Points (N, 3), unit normals (N, 3) of their surroundings, turned to the photos that see them, colours (N, 3)."""
-    centres = {key: image.projection_center() for key, image in model.images.items() if image.has_pose}
+    """Points (N, 3), unit normals (N, 3) of their surroundings, turned to the photos that see them, colors (N, 3)."""
+    centers = {key: image.projection_center() for key, image in model.images.items() if image.has_pose}
     known = [model.points3D[key] for key in sorted(model.points3D)]
     points = np.array([point.xyz for point in known]).reshape(-1, 3)
-    seen_from = np.array([np.mean([centres[e.image_id] for e in point.track.elements], axis=0) for point in known])
+    seen_from = np.array([np.mean([centers[e.image_id] for e in point.track.elements], axis=0) for point in known])
     open3d = load_open3d()
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
+    cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBORS))
     normals = np.asarray(cloud.normals).copy()
     normals[((seen_from - points) * normals).sum(axis=1) < 0] *= -1.0
     return points, normals, np.array([point.color for point in known], np.uint8).reshape(-1, 3)

@@ -63,7 +63,7 @@ def part_of(whole: SurfaceSet, count: int, cache: Path) -> SurfaceSet:
 
 
 def finished_model(photos: Path, out: Path, settings: Settings) -> Model:
-    """The textured surface that a finished run holds; with colours of the vertices where there is no texture."""
+    """The textured surface that a finished run holds; with colors of the vertices where there is no texture."""
     last = "texture" if "texture" in NAMES else "mesh"
     with opened_run(out, settings, None) as run:
         found = run_stages(photos, run, last=last)(last)

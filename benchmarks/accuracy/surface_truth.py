@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from report import Row
 
-from sfm_app.synthetic.cameras import camera_centre
-from sfm_app.synthetic.compare import align_centres, sample_surface, sample_triangles, scene_size, surface_distances
+from sfm_app.synthetic.cameras import camera_center
+from sfm_app.synthetic.compare import align_centers, sample_surface, sample_triangles, scene_size, surface_distances
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.render import cast, ray_caster
 from sfm_app.types import Surface
@@ -25,19 +25,19 @@ HIDDEN = 2e-3
 """How far behind what a photo sees first a place counts as seen by it, in sizes of the scene."""
 
 
-def truth_scores(surface: Surface, centres: Mapping[str, FloatArray], truth: Truth, seen: FloatArray) -> Row:
+def truth_scores(surface: Surface, centers: Mapping[str, FloatArray], truth: Truth, seen: FloatArray) -> Row:
     """Accuracy, completeness, their harmonic mean, the median distance, the share that is right in detail; in percent.
 
     Args:
-        surface: in the frame of the reconstruction; moved onto the truth by the camera centres.
-        centres: (3,) by photo name in that frame.
+        surface: in the frame of the reconstruction; moved onto the truth by the camera centers.
+        centers: (3,) by photo name in that frame.
         truth: of the rendered photos.
         seen: (N, 3) places of the true surface from `seen_places`.
     """
     names = ("accuracy %", "completeness %", "F %", "median %", "within 0.1 %")
     if not len(surface.faces):
         return dict.fromkeys(names)
-    size, aligned = scene_size(truth), align_centres(centres, truth)(surface.vertices)
+    size, aligned = scene_size(truth), align_centers(centers, truth)(surface.vertices)
     to_truth = surface_distances(sample_surface(aligned, surface.faces, SAMPLES), truth.vertices, truth.faces) / size
     to_found = surface_distances(seen, aligned, surface.faces) / size
     accuracy, completeness = float(np.mean(to_truth <= ACCURATE)), float(np.mean(to_found <= COMPLETE))
@@ -59,18 +59,18 @@ def seen_places(truth: Truth, photos: int = SEEN_BY, samples: int = 3 * SAMPLES)
     slack = HIDDEN * scene_size(truth)
     counted = np.zeros(len(places), np.int64)
     for name, pose in truth.cam_from_world.items():
-        centre, camera = camera_centre(pose), truth.cameras[name]
+        center, camera = camera_center(pose), truth.cameras[name]
         x = places @ pose[:, :3].T + pose[:, 3]
         plane = x[:, :2] / np.maximum(x[:, 2:], 1e-9)
         plane = plane * (1.0 + camera.radial * (plane**2).sum(axis=1, keepdims=True))
         pixel = plane * np.diag(camera.K)[:2] + camera.K[:2, 2]
         within = (x[:, 2] > 0) & ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all(axis=1)
-        ways = places - centre
+        ways = places - center
         distance = np.linalg.norm(ways, axis=1)
         facing = -(ways * normals).sum(axis=1) > np.cos(np.radians(GRAZING_DEG)) * distance
         asked = np.flatnonzero(within & facing)
         # the ways are as long as the distance, so that t_hit counts in them
-        first = cast(caster, centre, ways[asked])["t_hit"].astype(np.float64) * distance[asked]
+        first = cast(caster, center, ways[asked])["t_hit"].astype(np.float64) * distance[asked]
         counted[asked[first >= distance[asked] - slack]] += 1
     return places[counted >= photos]
 

@@ -1,7 +1,7 @@
 """Do our model files open everywhere, and do they look right? One row per GLB.
 
 Runs the Khronos validator and three.js in headless Chromium (benchmarks/viewers, needs Node and `npm install` there),
-Open3D and trimesh on what finished runs left behind and on a small model with two pages of texture whose colours are
+Open3D and trimesh on what finished runs left behind and on a small model with two pages of texture whose colors are
 known. A screenshot of each model goes to benchmarks/results/viewers-NAME.png: look at them.
 """
 
@@ -23,7 +23,7 @@ from report import RESULTS, document, table, write
 
 from sfm_app.colmap.model import sparse_model
 from sfm_app.formats import EXPORTERS
-from sfm_app.formats.frusta import centre, scene_size
+from sfm_app.formats.frusta import center, scene_size
 from sfm_app.meshing.open3d import load_open3d
 from sfm_app.types import Frustum, Model, Surface, Texture
 
@@ -37,7 +37,7 @@ ABOUT = """\
 Every GLB through the Khronos validator, three.js in headless Chromium, Open3D and trimesh; the surface as its PLY has
 it. on screen: share of the picture that the model covers. outward: share of the vertices whose normal looks at a
 camera; 1 for a closed surface whose volume is positive. double edges: with more than two triangles; open edges: with
-one. off centre: distance of the surface's middle (median over its area) from 0, in sizes of the scene. up +- deg:
+one. off center: distance of the surface's middle (median over its area) from 0, in sizes of the scene. up +- deg:
 standard deviation of up, up odds: odds to one against a model on its head or side, both as their evidence has it and
 no proof. photos turned: by how many degrees clockwise the program believes that the photos have to be turned; wrong
 where people who look at them say otherwise. ok: names what is not as it should be."""
@@ -46,11 +46,11 @@ FILES = (
     "ok",
 )  # fmt: skip
 SURFACES = (
-    "file", "triangles", "not finite", "degenerate", "double edges", "open edges", "outward", "off centre", "up by",
+    "file", "triangles", "not finite", "degenerate", "double edges", "open edges", "outward", "off center", "up by",
     "up +- deg", "up odds", "photos turned", "ok",
 )  # fmt: skip
 
-LIMITS = {"outward": 0.95, "off centre": 0.2, "up +- deg": 3.0, "up odds": 20.0, "on screen": 0.002}
+LIMITS = {"outward": 0.95, "off center": 0.2, "up +- deg": 3.0, "up odds": 20.0, "on screen": 0.002}
 TURNED_DEG = {"temple16": 270}
 """By run: how far its photos have to be turned clockwise to be upright, as people see it; the others are upright."""
 
@@ -104,7 +104,7 @@ def gather(runs: Sequence[Path], place: Path) -> list[Subject]:
 
 
 def sample() -> Model:
-    """A ball, its upper half on one page of texture and the lower on another, each of one colour."""
+    """A ball, its upper half on one page of texture and the lower on another, each of one color."""
     mesh = trimesh.creation.icosphere(subdivisions=4)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces, np.int64)
     corners = vertices[faces]
@@ -159,17 +159,17 @@ def faults(subject: Subject, seen: Mapping[str, Any], readers: Mapping[str, Mapp
         "degenerate triangles": row.get("degenerate"),
         "not manifold": row.get("double edges"),
         "normals": row.get("outward", 1.0) < LIMITS["outward"],
-        "off centre": row.get("off centre", 0.0) > LIMITS["off centre"],
+        "off center": row.get("off center", 0.0) > LIMITS["off center"],
         "vertical not sure": row.get("up +- deg", 0.0) > LIMITS["up +- deg"],
         "up not sure": row.get("up odds", np.inf) < LIMITS["up odds"],
         "on its head or side": row.get("photos turned", 0) != TURNED_DEG.get(subject.run, 0),
-        "other colours": subject.name == SAMPLE and not shows_pages(three["most"]),
+        "other colors": subject.name == SAMPLE and not shows_pages(three["most"]),
     }
     return [what for what, fault in tests.items() if fault]
 
 
 def shows_pages(most: Sequence[int]) -> bool:
-    """Whether the two colours that cover most are those of the sample's pages: neither lit nor too dark."""
+    """Whether the two colors that cover most are those of the sample's pages: neither lit nor too dark."""
     colors = sorted((value >> 16, value >> 8 & 255, value & 255) for value in most)
     return bool(np.abs(np.array(colors) - np.array(sorted(PAGES))).max() <= 3)
 
@@ -214,7 +214,7 @@ def looked_at(subject: Subject) -> Row:
     outward = float(volume > 0) if closed else facing(vertices, normals, subject.cameras)
     return row | {
         "surface triangles": len(faces),
-        "off centre": round(off_centre(corners, area) / scene_size(vertices), 3),
+        "off center": round(off_center(corners, area) / scene_size(vertices), 3),
         "degenerate": int((area == 0).sum()),
         "double edges": int((shared > 2).sum()),
         "open edges": int((shared == 1).sum()),
@@ -222,7 +222,7 @@ def looked_at(subject: Subject) -> Row:
     }
 
 
-def off_centre(corners: np.ndarray, area: np.ndarray) -> float:
+def off_center(corners: np.ndarray, area: np.ndarray) -> float:
     """How far the middle of the surface, the median of its area along each axis, lies from 0."""
     middle = []
     for values in corners.mean(axis=1).T:
@@ -236,7 +236,7 @@ def facing(vertices: np.ndarray, normals: np.ndarray, cameras: Sequence[Frustum]
     """Share of the vertices whose normal looks at one of the cameras."""
     looks = np.zeros(len(vertices), bool)
     for camera in cameras:
-        looks |= np.sum((centre(camera) - vertices) * normals, axis=1) > 0
+        looks |= np.sum((center(camera) - vertices) * normals, axis=1) > 0
     return float(looks.mean())
 
 

@@ -28,7 +28,7 @@ from figures import pyplot
 from lab import Drawn, Lab
 from report import RESULTS, document, on_one_thread, table, write
 from setups import NOISE_PX
-from slices import kruppa_under_noise, one_outlier, parallel_axes, surfaces, wrong_centre
+from slices import kruppa_under_noise, one_outlier, parallel_axes, surfaces, wrong_center
 from sweeps import FIGURES as SWEEPS
 from sweeps import sweep
 from tables import real_sequences
@@ -38,7 +38,7 @@ TABLES = "tables"
 PARTS: Mapping[str, Callable[[Lab], Drawn]] = {
     "5.1": one_outlier,
     "5.2": parallel_axes,
-    "5.3": wrong_centre,
+    "5.3": wrong_center,
     "5.4": surfaces,
     "5.5": kruppa_under_noise,
     "5.7-5.8": bounds,
@@ -63,7 +63,7 @@ def setting_of(lab: Lab) -> str:
     return (
         f"{lab.tests} tests a level, {lab.runs} runs a sequence ({lab.fewer}), "
         f"seed {lab.seed}. Synthetic sequences are those of section 5.5.3: five cameras, 512 x 512, 200 points, fx 500 "
-        f"to 1000, fy/fx 0.8 to 1.2, the centre up to 10 % off, and {NOISE_PX} px of noise, which the thesis does not "
+        f"to 1000, fy/fx 0.8 to 1.2, the center up to 10 % off, and {NOISE_PX} px of noise, which the thesis does not "
         "name. F's come from LEV-RANSAC; an outlying F is fitted to all its matches by the 8-point algorithm. e_focal "
         f"and e_OC are those of section 5.5.3, at most {CAP_PERCENT:g} % each, as means over the answers; medians and "
         "the share of answers are in the CSV files. `zero-curves-thesis`, `multi-start`, `perturbation`, `geometric`, "

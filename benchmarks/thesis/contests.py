@@ -71,8 +71,8 @@ def e_focal(K: FloatArray, true_K: FloatArray) -> float:
     return float(50.0 * sum(abs(K[k, k] / true_K[k, k] - 1.0) for k in (0, 1)))
 
 
-def e_centre(K: FloatArray, true_K: FloatArray) -> float:
-    """Thesis 5.5.3, e_OC: mean error of the optical centre's x and y in percent of the truth."""
+def e_center(K: FloatArray, true_K: FloatArray) -> float:
+    """Thesis 5.5.3, e_OC: mean error of the optical center's x and y in percent of the truth."""
     return float(50.0 * sum(abs(K[k, 2] / true_K[k, 2] - 1.0) for k in (0, 1)))
 
 
@@ -116,7 +116,7 @@ def summary(method: str, x: float, tries: Sequence[Attempt]) -> Row:
     """Mean and median errors over the answers, and how many there are."""
     answers = [(attempt.K, attempt.true_K) for attempt in tries if attempt.K is not None]
     row: Row = {"method": method, "x": rounded(x), "tests": len(tries), "answered": len(answers) / max(len(tries), 1)}
-    for title, error in (("e_focal", e_focal), ("e_OC", e_centre)):
+    for title, error in (("e_focal", e_focal), ("e_OC", e_center)):
         errors = [min(error(K, true_K), CAP_PERCENT) for K, true_K in answers]
         row[title] = rounded(float(np.mean(errors))) if errors else None
         row[f"{title} median"] = rounded(float(np.median(errors))) if errors else None

@@ -90,8 +90,8 @@ def camera_matrix_of(P: FloatArray) -> FloatArray:
 
 def fundamental_of(P1: FloatArray, P2: FloatArray) -> FloatArray:
     """(3, 3) F of unit norm with x2' F x1 = 0 (Hartley & Zisserman, eq. 9.1)."""
-    centre = np.linalg.svd(P1)[2][-1]
-    e2 = P2 @ centre
+    center = np.linalg.svd(P1)[2][-1]
+    e2 = P2 @ center
     cross = np.array([[0, -e2[2], e2[1]], [e2[2], 0, -e2[0]], [-e2[1], e2[0], 0]])
     F = cross @ P2 @ np.linalg.pinv(P1)
     return np.asarray(F / np.linalg.norm(F))

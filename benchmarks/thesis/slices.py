@@ -20,7 +20,7 @@ from sfm_app.types import CameraPairs
 SHOWN = ("Wadham", "Merton1")
 SCALES = np.linspace(0.4, 2.0, 161)
 """Focal lengths of a slice, over the true one."""
-CENTRE_OFF_PX = 100.0
+CENTER_OFF_PX = 100.0
 MUCH = 0.05
 """A minimum that moves by this share of the focal has moved."""
 HUANG_FAUGERAS, KRUPPA, SINES = FORMS = ("Huang-Faugeras", "Kruppa (5.6)", "Kruppa, sines")
@@ -80,26 +80,26 @@ def parallel_axes(lab: Lab) -> Drawn:
     return Drawn([Claim("5.2", says, verdict([a > b for a, b in zip(flat, sharp, strict=True)]), numbers)])
 
 
-def wrong_centre(lab: Lab) -> Drawn:
-    """Figure 5.3: the optical centre is taken to be 100 px beside the true one."""
+def wrong_center(lab: Lab) -> Drawn:
+    """Figure 5.3: the optical center is taken to be 100 px beside the true one."""
     panels, moved, numbers = [], [], []
     for name in SHOWN:
         sequence = lab.sequence(name)
         Fs = np.array([fit.F for fit in robust_fits(sequence.matches, lab.seed).values()])
         off = sequence.K.copy()
-        off[0, 2] += CENTRE_OFF_PX
-        lines = {"right centre": focal_slice(Fs, sequence.K), "centre 100 px off": focal_slice(Fs, off)}
+        off[0, 2] += CENTER_OFF_PX
+        lines = {"right center": focal_slice(Fs, sequence.K), "center 100 px off": focal_slice(Fs, off)}
         panels.append(_panel(sequence, lines))
         least = [lowest(panels[-1], line) for line in lines]
         moved.append(abs(least[1] / least[0] - 1.0) > MUCH)
-        numbers.append(f"{name}: minimum at {least[0]:.0f} px, with the wrong centre at {least[1]:.0f} px")
+        numbers.append(f"{name}: minimum at {least[0]:.0f} px, with the wrong center at {least[1]:.0f} px")
     lab.keep("5.3", draw(panels, "fx, px", "objective (5.8)"), rows_of(panels))
-    says = "an error of 100 px in the optical centre moves the minimum"
+    says = "an error of 100 px in the optical center moves the minimum"
     return Drawn([Claim("5.3", says, verdict(moved), "; ".join(numbers))])
 
 
 def surfaces(lab: Lab) -> Drawn:
-    """Figure 5.4: the objective over fx and the centre's x, for the Corridor and, in place of Valbonne, for Wadham."""
+    """Figure 5.4: the objective over fx and the center's x, for the Corridor and, in place of Valbonne, for Wadham."""
     figure, axes = pyplot().subplots(1, 2, figsize=(9.6, 3.6))
     rows = []
     for axis, name in zip(axes, ("Corridor", "Wadham"), strict=True):
@@ -138,7 +138,7 @@ def kruppa_under_noise(lab: Lab) -> Drawn:
     says = "the Kruppa equations suffer far more (here: twice) from noise on F than the Huang-Faugeras constraint"
     note = (
         "Noise of standard deviation 0.001 on every entry of F of unit norm, in units of the image width about the "
-        "centre: in pixels it would erase F. The claim is about how far it moves the minimum, as medians of "
+        "center: in pixels it would erase F. The claim is about how far it moves the minimum, as medians of "
         f"{lab.tests} draws, and about the ratios of (5.6). As the sine of the angle between the two sides of (5.5), "
         "the form of `kruppa`, the same equations have their minimum where Huang-Faugeras has it, and hold out as well."
     )

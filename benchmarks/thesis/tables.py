@@ -66,7 +66,7 @@ _NOTE = (
     "VGG sequences: the corners and matches that come with them (the thesis matched SIFT), all pairs of views that "
     "share 20 corners. Photos: SIFT matches of `sfm-app`. Pairs that LEV-RANSAC rejects or calls degenerate take no "
     "part. Truth is the K of the first view, as in Table 5.2; in the Corridor the true K's drift over its 11 views, by "
-    "5 % in the focal and by 32 % in the centre. Means are over the runs with an answer; `answered` is their share. A "
+    "5 % in the focal and by 32 % in the center. Means are over the runs with an answer; `answered` is their share. A "
     "method of the thesis always answers, unless too few curves are left; `zero-curves` may say that the photos do not "
     "determine K. The K's that come with the VGG sequences were fitted without a lens; `zero-curves` finds one "
     "(k1 -0.05 to -0.10) and then a shorter focal, as does COLMAP's bundle adjustment on the photos of Merton I (k1 "
@@ -151,14 +151,14 @@ def claims(rows: Sequence[Row]) -> list[Claim]:
     average = {row["method"]: row for row in means(rows)}
     corridor = {row["method"]: row for row in rows if row["sequence"] == "Corridor"}
     focal = {name: row["here"] for name, row in average.items()}
-    centre = {name: _mean([row["e_OC"] for row in rows if row["method"] == name]) for name in PRINTED_ORDER}
+    center = {name: _mean([row["e_OC"] for row in rows if row["method"] == name]) for name in PRINTED_ORDER}
     poor = {name: corridor[name]["e_focal"] for name in PRINTED_ORDER if name in corridor}
     poor = {name: value for name, value in poor.items() if value is not None}
     says = "all are poor on the Corridor (here: over 30 %)"
     found = [
         _ranked("Zero Curves has the lowest mean e_focal", focal, ZERO_CURVES, lowest=True),
         _ranked("the non-robust method has the highest", focal, NON_ROBUST, lowest=False),
-        _ranked("Perturbation has the lowest mean e_OC", centre, PERTURBATION, lowest=True),
+        _ranked("Perturbation has the lowest mean e_OC", center, PERTURBATION, lowest=True),
         Claim("5.3", says, verdict([value > 30 for value in poor.values()]), _listed(poor)),
     ]
     if PRODUCTION in average:

@@ -17,7 +17,7 @@ from setups import HEAVY, NOISE_PX, REACH_PX
 from slices import parallel_pair
 
 from sfm_app.selfcal.inputs import Pairs, prepare
-from sfm_app.selfcal.thesis.curves import centre_curves, degeneracy, focal_curves, usable
+from sfm_app.selfcal.thesis.curves import center_curves, degeneracy, focal_curves, usable
 from sfm_app.selfcal.thesis.meeting_point import meeting_point
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks, pair_matches
 from sfm_app.types import CameraPairs
@@ -41,19 +41,19 @@ def swept(samples: int = SAMPLES) -> FloatArray:
 
 
 def curves_of(Fs: FloatArray, size: tuple[int, int], samples: int = SAMPLES) -> FloatArray:
-    """(P, S) focal curves in image widths, the optical centre in the middle."""
+    """(P, S) focal curves in image widths, the optical center in the middle."""
     return focal_curves(prepared(Fs, size), swept(samples), (0.5, 0.5 * size[1] / size[0]))
 
 
 def support(curves: FloatArray) -> FloatArray:
-    """(P, S) the sum that thesis (5.33) maximises, for every sample of every curve."""
+    """(P, S) the sum that thesis (5.33) maximizes, for every sample of every curve."""
     distances = np.abs(curves[:, None] - curves[None])
     return np.asarray(np.exp(-distances / SIGMA).sum(axis=1) - 1.0)
 
 
 def examples(lab: Lab) -> Drawn:
     """Figure 5.11: curves of exact F's of synthetic cameras, and of real ones."""
-    tracks = make_tracks(TrackOptions(centre_offset=0.0, width=1024, height=768), lab.seed)
+    tracks = make_tracks(TrackOptions(center_offset=0.0, width=1024, height=768), lab.seed)
     castle = lab.sequence("Castle-P19").first(5)
     real = robust_fits(castle.matches, lab.seed)
     figure, axes = pyplot().subplots(2, 2, figsize=(9, 7))
@@ -66,14 +66,14 @@ def examples(lab: Lab) -> Drawn:
     for line, (title, Fs, size, K) in zip(axes, shown, strict=True):
         width, pairs = size[0], prepared(Fs, size)
         curves = curves_of(Fs, size)
-        centres = centre_curves(pairs, np.arange(1, SAMPLES + 1) / SAMPLES, (K[0, 0] / width, K[1, 1] / width))
+        centers = center_curves(pairs, np.arange(1, SAMPLES + 1) / SAMPLES, (K[0, 0] / width, K[1, 1] / width))
         _plot(line[0], width * swept(), width * curves, (K[0, 0], K[1, 1]), RANGE * width)
         label(line[0], "fx, px", "fy, px", f"{title}: focal")
         x = width * np.arange(1, SAMPLES + 1) / SAMPLES
-        _plot(line[1], x, width * centres, (K[0, 2], K[1, 2]), size[1])
-        label(line[1], "cx, px", "cy, px", f"{title}: optical centre")
+        _plot(line[1], x, width * centers, (K[0, 2], K[1, 2]), size[1])
+        label(line[1], "cx, px", "cy, px", f"{title}: optical center")
         misses.append([abs(np.interp(K[0, 0], width * swept(), width * curve) / K[1, 1] - 1.0) for curve in curves])
-        for kind, axis, found in (("focal", width * swept(), curves), ("centre", x, centres)):
+        for kind, axis, found in (("focal", width * swept(), curves), ("center", x, centers)):
             rows += rows_of([Panel(f"{title}, {kind}", axis, {f"F{k + 1}": width * c for k, c in enumerate(found)})])
     lab.keep("5.11", figure, rows)
     numbers = f"at the true fx they miss the true fy by {100 * max(misses[0]):.2f} % at most; "
@@ -85,7 +85,7 @@ def examples(lab: Lab) -> Drawn:
 
 
 def outlying(lab: Lab) -> Drawn:
-    """Figure 5.12: ten curves of which two are outlying, and the function that their meeting point maximises."""
+    """Figure 5.12: ten curves of which two are outlying, and the function that their meeting point maximizes."""
     errors = [_meeting_error(*_two_outlying(seed)) for seed in range(lab.seed, lab.seed + lab.tests)]
     fits, size, K = _two_outlying(lab.seed)
     curves = usable(curves_of(np.array([fit.F for fit in fits.values()]), size), RANGE)
@@ -131,7 +131,7 @@ def timing(lab: Lab) -> Drawn:
     slower = f"slower at {', '.join(crossing) or 'none'} of the {len(samples)} numbers measured, up to {samples[-1]}"
     claims = [
         Claim("5.14a", "the time of the search grows linearly with the number of F's", verdict([growth < 9]), linear),
-        Claim("5.14b", "it is faster than a nonlinear optimisation up to 370 samples", verdict(faster), slower),
+        Claim("5.14b", "it is faster than a nonlinear optimization up to 370 samples", verdict(faster), slower),
     ]
     return Drawn(claims, note="Medians of 9 runs, without the time for the curves themselves.")
 
@@ -227,7 +227,7 @@ def _of_two(focals: tuple[float, float], seed: int) -> tuple[FloatArray, tuple[i
     found = []
     for n, focal in enumerate(focals):
         options = TrackOptions(
-            cameras=4, focal_px=(focal, focal), aspect=(1.0, 1.0), centre_offset=0.0, sigma_px=NOISE_PX
+            cameras=4, focal_px=(focal, focal), aspect=(1.0, 1.0), center_offset=0.0, sigma_px=NOISE_PX
         )
         tracks = make_tracks(options, 2 * seed + n)
         found += [fit.F for fit in robust_fits(dict(pair_matches(tracks)), seed).values()][:5]

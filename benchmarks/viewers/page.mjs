@@ -2,8 +2,8 @@
 import * as THREE from 'three';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
 
-const GREY = 0x9a9a9a;
-const DARK = 0x202020; // behind points, of which most are as light as the grey
+const GRAY = 0x9a9a9a;
+const DARK = 0x202020; // behind points, of which most are as light as the gray
 const FROM = new THREE.Vector3(0.35, 0.25, 1).normalize(); // +z is the front of a glTF model
 const FOV = 35;
 const MARGIN = 1.08;
@@ -89,7 +89,7 @@ window.show = async (url, size) => {
   renderer.setSize(size.width, size.height);
   const scene = new THREE.Scene();
   const parts = counted(gltf.scene);
-  const background = parts.triangles ? GREY : DARK;
+  const background = parts.triangles ? GRAY : DARK;
   scene.background = new THREE.Color(background);
   scene.add(gltf.scene, new THREE.HemisphereLight(0xffffff, 0x888888, 2), new THREE.DirectionalLight(0xffffff, 2));
   const box = new THREE.Box3().setFromObject(gltf.scene);

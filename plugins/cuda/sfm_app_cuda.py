@@ -1,6 +1,6 @@
 """COLMAP's PatchMatch stereo (Schoenberger et al., ECCV 2016) on the GPU, as a plug-in of sfm-app.
 
-Photos are done one after the other, first on their own, then with the depths of their neighbours, so that progress is
+Photos are done one after the other, first on their own, then with the depths of their neighbors, so that progress is
 seen per photo and a run that was killed goes on with the photo at which it stopped: COLMAP leaves maps alone that are
 there already.
 """
@@ -30,7 +30,7 @@ def unavailable() -> str:
 
 
 def make(task: DepthTask) -> list[Rejected | None]:
-    """Depth and normal maps of all photos that have neighbours."""
+    """Depth and normal maps of all photos that have neighbors."""
     gpu = Lock()
     everything = range(len(task.views))
     task.map(partial(_match, task=task, geometric=False, gpu=gpu), everything, "matching depths")
@@ -39,14 +39,14 @@ def make(task: DepthTask) -> list[Rejected | None]:
 
 def _match(index: int, task: DepthTask, geometric: bool, gpu: Lock) -> Rejected | None:
     view = task.views[index]
-    neighbours = [task.views[other] for other in task.ranked[index]]
+    neighbors = [task.views[other] for other in task.ranked[index]]
     kind: Kind = "geometric" if geometric else "photometric"
-    if not neighbours:
+    if not neighbors:
         return Rejected("no photo shares enough points")
     with gpu:
         if not task.store.has(view, kind):
             config = task.folder / "stereo" / CONFIG
-            config.write_text(f"{view.name}\n{', '.join(other.name for other in neighbours)}\n", encoding="utf-8")
+            config.write_text(f"{view.name}\n{', '.join(other.name for other in neighbors)}\n", encoding="utf-8")
             try:
                 pycolmap.patch_match_stereo(task.folder, options=_options(task.options, geometric), config_path=config)
             except Exception as err:  # pycolmap raises RuntimeError and ValueError without a common base

@@ -41,8 +41,8 @@ def colmap(monkeypatch, task):
     calls = []
 
     def patch_match_stereo(folder, *, options, config_path):
-        name, neighbours = config_path.read_text(encoding="utf-8").splitlines()
-        calls.append((name, neighbours, options.geom_consistency))
+        name, neighbors = config_path.read_text(encoding="utf-8").splitlines()
+        calls.append((name, neighbors, options.geom_consistency))
         assert (folder, options.filter) == (task.folder, options.geom_consistency)
         assert (options.filter_min_num_consistent, options.max_image_size) == (3, 700)
         if len(calls) != 3:
@@ -54,7 +54,7 @@ def colmap(monkeypatch, task):
     return calls
 
 
-def test_every_photo_alone_first_then_with_its_neighbours(task, colmap):
+def test_every_photo_alone_first_then_with_its_neighbors(task, colmap):
     found = sfm_app_cuda.make(task)
 
     assert colmap == [

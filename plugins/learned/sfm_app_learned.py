@@ -32,10 +32,10 @@ many matches."""
 MOST = 1024
 """Keypoints, the strongest: matching takes 2 to 4 s a pair on one core, with 2048 of them four times as long."""
 CONTRAST = 8
-"""Grey levels; in a picture with fewer the network finds its own padding."""
+"""Gray levels; in a picture with fewer the network finds its own padding."""
 NEAR, LEAST = 0.8, 20
 """Cosine between descriptors, and so many features that near to each other: with fewer, a pair is not worth the
-seconds. On dinoSparseRing all neighbours have 28 or more and half of all pairs fewer than 20; chosen there alone."""
+seconds. On dinoSparseRing all neighbors have 28 or more and half of all pairs fewer than 20; chosen there alone."""
 ONE_AT_A_TIME = Lock()
 
 
@@ -56,7 +56,7 @@ def find(picture: NDArray[np.uint8], options: MatchSettings) -> Features:
         found = _finder(min(MOST, options.max_features))(pixels)[0]
     scores = found.keypoint_scores.numpy()
     best = np.argsort(-scores, kind="stable")
-    keypoints = found.keypoints.numpy().astype(np.float64)[best] + 0.5  # the networks' pixels have whole centres
+    keypoints = found.keypoints.numpy().astype(np.float64)[best] + 0.5  # the networks' pixels have whole centers
     keypoints *= np.array([width / shown.shape[1], height / shown.shape[0]])
     inside = np.clip(keypoints, 0.0, [width, height])
     return Features((width, height), inside, {"descriptors": found.descriptors.numpy()[best].astype(np.float32)})

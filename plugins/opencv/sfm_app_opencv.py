@@ -36,7 +36,7 @@ def fit_usac(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: in
 
 
 def fit_usac_accurate(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-    """USAC with graph-cut local optimisation (Barath and Matas 2018)."""
+    """USAC with graph-cut local optimization (Barath and Matas 2018)."""
     return estimate_with(partial(_find, cv2.USAC_ACCURATE), x1, x2, options, seed)
 
 
@@ -61,6 +61,6 @@ def sfm_estimators() -> Iterable[Estimator]:
     return [
         Estimator("opencv-magsac", fit_magsac, "OpenCV's MAGSAC++"),
         Estimator("opencv-usac", fit_usac, "OpenCV's USAC with its default parts"),
-        Estimator("opencv-usac-accurate", fit_usac_accurate, "OpenCV's USAC with graph-cut local optimisation"),
+        Estimator("opencv-usac-accurate", fit_usac_accurate, "OpenCV's USAC with graph-cut local optimization"),
         Estimator("opencv-ransac", fit_ransac, "OpenCV's RANSAC, its best sample as it is"),
     ]

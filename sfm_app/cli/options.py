@@ -84,7 +84,7 @@ def assigned(text: str) -> dict[str, Any]:
     """Return TABLE.KEY=VALUE as nested settings; ConfigError where it is something else."""
     name, equals, value = text.partition("=")
     if not equals:
-        raise ConfigError(f"--set {text}: no '=' in it", hint="write --set depth.neighbours=6")
+        raise ConfigError(f"--set {text}: no '=' in it", hint="write --set depth.neighbors=6")
     try:
         return tomllib.loads(f"{name}={value}")
     except (ValueError, RecursionError):
@@ -92,4 +92,4 @@ def assigned(text: str) -> dict[str, Any]:
     try:
         return tomllib.loads(f'{name}="{value}"')  # a word without quotes
     except (ValueError, RecursionError) as err:
-        raise ConfigError(f"--set {text}: not TOML: {err}", hint="write --set depth.neighbours=6") from None
+        raise ConfigError(f"--set {text}: not TOML: {err}", hint="write --set depth.neighbors=6") from None

@@ -86,7 +86,7 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
     yield from _badly_adjusted(summary.get("adjustment", {}))
     orientation = summary.get("orientation", {})
     if orientation.get("failed"):
-        yield f"it stands as mapping left it, neither upright nor in metres: {orientation['failed']}"
+        yield f"it stands as mapping left it, neither upright nor in meters: {orientation['failed']}"
     elif orientation:
         deviation = orientation["up_deviation_deg"]
         sure = f"to about {max(deviation, 0.1):.1f} degrees" if deviation is not None else "nobody knows how exactly"
@@ -155,4 +155,4 @@ def _perhaps_not_upright(orientation: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _unit(orientation: Mapping[str, Any]) -> str:
-    return "metres by GPS" if orientation["unit"] == "metre" else "a unit of its own"
+    return "meters by GPS" if orientation["unit"] == "meter" else "a unit of its own"

@@ -69,7 +69,7 @@ def adjust(model: Any, database: Path) -> Adjusted:
     """
     model, points = pycolmap.Reconstruction(model), model.num_points3D()
     for camera in model.cameras.values():
-        _generalise(camera)
+        _generalize(camera)
     drop_endless(model)
     graph = _correspondences(model, database)
     open_points = []
@@ -209,7 +209,7 @@ def used_cameras(model: Any) -> Counter[int]:
     return Counter(model.images[image_id].camera_id for image_id in sorted(model.reg_image_ids()))
 
 
-def _generalise(camera: Any) -> None:
+def _generalize(camera: Any) -> None:
     """Change the camera in place to the model that holds all that may be freed; both share the first radial term."""
     if camera.model.name != TWO_FOCALS:
         K, radial = camera.calibration_matrix(), float(camera.params[camera.extra_params_idxs()[0]])

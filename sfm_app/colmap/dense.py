@@ -60,12 +60,12 @@ def _view(model: "pycolmap.Reconstruction", image: "pycolmap.Image") -> View:
         height=camera.height,
         point_ids=np.array(ids, np.int64),
         points=np.array([model.points3D[i].xyz for i in ids], np.float64).reshape(-1, 3),
-        # COLMAP's fusion puts the depth of pixel (row, col) on the ray through (col, row), half a pixel off its centre.
+        # COLMAP's fusion puts the depth of pixel (row, col) on the ray through (col, row), half a pixel off its center.
         sample_px=0.0,
     )
 
 
-def read_grey(dense_dir: Path, view: View) -> NDArray[np.uint8]:
+def read_gray(dense_dir: Path, view: View) -> NDArray[np.uint8]:
     """Return the undistorted photo of a view, (H, W)."""
     # imdecode, because OpenCV does not open names beyond ASCII on every system
     image = cv2.imdecode(np.fromfile(dense_dir / "images" / view.name, np.uint8), cv2.IMREAD_GRAYSCALE)
@@ -90,7 +90,7 @@ class DenseStore:
         self.dense_dir = dense_dir
 
     def photo(self, view: View) -> NDArray[np.uint8]:
-        return read_grey(self.dense_dir, view)
+        return read_gray(self.dense_dir, view)
 
     def has(self, view: View, kind: Kind) -> bool:
         # the depth map is what is written last

@@ -14,7 +14,7 @@ from sfm_app.stereo import View
 
 MASKS = "masks"
 REACH_PX = 2
-"""Pixels around what is masked that are not used either: colours are read between four pixels, half a pixel aside."""
+"""Pixels around what is masked that are not used either: colors are read between four pixels, half a pixel aside."""
 
 BoolImage = NDArray[np.bool_]
 """(H, W)."""

@@ -94,8 +94,8 @@ def cameras_of(model: Any) -> dict[int, tuple[NDArray[np.float64], float]]:
     return found
 
 
-def colour(model: Any, photo_dir: Path, workers: int) -> None:
-    """Give every point the mean colour of its pixels."""
+def color(model: Any, photo_dir: Path, workers: int) -> None:
+    """Give every point the mean color of its pixels."""
     patiently(lambda: model.extract_colors_for_all_images(photo_dir, num_threads=workers))
 
 
@@ -188,7 +188,7 @@ def seen_points(model: Any, most: int) -> SeenPoints:
 
 
 def sparse_model(model_dir: Path) -> Model:
-    """Return the coloured points of a model on disk, and its photos where they were taken, in order of ids.
+    """Return the colored points of a model on disk, and its photos where they were taken, in order of ids.
 
     Points that two photos see have no third one to confirm them, and the wrong ones among them lie far out, where they
     make the scene a dot in its viewer: outside the box of the confirmed points they are left out.

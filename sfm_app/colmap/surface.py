@@ -51,7 +51,7 @@ def read_fused(dense_dir: Path) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 
 def poisson(dense_dir: Path, depth: int) -> Surface:
-    """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points, with their colours.
+    """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points, with their colors.
 
     Args:
         dense_dir: dense workspace.
@@ -68,7 +68,7 @@ def poisson(dense_dir: Path, depth: int) -> Surface:
 def simplify(surface: Surface, share: float, max_error: float, scratch: Path) -> Surface:
     """Collapse edges, cheapest first by their quadric error (Garland and Heckbert, SIGGRAPH 1997).
 
-    Each vertex has the mean colour of those that it stands for.
+    Each vertex has the mean color of those that it stands for.
 
     Args:
         surface: a manifold; its borders are kept.
@@ -87,9 +87,9 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
 
 
 def _mean_colors(surface: Surface, vertices: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Return (V, 3) mean colour of the old vertices to which each new one (V, 3) is nearest.
+    """Return (V, 3) mean color of the old vertices to which each new one (V, 3) is nearest.
 
-    Pycolmap 4.2 reads no colours.
+    Pycolmap 4.2 reads no colors.
     """
     from scipy.spatial import cKDTree
 

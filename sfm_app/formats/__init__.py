@@ -8,7 +8,7 @@ from sfm_app.formats.ply import write_ply
 from sfm_app.types import Model
 
 EXPORTERS: dict[str, tuple[Callable[[Model, str], Mapping[str, bytes]], str]] = {
-    "ply": (write_ply, "binary PLY, colours and normals per vertex; MeshLab, CloudCompare, Blender"),
+    "ply": (write_ply, "binary PLY, colors and normals per vertex; MeshLab, CloudCompare, Blender"),
     "glb": (write_glb, "binary glTF 2.0, textured, all in one file; web viewers, game engines, Blender"),
     "obj": (write_obj, "Wavefront OBJ with MTL and JPEG pages, textured; everything else"),
 }

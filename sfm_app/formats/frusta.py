@@ -12,7 +12,7 @@ CAMERA_COLOR = (255, 96, 32)
 """sRGB of the cameras: an orange that walls, trees and skies do not have."""
 
 FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
-"""Lines between the camera's centre (0) and the corners of its picture (1 to 4)."""
+"""Lines between the camera's center (0) and the corners of its picture (1 to 4)."""
 
 DOTS = 12
 """Per edge, where a format has no lines."""
@@ -26,14 +26,14 @@ def camera_lines(model: Model) -> tuple[FloatArray, IndexArray]:
     cameras = model.cameras
     if not cameras:
         return np.zeros((0, 3)), np.zeros((0, 2), np.int64)
-    depth = frustum_depth(np.array([centre(camera) for camera in cameras]), model.surface.vertices)
+    depth = frustum_depth(np.array([center(camera) for camera in cameras]), model.surface.vertices)
     corners = np.concatenate([frustum_corners(camera, depth) for camera in cameras])
     starts = 5 * np.arange(len(cameras), dtype=np.int64)
     return corners, (starts[:, None, None] + np.array(FRUSTUM_EDGES)).reshape(-1, 2)
 
 
 def camera_dots(model: Model) -> tuple[FloatArray, NDArray[np.uint8]]:
-    """Return the cameras of a model as dotted wire frames: places (D, 3) and colours (D, 3)."""
+    """Return the cameras of a model as dotted wire frames: places (D, 3) and colors (D, 3)."""
     corners, lines = camera_lines(model)
     along = np.linspace(0.0, 1.0, DOTS, endpoint=False)[:, None, None]
     dots = ((1 - along) * corners[lines[:, 0]] + along * corners[lines[:, 1]]).reshape(-1, 3)
@@ -41,17 +41,17 @@ def camera_dots(model: Model) -> tuple[FloatArray, NDArray[np.uint8]]:
 
 
 def painted(count: int) -> NDArray[np.uint8]:
-    """Return the cameras' colour for so many vertices."""
+    """Return the cameras' color for so many vertices."""
     return np.tile(np.array(CAMERA_COLOR, np.uint8), (count, 1))
 
 
-def centre(camera: Frustum) -> FloatArray:
+def center(camera: Frustum) -> FloatArray:
     """Return where a camera stands: (3,)."""
     return np.asarray(-camera.cam_from_world[:, :3].T @ camera.cam_from_world[:, 3])
 
 
 def frustum_corners(camera: Frustum, depth: float) -> FloatArray:
-    """Return (5, 3) the camera's centre and, at this depth, the corners of its picture from the top left one on,
+    """Return (5, 3) the camera's center and, at this depth, the corners of its picture from the top left one on,
     clockwise.
     """
     pixels = [(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]
@@ -60,15 +60,15 @@ def frustum_corners(camera: Frustum, depth: float) -> FloatArray:
     return np.asarray((seen - camera.cam_from_world[:, 3]) @ camera.cam_from_world[:, :3])
 
 
-def frustum_depth(centres: FloatArray, points: FloatArray) -> float:
+def frustum_depth(centers: FloatArray, points: FloatArray) -> float:
     """Return how deep the frusta are drawn.
 
-    A third of the usual distance between neighbouring cameras, within bounds.
+    A third of the usual distance between neighboring cameras, within bounds.
     """
-    size = max(scene_size(centres), scene_size(points)) or 1.0
-    apart = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    size = max(scene_size(centers), scene_size(points)) or 1.0
+    apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)
     np.fill_diagonal(apart, np.inf)
-    step = float(np.median(apart.min(axis=1))) if len(centres) > 1 else np.inf
+    step = float(np.median(apart.min(axis=1))) if len(centers) > 1 else np.inf
     return float(np.clip(step / 3, LEAST_SHARE * size, MOST_SHARE * size))
 
 
@@ -79,7 +79,7 @@ def scene_size(points: FloatArray) -> float:
 
 
 def with_cameras(model: Model) -> tuple[FloatArray, NDArray[np.uint8], IndexArray]:
-    """Return vertices of a model and behind them the corners of its cameras, their colours, and the cameras' lines."""
+    """Return vertices of a model and behind them the corners of its cameras, their colors, and the cameras' lines."""
     corners, lines = camera_lines(model)
     surface = model.surface
     colors = np.concatenate([surface.colors, painted(len(corners))])

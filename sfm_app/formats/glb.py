@@ -1,8 +1,8 @@
 """Binary glTF 2.0: one file that web viewers, game engines and Blender open.
 
-Photographed colours carry their light already, and a viewer that lights them once more makes them darker on one side
+Photographed colors carry their light already, and a viewer that lights them once more makes them darker on one side
 and pale on the other. So the material is KHR_materials_unlit: three.js, Babylon.js, model-viewer, Blender and others
-show the colours as the photos have them. Where the extension is unknown the material is a rough, matt surface, lit by
+show the colors as the photos have them. Where the extension is unknown the material is a rough, matt surface, lit by
 the normals, which are there for that and for relighting. It is not listed as required: nobody has to refuse the file.
 Without a material a viewer would take glTF's default, which is metal and looks black.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.formats.checks import check, unit_normals
-from sfm_app.formats.frusta import CAMERA_COLOR, camera_lines, centre, frustum_depth
+from sfm_app.formats.frusta import CAMERA_COLOR, camera_lines, center, frustum_depth
 from sfm_app.formats.gltf import Glb
 from sfm_app.formats.pages import jpeg, pages_in_use, split_corners
 from sfm_app.types import Frustum, Model, Texture
@@ -28,7 +28,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
-    """Return triangles with their texture or with a colour per vertex; else points; and the cameras, if there are any.
+    """Return triangles with their texture or with a color per vertex; else points; and the cameras, if there are any.
 
     Args:
         model: what to write.
@@ -45,7 +45,7 @@ def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
     if model.texture is not None and len(model.surface.faces):
         primitives = textured(glb, model, model.texture)
     else:
-        primitives = [coloured(glb, model)]
+        primitives = [colored(glb, model)]
     mesh = glb.add("meshes", {"name": name, "primitives": primitives})
     nodes = [glb.add("nodes", {"name": name, "mesh": mesh})]
     if model.cameras:
@@ -73,12 +73,12 @@ def textured(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
     return primitives
 
 
-def coloured(glb: Glb, model: Model) -> dict[str, Any]:
-    """Return triangles, or points where there are none, with a colour per vertex."""
+def colored(glb: Glb, model: Model) -> dict[str, Any]:
+    """Return triangles, or points where there are none, with a color per vertex."""
     surface = model.surface
     normals = unit_normals(surface) if len(surface.faces) else None
     attributes = shape(glb, surface.vertices, normals) | {"COLOR_0": glb.add_vertices(linear_colors(surface.colors))}
-    primitive = {"attributes": attributes, "material": photographed(glb, "colours")}
+    primitive = {"attributes": attributes, "material": photographed(glb, "colors")}
     if normals is None:
         return primitive | {"mode": POINTS}
     return primitive | {"indices": glb.add_indices(surface.faces, len(surface.vertices))}
@@ -91,7 +91,7 @@ def shape(glb: Glb, vertices: NDArray[np.float64], normals: NDArray[np.float64] 
 
 
 def photographed(glb: Glb, name: str, **base: Any) -> int:
-    """Return a material that shows its colours as they are; both sides, since an open surface has no inside to hide."""
+    """Return a material that shows its colors as they are; both sides, since an open surface has no inside to hide."""
     return glb.add(
         "materials",
         {
@@ -104,9 +104,9 @@ def photographed(glb: Glb, name: str, **base: Any) -> int:
 
 
 def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return linear light in [0, 1] of 8-bit sRGB colours, same shape (IEC 61966-2-1).
+    """Return linear light in [0, 1] of 8-bit sRGB colors, same shape (IEC 61966-2-1).
 
-    glTF multiplies colours of vertices into the light as they are, so they have to be linear, while photos are sRGB.
+    glTF multiplies colors of vertices into the light as they are, so they have to be linear, while photos are sRGB.
     Floats: 8 linear bits show steps in the shadows, and not every reader knows 16.
     """
     value = np.arange(256) / 255.0
@@ -130,18 +130,18 @@ def cameras(glb: Glb, model: Model) -> list[int]:
     }
     mesh = glb.add("meshes", {"name": "cameras", "primitives": [primitive]})
     nodes = [glb.add("nodes", {"name": "cameras", "mesh": mesh})]
-    near = 0.1 * frustum_depth(np.array([centre(camera) for camera in model.cameras]), model.surface.vertices)
+    near = 0.1 * frustum_depth(np.array([center(camera) for camera in model.cameras]), model.surface.vertices)
     return nodes + [glb.add("nodes", camera_node(glb, camera, near)) for camera in model.cameras]
 
 
 def camera_node(glb: Glb, camera: Frustum, near: float) -> dict[str, Any]:
-    """Return a camera of glTF where the photo was taken; its centre is in the middle, as glTF knows no other."""
+    """Return a camera of glTF where the photo was taken; its center is in the middle, as glTF knows no other."""
     lens = {
         "yfov": float(2 * np.arctan(camera.height / (2 * camera.K[1, 1]))),
         "aspectRatio": float(camera.width / camera.K[0, 0] * camera.K[1, 1] / camera.height),
         "znear": near,
     }
     matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = camera.cam_from_world[:, :3].T @ FLIP, centre(camera)
+    matrix[:3, :3], matrix[:3, 3] = camera.cam_from_world[:, :3].T @ FLIP, center(camera)
     number = glb.add("cameras", {"name": camera.name, "type": "perspective", "perspective": lens})
     return {"name": camera.name, "camera": number, "matrix": matrix.T.ravel().tolist()}

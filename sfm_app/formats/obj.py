@@ -21,11 +21,11 @@ CHUNK = 50_000
 """Rows that are formatted at once: Python numbers take several times the memory of their text."""
 
 MATERIAL = "newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 0\n"
-"""`illum 0` shows the colours as they are: photos carry their light already."""
+"""`illum 0` shows the colors as they are: photos carry their light already."""
 
 
 def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
-    """Return triangles with normals and their texture or a colour per vertex.
+    """Return triangles with normals and their texture or a color per vertex.
 
     Else points; and cameras, if any, as lines.
 
@@ -59,7 +59,7 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
 
 
 def vertex_lines(model: Model, *, with_colors: bool) -> Iterator[str]:
-    """Yield vertices, with colours behind the coordinates as MeshLab began it, normals, points and lines."""
+    """Yield vertices, with colors behind the coordinates as MeshLab began it, normals, points and lines."""
     vertices, colors, lines = with_cameras(model)
     place = f"%.{decimals(model.surface.vertices)}f"
     values, form = [vertices], [place] * 3

@@ -12,9 +12,9 @@ JPEG_QUALITY = 90
 
 
 def jpeg(page: NDArray[np.uint8]) -> bytes:
-    """Return a page of texture (H, W, 3) as JPEG, with colours as sharp as brightness.
+    """Return a page of texture (H, W, 3) as JPEG, with colors as sharp as brightness.
 
-    JPEG's usual half resolution for colours smears them across the borders of charts: on the page of a brick wall it
+    JPEG's usual half resolution for colors smears them across the borders of charts: on the page of a brick wall it
     costs 3 dB, and files of the same size are 1.5 dB nearer to the page with full resolution and less quality.
     """
     from PIL import Image

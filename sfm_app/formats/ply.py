@@ -19,10 +19,10 @@ Columns = list[NDArray[Any]]
 
 
 def write_ply(model: Model, name: str) -> Mapping[str, bytes]:
-    """Return triangles with normals and a colour per vertex; or points, and behind them the cameras as dotted frusta.
+    """Return triangles with normals and a color per vertex; or points, and behind them the cameras as dotted frusta.
 
     Dots, because readers differ in what they make of a file with points and edges or points and triangles, and some
-    then show no points at all. A cloud of coloured points is the same for everyone.
+    then show no points at all. A cloud of colored points is the same for everyone.
 
     Args:
         model: what to write; PLY has no common way to hold a texture, or the cameras of a surface: left out.

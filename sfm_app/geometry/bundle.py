@@ -124,7 +124,7 @@ def reduce(bundle: Bundle, scale_px: float) -> Reduced:
         bundle: the model; what it says about the cameras is right where poses and points fit best.
         scale_px: s of the loss s^2 (sqrt(1 + |r|^2 / s^2) - 1), which is COLMAP's SOFT_L1.
     """
-    r, by_view, by_point, seen = _linearised(bundle, scale_px)
+    r, by_view, by_point, seen = _linearized(bundle, scale_px)
     whiten, rank = _whiten(by_point, bundle.point, len(bundle.X))
     by_point = np.einsum("nki,nji->nkj", by_point, whiten[bundle.point])
     poses, cameras = POSE * len(bundle.R), CAMERA * len(bundle.params)
@@ -219,7 +219,7 @@ def lost_points(bundle: Bundle) -> NDArray[np.bool_]:
     return np.bincount(bundle.point[~in_sight(bundle, r)], minlength=len(bundle.X)) > 0
 
 
-def _linearised(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+def _linearized(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
     """Return weighted residuals (N, 2), derivatives by view (N, 2, 14) and point (N, 2, 3), and what counts.
 
     The rest are 0: a point behind its camera, or in the plane of it, would pull at all that is near.
@@ -273,9 +273,9 @@ def _gauge(bundle: Bundle) -> NDArray[np.int64]:
     """Return columns of the poses that are free when the first photo stays, and the distance to the photo farthest from
     it.
     """
-    centres = -np.einsum("nji,nj->ni", bundle.R, bundle.t)
-    far = int(np.argmax(np.linalg.norm(centres - centres[0], axis=1)))
-    relative = bundle.R[far] @ (centres[0] - centres[far])
+    centers = -np.einsum("nji,nj->ni", bundle.R, bundle.t)
+    far = int(np.argmax(np.linalg.norm(centers - centers[0], axis=1)))
+    relative = bundle.R[far] @ (centers[0] - centers[far])
     held = {POSE * far + 3 + int(np.argmax(np.abs(relative)))} | set(range(POSE))
     return np.array([k for k in range(POSE * len(bundle.R)) if k not in held], np.int64)
 

@@ -16,7 +16,7 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.floa
 
 
 def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) -> NDArray[np.float64]:
-    """Return (3, 3): square pixels, the optical centre in the middle, and the given focal or the usual guess.
+    """Return (3, 3): square pixels, the optical center in the middle, and the given focal or the usual guess.
 
     Args:
         size: (width, height) in pixels.

@@ -22,7 +22,7 @@ def algebraic_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray
     """Return |x2' F x1| with F of Frobenius norm 1 and points (x, y, 1): |A b| per match (thesis 2.28 and 4.2).
 
     Unlike the others it has no unit, and it changes with the origin and the scale of the coordinates: give it points
-    and F in the frame that is meant, such as that of `hartley_normalisation`.
+    and F in the frame that is meant, such as that of `hartley_normalization`.
 
     Args and errors as in `sampson_distance`.
 
@@ -83,7 +83,7 @@ def reprojection_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatAr
 
 
 def nearest_exact_matches(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the matches nearest to the given ones that fulfil x2' F x1 = 0.
+    """Return the matches nearest to the given ones that fulfill x2' F x1 = 0.
 
     Optimal triangulation in the images (HZ 12.5).
 

@@ -25,7 +25,7 @@ def homogeneous_pair(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArr
     return h1, h2
 
 
-def hartley_normalisation(x: ArrayLike) -> FloatArray:
+def hartley_normalization(x: ArrayLike) -> FloatArray:
     """Return the (3, 3) similarity that puts the centroid at 0 and the mean distance from it at sqrt(2).
 
     Raises:
@@ -33,17 +33,17 @@ def hartley_normalisation(x: ArrayLike) -> FloatArray:
     """
     points = homogeneous(x)[:, :2]
     if not len(points):
-        raise ValueError("no points to normalise")
-    centre = points.mean(axis=0)
-    spread = float(np.hypot(*(points - centre).T).mean())
-    if not spread > 1e-9 * max(1.0, float(np.abs(centre).max())):
+        raise ValueError("no points to normalize")
+    center = points.mean(axis=0)
+    spread = float(np.hypot(*(points - center).T).mean())
+    if not spread > 1e-9 * max(1.0, float(np.abs(center).max())):
         raise ValueError("all points coincide")
     scale = np.sqrt(2) / spread
-    return np.array([[scale, 0, -scale * centre[0]], [0, scale, -scale * centre[1]], [0, 0, 1]])
+    return np.array([[scale, 0, -scale * center[0]], [0, scale, -scale * center[1]], [0, 0, 1]])
 
 
 def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) -> FloatArray:
-    """Return normalised 8-point algorithm (thesis 4.3.2): algebraic least squares, then the nearest matrix of rank 2.
+    """Return normalized 8-point algorithm (thesis 4.3.2): algebraic least squares, then the nearest matrix of rank 2.
 
     Args:
         x1: (N, 2) pixels, N >= 8.
@@ -59,7 +59,7 @@ def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) 
     h1, h2 = homogeneous_pair(x1, x2)
     if len(h1) < 8:
         raise ValueError(f"the 8-point algorithm needs 8 matches, got {len(h1)}")
-    T1, T2 = hartley_normalisation(h1[:, :2]), hartley_normalisation(h2[:, :2])
+    T1, T2 = hartley_normalization(h1[:, :2]), hartley_normalization(h2[:, :2])
     h1, h2 = h1 @ T1.T, h2 @ T2.T
     design = (h2[:, :, None] * h1[:, None, :]).reshape(-1, 9)
     if weights is not None:
@@ -91,7 +91,7 @@ def unit_norm(F: ArrayLike) -> FloatArray:
 
 
 def epipoles(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return homogeneous unit vectors e1, e2 with F e1 = 0 and F' e2 = 0: each camera centre seen by the other."""
+    """Return homogeneous unit vectors e1, e2 with F e1 = 0 and F' e2 = 0: each camera center seen by the other."""
     U, _, Vt = np.linalg.svd(np.asarray(F, dtype=np.float64))
     return Vt[2], U[:, 2]
 
@@ -101,7 +101,7 @@ def canonical_cameras(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
 
     v is free: it says which plane of the scene lies at infinity. With F of norm 1, singular values s1 >= s2, and
     v = sqrt(s1 s2) e1 the left 3 x 3 of P2 has the singular values s1, sqrt(s1 s2), s2: invertible, and as well
-    conditioned as F lets it be. With pixels s1 / s2 is large; give F of centred points with coordinates near 1.
+    conditioned as F lets it be. With pixels s1 / s2 is large; give F of centered points with coordinates near 1.
 
     Args:
         F: (3, 3), rank 2, any scale.

@@ -52,7 +52,7 @@ def relative_pose(E: Array, x1: Array, x2: Array) -> tuple[Array, Array, Array, 
 
     Args:
         E: (3, 3) essential matrix.
-        x1: (N, 2) normalised image points of view 1, that is (K1^-1 x)_1,2.
+        x1: (N, 2) normalized image points of view 1, that is (K1^-1 x)_1,2.
         x2: (N, 2) partners in view 2.
 
     Returns:

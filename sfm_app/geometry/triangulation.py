@@ -28,12 +28,12 @@ def triangulate(P1: Array, P2: Array, x1: Array, x2: Array) -> Array:
     return points
 
 
-def triangulation_angle_deg(X: Array, centre1: Array, centre2: Array) -> Array:
-    """Return angle at which the two rays to each point meet: X (N, 3), camera centres (3,).
+def triangulation_angle_deg(X: Array, center1: Array, center2: Array) -> Array:
+    """Return angle at which the two rays to each point meet: X (N, 3), camera centers (3,).
 
     (N,) degrees in [0, 180].
     """
-    ray1, ray2 = X - centre1, X - centre2
+    ray1, ray2 = X - center1, X - center2
     with np.errstate(invalid="ignore"):
         cosine = (ray1 * ray2).sum(axis=1) / (np.linalg.norm(ray1, axis=1) * np.linalg.norm(ray2, axis=1))
     angles: Array = np.degrees(np.arccos(np.clip(np.nan_to_num(cosine, nan=1.0), -1.0, 1.0)))

@@ -20,17 +20,17 @@ class Occluders:
         self._scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces.astype(np.uint32)))
 
-    def hidden(self, centre: NDArray[np.float64], slack: float, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def hidden(self, center: NDArray[np.float64], slack: float, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return (N,) whether a triangle lies between a point and the camera.
 
         Args:
-            centre: (3,) of the camera.
+            center: (3,) of the camera.
             slack: length of the first part of the way that does not count; the points' own triangles are there.
             points: (N, 3).
         """
-        way = centre - points
+        way = center - points
         length = np.linalg.norm(way, axis=1, keepdims=True)
         start = points + way * np.minimum(slack / np.maximum(length, 1e-300), 1.0)
-        rays = np.concatenate([start, centre - start], axis=1).astype(np.float32)
+        rays = np.concatenate([start, center - start], axis=1).astype(np.float32)
         found = self._scene.test_occlusions(self._tensor(rays), 0.0, 1.0, nthreads=1)
         return np.asarray(found.numpy(), np.bool_)

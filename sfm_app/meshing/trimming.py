@@ -17,7 +17,7 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 SMOOTHING = 20
-"""Averages over neighbours that take the fringe off the border."""
+"""Averages over neighbors that take the fringe off the border."""
 MAX_FREE = 0.1
 """A gap is not bridged where photos see through this share of it: then it is the way around an edge, not a hole."""
 
@@ -124,12 +124,12 @@ def drop_doubtful(surface: Surface, support: FloatArray, confirmed: NDArray[np.i
 
 
 def smooth_support(surface: Surface, support: FloatArray, steps: int) -> FloatArray:
-    """Return (V,) support after `steps` averages over the vertex and its neighbours: the border loses its fringe."""
+    """Return (V,) support after `steps` averages over the vertex and its neighbors: the border loses its fringe."""
     edges, _ = edges_of(surface.faces)
     graph = _graph(edges, len(support))
-    neighbours = np.maximum(np.bincount(edges.ravel(), minlength=len(support)), 1)
+    neighbors = np.maximum(np.bincount(edges.ravel(), minlength=len(support)), 1)
     for _ in range(steps):
-        support = 0.5 * support + 0.5 * (graph @ support + graph.T @ support) / neighbours
+        support = 0.5 * support + 0.5 * (graph @ support + graph.T @ support) / neighbors
     return support
 
 

@@ -1,4 +1,4 @@
-"""Colours of a surface's vertices, from the photos that see them."""
+"""Colors of a surface's vertices, from the photos that see them."""
 
 from dataclasses import dataclass
 
@@ -14,10 +14,10 @@ ColorImage = NDArray[np.uint8]
 
 @dataclass(slots=True, eq=False)
 class Paint:
-    """Colours gathered photo by photo, and how much they weigh."""
+    """Colors gathered photo by photo, and how much they weigh."""
 
     total: NDArray[np.float32]
-    """(V, 3) weighted sum of the colours."""
+    """(V, 3) weighted sum of the colors."""
     weight: NDArray[np.float32]
     """(V,)."""
 
@@ -42,7 +42,7 @@ def sample_colors(
 ) -> Paint:
     """Return what one photo adds.
 
-    Its colours where it confirms the points, weighted by the pixels that a patch there gets.
+    Its colors where it confirms the points, weighted by the pixels that a patch there gets.
 
     Args:
         points: (N, 3).

@@ -31,7 +31,7 @@ class Eye:
     depth: DepthArray
     """0 where unknown, negative where the photo is masked and says nothing."""
     sample_px: float
-    """Where inside its pixel a depth is taken, in x and y; 0.5 is the pixel's centre."""
+    """Where inside its pixel a depth is taken, in x and y; 0.5 is the pixel's center."""
 
     @property
     def projection(self) -> FloatArray:
@@ -40,7 +40,7 @@ class Eye:
 
     @property
     def center(self) -> FloatArray:
-        """(3,) centre of projection in the world."""
+        """(3,) center of projection in the world."""
         return np.asarray(-self.R.T @ self.t)
 
     @property

@@ -54,7 +54,7 @@ class Roll:
     """-log likelihood of the poses, and of people turning their photos so."""
 
 
-def ups_from_roll(rotations: FloatArray, centres: FloatArray) -> tuple[Roll, ...]:
+def ups_from_roll(rotations: FloatArray, centers: FloatArray) -> tuple[Roll, ...]:
     """Return, for photos turned by 0, 90, 180, 270 degrees, the direction for which they are held most nearly level.
 
     Roll alone does not tell portrait photos of a wall from landscape photos of the same wall lying on its side, so
@@ -64,16 +64,16 @@ def ups_from_roll(rotations: FloatArray, centres: FloatArray) -> tuple[Roll, ...
 
     Args:
         rotations: (N, 3, 3) cam_from_world, N >= 1; camera axes x right, y down, z forward.
-        centres: (N, 3) camera centres.
+        centers: (N, 3) camera centers.
     """
-    return tuple(_best(turn, proposals, rotations, centres) for turn, proposals in enumerate(_proposals(rotations)))
+    return tuple(_best(turn, proposals, rotations, centers) for turn, proposals in enumerate(_proposals(rotations)))
 
 
-def _best(turn: int, proposals: FloatArray, rotations: FloatArray, centres: FloatArray) -> Roll:
+def _best(turn: int, proposals: FloatArray, rotations: FloatArray, centers: FloatArray) -> Roll:
     best, least = (proposals[0], ROLLS_DEG[0]), np.inf
     for proposal, roll_deg in product(proposals, ROLLS_DEG):
         for up in (proposal, _refined(proposal, rotations, roll_deg)):
-            cost = _cost(up, turn, rotations, roll_deg) + _climbing(up, centres)
+            cost = _cost(up, turn, rotations, roll_deg) + _climbing(up, centers)
             if cost < least - 1e-9:
                 best, least = (up, roll_deg), cost
     return Roll(best[0], 90 * turn, *_uncertainty(best[0], rotations, best[1]), least)
@@ -111,9 +111,9 @@ def _cost(up: FloatArray, turn: int, rotations: FloatArray, roll_deg: float) -> 
     return float(min(len(rotations), VOICES) * per_photo.mean() + TURNED[turn])
 
 
-def _climbing(up: FloatArray, centres: FloatArray) -> float:
+def _climbing(up: FloatArray, centers: FloatArray) -> float:
     """Return -log likelihood of how much of the cameras' spread is height: Cauchy, since a few do climb."""
-    spread = centres - centres.mean(axis=0)
+    spread = centers - centers.mean(axis=0)
     total = float((spread**2).sum())
     return float(np.log1p(((spread @ up) ** 2).sum() / (total * CLIMB**2))) if total > 0 else 0.0
 

@@ -17,7 +17,7 @@ EQUATOR_M, FLATTENING = 6378137.0, 1.0 / 298.257223563
 """WGS84."""
 
 GPS_M, GPS_SHARE = 10.0, 0.15
-"""Largest residual that passes for the error of consumer GPS: in metres, or as a share of how far the photos spread."""
+"""Largest residual that passes for the error of consumer GPS: in meters, or as a share of how far the photos spread."""
 
 CHANCE = 1e-3
 """Probability at most that positions which know nothing of the cameras fit as well."""
@@ -36,12 +36,12 @@ MAX_PAIRS = 500
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Georeference:
-    """The similarity from the reconstruction to metres on the ground."""
+    """The similarity from the reconstruction to meters on the ground."""
 
     enu_from_world: Similarity
-    """To metres east, north and up of `origin`."""
+    """To meters east, north and up of `origin`."""
     origin: GpsPosition
-    """Where (0, 0, 0) of those metres is; without altitude, up counts from the cameras' median height."""
+    """Where (0, 0, 0) of those meters is; without altitude, up counts from the cameras' median height."""
     photos: int
     """Distinct positions that agree."""
     of: int
@@ -70,7 +70,7 @@ class NoGeoreference:
 
 
 def georeference(
-    centres: FloatArray, positions: Sequence[GpsPosition | None], up: FloatArray, *, up_is_sure: bool = True
+    centers: FloatArray, positions: Sequence[GpsPosition | None], up: FloatArray, *, up_is_sure: bool = True
 ) -> Georeference | NoGeoreference:
     """Find scale, heading and place from the positions of the photos, if these agree with the cameras.
 
@@ -79,7 +79,7 @@ def georeference(
     is unsure and the positions fix it well in space, theirs is taken.
 
     Args:
-        centres: (N, 3) camera centres.
+        centers: (N, 3) camera centers.
         positions: per photo, None where there is none.
         up: (3,) unit vector in the world.
         up_is_sure: whether `up` rests on more than the cameras' roll.
@@ -91,7 +91,7 @@ def georeference(
     if len(set(given)) < LEAST_PHOTOS:
         return NoGeoreference(f"{len(set(given))} different positions, {LEAST_PHOTOS} are needed")
     origin = _middle(given)
-    enu, cameras = enu_m(given, origin), centres[known]
+    enu, cameras = enu_m(given, origin), centers[known]
     level = _along_ground(cameras, enu, up, origin)
     if up_is_sure and level:
         return level
@@ -101,7 +101,7 @@ def georeference(
 
 
 def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
-    """Return (N, 3) metres east, north and up of an origin; up is 0 where either altitude is unknown.
+    """Return (N, 3) meters east, north and up of an origin; up is 0 where either altitude is unknown.
 
     To the first order in the angles, with the ellipsoid's radii at the origin: 1 m off over 5 km.
     """
@@ -117,7 +117,7 @@ def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
 
 
 def position_at(enu: FloatArray, origin: GpsPosition) -> GpsPosition:
-    """Return the position so many metres (3,) east, north and up of an origin; `enu_m` backwards."""
+    """Return the position so many meters (3,) east, north and up of an origin; `enu_m` backwards."""
     meridian, parallel = _radii_m(origin)
     longitude = (origin.longitude_deg + float(np.degrees(enu[0] / parallel)) + 180.0) % 360.0 - 180.0
     altitude = None if origin.altitude_m is None else origin.altitude_m + float(enu[2])

@@ -62,21 +62,21 @@ class Upright:
 
 
 def up_direction(
-    rotations: FloatArray, centres: FloatArray, scenery: Scenery, segments: Segments, turn_deg: int | None = None
+    rotations: FloatArray, centers: FloatArray, scenery: Scenery, segments: Segments, turn_deg: int | None = None
 ) -> Upright:
     """Find up from the vertical lines of the scene near where the cameras' roll has it; else from roll or the ground.
 
     Args:
         rotations: (N, 3, 3) cam_from_world of the photos, N >= 1.
-        centres: (N, 3) camera centres.
+        centers: (N, 3) camera centers.
         scenery: what the photos show; tells the ways up apart in which they may have been taken.
         segments: lines in the photos; may be empty.
         turn_deg: by how much the photos have to be turned clockwise to stand upright: 0, 90, 180 or 270; None where
             nobody knows.
     """
-    rolls = ups_from_roll(rotations, centres)
+    rolls = ups_from_roll(rotations, centers)
     if turn_deg is None:
-        standing = stand(rolls, rotations, centres, scenery)
+        standing = stand(rolls, rotations, centers, scenery)
     else:
         standing = Standing(rolls[turn_deg // 90], {}, np.inf, np.inf)
     roll = standing.roll
@@ -115,19 +115,19 @@ def facing(upright: Upright, rotations: FloatArray, points: FloatArray) -> tuple
     return (np.asarray(nearest), found_by) if square else (towards, CAMERAS)
 
 
-def viewer_frame(up: FloatArray, towards: FloatArray, points: FloatArray, metres: float | None = None) -> Similarity:
+def viewer_frame(up: FloatArray, towards: FloatArray, points: FloatArray, meters: float | None = None) -> Similarity:
     """Return the similarity into the frame of glTF viewers: y up, z to the viewer, the points about 0.
 
     Args:
         up: (3,) unit vector in the world.
         towards: (3,) unit vector at right angles to it, see `facing`.
         points: (P, 3) of the scene.
-        metres: per unit of the world; where None, four of five points come to lie within 1 of the middle.
+        meters: per unit of the world; where None, four of five points come to lie within 1 of the middle.
     """
     R = np.stack([np.cross(up, towards), up, towards])
     # The median would follow the points to where most of them happen to be, the whole box the farthest few.
     turned = points @ R.T
-    centre = np.mean(np.quantile(turned, MIDDLE, axis=0), axis=0)
-    size = float(np.percentile(np.linalg.norm(turned - centre, axis=1), 80))
-    scale = 1.0 / max(size, 1e-12) if metres is None else metres
-    return Similarity(scale, R, -scale * centre)
+    center = np.mean(np.quantile(turned, MIDDLE, axis=0), axis=0)
+    size = float(np.percentile(np.linalg.norm(turned - center, axis=1), 80))
+    scale = 1.0 / max(size, 1e-12) if meters is None else meters
+    return Similarity(scale, R, -scale * center)

@@ -45,8 +45,8 @@ def dominant_plane(points: FloatArray, axis: FloatArray, between_deg: tuple[floa
     cloud = points[rng.permutation(len(points))[:MOST_POINTS]]
     if len(cloud) < 10:
         return None
-    centre = np.median(cloud, axis=0)
-    reach = NEAR * float(np.percentile(np.linalg.norm(cloud - centre, axis=1), 80))
+    center = np.median(cloud, axis=0)
+    reach = NEAR * float(np.percentile(np.linalg.norm(cloud - center, axis=1), 80))
     best, most = None, LEAST_SHARE * len(cloud)
     for triple in rng.integers(0, len(cloud), (TRIPLES, 3)):
         a, b, c = cloud[triple]

@@ -20,7 +20,7 @@ LEAST_POINTS = 10
 LITTLE_DEPTH = 0.05
 """Spread of log depth below which it is the shape of a thing far away rather than the way to it."""
 
-NEIGHBOURS, AROUND = 12, 60
+NEIGHBORS, AROUND = 12, 60
 """Points that a piece of surface is laid through, and whose mean a normal and its brightness are compared with."""
 
 FLAT = 0.2
@@ -39,7 +39,7 @@ NO_CHANGE = 1e-6
 """Root mean square of normals or log brightness below which they are all the same, and digits are all that is left."""
 
 EVEN, BLUR_SKY_PX, LEAST_SKY = 1.5, 1.0, 40
-"""Slope in grey levels per pixel below which a picture is even, its blur, and the darkest sky."""
+"""Slope in gray levels per pixel below which a picture is even, its blur, and the darkest sky."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,39 +54,39 @@ class Surfaces:
     """(N,) what log brightness differs by from that around."""
 
 
-def small_picture(grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a grey photo, shrunk to `PICTURE_PX`."""
-    shrink = min(1.0, PICTURE_PX / max(grey.shape))
-    size = (max(1, round(grey.shape[1] * shrink)), max(1, round(grey.shape[0] * shrink)))
-    return np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA), np.uint8)
+def small_picture(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return a gray photo, shrunk to `PICTURE_PX`."""
+    shrink = min(1.0, PICTURE_PX / max(gray.shape))
+    size = (max(1, round(gray.shape[1] * shrink)), max(1, round(gray.shape[0] * shrink)))
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def surfaces_of(
-    points: FloatArray, brightness: FloatArray, seen: Sequence[NDArray[np.int64]], centres: FloatArray
+    points: FloatArray, brightness: FloatArray, seen: Sequence[NDArray[np.int64]], centers: FloatArray
 ) -> Surfaces:
-    """Return planes through the neighbours of each point, where these lie on one.
+    """Return planes through the neighbors of each point, where these lie on one.
 
     Args:
         points: (P, 3).
         brightness: (P,) 0 to 255.
         seen: per photo the points that it sees.
-        centres: (N, 3) camera centres of the photos.
+        centers: (N, 3) camera centers of the photos.
     """
     from scipy.spatial import cKDTree
 
-    if len(points) < NEIGHBOURS:
+    if len(points) < NEIGHBORS:
         return Surfaces(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
     around = np.asarray(cKDTree(points).query(points, k=min(AROUND, len(points)))[1])
-    near = points[around[:, :NEIGHBOURS]]
+    near = points[around[:, :NEIGHBORS]]
     near = near - near.mean(axis=1, keepdims=True)
     variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
     towards = np.zeros_like(points)
-    for chosen, centre in zip(seen, centres, strict=True):
-        towards[chosen] += unit(centre - points[chosen])
+    for chosen, center in zip(seen, centers, strict=True):
+        towards[chosen] += unit(center - points[chosen])
     normals = axes[:, :, 0]
     normals = normals * np.where((normals * towards).sum(axis=1) < 0, -1.0, 1.0)[:, None]
-    grey = np.log(10.0 + brightness)
-    bends, shades = normals - normals[around].mean(axis=1), grey - grey[around].mean(axis=1)
+    gray = np.log(10.0 + brightness)
+    bends, shades = normals - normals[around].mean(axis=1), gray - gray[around].mean(axis=1)
     flat = (variances[:, 0] < FLAT * variances[:, 1]) & towards.any(axis=1)
     return Surfaces(normals[flat], bends[flat], shades[flat])
 
@@ -94,7 +94,7 @@ def surfaces_of(
 def low_is_near(
     up: FloatArray,
     rotations: FloatArray,
-    centres: FloatArray,
+    centers: FloatArray,
     points: FloatArray,
     seen: Sequence[NDArray[np.int64]],
 ) -> float:
@@ -103,8 +103,8 @@ def low_is_near(
     The ground comes nearer towards the lower border; facades seen from the street lean away. In [-1, 1].
     """
     found = []
-    for R, centre, chosen in zip(rotations, centres, seen, strict=True):
-        local = np.einsum("ij,nj->ni", R, points[chosen] - centre)
+    for R, center, chosen in zip(rotations, centers, seen, strict=True):
+        local = np.einsum("ij,nj->ni", R, points[chosen] - center)
         local = local[local[:, 2] > 0]
         if len(local) < LEAST_POINTS:
             continue
@@ -151,8 +151,8 @@ def ledges_are_lit(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDA
     for R, picture in zip(rotations, pictures, strict=True):
         if picture is None or min(picture.shape) < 3:
             continue
-        grey = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), BLUR_PX)
-        slope = _slope(np.sqrt(grey), R @ up)[~_black_background(grey)[1:-1, 1:-1]]
+        gray = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), BLUR_PX)
+        slope = _slope(np.sqrt(gray), R @ up)[~_black_background(gray)[1:-1, 1:-1]]
         power = (slope**2).sum()
         found.append(float((slope * np.abs(slope)).sum() / power) if power > 0 else 0.0)
     return float(np.mean(found)) if found else 0.0
@@ -167,11 +167,11 @@ def sky_is_above(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArr
     for R, picture in zip(rotations, pictures, strict=True):
         if picture is None or min(picture.shape) < 3:
             continue
-        grey = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), BLUR_SKY_PX)
-        steep = np.hypot(_slope(grey, np.array([1.0, 0.0])), _slope(grey, np.array([0.0, 1.0])))
-        grey = grey[1:-1, 1:-1]
-        even = (steep < EVEN) & (grey > max(float(np.median(grey)), LEAST_SKY))
-        y, x = np.mgrid[: grey.shape[0], : grey.shape[1]] - 0.5 * (np.array(grey.shape)[:, None, None] - 1)
+        gray = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), BLUR_SKY_PX)
+        steep = np.hypot(_slope(gray, np.array([1.0, 0.0])), _slope(gray, np.array([0.0, 1.0])))
+        gray = gray[1:-1, 1:-1]
+        even = (steep < EVEN) & (gray > max(float(np.median(gray)), LEAST_SKY))
+        y, x = np.mgrid[: gray.shape[0], : gray.shape[1]] - 0.5 * (np.array(gray.shape)[:, None, None] - 1)
         axis = R @ up
         height = x * axis[0] + y * axis[1]
         border = 0.5 * np.abs(height).max()
@@ -180,13 +180,13 @@ def sky_is_above(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArr
     return float(np.mean(found)) if found else 0.0
 
 
-def _black_background(grey: NDArray[np.float32]) -> NDArray[np.bool_]:
+def _black_background(gray: NDArray[np.float32]) -> NDArray[np.bool_]:
     broad, border = (np.ones((width, width), np.uint8) for width in (BROAD_PX, 2 * BORDER_PX + 1))
-    black = cv2.morphologyEx((grey < BLACK).astype(np.uint8), cv2.MORPH_OPEN, broad)
+    black = cv2.morphologyEx((gray < BLACK).astype(np.uint8), cv2.MORPH_OPEN, broad)
     return np.asarray(cv2.dilate(black, border) > 0)
 
 
-def _slope(grey: NDArray[np.float32], axis: FloatArray) -> NDArray[np.float32]:
-    """Return (H - 2, W - 2) derivative along an axis (x, y, ...) in the picture, in grey levels per pixel."""
-    down, right = grey[2:, 1:-1] - grey[:-2, 1:-1], grey[1:-1, 2:] - grey[1:-1, :-2]
+def _slope(gray: NDArray[np.float32], axis: FloatArray) -> NDArray[np.float32]:
+    """Return (H - 2, W - 2) derivative along an axis (x, y, ...) in the picture, in gray levels per pixel."""
+    down, right = gray[2:, 1:-1] - gray[:-2, 1:-1], gray[1:-1, 2:] - gray[1:-1, :-2]
     return np.asarray(0.5 * (axis[0] * right + axis[1] * down), np.float32)

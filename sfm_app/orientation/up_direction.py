@@ -58,7 +58,7 @@ CUES: Mapping[str, Cue] = {
     "sky is above": Cue(0.20, 0.27),
 }
 """From eight photo sets, three rendered ones and seven of corners only; each set alone would be decided alike by the
-figures of the others. Neighbouring points share noise, hence more than 1."""
+figures of the others. Neighboring points share noise, hence more than 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,16 +94,16 @@ class Standing:
         return min(self.not_upside_down, self.not_on_its_side)
 
 
-def stand(rolls: Sequence[Roll], rotations: FloatArray, centres: FloatArray, scenery: Scenery) -> Standing:
+def stand(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery) -> Standing:
     """Return first the vertical, from how the cameras are held and the ledges; then which end of it is up.
 
     Args:
         rolls: what the cameras say if most photos are turned by 0, 90, 180, 270 degrees; opposites share a vertical.
         rotations: (N, 3, 3) cam_from_world of the photos.
-        centres: (N, 3) camera centres.
+        centers: (N, 3) camera centers.
         scenery: what they show.
     """
-    surfaces = surfaces_of(scenery.points, scenery.brightness, scenery.seen, centres)
+    surfaces = surfaces_of(scenery.points, scenery.brightness, scenery.seen, centers)
     ledges = [ledges_are_lit(roll.up, rotations, scenery.pictures) for roll in rolls[:2]]
     upright, lying = (
         float(np.logaddexp(-roll.cost, -opposite.cost)) for roll, opposite in zip(rolls[:2], rolls[2:], strict=True)
@@ -112,7 +112,7 @@ def stand(rolls: Sequence[Roll], rotations: FloatArray, centres: FloatArray, sce
     chosen = 0 if gap >= 0 else 1
     up, down = rolls[chosen], rolls[chosen + 2]
     values = {
-        "low is near": low_is_near(up.up, rotations, centres, scenery.points, scenery.seen),
+        "low is near": low_is_near(up.up, rotations, centers, scenery.points, scenery.seen),
         "tops are seen": tops_are_seen(up.up, surfaces),
         "tops are bright": tops_are_bright(up.up, surfaces),
         "ledges are lit": ledges[chosen],

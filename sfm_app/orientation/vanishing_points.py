@@ -1,6 +1,6 @@
 """Directions in which many straight lines of a scene run: vertical edges, the horizontals of a facade.
 
-A line segment in a photo and the camera centre span a plane; the direction of the line in the world lies in it. So a
+A line segment in a photo and the camera center span a plane; the direction of the line in the world lies in it. So a
 segment is the plane's unit normal, and segments of all photos of a scene with known poses vote together.
 """
 
@@ -38,9 +38,9 @@ class Segments:
     """Line segments of several photos, in the world."""
 
     normals: FloatArray
-    """(N, 3) unit normals of the planes through camera centre and segment."""
+    """(N, 3) unit normals of the planes through camera center and segment."""
     middles: FloatArray
-    """(N, 3) unit directions from the camera centre to the segments' middles."""
+    """(N, 3) unit directions from the camera center to the segments' middles."""
     lengths: FloatArray
     """(N,) in pixels: what they count."""
     photos: NDArray[np.int64]
@@ -72,7 +72,7 @@ def segment_planes(first: FloatArray, second: FloatArray, photo: int, scale_px: 
     """Return segments of one photo from the rays (N, 3), in the world, to their two ends.
 
     Args:
-        first: (N, 3) directions from the camera centre to one end of each.
+        first: (N, 3) directions from the camera center to one end of each.
         second: (N, 3) to the other end.
         photo: the photo's number.
         scale_px: focal length in pixels, to turn angles into lengths.

@@ -10,7 +10,7 @@ from sfm_app.types import Photo
 
 ON_END_DEG = 90
 """What a photo on end is taken to be turned by where nobody knows. The other way round only mirrors the place of the
-optical centre, which lies near the middle."""
+optical center, which lies near the middle."""
 
 
 def grouped(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:

@@ -24,7 +24,7 @@ LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
 
 LARGE_PX = 50_000_000
 LEAST_BYTES_PER_PX = 0.02
-"""Large photos have more, however hard they are compressed; an area of one colour has less."""
+"""Large photos have more, however hard they are compressed; an area of one color has less."""
 MOST_FRAMES = 100
 DAMAGED = "truncated or damaged"
 ONE_AT_A_TIME = Lock()
@@ -131,7 +131,7 @@ def _exif_of(image: Image.Image) -> Image.Exif:
 
 
 def upright(picture: Picture) -> Image.Image:
-    """Return the picture upright by EXIF, in RGB or grey of 8 bits, what is transparent on white."""
+    """Return the picture upright by EXIF, in RGB or gray of 8 bits, what is transparent on white."""
     return turned_upright(_eight_bit(picture.image), orientation(picture.exif))
 
 
@@ -170,7 +170,7 @@ def _eight_bit(image: Image.Image) -> Image.Image:
 
 
 def _levels(deep: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return grey of 16 bits, or of what range ever, in 256 levels."""
+    """Return gray of 16 bits, or of what range ever, in 256 levels."""
     values = np.nan_to_num(deep.astype(np.float64))
     low, high = values.min(), values.max()
     if deep.dtype.kind in "iu" and low >= 0 and high <= 65535:

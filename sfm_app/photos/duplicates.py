@@ -11,7 +11,7 @@ ALIKE = 0.015
 """Root mean square difference, as a share of the contrast, of pictures that are one. A step of a thousandth of the
 width to the side makes more of it; saving a picture anew, smaller or as JPEG, less."""
 LEAST_CONTRAST = 4.0
-"""Grey levels; of pictures with less nothing can be said."""
+"""Gray levels; of pictures with less nothing can be said."""
 
 
 def without_copies(glances: Sequence[Glance]) -> tuple[list[Photo], list[UnusablePhoto]]:

@@ -18,7 +18,7 @@ LONGEST = 1.5
 LEAST_FOLLOWED = 0.6
 """It is a step, too, when a smaller share of the corners is found again: the overlap goes."""
 BLURRED = 0.5
-"""A frame with less than this share of its neighbours' sharpness is blurred."""
+"""A frame with less than this share of its neighbors' sharpness is blurred."""
 RECENT = 30
 """Frames that sharpness is compared with; a longer blur than most of them is taken for what there is."""
 SHARP_PERCENTILE = 80
@@ -39,7 +39,7 @@ class Look:
     frame: int
     """Its number."""
     sharpness: float
-    """Variance of the Laplacian; to be compared with that of neighbours only."""
+    """Variance of the Laplacian; to be compared with that of neighbors only."""
     way: float
     """Steps from the first frame to here."""
 
@@ -61,14 +61,14 @@ class Follower:
         self._moved = 0.0
         self._recent: deque[float] = deque(maxlen=RECENT)
 
-    def look(self, frame: int, grey: Picture) -> Look:
+    def look(self, frame: int, gray: Picture) -> Look:
         """Return the next frame; all are of one size."""
-        sharpness = float(cv2.Laplacian(grey, cv2.CV_32F).var())
+        sharpness = float(cv2.Laplacian(gray, cv2.CV_32F).var())
         self._recent.append(sharpness)
         if self._reference is None or len(self._corners) < FEWEST:
-            self._refer(grey)
+            self._refer(gray)
             return Look(frame, sharpness, self._passed)
-        self._moved, followed = self._follow(self._reference, grey)
+        self._moved, followed = self._follow(self._reference, gray)
         # blur loses corners that come back: no reason to take such a frame
         blurred = sharpness < BLURRED * float(np.percentile(self._recent, SHARP_PERCENTILE))
         lost = 0.0 if blurred else min(1.0, (1 - followed) / (1 - LEAST_FOLLOWED))
@@ -76,29 +76,29 @@ class Follower:
         way = self._passed + part
         if part >= (LONGEST if blurred else 1.0):
             self._passed = way
-            self._refer(grey)
+            self._refer(gray)
         return Look(frame, sharpness, way)
 
-    def _refer(self, grey: Picture) -> None:
-        corners = cv2.goodFeaturesToTrack(grey, CORNERS, qualityLevel=0.01, minDistance=max(grey.shape) / 60)
-        self._reference, self._moved = grey, 0.0
+    def _refer(self, gray: Picture) -> None:
+        corners = cv2.goodFeaturesToTrack(gray, CORNERS, qualityLevel=0.01, minDistance=max(gray.shape) / 60)
+        self._reference, self._moved = gray, 0.0
         self._corners = np.zeros((0, 1, 2), np.float32) if corners is None else np.asarray(corners, np.float32)
         self._last = self._corners
         self.seen = self.seen or len(self._corners) >= FEWEST
 
-    def _follow(self, reference: Picture, grey: Picture) -> tuple[float, float]:
+    def _follow(self, reference: Picture, gray: Picture) -> tuple[float, float]:
         """Return by how many longer sides the median corner moved, and the share of the corners that is found again."""
-        there, found = _tracked(reference, grey, self._corners, self._last)
-        back, found_back = _tracked(grey, reference, there, self._corners)
+        there, found = _tracked(reference, gray, self._corners, self._last)
+        back, found_back = _tracked(gray, reference, there, self._corners)
         off = np.linalg.norm(back - self._corners, axis=2)[:, 0]
-        inside = np.all((there[:, 0] >= 0) & (there[:, 0] < grey.shape[::-1]), axis=1)
+        inside = np.all((there[:, 0] >= 0) & (there[:, 0] < gray.shape[::-1]), axis=1)
         alive = found & found_back & (off < THERE_AND_BACK_PX) & inside
         if np.count_nonzero(alive) < FEWEST:
             return self._moved, float(np.mean(alive))
         flow = (there - self._corners)[alive, 0]
         # corners that are lost now are looked for beside the others the next time
         self._last = np.where(alive[:, None, None], there, self._corners + np.median(flow, axis=0)).astype(np.float32)
-        return float(np.median(np.linalg.norm(flow, axis=1))) / max(grey.shape), float(np.mean(alive))
+        return float(np.median(np.linalg.norm(flow, axis=1))) / max(gray.shape), float(np.mean(alive))
 
 
 def _tracked(before: Picture, after: Picture, points: FloatArray, guess: FloatArray) -> tuple[FloatArray, BoolArray]:

@@ -14,7 +14,7 @@ NEAR, FAR = 0.25, 0.5
 """The sharpest frame is looked for within so many steps to either side; further away where all of these are blurred."""
 GAP = 1.5
 """Steps between frames that may pass without one where there are blurred ones only."""
-HARDLY_MOVED, LESS_SHARP, TOO_MANY = "hardly moved on", "less sharp than a neighbour", "more than max_frames"
+HARDLY_MOVED, LESS_SHARP, TOO_MANY = "hardly moved on", "less sharp than a neighbor", "more than max_frames"
 
 
 @dataclass(frozen=True, slots=True)

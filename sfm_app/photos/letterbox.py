@@ -1,7 +1,7 @@
-"""Bars of one colour around a picture: what services add to bring photos of any size to one.
+"""Bars of one color around a picture: what services add to bring photos of any size to one.
 
 The picture within is the photo: its size tells cameras apart, and its middle, not that of the whole, is where the
-optical centre usually lies. A bar is of one colour, and ends at a straight edge, all along which the picture differs
+optical center usually lies. A bar is of one color, and ends at a straight edge, all along which the picture differs
 from it; a black background or a blown-out sky does not end like that.
 """
 
@@ -15,14 +15,14 @@ from PIL import Image
 from sfm_app.types import Frame, Photo
 
 ALIKE = 8
-"""Grey levels by which a bar may differ from its colour: JPEG leaves fewer, but for what rings beside the edge."""
+"""Gray levels by which a bar may differ from its color: JPEG leaves fewer, but for what rings beside the edge."""
 STRAY = 0.01
 """Share of a line that may differ by more."""
 UNLIKE, LEAST_EDGE = 16, 0.7
-"""Grey levels by which so large a share of the line behind the edge must differ from the bar."""
+"""Gray levels by which so large a share of the line behind the edge must differ from the bar."""
 BLUR_PX, RINGING_PX = 3, 18
-"""Lines from the first that is not of one colour to the picture: resizing blurs the edge, and JPEG rings as far as its
-blocks of colour reach, 16 pixels; then the bar ends where the picture begins."""
+"""Lines from the first that is not of one color to the picture: resizing blurs the edge, and JPEG rings as far as its
+blocks of color reach, 16 pixels; then the bar ends where the picture begins."""
 LEAST_PX, LEAST_SHARE = 4, 0.008
 """A thinner bar, in pixels and in shares of the side, moves nothing."""
 MOST_SHARE = 0.7
@@ -34,7 +34,7 @@ SAME_PX, SAME_SHARE = 4.0, 0.01
 def shown_part(picture: Image.Image) -> Frame | None:
     """Return the picture within bars; None where there are none.
 
-    A bar above without one below is not believed: it may be a sky of one colour above a level horizon.
+    A bar above without one below is not believed: it may be a sky of one color above a level horizon.
     """
     pixels = np.asarray(picture.convert("RGB"))
     height, width = pixels.shape[:2]
@@ -51,7 +51,7 @@ def shown_part(picture: Image.Image) -> Frame | None:
 def with_one_frame(photos: Sequence[Photo]) -> Iterator[Photo]:
     """Yield photos of one size with the pictures within them made equal where they nearly are.
 
-    Where all bars that are seen are alike, photos whose bars are not seen (a sky of their colour) have them, too. Bars
+    Where all bars that are seen are alike, photos whose bars are not seen (a sky of their color) have them, too. Bars
     around fewer than half of the photos are not believed: a wall before an empty ground ends at straight edges, too.
     """
     if 2 * sum(photo.shown is not None for photo in photos) < len(photos):
@@ -84,16 +84,16 @@ def _edges(frame: Frame) -> NDArray[np.int64]:
 
 def _bar(lines: NDArray[np.uint8]) -> int:
     """Return how many of the first lines (N, M, 3) are a bar."""
-    colour = np.median(lines[0], axis=0).astype(np.int16)
+    color = np.median(lines[0], axis=0).astype(np.int16)
     most = int(MOST_SHARE * len(lines))
-    first = next((k for k in range(most) if _share(lines[k], colour, ALIKE) > STRAY), 0)
+    first = next((k for k in range(most) if _share(lines[k], color, ALIKE) > STRAY), 0)
     if first < max(LEAST_PX, LEAST_SHARE * len(lines)):
         return 0
     behind = range(first, min(first + RINGING_PX, most))
-    edge = next((k for k in behind if _share(lines[k], colour, UNLIKE) >= LEAST_EDGE), 0)
+    edge = next((k for k in behind if _share(lines[k], color, UNLIKE) >= LEAST_EDGE), 0)
     return first if 0 < edge <= first + BLUR_PX else edge
 
 
-def _share(line: NDArray[np.uint8], colour: NDArray[np.int16], levels: int) -> float:
-    """Return share of a line (M, 3) that differs from a colour by more."""
-    return float(np.mean(np.max(np.abs(line.astype(np.int16) - colour), axis=1) > levels))
+def _share(line: NDArray[np.uint8], color: NDArray[np.int16], levels: int) -> float:
+    """Return share of a line (M, 3) that differs from a color by more."""
+    return float(np.mean(np.max(np.abs(line.astype(np.int16) - color), axis=1) > levels))

@@ -98,7 +98,7 @@ def read_used(target: Path, name: str) -> BoolImage:
 
 
 def without_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uint8]:
-    """Return a photo (H, W, 3) whose masked pixels take the colour of the nearest one that may be used.
+    """Return a photo (H, W, 3) whose masked pixels take the color of the nearest one that may be used.
 
     Then neither interpolation nor a smaller size brings back what is masked.
     """

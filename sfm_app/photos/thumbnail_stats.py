@@ -18,9 +18,9 @@ EDGES = 99
 NOISE_PX, WIDE_PX = 1.5, 17
 """Blur that takes the noise away, and how wide what is compared with is blurred once more."""
 BLOCK_PX = 8
-"""Side of the squares that have one colour or not."""
+"""Side of the squares that have one color or not."""
 DIM, LEAST_PX = 4.0, 200
-"""Grey levels of contrast, and pixels, below which nothing can be said about sharpness."""
+"""Gray levels of contrast, and pixels, below which nothing can be said about sharpness."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,32 +29,32 @@ class Glance:
 
     photo: Photo
     small: NDArray[np.float32]
-    """(SIDE_PX, SIDE_PX) upright and grey."""
+    """(SIDE_PX, SIDE_PX) upright and gray."""
     blur: float = 0.0
     """Share of their slope that edges keep when they are blurred once more; near 1 where they are blurred already."""
     flat: float = 0.0
-    """Share of the picture in which neighbours are alike to the last bit."""
+    """Share of the picture in which neighbors are alike to the last bit."""
 
 
 def glance(photo: Photo, upright: Image.Image) -> Glance:
     """Look at a photo."""
-    grey = upright.convert("L")
-    return Glance(photo, small_picture(grey), blur_of(grey), flat_share(grey))
+    gray = upright.convert("L")
+    return Glance(photo, small_picture(gray), blur_of(gray), flat_share(gray))
 
 
-def small_picture(grey: Image.Image) -> NDArray[np.float32]:
+def small_picture(gray: Image.Image) -> NDArray[np.float32]:
     """Return what is compared to find copies."""
-    return np.asarray(grey.resize((SIDE_PX, SIDE_PX), Image.Resampling.LANCZOS, reducing_gap=6.0), np.float32)
+    return np.asarray(gray.resize((SIDE_PX, SIDE_PX), Image.Resampling.LANCZOS, reducing_gap=6.0), np.float32)
 
 
-def blur_of(grey: Image.Image) -> float:
+def blur_of(gray: Image.Image) -> float:
     """Return how much of their slope edges keep when they are blurred once more, in [0, 1].
 
     The worse of both directions.
     """
-    grey = grey.copy()
-    grey.thumbnail((LOOKED_AT_PX, LOOKED_AT_PX), Image.Resampling.BOX)
-    fine = cv2.GaussianBlur(np.asarray(grey, np.float32), (0, 0), NOISE_PX)
+    gray = gray.copy()
+    gray.thumbnail((LOOKED_AT_PX, LOOKED_AT_PX), Image.Resampling.BOX)
+    fine = cv2.GaussianBlur(np.asarray(gray, np.float32), (0, 0), NOISE_PX)
     if fine.std() < DIM or min(fine.shape) < LEAST_PX:
         return 0.0
     wide = cv2.blur(fine, (WIDE_PX, 1)), cv2.blur(fine, (1, WIDE_PX))
@@ -63,10 +63,10 @@ def blur_of(grey: Image.Image) -> float:
 
 
 def flat_share(picture: Image.Image) -> float:
-    """Return share of the picture, in small squares, that has one colour."""
-    grey = np.asarray(picture)
-    height, width = (side // BLOCK_PX * BLOCK_PX for side in grey.shape)
-    squares = grey[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX)
+    """Return share of the picture, in small squares, that has one color."""
+    gray = np.asarray(picture)
+    height, width = (side // BLOCK_PX * BLOCK_PX for side in gray.shape)
+    squares = gray[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX)
     return float(np.mean(np.ptp(squares, axis=(1, 3)) == 0)) if squares.size else 0.0
 
 

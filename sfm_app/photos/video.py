@@ -90,7 +90,7 @@ class Video:
         return self.seconds + 2 / self.rate < CUT_SHORT * self.claimed / self.rate
 
     def small_frames(self) -> Iterator[tuple[int, Picture]]:
-        """Yield small grey pictures of the frames that are looked at, with their numbers."""
+        """Yield small gray pictures of the frames that are looked at, with their numbers."""
         size: tuple[int, int] | None = None
         for number in self._grabbed():
             if number % self.stride:
@@ -104,7 +104,7 @@ class Video:
             if size is None:
                 shrunk = min(1.0, SMALL_PX / max(picture.shape[:2]))
                 size = max(1, round(picture.shape[1] * shrunk)), max(1, round(picture.shape[0] * shrunk))
-            yield number, _grey(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+            yield number, _gray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
     def jpegs(self, numbers: Sequence[int]) -> Iterator[tuple[int, bytes]]:
         """Yield frames at full size as JPEG, with their numbers, in rising order; fewer where the file has changed."""
@@ -126,7 +126,7 @@ class Video:
             yield self.frames - 1
 
 
-def _grey(picture: NDArray[np.uint8]) -> Picture:
+def _gray(picture: NDArray[np.uint8]) -> Picture:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.ndim == 3 else picture, np.uint8)
 
 

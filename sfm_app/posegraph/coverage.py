@@ -1,6 +1,6 @@
 """How much of what two photos show they have in common, and which pairs that makes the backbone of a photo set.
 
-Neighbours on a walk share most of what the rest of the set knows about either of them. Photos of equal things in
+Neighbors on a walk share most of what the rest of the set knows about either of them. Photos of equal things in
 different places share the things, however many matches these give, and nothing around them.
 """
 

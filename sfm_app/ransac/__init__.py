@@ -25,7 +25,7 @@ FloatArray = NDArray[np.float64]
 FitFundamentalLike = Callable[[FloatArray, FloatArray, EpipolarSettings, int], EpipolarFit | Rejected]
 
 ESTIMATORS: dict[str, tuple[FitFundamentalLike, str]] = {
-    "lev-ransac": (fit_lev_ransac, "samples guided by Cook's distances, local optimisation, robust refit; the default"),
+    "lev-ransac": (fit_lev_ransac, "samples guided by Cook's distances, local optimization, robust refit; the default"),
     **{name: (classical(name), about) for name, (_, about) in RECIPES.items()},
 }
 """Name, way to fit, and one line about it."""

@@ -53,7 +53,7 @@ class Best:
         return True
 
     def _replace(self, model: FloatArray, found: float) -> None:
-        """Replace the best model by that of a sample, or by what local optimisation makes of it."""
+        """Replace the best model by that of a sample, or by what local optimization makes of it."""
         self.f, self._lowest = model, found
         if self._recipe.improve is not None:
             improved = self._improved(model.reshape(3, 3))
@@ -64,7 +64,7 @@ class Best:
         self.to_beat[:] = self._lowest
 
     def challenged_by(self, F: FloatArray) -> bool:
-        """Return whether F (3, 3), locally optimised, is the best model by the finer penalty."""
+        """Return whether F (3, 3), locally optimized, is the best model by the finer penalty."""
         improved = self._improved(F)
         score = penalty(self._points, 0, improved, self._fine or self.loss, self._lowest, OPEN)
         if score < self._lowest:

@@ -108,7 +108,7 @@ def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings)
     matches = prepare(first, second, seed=0)
     if len(matches.points) < options.min_inliers:
         return Rejected(TOO_FEW_MATCHES)
-    return _judge_any(first, second, matches, _in_frame(F, matches.unit_px, matches.centre), 1, options)
+    return _judge_any(first, second, matches, _in_frame(F, matches.unit_px, matches.center), 1, options)
 
 
 def matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> int:
@@ -125,19 +125,19 @@ def matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: Epipo
     """
     matches = prepare(*check_points(x1, x2), seed=0)
     threshold = options.max_error_px / matches.unit_px
-    in_frame = _in_frame(F, matches.unit_px, matches.centre)
+    in_frame = _in_frame(F, matches.unit_px, matches.center)
     f = np.ascontiguousarray(in_frame / np.linalg.norm(in_frame))
     agreeing = np.asfortranarray(matches.points[squared_distances(matches.points, f.reshape(9)) <= threshold**2])
     H = dominant_homography(agreeing, f, threshold)
     return int(np.count_nonzero(transfer_distance(H, agreeing) > OFF_PLANE * threshold))
 
 
-def _in_frame(F: ArrayLike, unit_px: float, centre: FloatArray) -> FloatArray:
-    """Return F of pixels as F of points that are centred and in units; the inverse of `Matches.to_pixels`."""
+def _in_frame(F: ArrayLike, unit_px: float, center: FloatArray) -> FloatArray:
+    """Return F of pixels as F of points that are centered and in units; the inverse of `Matches.to_pixels`."""
     pixels = np.asarray(F, dtype=np.float64)
     if pixels.shape != (3, 3):
         raise ValueError(f"F must have shape (3, 3), got {pixels.shape}")
-    to1, to2 = (np.array([[unit_px, 0, x], [0, unit_px, y], [0, 0, 1]]) for x, y in (centre[:2], centre[2:]))
+    to1, to2 = (np.array([[unit_px, 0, x], [0, unit_px, y], [0, 0, 1]]) for x, y in (center[:2], center[2:]))
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is rejected
         return np.asarray(to2.T @ pixels @ to1)
 
@@ -173,5 +173,5 @@ def _judge(
         priors=prior_validity(points, f, threshold, sigma_from_inliers=True)[matches.rows],
         trials=trials,
         rms_px=math.sqrt(float(squared_px[accepted].mean())),
-        degeneracy=find_degeneracy(points, F, inliers, wrong, threshold, matches.centre / matches.unit_px),
+        degeneracy=find_degeneracy(points, F, inliers, wrong, threshold, matches.center / matches.unit_px),
     )

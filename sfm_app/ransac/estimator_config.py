@@ -51,7 +51,7 @@ class Recipe:
     patience: Callable[[FloatArray, FloatArray, float], float] | None = None
     """(points, F, threshold) -> samples without a better model that end the search (see `evidence`)."""
     improve: Refine | None = None
-    """Local optimisation of every new best model of a sample."""
+    """Local optimization of every new best model of a sample."""
     fine_score: Score | None = None
     """The penalty by which improved models compete, apart from those of samples; None: all compete by `score`."""
     recover: Recover | None = None

@@ -1,7 +1,7 @@
 """LEV-RANSAC as the program uses it: Algorithm 1 with what today's estimators have learnt since.
 
 One kind of cost goes through all of it, r^2 / (r^2 + c^2), which has no threshold to fall off: at a coarse scale c for
-the models of samples, which are noisy, and at a fine one for models that were optimised on all matches nearby. Fine
+the models of samples, which are noisy, and at a fine one for models that were optimized on all matches nearby. Fine
 scales tell the true geometry from one that lies on repeated structure or on a single plane.
 """
 
@@ -31,7 +31,7 @@ _LOCAL_MATCHES, _LOCAL_STEPS, _ENOUGH = 1000, (5, 3), 1e-3
 _REACH, _FINAL_STEPS = 3.0, 12
 
 
-def optimise_locally(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+def optimize_locally(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
     """Fit by 8 points to the matches within twice the threshold, then Sampson steps, coarse and fine, on all around.
 
     A model through seven noisy matches misses many true ones by more than the threshold; from the wider set it reaches
@@ -62,7 +62,7 @@ PRODUCTION = Recipe(
     least_trials=100,
     patience=samples_to_wait,
     oriented=True,
-    improve=optimise_locally,
+    improve=optimize_locally,
     recover=with_another_epipole,
     finish=refit_to_all,
 )

@@ -55,7 +55,7 @@ class Matches:
     """The distinct matches of a pair as the estimators see them."""
 
     points: FloatArray
-    """(M, 4) x1, y1, x2, y2 in random order; each view centred, both divided by `unit_px`.
+    """(M, 4) x1, y1, x2, y2 in random order; each view centered, both divided by `unit_px`.
 
     In Fortran order: kernels run along the matches, and a column on end in memory lets them take several at once.
     """
@@ -63,15 +63,15 @@ class Matches:
     """(N,) for each match as given, its row in `points`."""
     unit_px: float
     """Pixels per unit of `points`; one scale for both views, so that a Sampson distance stays one."""
-    centre: FloatArray
+    center: FloatArray
     """(4,) pixels x1, y1, x2, y2 of the origin of `points`."""
 
     def to_pixels(self, F: FloatArray) -> FloatArray:
         """Return F of `points` as F of pixels, Frobenius norm 1."""
-        return unit_norm(self._transform(self.centre[2:]).T @ F @ self._transform(self.centre[:2]))
+        return unit_norm(self._transform(self.center[2:]).T @ F @ self._transform(self.center[:2]))
 
-    def _transform(self, centre: FloatArray) -> FloatArray:
-        return np.array([[1, 0, -centre[0]], [0, 1, -centre[1]], [0, 0, self.unit_px]]) / self.unit_px
+    def _transform(self, center: FloatArray) -> FloatArray:
+        return np.array([[1, 0, -center[0]], [0, 1, -center[1]], [0, 0, self.unit_px]]) / self.unit_px
 
 
 def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
@@ -92,8 +92,8 @@ def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
     rows = np.empty_like(ranked)
     rows[ranked] = place[np.cumsum(is_new) - 1]
     points = np.asfortranarray(stacked.take(first[order], axis=0))
-    centre, unit_px = _frame(points)
-    return Matches((points - centre) / unit_px, rows, unit_px, centre)
+    center, unit_px = _frame(points)
+    return Matches((points - center) / unit_px, rows, unit_px, center)
 
 
 def _frame(points: FloatArray) -> tuple[FloatArray, float]:
@@ -104,8 +104,8 @@ def _frame(points: FloatArray) -> tuple[FloatArray, float]:
     if not len(points):
         return np.zeros(4), 1.0
     middle, deviations = len(points) // 2, np.empty_like(points)
-    centre = np.array([np.partition(column, middle)[middle] for column in points.T])
-    np.abs(points - centre, out=deviations)
+    center = np.array([np.partition(column, middle)[middle] for column in points.T])
+    np.abs(points - center, out=deviations)
     ranked = int(_MOST * (deviations.size - 1))
     unit_px = float(np.partition(deviations.ravel(order="K"), ranked)[ranked]) / _MOST_TO_RMS
-    return centre, unit_px or float(np.sqrt((deviations**2).mean())) or 1.0
+    return center, unit_px or float(np.sqrt((deviations**2).mean())) or 1.0

@@ -1,4 +1,4 @@
-"""How the finished scene is put before the viewer: upright, centred, and in metres where GPS says how large it is."""
+"""How the finished scene is put before the viewer: upright, centered, and in meters where GPS says how large it is."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -43,7 +43,7 @@ class Look:
     lines: FloatArray
     """(N, 4) line segments in its pixels."""
     picture: NDArray[np.uint8] | None
-    """The photo itself, grey and small; None where it could not be read."""
+    """The photo itself, gray and small; None where it could not be read."""
 
 
 PhotoLooks = Mapping[int, "Future[Look]"]
@@ -71,10 +71,10 @@ def orient_or_leave(model: Any, matches: MatchGraph, looks: PhotoLooks, turn_deg
 
 
 def orient(model: Any, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | None = None) -> dict[str, Any]:
-    """Move the model into the frame of glTF viewers: y up, seen from +z, centred, of size about 1 or in metres.
+    """Move the model into the frame of glTF viewers: y up, seen from +z, centered, of size about 1 or in meters.
 
     Args:
-        model: COLMAP's model, coloured; changed in place.
+        model: COLMAP's model, colored; changed in place.
         matches: knows the photos' names and GPS positions.
         looks: at photos.
         turn_deg: by how much the photos have to be turned clockwise to stand upright; None where nobody knows.
@@ -91,20 +91,20 @@ def orient(model: Any, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | N
     if not len(points):
         raise NumericalError("it has no points")
     matrices = np.array(list(poses.values()))
-    centres = -np.einsum("nij,ni->nj", matrices[:, :, :3], matrices[:, :, 3])
+    centers = -np.einsum("nij,ni->nj", matrices[:, :, :3], matrices[:, :, 3])
     turns = [matches.images[photo].turn_deg for photo in poses]
     R = np.array([turned(rotation, turn) for rotation, turn in zip(matrices[:, :, :3], turns, strict=True)])
     found = {photo: looks[photo].result() for photo in poses if photo in looks}
-    upright = up_direction(R, centres, scenery_of(model, found), lines_of(model, found), turn_deg)
+    upright = up_direction(R, centers, scenery_of(model, found), lines_of(model, found), turn_deg)
     positions = [matches.images[key].gps for key in poses]
-    gps = _georeference(centres, positions, upright)
-    metres = None
+    gps = _georeference(centers, positions, upright)
+    meters = None
     if isinstance(gps, Georeference):
-        metres = gps.enu_from_world.scale
+        meters = gps.enu_from_world.scale
         if gps.up_deviation_deg is not None:
             upright = upright.turned_to(gps.enu_from_world.R[2], gps.up_deviation_deg)
     towards, front = facing(upright, R, points)
-    viewer = viewer_frame(upright.up, towards, points, metres)
+    viewer = viewer_frame(upright.up, towards, points, meters)
     if not is_sound(viewer):
         raise NumericalError("the frame of the viewer holds what is no number")
     with backend("turning the model upright"):
@@ -115,10 +115,10 @@ def orient(model: Any, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | N
 
 
 def _georeference(
-    centres: FloatArray, positions: Sequence[GpsPosition | None], upright: Upright
+    centers: FloatArray, positions: Sequence[GpsPosition | None], upright: Upright
 ) -> Georeference | NoGeoreference:
     try:
-        found = georeference(centres, positions, upright.up, up_is_sure=upright.found_by == LINES)
+        found = georeference(centers, positions, upright.up, up_is_sure=upright.found_by == LINES)
     except FAILURES as err:
         logger.info("the GPS positions could not be used", exc_info=err)
         return NoGeoreference(f"the computation failed: {reason_of(err)}")
@@ -161,8 +161,8 @@ def look_at(path: Path, turn_deg: int = 0) -> Look:
     read = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if read is None:
         return Look(np.zeros((0, 4)), None)
-    grey = np.asarray(read, np.uint8)
-    return Look(line_segments(grey), np.rot90(small_picture(grey), -turn_deg // 90))
+    gray = np.asarray(read, np.uint8)
+    return Look(line_segments(gray), np.rot90(small_picture(gray), -turn_deg // 90))
 
 
 def _in_world(model: Any, image_id: int, lines: FloatArray) -> Segments:
@@ -194,7 +194,7 @@ def where_it_stands(viewer: Similarity, gps: Georeference | NoGeoreference) -> d
     origin = position_at(enu_from_model.t, gps.origin)
     east, north, _ = -enu_from_model.R[:, 2]
     return {
-        "unit": "metre",
+        "unit": "meter",
         "gps": f"{gps.photos} of {gps.of} positions agree",
         "georeference": {
             "latitude_deg": round(origin.latitude_deg, 8),

@@ -57,7 +57,7 @@ def jumps(model: Any) -> list[list[str]]:
         placed = sorted((image.name, image.projection_center()) for image in model.images.values() if image.has_pose)
     if len(placed) < LEAST_IN_ORDER:
         return []
-    steps = np.linalg.norm(np.diff([centre for _, centre in placed], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff([center for _, center in placed], axis=0), axis=1)
     long = np.flatnonzero(steps > JUMP * np.median(steps))
     return [[placed[k][0], placed[k + 1][0]] for k in long] if len(long) <= MOST_JUMPS * len(steps) else []
 

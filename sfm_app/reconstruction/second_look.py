@@ -1,4 +1,4 @@
-"""A second look at photos without a place: finer features for them and their likely neighbours, then all over again.
+"""A second look at photos without a place: finer features for them and their likely neighbors, then all over again.
 
 On plain things and over wide steps the usual features find little. Features that follow the shape of their surroundings
 (affine shape, domain-size pooling), fainter ones and looser matches find more there; for all photos they would cost too
@@ -35,7 +35,7 @@ links 19, 22, 31 and 43 matches are right at 0.8 (of 33, 30, 39, 51), and 26, 29
 9 + 6 photos in two models become 15 in one."""
 ALL_PAIRS = 30
 """Up to so many photos, those without a place are matched with all others."""
-NEIGHBOURS, IN_ORDER = 8, 2
+NEIGHBORS, IN_ORDER = 8, 2
 """Else with so many that have most raw matches with them, and with so many before and after them by name."""
 MANY, FEW_LOST = 60, 0.05
 """Of so many photos or more, a smaller share without a place is not worth mapping all again."""
@@ -89,7 +89,7 @@ def lost_photos(found: Found) -> list[int]:
 
 
 def pairs_to_see(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
-    """Return pairs of lost photos with each other and with their likely neighbours."""
+    """Return pairs of lost photos with each other and with their likely neighbors."""
     every = sorted(matches.images)
     if len(every) <= ALL_PAIRS:
         return [(a, b) for k, a in enumerate(every) for b in every[k + 1 :] if a in lost or b in lost]
@@ -101,7 +101,7 @@ def pairs_to_see(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
     pairs = set()
     for photo in lost:
         around = by_name[max(0, place[photo] - IN_ORDER) : place[photo] + IN_ORDER + 1]
-        likely = sorted(matched[photo], key=lambda other: (-matched[photo][other], other))[:NEIGHBOURS]
+        likely = sorted(matched[photo], key=lambda other: (-matched[photo][other], other))[:NEIGHBORS]
         pairs |= {(min(photo, other), max(photo, other)) for other in (*around, *likely) if other != photo}
     return sorted(pairs)
 

@@ -13,7 +13,7 @@ from sfm_app.colmap.backend import backend
 
 LEAST = 5
 """Points that two placed photos and the next one see, below which the scale between them is open: a pose takes three,
-two more contradict a wrong one. Of the photo sets only temple16 with every second photo (0; its centres are a third
+two more contradict a wrong one. Of the photo sets only temple16 with every second photo (0; its centers are a third
 off) and dinoSparseRing (2) have less; right models of castle-P19 and temple16 have 8."""
 
 

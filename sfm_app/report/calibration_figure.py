@@ -1,6 +1,6 @@
 """Where the zero curves of all pairs meet, drawn: thesis Figure 5.13, with the votes behind the curves.
 
-One row per camera. Left: the two focals, with the optical centre where it was found; right: the optical centre, with
+One row per camera. Left: the two focals, with the optical center where it was found; right: the optical center, with
 the focals as found. Bright is where many pairs agree.
 """
 
@@ -13,10 +13,10 @@ import numpy as np
 
 from sfm_app.calibrating import camera_pairs
 from sfm_app.errors import ConfigError
-from sfm_app.report.words import centre_text, focal_text, held_text, lens_text, verdict
+from sfm_app.report.words import center_text, focal_text, held_text, lens_text, verdict
 from sfm_app.selfcal.consensus.consensus import Consensus
 from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
-from sfm_app.selfcal.thesis.curves import centre_curves, focal_curves
+from sfm_app.selfcal.thesis.curves import center_curves, focal_curves
 from sfm_app.selfcal.undistort_pairs import without_lens
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchGraph, ViewGraph
 
@@ -106,7 +106,7 @@ def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
 
 def in_words(camera: Calibration) -> str:
     """Return what was found, a line for each thing."""
-    texts = (verdict(camera), focal_text(camera), centre_text(camera), lens_text(camera), held_text(camera))
+    texts = (verdict(camera), focal_text(camera), center_text(camera), lens_text(camera), held_text(camera))
     return "\n".join(fill(text, 150) for text in texts if text).replace("+-", "±")
 
 
@@ -118,16 +118,16 @@ def draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
     left, right = part.subplots(1, 2)
     left.axline((0.0, 0.0), slope=1.0, color=GUIDE, linewidth=0.8, linestyle=":", label="square pixels")
     right.plot(camera.width / 2, camera.height / 2, "+", color=GUIDE, markersize=9, label="middle of the photo")
-    for axes, plane in ((left, focal_plane(camera, pairs)), (right, centre_plane(camera, pairs))):
+    for axes, plane in ((left, focal_plane(camera, pairs)), (right, center_plane(camera, pairs))):
         draw_plane(axes, plane, camera, pairs)
     part.colorbar(right.images[0], ax=right, label="share of the pairs' votes", shrink=0.8)
 
 
 def focal_plane(camera: Calibration, pairs: Pairs) -> Plane:
-    """Return fx and fy, with the optical centre where it was found."""
+    """Return fx and fy, with the optical center where it was found."""
     unit, (low, high) = _unit(camera), FOCALS_SHOWN
     (fx, _, cx), (_, fy, cy), _ = camera.K
-    centre = ((cx - camera.width / 2) / unit, (cy - camera.height / 2) / unit)
+    center = ((cx - camera.width / 2) / unit, (cy - camera.height / 2) / unit)
     return Plane(
         names=("fx", "fy"),
         title=f"Focal length: every line is what one of {len(pairs)} pairs of photos allows"
@@ -137,22 +137,22 @@ def focal_plane(camera: Calibration, pairs: Pairs) -> Plane:
         extent=(low * fx, high * fx, low * fy, high * fy),
         found=(fx, fy),
         spread=(camera.spread.get("fx", 0.0), camera.spread.get("fy", 0.0)),
-        curves=lambda x: unit * focal_curves(pairs, x / unit, centre),
+        curves=lambda x: unit * focal_curves(pairs, x / unit, center),
     )
 
 
-def centre_plane(camera: Calibration, pairs: Pairs) -> Plane:
+def center_plane(camera: Calibration, pairs: Pairs) -> Plane:
     """Return cx and cy over the whole photo, with the focals as found."""
     unit, u0, v0 = _unit(camera), camera.width / 2, camera.height / 2
     focals = (camera.K[0, 0] / unit, camera.K[1, 1] / unit)
     return Plane(
         names=("cx", "cy"),
-        title="Optical centre, in the frame of the photo",
+        title="Optical center, in the frame of the photo",
         labels=("across the photo, px", "down the photo, px"),
         extent=(0.0, float(camera.width), float(camera.height), 0.0),
         found=(camera.K[0, 2], camera.K[1, 2]),
         spread=(camera.spread.get("cx", 0.0), camera.spread.get("cy", 0.0)),
-        curves=lambda x: unit * centre_curves(pairs, (x - u0) / unit, focals) + v0,
+        curves=lambda x: unit * center_curves(pairs, (x - u0) / unit, focals) + v0,
     )
 
 

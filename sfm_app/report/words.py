@@ -6,7 +6,7 @@ from sfm_app.types import Calibration
 
 SOURCES = {"exif": "what the camera wrote into the files", "guess": "the usual guess", "estimate": "an estimate"}
 HELD = {
-    "centre": "optical centre near the middle of the photo",
+    "center": "optical center near the middle of the photo",
     "aspect": "square pixels",
     "k1": "a lens that bends no lines",
 }
@@ -40,14 +40,14 @@ def focal_text(camera: Calibration) -> str:
     return f"{focal}: the camera sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom{shape}."
 
 
-def centre_text(camera: Calibration) -> str:
-    """Say where the optical centre is, from the middle of the photo."""
+def center_text(camera: Calibration) -> str:
+    """Say where the optical center is, from the middle of the photo."""
     right, below = camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2
     if max(abs(right), abs(below)) < 0.5:
-        return "Optical centre in the middle of the photo."
+        return "Optical center in the middle of the photo."
     across = f"{abs(right):.0f} px{_deviation(camera, 'cx')} {'right' if right > 0 else 'left'} of"
     down = f"{abs(below):.0f} px{_deviation(camera, 'cy')} {'below' if below > 0 else 'above'}"
-    return f"Optical centre {across} and {down} the middle of the photo."
+    return f"Optical center {across} and {down} the middle of the photo."
 
 
 def lens_text(camera: Calibration) -> str:

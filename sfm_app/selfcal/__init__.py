@@ -15,7 +15,7 @@ CALIBRATORS: dict[str, tuple[CalibrateFunction, str]] = {
     ),
     zero_curves_thesis.METHOD: (
         zero_curves_thesis.calibrate,
-        "thesis Algorithm 4 to the letter: zero curves of the focals, then of the centre",
+        "thesis Algorithm 4 to the letter: zero curves of the focals, then of the center",
     ),
     multi_start.METHOD: (
         multi_start.calibrate,

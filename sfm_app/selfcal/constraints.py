@@ -51,13 +51,13 @@ def singular_value_ratio(pair: FloatArray, fx: float, fy: float, u: float, v: fl
     return float(np.sqrt(max(a - twice, 0.0) / (a + twice)))
 
 
-def focal_polynomials(pairs: Pairs, fx: FloatArray, centre: tuple[float, float]) -> FloatArray:
-    """Return thesis (5.27): a^2 - 4p as a quartic in fy^2, for every pair and every swept fx, with the centre fixed.
+def focal_polynomials(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> FloatArray:
+    """Return thesis (5.27): a^2 - 4p as a quartic in fy^2, for every pair and every swept fx, with the center fixed.
 
     Returns:
         (P, S, 5) coefficients, lowest power first; all zero where the constraint holds for any fy.
     """
-    u, v = centre
+    u, v = center
     C = np.array([[1.0, 0.0, u], [0.0, 1.0, v], [0.0, 0.0, 1.0]])
     G = (C.T @ pairs.F @ C) ** 2
     x = (fx**2)[None, :]
@@ -74,7 +74,7 @@ def focal_polynomials(pairs: Pairs, fx: FloatArray, centre: tuple[float, float])
     return _constraint(a, n1, n2, pairs.product)
 
 
-def centre_polynomials(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
+def center_polynomials(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
     """Return thesis (5.28): a^2 - 4p as an octic in v, for every pair and every swept u, with both focals fixed.
 
     Returns:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.bundle import CAMERA, CX, CY, FX, FY, K1, K2, P1, P2, Reduced
 from sfm_app.geometry.spd_solve import inverse_of_positive, inverses_of_positive
-from sfm_app.selfcal.adjustment.camera_priors import ASPECT, CENTRE, FREE_SHARE, LENS, NARROW, WIDE
+from sfm_app.selfcal.adjustment.camera_priors import ASPECT, CENTER, FREE_SHARE, LENS, NARROW, WIDE
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -29,17 +29,17 @@ class Part:
     name: str
     places: tuple[int, ...]
     narrow: float
-    """Standard deviation about the usual value; the centre's in longer sides."""
+    """Standard deviation about the usual value; the center's in longer sides."""
     wide: float
     share: float
     """Share of cameras for which the wide prior is the right one."""
     stays: bool
     """Whether it stays as it is where the photos do not determine it; else it is drawn to its usual value. Mapping
-    knows centre and aspect from the calibration, but finds a lens with nothing to hold it."""
+    knows center and aspect from the calibration, but finds a lens with nothing to hold it."""
 
 
 PARTS = (
-    Part("centre", (CX, CY), NARROW[CENTRE], WIDE[CENTRE], FREE_SHARE[CENTRE], True),
+    Part("center", (CX, CY), NARROW[CENTER], WIDE[CENTER], FREE_SHARE[CENTER], True),
     Part("aspect", (LOG_ASPECT,), NARROW[ASPECT], WIDE[ASPECT], FREE_SHARE[ASPECT], True),
     Part("k1", (K1,), NARROW[LENS], WIDE[LENS], FREE_SHARE[LENS], False),
     Part("k2", (K2,), 0.01, 0.2, 0.3, False),
@@ -60,15 +60,15 @@ FOCALS = (0.05, 100.0)
 """In longer sides: a view of 169 degrees, and one of half a degree. What lies outside has run away."""
 MISFIT = 4.0
 """Errors of cameras, in what independent noise in the observations explains: lenses are not quite of the model's form,
-neighbouring observations err alike. Measured on photos with known cameras."""
+neighboring observations err alike. Measured on photos with known cameras."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPriors:
     """What is believed about the cameras before the bundle is asked, one row each."""
 
-    centres: FloatArray
-    """(C, 2) where the centre usually is, in pixels: the middle of the photo."""
+    centers: FloatArray
+    """(C, 2) where the center usually is, in pixels: the middle of the photo."""
     sides: FloatArray
     """(C,) longer side in pixels."""
     asked: BoolArray
@@ -78,7 +78,7 @@ class CameraPriors:
         """Return (C, 8) of the prior when `free` (C, 5) says what has the wide one."""
         deviation = np.full((len(free), CAMERA), FOCAL_SPREAD)
         for k, part in enumerate(PARTS):
-            unit = self.sides if part.name == "centre" else np.ones(len(free))
+            unit = self.sides if part.name == "center" else np.ones(len(free))
             sigma = np.where(free[:, k], part.wide, part.narrow) * unit
             deviation[:, list(part.places)] = sigma[:, None]
         return np.asarray(deviation**-2.0, np.float64)
@@ -89,7 +89,7 @@ class CameraPriors:
         None for the focal, nor for what the photos are not asked.
         """
         away = np.zeros_like(params)
-        away[:, [CX, CY]] = self.centres - params[:, [CX, CY]]
+        away[:, [CX, CY]] = self.centers - params[:, [CX, CY]]
         away[:, LOG_ASPECT] = np.log(params[:, FX] / params[:, FY])
         away[:, [K1, K2, P1, P2]] = -params[:, [K1, K2, P1, P2]]
         return np.where(spread(self.asked), away, 0.0)

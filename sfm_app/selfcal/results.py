@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.camera import camera_matrix, guessed_camera_matrix
-from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, KAPPA, LOG_ASPECT, LOG_FOCAL
+from sfm_app.selfcal.lens import CENTER_U, CENTER_V, KAPPA, LOG_ASPECT, LOG_FOCAL
 from sfm_app.types import Calibration
 
 GUESS = "guess"
@@ -27,7 +27,7 @@ def calibration_of(
     """Return answer from the parameters (5,) of `lens`, about the middle, in units of the longer side unless told."""
     unit = float(max(size)) if unit_px is None else unit_px
     focal, half = float(np.exp(theta[LOG_FOCAL])), float(np.exp(0.5 * theta[LOG_ASPECT]))
-    cx, cy = unit * theta[CENTRE_U] + size[0] / 2, unit * theta[CENTRE_V] + size[1] / 2
+    cx, cy = unit * theta[CENTER_U] + size[0] / 2, unit * theta[CENTER_V] + size[1] / 2
     K = camera_matrix(unit * focal / half, unit * focal * half, float(cx), float(cy))
     return Calibration(K, *size, method, identifiable=True, radial=float(theta[KAPPA]) * focal**2)
 

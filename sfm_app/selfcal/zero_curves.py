@@ -1,6 +1,6 @@
 """Zero Curves as the product uses it: thesis (5.33) over all of K at once, then the matches themselves, then a verdict.
 
-Beyond the thesis: the centre is sought together with the focal (cropped photos), fy/fx and a lens are freed where the
+Beyond the thesis: the center is sought together with the focal (cropped photos), fy/fx and a lens are freed where the
 photos ask for it, every parameter comes with a standard deviation, and an answer that the pairs do not determine is not
 given. The consensus of the pairs finds the camera from nothing; the adjustment of `refine` makes it exact.
 """
@@ -28,16 +28,16 @@ METHOD = "zero-curves"
 MIN_PAIRS = 3
 """Each F gives two constraints; below three pairs nothing is left to contradict a wrong K."""
 FEW_PAIRS = 3
-"""So many pairs fit almost any centre: without their matches it is held where uncropped photos have it."""
+"""So many pairs fit almost any center: without their matches it is held where uncropped photos have it."""
 UNCROPPED_SIGMA = 0.02
-"""Standard deviation of the centre of such photos about the middle, in widths."""
+"""Standard deviation of the center of such photos about the middle, in widths."""
 VOTES_SIGMA, KEPT = 0.01, 0.8
 """A camera that keeps less than this share of the votes (of this width) that the peak of the consensus has follows
 matches that most pairs contradict. On fourteen sets and variants right adjustments keep 0.97 to 1, the one that many
 wrong F's pulled away (fox50) 0.35; without that set the bound would be the same."""
 ENOUGH_PAIRS = 6.0
 """Effective pairs that must agree on the peak to contradict: twelve constraints on five parameters of a camera.
-With three pairs (merton1) the peak's centre is anywhere."""
+With three pairs (merton1) the peak's center is anywhere."""
 AGREES = 0.1
 """Pairs with r below this at the peak are then listened to, and no others; on the same sets 0.03 and 0.05 move no focal
 by more than 0.1 %."""
@@ -53,7 +53,7 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
     Args:
         pairs: for their weights see `selfcal.pair_weights`. Without inliers nothing is known about a lens, and the
             standard deviations come from resampling the pairs.
-        options: `centre_sigma` of the prior on the optical centre, and whether to look for a lens.
+        options: `center_sigma` of the prior on the optical center, and whether to look for a lens.
         seed: of that resampling.
 
     Returns:
@@ -74,8 +74,8 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 def _from_fundamentals(pairs: CameraPairs, usable: Pairs, options: CalibrationSettings, seed: int) -> Calibration:
     """Return the peak of the consensus, when the matrices are all that is known."""
     side = float(max(pairs.size))
-    centre_sigma = options.centre_sigma if len(usable) > FEW_PAIRS else min(options.centre_sigma, UNCROPPED_SIGMA)
-    consensus = Consensus(usable, centre_sigma * pairs.size[0] / side)
+    center_sigma = options.center_sigma if len(usable) > FEW_PAIRS else min(options.center_sigma, UNCROPPED_SIGMA)
+    consensus = Consensus(usable, center_sigma * pairs.size[0] / side)
     answer = consensus_peak.found(consensus)
     scatter = answer.scatter(consensus, seed)
     log_focal_spread = answer.deviation(scatter[:, LOG_FOCAL])
@@ -99,7 +99,7 @@ def _from_matches(
     A consensus without the lens has the last word.
     """
     side = float(max(pairs.size))
-    sigma = options.centre_sigma * pairs.size[0] / side
+    sigma = options.center_sigma * pairs.size[0] / side
     hint = float(np.median(pairs.focal_hints_px)) / side if pairs.focal_hints_px else np.nan
     priors = CameraPriors(np.ones(1), np.array([hint]), sigma, options.lens)
     adjusted = _adjusted(pairs, usable, priors)
@@ -154,7 +154,7 @@ class _Adjusted:
 
     @property
     def contradicted(self) -> bool:
-        """Whether enough pairs agree on another camera to say that this one is wrong: few fit almost any centre."""
+        """Whether enough pairs agree on another camera to say that this one is wrong: few fit almost any center."""
         enough = min(effective_count(self.answer.votes), float(len(self.agreeing)))
         return self.votes_kept < KEPT and enough >= ENOUGH_PAIRS
 
@@ -168,17 +168,17 @@ def _adjusted(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _
     """Adjust the camera to the matches of all pairs, or only of those that agree on the peak that `before` left."""
     matches, Fs = _in_sides(pairs, usable)
     if before is None:
-        first, listened = consensus_peak.found(Consensus(usable, priors.centre_sigma)), np.arange(len(usable))
+        first, listened = consensus_peak.found(Consensus(usable, priors.center_sigma)), np.arange(len(usable))
         plain = np.array([USUAL_FOCAL, 0.0, 0.0, 0.0])
         starts = [np.append(theta, 0.0)[None] for theta in (first.theta, *first.others[:1], plain)]
     else:
         first, listened = before.answer, before.agreeing
         starts = [np.append(first.theta, before.fit.state.thetas[0, KAPPA])[None]]
     fit = refined(matches.chosen(listened), Fs[listened], starts, priors)
-    consensus, answer = Consensus(usable, priors.centre_sigma), first
+    consensus, answer = Consensus(usable, priors.center_sigma), first
     if fit.free[0, LENS]:
         straight = _in_pixels(straight_fundamentals(of_all_pairs(fit, matches, Fs)), pairs)
-        consensus = Consensus(_prepared(CameraPairs(straight, usable.weights, pairs.size)), priors.centre_sigma)
+        consensus = Consensus(_prepared(CameraPairs(straight, usable.weights, pairs.size)), priors.center_sigma)
     if fit.free[0, LENS] or (before is not None and before.fit.free[0, LENS]):
         answer = consensus_peak.found(consensus)
     if abs(answer.theta[LOG_FOCAL] - fit.state.thetas[0, LOG_FOCAL]) > ELSEWHERE:

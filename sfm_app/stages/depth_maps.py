@@ -17,7 +17,7 @@ from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.hashing import fingerprint
 from sfm_app.settings import DepthSettings
-from sfm_app.stereo import DepthTask, View, rank_neighbours
+from sfm_app.stereo import DepthTask, View, rank_neighbors
 from sfm_app.types import Rejected, Scene
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
@@ -27,7 +27,7 @@ CONFIRMING = 2
 
 
 def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: DepthSettings, run: RunContext) -> Path:
-    """Give every photo that has neighbours a depth and a normal map; a run that was killed goes on where it stopped.
+    """Give every photo that has neighbors a depth and a normal map; a run that was killed goes on where it stopped.
 
     Returns:
         The dense workspace.
@@ -41,7 +41,7 @@ def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: Dep
     run.record(method=method.name, method_reason=why)
     prepare(scene, photo_dir, dense_dir, method.name, run)
     views = read_views(dense_dir)
-    ranked = rank_neighbours(views, CONFIRMING * options.neighbours)
+    ranked = rank_neighbors(views, CONFIRMING * options.neighbors)
     with single_threaded_opencv():
         found = method.make(DepthTask(dense_dir, views, ranked, options, DenseStore(dense_dir), run.map))
     if run.mask_dir is not None:

@@ -112,7 +112,7 @@ def photos_needed(views: list[View], run: RunContext) -> int:
 
 
 def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> tuple[Surface, Support]:
-    """Return the surface in the colours of the photos, and what they say about each of its vertices."""
+    """Return the surface in the colors of the photos, and what they say about each of its vertices."""
     normals = vertex_normals(surface.vertices, surface.faces)
     tolerance = run.settings.depth.consistency
 

@@ -10,7 +10,7 @@ from typing import Any
 from sfm_app.atomic_io import replacing
 from sfm_app.colmap.backend import backend, check_written
 from sfm_app.colmap.bundle import Adjusted, adjusted_or_as_it_was
-from sfm_app.colmap.model import colour, photos_of, read_scene, sparse_model
+from sfm_app.colmap.model import color, photos_of, read_scene, sparse_model
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_depth, why_no_scene
 from sfm_app.numerical import json_text
@@ -49,9 +49,9 @@ def adjusted_scene(found: Found, run: RunContext) -> Scene:
     looks = look_at_photos([attempt.model for attempt in outcome.models], matches, run)
     adjusted = [adjusted_or_as_it_was(attempt.model, found.run.workspace.database) for attempt in outcome.models]
     models = [found.model for found in adjusted]
-    with backend("reading colours"):
+    with backend("reading colors"):
         for model in models:
-            colour(model, run.workspace.photos, run.workers)
+            color(model, run.workspace.photos, run.workers)
     turn_deg = None if run.settings.scene.turn_deg == "auto" else run.settings.scene.turn_deg
     orientations = [orient_or_leave(model, matches, looks, turn_deg) for model in models]
     write_models(models, run)

@@ -70,7 +70,7 @@ class Files:
 
 
 def digest(surface: Surface) -> str:
-    """Return hash of vertices, triangles and colours."""
+    """Return hash of vertices, triangles and colors."""
     found = blake2b()
     for part in (surface.vertices, surface.faces, surface.colors):
         found.update(part.tobytes())

@@ -2,7 +2,7 @@
 
 from sfm_app.stereo.depth import DepthMap, Estimate, confirm_depths, match_depths
 from sfm_app.stereo.method import DepthStore, DepthTask, Kind, make_on_cpu
-from sfm_app.stereo.neighbours import rank_neighbours
+from sfm_app.stereo.neighbors import rank_neighbors
 from sfm_app.stereo.view import View, region
 
 __all__ = [
@@ -15,6 +15,6 @@ __all__ = [
     "confirm_depths",
     "make_on_cpu",
     "match_depths",
-    "rank_neighbours",
+    "rank_neighbors",
     "region",
 ]

@@ -18,18 +18,18 @@ LEVELS = 16
 def merge_hypotheses(
     depths: NDArray[np.float32], parallaxes: NDArray[np.float32], tolerance: float
 ) -> tuple[DepthArray, NDArray[np.uint8]]:
-    """Return one depth per pixel from those that the neighbours gave.
+    """Return one depth per pixel from those that the neighbors gave.
 
     The depth with the heaviest company within the tolerance wins; the company is averaged. A depth weighs the square of
     its parallax, which is inversely proportional to its variance.
 
     Args:
-        depths: (N, H, W), 0 where a neighbour gave none.
+        depths: (N, H, W), 0 where a neighbor gave none.
         parallaxes: (N, H, W) in pixels.
         tolerance: largest relative difference of depths that agree.
 
     Returns:
-        (H, W) depth, 0 where no neighbour gave any, and (H, W) how many neighbours agree with it.
+        (H, W) depth, 0 where no neighbor gave any, and (H, W) how many neighbors agree with it.
     """
     depth = np.zeros(depths.shape[1:], np.float32)
     support = np.zeros(depths.shape[1:], np.uint8)

@@ -1,4 +1,4 @@
-"""Depth maps of a photo: matched with its neighbours, then checked against their depth maps."""
+"""Depth maps of a photo: matched with its neighbors, then checked against their depth maps."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ from sfm_app.stereo.patch_match import NO_MATCH, PlaneArray, improve_planes
 from sfm_app.stereo.planar_fill import bridge_even_areas
 from sfm_app.stereo.rectify import rectify
 from sfm_app.stereo.textureless import without_surface
-from sfm_app.stereo.view import DepthArray, GreyImage, View
+from sfm_app.stereo.view import DepthArray, GrayImage, View
 from sfm_app.types import Rejected
 
 SWEEPS = 1
@@ -28,7 +28,7 @@ WEAK_NEED = 3
 UNSURE = 0.5
 """Correlation below which one more depth map has to agree."""
 
-CLIPPED_GREY = 4
+CLIPPED_GRAY = 4
 """Within so many levels of black or of white nothing is seen, and what matching finds there comes from beside it."""
 
 
@@ -52,31 +52,31 @@ class Estimate:
 
     depth: DepthArray
     confidence: NDArray[np.float32]
-    """(H, W) in [0, 1]: how well the better half of the neighbours look alike there; 0 where the depth is 0."""
+    """(H, W) in [0, 1]: how well the better half of the neighbors look alike there; 0 where the depth is 0."""
 
 
 def match_depths(
-    view: View, candidates: Sequence[View], load: Callable[[View], GreyImage], count: int, tolerance: float
+    view: View, candidates: Sequence[View], load: Callable[[View], GrayImage], count: int, tolerance: float
 ) -> Estimate | Rejected:
     """Match a photo with the first `count` candidates that can be rectified with it, and find what suits them all.
 
-    Semi-global matching with each neighbour gives depths; where they agree they start PatchMatch with all neighbours.
+    Semi-global matching with each neighbor gives depths; where they agree they start PatchMatch with all neighbors.
     """
     image = load(view)
-    # images have their values at the pixels' centres
+    # images have their values at the pixels' centers
     centered = replace(view, sample_px=0.5)
-    used: list[tuple[View, GreyImage]] = []
+    used: list[tuple[View, GrayImage]] = []
     found: list[tuple[DepthArray, DepthArray]] = []
     reason = "no photo shares enough points"
-    for neighbour in candidates:
-        rectification = rectify(centered, neighbour)
+    for neighbor in candidates:
+        rectification = rectify(centered, neighbor)
         if isinstance(rectification, Rejected):
             reason = rectification.reason
             continue
-        used.append((neighbour, load(neighbour)))
-        left, right = rectification.warp(image, used[-1][1], (centered, neighbour))
+        used.append((neighbor, load(neighbor)))
+        left, right = rectification.warp(image, used[-1][1], (centered, neighbor))
         disparity = disparities(left, right, rectification.disparities)
-        found.append(depths_from_disparities(disparity, rectification, centered, neighbour))
+        found.append(depths_from_disparities(disparity, rectification, centered, neighbor))
         if len(found) == count:
             break
     if not found:
@@ -88,10 +88,10 @@ def match_depths(
     return _sampled(planes, cost, view.sample_px)
 
 
-def clipped(image: GreyImage) -> NDArray[np.bool_]:
+def clipped(image: GrayImage) -> NDArray[np.bool_]:
     """Return (H, W) whether a photo is black or blown out at a pixel and around it."""
     around = cv2.blur(image, (3, 3))
-    return np.asarray((around <= CLIPPED_GREY) | (around >= 255 - CLIPPED_GREY))
+    return np.asarray((around <= CLIPPED_GRAY) | (around >= 255 - CLIPPED_GRAY))
 
 
 def _started(depth: DepthArray) -> PlaneArray:
@@ -112,7 +112,7 @@ def _sampled(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) ->
 
 def confirm_depths(
     view: View,
-    image: GreyImage,
+    image: GrayImage,
     estimate: Estimate,
     others: Sequence[tuple[View, DepthArray]],
     min_agreeing: int,

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.stereo.rectify import Rectification
-from sfm_app.stereo.view import DepthArray, FloatArray, GreyImage, View
+from sfm_app.stereo.view import DepthArray, FloatArray, GrayImage, View
 
 BLOCK_PX = 3
 NO_DISPARITY = -1.0
@@ -14,7 +14,7 @@ MIN_PARALLAX_PX = 1.0
 """Less says nothing about the depth: next to the epipole, and far away."""
 
 
-def disparities(left: GreyImage, right: GreyImage, count: int) -> NDArray[np.float32]:
+def disparities(left: GrayImage, right: GrayImage, count: int) -> NDArray[np.float32]:
     """Return semi-global matching (Hirschmueller, PAMI 2008; OpenCV's block variant) in [0, count), to sub-pixels.
 
     Returns:
@@ -39,20 +39,20 @@ def disparities(left: GreyImage, right: GreyImage, count: int) -> NDArray[np.flo
 
 
 def depths_from_disparities(
-    disparity: NDArray[np.float32], rectification: Rectification, reference: View, neighbour: View
+    disparity: NDArray[np.float32], rectification: Rectification, reference: View, neighbor: View
 ) -> tuple[DepthArray, DepthArray]:
     """Bring a rectified disparity map back into the reference.
 
     Returns:
-        (H, W) depth of the reference's pixels, 0 where unknown or not seen by the neighbour, and (H, W) the parallax
+        (H, W) depth of the reference's pixels, 0 where unknown or not seen by the neighbor, and (H, W) the parallax
         in pixels, to which the relative accuracy of the depth is proportional.
     """
     K_inv = np.linalg.inv(reference.K)
     to_rectified = rectification.rotation @ reference.R.T @ K_inv
-    # x of the neighbour = M x z + m for the pixel x of the reference at depth z
-    M = neighbour.K @ neighbour.R @ reference.R.T @ K_inv
-    m = neighbour.K @ (neighbour.t - neighbour.R @ reference.R.T @ reference.t)
-    size = np.array([reference.height, reference.width, neighbour.height, neighbour.width])
+    # x of the neighbor = M x z + m for the pixel x of the reference at depth z
+    M = neighbor.K @ neighbor.R @ reference.R.T @ K_inv
+    m = neighbor.K @ (neighbor.t - neighbor.R @ reference.R.T @ reference.t)
+    size = np.array([reference.height, reference.width, neighbor.height, neighbor.width])
     depth = np.zeros((reference.height, reference.width), np.float32)
     parallax = np.zeros_like(depth)
     r = rectification
@@ -103,7 +103,7 @@ def _lift(
                 continue
             p0 = (z * (P[0, 0] * x + P[0, 1] * y + P[0, 2]) + P[0, 3]) / p2
             p1 = (z * (P[1, 0] * x + P[1, 1] * y + P[1, 2]) + P[1, 3]) / p2
-            # beyond the neighbour's border the matcher only guesses from what is beside
+            # beyond the neighbor's border the matcher only guesses from what is beside
             if 2 < p0 < size[3] - 2 and 2 < p1 < size[2] - 2:
                 depth[row, col] = z
                 parallax[row, col] = shift

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sfm_app.numerical import FAILURES, reason_of
 from sfm_app.settings import DepthSettings
 from sfm_app.stereo.depth import DepthMap, Estimate, confirm_depths, match_depths
-from sfm_app.stereo.view import GreyImage, View
+from sfm_app.stereo.view import GrayImage, View
 from sfm_app.types import Rejected
 
 Kind = Literal["photometric", "geometric"]
@@ -22,7 +22,7 @@ Kind = Literal["photometric", "geometric"]
 class DepthStore(Protocol):
     """Where photos come from and maps go; a map appears complete or not at all."""
 
-    def photo(self, view: View, /) -> GreyImage:
+    def photo(self, view: View, /) -> GrayImage:
         """Return the photo without distortion, (H, W)."""
 
     def has(self, view: View, kind: Kind, /) -> bool:
@@ -61,7 +61,7 @@ class DepthTask:
 
 
 def make_on_cpu(task: DepthTask) -> list[Rejected | None]:
-    """Match every photo with its neighbours, then keep what the depth maps of other photos confirm.
+    """Match every photo with its neighbors, then keep what the depth maps of other photos confirm.
 
     Returns:
         For every view why it has no maps, or None.
@@ -80,7 +80,7 @@ def _match(index: int, task: DepthTask) -> Rejected | None:
         return None
     candidates = [task.views[other] for other in task.ranked[index]]
     try:
-        found = match_depths(view, candidates, task.store.photo, task.options.neighbours, task.options.consistency)
+        found = match_depths(view, candidates, task.store.photo, task.options.neighbors, task.options.consistency)
     except FAILURES as err:
         return Rejected(f"the computation failed: {reason_of(err)}")
     if isinstance(found, Rejected):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.stereo.view import FloatArray, GreyImage, View
+from sfm_app.stereo.view import FloatArray, GrayImage, View
 
 PlaneArray = NDArray[np.float32]
 """(H, W, 3): inverse depth q and its slopes, q + qu du + qv dv at (du, dv) pixels beside; q = 0 where unknown."""
@@ -23,12 +23,12 @@ STRIDE_PX = 2
 SIDE = 2 * REACH + 1
 BORDER = REACH * STRIDE_PX
 SIGMA_PX = 4.0
-FALLOFF_GREY = 12.0
-"""Pixels that differ so much in grey from the middle weigh 1/e: they may belong to something else."""
-NOISE_GREY = 2.0
-"""Standard deviation of grey that is no texture."""
+FALLOFF_GRAY = 12.0
+"""Pixels that differ so much in gray from the middle weigh 1/e: they may belong to something else."""
+NOISE_GRAY = 2.0
+"""Standard deviation of gray that is no texture."""
 NO_MATCH = 2.0
-"""The cost where no neighbour sees the pixel; worse than any."""
+"""The cost where no neighbor sees the pixel; worse than any."""
 MIN_GAIN = 0.01
 """A plane that is better by less is not taken: noise alone would make flat areas rough."""
 STEP_PX = 0.3
@@ -38,18 +38,18 @@ SLOPE = 0.2
 SAME_PX, SAME_SLOPE = 0.1, 0.03
 """Parallax within which two planes count as one, at the pixel and per pixel beside it."""
 MIN_AREA, MAX_AREA = 0.1, 8.0
-"""Areas of a pixel in the neighbour between which it can be compared."""
+"""Areas of a pixel in the neighbor between which it can be compared."""
 
 
 def improve_planes(
-    planes: PlaneArray, view: View, image: GreyImage, others: Sequence[tuple[View, GreyImage]], sweeps: int
+    planes: PlaneArray, view: View, image: GrayImage, others: Sequence[tuple[View, GrayImage]], sweeps: int
 ) -> NDArray[np.float32]:
-    """Improve planes about the pixels' centres in place: down and to the right, then back, and so on.
+    """Improve planes about the pixels' centers in place: down and to the right, then back, and so on.
 
     A pixel tries the planes of the two pixels that the sweep has just left, and small changes of its own. A plane costs
-    1 - the normalised cross-correlation of the pixel's window with its image in a neighbour, the mean over the better
-    half of the neighbours, because the others may see something in front. Weights in the window fall with the distance
-    and with the difference in grey from the middle.
+    1 - the normalized cross-correlation of the pixel's window with its image in a neighbor, the mean over the better
+    half of the neighbors, because the others may see something in front. Weights in the window fall with the distance
+    and with the difference in gray from the middle.
 
     Returns:
         (H, W) cost in [0, 2]; 2 where nothing is known.
@@ -65,7 +65,7 @@ def improve_planes(
         projections[k] = other.K @ np.column_stack([relative @ K_inv, other.t - relative @ view.t])
     steps = np.arange(-REACH, REACH + 1) * STRIDE_PX
     near = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2) / SIGMA_PX**2)
-    alike = np.exp(-np.arange(256) / FALLOFF_GREY)
+    alike = np.exp(-np.arange(256) / FALLOFF_GRAY)
     cost = np.full(image.shape, NO_MATCH, np.float32)
     for sweep in range(sweeps):
         _sweep(sweep, image, (near, alike), (stack.ravel(), width, sizes, projections), planes, cost)
@@ -74,11 +74,11 @@ def improve_planes(
 
 @kernel
 def _sweep(
-    sweep: int, image: GreyImage, falloff: Any, others: Any, planes: PlaneArray, cost: NDArray[np.float32]
+    sweep: int, image: GrayImage, falloff: Any, others: Any, planes: PlaneArray, cost: NDArray[np.float32]
 ) -> None:
     height, width = image.shape
     step = 1 if sweep % 2 == 0 else -1
-    weights, greys = np.empty(SIDE * SIDE, np.float32), np.empty(SIDE * SIDE, np.float32)
+    weights, grays = np.empty(SIDE * SIDE, np.float32), np.empty(SIDE * SIDE, np.float32)
     costs = np.empty(len(others[3]))
     best, trial = np.empty(3), np.empty(3)
     for k in range(BORDER, height - BORDER):
@@ -87,8 +87,8 @@ def _sweep(
         state = np.uint64(2 * row + 1) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(sweep)
         for m in range(BORDER, width - BORDER):
             col = m if step == 1 else width - 1 - m
-            mean, variance = _read_window(image, row, col, falloff, weights, greys)
-            window = (weights, greys, mean, variance)
+            mean, variance = _read_window(image, row, col, falloff, weights, grays)
+            window = (weights, grays, mean, variance)
             for c in range(3):
                 best[c] = planes[row, col, c]
             known = best[0] > 0
@@ -120,21 +120,21 @@ def _sweep(
 
 @kernel
 def _read_window(
-    image: GreyImage, row: int, col: int, falloff: Any, weights: NDArray[np.float32], greys: NDArray[np.float32]
+    image: GrayImage, row: int, col: int, falloff: Any, weights: NDArray[np.float32], grays: NDArray[np.float32]
 ) -> tuple[float, float]:
-    """Fill in weights, of sum 1, and grey values around a pixel; gives their weighted mean and variance."""
+    """Fill in weights, of sum 1, and gray values around a pixel; gives their weighted mean and variance."""
     near, alike = falloff
     middle = np.int64(image[row, col])  # int() of an unsigned number stays unsigned
     total, mean, square = 0.0, 0.0, 0.0
     k = 0
     for i in range(SIDE):
         for j in range(SIDE):
-            grey = np.int64(image[row + (i - REACH) * STRIDE_PX, col + (j - REACH) * STRIDE_PX])
-            weight = near[i, j] * alike[abs(grey - middle)]
-            weights[k], greys[k] = weight, grey
+            gray = np.int64(image[row + (i - REACH) * STRIDE_PX, col + (j - REACH) * STRIDE_PX])
+            weight = near[i, j] * alike[abs(gray - middle)]
+            weights[k], grays[k] = weight, gray
             total += weight
-            mean += weight * grey
-            square += weight * grey * grey
+            mean += weight * gray
+            square += weight * gray * gray
             k += 1
     for k in range(SIDE * SIDE):
         weights[k] /= total
@@ -144,7 +144,7 @@ def _read_window(
 
 @kernel
 def _inverse_depth_per_px(row: int, col: int, q: float, projections: FloatArray) -> float:
-    """Return the change of the inverse depth that moves the pixel by one pixel in the neighbour where it moves most."""
+    """Return the change of the inverse depth that moves the pixel by one pixel in the neighbor where it moves most."""
     most = 1e-12
     x, y = col + 0.5, row + 0.5
     for k in range(len(projections)):
@@ -214,8 +214,8 @@ def _cost(row: int, col: int, plane: FloatArray, window: Any, others: Any, costs
 
 @kernel
 def _correlation(stack: NDArray[np.float32], start: int, stride: int, affine: Any, window: Any) -> float:
-    """Return weighted normalised cross-correlation of a window and its image; noise on both sides lowers it."""
-    weights, greys, mean, variance = window
+    """Return weighted normalized cross-correlation of a window and its image; noise on both sides lowers it."""
+    weights, grays, mean, variance = window
     u, v = np.float32(affine[0]), np.float32(affine[1])
     uu, uv, vu, vv = np.float32(affine[2]), np.float32(affine[3]), np.float32(affine[4]), np.float32(affine[5])
     one, square, mixed = np.float32(0), np.float32(0), np.float32(0)
@@ -232,12 +232,12 @@ def _correlation(stack: NDArray[np.float32], start: int, stride: int, affine: An
             below = above + np.uint64(stride)
             upper = stack[above] + fx * (stack[above + np.uint64(1)] - stack[above])
             lower = stack[below] + fx * (stack[below + np.uint64(1)] - stack[below])
-            grey = upper + fy * (lower - upper)
-            weighted = weights[k] * grey
+            gray = upper + fy * (lower - upper)
+            weighted = weights[k] * gray
             one += weighted
-            square += weighted * grey
-            mixed += weighted * greys[k]
+            square += weighted * gray
+            mixed += weighted * grays[k]
             k += 1
-    noise = NOISE_GREY * NOISE_GREY
+    noise = NOISE_GRAY * NOISE_GRAY
     spread = (variance + noise) * (max(0.0, float(square - one * one)) + noise)
     return float((mixed - one * mean) / np.sqrt(spread))

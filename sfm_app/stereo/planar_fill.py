@@ -1,6 +1,6 @@
-"""Plain walls: areas of even colour whose known depths lie on one plane are that plane, between what is known.
+"""Plain walls: areas of even color whose known depths lie on one plane are that plane, between what is known.
 
-Where a photo shows nothing but one colour there is nothing to match, and what matching finds there is scattered and
+Where a photo shows nothing but one color there is nothing to match, and what matching finds there is scattered and
 rough. People paint flat things evenly, so that a plane says more than each pixel does (Gallup, Frahm, Pollefeys:
 Piecewise planar and non-planar stereo for urban scene reconstruction. CVPR 2010). Nothing is carried on beyond the
 known depths, and skies have none.
@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.stereo.view import DepthArray, FloatArray, GreyImage
+from sfm_app.stereo.view import DepthArray, FloatArray, GrayImage
 
 BLUR_PX = 1.5
 MAX_SLOPE = 2.5
-"""Grey levels per pixel of the blurred photo within an area."""
+"""Gray levels per pixel of the blurred photo within an area."""
 MIN_AREA = 0.002
 """Of an area, as a share of the photo; smaller gaps are closed by the surface."""
 MIN_KNOWN = 0.1
@@ -29,8 +29,8 @@ MAX_BEND = 0.3
 """Largest root mean square over the cells, in tolerances."""
 
 
-def bridge_even_areas(depth: DepthArray, image: GreyImage, tolerance: float) -> DepthArray:
-    """Put areas of even colour on their planes, as far as known depths reach around them.
+def bridge_even_areas(depth: DepthArray, image: GrayImage, tolerance: float) -> DepthArray:
+    """Put areas of even color on their planes, as far as known depths reach around them.
 
     Args:
         depth: (H, W) depths that other photos confirm, 0 where unknown.
@@ -51,7 +51,7 @@ def bridge_even_areas(depth: DepthArray, image: GreyImage, tolerance: float) -> 
     return bridged
 
 
-def _even(image: GreyImage) -> NDArray[np.bool_]:
+def _even(image: GrayImage) -> NDArray[np.bool_]:
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR_PX)
     slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125))
     return np.asarray(slope < MAX_SLOPE)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sfm_app.stereo.view import FloatArray, GreyImage, View
+from sfm_app.stereo.view import FloatArray, GrayImage, View
 from sfm_app.types import Rejected
 
 MAX_DISPARITIES = 256
@@ -28,7 +28,7 @@ BORDER_SAMPLES = 33
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectification:
-    """How the reference (left) and its neighbour (right) come onto one canvas.
+    """How the reference (left) and its neighbor (right) come onto one canvas.
 
     A direction at the angle theta from the baseline, in the plane at the angle phi about it, comes to the row
     ``(phi - phi_min) * rows_per_rad`` and the column ``(theta_max - theta) * columns_per_rad + disparities`` of the
@@ -37,7 +37,7 @@ class Rectification:
     """
 
     rotation: FloatArray
-    """(3, 3) rectified frame from world; the x axis points from the reference to the neighbour."""
+    """(3, 3) rectified frame from world; the x axis points from the reference to the neighbor."""
     baseline: float
     theta_max: float
     phi_min: float
@@ -48,12 +48,12 @@ class Rectification:
     offset_px: float
     disparities: int
 
-    def warp(self, reference: GreyImage, neighbour: GreyImage, views: tuple[View, View]) -> tuple[GreyImage, GreyImage]:
+    def warp(self, reference: GrayImage, neighbor: GrayImage, views: tuple[View, View]) -> tuple[GrayImage, GrayImage]:
         """Warp both photos to the canvas, black where they have no pixels; photos may be smaller than their views."""
         left = self._warp(reference, views[0], 0.0)
-        return left, self._warp(neighbour, views[1], self.offset_px)
+        return left, self._warp(neighbor, views[1], self.offset_px)
 
-    def _warp(self, image: GreyImage, view: View, shift_px: float) -> GreyImage:
+    def _warp(self, image: GrayImage, view: View, shift_px: float) -> GrayImage:
         columns = np.arange(self.size[0]) + 0.5 - self.disparities - shift_px
         theta = self.theta_max - columns / self.columns_per_rad
         phi = self.phi_min + (np.arange(self.size[1]) + 0.5)[:, None] / self.rows_per_rad
@@ -63,28 +63,28 @@ class Rectification:
         across = np.sin(phi).astype(np.float32), np.cos(phi).astype(np.float32)
         x, y, w = (cos * row[0] + sin * (across[0] * row[1] + across[1] * row[2]) for row in M)
         ahead = (w > 1e-6) & (sin > 0)  # beyond the end of the baseline everything comes once more, mirrored
-        # OpenCV has pixel centres at whole numbers
+        # OpenCV has pixel centers at whole numbers
         u = np.where(ahead, x / np.where(ahead, w, 1), -9) - np.float32(0.5)
         v = np.where(ahead, y / np.where(ahead, w, 1), -9) - np.float32(0.5)
         return np.asarray(cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT), np.uint8)
 
 
-def rectify(reference: View, neighbour: View) -> Rectification | Rejected:
+def rectify(reference: View, neighbor: View) -> Rectification | Rejected:
     """Lay the rows of a canvas along the epipolar planes, whatever the direction of the baseline.
 
     The canvas shows what both photos see of the depths that the reference's sparse points span, at the
     reference's resolution; at less where the disparities would exceed `MAX_DISPARITIES` or its area `MAX_GROWTH`.
     """
-    rotation = _rectified_rotation(reference, neighbour)
+    rotation = _rectified_rotation(reference, neighbor)
     if rotation is None:
         return Rejected("same place")
-    angles = _triangulation_angles(reference, neighbour, rotation)
+    angles = _triangulation_angles(reference, neighbor, rotation)
     if len(angles) < MIN_POINTS:
         return Rejected("too few sparse points")
     per_rad = float(np.sqrt(reference.K[0, 0] * reference.K[1, 1]))
     near, far = _angle_range(angles, (MAX_DISPARITIES - 2 * MARGIN_PX) / per_rad)
-    left, right = _bounds(rotation, reference), _bounds(rotation, neighbour)
-    # theta grows by the triangulation angle from the reference to the neighbour
+    left, right = _bounds(rotation, reference), _bounds(rotation, neighbor)
+    # theta grows by the triangulation angle from the reference to the neighbor
     low = np.maximum(left[0], right[0] - [near, 0])
     high = np.minimum(left[1], right[1] - [far, 0])
     if np.any(high - low <= 0):
@@ -98,7 +98,7 @@ def rectify(reference: View, neighbour: View) -> Rectification | Rejected:
     height = int(np.ceil(per_rad * widest * (high[1] - low[1])))
     return Rectification(
         rotation,
-        float(np.linalg.norm(neighbour.center - reference.center)),
+        float(np.linalg.norm(neighbor.center - reference.center)),
         theta_max=float(high[0]),
         phi_min=float(low[1]),
         columns_per_rad=per_rad,
@@ -109,8 +109,8 @@ def rectify(reference: View, neighbour: View) -> Rectification | Rejected:
     )
 
 
-def _rectified_rotation(reference: View, neighbour: View) -> FloatArray | None:
-    baseline = neighbour.center - reference.center
+def _rectified_rotation(reference: View, neighbor: View) -> FloatArray | None:
+    baseline = neighbor.center - reference.center
     length = np.linalg.norm(baseline)
     if length == 0:
         return None
@@ -127,12 +127,12 @@ def _directions(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.arctan2(np.hypot(rays[:, 1], rays[:, 2]), rays[:, 0]), np.arctan2(rays[:, 1], rays[:, 2])
 
 
-def _triangulation_angles(reference: View, neighbour: View, rotation: FloatArray) -> FloatArray:
+def _triangulation_angles(reference: View, neighbor: View, rotation: FloatArray) -> FloatArray:
     """Return (N,) angles, in radians, under which the reference's sparse points in front of both see the baseline."""
-    ahead = (reference.depths > 0) & (reference.points @ neighbour.R[2] + neighbour.t[2] > 0)
+    ahead = (reference.depths > 0) & (reference.points @ neighbor.R[2] + neighbor.t[2] > 0)
     points = reference.points[ahead]
     return np.asarray(
-        _directions((points - neighbour.center) @ rotation.T)[0]
+        _directions((points - neighbor.center) @ rotation.T)[0]
         - _directions((points - reference.center) @ rotation.T)[0]
     )
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 DepthArray = NDArray[np.float32]
 """(H, W) depth along the optical axis in scene units, 0 where unknown."""
-GreyImage = NDArray[np.uint8]
+GrayImage = NDArray[np.uint8]
 """(H, W)."""
 
 
@@ -23,7 +23,7 @@ def _no_points() -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A posed photo without distortion: x ~ K (R X + t), pixel centres at +0.5."""
+    """A posed photo without distortion: x ~ K (R X + t), pixel centers at +0.5."""
 
     name: str
     K: FloatArray
@@ -39,11 +39,11 @@ class View:
     points: FloatArray = field(default_factory=_no_points)
     """(M, 3) those points in the world."""
     sample_px: float = 0.5
-    """Where inside its pixel a depth is taken, in x and y: 0.5 is the pixel's centre, 0 its top-left corner."""
+    """Where inside its pixel a depth is taken, in x and y: 0.5 is the pixel's center, 0 its top-left corner."""
 
     @property
     def center(self) -> FloatArray:
-        """(3,) centre of projection in the world."""
+        """(3,) center of projection in the world."""
         return np.asarray(-self.R.T @ self.t)
 
     @property

@@ -21,7 +21,7 @@ class Body:
 
 @dataclass(frozen=True, slots=True)
 class SyntheticScene:
-    """Bodies under a fixed light; y up, scene units are about metres."""
+    """Bodies under a fixed light; y up, scene units are about meters."""
 
     name: str
     bodies: tuple[Body, ...]

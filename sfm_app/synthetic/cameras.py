@@ -23,7 +23,7 @@ class Camera:
     width: int
     height: int
     radial: float = 0.0
-    """k1 of COLMAP's SIMPLE_RADIAL and OPENCV: x_d = x_u (1 + k1 r^2) about the optical centre, with
+    """k1 of COLMAP's SIMPLE_RADIAL and OPENCV: x_d = x_u (1 + k1 r^2) about the optical center, with
     x = (X/Z, Y/Z) and r = |x_u|, so that r counts in focal lengths; < 0: barrel."""
 
 
@@ -98,17 +98,17 @@ def make_camera(
     width: int,
     height: int,
     focal_widths: float = 1.05,
-    centre: tuple[float, float] = (0.53, 0.48),
+    center: tuple[float, float] = (0.53, 0.48),
     aspect: float = 1.0,
     radial: float = 0.0,
 ) -> Camera:
-    """Return a camera about which a guess goes wrong: its optical centre is not the middle of the photo.
+    """Return a camera about which a guess goes wrong: its optical center is not the middle of the photo.
 
     Args:
         width: pixels, >= 16.
         height: pixels, >= 16.
         focal_widths: fx as a share of the width, > 0.
-        centre: optical centre as shares of width and height.
+        center: optical center as shares of width and height.
         aspect: fy / fx, > 0.
         radial: k1 as in `Camera`.
 
@@ -118,7 +118,7 @@ def make_camera(
     if min(width, height) < 16 or not (0 < focal_widths < math.inf and 0 < aspect < math.inf):
         raise ConfigError("synthetic camera: size, focal_widths or aspect is out of range")
     fx = focal_widths * width
-    return Camera(camera_matrix(fx, fx * aspect, centre[0] * width, centre[1] * height), width, height, radial)
+    return Camera(camera_matrix(fx, fx * aspect, center[0] * width, center[1] * height), width, height, radial)
 
 
 def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Views:
@@ -132,8 +132,8 @@ def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Vie
     height = _spread(options.height, count, rng)
     roll_deg = _spread((-options.roll_deg, options.roll_deg), count, rng)
     aims = np.array(options.aim) + rng.uniform(-1.0, 1.0, (count, 3)) * options.aim_spread
-    centres = np.column_stack([distance * np.sin(azimuth), height, distance * np.cos(azimuth)])
-    poses = [look_at(centre, aim, roll) for centre, aim, roll in zip(centres, aims, roll_deg, strict=True)]
+    centers = np.column_stack([distance * np.sin(azimuth), height, distance * np.cos(azimuth)])
+    poses = [look_at(center, aim, roll) for center, aim, roll in zip(centers, aims, roll_deg, strict=True)]
     return Views.of(camera, poses)
 
 
@@ -169,11 +169,11 @@ def past(camera: Camera, options: PastOptions | None = None, seed: int = 0) -> V
     rng = np.random.default_rng([seed, 13])
     count = options.photos
     x = options.length * (np.arange(count) / (count - 1) - 0.5)
-    centres = np.column_stack([x, _spread(options.height, count, rng), _spread(options.distance, count, rng)])
+    centers = np.column_stack([x, _spread(options.height, count, rng), _spread(options.distance, count, rng)])
     # parallel axes would leave the focal length undetermined
     aims = np.column_stack([x * _spread((0.2, 0.9), count, rng), _spread(options.aim, count, rng), np.zeros(count)])
     roll_deg = _spread((-options.roll_deg, options.roll_deg), count, rng)
-    return Views.of(camera, [look_at(c, a, roll) for c, a, roll in zip(centres, aims, roll_deg, strict=True)])
+    return Views.of(camera, [look_at(c, a, roll) for c, a, roll in zip(centers, aims, roll_deg, strict=True)])
 
 
 def orbit(
@@ -183,7 +183,7 @@ def orbit(
     distance: float = 5.6,
     aim: tuple[float, float, float] = (0.0, 1.3, -0.2),
 ) -> Views:
-    """Place upright photos evenly on a level circle, all looking at its centre: they leave the focal undetermined.
+    """Place upright photos evenly on a level circle, all looking at its center: they leave the focal undetermined.
 
     Any two of the optical axes meet at the same distance from both cameras (isosceles), and then one F says nothing
     about the focal length (Sturm 2001); K is the same for all photos.
@@ -193,7 +193,7 @@ def orbit(
         photos: >= 2.
         sweep_deg: angle of the arc that the photos share out, in degrees, (0, 360].
         distance: radius of the circle, in scene units, > 0.
-        aim: the circle's centre.
+        aim: the circle's center.
 
     Raises:
         ConfigError: a value is out of range.
@@ -208,7 +208,7 @@ def orbit(
 
 
 def panorama(
-    camera: Camera, photos: int = 6, step_deg: float = 12.0, centre: tuple[float, float, float] = (0.0, 1.5, 4.5)
+    camera: Camera, photos: int = 6, step_deg: float = 12.0, center: tuple[float, float, float] = (0.0, 1.5, 4.5)
 ) -> Views:
     """Return photos from one spot, turned from left to right, each a little up or down and rolled: they hold no depth.
 
@@ -216,30 +216,30 @@ def panorama(
         camera: takes all photos.
         photos: >= 2.
         step_deg: angle from photo to photo, in degrees.
-        centre: the spot, in scene units; the middle of the photos looks towards -z.
+        center: the spot, in scene units; the middle of the photos looks towards -z.
     """
     azimuth = np.radians(step_deg) * (np.arange(photos) - (photos - 1) / 2)
     tilt, roll_deg = 0.05 * np.cos(np.pi * np.arange(photos)), 3.0 * np.sin(2.0 * np.arange(photos))
-    spot, ways = np.array(centre), np.column_stack([np.sin(azimuth), tilt, -np.cos(azimuth)])
+    spot, ways = np.array(center), np.column_stack([np.sin(azimuth), tilt, -np.cos(azimuth)])
     return Views.of(camera, [look_at(spot, spot + way, roll) for way, roll in zip(ways, roll_deg, strict=True)])
 
 
-def look_at(centre: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> FloatArray:
-    """Return (3, 4) cam_from_world of a camera at `centre` (3,) that looks at `aim` (3,), world y up.
+def look_at(center: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> FloatArray:
+    """Return (3, 4) cam_from_world of a camera at `center` (3,) that looks at `aim` (3,), world y up.
 
     Raises:
         ValueError: the camera looks straight up or down, so that its roll is undefined.
     """
-    forward = _unit(np.asarray(aim, dtype=np.float64) - centre)
+    forward = _unit(np.asarray(aim, dtype=np.float64) - center)
     right = np.cross(forward, [0.0, 1.0, 0.0])
     if np.linalg.norm(right) < 1e-9:
         raise ValueError("a camera that looks straight up or down has no roll")
     right = _unit(right)
     R = axis_rotation(np.array([0.0, 0.0, 1.0]), roll_deg) @ np.stack([right, np.cross(forward, right), forward])
-    return np.column_stack([R, -R @ centre])
+    return np.column_stack([R, -R @ center])
 
 
-def camera_centre(cam_from_world: FloatArray) -> FloatArray:
+def camera_center(cam_from_world: FloatArray) -> FloatArray:
     """Return (3,) position in the world of a camera with the (3, 4) pose [R | t]."""
     return np.asarray(-cam_from_world[:, :3].T @ cam_from_world[:, 3])
 
@@ -257,7 +257,7 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
 
     Args:
         camera: its lens distortion is undone exactly.
-        offset_px: where in each pixel the ray goes through; (0.5, 0.5) is the centre.
+        offset_px: where in each pixel the ray goes through; (0.5, 0.5) is the center.
 
     Returns:
         (height * width, 3), z = 1.
@@ -273,7 +273,7 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
 
 
 def _undistorted_over_distorted(distorted: FloatArray, k1: float) -> FloatArray:
-    """Return r / d where r (1 + k1 r^2) = d, on the branch through the centre."""
+    """Return r / d where r (1 + k1 r^2) = d, on the branch through the center."""
     # for k1 < 0 the left side rises up to r^2 = -1 / (3 k1), where it is 2 r / 3, and then falls
     if k1 < 0 and distorted.max(initial=0.0) >= 2.0 / 3.0 / math.sqrt(-3.0 * k1):
         raise ConfigError(f"synthetic camera: a radial distortion of {k1:g} folds within the photo")

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.similarity import Similarity, robust_similarity
 from sfm_app.meshing.open3d import load_open3d
-from sfm_app.synthetic.cameras import Camera, camera_centre, pixel_rays
+from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.render import cast, ray_caster
 
@@ -35,8 +35,8 @@ def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
     return float(50.0 * sum(abs(K[i, i] / true[i, i] - 1.0) for i in (0, 1)))
 
 
-def centre_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
-    """Return e_OC of thesis section 5.5.3: mean error of the optical centre's x and y in percent of the truth.
+def center_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
+    """Return e_OC of thesis section 5.5.3: mean error of the optical center's x and y in percent of the truth.
 
     As above.
     """
@@ -47,33 +47,33 @@ def centre_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
 def surface_error(
     vertices: FloatArray,
     faces: IndexArray,
-    centres: Mapping[str, FloatArray],
+    centers: Mapping[str, FloatArray],
     truth: Truth,
     samples: int = SAMPLES,
 ) -> float:
     """Return median distance of a reconstructed surface to the true one, as a share of the scene's size.
 
-    The reconstruction is moved onto the truth by the similarity between the camera centres. The scene's size is the
+    The reconstruction is moved onto the truth by the similarity between the camera centers. The scene's size is the
     diagonal of the bounding box of the true surface that the photos see. The median says nothing about what is
     missing: see `surface_coverage`.
 
     Args:
         vertices: (V, 3) in the reconstruction's frame.
         faces: (T, 3) vertex indices.
-        centres: camera centre (3,) by photo name in the frame of `vertices`; at least 3 photos of the truth.
+        centers: camera center (3,) by photo name in the frame of `vertices`; at least 3 photos of the truth.
         truth: of the photo folder.
         samples: points drawn evenly from the surface (fixed seed).
 
     Raises:
-        ValueError: fewer than 3 common photos, their centres lie on a line, or the surface has no area.
+        ValueError: fewer than 3 common photos, their centers lie on a line, or the surface has no area.
     """
-    return float(np.median(_distances_to_truth(vertices, faces, centres, truth, samples)))
+    return float(np.median(_distances_to_truth(vertices, faces, centers, truth, samples)))
 
 
 def surface_accuracy(
     vertices: FloatArray,
     faces: IndexArray,
-    centres: Mapping[str, FloatArray],
+    centers: Mapping[str, FloatArray],
     truth: Truth,
     tolerance: float = 0.005,
 ) -> float:
@@ -81,13 +81,13 @@ def surface_accuracy(
 
     Arguments and errors as for `surface_error`.
     """
-    return float(np.mean(_distances_to_truth(vertices, faces, centres, truth) <= tolerance))
+    return float(np.mean(_distances_to_truth(vertices, faces, centers, truth) <= tolerance))
 
 
 def surface_coverage(
     vertices: FloatArray,
     faces: IndexArray,
-    centres: Mapping[str, FloatArray],
+    centers: Mapping[str, FloatArray],
     truth: Truth,
     tolerance: float = 0.01,
 ) -> float:
@@ -95,7 +95,7 @@ def surface_coverage(
 
     Weighted as the photos see it: evenly over their pixels. Arguments and errors as for `surface_error`.
     """
-    aligned = align_centres(centres, truth)(vertices)
+    aligned = align_centers(centers, truth)(vertices)
     if not _area(aligned, faces).sum() > 0:
         raise ValueError("the surface has no area")
     return float(np.mean(surface_distances(seen_points(truth), aligned, faces) <= tolerance * scene_size(truth)))
@@ -112,24 +112,24 @@ def seen_points(truth: Truth) -> FloatArray:
     found = []
     for name, pose in truth.cam_from_world.items():
         directions = pixel_rays(_coarse(truth.cameras[name])) @ pose[:, :3]
-        depth = cast(caster, camera_centre(pose), directions)["t_hit"].astype(np.float64)
+        depth = cast(caster, camera_center(pose), directions)["t_hit"].astype(np.float64)
         hit = np.isfinite(depth)
-        found.append(camera_centre(pose) + directions[hit] * depth[hit, None])
+        found.append(camera_center(pose) + directions[hit] * depth[hit, None])
     return np.concatenate(found)
 
 
-def align_centres(centres: Mapping[str, FloatArray], truth: Truth) -> Similarity:
-    """Return the similarity that takes found camera centres to the true ones, not led astray by wrong photos.
+def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity:
+    """Return the similarity that takes found camera centers to the true ones, not led astray by wrong photos.
 
     Raises:
-        ValueError: fewer than 3 common photos, or all centres lie on a line.
+        ValueError: fewer than 3 common photos, or all centers lie on a line.
     """
-    true_centres = truth.centres
-    names = sorted(set(centres) & set(true_centres))
+    true_centers = truth.centers
+    names = sorted(set(centers) & set(true_centers))
     if len(names) < 3:
-        raise ValueError(f"{len(names)} of the found camera centres are known; 3 are needed")
-    a = np.array([centres[name] for name in names], dtype=np.float64)
-    b = np.array([true_centres[name] for name in names])
+        raise ValueError(f"{len(names)} of the found camera centers are known; 3 are needed")
+    a = np.array([centers[name] for name in names], dtype=np.float64)
+    b = np.array([true_centers[name] for name in names])
     return robust_similarity(a, b)
 
 
@@ -168,12 +168,12 @@ def surface_distances(points: FloatArray, vertices: FloatArray, faces: IndexArra
 def _distances_to_truth(
     vertices: FloatArray,
     faces: IndexArray,
-    centres: Mapping[str, FloatArray],
+    centers: Mapping[str, FloatArray],
     truth: Truth,
     samples: int = SAMPLES,
 ) -> FloatArray:
     """Give (samples,) distances of places spread evenly over a reconstructed surface to true one, in scene sizes."""
-    points = sample_surface(align_centres(centres, truth)(vertices), faces, samples)
+    points = sample_surface(align_centers(centers, truth)(vertices), faces, samples)
     return surface_distances(points, truth.vertices, truth.faces) / scene_size(truth)
 
 

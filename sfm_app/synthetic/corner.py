@@ -13,7 +13,7 @@ from sfm_app.synthetic.textures import Material
 PLASTER = Material(
     pattern="stone", base=(214, 208, 192), second=(205, 198, 182), joint=(208, 202, 186), scale=0.5, contrast=0.03
 )
-"""Paint on plaster: grey levels differ by about as much as the noise of a photo."""
+"""Paint on plaster: gray levels differ by about as much as the noise of a photo."""
 PAPER = Material(
     pattern="leaves", base=(150, 164, 158), second=(186, 190, 172), joint=(122, 138, 136), scale=0.11, contrast=0.25
 )

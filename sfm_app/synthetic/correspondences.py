@@ -88,8 +88,8 @@ class TrackOptions:
     """Range of fx, in pixels."""
     aspect: tuple[float, float] = (0.8, 1.2)
     """Range of fy / fx."""
-    centre_offset: float = 0.1
-    """Largest offset of the optical centre from the middle, as a share of width and height, in [0, 0.4]."""
+    center_offset: float = 0.1
+    """Largest offset of the optical center from the middle, as a share of width and height, in [0, 0.4]."""
     max_rotation_deg: float = 30.0
     """Largest rotation of a camera away from the common start, in degrees, (0, 90]."""
     max_shift: float = 0.6
@@ -107,7 +107,7 @@ class TrackOptions:
             size=min(self.width, self.height) >= 16,
             focal_px=0 < self.focal_px[0] <= self.focal_px[1] < math.inf,
             aspect=0 < self.aspect[0] <= self.aspect[1] < math.inf,
-            centre_offset=0 <= self.centre_offset <= 0.4,
+            center_offset=0 <= self.center_offset <= 0.4,
             max_rotation_deg=0 < self.max_rotation_deg <= 90,
             max_shift=0 < self.max_shift <= 2,
         )
@@ -184,8 +184,8 @@ def make_pair(options: PairOptions, seed: int) -> TwoViews:
     for _ in range(MAX_SETUPS):
         R = random_rotation(rng, options.max_rotation_deg)
         # the least baseline keeps the epipolar geometry away from a pure rotation
-        centre = _direction(rng) * options.max_baseline * rng.uniform(0.1, 1.0)
-        poses = (np.stack([np.eye(3), R]), np.stack([np.zeros(3), -R @ centre]))
+        center = _direction(rng) * options.max_baseline * rng.uniform(0.1, 1.0)
+        poses = (np.stack([np.eye(3), R]), np.stack([np.zeros(3), -R @ center]))
         Ks = np.stack([K, K])
         if _converges(Ks, poses, size, rng):
             exact = _project(Ks, poses, _visible_points(Ks, poses, size, options.points, rng))
@@ -209,8 +209,8 @@ def make_tracks(options: TrackOptions, seed: int) -> Tracks:
     for _ in range(MAX_SETUPS):
         Ks = _random_intrinsics(options, rng)
         R = np.stack([random_rotation(rng, options.max_rotation_deg) for _ in range(options.cameras)])
-        centres = np.stack([_direction(rng) * options.max_shift * rng.uniform() for _ in range(options.cameras)])
-        poses = (R, -np.einsum("cij,cj->ci", R, centres))
+        centers = np.stack([_direction(rng) * options.max_shift * rng.uniform() for _ in range(options.cameras)])
+        poses = (R, -np.einsum("cij,cj->ci", R, centers))
         if _converges(Ks, poses, size, rng):
             return _tracks(options, Ks, poses, rng)
     raise ConfigError("no random cameras see the same points", hint="lower max_rotation_deg or max_shift")
@@ -269,7 +269,7 @@ def _tracks(options: TrackOptions, Ks: FloatArray, poses: Poses, rng: np.random.
 def _random_intrinsics(options: TrackOptions, rng: np.random.Generator) -> FloatArray:
     fx = rng.uniform(*options.focal_px)
     fy = fx * rng.uniform(*options.aspect)
-    shift = rng.uniform(-options.centre_offset, options.centre_offset, 2)
+    shift = rng.uniform(-options.center_offset, options.center_offset, 2)
     K = camera_matrix(fx, fy, options.width * (0.5 + shift[0]), options.height * (0.5 + shift[1]))
     Ks = np.repeat(K[None], options.cameras, axis=0)
     Ks[-1, :2, :2] *= options.other_focal

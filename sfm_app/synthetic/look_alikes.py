@@ -133,24 +133,24 @@ def _photographed(place: Place, view: Placement, rng: np.random.Generator) -> tu
     Y = place.X @ R.T + t
     with np.errstate(divide="ignore", invalid="ignore"):
         x = Y[:, :2] / Y[:, 2:] * FOCAL + 0.5 * np.array(SIZE)
-    centre = -R.T @ t
-    way = centre - place.X
+    center = -R.T @ t
+    way = center - place.X
     facing = (place.normals * way).sum(1) >= STEEP * np.linalg.norm(way, axis=1)
     facing |= ~place.normals.any(axis=1)
     good = (Y[:, 2] > NEAR) & (Y[:, 2] < FAR) & ((x > 0) & (x < SIZE)).all(axis=1) & facing
     good &= rng.uniform(size=len(good)) < SEEN
     if place.pillar:
-        good &= ~_hidden(place.X, centre, place.pillar)
+        good &= ~_hidden(place.X, center, place.pillar)
     chosen = np.flatnonzero(good)
     return chosen, x[chosen] + rng.normal(0.0, NOISE_PX, (len(chosen), 2))
 
 
-def _hidden(X: FloatArray, centre: FloatArray, radius: float) -> NDArray[np.bool_]:
+def _hidden(X: FloatArray, center: FloatArray, radius: float) -> NDArray[np.bool_]:
     """Return (N,) whether the way from the camera to a point runs through the cylinder.
 
     Its own surface is not hidden.
     """
-    ground, start = X[:, [0, 2]], centre[[0, 2]]
+    ground, start = X[:, [0, 2]], center[[0, 2]]
     way = ground - start
     nearest = np.clip(-(way @ start) / (way**2).sum(1), 0.0, 1.0)
     closest = np.linalg.norm(start + nearest[:, None] * way, axis=1)

@@ -14,7 +14,7 @@ from PIL import Image
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.progress import Progress, Silent, track
 from sfm_app.synthetic.bodies import SyntheticScene
-from sfm_app.synthetic.cameras import Camera, Views, camera_centre
+from sfm_app.synthetic.cameras import Camera, Views, camera_center
 from sfm_app.synthetic.render import GAMMA, prepare, render_scene
 
 FloatArray = NDArray[np.float64]
@@ -34,7 +34,7 @@ class PhotoOptions:
     blur_px: float = 0.5
     """Standard deviation of the Gaussian blur, in pixels, >= 0."""
     noise: float = 1.5
-    """Standard deviation of the sensor noise, in grey levels of 255, >= 0."""
+    """Standard deviation of the sensor noise, in gray levels of 255, >= 0."""
     quality: int = 92
     """JPEG quality, 1..95."""
     seed: int = 0
@@ -84,9 +84,9 @@ class Truth:
         return self.camera.K
 
     @property
-    def centres(self) -> dict[str, FloatArray]:
-        """Camera centre (3,) in the world by photo name."""
-        return {name: camera_centre(pose) for name, pose in self.cam_from_world.items()}
+    def centers(self) -> dict[str, FloatArray]:
+        """Camera center (3,) in the world by photo name."""
+        return {name: camera_center(pose) for name, pose in self.cam_from_world.items()}
 
 
 def write_photo_folder(
@@ -143,7 +143,7 @@ def save_truth(truth: Truth, folder: Path) -> None:
             }
         )
     text = {
-        "convention": "x ~ K d(R X + t); world to camera; x right, y down, z forward; pixel centres at +0.5; "
+        "convention": "x ~ K d(R X + t); world to camera; x right, y down, z forward; pixel centers at +0.5; "
         "d(x) = x (1 + radial |x|^2) on x = (X/Z, Y/Z)",
         "images": images,
     }

@@ -1,4 +1,4 @@
-"""Pictures of a finished model: in its own colours as a camera would see it, its bare shape in grey, beside a photo."""
+"""Pictures of a finished model: in its own colors as a camera would see it, its bare shape in gray, beside a photo."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.synthetic.cameras import Camera, camera_centre, pixel_rays
+from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
 from sfm_app.synthetic.render import cast, ray_caster
 from sfm_app.types import Surface
 from sfm_app.types.model import Model, Texture
@@ -15,7 +15,7 @@ from sfm_app.types.model import Model, Texture
 FloatArray = NDArray[np.float64]
 Colors = NDArray[np.uint8]
 BoolArray = NDArray[np.bool_]
-GREY, INSIDE = np.array([205.0, 205.0, 205.0]), np.array([196.0, 120.0, 110.0])
+GRAY, INSIDE = np.array([205.0, 205.0, 205.0]), np.array([196.0, 120.0, 110.0])
 """Of the bare shape in full light, seen from outside and from inside."""
 AMBIENT = 0.25
 """Light that reaches every face of the bare shape, 0..1."""
@@ -46,7 +46,7 @@ class Picture:
     """(H, W) where the model is seen."""
 
     def on(self, background: tuple[int, int, int] = (255, 255, 255)) -> Colors:
-        """Return (H, W, 3) with a colour where nothing is seen."""
+        """Return (H, W, 3) with a color where nothing is seen."""
         return np.where(self.covered[..., None], self.colors, np.array(background, np.uint8))
 
 
@@ -57,11 +57,11 @@ def prepare_model(model: Model) -> PreparedModel:
 
 
 def render_model(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
-    """Return the model with its own colours, without light.
+    """Return the model with its own colors, without light.
 
-    The texture, or the colours of the vertices where there is none.
+    The texture, or the colors of the vertices where there is none.
 
-    Both sides of a triangle are seen. A pixel shows the model at its centre, so that a texture much finer than the
+    Both sides of a triangle are seen. A pixel shows the model at its center, so that a texture much finer than the
     pixels flickers.
 
     Args:
@@ -70,7 +70,7 @@ def render_model(model: Model | PreparedModel, camera: Camera, cam_from_world: F
         cam_from_world: (3, 4) pose.
     """
     directions = pixel_rays(camera) @ cam_from_world[:, :3]
-    return view_along(model, camera_centre(cam_from_world), directions.reshape(camera.height, camera.width, 3))
+    return view_along(model, camera_center(cam_from_world), directions.reshape(camera.height, camera.width, 3))
 
 
 def view_along(model: Model | PreparedModel, origin: FloatArray, directions: FloatArray) -> Picture:
@@ -90,7 +90,7 @@ def view_along(model: Model | PreparedModel, origin: FloatArray, directions: Flo
 
 
 def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
-    """Return the bare shape in grey, each triangle lit by itself, so that every bump shows.
+    """Return the bare shape in gray, each triangle lit by itself, so that every bump shows.
 
     Reddish where seen from inside.
 
@@ -102,13 +102,13 @@ def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: F
         return Picture(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.bool_))
     R = cam_from_world[:, :3]
     directions = pixel_rays(camera) @ R
-    hits = cast(prepared.rays, camera_centre(cam_from_world), directions)
+    hits = cast(prepared.rays, camera_center(cam_from_world), directions)
     normals = hits["primitive_normals"].astype(np.float64)
     inside = (normals * directions).sum(axis=1) > 0
     facing = np.abs(normals @ (LAMP @ R))
     light = AMBIENT + (1.0 - AMBIENT) * np.where(np.isfinite(facing), facing, 0.0)
     covered = np.isfinite(hits["t_hit"])
-    colors = light[:, None] * np.where(inside[:, None], INSIDE, GREY) * covered[:, None]
+    colors = light[:, None] * np.where(inside[:, None], INSIDE, GRAY) * covered[:, None]
     return Picture(np.round(colors).astype(np.uint8).reshape(*shape, 3), covered.reshape(shape))
 
 
@@ -154,7 +154,7 @@ def _from_vertices(surface: Surface, face: NDArray[np.int64], weights: FloatArra
 
 
 def _from_pages(texture: Texture, face: NDArray[np.int64], weights: FloatArray) -> Colors:
-    """Return bilinear look-up; texel centres at +0.5, the border repeated."""
+    """Return bilinear look-up; texel centers at +0.5, the border repeated."""
     place = np.einsum("hwk,hwkc->hwc", weights, texture.uv[face].astype(np.float64))
     page_of = texture.page[face]
     found = np.zeros((*face.shape, 3), np.uint8)

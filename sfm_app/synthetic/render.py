@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.meshing.open3d import load_open3d
 from sfm_app.synthetic.bodies import SyntheticScene
-from sfm_app.synthetic.cameras import Camera, camera_centre, pixel_rays
+from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
 from sfm_app.synthetic.textures import mixture
 
 FloatArray = NDArray[np.float64]
@@ -35,7 +35,7 @@ class PreparedScene:
     face_material: NDArray[np.int64]
     materials: FloatArray
     lights: FloatArray
-    """(5, 3): direction to the sun, sun and sky colours, zenith and horizon colours."""
+    """(5, 3): direction to the sun, sun and sky colors, zenith and horizon colors."""
 
 
 def prepare(scene: SyntheticScene) -> PreparedScene:
@@ -72,14 +72,14 @@ def render_scene(
         (height, width, 3) linear RGB, about 0..1.
     """
     R = cam_from_world[:, :3]
-    centre = camera_centre(cam_from_world)
+    center = camera_center(cam_from_world)
     total = np.zeros((camera.height * camera.width, 3))
     offsets = (np.arange(supersampling) + 0.5) / supersampling
     for dy in offsets:
         for dx in offsets:
             directions = pixel_rays(camera, (float(dx), float(dy))) @ R
-            hits = cast(scene.rays, centre, directions)
-            lit = _lit(scene, centre, directions, hits)
+            hits = cast(scene.rays, center, directions)
+            lit = _lit(scene, center, directions, hits)
             # t_hit counts in z depth, since the rays have z = 1: the size of a pixel is depth / f
             pixel = np.where(np.isfinite(hits["t_hit"]), hits["t_hit"], 1.0) / camera.K[0, 0]
             shade(
@@ -112,7 +112,7 @@ def cast(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, N
 
 
 def _lit(
-    scene: PreparedScene, centre: FloatArray, directions: FloatArray, hits: dict[str, NDArray[Any]]
+    scene: PreparedScene, center: FloatArray, directions: FloatArray, hits: dict[str, NDArray[Any]]
 ) -> NDArray[np.bool_]:
     """Return whether the sun reaches each hit; only asked where the surface faces the sun."""
     sun = scene.lights[0]
@@ -120,7 +120,7 @@ def _lit(
     asked = np.flatnonzero(lit)
     rays = np.empty((len(asked), 6), dtype=np.float32)
     # a step towards the sun keeps the surface from shadowing itself
-    rays[:, :3] = centre + directions[asked] * hits["t_hit"][asked, None] + 4e-3 * sun
+    rays[:, :3] = center + directions[asked] * hits["t_hit"][asked, None] + 4e-3 * sun
     rays[:, 3:] = sun
     lit[asked] = ~scene.rays.test_occlusions(load_open3d().core.Tensor(rays)).numpy()
     return np.asarray(lit)
@@ -145,7 +145,7 @@ def _openness(caster: Any, vertices: FloatArray, normals: FloatArray) -> FloatAr
 
 @kernel
 def shade(hits: Any, tables: Any, total: NDArray[np.float64]) -> None:
-    """Add the colour of every ray to `total` (N, 3), linear RGB.
+    """Add the color of every ray to `total` (N, 3), linear RGB.
 
     `hits`: directions (N, 3), primitive ids (N,), barycentric uv (N, 2), pixel size at the hit (N,), in sunlight (N,).
     `tables`: faces, vertex table, material per face, materials and lights of `PreparedScene`.

@@ -35,7 +35,7 @@ class Shape:
 
 
 def box(width: float, height: float, depth: float, spacing: float = 0.15) -> Shape:
-    """Return a box centred in x and z that stands on y = 0, its sides cut into squares of about `spacing`."""
+    """Return a box centered in x and z that stands on y = 0, its sides cut into squares of about `spacing`."""
     size = np.array([width, height, depth])
     parts = []
     for axis in range(3):
@@ -73,7 +73,7 @@ def revolved(
 
 
 def torus(radius: float, tube: float, span_deg: float = 360.0) -> Shape:
-    """Return a ring of round section about the y axis, centred at the origin."""
+    """Return a ring of round section about the y axis, centered at the origin."""
     angle = np.linspace(0.0, 2.0 * math.pi, 25)
     section = np.column_stack([radius + tube * np.cos(angle), tube * np.sin(angle)])
     return revolved(section, segments=max(8, round(span_deg / 5.0)), span_deg=span_deg)
@@ -164,7 +164,7 @@ def _turned(
 
 
 def _strips(segments: int, rows: int, count: int) -> IndexArray:
-    """Give triangles between `segments` pairs of neighbours among `count` columns of `rows` vertices; last meets the
+    """Give triangles between `segments` pairs of neighbors among `count` columns of `rows` vertices; last meets the
     first where there are as many."""
     ring = np.arange(segments)[:, None] * rows + np.arange(rows - 1)
     step = (ring + rows) % (count * rows)

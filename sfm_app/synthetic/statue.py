@@ -19,7 +19,7 @@ BRONZE = Material(
     pattern="leaves", base=(74, 96, 66), second=(132, 118, 66), joint=(40, 44, 30), scale=0.035, contrast=0.4
 )
 SHARPNESS = 2.6
-"""How little neighbouring blobs run together."""
+"""How little neighboring blobs run together."""
 PLINTH_TOP_Y = 1.02
 BLOBS = np.array([
     # middle x, y, z; half axes x, y, z; weight

@@ -1,6 +1,6 @@
-"""Procedural surface colours as machine code: rich at every scale, so that feature detectors find something everywhere.
+"""Procedural surface colors as machine code: rich at every scale, so that feature detectors find something everywhere.
 
-A colour is a function of the place on the body alone, so it is the same from every side. Detail finer than a pixel is
+A color is a function of the place on the body alone, so it is the same from every side. Detail finer than a pixel is
 faded out, since it would flicker between photos.
 """
 
@@ -22,7 +22,7 @@ PATTERNS: tuple[str, ...] = get_args(Pattern)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Material:
-    """How a body is coloured. Colours are sRGB, 0..255."""
+    """How a body is colored. Colors are sRGB, 0..255."""
 
     pattern: Pattern
     base: Color
@@ -36,7 +36,7 @@ class Material:
     """Strength of the fine grain, 0..1."""
 
     def row(self, seed: int) -> FloatArray:
-        """Return (13,) numbers for the kernels: pattern, scale, contrast, seed, then three linear RGB colours."""
+        """Return (13,) numbers for the kernels: pattern, scale, contrast, seed, then three linear RGB colors."""
         colors = [(np.array(c) / 255.0) ** 2.2 for c in (self.base, self.second, self.joint)]
         return np.concatenate([[PATTERNS.index(self.pattern), self.scale, self.contrast, seed], *colors])
 
@@ -142,7 +142,7 @@ def tiles(
 
 @kernel
 def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
-    """Return Greek pottery: share of the second colour (glaze), share of the thin lines.
+    """Return Greek pottery: share of the second color (glaze), share of the thin lines.
 
     Bands by height, figures by angle.
     """
@@ -169,7 +169,7 @@ def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
 def mixture(
     row: NDArray[np.float64], p: tuple[float, float, float], n: tuple[float, float, float], footprint: float
 ) -> tuple[float, float, float]:
-    """Return share of the second colour, share of the joint colour, and brightness (about 1) at a place of a body.
+    """Return share of the second color, share of the joint color, and brightness (about 1) at a place of a body.
 
     `row` is `Material.row()`, `p` the place and `n` the unit normal on the body before it was moved.
     """

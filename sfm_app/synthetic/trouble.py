@@ -21,7 +21,7 @@ from sfm_app.synthetic.cameras import (
     Views,
     arc,
     axis_rotation,
-    camera_centre,
+    camera_center,
     look_at,
     make_camera,
     orbit,
@@ -156,7 +156,7 @@ def in_front(image: FloatArray, still: Seen, moving: Seen, camera: Camera, super
     depth = []
     for scene, pose in (still, moving):
         directions = pixel_rays(camera) @ pose[:, :3]
-        depth.append(cast(scene.rays, camera_centre(pose), directions)["t_hit"].reshape(image.shape[:2]))
+        depth.append(cast(scene.rays, camera_center(pose), directions)["t_hit"].reshape(image.shape[:2]))
     nearer = depth[1] < depth[0]
     if not nearer.any():
         return image
@@ -187,14 +187,14 @@ def _scene(place: str, rng: Random) -> SyntheticScene:
 
 
 def _camera(drawn: set[str], rng: Random) -> Camera:
-    """Draw the camera of a folder; its centre, pixels and lens may be part of the trouble."""
+    """Draw the camera of a folder; its center, pixels and lens may be part of the trouble."""
     width, height = (int(side) for side in rng.choice(SIZES))
     longer = math.exp(rng.uniform(math.log(0.75), math.log(1.6)))
-    centre = 0.5 + rng.normal(0.0, 0.008, 2)
+    center = 0.5 + rng.normal(0.0, 0.008, 2)
     if "crop" in drawn:
-        centre = centre + rng.choice((-1.0, 1.0), 2) * rng.uniform(0.04, 0.16, 2)
+        center = center + rng.choice((-1.0, 1.0), 2) * rng.uniform(0.04, 0.16, 2)
     aspect = float(rng.choice((0.75, 0.85, 1.2, 1.33))) if "squeeze" in drawn else 1.0
-    camera = make_camera(width, height, longer * max(width, height) / width, (centre[0], centre[1]), aspect)
+    camera = make_camera(width, height, longer * max(width, height) / width, (center[0], center[1]), aspect)
     # how far a corner of the photo is pushed; a phone's lens is corrected to about half a percent
     bend = rng.choice((-1.0, 1.0)) * rng.uniform(0.03, 0.1) if "lens" in drawn else rng.normal(0.0, 0.003)
     return bent(camera, float(bend))
@@ -250,10 +250,10 @@ def _with_cameras(views: Views, drawn: set[str], rng: Random) -> Views:
     names = sorted(views.cameras)
     if "two cameras" in drawn:
         factor = float(rng.choice((0.65, 0.8, 1.25, 1.5)))
-        centre = rng.normal(0.0, 0.01, 2)
+        center = rng.normal(0.0, 0.01, 2)
         other = zoomed(views.cameras[names[0]], factor)
         K = other.K.copy()
-        K[:2, 2] += centre * (other.width, other.height)
+        K[:2, 2] += center * (other.width, other.height)
         # in turn or one after the other: as two people, or as one with two cameras
         turn = names[1::2] if rng.uniform() < 0.5 else names[: len(names) // 2]
         views = views.taken_with(replace(other, K=K), turn)

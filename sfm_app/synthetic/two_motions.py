@@ -15,7 +15,7 @@ FloatArray = NDArray[np.float64]
 RADIUS = (0.1, 0.2)
 """Of the moving object, in units of the distance to the middle of the scene."""
 MAX_TURN_DEG, MAX_SHIFT = 30.0, 0.3
-"""How far the object turns about its centre and shifts between the two images."""
+"""How far the object turns about its center and shifts between the two images."""
 LEAST_DEPARTURE_PX = 5.0
 """Median Sampson distance of the object's exact matches to the geometry of the scene: an object that slides along its
 epipolar lines does not count as moving."""
@@ -77,13 +77,13 @@ def _moving_object(
     size = np.array([options.width, options.height])
     for _ in range(MAX_SETUPS):
         pixel = np.append(rng.uniform(size=2) * size, 1.0)
-        centre = np.linalg.inv(still.K1) @ pixel * rng.uniform(NEAR, FAR)
+        center = np.linalg.inv(still.K1) @ pixel * rng.uniform(NEAR, FAR)
         turn = random_rotation(rng, MAX_TURN_DEG)
         shift = rng.uniform(-MAX_SHIFT, MAX_SHIFT, 3)
-        R, t = still.R @ turn, still.R @ (centre + shift - turn @ centre) + still.t
+        R, t = still.R @ turn, still.R @ (center + shift - turn @ center) + still.t
         directions = rng.normal(size=(8 * count, 3))
         radii = rng.uniform(*RADIUS) * rng.uniform(size=(8 * count, 1)) ** (1 / 3)
-        X = centre + radii * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        X = center + radii * directions / np.linalg.norm(directions, axis=1, keepdims=True)
         depths = np.stack([X[:, 2], (X @ R.T + t)[:, 2]])
         X = X[(depths > NEAR / 4).all(axis=0)]
         x1, x2 = _projected(still.K1, X), _projected(still.K2, X @ R.T + t)

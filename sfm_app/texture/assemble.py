@@ -100,12 +100,12 @@ def texture_surface(
         spread: runs work for each photo.
 
     Returns:
-        The surface with its texture, cut if asked for and with colours from the photos; and figures for the manifest.
+        The surface with its texture, cut if asked for and with colors from the photos; and figures for the manifest.
     """
     mesh = facets(surface)
     looks = _look_at_all(views, mesh, store, hidden, spread)
     seen = _believe(looks, mesh)
-    chosen = without_specks(choose_photos(seen.worth, mesh), seen.usable, mesh.neighbours)
+    chosen = without_specks(choose_photos(seen.worth, mesh), seen.usable, mesh.neighbors)
     unseen = chosen == NONE
     if options.unseen == "cut" and not unseen.all():
         mesh = facets(select_faces(surface, ~unseen))
@@ -160,7 +160,7 @@ def _believe(looks: FaceViews, mesh: Facets) -> Seen:
     sharp[read] = sharpness_factors(looks.sharpness[read])
     worth *= sharp[:, None].astype(np.float32)
     gains = photo_gains(colors, worth > 0)
-    strange = strangers(colors, gains, worth > 0, mesh.neighbours)
+    strange = strangers(colors, gains, worth > 0, mesh.neighbors)
     worth[strange] *= -1.0
     return Seen(worth, colors, gains, int(strange.sum()))
 
@@ -188,7 +188,7 @@ def _paint_photo(photo: int, plan: Plan, views: Sequence[PhotoView], store: Stor
     triangles, shares = _shares(photo, plan)
     if not len(triangles):
         return
-    beside = plan.mesh.neighbours[triangles]
+    beside = plan.mesh.neighbors[triangles]
     rims = (beside == NONE) | (plan.seen.worth[photo, beside] == 0)
     view, scale = views[photo], plan.layout.scale
     if scale < 1.0:
@@ -229,7 +229,7 @@ def _allowed_weight(blend: Blend, usable: NDArray[np.bool_], chosen: IntArray, m
 
 
 def _finish(plan: Plan, canvases: Sequence[Canvas]) -> Model:
-    """Round the pages, colour what no photo sees, and fill what lies between the charts."""
+    """Round the pages, color what no photo sees, and fill what lies between the charts."""
     drawn = plan.chosen != NONE
     pages, painted = (list(part) for part in zip(*(finished(page) for page in canvases), strict=True))
     corner_colors = np.zeros((len(drawn), 3, 3))

@@ -1,7 +1,7 @@
 """Near a seam both photos count: weights of the photos at the vertices, and offsets that level them out.
 
 A vertex takes each photo by the share of its triangles that show it; shares spread over a few rings of vertices, as
-far as the other photo sees them. Where two photos meet at a vertex their colours there should be equal: offsets that
+far as the other photo sees them. Where two photos meet at a vertex their colors there should be equal: offsets that
 change slowly over the chart make them so (Lempitsky & Ivanov 2007; Waechter et al. 2014, section 3.2).
 """
 
@@ -31,7 +31,7 @@ class Blend:
     weight: NDArray[np.float32]
     """(N,) share of the photo at the vertex; a vertex's sum to 1."""
     offset: NDArray[np.float32]
-    """(N, 3) grey levels that the photo gets there after its gain."""
+    """(N, 3) gray levels that the photo gets there after its gain."""
 
     def of(self, photo: int) -> slice:
         """Return rows of a photo."""

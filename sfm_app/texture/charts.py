@@ -1,6 +1,6 @@
 """Charts: connected triangles of one photo, laid out as they lie in that photo.
 
-The photo is the parametrisation: nothing is stretched, and a texel is a pixel. Triangles that a photo sees cannot
+The photo is the parametrization: nothing is stretched, and a texel is a pixel. Triangles that a photo sees cannot
 cover each other in it, but for those at the rim of what hides others; these get charts of their own.
 """
 
@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 MOST_LAYERS = 4
 """Of triangles over each other in one photo; what still overlaps then shows the same pixels twice."""
 SMALL = 12
-"""Charts of fewer triangles go over to the photo of a neighbouring chart that sees them, too."""
+"""Charts of fewer triangles go over to the photo of a neighboring chart that sees them, too."""
 ROUNDS = 3
 EDGE = 1e-6
 """Barycentric coordinates below count as on the edge."""
@@ -49,13 +49,13 @@ def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: fl
     _project_corners(chosen, cameras, mesh.vertices, mesh.faces, corners)
     tiles = np.floor(corners.mean(axis=1) / tile_px).astype(np.int64)
     group = np.where(chosen == NONE, NONE, (chosen * 4096 + tiles[:, 1]) * 4096 + tiles[:, 0])
-    of, count = components(group, mesh.neighbours)
+    of, count = components(group, mesh.neighbors)
     for layer in range(1, MOST_LAYERS):
         folded = folds(of, count, corners)
         if not folded.any():
             break
         group[folded] += layer << 40
-        of, count = components(group, mesh.neighbours)
+        of, count = components(group, mesh.neighbors)
     photo = np.full(count, NONE, np.int32)
     photo[of[of != NONE]] = chosen[of != NONE]
     return Charts(of, photo, corners)
@@ -99,7 +99,7 @@ def _find_folds(
                 continue
             for y in range(int(min(ay, by, cy)), int(max(ay, by, cy)) + 1):
                 for x in range(int(min(ax, bx, cx)), int(max(ax, bx, cx)) + 1):
-                    # strictly inside: neighbours share the pixels on their common edge
+                    # strictly inside: neighbors share the pixels on their common edge
                     u = ((x - ax) * (cy - ay) - (y - ay) * (cx - ax)) / turn
                     v = ((bx - ax) * (y - ay) - (by - ay) * (x - ax)) / turn
                     if min(u, v, 1.0 - u - v) > EDGE:
@@ -107,27 +107,27 @@ def _find_folds(
                         taken[y, x] = True
 
 
-def components(group: NDArray[np.int64], neighbours: IntArray) -> tuple[IntArray, int]:
+def components(group: NDArray[np.int64], neighbors: IntArray) -> tuple[IntArray, int]:
     """Find connected triangles of equal group: (T,) number of component, -1 where the group is -1, and their count."""
     of = np.full(len(group), NONE, np.int32)
-    return of, _flood(group, neighbours, of)
+    return of, _flood(group, neighbors, of)
 
 
-def without_specks(chosen: IntArray, usable: NDArray[np.bool_], neighbours: IntArray) -> IntArray:
-    """Give charts of a few triangles the photo of a neighbour that may be used for all of them.
+def without_specks(chosen: IntArray, usable: NDArray[np.bool_], neighbors: IntArray) -> IntArray:
+    """Give charts of a few triangles the photo of a neighbor that may be used for all of them.
 
     Args:
         chosen: (T,) photo of each triangle, -1 for none.
         usable: (P, T) whether a photo may be used for a triangle.
-        neighbours: (T, 3) triangles beside each triangle.
+        neighbors: (T, 3) triangles beside each triangle.
     """
     chosen = chosen.copy()
     for _ in range(ROUNDS):
-        of, count = components(chosen.astype(np.int64), neighbours)
+        of, count = components(chosen.astype(np.int64), neighbors)
         sizes = np.bincount(of[of != NONE], minlength=count)
         order = np.argsort(of, kind="stable").astype(np.int32)
         starts = np.concatenate([[0], np.cumsum(sizes)]) + int(np.count_nonzero(of == NONE))
-        if not _absorb(sizes, starts, order, usable, neighbours, chosen):
+        if not _absorb(sizes, starts, order, usable, neighbors, chosen):
             break
     return chosen
 
@@ -146,7 +146,7 @@ def _project_corners(
 
 
 @kernel
-def _flood(group: NDArray[np.int64], neighbours: IntArray, of: IntArray) -> int:
+def _flood(group: NDArray[np.int64], neighbors: IntArray, of: IntArray) -> int:
     stack = np.empty(len(group), np.int64)
     count = 0
     for seed in range(len(group)):
@@ -158,7 +158,7 @@ def _flood(group: NDArray[np.int64], neighbours: IntArray, of: IntArray) -> int:
             top -= 1
             f = stack[top]
             for k in range(3):
-                g = neighbours[f, k]
+                g = neighbors[f, k]
                 if g != NONE and of[g] == NONE and group[g] == group[f]:
                     of[g] = count
                     stack[top] = g
@@ -173,10 +173,10 @@ def _absorb(
     starts: NDArray[np.int64],
     order: IntArray,
     usable: NDArray[np.bool_],
-    neighbours: IntArray,
+    neighbors: IntArray,
     chosen: IntArray,
 ) -> int:
-    """Return small components take the neighbouring photo with the longest common border; how many did."""
+    """Return small components take the neighboring photo with the longest common border; how many did."""
     absorbed = 0
     border = np.zeros(len(usable), np.int64)
     for c in range(len(sizes)):
@@ -186,7 +186,7 @@ def _absorb(
         own = chosen[order[starts[c]]]
         for at in range(starts[c], starts[c + 1]):
             for k in range(3):
-                g = neighbours[order[at], k]
+                g = neighbors[order[at], k]
                 if g != NONE and chosen[g] != NONE and chosen[g] != own:
                     border[chosen[g]] += 1
         best = NONE

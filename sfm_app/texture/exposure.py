@@ -1,7 +1,7 @@
 """Exposure and white balance of the photos, from triangles that several of them see.
 
 Each photo multiplies every channel by a gain: log c[f, p] = log a[f] + g[p] + noise, for triangle f and photo p. The
-colours a of the surface are eliminated, the gains g come from iteratively reweighted least squares (Cauchy), so that
+colors a of the surface are eliminated, the gains g come from iteratively reweighted least squares (Cauchy), so that
 shadows, highlights and people who walk through count little.
 """
 
@@ -17,9 +17,9 @@ FloatArray = NDArray[np.float64]
 SAMPLES = 30_000
 """Triangles that are looked at, spread evenly."""
 DARKEST, BRIGHTEST = 8, 247
-"""Grey levels outside are close to clipping and say nothing about the gain."""
+"""Gray levels outside are close to clipping and say nothing about the gain."""
 NOISE = 0.05
-"""Of log colours; what deviates by more counts less and less."""
+"""Of log colors; what deviates by more counts less and less."""
 ROUNDS = 15
 PRIOR = 0.01
 """Weight of "no gain", as a share of the mean weight of a photo: holds what the photos do not determine."""

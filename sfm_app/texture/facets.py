@@ -18,7 +18,7 @@ class Facets:
     """A surface with tables that the texture needs again and again."""
 
     surface: Surface
-    neighbours: IntArray
+    neighbors: IntArray
     """(T, 3) the triangle across edge k, from corner k to corner k + 1; -1 at borders and where more than two meet."""
     edges: NDArray[np.int64]
     """(E, 2) vertices of every edge, each once, smaller first."""
@@ -35,20 +35,20 @@ class Facets:
 
 
 def facets(surface: Surface) -> Facets:
-    """Look up the neighbours of all triangles."""
+    """Look up the neighbors of all triangles."""
     starts, ends = surface.faces.ravel(), np.roll(surface.faces, -1, axis=1).ravel()
     key = np.minimum(starts, ends) * np.int64(len(surface.vertices)) + np.maximum(starts, ends)
     order = np.argsort(key, kind="stable")
     ranked = key[order]
     first = np.flatnonzero(np.concatenate([[True], ranked[1:] != ranked[:-1]])) if len(ranked) else np.empty(0, int)
     shared = np.diff(np.append(first, len(ranked)))
-    neighbours = np.full(len(key), NONE, np.int32)
+    neighbors = np.full(len(key), NONE, np.int32)
     one, other = order[first[shared == 2]], order[first[shared == 2] + 1]
-    neighbours[one], neighbours[other] = other // 3, one // 3
+    neighbors[one], neighbors[other] = other // 3, one // 3
     edges = np.column_stack(np.divmod(ranked[first], np.int64(max(len(surface.vertices), 1))))
     lengths = np.linalg.norm(surface.vertices[edges[:, 0]] - surface.vertices[edges[:, 1]], axis=1)
     spacing = float(np.median(lengths)) if len(lengths) else 0.0
-    return Facets(surface, neighbours.reshape(-1, 3), edges, spacing)
+    return Facets(surface, neighbors.reshape(-1, 3), edges, spacing)
 
 
 def at_vertices(values: FloatArray, faces: NDArray[np.int64], size: int) -> FloatArray:

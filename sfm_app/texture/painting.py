@@ -31,7 +31,7 @@ class Canvas:
     owner: IntArray
     """(H, W) triangle that a texel belongs to, -1 for none."""
     total: IntArray
-    """(H, W, 3) sum of what the photos gave, in 1 / FINE grey levels: whole numbers add up alike in any order."""
+    """(H, W, 3) sum of what the photos gave, in 1 / FINE gray levels: whole numbers add up alike in any order."""
 
 
 def canvas(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatArray) -> Canvas:
@@ -105,7 +105,7 @@ def paint(
         triangles: (N,) those of the page that the photo counts for.
         corners: (T, 3, 2) texels.
         points: (N, 3, 3) corners in the scene.
-        shares: (N, 3, 4) at each corner the weight of the photo, and the grey levels to add to its channels.
+        shares: (N, 3, 4) at each corner the weight of the photo, and the gray levels to add to its channels.
         rims: (N, 3) whether the edge from corner k to k + 1 is where the photo stops seeing the surface.
         owner: (H, W) of the page.
         total: (H, W, 3) of the page.
@@ -195,9 +195,9 @@ def finished(page: Canvas) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
 
 
 def fill_background(page: NDArray[np.uint8], painted: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Return texels that nobody owns take the mean colour of what is painted in the smallest block around them.
+    """Return texels that nobody owns take the mean color of what is painted in the smallest block around them.
 
-    Blocks are those of mip maps, so a page made smaller by a viewer keeps its colours up to the rim of the charts.
+    Blocks are those of mip maps, so a page made smaller by a viewer keeps its colors up to the rim of the charts.
     """
     if painted.all() or min(page.shape[:2]) < 2:
         return page

@@ -1,7 +1,7 @@
 """Photos that show something else than the surface: passers-by, cars, leaves, reflections.
 
-Where at least three photos see a triangle, the colour that lies far from the middle of the others is not the
-surface's. A single triangle may deviate by chance, a person covers many: deviations are averaged over neighbours.
+Where at least three photos see a triangle, the color that lies far from the middle of the others is not the
+surface's. A single triangle may deviate by chance, a person covers many: deviations are averaged over neighbors.
 After Sinha et al. 2008 and Waechter et al. 2014 (section 3.1), with medians in place of their Gaussian.
 """
 
@@ -15,15 +15,15 @@ from sfm_app.texture.median import median
 LEAST_VIEWS = 3
 """Two photos that disagree do not say which of them is right."""
 LEVELS = 10.0
-"""Grey levels that colours of one triangle may differ by without a reason."""
+"""Gray levels that colors of one triangle may differ by without a reason."""
 OUTLYING = 3.0
 """Times the usual deviation of a triangle, beyond which a photo is left out."""
 ROUNDS = 4
-"""Of averaging over neighbours: about as many triangles make a stranger."""
+"""Of averaging over neighbors: about as many triangles make a stranger."""
 
 
 def strangers(
-    colors: NDArray[np.uint8], gains: NDArray[np.float64], seen: NDArray[np.bool_], neighbours: IntArray
+    colors: NDArray[np.uint8], gains: NDArray[np.float64], seen: NDArray[np.bool_], neighbors: IntArray
 ) -> NDArray[np.bool_]:
     """Return which photos show something else at which triangles.
 
@@ -31,7 +31,7 @@ def strangers(
         colors: (P, T, 3) RGB of the triangles in the photos.
         gains: (P, 3) of the photos.
         seen: (P, T) whether a photo sees a triangle.
-        neighbours: (T, 3) triangles beside each triangle, -1 for none.
+        neighbors: (T, 3) triangles beside each triangle, -1 for none.
 
     Returns:
         (P, T), True only where seen.
@@ -43,8 +43,8 @@ def strangers(
         smooth = score[photo].copy()
         for _ in range(ROUNDS):
             before = smooth.copy()
-            _average(before, seen[photo], neighbours, smooth)
-        _mark(smooth, seen[photo], neighbours, found[photo])
+            _average(before, seen[photo], neighbors, smooth)
+        _mark(smooth, seen[photo], neighbors, found[photo])
     found &= seen.sum(axis=0) >= LEAST_VIEWS
     _spare_the_last(found, seen)
     return found
@@ -90,15 +90,15 @@ def _deviations(
 
 @kernel
 def _average(
-    before: NDArray[np.float32], seen: NDArray[np.bool_], neighbours: IntArray, after: NDArray[np.float32]
+    before: NDArray[np.float32], seen: NDArray[np.bool_], neighbors: IntArray, after: NDArray[np.float32]
 ) -> None:
-    """Average over each triangle and its neighbours that the photo sees."""
+    """Average over each triangle and its neighbors that the photo sees."""
     for f in range(len(before)):
         if not seen[f]:
             continue
         total, count = before[f], 1
         for k in range(3):
-            g = neighbours[f, k]
+            g = neighbors[f, k]
             if g != NONE and seen[g]:
                 total += before[g]
                 count += 1
@@ -106,14 +106,14 @@ def _average(
 
 
 @kernel
-def _mark(score: NDArray[np.float32], seen: NDArray[np.bool_], neighbours: IntArray, found: NDArray[np.bool_]) -> None:
+def _mark(score: NDArray[np.float32], seen: NDArray[np.bool_], neighbors: IntArray, found: NDArray[np.bool_]) -> None:
     """Mark triangles that deviate, and those beside them, which a stranger may cover in part."""
     for f in range(len(score)):
         if not seen[f]:
             continue
         found[f] = score[f] > OUTLYING
         for k in range(3):
-            g = neighbours[f, k]
+            g = neighbors[f, k]
             if g != NONE and seen[g] and score[g] > OUTLYING:
                 found[f] = True
 

@@ -18,7 +18,7 @@ class Store(Protocol):
     def used(self, view: PhotoView, /) -> NDArray[np.bool_] | None:
         """Return (height, width) which pixels of a photo at full size may be used; None where all may.
 
-        Photos show nothing of the others: these have the colour of one that may be used. OSError as above.
+        Photos show nothing of the others: these have the color of one that may be used. OSError as above.
         """
 
     def recall(self, name: str, /) -> Mapping[str, NDArray[Any]] | None:

@@ -1,4 +1,4 @@
-"""Triangles that no photo sees: coloured like what is around them, or cut away."""
+"""Triangles that no photo sees: colored like what is around them, or cut away."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +14,14 @@ BLOCK = 64
 """Most such squares beside each other."""
 CURVE_BITS = 12
 HOLD = 1e-4
-"""Weight of the colour that an unseen vertex had before, beside 1 for each neighbour: for parts that no photo sees."""
+"""Weight of the color that an unseen vertex had before, beside 1 for each neighbor: for parts that no photo sees."""
 
 
 def vertex_colors(mesh: Facets, seen: NDArray[np.bool_], corner_colors: FloatArray) -> FloatArray:
-    """Return colours of all vertices, spread from the triangles that photos see over those that none does.
+    """Return colors of all vertices, spread from the triangles that photos see over those that none does.
 
     Args:
-        mesh: the surface; its colours stay where nothing seen is connected.
+        mesh: the surface; its colors stay where nothing seen is connected.
         seen: (T,)
         corner_colors: (S, 3, 3) RGB at the corners of the seen triangles.
 
@@ -75,7 +75,7 @@ def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int)
 def along_a_curve(points: FloatArray) -> NDArray[np.int64]:
     """Return order (N,) of points (N, 3) in which most have those near them beside them (Morton 1966).
 
-    Squares beside each other then have like colours, and lossy compression of the page does little harm.
+    Squares beside each other then have like colors, and lossy compression of the page does little harm.
     """
     low = points.min(axis=0, initial=np.inf)
     span = max(float(np.max(points.max(axis=0, initial=-np.inf) - low, initial=0.0)), 1e-300)
@@ -88,9 +88,9 @@ def along_a_curve(points: FloatArray) -> NDArray[np.int64]:
 
 
 def square_texels(corner_colors: FloatArray) -> NDArray[np.uint8]:
-    """Return (N, 2, 2, 3) texels whose bilinear interpolation gives colours (N, 3, 3) at the corners.
+    """Return (N, 2, 2, 3) texels whose bilinear interpolation gives colors (N, 3, 3) at the corners.
 
-    The first corner lies on the top-left texel's centre, the second on the right one's, the third on the lower one's.
+    The first corner lies on the top-left texel's center, the second on the right one's, the third on the lower one's.
     """
     a, b, c = (corner_colors[:, k] for k in range(3))
     texels = np.stack([np.stack([a, b], axis=1), np.stack([c, b + c - a], axis=1)], axis=1)

@@ -1,4 +1,4 @@
-"""What one photo shows of every triangle: whether it sees it, how well, and in which colour."""
+"""What one photo shows of every triangle: whether it sees it, how well, and in which color."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ RIM_RINGS, RIM_WORTH = 2, 0.5
 """Each ring of triangles next to those that a photo does not see is worth so much less: where the surface is a pixel
 off, they show what lies before or behind it."""
 MASK_RIM_PX = 1.0
-"""A triangle with a masked pixel so near is not seen: colours are read between pixels."""
+"""A triangle with a masked pixel so near is not seen: colors are read between pixels."""
 SHARPNESS_RANGE = (0.2, 1.0)
 
 
@@ -62,7 +62,7 @@ def look(
         np.cumsum(np.cumsum(~used, axis=0, dtype=np.int32), axis=1, out=masked[1:, 1:])
         _drop_masked(view.row, masked, mesh.vertices, mesh.faces, worth)
     candidates = np.flatnonzero(worth)
-    worth[candidates[_blocked(candidates, mesh, partial(hidden, view.centre, SLACK * mesh.spacing))]] = 0.0
+    worth[candidates[_blocked(candidates, mesh, partial(hidden, view.center, SLACK * mesh.spacing))]] = 0.0
     color[worth == 0] = 0
     beyond = worth == 0
     for _ in range(RIM_RINGS):
@@ -76,7 +76,7 @@ def look(
 def _blocked(
     candidates: NDArray[np.int64], mesh: Facets, hidden: Callable[[FloatArray], NDArray[np.bool_]]
 ) -> NDArray[np.bool_]:
-    """Return which of the triangles (N,) are hidden, at the centre or at two corners."""
+    """Return which of the triangles (N,) are hidden, at the center or at two corners."""
     corners = mesh.faces[candidates]
     covered = np.zeros(len(mesh.vertices), np.bool_)
     covered[corners] = True
@@ -90,17 +90,17 @@ def _blocked(
 
 def sharpness(photo: NDArray[np.uint8], used: NDArray[np.bool_] | None = None) -> float:
     """Return ratio of the energies of the Laplacian at full and at half size, where the photo may be used; >= 0."""
-    grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
-    half = cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    fine, coarse = (_energy(part, used) for part in (grey, half))
+    gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
+    half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    fine, coarse = (_energy(part, used) for part in (gray, half))
     return fine / coarse if coarse > 0 else 0.0
 
 
-def _energy(grey: NDArray[np.uint8], used: NDArray[np.bool_] | None) -> float:
-    energy = np.square(cv2.Laplacian(grey, cv2.CV_32F))
+def _energy(gray: NDArray[np.uint8], used: NDArray[np.bool_] | None) -> float:
+    energy = np.square(cv2.Laplacian(gray, cv2.CV_32F))
     if used is None:
         return float(np.mean(energy))
-    size = grey.shape[1], grey.shape[0]
+    size = gray.shape[1], gray.shape[0]
     counted = energy[cv2.resize(used.view(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0]
     return float(np.mean(counted)) if counted.size else 0.0
 
@@ -121,7 +121,7 @@ def _measure(
     worth: NDArray[np.float32],
     color: NDArray[np.uint8],
 ) -> None:
-    """Write area in pixels times cosine, and mean colour, of the triangles that face the camera within the photo."""
+    """Write area in pixels times cosine, and mean color, of the triangles that face the camera within the photo."""
     height, width = photo.shape[0], photo.shape[1]
     x, y, corner = np.empty(4), np.empty(4), np.empty((4, 3))
     for f in range(len(faces)):
@@ -208,11 +208,11 @@ def _span(corner: FloatArray, top: float, bottom: float) -> tuple[float, float]:
 
 @kernel
 def _cosine(camera: FloatArray, corner: FloatArray) -> float:
-    """Return between the triangle's normal and the way from its centre to the camera."""
+    """Return between the triangle's normal and the way from its center to the camera."""
     ax, ay, az = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     bx, by, bz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    # the camera's own axes times its translation give the way without the centre
+    # the camera's own axes times its translation give the way without the center
     wx = wy = wz = 0.0
     for row in range(3):
         at = 8 + 4 * row

@@ -24,7 +24,7 @@ TINY = 1e-30
 
 
 def choose_photos(worth: NDArray[np.float32], mesh: Facets) -> IntArray:
-    """Return the photo that colours each triangle.
+    """Return the photo that colors each triangle.
 
     Args:
         worth: (P, T) of each photo for each triangle, at most 0 where it must not be used.
@@ -40,15 +40,15 @@ def choose_photos(worth: NDArray[np.float32], mesh: Facets) -> IntArray:
     lost = np.log(np.maximum(values[:, :1], TINY) / np.maximum(values, TINY))
     cost = (PRICE_OF_DETAIL * _relative_size(mesh)[:, None] * np.minimum(lost, MOST_LOST)).astype(np.float32)
     price = _edge_prices(mesh)
-    back = _places_at_neighbours(mesh.neighbours)
+    back = _places_at_neighbors(mesh.neighbors)
     chosen = np.full(triangles, NONE, np.int32)
     messages = np.zeros((triangles, 3, kept), np.float32)
     for _ in range(ROUNDS):
         for forward in (True, False):
-            _pass_messages(labels, cost, mesh.neighbours, back, price, messages, forward)
-    _decode(labels, cost, mesh.neighbours, price, messages, chosen)
+            _pass_messages(labels, cost, mesh.neighbors, back, price, messages, forward)
+    _decode(labels, cost, mesh.neighbors, price, messages, chosen)
     for _ in range(ROUNDS):
-        if not _improve(labels, cost, mesh.neighbours, price, chosen):
+        if not _improve(labels, cost, mesh.neighbors, price, chosen):
             break
     return chosen
 
@@ -68,10 +68,10 @@ def _edge_prices(mesh: Facets) -> NDArray[np.float32]:
     return np.asarray(lengths / max(mesh.spacing, 1e-300), np.float32)
 
 
-def _places_at_neighbours(neighbours: IntArray) -> IntArray:
-    """Return (T, 3) at which place of its neighbour's row a triangle stands."""
-    own = np.arange(len(neighbours))[:, None, None]
-    return np.asarray(np.argmax(neighbours[neighbours] == own, axis=2), np.int32)
+def _places_at_neighbors(neighbors: IntArray) -> IntArray:
+    """Return (T, 3) at which place of its neighbor's row a triangle stands."""
+    own = np.arange(len(neighbors))[:, None, None]
+    return np.asarray(np.argmax(neighbors[neighbors] == own, axis=2), np.int32)
 
 
 @kernel
@@ -94,26 +94,26 @@ def _keep_best(worth: NDArray[np.float32], labels: IntArray, values: NDArray[np.
 def _pass_messages(
     labels: IntArray,
     cost: NDArray[np.float32],
-    neighbours: IntArray,
+    neighbors: IntArray,
     back: IntArray,
     price: NDArray[np.float32],
     messages: NDArray[np.float32],
     forward: bool,
 ) -> None:
-    """Pass messages once; messages[f, k] is what neighbour k of f says about the labels of f."""
+    """Pass messages once; messages[f, k] is what neighbor k of f says about the labels of f."""
     triangles, kept = labels.shape
     belief = np.empty(kept)
     for step in range(triangles):
         f = step if forward else triangles - 1 - step
         before = after = 0
         for k in range(3):
-            before += NONE < neighbours[f, k] < f
-            after += neighbours[f, k] > f
+            before += NONE < neighbors[f, k] < f
+            after += neighbors[f, k] > f
         share = 1.0 / max(before, after, 1)
         for m in range(kept):
             belief[m] = cost[f, m] + messages[f, 0, m] + messages[f, 1, m] + messages[f, 2, m]
         for k in range(3):
-            g = neighbours[f, k]
+            g = neighbors[f, k]
             if g == NONE or (g > f) != forward or labels[f, 0] == NONE or labels[g, 0] == NONE:
                 continue
             least = np.inf
@@ -136,7 +136,7 @@ def _pass_messages(
 def _decode(
     labels: IntArray,
     cost: NDArray[np.float32],
-    neighbours: IntArray,
+    neighbors: IntArray,
     price: NDArray[np.float32],
     messages: NDArray[np.float32],
     chosen: IntArray,
@@ -149,7 +149,7 @@ def _decode(
                 continue
             value = cost[f, m]
             for k in range(3):
-                g = neighbours[f, k]
+                g = neighbors[f, k]
                 if g > f:
                     value += messages[f, k, m]
                 elif g != NONE and chosen[g] != NONE and chosen[g] != labels[f, m]:
@@ -161,9 +161,9 @@ def _decode(
 
 @kernel
 def _improve(
-    labels: IntArray, cost: NDArray[np.float32], neighbours: IntArray, price: NDArray[np.float32], chosen: IntArray
+    labels: IntArray, cost: NDArray[np.float32], neighbors: IntArray, price: NDArray[np.float32], chosen: IntArray
 ) -> int:
-    """Let every triangle take what suits it best beside its neighbours; how many changed."""
+    """Let every triangle take what suits it best beside its neighbors; how many changed."""
     changed = 0
     for f in range(len(labels)):
         least, best = np.inf, chosen[f]
@@ -172,7 +172,7 @@ def _improve(
                 continue
             value = float(cost[f, m])
             for k in range(3):
-                g = neighbours[f, k]
+                g = neighbors[f, k]
                 if g != NONE and chosen[g] != NONE and chosen[g] != labels[f, m]:
                     value += price[f, k]
             if value < least:

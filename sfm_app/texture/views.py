@@ -35,7 +35,7 @@ class PhotoView:
         return np.concatenate([self.lens, self.cam_from_world.ravel()])
 
     @property
-    def centre(self) -> FloatArray:
+    def center(self) -> FloatArray:
         """(3,) where the camera stands."""
         return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3], np.float64)
 

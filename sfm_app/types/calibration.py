@@ -31,7 +31,7 @@ class Calibration:
     spread: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations where the calibrator estimates them: "fx", "fy", "cx", "cy" in pixels, "k1"."""
     held: tuple[str, ...] = ()
-    """What the photos do not determine and so stays at its usual value: "centre", "aspect", "k1"."""
+    """What the photos do not determine and so stays at its usual value: "center", "aspect", "k1"."""
     key_pairs: tuple[PairId, ...] = ()
     """Pairs of photos that a reconstruction starts from best, by what they say about K; best first."""
     evidence: Mapping[str, float] = field(default_factory=dict)

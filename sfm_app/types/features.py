@@ -15,7 +15,7 @@ class Features:
     size: tuple[int, int]
     """Width and height of the picture in pixels."""
     keypoints: NDArray[np.float64]
-    """(N, 2) x and y in pixels of the picture; the centre of the top-left pixel is (0.5, 0.5)."""
+    """(N, 2) x and y in pixels of the picture; the center of the top-left pixel is (0.5, 0.5)."""
     values: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Descriptors, scores and the like, with N rows each."""
 

@@ -46,7 +46,7 @@ class Photo:
     notes: tuple[str, ...] = ()
     """What people should know about how it is read."""
     shown: Frame | None = None
-    """The picture within bars of one colour, as it is laid out; None where all of it is picture."""
+    """The picture within bars of one color, as it is laid out; None where all of it is picture."""
     mask: str = ""
     """Path of its mask inside the folder of masks; empty where all of it may be used."""
 

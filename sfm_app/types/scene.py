@@ -23,7 +23,7 @@ class CameraModel:
     deviations: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations: "fx", "fy", "cx", "cy" in pixels, "k1", "k2", "p1", "p2"."""
     determined: tuple[str, ...] = ()
-    """What the photos determine besides the focal: "centre", "aspect", "k1", ...; the rest stayed as it was."""
+    """What the photos determine besides the focal: "center", "aspect", "k1", ...; the rest stayed as it was."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""

@@ -1,4 +1,4 @@
-"""A coloured triangle mesh."""
+"""A colored triangle mesh."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """Triangles with a colour per vertex, in the frame of the scene."""
+    """Triangles with a color per vertex, in the frame of the scene."""
 
     vertices: NDArray[np.float64]
     """(V, 3) scene coordinates, y up."""

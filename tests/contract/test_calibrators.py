@@ -28,14 +28,14 @@ def fundamentals(count, seed, *, noise=3e-4, motion="free"):
     """(P, 3, 3) for all pairs of `count` cameras of matrix K; `noise` is that of the entries of E."""
     rng = np.random.default_rng(seed)
     turns = rng.uniform(-0.6, 0.6, (count, 3)) if motion == "free" else np.zeros((count, 3))
-    centres = rng.normal(size=(count, 3))
+    centers = rng.normal(size=(count, 3))
     if motion == "orbit":
         turns[:, 1] = 0.25 * np.arange(count)
-        centres = np.stack([-np.sin(turns[:, 1]), np.zeros(count), -np.cos(turns[:, 1])], axis=1)
+        centers = np.stack([-np.sin(turns[:, 1]), np.zeros(count), -np.cos(turns[:, 1])], axis=1)
     rotations = Rotation.from_rotvec(turns).as_matrix().transpose(0, 2, 1)
     inverse, found = np.linalg.inv(K), []
     for i, j in combinations(range(count), 2):
-        t = rotations[j] @ (centres[i] - centres[j])
+        t = rotations[j] @ (centers[i] - centers[j])
         E = np.cross(np.eye(3), t / np.linalg.norm(t)).T @ rotations[j] @ rotations[i].T
         found.append(inverse.T @ (E + rng.normal(0, noise, (3, 3))) @ inverse)
     return np.array(found)
@@ -86,7 +86,7 @@ def is_well_formed(found):
     assert found.method in (*CALIBRATORS, "guess", "estimate")
     assert np.isfinite(found.radial)
     assert set(found.spread) <= {"fx", "fy", "cx", "cy", "k1"}
-    assert set(found.held) <= {"centre", "aspect", "k1"}
+    assert set(found.held) <= {"center", "aspect", "k1"}
     assert all(np.isfinite(value) and value >= 0 for value in found.spread.values())
     assert all(isinstance(value, float) and np.isfinite(value) for value in found.evidence.values())
     return True
@@ -202,13 +202,13 @@ def test_ten_runs_in_threads_give_the_same_bytes(calibrate):
 
 
 TRACKS = TrackOptions(
-    points=150, sigma_px=0.5, width=1000, height=750, focal_px=(1100, 1100), aspect=(1, 1), centre_offset=0.0
+    points=150, sigma_px=0.5, width=1000, height=750, focal_px=(1100, 1100), aspect=(1, 1), center_offset=0.0
 )
 
 
 @cache
 def matched(seed):
-    """Pairs with their matches, of a camera with focal 1100 and the centre in the middle."""
+    """Pairs with their matches, of a camera with focal 1100 and the center in the middle."""
     tracks, rng, Fs = make_tracks(TRACKS, seed), np.random.default_rng(seed), []
     for view in tracks.pairs.values():
         E = view.K.T @ view.F @ view.K

@@ -61,7 +61,7 @@ def graph(method, place, tmp_path_factory):
     return found(method, place, tmp_path_factory.mktemp("plain") / "out")
 
 
-def test_most_matches_of_neighbours_are_right(place, graph):
+def test_most_matches_of_neighbors_are_right(place, graph):
     _, _, truth = place
     K = truth.K
     for pair in PAIRS:

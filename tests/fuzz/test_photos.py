@@ -95,7 +95,7 @@ def chunk(name, data):
 
 
 def png(width, height, extra=b""):
-    """A picture of one colour."""
+    """A picture of one color."""
     packer, row = zlib.compressobj(9), bytes(1 + 4 * width)
     data = b"".join(packer.compress(row) for _ in range(height)) + packer.flush()
     head = struct.pack(">IIBBBBB", width, height, 8, 6, 0, 0, 0)
@@ -127,10 +127,10 @@ def avif(width, height):
 
 
 NUISANCES = {
-    "pixels of one colour": lambda: png(9_000, 6_000),
-    "WebP of one colour": lambda: webp(9_000, 6_000),
+    "pixels of one color": lambda: png(9_000, 6_000),
+    "WebP of one color": lambda: webp(9_000, 6_000),
     "a hundred megabytes of text": lambda: png(80, 80, chunk(b"zTXt", b"x\0\0" + zlib.compress(bytes(10**8), 1))),
-    "a hundred megabytes of colours": lambda: png(80, 80, chunk(b"iCCP", b"x\0\0" + zlib.compress(bytes(10**8), 1))),
+    "a hundred megabytes of colors": lambda: png(80, 80, chunk(b"iCCP", b"x\0\0" + zlib.compress(bytes(10**8), 1))),
     "a hundred thousand pictures": lambda: tiff(100_000),
     "pictures in a ring": lambda: tiff(3, ring=True),
     "AVIF with a large head": lambda: avif(60_000, 60_000) if features.check("avif") else png(20_000, 9_000),
@@ -147,10 +147,10 @@ def test_bombs_are_refused_or_cost_little(tmp_path):
 
     assert megabytes < 200
     assert {names[file]: reason for file, reason in found.items()} == {
-        "pixels of one colour": "too many pixels for a file of its size",
-        "WebP of one colour": "too many pixels for a file of its size",
+        "pixels of one color": "too many pixels for a file of its size",
+        "WebP of one color": "too many pixels for a file of its size",
         "a hundred megabytes of text": "truncated or damaged",
-        "a hundred megabytes of colours": "truncated or damaged",
+        "a hundred megabytes of colors": "truncated or damaged",
         "a hundred thousand pictures": "",
         "pictures in a ring": "",
         "AVIF with a large head": "truncated or damaged" if features.check("avif") else "too many pixels",

@@ -182,7 +182,7 @@ PERSON, STAMP = np.s_[110:260, 200:270], np.s_[285:315, 340:470]
 
 
 def magenta(colors):
-    """How much more red and blue than green, in grey levels."""
+    """How much more red and blue than green, in gray levels."""
     red, green, blue = np.moveaxis(np.asarray(colors, np.float64)[..., :3], -1, 0)
     return np.minimum(red, blue) - green
 

@@ -93,8 +93,8 @@ def test_ten_photos_of_a_white_wall(folder, tmp_path, noise, says):
     y, x = np.mgrid[:360, :480]
     for k in range(10):
         lit = 225 + 8 * np.exp(-((x - 240 - 9 * k) ** 2 + (y - 150) ** 2) / 45000)
-        grey = lit + np.random.default_rng(k).normal(scale=noise, size=lit.shape)
-        Image.fromarray(np.clip(grey, 0, 255).astype(np.uint8)).convert("RGB").save(folder / f"{k}.jpg", quality=92)
+        gray = lit + np.random.default_rng(k).normal(scale=noise, size=lit.shape)
+        Image.fromarray(np.clip(gray, 0, 255).astype(np.uint8)).convert("RGB").save(folder / f"{k}.jpg", quality=92)
 
     result, out = run(folder, tmp_path)
 

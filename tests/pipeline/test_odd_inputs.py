@@ -132,8 +132,8 @@ def locked(folder):
 FILES = {
     "CMYK": (saved("x.jpg", mode="CMYK"), "x.jpg", USED),
     "progressive": (saved("x.jpg", progressive=True), "x.jpg", USED),
-    "colour profile": (saved("x.jpg", icc_profile=b"no profile at all"), "x.jpg", USED),
-    "grey": (saved("x.png", mode="L"), "x.png", USED),
+    "color profile": (saved("x.jpg", icc_profile=b"no profile at all"), "x.jpg", USED),
+    "gray": (saved("x.png", mode="L"), "x.png", USED),
     "palette": (saved("x.png", mode="P"), "x.png", USED),
     "two levels": (saved("x.png", mode="1"), "x.png", USED),
     "alpha": (saved("x.png", mode="RGBA"), "x.png", USED),

@@ -19,8 +19,8 @@ from sfm_app.colmap.dense import DenseStore
 from sfm_app.pipeline import NAMES
 from sfm_app.settings import Settings
 from sfm_app.stages.texture import PARTS, Files
-from sfm_app.synthetic.cameras import camera_centre
-from sfm_app.synthetic.compare import centre_error_percent, focal_error_percent, surface_error
+from sfm_app.synthetic.cameras import camera_center
+from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_error
 from sfm_app.texture import atlas
 from sfm_app.workspace import LOCK, Workspace
 
@@ -40,7 +40,7 @@ def test_camera_is_found(finished):
 
     assert run.calibration.identifiable
     assert focal_error_percent(run.calibration.K, truth) < 2.0
-    assert centre_error_percent(run.calibration.K, truth) < 4.0
+    assert center_error_percent(run.calibration.K, truth) < 4.0
     assert focal_error_percent(refined, truth) < 1.0
 
 
@@ -54,9 +54,9 @@ def test_every_photo_has_a_place(finished):
 def test_mesh_lies_on_the_true_surface(finished):
     run, truth = finished
     mesh = trimesh.load(run.out / "model.ply", process=False)
-    centres = {name: camera_centre(pose) for name, pose in run.scene.cam_from_world.items()}
+    centers = {name: camera_center(pose) for name, pose in run.scene.cam_from_world.items()}
 
-    error = surface_error(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64), centres, truth)
+    error = surface_error(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int64), centers, truth)
 
     assert len(mesh.faces) > 5000
     assert error < 0.01

@@ -27,9 +27,9 @@ def clip(tmp_path_factory):
         if k < FRAMES - 3:
             u = k / (FRAMES - 4)
             turn, distance, height = np.radians(44.0 * (u - 0.5)), 5.4 + 0.8 * np.sin(5 * u), 1.6 + 0.8 * np.sin(7 * u)
-            centre = np.array([distance * np.sin(turn), height, distance * np.cos(turn)])
+            center = np.array([distance * np.sin(turn), height, distance * np.cos(turn)])
             aim = np.array([0.3 * np.sin(4 * u), 1.3 + 0.3 * np.cos(6 * u), -0.2])
-            image = render_scene(scene, camera, look_at(centre, aim, 10 * np.sin(3 * u)), 1)
+            image = render_scene(scene, camera, look_at(center, aim, 10 * np.sin(3 * u)), 1)
         picture = develop(image, options, np.random.default_rng(k))
         if k % 7 == 3:
             picture = cv2.GaussianBlur(picture, (0, 0), 2.5)

@@ -38,7 +38,7 @@ def test_what_was_found_is_set_beside_the_truth(rendered, scene, model, tmp_path
     result = compared(run, scene, model, truth, (1.0, 2.0), tmp_path)
 
     assert result.photos == result.registered == 7
-    assert result.refined_focal_error_percent == pytest.approx(1.0) and result.refined_centre_error_percent == 0.0
+    assert result.refined_focal_error_percent == pytest.approx(1.0) and result.refined_center_error_percent == 0.0
     assert result.surface_error_percent == 0.0
     assert result.surface_accuracy_percent == result.surface_coverage_percent == 100.0
     assert result.pages_px == [[30, 20], [16, 16]]

@@ -128,7 +128,7 @@ def test_a_surface_that_was_cut_off_is_no_crash(finished, left):
     assert "goes on where it stopped" in result.stderr
 
 
-def test_a_model_without_a_texture_has_the_colours_of_its_vertices(ball, finished):
+def test_a_model_without_a_texture_has_the_colors_of_its_vertices(ball, finished):
     np.savez(
         finished / LAST.files[0], vertices=ball.surface.vertices, faces=ball.surface.faces, colors=ball.surface.colors
     )

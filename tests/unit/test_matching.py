@@ -50,8 +50,8 @@ def filled(tmp_path):
         with opened_run(tmp_path / "out", Settings.from_mapping({"workers": 1, "matching": matching}), None) as run:
             run.workspace.photos.mkdir(parents=True, exist_ok=True)
             run.inputs = "same"
-            for name, colour in zip(NAMES, ("red", "lime", "blue"), strict=True):
-                Image.new("RGB", SIZE, colour).save(run.workspace.photos / name)
+            for name, color in zip(NAMES, ("red", "lime", "blue"), strict=True):
+                Image.new("RGB", SIZE, color).save(run.workspace.photos / name)
             if not run.workspace.database.exists():
                 create_database(run.workspace.database, photos)
             fill_database(method, run, pairs)
@@ -61,7 +61,7 @@ def filled(tmp_path):
     return fill
 
 
-def test_every_photo_is_seen_once_in_its_colours_and_every_pair_matched(filled):
+def test_every_photo_is_seen_once_in_its_colors_and_every_pair_matched(filled):
     ways = Corners()
     graph = filled(ways.method)
 

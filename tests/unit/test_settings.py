@@ -9,7 +9,7 @@ from sfm_app.settings import QUALITY_PRESETS, Settings
 
 def test_toml_round_trip(tmp_path):
     path = tmp_path / "run.toml"
-    changed = Settings.from_mapping({"seed": 7, "quality": "draft", "depth": {"neighbours": 9}})
+    changed = Settings.from_mapping({"seed": 7, "quality": "draft", "depth": {"neighbors": 9}})
     path.write_text(changed.to_toml(), encoding="utf-8")
 
     assert Settings.from_toml(path) == changed

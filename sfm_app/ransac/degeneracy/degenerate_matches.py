@@ -34,7 +34,7 @@ _ROTATION_TOLERANCE = 0.05
 
 
 def find_degeneracy(
-    points: FloatArray, F: FloatArray, inliers: BoolArray, wrong: FloatArray, threshold: float, centres: FloatArray
+    points: FloatArray, F: FloatArray, inliers: BoolArray, wrong: FloatArray, threshold: float, centers: FloatArray
 ) -> str:
     """Return what leaves F undetermined.
 
@@ -44,7 +44,7 @@ def find_degeneracy(
         inliers: (N,) at least 3 of them.
         wrong: (M,) squared distances of mismatches to F, from `chance.squared_mismatches`.
         threshold: largest distance of an inlier.
-        centres: (4,) the origin of `points` in a frame that both views share, in the same units.
+        centers: (4,) the origin of `points` in a frame that both views share, in the same units.
 
     Returns:
         "collinear" where all matches lie on one line of a photo, or in one place (but for a few that may be accident),
@@ -60,7 +60,7 @@ def find_degeneracy(
     off_plane = transfer_distance(H, points) > OFF_PLANE * threshold
     planar = _may_be_accident(off_plane, inliers, _PARALLAX_SAMPLE, chance)
     parallax = np.count_nonzero(off_plane & inliers) / np.count_nonzero(inliers)
-    if (planar or parallax < _PARALLAX_OF_A_MOTION) and is_rotation(H, points, centres):
+    if (planar or parallax < _PARALLAX_OF_A_MOTION) and is_rotation(H, points, centers):
         return "rotation"
     return "planar" if planar else ""
 
@@ -106,14 +106,14 @@ def _dominant_line(x: FloatArray, y: FloatArray, width: float) -> tuple[float, f
     return best
 
 
-def is_rotation(H: FloatArray, points: FloatArray, centres: FloatArray) -> bool:
-    """Return whether H = K R K^-1 for one focal length and an optical centre in the middle of where both views have
+def is_rotation(H: FloatArray, points: FloatArray, centers: FloatArray) -> bool:
+    """Return whether H = K R K^-1 for one focal length and an optical center in the middle of where both views have
     points.
     """
-    placed = points + centres
+    placed = points + centers
     low, high = np.quantile(np.vstack([placed[:, :2], placed[:, 2:]]), _EXTENT, axis=0)
     middle, side = (low + high) / 2, float((high - low).max())
-    to1, to2 = _shift(middle - centres[:2]), _shift(centres[2:] - middle)
+    to1, to2 = _shift(middle - centers[:2]), _shift(centers[2:] - middle)
     for focal in _FOCALS * side:
         K = np.diag([focal, focal, 1.0])
         stretch = np.linalg.svd(np.linalg.inv(K) @ to2 @ H @ to1 @ K, compute_uv=False)

@@ -25,13 +25,13 @@ def refit_eight_point(points: FloatArray, F: FloatArray, threshold: float) -> Fl
 
 
 def refit_sampson(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Minimise the Sampson distance (thesis 4.2)."""
+    """Minimize the Sampson distance (thesis 4.2)."""
     inliers = _inliers(points, F, threshold)
     return refine_sampson(inliers, refit_eight_point(points, F, threshold)) if len(inliers) >= 8 else F
 
 
 def refit_reprojection(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Minimise the reprojection distance (thesis 4.3), from the least squares on its first order."""
+    """Minimize the reprojection distance (thesis 4.3), from the least squares on its first order."""
     inliers = _inliers(points, F, threshold)
     return F if len(inliers) < 8 else refine_reprojection(inliers, refit_sampson(points, F, threshold))
 

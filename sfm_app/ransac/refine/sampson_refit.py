@@ -50,7 +50,7 @@ def refine_sampson(
 
 
 def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach: float, most_steps: int) -> FloatArray:
-    """Give maximum likelihood of F, inliers' sigma and their share, by expectation maximisation (thesis 3.5 and 4.6).
+    """Give maximum likelihood of F, inliers' sigma and their share, by expectation maximization (thesis 3.5 and 4.6).
 
     Among the matches within `reach` thresholds, distances of inliers are those of a Gaussian about 0, all others are
     spread evenly. The weight of a match is the probability that it is an inlier. sigma is at most one threshold.
@@ -108,9 +108,9 @@ def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
             V[i, k] = vectors[i, 2 - k]
         for i in range(3):
             U[i, k] = F[i, 0] * V[0, k] + F[i, 1] * V[1, k] + F[i, 2] * V[2, k]
-    first = _normalise(U, FIRST)
+    first = _normalize(U, FIRST)
     _turn_away(U)  # what rounding left where s is small
-    second = _normalise(U, 1)
+    second = _normalize(U, 1)
     if not second > 1e-12 * first:  # rank 1: any direction will do
         least = 0
         for i in range(1, 3):
@@ -118,7 +118,7 @@ def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
         for i in range(3):
             U[i, 1] = 1.0 if i == least else 0.0
         _turn_away(U)
-        _normalise(U, 1)
+        _normalize(U, 1)
     for i in range(3):  # the third columns meet the singular value 0: they make rotations of both
         j, k = (i + 1) % 3, (i + 2) % 3
         U[i, 2] = U[j, 0] * U[k, 1] - U[k, 0] * U[j, 1]
@@ -127,7 +127,7 @@ def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
 
 
 @kernel
-def _normalise(U: FloatArray, k: int) -> float:
+def _normalize(U: FloatArray, k: int) -> float:
     """Return column k over its length; the length."""
     length = np.sqrt(U[0, k] * U[0, k] + U[1, k] * U[1, k] + U[2, k] * U[2, k])
     for i in range(3):

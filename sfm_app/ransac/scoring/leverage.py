@@ -6,7 +6,7 @@ matrix is that of A restricted to them. With all nine directions the ninth would
 noise.
 
 Leverage and Cook's distance do not change when each view is shifted and scaled, because this maps the rows of A
-linearly (and A f is small): one well-scaled frame (`points.Matches`) gives what Hartley's normalisation gives.
+linearly (and A f is small): one well-scaled frame (`points.Matches`) gives what Hartley's normalization gives.
 """
 
 import numpy as np

@@ -40,7 +40,7 @@ def window(points: FloatArray) -> float:
 
 
 def inlier_share(squared: FloatArray, sigma: float, width: float) -> float:
-    """Return gamma = p(v) of the mixture by expectation maximisation, for given sigma and w.
+    """Return gamma = p(v) of the mixture by expectation maximization, for given sigma and w.
 
     Args:
         squared: (N,) squared distances to the model.

@@ -207,7 +207,7 @@ def _null_space(points: FloatArray, sample: IntArray, basis: FloatArray) -> bool
             for j in range(k + 1, SAMPLE_SIZE):
                 behind += rows[k, j] * basis[n, place[j]]
             basis[n, place[k]] = -behind
-    _orthonormalise(basis[0], basis[1])
+    _orthonormalize(basis[0], basis[1])
     return True
 
 
@@ -230,7 +230,7 @@ def _bring_pivot(rows: FloatArray, place: IntArray, k: int) -> float:
 
 
 @kernel
-def _orthonormalise(a: FloatArray, b: FloatArray) -> None:
+def _orthonormalize(a: FloatArray, b: FloatArray) -> None:
     length, dot, left = 0.0, 0.0, 0.0
     for j in range(9):
         length += a[j] * a[j]

@@ -98,7 +98,7 @@ def _shifted(points: FloatArray, f: FloatArray, shifts: int) -> FloatArray:
 def accidental_share(wrong: FloatArray, threshold: float) -> float:
     """Return probability that a wrong match agrees with a model, in (0, 1), from the squared distances of mismatches.
 
-    Measured, not modelled: it knows the extent of the photos, where their points cluster, and where the epipoles are.
+    Measured, not modeled: it knows the extent of the photos, where their points cluster, and where the epipoles are.
     """
     return (int(np.count_nonzero(wrong <= threshold * threshold)) + 1.0) / (len(wrong) + 2.0)
 

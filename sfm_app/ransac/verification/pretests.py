@@ -5,7 +5,7 @@ must be inliers for it to go on. For the bail-out test and T(d,d) that is their 
 after m matches depends only on how many of them were inliers, so that its threshold is such a list too: the line of
 rejection numbers of sequential sampling inspection.
 
-Randomised tests begin at a random match, afresh for every hypothesis. In a fixed order all hypotheses would be judged
+Randomized tests begin at a random match, afresh for every hypothesis. In a fixed order all hypotheses would be judged
 on the same first matches: if these are outliers every good model falls, however long the search goes on, while the
 stopping rules count on errors that are independent from one hypothesis to the next.
 """

@@ -21,7 +21,7 @@ from sfm_app.selfcal.adjustment.structureless_ba import (
     reweighted,
     settled,
 )
-from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL
+from sfm_app.selfcal.lens import CENTER_U, CENTER_V, LOG_ASPECT, LOG_FOCAL
 from sfm_app.selfcal.undistort_pairs import straight_points
 
 FloatArray = NDArray[np.float64]
@@ -133,7 +133,7 @@ def scatter_by_photos(fit: Fit) -> FloatArray:
 
     0 where photos are too few to ask.
 
-    Neighbours in the list go together: what is wrong with one photo (blur, a moving shutter, a repeated wall) is often
+    Neighbors in the list go together: what is wrong with one photo (blur, a moving shutter, a repeated wall) is often
     wrong with the next. With each group left out the cameras take the step that the other pairs ask for; every pair
     weighs what it weighs, or where right pairs are left out wrong ones would take their place.
     """
@@ -171,7 +171,7 @@ def straight_fundamentals(fit: Fit) -> FloatArray:
 def camera_matrix_of(theta: FloatArray) -> FloatArray:
     """Return (3, 3) camera matrix of the parameters (5,), in their units about the middle."""
     f, half = np.exp(theta[LOG_FOCAL]), np.exp(0.5 * theta[LOG_ASPECT])
-    return np.array([[f / half, 0.0, theta[CENTRE_U]], [0.0, f * half, theta[CENTRE_V]], [0.0, 0.0, 1.0]])
+    return np.array([[f / half, 0.0, theta[CENTER_U]], [0.0, f * half, theta[CENTER_V]], [0.0, 0.0, 1.0]])
 
 
 def _best(fits: Sequence[Fit]) -> Fit:

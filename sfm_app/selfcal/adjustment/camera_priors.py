@@ -1,6 +1,6 @@
 """What is believed about a camera before a photo is seen, and how far the pairs may change that.
 
-Most photos are uncropped, their pixels square, their lens nearly straight; some are not. So centre, aspect and lens
+Most photos are uncropped, their pixels square, their lens nearly straight; some are not. So center, aspect and lens
 each have two priors: a narrow one about the usual value, and a wide one. A parameter is freed only where the evidence
 for the wide prior (the marginal likelihood, by Laplace's approximation) outweighs how rare such photos are; otherwise
 it stays near its usual value. A focal that EXIF claims is one more narrow prior, which loses against pairs that
@@ -17,22 +17,22 @@ from numpy.typing import NDArray
 from sfm_app.geometry.spd_solve import inverses_of_positive
 from sfm_app.selfcal.adjustment.structureless_ba import Prior
 from sfm_app.selfcal.adjustment.two_view_cost import CAMERA
-from sfm_app.selfcal.lens import CENTRE_U, KAPPA, LOG_ASPECT, LOG_FOCAL
+from sfm_app.selfcal.lens import CENTER_U, KAPPA, LOG_ASPECT, LOG_FOCAL
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-CENTRE, ASPECT, LENS, FOCAL = range(4)
+CENTER, ASPECT, LENS, FOCAL = range(4)
 """Places in `free`: what may be freed from its usual value."""
-NAMES = ("centre", "aspect", "k1", "focal")
+NAMES = ("center", "aspect", "k1", "focal")
 USUAL_FOCAL, FOCAL_SPREAD = np.log(1.2), 0.7
 """Mean and standard deviation of log f, f in longer sides, where nobody claims one."""
 HINT_SPREAD = 0.05
-"""Of a claimed focal: EXIF rounds millimetres, and the sensor's size to 35 mm."""
-NARROW = {CENTRE: 0.012, ASPECT: 0.002, LENS: 0.005}
-"""Standard deviations about the usual value: of the centre in longer sides, of log fy/fx, of k1."""
-WIDE = {CENTRE: 0.15, ASPECT: 0.25, LENS: 0.2}
-COLUMNS = {CENTRE: [CENTRE_U, CENTRE_U + 1], ASPECT: [LOG_ASPECT], LENS: [KAPPA]}
+"""Of a claimed focal: EXIF rounds millimeters, and the sensor's size to 35 mm."""
+NARROW = {CENTER: 0.012, ASPECT: 0.002, LENS: 0.005}
+"""Standard deviations about the usual value: of the center in longer sides, of log fy/fx, of k1."""
+WIDE = {CENTER: 0.15, ASPECT: 0.25, LENS: 0.2}
+COLUMNS = {CENTER: [CENTER_U, CENTER_U + 1], ASPECT: [LOG_ASPECT], LENS: [KAPPA]}
 """Places in the parameters of a camera."""
 UNDETERMINED = 0.5
 """A parameter whose narrow prior the pairs do not make narrower than this stays at its usual value."""
@@ -42,7 +42,7 @@ LEAST_SPARE = 0.25
 """Share of the constraints that must be left to contradict the cameras, or nothing more is freed."""
 STRAIGHT = 1e-6
 """The same of k1 where nobody wants to know about it."""
-FREE_SHARE = {CENTRE: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
+FREE_SHARE = {CENTER: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
 """Share of photo sets in which the wide prior is the right one; for FOCAL, in which a claim is wrong."""
 
 
@@ -54,8 +54,8 @@ class CameraPriors:
     """(C,) longer side of the photos, in the units of the matches."""
     hints: FloatArray
     """(C,) claimed focal in the same units, NaN where nobody claims one."""
-    centre_sigma: float = WIDE[CENTRE]
-    """Wide prior on the centre, in longer sides."""
+    center_sigma: float = WIDE[CENTER]
+    """Wide prior on the center, in longer sides."""
     lens: bool = True
     """False: every lens is taken as straight."""
 
@@ -69,8 +69,8 @@ class CameraPriors:
         with np.errstate(invalid="ignore"):
             mean[:, LOG_FOCAL] = np.where(hinted, np.log(self.hints), USUAL_FOCAL + np.log(self.sides))
         deviation[:, LOG_FOCAL] = np.where(hinted, HINT_SPREAD, FOCAL_SPREAD)
-        wide = self.centre_sigma
-        deviation[:, CENTRE_U : CENTRE_U + 2] = (np.where(free[:, CENTRE], wide, NARROW[CENTRE]) * self.sides)[:, None]
+        wide = self.center_sigma
+        deviation[:, CENTER_U : CENTER_U + 2] = (np.where(free[:, CENTER], wide, NARROW[CENTER]) * self.sides)[:, None]
         deviation[:, LOG_ASPECT] = np.where(free[:, ASPECT], WIDE[ASPECT], NARROW[ASPECT])
         k1 = np.where(free[:, LENS], WIDE[LENS], NARROW[LENS]) if self.lens else STRAIGHT
         deviation[:, KAPPA] = k1 / np.exp(2.0 * thetas[:, LOG_FOCAL])
@@ -135,7 +135,7 @@ class Evidence:
     def choices(self, free: BoolArray, camera: int) -> list[BoolArray]:
         """Return all choices for one camera, the others as in `free` (C, 4); those that free less come first.
 
-        What would leave hardly a constraint to contradict it is no choice: three pairs fit almost any centre.
+        What would leave hardly a constraint to contradict it is no choice: three pairs fit almost any center.
         """
         trials: list[BoolArray] = []
         for switches in sorted(product((False, True), repeat=free.shape[1]), key=sum):
@@ -217,5 +217,5 @@ def spare(free: BoolArray, pairs: float) -> float:
 
     A pair gives two. The fewer are left, the less the pairs' scatter about the fit says about their errors.
     """
-    sought = len(free) + 2 * np.count_nonzero(free[:, CENTRE]) + np.count_nonzero(free[:, [ASPECT, LENS]])
+    sought = len(free) + 2 * np.count_nonzero(free[:, CENTER]) + np.count_nonzero(free[:, [ASPECT, LENS]])
     return max(1.0 - sought / max(2.0 * pairs, 1e-9), 0.1)

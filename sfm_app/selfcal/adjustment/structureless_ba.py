@@ -2,7 +2,7 @@
 
 Every pair has its own relative pose, which is eliminated (Schur complement): what is left of a pair is what it says
 about the cameras, one Hessian and one gradient. A pair whose matches are right but whose geometry is not (repeated
-facades, another camera, a zoom) pulls at the cameras far harder than its noise allows; it is recognised by that and
+facades, another camera, a zoom) pulls at the cameras far harder than its noise allows; it is recognized by that and
 weighs less.
 """
 
@@ -31,7 +31,7 @@ LOWER_QUARTILE = 0.288
 LEAST_SIGMA_PX = 0.1
 FEW_PHOTOS, CAUTION = 5, 0.25
 """A camera of fewer photos answers to what no model holds (a lens, a wall that is not quite still) with a focal and a
-centre of its own: what its pairs say counts as if their noise were twice as large."""
+center of its own: what its pairs say counts as if their noise were twice as large."""
 ROUNDS = 25
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e8
 ARRIVED = 2e-5

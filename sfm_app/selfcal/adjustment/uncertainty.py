@@ -7,7 +7,7 @@ from sfm_app.geometry.spd_solve import lifted
 from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, scatter_by_photos
 from sfm_app.selfcal.adjustment.structureless_ba import ALONE
 from sfm_app.selfcal.adjustment.two_view_cost import CAMERA
-from sfm_app.selfcal.lens import CENTRE_U, CENTRE_V, KAPPA, LOG_ASPECT, LOG_FOCAL
+from sfm_app.selfcal.lens import CENTER_U, CENTER_V, KAPPA, LOG_ASPECT, LOG_FOCAL
 from sfm_app.types import PairId
 
 FloatArray = NDArray[np.float64]
@@ -32,7 +32,7 @@ def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> Float
         wider = np.maximum(scatter_by_photos(fit) / deviations, 1.0)
         found = found * np.outer(wider, wider)
     floor = np.tile(MODEL_ERROR, (len(sides), 1))
-    floor[:, CENTRE_U : CENTRE_V + 1] *= sides[:, None]
+    floor[:, CENTER_U : CENTER_V + 1] *= sides[:, None]
     floor[:, KAPPA] /= np.exp(2.0 * fit.state.thetas[:, LOG_FOCAL])
     return np.asarray(found + np.diag(floor.ravel() ** 2), np.float64)
 
@@ -45,7 +45,7 @@ def spread_of(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, f
     slopes = np.zeros((CAMERA, CAMERA))
     slopes[0, [LOG_FOCAL, LOG_ASPECT]] = focal / half, -0.5 * focal / half
     slopes[1, [LOG_FOCAL, LOG_ASPECT]] = focal * half, 0.5 * focal * half
-    slopes[2, CENTRE_U] = slopes[3, CENTRE_V] = unit_px
+    slopes[2, CENTER_U] = slopes[3, CENTER_V] = unit_px
     slopes[4, [LOG_FOCAL, KAPPA]] = 2.0 * theta[KAPPA] * squared, squared
     deviations = np.sqrt(np.maximum(np.diag(slopes @ cov @ slopes.T), 0.0))
     return dict(zip(("fx", "fy", "cx", "cy", "k1"), deviations.tolist(), strict=True))

@@ -56,7 +56,7 @@ def predicted(
     Args:
         tables: the pairs, without lens, in longer sides about the middle; its members are not used.
         photos: per pair its two photos.
-        starts: (5,) each, cameras whose centre and pixels may be those of the photos; the middle is tried besides.
+        starts: (5,) each, cameras whose center and pixels may be those of the photos; the middle is tried besides.
         labels: number of the camera by photo when there are few; all 0 when there is one.
         seed: of the choice of the pairs held.
     """

@@ -56,7 +56,7 @@ def separated(
         return one, dict.fromkeys(everyone, 0)
     cameras = np.repeat(one, 1 + len(focals), axis=0)
     cameras[1:, LOG_FOCAL] += focals
-    labels = pairs.labelled(cameras, everyone, core)
+    labels = pairs.labeled(cameras, everyone, core)
     gain = pairs.total(cameras, labels) - max(
         pairs.total(cameras, dict.fromkeys(everyone, k)) for k in range(len(cameras))
     )
@@ -116,7 +116,7 @@ class _Pairs:
         clear = votes[best] - votes[TRIALS // 2] > CLEARLY * most and votes[best] >= FAIR_SHARE * most
         return [float(steps[best])] if clear and abs(steps[best]) > OTHER_FOCAL else []
 
-    def labelled(self, cameras: FloatArray, everyone: Sequence[int], core: set[int]) -> dict[int, int]:
+    def labeled(self, cameras: FloatArray, everyone: Sequence[int], core: set[int]) -> dict[int, int]:
         """Give every photo with camera for which its pairs vote most, the others as they are, until none changes."""
         labels = {photo: 0 if photo in core else -1 for photo in everyone}
         for _ in range(ROUNDS):

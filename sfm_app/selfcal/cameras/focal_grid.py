@@ -10,7 +10,7 @@ from sfm_app.selfcal.inputs import FloatArray
 from sfm_app.selfcal.lens import LOG_FOCAL
 
 SIGMA = 0.05
-"""Width of the votes, in units of r: neighbours on the grid of focals, 7 % apart, still vote for each other."""
+"""Width of the votes, in units of r: neighbors on the grid of focals, 7 % apart, still vote for each other."""
 MOST_PAIRS = 1500
 """Evenly chosen where there are more: tables of all focals of both photos take 13 kB a pair."""
 
@@ -26,7 +26,7 @@ class FocalGrid:
     Args:
         tables: the pairs, without lens.
         rows: (P,) which of them.
-        theta: (5,) the camera whose centre and pixels are those of all photos.
+        theta: (5,) the camera whose center and pixels are those of all photos.
         members: (P, 2) photos, counted from 0.
     """
 

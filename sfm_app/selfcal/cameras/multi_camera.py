@@ -83,7 +83,7 @@ def calibrate_several(
     sides = np.array([max(camera.size) / unit for camera in cameras])
     hints = np.array([camera.hint_px for camera in cameras]) / unit
     families = np.array([camera.family for camera in cameras], np.int64)
-    priors = Tied(sides, hints, options.centre_sigma, options.lens, families)
+    priors = Tied(sides, hints, options.center_sigma, options.lens, families)
     weights = pairs.weights[kept]
     thetas = np.array([_first(camera, side, unit) for camera, side in zip(cameras, sides, strict=True)])
     unknown = np.array([camera.start is None for camera in cameras])

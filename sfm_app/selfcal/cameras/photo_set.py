@@ -137,7 +137,7 @@ def _split(camera: Camera, number: int, pairs: PhotoPairs, options: CalibrationS
     ready = prepare(own, unit_px=side, origin_px=(own.size[0] / 2, own.size[1] / 2))
     if len(ready) == 0:
         return [camera]
-    starts = peaks_of(Consensus(ready, options.centre_sigma * own.size[0] / side))
+    starts = peaks_of(Consensus(ready, options.center_sigma * own.size[0] / side))
     if found.identifiable:
         starts.append(np.append(parameters_of(found, side)[:4], 0.0))
     tables = Tables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)

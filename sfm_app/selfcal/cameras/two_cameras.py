@@ -64,7 +64,7 @@ def two_cameras(tables: Tables, photos: Sequence[PairId], starts: Sequence[Float
     Args:
         tables: the pairs, without lens, in longer sides about the middle; its members are not used.
         photos: per pair its two photos.
-        starts: (5,) each, cameras whose centre and pixels may be those of the photos.
+        starts: (5,) each, cameras whose center and pixels may be those of the photos.
     """
     rows = chosen_pairs(len(photos))
     everyone = sorted({photo for pair in photos for photo in pair})

@@ -6,7 +6,7 @@ satisfy the constraint? Each pair speaks with at most its weight, so outliers do
 
     support(theta) = sum_i w_i exp(-r_i(theta) / sigma),      r = (s1 - s2) / (s1 + s2) of E_i = K'F_iK
 
-A pair's say is read as a log-likelihood, so that a prior on the centre adds to it: it decides where pairs are few and
+A pair's say is read as a log-likelihood, so that a prior on the center adds to it: it decides where pairs are few and
 fades where they are many.
 """
 
@@ -18,7 +18,7 @@ from sfm_app.jit import kernel
 from sfm_app.selfcal.constraints import singular_value_ratio
 from sfm_app.selfcal.inputs import FloatArray, Pairs
 
-LOG_FOCAL, CENTRE_U, CENTRE_V, LOG_ASPECT = range(4)
+LOG_FOCAL, CENTER_U, CENTER_V, LOG_ASPECT = range(4)
 """Places in theta."""
 FIRST_STEPS = np.array([0.05, 0.03, 0.03, 0.05])
 """First steps of the local search along theta."""
@@ -28,27 +28,27 @@ MOST_STEPS = 300
 
 
 class Consensus:
-    """The function that the right K maximises.
+    """The function that the right K maximizes.
 
     Args:
         pairs: what votes.
-        centre_sigma: standard deviation of the prior on (u, v) about (0, 0), in units of the pairs; may be inf.
+        center_sigma: standard deviation of the prior on (u, v) about (0, 0), in units of the pairs; may be inf.
         weights: (P,) to use instead of those of the pairs.
     """
 
-    def __init__(self, pairs: Pairs, centre_sigma: float, weights: FloatArray | None = None) -> None:
+    def __init__(self, pairs: Pairs, center_sigma: float, weights: FloatArray | None = None) -> None:
         self.pairs = pairs
-        self.centre_sigma = centre_sigma
+        self.center_sigma = center_sigma
         self.weights = pairs.weights if weights is None else weights
         self._packed = pairs.packed
 
     def weighted(self, weights: FloatArray) -> "Consensus":
         """Return the same pairs with other weights (P,)."""
-        return Consensus(self.pairs, self.centre_sigma, weights)
+        return Consensus(self.pairs, self.center_sigma, weights)
 
     def at(self, thetas: FloatArray, sigma: float) -> FloatArray:
         """Return (N,) supports plus log-priors at the rows of `thetas` (N, 4)."""
-        return np.asarray(_values(self._packed, self.weights, self.centre_sigma, thetas, sigma))
+        return np.asarray(_values(self._packed, self.weights, self.center_sigma, thetas, sigma))
 
     def ratios(self, theta: FloatArray) -> FloatArray:
         """Return (P,) r_i at theta."""
@@ -69,7 +69,7 @@ class Consensus:
                 simplex = np.tile(theta, (len(free) + 1, 1))
                 for row, index in enumerate(free):
                     simplex[row + 1, index] += steps[index]
-                theta, value = _climbed(self._packed, self.weights, self.centre_sigma, simplex, sigma)
+                theta, value = _climbed(self._packed, self.weights, self.center_sigma, simplex, sigma)
         return theta, value
 
 
@@ -83,10 +83,10 @@ def _ratios(packed: FloatArray, theta: FloatArray) -> FloatArray:
 
 
 @kernel
-def _value(packed: FloatArray, weights: FloatArray, centre_sigma: float, theta: FloatArray, sigma: float) -> float:
-    """Return sum_i w_i exp(-r_i / sigma) plus the log-prior of the centre."""
+def _value(packed: FloatArray, weights: FloatArray, center_sigma: float, theta: FloatArray, sigma: float) -> float:
+    """Return sum_i w_i exp(-r_i / sigma) plus the log-prior of the center."""
     fx, fy = np.exp(theta[0] - 0.5 * theta[3]), np.exp(theta[0] + 0.5 * theta[3])
-    value = -0.5 * (theta[1] ** 2 + theta[2] ** 2) / centre_sigma**2
+    value = -0.5 * (theta[1] ** 2 + theta[2] ** 2) / center_sigma**2
     for i in range(len(packed)):
         value += weights[i] * np.exp(-singular_value_ratio(packed[i], fx, fy, theta[1], theta[2]) / sigma)
     return float(value)
@@ -94,41 +94,41 @@ def _value(packed: FloatArray, weights: FloatArray, centre_sigma: float, theta: 
 
 @kernel
 def _values(
-    packed: FloatArray, weights: FloatArray, centre_sigma: float, thetas: FloatArray, sigma: float
+    packed: FloatArray, weights: FloatArray, center_sigma: float, thetas: FloatArray, sigma: float
 ) -> FloatArray:
     values = np.empty(len(thetas))
     for k in range(len(thetas)):
-        values[k] = _value(packed, weights, centre_sigma, thetas[k], sigma)
+        values[k] = _value(packed, weights, center_sigma, thetas[k], sigma)
     return values
 
 
 @kernel
 def _climbed(
-    packed: FloatArray, weights: FloatArray, centre_sigma: float, simplex: FloatArray, sigma: float
+    packed: FloatArray, weights: FloatArray, center_sigma: float, simplex: FloatArray, sigma: float
 ) -> tuple[FloatArray, float]:
     """Return Nelder and Mead (1965) upwards from a simplex (n + 1, 4), with their coefficients 1, 2, 1/2, 1/2."""
     count = len(simplex)
-    values = _values(packed, weights, centre_sigma, simplex, sigma)
+    values = _values(packed, weights, center_sigma, simplex, sigma)
     for _ in range(MOST_STEPS):
         _sort(simplex, values)
         if values[0] - values[-1] <= FINISHED_VALUE and _extent(simplex) <= FINISHED_STEP:
             break
         worst = values[-1]
         trial = _moved(simplex, 1.0)
-        value = _value(packed, weights, centre_sigma, trial, sigma)
+        value = _value(packed, weights, center_sigma, trial, sigma)
         if value > values[0]:
             further = _moved(simplex, 2.0)
-            better = _value(packed, weights, centre_sigma, further, sigma)
+            better = _value(packed, weights, center_sigma, further, sigma)
             if better > value:
                 trial, value = further, better
         elif value <= values[-2]:
             floor = max(value, worst)
             trial = _moved(simplex, 0.5 if value > worst else -0.5)
-            value = _value(packed, weights, centre_sigma, trial, sigma)
+            value = _value(packed, weights, center_sigma, trial, sigma)
             if value <= floor:
                 for k in range(1, count):
                     simplex[k] = 0.5 * (simplex[0] + simplex[k])
-                    values[k] = _value(packed, weights, centre_sigma, simplex[k], sigma)
+                    values[k] = _value(packed, weights, center_sigma, simplex[k], sigma)
                 continue
         simplex[-1] = trial
         values[-1] = value

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_app.selfcal.consensus.consensus import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, Consensus
+from sfm_app.selfcal.consensus.consensus import CENTER_U, CENTER_V, LOG_ASPECT, LOG_FOCAL, Consensus
 from sfm_app.selfcal.consensus.peak_evidence import (
     RIVAL_RATIO,
     best_rival,
@@ -19,7 +19,7 @@ from sfm_app.selfcal.consensus.peak_evidence import (
 from sfm_app.selfcal.consensus.peak_search import FOCAL_RANGE, SIGMAS, Peak, Profile, peaks, scan
 from sfm_app.selfcal.inputs import FloatArray
 
-SQUARE_PIXELS = (LOG_FOCAL, CENTRE_U, CENTRE_V)
+SQUARE_PIXELS = (LOG_FOCAL, CENTER_U, CENTER_V)
 ANY_PIXELS = (*SQUARE_PIXELS, LOG_ASPECT)
 LOG_ASPECTS = tuple(np.linspace(-0.6, 0.6, 9))
 """log fy/fx on the grid: 0.55 to 1.8."""
@@ -134,8 +134,8 @@ def objection(theta: FloatArray, log_focal_spread: float, half_size: tuple[float
     focal, (low, high) = float(np.exp(theta[LOG_FOCAL])), FOCAL_RANGE
     if not low * EDGE < focal < high / EDGE:
         return f"the focal runs to the end of the range, {focal:.2f} longer sides"
-    if np.any(np.abs(theta[CENTRE_U : CENTRE_V + 1]) > half_size):
-        return "the optical centre runs out of the photo"
+    if np.any(np.abs(theta[CENTER_U : CENTER_V + 1]) > half_size):
+        return "the optical center runs out of the photo"
     if log_focal_spread > MAX_LOG_FOCAL_SPREAD:
         return f"the focal is uncertain by {100 * log_focal_spread:.0f} %"
     return ""

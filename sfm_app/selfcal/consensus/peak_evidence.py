@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sfm_app.selfcal.consensus.consensus import CENTRE_U, CENTRE_V, LOG_ASPECT, LOG_FOCAL, Consensus
+from sfm_app.selfcal.consensus.consensus import CENTER_U, CENTER_V, LOG_ASPECT, LOG_FOCAL, Consensus
 from sfm_app.selfcal.consensus.peak_search import SIGMAS, Profile
 from sfm_app.selfcal.inputs import FloatArray
 
@@ -118,5 +118,5 @@ def spread_px(thetas: FloatArray, unit_px: float, count: float, parameters: int)
     """Return standard deviations of fx, fy, cx, cy, in pixels; see `deviation`."""
     focal, half = np.exp(thetas[:, LOG_FOCAL]) * unit_px, np.exp(0.5 * thetas[:, LOG_ASPECT])
     columns = {"fx": focal / half, "fy": focal * half}
-    columns |= {"cx": thetas[:, CENTRE_U] * unit_px, "cy": thetas[:, CENTRE_V] * unit_px}
+    columns |= {"cx": thetas[:, CENTER_U] * unit_px, "cy": thetas[:, CENTER_V] * unit_px}
     return {name: deviation(column, count, parameters) for name, column in columns.items()}

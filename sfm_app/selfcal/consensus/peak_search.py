@@ -12,9 +12,9 @@ FOCAL_RANGE = (0.3, 5.0)
 """Focals that are tried, in units of the longer side: 118 to 11 degrees of view."""
 FOCALS = 29
 """Focals on the grid, each 10 % above the one before."""
-CENTRE_REACH = 0.4
-"""Centres are tried up to this far from the middle, in units of the longer side."""
-CENTRE_STEP = 0.08
+CENTER_REACH = 0.4
+"""Centers are tried up to this far from the middle, in units of the longer side."""
+CENTER_STEP = 0.08
 SIGMAS = (0.05, 0.02)
 """Widths of the consensus, in units of r: the first finds a peak, the second refines it and compares it with others."""
 MOST_STARTS = 4
@@ -41,8 +41,8 @@ class Profile(NamedTuple):
 def scan(consensus: Consensus, log_aspects: Sequence[float]) -> Profile:
     """Look at every cell of the grid."""
     focals = np.geomspace(*FOCAL_RANGE, FOCALS)
-    centres = np.arange(-CENTRE_REACH, CENTRE_REACH + CENTRE_STEP / 2, CENTRE_STEP)
-    cells = np.meshgrid(np.log(focals), centres, centres, np.asarray(log_aspects), indexing="ij")
+    centers = np.arange(-CENTER_REACH, CENTER_REACH + CENTER_STEP / 2, CENTER_STEP)
+    cells = np.meshgrid(np.log(focals), centers, centers, np.asarray(log_aspects), indexing="ij")
     thetas = np.stack(cells, axis=-1).reshape(FOCALS, -1, 4)
     values = consensus.at(thetas.reshape(-1, 4), SIGMAS[0]).reshape(FOCALS, -1)
     best = np.argmax(values, axis=1)

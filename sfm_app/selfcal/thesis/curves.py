@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sfm_app.selfcal.constraints import centre_polynomials, focal_polynomials
+from sfm_app.selfcal.constraints import center_polynomials, focal_polynomials
 from sfm_app.selfcal.inputs import FloatArray, Pairs
 from sfm_app.selfcal.thesis.roots import ComplexArray, swept_roots
 
@@ -12,13 +12,13 @@ MAX_OUT_OF_RANGE = 0.5
 """A curve with a larger share of samples out of range is degenerate (thesis 5.35)."""
 
 
-def focal_curves(pairs: Pairs, fx: FloatArray, centre: tuple[float, float]) -> FloatArray:
+def focal_curves(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> FloatArray:
     """Return Z^f of thesis (5.29), (5.31): fy at every swept fx.
 
     Returns:
         (P, S) fy; 0 where no root has a non-zero real part. Not clipped to a range: `degeneracy` wants to see it.
     """
-    coefficients = focal_polynomials(pairs, fx, centre)
+    coefficients = focal_polynomials(pairs, fx, center)
     # the quartic is in fy^2: a negative fy^2 becomes an fy without real part, which the choice of the root passes over
     roots = np.sqrt(swept_roots(coefficients))
     # the imaginary part is to be "approximately zero": roots in which it prevails form tails near fy = 0 on which all
@@ -26,9 +26,9 @@ def focal_curves(pairs: Pairs, fx: FloatArray, centre: tuple[float, float]) -> F
     return _chosen(np.where(np.abs(roots.imag) <= np.abs(roots.real), roots, 0.0))
 
 
-def centre_curves(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
+def center_curves(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
     """Return Z^oc of thesis (5.30): v at every swept u; as `focal_curves`."""
-    return _chosen(swept_roots(centre_polynomials(pairs, u, focal)))
+    return _chosen(swept_roots(center_polynomials(pairs, u, focal)))
 
 
 def degeneracy(curves: FloatArray, upper: float) -> FloatArray:

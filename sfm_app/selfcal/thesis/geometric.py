@@ -17,7 +17,7 @@ LEAST_RESIDUAL_PX = 1e-3
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimise (5.8) from K_init with each pair weighted by the inverse of its mean epipolar residual.
+    """Minimize (5.8) from K_init with each pair weighted by the inverse of its mean epipolar residual.
 
     Args:
         pairs: F's and inliers; without inliers the given weights stand in.

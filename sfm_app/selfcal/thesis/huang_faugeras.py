@@ -1,4 +1,4 @@
-"""The Huang-Faugeras constraint minimised over all pairs alike: the thesis's "non-robust" method (5.5.3)."""
+"""The Huang-Faugeras constraint minimized over all pairs alike: the thesis's "non-robust" method (5.5.3)."""
 
 from sfm_app.selfcal.inputs import Pairs
 from sfm_app.selfcal.thesis.least_squares import fitted
@@ -10,7 +10,7 @@ METHOD = "huang-faugeras"
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimise (5.8) from K_init with equal weights.
+    """Minimize (5.8) from K_init with equal weights.
 
     Args:
         pairs: F's; weights tell which pairs take part (> 0), and count in the verdict only.

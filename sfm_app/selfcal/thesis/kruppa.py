@@ -1,4 +1,4 @@
-"""The Kruppa equations (thesis 5.2.3), their focal-only form (Sturm 2001), and a calibrator that minimises them.
+"""The Kruppa equations (thesis 5.2.3), their focal-only form (Sturm 2001), and a calibrator that minimizes them.
 
 (5.5) says  F C F' ~ [e2] C [e2]'  with C = KK' and the epipole e2. In the basis of F's own singular vectors,
 F = U diag(a, b) V', it shrinks to 2 x 2 matrices (Lourakis and Deriche 1999)::
@@ -79,8 +79,8 @@ def _sides(halves: Halves, cameras: FloatArray) -> tuple[FloatArray, FloatArray]
     return np.stack([a * a, a * b, b * b], axis=-1) * B, A[..., ::-1] * np.array([1.0, -1.0, 1.0])
 
 
-def focals_of(pairs: Pairs, centre: tuple[float, float]) -> FloatArray:
-    """Return the focal that each pair asks for if the pixels are square and the centre is known (Sturm 2001).
+def focals_of(pairs: Pairs, center: tuple[float, float]) -> FloatArray:
+    """Return the focal that each pair asks for if the pixels are square and the center is known (Sturm 2001).
 
     The equations that hold with the off-diagonal entries are linear in f^2 once the trivial root f = 1 is divided out;
     they fail where the optical axes lie in one plane. The third is quadratic. Of the solutions of both that one is
@@ -89,14 +89,14 @@ def focals_of(pairs: Pairs, centre: tuple[float, float]) -> FloatArray:
     Returns:
         (P,) in the units of the pairs; NaN where the equations hold for any focal, or for none.
     """
-    to_centre = np.array([[1.0, 0.0, centre[0]], [0.0, 1.0, centre[1]], [0.0, 0.0, 1.0]])
-    centred = Halves.of(to_centre.T @ pairs.F @ to_centre)
-    linear, quadratic = _focal_polynomials(centred)
+    to_center = np.array([[1.0, 0.0, center[0]], [0.0, 1.0, center[1]], [0.0, 0.0, 1.0]])
+    centered = Halves.of(to_center.T @ pairs.F @ to_center)
+    linear, quadratic = _focal_polynomials(centered)
     squares = np.column_stack([_common_root(linear), *_roots(quadratic).T])
     focals = np.sqrt(np.where(squares > 0, squares, np.nan))
     cameras = np.stack([focals, focals, np.zeros_like(focals), np.zeros_like(focals)], axis=-1)
     rows = np.arange(len(pairs))
-    errors = np.linalg.norm(kruppa_equations(centred[rows[:, None]], cameras), axis=-1)
+    errors = np.linalg.norm(kruppa_equations(centered[rows[:, None]], cameras), axis=-1)
     return np.asarray(focals[rows, np.argmin(np.where(np.isfinite(errors), errors, np.inf), axis=1)])
 
 

@@ -43,7 +43,7 @@ def minima(
 ) -> Minima:
     """Return Levenberg-Marquardt from many starts at once, each on pairs of its own.
 
-    Thesis (5.8) sums the terms; Levenberg-Marquardt, which the thesis minimises it with, sums their squares.
+    Thesis (5.8) sums the terms; Levenberg-Marquardt, which the thesis minimizes it with, sums their squares.
 
     Args:
         halves: (B, P) pairs.

@@ -49,7 +49,7 @@ def meeting_point(curves: FloatArray, upper: float, sigma: float) -> Meeting | N
 def meeting_points(curves: FloatArray, sweep: FloatArray, limits: tuple[float, float], sigma: float) -> list[Meeting]:
     """Return all well-separated peaks of the support along the sweep: the cameras in a set of several (Figure 5.15).
 
-    A peak is higher than its neighbours along the sweep, `SEPARATION` away from higher peaks, and has `LEAST_SHARE` of
+    A peak is higher than its neighbors along the sweep, `SEPARATION` away from higher peaks, and has `LEAST_SHARE` of
     the highest one's support.
 
     Args:

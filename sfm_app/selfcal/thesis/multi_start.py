@@ -52,8 +52,8 @@ def algorithm_2(pairs: Pairs, tall: float, evidence: dict[str, float], seed: int
     mean, deviation = focal_distribution(pairs, tall)
     evidence |= {"starts": float(count), "focal_mean": mean, "focal_deviation": deviation}
     focal = np.clip(rng.normal(mean, deviation, count), *FOCAL_RANGE)
-    centre = rng.normal([0.5, 0.5 * tall], [1 / 6, tall / 6], (count, 2))
-    starts = np.column_stack([focal, focal, centre])
+    center = rng.normal([0.5, 0.5 * tall], [1 / 6, tall / 6], (count, 2))
+    starts = np.column_stack([focal, focal, center])
     # sorted by a property that neither scale nor direction nor place changes: the order of the pairs has no effect
     halves = Halves.of(pairs.F)[np.argsort(pairs.product, kind="stable")]
     triples = np.argsort(rng.random((count, len(pairs))), axis=1)[:, :SAMPLE]

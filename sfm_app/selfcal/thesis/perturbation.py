@@ -18,7 +18,7 @@ NORMAL_MAD = 1.4826
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimise (5.8) again and again, with weights from the error discrepancy (thesis Algorithm 3).
+    """Minimize (5.8) again and again, with weights from the error discrepancy (thesis Algorithm 3).
 
     Args:
         pairs: F's; weights tell which pairs take part (> 0), and count in the verdict only.

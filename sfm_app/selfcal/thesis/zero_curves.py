@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 from sfm_app.selfcal.inputs import Pairs
-from sfm_app.selfcal.thesis.curves import centre_curves, focal_curves, usable
+from sfm_app.selfcal.thesis.curves import center_curves, focal_curves, usable
 from sfm_app.selfcal.thesis.meeting_point import meeting_point
 from sfm_app.selfcal.thesis.verdict import Camera, answered
 from sfm_app.settings import CalibrationSettings
@@ -51,10 +51,10 @@ def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: 
         return f"{len(curves)} of {len(pairs)} pairs have a usable focal curve, 2 are needed"
     evidence["focal_support"] = focal.support
 
-    curves = usable(centre_curves(pairs, sweep, (fx[focal.sample], focal.value)), tall)
-    evidence["centre_curves"] = float(len(curves))
-    centre = meeting_point(curves, tall, SIGMA_SHARE * tall)
-    if centre is None:
-        return f"{len(curves)} of {len(pairs)} pairs have a usable centre curve, 2 are needed"
-    evidence["centre_support"] = centre.support
-    return Camera(float(fx[focal.sample]), focal.value, float(sweep[centre.sample]), centre.value)
+    curves = usable(center_curves(pairs, sweep, (fx[focal.sample], focal.value)), tall)
+    evidence["center_curves"] = float(len(curves))
+    center = meeting_point(curves, tall, SIGMA_SHARE * tall)
+    if center is None:
+        return f"{len(curves)} of {len(pairs)} pairs have a usable center curve, 2 are needed"
+    evidence["center_support"] = center.support
+    return Camera(float(fx[focal.sample]), focal.value, float(sweep[center.sample]), center.value)

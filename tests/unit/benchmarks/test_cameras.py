@@ -16,23 +16,23 @@ K = camera_matrix(1000.0, 1010.0, 400.0, 300.0)
 TURN = axis_rotation(np.array([0.6, 0.0, 0.8]), 50.0)
 
 
-def pose(centre, angle_deg=0.0):
+def pose(center, angle_deg=0.0):
     R = axis_rotation(np.array([0.0, 1.0, 0.0]), angle_deg)
-    return np.column_stack([R, -R @ np.asarray(centre, float)])
+    return np.column_stack([R, -R @ np.asarray(center, float)])
 
 
 def moved(poses, scale, R, t):
     """The same cameras in a world that x -> scale R x + t has changed."""
     found = {}
     for name, P in poses.items():
-        centre = scale * R @ (-P[:, :3].T @ P[:, 3]) + t
+        center = scale * R @ (-P[:, :3].T @ P[:, 3]) + t
         rotation = P[:, :3] @ R.T
-        found[name] = np.column_stack([rotation, -rotation @ centre])
+        found[name] = np.column_stack([rotation, -rotation @ center])
     return found
 
 
 CORNERS = {"a": (2, 0, 0), "b": (-2, 0, 0), "c": (0, 2, 0), "d": (0, -2, 0)}
-POSES = {name: pose(centre, 10.0 * n) for n, (name, centre) in enumerate(CORNERS.items())}
+POSES = {name: pose(center, 10.0 * n) for n, (name, center) in enumerate(CORNERS.items())}
 
 
 def test_a_similarity_changes_no_score():
@@ -84,7 +84,7 @@ def test_every_photo_is_compared_with_its_own_camera():
 def test_nothing_found_scores_nothing():
     row = accuracy([], truth(), 4)
 
-    assert (row["registered"], row["models"], row["AUC@5"], row["e_focal %"], row["centre rms %"]) == (
+    assert (row["registered"], row["models"], row["AUC@5"], row["e_focal %"], row["center rms %"]) == (
         0,
         0,
         0,

@@ -11,7 +11,7 @@ import sweep_claims
 import tables
 from bounds import full_bound, gap, reduced_bound
 from chapter5 import IN_ORDER, MOST, PARTS, most_of
-from contests import CAP_PERCENT, NON_ROBUST, PRODUCTION, Attempt, answer_of, contest, e_centre, e_focal, summary
+from contests import CAP_PERCENT, NON_ROBUST, PRODUCTION, Attempt, answer_of, contest, e_center, e_focal, summary
 from fits import Fit, fit_to_all, robust_fits, with_outlying
 from lab import Lab
 from panels import Panel, lowest, rows_of
@@ -118,8 +118,8 @@ def test_raw_matches_replace_as_many_matrices_as_asked(tracks):
 
 def test_errors_are_those_of_section_5_5_3():
     found = camera_matrix(880.0, 900.0, 200.0, 220.0)
-    assert e_focal(found, K) == pytest.approx(5.0) and e_centre(found, K) == pytest.approx(15.0)
-    assert e_focal(K, K) == e_centre(K, K) == 0.0
+    assert e_focal(found, K) == pytest.approx(5.0) and e_center(found, K) == pytest.approx(15.0)
+    assert e_focal(K, K) == e_center(K, K) == 0.0
 
 
 def calibration(method, identifiable, **evidence):

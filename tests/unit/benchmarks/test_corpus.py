@@ -21,15 +21,15 @@ from PIL import Image
 
 import sfm_app
 from sfm_app.geometry.camera import camera_matrix
-from sfm_app.synthetic.cameras import axis_rotation, camera_centre, look_at
+from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at
 
 K = camera_matrix(1000.0, 1000.0, 400.0, 300.0)
 Y = np.array([0.0, 1.0, 0.0])
 
 
-def pose(centre, angle_deg=0.0):
+def pose(center, angle_deg=0.0):
     R = axis_rotation(Y, angle_deg)
-    return np.column_stack([R, -R @ np.asarray(centre, float)])
+    return np.column_stack([R, -R @ np.asarray(center, float)])
 
 
 def walk(places):
@@ -52,17 +52,17 @@ def test_an_offset_camera_is_fitted_and_what_is_off_remains():
     beside = {}
     for name, P in ours.items():
         R = turn @ P[:, :3] @ world.T
-        centre = 1.7 * world @ camera_centre(P) + [3.0, -1.0, 0.5] + R.T @ shift
-        beside[name] = np.column_stack([R, -R @ centre])
+        center = 1.7 * world @ camera_center(P) + [3.0, -1.0, 0.5] + R.T @ shift
+        beside[name] = np.column_stack([R, -R @ center])
 
     found = offset_errors(ours, beside)
-    assert found.centre.max() < 1e-3 and found.rotation_deg.max() < 0.05
+    assert found.center.max() < 1e-3 and found.rotation_deg.max() < 0.05
     assert found.shift == pytest.approx(np.linalg.norm(shift), abs=1e-3)
     assert found.turn_deg == pytest.approx(2.5, abs=0.05)
 
     moved = {name: P + np.column_stack([np.zeros((3, 3)), [0.05 * (k == 4), 0, 0]]) for k, (name, P) in enumerate(
         beside.items())}  # fmt: skip
-    assert 0.04 < offset_errors(ours, moved).centre.max() < 0.06
+    assert 0.04 < offset_errors(ours, moved).center.max() < 0.06
     assert offset_errors(dict(list(ours.items())[:3]), beside) is None
 
 
@@ -99,7 +99,7 @@ def test_errors_are_counted_in_what_is_stated(tmp_path):
         "stated": 6, "beyond 3 sd": 1, "beyond 3 sd, truth's doubt granted": 0, "focals called identifiable": 4,
         "of them over 3 % off": 1,
     }  # fmt: skip
-    assert claims(rows) == {"claimed focal %": 2.0, "claimed centre %": 1.0, "focal of 3 % or 3 sd": 1.667}
+    assert claims(rows) == {"claimed focal %": 2.0, "claimed center %": 1.0, "focal of 3 % or 3 sd": 1.667}
 
 
 def test_a_guess_claims_nothing_before_and_a_wide_deviation_nothing_after(tmp_path):
@@ -109,7 +109,7 @@ def test_a_guess_claims_nothing_before_and_a_wide_deviation_nothing_after(tmp_pa
 
     assert {row["when"] for row in rows} == {"after"}
     assert counted(rows)["focals called identifiable"] == 0
-    assert claims(rows) == {"claimed focal %": 0.0, "claimed centre %": 0.0, "focal of 3 % or 3 sd": 0.667}
+    assert claims(rows) == {"claimed focal %": 0.0, "claimed center %": 0.0, "focal of 3 % or 3 sd": 0.667}
     assert parameters(tmp_path / "nothing", truth, Doubt(0.0, 0.0)) == []
 
 

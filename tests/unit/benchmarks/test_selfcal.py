@@ -42,8 +42,8 @@ def test_photo_and_camera_change_alike(change):
     changed = np.asarray(photo_sets.changed_photo(spotted(516, 308), todo).convert("L"), float)
 
     rows, columns = np.mgrid[: changed.shape[0], : changed.shape[1]] + 0.5
-    centre = (columns * changed).sum() / changed.sum(), (rows * changed).sum() / changed.sum()
-    assert centre == pytest.approx((photo_sets.changed_camera(K, todo, (800, 600)) @ direction)[:2], abs=0.05)
+    center = (columns * changed).sum() / changed.sum(), (rows * changed).sum() / changed.sum()
+    assert center == pytest.approx((photo_sets.changed_camera(K, todo, (800, 600)) @ direction)[:2], abs=0.05)
 
 
 @pytest.mark.parametrize("size", [(800, 600), (600, 800), (333, 1000)])
@@ -104,7 +104,7 @@ def test_errors_are_counted_in_stated_deviations():
 
     assert (row["known"], row["in 3 sd"], row["worst e_focal %"]) == ("yes", "no", None)
     assert (row["fx sd"], row["fy sd"], row["cx sd"], row["cy sd"]) == (2.0, 1.0, 0.0, 4.0)
-    assert (row["e_focal %"], row["centre % of width"], row["k1 error"]) == (1.5, 3.0, 0.02)
+    assert (row["e_focal %"], row["center % of width"], row["k1 error"]) == (1.5, 3.0, 0.02)
 
 
 def test_of_several_cameras_the_median_and_the_worst_count():

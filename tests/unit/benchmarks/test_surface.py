@@ -41,7 +41,7 @@ def joined(*parts):
 
 def truth_of(*parts):
     """Three photos from above, which see all of a square of side 2 at the origin."""
-    camera = make_camera(120, 120, centre=(0.5, 0.5))
+    camera = make_camera(120, 120, center=(0.5, 0.5))
     eyes = ((0.0, 3.0, 0.6), (0.7, 3.0, -0.3), (-0.7, 3.2, -0.3))
     views = Views.of(camera, [look_at(np.array(eye), np.zeros(3)) for eye in eyes])
     return Truth(dict(views.cameras), dict(views.cam_from_world), *joined(*parts))
@@ -49,9 +49,9 @@ def truth_of(*parts):
 
 def scores(truth, vertices, faces):
     """As for a reconstruction in a frame of its own."""
-    centres = {name: TURN(centre[None])[0] for name, centre in truth.centres.items()}
+    centers = {name: TURN(center[None])[0] for name, center in truth.centers.items()}
     surface = Surface(TURN(vertices), faces, np.zeros((len(vertices), 3), np.uint8))
-    return truth_scores(surface, centres, truth, seen_places(truth, samples=4000))
+    return truth_scores(surface, centers, truth, seen_places(truth, samples=4000))
 
 
 def test_the_truth_itself_is_accurate_and_complete():
@@ -111,7 +111,7 @@ def test_psnr_does_not_mind_exposure_but_noise():
             expected, abs=0.15
         )
     flat = np.full((100, 3), 90, np.uint8)
-    assert psnr_db(flat, flat + np.uint8(7)) > 80, "one colour fits another"
+    assert psnr_db(flat, flat + np.uint8(7)) > 80, "one color fits another"
 
 
 def test_likeness_counts_covered_pixels_alone():
@@ -203,7 +203,7 @@ def test_sets_are_rendered_scenes_or_folders_and_parts_are_the_same_files(tmp_pa
         surface_set("lake", tmp_path / "data", tmp_path)
 
 
-def test_pages_of_pictures_stay_small_and_keep_their_colours(tmp_path):
+def test_pages_of_pictures_stay_small_and_keep_their_colors(tmp_path):
     noise = np.random.default_rng(0).integers(0, 256, (700, 2000, 3)).astype(np.uint8)
     plain = np.zeros((900, 2000, 3), np.uint8)
     plain[:, :1000], plain[:, 1000:] = (200, 40, 90), (30, 160, 220)

@@ -29,7 +29,7 @@ def test_the_sample_is_as_it_should_be(tmp_path):
 
     assert row["ok"] == "yes"
     assert (row["Open3D"], row["trimesh"]) == ("5120 triangles + 2 pages", "5120 triangles")
-    assert (row["open edges"], row["outward"], row["off centre"]) == (0, 1.0, pytest.approx(0, abs=0.02))
+    assert (row["open edges"], row["outward"], row["off center"]) == (0, 1.0, pytest.approx(0, abs=0.02))
 
 
 STANDING = {
@@ -64,7 +64,7 @@ def changed(**parts):
     ("model", "fault"),
     [
         (changed(faces=lambda surface: surface.faces[:, ::-1]), "normals"),
-        (changed(vertices=lambda surface: surface.vertices + np.array([2.0, 0, 0])), "off centre"),
+        (changed(vertices=lambda surface: surface.vertices + np.array([2.0, 0, 0])), "off center"),
         (changed(faces=lambda surface: np.concatenate([surface.faces[:-1], [[0, 0, 1]]])), "degenerate triangles"),
         (changed(faces=lambda surface: np.concatenate([surface.faces[1:], surface.faces[1:2]])), "not manifold"),
     ],
@@ -82,7 +82,7 @@ def test_what_is_wrong_with_a_surface_is_named(tmp_path, model, fault):
         ("three", {"said": ["no texture"]}, "three.js complains"),
         ("three", {"covered": 0.0}, "nothing to see"),
         ("three", {"textures": 1}, "Open3D misses pages"),
-        ("three", {"most": [0xC85A3C, 0x000000]}, "other colours"),
+        ("three", {"most": [0xC85A3C, 0x000000]}, "other colors"),
     ],
 )
 def test_what_viewers_do_not_like_is_named(tmp_path, part, value, fault):

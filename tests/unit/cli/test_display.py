@@ -13,7 +13,7 @@ KNOWN = Calibration(
     radial=-0.05, spread={"fx": 1.25, "fy": 2.0, "cx": 3.0, "cy": 4.0, "k1": 0.01}, held=("aspect",),
     key_pairs=((1, 2), (2, 3), (3, 4), (4, 5)),
 )  # fmt: skip
-GUESS = Calibration(K, 1000, 800, "guess", False, "an orbit", held=("centre",))
+GUESS = Calibration(K, 1000, 800, "guess", False, "an orbit", held=("center",))
 
 
 def test_every_parameter_stands_beside_its_deviation():
@@ -58,7 +58,7 @@ def test_json_holds_everything_that_is_known_of_a_camera():
 
 def test_refined_cameras_stand_with_their_deviations(tmp_path):
     deviations = {"fx": 0.75, "fy": 1.5, "cx": 2.0, "cy": 2.5, "k1": 0.01}
-    camera = CameraModel("OPENCV", (500.0, 510.0, 480.0, 410.0, -0.05, 0, 0, 0), K, 1000, 800, deviations, ("centre",))
+    camera = CameraModel("OPENCV", (500.0, 510.0, 480.0, 410.0, -0.05, 0, 0, 0), K, 1000, 800, deviations, ("center",))
     scene = Scene(tmp_path, {}, {}, {"one": camera}, 10, 20, 0.3)
     run = Run(tmp_path, None, scene, None, None, {})
 
@@ -67,7 +67,7 @@ def test_refined_cameras_stand_with_their_deviations(tmp_path):
         for line in run_lines(run)
     )
     found = json.loads(json.dumps(run_summary(run)))["scene"]["cameras"]["one"]
-    assert found["deviations"] == deviations and found["determined"] == ["centre"]
+    assert found["deviations"] == deviations and found["determined"] == ["center"]
     assert found["K"] == K.tolist() and found["params"][4] == -0.05
 
 

@@ -66,10 +66,10 @@ def test_what_finer_features_brought_is_said():
     assert "finer" not in told()[0]
 
 
-def test_metres_are_named():
-    text, _ = told(orientation=COUNTS["orientation"] | {"unit": "metre"})
+def test_meters_are_named():
+    text, _ = told(orientation=COUNTS["orientation"] | {"unit": "meter"})
 
-    assert "in metres by GPS" in text
+    assert "in meters by GPS" in text
 
 
 def test_a_model_that_may_stand_the_wrong_way_up_comes_with_a_remedy():
@@ -97,7 +97,7 @@ def test_what_the_last_adjustment_could_not_do_is_said():
 def test_a_model_that_could_not_be_turned_upright_says_so():
     text, _ = told(orientation={"failed": "it has no points", "unit": "that of mapping", "gps": "not used"})
 
-    assert "stands as mapping left it, neither upright nor in metres: it has no points" in text
+    assert "stands as mapping left it, neither upright nor in meters: it has no points" in text
     unsure, _ = told(orientation=COUNTS["orientation"] | {"up_deviation_deg": None})
     assert "upright by vanishing lines, nobody knows how exactly" in unsure
 

@@ -34,7 +34,7 @@ def synthetic(tmp_path_factory):
 
 @pytest.fixture
 def mapped(synthetic):
-    """Makes a model as mapping leaves it: one focal, a centre that may be off; and its database."""
+    """Makes a model as mapping leaves it: one focal, a center that may be off; and its database."""
 
     def make(true_params=PLAIN, noise_px=0.3, photos=8, cameras=1, start=(880.0, 500.0, 400.0, 0.0), seed=1):
         model, database = synthetic(true_params, noise_px, photos, cameras, seed)

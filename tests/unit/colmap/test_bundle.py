@@ -1,4 +1,4 @@
-"""The last adjustment on models that COLMAP synthesises."""
+"""The last adjustment on models that COLMAP synthesizes."""
 
 import numpy as np
 import pytest
@@ -15,12 +15,12 @@ NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
 @pytest.mark.parametrize("radial", [0.0, -0.08])
-def test_focal_centre_and_lens_are_found_as_far_off_as_stated(mapped, radial):
+def test_focal_center_and_lens_are_found_as_far_off_as_stated(mapped, radial):
     true = [900.0, 900.0, 530.0, 380.0, radial, 0.0, 0.0, 0.0]
     found = adjust(*mapped(true, start=(880.0, 500.0, 400.0, radial)))
     camera, deviations = found.model.cameras[1], found.deviations[1]
 
-    assert "centre" in found.determined[1]
+    assert "center" in found.determined[1]
     assert camera.params[:2] == pytest.approx([900, 900], rel=0.002)
     assert camera.params[2:4] == pytest.approx([530, 380], abs=3)
     assert camera.params[4] == pytest.approx(radial, abs=0.01)
@@ -30,12 +30,12 @@ def test_focal_centre_and_lens_are_found_as_far_off_as_stated(mapped, radial):
     assert 0.2 < found.model.compute_mean_reprojection_error() < 0.5
 
 
-def test_a_narrow_view_keeps_its_centre_and_says_that_it_may_be_off(mapped):
+def test_a_narrow_view_keeps_its_center_and_says_that_it_may_be_off(mapped):
     true = [3000.0, 3000.0, 506.0, 395.0, 0.0, 0.0, 0.0, 0.0]
     found = adjust(*mapped(true, noise_px=0.6, start=(2940.0, 500.0, 400.0, 0.0)))
     camera, deviations = found.model.cameras[1], found.deviations[1]
 
-    assert "centre" not in found.determined[1]
+    assert "center" not in found.determined[1]
     assert tuple(camera.params[2:4]) == (500.0, 400.0)
     assert 4 < deviations["cx"] < 15 and 4 < deviations["cy"] < 15
     assert abs(camera.params[0] - 3000) < 3 * deviations["fx"]
@@ -72,7 +72,7 @@ def test_the_camera_with_most_photos_does_not_free_one_of_a_single_photo(mapped)
     found = adjust(model, database)
 
     assert found.model.images[lone].has_pose
-    assert "centre" in found.determined[1] and "centre" not in found.determined[2]
+    assert "center" in found.determined[1] and "center" not in found.determined[2]
     assert found.model.cameras[2].params[2:4].tolist() == [500.0, 400.0]
     for key, tolerance in ((1, 0.003), (2, 0.01)):
         assert found.model.cameras[key].mean_focal_length() == pytest.approx(900, rel=tolerance)

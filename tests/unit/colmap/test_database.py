@@ -146,7 +146,7 @@ def test_only_a_k_that_is_known_counts_as_prior_knowledge(stored):
     [
         (calibration(aspect=1.02, held=("aspect",)), SQUARE_PIXELS),
         (calibration(aspect=1.004), SQUARE_PIXELS),
-        (calibration(aspect=1.006, held=("centre",)), TWO_FOCALS),
+        (calibration(aspect=1.006, held=("center",)), TWO_FOCALS),
         (calibration(aspect=1 / 1.006), TWO_FOCALS),
     ],
 )

@@ -12,7 +12,7 @@ from sfm_app.colmap.dense import (
     DenseStore,
     drop_estimates,
     read_depth,
-    read_grey,
+    read_gray,
     read_views,
     undistort,
     write_maps,
@@ -71,7 +71,7 @@ def test_views_are_those_of_the_model(workspace):
     assert [view.name for view in views] == ["1.png", "2.png", "3.png"]
     np.testing.assert_allclose(views[0].center, [-0.4, 0.04, 0], atol=1e-12)
     np.testing.assert_allclose(views[0].K, [[110, 0, 63], [0, 105, 41], [0, 0, 1]])
-    assert read_grey(dense, views[0]).shape == (90, 120)
+    assert read_gray(dense, views[0]).shape == (90, 120)
     assert all(np.all(np.diff(view.point_ids) > 0) for view in views)
     np.testing.assert_allclose(views[1].points @ NORMAL, DISTANCE, atol=1e-9)
 
@@ -140,7 +140,7 @@ def test_the_box_cuts_the_points(workspace):
     assert read_fused(dense)[0][:, 0].min() >= 0
 
 
-def test_the_surface_has_the_shape_and_the_colours_of_the_points(workspace):
+def test_the_surface_has_the_shape_and_the_colors_of_the_points(workspace):
     dense, views = workspace
     fuse(dense, views, 3, BOX, dense / FUSED)
 
@@ -174,7 +174,7 @@ def test_a_surface_does_not_depend_on_those_before_it(workspace):
     np.testing.assert_array_equal(after.faces, before.faces)
 
 
-def test_simplification_spares_what_is_curved_and_keeps_borders_and_colours(tmp_path):
+def test_simplification_spares_what_is_curved_and_keeps_borders_and_colors(tmp_path):
     fine = wavy(40)
 
     found = simplify(fine, 0.2, 0.0, tmp_path)

@@ -68,7 +68,7 @@ def mapped_globally(place, names, token=NEVER, seed=0):
     return mapping.map_globally(place, names, place / ".global", seed, token)
 
 
-def centres(model):
+def centers(model):
     return np.array([model.images[key].projection_center() for key in sorted(model.images)])
 
 
@@ -92,7 +92,7 @@ def test_all_photos_at_once_give_the_true_model_the_same_bytes_twice(synthetic, 
         written.append({path.name: path.read_bytes() for path in target.iterdir()})
 
     assert model.num_reg_images() == 5 and model.num_points3D() > 90
-    assert 1e-5 < np.abs(spans(centres(model)) - spans(centres(true))).max() < 0.01
+    assert 1e-5 < np.abs(spans(centers(model)) - spans(centers(true))).max() < 0.01
     assert written[0] == written[1] and "images.bin" in written[0]
     assert [path.name for path in place.iterdir()] == ["database.db"]
     assert (place / "database.db").read_bytes() == before

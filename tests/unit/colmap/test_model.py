@@ -1,4 +1,4 @@
-"""Cameras and models that COLMAP synthesises, through our side of it."""
+"""Cameras and models that COLMAP synthesizes, through our side of it."""
 
 import numpy as np
 import pytest
@@ -42,8 +42,8 @@ def test_rays_of_a_lens_meet_the_points_that_the_photo_shows(synthetic):
     poses, _ = posed_photos(model)
     key = min(poses)
     seen = [point for point in model.images[key].points2D if point.has_point3D()]
-    centre = -poses[key][:, :3].T @ poses[key][:, 3]
-    truth = np.array([model.points3D[point.point3D_id].xyz for point in seen]) - centre
+    center = -poses[key][:, :3].T @ poses[key][:, 3]
+    truth = np.array([model.points3D[point.point3D_id].xyz for point in seen]) - center
 
     rays = viewing_rays(model, key, np.array([point.xy for point in seen]))
     sine = np.linalg.norm(np.cross(rays, truth), axis=1) / np.linalg.norm(rays, axis=1) / np.linalg.norm(truth, axis=1)

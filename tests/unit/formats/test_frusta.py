@@ -45,9 +45,9 @@ def test_dots_lie_on_the_edges(cloud):
 def test_frusta_are_seen_and_do_not_hide_the_scene(step, depth):
     """A third of a step, but 1 % to 10 % of the scene, of size 1.8 sqrt(3), or of the walk where that is longer."""
     points = np.random.default_rng(0).uniform(-1, 1, (500, 3))
-    centres = step * np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    centers = step * np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
 
-    assert frustum_depth(centres, points) == pytest.approx(depth, rel=0.05)
+    assert frustum_depth(centers, points) == pytest.approx(depth, rel=0.05)
 
 
 def test_without_cameras_there_is_nothing(ball):

@@ -86,7 +86,7 @@ def test_numbers_are_what_the_tree_says_of_them(model):
             assert tree["bufferViews"][tree["accessors"][primitive["indices"]]["bufferView"]]["target"] == 34963
 
 
-def test_every_material_shows_colours_as_they_are_from_both_sides(model):
+def test_every_material_shows_colors_as_they_are_from_both_sides(model):
     tree, _ = taken_apart(glb_of(model))
 
     assert tree["asset"] == {"version": "2.0", "generator": "sfm_app"}
@@ -161,7 +161,7 @@ def test_indices_are_as_small_as_fits(vertices, kind):
     assert array(tree, buffer, number).max() == vertices - 1
 
 
-def test_linear_colours_come_back_as_the_srgb_they_were():
+def test_linear_colors_come_back_as_the_srgb_they_were():
     every = np.arange(256, dtype=np.uint8)
     light = linear_colors(np.column_stack([every, every, every]))
 
@@ -214,7 +214,7 @@ def test_trimesh_shows_the_texture(textured_ball):
     np.testing.assert_allclose(seen, [(200, 40, 30), (30, 60, 200)], atol=4)
 
 
-def test_trimesh_takes_vertex_colours_where_it_skips_materials(ball):
+def test_trimesh_takes_vertex_colors_where_it_skips_materials(ball):
     mesh = trimesh.load(io.BytesIO(glb_of(ball)), file_type="glb", force="mesh", process=False, skip_materials=True)
 
     expected = linear_colors(ball.surface.colors) * 255
@@ -232,7 +232,7 @@ def test_open3d_reads_all_kinds(model, tmp_path):
     assert len(pictures) == (len(model.texture.pages) if model.texture else 0)
 
 
-def test_colours_of_neighbouring_charts_stay_apart():
+def test_colors_of_neighboring_charts_stay_apart():
     page = np.zeros((64, 64, 3), np.uint8)
     page[:, ::2], page[:, 1::2] = (220, 30, 30), (30, 30, 220)
 

@@ -42,7 +42,7 @@ def test_the_materials_name_the_pages_beside_them(textured_ball):
         np.testing.assert_allclose(np.asarray(Image.open(io.BytesIO(files[f"my_model_{number}.jpg"]))), page, atol=4)
 
 
-def test_without_a_texture_vertices_carry_the_colours(ball):
+def test_without_a_texture_vertices_carry_the_colors(ball):
     files = write_obj(ball, "model")
 
     v = np.array(lines(files, "v"), float)

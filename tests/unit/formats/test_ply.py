@@ -15,7 +15,7 @@ def rows(model):
     return trimesh.load(io.BytesIO(data), file_type="ply", process=False).metadata["_ply_raw"]
 
 
-def test_a_surface_has_places_normals_and_the_colours_of_the_photos(ball):
+def test_a_surface_has_places_normals_and_the_colors_of_the_photos(ball):
     vertex = rows(ball)["vertex"]["data"]
 
     places, normals, colors = (

@@ -15,9 +15,9 @@ def rotations(count, step=0.15):
     return np.moveaxis(np.array([[c, o, s], [o, i, o], [-s, o, c]]), 2, 0)
 
 
-def bundle_of(X, R, centres, noise_px=0.3, seed=0):
+def bundle_of(X, R, centers, noise_px=0.3, seed=0):
     """Every photo sees every point; as measured through the camera with noise."""
-    t = -np.einsum("nij,nj->ni", R, centres)
+    t = -np.einsum("nij,nj->ni", R, centers)
     photo, point = (index.ravel() for index in np.indices((len(R), len(X))))
     empty = Bundle(CAMERA, np.zeros(len(R), np.int64), R, t, X, photo, point, np.zeros((len(photo), 2)))
     with np.errstate(all="ignore"):

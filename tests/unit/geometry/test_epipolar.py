@@ -12,7 +12,7 @@ from sfm_app.geometry.epipolar import (
     eight_point,
     epipoles,
     fundamental_from_pose,
-    hartley_normalisation,
+    hartley_normalization,
     homogeneous,
     nearest_rank_two,
     unit_norm,
@@ -27,19 +27,19 @@ def same_up_to_sign(F, G):
 
 
 @given(seed=SEEDS, shift=st.floats(-1e4, 1e4), scale=st.floats(1e-3, 1e3))
-def test_hartley_normalisation_centres_and_scales(seed, shift, scale):
+def test_hartley_normalization_centers_and_scales(seed, shift, scale):
     x = np.random.default_rng(seed).normal(size=(30, 2)) * scale + shift
 
-    y = homogeneous(x) @ hartley_normalisation(x).T
+    y = homogeneous(x) @ hartley_normalization(x).T
 
     assert np.abs(y[:, :2].mean(axis=0)).max() < 1e-6
     assert np.hypot(y[:, 0], y[:, 1]).mean() == pytest.approx(np.sqrt(2))
 
 
 @pytest.mark.parametrize("x", [np.empty((0, 2)), np.full((5, 2), 1e5)])
-def test_points_without_extent_cannot_be_normalised(x):
+def test_points_without_extent_cannot_be_normalized(x):
     with pytest.raises(ValueError, match=r"no points|coincide"):
-        hartley_normalisation(x)
+        hartley_normalization(x)
 
 
 @settings(max_examples=25, deadline=None)
@@ -115,8 +115,8 @@ def test_pose_gives_the_matrix_of_the_synthetic_pair():
     e1, e2 = epipoles(F)
     assert np.abs(F @ e1).max() < 1e-12
     assert np.abs(F.T @ e2).max() < 1e-12
-    centre1_in_2 = pair.K2 @ pair.t
-    assert np.abs(np.cross(e2, centre1_in_2 / np.linalg.norm(centre1_in_2))).max() < 1e-9
+    center1_in_2 = pair.K2 @ pair.t
+    assert np.abs(np.cross(e2, center1_in_2 / np.linalg.norm(center1_in_2))).max() < 1e-9
 
 
 def test_pose_without_baseline_has_none():

@@ -17,7 +17,7 @@ def cross(t):
 
 
 def scene(seed, R, t, n=60):
-    """Points before both cameras, and their normalised projections."""
+    """Points before both cameras, and their normalized projections."""
     rng = np.random.default_rng(seed)
     X = rng.uniform([-2, -2, 5], [2, 2, 9], (n, 3))
     Y = X @ R.T + t

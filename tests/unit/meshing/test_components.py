@@ -17,7 +17,7 @@ def test_islands_below_the_share_are_dropped(share, left, sheet, together):
     assert found.vertices[:, 0].max() == {2: 53, 1: 9}[left]
 
 
-def test_selection_keeps_corners_and_colours_together(sheet):
+def test_selection_keeps_corners_and_colors_together(sheet):
     surface = sheet(6)
     keep = np.arange(len(surface.faces)) % 3 == 0
 

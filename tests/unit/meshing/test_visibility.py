@@ -1,4 +1,4 @@
-"""What a depth map says about points, and the colours that it lends them."""
+"""What a depth map says about points, and the colors that it lends them."""
 
 import numpy as np
 import pytest
@@ -52,7 +52,7 @@ def test_what_is_masked_says_nothing(eye):
     assert verdict.tolist() == [SILENT, EMPTY, CONFIRMED, SILENT]
 
 
-def test_colours_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
+def test_colors_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
     image = np.zeros((60, 80, 3), np.uint8)
     image[..., 0] = np.arange(80) * 2
     points = np.array([[0, 0, 10.0], [0.5, -1, 10.0], [3, 0, 10.0]])

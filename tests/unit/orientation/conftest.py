@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_app.orientation.vanishing_points import Segments, joined, segment_planes
-from sfm_app.synthetic.cameras import axis_rotation, camera_centre, look_at
+from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at
 
 FOCAL_PX = 1000.0
 
@@ -17,7 +17,7 @@ class House:
     """A scene with y up, seen from +z, then turned as a whole by an unknown rotation."""
 
     rotations: np.ndarray
-    centres: np.ndarray
+    centers: np.ndarray
     points: np.ndarray
     segments: Segments
     turned: np.ndarray
@@ -49,7 +49,7 @@ def house(rolls_deg, *, aim_y=2.0, lines=(150, 150), clutter=100, noise_px=0.5, 
     level = edges(rng, sideways.T[[0, 2]], lines[1])
     wild = edges(rng, Rotation.random(1000, random_state=seed).as_matrix()[:, 0], clutter)
     ends = np.concatenate([vertical, level, wild], axis=1)
-    parts, rotations, centres = [], [], []
+    parts, rotations, centers = [], [], []
     for k, (azimuth, roll) in enumerate(zip(azimuths, rolls_deg, strict=True)):
         place = np.array([9 * np.sin(azimuth), 1.6 + 0.1 * rng.normal(), 9 * np.cos(azimuth)])
         pose = look_at(place, np.array([0.0, aim_y, 0.0]) + 0.2 * rng.normal(size=3), roll)
@@ -59,9 +59,9 @@ def house(rolls_deg, *, aim_y=2.0, lines=(150, 150), clutter=100, noise_px=0.5, 
         R = pose[:, :3] @ turned.T
         parts.append(segment_planes(*(x @ R), k, FOCAL_PX))
         rotations.append(R)
-        centres.append(turned @ camera_centre(pose))
+        centers.append(turned @ camera_center(pose))
     points = rng.uniform([-2, 0, -1.5], [2, 3, 1.5], (400, 3)) @ turned.T
-    return House(np.array(rotations), np.array(centres), points, joined(parts), turned)
+    return House(np.array(rotations), np.array(centers), points, joined(parts), turned)
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ METRES = 12.5
 
 
 def walk(count, radius_m, noise_m, seed=0, altitude_noise_m=None):
-    """Camera centres along an arc, in an unknown frame with an unknown unit, and the positions a phone notes there.
+    """Camera centers along an arc, in an unknown frame with an unknown unit, and the positions a phone notes there.
 
     Returns:
-        Centres (N, 3), positions, up (3,) in the unknown frame, true metres (N, 3) east, north, up of `ORIGIN`.
+        Centers (N, 3), positions, up (3,) in the unknown frame, true meters (N, 3) east, north, up of `ORIGIN`.
     """
     rng = np.random.default_rng(seed)
     angles = np.linspace(0, 2.5, count)
@@ -25,7 +25,7 @@ def walk(count, radius_m, noise_m, seed=0, altitude_noise_m=None):
     return enu @ R.T / METRES + [3, -2, 5], [position_at(row, ORIGIN) for row in enu + noise], R[:, 2], enu
 
 
-def test_metres_on_the_ellipsoid_and_back():
+def test_meters_on_the_ellipsoid_and_back():
     here = GpsPosition(60.0, 179.9999, 100.0)
 
     enu = enu_m([GpsPosition(60.0, -179.9999, 90.0), GpsPosition(60.001, 179.9999, None)], here)
@@ -38,38 +38,38 @@ def test_metres_on_the_ellipsoid_and_back():
 
 @pytest.mark.parametrize("seed", range(3))
 def test_scale_heading_and_place(seed):
-    centres, positions, up, enu = walk(12, 60.0, 3.0, seed)
+    centers, positions, up, enu = walk(12, 60.0, 3.0, seed)
 
-    found = georeference(centres, positions, up)
+    found = georeference(centers, positions, up)
 
     assert found and (found.photos, found.of) == (12, 12)
     assert found.enu_from_world.scale == pytest.approx(METRES, rel=4 * found.scale_deviation)
     assert 0.005 < found.scale_deviation < 0.03
     assert 1.5 < found.rms_m < 6
     assert np.allclose(found.enu_from_world.R @ up, [0, 0, 1])
-    moved = found.enu_from_world(centres)
+    moved = found.enu_from_world(centers)
     places = enu_m([position_at(row, found.origin) for row in moved], ORIGIN)
     assert 0.1 < np.linalg.norm((places - enu)[:, :2], axis=1).max() < 8
     assert found.up_deviation_deg is None
 
 
 def test_a_third_of_the_positions_may_be_wrong():
-    centres, positions, up, _ = walk(12, 60.0, 3.0)
+    centers, positions, up, _ = walk(12, 60.0, 3.0)
     for k in (0, 5, 6, 11):
         positions[k] = replace(positions[k], latitude_deg=positions[k].latitude_deg + 0.002 * (k - 5.5))
     positions[3] = None
 
-    found = georeference(centres, positions, up)
+    found = georeference(centers, positions, up)
 
     assert found and (found.photos, found.of) == (7, 11)
     assert found.enu_from_world.scale == pytest.approx(METRES, rel=0.06)
 
 
 def test_three_exact_positions_are_enough_two_are_not():
-    centres, positions, up, _ = walk(3, 60.0, 0.02)
+    centers, positions, up, _ = walk(3, 60.0, 0.02)
 
-    assert georeference(centres, positions, up).enu_from_world.scale == pytest.approx(METRES, rel=0.005)
-    two = georeference(centres, [positions[0], positions[1], positions[1]], up)
+    assert georeference(centers, positions, up).enu_from_world.scale == pytest.approx(METRES, rel=0.005)
+    two = georeference(centers, [positions[0], positions[1], positions[1]], up)
     assert not two and "2 different positions" in two.reason
 
 
@@ -81,26 +81,26 @@ def test_no_positions():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_photos_from_one_spot_have_no_scale(seed):
-    centres, positions, up, _ = walk(12, 1.5, 4.0, seed)
+    centers, positions, up, _ = walk(12, 1.5, 4.0, seed)
 
-    found = georeference(centres, positions, up)
+    found = georeference(centers, positions, up)
 
     assert not found and "fix no scale" in found.reason
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_positions_of_other_photos_do_not_agree(seed):
-    centres, positions, up, _ = walk(12, 60.0, 3.0, seed)
+    centers, positions, up, _ = walk(12, 60.0, 3.0, seed)
 
     swapped = [positions[k] for k in np.random.default_rng(seed).permutation(12)]
 
-    assert not georeference(centres, swapped, up)
+    assert not georeference(centers, swapped, up)
 
 
 def test_a_mirrored_walk_does_not_agree():
-    centres, positions, up, _ = walk(12, 60.0, 3.0)
+    centers, positions, up, _ = walk(12, 60.0, 3.0)
 
-    assert not georeference(centres, positions, -up), "upside down, the walk turns the other way"
+    assert not georeference(centers, positions, -up), "upside down, the walk turns the other way"
 
 
 def test_a_drone_says_where_up_is_when_its_cameras_do_not():

@@ -23,7 +23,7 @@ def shown(scene, points=None):
 
 def found_up(scene, segments=None, points=None, turn_deg=None):
     segments = scene.segments if segments is None else segments
-    return up_direction(scene.rotations, scene.centres, shown(scene, points), segments, turn_deg)
+    return up_direction(scene.rotations, scene.centers, shown(scene, points), segments, turn_deg)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -148,10 +148,10 @@ def test_a_wall_of_points_is_a_front_too(build_house):
     assert error_deg(towards, scene.front) == pytest.approx(np.degrees(0.2), abs=3)
 
 
-def test_the_viewer_sees_the_scene_upright_centred_and_of_size_one(build_house):
+def test_the_viewer_sees_the_scene_upright_centered_and_of_size_one(build_house):
     scene = build_house(HAND_HELD)
     seen = viewer_frame(scene.up, scene.front, scene.points)
-    metric = viewer_frame(scene.up, scene.front, scene.points, metres=2.5)
+    metric = viewer_frame(scene.up, scene.front, scene.points, meters=2.5)
 
     assert np.allclose(seen.R @ scene.up, [0, 1, 0]) and np.allclose(seen.R @ scene.front, [0, 0, 1])
     assert np.linalg.det(seen.R) == pytest.approx(1)

@@ -9,10 +9,10 @@ from sfm_app.orientation.line_segments import line_segments
 def test_edges_of_a_tilted_square(size):
     width, height = size
     corners = np.array([[0.3, 0.3], [0.7, 0.35], [0.65, 0.75], [0.25, 0.7]]) * [width, height]
-    grey = np.full((height, width), 40, np.uint8)
-    cv2.fillPoly(grey, [np.round(corners * 256).astype(np.int32)], 200, lineType=cv2.LINE_AA, shift=8)
+    gray = np.full((height, width), 40, np.uint8)
+    cv2.fillPoly(gray, [np.round(corners * 256).astype(np.int32)], 200, lineType=cv2.LINE_AA, shift=8)
 
-    found = line_segments(grey)
+    found = line_segments(gray)
 
     assert len(found) == 4
     for a, b in zip(corners + 0.5, np.roll(corners, -1, axis=0) + 0.5, strict=True):

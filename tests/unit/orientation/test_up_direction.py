@@ -14,7 +14,7 @@ from sfm_app.orientation.up_cues import (
     tops_are_seen,
 )
 from sfm_app.orientation.up_direction import CUES, MOST, Cue, Scenery, odds, stand
-from sfm_app.synthetic.cameras import axis_rotation, camera_centre, look_at, pixel_rays
+from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at, pixel_rays
 from sfm_app.synthetic.render import GAMMA, cast, prepare, render_scene
 from sfm_app.synthetic.scenes import build_scene, scene_views
 
@@ -23,7 +23,7 @@ VIEW_AXIS = np.array([0.0, 0.0, 1.0])
 
 
 def stripes(rows):
-    """A picture (H, 120) with these grey levels, row by row, and a little texture."""
+    """A picture (H, 120) with these gray levels, row by row, and a little texture."""
     texture = np.random.default_rng(0).normal(scale=1.0, size=(len(rows), 120))
     return np.clip(np.asarray(rows)[:, None] + texture, 0, 255).astype(np.uint8)
 
@@ -34,14 +34,14 @@ def ledge_rows(count=4):
 
 
 def terrain(light, seed=0):
-    """Points (P, 3) of a bumpy ground, lit from a direction, of patchy colour; seen from above."""
+    """Points (P, 3) of a bumpy ground, lit from a direction, of patchy color; seen from above."""
     rng = np.random.default_rng(seed)
     x, z = rng.uniform(-3, 3, (2, 4000))
     y = 0.4 * np.sin(3 * x) + 0.4 * np.cos(3 * z)
     normals = np.column_stack([-1.2 * np.cos(3 * x), np.ones_like(x), 1.2 * np.sin(3 * z)])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    colour = rng.uniform(0.7, 1.3, len(x))
-    return np.column_stack([x, y, z]), 120 * colour * (1.0 + 0.8 * normals @ light)
+    color = rng.uniform(0.7, 1.3, len(x))
+    return np.column_stack([x, y, z]), 120 * color * (1.0 + 0.8 * normals @ light)
 
 
 def turned_by(turn_deg, rotations, scenery):
@@ -53,35 +53,35 @@ def turned_by(turn_deg, rotations, scenery):
 
 @pytest.fixture(scope="module", params=["corner", "facade"])
 def rendered(request):
-    """Six small photos of a rendered scene with y up, as rotations, centres and what they show."""
+    """Six small photos of a rendered scene with y up, as rotations, centers and what they show."""
     scene, views = prepare(build_scene(request.param)), scene_views(request.param)
-    rotations, centres, points, brightness, seen, pictures = [], [], [], [], [], []
+    rotations, centers, points, brightness, seen, pictures = [], [], [], [], [], []
     for name in sorted(views.cam_from_world)[::2][:6]:
         camera, pose = views.cameras[name], views.cam_from_world[name]
         shrink = 192 / camera.width
         K = np.diag([shrink, shrink, 1.0]) @ camera.K
         camera = replace(camera, K=K, width=192, height=round(shrink * camera.height))
         image = 255 * np.clip(render_scene(scene, camera, pose, supersampling=1), 0, 1) ** (1 / GAMMA)
-        grey = image.mean(axis=2).astype(np.uint8)
+        gray = image.mean(axis=2).astype(np.uint8)
         directions = pixel_rays(camera) @ pose[:, :3]
-        depth = cast(scene.rays, camera_centre(pose), directions)["t_hit"].astype(np.float64)
+        depth = cast(scene.rays, camera_center(pose), directions)["t_hit"].astype(np.float64)
         known = np.isfinite(depth) & (np.arange(depth.size) % 53 == 0)
         seen.append(np.arange(np.count_nonzero(known)) + sum(map(len, points)))
-        points.append(camera_centre(pose) + directions[known] * depth[known, None])
-        brightness.append(grey.ravel()[known].astype(float))
+        points.append(camera_center(pose) + directions[known] * depth[known, None])
+        brightness.append(gray.ravel()[known].astype(float))
         rotations.append(pose[:, :3])
-        centres.append(camera_centre(pose))
-        pictures.append(grey)
+        centers.append(camera_center(pose))
+        pictures.append(gray)
     scenery = Scenery(np.concatenate(points), np.concatenate(brightness), tuple(seen), tuple(pictures))
-    return np.array(rotations), np.array(centres), scenery
+    return np.array(rotations), np.array(centers), scenery
 
 
 @pytest.mark.parametrize("turn_deg", [0, 180])
 def test_rendered_photos_stand_upright_whichever_way_they_were_held(rendered, turn_deg):
-    rotations, centres, scenery = rendered
+    rotations, centers, scenery = rendered
     R, shown = turned_by(turn_deg, rotations, scenery)
 
-    standing = stand(ups_from_roll(R, centres), R, centres, shown)
+    standing = stand(ups_from_roll(R, centers), R, centers, shown)
 
     assert standing.roll.turn_deg == turn_deg
     assert standing.roll.up @ UP > np.cos(np.radians(20))
@@ -100,7 +100,7 @@ def test_photos_on_their_side_of_a_walk_around_something(build_house, turn_deg):
     scenery = Scenery(points, np.full(len(points), 100.0), (np.arange(len(points)),) * 6, (None,) * 6)
     R, shown = turned_by(turn_deg, house.rotations, scenery)
 
-    standing = stand(ups_from_roll(R, house.centres), R, house.centres, shown)
+    standing = stand(ups_from_roll(R, house.centers), R, house.centers, shown)
 
     assert standing.roll.turn_deg == turn_deg
     assert standing.roll.up @ house.up > np.cos(np.radians(20))
@@ -113,7 +113,7 @@ def test_no_single_cue_turns_photos_that_are_held_upright(build_house):
     ceiling = np.random.default_rng(3).uniform([-4, 4, -4], [4, 4, 9], (900, 3)) @ house.turned.T
     scenery = Scenery(ceiling, np.full(900, 100.0), (np.arange(900),) * 6, (None,) * 6)
 
-    standing = stand(ups_from_roll(house.rotations, house.centres), house.rotations, house.centres, scenery)
+    standing = stand(ups_from_roll(house.rotations, house.centers), house.rotations, house.centers, scenery)
 
     assert standing.roll.turn_deg == 0 and standing.roll.up @ house.up > 0.9
     assert standing.evidence["low is near"] == -MOST and standing.evidence["tops are seen"] == -MOST
@@ -124,7 +124,7 @@ def test_without_scenery_cameras_are_held_upright(build_house):
     house = build_house((1.0, -2.0, 0.5, 1.5), sweep_deg=90.0)
     nothing = Scenery(np.zeros((0, 3)), np.zeros(0), (np.zeros(0, np.int64),) * 4, (None,) * 4)
 
-    standing = stand(ups_from_roll(house.rotations, house.centres), house.rotations, house.centres, nothing)
+    standing = stand(ups_from_roll(house.rotations, house.centers), house.rotations, house.centers, nothing)
 
     assert standing.roll.turn_deg == 0 and not any(standing.evidence.values())
     assert standing.not_upside_down == pytest.approx(TURNED[2])
@@ -133,7 +133,7 @@ def test_without_scenery_cameras_are_held_upright(build_house):
 def test_opposite_turns_have_opposite_directions(build_house):
     house = build_house((1.0, 88.0, 0.5, 31.0, -1.0, 2.0))
 
-    rolls = ups_from_roll(house.rotations, house.centres)
+    rolls = ups_from_roll(house.rotations, house.centers)
 
     assert [roll.turn_deg for roll in rolls] == [0, 90, 180, 270]
     for roll, opposite in zip(rolls[:2], rolls[2:], strict=True):
@@ -146,7 +146,7 @@ def test_three_steps_along_a_wall_are_level(build_house, turn_deg):
     house = build_house((turn_deg + 1.0, turn_deg - 2.0, turn_deg + 0.5), sweep_deg=15.0, lines=(0, 0))
     nothing = Scenery(np.zeros((0, 3)), np.zeros(0), (np.zeros(0, np.int64),) * 3, (None,) * 3)
 
-    standing = stand(ups_from_roll(house.rotations, house.centres), house.rotations, house.centres, nothing)
+    standing = stand(ups_from_roll(house.rotations, house.centers), house.rotations, house.centers, nothing)
 
     assert abs(standing.roll.up @ house.up) > 0.98
     assert 0.2 < standing.not_on_its_side < 8
@@ -166,9 +166,9 @@ def test_ledges_are_lit_from_above():
 def test_the_border_of_a_black_background_is_no_ledge():
     upright = look_at(np.array([0, 0, 5.0]), np.zeros(3))[:, :3]
     below = 80 + ledge_rows(3) / 3
-    grey, black = (stripes(np.concatenate([np.full(60, level), below])) for level in (30.0, 0.0))
+    gray, black = (stripes(np.concatenate([np.full(60, level), below])) for level in (30.0, 0.0))
 
-    assert ledges_are_lit(UP, [upright], [grey]) < -0.3 < 0.3 < ledges_are_lit(UP, [upright], [black])
+    assert ledges_are_lit(UP, [upright], [gray]) < -0.3 < 0.3 < ledges_are_lit(UP, [upright], [black])
 
 
 def test_the_sky_is_even_and_bright():
@@ -205,7 +205,7 @@ def test_what_no_photo_sees_says_nothing():
 def test_low_is_near_on_the_ground_and_not_on_a_distant_thing():
     rng = np.random.default_rng(0)
     pose = look_at(np.array([0, 1.6, 8.0]), np.array([0, 1.0, 0]))
-    places = pose[None, :, :3], camera_centre(pose)[None]
+    places = pose[None, :, :3], camera_center(pose)[None]
     ground = rng.uniform([-4, 0, -9], [4, 0, 6], (500, 3))
     far = rng.uniform([-0.01, 0.99, -0.01], [0.01, 1.01, 0.01], (500, 3))
     tilted = far + 0.5 * np.outer(far[:, 1] - 1.0, [0, 0, -1])

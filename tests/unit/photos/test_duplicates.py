@@ -63,13 +63,13 @@ def test_a_step_to_the_side_is_another_photo(shift):
 
 
 def test_a_bright_and_a_dark_exposure_are_two_photos():
-    dark = scene().point(lambda grey: grey // 2)
+    dark = scene().point(lambda gray: gray // 2)
 
     assert len(without_copies([glance("a", scene()), glance("b", dark)])[0]) == 2
 
 
 def test_blank_pictures_say_nothing():
-    blank = Image.new("RGB", (320, 240), "grey")
+    blank = Image.new("RGB", (320, 240), "gray")
 
     assert len(without_copies([glance(name, blank) for name in "abc"])[0]) == 3
     assert without_copies([]) == ([], [])

@@ -1,4 +1,4 @@
-"""Bars of one colour around pictures, and which photos share a camera by them."""
+"""Bars of one color around pictures, and which photos share a camera by them."""
 
 import io
 
@@ -12,14 +12,14 @@ from sfm_app.types import Photo
 
 
 def textured(width, height, seed=0):
-    """A picture without any line of one colour."""
+    """A picture without any line of one color."""
     rng = np.random.default_rng(seed)
     coarse = Image.fromarray(rng.integers(30, 230, (height // 16 + 2, width // 16 + 2, 3)).astype(np.uint8))
     return coarse.resize((width, height), Image.Resampling.BICUBIC)
 
 
-def barred(size, frame, colour=(0, 0, 0), seed=0):
-    whole = Image.new("RGB", size, colour)
+def barred(size, frame, color=(0, 0, 0), seed=0):
+    whole = Image.new("RGB", size, color)
     whole.paste(textured(frame[2], frame[3], seed), frame[:2])
     return whole
 
@@ -34,11 +34,11 @@ def photo(name="a.jpg", shown=None, size=(600, 400), group=""):
     return Photo(name, *size, group, shown=shown)
 
 
-@pytest.mark.parametrize("colour", [(0, 0, 0), (255, 255, 255), (20, 40, 60)])
+@pytest.mark.parametrize("color", [(0, 0, 0), (255, 255, 255), (20, 40, 60)])
 @pytest.mark.parametrize("frame", [(0, 50, 600, 300), (80, 0, 440, 400), (0, 0, 600, 310), (0, 0, 450, 400),
                                    (30, 20, 500, 350)])  # fmt: skip
-def test_pictures_within_bars_are_found(frame, colour):
-    picture = barred((600, 400), frame, colour)
+def test_pictures_within_bars_are_found(frame, color):
+    picture = barred((600, 400), frame, color)
     assert shown_part(picture) == frame
     rung = shown_part(as_jpeg(picture))
     assert rung is not None
@@ -60,7 +60,7 @@ def test_a_thing_on_a_plain_ground_has_no_bars():
     assert shown_part(Image.new("RGB", (320, 240), (7, 7, 7))) is None
 
 
-def test_a_sky_of_one_colour_above_a_level_horizon_is_no_bar():
+def test_a_sky_of_one_color_above_a_level_horizon_is_no_bar():
     assert shown_part(barred((320, 240), (0, 100, 320, 140), (235, 235, 235))) is None
 
 

@@ -16,7 +16,7 @@ from sfm_app.types import Photo, UnusablePhoto
 USED = np.zeros((40, 60), bool)
 USED[5:35, 20:50] = True
 USED[:10, 30:] = False
-GREY = np.where(USED, np.uint8(255), np.uint8(0))
+GRAY = np.where(USED, np.uint8(255), np.uint8(0))
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def laid_out(found, photos, masks, tmp_path):
 )
 def test_masks_are_named_as_colmap_names_them(photos, masks, name, there, expected):
     for mask in there:
-        Image.fromarray(GREY).save(masks / mask, "PNG")
+        Image.fromarray(GRAY).save(masks / mask, "PNG")
 
     found = find_mask(photo(name), photos, masks)
 
@@ -73,18 +73,18 @@ def palette():
 
 def cut_out():
     """What programs that take away a background save: the pixels behind it are still there."""
-    return Image.fromarray(np.dstack([np.full((*USED.shape, 3), 90, np.uint8), GREY]))
+    return Image.fromarray(np.dstack([np.full((*USED.shape, 3), 90, np.uint8), GRAY]))
 
 
 KINDS = {
-    "grey": lambda: Image.fromarray(GREY),
-    "faint": lambda: Image.fromarray(GREY // 255),
-    "two levels": lambda: Image.fromarray(GREY).convert("1"),
+    "gray": lambda: Image.fromarray(GRAY),
+    "faint": lambda: Image.fromarray(GRAY // 255),
+    "two levels": lambda: Image.fromarray(GRAY).convert("1"),
     "palette": palette,
-    "blue": lambda: Image.fromarray(np.dstack([0 * GREY, 0 * GREY, GREY])),
-    "black and opaque": lambda: Image.fromarray(GREY).convert("RGBA"),
+    "blue": lambda: Image.fromarray(np.dstack([0 * GRAY, 0 * GRAY, GRAY])),
+    "black and opaque": lambda: Image.fromarray(GRAY).convert("RGBA"),
     "transparent": cut_out,
-    "transparent grey": lambda: cut_out().convert("LA"),
+    "transparent gray": lambda: cut_out().convert("LA"),
     "16 bits": lambda: Image.fromarray(np.where(USED, np.uint16(1), np.uint16(0))),
 }
 
@@ -105,7 +105,7 @@ def test_a_photo_without_a_mask_is_used_whole(photos, masks, tmp_path):
 
 
 def test_masks_go_by_the_name_of_the_photo_in_the_run(photos, masks, tmp_path):
-    Image.fromarray(GREY).save(masks / "a.webp.png")
+    Image.fromarray(GRAY).save(masks / "a.webp.png")
     found = find_mask(photo("a.webp"), photos, masks)
 
     seen = laid_out(replace(found, name="a.webp.jpg", original="a.webp"), photos, masks, tmp_path)
@@ -115,7 +115,7 @@ def test_masks_go_by_the_name_of_the_photo_in_the_run(photos, masks, tmp_path):
 
 @pytest.mark.parametrize("times", [0.5, 2, 3])
 def test_masks_of_another_size_are_brought_to_that_of_the_photo(photos, masks, tmp_path, times):
-    Image.fromarray(GREY).save(masks / "a.jpg.png")
+    Image.fromarray(GRAY).save(masks / "a.jpg.png")
     size = round(60 * times), round(40 * times)
 
     seen = laid_out(find_mask(photo("a.jpg", *size), photos, masks), photos, masks, tmp_path)
@@ -126,7 +126,7 @@ def test_masks_of_another_size_are_brought_to_that_of_the_photo(photos, masks, t
 
 @pytest.mark.parametrize("size", [(61, 41), (120, 81), (600, 399), (29, 20)])
 def test_a_pixel_more_or_less_is_the_same_shape(photos, masks, size):
-    Image.fromarray(GREY).save(masks / "a.jpg.png")
+    Image.fromarray(GRAY).save(masks / "a.jpg.png")
 
     assert find_mask(photo("a.jpg", *size), photos, masks).mask == "a.jpg.png"
 
@@ -139,7 +139,7 @@ TURNED = {1: USED, 3: USED[::-1, ::-1], 6: np.rot90(USED, -1), 8: np.rot90(USED,
 def test_masks_of_photos_that_exif_turns(photos, masks, tmp_path, orientation, drawn):
     upright, exif = TURNED[orientation], Image.Exif()
     exif[0x0112] = orientation
-    Image.fromarray(GREY).save(photos / "a.jpg", exif=exif)
+    Image.fromarray(GRAY).save(photos / "a.jpg", exif=exif)
     pixels, tags = (upright, {}) if drawn == "as seen" else (USED, {"exif": exif} if drawn == "with EXIF" else {})
     if (orientation, drawn) == (3, "as filed"):
         pixels = upright  # nothing tells a mask upside down from one that is not: as seen
@@ -151,8 +151,8 @@ def test_masks_of_photos_that_exif_turns(photos, masks, tmp_path, orientation, d
 
 
 def test_a_mask_of_another_shape_is_refused(photos, masks):
-    Image.fromarray(GREY).save(photos / "a.jpg")
-    Image.fromarray(GREY).save(masks / "a.jpg.png")
+    Image.fromarray(GRAY).save(photos / "a.jpg")
+    Image.fromarray(GRAY).save(masks / "a.jpg.png")
 
     for size in ((60, 50), (40, 60), (600, 380)):
         words = f"the mask a.jpg.png cannot be used: it has 60 x 40 pixels, its photo {size[0]} x {size[1]}"
@@ -161,7 +161,7 @@ def test_a_mask_of_another_shape_is_refused(photos, masks):
 
 
 def test_nothing_is_left_of_a_photo_whose_mask_is_black(photos, masks):
-    Image.fromarray(0 * GREY).save(masks / "a.jpg.png")
+    Image.fromarray(0 * GRAY).save(masks / "a.jpg.png")
 
     assert find_mask(photo(), photos, masks) == UnusablePhoto("a.jpg", "its mask a.jpg.png is all black")
 
@@ -213,7 +213,7 @@ def test_photos_and_output_inside_the_folder_of_masks_are_no_masks(tmp_path):
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.02, 0.5, 0.98]))
-def test_masked_pixels_take_the_colour_of_the_nearest_that_is_not(seed, share):
+def test_masked_pixels_take_the_color_of_the_nearest_that_is_not(seed, share):
     rng = np.random.default_rng(seed)
     used = rng.random((9, 13)) < share
     used[rng.integers(9), rng.integers(13)] = True

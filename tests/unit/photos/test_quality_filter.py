@@ -30,7 +30,7 @@ def smeared(image, length):
 
 
 def window(size):
-    """A screenshot: areas of one colour, and letters."""
+    """A screenshot: areas of one color, and letters."""
     image = Image.new("RGB", size, "white")
     draw = ImageDraw.Draw(image)
     draw.rectangle((0, 0, size[0], 60), fill=(30, 60, 160))

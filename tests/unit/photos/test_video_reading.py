@@ -14,7 +14,7 @@ COUNT = 24
 
 
 def write(path, code="MJPG", count=COUNT):
-    """Frames of a growing grey; the left half is darker."""
+    """Frames of a growing gray; the left half is darker."""
     writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*code), 30.0, SIZE)
     for k in range(count):
         picture = np.full((HEIGHT, WIDTH, 3), 80 + 6 * k, np.uint8)

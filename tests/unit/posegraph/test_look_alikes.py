@@ -17,8 +17,8 @@ def turn(degrees):
     return Rotation.from_euler("y", degrees, degrees=True).as_matrix()
 
 
-def view(centre, aim):
-    pose = look_at(np.array(centre, float), np.array(aim, float))
+def view(center, aim):
+    pose = look_at(np.array(center, float), np.array(aim, float))
     return pose[:, :3], pose[:, 3]
 
 
@@ -53,8 +53,8 @@ def orbit(seed, photos=24, nearer=4.0, farther=4.0):
     place = gathered((X, np.vstack([ball, np.zeros_like(room)])), [])
     angles = np.linspace(0, 2 * np.pi, photos, endpoint=False)
     ways = np.linspace(nearer, farther, photos)
-    centres = [[r * np.cos(t), 0.2 * np.sin(2 * t), r * np.sin(t)] for t, r in zip(angles, ways, strict=True)]
-    return matched(place, [view(centre, [0, 0, 0]) for centre in centres], seed)
+    centers = [[r * np.cos(t), 0.2 * np.sin(2 * t), r * np.sin(t)] for t, r in zip(angles, ways, strict=True)]
+    return matched(place, [view(center, [0, 0, 0]) for center in centers], seed)
 
 
 def can(seed, photos=36):
@@ -68,8 +68,8 @@ def can(seed, photos=36):
     stands = [(turn(0), np.zeros(3)), (turn(180), np.zeros(3))]
     place = gathered(from_all_sides(room), [((printed, normals), stands)], pillar=1.0)
     turns = np.linspace(0, 2 * np.pi, photos, endpoint=False)
-    centres = [[5.5 * np.cos(t), 0.2 * np.sin(3 * t) - 1.0, 5.5 * np.sin(t)] for t in turns]
-    return matched(place, [view(centre, [0, 0, 0]) for centre in centres], seed)
+    centers = [[5.5 * np.cos(t), 0.2 * np.sin(3 * t) - 1.0, 5.5 * np.sin(t)] for t in turns]
+    return matched(place, [view(center, [0, 0, 0]) for center in centers], seed)
 
 
 def told_apart(scene):

@@ -22,7 +22,7 @@ POINTS, THRESHOLD = MATCHES.points, 2.0 / MATCHES.unit_px
 def in_frame(F):
     to1, to2 = (
         np.array([[MATCHES.unit_px, 0, x], [0, MATCHES.unit_px, y], [0, 0, 1]])
-        for x, y in (MATCHES.centre[:2], MATCHES.centre[2:])
+        for x, y in (MATCHES.center[:2], MATCHES.center[2:])
     )
     F = to2.T @ F @ to1
     return F / np.linalg.norm(F)

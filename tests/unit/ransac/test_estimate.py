@@ -65,7 +65,7 @@ def test_wrong_shapes_are_refused():
         judge(PAIR.x1, PAIR.x2[:50], PAIR.F, OPTIONS)
 
 
-def test_a_search_sees_distinct_centred_matches_in_the_order_of_the_seed():
+def test_a_search_sees_distinct_centered_matches_in_the_order_of_the_seed():
     seen = []
 
     def find(x1, x2, options, seed):

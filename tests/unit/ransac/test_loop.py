@@ -94,7 +94,7 @@ def test_priors_guide_the_samples():
     assert support(guided) > support(blind) + 10
 
 
-def test_local_optimisation_is_kept_only_if_better():
+def test_local_optimization_is_kept_only_if_better():
     m = scene(0.3)
     truth = search(m, options(), 5, PLAIN)
     told = replace(PLAIN, improve=always(truth.F))
@@ -321,7 +321,7 @@ def test_tests_are_reviewed_and_told_of_every_trial_and_model(scripted):
     assert told == [40, 10, 0.5, 40, 10]
 
 
-def test_an_outlier_in_front_does_not_spoil_a_randomised_test():
+def test_an_outlier_in_front_does_not_spoil_a_randomized_test():
     pair = make_pair(PairOptions(points=300, outliers=0.3, sigma_px=0.1), 2)
     m = prepare(pair.x1, pair.x2, 0)
     inlier = np.empty(300, dtype=bool)

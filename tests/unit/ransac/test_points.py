@@ -55,7 +55,7 @@ def test_repeats_leave_and_rows_find_the_way_back(seed, repeats):
     m = prepare(x[:, :2], x[:, 2:], seed)
 
     assert m.points.shape == (20, 4)
-    np.testing.assert_allclose(m.points[m.rows] * m.unit_px + m.centre, x, atol=1e-9)
+    np.testing.assert_allclose(m.points[m.rows] * m.unit_px + m.center, x, atol=1e-9)
     assert 0.7 < np.sqrt((m.points**2).mean()) < 1.4
     np.testing.assert_allclose(np.mean(m.points < 0, axis=0), 0.5)
     assert m.points.flags.f_contiguous
@@ -68,7 +68,7 @@ def test_absurd_matches_and_repeats_do_not_move_the_frame():
     m = prepare(absurd[:, :2], absurd[:, 2:], 0)
     assert len(m.points) == 102
     assert m.unit_px == pytest.approx(plain.unit_px, rel=0.1)
-    assert np.abs(m.centre - plain.centre).max() < 0.1 * m.unit_px
+    assert np.abs(m.center - plain.center).max() < 0.1 * m.unit_px
     assert plain.unit_px == pytest.approx(500 / 3**0.5, rel=0.1)
 
 

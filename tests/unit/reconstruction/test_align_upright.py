@@ -56,8 +56,8 @@ def true_positions(views):
     turn = np.radians(HEADING_DEG)
     ahead, right = np.array([np.sin(turn), np.cos(turn), 0.0]), np.array([np.cos(turn), -np.sin(turn), 0.0])
     axes = np.stack([right, [0, 0, 1.0], -ahead])
-    centres = [-pose[:, :3].T @ pose[:, 3] for pose in views.cam_from_world.values()]
-    return [position_at(METRES * centre @ axes, GpsPosition(48.2, 16.37, 170.0)) for centre in centres]
+    centers = [-pose[:, :3].T @ pose[:, 3] for pose in views.cam_from_world.values()]
+    return [position_at(METRES * center @ axes, GpsPosition(48.2, 16.37, 170.0)) for center in centers]
 
 
 ROTATIONS = {
@@ -84,14 +84,14 @@ def test_without_gps_the_model_has_size_one_and_stands_upright(tmp_path):
     assert np.mean([pose[2, 2] for pose in poses.values()]) < -0.8, "photos look from the viewer's side"
 
 
-def test_with_gps_the_model_is_in_metres_and_knows_its_place(tmp_path):
+def test_with_gps_the_model_is_in_meters_and_knows_its_place(tmp_path):
     _, model, matches, run = scene(tmp_path, true_positions)
     shape = posed_photos(model)[1]
 
     entry = orient(model, matches, look_at_photos([model], matches, run))
     points = posed_photos(model)[1]
 
-    assert entry["unit"] == "metre" and entry["gps"] == "12 of 12 positions agree"
+    assert entry["unit"] == "meter" and entry["gps"] == "12 of 12 positions agree"
     assert np.ptp(points, axis=0).max() / np.linalg.norm(np.ptp(shape, axis=0)) > 5
     extent = np.linalg.norm(points - np.median(points, axis=0), axis=1).max()
     assert extent == pytest.approx(METRES * np.hypot(2, np.hypot(1, 0.5)), rel=0.1)
@@ -179,7 +179,7 @@ def test_a_model_without_points_stays_as_it_is_and_the_entry_says_why(tmp_path):
     assert all(np.array_equal(pose, before[key]) for key, pose in posed_photos(model)[0].items())
 
 
-def test_gps_that_fails_leaves_the_model_upright_without_metres(tmp_path, monkeypatch):
+def test_gps_that_fails_leaves_the_model_upright_without_meters(tmp_path, monkeypatch):
     def failing(*_, **__):
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 

@@ -249,14 +249,14 @@ def test_photos_of_the_main_group_that_stayed_out_are_worth_another_pass(synthet
     assert not worth(without(with_camera(synthetic.copy(), TRUE), [6]), synthetic, known, photos=5)
 
 
-def test_what_is_learned_is_focal_centre_and_lens(synthetic, cameras):
-    guess = cameras(FOCAL * 1.2, method="guess", identifiable=False, reason="an orbit", held=("centre",))
+def test_what_is_learned_is_focal_center_and_lens(synthetic, cameras):
+    guess = cameras(FOCAL * 1.2, method="guess", identifiable=False, reason="an orbit", held=("center",))
     model = with_camera(synthetic.copy(), [1300.0, 500.0, 390.0, -0.07])
 
     found = learned(model, synthetic, guess).main
 
     assert found.K.tolist() == [[1300.0, 0, 500.0], [0, 1300.0, 390.0], [0, 0, 1]]
-    assert (found.radial, found.reason, found.held) == (-0.07, "", ("centre",))
+    assert (found.radial, found.reason, found.held) == (-0.07, "", ("center",))
 
 
 def test_a_camera_of_no_photo_in_the_model_stays_what_it_was(synthetic, cameras):

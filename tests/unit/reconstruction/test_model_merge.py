@@ -32,7 +32,7 @@ def within(pair):
     return (pair[0] <= 3) == (pair[1] <= 3)
 
 
-def centres(model):
+def centers(model):
     return np.array([-pose[:, :3].T @ pose[:, 3] for pose in posed_photos(model)[0].values()])
 
 
@@ -48,7 +48,7 @@ def test_halves_become_one_model_as_exact_as_the_whole(synthetic, halves, run):
 
     assert photos_of(found.model) == [1, 2, 3, 4, 5, 6]
     assert found.note.startswith("3 and 3 photos joined by ")
-    true, got = centres(synthetic.model), centres(found.model)
+    true, got = centers(synthetic.model), centers(found.model)
     size = np.linalg.norm(true - true.mean(axis=0), axis=1).max()
     assert np.linalg.norm(umeyama(got, true)(got) - true, axis=1).max() < 0.005 * size
     assert 0.05 < found.model.compute_mean_reprojection_error() < 0.5

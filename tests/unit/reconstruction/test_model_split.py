@@ -22,7 +22,7 @@ def parts(worths, photos):
 LEFT, RIGHT = dict.fromkeys(combinations((1, 2, 3, 4), 2), 200), dict.fromkeys(combinations((5, 6, 7), 2), 150)
 
 
-def test_a_chain_holds_together_by_its_neighbours():
+def test_a_chain_holds_together_by_its_neighbors():
     assert parts({(1, 2): 20, (2, 3): 300, (3, 4): 16, (4, 5): 50}, range(1, 6)) == [(1, 2, 3, 4, 5)]
 
 

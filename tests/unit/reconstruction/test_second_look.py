@@ -147,7 +147,7 @@ def test_in_small_sets_a_lost_photo_is_matched_with_all_others():
     assert pairs_to_see([2], photos(4)) == [(1, 2), (2, 3), (2, 4)]
 
 
-def test_in_large_sets_it_is_matched_with_its_neighbours():
+def test_in_large_sets_it_is_matched_with_its_neighbors():
     graph = photos(100, [((50, k), 100 + k) for k in range(80, 100)] + [((10, 50), 500)])
 
     found = pairs_to_see([50], graph)

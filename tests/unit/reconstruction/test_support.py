@@ -42,8 +42,8 @@ def test_points_behind_a_camera_are_not_explained(synthetic):
     """With photo 2 beyond photo 1 on the other side, epipolar lines stay and points change sides."""
     model = synthetic.copy()
     first, second = (model.images[key].cam_from_world().matrix() for key in (1, 2))
-    centre = [-pose[:, :3].T @ pose[:, 3] for pose in (first, second)]
-    there = 2.0 * centre[0] - centre[1]
+    center = [-pose[:, :3].T @ pose[:, 3] for pose in (first, second)]
+    there = 2.0 * center[0] - center[1]
     moved = pycolmap.Rigid3d(pycolmap.Rotation3d(second[:, :3]), -second[:, :3] @ there)
     model.frames[model.images[2].frame_id].rig_from_world = moved
 

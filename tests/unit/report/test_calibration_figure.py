@@ -8,7 +8,7 @@ from sfm_app.errors import ConfigError
 from sfm_app.report.calibration_figure import (
     MOST_CAMERAS,
     Panel,
-    centre_plane,
+    center_plane,
     check_figure,
     draw_calibration,
     focal_plane,
@@ -55,7 +55,7 @@ def test_other_suffixes_are_refused_by_name(tmp_path, name):
     assert ".png" in caught.value.hint
 
 
-@pytest.mark.parametrize("make", [focal_plane, centre_plane])
+@pytest.mark.parametrize("make", [focal_plane, center_plane])
 def test_votes_are_unanimous_at_the_camera_and_nowhere_higher(panel, make):
     plane = make(panel.camera, prepared(panel))
     left, right, bottom, top = plane.extent
@@ -70,7 +70,7 @@ def test_votes_are_unanimous_at_the_camera_and_nowhere_higher(panel, make):
     assert 0.8 < shares.max() <= 1.0
 
 
-@pytest.mark.parametrize("make", [focal_plane, centre_plane])
+@pytest.mark.parametrize("make", [focal_plane, center_plane])
 def test_curves_pass_through_the_camera(panel, make):
     plane = make(panel.camera, prepared(panel))
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfm_app.geometry.camera import camera_matrix
-from sfm_app.report.words import centre_text, field_of_view_deg, focal_text, held_text, lens_text, verdict
+from sfm_app.report.words import center_text, field_of_view_deg, focal_text, held_text, lens_text, verdict
 from sfm_app.types import Calibration
 
 
@@ -11,7 +11,7 @@ def camera(fx=500.0, fy=500.0, cx=500.0, cy=400.0, **values):
     return Calibration(camera_matrix(fx, fy, cx, cy), 1000, 800, **found)
 
 
-def test_the_field_of_view_counts_from_the_optical_centre():
+def test_the_field_of_view_counts_from_the_optical_center():
     across, down = field_of_view_deg(camera(cx=0.0))
 
     assert across == pytest.approx(np.degrees(np.arctan(2.0)))
@@ -34,8 +34,8 @@ def test_the_focal_says_how_sure_it_is_and_how_wide_it_sees():
         (508.0, 396.0, "8 px right of and 4 px above the middle of the photo."),
     ],
 )
-def test_the_centre_is_told_from_the_middle(cx, cy, says):
-    assert centre_text(camera(cx=cx, cy=cy)) == f"Optical centre {says}"
+def test_the_center_is_told_from_the_middle(cx, cy, says):
+    assert center_text(camera(cx=cx, cy=cy)) == f"Optical center {says}"
 
 
 def test_a_guess_says_what_it_is_and_why():
@@ -46,10 +46,10 @@ def test_a_guess_says_what_it_is_and_why():
 
 
 def test_a_lens_and_what_is_held_are_told_only_where_there_is_something_to_tell():
-    plain, bent = camera(), camera(radial=-0.12, spread={"k1": 0.004}, held=("centre", "aspect"))
+    plain, bent = camera(), camera(radial=-0.12, spread={"k1": 0.004}, held=("center", "aspect"))
 
     assert (lens_text(plain), held_text(plain)) == ("", "")
     assert lens_text(bent) == "The lens bends lines outwards (barrel), k1 -0.120 +- 0.004."
-    assert held_text(bent).endswith("optical centre near the middle of the photo, square pixels.")
-    assert held_text(camera(held=("centre",), identifiable=False)) == ""
+    assert held_text(bent).endswith("optical center near the middle of the photo, square pixels.")
+    assert held_text(camera(held=("center",), identifiable=False)) == ""
     assert lens_text(camera(radial=-0.003, held=("k1",))) == ""

@@ -31,15 +31,15 @@ class Views:
 def free_motion(rng, count):
     """Cameras in front of a scene, each looking somewhere else in it."""
     turn = rng.uniform(-0.5, 0.5, count)
-    centres = np.stack([5 * np.sin(turn), rng.uniform(-1, 1, count), -5 * np.cos(turn)], axis=1)
-    centres[:, 2] += rng.uniform(-0.8, 0.8, count)
-    return [(_looking(C, rng.normal(0, 0.5, 3), rng.normal(0, 0.3)), C) for C in centres]
+    centers = np.stack([5 * np.sin(turn), rng.uniform(-1, 1, count), -5 * np.cos(turn)], axis=1)
+    centers[:, 2] += rng.uniform(-0.8, 0.8, count)
+    return [(_looking(C, rng.normal(0, 0.5, 3), rng.normal(0, 0.3)), C) for C in centers]
 
 
 def orbit(rng, count):
-    """Cameras on a circle that look at its centre."""
-    centres = [5 * np.array([np.sin(turn), 0, -np.cos(turn)]) for turn in 0.25 * np.arange(count)]
-    return [(_looking(C, np.zeros(3), 0.0), C) for C in centres]
+    """Cameras on a circle that look at its center."""
+    centers = [5 * np.array([np.sin(turn), 0, -np.cos(turn)]) for turn in 0.25 * np.arange(count)]
+    return [(_looking(C, np.zeros(3), 0.0), C) for C in centers]
 
 
 def translation(rng, count):
@@ -50,12 +50,12 @@ def translation(rng, count):
 def level(rng, count):
     """Cameras that only pan, at one height."""
     turn = rng.uniform(-0.5, 0.5, count)
-    centres = np.stack([5 * np.sin(turn), np.zeros(count), -5 * np.cos(turn)], axis=1)
-    return [(_looking(C, rng.normal(0, 0.5, 3) * [1, 0, 1], 0.0), C) for C in centres]
+    centers = np.stack([5 * np.sin(turn), np.zeros(count), -5 * np.cos(turn)], axis=1)
+    return [(_looking(C, rng.normal(0, 0.5, 3) * [1, 0, 1], 0.0), C) for C in centers]
 
 
-def _looking(centre, target, roll):
-    z = (target - centre) / np.linalg.norm(target - centre)
+def _looking(center, target, roll):
+    z = (target - center) / np.linalg.norm(target - center)
     x = np.cross([0, 1.0, 0], z) / np.linalg.norm(np.cross([0, 1.0, 0], z))
     return Rotation.from_rotvec([0, 0, roll]).as_matrix() @ np.stack([x, np.cross(z, x), z])
 
@@ -78,10 +78,10 @@ def views():
     """Makes `Views`: count, seed, noise, motion, and the camera."""
 
     def make(
-        count=6, seed=0, *, noise=1e-3, motion=free_motion, focal=1000.0, aspect=1.0, centre=None, size=(1000, 750)
+        count=6, seed=0, *, noise=1e-3, motion=free_motion, focal=1000.0, aspect=1.0, center=None, size=(1000, 750)
     ):
         rng = np.random.default_rng(seed)
-        cx, cy = centre or (size[0] / 2, size[1] / 2)
+        cx, cy = center or (size[0] / 2, size[1] / 2)
         K = np.array([[focal / np.sqrt(aspect), 0, cx], [0, focal * np.sqrt(aspect), cy], [0, 0, 1]])
         cameras = motion(rng, count)
         Fs = [fundamental(K, a, b, rng.normal(0, noise, (3, 3))) for a, b in combinations(cameras, 2)]
@@ -123,14 +123,14 @@ def parallel(rng, count):
 
 def turning(rng, count):
     """Cameras that hardly move from one place."""
-    centres = np.array([0, 0, -5.0]) + rng.normal(0, 0.02, (count, 3))
-    return [(_looking(C, rng.normal(0, 0.5, 3), rng.normal(0, 0.2)), C) for C in centres]
+    centers = np.array([0, 0, -5.0]) + rng.normal(0, 0.02, (count, 3))
+    return [(_looking(C, rng.normal(0, 0.5, 3), rng.normal(0, 0.2)), C) for C in centers]
 
 
 def onward(rng, count):
     """Cameras that go straight ahead."""
-    centres = np.array([0, 0, -5.0]) + np.linspace(-1, 1, count)[:, None] * [0.05, 0.02, 1]
-    return [(Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix(), C) for C in centres]
+    centers = np.array([0, 0, -5.0]) + np.linspace(-1, 1, count)[:, None] * [0.05, 0.02, 1]
+    return [(Rotation.from_rotvec(rng.normal(0, 0.01, 3)).as_matrix(), C) for C in centers]
 
 
 def _photo(X, pose, K, k1):
@@ -168,14 +168,14 @@ def shots():
     """Makes `Shots`: number of photos, seed, motion, lens, noise; focals and sizes may differ from photo to photo."""
 
     def make(
-        count=6, seed=0, *, motion=free_motion, focal=1000.0, aspect=1.0, centre=(0.5, 0.5), size=(1000, 750), k1=0.0,
+        count=6, seed=0, *, motion=free_motion, focal=1000.0, aspect=1.0, center=(0.5, 0.5), size=(1000, 750), k1=0.0,
         noise_px=0.5, points=250, hints=(),
     ):  # fmt: skip
         focals = np.broadcast_to(focal, count)
         sizes = [size] * count if isinstance(size[0], int) else list(size)
         root = np.sqrt(aspect)
         Ks = np.array(
-            [[[f / root, 0, w * centre[0]], [0, f * root, h * centre[1]], [0, 0, 1]]
+            [[[f / root, 0, w * center[0]], [0, f * root, h * center[1]], [0, 0, 1]]
              for f, (w, h) in zip(focals, sizes, strict=True)]
         )  # fmt: skip
         Fs, ids, inliers = _shots(motion, seed, points, Ks, sizes, k1, noise_px)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.selfcal.constraints import centre_polynomials, focal_polynomials, singular_value_ratio
+from sfm_app.selfcal.constraints import center_polynomials, focal_polynomials, singular_value_ratio
 from sfm_app.selfcal.inputs import prepare
 from sfm_app.types import CameraPairs
 
@@ -47,7 +47,7 @@ def test_ratio_is_that_of_the_singular_values(seed, fx, fy, u, v):
 def test_polynomials_are_thesis_5_25(seed, fx, fy, u, v):
     pairs = random_pairs(seed)
     in_fy = focal_polynomials(pairs, np.array([fx]), (u, v))[:, 0] @ (fy**2) ** np.arange(5)
-    in_v = centre_polynomials(pairs, np.array([u]), (fx, fy))[:, 0] @ v ** np.arange(9)
+    in_v = center_polynomials(pairs, np.array([u]), (fx, fy))[:, 0] @ v ** np.arange(9)
     for i in range(len(pairs)):
         E = essential(pairs.F[i], fx, fy, u, v)
         size = np.trace(E @ E.T) ** 2
@@ -60,7 +60,7 @@ def test_every_swept_sample_has_its_polynomial():
     sweep = np.array([0.5, 1.0, 2.0])
     for whole, one in (
         (focal_polynomials(pairs, sweep, (0.1, 0.2)), focal_polynomials(pairs, sweep[1:2], (0.1, 0.2))),
-        (centre_polynomials(pairs, sweep, (1.0, 1.1)), centre_polynomials(pairs, sweep[1:2], (1.0, 1.1))),
+        (center_polynomials(pairs, sweep, (1.0, 1.1)), center_polynomials(pairs, sweep[1:2], (1.0, 1.1))),
     ):
         assert whole.shape[:2] == (3, 3)
         np.testing.assert_array_equal(whole[:, 1], one[:, 0])
@@ -68,7 +68,7 @@ def test_every_swept_sample_has_its_polynomial():
 
 
 def test_the_true_camera_satisfies_the_constraint(views):
-    made = views(4, noise=0.0, focal=900, aspect=1.2, centre=(420, 400))
+    made = views(4, noise=0.0, focal=900, aspect=1.2, center=(420, 400))
     pairs = prepare(CameraPairs.of(made.Fs, made.size, made.weights), unit_px=1000.0, origin_px=(0.0, 0.0))
     K = made.K / 1000
     for i in range(len(pairs)):
@@ -81,7 +81,7 @@ def test_translation_satisfies_it_with_any_camera(views):
     pairs = prepare(CameraPairs.of(made.Fs, made.size, made.weights), unit_px=1000.0, origin_px=(0.0, 0.0))
     assert ratio(pairs, 0, 0.4, 2.0, 0.9, -0.3) < 1e-6
     assert not np.any(focal_polynomials(pairs, np.array([0.3, 1.0, 3.0]), (0.5, 0.4)))
-    assert not np.any(centre_polynomials(pairs, np.array([0.3, 1.0]), (1.0, 1.1)))
+    assert not np.any(center_polynomials(pairs, np.array([0.3, 1.0]), (1.0, 1.1)))
 
 
 def test_a_matrix_of_rank_one_is_as_far_from_it_as_can_be():

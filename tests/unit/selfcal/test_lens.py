@@ -58,7 +58,7 @@ def test_derivatives_are_those_of_differences(k1):
         np.testing.assert_allclose(seen(x, k1)[2:6].reshape(2, 2), np.column_stack(columns), rtol=1e-6, atol=1e-7)
 
 
-def test_at_the_centre_there_is_no_lens():
+def test_at_the_center_there_is_no_lens():
     fx, fy, u, v, _ = camera(-0.3)[1]
     np.testing.assert_allclose(seen((u, v), -0.3), [0, 0, 1 / fx, 0, 0, 1 / fy, 0], atol=1e-12)
 

@@ -66,7 +66,7 @@ def freed(found, camera=0):
     ("change", "parts"),
     [
         ({}, set()),
-        ({2: 620.0}, {"centre"}),
+        ({2: 620.0}, {"center"}),
         ({1: 1150.0}, {"aspect"}),
         ({4: -0.1}, {"k1"}),
         ({4: -0.2, 5: 0.2}, {"k1", "k2"}),
@@ -113,7 +113,7 @@ def test_what_is_not_determined_stays_where_it_is_and_may_be_off():
     found = answer(bundle)
 
     assert found.params[0, 2:4].tolist() == [498.0, 401.0]
-    assert not found.determined[0, NAMES.index("centre")]
+    assert not found.determined[0, NAMES.index("center")]
     # three photo sets of ten are cropped, by 15 % of the longer side
     assert found.deviations[0, 2:4] == pytest.approx(np.sqrt(0.3) * 150, rel=0.1)
 

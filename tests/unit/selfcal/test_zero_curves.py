@@ -16,7 +16,7 @@ def run(made, seed=0, weights=None):
 
 
 def errors(found, K, size):
-    """Largest relative focal error, and largest error of the centre in longer sides."""
+    """Largest relative focal error, and largest error of the center in longer sides."""
     focal = np.abs(np.diag(found.K)[:2] / np.diag(K)[:2] - 1).max()
     return focal, np.abs(found.K[:2, 2] - K[:2, 2]).max() / max(size)
 
@@ -25,10 +25,10 @@ CAMERAS = {
     "plain": {},
     "wide": {"focal": 450},
     "narrow": {"focal": 2700, "noise": 2e-4},
-    "cropped": {"centre": (720, 260)},
+    "cropped": {"center": (720, 260)},
     "portrait": {"size": (750, 1000)},
     "squeezed": {"aspect": 0.75},
-    "stretched and cropped": {"aspect": 1.25, "centre": (400, 450)},
+    "stretched and cropped": {"aspect": 1.25, "center": (400, 450)},
     "level": {"motion": "level", "noise": 3e-4},
 }
 
@@ -45,13 +45,13 @@ def test_finds_the_camera(views, camera, seed):
 
     assert found.identifiable, found.reason
     assert found.method == METHOD
-    focal, centre = errors(found, made.K, made.size)
+    focal, center = errors(found, made.K, made.size)
     assert 0 < focal < 0.02
-    assert 0 < centre < 0.02
+    assert 0 < center < 0.02
     assert found.evidence["agreeing_pairs"] > 15
 
 
-@pytest.mark.parametrize("knobs", [{}, {"focal": 2700}, {"centre": (720, 260)}])
+@pytest.mark.parametrize("knobs", [{}, {"focal": 2700}, {"center": (720, 260)}])
 def test_pixels_stay_square_unless_the_pairs_clearly_say_otherwise(views, knobs):
     for seed in range(12):
         found = run(views(6, seed, **knobs))
@@ -101,7 +101,7 @@ def test_a_zoomed_photo_is_outvoted(views):
     made, zoomed = views(5, noise=3e-4), views(5, noise=3e-4, focal=1500)
     Fs = made.Fs.copy()
     with_photo_0 = [0, 1, 2, 3]
-    # photo 0 was taken at 1.5 times the focal: its pixels are those of the others, 1.5 times further from the centre
+    # photo 0 was taken at 1.5 times the focal: its pixels are those of the others, 1.5 times further from the center
     zoom = made.K @ np.linalg.inv(zoomed.K)
     Fs[with_photo_0] = made.Fs[with_photo_0] @ zoom
     found = calibrate(CameraPairs.of(Fs, made.size, made.weights), OPTIONS, 0)
@@ -152,18 +152,18 @@ def test_one_pair_repeated_is_one_pair(views):
         assert not found.identifiable
 
 
-def test_three_pairs_leave_the_centre_near_the_middle(views):
+def test_three_pairs_leave_the_center_near_the_middle(views):
     made = views(3, 1, noise=4e-3)
-    found = calibrate(CameraPairs.of(made.Fs, made.size), OPTIONS.model_copy(update={"centre_sigma": 1.0}), 0)
+    found = calibrate(CameraPairs.of(made.Fs, made.size), OPTIONS.model_copy(update={"center_sigma": 1.0}), 0)
 
     assert 0 < np.linalg.norm(found.K[:2, 2] - [500, 375]) < 60
 
 
-def test_the_prior_holds_the_centre_of_few_pairs(views):
+def test_the_prior_holds_the_center_of_few_pairs(views):
     made = views(4, 1, noise=4e-3)
     offsets = []
     for sigma in (0.01, 1.0):
-        options = OPTIONS.model_copy(update={"centre_sigma": sigma})
+        options = OPTIONS.model_copy(update={"center_sigma": sigma})
         found = calibrate(CameraPairs.of(made.Fs, made.size), options, 0)
         offsets.append(np.linalg.norm(found.K[:2, 2] - [500, 375]))
     assert offsets[0] < 20
@@ -173,9 +173,9 @@ def test_the_prior_holds_the_centre_of_few_pairs(views):
 def test_the_prior_is_measured_in_widths(views):
     made = views(4, 1, noise=4e-3)
     swap = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])
-    lying = calibrate(CameraPairs.of(made.Fs, (1000, 750)), OPTIONS.model_copy(update={"centre_sigma": 0.06}), 0)
+    lying = calibrate(CameraPairs.of(made.Fs, (1000, 750)), OPTIONS.model_copy(update={"center_sigma": 0.06}), 0)
     standing = calibrate(
-        CameraPairs.of(swap @ made.Fs @ swap, (750, 1000)), OPTIONS.model_copy(update={"centre_sigma": 0.08}), 0
+        CameraPairs.of(swap @ made.Fs @ swap, (750, 1000)), OPTIONS.model_copy(update={"center_sigma": 0.08}), 0
     )
     assert lying.identifiable
     np.testing.assert_allclose(swap @ standing.K @ swap, lying.K, rtol=1e-3)
@@ -197,7 +197,7 @@ def test_inlier_counts_make_weights(views):
 def with_other_pairs(shots, seed):
     """28 pairs of one camera among 378 of photos that have no camera in common, and the true K."""
     right, focals = shots(8, seed, points=400), np.random.default_rng(seed + 100).normal(np.log(620), 0.3, 28)
-    wrong = shots(28, seed + 50, focal=np.exp(focals), centre=(0.5, 0.2), points=80, noise_px=2.0)
+    wrong = shots(28, seed + 50, focal=np.exp(focals), center=(0.5, 0.2), points=80, noise_px=2.0)
     inliers = (*right.pairs.inliers, *wrong.pairs.inliers)
     ids = (*right.pairs.photos, *((i + 8, j + 8) for i, j in wrong.pairs.photos))
     Fs = np.concatenate([right.pairs.Fs, wrong.pairs.Fs])

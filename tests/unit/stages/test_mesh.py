@@ -98,7 +98,7 @@ def test_a_closed_thing_seen_all_round_is_closed(ball):
     assert counts["triangles"] == len(surface.faces) < 0.6 * counts["raw_triangles"]
 
 
-def test_normals_point_outward_and_colours_are_those_of_the_photos(ball):
+def test_normals_point_outward_and_colors_are_those_of_the_photos(ball):
     surface, _ = ball
     normals = vertex_normals(surface.vertices, surface.faces)
 

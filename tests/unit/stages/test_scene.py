@@ -242,7 +242,7 @@ def test_refined_cameras_stand_beside_the_calibration_and_leave_it_valid(tmp_pat
     before = Intrinsics({"one": Calibration(K, 640, 480, "zero-curves", True)})
     place.calibration.write_text(json.dumps(before.to_dict()))
     place.manifest.finish("intrinsics", StageRecord("abc", 1.0, {}, place.manifest.sizes(("calibration.json",))), {})
-    camera = CameraModel("OPENCV", (800.0,) * 8, K, 640, 480, {"fx": 1.5, "cx": 2.5}, ("centre",))
+    camera = CameraModel("OPENCV", (800.0,) * 8, K, 640, 480, {"fx": 1.5, "cx": 2.5}, ("center",))
 
     scene.write_refined(
         Scene(tmp_path, {}, {}, {"one": camera}, 10, 20, 0.3), SimpleNamespace(workspace=place)
@@ -250,7 +250,7 @@ def test_refined_cameras_stand_beside_the_calibration_and_leave_it_valid(tmp_pat
 
     found = json.loads(place.calibration.read_text())
     assert found["refined"]["one"]["deviations"] == {"fx": 1.5, "cx": 2.5}
-    assert (found["refined"]["one"]["K"], found["refined"]["one"]["determined"]) == (K.tolist(), ["centre"])
+    assert (found["refined"]["one"]["K"], found["refined"]["one"]["determined"]) == (K.tolist(), ["center"])
     assert Intrinsics.from_dict(found).to_dict() == before.to_dict()
     assert not place.manifest.spoilt(place.manifest.record("intrinsics"))
 

@@ -40,12 +40,12 @@ def test_a_model_without_a_texture_comes_back(tmp_path):
 
 
 def test_photos_are_rgb_and_of_the_view_s_size(tmp_path):
-    grey = np.zeros((40, 60), np.uint8)
-    grey[:, 30:] = 200
-    Image.fromarray(grey).save(tmp_path / "a.png")
+    gray = np.zeros((40, 60), np.uint8)
+    gray[:, 30:] = 200
+    Image.fromarray(gray).save(tmp_path / "a.png")
     view = PhotoView("a.png", (50.0, 50.0, 30.0, 20.0, 0, 0, 0, 0), np.eye(3, 4), 60, 40)
 
-    np.testing.assert_array_equal(read_photo(tmp_path, view), np.repeat(grey[:, :, None], 3, axis=2))
+    np.testing.assert_array_equal(read_photo(tmp_path, view), np.repeat(gray[:, :, None], 3, axis=2))
     small = read_photo(tmp_path, view.scaled(20, 10))
     assert small.shape == (10, 20, 3)
     assert (small[:, :10] == 0).all()

@@ -24,7 +24,7 @@ class Plane:
         return ((self.distance - self.normal @ view.center) / (rays @ self.normal)).astype(np.float32)
 
     def photo(self, view: View) -> np.ndarray:
-        """(H, W) grey photo."""
+        """(H, W) gray photo."""
         rays = self._rays(view, 0.5)
         depth = (self.distance - self.normal @ view.center) / (rays @ self.normal)
         points = view.center + depth[..., None] * rays
@@ -50,7 +50,7 @@ def plane() -> Plane:
 
 @pytest.fixture(scope="session")
 def make_view(plane):
-    """A view of the plane from a centre, looking along +z unless turned, with sparse points where it sees the plane."""
+    """A view of the plane from a center, looking along +z unless turned, with sparse points where it sees the plane."""
 
     def make(center, name="a", turn=(0.0, 0.0, 0.0), size=(240, 180), sample_px=0.5) -> View:
         R = cv2.Rodrigues(np.array(turn, float))[0]

@@ -1,4 +1,4 @@
-"""Merging what neighbours say, and counting who agrees."""
+"""Merging what neighbors say, and counting who agrees."""
 
 import numpy as np
 
@@ -29,7 +29,7 @@ def test_no_hypothesis_gives_no_depth():
     assert support[0, 0] == 0
 
 
-def test_the_order_of_the_neighbours_does_not_matter():
+def test_the_order_of_the_neighbors_does_not_matter():
     rng = np.random.default_rng(0)
     depths = rng.uniform(4.95, 5.05, (3, 8, 9)).astype(np.float32)
     parallaxes = rng.uniform(5, 20, depths.shape).astype(np.float32)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.stereo import DepthMap, Estimate, confirm_depths, match_depths, rank_neighbours, region
+from sfm_app.stereo import DepthMap, Estimate, confirm_depths, match_depths, rank_neighbors, region
 from sfm_app.stereo.view import View
 from sfm_app.types import Rejected
 
@@ -19,7 +19,7 @@ def views(make_view):
 
 @pytest.fixture(scope="module")
 def matched(plane, views):
-    ranked = rank_neighbours(views, 3)
+    ranked = rank_neighbors(views, 3)
     return [
         match_depths(view, [views[j] for j in row], plane.photo, 3, 0.01)
         for view, row in zip(views, ranked, strict=True)
@@ -62,13 +62,13 @@ def test_two_photos_confirm_each_other(plane, views, matched):
 
 
 def test_same_input_gives_the_same_bytes(plane, views, matched):
-    again = match_depths(views[1], [views[j] for j in rank_neighbours(views, 3)[1]], plane.photo, 3, 0.01)
+    again = match_depths(views[1], [views[j] for j in rank_neighbors(views, 3)[1]], plane.photo, 3, 0.01)
 
     assert again.depth.tobytes() == matched[1].depth.tobytes()
     assert again.confidence.tobytes() == matched[1].confidence.tobytes()
 
 
-def test_a_photo_without_neighbours_is_a_value_with_a_reason(plane, views):
+def test_a_photo_without_neighbors_is_a_value_with_a_reason(plane, views):
     assert match_depths(views[0], [], plane.photo, 3, 0.01) == Rejected("no photo shares enough points")
     same_place = match_depths(views[0], [views[0]], plane.photo, 3, 0.01)
     assert same_place == Rejected("same place")
@@ -114,11 +114,11 @@ def test_region_leaves_strays_out():
     assert np.all((high < 1.5) & (high > 1.2))
 
 
-@pytest.mark.parametrize("grey", [0, 255])
-def test_what_is_black_or_blown_out_is_not_made_up_from_what_is_beside_it(plane, views, grey):
+@pytest.mark.parametrize("gray", [0, 255])
+def test_what_is_black_or_blown_out_is_not_made_up_from_what_is_beside_it(plane, views, gray):
     def photo(view):
         pixels = plane.photo(view).clip(20, 235)
-        pixels[:, 120:] = grey
+        pixels[:, 120:] = gray
         return pixels
 
     found = match_depths(views[1], [views[0], views[2]], photo, 2, 0.01)

@@ -14,10 +14,10 @@ SEAM = (np.hypot(ROW - 40, COL - 40) < 22 + REACH_PX - 1) & ~DISC
 
 
 def photo(inside, outside, spread=2.0, seed=0):
-    """A disc of one mean grey on another, with noise or texture of a standard deviation in it."""
+    """A disc of one mean gray on another, with noise or texture of a standard deviation in it."""
     rng = np.random.default_rng(seed)
-    grey = np.where(DISC, rng.normal(inside, spread, DISC.shape), rng.normal(outside, 1.5, DISC.shape))
-    return np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    gray = np.where(DISC, rng.normal(inside, spread, DISC.shape), rng.normal(outside, 1.5, DISC.shape))
+    return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
 
 
 def depths(known):
@@ -51,19 +51,19 @@ def test_nothing_goes_around_a_hole_in_a_surface_of_one_look():
 
 def test_a_narrow_gap_lies_in_a_surface_and_keeps_its_rim():
     crack = np.abs(COL - 40) < REACH_PX
-    grey = np.where(np.abs(COL - 40) < REACH_PX + 4, 60, 200).astype(np.uint8)
+    gray = np.where(np.abs(COL - 40) < REACH_PX + 4, 60, 200).astype(np.uint8)
 
-    np.testing.assert_array_equal(without_spill(depths(~crack), grey), depths(~crack))
+    np.testing.assert_array_equal(without_spill(depths(~crack), gray), depths(~crack))
     broad = np.abs(COL - 40) <= REACH_PX + 1
-    assert np.all(without_spill(depths(~broad), grey)[np.abs(COL - 40) < REACH_PX + 4] == 0)
+    assert np.all(without_spill(depths(~broad), gray)[np.abs(COL - 40) < REACH_PX + 4] == 0)
 
 
 def test_what_is_thin_keeps_what_does_not_look_like_the_empty_side():
     wire, seam = np.abs(COL - 40) <= 1, np.abs(COL - 40) < REACH_PX
-    grey = photo(200, 200)
-    grey[wire] = 120
+    gray = photo(200, 200)
+    gray[wire] = 120
 
-    found = without_spill(depths(seam), grey)
+    found = without_spill(depths(seam), gray)
 
     np.testing.assert_array_equal(found > 0, wire)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_app.settings import DepthSettings
-from sfm_app.stereo import DepthTask, make_on_cpu, method, rank_neighbours
+from sfm_app.stereo import DepthTask, make_on_cpu, method, rank_neighbors
 from sfm_app.types import Rejected
 
 
@@ -50,7 +50,7 @@ def task_for(views, store):
     def one_by_one(function, items, _):
         return [function(item) for item in items]
 
-    return DepthTask(None, views, rank_neighbours(views, 4), DepthSettings(neighbours=2), store, one_by_one)
+    return DepthTask(None, views, rank_neighbors(views, 4), DepthSettings(neighbors=2), store, one_by_one)
 
 
 def test_a_killed_run_goes_on_with_the_photo_it_stopped_at(plane, views):

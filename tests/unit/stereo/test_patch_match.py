@@ -10,7 +10,7 @@ CENTERS = [(0.5, 0, 0), (-0.4, 0.2, 0), (0, 0.5, 0.3)]
 
 @pytest.fixture(scope="module")
 def setting(plane, make_view):
-    """A view, its photo and three neighbours with theirs."""
+    """A view, its photo and three neighbors with theirs."""
     view = make_view((0, 0, 0))
     others = [make_view(center, turn=(0.02, -0.03, 0.05)) for center in CENTERS]
     return view, plane.photo(view), [(other, plane.photo(other)) for other in others]

@@ -12,7 +12,7 @@ WALL = 1 / (0.2 + 2e-4 * COL - 1e-4 * ROW)
 
 
 def paint(texture_from_col: int) -> np.ndarray:
-    """A wall of one colour, with a pattern beside it."""
+    """A wall of one color, with a pattern beside it."""
     rng = np.random.default_rng(1)
     pattern = rng.integers(0, 255, (HEIGHT // 4, WIDTH // 4)).repeat(4, 0).repeat(4, 1)
     return np.where(texture_from_col > COL, 180 + rng.normal(0, 1, COL.shape), pattern).astype(np.uint8)
@@ -55,7 +55,7 @@ def test_nothing_is_carried_beyond_what_is_known():
     [
         WALL * (1 + 0.3 * np.random.default_rng(3).random((HEIGHT, WIDTH))),  # what chance agrees on in a sky
         WALL * (1 + 0.02 * ((COL - 160) / 160) ** 2),  # a round column
-        np.where(COL < 160, WALL, 1.05 * WALL),  # two walls of one colour
+        np.where(COL < 160, WALL, 1.05 * WALL),  # two walls of one color
     ],
     ids=["chance", "bend", "step"],
 )

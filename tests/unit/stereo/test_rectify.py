@@ -53,18 +53,18 @@ sphere = st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)).filter(
 def test_rows_match_and_disparities_follow_depth_whatever_the_motion(direction, turns):
     points = cloud()
     reference = view_at([0, 0, 0], points=points)
-    neighbour = view_at(0.6 * np.array(direction) / np.linalg.norm(direction), turned(*turns))
+    neighbor = view_at(0.6 * np.array(direction) / np.linalg.norm(direction), turned(*turns))
 
-    found = rectify(reference, neighbour)
+    found = rectify(reference, neighbor)
 
     assert isinstance(found, Rectification), found
     left = on_canvas(found, reference, points)
-    right = on_canvas(found, neighbour, points, found.offset_px)
+    right = on_canvas(found, neighbor, points, found.offset_px)
     np.testing.assert_allclose(left[:, 1], right[:, 1], atol=1e-6)
     disparity = left[:, 0] - right[:, 0]
-    both = seen(reference, points) & seen(neighbour, points)
+    both = seen(reference, points) & seen(neighbor, points)
     assert both.sum() > 50
-    to_point, to_other = points - reference.center, points - neighbour.center
+    to_point, to_other = points - reference.center, points - neighbor.center
     cosine = np.sum(to_point * to_other, axis=1) / np.linalg.norm(to_point, axis=1) / np.linalg.norm(to_other, axis=1)
     angle = np.arccos(np.minimum(cosine, 1))
     np.testing.assert_allclose(disparity + found.offset_px, angle * found.columns_per_rad, atol=1e-3)
@@ -76,18 +76,18 @@ def test_rows_match_and_disparities_follow_depth_whatever_the_motion(direction, 
 
 @pytest.mark.parametrize("center", [(0.5, 0, 0), (-0.5, 0, 0), (0, 0.5, 0), (0.02, 0.01, 0.5), (0, 0, -0.5)])
 def test_photos_are_warped_to_where_the_points_are(center):
-    reference, neighbour = view_at([0, 0, 0], points=cloud()), view_at(center, turned(0, 0, 0.1))
-    found = rectify(reference, neighbour)
+    reference, neighbor = view_at([0, 0, 0], points=cloud()), view_at(center, turned(0, 0, 0.1))
+    found = rectify(reference, neighbor)
     point = np.array([[0.5, 0.4, 5.0]])
     photos = []
-    for view in (reference, neighbour):
+    for view in (reference, neighbor):
         x = K @ (view.R @ point[0] + view.t)
         v, u = np.mgrid[:240, :320] + 0.5
         photos.append((250 * np.exp(-((u - x[0] / x[2]) ** 2 + (v - x[1] / x[2]) ** 2) / 18)).astype(np.uint8))
 
-    warped = found.warp(*photos, (reference, neighbour))
+    warped = found.warp(*photos, (reference, neighbor))
 
-    for image, view, shift_px in zip(warped, (reference, neighbour), (0.0, found.offset_px), strict=True):
+    for image, view, shift_px in zip(warped, (reference, neighbor), (0.0, found.offset_px), strict=True):
         y, x = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
         weight = np.where(image > 20, image, 0).astype(float)
         centroid = [np.sum(weight * x), np.sum(weight * y)] / np.sum(weight)

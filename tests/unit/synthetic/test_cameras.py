@@ -11,7 +11,7 @@ from sfm_app.synthetic.cameras import (
     ArcOptions,
     arc,
     axis_rotation,
-    camera_centre,
+    camera_center,
     look_at,
     make_camera,
     orbit,
@@ -25,13 +25,13 @@ COORDINATES = st.floats(-5, 5)
 @given(x=COORDINATES, y=COORDINATES, z=COORDINATES, roll=st.floats(-180, 180))
 @settings(deadline=None)
 def test_a_camera_sees_its_aim_in_the_middle(x, y, z, roll):
-    centre, aim = np.array([0.0, 1.0, 9.0]), np.array([x, y, z])
-    pose = look_at(centre, aim, roll)
+    center, aim = np.array([0.0, 1.0, 9.0]), np.array([x, y, z])
+    pose = look_at(center, aim, roll)
     R, t = pose[:, :3], pose[:, 3]
 
     assert np.allclose(R @ R.T, np.eye(3)) and np.linalg.det(R) == pytest.approx(1.0)
-    assert np.allclose(camera_centre(pose), centre)
-    assert np.allclose(R @ aim + t, [0, 0, np.linalg.norm(aim - centre)], atol=1e-9)
+    assert np.allclose(camera_center(pose), center)
+    assert np.allclose(R @ aim + t, [0, 0, np.linalg.norm(aim - center)], atol=1e-9)
 
 
 def test_without_roll_the_world_stands_upright():
@@ -62,7 +62,7 @@ def test_rays_undo_projection_and_distortion(k1, aspect, width):
 
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(30) + 0.5)
     assert np.allclose(pixels[:, 0], u.ravel(), atol=1e-11) and np.allclose(pixels[:, 1], v.ravel(), atol=1e-11)
-    assert np.all(1 + 3 * k1 * (x * x + y * y) > 0), "the branch through the centre"
+    assert np.all(1 + 3 * k1 * (x * x + y * y) > 0), "the branch through the center"
 
 
 def test_the_sign_of_k1_is_colmaps():
@@ -70,18 +70,18 @@ def test_the_sign_of_k1_is_colmaps():
     assert np.all(cushion < plain) and np.all(plain < barrel)
 
 
-def test_the_ray_through_the_optical_centre_is_the_axis():
-    camera = make_camera(16, 16, centre=(0.53125, 0.53125), radial=-0.1)
+def test_the_ray_through_the_optical_center_is_the_axis():
+    camera = make_camera(16, 16, center=(0.53125, 0.53125), radial=-0.1)
     assert pixel_rays(camera)[8 * 16 + 8].tolist() == [0.0, 0.0, 1.0]
 
 
 @given(share=st.floats(0.5, 1.5).filter(lambda share: abs(share - 1) > 1e-6))
 @settings(deadline=None)
 def test_distortion_that_folds_within_the_photo_is_refused(share):
-    plain = make_camera(40, 30, centre=(0.5, 0.5))
-    rim = np.hypot(19.5 / plain.K[0, 0], 14.5 / plain.K[1, 1])  # the outermost pixel centres
+    plain = make_camera(40, 30, center=(0.5, 0.5))
+    rim = np.hypot(19.5 / plain.K[0, 0], 14.5 / plain.K[1, 1])  # the outermost pixel centers
     folds_at_rim = -4.0 / 27.0 / rim**2
-    camera = make_camera(40, 30, centre=(0.5, 0.5), radial=share * folds_at_rim)
+    camera = make_camera(40, 30, center=(0.5, 0.5), radial=share * folds_at_rim)
     if share > 1:
         with pytest.raises(ConfigError, match="folds within the photo"):
             pixel_rays(camera)
@@ -89,7 +89,7 @@ def test_distortion_that_folds_within_the_photo_is_refused(share):
         assert np.all(np.isfinite(pixel_rays(camera)))
 
 
-def test_the_optical_centre_is_not_the_middle():
+def test_the_optical_center_is_not_the_middle():
     K = make_camera(960, 640).K
     assert abs(K[0, 2] - 480) / 960 == pytest.approx(0.03)
     assert K[0, 0] == pytest.approx(1008.0) and K[0, 1] == 0.0
@@ -98,25 +98,25 @@ def test_the_optical_centre_is_not_the_middle():
 def miss_of_axes(views):
     """(N,) how far each optical axis passes the point that is nearest to all of them."""
     poses = np.array(list(views.cam_from_world.values()))
-    centres = np.array([camera_centre(pose) for pose in poses])
+    centers = np.array([camera_center(pose) for pose in poses])
     axes = poses[:, 2, :3]
     away = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    meeting = np.linalg.solve(away.sum(axis=0), np.einsum("nij,nj->i", away, centres))
-    return np.linalg.norm(np.einsum("nij,nj->ni", away, meeting - centres), axis=1)
+    meeting = np.linalg.solve(away.sum(axis=0), np.einsum("nij,nj->i", away, centers))
+    return np.linalg.norm(np.einsum("nij,nj->ni", away, meeting - centers), axis=1)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_an_arc_is_no_orbit(seed):
     options = ArcOptions()
     views = arc(make_camera(96, 64), options, seed)
-    centres = np.array([camera_centre(pose) for pose in views.cam_from_world.values()])
-    ground_distance = np.hypot(centres[:, 0], centres[:, 2])
+    centers = np.array([camera_center(pose) for pose in views.cam_from_world.values()])
+    ground_distance = np.hypot(centers[:, 0], centers[:, 2])
 
     assert list(views.cam_from_world) == [f"view_{k:02d}.jpg" for k in range(12)] == list(views.cameras)
     assert options.distance[0] <= ground_distance.min() and ground_distance.max() <= options.distance[1]
     assert np.ptp(ground_distance) > 0.7 * np.ptp(options.distance)
-    assert np.ptp(centres[:, 1]) > 0.7 * np.ptp(options.height)
-    azimuth = np.degrees(np.arctan2(centres[:, 0], centres[:, 2]))
+    assert np.ptp(centers[:, 1]) > 0.7 * np.ptp(options.height)
+    azimuth = np.degrees(np.arctan2(centers[:, 0], centers[:, 2]))
     assert np.ptp(azimuth) == pytest.approx(options.sweep_deg)
     assert 0.1 < miss_of_axes(views).mean() < 1.0
 
@@ -126,18 +126,18 @@ def test_in_an_orbit_all_axes_meet_at_one_distance(photos, sweep_deg):
     aim = np.array([0.5, 1.0, -0.3])
     views = orbit(make_camera(96, 64), photos, sweep_deg, distance=4.0, aim=tuple(aim))
     poses = np.array(list(views.cam_from_world.values()))
-    centres = np.array([camera_centre(pose) for pose in poses])
+    centers = np.array([camera_center(pose) for pose in poses])
 
     assert len(poses) == photos and miss_of_axes(views).max() < 1e-9
-    assert np.allclose(np.linalg.norm(centres - aim, axis=1), 4.0) and np.allclose(centres[:, 1], 1.0)
+    assert np.allclose(np.linalg.norm(centers - aim, axis=1), 4.0) and np.allclose(centers[:, 1], 1.0)
     assert np.allclose(poses[:, 1, :3], [0, -1, 0]), "upright"
-    steps = np.linalg.norm(np.diff(centres, axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
     assert np.allclose(steps, 8.0 * np.sin(np.radians(sweep_deg / photos / 2)))
 
 
 def test_an_orbit_leaves_the_focal_undetermined():
     """A wrong focal makes every pair essential as well; on an arc it does not."""
-    K = make_camera(96, 64, centre=(0.5, 0.5)).K
+    K = make_camera(96, 64, center=(0.5, 0.5)).K
     wrong = K.copy()
     wrong[0, 0] *= 1.3
     wrong[1, 1] *= 1.3
@@ -152,7 +152,7 @@ def test_an_orbit_leaves_the_focal_undetermined():
             found.append(s[1] / s[0])
         return min(found)
 
-    camera = make_camera(96, 64, centre=(0.5, 0.5))
+    camera = make_camera(96, 64, center=(0.5, 0.5))
     assert ratio(orbit(camera)) > 1 - 1e-9 > 0.99 > ratio(arc(camera))
 
 
@@ -187,9 +187,9 @@ def test_impossible_cameras_are_refused():
 
 
 def test_a_panorama_is_taken_from_one_spot():
-    views = panorama(make_camera(96, 64), photos=5, step_deg=10.0, centre=(1.0, 2.0, 3.0))
+    views = panorama(make_camera(96, 64), photos=5, step_deg=10.0, center=(1.0, 2.0, 3.0))
     poses = list(views.cam_from_world.values())
     turned = [np.degrees(np.arccos(np.clip(a[2, :3] @ b[2, :3], -1, 1))) for a, b in combinations(poses, 2)]
 
-    assert np.allclose([camera_centre(pose) for pose in poses], [1.0, 2.0, 3.0])
+    assert np.allclose([camera_center(pose) for pose in poses], [1.0, 2.0, 3.0])
     assert 9.0 < min(turned) < 12.0 and 38.0 < max(turned) < 42.0

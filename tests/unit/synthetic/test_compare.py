@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.synthetic.cameras import axis_rotation, make_camera
 from sfm_app.synthetic.compare import (
-    align_centres,
-    centre_error_percent,
+    align_centers,
+    center_error_percent,
     focal_error_percent,
     sample_surface,
     scene_size,
@@ -30,8 +30,8 @@ def random_similarity(rng):
 
 def moved(truth, similarity):
     """The truth as a reconstruction would have it: in a frame of its own."""
-    centres = {name: similarity(c[None])[0] for name, c in truth.centres.items()}
-    return similarity(truth.vertices), truth.faces, centres
+    centers = {name: similarity(c[None])[0] for name, c in truth.centers.items()}
+    return similarity(truth.vertices), truth.faces, centers
 
 
 @pytest.fixture(scope="module")
@@ -44,20 +44,20 @@ def plane_truth(photos):
 def test_errors_of_K_are_those_of_the_thesis(photos):
     truth = photos[1]
     K = truth.K.copy()
-    assert focal_error_percent(K, truth) == centre_error_percent(K, truth) == 0.0
+    assert focal_error_percent(K, truth) == center_error_percent(K, truth) == 0.0
     K[0, 0] *= 1.02
     K[1, 1] *= 0.96
     K[0, 2] *= 0.9
     assert focal_error_percent(K, truth) == pytest.approx(3.0)
-    assert centre_error_percent(K, truth) == pytest.approx(5.0)
+    assert center_error_percent(K, truth) == pytest.approx(5.0)
 
 
 def test_with_several_cameras_K_is_judged_by_its_photo(photos):
     truth = photos[1]
-    tele = make_camera(120, 80, focal_widths=2.1, centre=(0.5, 0.5))
+    tele = make_camera(120, 80, focal_widths=2.1, center=(0.5, 0.5))
     mixed = replace(truth, cameras={**truth.cameras, "view_02.jpg": tele})
 
-    assert focal_error_percent(tele.K, mixed, "view_02.jpg") == centre_error_percent(tele.K, mixed, "view_02.jpg") == 0
+    assert focal_error_percent(tele.K, mixed, "view_02.jpg") == center_error_percent(tele.K, mixed, "view_02.jpg") == 0
     assert focal_error_percent(tele.K, mixed, "view_00.jpg") == pytest.approx(100.0)
     with pytest.raises(ValueError, match="several cameras"):
         focal_error_percent(tele.K, mixed)
@@ -75,7 +75,7 @@ def test_wrong_photos_do_not_spoil_the_alignment(wrong):
     noisy = found + rng.normal(scale=1e-3, size=found.shape)
     noisy[:wrong] += rng.normal(size=(wrong, 3)) * 3
 
-    similarity = align_centres(dict(zip(names, noisy, strict=True)), truth)
+    similarity = align_centers(dict(zip(names, noisy, strict=True)), truth)
 
     error = np.linalg.norm(similarity(noisy[wrong:]) - right[wrong:], axis=1) / true.scale
     assert 2e-4 < np.sqrt(np.mean(error**2)) < 4e-3, "what is left is the noise"
@@ -83,29 +83,29 @@ def test_wrong_photos_do_not_spoil_the_alignment(wrong):
 
 def test_alignment_needs_three_known_photos_off_a_line(photos):
     truth = photos[1]
-    two = dict(list(truth.centres.items())[:2]) | {"stranger.jpg": np.zeros(3)}
-    with pytest.raises(ValueError, match="2 of the found camera centres"):
-        align_centres(two, truth)
-    on_a_line = {name: np.array([float(k), 0.0, 0.0]) for k, name in enumerate(truth.centres)}
+    two = dict(list(truth.centers.items())[:2]) | {"stranger.jpg": np.zeros(3)}
+    with pytest.raises(ValueError, match="2 of the found camera centers"):
+        align_centers(two, truth)
+    on_a_line = {name: np.array([float(k), 0.0, 0.0]) for k, name in enumerate(truth.centers)}
     with pytest.raises(ValueError, match="on a line"):
-        align_centres(on_a_line, truth)
+        align_centers(on_a_line, truth)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_truth_in_another_frame_has_no_error(photos, seed):
-    vertices, faces, centres = moved(photos[1], random_similarity(np.random.default_rng(seed)))
-    assert surface_error(vertices, faces, centres, photos[1]) < 1e-5
-    assert surface_accuracy(vertices, faces, centres, photos[1], tolerance=1e-5) == 1.0
-    assert surface_coverage(vertices, faces, centres, photos[1]) == 1.0
+    vertices, faces, centers = moved(photos[1], random_similarity(np.random.default_rng(seed)))
+    assert surface_error(vertices, faces, centers, photos[1]) < 1e-5
+    assert surface_accuracy(vertices, faces, centers, photos[1], tolerance=1e-5) == 1.0
+    assert surface_coverage(vertices, faces, centers, photos[1]) == 1.0
 
 
 @pytest.mark.parametrize("offset", [0.01, 0.1])
 def test_the_error_is_the_distance_over_the_scene_size(plane_truth, offset):
     raised = plane_truth.vertices + np.array([0.0, offset, 0.0])
-    error = surface_error(raised, plane_truth.faces, plane_truth.centres, plane_truth)
+    error = surface_error(raised, plane_truth.faces, plane_truth.centers, plane_truth)
     assert error == pytest.approx(offset / scene_size(plane_truth), rel=1e-3)
-    assert surface_coverage(raised, plane_truth.faces, plane_truth.centres, plane_truth, tolerance=error * 1.01) == 1.0
-    assert surface_coverage(raised, plane_truth.faces, plane_truth.centres, plane_truth, tolerance=error * 0.99) == 0.0
+    assert surface_coverage(raised, plane_truth.faces, plane_truth.centers, plane_truth, tolerance=error * 1.01) == 1.0
+    assert surface_coverage(raised, plane_truth.faces, plane_truth.centers, plane_truth, tolerance=error * 0.99) == 0.0
 
 
 def test_accuracy_is_the_share_of_the_area_that_is_near(plane_truth):
@@ -114,15 +114,15 @@ def test_accuracy_is_the_share_of_the_area_that_is_near(plane_truth):
     above = np.array([0.0, 0.006 * size, 0.0]), np.array([0.0, 0.004 * size, 0.0])
     vertices = np.concatenate([plane_truth.vertices + offset for offset in above])
     faces = np.concatenate([plane_truth.faces[:1], plane_truth.faces + 4])
-    assert surface_accuracy(vertices, faces, plane_truth.centres, plane_truth) == pytest.approx(2 / 3, abs=0.02)
-    assert surface_accuracy(vertices, faces, plane_truth.centres, plane_truth, tolerance=0.0061) == 1.0
-    assert surface_accuracy(vertices, faces, plane_truth.centres, plane_truth, tolerance=0.0039) == 0.0
+    assert surface_accuracy(vertices, faces, plane_truth.centers, plane_truth) == pytest.approx(2 / 3, abs=0.02)
+    assert surface_accuracy(vertices, faces, plane_truth.centers, plane_truth, tolerance=0.0061) == 1.0
+    assert surface_accuracy(vertices, faces, plane_truth.centers, plane_truth, tolerance=0.0039) == 0.0
 
 
 def test_coverage_tells_half_a_surface_from_a_whole_one(plane_truth):
     half = plane_truth.faces[:1]
-    assert surface_error(plane_truth.vertices, half, plane_truth.centres, plane_truth) < 1e-6
-    assert 0.3 < surface_coverage(plane_truth.vertices, half, plane_truth.centres, plane_truth, tolerance=1e-4) < 0.7
+    assert surface_error(plane_truth.vertices, half, plane_truth.centers, plane_truth) < 1e-6
+    assert 0.3 < surface_coverage(plane_truth.vertices, half, plane_truth.centers, plane_truth, tolerance=1e-4) < 0.7
 
 
 def test_the_scene_is_what_the_photos_see(photos, plane_truth):
@@ -153,8 +153,8 @@ def test_a_surface_without_area_is_refused(photos):
     truth = photos[1]
     nothing = np.zeros((0, 3), dtype=np.int64)
     with pytest.raises(ValueError, match="no area"):
-        surface_error(truth.vertices, nothing, truth.centres, truth)
+        surface_error(truth.vertices, nothing, truth.centers, truth)
     with pytest.raises(ValueError, match="no area"):
-        surface_accuracy(truth.vertices, nothing, truth.centres, truth)
+        surface_accuracy(truth.vertices, nothing, truth.centers, truth)
     with pytest.raises(ValueError, match="no area"):
-        surface_coverage(truth.vertices, nothing, truth.centres, truth)
+        surface_coverage(truth.vertices, nothing, truth.centers, truth)

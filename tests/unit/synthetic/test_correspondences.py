@@ -165,11 +165,11 @@ def test_another_focal_length_spoils_the_pairs_of_the_last_camera_only():
 def test_the_setups_are_those_of_the_thesis(seed):
     tracks = make_tracks(TrackOptions(), seed)
     axes = tracks.R[:, 2]
-    centres = -np.einsum("cij,ci->cj", tracks.R, tracks.t)
+    centers = -np.einsum("cij,ci->cj", tracks.R, tracks.t)
 
     assert tracks.x.shape == (5, 200, 2) and len(tracks.X) == 200
-    assert np.degrees(np.arccos(axes @ [0, 0, 1])).max() <= 30 and np.linalg.norm(centres, axis=1).max() <= 0.6
-    assert np.ptp(centres, axis=0).min() > 0.05, "they moved in every direction"
+    assert np.degrees(np.arccos(axes @ [0, 0, 1])).max() <= 30 and np.linalg.norm(centers, axis=1).max() <= 0.6
+    assert np.ptp(centers, axis=0).min() > 0.05, "they moved in every direction"
     assert len({make_tracks(TrackOptions(points=8), n).K[0, 0, 0] for n in range(4)}) == 4, "each setup has its own K"
 
 

@@ -75,7 +75,7 @@ def test_truth_file_says_x_is_K_RX_plus_t(photos, tmp_path):
 
     assert first["file"] == "view_00.jpg" and (first["width"], first["height"]) == (120, 80)
     assert h[2] > 0 and 0 < h[0] / h[2] < 120 and 0 < h[1] / h[2] < 80, "the ball is in the photo"
-    assert np.allclose(truth.centres["view_00.jpg"], -np.array(first["R"]).T @ first["t"])
+    assert np.allclose(truth.centers["view_00.jpg"], -np.array(first["R"]).T @ first["t"])
 
 
 def test_every_photo_is_taken_with_its_own_camera(photos, still_life, four_views, tmp_path):
@@ -93,10 +93,10 @@ def test_every_photo_is_taken_with_its_own_camera(photos, still_life, four_views
 
 
 def test_noise_is_the_injected_noise():
-    grey = np.full((200, 200, 3), 0.2)
+    gray = np.full((200, 200, 3), 0.2)
     for noise in (0.8, 3.0):
-        levels = develop(grey, PhotoOptions(noise=noise, blur_px=1.0), np.random.default_rng(0)).astype(float)
-        # rounding to grey levels adds 1/12
+        levels = develop(gray, PhotoOptions(noise=noise, blur_px=1.0), np.random.default_rng(0)).astype(float)
+        # rounding to gray levels adds 1/12
         assert levels.std() == pytest.approx(np.hypot(noise, np.sqrt(1 / 12)), rel=0.02)
         assert levels.mean() == pytest.approx(255 * 0.2 ** (1 / 2.2), abs=0.1)
 

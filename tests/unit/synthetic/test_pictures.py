@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.synthetic.cameras import Camera, camera_centre, look_at, make_camera
+from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera
 from sfm_app.synthetic.pictures import (
     beside_photo,
     prepare_model,
@@ -32,7 +32,7 @@ def textured(page, *, pages=1):
     return Model(square(), Texture(uv, np.full(2, pages - 1, np.int32), (np.zeros_like(page),) * (pages - 1) + (page,)))
 
 
-def test_a_model_without_texture_has_the_colours_of_its_vertices():
+def test_a_model_without_texture_has_the_colors_of_its_vertices():
     picture = render_model(Model(square()), CAMERA, STRAIGHT)
     assert np.array_equal(picture.covered, np.arange(40)[None, :].repeat(20, axis=0) >= 20)
     share = (np.arange(20) + 0.5) / 20
@@ -50,12 +50,12 @@ def test_a_page_of_the_size_of_its_pixels_is_shown_texel_by_texel(pages):
     assert np.abs(picture.colors[:, 20:].astype(int) - np.roll(page, 1, axis=1)).mean() > 40
 
 
-def test_texels_are_mixed_between_their_centres_and_repeated_at_the_border():
+def test_texels_are_mixed_between_their_centers_and_repeated_at_the_border():
     page = np.zeros((1, 2, 3), np.uint8)
     page[0, 1] = 200
     row = render_model(textured(page), CAMERA, STRAIGHT).colors[10, 20:, 0].astype(float)
     expected = 200 * np.clip(2 * (np.arange(20) + 0.5) / 20 - 0.5, 0, 1)
-    assert np.allclose(row, expected, atol=4), "the centres of the two texels lie at 1/4 and 3/4"
+    assert np.allclose(row, expected, atol=4), "the centers of the two texels lie at 1/4 and 3/4"
 
 
 def test_the_lens_bends_the_picture():
@@ -74,12 +74,12 @@ def test_any_rays_give_the_picture_of_their_camera():
     assert np.array_equal(same.colors, render_model(model, CAMERA, STRAIGHT).colors)
 
 
-def test_the_bare_shape_is_grey_outside_and_reddish_inside():
+def test_the_bare_shape_is_gray_outside_and_reddish_inside():
     outside = render_shape(Model(square()), CAMERA, STRAIGHT)
     inside = render_shape(Model(square(FACES[:, ::-1])), CAMERA, STRAIGHT)
     assert np.array_equal(outside.covered, inside.covered)
-    grey, red = outside.colors[outside.covered], inside.colors[inside.covered]
-    assert np.all(grey[:, 0] == grey[:, 1]) and np.all(grey[:, 0] == grey[:, 2])
+    gray, red = outside.colors[outside.covered], inside.colors[inside.covered]
+    assert np.all(gray[:, 0] == gray[:, 1]) and np.all(gray[:, 0] == gray[:, 2])
     assert np.all(red[:, 0].astype(int) > red[:, 1].astype(int) + 20)
 
 
@@ -127,7 +127,7 @@ def test_walking_around_keeps_height_distance_and_what_is_in_the_middle(angle_de
     middle = pose[:, :3].T @ (np.array([0.0, 0.0, depth]) - pose[:, 3])
 
     assert walked[:, :3] @ middle + walked[:, 3] == pytest.approx([0.0, 0.0, depth])
-    before, after = camera_centre(pose) - middle, camera_centre(walked) - middle
+    before, after = camera_center(pose) - middle, camera_center(walked) - middle
     assert after[1] == pytest.approx(before[1]) and np.linalg.norm(after) == pytest.approx(np.linalg.norm(before))
     turned = before[[0, 2]] @ after[[0, 2]] / np.linalg.norm(before[[0, 2]]) ** 2
     assert turned == pytest.approx(np.cos(np.radians(angle_deg)), abs=1e-9)

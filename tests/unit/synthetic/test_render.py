@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.synthetic.bodies import Body, SyntheticScene
-from sfm_app.synthetic.cameras import Camera, camera_centre, look_at, make_camera, pixel_rays
+from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera, pixel_rays
 from sfm_app.synthetic.render import cast, prepare, ray_caster, render_scene
 from sfm_app.synthetic.shapes import box
 from sfm_app.synthetic.textures import Material
@@ -22,11 +22,11 @@ def test_two_views_show_the_same_surface_in_the_right_pixels(prepared, still_lif
     first, second = (render_scene(prepared, camera, pose, supersampling=3) for pose in poses)
     directions = pixel_rays(camera) @ poses[0][:, :3]
     caster = ray_caster(still_life.vertices, still_life.faces)
-    hits = cast(caster, camera_centre(poses[0]), directions)
+    hits = cast(caster, camera_center(poses[0]), directions)
     hit = np.isfinite(hits["t_hit"])
-    points = camera_centre(poses[0]) + directions[hit] * hits["t_hit"][hit, None]
+    points = camera_center(poses[0]) + directions[hit] * hits["t_hit"][hit, None]
     h = (points @ poses[1][:, :3].T + poses[1][:, 3]) @ camera.K.T
-    x2 = h[:, :2] / h[:, 2:] - 0.5  # to array indices, pixel centres being at +0.5
+    x2 = h[:, :2] / h[:, 2:] - 0.5  # to array indices, pixel centers being at +0.5
 
     def mismatch(dx, dy):
         shifted = x2 + np.array([dx, dy])
@@ -43,8 +43,8 @@ def test_two_views_show_the_same_surface_in_the_right_pixels(prepared, still_lif
     assert all(mismatch(dx, dy) > 1.2 * best for dx, dy in [(0.5, 0), (-0.5, 0), (0, 0.5), (0, -0.5)])
 
 
-def test_a_pixel_is_seen_through_its_centre():
-    """A wall whose edges lie at x = 10.25 and 30.75, y = 4.25 and 15.75 pixels covers whole pixels by their centres."""
+def test_a_pixel_is_seen_through_its_center():
+    """A wall whose edges lie at x = 10.25 and 30.75, y = 4.25 and 15.75 pixels covers whole pixels by their centers."""
     white = Material(pattern="stone", base=(230, 230, 230), second=(230, 230, 230), joint=(230, 230, 230))
     wall = box(20.5, 11.5, 1.0, spacing=50.0).moved((-4.5, -15.75 + 15.0, -20.5))
     scene = prepare(SyntheticScene("wall", (Body(wall, white),), to_light=(0.0, 0.0, 1.0)))
@@ -87,7 +87,7 @@ def test_bodies_of_one_material_have_their_own_stains():
     white = Material(pattern="stone", base=(200, 200, 200), second=(100, 100, 100))
     twins = tuple(Body(box(1.0, 1.0, 1.0).moved((x, 0.0, 0.0)), white) for x in (-0.5, 0.5))
     pose = look_at(np.array([0.0, 0.5, 9.0]), np.array([0.0, 0.5, 0.0]))
-    camera = make_camera(200, 100, focal_widths=3.0, centre=(0.5, 0.5))
+    camera = make_camera(200, 100, focal_widths=3.0, center=(0.5, 0.5))
     image = render_scene(prepare(SyntheticScene("twins", twins, to_light=(0.0, 0.0, 1.0))), camera, pose)[..., 1]
     left, right = image[30:70, 30:60], image[30:70, 101:131]  # one unit is 71 pixels
     assert left.std() > 0.01 and abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 0.5
@@ -99,9 +99,9 @@ def test_rendering_repeats_to_the_bit(prepared, four_views):
     assert render_scene(prepared, camera, pose).tobytes() == render_scene(prepared, camera, pose).tobytes()
 
 
-def test_distortion_moves_the_rim_but_not_the_centre(prepared, four_views):
+def test_distortion_moves_the_rim_but_not_the_center(prepared, four_views):
     pose = next(iter(four_views.cam_from_world.values()))
-    plain = make_camera(120, 80, centre=(0.5, 0.5))
+    plain = make_camera(120, 80, center=(0.5, 0.5))
     barrel = Camera(plain.K, 120, 80, radial=-0.4)
     difference = np.abs(render_scene(prepared, plain, pose) - render_scene(prepared, barrel, pose)).mean(axis=2)
     assert difference[38:42, 58:62].mean() < 0.3 * difference[:, :10].mean()

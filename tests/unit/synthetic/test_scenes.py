@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfm_app.errors import ConfigError
-from sfm_app.synthetic.cameras import PastOptions, camera_centre, make_camera, past, pixel_rays
+from sfm_app.synthetic.cameras import PastOptions, camera_center, make_camera, past, pixel_rays
 from sfm_app.synthetic.corner import PLASTER, corner
 from sfm_app.synthetic.render import GAMMA, cast, prepare, ray_caster, render_scene
 from sfm_app.synthetic.scenes import WALKS, build_scene, scene_views
@@ -55,7 +55,7 @@ def test_waves_have_unit_variance_and_a_seed():
 
 
 def test_the_bust_has_a_face_at_the_front_only():
-    """The nose stands out towards +z by some centimetres; hair and cloth are rough, the face is smooth."""
+    """The nose stands out towards +z by some centimeters; hair and cloth are rough, the face is smooth."""
 
     def depth(x, y, side):
         z = np.linspace(0.6, 0.0, 1201)
@@ -77,27 +77,27 @@ def test_photos_look_at_their_scene_from_outside_of_it(name):
         camera = views.cameras[photo]
         assert 1000 <= max(camera.width, camera.height) <= 1200
         coarse = type(camera)(np.diag([0.05, 0.05, 1.0]) @ camera.K, camera.width // 20, camera.height // 20)
-        hits = cast(caster, camera_centre(pose), pixel_rays(coarse) @ pose[:, :3])
+        hits = cast(caster, camera_center(pose), pixel_rays(coarse) @ pose[:, :3])
         depth = hits["t_hit"][np.isfinite(hits["t_hit"])]
         assert 0.35 < np.isfinite(hits["t_hit"]).mean() <= 1.0, "the scene fills a good part of every photo"
         assert depth.min() > 0.5, "nobody stands in a wall"
 
 
 def test_the_statue_is_seen_all_round_and_the_facade_from_the_street():
-    eyes = np.array([camera_centre(pose) for pose in scene_views("statue").cam_from_world.values()])
+    eyes = np.array([camera_center(pose) for pose in scene_views("statue").cam_from_world.values()])
     around = np.sort(np.degrees(np.arctan2(eyes[:, 0], eyes[:, 2])))
     assert max(np.diff(around).max(), 360 - np.ptp(around)) < 25
-    along = np.array([camera_centre(pose) for pose in scene_views("facade").cam_from_world.values()])
+    along = np.array([camera_center(pose) for pose in scene_views("facade").cam_from_world.values()])
     assert np.ptp(along[:, 0]) > 7 and along[:, 2].min() > 5 and np.all(np.diff(along[:, 0]) > 0)
 
 
 def test_the_plain_wall_is_plain_but_not_even():
-    """Grey levels that differ by about the noise of a photo, where the paper on the other wall differs by far more."""
+    """Gray levels that differ by about the noise of a photo, where the paper on the other wall differs by far more."""
     scene = corner()
     prepared, pose = prepare(scene), next(iter(scene_views("corner").cam_from_world.values()))
     camera = make_camera(288, 192, focal_widths=0.9)
     levels = 255 * np.clip(render_scene(prepared, camera, pose, supersampling=1), 0, 1) ** (1 / GAMMA)
-    hits = cast(prepared.rays, camera_centre(pose), pixel_rays(camera) @ pose[:, :3])
+    hits = cast(prepared.rays, camera_center(pose), pixel_rays(camera) @ pose[:, :3])
     seen = np.isfinite(hits["t_hit"])
     body = np.full(seen.shape, -1)
     body[seen] = prepared.face_material[hits["primitive_ids"][seen]]
@@ -112,7 +112,7 @@ def test_the_plain_wall_is_plain_but_not_even():
 def test_a_walk_past_a_wall_turns_its_head():
     views = past(make_camera(120, 80), PastOptions(photos=8, length=6.0), seed=1)
     poses = np.array(list(views.cam_from_world.values()))
-    eyes = np.array([camera_centre(pose) for pose in poses])
+    eyes = np.array([camera_center(pose) for pose in poses])
     assert np.allclose(np.diff(eyes[:, 0]), 6.0 / 7) and np.all((eyes[:, 2] > 5) & (eyes[:, 2] < 7))
     ways = poses[:, 2, :3]
     angles = np.degrees(np.arccos(np.clip(ways @ ways.T, -1, 1)))

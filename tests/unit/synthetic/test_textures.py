@@ -12,11 +12,11 @@ PLACES = st.floats(-100, 100)
 
 def test_lattice_values_are_uniform_and_unrelated():
     values = np.array([lattice(i, j, -i, 5) for i in range(-40, 40) for j in range(50)])
-    neighbours = np.array([lattice(i + 1, j, -i - 1, 5) for i in range(-40, 40) for j in range(50)])
+    neighbors = np.array([lattice(i + 1, j, -i - 1, 5) for i in range(-40, 40) for j in range(50)])
 
     assert values.min() >= 0 and values.max() < 1
     assert np.allclose(np.quantile(values, [0.25, 0.5, 0.75]), [0.25, 0.5, 0.75], atol=0.03)
-    assert abs(np.corrcoef(values, neighbours)[0, 1]) < 0.05
+    assert abs(np.corrcoef(values, neighbors)[0, 1]) < 0.05
 
 
 @given(x=PLACES, y=PLACES, z=PLACES)
@@ -48,8 +48,8 @@ def test_octaves_fade_out_without_a_jump():
 
 
 def test_bricks_are_laid_in_running_bond():
-    centre, name = bricks(1.0, 0.5, 0)
-    assert centre == pytest.approx(0.5) and bricks(1.9, 0.9, 0)[1] == name
+    center, name = bricks(1.0, 0.5, 0)
+    assert center == pytest.approx(0.5) and bricks(1.9, 0.9, 0)[1] == name
     assert bricks(0.0, 0.5, 0)[0] == pytest.approx(0.0), "a joint between two bricks of row 0"
     assert bricks(0.0, 1.5, 0)[0] == pytest.approx(0.5), "the middle of a brick of row 1"
     assert bricks(2.5, 0.5, 0)[1] != name
@@ -76,7 +76,7 @@ def test_patterns_mix_within_range_and_vary(pattern):
     assert not np.allclose(mixed[:, 2], elsewhere[:, 2]), "two bodies of one material differ"
 
 
-def test_material_colours_are_linear():
+def test_material_colors_are_linear():
     row = Material(pattern="wood", base=(255, 0, 128), second=(0, 0, 0)).row(seed=7)
     assert row.shape == (13,)
     assert row[:4].tolist() == [PATTERNS.index("wood"), 0.3, 0.5, 7]

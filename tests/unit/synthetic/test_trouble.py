@@ -6,7 +6,7 @@ from PIL import Image
 
 from sfm_app.errors import InputError
 from sfm_app.synthetic.bodies import Body
-from sfm_app.synthetic.cameras import Views, camera_centre, make_camera, pixel_rays
+from sfm_app.synthetic.cameras import Views, camera_center, make_camera, pixel_rays
 from sfm_app.synthetic.strewn import faded, moving_thing, twins
 from sfm_app.synthetic.trouble import (
     KINDS,
@@ -82,15 +82,15 @@ def test_cameras_are_those_of_the_trouble():
 def test_a_way_straight_ahead_and_one_to_the_side():
     for walk, axis in (("forward", 2), ("sideways", 0)):
         plan = plan_with(walk)
-        centres = np.array([camera_centre(pose) for pose in plan.views.cam_from_world.values()])
+        centers = np.array([camera_center(pose) for pose in plan.views.cam_from_world.values()])
         ahead = np.array([pose[2, :3] for pose in plan.views.cam_from_world.values()])
-        span = np.ptp(centres, axis=0)
+        span = np.ptp(centers, axis=0)
         assert span[axis] > 10 * np.delete(span, axis).max()
         assert (ahead @ [0.0, 0.0, -1.0]).min() > 0.98
 
 
 def test_a_lens_pushes_the_farthest_corner_by_what_is_asked_and_zooming_keeps_the_bend():
-    camera = bent(make_camera(640, 480, 1.0, centre=(0.4, 0.55)), -0.08)
+    camera = bent(make_camera(640, 480, 1.0, center=(0.4, 0.55)), -0.08)
     corner = np.array([640.0, 0.0])
     seen = (corner - camera.K[:2, 2]) / camera.K[0, 0]
 
@@ -123,7 +123,7 @@ def test_what_moves_is_seen_elsewhere_and_the_rest_stays(tmp_path):
     plan = small(plan_with("moving object"), photos=1)
     name = "view_00.jpg"
     R, t = plan.views.cam_from_world[name][:, :3], plan.views.cam_from_world[name][:, 3]
-    ahead = camera_centre(plan.views.cam_from_world[name]) + 1.5 * R[2] - 0.4 * np.array([0.0, 1.0, 0.0])
+    ahead = camera_center(plan.views.cam_from_world[name]) + 1.5 * R[2] - 0.4 * np.array([0.0, 1.0, 0.0])
     still = replace(plan, spoiling=replace(plan.spoiling, thing=None, blur_px={}, defocus_px={}))
     moving = replace(
         plan,

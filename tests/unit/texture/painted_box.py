@@ -42,13 +42,13 @@ def around(count=9, size=(320, 240), height=1.6, k1=-0.05):
     """Photos from a circle above the box: its bottom is never seen."""
     views = []
     for angle in 2 * np.pi * np.arange(count) / count:
-        centre = np.array([4.0 * np.cos(angle), height, 4.0 * np.sin(angle)])
-        forward = -centre / np.linalg.norm(centre)
+        center = np.array([4.0 * np.cos(angle), height, 4.0 * np.sin(angle)])
+        forward = -center / np.linalg.norm(center)
         right = np.cross(forward, [0.0, 1.0, 0.0])
         right /= np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
         lens = (1.3 * size[0], 1.3 * size[0], size[0] / 2 + 3.0, size[1] / 2 - 2.0, k1, 0.01, 0.0, 0.0)
-        views.append(PhotoView(f"{len(views):03}.png", lens, np.column_stack([R, -R @ centre]), *size))
+        views.append(PhotoView(f"{len(views):03}.png", lens, np.column_stack([R, -R @ center]), *size))
     return views
 
 
@@ -63,11 +63,11 @@ def photograph(view):
         r2 = np.sum(plane**2, axis=1, keepdims=True)
         plane = distorted / (1 + k1 * r2 + k2 * r2**2)
     ways = np.column_stack([plane, np.ones(len(plane))]) @ view.cam_from_world[:, :3]
-    near, far = (-HALF - view.centre) / ways, (HALF - view.centre) / ways
+    near, far = (-HALF - view.center) / ways, (HALF - view.center) / ways
     enter, leave = np.minimum(near, far).max(axis=1), np.maximum(near, far).min(axis=1)
     photo = np.full((len(ways), 3), float(BACKGROUND))
     hit = enter < leave
-    photo[hit] = paint_at(view.centre + enter[hit, None] * ways[hit])
+    photo[hit] = paint_at(view.center + enter[hit, None] * ways[hit])
     return np.round(photo).astype(np.uint8).reshape(view.height, view.width, 3)
 
 
@@ -107,7 +107,7 @@ def one_by_one(function, items, label):
 
 
 def on_surface(model, count=4000, seed=0, among=None):
-    """Random points of a textured surface: their triangles, their places (N, 3), and the texture's colours there."""
+    """Random points of a textured surface: their triangles, their places (N, 3), and the texture's colors there."""
     rng = np.random.default_rng(seed)
     faces = rng.choice(np.arange(len(model.surface.faces)) if among is None else np.flatnonzero(among), count)
     parts = rng.dirichlet([1.0, 1.0, 1.0], count)

@@ -37,17 +37,17 @@ def plain():
     return textured(Album())
 
 
-def test_every_point_has_its_colour(plain):
+def test_every_point_has_its_color(plain):
     model, figures = plain
     wrong = errors(model)
     assert np.median(wrong) < 2.0
     assert np.quantile(wrong, 0.99) < 6.0
-    assert 200 < figures["unseen_triangles"] < 400  # the bottom has 288; its neighbours may be seen too obliquely
+    assert 200 < figures["unseen_triangles"] < 400  # the bottom has 288; its neighbors may be seen too obliquely
     assert figures["strange_views_of_triangles"] == 0
     assert np.abs(np.array(list(figures["gains"].values())) - 1.0).max() < 0.01
 
 
-def test_vertices_get_the_photos_colours(plain):
+def test_vertices_get_the_photos_colors(plain):
     model, _ = plain
     above = model.surface.vertices[:, 1] > -0.99 * HALF[1]
     wrong = np.abs(model.surface.colors[above] - paint_at(model.surface.vertices[above])).max(axis=1)
@@ -147,7 +147,7 @@ def test_unseen_triangles_look_like_what_is_around_them(plain):
     rim = model.surface.colors[np.isclose(model.surface.vertices[:, 1], -HALF[1])]
     assert colors.min() > rim.min() - 3
     assert colors.max() < rim.max() + 3
-    assert colors.std(axis=0).min() > 3.0  # not one flat colour
+    assert colors.std(axis=0).min() > 3.0  # not one flat color
 
 
 def test_unseen_triangles_can_be_cut(plain):
@@ -187,7 +187,7 @@ def test_a_photo_that_is_gone_is_counted():
     assert np.quantile(errors(model), 0.99) < 8.0
 
 
-def test_without_any_photo_the_old_colours_remain():
+def test_without_any_photo_the_old_colors_remain():
     lost = tuple(view.name for view in VIEWS)
     model, figures = textured(Album(lost=lost))
     assert figures["unseen_triangles"] == len(BOX.faces)
@@ -196,9 +196,9 @@ def test_without_any_photo_the_old_colours_remain():
 
 
 def test_an_occluder_leaves_no_print():
-    """A board between one camera and the box: the box must not show the board's colour."""
+    """A board between one camera and the box: the box must not show the board's color."""
     views = VIEWS
-    board_at = views[4].centre * 0.6
+    board_at = views[4].center * 0.6
     side = np.cross(board_at, [0.0, 1.0, 0.0])
     side *= 0.25 / np.linalg.norm(side)
     up = np.array([0.0, 0.25, 0.0])
@@ -212,7 +212,7 @@ def test_an_occluder_leaves_no_print():
     rectangle = (slice(int(y.min()), int(y.max()) + 1), slice(int(x.min()), int(x.max()) + 1))
     model, _ = textured(Album(passers_by={views[4].name: rectangle}), surface=surface, views=views[3:6])
     among = np.concatenate([seen_part(replace(model, surface=BOX)), np.zeros(4, bool)])
-    _, points, colors = on_surface(model, among=among & (surface.vertices[faces].mean(axis=1) @ views[4].centre > 0.5))
+    _, points, colors = on_surface(model, among=among & (surface.vertices[faces].mean(axis=1) @ views[4].center > 0.5))
     assert np.quantile(np.abs(colors - paint_at(points)).max(axis=1), 0.97) < 12.0
 
 

@@ -51,7 +51,7 @@ def test_projection_is_opencvs():
     expected = cv2.projectPoints(points, rotation, shift, K, np.array(lens[4:]))[0][:, 0]
     found = np.array([project(view.row, *point) for point in points])
     np.testing.assert_allclose(found[:, :2], expected, atol=1e-9)
-    behind = view.centre - 3 * view.cam_from_world[2, :3]
+    behind = view.center - 3 * view.cam_from_world[2, :3]
     assert project(view.row, *behind)[2] == 0.0
 
 
@@ -68,7 +68,7 @@ def test_other_camera_models_are_refused():
         photo_view("a", camera, np.eye(3, 4))
 
 
-def test_sampling_is_linear_between_pixel_centres():
+def test_sampling_is_linear_between_pixel_centers():
     y, x = np.mgrid[:5, :7]
     photo = np.stack([10 * x, 20 * y, x + y], axis=2).astype(np.uint8)
     assert sample(photo, 2.75, 3.25, 0) == pytest.approx(22.5)
@@ -124,17 +124,17 @@ def test_strangers_are_areas_not_specks():
     rng = np.random.default_rng(5)
     count = len(mesh.faces)
     colors = (120 + rng.normal(0, 5, (4, count, 3))).astype(np.uint8)
-    centres = mesh.vertices[mesh.faces].mean(axis=1)
-    person = np.linalg.norm(centres - [1.0, 0.1, 0.1], axis=1) < 0.35
+    centers = mesh.vertices[mesh.faces].mean(axis=1)
+    person = np.linalg.norm(centers - [1.0, 0.1, 0.1], axis=1) < 0.35
     colors[2, person] = (20, 160, 220)
-    speck = int(np.argmax(centres[:, 1]))
+    speck = int(np.argmax(centers[:, 1]))
     colors[1, speck] = 200
     seen = np.ones((4, count), bool)
-    found = strangers(colors, np.ones((4, 3)), seen, mesh.neighbours)
+    found = strangers(colors, np.ones((4, 3)), seen, mesh.neighbors)
     assert found[2, person].all()
     assert 0 < found[2].sum() - person.sum() < 0.6 * person.sum()  # a rim around it, no more
     assert not found[[0, 1, 3]].any()
-    two = strangers(colors[1:3], np.ones((2, 3)), seen[:2], mesh.neighbours)
+    two = strangers(colors[1:3], np.ones((2, 3)), seen[:2], mesh.neighbors)
     assert not two.any()
 
 
@@ -146,7 +146,7 @@ def energy(chosen, worth, mesh):
     size = np.sqrt(0.5 / (np.sqrt(3) / 4 * mesh.spacing**2))
     corners = mesh.vertices[mesh.faces]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2) / mesh.spacing
-    beside = mesh.neighbours
+    beside = mesh.neighbors
     cut = (beside != NONE) & (chosen[beside] != chosen[:, None])
     return PRICE_OF_DETAIL * size * np.minimum(lost, 3.0).sum() + (lengths * cut).sum() / 2
 
@@ -171,13 +171,13 @@ def test_photos_that_must_not_be_used_are_not():
     assert (found[3:] != NONE).all()
 
 
-def test_specks_go_over_to_their_neighbours():
+def test_specks_go_over_to_their_neighbors():
     mesh = facets(box(6))
     chosen = np.zeros(len(mesh.faces), np.int32)
     chosen[100], chosen[200] = 1, 1
     usable = np.ones((2, len(chosen)), bool)
     usable[0, 200] = False
-    found = without_specks(chosen, usable, mesh.neighbours)
+    found = without_specks(chosen, usable, mesh.neighbors)
     assert np.flatnonzero(found).tolist() == [200]
 
 
@@ -187,12 +187,12 @@ def test_specks_go_over_to_their_neighbours():
 def test_components_hang_together():
     mesh = strip(4)
     group = np.array([0, 0, 1, 1, 0, 0, 1, NONE], np.int64)
-    of, count = components(group, mesh.neighbours)
+    of, count = components(group, mesh.neighbors)
     assert count == 3
     assert of.tolist() == [0, 0, 1, 2, 0, 0, 1, NONE]
 
 
-def test_a_fold_is_found_and_neighbours_are_not():
+def test_a_fold_is_found_and_neighbors_are_not():
     corners = np.array([[[0, 0], [9, 0], [9, 9]], [[0, 0], [9, 9], [0, 9]], [[2, 1], [8, 1], [8, 7]]], float)
     assert folds(np.array([0, 0, 0], np.int32), 1, corners + 0.3).tolist() == [False, False, True]
     assert not folds(np.array([0, 0, 1], np.int32), 2, corners + 0.3).any()
@@ -222,7 +222,7 @@ def test_packed_charts_keep_their_distance(seed, count, page_px, pages):
     assert max(int(page.max()) for page in taken) == 1
 
 
-def test_squares_show_three_colours_exactly():
+def test_squares_show_three_colors_exactly():
     rng = np.random.default_rng(2)
     colors = rng.uniform(60, 190, (5, 3, 3))
     texels = square_texels(colors).astype(float)
@@ -241,7 +241,7 @@ def test_squares_never_share_a_texel():
         assert (here[:, 1].max() + 2, here[:, 2].max() + 2) == (width, height)
 
 
-def test_background_takes_the_colour_next_to_it():
+def test_background_takes_the_color_next_to_it():
     page = np.zeros((64, 48, 3), np.uint8)
     painted = np.zeros((64, 48), bool)
     page[:20, :10], painted[:20, :10] = 200, True
@@ -253,7 +253,7 @@ def test_background_takes_the_colour_next_to_it():
     assert filled.min() >= 60
 
 
-# blending and levelling
+# blending and leveling
 
 
 def test_weights_blend_near_the_seam_only():
@@ -270,7 +270,7 @@ def test_weights_blend_near_the_seam_only():
     assert (np.diff(first[:13]) <= 1e-9).all()
 
 
-def test_levelling_takes_the_step_out_of_a_seam():
+def test_leveling_takes_the_step_out_of_a_seam():
     mesh = strip(40)
     chosen = np.tile((np.arange(40) >= 20).astype(np.int32), 2)
     usable = np.ones((2, 80), bool)

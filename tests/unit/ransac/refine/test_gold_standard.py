@@ -39,7 +39,7 @@ def cost(points, F, scale=np.inf):
 
 @pytest.mark.parametrize("scale", [np.inf, 0.01])
 @pytest.mark.parametrize("seed", range(4))
-def test_no_neighbour_of_rank_two_is_better(seed, scale):
+def test_no_neighbor_of_rank_two_is_better(seed, scale):
     _, m, start = scene(seed, points=100, sigma_px=3)
 
     F = refine_reprojection(m.points, start, scale=scale, most_steps=100)

@@ -31,7 +31,7 @@ def cost(points, F, scale=np.inf):
 
 @pytest.mark.parametrize("scale", [np.inf, 0.01])
 @pytest.mark.parametrize("seed", range(4))
-def test_no_neighbour_of_rank_two_is_better(seed, scale):
+def test_no_neighbor_of_rank_two_is_better(seed, scale):
     _, m, good = scene(seed, points=200)
     start = fit_eight_point(m.points, good.astype(float))
 

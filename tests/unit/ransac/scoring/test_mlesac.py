@@ -1,4 +1,4 @@
-"""MLESAC: the likelihood of 3.5, and the share of inliers that maximises it."""
+"""MLESAC: the likelihood of 3.5, and the share of inliers that maximizes it."""
 
 import math
 
@@ -22,7 +22,7 @@ def distances(gamma, count=20_000, width=100.0):
 
 
 @pytest.mark.parametrize("gamma", [0.05, 0.3, 0.6, 0.95])
-def test_expectation_maximisation_recovers_the_share(gamma):
+def test_expectation_maximization_recovers_the_share(gamma):
     assert inlier_share(distances(gamma) ** 2, SIGMA, 100.0) == pytest.approx(gamma, abs=0.012)
 
 

@@ -52,7 +52,7 @@ def test_the_true_model_puts_the_priors_on_inliers():
     m = prepare(pair.x1, pair.x2, 0)
     F = np.diag([m.unit_px, m.unit_px, 1])
     shift1, shift2 = np.eye(3), np.eye(3)
-    shift1[:2, 2], shift2[:2, 2] = m.centre[:2], m.centre[2:]
+    shift1[:2, 2], shift2[:2, 2] = m.center[:2], m.center[2:]
     f = (F.T @ shift2.T @ pair.F @ shift1 @ F).reshape(9)
 
     valid = residual_validity(m.points, f, 1.0)[m.rows]

@@ -7,7 +7,7 @@ import pytest
 
 from sfm_app.selfcal.adjustment.camera_priors import (
     ASPECT,
-    CENTRE,
+    CENTER,
     FOCAL,
     HINT_SPREAD,
     LENS,
@@ -40,7 +40,7 @@ SURE = [1e-3] * 5
 
 
 @pytest.mark.parametrize(
-    ("offset", "place"), [((0, 0.05, 0, 0, 0), CENTRE), ((0, 0, 0, 0.1, 0), ASPECT), ((0, 0, 0, 0, 0.08), LENS)]
+    ("offset", "place"), [((0, 0.05, 0, 0, 0), CENTER), ((0, 0, 0, 0.1, 0), ASPECT), ((0, 0, 0, 0, 0.08), LENS)]
 )
 def test_what_sure_pairs_contradict_is_freed_and_nothing_else(offset, place):
     np.testing.assert_array_equal(evidence(SURE, offset).best(NOTHING), freed(place))
@@ -48,7 +48,7 @@ def test_what_sure_pairs_contradict_is_freed_and_nothing_else(offset, place):
 
 def test_usual_cameras_stay_usual():
     for deviation in (1e-3, 0.01, 0.1, 1.0):
-        np.testing.assert_array_equal(evidence([deviation] * 5).best(freed(CENTRE, ASPECT, LENS)), NOTHING)
+        np.testing.assert_array_equal(evidence([deviation] * 5).best(freed(CENTER, ASPECT, LENS)), NOTHING)
 
 
 def test_unsure_pairs_free_nothing():
@@ -61,7 +61,7 @@ def test_the_log_evidence_is_the_integral():
     found = evidence([0.05, 0.02, 1e-8, 1e-8, 1e-8], (0.1, 0.04, 0, 0, 0), theta=(0.3, 0.01, 0, 0, 0))
     f, u = np.meshgrid(np.linspace(-1, 1, 801), np.linspace(-0.4, 0.4, 801), indexing="ij")
     values = []
-    for free in (NOTHING, freed(CENTRE)):
+    for free in (NOTHING, freed(CENTER)):
         prior = found.priors.prior(free, found.thetas)
         likelihood = found.g[0] * f + found.g[1] * u - 0.5 * (found.H[0, 0] * f**2 + found.H[1, 1] * u**2)
         belief = sum(
@@ -70,10 +70,10 @@ def test_the_log_evidence_is_the_integral():
             for k, d in ((0, f), (1, u))
         )
         integral = np.sum(np.exp(likelihood + belief)) * (f[1, 0] - f[0, 0]) * (u[0, 1] - u[0, 0])
-        # the second centre parameter is known to be 0: its prior density there is the rest
+        # the second center parameter is known to be 0: its prior density there is the rest
         rest = 0.5 * np.log(prior.precision[0, 2])
         values.append(np.log(integral) + rest + found.priors.log_odds(free))
-    posteriors = [found.posterior(free)[0] for free in (NOTHING, freed(CENTRE))]
+    posteriors = [found.posterior(free)[0] for free in (NOTHING, freed(CENTER))]
     assert posteriors[1] - posteriors[0] == pytest.approx(values[1] - values[0], abs=1e-3)
     assert abs(values[1] - values[0]) > 0.5
 
@@ -117,7 +117,7 @@ def test_the_covariance_covers_all_choices(offset):
 
     np.testing.assert_allclose(mixed, mixed.T, rtol=1e-9)
     assert np.linalg.eigvalsh(mixed).min() > 0
-    widest = found.posterior(freed(CENTRE, ASPECT, LENS))[2]
+    widest = found.posterior(freed(CENTER, ASPECT, LENS))[2]
     assert np.all(np.diag(mixed) >= 0.5 * np.diag(found.posterior(best)[2]))
     assert mixed[3, 3] < widest[3, 3]
 
@@ -129,7 +129,7 @@ def test_what_is_nearly_free_is_nearly_as_uncertain():
 
 
 def test_few_pairs_say_less_than_their_scatter():
-    free = freed(CENTRE, ASPECT, LENS)
+    free = freed(CENTER, ASPECT, LENS)
     assert spare(free, 1e9) == pytest.approx(1.0)
     assert spare(NOTHING, 3.0) == pytest.approx(1 - 1 / 6)
     assert spare(free, 5.0) == pytest.approx(0.5)

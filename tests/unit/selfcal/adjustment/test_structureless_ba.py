@@ -48,10 +48,10 @@ CAMERAS = {
     "plain": {},
     "barrel": {"k1": -0.12},
     "pincushion": {"k1": 0.08},
-    "cropped": {"centre": (0.58, 0.45)},
+    "cropped": {"center": (0.58, 0.45)},
     "squeezed": {"aspect": 0.8},
     "long": {"focal": 2200.0},
-    "all at once": {"k1": -0.1, "centre": (0.56, 0.46), "aspect": 1.15},
+    "all at once": {"k1": -0.1, "center": (0.56, 0.46), "aspect": 1.15},
 }
 
 
@@ -65,13 +65,13 @@ def test_finds_the_camera_as_well_as_it_says(shots, camera):
     assert 0 < abs(found.K[0, 0] / made.Ks[0, 0, 0] - 1) < 0.015
     assert 0 < found.spread["fx"] < 0.012 * made.Ks[0, 0, 0]
     assert found.evidence["noise_px"] == pytest.approx(0.5, rel=0.1)
-    freed = {"k1": "k1", "centre": "centre", "aspect": "aspect"}
+    freed = {"k1": "k1", "center": "center", "aspect": "aspect"}
     assert not {freed[knob] for knob in CAMERAS[camera] if knob in freed} & set(found.held)
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_finds_the_camera_of_the_thesis_or_says_that_its_pairs_and_their_matches_do_not_agree(seed):
-    # aspect 0.8 to 1.2, centre up to 0.1 off; the F's are exact, the matches are not
+    # aspect 0.8 to 1.2, center up to 0.1 off; the F's are exact, the matches are not
     tracks = make_tracks(TrackOptions(sigma_px=0.5), seed)
     inliers = tuple(np.hstack([view.x1, view.x2]) for view in tracks.pairs.values())
     pairs = CameraPairs(tracks.F, np.ones(10), tracks.size, tuple(tracks.pairs), inliers)

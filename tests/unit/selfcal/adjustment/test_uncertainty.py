@@ -24,7 +24,7 @@ def test_standard_deviations_are_those_of_repeated_photos(shots):
     # 32 sets, each judged by the standard deviations it comes with
     scores = []
     for seed in range(32):
-        made = shots(5, 40 + seed, k1=-0.1, centre=(0.56, 0.46), points=90, noise_px=1.0)
+        made = shots(5, 40 + seed, k1=-0.1, center=(0.56, 0.46), points=90, noise_px=1.0)
         fit = fitted(made.pairs)
         theta = fit.state.thetas[0]
         said = spread_of(theta, covariance(fit, np.ones(1)), SIDE)

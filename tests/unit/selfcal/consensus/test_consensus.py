@@ -62,7 +62,7 @@ def test_climbing_moves_what_is_free_and_never_down(consensus):
 
 @pytest.mark.parametrize("focal", [0.5, 1.0, 2.5])
 def test_the_highest_peak_is_the_truth(consensus, focal):
-    made = consensus(focal=1000 * focal, centre=(560, 340), noise=3e-4)
+    made = consensus(focal=1000 * focal, center=(560, 340), noise=3e-4)
     profile = scan(made, (0.0,))
     assert profile.thetas.shape == (FOCALS, 4)
     np.testing.assert_allclose(np.exp(profile.thetas[[0, -1], 0]), FOCAL_RANGE)

@@ -13,5 +13,5 @@ def test_what_the_pairs_agree_on_can_still_be_wrong():
     assert "uncertain by 12 %" in objected([0.0, 0.0, 0.0, 0.0], spread=0.12)
     assert "end of the range" in objected([np.log(0.3), 0.0, 0.0, 0.0])
     assert "end of the range" in objected([np.log(5.1), 0.0, 0.0, 0.0])
-    assert "centre" in objected([0.0, 0.51, 0.0, 0.0])
-    assert "centre" in objected([0.0, 0.0, -0.38, 0.0])
+    assert "center" in objected([0.0, 0.51, 0.0, 0.0])
+    assert "center" in objected([0.0, 0.0, -0.38, 0.0])

@@ -38,7 +38,7 @@ def form(request):
 
 
 def test_it_vanishes_at_the_true_camera_and_at_no_other(views, form):
-    made = views(4, noise=0.0, focal=900, aspect=1.2, centre=(420, 400))
+    made = views(4, noise=0.0, focal=900, aspect=1.2, center=(420, 400))
     other = made.K.copy()
     other[0, 0] *= 1.2
     moved = made.K.copy()

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.constraints import centre_polynomials, focal_polynomials
+from sfm_app.selfcal.constraints import center_polynomials, focal_polynomials
 from sfm_app.selfcal.inputs import prepare
-from sfm_app.selfcal.thesis.curves import centre_curves, degeneracy, focal_curves, usable
+from sfm_app.selfcal.thesis.curves import center_curves, degeneracy, focal_curves, usable
 from sfm_app.selfcal.thesis.roots import companion_roots
 from sfm_app.types import CameraPairs
 
@@ -28,9 +28,9 @@ def test_curves_are_those_of_the_companion_matrices(views, noise):
     pairs, sweep = in_widths(views(6, noise=noise)), np.linspace(0.01, 1, 100)
 
     fy = focal_curves(pairs, 3 * sweep, (0.5, 0.375))
-    v = centre_curves(pairs, sweep, (1.0, 1.1))
+    v = center_curves(pairs, sweep, (1.0, 1.1))
 
-    quartics, octics = focal_polynomials(pairs, 3 * sweep, (0.5, 0.375)), centre_polynomials(pairs, sweep, (1.0, 1.1))
+    quartics, octics = focal_polynomials(pairs, 3 * sweep, (0.5, 0.375)), center_polynomials(pairs, sweep, (1.0, 1.1))
     roots = np.sqrt(companion_roots(quartics))
     roots[np.abs(roots.imag) > np.abs(roots.real)] = 0.0  # not "approximately zero"
     np.testing.assert_allclose(fy, thesis_curve(roots), rtol=1e-9, atol=1e-12)
@@ -45,7 +45,7 @@ def test_exact_curves_run_through_the_true_camera(views, seed):
     pairs, K = in_widths(made), made.K / 1000
 
     fy = focal_curves(pairs, K[0, 0] * np.array([0.5, 1.0, 1.5]), (K[0, 2], K[1, 2]))
-    v = centre_curves(pairs, K[0, 2] * np.array([0.5, 1.0, 1.5]), (K[0, 0], K[1, 1]))
+    v = center_curves(pairs, K[0, 2] * np.array([0.5, 1.0, 1.5]), (K[0, 0], K[1, 1]))
 
     np.testing.assert_allclose(fy[:, 1], K[1, 1], rtol=1e-4)
     np.testing.assert_allclose(v[:, 1], K[1, 2], rtol=1e-4)
@@ -78,5 +78,5 @@ def test_degeneracy_is_the_share_out_of_range():
 def test_no_pairs_no_curves():
     pairs = prepare(CameraPairs.of(np.empty((0, 3, 3)), (4, 3), []), unit_px=4.0, origin_px=(0.0, 0.0))
     assert focal_curves(pairs, np.ones(7), (0.5, 0.4)).shape == (0, 7)
-    assert centre_curves(pairs, np.ones(7), (1.0, 1.0)).shape == (0, 7)
+    assert center_curves(pairs, np.ones(7), (1.0, 1.0)).shape == (0, 7)
     assert len(usable(np.empty((0, 7)), 3.0)) == 0

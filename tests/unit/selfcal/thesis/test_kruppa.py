@@ -21,7 +21,7 @@ def camera_of(K, factor=1.0):
 
 
 def test_true_cameras_satisfy_5_5_and_the_equations(views):
-    made = views(4, noise=0.0, focal=900, aspect=1.1, centre=(450, 400))
+    made = views(4, noise=0.0, focal=900, aspect=1.1, center=(450, 400))
     pairs = in_widths(made.Fs)
     C = (made.K / [[1000], [1000], [1]]) @ (made.K / [[1000], [1000], [1]]).T
     for F, e2 in zip(pairs.F, pairs.e2, strict=True):
@@ -51,7 +51,7 @@ def test_scale_and_sign_of_f_have_no_effect(views):
 
 @pytest.mark.parametrize("focal", [400.0, 1000.0, 2500.0])  # 1000 px is the width: f = 1 is a trivial root
 def test_the_focal_of_an_exact_pair_is_the_true_one(views, focal):
-    made = views(5, seed=3, noise=0.0, focal=focal, centre=(520, 340))
+    made = views(5, seed=3, noise=0.0, focal=focal, center=(520, 340))
     np.testing.assert_allclose(focals_of(in_widths(made.Fs), (0.52, 0.34)), focal / 1000, rtol=1e-6)
 
 
@@ -76,11 +76,11 @@ def test_pairs_without_a_focal_give_none(views, motion):
 
 
 def test_finds_the_camera(views):
-    made = views(6, noise=5e-4, aspect=1.1, centre=(530, 350))
+    made = views(6, noise=5e-4, aspect=1.1, center=(530, 350))
     found = calibrate(CameraPairs.of(made.Fs, made.size), OPTIONS, 0)
     assert (found.identifiable, found.method) == (True, METHOD), found.reason
     assert 0 < np.abs(found.K - made.K).max() < 30
-    assert found.evidence["focal_estimates"] == 10  # the centre is off: five pairs ask for f^2 < 0
+    assert found.evidence["focal_estimates"] == 10  # the center is off: five pairs ask for f^2 < 0
 
 
 def test_without_any_focal_of_its_own_it_starts_from_the_usual_one(views):

@@ -21,7 +21,7 @@ def truth(made):
 
 @pytest.mark.parametrize("count", [3, 6])
 def test_exact_pairs_lead_to_the_exact_camera(views, count):
-    made = views(count, seed=1, noise=0.0, focal=1200, aspect=0.9, centre=(560, 330))
+    made = views(count, seed=1, noise=0.0, focal=1200, aspect=0.9, center=(560, 330))
     found = fitted(in_widths(made), Camera.initial(0.75), np.ones(count * (count - 1) // 2))
     np.testing.assert_allclose(found, truth(made), atol=1e-5)
 

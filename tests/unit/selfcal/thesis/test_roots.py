@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.selfcal.constraints import centre_polynomials, focal_polynomials
+from sfm_app.selfcal.constraints import center_polynomials, focal_polynomials
 from sfm_app.selfcal.inputs import prepare
 from sfm_app.selfcal.thesis import roots as roots
 from sfm_app.selfcal.thesis.roots import companion_roots, swept_roots
@@ -62,7 +62,7 @@ def test_swept_roots_are_the_companion_roots(views, noise, to_eigenvalues):
     sweep = np.linspace(0.01, 1, 100)
     for polynomials in (
         focal_polynomials(pairs, 3 * sweep, (0.5, 0.375)),
-        centre_polynomials(pairs, sweep, (1.0, 1.0)),
+        center_polynomials(pairs, sweep, (1.0, 1.0)),
     ):
         found = swept_roots(polynomials)
         assert off(found, companion_roots(polynomials)) < 1e-7

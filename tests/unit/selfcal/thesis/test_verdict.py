@@ -17,7 +17,7 @@ def camera_of(made, factor=1.0):
 
 
 def test_a_camera_that_the_pairs_support_is_known(views):
-    made = views(5, aspect=1.1, centre=(520, 350))
+    made = views(5, aspect=1.1, center=(520, 350))
     found = judged(made, camera_of(made))
     assert (found.identifiable, found.method, found.reason) == (True, "mine", "")
     np.testing.assert_allclose(found.K, made.K)

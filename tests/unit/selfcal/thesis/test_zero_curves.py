@@ -30,7 +30,7 @@ def test_finds_the_camera_to_a_sample_of_the_sweep(views, aspect, seed):
     assert found.evidence["focal_curves"] <= found.evidence["pairs"] == 10
 
 
-def test_focal_and_centre_in_x_are_samples_of_the_sweep(views):
+def test_focal_and_center_in_x_are_samples_of_the_sweep(views):
     found = run(views(5), OPTIONS.model_copy(update={"samples": 50}))
     assert found.K[0, 0] / 60 == pytest.approx(round(found.K[0, 0] / 60))
     assert found.K[0, 2] / 20 == pytest.approx(round(found.K[0, 2] / 20))
@@ -53,8 +53,8 @@ def test_level_cameras_leave_no_curve(views):
 
 
 def test_an_answer_that_the_pairs_contradict_is_not_given(views):
-    # the centre is far from the middle, which the focal curves take it to be in
-    found = run(views(5, centre=(850, 150)))
+    # the center is far from the middle, which the focal curves take it to be in
+    found = run(views(5, center=(850, 150)))
     assert not found.identifiable
     assert "the pairs" in found.reason
     assert {"fx_px", "fy_px", "cx_px", "cy_px"} <= set(found.evidence)

@@ -12,10 +12,10 @@ BEST_ANGLE_DEG = 8.0
 """Smaller angles give inexact depths, larger ones images that look different."""
 
 
-def rank_neighbours(views: Sequence[View], count: int) -> list[list[int]]:
+def rank_neighbors(views: Sequence[View], count: int) -> list[list[int]]:
     """Return, for every view, the indices of the views that serve it best, best first, at most `count`.
 
-    Greedy coverage: the next neighbour is the one that adds most to the sparse points of the view. A point adds its
+    Greedy coverage: the next neighbor is the one that adds most to the sparse points of the view. A point adds its
     weight (triangulation angle, difference in scale), up to halved for each time that it is covered already, so that
     the choice spreads over the photo instead of crowding on one side.
     """
@@ -57,7 +57,7 @@ def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
 
 
 def triangulation_angles_deg(center1: FloatArray, center2: FloatArray, points: FloatArray) -> NDArray[np.float64]:
-    """Return (N,) angles in degrees under which points (N, 3) see two centres (3,)."""
+    """Return (N,) angles in degrees under which points (N, 3) see two centers (3,)."""
     ray1, ray2 = points - center1, points - center2
     # atan2 keeps small angles exact, where arccos of a rounded cosine does not
     sine = np.linalg.norm(np.cross(ray1, ray2), axis=1)

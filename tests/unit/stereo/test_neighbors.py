@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.stereo.neighbours import BEST_ANGLE_DEG, point_weights, rank_neighbours, triangulation_angles_deg
+from sfm_app.stereo.neighbors import BEST_ANGLE_DEG, point_weights, rank_neighbors, triangulation_angles_deg
 from sfm_app.stereo.view import View
 
 
@@ -32,7 +32,7 @@ def test_prefers_good_angles_to_narrow_and_wide_ones(points):
     best = 10 * np.tan(np.radians(BEST_ANGLE_DEG))
     views = [view_at((x, 0, 0), points) for x in (0.0, 0.02 * best, best, 6 * best)]
 
-    assert rank_neighbours(views, 1)[0] == [2]
+    assert rank_neighbors(views, 1)[0] == [2]
 
 
 def test_spreads_over_the_photo_instead_of_taking_the_same_side_twice(points):
@@ -45,16 +45,16 @@ def test_spreads_over_the_photo_instead_of_taking_the_same_side_twice(points):
         view_at((-1.4, 0, 0), points, right),
     ]
 
-    ranked = rank_neighbours(views, 2)[0]
+    ranked = rank_neighbors(views, 2)[0]
 
     assert ranked[0] in (1, 2)
     assert ranked[1] == 3
 
 
-def test_strangers_and_the_view_itself_are_no_neighbours(points):
+def test_strangers_and_the_view_itself_are_no_neighbors(points):
     views = [view_at((0, 0, 0), points, range(50)), view_at((1, 0, 0), points, range(48, 100))]
 
-    assert rank_neighbours(views, 4) == [[], []]
+    assert rank_neighbors(views, 4) == [[], []]
 
 
 def test_weights_fall_with_differing_scale_and_vanish_behind_a_camera(points):
