@@ -5,7 +5,7 @@ only the first run on a machine compiles.
 """
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -30,5 +30,20 @@ def _compiled(function: Function, *, fastmath: bool | set[str]) -> Function:
     try:
         compiled: Function = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder to cache in can be written: compile anew in every process
-        compiled = numba.njit(**options)(function)
+        return cast(Function, numba.njit(**options)(function))
+    _forget_unreadable(compiled)
     return compiled
+
+
+def _forget_unreadable(compiled: Any) -> None:
+    """Let a kernel compile anew where its cache names classes that are gone: an upgrade leaves old caches behind."""
+    cache_file = compiled._cache._cache_file
+    load = cache_file._load_index
+
+    def load_or_forget() -> dict[Any, Any]:
+        try:
+            return cast("dict[Any, Any]", load())
+        except (AttributeError, ImportError):
+            return {}
+
+    cache_file._load_index = load_or_forget

@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import numba
 import numpy as np
 import pytest
@@ -37,3 +40,30 @@ def test_sums_in_lanes_still_know_infinities():
     assert total(values) == np.inf
     values[0] = -np.inf
     assert np.isnan(total(values))
+
+
+CODE = """
+from typing import NamedTuple
+from sfm_app.jit import kernel
+
+class {name}(NamedTuple):
+    value: float
+
+@kernel
+def twice(thing):
+    return 2.0 * thing.value
+
+print(twice({name}(21.0)))
+"""
+
+
+def test_a_cache_that_names_a_class_which_is_gone_is_made_anew(tmp_path):
+    """As an upgrade leaves it behind."""
+    for name in ("Old", "New"):
+        (tmp_path / "module.py").write_text(CODE.format(name=name), encoding="utf-8")
+        # imported, not run: numba pickles the class by its module
+        done = subprocess.run(
+            [sys.executable, "-c", "import module"], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert (done.stdout.strip(), done.returncode) == ("42.0", 0), done.stderr
+    assert list(tmp_path.rglob("*.nbi"))
