@@ -81,7 +81,7 @@ def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb:
     searched = [_megapixels(size, settings.matching.max_image_size_px) for size in sizes]
     mapped = [_megapixels(size, settings.depth.max_image_size_px) for size in sizes]
     features = sum(min(settings.matching.max_features, FEATURES_PER_MP * one) for one in searched) / max(count, 1)
-    pages = settings.texture.max_pages * settings.texture.max_page_px**2 / MEGA
+    pages = settings.texture.max_pages * settings.texture.max_atlas_px**2 / MEGA
     return Plan(
         count,
         pairs,

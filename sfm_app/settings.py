@@ -41,7 +41,7 @@ class PhotoSettings(Section):
         "each: none share",
     )
     max_frames: int = Field(100, ge=2, le=2000, description="most frames of a video that are used")
-    keep_all: bool = Field(False, description="use copies, blurred photos and screenshots, too")
+    keep_low_quality: bool = Field(False, description="use copies, blurred photos and screenshots, too")
     max_megapixels: float = Field(64.0, ge=0.1, le=178, description="larger photos are scaled down to so many")
     min_side_px: int = Field(64, ge=16, le=4096, description="photos with a shorter side are left out, in pixels")
 
@@ -94,7 +94,7 @@ class SceneSettings(Section):
         "auto",
         description="incremental: photo after photo from a seed; global: all at once; auto: the one that explains more",
     )
-    seed_pairs: int = Field(5, ge=1, le=100, description="most seed pairs that are tried")
+    max_init_pairs: int = Field(5, ge=1, le=100, description="most seed pairs that are tried")
     min_seed_angle_deg: float = Field(
         2.0, gt=0, le=90, description="least median triangulation angle of a seed pair, in degrees"
     )
@@ -102,7 +102,7 @@ class SceneSettings(Section):
     second_look: bool = Field(
         True, description="seek finer features in photos that found no place, and in their neighbors, and map again"
     )
-    turn_deg: Literal["auto", 0, 90, 180, 270] = Field(
+    photo_rotation_deg: Literal["auto", 0, 90, 180, 270] = Field(
         "auto", description="by how much most photos have to be turned clockwise to be upright, in degrees"
     )
 
@@ -127,13 +127,13 @@ class MeshSettings(Section):
 
     poisson_depth: int = Field(12, ge=5, le=14, description="greatest depth of the Poisson octree")
     trim: bool = Field(True, description="cut off surface that no photo confirms; false keeps Poisson's closed surface")
-    max_gap: float = Field(
+    max_gap_triangles: float = Field(
         20.0, ge=0, le=1000, description="gaps in what photos confirm are closed up to this width, in triangles"
     )
     min_island: float = Field(
         0.003, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
     )
-    max_error: float = Field(
+    max_error_edges: float = Field(
         0.15, ge=0, le=10, description="simplification may move the surface so far, in edges of Poisson's triangles"
     )
     faces: int = Field(200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh")
@@ -142,9 +142,9 @@ class MeshSettings(Section):
 class TextureSettings(Section):
     """The pictures on the surface."""
 
-    max_page_px: int = Field(4096, ge=256, le=16384, description="longest side of a page of texture, in pixels")
+    max_atlas_px: int = Field(4096, ge=256, le=16384, description="longest side of a page of texture, in pixels")
     max_pages: int = Field(4, ge=1, le=64, description="most pages; where the photos show more, it is scaled down")
-    unseen: Literal["color", "cut"] = Field(
+    unseen_faces: Literal["color", "cut"] = Field(
         "color", description="triangles that no photo sees: color: painted like what is around them; cut: left out"
     )
 
@@ -202,14 +202,14 @@ QUALITY_PRESETS: dict[str, dict[str, Any]] = {
         "matching": {"max_image_size_px": 1000, "max_features": 4096},
         "depth": {"max_image_size_px": 640, "neighbors": 3},
         "mesh": {"poisson_depth": 10, "faces": 50_000},
-        "texture": {"max_page_px": 2048, "max_pages": 1},
+        "texture": {"max_atlas_px": 2048, "max_pages": 1},
     },
     "normal": {},
     "high": {
         "matching": {"max_image_size_px": 3200, "max_features": 16384},
         "depth": {"max_image_size_px": 2000, "neighbors": 6},
         "mesh": {"poisson_depth": 13, "faces": 1_000_000},
-        "texture": {"max_page_px": 8192},
+        "texture": {"max_atlas_px": 8192},
     },
 }
 

@@ -16,9 +16,9 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 OWN_FLAGS = {
-    "images": "photos", "masks": "photos", "cameras": "photos", "keep_all": "photos", "max_frames": "photos",
+    "images": "photos", "masks": "photos", "cameras": "photos", "keep_low_quality": "photos", "max_frames": "photos",
     "features": "matching", "estimator": "epipolar", "calibrator": "calibration",
-    "mapper": "scene", "faces": "mesh", "unseen": "texture",
+    "mapper": "scene", "faces": "mesh", "unseen_faces": "texture",
 }  # fmt: skip
 """Settings with a flag of their own, and their tables."""
 
@@ -40,14 +40,18 @@ def settings_options(command: Command) -> Command:
         ),
         click.option("--cameras", help="auto, single, folder or each: which photos share one.  [default: auto]"),
         click.option("--max-frames", type=int, help="Most frames of a video that are used.  [default: 100]"),
-        click.option("--keep-all", is_flag=True, default=None, help="Use copies, blurred photos and screenshots, too."),
+        click.option(
+            "--keep-low-quality", is_flag=True, default=None, help="Use copies, blurred photos and screenshots, too."
+        ),
         click.option("--features", help="Way to find and match features.  [default: sift]"),
         click.option("--estimator", help="Estimator of fundamental matrices.  [default: lev-ransac]"),
         click.option("--calibrator", help="Calibrator.  [default: zero-curves]"),
         click.option("--mapper", help="auto, incremental or global.  [default: auto]"),
         click.option("--faces", type=int, help="Most triangles of the mesh.  [default: 200000]"),
         click.option(
-            "--unseen", type=click.Choice(("color", "cut")), help="Triangles that no photo sees.  [default: color]"
+            "--unseen-faces",
+            type=click.Choice(("color", "cut")),
+            help="Triangles that no photo sees.  [default: color]",
         ),
         click.option("--no-plugins", is_flag=True, help="Load nothing but what the program itself has."),
         click.option("--set", "assignments", multiple=True, metavar="TABLE.KEY=VALUE", help="Any other setting."),

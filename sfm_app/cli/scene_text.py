@@ -151,7 +151,10 @@ def _perhaps_not_upright(orientation: Mapping[str, Any]) -> Iterator[str]:
         odds = orientation.get(key, UNSURE_ODDS)
         if odds < UNSURE_ODDS:
             others = " or ".join(str((orientation["photos_turned_deg"] + turn) % 360) for turn in turns)
-            yield f"beware: it may {what} (odds {odds:.1f} to 1 against); if so, --set scene.turn_deg={others} helps"
+            yield (
+                f"beware: it may {what} (odds {odds:.1f} to 1 against); if so, "
+                f"--set scene.photo_rotation_deg={others} helps"
+            )
 
 
 def _unit(orientation: Mapping[str, Any]) -> str:

@@ -60,18 +60,18 @@ class Support:
         return np.asarray((self.confirmed > 0) & ~self.free & enough)
 
 
-def trim(surface: Surface, support: Support, max_gap: float, least: float) -> Surface:
+def trim(surface: Surface, support: Support, max_gap_triangles: float, least: float) -> Surface:
     """Keep what photos confirm and do not see through, and the small gaps in it; the border is a smooth line.
 
     Args:
         surface: closed, as Poisson gives it.
         support: of its vertices.
-        max_gap: as for `bridge_gaps`.
+        max_gap_triangles: as for `bridge_gaps`.
         least: as for `drop_doubtful`.
     """
     sign = np.where(support.believed, 1.0, -1.0)
-    smooth = smooth_support(surface, bridge_gaps(surface, sign, support.free, max_gap), SMOOTHING)
-    whole = bridge_gaps(surface, smooth, support.free, max_gap)
+    smooth = smooth_support(surface, bridge_gaps(surface, sign, support.free, max_gap_triangles), SMOOTHING)
+    whole = bridge_gaps(surface, smooth, support.free, max_gap_triangles)
     return cut(surface, drop_doubtful(surface, whole, support.confirmed, least))
 
 

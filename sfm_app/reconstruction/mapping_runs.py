@@ -97,7 +97,7 @@ def attempts(group: Group, run: RunContext) -> list[Attempt]:
     options = run.settings.scene
     at_once = options.mapper != "incremental" and len(group.photos) >= LEAST_GLOBAL
     seeds = rank_seeds(group.matches, group.graph, group.intrinsics, group.photos, options.min_seed_angle_deg)
-    seeds = seeds[: options.seed_pairs] if options.mapper != "global" or not at_once else []
+    seeds = seeds[: options.max_init_pairs] if options.mapper != "global" or not at_once else []
     if at_once:
         copy_database(run.workspace.database, run.workspace.root / GLOBAL_FOLDER)
     with _mapping(group, run) as made:

@@ -56,7 +56,7 @@ def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surfac
         raw = nonempty(poisson(dense_dir, depth), "the fused points span no surface")
     colored, support = looked_at(raw, dense_dir, views, run)
     least = SURE * photos_needed(views, run)
-    trimmed = trim(colored, support, options.max_gap, least) if options.trim else colored
+    trimmed = trim(colored, support, options.max_gap_triangles, least) if options.trim else colored
     detailed = nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
     run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
     with run.step("simplifying"):
@@ -132,9 +132,9 @@ def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunCont
 def simplified(surface: Surface, options: MeshSettings, dense_dir: Path) -> Surface:
     """Simplify to as few triangles as the error allows, and no more than asked for."""
     simple = surface
-    if options.max_error:
+    if options.max_error_edges:
         edge = median_edge(surface.vertices, surface.faces)
-        simple = simplify(surface, 1.0 / len(surface.faces), options.max_error * edge, dense_dir)
+        simple = simplify(surface, 1.0 / len(surface.faces), options.max_error_edges * edge, dense_dir)
     if len(simple.faces) > options.faces:
         simple = simplify(simple, options.faces / len(simple.faces), 0.0, dense_dir)
     return simple

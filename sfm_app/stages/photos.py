@@ -49,7 +49,7 @@ def read_photos(folder: Path, run: RunContext) -> PhotoSet:
     glances = [photo for photo in found if isinstance(photo, Glance)]
     unusable = [photo for photo in found if isinstance(photo, UnusablePhoto)]
     glances, blackened = masked(glances, folder, run)
-    photos, needless = chosen(glances, keep_all=options.keep_all)
+    photos, needless = chosen(glances, keep_low_quality=options.keep_low_quality)
     unusable = sorted(unusable + blackened + needless, key=lambda photo: photo.name)
     if len(photos) < 2:
         raise InputError(
@@ -78,9 +78,9 @@ def within_memory(run: RunContext) -> PhotoSettings:
     return options.model_copy(update={"max_megapixels": largest})
 
 
-def chosen(glances: list[Glance], *, keep_all: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
+def chosen(glances: list[Glance], *, keep_low_quality: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
     """Return the photos that are worth their time, and the others."""
-    if keep_all:
+    if keep_low_quality:
         return [glance.photo for glance in glances], []
     useful, useless = screened(glances)
     photos, copies = without_copies(useful)

@@ -52,7 +52,7 @@ def adjusted_scene(found: Found, run: RunContext) -> Scene:
     with backend("reading colors"):
         for model in models:
             color(model, run.workspace.photos, run.workers)
-    turn_deg = None if run.settings.scene.turn_deg == "auto" else run.settings.scene.turn_deg
+    turn_deg = None if run.settings.scene.photo_rotation_deg == "auto" else run.settings.scene.photo_rotation_deg
     orientations = [orient_or_leave(model, matches, looks, turn_deg) for model in models]
     write_models(models, run)
     run.write_model(sparse_model(run.workspace.sparse), POINTS)

@@ -20,7 +20,7 @@ from sfm_app.texture.painting import Canvas, canvas, fill_background, finished, 
 from sfm_app.texture.photo_consistency import strangers
 from sfm_app.texture.seam_leveling import level
 from sfm_app.texture.store import Store
-from sfm_app.texture.unseen import along_a_curve, block_sizes, square_texels, squares, vertex_colors
+from sfm_app.texture.unseen_faces import along_a_curve, block_sizes, square_texels, squares, vertex_colors
 from sfm_app.texture.view_scoring import Hidden, Look, look, sharpness_factors
 from sfm_app.texture.view_selection import choose_photos
 from sfm_app.texture.views import PhotoView
@@ -107,7 +107,7 @@ def texture_surface(
     seen = _believe(looks, mesh)
     chosen = without_specks(choose_photos(seen.worth, mesh), seen.usable, mesh.neighbors)
     unseen = chosen == NONE
-    if options.unseen == "cut" and not unseen.all():
+    if options.unseen_faces == "cut" and not unseen.all():
         mesh = facets(select_faces(surface, ~unseen))
         kept = ~unseen
         seen = Seen(seen.worth[:, kept], seen.colors[:, kept], seen.gains, seen.strange)
@@ -166,9 +166,9 @@ def _believe(looks: FaceViews, mesh: Facets) -> Seen:
 
 
 def _plan(mesh: Facets, seen: Seen, chosen: IntArray, views: Sequence[PhotoView], options: TextureSettings) -> Plan:
-    charts = make_charts(chosen, np.array([view.row for view in views]), mesh, options.max_page_px / 2)
+    charts = make_charts(chosen, np.array([view.row for view in views]), mesh, options.max_atlas_px / 2)
     blocks = block_sizes(int((chosen == NONE).sum()))
-    layout, places = pack(charts, blocks, options.max_page_px, options.max_pages)
+    layout, places = pack(charts, blocks, options.max_atlas_px, options.max_pages)
     corners, page = charts.corners * layout.scale, np.zeros(len(chosen), np.int32)
     drawn = chosen != NONE
     corners[drawn] += layout.shift[charts.of[drawn]][:, None, :]

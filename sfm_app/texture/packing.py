@@ -41,21 +41,21 @@ class Layout:
     """(width, height) of each page."""
 
 
-def pack(charts: Charts, blocks: IntArray, max_page_px: int, max_pages: int) -> tuple[Layout, IntArray]:
+def pack(charts: Charts, blocks: IntArray, max_atlas_px: int, max_pages: int) -> tuple[Layout, IntArray]:
     """Lay charts, and rectangles beside them, onto as few pages as possible; smaller where they do not fit.
 
     Args:
         charts: their triangles in pixels of the photos.
         blocks: (B, 2) widths and heights of rectangles, which are never scaled.
-        max_page_px: longest side of a page.
+        max_atlas_px: longest side of a page.
         max_pages: most pages, unless the margins of tiny charts alone need more.
 
     Returns:
         The layout of the charts, and (B, 3) page, x and y of the rectangles.
     """
-    scale = min(1.0, float(np.sqrt(FILL * max_pages * max_page_px**2 / max(_area(charts), 1.0))))
+    scale = min(1.0, float(np.sqrt(FILL * max_pages * max_atlas_px**2 / max(_area(charts), 1.0))))
     while True:
-        placed = _try_to_pack(charts, blocks, scale, max_page_px, max_pages)
+        placed = _try_to_pack(charts, blocks, scale, max_atlas_px, max_pages)
         if placed is not None:
             return placed
         if scale > LEAST_SCALE:
@@ -72,14 +72,14 @@ def _area(charts: Charts) -> float:
 
 
 def _try_to_pack(
-    charts: Charts, blocks: IntArray, scale: float, max_page_px: int, max_pages: int
+    charts: Charts, blocks: IntArray, scale: float, max_atlas_px: int, max_pages: int
 ) -> tuple[Layout, IntArray] | None:
     count = len(charts.photo)
     origin, cells, starts, low, high = _profiles(charts, scale)
     block_cells = -(-blocks // CELL)
     area = float(np.sum(high - low)) + float(np.sum(block_cells.astype(np.int64).prod(axis=1)))
     widest = max((int(c) for c in np.concatenate([cells[:, 0], block_cells[:, 0]])), default=1)
-    page_cells = max_page_px // CELL
+    page_cells = max_atlas_px // CELL
     width = page_cells if scale < 1.0 else min(page_cells, max(widest, int(np.ceil(np.sqrt(area / FILL)))))
     if widest > page_cells or area > max_pages * page_cells * width:
         return None

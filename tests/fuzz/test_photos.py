@@ -185,7 +185,16 @@ def accepted(folder):
 def test_colmap_survives_the_damaged_photos_that_we_accept(tmp_path):
     """COLMAP decodes them once more, in ways of its own."""
     names = accepted(tmp_path / "photos")
-    flags = ("--keep-all", "--set", "matching.max_features=100", "-q", "--workers", "2", "--until", "match_graph")
+    flags = (
+        "--keep-low-quality",
+        "--set",
+        "matching.max_features=100",
+        "-q",
+        "--workers",
+        "2",
+        "--until",
+        "match_graph",
+    )
     command = [sys.executable, "-m", "sfm_app", "run", str(tmp_path / "photos"), "-o", str(tmp_path / "out"), *flags]
 
     process = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)

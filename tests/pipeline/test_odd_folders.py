@@ -126,9 +126,9 @@ def test_twenty_copies_of_one_photo(courtyard, folder, tmp_path):
     assert result.exit_code == 3
     assert "only one usable photo" in result.stderr and "19 copies of another" in result.stderr
 
-    result, out = run(folder, tmp_path, "--keep-all")
+    result, out = run(folder, tmp_path, "--keep-low-quality")
     ends_with(result, "20 copies of one photo")
-    ends_with(call("calibrate", folder, "-o", out, "--keep-all"), "20 copies of one photo")
+    ends_with(call("calibrate", folder, "-o", out, "--keep-low-quality"), "20 copies of one photo")
 
 
 def test_two_groups_of_photos_give_the_larger_one(courtyard, heap, folder, tmp_path):

@@ -306,7 +306,11 @@ COMMANDS = {
     "unknown table": (["{photos}", "-o", "{here}/out", "--set", "colmap.x=1"], 2, "unknown setting"),
     "wrong type": (["{photos}", "-o", "{here}/out", "--set", "mesh.faces=many"], 2, "mesh.faces"),
     "out of range": (["{photos}", "-o", "{here}/out", "--seed", "-1"], 2, "seed"),
-    "not finite": (["{photos}", "-o", "{here}/out", "--set", "mesh.max_gap=nan"], 2, "mesh.max_gap"),
+    "not finite": (
+        ["{photos}", "-o", "{here}/out", "--set", "mesh.max_gap_triangles=nan"],
+        2,
+        "mesh.max_gap_triangles",
+    ),
     "a plug-in that is not loaded": (
         ["{photos}", "-o", "{here}/out", "--no-plugins", "--estimator", "poselib-lo-ransac"],
         2,

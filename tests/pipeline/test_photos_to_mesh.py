@@ -121,7 +121,9 @@ def test_a_changed_setting_redoes_only_what_it_touches(finished, rendered, tmp_p
     run, _ = finished
     shutil.copytree(run.out, tmp_path / "out", symlinks=True)
     before = {name: stage["fingerprint"] for name, stage in run.manifest["stages"].items()}
-    changed = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 480}, "mesh": {"max_gap": 10}})
+    changed = Settings.from_mapping(
+        {"quality": "draft", "depth": {"max_image_size_px": 480}, "mesh": {"max_gap_triangles": 10}}
+    )
 
     after = sfm_app.reconstruct(rendered[0], tmp_path / "out", changed).manifest["stages"]
 

@@ -56,7 +56,7 @@ def test_a_stage_that_was_never_done_needs_no_reason(run):
 
 def test_settings_of_other_stages_change_nothing(run):
     finished(run)
-    set_to(run, mesh={"faces": 1000}, photos={"keep_all": True}, workers=2)
+    set_to(run, mesh={"faces": 1000}, photos={"keep_low_quality": True}, workers=2)
 
     assert why(run) is None
 

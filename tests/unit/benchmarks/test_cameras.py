@@ -153,9 +153,9 @@ def test_steps_of_both_sides_meet_in_the_same_columns():
 
 
 def test_methods_take_turns_and_other_settings_are_methods():
-    these = methods({"scene.seed_pairs=2": {"scene": {"seed_pairs": 2}}})
+    these = methods({"scene.max_init_pairs=2": {"scene": {"max_init_pairs": 2}}})
 
-    assert [method.name for method in these] == ["sfm-app", "sfm-app, scene.seed_pairs=2", "incremental", "global"]
+    assert [method.name for method in these] == ["sfm-app", "sfm-app, scene.max_init_pairs=2", "incremental", "global"]
     assert taking_turns(these, 6)[0].name == "incremental"
     assert [method.kind for method in methods({}, ours_only=True)] == ["sfm-app"]
 

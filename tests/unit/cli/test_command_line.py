@@ -122,12 +122,14 @@ def test_photos_of_different_places_end_with_exit_code_4(unrelated, tmp_path):
 
 
 def test_config_prints_toml_that_loads(tmp_path):
-    result = call("config", "--quality", "high", "--set", "mesh.max_gap=3", "--estimator", "msac", "--faces", "5000")
+    result = call(
+        "config", "--quality", "high", "--set", "mesh.max_gap_triangles=3", "--estimator", "msac", "--faces", "5000"
+    )
     path = tmp_path / "run.toml"
     path.write_text(result.stdout, encoding="utf-8")
 
     loaded = Settings.from_toml(path)
-    assert (loaded.quality, loaded.mesh.max_gap, loaded.epipolar.estimator) == ("high", 3.0, "msac")
+    assert (loaded.quality, loaded.mesh.max_gap_triangles, loaded.epipolar.estimator) == ("high", 3.0, "msac")
     assert loaded.mesh.faces == 5000
     assert loaded.depth.max_image_size_px == Settings.from_mapping({"quality": "high"}).depth.max_image_size_px
 

@@ -156,7 +156,7 @@ def test_a_global_mapper_that_fails_leaves_the_other_model(try_out):
     ],
 )
 def test_seeds_are_tried_until_one_grows(try_out, grown, at_once, placed):
-    found, _ = try_out(grown, at_once, seed_pairs=5)
+    found, _ = try_out(grown, at_once, max_init_pairs=5)
 
     assert [attempt.photos for attempt in found] == placed
     assert all(attempt.model is None for attempt in found if not attempt.photos)
@@ -176,7 +176,7 @@ def test_one_mapper_alone(try_out):
 
 
 def test_photos_that_the_global_mapper_left_out_get_a_second_chance(try_out):
-    found, _ = try_out([3], at_once=8, completed=10, seed_pairs=1)
+    found, _ = try_out([3], at_once=8, completed=10, max_init_pairs=1)
 
     assert summary(found) == [("incremental", 3), ("global", 8), ("incremental", 10)]
     assert found[2].note == "what was left out, photo by photo: 10 photos"

@@ -115,8 +115,8 @@ def test_a_photo_is_used_for_the_triangles_that_show_nothing_masked():
     used = masked_crossing(view)
     near = cv2.erode(used.view(np.uint8), np.ones((7, 7), np.uint8)) > 0
 
-    whole = textured(Album(), views=[view], unseen="cut")[0].surface
-    kept = textured(Album(masks={view.name: used}), views=[view], unseen="cut")[0].surface
+    whole = textured(Album(), views=[view], unseen_faces="cut")[0].surface
+    kept = textured(Album(masks={view.name: used}), views=[view], unseen_faces="cut")[0].surface
 
     parts = np.random.default_rng(0).dirichlet([1.0] * 3, 300)
     shown = [_pixels(view, np.einsum("nk,tkc->tnc", parts, part.vertices[part.faces])) for part in (whole, kept)]
@@ -151,7 +151,7 @@ def test_unseen_triangles_look_like_what_is_around_them(plain):
 
 
 def test_unseen_triangles_can_be_cut(plain):
-    model, figures = textured(Album(), unseen="cut")
+    model, figures = textured(Album(), unseen_faces="cut")
     assert len(model.surface.faces) == len(BOX.faces) - figures["unseen_triangles"]
     assert len(model.texture.uv) == len(model.texture.page) == len(model.surface.faces)
     assert np.unique(model.surface.faces).tolist() == list(range(len(model.surface.vertices)))
@@ -160,7 +160,7 @@ def test_unseen_triangles_can_be_cut(plain):
 
 
 def test_small_pages_make_everything_smaller():
-    model, figures = textured(Album(), max_page_px=256, max_pages=1)
+    model, figures = textured(Album(), max_atlas_px=256, max_pages=1)
     assert all(max(page.shape[:2]) <= 256 for page in model.texture.pages)
     assert len(model.texture.pages) == 1
     assert 0.2 < figures["scale"] < 1.0

@@ -20,7 +20,7 @@ from sfm_app.texture.packing import MARGIN, pack
 from sfm_app.texture.painting import canvas, fill_background
 from sfm_app.texture.photo_consistency import strangers
 from sfm_app.texture.seam_leveling import level, solve_ties
-from sfm_app.texture.unseen import along_a_curve, block_sizes, square_texels, squares
+from sfm_app.texture.unseen_faces import along_a_curve, block_sizes, square_texels, squares
 from sfm_app.texture.view_scoring import sharpness, sharpness_factors
 from sfm_app.texture.view_selection import PRICE_OF_DETAIL, choose_photos
 from sfm_app.texture.views import project, sample
