@@ -34,7 +34,9 @@ def may_have_one_each(model: Attempt | None, intrinsics: Intrinsics, views: View
         views: fundamental matrices.
         settings: who says which photos are of one camera is believed.
     """
-    if model is None or settings.photos.cameras != "auto" or not LEAST <= len(photos_in(views.fits)) <= MOST:
+    if model is None or settings.photos.cameras != "auto":
+        return False
+    if not LEAST <= max(model.photos, len(photos_in(views.fits))) <= MOST:  # pairs on a plane are not counted as fits
         return False
     return _share_against(model) > CONTRADICTED or leaves_many_out(model, intrinsics, views)
 

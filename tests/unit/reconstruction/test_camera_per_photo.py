@@ -59,6 +59,14 @@ def test_it_is_asked_where_one_camera_does_not_explain_photos_that_nobody_groupe
     assert may_have_one_each(attempt(photos(placed), contradicted), guess, views(number), settings) is asked
 
 
+def test_it_is_asked_of_photos_of_a_plane_whose_pairs_are_all_degenerate(cameras):
+    none = ViewGraph({}, {})
+    guess = cameras(method="guess", identifiable=False)
+
+    assert may_have_one_each(attempt(photos(6), 2), guess, none, AUTO)
+    assert not may_have_one_each(attempt(photos(LEAST - 1), 2), guess, none, AUTO)
+
+
 def test_without_a_model_it_is_not_asked(cameras):
     assert not may_have_one_each(None, cameras(), views(6), AUTO)
 
