@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 MAX_TRIPLES = 500
+MOST_LISTED = 60
+"""Points up to which all triples are listed before some are drawn; of a thousand there are 166 million."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,9 +56,7 @@ def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
         ValueError: fewer than 3 points, or all lie on a line.
     """
     count = len(a)
-    triples = np.array(list(combinations(range(count), 3)), np.intp).reshape(-1, 3)
-    if len(triples) > MAX_TRIPLES:
-        triples = np.random.default_rng(0).permutation(triples)[:MAX_TRIPLES]
+    triples = _triples(count)
     best, residual = np.inf, np.zeros(count)
     for triple in triples:
         if _on_a_line(a[triple]) or _on_a_line(b[triple]):
@@ -70,6 +70,15 @@ def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
         raise ValueError("fewer than 3 points, or all on a line: they fix no rotation")
     agreeing = residual <= max(2.5 * 1.4826 * best, np.sort(residual)[2])
     return umeyama(a[agreeing], b[agreeing])
+
+
+def _triples(count: int) -> NDArray[np.intp]:
+    """All triples of so many points, or `MAX_TRIPLES` of them, drawn with a fixed seed."""
+    rng = np.random.default_rng(0)
+    if count > MOST_LISTED:
+        return np.array([rng.choice(count, 3, replace=False) for _ in range(MAX_TRIPLES)], np.intp)
+    triples = np.array(list(combinations(range(count), 3)), np.intp).reshape(-1, 3)
+    return rng.permutation(triples)[:MAX_TRIPLES] if len(triples) > MAX_TRIPLES else triples
 
 
 def _on_a_line(points: FloatArray) -> bool:

@@ -87,7 +87,8 @@ def _from_fundamentals(pairs: CameraPairs, usable: Pairs, options: CalibrationSe
         return guessed(pairs.size, reason, evidence)
     spread = spread_px(scatter, side, effective_count(answer.votes), len(answer.free))
     found = calibration_of(np.append(answer.theta, 0.0), pairs.size, METHOD)
-    doubt = consensus_peak.vagueness(log_focal_spread) or answer.doubt_of_pixels
+    doubt = consensus_peak.vagueness(log_focal_spread) or answer.doubt_of_focal(usable.weights)
+    doubt = doubt or answer.doubt_of_pixels
     return roughly(replace(found, spread=spread, evidence=evidence), doubt)
 
 
@@ -129,7 +130,7 @@ def _from_matches(
         held=fit.names_held(0),
         key_pairs=key_pairs(fit, photos),
     )
-    doubt = answer.doubt_of_pixels if "aspect" in found.held else ""
+    doubt = answer.doubt_of_focal(judged.weights) or (answer.doubt_of_pixels if "aspect" in found.held else "")
     return roughly(found, consensus_peak.vagueness(evidence["log_focal_spread"]) or doubt)
 
 

@@ -13,6 +13,7 @@ from sfm_app.colmap.bundle import Adjusted, adjusted_or_as_it_was
 from sfm_app.colmap.model import color, photos_of, read_scene, sparse_model
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_depth, why_no_scene
+from sfm_app.errors import ReconstructionError
 from sfm_app.numerical import json_text
 from sfm_app.reconstruction import Found, Outcome, clear, look_again, reconstruct
 from sfm_app.reconstruction.align_upright import look_at_photos, orient_or_leave
@@ -33,9 +34,12 @@ def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrins
     """
     first = Found(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
     try:
-        return adjusted_scene(look_again(first), run)
-    finally:
+        scene = adjusted_scene(look_again(first), run)
+    except ReconstructionError:  # any other end, such as Ctrl-C or a full disk: the same command goes on with it
         clear(run)
+        raise
+    clear(run)
+    return scene
 
 
 def adjusted_scene(found: Found, run: RunContext) -> Scene:

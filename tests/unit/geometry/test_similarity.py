@@ -51,3 +51,16 @@ def test_points_that_fix_no_rotation():
     for few in (line, line[:2]):
         with pytest.raises(ValueError, match="fix no rotation"):
             robust_similarity(few, few)
+
+
+def test_thousands_of_points_with_a_third_wrong_take_no_memory():
+    rng = np.random.default_rng(5)
+    true = Similarity(2.5, np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([1.0, 2.0, 3.0]))
+    a = rng.normal(size=(3000, 3))
+    b = true(a) + rng.normal(scale=1e-3, size=a.shape)
+    b[:1000] = rng.normal(size=(1000, 3))
+
+    found = robust_similarity(a, b)
+
+    assert abs(found.scale - true.scale) < 1e-3 and np.allclose(found.R, true.R, atol=1e-3)
+    assert np.allclose(found.t, true.t, atol=1e-3)

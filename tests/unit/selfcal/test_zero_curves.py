@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.selfcal import pair_weights, zero_curves
+from sfm_app.selfcal.consensus import consensus_peak
 from sfm_app.selfcal.zero_curves import METHOD, calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import CameraPairs
@@ -72,6 +73,15 @@ def test_pixels_that_may_not_be_square_are_not_claimed_to_be_known(views):
 
     assert len(held) >= 2 and not any(one.identifiable for one in held)
     assert any(one.reason == "its pixels may not be square" for one in held)
+
+
+@pytest.mark.parametrize(
+    ("lead", "missing", "doubted"), [(0.1, 0.4, True), (0.3, 0.4, False), (0.1, 0.1, False), (0.3, 0.1, False)]
+)
+def test_a_small_lead_counts_only_where_few_votes_are_missing(lead, missing, doubted):
+    votes = np.full(10, 1.0 - missing)
+    answer = consensus_peak.Answer(np.zeros(4), consensus_peak.SQUARE_PIXELS, 0.01, lead * votes.sum(), votes, 0.0, ())
+    assert bool(answer.doubt_of_focal(np.ones(10))) is doubted
 
 
 @pytest.mark.parametrize("count", [3, 5])
@@ -171,7 +181,7 @@ def test_the_prior_holds_the_center_of_few_pairs(views):
 
 
 def test_the_prior_is_measured_in_widths(views):
-    made = views(4, 1, noise=4e-3)
+    made = views(4, 1, noise=3e-3)
     swap = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])
     lying = calibrate(CameraPairs.of(made.Fs, (1000, 750)), OPTIONS.model_copy(update={"center_sigma": 0.06}), 0)
     standing = calibrate(

@@ -38,7 +38,7 @@ from sfm_app.types import (
     Scene,
     ViewGraph,
 )  # fmt: skip
-from sfm_app.workspace import Workspace
+from sfm_app.workspace import SECOND_LOOK, Workspace
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +147,22 @@ def test_cameras_that_mapping_divided_are_read_back_and_the_calibration_stays_se
     photos = PhotoSet(run.workspace.root, tuple(Photo(x.name, 1024, 768, "one") for x in matches.images.values()))
     again = scene.load_scene(photos, made.intrinsics, run)
     assert again.camera_of == found.camera_of and again.cameras.keys() == found.cameras.keys()
+
+
+@pytest.mark.parametrize(("end", "stays"), [(KeyboardInterrupt(), True), (ReconstructionError("no depth"), False)])
+def test_what_a_second_look_found_stays_when_it_is_interrupted(run, monkeypatch, end, stays):
+    def look_again(first):
+        place.mkdir()
+        raise end
+
+    place = run.workspace.root / SECOND_LOOK
+    monkeypatch.setattr(scene, "reconstruct", lambda *_: None)
+    monkeypatch.setattr(scene, "look_again", look_again)
+
+    with pytest.raises(type(end)):
+        scene.reconstruct_scene(None, None, None, run)
+
+    assert place.exists() is stays
 
 
 def test_a_model_that_cannot_be_adjusted_is_kept_as_mapping_left_it_and_the_run_says_so(synthetic, run, monkeypatch):
