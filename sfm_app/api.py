@@ -61,21 +61,22 @@ def reconstruct(
     Raises:
         SfmError: see `sfm_app.errors`; carries what went wrong and what to do.
     """
-    from sfm_app.pipeline import NAMES, run_stages  # loads COLMAP, which an estimator alone can do without
+    from sfm_app import pipeline  # loads COLMAP, which an estimator alone can do without
 
     with opened_run(Path(out), settings or Settings(), progress) as run:
         run.plugins.depth_method(run.settings.depth.method)  # refused now, not when half of the work is done
-        products = run_stages(Path(photos), run, first, last, wanted=("intrinsics", "scene", "files"))
+        wanted = (pipeline.INTRINSICS, pipeline.SCENE, pipeline.FILES)
+        products = pipeline.run_stages(Path(photos), run, first, last, wanted)
         manifest = run.workspace.manifest.read()
-        done = {name: manifest["stages"][name] for name in NAMES[: NAMES.index(last) + 1]}
-        scene = products("scene") if "scene" in done else None
+        done = pipeline.PIPELINE.until(last)
+        scene = products[pipeline.SCENE] if pipeline.SCENE in done else None
         return Run(
             out=run.workspace.root,
-            calibration=products("intrinsics") if "intrinsics" in done else None,
+            calibration=products[pipeline.INTRINSICS] if pipeline.INTRINSICS in done else None,
             scene=scene,
             model_dir=scene.model_dir if scene else None,
-            mesh_path=products("files")[-1] if "files" in done else None,
-            manifest={**manifest, "stages": done},
+            mesh_path=products[pipeline.FILES][-1] if pipeline.FILES in done else None,
+            manifest={**manifest, "stages": {stage.name: manifest["stages"][stage.name] for stage in done}},
         )
 
 
@@ -134,7 +135,7 @@ def calibrate_photos(
     Raises:
         SfmError: see `sfm_app.errors`.
     """
-    from sfm_app.pipeline import run_stages  # as above
+    from sfm_app import pipeline  # as above
     from sfm_app.report import check_figure, draw_intrinsics
 
     if figure is not None:
@@ -143,10 +144,11 @@ def calibrate_photos(
         tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch,
         opened_run(Path(out or scratch), settings or Settings(), progress) as run,
     ):
-        products = run_stages(Path(photos), run, last="intrinsics", wanted=("match_graph", "view_graph", "intrinsics"))
-        found: Intrinsics = products("intrinsics")
+        wanted = (pipeline.MATCH_GRAPH, pipeline.VIEW_GRAPH, pipeline.INTRINSICS)
+        products = pipeline.run_stages(Path(photos), run, last=pipeline.INTRINSICS.name, wanted=wanted)
+        found = products[pipeline.INTRINSICS]
         if figure is not None:
-            draw_intrinsics(Path(figure), products("match_graph"), products("view_graph"), found)
+            draw_intrinsics(Path(figure), products[pipeline.MATCH_GRAPH], products[pipeline.VIEW_GRAPH], found)
     return found
 
 

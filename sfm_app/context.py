@@ -1,9 +1,9 @@
-"""What a stage gets besides its inputs: workers, seed, progress, and a place to note what it counted."""
+"""What a stage gets besides its inputs: settings, workers, progress, and a place to note what it counted."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,9 +23,9 @@ STANDARD_FORMATS = ("ply", "glb")
 """What every run writes its models as; `sfm-app export` makes others of them."""
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class RunContext:
-    """One run of the program."""
+    """One run of the program, or, from `for_stage` on, one stage of it."""
 
     settings: Settings
     workspace: Workspace
@@ -33,10 +33,14 @@ class RunContext:
     executor: Executor
     workers: int
     progress: Progress = field(default_factory=Silent)
-    counts: dict[str, Any] = field(default_factory=dict)
-    """What the current stage has counted so far."""
-    inputs: str = ""
-    """Fingerprint of everything that the current stage's result depends on."""
+    fingerprint: str = ""
+    """Hash of everything that the stage's result depends on."""
+    statistics: dict[str, Any] = field(default_factory=dict)
+    """What the stage has counted so far, for the manifest; no part of a product is read from here."""
+
+    def for_stage(self, fingerprint: str) -> "RunContext":
+        """Return the same run for a stage that has counted nothing yet."""
+        return replace(self, fingerprint=fingerprint, statistics={})
 
     @property
     def seed(self) -> int:
@@ -49,15 +53,10 @@ class RunContext:
         return 1000 * self.settings.max_memory_gb or SHARE_OF_MACHINE * machine_memory_mb()
 
     @contextmanager
-    def with_workers(self, workers: int) -> Iterator[None]:
-        """Use so many workers instead of what the settings say."""
-        before = self.workers, self.executor
+    def with_workers(self, workers: int) -> Iterator["RunContext"]:
+        """Provide the same run with so many workers, which end with the block."""
         with make_executor(workers) as executor:
-            self.workers, self.executor = workers, executor
-            try:
-                yield
-            finally:
-                self.workers, self.executor = before
+            yield replace(self, workers=workers, executor=executor)
 
     @property
     def mask_dir(self) -> Path | None:
@@ -74,9 +73,9 @@ class RunContext:
         """Show that a long piece of work, which cannot say how far it is, is under way."""
         yield from track(self.progress, [None], label, 1)
 
-    def record(self, **counts: Any) -> None:
-        """Note figures of the current stage for the manifest; plain numbers, strings, lists and dicts."""
-        self.counts |= counts
+    def record(self, **figures: Any) -> None:
+        """Note figures of the stage for the manifest; plain numbers, strings, lists and dicts."""
+        self.statistics.update(figures)
 
     def model_paths(self, name: str) -> tuple[Path, ...]:
         """Return where a model of this name is in the output folder."""

@@ -12,7 +12,7 @@ from sfm_app.api import Run, reconstruct
 from sfm_app.errors import InputError
 from sfm_app.progress import Progress
 from sfm_app.settings import Settings
-from sfm_app.stages.texture import load_texture
+from sfm_app.stages.texture import read_texture
 from sfm_app.synthetic.cameras import Camera, arc, camera_center, make_camera
 from sfm_app.synthetic.compare import (
     center_error_percent,
@@ -77,7 +77,7 @@ def run_demo(out: Path, settings: Settings, progress: Progress) -> DemoResult:
     done = time.perf_counter()
     if run.scene is None or run.calibration is None:
         raise InputError("the demo's reconstruction is incomplete", hint=f"remove {out} and try again")
-    model = load_texture(Workspace(run.out).dense)
+    model = read_texture(Workspace(run.out))
     draw(model, run.scene, out)
     return compared(run, run.scene, model, truth, (rendered - start, done - rendered), out)
 

@@ -67,8 +67,8 @@ def graph_of(found: Mapping[PairId, Fitted]) -> ViewGraph:
 def in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run: RunContext) -> dict[PairId, Fitted]:
     """Return what `fit_pair` makes of every pair, in their order; parts that are complete are kept as they come."""
     folder = run.workspace.view_graph_parts
-    if not can_go_on(folder, run.inputs):
-        mark_unfinished(folder, run.inputs)
+    if not can_go_on(folder, run.fingerprint):
+        mark_unfinished(folder, run.fingerprint)
     parts = {folder / f"{first:06d}.npz": pairs[first : first + PART] for first in range(0, len(pairs), PART)}
     known = {path: read_part(path, part) for path, part in parts.items()}
     left = [pair for path, part in parts.items() if known[path] is None for pair in part]

@@ -32,7 +32,7 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
             return dict(stored)
 
 
-def seal(root: Path, *names: str) -> str:
+def digest_files(root: Path, *names: str) -> str:
     """Return hash of the names and bytes of files and of what lies in folders, links left out.
 
     Raises:

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.atomic_io import replacing
+from sfm_app.errors import InputError
 from sfm_app.hashing import fingerprint
 from sfm_app.numerical import json_text
 
 MANIFEST = "manifest.json"
-DATABASE = "database.db"
-CALIBRATION = "calibration.json"
-SHARED = (DATABASE, CALIBRATION)
-"""Files that later stages add to."""
+FORMAT = 2
+"""Raised when what stages leave can no longer be read by an earlier or later program."""
 CHECK = "check"
 """In a record: hash of the rest. What was changed by hand, or is half of it, is no record."""
 MOST_BYTES = 64_000_000
@@ -29,12 +28,12 @@ class StageRecord:
     seconds: float
     counts: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, int] = field(default_factory=dict)
-    """What the stage wrote, with the size in bytes; -1 for what later stages add to (folders, SHARED)."""
+    """What the stage wrote, with the size in bytes; -1 for folders, and for the database, which readers may tidy up."""
     peak_mb: int | None = None
     """Most memory that the process had held by the end of the stage, in MB; None where the system does not say."""
     made_with: Mapping[str, Any] = field(default_factory=dict)
     """The settings and versions that its result depends on."""
-    seal: str = ""
+    digest: str = ""
     """Hash of what later runs read of it, so that damage is found before it is read."""
 
 
@@ -55,6 +54,19 @@ class Manifest:
             return {}
         return found if isinstance(found, dict) and isinstance(found.get("stages", {}), dict) else {}
 
+    def check_format(self) -> None:
+        """Check that this program can read what a run has left.
+
+        Raises:
+            InputError: another version has made it.
+        """
+        found = self.read()
+        if found.get("stages") and found.get("format") != FORMAT:
+            raise InputError(
+                f"the run in {self.root} was made by another version of sfm-app",
+                hint="name another output folder with -o, or remove this one",
+            )
+
     def record(self, stage: str) -> StageRecord | None:
         """Return the record of a finished stage, if the manifest has one, just as it was written."""
         entry = self.read().get("stages", {}).get(stage)
@@ -63,7 +75,7 @@ class Manifest:
         except (AttributeError, KeyError, TypeError, RecursionError):
             return None
 
-    def spoilt(self, record: StageRecord) -> list[str]:
+    def changed_files(self, record: StageRecord) -> list[str]:
         """Return files of a finished stage that are gone or have another size."""
         return [name for name, size in record.files.items() if _size(self.root / name) != size]
 
@@ -78,7 +90,7 @@ class Manifest:
         """Enter a finished stage; `head` (settings, versions, ...) replaces the rest of the manifest."""
         entry = json.loads(json_text(asdict(record)))
         stages = self.read().get("stages", {}) | {stage: {**entry, CHECK: fingerprint(entry)}}
-        self.write({**head, "stages": stages})
+        self.write({"format": FORMAT, **head, "stages": stages})
 
     def write(self, manifest: Mapping[str, Any]) -> None:
         """Replace the manifest as a whole."""
@@ -94,4 +106,4 @@ class Manifest:
 def _size(path: Path) -> int | None:
     if not path.exists():
         return None
-    return -1 if path.is_dir() or path.name in SHARED else path.stat().st_size
+    return -1 if path.is_dir() or path.suffix == ".db" else path.stat().st_size

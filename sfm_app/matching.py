@@ -59,8 +59,8 @@ def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId
             place.database, place.photos, list(names.values()), options, run.workers, run.progress, run.mask_dir,
             method.sift, pairs,
         )  # fmt: skip
-    if not can_go_on(place.feature_parts, run.inputs):
-        mark_unfinished(place.feature_parts, run.inputs)
+    if not can_go_on(place.feature_parts, run.fingerprint):
+        mark_unfinished(place.feature_parts, run.fingerprint)
     _find(method, names, run)
     _match(method, pairs_of(names) if pairs is None else pairs, run)
     shutil.rmtree(place.feature_parts)

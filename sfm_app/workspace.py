@@ -7,19 +7,22 @@ import platform
 import tempfile
 from collections.abc import Iterator
 from datetime import datetime
+from itertools import chain
 from pathlib import Path
 
 from filelock import FileLock, Timeout
 
 from sfm_app.atomic_io import UNFINISHED
 from sfm_app.errors import InputError
-from sfm_app.manifest import CALIBRATION, DATABASE, MANIFEST, Manifest
+from sfm_app.manifest import MANIFEST, Manifest
 
-WRITTEN = ("photos", "frames", "masks", "sparse", "dense", "other_models", DATABASE, CALIBRATION)
+DATABASE, CALIBRATION, SCENE = "database.db", "calibration.json", "scene.json"
+FOLDERS = ("photos", "frames", "masks", "sparse", "other_models", "dense", "surface", "texture")
+WRITTEN = (*FOLDERS, DATABASE, CALIBRATION, SCENE)
 """What a run removes before it writes it."""
 LOCK, HOLDER = ".lock", ".held-by.txt"
-LOG, PARTS, FEATURES, SECOND_LOOK = "log.txt", "view_graph_parts", "feature_parts", ".second_look"
-FOLLOWED = (*WRITTEN, LOCK, HOLDER, LOG, PARTS, FEATURES, SECOND_LOOK)
+LOG, PARTS, FEATURES, MAPPING = "log.txt", "view_graph_parts", "feature_parts", ".mapping"
+FOLLOWED = (*WRITTEN, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING)
 """What a run writes to without replacing it: a link would lead it out of the folder."""
 PHOTO_SET, VIEW_GRAPH = "photos.json", "view_graph.npz"
 
@@ -68,6 +71,11 @@ class Workspace:
         return self.root / CALIBRATION
 
     @property
+    def scene(self) -> Path:
+        """What is known about the scene besides COLMAP's model: refined cameras, and why photos have no place."""
+        return self.root / SCENE
+
+    @property
     def sparse(self) -> Path:
         return self.root / "sparse"
 
@@ -78,7 +86,18 @@ class Workspace:
 
     @property
     def dense(self) -> Path:
+        """COLMAP's dense workspace: undistorted photos, depth and normal maps."""
         return self.root / "dense"
+
+    @property
+    def surface(self) -> Path:
+        """Fused points, and the surface through them."""
+        return self.root / "surface"
+
+    @property
+    def texture(self) -> Path:
+        """The surface with its texture."""
+        return self.root / "texture"
 
     @property
     def database_marker(self) -> Path:
@@ -195,9 +214,8 @@ class Workspace:
 
     def discard_unfinished(self) -> None:
         """Let no run go on with what a stage has left half done."""
-        for path in (self.database_marker, self.frames_marker, *self.root.glob(f"*/{UNFINISHED}")):
-            path.unlink(missing_ok=True)
-        for path in self.dense.glob(f"*/{UNFINISHED}"):
+        markers = (self.root.glob(f"{folder}/{UNFINISHED}") for folder in ("*", "*/*"))
+        for path in (self.database_marker, self.frames_marker, *chain(*markers)):
             path.unlink(missing_ok=True)
 
 

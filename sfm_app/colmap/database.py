@@ -1,11 +1,10 @@
-"""COLMAP's SQLite database: photos and cameras in, keypoints and matches out, our epipolar geometries and K back in."""
+"""COLMAP's SQLite database: photos and cameras in, keypoints and matches out, our relative poses and K back in."""
 
 import contextlib
 import ctypes
 import hashlib
-import shutil
 import sqlite3
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.geometry.epipolar import cross_matrix
 from sfm_app.types import (
     Calibration,
-    EpipolarFit,
     Intrinsics,
     MatchedImage,
     MatchGraph,
@@ -79,7 +77,7 @@ MATCHES = (
 """What stays as it is once the photos are matched."""
 
 
-def matches_seal(path: Path) -> str:
+def digest_matches(path: Path) -> str:
     """Return hash of photos, keypoints and matches."""
     found = hashlib.blake2b(digest_size=16)
     with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as connection:
@@ -159,14 +157,26 @@ def write_matches(path: Path, pair: PairId, rows: NDArray[np.uint32]) -> None:
         database.write_matches(*pair, np.ascontiguousarray(rows, np.uint32))
 
 
-def empty_copy(database: Path, target: Path) -> None:
-    """Copy a database with its photos and cameras, and nothing that was found in them."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    remove_database(target)
-    shutil.copyfile(database, target)
-    with opened(target) as copy:
-        for clear in (copy.clear_two_view_geometries, copy.clear_matches, copy.clear_descriptors, copy.clear_keypoints):
-            clear()
+def write_match_graph(path: Path, matches: MatchGraph) -> None:
+    """Make a database of the photos, keypoints and raw matches of a match graph, under the same ids.
+
+    Its cameras are guesses, one for each group of photos, until `write_calibrations` replaces them.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    remove_database(path)
+    groups = list(dict.fromkeys(image.group for _, image in sorted(matches.images.items())))
+    with opened(path) as database:
+        for photo, known in sorted(matches.images.items()):
+            camera_id, size = 1 + groups.index(known.group), (known.width, known.height)
+            if not database.exists_camera(camera_id):
+                _write_camera(database, camera_id, Calibration(guessed_camera_matrix(size), *size, "guess", False))
+            image = pycolmap.Image(name=known.name, camera_id=camera_id, image_id=photo)
+            database.write_image(image, use_image_id=True)
+            _write_frame(database, image)
+        for photo, keypoints in matches.keypoints.items():
+            _put_keypoints(database, photo, keypoints)
+        for pair, rows in matches.matches.items():
+            database.write_matches(*pair, np.ascontiguousarray(rows, np.uint32))
 
 
 def read_features(path: Path) -> tuple[dict[int, NDArray[np.float64]], dict[PairId, NDArray[np.uint32]]]:
@@ -176,25 +186,6 @@ def read_features(path: Path) -> tuple[dict[int, NDArray[np.float64]], dict[Pair
         pair_ids, rows = database.read_all_matches()
     keypoints = {photo: np.asarray(x, np.float64)[:, :2].copy() for photo, x in sorted(found.items()) if len(x)}
     return keypoints, {_pair(key): np.asarray(row, np.uint32) for key, row in zip(pair_ids, rows, strict=True)}
-
-
-def write_features(path: Path, matches: MatchGraph) -> None:
-    """Replace all keypoints and matches."""
-    with opened(path) as database:
-        database.clear_two_view_geometries()
-        database.clear_matches()
-        for photo, keypoints in matches.keypoints.items():
-            _put_keypoints(database, photo, keypoints)
-        for pair, rows in matches.matches.items():
-            database.write_matches(*pair, np.ascontiguousarray(rows, np.uint32))
-
-
-def write_epipolar_fits(path: Path, matches: MatchGraph, fits: Mapping[PairId, EpipolarFit]) -> None:
-    """Replace all two-view geometries by ours."""
-    with opened(path) as database:
-        database.clear_two_view_geometries()
-        for pair, fit in fits.items():
-            database.write_two_view_geometry(*pair, _two_view_geometry(fit, matches.matches[pair]))
 
 
 def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
@@ -280,15 +271,6 @@ def camera_params(K: NDArray[np.float64], camera_model: str, radial: float = 0.0
 def _pair(pair_id: int) -> PairId:
     first, second = pycolmap.pair_id_to_image_pair(pair_id)
     return int(first), int(second)
-
-
-def _two_view_geometry(fit: EpipolarFit, matches: NDArray[np.uint32]) -> Any:
-    geometry = pycolmap.TwoViewGeometry()
-    kinds = pycolmap.TwoViewGeometryConfiguration
-    geometry.config = kinds.PLANAR_OR_PANORAMIC if fit.degeneracy else kinds.UNCALIBRATED
-    geometry.F = fit.F
-    geometry.inlier_matches = np.ascontiguousarray(matches[fit.inliers])
-    return geometry
 
 
 def _posed_geometry(pose: RelativePose, matches: NDArray[np.uint32]) -> Any:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import backend, check_written, pycolmap
 from sfm_app.colmap.masks import used_pixels
 from sfm_app.colmap.worker_process import finished
-from sfm_app.hashing import is_below
+from sfm_app.hashing import digest_files, is_below
 from sfm_app.progress import Progress
 from sfm_app.stereo import DepthMap, Estimate, Kind, View
 
@@ -20,7 +20,7 @@ MASKED = -1.0
 """In place of the depth where a photo is masked. COLMAP's fusion takes it for none; `sfm_app.meshing` does not take it
 for empty space."""
 MAPS = ("sparse", "images", f"stereo/{DEPTHS}", f"stereo/{NORMALS}")
-"""What the maps of a finished workspace are read from."""
+"""What a finished workspace is read from."""
 
 
 def undistort(
@@ -139,6 +139,17 @@ def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
     for view in views:
         for folder in (DEPTHS, NORMALS, CONFIDENCES):
             _map_path(dense_dir, folder, view, "photometric").unlink(missing_ok=True)
+
+
+def write_fusion_views(dense_dir: Path, views: Sequence[View]) -> None:
+    """Write down for COLMAP's fusion which views have maps."""
+    config = "".join(f"{view.name}\n" for view in views if map_file(dense_dir, view).exists())
+    (dense_dir / "stereo" / "fusion.cfg").write_text(config, encoding="utf-8")
+
+
+def digest_maps(dense_dir: Path) -> str:
+    """Return hash of what the maps of a finished workspace are read from."""
+    return digest_files(dense_dir, *MAPS)
 
 
 def _read_depth_format(dense_dir: Path, folder: str, view: View, kind: Kind) -> NDArray[np.float32]:

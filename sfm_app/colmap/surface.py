@@ -1,6 +1,5 @@
 """COLMAP's fusion of depth maps, Poisson's surface through the fused points, and fewer triangles for it."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +8,6 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.worker_process import finished
-from sfm_app.stereo import View
 from sfm_app.types import Surface
 
 FUSED = "fused.ply"
@@ -19,7 +17,6 @@ FULL_DEPTH = 5
 
 def fuse(
     dense_dir: Path,
-    views: Sequence[View],
     min_views: int,
     box: NDArray[np.float64],
     target: Path,
@@ -28,37 +25,34 @@ def fuse(
     """Fuse the geometric maps of these views into the PLY file `target`.
 
     Args:
-        dense_dir: dense workspace.
-        views: those that have maps.
+        dense_dir: dense workspace; `dense.write_fusion_views` has said which of its views have maps.
         min_views: photos that have to see a point.
         box: (2, 3) lowest and highest coordinates that are kept.
         target: in any folder.
         cache_gb: memory for the maps of photos; with less, they are read more often.
     """
-    config = "".join(f"{view.name}\n" for view in views)
-    (dense_dir / "stereo" / "fusion.cfg").write_text(config, encoding="utf-8")
     task = {"dense": str(dense_dir), "target": str(target), "min_views": min_views, "box": box.tolist()}
     finished("sfm_app.colmap.surface_process", {"do": "fuse", "cache_gb": cache_gb, **task}, "fusing depth maps")
     target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; nobody asks
 
 
-def read_fused(dense_dir: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def read_fused(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Read fused points (N, 3) and their unit normals (N, 3), which point to the photos that see them."""
     with backend("reading the fused points"):
-        vertex = trimesh.load(dense_dir / FUSED).metadata["_ply_raw"]["vertex"]["data"]
+        vertex = trimesh.load(folder / FUSED).metadata["_ply_raw"]["vertex"]["data"]
         points, normals = (np.stack([vertex[c] for c in names], axis=1) for names in ("xyz", ("nx", "ny", "nz")))
     return points.astype(np.float64), normals.astype(np.float64)
 
 
-def poisson(dense_dir: Path, depth: int) -> Surface:
+def poisson(folder: Path, depth: int) -> Surface:
     """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points, with their colors.
 
     Args:
-        dense_dir: dense workspace.
+        folder: of the fused points.
         depth: of the octree, FULL_DEPTH where less; the finest cell is the largest extent of the points over 2^depth.
     """
-    path = dense_dir / "poisson.ply"
-    task = {"points": str(dense_dir / FUSED), "target": str(path), "depth": max(depth, FULL_DEPTH)}
+    path = folder / "poisson.ply"
+    task = {"points": str(folder / FUSED), "target": str(path), "depth": max(depth, FULL_DEPTH)}
     finished("sfm_app.colmap.surface_process", {"do": "poisson", **task}, "finding the surface")
     surface = _read(path)
     path.unlink()

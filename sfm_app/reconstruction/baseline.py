@@ -21,7 +21,7 @@ from sfm_app.types.epipolar import EpipolarFit
 
 logger = logging.getLogger("sfm_app")
 
-FOLDER = ".rival"
+FOLDER = "rival"
 MAPPER, HOW = "colmap", "as COLMAP does by itself"
 LEFT_OUT, MANY = 0.25, 60
 """Share of the photos without a place from which on other focals are tried, and photos from which on they are not."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.database import write_calibrations, write_pose_graph
+from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
 from sfm_app.colmap.model import cameras_of, part_of, photos_of
 from sfm_app.context import RunContext
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
@@ -77,6 +77,8 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
     were guesses, or photos of the main group stayed out, the cameras that mapping found are taken for a second pass:
     with them, relative poses are right that were not before. So it goes on while the passes get better.
     """
+    with backend("entering photos"):
+        write_match_graph(run.workspace.database, matches)
     best = _pass(matches, views, intrinsics, run)
     matches, views = without_look_alikes(matches, views, best.graph)
     best = with_rival(best, matches, views, intrinsics, run)

@@ -36,7 +36,7 @@ CONTRADICTED = 0.01
 """Share of the inliers of fundamental matrices that may contradict a model which leaves nothing to be wished for."""
 WELL_KNOWN = 0.01
 """Relative deviation of a focal that mapping leaves alone."""
-GLOBAL_FOLDER = ".global"
+INCREMENTAL_FOLDER, GLOBAL_FOLDER = "incremental", "global"
 
 Maker = Callable[[Any], "list[Attempt]"]
 """What makes models until a token stops it."""
@@ -212,7 +212,7 @@ def _completed(group: Group, best: Attempt, run: RunContext, token: Any) -> list
 def _grown(group: Group, start: Any, run: RunContext, token: Any) -> Any:
     place = run.workspace
     return map_incrementally(
-        place.database, place.photos, start, place.root / ".mapping", run.seed, run.progress.advance, token,
+        place.database, place.photos, start, place.root / INCREMENTAL_FOLDER, run.seed, run.progress.advance, token,
         known=all(well_known(group.intrinsics.camera(group.matches.images[photo])) for photo in group.photos),
     )  # fmt: skip
 

@@ -5,16 +5,14 @@ On plain things and over wide steps the usual features find little. Features tha
 much, and where all photos have their place they add nothing.
 """
 
-import shutil
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sfm_app.atomic_io import can_go_on, mark_unfinished
 from sfm_app.calibrating import find_intrinsics
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.database import empty_copy, read_features, write_features
+from sfm_app.colmap.database import read_features, write_match_graph
 from sfm_app.colmap.model import photos_of
 from sfm_app.context import RunContext
 from sfm_app.errors import SfmError
@@ -26,9 +24,9 @@ from sfm_app.reconstruction.mapping_passes import Outcome, reconstruct
 from sfm_app.reconstruction.mapping_runs import Attempt, better, judged
 from sfm_app.reconstruction.unregistered import names_of
 from sfm_app.types import Intrinsics, MatchGraph, PairId, ViewGraph
-from sfm_app.workspace import SECOND_LOOK, Aside
+from sfm_app.workspace import Aside
 
-FEATURES = "features"
+FOLDER, FEATURES = "second_look", "features"
 LOOSE_RATIO = 0.85
 """Largest ratio of the distances to the best and the second best descriptor. Chosen on dinoSparseRing: of its weakest
 links 19, 22, 31 and 43 matches are right at 0.8 (of 33, 30, 39, 51), and 26, 29, 45 and 55 at 0.85 (of 58, 52, 81, 77):
@@ -56,7 +54,7 @@ class Found:
 def look_again(first: Found) -> Found:
     """Look again at the photos that the main model does not hold; what was found first stays unless more find a place.
 
-    Whatever fails on the way costs nothing but the attempt. The caller removes what lies in `SECOND_LOOK`, by `clear`.
+    Whatever fails on the way costs nothing but the attempt.
     """
     run, lost = first.run, lost_photos(first)
     if not lost or run.settings.matching.features == SIFT_DSP or not run.settings.scene.second_look:
@@ -73,11 +71,6 @@ def look_again(first: Found) -> Found:
     taken = second is not None and _is_better(second, first)
     run.record(second_look=report | {"placed": placed, "taken": taken})
     return second if second is not None and taken else first
-
-
-def clear(run: RunContext) -> None:
-    """Remove what a second look has left."""
-    shutil.rmtree(run.workspace.root / SECOND_LOOK, ignore_errors=True)
 
 
 def lost_photos(found: Found) -> list[int]:
@@ -112,14 +105,12 @@ def _seen_again(first: Found, pairs: Sequence[PairId], report: dict[str, Any]) -
     finer = replace(run, workspace=Aside(run.workspace, FEATURES))
     with backend("looking for finer features"):
         if not finer.workspace.database.exists():
-            empty_copy(first.run.workspace.database, finer.workspace.database)
+            write_match_graph(finer.workspace.database, replace(first.matches, keypoints={}, matches={}))
     fill_database(run.plugins.feature_method(SIFT_DSP), finer, pairs)
     with backend("adding matches"):
         matches, changed = with_added(first.matches, *read_features(finer.workspace.database))
         if not changed:
             return None
-        empty_copy(first.run.workspace.database, run.workspace.database)
-        write_features(run.workspace.database, matches)
     fitted = graph_of(fit_pairs(matches, changed, run))
     asked = set(changed)
     kept = {pair: fit for pair, fit in first.views.fits.items() if pair not in asked}
@@ -138,12 +129,10 @@ def _mostly_known(found: Found) -> bool:
 
 def _aside(run: RunContext) -> RunContext:
     """Return the run in a folder of its own, where what a killed run left is taken up again."""
-    place = Aside(run.workspace, SECOND_LOOK)
-    if not can_go_on(place.root, run.inputs):
-        mark_unfinished(place.root, run.inputs)
+    place = Aside(run.workspace, FOLDER)
     loose = run.settings.matching.model_copy(update={"max_ratio": max(LOOSE_RATIO, run.settings.matching.max_ratio)})
     settings = run.settings.model_copy(update={"matching": loose})
-    return replace(run, workspace=place, settings=settings, counts={})
+    return replace(run, workspace=place, settings=settings, statistics={})
 
 
 def _placed(outcome: Outcome) -> int:

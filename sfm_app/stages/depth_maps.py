@@ -11,14 +11,23 @@ import cv2
 import numpy as np
 
 from sfm_app.atomic_io import can_go_on, mark_finished, mark_unfinished
-from sfm_app.colmap.dense import DenseStore, drop_estimates, hide_masked, read_depth, read_views, undistort
+from sfm_app.colmap.dense import (
+    DenseStore,
+    digest_maps,
+    drop_estimates,
+    hide_masked,
+    read_depth,
+    read_views,
+    undistort,
+    write_fusion_views,
+)
 from sfm_app.colmap.masks import mask_undistorter
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.hashing import fingerprint
-from sfm_app.settings import DepthSettings
 from sfm_app.stereo import DepthTask, View, rank_neighbors
 from sfm_app.types import Rejected, Scene
+from sfm_app.workspace import Workspace
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
@@ -26,7 +35,7 @@ CONFIRMING = 2
 """A depth map is checked against this many times as many photos as it was made from."""
 
 
-def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: DepthSettings, run: RunContext) -> Path:
+def make(scene: Scene, run: RunContext) -> Path:
     """Give every photo that has neighbors a depth and a normal map; a run that was killed goes on where it stopped.
 
     Returns:
@@ -37,9 +46,10 @@ def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: Dep
         ConfigError: the method that was asked for cannot run here.
         BackendError: COLMAP failed.
     """
+    dense_dir, options = run.workspace.dense, run.settings.depth
     method, why = run.plugins.depth_method(options.method)
     run.record(method=method.name, method_reason=why)
-    prepare(scene, photo_dir, dense_dir, method.name, run)
+    prepare(scene, dense_dir, method.name, run)
     views = read_views(dense_dir)
     ranked = rank_neighbors(views, CONFIRMING * options.neighbors)
     with single_threaded_opencv():
@@ -48,17 +58,28 @@ def make_depth_maps(scene: Scene, photo_dir: Path, dense_dir: Path, options: Dep
         run.map(partial(hide_masked, dense_dir), views, "masking depth maps")
     record(dense_dir, views, found, run)
     drop_estimates(dense_dir, views)
+    write_fusion_views(dense_dir, views)
     mark_finished(dense_dir)
     return dense_dir
 
 
-def prepare(scene: Scene, photo_dir: Path, dense_dir: Path, method: str, run: RunContext) -> None:
+def load(run: RunContext) -> Path:
+    """Return the dense workspace."""
+    return run.workspace.dense
+
+
+def digest(place: Workspace) -> str:
+    """Return hash of the undistorted photos and their maps."""
+    return digest_maps(place.dense)
+
+
+def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None:
     """Undistort photos and masks, unless a killed run has left a workspace with the same model and other inputs."""
     model = [(file.name, blake2b(file.read_bytes()).hexdigest()) for file in sorted(scene.model_dir.glob("*.bin"))]
-    made_from = fingerprint(run.inputs, method, model)
+    made_from = fingerprint(run.fingerprint, method, model)
     if not can_go_on(dense_dir, made_from):
         largest = run.settings.depth.max_image_size_px
-        undistort(scene.model_dir, photo_dir, dense_dir, largest, run.workers, run.progress)
+        undistort(scene.model_dir, run.workspace.photos, dense_dir, largest, run.workers, run.progress)
         if run.mask_dir is not None:
             undistort_mask = mask_undistorter(scene.model_dir, run.mask_dir, dense_dir)
             run.map(undistort_mask, read_views(dense_dir), "undistorting masks")

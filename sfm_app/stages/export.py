@@ -2,14 +2,16 @@
 
 from pathlib import Path
 
-from sfm_app.context import RunContext
+from sfm_app.context import STANDARD_FORMATS, RunContext
 from sfm_app.formats.pages import JPEG_QUALITY
+from sfm_app.hashing import digest_files
 from sfm_app.types import Model
+from sfm_app.workspace import Workspace
 
 NAME = "model"
 
 
-def write_files(model: Model, run: RunContext) -> tuple[Path, ...]:
+def make(model: Model, run: RunContext) -> tuple[Path, ...]:
     """Write the finished model in every standard format; the last one is the one to open."""
     paths = run.write_model(model, NAME)
     if model.texture is not None:
@@ -18,6 +20,11 @@ def write_files(model: Model, run: RunContext) -> tuple[Path, ...]:
     return paths
 
 
-def load_files(run: RunContext) -> tuple[Path, ...]:
+def load(run: RunContext) -> tuple[Path, ...]:
     """Return paths of the files that are there."""
     return run.model_paths(NAME)
+
+
+def digest(place: Workspace) -> str:
+    """Return hash of the files of the model."""
+    return digest_files(place.root, *(f"{NAME}.{suffix}" for suffix in STANDARD_FORMATS))

@@ -4,16 +4,14 @@ import json
 
 from sfm_app.atomic_io import replacing
 from sfm_app.calibrating import find_intrinsics
-from sfm_app.colmap.backend import backend
-from sfm_app.colmap.database import write_calibrations
 from sfm_app.context import RunContext
-from sfm_app.hashing import fingerprint
+from sfm_app.hashing import digest_files
 from sfm_app.numerical import json_text
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, ViewGraph
 from sfm_app.workspace import Workspace
 
 
-def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
+def make(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
     """Find the cameras, write them down and count them."""
     intrinsics, cameras = find_intrinsics(matches, views, run)
     run.record(
@@ -23,25 +21,17 @@ def calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrins
     )
     with replacing(run.workspace.calibration) as path:
         path.write_text(json_text(intrinsics.to_dict()), encoding="utf-8")
-    with backend("writing calibrations"):
-        write_calibrations(run.workspace.database, matches, intrinsics)
     return intrinsics
 
 
-def intrinsics_seal(place: Workspace) -> str:
-    """Return hash of what this stage left: calibration.json without what the scene adds.
-
-    The cameras of the database are none of it: mapping enters those that it tries.
-    """
-    known = json.loads(place.calibration.read_text(encoding="utf-8"))
-    for added in ("refined", "refined_camera_of"):
-        known.pop(added, None)
-    return fingerprint(known)
-
-
-def load_intrinsics(run: RunContext) -> Intrinsics:
+def load(run: RunContext) -> Intrinsics:
     """Read calibration.json back."""
     return Intrinsics.from_dict(json.loads(run.workspace.calibration.read_text(encoding="utf-8")))
+
+
+def digest(place: Workspace) -> str:
+    """Return hash of calibration.json."""
+    return digest_files(place.root, place.calibration.name)
 
 
 def _summary(camera: Calibration) -> dict[str, object]:

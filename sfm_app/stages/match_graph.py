@@ -2,14 +2,15 @@
 
 from sfm_app.atomic_io import is_made_from
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.database import create_database, is_sound, read_match_graph, remove_database
+from sfm_app.colmap.database import create_database, digest_matches, is_sound, read_match_graph, remove_database
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import NOTHING_MATCHED, why_no_scene
 from sfm_app.matching import fill_database
 from sfm_app.types import MatchGraph, PhotoSet
+from sfm_app.workspace import Workspace
 
 
-def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
+def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
     """Find features and match every photo with every other, without geometric verification.
 
     What a killed run has found of the same photos stays.
@@ -19,14 +20,14 @@ def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
     """
     place, options = run.workspace, run.settings.matching
     marker = place.database_marker
-    if not (is_made_from(marker, run.inputs) and is_sound(place.database)):
+    if not (is_made_from(marker, run.fingerprint) and is_sound(place.database)):
         marker.unlink(missing_ok=True)
         remove_database(place.database)
         with backend("entering photos"):
             create_database(place.database, photos)
-        marker.write_text(run.inputs, encoding="utf-8")
+        marker.write_text(run.fingerprint, encoding="utf-8")
     in_force = fill_database(run.plugins.feature_method(options.features), run)
-    graph = load_match_graph(photos, run)
+    graph = load(photos, run)
     run.record(
         keypoints={graph.images[key].name: len(points) for key, points in graph.keypoints.items()},
         pairs=len(graph.matches),
@@ -39,7 +40,7 @@ def match_photos(photos: PhotoSet, run: RunContext) -> MatchGraph:
     return graph
 
 
-def load_match_graph(photos: PhotoSet, run: RunContext) -> MatchGraph:
+def load(photos: PhotoSet, run: RunContext) -> MatchGraph:
     """Read the match graph back from the database.
 
     Raises:
@@ -49,3 +50,8 @@ def load_match_graph(photos: PhotoSet, run: RunContext) -> MatchGraph:
         raise ValueError(f"{run.workspace.database} is damaged")
     with backend("reading the database"):
         return read_match_graph(run.workspace.database, photos)
+
+
+def digest(place: Workspace) -> str:
+    """Return hash of the photos, keypoints and matches in the database."""
+    return digest_matches(place.database)

@@ -12,7 +12,7 @@ from sfm_app.context import RunContext
 from sfm_app.cost_estimate import cache_gb
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.triangles import median_edge, vertex_normals
-from sfm_app.hashing import load_arrays, seal
+from sfm_app.hashing import digest_files, load_arrays
 from sfm_app.meshing import (
     Eye,
     Paint,
@@ -29,6 +29,7 @@ from sfm_app.progress import track
 from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View, region
 from sfm_app.types import Surface
+from sfm_app.workspace import Workspace
 
 SURFACE = "surface.npz"
 WHOLE = "fused.txt"
@@ -42,27 +43,29 @@ SURE = 2 / 3
 """A part stays when this share of the photos that a fused point needs confirm its average vertex."""
 
 
-def make_mesh(dense_dir: Path, options: MeshSettings, run: RunContext) -> Surface:
-    """Span a surface over the fused points, keep what the photos confirm, simplify it, and keep it beside them.
+def make(dense_dir: Path, run: RunContext) -> Surface:
+    """Span a surface over the fused points, keep what the photos confirm, and simplify it.
 
     Raises:
         ReconstructionError: the depth maps do not give a surface; says why.
         BackendError: COLMAP failed.
     """
+    place, options = run.workspace.surface, run.settings.mesh
+    place.mkdir(exist_ok=True)
     views = [view for view in read_views(dense_dir) if map_file(dense_dir, view).exists()]
     points = fused_points(dense_dir, views, run)
     depth = octree_depth(points, options.poisson_depth)
     with run.step("finding the surface"):
-        raw = nonempty(poisson(dense_dir, depth), "the fused points span no surface")
+        raw = nonempty(poisson(place, depth), "the fused points span no surface")
     colored, support = looked_at(raw, dense_dir, views, run)
     least = SURE * photos_needed(views, run)
     trimmed = trim(colored, support, options.max_gap_triangles, least) if options.trim else colored
     detailed = nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
     run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
     with run.step("simplifying"):
-        surface = nonempty(make_manifold(simplified(detailed, options, dense_dir)), "the surface has no extent")
+        surface = nonempty(make_manifold(simplified(detailed, options, place)), "the surface has no extent")
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
-    with replacing(dense_dir / SURFACE) as path:
+    with replacing(place / SURFACE) as path:
         np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
     return surface
 
@@ -78,26 +81,32 @@ def nonempty(surface: Surface, otherwise: str) -> Surface:
     return surface
 
 
-def load_surface(dense_dir: Path) -> Surface:
-    """Return the surface that `make_mesh` left in a dense workspace."""
-    stored = load_arrays(dense_dir / SURFACE)
+def load(run: RunContext) -> Surface:
+    """Read the surface back."""
+    stored = load_arrays(run.workspace.surface / SURFACE)
     return Surface(stored["vertices"], stored["faces"], stored["colors"])
+
+
+def digest(place: Workspace) -> str:
+    """Return hash of the surface."""
+    return digest_files(place.surface, SURFACE)
 
 
 def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.float64]:
     """Give (N, 3) points of all depth maps together, fused anew only where a depth map, or their folder, is younger."""
     if not views:
         raise ReconstructionError("no photo has a depth map", hint=HINT)
-    target = dense_dir / FUSED
+    place = run.workspace.surface
+    target = place / FUSED
     files = [map_file(dense_dir, view) for view in views]
     youngest = max(path.stat().st_mtime_ns for path in (*files, files[0].parent))
-    whole = dense_dir / WHOLE
-    sealed = target.exists() and is_made_from(whole, seal(dense_dir, FUSED))
-    if not sealed or target.stat().st_mtime_ns <= youngest:
+    whole = place / WHOLE
+    sound = target.exists() and is_made_from(whole, digest_files(place, FUSED))
+    if not sound or target.stat().st_mtime_ns <= youngest:
         with run.step("fusing depth maps"), replacing(target) as path:
-            fuse(dense_dir, views, photos_needed(views, run), region(views), path, cache_gb(run.memory_mb))
-        whole.write_text(seal(dense_dir, FUSED), encoding="utf-8")
-    points, _ = read_fused(dense_dir)
+            fuse(dense_dir, photos_needed(views, run), region(views), path, cache_gb(run.memory_mb))
+        whole.write_text(digest_files(place, FUSED), encoding="utf-8")
+    points, _ = read_fused(place)
     run.record(fused_points=len(points))
     if len(points) < MIN_POINTS:
         raise ReconstructionError(
@@ -129,12 +138,12 @@ def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunCont
     return Surface(surface.vertices, surface.faces, paint.over(surface.colors)), support
 
 
-def simplified(surface: Surface, options: MeshSettings, dense_dir: Path) -> Surface:
+def simplified(surface: Surface, options: MeshSettings, scratch: Path) -> Surface:
     """Simplify to as few triangles as the error allows, and no more than asked for."""
     simple = surface
     if options.max_error_edges:
         edge = median_edge(surface.vertices, surface.faces)
-        simple = simplify(surface, 1.0 / len(surface.faces), options.max_error_edges * edge, dense_dir)
+        simple = simplify(surface, 1.0 / len(surface.faces), options.max_error_edges * edge, scratch)
     if len(simple.faces) > options.faces:
-        simple = simplify(simple, options.faces / len(simple.faces), 0.0, dense_dir)
+        simple = simplify(simple, options.faces / len(simple.faces), 0.0, scratch)
     return simple

@@ -1,4 +1,4 @@
-"""photos: folder -> PhotoSet."""
+"""photos: folder or video -> PhotoSet."""
 
 import errno
 import json
@@ -14,7 +14,7 @@ from sfm_app.atomic_io import replacing
 from sfm_app.context import RunContext
 from sfm_app.cost_estimate import megapixels_within
 from sfm_app.errors import InputError
-from sfm_app.hashing import is_below, seal
+from sfm_app.hashing import digest_files, is_below
 from sfm_app.photos import (
     MASK_HINT,
     Glance,
@@ -34,15 +34,33 @@ from sfm_app.photos import (
     without_copies,
 )
 from sfm_app.settings import PhotoSettings
+from sfm_app.stages.video_frames import folder_of, photos_of
 from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
+from sfm_app.workspace import Workspace
+
+
+def make(source: Path, run: RunContext) -> PhotoSet:
+    """Look at every file of a folder, or at the frames of a video, and lay the usable photos out for COLMAP.
+
+    Raises:
+        InputError: the source is missing, fewer than two photos are usable, or a mask is not.
+    """
+    with photos_of(source, run) as folder:
+        return read_photos(folder, run)
+
+
+def load(source: Path, run: RunContext) -> PhotoSet:
+    """Read photos.json back; what is gone of what was laid out, or was damaged, is laid out again."""
+    return read_photo_set(folder_of(source, run), run)
+
+
+def digest(place: Workspace) -> str:
+    """Return hash of photos.json, which holds hashes of the copies."""
+    return digest_files(place.root, place.photo_set.name)
 
 
 def read_photos(folder: Path, run: RunContext) -> PhotoSet:
-    """Look at every file of the folder and lay the usable photos out for COLMAP.
-
-    Raises:
-        InputError: the folder is missing, fewer than two photos are usable, or a mask is not.
-    """
+    """Look at every file of the folder and lay the usable photos out for COLMAP; errors as `make`."""
     options = within_memory(run)
     names = files_of(folder, run)
     found = run.map(partial(read_photo, folder, options=options), names, "photos")
@@ -160,26 +178,26 @@ def laid_out(photo: Photo, *, folder: Path, target: Path) -> None:
 def save_photo_set(photos: PhotoSet, run: RunContext) -> None:
     """Write photos.json, with hashes of the copies."""
     known = {"photos": [asdict(photo) for photo in photos.photos], "unusable": [asdict(p) for p in photos.unusable]}
-    copies = {photo.name: _copy_seal(photo, run) for photo in photos.photos}
+    copies = {photo.name: _copy_digest(photo, run) for photo in photos.photos}
     with replacing(run.workspace.photo_set) as path:
         path.write_text(json.dumps({**known, "copies": copies}, indent=1) + "\n", encoding="utf-8")
 
 
-def _copy_seal(photo: Photo, run: RunContext) -> str | None:
+def _copy_digest(photo: Photo, run: RunContext) -> str | None:
     """Return hash of the bytes of a copy; None where a link leads to the photo, or where nothing is."""
     place = run.workspace.photos / photo.name
-    return seal(run.workspace.photos, photo.name) if place.is_file() and not place.is_symlink() else None
+    return digest_files(run.workspace.photos, photo.name) if place.is_file() and not place.is_symlink() else None
 
 
-def load_photo_set(folder: Path, run: RunContext) -> PhotoSet:
-    """Read photos.json back; what is gone of what was laid out, or was damaged, is laid out again."""
+def read_photo_set(folder: Path, run: RunContext) -> PhotoSet:
+    """Read photos.json back, and lay out what is missing."""
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
     photos, masks = tuple(_photo(entry) for entry in values["photos"]), mask_folder(run)
     if not all(is_below(photo.name) for photo in photos):
         raise ValueError(f"{run.workspace.photo_set} names photos outside of their folder")
     for photo in photos:
         place, copy = run.workspace.photos / photo.name, values["copies"].get(photo.name)
-        if copy != _copy_seal(photo, run) or not (copy or place.resolve() == place_of(folder, photo.path)):
+        if copy != _copy_digest(photo, run) or not (copy or place.resolve() == place_of(folder, photo.path)):
             if folder == run.workspace.frames and not (folder / photo.path).exists():
                 raise FileNotFoundError(errno.ENOENT, "no such frame", str(folder / photo.path))
             laid_out(photo, folder=folder, target=run.workspace.photos)

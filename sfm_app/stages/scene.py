@@ -7,39 +7,63 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sfm_app.atomic_io import replacing
+from sfm_app.atomic_io import can_go_on, mark_unfinished, replacing
 from sfm_app.colmap.backend import backend, check_written
 from sfm_app.colmap.bundle import Adjusted, adjusted_or_as_it_was
 from sfm_app.colmap.model import color, photos_of, read_scene, sparse_model
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_depth, why_no_scene
 from sfm_app.errors import ReconstructionError
+from sfm_app.hashing import digest_files
 from sfm_app.numerical import json_text
-from sfm_app.reconstruction import Found, Outcome, clear, look_again, reconstruct
+from sfm_app.reconstruction import Found, Outcome, look_again, reconstruct
 from sfm_app.reconstruction.align_upright import look_at_photos, orient_or_leave
 from sfm_app.reconstruction.look_alikes import in_words, jumps
 from sfm_app.reconstruction.unregistered import left_out, names_of
 from sfm_app.reconstruction.weak_scale import weakly_joined
-from sfm_app.types import Intrinsics, MatchGraph, PhotoSet, Scene, ViewGraph
+from sfm_app.types import Intrinsics, MatchGraph, Scene, ViewGraph
+from sfm_app.workspace import MAPPING, Aside, Workspace
 
 POINTS = "points"
 """Name of the files with the points and cameras."""
 
 
-def reconstruct_scene(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
+def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
     """Map the photos and adjust everything; the largest model goes on, the others are kept beside it.
 
     Raises:
         ReconstructionError: no pair of photos grows into a model; says what was seen.
     """
-    first = Found(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
+    aside = mapping_run(run)
+    first = Found(reconstruct(matches, views, intrinsics, aside), matches, views, intrinsics, aside)
     try:
         scene = adjusted_scene(look_again(first), run)
     except ReconstructionError:  # any other end, such as Ctrl-C or a full disk: the same command goes on with it
-        clear(run)
+        shutil.rmtree(aside.workspace.root, ignore_errors=True)
         raise
-    clear(run)
+    shutil.rmtree(aside.workspace.root, ignore_errors=True)
     return scene
+
+
+def load(run: RunContext) -> Scene:
+    """Read the model and scene.json back."""
+    place = run.workspace
+    known = json.loads(place.scene.read_text(encoding="utf-8"))
+    with backend("reading the sparse model"):
+        return read_scene(place.sparse, known["camera_of"], known["unregistered"], known["cameras"])
+
+
+def digest(place: Workspace) -> str:
+    """Return hash of the model and scene.json."""
+    return digest_files(place.root, place.sparse.name, place.scene.name)
+
+
+def mapping_run(run: RunContext) -> RunContext:
+    """Return the run in a folder of its own, where mapping has its database and what a killed run left is kept."""
+    place = Aside(run.workspace, MAPPING)
+    if not can_go_on(place.root, run.fingerprint):
+        mark_unfinished(place.root, run.fingerprint)
+    return replace(run, workspace=place)
 
 
 def adjusted_scene(found: Found, run: RunContext) -> Scene:
@@ -64,7 +88,7 @@ def adjusted_scene(found: Found, run: RunContext) -> Scene:
     reasons = left_out(set(members[0]), members[1:], matches, views, outcome.graph)
     names = {image.name: outcome.intrinsics.name_of(image) for image in matches.images.values()}
     scene = read_scene(run.workspace.sparse, names, reasons, refined_by_name(adjusted[0], names))
-    write_refined(scene, run)
+    write_scene(scene, run)
     run.record(
         registered=len(scene.registered),
         of=len(matches.images),
@@ -73,7 +97,6 @@ def adjusted_scene(found: Found, run: RunContext) -> Scene:
         points=scene.points,
         observations=scene.observations,
         mean_reprojection_px=round(scene.mean_reprojection_px, 4),
-        cameras={name: camera.to_dict() for name, camera in scene.cameras.items()},
         orientation=orientations[0],
         adjustment=how_it_was_adjusted(adjusted, names),
         **how_it_was_made(outcome),
@@ -173,21 +196,12 @@ def refined_by_name(adjusted: Adjusted, names: Mapping[str, str]) -> dict[str, d
     }
 
 
-def write_refined(scene: Scene, run: RunContext) -> None:
-    """Enter the refined cameras, and whose photos are whose, into calibration.json, beside what was found before."""
-    path = run.workspace.calibration
-    known = json.loads(path.read_text(encoding="utf-8"))
-    known["refined"] = {name: camera.to_dict() for name, camera in scene.cameras.items()}
-    known["refined_camera_of"] = dict(scene.camera_of)
-    with replacing(path) as beside:
-        beside.write_text(json_text(known), encoding="utf-8")
-
-
-def load_scene(photos: PhotoSet, intrinsics: Intrinsics, run: RunContext) -> Scene:
-    """Read the model back; why photos were left out stands in the manifest."""
-    record = run.workspace.manifest.record("scene")
-    known = json.loads(run.workspace.calibration.read_text(encoding="utf-8")).get("refined_camera_of", {})
-    names = {photo.name: known.get(photo.name, intrinsics.name_of(photo)) for photo in photos.photos}
-    with backend("reading the sparse model"):
-        counts = record.counts if record else {}
-        return read_scene(run.workspace.sparse, names, counts.get("unregistered", {}), counts.get("cameras", {}))
+def write_scene(scene: Scene, run: RunContext) -> None:
+    """Write scene.json: what COLMAP's model does not hold."""
+    known = {
+        "cameras": {name: camera.to_dict() for name, camera in scene.cameras.items()},
+        "camera_of": dict(scene.camera_of),
+        "unregistered": dict(scene.unregistered),
+    }
+    with replacing(run.workspace.scene) as path:
+        path.write_text(json_text(known), encoding="utf-8")

@@ -12,31 +12,31 @@ from PIL import Image
 
 from sfm_app.atomic_io import can_go_on, mark_unfinished, replacing
 from sfm_app.context import RunContext
-from sfm_app.hashing import fingerprint, load_arrays
+from sfm_app.hashing import digest_files, fingerprint, load_arrays
 from sfm_app.meshing.occlusion import Occluders
 from sfm_app.photos import read_used, without_masked
-from sfm_app.settings import TextureSettings
 from sfm_app.texture import PhotoView, photo_view, texture_surface
 from sfm_app.types import Model, Scene, Surface, Texture
+from sfm_app.workspace import Workspace
 
 TEXTURE = "texture.npz"
-PARTS = "texture_parts"
-"""In the dense workspace while the texture is made: what is done with each photo."""
+PARTS = "parts"
+"""Beside it while the texture is made: what is done with each photo."""
 
 
-def make_texture(scene: Scene, surface: Surface, options: TextureSettings, run: RunContext) -> Model:
-    """Paint the surface with the photos at full size, and keep it beside the depth maps.
+def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
+    """Paint the surface with the photos at full size.
 
     A run that was killed goes on where it stopped.
     """
-    views, parts = photo_views(scene), run.workspace.dense / PARTS
+    views, parts = photo_views(scene), run.workspace.texture / PARTS
     cameras = [(view.name, view.row.tolist(), view.width, view.height) for view in views]
-    made_from = fingerprint(run.inputs, cameras, digest(surface))
+    made_from = fingerprint(run.fingerprint, cameras, surface_digest(surface))
     if not can_go_on(parts, made_from):
         mark_unfinished(parts, made_from)
     hidden = Occluders(surface.vertices, surface.faces).hidden
     store = Files(run.workspace.photos, parts, run.mask_dir)
-    model, figures = texture_surface(surface, views, store, hidden, options, run.map)
+    model, figures = texture_surface(surface, views, store, hidden, run.settings.texture, run.map)
     run.record(**figures)
     save_texture(model, run)
     shutil.rmtree(parts)
@@ -69,7 +69,7 @@ class Files:
         return self.folder / f"{name}.npz"
 
 
-def digest(surface: Surface) -> str:
+def surface_digest(surface: Surface) -> str:
     """Return hash of vertices, triangles and colors."""
     found = blake2b()
     for part in (surface.vertices, surface.faces, surface.colors):
@@ -97,19 +97,29 @@ def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None 
 
 
 def save_texture(model: Model, run: RunContext) -> None:
-    """Write dense/texture.npz."""
+    """Write texture/texture.npz."""
     surface, texture = model.surface, model.texture
     stored: dict[str, Any] = {"vertices": surface.vertices, "faces": surface.faces, "colors": surface.colors}
     if texture is not None:
         stored |= {"uv": texture.uv, "page": texture.page}
         stored |= {f"page{number}": page for number, page in enumerate(texture.pages)}
-    with replacing(run.workspace.dense / TEXTURE) as path:
+    with replacing(run.workspace.texture / TEXTURE) as path:
         np.savez(path, **stored)
 
 
-def load_texture(dense_dir: Path) -> Model:
-    """Return the model that `make_texture` left in a dense workspace."""
-    stored = load_arrays(dense_dir / TEXTURE)
+def load(run: RunContext) -> Model:
+    """Read the surface with its texture back."""
+    return read_texture(run.workspace)
+
+
+def digest(place: Workspace) -> str:
+    """Return hash of the surface with its texture."""
+    return digest_files(place.texture, TEXTURE)
+
+
+def read_texture(place: Workspace) -> Model:
+    """Read the surface with its texture from an output folder."""
+    stored = load_arrays(place.texture / TEXTURE)
     surface = Surface(stored["vertices"], stored["faces"], stored["colors"])
     if "uv" not in stored:
         return Model(surface)

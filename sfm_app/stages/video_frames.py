@@ -84,7 +84,7 @@ def kept(run: RunContext) -> Chosen | None:
         chosen = Chosen(found["made_from"], tuple(map(int, found["frames"])), dict(found["counts"]))
     except (OSError, ValueError, TypeError, LookupError):
         return None
-    return chosen if chosen.made_from == run.inputs else None
+    return chosen if chosen.made_from == run.fingerprint else None
 
 
 def chosen_from(source: Path, run: RunContext) -> Chosen:
@@ -117,7 +117,7 @@ def chosen_from(source: Path, run: RunContext) -> Chosen:
         "left_out": choice.left_out | ({BLACK: video.black} if video.black else {}),
         "notes": notes,
     }
-    return Chosen(run.inputs, choice.frames, counts)
+    return Chosen(run.fingerprint, choice.frames, counts)
 
 
 def write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None:

@@ -5,16 +5,15 @@ import shutil
 import numpy as np
 
 from sfm_app.atomic_io import replacing
-from sfm_app.colmap.backend import backend
-from sfm_app.colmap.database import write_epipolar_fits
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_scene
 from sfm_app.fitting import fit_pairs, graph_of
-from sfm_app.hashing import load_arrays
+from sfm_app.hashing import digest_files, load_arrays
 from sfm_app.types import MatchGraph, ViewGraph
+from sfm_app.workspace import Workspace
 
 
-def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
+def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
     """Fit every pair on its own, and count why pairs fell.
 
     Raises:
@@ -33,12 +32,15 @@ def build_view_graph(matches: MatchGraph, run: RunContext) -> ViewGraph:
         raise why_no_scene(matches, graph, run.settings.matching).error()
     with replacing(run.workspace.view_graph) as path:
         np.savez_compressed(path, allow_pickle=False, **graph.to_arrays())
-    with backend("writing epipolar geometries"):
-        write_epipolar_fits(run.workspace.database, matches, graph.fits)
     shutil.rmtree(run.workspace.view_graph_parts)
     return graph
 
 
-def load_view_graph(run: RunContext) -> ViewGraph:
+def load(run: RunContext) -> ViewGraph:
     """Read view_graph.npz back."""
     return ViewGraph.from_arrays(load_arrays(run.workspace.view_graph))
+
+
+def digest(place: Workspace) -> str:
+    """Return hash of view_graph.npz."""
+    return digest_files(place.root, place.view_graph.name)

@@ -229,4 +229,4 @@ def test_photos_that_colmap_cannot_read_have_no_keypoints(photos, tmp_path, chan
         found = match_photos(photo_set, run)
 
     assert [image.name for image in found.images.values() if not len(found.keypoints[image.id])] == [path.name]
-    assert run.counts["keypoints"][path.name] == 0
+    assert run.statistics["keypoints"][path.name] == 0

@@ -14,7 +14,7 @@ from sfm_app.manifest import StageRecord
 from sfm_app.pipeline import NAMES, STAGES
 from sfm_app.workspace import Workspace
 
-LAST = STAGES[NAMES.index(STAGES[-1].takes[-1])]
+LAST = STAGES[-1].takes[-1]
 """The stage whose product the files of the model hold."""
 
 
@@ -22,7 +22,7 @@ LAST = STAGES[NAMES.index(STAGES[-1].takes[-1])]
 def finished(textured_ball, tmp_path):
     """What a run leaves that has only its files to write."""
     place = Workspace(tmp_path / "out")
-    place.dense.mkdir(parents=True)
+    place.texture.mkdir(parents=True)
     surface, texture = textured_ball.surface, textured_ball.texture
     np.savez(
         place.root / LAST.files[0],
@@ -30,7 +30,7 @@ def finished(textured_ball, tmp_path):
         uv=texture.uv, page=texture.page, page0=texture.pages[0], page1=texture.pages[1],
     )  # fmt: skip
     for stage in NAMES[:-1]:
-        place.manifest.finish(stage, StageRecord("", 0.0, seal=LAST.seal(place)), {})
+        place.manifest.finish(stage, StageRecord("", 0.0, digest=LAST.digest(place)), {})
     return place.root
 
 
@@ -133,7 +133,7 @@ def test_a_model_without_a_texture_has_the_colors_of_its_vertices(ball, finished
         finished / LAST.files[0], vertices=ball.surface.vertices, faces=ball.surface.faces, colors=ball.surface.colors
     )
     place = Workspace(finished)
-    place.manifest.finish(LAST.name, StageRecord("", 0.0, seal=LAST.seal(place)), {})
+    place.manifest.finish(LAST.name, StageRecord("", 0.0, digest=LAST.digest(place)), {})
 
     (path,) = sfm_app.export_model(finished, "glb")
 

@@ -3,7 +3,7 @@ import zipfile
 import numpy as np
 import pytest
 
-from sfm_app.hashing import MOST_BYTES, fingerprint, is_below, load_arrays, seal
+from sfm_app.hashing import MOST_BYTES, digest_files, fingerprint, is_below, load_arrays
 
 
 def test_arrays_come_back(tmp_path):
@@ -41,8 +41,8 @@ def test_the_seal_of_a_folder_is_of_its_names_and_bytes(tmp_path, change):
     (folder / "deep").mkdir(parents=True)
     (folder / "a.bin").write_bytes(b"1234")
     (folder / "deep" / "b.bin").write_bytes(b"5678")
-    before = seal(tmp_path, "in")
-    assert seal(tmp_path, "in") == before
+    before = digest_files(tmp_path, "in")
+    assert digest_files(tmp_path, "in") == before
     path = folder / "deep" / "b.bin"
     if change == "other bytes":
         path.write_bytes(b"5679")
@@ -54,12 +54,12 @@ def test_the_seal_of_a_folder_is_of_its_names_and_bytes(tmp_path, change):
         path.rename(tmp_path / "b.bin")
         path.symlink_to(tmp_path / "b.bin")
 
-    assert seal(tmp_path, "in") != before
+    assert digest_files(tmp_path, "in") != before
 
 
 def test_what_is_gone_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"x\.bin"):
-        seal(tmp_path, "x.bin")
+        digest_files(tmp_path, "x.bin")
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ def finish(manifest, name="photos", print_of_inputs="abc", files=("a.txt",)):
 
 def is_current(manifest, stage, print_of_inputs):
     record = manifest.record(stage)
-    return record is not None and record.fingerprint == print_of_inputs and not manifest.spoilt(record)
+    return record is not None and record.fingerprint == print_of_inputs and not manifest.changed_files(record)
 
 
 def test_a_finished_stage_is_current_until_its_inputs_change(manifest):

@@ -49,12 +49,11 @@ def filled(tmp_path):
     def fill(method, pairs=None, **matching):
         with opened_run(tmp_path / "out", Settings.from_mapping({"workers": 1, "matching": matching}), None) as run:
             run.workspace.photos.mkdir(parents=True, exist_ok=True)
-            run.inputs = "same"
             for name, color in zip(NAMES, ("red", "lime", "blue"), strict=True):
                 Image.new("RGB", SIZE, color).save(run.workspace.photos / name)
             if not run.workspace.database.exists():
                 create_database(run.workspace.database, photos)
-            fill_database(method, run, pairs)
+            fill_database(method, run.for_stage("same"), pairs)
             assert not run.workspace.feature_parts.exists()
             return read_match_graph(run.workspace.database, photos)
 

@@ -72,7 +72,7 @@ class Answer:
         return "its pixels may not be square" if doubtful else ""
 
     def doubt_of_focal(self, weights: FloatArray) -> str:
-        """Why an answer to pairs of these weights (P,) is an estimate though its deviation is small, or nothing."""
+        """Return why an answer, to pairs of weights (P,), is an estimate though its deviation is small, or nothing."""
         mass = float(np.sum(self.votes))
         doubtful = self.lead < CLEAR_LEAD_SHARE * mass and mass < FEW_ASTRAY * float(np.sum(weights))
         return "many pairs fit other focals nearly as well, and some fit none" if doubtful else ""

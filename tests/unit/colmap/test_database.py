@@ -16,12 +16,12 @@ from sfm_app.colmap.database import (
     opened,
     read_match_graph,
     write_calibrations,
-    write_epipolar_fits,
+    write_match_graph,
     write_pose_graph,
 )
 from sfm_app.colmap.model import model_from_seed
 from sfm_app.geometry.two_view_init import TwoViewSeed
-from sfm_app.types import Calibration, EpipolarFit, Intrinsics, Photo, PhotoSet, PoseGraph, RelativePose
+from sfm_app.types import Calibration, Intrinsics, Photo, PhotoSet, PoseGraph, RelativePose
 
 NAMES = ("b.png", "a.png", "c.png")
 
@@ -61,19 +61,23 @@ def test_photos_are_numbered_by_name_and_share_cameras_by_group(stored):
     assert cameras[0] == cameras[1] != cameras[2]
 
 
-def test_fits_replace_the_two_view_geometries(stored):
-    path, photos, _, matches = stored
-    graph = read_match_graph(path, photos)
-    inliers = np.arange(12) < 9
+def test_a_match_graph_makes_a_database_that_reads_the_same(stored, tmp_path):
+    path, photos, _, _ = stored
+    graph, copy = read_match_graph(path, photos), tmp_path / "folder" / "copy.db"
 
-    for F in (np.eye(3), np.diag([1.0, 2, 3])):
-        fit = EpipolarFit(F, inliers, np.ones(12), 5, 0.3)
-        write_epipolar_fits(path, graph, {(1, 2): fit})
+    for _ in range(2):  # what was there before goes
+        write_match_graph(copy, graph)
 
-    with opened(path) as database:
-        geometry = database.read_two_view_geometry(1, 2)
-    assert np.allclose(geometry.F, np.diag([1.0, 2, 3]))
-    assert np.array_equal(geometry.inlier_matches, matches[:9])
+    again = read_match_graph(copy, photos)
+    assert again.images == graph.images
+    for photo, keypoints in graph.keypoints.items():
+        np.testing.assert_array_equal(again.keypoints[photo], keypoints)
+    np.testing.assert_array_equal(again.matches[1, 2], graph.matches[1, 2])
+    for database in (path, copy):
+        write_calibrations(database, graph, Intrinsics({"one": calibration(), "two": TWO}))
+    assert {table: rows for table, rows in rows_of(copy).items() if table != "keypoints"} == {
+        table: rows for table, rows in rows_of(path).items() if table != "keypoints"
+    }
 
 
 KINDS = {"calibrated": "CALIBRATED", "uncalibrated": "UNCALIBRATED", "planar": "PLANAR", "rotation": "PANORAMIC"}
@@ -83,7 +87,8 @@ KINDS = {"calibrated": "CALIBRATED", "uncalibrated": "UNCALIBRATED", "planar": "
 def test_relative_poses_replace_the_two_view_geometries(stored, kind):
     path, photos, _, matches = stored
     graph = read_match_graph(path, photos)
-    write_epipolar_fits(path, graph, {(1, 2): EpipolarFit(np.eye(3), np.ones(12, bool), np.ones(12), 5, 0.3)})
+    still = RelativePose(np.eye(3), np.eye(3)[0], np.ones(12, bool), 5.0, 1.0, "calibrated")
+    write_pose_graph(path, graph, PoseGraph({(1, 2): still}, {}, ()))
     R, t = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.6, 0.0, -0.8])
     inliers = np.arange(12) % 2 == 0
     pose = RelativePose(R, t, inliers, 9.0, 1.0, kind)
@@ -206,7 +211,8 @@ def test_a_seed_of_photos_of_two_cameras_becomes_a_model(stored):
     graph = read_match_graph(path, photos)
     cameras = {"one": calibration(), "one #2": calibration(99.0), "two": TWO}
     write_calibrations(path, graph, Intrinsics(cameras, {"b.png": "one #2"}))
-    write_epipolar_fits(path, graph, {(1, 2): EpipolarFit(np.eye(3), np.ones(12, bool), np.ones(12), 5, 0.3)})
+    pose = RelativePose(np.eye(3), np.array([-1.0, 0, 0]), np.ones(12, bool), 10.0, 1.0, "calibrated")
+    write_pose_graph(path, graph, PoseGraph({(1, 2): pose}, {}, ()))
     X = np.random.default_rng(1).uniform([-1, -1, 4], [1, 1, 6], (12, 3))
     seed = TwoViewSeed(np.eye(3), np.array([-1.0, 0, 0]), X, np.ones(12, bool), 10.0, 1.0)
 

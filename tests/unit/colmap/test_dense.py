@@ -15,6 +15,7 @@ from sfm_app.colmap.dense import (
     read_gray,
     read_views,
     undistort,
+    write_fusion_views,
     write_maps,
 )
 from sfm_app.colmap.surface import FUSED, fuse, poisson, read_fused, simplify
@@ -62,6 +63,7 @@ def workspace(tmp_path_factory):
         depth = ((DISTANCE - NORMAL @ view.center) / (rays @ NORMAL)).astype(np.float32)
         normals = np.broadcast_to((-view.R @ NORMAL).astype(np.float32), (*depth.shape, 3))
         write_maps(place / "dense", view, DepthMap(depth, normals))
+    write_fusion_views(place / "dense", views)
     return place / "dense", views
 
 
@@ -77,9 +79,9 @@ def test_views_are_those_of_the_model(workspace):
 
 
 def test_fused_points_lie_on_the_plane_and_face_the_cameras(workspace):
-    dense, views = workspace
+    dense, _ = workspace
 
-    fuse(dense, views, 3, BOX, dense / FUSED)
+    fuse(dense, 3, BOX, dense / FUSED)
     points, normals = read_fused(dense)
 
     assert 1000 < len(points) < 120 * 90
@@ -134,15 +136,15 @@ def interrupt(*_):
 
 
 def test_the_box_cuts_the_points(workspace):
-    dense, views = workspace
+    dense, _ = workspace
 
-    fuse(dense, views, 2, np.array([[0.0, -50, -50], [50, 50, 50]]), dense / FUSED)
+    fuse(dense, 2, np.array([[0.0, -50, -50], [50, 50, 50]]), dense / FUSED)
     assert read_fused(dense)[0][:, 0].min() >= 0
 
 
 def test_the_surface_has_the_shape_and_the_colors_of_the_points(workspace):
-    dense, views = workspace
-    fuse(dense, views, 3, BOX, dense / FUSED)
+    dense, _ = workspace
+    fuse(dense, 3, BOX, dense / FUSED)
 
     surface = poisson(dense, 6)
 
@@ -165,8 +167,8 @@ def wavy(size: int) -> Surface:
 
 
 def test_a_surface_does_not_depend_on_those_before_it(workspace):
-    dense, views = workspace
-    fuse(dense, views, 3, BOX, dense / FUSED)
+    dense, _ = workspace
+    fuse(dense, 3, BOX, dense / FUSED)
 
     before, _, after = (poisson(dense, depth) for depth in (6, 2, 6))
 

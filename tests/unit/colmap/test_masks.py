@@ -7,7 +7,16 @@ from PIL import Image
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import create_database, read_match_graph
-from sfm_app.colmap.dense import MASKED, DenseStore, hide_masked, read_depth, read_views, undistort, write_maps
+from sfm_app.colmap.dense import (
+    MASKED,
+    DenseStore,
+    hide_masked,
+    read_depth,
+    read_views,
+    undistort,
+    write_fusion_views,
+    write_maps,
+)
 from sfm_app.colmap.features import find_and_match
 from sfm_app.colmap.masks import REACH_PX, mask_undistorter, used_pixels
 from sfm_app.colmap.surface import FUSED, fuse, read_fused
@@ -137,7 +146,8 @@ def test_nothing_is_fused_from_what_is_masked(dense):
     used = used_pixels(folder, view)
     np.testing.assert_array_equal(read_depth(folder, view, "geometric"), np.where(used, 4, np.float32(MASKED)))
 
-    fuse(folder, [view], 1, np.array([[-50.0] * 3, [50.0] * 3]), folder / FUSED)
+    write_fusion_views(folder, [view])
+    fuse(folder, 1, np.array([[-50.0] * 3, [50.0] * 3]), folder / FUSED)
     points, _ = read_fused(folder)
 
     at = (points @ view.R.T + view.t) @ view.K.T

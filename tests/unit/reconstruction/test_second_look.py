@@ -1,23 +1,21 @@
 """The second look, with features and mappers that find what the test says; databases and geometries are real."""
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sfm_app.api import opened_run
-from sfm_app.colmap.database import read_features, write_keypoints, write_matches
+from sfm_app.colmap.database import write_keypoints, write_matches
 from sfm_app.colmap.model import photos_of
 from sfm_app.errors import BackendError
 from sfm_app.reconstruction import second_look as module
 from sfm_app.reconstruction.mapping_passes import Outcome
 from sfm_app.reconstruction.mapping_runs import Attempt
-from sfm_app.reconstruction.second_look import LOOSE_RATIO, Found, clear, look_again, lost_photos, pairs_to_see
+from sfm_app.reconstruction.second_look import LOOSE_RATIO, Found, look_again, lost_photos, pairs_to_see
 from sfm_app.reconstruction.support import explained_pairs
 from sfm_app.settings import Settings
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, ViewGraph
-from sfm_app.workspace import SECOND_LOOK
 
 LOST = 6
 
@@ -40,9 +38,7 @@ def first(synthetic, cameras, tmp_path):
     views = ViewGraph({pair: fit for pair, fit in synthetic.views.fits.items() if LOST not in pair}, {})
     with opened_run(tmp_path / "out", Settings.from_mapping({"workers": 1}), None) as run:
         run.workspace.root.mkdir(parents=True)
-        shutil.copyfile(synthetic.database, run.workspace.database)
-        run.inputs = "these"
-        yield Found(outcome_of(synthetic, matches, views, 5), matches, views, cameras(), run)
+        yield Found(outcome_of(synthetic, matches, views, 5), matches, views, cameras(), run.for_stage("these"))
 
 
 @pytest.fixture
@@ -62,7 +58,7 @@ def finer(monkeypatch, synthetic):
                 write_matches(run.workspace.database, pair, synthetic.matches.matches[pair])
 
         def reconstruct(matches, views, intrinsics, run):
-            asked.append((matches, views, intrinsics, read_features(run.workspace.database)))
+            asked.append((matches, views, intrinsics))
             return outcome_of(synthetic, matches, views, places)
 
         monkeypatch.setattr(module, "fill_database", fill_database)
@@ -78,14 +74,13 @@ def test_a_lost_photo_finds_its_place_by_finer_features(first, finer):
     found = look_again(first)
 
     assert asked[0] == ("sift-dsp", [(k, LOST) for k in range(1, LOST)], LOOSE_RATIO)
-    matches, views, intrinsics, (keypoints, rows) = asked[1]
+    matches, views, intrinsics = asked[1]
     assert intrinsics is first.intrinsics  # it was known
-    assert all((k, LOST) in views.fits and len(rows[k, LOST]) >= 100 for k in range(1, LOST))
+    assert all((k, LOST) in views.fits and len(matches.matches[k, LOST]) >= 100 for k in range(1, LOST))
     assert all(views.fits[pair] is fit for pair, fit in first.views.fits.items())
-    assert {k: len(x) for k, x in keypoints.items()} == {k: len(x) for k, x in matches.keypoints.items()}
     assert photos_of(found.outcome.models[0].model) == [1, 2, 3, 4, 5, 6]
     assert found.run.workspace.database != first.run.workspace.database
-    said = first.run.counts["second_look"]
+    said = first.run.statistics["second_look"]
     assert (said["placed"], said["taken"], said["pairs_with_geometry"]) == ([5, 6], True, [10, 15])
 
 
@@ -102,21 +97,21 @@ def test_what_was_found_first_stays_where_no_more_photos_find_a_place(first, fin
     finer(places=5)
 
     assert look_again(first) is first
-    assert first.run.counts["second_look"]["taken"] is False
+    assert first.run.statistics["second_look"]["taken"] is False
 
 
 def test_a_second_look_that_fails_costs_nothing(first, finer):
     finer(failing=BackendError("the disk is full"))
 
     assert look_again(first) is first
-    assert first.run.counts["second_look"]["failed"] == "the disk is full"
+    assert first.run.statistics["second_look"]["failed"] == "the disk is full"
 
 
 def test_nobody_looks_twice_where_all_photos_have_a_place(first, finer, synthetic):
     asked = finer()
     whole = replace(first, outcome=outcome_of(synthetic, first.matches, first.views, 6))
 
-    assert look_again(whole) is whole and asked == [] and "second_look" not in first.run.counts
+    assert look_again(whole) is whole and asked == [] and "second_look" not in first.run.statistics
 
 
 @pytest.mark.parametrize("chosen", [{"scene": {"second_look": False}}, {"matching": {"features": "sift-dsp"}}])
@@ -125,16 +120,6 @@ def test_nobody_looks_twice_where_that_is_not_wanted(first, finer, chosen):
     unasked = replace(first, run=replace(first.run, settings=Settings.from_mapping(chosen)))
 
     assert look_again(unasked) is unasked and asked == []
-
-
-def test_nothing_is_left_behind(first, finer):
-    finer()
-    look_again(first)
-    assert (first.run.workspace.root / SECOND_LOOK).exists()
-
-    clear(first.run)
-
-    assert not (first.run.workspace.root / SECOND_LOOK).exists()
 
 
 def photos(count, matches=()):

@@ -15,7 +15,7 @@ from sfm_app.photos import save_used
 from sfm_app.plugins import DepthMethod, hookimpl, load_plugins
 from sfm_app.progress import Silent
 from sfm_app.settings import DepthSettings, Settings
-from sfm_app.stages.depth_maps import make_depth_maps
+from sfm_app.stages import depth_maps
 from sfm_app.stereo import DepthMap
 from sfm_app.types import Rejected
 
@@ -67,14 +67,15 @@ class Method:
         return load_plugins([SimpleNamespace(sfm_depth_methods=sfm_depth_methods)], installed=False)
 
 
-def run_stage(scene, ways, inputs="", mask_dir=None, **settings):
+def run_stage(scene, ways, fingerprint="", mask_dir=None, **settings):
     counts = {}
     options = DepthSettings(**{"method": "ours", **settings})
+    place = SimpleNamespace(photos=scene.photo_dir, dense=scene.dense_dir)
     run = SimpleNamespace(
-        plugins=ways.plugins, record=lambda **more: counts.update(more), map=one_by_one, inputs=inputs,
-        settings=Settings(depth=options), workers=2, progress=Silent(), mask_dir=mask_dir,
+        plugins=ways.plugins, record=lambda **more: counts.update(more), map=one_by_one, fingerprint=fingerprint,
+        settings=Settings(depth=options), workspace=place, workers=2, progress=Silent(), mask_dir=mask_dir,
     )  # fmt: skip
-    assert make_depth_maps(scene, scene.photo_dir, scene.dense_dir, options, run) == scene.dense_dir
+    assert depth_maps.make(scene, run) == scene.dense_dir
     return counts
 
 
@@ -125,7 +126,7 @@ def test_nothing_is_kept_that_was_made_from_something_else(scene, change):
         model.write(scene.model_dir)
     method = Method()
 
-    run_stage(scene, method, inputs="others" if change == "inputs" else "")
+    run_stage(scene, method, fingerprint="others" if change == "inputs" else "")
 
     assert method.asked == ["1.png", "2.png", "3.png"]
 

@@ -7,7 +7,7 @@ from sfm_app.formats import EXPORTERS
 from sfm_app.formats.pages import JPEG_QUALITY
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings
-from sfm_app.stages.export import load_files, write_files
+from sfm_app.stages import export
 from sfm_app.workspace import Workspace
 
 
@@ -17,13 +17,13 @@ def run(tmp_path):
 
 
 def test_the_manifest_says_how_large_the_files_are_and_how_good_the_pictures(textured_ball, run):
-    paths = write_files(textured_ball, run)
+    paths = export.make(textured_ball, run)
 
-    assert paths == load_files(run)
+    assert paths == export.load(run)
     assert [path.name for path in paths] == ["model.ply", "model.glb"]
     for path in paths:
         assert path.read_bytes() == EXPORTERS[path.suffix[1:]][0](textured_ball, "model")[path.name]
-    assert run.counts == {
+    assert run.statistics == {
         "bytes": {path.name: path.stat().st_size for path in paths},
         "pages_px": [[64, 64], [96, 32]],
         "jpeg_quality": JPEG_QUALITY,
@@ -31,6 +31,6 @@ def test_the_manifest_says_how_large_the_files_are_and_how_good_the_pictures(tex
 
 
 def test_without_a_texture_it_says_nothing_about_pictures(ball, run):
-    write_files(ball, run)
+    export.make(ball, run)
 
-    assert list(run.counts) == ["bytes"]
+    assert list(run.statistics) == ["bytes"]

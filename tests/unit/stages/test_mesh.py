@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.dense import map_file, read_views, write_maps
+from sfm_app.colmap.dense import map_file, read_views, write_fusion_views, write_maps
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.triangles import edges_of, vertex_normals
 from sfm_app.parallel import make_executor
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings
-from sfm_app.stages.mesh import load_surface, make_mesh
+from sfm_app.stages import mesh
 from sfm_app.stereo import DepthMap
 from sfm_app.synthetic.cameras import look_at
 from sfm_app.workspace import Workspace
@@ -68,17 +68,18 @@ def dense(tmp_path_factory):
     for view in read_views(place):
         cv2.imwrite(str(place / "images" / view.name), np.full((HEIGHT, WIDTH, 3), (40, 90, 200), np.uint8))
         write_maps(place, view, true_maps(view))
+    write_fusion_views(place, read_views(place))
     return place
 
 
-def run_in(dense, workers=2, **mesh):
-    settings = Settings.from_mapping({"mesh": mesh})
+def run_in(dense, workers=2, **options):
+    settings = Settings.from_mapping({"mesh": options})
     return RunContext(settings, Workspace(dense.parent), load_plugins(), make_executor(workers), workers)
 
 
 def made(dense, **options):
     run = run_in(dense, **options)
-    return make_mesh(dense, run.settings.mesh, run), run.counts
+    return mesh.make(dense, run), run.statistics
 
 
 @pytest.fixture(scope="module")
@@ -107,16 +108,16 @@ def test_normals_point_outward_and_colors_are_those_of_the_photos(ball):
 
 
 def test_fewer_faces_do_not_fuse_again_and_one_worker_gives_the_same_bytes(dense, ball):
-    stamp = (dense / "fused.ply").stat().st_mtime_ns
+    stamp = (dense.parent / "surface" / "fused.ply").stat().st_mtime_ns
 
     few, _ = made(dense, faces=500)
     again, _ = made(dense, workers=1)
 
-    assert (dense / "fused.ply").stat().st_mtime_ns == stamp
+    assert (dense.parent / "surface" / "fused.ply").stat().st_mtime_ns == stamp
     assert 400 < len(few.faces) <= 500
     for name in ("vertices", "faces", "colors"):
         np.testing.assert_array_equal(getattr(again, name), getattr(ball[0], name))
-        np.testing.assert_array_equal(getattr(load_surface(dense), name), getattr(again, name))
+        np.testing.assert_array_equal(getattr(mesh.load(run_in(dense)), name), getattr(again, name))
 
 
 def test_what_no_photo_sees_is_cut_off_or_kept_closed(dense, tmp_path):
@@ -125,6 +126,7 @@ def test_what_no_photo_sees_is_cut_off_or_kept_closed(dense, tmp_path):
     for view in read_views(half):
         if view.center[2] < 1.0:
             map_file(half, view).unlink()
+    write_fusion_views(half, read_views(half))
 
     cut, _ = made(half)
     closed, _ = made(half, trim=False)
@@ -141,6 +143,7 @@ def test_maps_that_agree_on_nothing_give_an_error_that_says_so(dense, tmp_path):
         write_maps(poor, view, DepthMap(maps.depth * np.float32(factor), maps.normals))
     for view in read_views(poor)[3:]:
         map_file(poor, view).unlink()
+    write_fusion_views(poor, read_views(poor))
 
     with pytest.raises(ReconstructionError, match=r"3 depth maps agree on \w+ points") as err:
         made(poor)

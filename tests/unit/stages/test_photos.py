@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from sfm_app.errors import InputError
 from sfm_app.parallel import make_executor
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings
-from sfm_app.stages.photos import load_photo_set, read_photos
+from sfm_app.stages import photos
 from sfm_app.workspace import Workspace
 
 
@@ -55,7 +56,7 @@ def test_every_file_is_used_or_has_a_reason(folder, run):
     (folder / "sub dir").mkdir()
     Image.fromarray(PIXELS).save(folder / "sub dir" / "ü b.jpg")
 
-    found = read_photos(folder, run)
+    found = photos.make(folder, run)
 
     assert [photo.name for photo in found.photos] == ["a.jpg", "b.png", "sub dir/ü b.jpg"]
     assert reasons(found) == {
@@ -66,7 +67,7 @@ def test_every_file_is_used_or_has_a_reason(folder, run):
         "tiny.png": "smaller than 64 px",
         "copy.png": "the same picture as b.png",
     }
-    assert load_photo_set(folder, run) == found
+    assert photos.load(folder, run) == found
     assert np.array_equal(np.asarray(Image.open(run.workspace.photos / "b.png")), pixels(2))
 
 
@@ -76,7 +77,7 @@ def test_a_camera_that_was_turned_keeps_its_layout_and_mirrors_are_undone(folder
     exif[0x0112] = orientation
     Image.fromarray(PIXELS).save(folder / "turned.png", exif=exif)
 
-    photo = next(photo for photo in read_photos(folder, run).photos if photo.name == "turned.png")
+    photo = next(photo for photo in photos.make(folder, run).photos if photo.name == "turned.png")
     seen = Image.open(run.workspace.photos / "turned.png")
     seen.load()
 
@@ -96,7 +97,7 @@ def test_odd_pixel_formats_become_eight_bit(folder, run, mode):
     name = "odd.jpg" if mode == "CMYK" else "odd.png"
     image.save(folder / name)
 
-    read_photos(folder, run)
+    photos.make(folder, run)
     seen = Image.open(run.workspace.photos / name)
     seen.load()
 
@@ -111,7 +112,7 @@ def test_photos_of_one_size_share_a_camera_unless_exif_tells_them_apart(folder, 
     exif[0x0110] = "Box Brownie"
     Image.fromarray(PIXELS).save(folder / "d.jpg", exif=exif)
 
-    groups = read_photos(folder, run).groups
+    groups = photos.make(folder, run).groups
 
     assert [[photo.name for photo in members] for members in groups.values()] == [
         ["a.jpg", "b.png"],
@@ -124,11 +125,11 @@ def test_bars_around_a_picture_are_seen_and_read_back(folder, run):
     within = np.zeros((240, 320, 3), np.uint8)
     within[30:210] = np.random.default_rng(5).integers(60, 255, (180, 320, 3))
     Image.fromarray(within).save(folder / "barred.png")
-    found = {photo.name: photo for photo in read_photos(folder, run).photos}
+    found = {photo.name: photo for photo in photos.make(folder, run).photos}
     assert found["barred.png"].shown == (0, 30, 320, 180)
     assert found["barred.png"].group == "320x180 in 320x240"
     assert {photo.shown for name, photo in found.items() if name != "barred.png"} == {None}
-    assert {photo.name: photo for photo in load_photo_set(folder, run).photos} == found
+    assert {photo.name: photo for photo in photos.load(folder, run).photos} == found
 
 
 def test_exif_focal_is_read_as_a_hint_in_pixels(folder, run):
@@ -136,7 +137,7 @@ def test_exif_focal_is_read_as_a_hint_in_pixels(folder, run):
     exif.get_ifd(0x8769)[0xA405] = 27
     Image.fromarray(PIXELS).save(folder / "e.jpg", exif=exif)
 
-    photo = next(photo for photo in read_photos(folder, run).photos if photo.name == "e.jpg")
+    photo = next(photo for photo in photos.make(folder, run).photos if photo.name == "e.jpg")
 
     assert photo.exif_focal_px == pytest.approx(27 / 36 * 128)
 
@@ -158,8 +159,8 @@ def with_gps(folder, **entries):
 
 
 def read_gps(folder, run):
-    found = read_photos(folder, run)
-    assert load_photo_set(folder, run) == found
+    found = photos.make(folder, run)
+    assert photos.load(folder, run) == found
     return next(photo.gps for photo in found.photos if photo.name == "where.jpg")
 
 
@@ -171,7 +172,7 @@ def test_gps_is_read_as_a_hint(folder, run):
     assert gps.latitude_deg == pytest.approx(-(33 + 51 / 60 + 24.5 / 3600), abs=1e-6)
     assert gps.longitude_deg == pytest.approx(151 + 12 / 60 + 54.25 / 3600, abs=1e-6)
     assert gps.altitude_m == pytest.approx(7.5)
-    assert run.counts["gps"] == 1
+    assert run.statistics["gps"] == 1
 
 
 @pytest.mark.parametrize(
@@ -205,10 +206,10 @@ def test_a_position_that_cannot_be_true_is_none(folder, run, entries):
 
 
 def test_photos_too_large_for_the_memory_are_scaled_down_and_say_so(folder, run):
-    run.settings = Settings.from_mapping({"max_memory_gb": 1})
+    run = replace(run, settings=Settings.from_mapping({"max_memory_gb": 1}))
     Image.fromarray(np.tile(PIXELS, (20, 14, 1))).save(folder / "large.jpg", quality=50)
 
-    photo = next(photo for photo in read_photos(folder, run).photos if photo.name == "large.jpg")
+    photo = next(photo for photo in photos.make(folder, run).photos if photo.name == "large.jpg")
 
     assert 1.9e6 < photo.width * photo.height <= 2e6
     assert photo.notes == (f"scaled down from 1792 x 1920 to {photo.width} x {photo.height} pixels",)
@@ -219,7 +220,7 @@ def test_the_output_folder_inside_the_photos_is_not_read(folder, tmp_path):
     workspace.create()
     Image.fromarray(PIXELS).save(folder / "out" / "model.png")
     with make_executor(1) as executor:
-        found = read_photos(folder, RunContext(Settings(), workspace, load_plugins(installed=False), executor, 1))
+        found = photos.make(folder, RunContext(Settings(), workspace, load_plugins(installed=False), executor, 1))
 
     assert [photo.name for photo in found.photos] == ["a.jpg", "b.png"]
 
@@ -242,13 +243,13 @@ def test_too_few_photos(tmp_path, run, names, says):
             (folder / name).write_text("text")
 
     with pytest.raises(InputError, match=says):
-        read_photos(folder, run)
+        photos.make(folder, run)
 
 
 def test_a_missing_folder_or_a_file(tmp_path, run):
     with pytest.raises(InputError, match="no such folder"):
-        read_photos(tmp_path / "nowhere", run)
+        photos.make(tmp_path / "nowhere", run)
     path = Path(tmp_path / "file.jpg")
     path.write_bytes(b"x")
     with pytest.raises(InputError, match="not a folder"):
-        read_photos(path, run)
+        photos.make(path, run)

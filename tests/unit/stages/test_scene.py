@@ -16,14 +16,12 @@ from sfm_app.colmap.model import part_of, photos_of
 from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.camera import camera_matrix
-from sfm_app.manifest import StageRecord
 from sfm_app.plugins import load_plugins
 from sfm_app.reconstruction import Outcome
 from sfm_app.reconstruction.mapping_runs import Attempt
 from sfm_app.reconstruction.support import Explained
 from sfm_app.settings import Settings
 from sfm_app.stages import scene
-from sfm_app.stages.intrinsics import intrinsics_seal
 from sfm_app.types import (
     Calibration,
     CameraModel,
@@ -31,14 +29,12 @@ from sfm_app.types import (
     Intrinsics,
     MatchedImage,
     MatchGraph,
-    Photo,
-    PhotoSet,
     PoseGraph,
     RelativePose,
     Scene,
     ViewGraph,
 )  # fmt: skip
-from sfm_app.workspace import SECOND_LOOK, Workspace
+from sfm_app.workspace import MAPPING, Workspace
 
 
 @pytest.fixture(scope="module")
@@ -59,10 +55,23 @@ def synthetic(tmp_path_factory):
 
 @pytest.fixture
 def run(synthetic, tmp_path):
-    """A run whose folder holds the database."""
-    shutil.copyfile(synthetic[0], tmp_path / "database.db")
+    """A run in an empty folder."""
     settings = Settings.from_mapping({"scene": {"second_look": False}})
     return RunContext(settings, Workspace(tmp_path), load_plugins(), ThreadPoolExecutor(1), 1)
+
+
+@pytest.fixture
+def mapped(synthetic, monkeypatch):
+    """Lets mapping find what the test says; the database that it has made is COLMAP's."""
+
+    def find(made):
+        def reconstruct(matches, views, intrinsics, run):
+            shutil.copyfile(synthetic[0], run.workspace.database)
+            return made
+
+        monkeypatch.setattr(scene, "reconstruct", reconstruct)
+
+    return find
 
 
 def attempt(model, explained=None):
@@ -89,19 +98,17 @@ def inputs(model, fits=((1, 8),)):
     return MatchGraph(images, dict.fromkeys(images, np.ones((20, 2))), {}), ViewGraph(dict.fromkeys(fits, fit), {})
 
 
-def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthetic, run, monkeypatch):
+def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthetic, run, mapped):
     true = synthetic[1]
     main, other = part_of(true, (1, 2, 3, 4)), part_of(true, (5, 6, 7))
     for camera in main.cameras.values():
         camera.params = [1270.0, 512.0, 384.0, 0.0]
     made = outcome(attempt(main), attempt(other), graph=PoseGraph({}, {(1, 8): "contradicts other pairs"}, ()))
-    monkeypatch.setattr(scene, "reconstruct", lambda *_: made)
+    mapped(made)
     matches, views = inputs(true)
     name = {key: image.name for key, image in matches.images.items()}
 
-    run.workspace.calibration.write_text(json.dumps(made.intrinsics.to_dict()))
-
-    found = scene.reconstruct_scene(matches, views, made.intrinsics, run)
+    found = scene.make(matches, views, made.intrinsics, run)
 
     assert sorted(found.cam_from_world) == [name[key] for key in (1, 2, 3, 4)]
     assert found.cameras["one"].K[0, 0] == pytest.approx(1280, rel=0.003)
@@ -111,90 +118,85 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
         name[8]: "could not be placed: 20 inliers with the nearest photo that was, "
         "but that pair was dropped: contradicts other pairs",
     }
-    assert run.counts["registered"] == 4 and run.counts["of"] == 8
-    assert run.counts["other_models"] == [[name[key] for key in (5, 6, 7)]]
-    assert run.counts["pairs_dropped"] == {"contradicts other pairs": 1}
+    assert run.statistics["registered"] == 4 and run.statistics["of"] == 8
+    assert run.statistics["other_models"] == [[name[key] for key in (5, 6, 7)]]
+    assert run.statistics["pairs_dropped"] == {"contradicts other pairs": 1}
     assert photos_of(pycolmap.Reconstruction(run.workspace.other_models / "1")) == [5, 6, 7]
 
-    assert list(run.counts["bytes"]) == ["points.ply", "points.glb"]
-    for file, size in run.counts["bytes"].items():
+    assert list(run.statistics["bytes"]) == ["points.ply", "points.glb"]
+    for file, size in run.statistics["bytes"].items():
         assert (run.workspace.root / file).stat().st_size == size > 1000
 
-    record = StageRecord("", 0.0, run.counts)
-    run.workspace.manifest.finish("scene", record, {})
-    photos = PhotoSet(run.workspace.root, tuple(Photo(text, 1024, 768, "one") for text in name.values()))
-    again = scene.load_scene(photos, made.intrinsics, run)
+    again = scene.load(run)
     assert again.unregistered == found.unregistered and again.points == found.points
     assert all(np.array_equal(again.cam_from_world[key], value) for key, value in found.cam_from_world.items())
 
 
-def test_cameras_that_mapping_divided_are_read_back_and_the_calibration_stays_sealed(synthetic, run, monkeypatch):
+def test_cameras_that_mapping_divided_are_read_back(synthetic, run, mapped):
     true = synthetic[1]
     made = outcome(attempt(pycolmap.Reconstruction(true)))
     matches, views = inputs(true)
     one = made.intrinsics.cameras["one"]
     last = matches.images[8].name
     divided = Intrinsics({"one": one, "one #2": one}, {last: "one #2"})
-    monkeypatch.setattr(scene, "reconstruct", lambda *_: replace(made, intrinsics=divided))
-    run.workspace.calibration.write_text(json.dumps(made.intrinsics.to_dict()))
-    sealed = intrinsics_seal(run.workspace)
+    mapped(replace(made, intrinsics=divided))
 
-    found = scene.reconstruct_scene(matches, views, made.intrinsics, run)
+    found = scene.make(matches, views, made.intrinsics, run)
 
     assert (found.camera_of[last], len(found.cameras)) == ("one #2", 2)
-    assert intrinsics_seal(run.workspace) == sealed
-    run.workspace.manifest.finish("scene", StageRecord("", 0.0, run.counts), {})
-    photos = PhotoSet(run.workspace.root, tuple(Photo(x.name, 1024, 768, "one") for x in matches.images.values()))
-    again = scene.load_scene(photos, made.intrinsics, run)
+    again = scene.load(run)
     assert again.camera_of == found.camera_of and again.cameras.keys() == found.cameras.keys()
 
 
 @pytest.mark.parametrize(("end", "stays"), [(KeyboardInterrupt(), True), (ReconstructionError("no depth"), False)])
 def test_what_a_second_look_found_stays_when_it_is_interrupted(run, monkeypatch, end, stays):
     def look_again(first):
-        place.mkdir()
+        (place / "found").mkdir()
         raise end
 
-    place = run.workspace.root / SECOND_LOOK
+    place = run.workspace.root / MAPPING
     monkeypatch.setattr(scene, "reconstruct", lambda *_: None)
     monkeypatch.setattr(scene, "look_again", look_again)
 
     with pytest.raises(type(end)):
-        scene.reconstruct_scene(None, None, None, run)
+        scene.make(None, None, None, run)
 
-    assert place.exists() is stays
+    assert (place / "found").exists() is stays
+    if stays:
+        assert (scene.mapping_run(run).workspace.root / "found").exists()
+        other = run.for_stage("other photos")
+        assert not (scene.mapping_run(other).workspace.root / "found").exists()
 
 
-def test_a_model_that_cannot_be_adjusted_is_kept_as_mapping_left_it_and_the_run_says_so(synthetic, run, monkeypatch):
+def test_a_model_that_cannot_be_adjusted_is_kept_and_the_run_says_so(synthetic, run, mapped, monkeypatch):
     def failing(*_):
         raise np.linalg.LinAlgError("Matrix is not positive definite")
 
     true = synthetic[1]
     made = outcome(attempt(part_of(true, (1, 2, 3, 4))), attempt(part_of(true, (5, 6, 7))))
-    monkeypatch.setattr(scene, "reconstruct", lambda *_: made)
+    mapped(made)
     monkeypatch.setattr(bundle, "reduce", failing)
     matches, views = inputs(true)
-    run.workspace.calibration.write_text(json.dumps(made.intrinsics.to_dict()))
 
-    found = scene.reconstruct_scene(matches, views, made.intrinsics, run)
+    found = scene.make(matches, views, made.intrinsics, run)
 
     reason = "the computation failed while adjusting the bundle: Matrix is not positive definite"
-    assert run.counts["adjustment"] == {"failed": reason, "failed_in_other_models": {"1": reason}}
+    assert run.statistics["adjustment"] == {"failed": reason, "failed_in_other_models": {"1": reason}}
     assert len(found.cam_from_world) == 4 and found.cameras["one"].params == (1280.0, 512.0, 384.0, 0.0)
     assert (found.cameras["one"].deviations, found.cameras["one"].determined) == ({}, ())
-    assert json.loads(run.workspace.calibration.read_text(), parse_constant=pytest.fail)["refined"]["one"]
-    assert "the last adjustment failed" in "\n".join(scene_lines(found, run.counts))
+    assert json.loads(run.workspace.scene.read_text(), parse_constant=pytest.fail)["cameras"]["one"]
+    assert "the last adjustment failed" in "\n".join(scene_lines(found, run.statistics))
 
 
-def test_without_a_model_the_error_says_what_was_seen_and_what_may_help(synthetic, run, monkeypatch):
-    monkeypatch.setattr(scene, "reconstruct", lambda *_: outcome(tried=("all at once: 0 photos",)))
+def test_without_a_model_the_error_says_what_was_seen_and_what_may_help(synthetic, run, mapped):
+    mapped(outcome(tried=("all at once: 0 photos",)))
     matches, views = inputs(synthetic[1])
 
     with pytest.raises(ReconstructionError, match=r"1 pairs with 20 to 20 inliers\); all at once: 0 photos") as caught:
-        scene.reconstruct_scene(matches, views, outcome().intrinsics, run)
+        scene.make(matches, views, outcome().intrinsics, run)
 
     assert "overlap" in caught.value.hint
-    assert not run.workspace.sparse.exists() and run.counts == {}
+    assert not run.workspace.sparse.exists() and run.statistics == {}
 
 
 def test_how_it_was_made_counts_pairs_and_matches():
@@ -242,7 +244,7 @@ def test_models_are_written_as_a_whole_and_nothing_of_an_earlier_run_is_left(syn
     written = files(place.sparse)
     assert "images.bin" in written and "old.bin" not in written
     assert sorted(path.name for path in place.other_models.iterdir()) == ["1", "2"]
-    assert sorted(path.name for path in place.root.iterdir()) == ["database.db", "other_models", "sparse"]
+    assert sorted(path.name for path in place.root.iterdir()) == ["other_models", "sparse"]
     found = [place.sparse, place.other_models / "1", place.other_models / "2"]
     assert [photos_of(pycolmap.Reconstruction(folder)) for folder in found] == [[1, 2, 3, 4], [5, 6], [7, 8]]
 
@@ -252,23 +254,20 @@ def test_models_are_written_as_a_whole_and_nothing_of_an_earlier_run_is_left(syn
     assert not place.other_models.exists()
 
 
-def test_refined_cameras_stand_beside_the_calibration_and_leave_it_valid(tmp_path):
+def test_what_the_model_does_not_hold_is_written_down(tmp_path):
     place = Workspace(tmp_path)
     K = camera_matrix(800.0, 800.0, 320.0, 240.0)
-    before = Intrinsics({"one": Calibration(K, 640, 480, "zero-curves", True)})
-    place.calibration.write_text(json.dumps(before.to_dict()))
-    place.manifest.finish("intrinsics", StageRecord("abc", 1.0, {}, place.manifest.sizes(("calibration.json",))), {})
     camera = CameraModel("OPENCV", (800.0,) * 8, K, 640, 480, {"fx": 1.5, "cx": 2.5}, ("center",))
 
-    scene.write_refined(
-        Scene(tmp_path, {}, {}, {"one": camera}, 10, 20, 0.3), SimpleNamespace(workspace=place)
-    )  # fmt: skip
+    scene.write_scene(
+        Scene(tmp_path, {}, {"b.jpg": "blurred"}, {"one": camera}, 10, 20, 0.3, {"a.jpg": "one"}),
+        SimpleNamespace(workspace=place),
+    )
 
-    found = json.loads(place.calibration.read_text())
-    assert found["refined"]["one"]["deviations"] == {"fx": 1.5, "cx": 2.5}
-    assert (found["refined"]["one"]["K"], found["refined"]["one"]["determined"]) == (K.tolist(), ["center"])
-    assert Intrinsics.from_dict(found).to_dict() == before.to_dict()
-    assert not place.manifest.spoilt(place.manifest.record("intrinsics"))
+    found = json.loads(place.scene.read_text())
+    assert found["cameras"]["one"]["deviations"] == {"fx": 1.5, "cx": 2.5}
+    assert (found["cameras"]["one"]["K"], found["cameras"]["one"]["determined"]) == (K.tolist(), ["center"])
+    assert (found["camera_of"], found["unregistered"]) == ({"a.jpg": "one"}, {"b.jpg": "blurred"})
 
 
 def test_what_is_known_of_refined_cameras_goes_by_their_names():

@@ -6,8 +6,9 @@ import pytest
 from PIL import Image
 
 from sfm_app.photos import save_used
+from sfm_app.settings import Settings
 from sfm_app.stages import texture
-from sfm_app.stages.texture import Files, digest, load_texture, make_texture, read_photo, save_texture
+from sfm_app.stages.texture import Files, read_photo, read_texture, save_texture, surface_digest
 from sfm_app.texture import PhotoView
 from sfm_app.types import CameraModel, Model, Surface, Texture
 from sfm_app.workspace import Workspace
@@ -18,7 +19,7 @@ SURFACE = Surface(np.eye(3), np.array([[0, 1, 2]]), np.full((3, 3), 9, np.uint8)
 
 def stored(model, place):
     save_texture(model, SimpleNamespace(workspace=Workspace(place)))
-    return load_texture(place / "dense")
+    return read_texture(Workspace(place))
 
 
 def test_a_model_comes_back_with_all_its_pages(tmp_path):
@@ -93,11 +94,11 @@ def test_the_digest_of_a_surface_is_that_of_all_its_parts():
         replace(SURFACE, colors=np.full((3, 3), 8, np.uint8)),
     ]
 
-    assert digest(same) == digest(SURFACE)
-    assert len({digest(surface) for surface in (SURFACE, *others)}) == 4
+    assert surface_digest(same) == surface_digest(SURFACE)
+    assert len({surface_digest(surface) for surface in (SURFACE, *others)}) == 4
 
 
-@pytest.mark.parametrize("change", ["", "inputs", "camera", "surface"])
+@pytest.mark.parametrize("change", ["", "fingerprint", "camera", "surface"])
 def test_nothing_is_used_that_was_found_with_something_else(tmp_path, monkeypatch, change):
     """The first run is killed at its second photo; photos that it has looked at are not read again."""
     found = []
@@ -109,17 +110,20 @@ def test_nothing_is_used_that_was_found_with_something_else(tmp_path, monkeypatc
             raise KeyboardInterrupt
         return Model(surface), {}
 
-    def run_stage(inputs="", focal=50.0, surface=SURFACE):
+    def run_stage(fingerprint="", focal=50.0, surface=SURFACE):
         camera = CameraModel("OPENCV", (focal, 50.0, 30.0, 20.0, 0, 0, 0, 0), np.eye(3), 60, 40)
         scene = SimpleNamespace(cameras={"one": camera}, camera_of={"a.png": "one"}, cam_from_world={"a.png": POSE})
-        run = SimpleNamespace(workspace=Workspace(tmp_path), inputs=inputs, map=None, record=dict, mask_dir=None)
-        make_texture(scene, surface, None, run)
+        run = SimpleNamespace(
+            workspace=Workspace(tmp_path), settings=Settings(), fingerprint=fingerprint, map=None, record=dict,
+            mask_dir=None,
+        )  # fmt: skip
+        texture.make(scene, surface, run)
 
     monkeypatch.setattr(texture, "texture_surface", texture_surface)
     with pytest.raises(KeyboardInterrupt):
         run_stage()
-    others = {"inputs": "others", "camera": 51.0, "surface": replace(SURFACE, vertices=2 * np.eye(3))}
+    others = {"fingerprint": "others", "camera": 51.0, "surface": replace(SURFACE, vertices=2 * np.eye(3))}
     run_stage(**({"focal" if change == "camera" else change: others[change]} if change else {}))
 
     assert (found[1] is None) == bool(change)
-    assert not (tmp_path / "dense" / texture.PARTS).exists()
+    assert not (tmp_path / "texture" / texture.PARTS).exists()

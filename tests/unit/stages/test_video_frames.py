@@ -21,7 +21,7 @@ def run(tmp_path):
     workspace = Workspace(tmp_path / "out")
     workspace.create()
     with make_executor(1) as executor:
-        yield RunContext(Settings(), workspace, load_plugins(installed=False), executor, 1, inputs="one")
+        yield RunContext(Settings(), workspace, load_plugins(installed=False), executor, 1, fingerprint="one")
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def frames_of(source, run):
 def test_a_video_becomes_a_folder_of_frames(clip, run):
     names = frames_of(clip, run)
 
-    counts = run.counts["video"]
+    counts = run.statistics["video"]
     assert 9 <= len(names) <= 11
     assert all(name.startswith("clip_0000") and name.endswith(".jpg") for name in names)
     with Image.open(run.workspace.frames / names[0]) as frame:
@@ -62,7 +62,7 @@ def test_a_video_becomes_a_folder_of_frames(clip, run):
 def test_a_folder_is_its_own(tmp_path, run):
     with photos_of(tmp_path, run) as folder:
         assert folder == tmp_path
-    assert "video" not in run.counts and not run.workspace.frames.exists()
+    assert "video" not in run.statistics and not run.workspace.frames.exists()
 
 
 class KilledError(Exception):
@@ -102,9 +102,8 @@ def test_a_marker_that_cannot_be_read_counts_as_none(clip, run, text):
 
 def test_other_inputs_choose_anew(clip, tmp_path, run):
     killed(clip, run)
-    run.inputs = "another"
 
-    assert len(frames_of(write(clip, range(0, 40, 4)), run)) <= 6
+    assert len(frames_of(write(clip, range(0, 40, 4)), run.for_stage("another"))) <= 6
 
 
 def test_a_video_that_is_cut_off_says_so(clip, run):
@@ -114,7 +113,7 @@ def test_a_video_that_is_cut_off_says_so(clip, run):
     names = frames_of(clip, run)
 
     assert 5 <= len(names) <= 8
-    assert "cut off" in run.counts["video"]["notes"][0]
+    assert "cut off" in run.statistics["video"]["notes"][0]
 
 
 @pytest.mark.parametrize(("places", "says"), [([5] * 9, "does not move"), ([9], "does not move")])
@@ -129,7 +128,7 @@ def test_frames_that_come_out_black_are_passed_over(tmp_path, run):
 
     names = frames_of(write(tmp_path / "clip.avi", places), run)
 
-    counts = run.counts["video"]
+    counts = run.statistics["video"]
     assert 9 <= len(names) <= 11
     assert all(int(name.removesuffix(".jpg")[-6:]) % 2 for name in names)
     assert counts["left_out"]["black"] == 20

@@ -27,11 +27,10 @@ def match_graph(widths=(640, 640, 640)):
 
 
 @pytest.fixture
-def build(tmp_path, monkeypatch):
-    monkeypatch.setattr(view_graph, "write_epipolar_fits", lambda *_: None)
+def build(tmp_path):
     with make_executor(2) as executor:
-        run = RunContext(Settings(), Workspace(tmp_path), load_plugins(), executor, 2, inputs="these")
-        yield lambda matches: (view_graph.build_view_graph(matches, run), run.counts)
+        run = RunContext(Settings(), Workspace(tmp_path), load_plugins(), executor, 2, fingerprint="these")
+        yield lambda matches: (view_graph.make(matches, run), run.statistics)
 
 
 def test_time_stamps_are_taken_out_and_counted(build):

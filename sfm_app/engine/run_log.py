@@ -1,0 +1,42 @@
+"""The log in the output folder, and how much memory the process has held."""
+
+import logging
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from sfm_app.context import RunContext
+
+logger = logging.getLogger("sfm_app")
+
+
+class LogFile(logging.FileHandler):
+    """A log that says nothing of a full disk: the run does."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        pass
+
+
+@contextmanager
+def logged(run: RunContext) -> Iterator[None]:
+    """Keep a log in the output folder, with the traceback of whatever ends the run."""
+    handler = LogFile(run.workspace.log, encoding="utf-8", errors="backslashreplace")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))
+    logger.addHandler(handler)
+    logger.setLevel(logging.INFO)
+    try:
+        yield
+    except BaseException:
+        logger.exception("the run ended here")
+        raise
+    finally:
+        logger.removeHandler(handler)
+        handler.close()
+
+
+def peak_memory_mb() -> int | None:
+    """Return the most memory that this process has held; None where the system is not Linux."""
+    status = Path("/proc/self/status")
+    found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text(encoding="utf-8")) if status.exists() else None
+    return int(found[1]) // 1024 if found else None

@@ -1,0 +1,85 @@
+"""What a stage is, and how its product is looked up."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, TypeVar, cast
+
+from sfm_app.context import RunContext
+from sfm_app.errors import DamagedProductError, InputError
+from sfm_app.workspace import Workspace
+
+Product = TypeVar("Product")
+Product_co = TypeVar("Product_co", covariant=True)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stage(Generic[Product_co]):
+    """One step from photos to mesh."""
+
+    name: str
+    takes: tuple["Stage[object]", ...]
+    """Stages whose products it needs."""
+    settings: tuple[str, ...]
+    """Settings, or tables of them, that its result depends on."""
+    files: tuple[str, ...]
+    """What it leaves in the output folder; nobody else writes there."""
+    make: Callable[["Products", RunContext], Product_co]
+    load: Callable[["Products", RunContext], Product_co]
+    """Reads back what `make` has left."""
+    digest: Callable[[Workspace], str]
+    """Hashes what `load` reads; it is compared before anything is read: COLMAP hangs or ends on damaged files."""
+
+
+class Products:
+    """Products by their stages; those of stages that were skipped are loaded when they are asked for.
+
+    Args:
+        run: where they are loaded from.
+        source: what the user has given; not needed to load what a finished run has left.
+    """
+
+    def __init__(self, run: RunContext, source: Path = Path()) -> None:
+        self.source, self._run = source, run
+        self._known: dict[str, object] = {}
+
+    def __getitem__(self, stage: Stage[Product]) -> Product:
+        """Return the product of a stage.
+
+        Raises:
+            DamagedProductError: what the stage has left is not as it was, or cannot be read.
+        """
+        if stage.name not in self._known:
+            with undamaged(stage, self._run):
+                self._known[stage.name] = stage.load(self, self._run)
+        return cast(Product, self._known[stage.name])
+
+    def keep(self, stage: Stage[Product], product: Product) -> None:
+        """Take in what a stage has just made."""
+        self._known[stage.name] = product
+
+
+@contextmanager
+def undamaged(stage: Stage[object], run: RunContext) -> Iterator[None]:
+    """Check what a stage has left, and read it.
+
+    Raises:
+        DamagedProductError: it is not as it was left, or cannot be read.
+    """
+    try:
+        record = run.workspace.manifest.record(stage.name)
+        if record is None or record.digest != stage.digest(run.workspace):
+            raise ValueError(f"the files of stage `{stage.name}` are not as it left them")
+        yield
+    except InputError:
+        raise
+    except Exception as err:  # whatever decoders make of damaged bytes
+        what = f"is not complete: {err.filename} is gone" if isinstance(err, FileNotFoundError) else "is damaged"
+        left = f"what stage `{stage.name}` left in {run.workspace.root} {what}"
+        raise DamagedProductError(left, go_on_hint(run), stage.name) from err
+
+
+def go_on_hint(run: RunContext) -> str:
+    """Say which command completes a run."""
+    return f"`sfm-app run PHOTOS -o {run.workspace.root}` goes on where it stopped"

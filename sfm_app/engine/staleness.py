@@ -1,0 +1,75 @@
+"""What a stage's result depends on: photos, settings, versions. And why a stage has to be done again."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from typing import Any
+
+from sfm_app.colmap.backend import versions as colmap_versions
+from sfm_app.context import RunContext
+from sfm_app.engine.stage import Stage
+from sfm_app.hashing import fingerprint
+
+OTHER_PHOTOS = "the photos have changed"
+CHANGES = 3
+"""So many are named."""
+
+
+def fingerprint_of(stage: Stage[object], inputs: Sequence[str], run: RunContext) -> str:
+    """Return hash of everything that a stage's result depends on: its inputs, its settings, the versions."""
+    return fingerprint(stage.name, made_with(stage, run), inputs)
+
+
+def made_with(stage: Stage[object], run: RunContext) -> dict[str, Any]:
+    """Return the values of a stage's settings, and the versions of what computes the result."""
+    values = run.settings.model_dump()
+    return {"settings": {key: value_of(values, key) for key in stage.settings}, "versions": versions()}
+
+
+def why_again(stage: Stage[object], inputs: str, run: RunContext) -> str | None:
+    """Return why a stage has to be done; empty where it never was, None where it is up to date.
+
+    Args:
+        stage: perhaps to be done.
+        inputs: its `fingerprint_of`.
+        run: the run.
+    """
+    record = run.workspace.manifest.record(stage.name)
+    if record is None:
+        return ""
+    if changed := run.workspace.manifest.changed_files(record):
+        return f"{changed[0]} is gone or was changed"
+    if record.fingerprint == inputs:
+        return None
+    found = list(_changes(record.made_with, json.loads(json.dumps(made_with(stage, run)))))
+    more = f" and {len(found) - CHANGES} more" if len(found) > CHANGES else ""
+    return f"{', '.join(found[:CHANGES])}{more}" if found else OTHER_PHOTOS
+
+
+def _changes(before: Any, now: Mapping[str, Any], name: str = "") -> Iterator[str]:
+    """Yield values that are others now, by their dotted names."""
+    for key, new in now.items():
+        old = before.get(key) if isinstance(before, Mapping) else None
+        inner = f"{name}.{key}".removeprefix(".").removeprefix("settings.").removeprefix("versions.")
+        if isinstance(new, dict):
+            yield from _changes(old, new, inner.removeprefix("settings").removeprefix("versions"))
+        elif old != new:
+            yield f"{inner} {json.dumps(old)} -> {json.dumps(new)}"
+
+
+def value_of(values: Any, key: str) -> Any:
+    """Return a value of nested mappings by its dotted name; None where there is none."""
+    for name in key.split("."):
+        values = values.get(name) if isinstance(values, Mapping) else None
+    return values
+
+
+def manifest_head(run: RunContext) -> dict[str, Any]:
+    """Return what the manifest says besides the stages."""
+    return {"program": "sfm-app", "versions": versions(), "settings": run.settings.model_dump()}
+
+
+def versions() -> dict[str, str]:
+    """Return versions of what computes the result."""
+    parts = ("sfm-app", "numpy", "numba", "opencv-contrib-python-headless", "open3d")
+    return {name: version(name) for name in parts} | colmap_versions()

@@ -1,0 +1,65 @@
+"""What a stage depends on, and why it is done again."""
+
+from dataclasses import replace
+
+from sfm_app.engine.stage import Stage
+from sfm_app.engine.staleness import fingerprint_of, made_with, manifest_head, value_of, why_again
+from sfm_app.manifest import StageRecord
+from sfm_app.settings import Settings
+
+STAGE = Stage("match_graph", (), ("matching", "photos.cameras", "seed"), ("x.txt",), None, None, None)
+
+
+def set_to(run, **values):
+    return replace(run, settings=Settings.from_mapping(values))
+
+
+def finished(run):
+    """A stage that was finished with what is in force."""
+    run.workspace.create()
+    (run.workspace.root / "x.txt").write_text("12")
+    made_from, used = fingerprint_of(STAGE, ["abc"], run), made_with(STAGE, run)
+    record = StageRecord(made_from, 1.0, {}, run.workspace.manifest.sizes(STAGE.files), made_with=used)
+    run.workspace.manifest.finish("match_graph", record, manifest_head(run))
+
+
+def why(run, inputs="abc"):
+    return why_again(STAGE, fingerprint_of(STAGE, [inputs], run), run)
+
+
+def test_a_stage_that_was_never_done_needs_no_reason(run):
+    assert why(run) == ""
+
+
+def test_settings_of_other_stages_change_nothing(run):
+    finished(run)
+    set_to(run, mesh={"faces": 1000}, photos={"keep_low_quality": True}, workers=2)
+
+    assert why(run) is None
+
+
+def test_a_setting_that_changed_is_named_with_both_values(run):
+    finished(run)
+    assert why(set_to(run, matching={"max_features": 500})) == "matching.max_features 8192 -> 500"
+    assert why(set_to(run, photos={"cameras": "single"}, seed=3)) == 'photos.cameras "auto" -> "single", seed 0 -> 3'
+
+
+def test_no_more_than_three_are_named(run):
+    finished(run)
+    said = why(set_to(run, quality="high", photos={"cameras": "each"}, seed=1, matching={"max_ratio": 0.7}))
+
+    assert said.count("->") == 3 and said.endswith("and 2 more")
+
+
+def test_photos_files_and_versions(run, monkeypatch):
+    finished(run)
+    assert why(run, "other photos") == "the photos have changed"
+    monkeypatch.setattr("sfm_app.engine.staleness.versions", lambda: {"numpy": "1.0"})
+    assert "-> " in why(run)
+    (run.workspace.root / "x.txt").unlink()
+    assert why(run) == "x.txt is gone or was changed"
+
+
+def test_values_are_found_by_dotted_names():
+    assert value_of({"a": {"b": 3}}, "a.b") == 3
+    assert value_of({"a": 1}, "a.b") is None
