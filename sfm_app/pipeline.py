@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from sfm_app.colmap.model import sparse_model
@@ -9,8 +10,9 @@ from sfm_app.context import RunContext
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage, go_on_hint, undamaged
 from sfm_app.errors import InputError
+from sfm_app.parallel import ordered_map
+from sfm_app.photos import read_source
 from sfm_app.stages import depth_maps, export, intrinsics, match_graph, mesh, photos, scene, texture, view_graph
-from sfm_app.stages.video_frames import settings_for
 from sfm_app.types import Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surface, ViewGraph
 
 PHOTOS: Stage[PhotoSet] = Stage(
@@ -100,11 +102,15 @@ STAGES, NAMES = PIPELINE.stages, PIPELINE.names
 
 
 def run_stages(
-    source: Path, run: RunContext, first: str = "", last: str = "files", wanted: Sequence[Stage[object]] = ()
+    photo_dir: Path, run: RunContext, first: str = "", last: str = "files", wanted: Sequence[Stage[object]] = ()
 ) -> Products:
-    """Turn photos, or a video, into products, up to stage `last`; arguments and errors as `Pipeline.run`."""
-    settings = settings_for(source, run.settings)
-    return PIPELINE.run(source, replace(run, settings=settings), first, last, wanted)
+    """Turn a folder of photos, or a video, into products, up to stage `last`; the rest as `Pipeline.run`."""
+    options, place = run.settings.photos, run.workspace
+    place.keep_apart(photo_dir)
+    if options.masks:
+        place.keep_apart(Path(options.masks), "masks")
+    source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
+    return PIPELINE.run(source, replace(run, settings=source.adapt(run.settings)), first, last, wanted)
 
 
 def stored_model(run: RunContext, *, points: bool = False) -> Model:

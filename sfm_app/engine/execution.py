@@ -6,17 +6,16 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import dropwhile
-from pathlib import Path
 
 from sfm_app.colmap.backend import check_written
 from sfm_app.context import RunContext
 from sfm_app.cost_estimate import plan_within
 from sfm_app.engine.run_log import logged, peak_memory_mb
-from sfm_app.engine.source import Source, source_of
 from sfm_app.engine.stage import Product, Products, Stage
 from sfm_app.engine.staleness import OTHER_PHOTOS, fingerprint_of, made_with, manifest_head, why_again
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
 from sfm_app.manifest import StageRecord
+from sfm_app.photos import Source
 from sfm_app.types import PhotoSet
 
 logger = logging.getLogger("sfm_app")
@@ -45,12 +44,12 @@ class Pipeline:
         return self.stages[: self.names.index(last) + 1]
 
     def run(
-        self, source: Path, run: RunContext, first: str = "", last: str = "", wanted: Sequence[Stage[object]] = ()
+        self, source: Source, run: RunContext, first: str = "", last: str = "", wanted: Sequence[Stage[object]] = ()
     ) -> Products:
         """Run what is not up to date; stages whose files are damaged are done again, too.
 
         Args:
-            source: a folder of photos, or a video.
+            source: what the user has given.
             run: the run.
             first: stage from which on everything is done again.
             last: stage to stop after; the last one where empty.
@@ -63,20 +62,18 @@ class Pipeline:
             if name not in self.names:
                 raise ConfigError(f"no stage is named '{name}'", hint=f"stages: {', '.join(self.names)}")
         stages = self.until(last or self.names[-1])
-        run.workspace.keep_apart(source)
-        given = source_of(source, run)
         run.workspace.create()
         with run.workspace.held(), logged(run):
             run.workspace.manifest.check_format()
             for _ in self.stages:
                 try:
-                    return _Execution(self, given, run, first).through(stages, wanted)
+                    return _Execution(self, source, run, first).through(stages, wanted)
                 except DamagedProductError as err:
                     logger.info("%s", err, exc_info=err)
                     run.progress.stage(err.stage, "damaged: done again")
                     self.forget(err.stage, run)
                     first = ""
-            return _Execution(self, given, run, first).through(stages, wanted)
+            return _Execution(self, source, run, first).through(stages, wanted)
 
     def forget(self, name: str, run: RunContext) -> None:
         """Take a stage out of the manifest, and those that build on its files; nobody builds on those of the photos."""
@@ -98,7 +95,7 @@ class _Execution:
     products: Products = field(init=False)
 
     def __post_init__(self) -> None:
-        self.products = Products(self.run, self.source.path)
+        self.products = Products(self.run, self.source)
 
     def through(self, stages: Sequence[Stage[object]], wanted: Sequence[Stage[object]]) -> Products:
         """Run these stages where they are not up to date, and read the products that are wanted."""

@@ -3,11 +3,11 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Generic, TypeVar, cast
 
 from sfm_app.context import RunContext
 from sfm_app.errors import DamagedProductError, InputError
+from sfm_app.photos import Source
 from sfm_app.workspace import Workspace
 
 Product = TypeVar("Product")
@@ -37,12 +37,19 @@ class Products:
 
     Args:
         run: where they are loaded from.
-        source: what the user has given; not needed to load what a finished run has left.
+        source: what the user has given; not needed to load what later stages have left.
     """
 
-    def __init__(self, run: RunContext, source: Path = Path()) -> None:
-        self.source, self._run = source, run
+    def __init__(self, run: RunContext, source: Source | None = None) -> None:
+        self._run, self._source = run, source
         self._known: dict[str, object] = {}
+
+    @property
+    def source(self) -> Source:
+        """What the user has given."""
+        if self._source is None:
+            raise ValueError("the photos of a finished run are not read again")
+        return self._source
 
     def __getitem__(self, stage: Stage[Product]) -> Product:
         """Return the product of a stage.

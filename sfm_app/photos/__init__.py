@@ -19,6 +19,7 @@ from sfm_app.photos.masks import (
 )
 from sfm_app.photos.probe import read_photo
 from sfm_app.photos.quality_filter import screened
+from sfm_app.photos.source import Source, read_source
 from sfm_app.photos.staging import lay_out, stored_names
 from sfm_app.photos.thumbnail_stats import Glance
 from sfm_app.photos.video import opened
@@ -29,6 +30,7 @@ __all__ = [
     "Follower",
     "Glance",
     "Look",
+    "Source",
     "UnreadableError",
     "choose",
     "find_mask",
@@ -44,6 +46,7 @@ __all__ = [
     "place_of",
     "read_photo",
     "read_picture",
+    "read_source",
     "read_used",
     "save_used",
     "screened",

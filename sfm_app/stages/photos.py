@@ -4,7 +4,7 @@ import errno
 import json
 import shutil
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -18,13 +18,13 @@ from sfm_app.hashing import digest_files, is_below
 from sfm_app.photos import (
     MASK_HINT,
     Glance,
+    Source,
     UnreadableError,
     find_mask,
     grouped,
     lay_out,
     lay_out_mask,
     list_files,
-    list_masks,
     mask_place,
     place_of,
     read_photo,
@@ -34,24 +34,26 @@ from sfm_app.photos import (
     without_copies,
 )
 from sfm_app.settings import PhotoSettings
-from sfm_app.stages.video_frames import folder_of, photos_of
+from sfm_app.stages.video_frames import video_frames
 from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
 from sfm_app.workspace import Workspace
 
 
-def make(source: Path, run: RunContext) -> PhotoSet:
+def make(source: Source, run: RunContext) -> PhotoSet:
     """Look at every file of a folder, or at the frames of a video, and lay the usable photos out for COLMAP.
 
     Raises:
         InputError: the source is missing, fewer than two photos are usable, or a mask is not.
     """
-    with photos_of(source, run) as folder:
-        return read_photos(folder, run)
+    if not source.video:
+        return read_photos(source, source.path, list(source.files), run)
+    with video_frames(source.path, run) as folder:
+        return read_photos(source, folder, list_files(folder, run.workspace.root), run)
 
 
-def load(source: Path, run: RunContext) -> PhotoSet:
+def load(source: Source, run: RunContext) -> PhotoSet:
     """Read photos.json back; what is gone of what was laid out, or was damaged, is laid out again."""
-    return read_photo_set(folder_of(source, run), run)
+    return read_photo_set(run.workspace.frames if source.video else source.path, source.mask_dir, run)
 
 
 def digest(place: Workspace) -> str:
@@ -59,14 +61,13 @@ def digest(place: Workspace) -> str:
     return digest_files(place.root, place.photo_set.name)
 
 
-def read_photos(folder: Path, run: RunContext) -> PhotoSet:
-    """Look at every file of the folder and lay the usable photos out for COLMAP; errors as `make`."""
+def read_photos(source: Source, folder: Path, names: Sequence[str], run: RunContext) -> PhotoSet:
+    """Look at these files of a folder and lay the usable photos out for COLMAP; errors as `make`."""
     options = within_memory(run)
-    names = files_of(folder, run)
     found = run.map(partial(read_photo, folder, options=options), names, "photos")
     glances = [photo for photo in found if isinstance(photo, Glance)]
     unusable = [photo for photo in found if isinstance(photo, UnusablePhoto)]
-    glances, blackened = masked(glances, folder, run)
+    glances, blackened = masked(glances, folder, source, run)
     photos, needless = chosen(glances, keep_low_quality=options.keep_low_quality)
     unusable = sorted(unusable + blackened + needless, key=lambda photo: photo.name)
     if len(photos) < 2:
@@ -74,12 +75,12 @@ def read_photos(folder: Path, run: RunContext) -> PhotoSet:
             too_few(folder, len(photos), unusable), hint="two photos of one place are the least; 10 to 50 work best"
         )
     named = tuple(stored_names(grouped(photos, options.cameras)))
-    photo_set = PhotoSet(folder, named, tuple(unusable), mask_folder(run))
+    photo_set = PhotoSet(folder, named, tuple(unusable), source.mask_dir)
     for place in (run.workspace.photos, run.workspace.masks):
         shutil.rmtree(place, ignore_errors=True)
     run.map(partial(laid_out, folder=folder, target=run.workspace.photos), photo_set.photos, "laying photos out")
     if photo_set.masks is not None:
-        lay_out_masks(photo_set, photo_set.masks, run)
+        lay_out_masks(photo_set, photo_set.masks, list(source.masks), run)
     save_photo_set(photo_set, run)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
     run.record(notes={photo.path: list(photo.notes) for photo in photos if photo.notes})
@@ -105,59 +106,31 @@ def chosen(glances: list[Glance], *, keep_low_quality: bool) -> tuple[list[Photo
     return photos, useless + copies
 
 
-def files_of(folder: Path, run: RunContext) -> list[str]:
-    """Return names of all files that a run has to account for.
-
-    Raises:
-        InputError: the folder is missing or unreadable.
-    """
-    chosen, masks = run.settings.photos.images, mask_folder(run)
-    return list_files(
-        folder, run.workspace.root, Path(chosen) if chosen else None, closed=() if masks is None else (masks,)
-    )
-
-
-def mask_folder(run: RunContext) -> Path | None:
-    """Return the folder of masks; None where none is given."""
-    return Path(run.settings.photos.masks) if run.settings.photos.masks else None
-
-
-def masks_of(folder: Path, run: RunContext) -> list[str]:
-    """Return names of all files in the folder of masks; none where no masks are given.
-
-    Raises:
-        InputError: it is missing or unreadable, holds the photos themselves, or the run would write over it.
-    """
-    masks = mask_folder(run)
-    if masks is None:
-        return []
-    run.workspace.keep_apart(masks, "masks")
-    return list_masks(masks, folder, run.workspace.root)
-
-
-def masked(glances: list[Glance], folder: Path, run: RunContext) -> tuple[list[Glance], list[UnusablePhoto]]:
+def masked(
+    glances: list[Glance], folder: Path, source: Source, run: RunContext
+) -> tuple[list[Glance], list[UnusablePhoto]]:
     """Return the photos with their masks, and those of which nothing is left.
 
     Raises:
         InputError: a mask cannot be used, or no photo has one.
     """
-    masks, names = mask_folder(run), masks_of(folder, run)
+    masks = source.mask_dir
     if masks is None:
         return glances, []
     found = run.map(lambda glance: find_mask(glance.photo, folder, masks), glances, "masks")
     if glances and all(isinstance(photo, Photo) and not photo.mask for photo in found):
-        raise InputError(f"none of the {len(names)} files in {masks} is the mask of a photo", hint=MASK_HINT)
+        raise InputError(f"none of the {len(source.masks)} files in {masks} is the mask of a photo", hint=MASK_HINT)
     kept = [
         replace(glance, photo=photo) for glance, photo in zip(glances, found, strict=True) if isinstance(photo, Photo)
     ]
     return kept, [photo for photo in found if isinstance(photo, UnusablePhoto)]
 
 
-def lay_out_masks(photo_set: PhotoSet, masks: Path, run: RunContext) -> None:
+def lay_out_masks(photo_set: PhotoSet, masks: Path, names: Sequence[str], run: RunContext) -> None:
     """Put a mask of every photo into the workspace, and count them."""
     lay_out = partial(lay_out_mask, folder=photo_set.folder, masks=masks, target=run.workspace.masks)
     run.map(lay_out, photo_set.photos, "laying masks out")
-    unused = unused_masks(masks_of(photo_set.folder, run), photo_set.photos)
+    unused = unused_masks(list(names), photo_set.photos)
     run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})
 
 
@@ -189,10 +162,10 @@ def _copy_digest(photo: Photo, run: RunContext) -> str | None:
     return digest_files(run.workspace.photos, photo.name) if place.is_file() and not place.is_symlink() else None
 
 
-def read_photo_set(folder: Path, run: RunContext) -> PhotoSet:
+def read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoSet:
     """Read photos.json back, and lay out what is missing."""
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
-    photos, masks = tuple(_photo(entry) for entry in values["photos"]), mask_folder(run)
+    photos = tuple(_photo(entry) for entry in values["photos"])
     if not all(is_below(photo.name) for photo in photos):
         raise ValueError(f"{run.workspace.photo_set} names photos outside of their folder")
     for photo in photos:

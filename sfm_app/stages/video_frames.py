@@ -10,10 +10,9 @@ from typing import Any
 
 from sfm_app.atomic_io import replacing
 from sfm_app.context import RunContext
-from sfm_app.errors import ConfigError, InputError
-from sfm_app.photos import Follower, UnreadableError, choose, head_of, is_video, opened
+from sfm_app.errors import InputError
+from sfm_app.photos import Follower, UnreadableError, choose, opened
 from sfm_app.progress import track
-from sfm_app.settings import Settings
 
 HINT = "walk around while you film, slowly, and keep the thing in view"
 DAMAGED = "play it to see whether it is whole; save it as MP4 with H.264"
@@ -34,37 +33,15 @@ class Chosen:
     """For the manifest."""
 
 
-def settings_for(source: Path, settings: Settings) -> Settings:
-    """Return the settings for a folder or a video: frames of one video share a camera, unless the user says otherwise.
-
-    Raises:
-        ConfigError: they do not go with a video.
-    """
-    if not is_video(head_of(source)):
-        return settings
-    if settings.photos.images:
-        raise ConfigError("--images lists photos of a folder, not frames of a video", hint="leave --images out")
-    cameras = "single" if settings.photos.cameras == "auto" else settings.photos.cameras
-    return settings.model_copy(update={"photos": settings.photos.model_copy(update={"cameras": cameras})})
-
-
-def folder_of(source: Path, run: RunContext) -> Path:
-    """Return where the photos are."""
-    return run.workspace.frames if is_video(head_of(source)) else source
-
-
 @contextmanager
-def photos_of(source: Path, run: RunContext) -> Iterator[Path]:
-    """Provide the folder of photos: the source itself, or the chosen frames of a video.
+def video_frames(source: Path, run: RunContext) -> Iterator[Path]:
+    """Provide a folder with the chosen frames of a video.
 
     A run that is killed before the block ends without an error does not choose again.
 
     Raises:
         InputError: the video cannot be read, or shows too little.
     """
-    if not is_video(head_of(source)):
-        yield source
-        return
     chosen = kept(run)
     if chosen is None:
         chosen = chosen_from(source, run)

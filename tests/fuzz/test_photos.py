@@ -14,10 +14,10 @@ import pytest
 from PIL import Image, features
 
 from sfm_app.api import opened_run
-from sfm_app.photos import Glance
+from sfm_app.photos import Glance, read_photo, read_source
 from sfm_app.settings import PhotoSettings, Settings
-from sfm_app.stages.match_graph import match_photos
-from sfm_app.stages.photos import read_photo, read_photos
+from sfm_app.stages import match_graph
+from sfm_app.stages import photos as photo_stage
 
 from .mutations import ANYTHING, damaged, exif_block, jpeg_segments
 
@@ -221,12 +221,12 @@ def test_photos_that_colmap_cannot_read_have_no_keypoints(photos, tmp_path, chan
     settings = Settings.from_mapping({"matching": {"max_features": 300}})
     with opened_run(tmp_path / "out", settings, None) as run:
         run.workspace.create()
-        photo_set = read_photos(photos, run)
+        photo_set = photo_stage.make(read_source(photos, run.workspace.root, settings.photos, map), run)
         path = run.workspace.photos / "view_02.jpg"
         path.unlink()
         change(path)
 
-        found = match_photos(photo_set, run)
+        found = match_graph.make(photo_set, run)
 
     assert [image.name for image in found.images.values() if not len(found.keypoints[image.id])] == [path.name]
     assert run.statistics["keypoints"][path.name] == 0

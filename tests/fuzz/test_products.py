@@ -13,6 +13,7 @@ from sfm_app.engine.stage import Products
 from sfm_app.engine.staleness import why_again
 from sfm_app.errors import SfmError
 from sfm_app.manifest import StageRecord
+from sfm_app.photos import read_source
 from sfm_app.pipeline import NAMES, STAGES, stored_model
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings
@@ -56,7 +57,7 @@ def load(made, run, stage):
     """The product, or the error that is allowed."""
     before = made.outside()
     try:
-        return Products(run, made.photos)[STAGES[NAMES.index(stage)]]
+        return Products(run, read_source(made.photos, made.out, run.settings.photos, map))[STAGES[NAMES.index(stage)]]
     except SfmError as err:
         assert "\n" not in str(err)
         return err

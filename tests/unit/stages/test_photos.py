@@ -9,6 +9,7 @@ from PIL.TiffImagePlugin import IFDRational
 from sfm_app.context import RunContext
 from sfm_app.errors import InputError
 from sfm_app.parallel import make_executor
+from sfm_app.photos import read_source
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings
 from sfm_app.stages import photos
@@ -46,6 +47,18 @@ def reasons(photo_set):
     return {photo.name: photo.reason for photo in photo_set.unusable}
 
 
+def source_of(folder, run):
+    return read_source(folder, run.workspace.root, run.settings.photos, map)
+
+
+def make(folder, run):
+    return photos.make(source_of(folder, run), run)
+
+
+def load(folder, run):
+    return photos.load(source_of(folder, run), run)
+
+
 def test_every_file_is_used_or_has_a_reason(folder, run):
     (folder / "notes.txt").write_text("no photo")
     (folder / "empty.jpg").write_bytes(b"")
@@ -56,7 +69,7 @@ def test_every_file_is_used_or_has_a_reason(folder, run):
     (folder / "sub dir").mkdir()
     Image.fromarray(PIXELS).save(folder / "sub dir" / "ü b.jpg")
 
-    found = photos.make(folder, run)
+    found = make(folder, run)
 
     assert [photo.name for photo in found.photos] == ["a.jpg", "b.png", "sub dir/ü b.jpg"]
     assert reasons(found) == {
@@ -67,7 +80,7 @@ def test_every_file_is_used_or_has_a_reason(folder, run):
         "tiny.png": "smaller than 64 px",
         "copy.png": "the same picture as b.png",
     }
-    assert photos.load(folder, run) == found
+    assert load(folder, run) == found
     assert np.array_equal(np.asarray(Image.open(run.workspace.photos / "b.png")), pixels(2))
 
 
@@ -77,7 +90,7 @@ def test_a_camera_that_was_turned_keeps_its_layout_and_mirrors_are_undone(folder
     exif[0x0112] = orientation
     Image.fromarray(PIXELS).save(folder / "turned.png", exif=exif)
 
-    photo = next(photo for photo in photos.make(folder, run).photos if photo.name == "turned.png")
+    photo = next(photo for photo in make(folder, run).photos if photo.name == "turned.png")
     seen = Image.open(run.workspace.photos / "turned.png")
     seen.load()
 
@@ -97,7 +110,7 @@ def test_odd_pixel_formats_become_eight_bit(folder, run, mode):
     name = "odd.jpg" if mode == "CMYK" else "odd.png"
     image.save(folder / name)
 
-    photos.make(folder, run)
+    make(folder, run)
     seen = Image.open(run.workspace.photos / name)
     seen.load()
 
@@ -112,7 +125,7 @@ def test_photos_of_one_size_share_a_camera_unless_exif_tells_them_apart(folder, 
     exif[0x0110] = "Box Brownie"
     Image.fromarray(PIXELS).save(folder / "d.jpg", exif=exif)
 
-    groups = photos.make(folder, run).groups
+    groups = make(folder, run).groups
 
     assert [[photo.name for photo in members] for members in groups.values()] == [
         ["a.jpg", "b.png"],
@@ -125,11 +138,11 @@ def test_bars_around_a_picture_are_seen_and_read_back(folder, run):
     within = np.zeros((240, 320, 3), np.uint8)
     within[30:210] = np.random.default_rng(5).integers(60, 255, (180, 320, 3))
     Image.fromarray(within).save(folder / "barred.png")
-    found = {photo.name: photo for photo in photos.make(folder, run).photos}
+    found = {photo.name: photo for photo in make(folder, run).photos}
     assert found["barred.png"].shown == (0, 30, 320, 180)
     assert found["barred.png"].group == "320x180 in 320x240"
     assert {photo.shown for name, photo in found.items() if name != "barred.png"} == {None}
-    assert {photo.name: photo for photo in photos.load(folder, run).photos} == found
+    assert {photo.name: photo for photo in load(folder, run).photos} == found
 
 
 def test_exif_focal_is_read_as_a_hint_in_pixels(folder, run):
@@ -137,7 +150,7 @@ def test_exif_focal_is_read_as_a_hint_in_pixels(folder, run):
     exif.get_ifd(0x8769)[0xA405] = 27
     Image.fromarray(PIXELS).save(folder / "e.jpg", exif=exif)
 
-    photo = next(photo for photo in photos.make(folder, run).photos if photo.name == "e.jpg")
+    photo = next(photo for photo in make(folder, run).photos if photo.name == "e.jpg")
 
     assert photo.exif_focal_px == pytest.approx(27 / 36 * 128)
 
@@ -159,8 +172,8 @@ def with_gps(folder, **entries):
 
 
 def read_gps(folder, run):
-    found = photos.make(folder, run)
-    assert photos.load(folder, run) == found
+    found = make(folder, run)
+    assert load(folder, run) == found
     return next(photo.gps for photo in found.photos if photo.name == "where.jpg")
 
 
@@ -209,7 +222,7 @@ def test_photos_too_large_for_the_memory_are_scaled_down_and_say_so(folder, run)
     run = replace(run, settings=Settings.from_mapping({"max_memory_gb": 1}))
     Image.fromarray(np.tile(PIXELS, (20, 14, 1))).save(folder / "large.jpg", quality=50)
 
-    photo = next(photo for photo in photos.make(folder, run).photos if photo.name == "large.jpg")
+    photo = next(photo for photo in make(folder, run).photos if photo.name == "large.jpg")
 
     assert 1.9e6 < photo.width * photo.height <= 2e6
     assert photo.notes == (f"scaled down from 1792 x 1920 to {photo.width} x {photo.height} pixels",)
@@ -220,7 +233,7 @@ def test_the_output_folder_inside_the_photos_is_not_read(folder, tmp_path):
     workspace.create()
     Image.fromarray(PIXELS).save(folder / "out" / "model.png")
     with make_executor(1) as executor:
-        found = photos.make(folder, RunContext(Settings(), workspace, load_plugins(installed=False), executor, 1))
+        found = make(folder, RunContext(Settings(), workspace, load_plugins(installed=False), executor, 1))
 
     assert [photo.name for photo in found.photos] == ["a.jpg", "b.png"]
 
@@ -243,13 +256,13 @@ def test_too_few_photos(tmp_path, run, names, says):
             (folder / name).write_text("text")
 
     with pytest.raises(InputError, match=says):
-        photos.make(folder, run)
+        make(folder, run)
 
 
 def test_a_missing_folder_or_a_file(tmp_path, run):
     with pytest.raises(InputError, match="no such folder"):
-        photos.make(tmp_path / "nowhere", run)
+        make(tmp_path / "nowhere", run)
     path = Path(tmp_path / "file.jpg")
     path.write_bytes(b"x")
     with pytest.raises(InputError, match="not a folder"):
-        photos.make(path, run)
+        make(path, run)

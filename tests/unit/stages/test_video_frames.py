@@ -6,11 +6,11 @@ import pytest
 from PIL import Image
 
 from sfm_app.context import RunContext
-from sfm_app.errors import ConfigError, InputError
+from sfm_app.errors import InputError
 from sfm_app.parallel import make_executor
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings
-from sfm_app.stages.video_frames import photos_of, settings_for, stem_of
+from sfm_app.stages.video_frames import stem_of, video_frames
 from sfm_app.workspace import Workspace
 
 SIZE = WIDTH, HEIGHT = 160, 96
@@ -41,7 +41,7 @@ def write(path, places):
 
 
 def frames_of(source, run):
-    with photos_of(source, run) as folder:
+    with video_frames(source, run) as folder:
         return sorted(path.name for path in folder.iterdir())
 
 
@@ -59,18 +59,12 @@ def test_a_video_becomes_a_folder_of_frames(clip, run):
     assert not run.workspace.frames_marker.exists()
 
 
-def test_a_folder_is_its_own(tmp_path, run):
-    with photos_of(tmp_path, run) as folder:
-        assert folder == tmp_path
-    assert "video" not in run.statistics and not run.workspace.frames.exists()
-
-
 class KilledError(Exception):
     pass
 
 
 def killed(source, run):
-    with pytest.raises(KilledError), photos_of(source, run):
+    with pytest.raises(KilledError), video_frames(source, run):
         raise KilledError
 
 
@@ -138,14 +132,6 @@ def test_frames_that_come_out_black_are_passed_over(tmp_path, run):
 def test_a_video_that_is_black_all_over_is_refused(tmp_path, run):
     with pytest.raises(InputError, match="interlaced"):
         frames_of(write(tmp_path / "clip.avi", [None] * 5), run)
-
-
-def test_frames_of_a_video_share_a_camera(clip, tmp_path):
-    assert settings_for(clip, Settings()).photos.cameras == "single"
-    assert settings_for(clip, Settings.from_mapping({"photos": {"cameras": "each"}})).photos.cameras == "each"
-    assert settings_for(tmp_path, Settings()).photos.cameras == "auto"
-    with pytest.raises(ConfigError, match="--images"):
-        settings_for(clip, Settings.from_mapping({"photos": {"images": "list.txt"}}))
 
 
 @pytest.mark.parametrize(

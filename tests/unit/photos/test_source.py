@@ -1,11 +1,13 @@
 """What the user has given, and how a change of it is seen."""
 
 import os
+from dataclasses import replace
 
 import pytest
 
-from sfm_app.engine.source import source_of
-from sfm_app.errors import InputError
+from sfm_app.errors import ConfigError, InputError
+from sfm_app.photos import read_source
+from sfm_app.settings import PhotoSettings, Settings
 from sfm_app.types import Photo, PhotoSet
 
 
@@ -18,26 +20,30 @@ def folder(tmp_path):
     return place
 
 
+def source_of(path, out, **options):
+    return read_source(path, out, PhotoSettings(**options), map)
+
+
 def photos(folder, *names, group=""):
     return PhotoSet(folder, tuple(Photo(name, 60, 40, group) for name in names))
 
 
-def test_only_photos_that_are_used_matter_to_later_stages(run, folder):
+def test_only_photos_that_are_used_matter_to_later_stages(folder, tmp_path):
     used = photos(folder, "a.jpg", "b.jpg")
-    before = source_of(folder, run)
+    before = source_of(folder, tmp_path / "out")
     (folder / "notes.txt").write_text("something else")
-    after = source_of(folder, run)
+    after = source_of(folder, tmp_path / "out")
 
     assert after.fingerprint != before.fingerprint and after.content(used) == before.content(used)
     assert after.content(photos(folder, "a.jpg", "b.jpg", group="other")) == before.content(used)
     assert after.content(photos(folder, "a.jpg")) != before.content(used)
     (folder / "b.jpg").write_text("another photo")
-    assert source_of(folder, run).content(used) != before.content(used)
+    assert source_of(folder, tmp_path / "out").content(used) != before.content(used)
 
 
 @pytest.mark.parametrize(("change", "says"), [("unlink", "is gone since"), ("touch", "has changed since")])
-def test_photos_that_change_under_a_run_are_seen(run, folder, change, says):
-    source, used = source_of(folder, run), photos(folder, "a.jpg", "b.jpg")
+def test_photos_that_change_under_a_run_are_seen(folder, tmp_path, change, says):
+    source, used = source_of(folder, tmp_path / "out"), photos(folder, "a.jpg", "b.jpg")
     (folder / "notes.txt").write_text("who cares")
     source.check(used)
     if change == "unlink":
@@ -47,3 +53,13 @@ def test_photos_that_change_under_a_run_are_seen(run, folder, change, says):
 
     with pytest.raises(InputError, match=says):
         source.check(used)
+
+
+def test_frames_of_a_video_share_a_camera_unless_told_otherwise(folder, tmp_path):
+    clip = replace(source_of(folder, tmp_path / "out"), video=True)
+
+    assert clip.adapt(Settings()).photos.cameras == "single"
+    assert clip.adapt(Settings.from_mapping({"photos": {"cameras": "each"}})).photos.cameras == "each"
+    assert source_of(folder, tmp_path / "out").adapt(Settings()).photos.cameras == "auto"
+    with pytest.raises(ConfigError, match="--images"):
+        clip.adapt(Settings.from_mapping({"photos": {"images": "list.txt"}}))

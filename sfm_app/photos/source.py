@@ -1,21 +1,23 @@
-"""What the user has given: photos or a video, perhaps masks, and hashes of every file."""
+"""What the user has given: a folder of photos or a video, perhaps masks, and hashes of every file."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from stat import S_ISREG
 
-from sfm_app.context import RunContext
-from sfm_app.errors import InputError
+from sfm_app.errors import ConfigError, InputError
 from sfm_app.hashing import fingerprint
-from sfm_app.parallel import ordered_map
-from sfm_app.photos import head_of, is_video, place_of
-from sfm_app.stages.photos import files_of, mask_folder, masks_of
+from sfm_app.photos.files import list_files, place_of
+from sfm_app.photos.masks import list_masks
+from sfm_app.photos.video_formats import head_of, is_video
+from sfm_app.settings import PhotoSettings, Settings
 from sfm_app.types import PhotoSet
 
 Stamp = tuple[int, int]
 """Size in bytes, and time of the last change in nanoseconds."""
+Spread = Callable[[Callable[[str], str], Sequence[str]], Iterable[str]]
+"""Calls a function for every item, perhaps in parallel, and gives the results in their order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,8 +25,11 @@ class Source:
     """A folder of photos or a video, as it was when the run began."""
 
     path: Path
+    video: bool
     files: Mapping[str, str]
-    """Hashes by name; a video alone has none."""
+    """Hashes of all files of the folder by name; of a video the hash of it, by an empty name."""
+    mask_dir: Path | None
+    """Folder of masks; None where none is given."""
     masks: Mapping[str, str]
     """Hashes by name."""
     stamps: Mapping[Path, Stamp]
@@ -34,6 +39,19 @@ class Source:
     def fingerprint(self) -> str:
         """Hash of all of it."""
         return fingerprint(str(self.path.resolve()), self.files, self.masks)
+
+    def adapt(self, settings: Settings) -> Settings:
+        """Return the settings that go with it: frames of one video share a camera, unless the user says otherwise.
+
+        Raises:
+            ConfigError: they do not go with a video.
+        """
+        if not self.video:
+            return settings
+        if settings.photos.images:
+            raise ConfigError("--images lists photos of a folder, not frames of a video", hint="leave --images out")
+        cameras = "single" if settings.photos.cameras == "auto" else settings.photos.cameras
+        return settings.model_copy(update={"photos": settings.photos.model_copy(update={"cameras": cameras})})
 
     def content(self, photos: PhotoSet) -> str:
         """Return hash of what stages take from the photos that are used; other files of the folder do not matter.
@@ -62,23 +80,27 @@ class Source:
                 raise InputError(f"{path} {what} since the run began", hint="run again once the files are restored")
 
 
-def source_of(path: Path, run: RunContext) -> Source:
-    """Read everything once.
+def read_source(path: Path, out: Path, options: PhotoSettings, spread: Spread) -> Source:
+    """Read every file once.
 
     Args:
         path: a folder of photos, or a video.
-        run: its settings may name masks, or list the photos to use.
+        out: the output folder; nothing in it is a photo.
+        options: may name masks, or list the photos to use.
+        spread: how files are read side by side.
 
     Raises:
-        InputError: it cannot be used.
+        InputError: the photos or the masks cannot be used.
     """
-    names = [""] if is_video(head_of(path)) else files_of(path, run)
-    masks = mask_folder(run)
-    mask_names = [] if masks is None else masks_of(path, run)
-    paths = [path / name for name in names] + [masks / name for name in mask_names if masks is not None]
+    video, mask_dir = is_video(head_of(path)), Path(options.masks) if options.masks else None
+    listed = Path(options.images) if options.images else None
+    names = [""] if video else list_files(path, out, listed, closed=() if mask_dir is None else (mask_dir,))
+    mask_names = [] if mask_dir is None else list_masks(mask_dir, path, out)
+    paths = [path / name for name in names] + [mask_dir / name for name in mask_names if mask_dir is not None]
     stamps = {file: stamp for file in paths if (stamp := _stamp(file)) is not None}
-    files = {"": digest(path)} if names == [""] else _contents(path, names, run)
-    return Source(path, files, {} if masks is None else _contents(masks, mask_names, run), stamps)
+    files = {"": digest(path)} if video else _contents(path, names, spread)
+    masks = {} if mask_dir is None else _contents(mask_dir, mask_names, spread)
+    return Source(path, video, files, mask_dir, masks, stamps)
 
 
 def digest(file: Path) -> str:
@@ -99,11 +121,11 @@ def _stamp(path: Path) -> Stamp | None:
     return (found.st_size, found.st_mtime_ns) if S_ISREG(found.st_mode) else None
 
 
-def _contents(folder: Path, names: Sequence[str], run: RunContext) -> dict[str, str]:
+def _contents(folder: Path, names: Sequence[str], spread: Spread) -> dict[str, str]:
     """Return hashes of files in a folder by name; instead of a hash, why a file is not read."""
 
     def digest_of(name: str) -> str:
         place = place_of(folder, name)
         return place if isinstance(place, str) else digest(place)
 
-    return dict(zip(names, ordered_map(run.executor, digest_of, names, ahead=4 * run.workers), strict=True))
+    return dict(zip(names, spread(digest_of, names), strict=True))
