@@ -90,7 +90,10 @@ def _bar(lines: NDArray[np.uint8]) -> int:
     if first < max(LEAST_PX, LEAST_SHARE * len(lines)):
         return 0
     behind = range(first, min(first + RINGING_PX, most))
-    edge = next((k for k in behind if _share(lines[k], color, UNLIKE) >= LEAST_EDGE), 0)
+    unlike = [_share(lines[k], color, UNLIKE) for k in behind]
+    edge = next((k for k, share in zip(behind, unlike, strict=True) if share >= LEAST_EDGE), 0)
+    if sum(share >= LEAST_EDGE / 2 for share in unlike[: max(edge - first, 0)]) > BLUR_PX:
+        return 0  # the edge slopes: a thing ends there, not the picture
     return first if 0 < edge <= first + BLUR_PX else edge
 
 

@@ -60,6 +60,14 @@ def test_a_thing_on_a_plain_ground_has_no_bars():
     assert shown_part(Image.new("RGB", (320, 240), (7, 7, 7))) is None
 
 
+@pytest.mark.parametrize("rise_px", [10, 14, 20])
+def test_a_wall_whose_end_slopes_has_no_bars(rise_px):
+    pixels = np.array(barred((600, 400), (0, 0, 600, 340), (220, 225, 235)))
+    rows, columns = np.mgrid[:400, :600]
+    pixels[rows > 340 - rise_px * columns / 600] = (220, 225, 235)
+    assert shown_part(as_jpeg(Image.fromarray(pixels), 92)) is None
+
+
 def test_a_sky_of_one_color_above_a_level_horizon_is_no_bar():
     assert shown_part(barred((320, 240), (0, 100, 320, 140), (235, 235, 235))) is None
 
