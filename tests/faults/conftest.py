@@ -28,7 +28,7 @@ class Folder:
 
     def result(self, out: Path) -> dict[str, bytes]:
         """What has to be the same byte for byte."""
-        names = ["view_graph.npz", "calibration.json", "model.glb", "model.ply"]
+        names = ["view_graph.npz", "calibration.json", "scene.json", "model.glb", "model.ply"]
         names += [f"sparse/{part}.bin" for part in ("cameras", "images", "points3D")]
         return {name: (out / name).read_bytes() for name in names}
 

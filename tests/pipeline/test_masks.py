@@ -14,7 +14,7 @@ from sfm_app.colmap.database import read_match_graph
 from sfm_app.colmap.dense import read_depth, read_views
 from sfm_app.pipeline import NAMES
 from sfm_app.settings import Settings
-from sfm_app.stages.texture import load_texture
+from sfm_app.stages.texture import read_texture
 from sfm_app.types import Photo, PhotoSet
 from sfm_app.workspace import Workspace
 
@@ -223,7 +223,7 @@ def test_nobody_is_left_of_whom_masks_cover(disturbed, tmp_path):
         middle = depth[depth.shape[0] // 2 : depth.shape[0] * 3 // 4, view.width * 45 // 100 : view.width * 53 // 100]
         assert (middle < 0).all()
         assert (depth > 0).mean() > 0.3
-    model = load_texture(out / "dense")
+    model = read_texture(Workspace(out))
     assert len(model.surface.faces) > 2000
     assert magenta(model.surface.colors).max() < 25
     assert max(magenta(page).max() for page in model.texture.pages) < 25  # 15 in the photos without her

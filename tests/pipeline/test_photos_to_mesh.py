@@ -174,7 +174,7 @@ def test_a_run_killed_among_its_depth_maps_ends_with_the_same_bytes(finished, re
 
 def test_a_run_killed_in_its_texture_ends_with_the_same_bytes(finished, rendered, tmp_path, monkeypatch):
     whole, out = finished[0], tmp_path / "out"
-    parts = out / "dense" / PARTS
+    parts = out / "texture" / PARTS
     shutil.copytree(whole.out, out, symlinks=True)
     monkeypatch.setattr(atlas, "EVERY_S", -1.0)
     monkeypatch.setattr(atlas, "MOST_OF_THE_TIME", np.inf)
@@ -200,7 +200,7 @@ def test_one_worker_and_two_give_the_same_bytes(rendered, tmp_path):
         outs.append(out)
 
     sparse = [f"sparse/{part}.bin" for part in ("cameras", "images", "points3D")]
-    for name in ("view_graph.npz", "calibration.json", *sparse):
+    for name in ("view_graph.npz", "calibration.json", "scene.json", *sparse):
         assert (outs[0] / name).read_bytes() == (outs[1] / name).read_bytes()
 
 
