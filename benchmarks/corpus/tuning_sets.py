@@ -33,8 +33,8 @@ GROUPS: Mapping[str, Group] = {
         ("ransac",), STRECHA, "synthetic pairs of thesis 4.8, pairs with two motions",
         "benchmarks/README.md, The parts alone; merton1 and temple16 were never tuned on",
     ),
-    "chance, degeneracy, stationary matches": Group(
-        ("ransac.chance", "ransac.degeneracy", "ransac.planes", "ransac.parallax", "ransac.stationary"), FIRST_EIGHT,
+    "chance, degeneracy, watermarks": Group(
+        ("ransac.verification.a_contrario", "ransac.degeneracy"), FIRST_EIGHT,
         "rendered planes, panoramas and logos", "docs/algorithms.md, All estimators: looked at on all real sets",
     ),
     "photos left out, bare photos": Group(
@@ -56,19 +56,19 @@ GROUPS: Mapping[str, Group] = {
         "docs/algorithms.md, Bundle adjustment; rendered folders only checked it",
     ),
     "upright: cues, lines, roll": Group(
-        ("geometry.standing", "geometry.cues", "geometry.roll", "geometry.vanishing", "geometry.upright"),
-        FIRST_EIGHT, "the rendered courtyard, statue, facade and corner", "geometry/standing.py",
+        ("orientation",),
+        FIRST_EIGHT, "the rendered courtyard, statue, facade and corner", "orientation/up_direction.py",
     ),
     "votes that a camera must keep, pairs that are listened to": Group(
         ("selfcal.zero_curves",), (*FIRST_EIGHT, "fox50", "kitchen25", "oats23", "books21"), "",
         "docs/algorithms.md, Wrong pairs in the majority; without fox50 the bound would be the same",
     ),
-    "one camera, several, or each its own; bars": Group(
-        ("selfcal.own_cameras", "selfcal.tied", "photos.bars"), ("reichstag10",), "120 random scenes of cameras",
+    "one camera, several, or each its own; letterbox": Group(
+        ("selfcal.cameras.camera_per_photo", "selfcal.adjustment.tied_priors", "photos.letterbox"), ("reichstag10",), "120 random scenes of cameras",
         "docs/algorithms.md, Several cameras; the random scenes alone give the same thresholds",
     ),
     "two cameras of one size": Group(
-        ("selfcal.two_cameras", "selfcal.focal_grid"), ("kitchen25",), "120 random scenes; trouble.py, seeds 0 to 64",
+        ("selfcal.cameras.two_cameras", "selfcal.cameras.focal_grid"), ("kitchen25",), "120 random scenes; trouble.py, seeds 0 to 64",
         "docs/algorithms.md, Several cameras; the photo sets only checked it",
     ),
     "finer features, second look": Group(
@@ -76,7 +76,7 @@ GROUPS: Mapping[str, Group] = {
         "docs/algorithms.md, Mapping; six other sets, thinned out, only checked it",
     ),
     "a camera for each photo in mapping, scale that hangs on few points": Group(
-        ("reconstruction.one_camera_each", "reconstruction.weak_links", "reconstruction.joined"),
+        ("reconstruction.camera_per_photo", "reconstruction.weak_scale", "reconstruction.model_merge"),
         ("temple16", "dinoSparseRing", "castle-P19"), "trouble.py, seeds 0 to 180 and 1000 to 1031",
         "docs/algorithms.md, Mapping; the photo sets chose only when a scale is called open",
     ),
@@ -85,7 +85,7 @@ GROUPS: Mapping[str, Group] = {
         "docs/algorithms.md, Look-alikes; either of the first two finds the other, every 15th photo of the third",
     ),
     "starts of poses, pairs on a plane, passes, other focals": Group(
-        ("posegraph.starts", "posegraph.graph", "reconstruction.passes"), ("dinoSparseRing", "kitchen25"), "",
+        ("posegraph.starts", "posegraph.graph", "reconstruction.mapping_passes"), ("dinoSparseRing", "kitchen25"), "",
         "docs/algorithms.md, From K to relative poses, Mapping; castle-P19, fountain-P11, temple16 as before",
     ),
     "depth, surface, texture (no figure of this table)": Group(

@@ -1,6 +1,7 @@
 """Every benchmark is a command: `python -m benchmarks.SUBJECT`."""
 
 import argparse
+import re
 import runpy
 import subprocess
 import sys
@@ -50,7 +51,7 @@ def test_the_help_shows_the_command(name, monkeypatch, capsys):
     shown = capsys.readouterr().out
     assert ended.value.code == 0
     assert shown.startswith(f"usage: python -m {name} ")
-    assert f"\n    python -m {name} " in shown, "its docstring shows how it is called"
+    assert re.search(rf"^ *python -m {name} ", shown, re.MULTILINE), "its docstring shows how it is called"
 
 
 @pytest.mark.parametrize("worker", ["benchmarks.cameras.worker", "benchmarks.surface.worker"])
