@@ -59,9 +59,10 @@ def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = Non
     command = module_command(WORKER, method.kind, str(folder), str(out), json.dumps(options))
     start = time.perf_counter()
     code, last = end_of(command, limit_s)
-    said = {"wall seconds": round(time.perf_counter() - start, 2)}
+    said: Row = {"wall seconds": round(time.perf_counter() - start, 2)}
     if (out / RESULT).exists():
-        return said | json.loads((out / RESULT).read_text(encoding="utf-8"))
+        found: Row = json.loads((out / RESULT).read_text(encoding="utf-8"))
+        return said | found
     failed = f"not done after {limit_s:g} s" if code is None else f"exit code {code}: {last}"
     return said | {"failed": failed, "exit code": code, "seconds": {}, "peak MB": None}
 

@@ -18,8 +18,13 @@ Method = Callable[[FloatArray, FloatArray, int], tuple[FloatArray | None, int | 
 class Pair(Protocol):
     """What an estimator sees."""
 
-    x1: FloatArray
-    x2: FloatArray
+    @property
+    def x1(self) -> FloatArray:
+        """(N, 2) pixels."""
+
+    @property
+    def x2(self) -> FloatArray:
+        """(N, 2) pixels, row by row the partners of x1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

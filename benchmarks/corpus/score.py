@@ -108,17 +108,17 @@ def _errors(stage: Stage, true: NDArray[np.float64], width: float, doubt: Doubt)
         whole = float(true[place]) if focal else width
         error, sd = abs(float(stage.K[place] - true[place])), stage.deviations.get(name, stage.deviations.get("f"))
         unsure = (doubt.focal if focal else doubt.center) / 100 * whole
-        known = sd is not None and math.isfinite(sd) and sd > 0
+        known = sd if sd is not None and math.isfinite(sd) and sd > 0 else None
         yield {
             "when": stage.when,
             "parameter": name,
             "identifiable": "yes" if stage.identifiable else "no",
             "found": round(float(stage.K[place]), 2),
             "true": round(float(true[place]), 2),
-            "sd": round(float(sd), 3) if known else None,
+            "sd": round(float(known), 3) if known else None,
             "error %": round(100 * error / whole, 3),
-            "in sd": round(error / sd, 2) if known else None,
-            "in sd, truth's doubt granted": round(error / math.hypot(sd, unsure), 2) if known else None,
+            "in sd": round(error / known, 2) if known else None,
+            "in sd, truth's doubt granted": round(error / math.hypot(known, unsure), 2) if known else None,
         }
 
 

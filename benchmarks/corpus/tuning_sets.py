@@ -64,11 +64,13 @@ GROUPS: Mapping[str, Group] = {
         "docs/algorithms.md, Wrong pairs in the majority; without fox50 the bound would be the same",
     ),
     "one camera, several, or each its own; letterbox": Group(
-        ("selfcal.cameras.camera_per_photo", "selfcal.adjustment.tied_priors", "photos.letterbox"), ("reichstag10",), "120 random scenes of cameras",
+        ("selfcal.cameras.camera_per_photo", "selfcal.adjustment.tied_priors", "photos.letterbox"),
+        ("reichstag10",), "120 random scenes of cameras",
         "docs/algorithms.md, Several cameras; the random scenes alone give the same thresholds",
     ),
     "two cameras of one size": Group(
-        ("selfcal.cameras.two_cameras", "selfcal.cameras.focal_grid"), ("kitchen25",), "120 random scenes; trouble.py, seeds 0 to 64",
+        ("selfcal.cameras.two_cameras", "selfcal.cameras.focal_grid"), ("kitchen25",),
+        "120 random scenes; trouble.py, seeds 0 to 64",
         "docs/algorithms.md, Several cameras; the photo sets only checked it",
     ),
     "finer features, second look": Group(

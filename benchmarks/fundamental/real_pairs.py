@@ -52,7 +52,7 @@ class RealPair:
     def is_usable(self) -> bool:
         """Whether the two photos show enough of the same."""
         true = self.is_true
-        return np.count_nonzero(true) >= LEAST_TRUE and float(true.mean()) >= LEAST_SHARE
+        return int(np.count_nonzero(true)) >= LEAST_TRUE and float(true.mean()) >= LEAST_SHARE
 
 
 def load_pairs(files: list[Path], limit: int | None = None) -> list[RealPair]:
@@ -92,7 +92,7 @@ def cached_ratio_matches(data: Path, name: str, cache: Path) -> Path:
         with opened_run(cache / name, Settings(), None) as run:
             graph = run_stages(data / name / "images", run, last="match_graph")("match_graph")
         truth = load_truth(data / name / "cameras.json")
-        arrays = {}
+        arrays: dict[str, FloatArray] = {}
         for ids in graph.matches:
             first, second = (Path(graph.images[key].name).stem for key in ids)
             if first in truth and second in truth and len(graph.matches[ids]):

@@ -88,7 +88,8 @@ def camera_of(image: MatchedImage, found: Intrinsics) -> Calibration:
 def literal(subject: Measured, method: str) -> Found:
     """A calibrator alone on the pairs within each camera; its own answer counts even where our verdict on it is no."""
     calibrator = load_plugins().calibrator(PRODUCTION if method == WITHOUT_MATCHES else method)
-    cameras, seconds, pairs = {}, 0.0, 0
+    cameras: dict[str, Calibration] = {}
+    seconds, pairs = 0.0, 0
     for images in subject.groups:
         of_camera = camera_pairs(images, subject.matches, subject.views)
         if method == WITHOUT_MATCHES:

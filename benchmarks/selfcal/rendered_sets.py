@@ -1,6 +1,7 @@
 """Rendered photo sets whose lens, path or mixture of cameras is what a calibrator has to find out."""
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 from benchmarks.common.photo_sets import PhotoSet, TrueCamera
@@ -33,8 +34,8 @@ def two_cameras(seed: int) -> Views:
 
 
 KINDS: Mapping[str, Callable[[int], Views]] = {
-    "rendered": lambda seed: walk(0.0, seed),
-    **{f"rendered k1={k1:+.2f}": lambda seed, k1=k1: walk(k1, seed) for k1 in LENSES},
+    "rendered": partial(walk, 0.0),
+    **{f"rendered k1={k1:+.2f}": partial(walk, k1) for k1 in LENSES},
     "rendered orbit": turntable,
     "rendered two cameras": two_cameras,
 }

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
@@ -36,7 +36,7 @@ def speed(subject: Measured | None, overrides: Mapping[str, Mapping[str, object]
             title = f"{method}{', ' if label else ''}{label}"
             if subject is not None:
                 pairs = _known(camera_pairs(subject.groups[0], subject.matches, subject.views), method)
-                seconds = _seconds(lambda p=pairs, s=settings: _calibrate(p, s))
+                seconds = _seconds(partial(_calibrate, pairs, settings))
                 rows.append(_row(f"{title}: {subject.photos.name}", len(pairs.Fs), seconds))
                 rows[-1]["matching seconds"] = subject.matching_seconds
             rows += _growth(title, method, settings)
@@ -67,7 +67,7 @@ def _growth(title: str, method: str, settings: Settings) -> list[Row]:
     for cameras in CAMERAS:
         pairs = _known(synthetic_pairs(cameras), method)
         name = f"{title}: {cameras} synthetic photos"
-        rows.append(_row(name, len(pairs.Fs), _seconds(lambda p=pairs: _calibrate(p, settings))))
+        rows.append(_row(name, len(pairs.Fs), _seconds(partial(_calibrate, pairs, settings))))
     counts, seconds = ([row[key] for row in rows] for key in ("pairs", "seconds"))
     power = float(np.polyfit(np.log(counts), np.log(seconds), 1)[0])
     return [*rows, {"method": f"{title}: seconds grow with the pairs to the power", "power": round(power, 2)}]

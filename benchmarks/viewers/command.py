@@ -100,7 +100,7 @@ def main() -> int:
 
 def gather(runs: Sequence[Path], place: Path) -> list[Subject]:
     """The GLBs of all runs and the sample, side by side under names of their own."""
-    files = EXPORTERS["glb"][0](sample(), SAMPLE) | EXPORTERS["ply"][0](sample(), SAMPLE)
+    files = {**EXPORTERS["glb"][0](sample(), SAMPLE), **EXPORTERS["ply"][0](sample(), SAMPLE)}
     for name, data in files.items():
         (place / name).write_bytes(data)
     found = [Subject(SAMPLE, place / f"{SAMPLE}.glb", place / f"{SAMPLE}.ply")]

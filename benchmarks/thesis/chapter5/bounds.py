@@ -3,8 +3,7 @@
 import numpy as np
 
 from benchmarks.common.figures import label, pyplot
-from benchmarks.thesis.chapter5.contests import FloatArray
-from benchmarks.thesis.chapter5.fits import fit_to_all
+from benchmarks.thesis.chapter5.fits import FloatArray, fit_to_all
 from benchmarks.thesis.chapter5.lab import Drawn, Lab
 from benchmarks.thesis.chapter5.panels import Panel, draw, rows_of
 from benchmarks.thesis.chapter5.sequences import ImageSequence
@@ -45,7 +44,7 @@ def bounds(lab: Lab) -> Drawn:
     for name in ("Merton1", "Wadham"):
         sequence = lab.sequence(name)
         pair, F = next(iter(sequence.Fs.items()))
-        F = _of_one_camera(F, *(sequence.Ks[view] for view in pair), sequence.K)
+        F = _of_one_camera(F, sequence.Ks[pair[0]], sequence.Ks[pair[1]], sequence.K)
         for title, rough in (("exact F", F), ("noisy F", _noisy(sequence, pair, F, lab.seed))):
             panels.append(Panel(f"{name}, {title}", 100 * OFF, _bounds(F, rough, sequence.K)))
     figure = draw(panels, "error of the focal, %", "s1 - s2", log=True, columns=2)

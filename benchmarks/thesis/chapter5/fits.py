@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 import sfm_app
 from sfm_app.ransac.points import prepare
 from sfm_app.ransac.refine.sampson_refit import fit_eight_point
+from sfm_app.types import EpipolarFit
 from sfm_app.types.matches import PairId
 
 FloatArray = NDArray[np.float64]
@@ -32,7 +33,7 @@ def robust_fits(matches: Mapping[PairId, FloatArray], seed: int) -> dict[PairId,
     for pair, rows in matches.items():
         own_seed = int(np.random.SeedSequence([seed, *pair]).generate_state(1)[0])
         fit = sfm_app.estimate_fundamental(rows[:, :2], rows[:, 2:], seed=own_seed)
-        if fit and not fit.degeneracy:
+        if isinstance(fit, EpipolarFit) and not fit.degeneracy:
             found[pair] = Fit(fit.F, rows[fit.inliers])
     return found
 

@@ -4,17 +4,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.common.figures import label, pyplot
 from benchmarks.common.results import Row
+
+Values = Sequence[float] | NDArray[np.float64]
 
 
 class Panel(NamedTuple):
     """Lines over one axis."""
 
     title: str
-    x: Sequence[float]
-    lines: Mapping[str, Sequence[float]]
+    x: Values
+    lines: Mapping[str, Values]
     truth: Sequence[float] = ()
     """Where the right answers lie on the x axis."""
 

@@ -47,7 +47,8 @@ class ImageSequence:
     @property
     def K(self) -> FloatArray:
         """(3, 3) of the first view, which is what Table 5.2 calls the truth."""
-        return self.Ks[0]
+        first: FloatArray = self.Ks[0]
+        return first
 
     def first(self, count: int) -> "ImageSequence":
         """The same, of the first views alone."""

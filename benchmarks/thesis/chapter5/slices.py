@@ -3,8 +3,7 @@
 import numpy as np
 
 from benchmarks.common.figures import label, pyplot
-from benchmarks.thesis.chapter5.contests import FloatArray
-from benchmarks.thesis.chapter5.fits import Fit, fit_to_all, robust_fits
+from benchmarks.thesis.chapter5.fits import Fit, FloatArray, fit_to_all, robust_fits
 from benchmarks.thesis.chapter5.lab import Drawn, Lab
 from benchmarks.thesis.chapter5.panels import Panel, draw, lowest, rounded, rows_of
 from benchmarks.thesis.chapter5.sequences import ImageSequence

@@ -9,8 +9,7 @@ from scipy.optimize import minimize
 
 from benchmarks.common.figures import label, pyplot
 from benchmarks.common.results import Row
-from benchmarks.thesis.chapter5.contests import FloatArray
-from benchmarks.thesis.chapter5.fits import Fits, robust_fits, with_outlying
+from benchmarks.thesis.chapter5.fits import Fits, FloatArray, robust_fits, with_outlying
 from benchmarks.thesis.chapter5.lab import Drawn, Lab
 from benchmarks.thesis.chapter5.panels import Panel, draw, rows_of
 from benchmarks.thesis.chapter5.setups import HEAVY, NOISE_PX, REACH_PX
@@ -166,7 +165,7 @@ def two_cameras(lab: Lab) -> Drawn:
         f"a dip between both true focals in {np.mean(both):.0%} of {len(both)} setups; the highest score lies within "
     )
     numbers += f"{200 * NEAR:.0f} % of one of them in {np.mean(best):.0%}"
-    return Drawn([Claim("5.15", "two cameras show as two peaks", verdict([np.mean(both) > 0.5]), numbers)])
+    return Drawn([Claim("5.15", "two cameras show as two peaks", verdict([float(np.mean(both)) > 0.5]), numbers)])
 
 
 def degenerate(lab: Lab) -> Drawn:
