@@ -43,7 +43,7 @@ $(INSTALLED): pyproject.toml constraints.txt $(PLUGINS:=/pyproject.toml)
 # RUNS: output folders of finished runs, such as RUNS="demo out"; needs Node
 viewers: $(INSTALLED)
 	npm --prefix benchmarks/viewers install --no-audit --no-fund --no-package-lock
-	$(BIN)/python benchmarks/accuracy/viewers.py $(RUNS)
+	$(BIN)/python -m benchmarks.viewers $(RUNS)
 
 clean:
 	rm -rf $(VENV) demo .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -1,6 +1,6 @@
 """What a run will cost, before it is spent: minutes and memory, by photos, pairs and settings; and how both are held.
 
-The figures come from photos of 12 megapixels on one core of a server of 2023 (`benchmarks/accuracy/hundred.py`). Other
+The figures come from photos of 12 megapixels on one core of a server of 2023 (`python -m benchmarks.hundred`). Other
 machines differ by a factor of two, and so do other scenes.
 """
 

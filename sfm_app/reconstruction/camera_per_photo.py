@@ -20,7 +20,7 @@ LEAST, MOST = 5, 60
 """Photos: of fewer, cameras of their own fit almost anything; of more, it costs more than it promises."""
 FEWER = 0.5
 """Share of the contradictions that cameras of their own may leave, or they are not what was wrong. Chosen on
-folders 0 to 180 of `benchmarks/accuracy/trouble.py`."""
+folders 0 to 180 of `python -m benchmarks.trouble`."""
 AS_GOOD = 0.002
 """So much larger a share may contradict two cameras for all photos; right ones leave up to so much, see above."""
 

@@ -36,7 +36,7 @@ FOCALS = 41
 MESSAGE_ROUNDS, DAMPING = 30, 0.5
 FAIR_SHARE, BORNE_OUT, NOT_ALL = 0.5, 0.8, "not all of its photos bear it out"
 """Shares of their votes that every photo, and all together, must give to a camera that photos of one size were divided
-into. Chosen on folders 0 to 179 and 1000 to 1020 of `benchmarks/accuracy/trouble.py`: two cameras get 0.86 to 0.93
+into. Chosen on folders 0 to 179 and 1000 to 1020 of `python -m benchmarks.trouble`: two cameras get 0.86 to 0.93
 (0.57 and 0.69 with a moving object), those of a zoom and those over 5 % off 0.44 to 0.76."""
 LEAST_PAIRS = 2
 """Pairs that a camera needs: two constraints find its focal, two more contradict a wrong one."""

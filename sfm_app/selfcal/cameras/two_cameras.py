@@ -23,7 +23,7 @@ NEAR = 4
 ROUNDS = 20
 LEAST_GAIN = 0.15
 """Share of the smaller camera's votes that two must win against one. Chosen on 120 random scenes of one camera (as for
-`own_cameras`; at most 0.02), and on rendered folders of `benchmarks/accuracy/trouble.py`, seeds 0 to 64: two cameras
+`own_cameras`; at most 0.02), and on rendered folders of `python -m benchmarks.trouble`, seeds 0 to 64: two cameras
 and zooms have 0.22 to 0.70. Of the photo sets of one camera, none of which was looked at before, 0.05 at most, but for
 a single photo of kitchen25."""
 CLEARLY, LEAST_PHOTOS = 2.5, 2

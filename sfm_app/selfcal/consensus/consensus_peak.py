@@ -27,14 +27,14 @@ ASPECT_GAIN = float(np.log(50))
 """Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square."""
 PERHAPS_ASPECT_GAIN = float(np.log(50 * 0.05))
 """Votes from which on square pixels are less than 95 % sure. Of 47 answers with square pixels on the photo sets and on
-folders 0 to 170 of `benchmarks/accuracy/trouble.py`, one had more (1.55), and its pixels were not square."""
+folders 0 to 170 of `python -m benchmarks.trouble`, one had more (1.55), and its pixels were not square."""
 MAX_LOG_FOCAL_SPREAD = 0.1
 """Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess."""
 IDENTIFIED_LOG_FOCAL_SPREAD = 0.02
 """Largest standard deviation of log f that counts as known: with 0.025 one focal of twenty is off by 5 %, and what is
 called identifiable should not be. Between this and the limit above the answer is an estimate: a better start than a
 guess, and no more. Of 109 cameras of seeds 0 to 180, 1000 to 1035 and 2000 to 2139 of
-`benchmarks/accuracy/trouble.py` four lie between 0.02 and 0.03: off by 10, 7, 2 and 1 %."""
+`python -m benchmarks.trouble` four lie between 0.02 and 0.03: off by 10, 7, 2 and 1 %."""
 CLEAR_LEAD_SHARE, FEW_ASTRAY = 0.2, 0.8
 """A focal a quarter away that loses less than this share of the votes is hardly told from the right one, by walks to
 the side or on one plane; then few votes may be missing, or what turned these pairs astray has pulled at the others. Of

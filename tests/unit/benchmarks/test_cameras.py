@@ -2,13 +2,13 @@ import json
 
 import numpy as np
 import pytest
-from cameras_bars import BARS, least, most, verdict
-from cameras_methods import methods, taking_turns
-from cameras_report import DEVIATIONS, medians, page, same_bytes
-from cameras_score import Model, TruePhoto, accuracy, camera_errors, stated_deviations, times, true_photos
-from photo_sets import steps
-from score import area_under_recall, pose_errors_deg, position_rms_percent
 
+from benchmarks.cameras.bars import BARS, least, most, verdict
+from benchmarks.cameras.methods import methods, taking_turns
+from benchmarks.cameras.report import DEVIATIONS, medians, page, same_bytes
+from benchmarks.cameras.score import Model, TruePhoto, accuracy, camera_errors, stated_deviations, times, true_photos
+from benchmarks.common.metrics import area_under_recall, pose_errors_deg, position_rms_percent
+from benchmarks.common.photo_sets import steps
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.synthetic.cameras import axis_rotation
 

@@ -3,25 +3,32 @@
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
-import contests
 import numpy as np
 import pytest
-import setups
-import sweep_claims
-import tables
-from bounds import full_bound, gap, reduced_bound
-from chapter5 import IN_ORDER, MOST, PARTS, most_of
-from contests import CAP_PERCENT, NON_ROBUST, PRODUCTION, Attempt, answer_of, contest, e_center, e_focal, summary
-from fits import Fit, fit_to_all, robust_fits, with_outlying
-from lab import Lab
-from panels import Panel, lowest, rows_of
-from sequences import ImageSequence, camera_matrix_of, corner_sequence, fundamental_of
-from setups import Trial
-from slices import SCALES, focal_slice
-from sweep_claims import CLAIMS, Said, claims_of, holds
-from sweeps import FIGURES
-from zero_curve_plots import SIGMA, support
 
+from benchmarks.thesis.chapter5 import contests, setups, sweep_claims, tables
+from benchmarks.thesis.chapter5.bounds import full_bound, gap, reduced_bound
+from benchmarks.thesis.chapter5.command import IN_ORDER, MOST, PARTS, most_of
+from benchmarks.thesis.chapter5.contests import (
+    CAP_PERCENT,
+    NON_ROBUST,
+    PRODUCTION,
+    Attempt,
+    answer_of,
+    contest,
+    e_center,
+    e_focal,
+    summary,
+)
+from benchmarks.thesis.chapter5.fits import Fit, fit_to_all, robust_fits, with_outlying
+from benchmarks.thesis.chapter5.lab import Lab
+from benchmarks.thesis.chapter5.panels import Panel, lowest, rows_of
+from benchmarks.thesis.chapter5.sequences import ImageSequence, camera_matrix_of, corner_sequence, fundamental_of
+from benchmarks.thesis.chapter5.setups import Trial
+from benchmarks.thesis.chapter5.slices import SCALES, focal_slice
+from benchmarks.thesis.chapter5.sweep_claims import CLAIMS, Said, claims_of, holds
+from benchmarks.thesis.chapter5.sweeps import FIGURES
+from benchmarks.thesis.chapter5.zero_curve_plots import SIGMA, support
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.selfcal.thesis.constraint_forms import essential

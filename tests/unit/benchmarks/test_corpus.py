@@ -5,21 +5,22 @@ import sys
 import time
 from pathlib import Path
 
-import chosen_on
-import corpus
 import numpy as np
 import pytest
-from cameras_methods import by_size, end_of, in_folders, methods
-from cameras_score import Model, TruePhoto
-from chosen_on import GROUPS, groups_table, seen_sets, unseen
-from corpus_bars import bars_of, behind, demands, folded
-from corpus_report import corpus_page
-from corpus_score import Doubt, claims, counted, fold_lines, of_walk, parameters
-from path_scores import offset_errors, order_scores
-from photo_sets import photo_set, steps, stride
 from PIL import Image
 
 import sfm_app
+from benchmarks.cameras.methods import by_size, in_folders, methods
+from benchmarks.cameras.score import Model, TruePhoto
+from benchmarks.common.photo_sets import photo_set, steps, stride
+from benchmarks.common.processes import end_of
+from benchmarks.corpus import command as corpus
+from benchmarks.corpus import kept_runs, tuning_sets
+from benchmarks.corpus.bars import bars_of, behind, demands, folded
+from benchmarks.corpus.report import corpus_page
+from benchmarks.corpus.score import Doubt, claims, counted, fold_lines, of_walk, parameters
+from benchmarks.corpus.trajectory import offset_errors, order_scores
+from benchmarks.corpus.tuning_sets import GROUPS, groups_table, seen_sets, unseen
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at
 
@@ -187,7 +188,7 @@ def test_groups_of_constants_name_modules_that_there_are():
         for module in group.modules:
             path = package / module.replace(".", "/")
             assert path.is_dir() or path.with_suffix(".py").is_file(), module
-    assert set(chosen_on.STRECHA) < set(seen_sets())
+    assert set(tuning_sets.STRECHA) < set(seen_sets())
 
 
 def photos_in(folder, count, size=(40, 30)):
@@ -255,22 +256,22 @@ def test_finished_runs_are_kept_until_program_settings_or_photos_change(tmp_path
     photos = photo_set(tmp_path / "data", "a", "", tmp_path / "cache")
     ours, stock = methods({})[0], methods({})[1]
     said = {"exit code": 0, "wall seconds": 5.0}
-    monkeypatch.setattr(corpus, "run", lambda *_: said)
+    monkeypatch.setattr(kept_runs, "run", lambda *_: said)
     out = tmp_path / "out"
 
-    assert corpus.kept(ours, photos, out, options(tmp_path)) is None
-    done = corpus.run_anew(ours, photos, out, 60.0)
-    assert corpus.kept(ours, photos, out, options(tmp_path)) == done
-    assert corpus.kept(ours, photos, out, options(tmp_path, keep=False)) is None
-    assert corpus.kept(stock, photos, out, options(tmp_path)) is None
-    assert corpus.kept(stock, photos, out, options(tmp_path, score_only=True)) == done
+    assert kept_runs.kept(ours, photos, out, options(tmp_path)) is None
+    done = kept_runs.run_anew(ours, photos, out, 60.0)
+    assert kept_runs.kept(ours, photos, out, options(tmp_path)) == done
+    assert kept_runs.kept(ours, photos, out, options(tmp_path, keep=False)) is None
+    assert kept_runs.kept(stock, photos, out, options(tmp_path)) is None
+    assert kept_runs.kept(stock, photos, out, options(tmp_path, score_only=True)) == done
     said |= {"exit code": None, "wall seconds": 60.0}
-    corpus.run_anew(ours, photos, out, 60.0)
-    assert corpus.kept(ours, photos, out, options(tmp_path)) is not None
-    assert corpus.kept(ours, photos, out, options(tmp_path, limit_min=2.0)) is None, "it gets more time"
+    kept_runs.run_anew(ours, photos, out, 60.0)
+    assert kept_runs.kept(ours, photos, out, options(tmp_path)) is not None
+    assert kept_runs.kept(ours, photos, out, options(tmp_path, limit_min=2.0)) is None, "it gets more time"
     photos_in(photos.folder / "more", 1)
     (photos.folder / "more" / "0000.png").rename(photos.folder / "0002.png")
-    assert corpus.kept(ours, photos, out, options(tmp_path)) is None
+    assert kept_runs.kept(ours, photos, out, options(tmp_path)) is None
 
 
 def test_a_set_that_cannot_be_read_is_no_end_of_the_others(tmp_path, monkeypatch, capsys):

@@ -7,8 +7,8 @@ import time
 from pathlib import Path
 
 import pytest
-from hundred import cpu_s, held_mb, page
 
+from benchmarks.hundred.command import cpu_s, held_mb, page
 from sfm_app.pipeline import NAMES
 
 HOLDS = "import sys; held = bytearray({mb}_000_000); print(flush=True); sys.stdin.read()"

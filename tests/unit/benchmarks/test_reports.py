@@ -1,11 +1,12 @@
 import json
 import sys
 
-import claims
 import numpy as np
 import pytest
-from corners import load_corners, with_outliers
-from report import RESULTS, document, pivot, problems, table
+
+from benchmarks.common.results import RESULTS, document, pivot, problems, table
+from benchmarks.thesis.chapter4 import claims
+from benchmarks.thesis.corners import load_corners, with_outliers
 
 ROWS = [{"method": "a", "outliers": 0.1, "ms": 1.5}, {"method": "a", "outliers": 0.7, "ms": None}]
 
@@ -47,8 +48,7 @@ def test_tables():
 
 
 def test_a_missing_package_is_named_with_the_way_to_get_it(monkeypatch):
-    import methods
-
+    from benchmarks.fundamental import methods
     from sfm_app.settings import EpipolarSettings
 
     monkeypatch.setitem(sys.modules, "poselib", None)

@@ -1,8 +1,15 @@
 import numpy as np
 import pytest
-from score import CAP_PX, LOST_DEG, area_under_recall, fundamental_pose_error_deg, mean_sampson_px, summary_px
-from turns import take_turns
 
+from benchmarks.common.metrics import (
+    CAP_PX,
+    LOST_DEG,
+    area_under_recall,
+    fundamental_pose_error_deg,
+    mean_sampson_px,
+    summary_px,
+)
+from benchmarks.common.timing import take_turns
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.synthetic.cameras import axis_rotation

@@ -1,11 +1,11 @@
 import numpy as np
-import photo_sets
 import pytest
-import selfcal_coverage
-import selfcal_score
 from PIL import Image
-from selfcal_methods import Found
 
+from benchmarks.common import photo_sets
+from benchmarks.selfcal import coverage as selfcal_coverage
+from benchmarks.selfcal import score as selfcal_score
+from benchmarks.selfcal.methods import Found
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration

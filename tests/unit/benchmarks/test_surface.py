@@ -2,19 +2,19 @@ import json
 
 import numpy as np
 import pytest
-from cameras_bars import least, most
 from PIL import Image
-from report import document, problems
-from surface_bars import BARS, asked
-from surface_measure import cost
-from surface_photos import Likeness, likeness, photo_scores, psnr_db, spread_out
-from surface_pictures import BYTES, WIDTHS_PX, save_page
-from surface_report import page
-from surface_rival import points_ply
-from surface_run import Said
-from surface_sets import REAL, RENDERED, SurfaceSet, part_of, surface_set
-from surface_truth import seen_places, truth_scores
 
+from benchmarks.cameras.bars import least, most
+from benchmarks.common.results import document, problems
+from benchmarks.surface.bars import BARS, asked
+from benchmarks.surface.measure import cost
+from benchmarks.surface.photos import Likeness, likeness, photo_scores, psnr_db, spread_out
+from benchmarks.surface.pictures import BYTES, WIDTHS_PX, save_page
+from benchmarks.surface.report import page
+from benchmarks.surface.sets import REAL, RENDERED, SurfaceSet, part_of, surface_set
+from benchmarks.surface.sparse_poisson import points_ply
+from benchmarks.surface.truth import seen_places, truth_scores
+from benchmarks.surface.worker import Said
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.synthetic.cameras import Views, axis_rotation, look_at, make_camera
 from sfm_app.synthetic.photo_folder import Truth
@@ -178,7 +178,7 @@ def test_the_page_and_the_document_hold_what_was_measured(tmp_path):
         {"photos": "kermit11", "method": "sfm-app", "failed": "mesh: no surface", "seconds together": None},
     ]  # fmt: skip
     parts = [{"photos": "pond first 3", "failed": "", "seconds per photo": 4.25, "s of texture": 7.75}]
-    text = page("About.", rows, parts, "surface")
+    text = page("About.", rows, parts, {"statue": "surface-statue.png"})
     assert "| pond first 3 | 4.25 | 7.75 |" in text
     assert "| statue | accuracy % at least 90 | 95 | yes |" in text and "mesh: no surface" in text
     assert "![statue](surface-statue.png)" in text and "surface-kermit11.png" not in text

@@ -3,9 +3,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import trouble
-from cameras_score import TruePhoto
 
+from benchmarks.cameras.score import TruePhoto
+from benchmarks.trouble import command as trouble
 from sfm_app.geometry.camera import camera_matrix
 
 K = camera_matrix(600.0, 600.0, 320.0, 240.0)

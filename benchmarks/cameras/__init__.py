@@ -1,0 +1,1 @@
+"""Cameras after bundle adjustment, beside stock pycolmap."""

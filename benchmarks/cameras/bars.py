@@ -1,0 +1,70 @@
+"""What cameras have to reach on each photo set, and whether they do."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+from benchmarks.cameras.worker import INCREMENTAL
+from benchmarks.common.results import Row
+
+
+class Bar(NamedTuple):
+    """A bound on one column."""
+
+    column: str
+    bound: float | str
+    """A figure, or the method whose figure in that column is the bound."""
+    at_most: bool
+
+
+def least(column: str, bound: float | str) -> Bar:
+    """The figure is not smaller."""
+    return Bar(column, bound, at_most=False)
+
+
+def most(column: str, bound: float | str) -> Bar:
+    """The figure is not larger."""
+    return Bar(column, bound, at_most=True)
+
+
+NOBODY_LEFT_OUT = most("unregistered", 0)
+HONEST = most("worst in sd", 3.0)
+"""The truth lies within three stated standard deviations."""
+NO_SLOWER = most("/ incremental", 1.0)
+SHARP = (most("e_focal %", 0.3), most("e_OC %", 0.5))
+BARS: Mapping[str, tuple[Bar, ...]] = {
+    "fountain-P11": (least("AUC@1", 0.84), most("center rms %", 0.08), *SHARP, HONEST, NO_SLOWER),
+    "Herz-Jesus-P8": (least("AUC@1", 0.82), most("center rms %", 0.10), *SHARP, HONEST, NO_SLOWER),
+    "castle-P19": (least("AUC@1", 0.48), most("center rms %", 0.70), HONEST, NO_SLOWER),
+    "fountain-P11 crop:460,200": (least("AUC@1", 0.80), HONEST),
+    "castle-P19 crop:460,200": (least("AUC@5", 0.52), HONEST),
+    "fountain-P11 scale:0.75,1": (least("AUC@1", 0.82), HONEST),
+    "castle-P19 scale:0.75,1": (least("AUC@5", 0.86), HONEST),
+    "fountain-P11 window:512,256,512,512+scale:2,2": (least("AUC@1", 0.64), HONEST),
+    "temple16": (NOBODY_LEFT_OUT, least("AUC@5", 0.70)),
+    "merton1": (least("AUC@5", 0.85),),
+    "reichstag10": (NOBODY_LEFT_OUT, least("AUC@5", 0.78)),
+    "lund-door12": (NOBODY_LEFT_OUT, most("reprojection px", INCREMENTAL)),
+    "kermit11": (NOBODY_LEFT_OUT, most("reprojection px", INCREMENTAL)),
+}
+"""By photo set, with its change. Where the truth is itself uncertain, nothing is asked of the standard deviations."""
+
+
+def verdict(row: Row, of_methods: Mapping[str, Row], bars: Sequence[Bar]) -> str:
+    """ "yes", or which bars are missed and by what; empty where there are none.
+
+    Args:
+        row: one method on one set.
+        of_methods: all methods on that set, by name.
+        bars: of that set.
+    """
+    missed = [text for text in (_missed(row, of_methods, bar) for bar in bars) if text]
+    return f"no: {'; '.join(missed)}" if missed else "yes" if bars else ""
+
+
+def _missed(row: Row, of_methods: Mapping[str, Row], bar: Bar) -> str:
+    bound = of_methods.get(bar.bound, {}).get(bar.column) if isinstance(bar.bound, str) else bar.bound
+    value, sign = row.get(bar.column), "at most" if bar.at_most else "at least"
+    if value is None or bound is None:
+        return f"{bar.column} not measured" if value is None else f"{bar.column} has no {bar.bound} beside it"
+    reached = value <= bound if bar.at_most else value >= bound
+    return "" if reached else f"{bar.column} {value:.4g}, {sign} {bound:.4g}"

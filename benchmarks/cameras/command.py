@@ -1,0 +1,95 @@
+"""Cameras of `sfm-app` beside those of stock pycolmap: the same pixels, the same run, nobody sees EXIF.
+
+    python -m benchmarks.cameras DATA --cache CACHE --repeat 3 --twice
+    python -m benchmarks.cameras DATA --cache CACHE --sets merton1 "castle-P19 crop:300,100" --ours-only
+    python -m benchmarks.cameras DATA --cache CACHE --also scene.min_seed_angle_deg=4
+
+Stock is pycolmap's default, incremental and global, but for one shared camera, a seed, and our cap on the image size.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from benchmarks.cameras.bars import BARS
+from benchmarks.cameras.measure import EACH, measure, warm_up
+from benchmarks.cameras.methods import STOCK, Method, methods, taking_turns
+from benchmarks.cameras.report import draw, medians, page
+from benchmarks.common.command_line import add_pictures, is_wanted, new_parser, overrides
+from benchmarks.common.photo_sets import PhotoSet, photo_set
+from benchmarks.common.results import RESULTS, Row, document, write
+
+ALSO: tuple[str, ...] = ()
+"""Settings under which the program runs once more unless --also names others."""
+ABOUT = (
+    "The same pixels for all: photos saved anew as PNG, upright, without EXIF. Every run in a process of its own, "
+    "methods taking turns, kernels compiled before; medians over the repetitions. e_focal, e_OC: mean errors of fx and "
+    "fy, and of cx and cy (thesis 5.5.3); e_OC_w: distance of the optical centers as a share of the unchanged photo's "
+    "width; center rms: of camera centers after a similarity, in percent of their mean distance from their mean; AUC: "
+    "area under the recall of the larger of rotation and translation error over all pairs of photos, 180 degrees for a "
+    "pair with a photo left out; every photo is compared with its own K. AUC@5 of each model: over its own photos, "
+    "where there are several. Seconds: from the photos to the final cameras; COLMAP verifies pairs while matching, we "
+    "after it; / incremental: total over that of stock incremental in the same repetition. sd: stated standard "
+    "deviation after bundle adjustment; fx in sd: error of fx in them; in 3 sd: whether all errors are. bar met: see "
+    "benchmarks/cameras/bars.py."
+)
+
+
+def chosen_sets(args: argparse.Namespace, cache: Path) -> Iterator[tuple[PhotoSet, str]]:
+    """Each set with the name of its data; the change stands behind a blank."""
+    for title in args.sets:
+        name, _, change = title.partition(" ")
+        yield photo_set(args.data, name, change, cache, "each" if name in args.each else "auto"), name
+
+
+def all_runs(args: argparse.Namespace, these: Sequence[Method], cache: Path) -> Iterator[Row]:
+    """Every set, every repetition, every method."""
+    sets = list(chosen_sets(args, cache))
+    warm_up([photos for photos, _ in sets], these, cache / "cameras" / "warm-up")
+    for photos, name in sets:
+        for repetition in range(max(args.repeat, 1 + args.twice)):
+            for method in taking_turns(these, repetition):
+                if method.kind in STOCK and repetition >= args.repeat:
+                    continue
+                out = cache / "cameras" / photos.folder.name / method.name.replace(" ", "_")
+                row = measure(photos, args.data / name / "cameras.json", method, out)
+                print(json.dumps(row), file=sys.stderr, flush=True)
+                yield row | {"repetition": repetition}
+
+
+def parser() -> argparse.ArgumentParser:
+    """Give the command line."""
+    parser = new_parser("cameras", __doc__)
+    parser.add_argument("data", type=Path, help="folder with NAME/images and NAME/cameras.json")
+    parser.add_argument("--cache", type=Path, help="keeps copies of photos and the last run of every method")
+    parser.add_argument("--sets", nargs="+", default=list(BARS), metavar="SET", help='"NAME" or "NAME CHANGE"')
+    parser.add_argument("--each", nargs="*", default=EACH, help="sets in which every photo has its own camera")
+    parser.add_argument("--ours-only", action="store_true", help="without stock pycolmap")
+    parser.add_argument("--without", nargs="*", default=[], choices=STOCK, help="ways of stock pycolmap to leave out")
+    parser.add_argument("--also", nargs="*", default=ALSO, metavar="TABLE.KEY=VALUE", help="ours under this, too")
+    parser.add_argument("--repeat", type=int, default=1, metavar="N", help="runs of every method")
+    parser.add_argument("--twice", action="store_true", help="ours at least twice: are the bytes the same?")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--name", default="cameras", help="name of the result files")
+    add_pictures(parser, "result files")
+    return parser
+
+
+def main() -> None:
+    """Measure all, and publish."""
+    args = parser().parse_args()
+    these = [
+        method for method in methods(overrides(args.also), ours_only=args.ours_only) if method.name not in args.without
+    ]
+    with tempfile.TemporaryDirectory(prefix="cameras-") as scratch:
+        runs = list(all_runs(args, these, args.cache or Path(scratch)))
+    rows = medians(runs)
+    options = {"methods": [method.name for method in these], "repeat": args.repeat, "each": list(args.each)}
+    found = document("cameras", ABOUT, options, {"sets": list(args.sets), "medians": rows}, runs)
+    drawn = is_wanted(args.pictures, args.name) and draw(rows, args.results, args.name)
+    text = page(ABOUT, rows, args.name if drawn else "")
+    write(args.results, args.name, found, text)
+    print(text)

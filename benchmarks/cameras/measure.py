@@ -1,0 +1,61 @@
+"""One method on one photo set: run, and scored against the truth."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from benchmarks.cameras.methods import Method, run
+from benchmarks.cameras.score import (
+    TruePhoto,
+    accuracy,
+    before_adjustment,
+    hashes,
+    read_models,
+    stated_deviations,
+    times,
+    true_photos,
+)
+from benchmarks.cameras.worker import OURS
+from benchmarks.common.photo_sets import PhotoSet, steps
+from benchmarks.common.results import Row
+
+EACH = ("reichstag10",)
+"""Sets in which every photo has its own camera."""
+FEW = 6
+"""Sets with fewer photos do not need all kernels."""
+
+
+def warm_up(sets: Sequence[PhotoSet], these: Sequence[Method], out: Path) -> None:
+    """Compile the kernels: one unmeasured run on the smallest set of every kind that is no special case."""
+    by_size = sorted(sets, key=lambda photos: (_count(photos) < FEW, _bytes(photos)), reverse=True)
+    smallest = {photos.cameras: photos for photos in by_size}
+    for photos in smallest.values():
+        for method in these:
+            if method.kind == OURS:
+                run(method, photos, out)
+
+
+def measure(photos: PhotoSet, truth_file: Path, method: Method, out: Path) -> Row:
+    """One method, once, on one set."""
+    said = run(method, photos, out)
+    return scored(said, photos, true_photos(truth_file, steps(photos.name.partition(" ")[2])), method, out)
+
+
+def scored(said: Row, photos: PhotoSet, truth: Mapping[str, TruePhoto], method: Method, out: Path) -> Row:
+    """The figures of a finished run; a truth of more photos than the set has is cut to those."""
+    truth = {name: true for name, true in truth.items() if (photos.folder / f"{name}.png").exists()}
+    models = read_models(out)
+    row = {"photos": photos.name, "method": method.name, "failed": said["failed"], "exit code": said["exit code"]}
+    row |= accuracy(models, truth, _count(photos)) | times(said["seconds"], complete=not said["failed"])
+    row |= {name: said[name] for name in ("wall seconds", "peak MB")}
+    if method.kind == OURS:
+        row |= before_adjustment(out, truth) | hashes(out)
+        row |= stated_deviations(out, models[0], truth) if models else {}
+    return row
+
+
+def _count(photos: PhotoSet) -> int:
+    return len(list(photos.folder.glob("*.png")))
+
+
+def _bytes(photos: PhotoSet) -> int:
+    return sum(path.stat().st_size for path in photos.folder.glob("*.png"))

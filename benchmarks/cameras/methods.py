@@ -1,0 +1,86 @@
+"""The ways from photos to cameras, and how one of them is run: in a process of its own, see worker.py."""
+
+import json
+import shutil
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from benchmarks.cameras.worker import GLOBAL, INCREMENTAL, OURS, RESULT
+from benchmarks.common.photo_sets import PhotoSet, put
+from benchmarks.common.processes import end_of, module_command
+from benchmarks.common.results import Row
+from sfm_app.settings import MatchSettings, merged
+
+STOCK = (INCREMENTAL, GLOBAL)
+WORKER = "benchmarks.cameras.worker"
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """One way from photos to cameras."""
+
+    name: str
+    kind: str = OURS
+    """`OURS`, or one of `STOCK`."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Of the program, beside its defaults."""
+
+
+def methods(also: Mapping[str, Mapping[str, Any]], *, ours_only: bool = False) -> list[Method]:
+    """The program as it comes and under other settings, and pycolmap's two ways of mapping."""
+    ours = [Method(OURS), *(Method(f"{OURS}, {label}", OURS, settings) for label, settings in also.items())]
+    return ours if ours_only else ours + [Method(kind, kind) for kind in STOCK]
+
+
+def taking_turns(these: Sequence[Method], repetition: int) -> list[Method]:
+    """Every repetition starts with another method, so that none always meets a cold or a busy machine."""
+    first = repetition % len(these)
+    return [*these[first:], *these[:first]]
+
+
+def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = None) -> Row:
+    """Run a method from nothing into OUT; seconds of its steps, peak memory, and why it failed where it did.
+
+    What has not ended after `limit_s` is ended, with all that it has started.
+    """
+    shutil.rmtree(out, ignore_errors=True)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    settings = merged({"photos": {"cameras": photos.cameras if photos.told else "auto"}}, method.settings)
+    cap = MatchSettings(**settings.get("matching", {})).max_image_size_px
+    options = {"settings": settings, "cameras": photos.cameras, "max_image_size_px": cap}
+    folder = photos.folder
+    if method.kind in STOCK and photos.cameras != "each" and len(sizes := by_size(folder)) > 1:
+        folder, options["cameras"] = in_folders(sizes, folder.with_name(f"{folder.name}-by-size")), "folder"
+    command = module_command(WORKER, method.kind, str(folder), str(out), json.dumps(options))
+    start = time.perf_counter()
+    code, last = end_of(command, limit_s)
+    said: Row = {"wall seconds": round(time.perf_counter() - start, 2)}
+    if (out / RESULT).exists():
+        found: Row = json.loads((out / RESULT).read_text(encoding="utf-8"))
+        return said | found
+    failed = f"not done after {limit_s:g} s" if code is None else f"exit code {code}: {last}"
+    return said | {"failed": failed, "exit code": code, "seconds": {}, "peak MB": None}
+
+
+def by_size(folder: Path) -> dict[tuple[int, int], list[Path]]:
+    """The photos of a folder by width and height."""
+    found: dict[tuple[int, int], list[Path]] = {}
+    for path in sorted(folder.glob("*.png")):
+        with Image.open(path) as image:
+            found.setdefault(image.size, []).append(path)
+    return found
+
+
+def in_folders(sizes: Mapping[tuple[int, int], Sequence[Path]], into: Path) -> Path:
+    """A folder for each size: told of one camera for all, COLMAP leaves out photos that lie on their side."""
+    for (width, height), photos in sizes.items():
+        folder = into / f"{width}x{height}"
+        folder.mkdir(parents=True, exist_ok=True)
+        for photo in photos:
+            put(photo, folder)
+    return into

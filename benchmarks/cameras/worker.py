@@ -1,0 +1,84 @@
+"""Photos to cameras by one method: ``python -m benchmarks.cameras.worker METHOD PHOTOS OUT JSON``, a process for each.
+
+Nothing is imported but what the method itself needs, so that memory and times are its own.
+"""
+
+import json
+import sys
+import time
+import zlib  # before pycolmap, see CONTRIBUTING.md
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common.memory import peak_mb
+
+OURS = "sfm-app"
+INCREMENTAL, GLOBAL = "incremental", "global"
+RESULT = "benchmark.json"
+"""In OUT: what the process says about itself."""
+MODES = {"each": "AUTO", "folder": "PER_FOLDER"}
+"""pycolmap's name for which photos share a camera, by ours; one camera for all where nothing is said."""
+
+
+def ours(photos: Path, out: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """The program until the cameras stand; its seconds are those of the manifest."""
+    import sfm_app
+
+    failed, code, run, manifest = "", 0, None, out / "manifest.json"
+    try:
+        run = sfm_app.reconstruct(photos, out, sfm_app.Settings.from_mapping(options["settings"]), last="scene")
+    except sfm_app.SfmError as error:
+        failed, code = str(error), error.exit_code
+    except Exception as error:  # as in the commands; log.txt has the traceback
+        failed, code = f"unexpected {type(error).__name__}: {error}", 1
+    stages = json.loads(manifest.read_text(encoding="utf-8"))["stages"] if manifest.exists() else {}
+    said = {"failed": failed, "exit code": code, "peak MB": peak_mb()}
+    if run is not None:
+        from sfm_app.cli.display import run_lines  # what it costs is no part of the method
+
+        said["summary"] = list(run_lines(run))
+    return said | {"seconds": {name: stage["seconds"] for name, stage in stages.items()}}
+
+
+def stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) -> dict[str, Any]:
+    """pycolmap's defaults but for a seed, a cap on the image size, and one camera for all photos where that is so."""
+    import pycolmap
+
+    zlib.crc32(b"")  # the import above is there for its side effect
+    out.mkdir()
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.set_random_seed(0)
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size = options["max_image_size_px"]
+    mode = getattr(pycolmap.CameraMode, MODES.get(options["cameras"], "SINGLE"))
+    database, sparse, seconds = out / "database.db", out / "sparse", {}
+    start = time.perf_counter()
+
+    def lap(step: str) -> None:
+        nonlocal start
+        seconds[step], start = round(time.perf_counter() - start, 2), time.perf_counter()
+
+    pycolmap.extract_features(database, photos, camera_mode=mode, extraction_options=extraction)
+    lap("features")
+    pycolmap.match_exhaustive(database)
+    lap("match_and_verify")
+    if mapper == GLOBAL:
+        pycolmap.calibrate_view_graph(database)
+        lap("calibrate")
+        pycolmap.global_mapping(database, photos, sparse)
+    else:
+        pycolmap.incremental_mapping(database, photos, sparse)
+    lap("map")
+    return {"failed": "", "exit code": 0, "seconds": seconds, "peak MB": peak_mb()}
+
+
+def main() -> None:
+    kind, photos, out, text = sys.argv[1:]
+    options = json.loads(text)
+    found = ours(Path(photos), Path(out), options) if kind == OURS else stock(Path(photos), Path(out), options, kind)
+    (Path(out) / RESULT).write_text(json.dumps(found), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

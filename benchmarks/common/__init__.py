@@ -1,0 +1,1 @@
+"""What several benchmarks need: result files, figures, metrics, photo sets, processes."""

@@ -1,0 +1,77 @@
+"""Several estimators on the same pairs in one run, taking turns pair by pair, timed one call at a time."""
+
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+Method = Callable[[FloatArray, FloatArray, int], tuple[FloatArray | None, int | None]]
+"""(x1, x2, seed) -> F or None, and the samples drawn where the method tells."""
+
+
+class Pair(Protocol):
+    """What an estimator sees."""
+
+    @property
+    def x1(self) -> FloatArray:
+        """(N, 2) pixels."""
+
+    @property
+    def x2(self) -> FloatArray:
+        """(N, 2) pixels, row by row the partners of x1."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Attempt:
+    """One method on one pair."""
+
+    F: FloatArray | None
+    """(3, 3), finite; None where the method gave no such matrix."""
+    ms: float
+    trials: int | None
+
+
+def take_turns(
+    methods: Mapping[str, Method], pairs: Sequence[Pair], seed: int = 0, label: str = ""
+) -> dict[str, list[Attempt]]:
+    """All methods on all pairs; every method has one call before that, unmeasured, to compile and load what it needs.
+
+    Returns:
+        Per method, one attempt for each pair. Pair n is estimated with `seed` + n.
+    """
+    attempts: dict[str, list[Attempt]] = {name: [] for name in methods}
+    for method in methods.values():
+        method(pairs[0].x1, pairs[0].x2, seed)
+    for n, pair in enumerate(pairs):
+        for name, method in methods.items():
+            start = time.perf_counter()
+            F, trials = method(pair.x1, pair.x2, seed + n)
+            ms = 1e3 * (time.perf_counter() - start)
+            attempts[name].append(Attempt(F if is_usable(F) else None, ms, trials))
+        print(f"\r{label} {n + 1}/{len(pairs)}", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    return attempts
+
+
+def is_usable(F: FloatArray | None) -> bool:
+    """Whether this is one matrix with numbers in it."""
+    return F is not None and F.shape == (3, 3) and bool(np.isfinite(F).all()) and bool(np.any(F))
+
+
+def timing(attempts: Sequence[Attempt]) -> dict[str, float | None]:
+    """Milliseconds, and the mean number of samples where the method tells."""
+    ms = np.array([attempt.ms for attempt in attempts])
+    trials = [attempt.trials for attempt in attempts if attempt.trials is not None]
+    return {
+        "ms median": round(float(np.median(ms)), 2),
+        "ms mean": round(float(ms.mean()), 2),
+        "ms p90": round(float(np.percentile(ms, 90)), 2),
+        "ms total": round(float(ms.sum()), 1),
+        "trials mean": round(float(np.mean(trials)), 1) if trials else None,
+    }

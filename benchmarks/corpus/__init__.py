@@ -1,0 +1,1 @@
+"""Every photo set, as it is and changed, beside stock pycolmap."""

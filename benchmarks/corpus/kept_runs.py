@@ -1,0 +1,67 @@
+"""Finished runs in the cache, and whether they would come out the same again."""
+
+import argparse
+import hashlib
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import sfm_app
+from benchmarks.cameras import worker
+from benchmarks.cameras.methods import Method, run
+from benchmarks.cameras.worker import OURS
+from benchmarks.common.photo_sets import PhotoSet
+from benchmarks.common.results import Row
+from sfm_app.staleness import versions
+
+RECORD = "corpus.json"
+"""In OUT: what was run, and what it said."""
+
+
+class Done(NamedTuple):
+    """A finished run."""
+
+    key: str
+    """Of the program, settings and photos that it was made with."""
+    said: Row
+
+
+def key_of(method: Method, photos: PhotoSet) -> str:
+    """Hash of what a run depends on; stock does not depend on our program."""
+    package = Path(sfm_app.__file__).parent
+    sources = sorted(package.rglob("*.py")) if method.kind == OURS else [Path(worker.__file__)]
+    found = hashlib.sha256(json.dumps([method.kind, method.settings, photos.cameras, versions()]).encode())
+    for path in [*sources, *sorted(photos.folder.glob("*.*g"))]:
+        content = path.read_bytes() if path.suffix == ".py" else str(path.stat().st_size).encode()
+        found.update(path.name.encode() + b"\0" + content)
+    return found.hexdigest()[:16]
+
+
+def finished(out: Path) -> Done | None:
+    """The run that lies in OUT, if it came to an end."""
+    try:
+        return Done(**json.loads((out / RECORD).read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return None
+
+
+def kept(method: Method, photos: PhotoSet, out: Path, args: argparse.Namespace) -> Done | None:
+    """What lies in OUT and need not be run again. What ran out of time is tried again when it gets more of it."""
+    before = finished(out)
+    if before is None or args.score_only:
+        return before
+    cut_short = before.said["exit code"] is None and before.said["wall seconds"] < 60 * args.limit_min
+    return before if args.keep and before.key == key_of(method, photos) and not cut_short else None
+
+
+def run_anew(method: Method, photos: PhotoSet, out: Path, limit_s: float) -> Done:
+    """Run a method and write down what it said."""
+    done = Done(key_of(method, photos), run(method, photos, out, limit_s))
+    remember(out, done)
+    return done
+
+
+def remember(out: Path, done: Done) -> None:
+    """Write down in OUT that a run came to an end, and how."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / RECORD).write_text(json.dumps(done._asdict()), encoding="utf-8")

@@ -1,0 +1,212 @@
+"""What a run over a set of the corpus is worth: cameras in stated deviations, walks, and what was said of folds."""
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.cameras.score import PLACES, Model, TruePhoto, read_models
+from benchmarks.common.results import Row
+from benchmarks.corpus.trajectory import offset_errors, order_scores
+
+WALKS = ("oats23", "books21")
+"""Sets whose truth is the order of the photos."""
+OFFSETS = ("kitchen1000",)
+"""Sets whose truth is the poses of another camera on the same rig, and no K."""
+PARAMETERS = ("fx", "fy", "cx", "cy")
+FAR_SD = 3.0
+"""A parameter that is so many stated deviations off is a miss."""
+FAR_PERCENT = 3.0
+"""A focal that is called identifiable and is so far off is confidently wrong."""
+FOLD_WORDS = re.compile(r"fold|alike|beware|jump", re.IGNORECASE)
+"""What a sentence about equal things in several places has in it."""
+WARNING_WORDS = re.compile(r"fold|beware", re.IGNORECASE)
+"""What it has in it where it says that the model may be wrong; "look-alikes told apart" says that it is not."""
+
+
+class Doubt(NamedTuple):
+    """How far the truth itself may be off, as its source says: one standard deviation, in percent."""
+
+    focal: float
+    center: float
+    """Of the width."""
+
+
+DOUBTS: Mapping[str, Doubt] = {
+    "fox50": Doubt(1.0, 1.0),
+    "lund-door12": Doubt(1.5, 1.0),
+    "merton1": Doubt(1.7, 0.9),
+    "reichstag10": Doubt(1.5, 2.0),
+}
+"""COLMAP models (their center held, or known to a percent), and three views whose K differ by a few percent."""
+
+
+def parameters(out: Path, truth: Mapping[str, TruePhoto], doubt: Doubt) -> list[Row]:
+    """Every parameter of every camera that the program states: what it found, the truth, the error in deviations.
+
+    Before adjustment only cameras that are called identifiable count: the others are guesses, and called so. A camera's
+    truth is the median over its photos.
+    """
+    path = out / "calibration.json"
+    found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    rows = []
+    for stage in _stages(found):
+        photos = [Path(photo).stem for photo in stage.photos if Path(photo).stem in truth]
+        if photos:
+            true = np.median([truth[photo].K for photo in photos], axis=0)
+            width = float(np.median([truth[photo].width for photo in photos]))
+            about = {"camera": stage.camera, "its photos": len(photos)}
+            rows += [about | row for row in _errors(stage, true, width, doubt)]
+    return rows
+
+
+class Stage(NamedTuple):
+    """What is stated of a camera before or after bundle adjustment."""
+
+    camera: str
+    photos: tuple[str, ...]
+    when: str
+    K: NDArray[np.float64]
+    deviations: Mapping[str, float]
+    identifiable: bool
+
+
+def _stages(found: Mapping[str, Any]) -> Iterator[Stage]:
+    """Every camera before adjustment, and after it, where mapping may have divided it."""
+    camera_of = found.get("camera_of", {})
+    for name, photos in _members(camera_of).items():
+        before = found["cameras"][name]
+        if before["identifiable"]:
+            yield Stage(name, photos, "before", np.array(before["K"]), before.get("spread", {}), identifiable=True)
+    for name, photos in _members(found.get("refined_camera_of", camera_of)).items():
+        after = found.get("refined", {}).get(name)
+        if after is not None:
+            K, deviations = np.array(after["K"]), after.get("deviations", {})
+            yield Stage(name, photos, "after", K, deviations, identifiable=_claimed(K, deviations))
+
+
+def _members(camera_of: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    """Photos by camera."""
+    return {name: tuple(photo for photo in camera_of if camera_of[photo] == name) for name in camera_of.values()}
+
+
+def _claimed(K: NDArray[np.float64], deviations: Mapping[str, float]) -> bool:
+    """Whether bundle adjustment calls its focals good to `FAR_PERCENT`: three deviations of each are no more."""
+    stated = [(K[PLACES[name][0]], deviations.get(name, deviations.get("f"))) for name in ("fx", "fy")]
+    return all(sd is not None and 0 < FAR_SD * sd <= FAR_PERCENT / 100 * focal for focal, sd in stated)
+
+
+def _errors(stage: Stage, true: NDArray[np.float64], width: float, doubt: Doubt) -> Iterator[Row]:
+    for name in PARAMETERS:
+        (place,) = PLACES[name]
+        focal = name in ("fx", "fy")
+        whole = float(true[place]) if focal else width
+        error, sd = abs(float(stage.K[place] - true[place])), stage.deviations.get(name, stage.deviations.get("f"))
+        unsure = (doubt.focal if focal else doubt.center) / 100 * whole
+        known = sd if sd is not None and math.isfinite(sd) and sd > 0 else None
+        yield {
+            "when": stage.when,
+            "parameter": name,
+            "identifiable": "yes" if stage.identifiable else "no",
+            "found": round(float(stage.K[place]), 2),
+            "true": round(float(true[place]), 2),
+            "sd": round(float(known), 3) if known else None,
+            "error %": round(100 * error / whole, 3),
+            "in sd": round(error / known, 2) if known else None,
+            "in sd, truth's doubt granted": round(error / math.hypot(known, unsure), 2) if known else None,
+        }
+
+
+def of_parameters(rows: Sequence[Row]) -> Row:
+    """The parameters of a run in a few figures."""
+    row: Row = {}
+    for when in ("before", "after"):
+        stated = [one for one in rows if one["when"] == when and one["in sd"] is not None]
+        row[f"worst in sd {when}"] = max((one["in sd"] for one in stated), default=None)
+        for name in PARAMETERS:
+            of_name = [one for one in rows if one["when"] == when and one["parameter"] == name]
+            if of_name:
+                worst = max(of_name, key=lambda one: one["error %"])
+                row |= {f"{name} % {when}": worst["error %"], f"sd {name} {when}": worst["sd"]}
+    return row
+
+
+def counted(rows: Sequence[Row]) -> Row:
+    """Of parameters: how many are stated, how many are far off, how many focals are confidently wrong."""
+    stated = [row for row in rows if row["in sd"] is not None]
+    focals = [row for row in rows if row["parameter"] in ("fx", "fy") and row["identifiable"] == "yes"]
+    granted = "in sd, truth's doubt granted"
+    return {
+        "stated": len(stated),
+        "beyond 3 sd": sum(row["in sd"] > FAR_SD for row in stated),
+        "beyond 3 sd, truth's doubt granted": sum(row[granted] > FAR_SD for row in stated),
+        "focals called identifiable": len(focals),
+        "of them over 3 % off": sum(row["error %"] > FAR_PERCENT for row in focals),
+    }
+
+
+def claims(rows: Sequence[Row]) -> Row:
+    """Errors of what is called identifiable before adjustment, 0 where nothing is; f in the bounds of kitti51."""
+    before = [row for row in rows if row["when"] == "before"]
+    after = [row for row in rows if row["when"] == "after" and row["parameter"] in ("fx", "fy")]
+    row: Row = {
+        "claimed focal %": max((one["error %"] for one in before if one["parameter"] in ("fx", "fy")), default=0.0),
+        "claimed center %": max((one["error %"] for one in before if one["parameter"] in ("cx", "cy")), default=0.0),
+    }
+    if after:
+        shares = [min(one["error %"] / FAR_PERCENT, (one["in sd"] or math.inf) / FAR_SD) for one in after]
+        row["focal of 3 % or 3 sd"] = round(max(shares), 3)
+    return row
+
+
+def of_walk(models: Sequence[Model], said: Sequence[str]) -> Row:
+    """The order of the photos in each model, and whether a fold goes without a word."""
+    orders = [order for order in (order_scores(model.poses) for model in models) if order is not None]
+    if not orders:
+        return {}
+    row: Row = {
+        "axis": round(orders[0].axis, 3),
+        "distance": round(orders[0].distance, 3),
+        "jumps": orders[0].jumps,
+        "axis of the worst part": round(min(order.axis for order in orders), 3),
+        "distance of the worst part": round(min(order.distance for order in orders), 3),
+    }
+    return row | {"warned of folds": "yes" if any(map(WARNING_WORDS.search, said)) else "no"}
+
+
+def of_offset(models: Sequence[Model], truth: Mapping[str, TruePhoto]) -> Row:
+    """Errors against a camera beside ours."""
+    poses = {name: photo.pose for name, photo in truth.items()}
+    found = offset_errors(models[0].poses, poses) if models else None
+    if found is None:
+        return {}
+    return {
+        "median center cm": round(100 * float(np.median(found.center)), 2),
+        "90 % center cm": round(100 * float(np.percentile(found.center, 90)), 2),
+        "median rotation deg": round(float(np.median(found.rotation_deg)), 2),
+    }
+
+
+def fold_lines(said: Sequence[str]) -> list[str]:
+    """What a run has said about equal things in several places."""
+    return [line.strip() for line in said if FOLD_WORDS.search(line)]
+
+
+def corpus_figures(name: str, out: Path, truth: Mapping[str, TruePhoto], said: Sequence[str]) -> tuple[Row, list[Row]]:
+    """What the corpus asks of a run beside what the cameras' table does: figures, and the parameters one by one."""
+    models = read_models(out)
+    row: Row = {"of photos in models": sum(len(model.poses) for model in models)}
+    stated: list[Row] = []
+    if name in WALKS:
+        row |= of_walk(models, said)
+    elif name in OFFSETS:
+        row |= of_offset(models, truth)
+    elif truth:
+        stated = parameters(out, truth, DOUBTS.get(name, Doubt(0.0, 0.0)))
+        row |= of_parameters(stated) | claims(stated)
+    return row, stated

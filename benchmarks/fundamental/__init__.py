@@ -1,0 +1,1 @@
+"""Fundamental matrices beside those of OpenCV, PoseLib and pycolmap."""

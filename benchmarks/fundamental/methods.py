@@ -1,0 +1,84 @@
+"""The estimators that are compared: ours by name through the public API, and the rivals as they come."""
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import sfm_app
+from benchmarks.common.timing import Method
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.plugins import load_plugins
+from sfm_app.settings import EpipolarSettings, Settings
+from sfm_app.types import EpipolarFit
+
+FloatArray = NDArray[np.float64]
+
+BASELINE = "OpenCV MAGSAC++"
+"""The rival that times are set in relation to."""
+RIVALS = ("OpenCV RANSAC", BASELINE, "PoseLib", "pycolmap LO-RANSAC")
+
+
+def our_estimators(names: Sequence[str], options: EpipolarSettings) -> dict[str, Method]:
+    """Estimators of sfm_app by name; unknown names are left out with a note, so that older states can be measured."""
+    known = load_plugins().estimators
+    if missing := [name for name in names if name not in known]:
+        print(f"left out, no such estimator: {', '.join(missing)}", file=sys.stderr)
+    return {name: _ours(name, options) for name in names if name in known}
+
+
+def _ours(name: str, options: EpipolarSettings) -> Method:
+    settings = Settings(epipolar=options)
+
+    def fit(x1: FloatArray, x2: FloatArray, seed: int) -> tuple[FloatArray | None, int | None]:
+        found = sfm_app.estimate_fundamental(x1, x2, method=name, seed=seed, settings=settings)
+        return (found.F, found.trials) if isinstance(found, EpipolarFit) else (None, None)
+
+    return fit
+
+
+def rivals(names: Sequence[str], options: EpipolarSettings) -> dict[str, Method]:
+    """Rivals by name, with our threshold, confidence and limit; what they return is not judged any further."""
+    cv2.setNumThreads(1)
+    makers = (_opencv(cv2.FM_RANSAC), _opencv(cv2.USAC_MAGSAC), _poselib, _pycolmap)
+    return {name: make(options) for name, make in zip(RIVALS, makers, strict=True) if name in names}
+
+
+def _opencv(flag: int) -> Any:
+    def make(options: EpipolarSettings) -> Method:
+        limits = (options.max_error_px, options.confidence, options.max_trials)
+        return lambda x1, x2, seed: (cv2.findFundamentalMat(x1, x2, flag, *limits)[0], None)  # noqa: ARG005
+
+    return make
+
+
+def _poselib(options: EpipolarSettings) -> Method:
+    try:
+        import poselib
+    except ImportError:
+        raise SystemExit("poselib is missing: pip install -e '.[bench]'") from None
+    limits = {
+        "max_epipolar_error": options.max_error_px,
+        "success_prob": options.confidence,
+        "max_iterations": options.max_trials,
+    }
+
+    def fit(x1: FloatArray, x2: FloatArray, seed: int) -> tuple[FloatArray | None, int | None]:
+        F, report = poselib.estimate_fundamental(x1, x2, {**limits, "seed": seed}, {})
+        return F, report["iterations"]
+
+    return fit
+
+
+def _pycolmap(options: EpipolarSettings) -> Method:
+    def fit(x1: FloatArray, x2: FloatArray, seed: int) -> tuple[FloatArray | None, int | None]:
+        ransac = pycolmap.RANSACOptions()
+        ransac.max_error, ransac.confidence, ransac.random_seed = options.max_error_px, options.confidence, seed
+        ransac.min_num_trials, ransac.max_num_trials = 100, options.max_trials
+        found = pycolmap.estimate_fundamental_matrix(x1, x2, ransac)
+        return (None if found is None else found["F"]), None
+
+    return fit

@@ -1,0 +1,148 @@
+"""Calibrations of one photo set before bundle adjustment: by the program's stage, by a calibrator alone, by COLMAP."""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+import sfm_app
+from benchmarks.common.photo_sets import PhotoSet, TrueCamera
+from benchmarks.selfcal import view_graph_calibration as rival
+from sfm_app.api import opened_run
+from sfm_app.calibrating import camera_pairs
+from sfm_app.geometry.camera import camera_matrix
+from sfm_app.pipeline import run_stages
+from sfm_app.plugins import load_plugins
+from sfm_app.settings import Settings, merged
+from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
+from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, ViewGraph
+from sfm_app.types.scene import CameraModel
+
+PRODUCTION = "zero-curves"
+WITHOUT_MATCHES = f"{PRODUCTION} without matches"
+"""From the fundamental matrices alone: what the consensus says by itself, which knows no lens."""
+ANSWER = ("fx_px", "fy_px", "cx_px", "cy_px")
+"""Evidence in which a literal method leaves its own answer, whatever our verdict on it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """What one method said about one photo set."""
+
+    method: str
+    cameras: Mapping[str, Calibration]
+    """By photo name without suffix."""
+    seconds: float
+    pairs: int
+    """Fundamental matrices it could use."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """A photo set up to its fundamental matrices, which all methods share."""
+
+    photos: PhotoSet
+    out: Path
+    """Output folder of the program."""
+    settings: Settings
+    matches: MatchGraph
+    views: ViewGraph
+    matching_seconds: float
+    """Of features and matches, when they were made."""
+
+    @property
+    def groups(self) -> list[list[MatchedImage]]:
+        """The photos by the camera that they are thought to share."""
+        images = list(self.matches.images.values())
+        return [[image for image in images if image.group == name] for name in dict.fromkeys(i.group for i in images)]
+
+
+def measured(photos: PhotoSet, cache: Path, seed: int = 0) -> Measured:
+    """Run the program up to the fundamental matrices, or take them from the cache."""
+    settings = Settings.from_mapping({"seed": seed, "workers": 1, "photos": {"cameras": photos.cameras}})
+    out = cache / "out" / photos.folder.name
+    with opened_run(out, settings, None) as run:
+        products = run_stages(photos.folder, run, last="view_graph")
+        matches, views = products("match_graph"), products("view_graph")
+        seconds = run.workspace.manifest.read()["stages"]["match_graph"]["seconds"]
+    return Measured(photos, out, settings, matches, views, seconds)
+
+
+def production(subject: Measured, overrides: Mapping[str, object] | None = None, label: str = PRODUCTION) -> Found:
+    """The stage `intrinsics`, with everything that the program does there, under other settings where given."""
+    settings = Settings.from_mapping(merged(subject.settings.model_dump(), overrides or {}))
+    with opened_run(subject.out, settings, None) as run:
+        found = run_stages(subject.photos.folder, run, first="intrinsics", last="intrinsics")("intrinsics")
+        seconds = run.workspace.manifest.read()["stages"]["intrinsics"]["seconds"]
+    cameras = {Path(image.name).stem: camera_of(image, found) for image in subject.matches.images.values()}
+    return Found(label, cameras, seconds, len(subject.views.fits))
+
+
+def camera_of(image: MatchedImage, found: Intrinsics) -> Calibration:
+    """The camera that the program takes to have made a photo."""
+    return found.camera(image)
+
+
+def literal(subject: Measured, method: str) -> Found:
+    """A calibrator alone on the pairs within each camera; its own answer counts even where our verdict on it is no."""
+    calibrator = load_plugins().calibrator(PRODUCTION if method == WITHOUT_MATCHES else method)
+    cameras: dict[str, Calibration] = {}
+    seconds, pairs = 0.0, 0
+    for images in subject.groups:
+        of_camera = camera_pairs(images, subject.matches, subject.views)
+        if method == WITHOUT_MATCHES:
+            of_camera = replace(of_camera, inliers=())
+        start = time.perf_counter()
+        found = calibrator.calibrate(of_camera, subject.settings.calibration, subject.settings.seed)
+        seconds += time.perf_counter() - start
+        pairs += len(of_camera.Fs)
+        if method != WITHOUT_MATCHES and all(name in found.evidence for name in ANSWER):
+            found = replace(found, K=camera_matrix(*(found.evidence[name] for name in ANSWER)))
+        cameras |= {Path(image.name).stem: found for image in images}
+    return Found(method, cameras, seconds, pairs)
+
+
+def colmap(subject: Measured) -> Found:
+    """View-graph calibration."""
+    database = subject.out / "database.db"
+    found, seconds = rival.view_graph_calibration(database, subject.out, subject.matches, subject.views)
+    cameras = {Path(subject.matches.images[key].name).stem: camera for key, camera in found.items()}
+    return Found(rival.METHOD, cameras, seconds, len(subject.views.fits))
+
+
+def every_method(
+    subject: Measured, methods: Sequence[str], others: Mapping[str, Mapping[str, object]]
+) -> Iterator[Found]:
+    """All of them, the production under its own settings and under the others named."""
+    yield production(subject)
+    for label, overrides in others.items():
+        yield production(subject, overrides, f"{PRODUCTION}, {label}")
+    yield colmap(subject)
+    for method in (WITHOUT_MATCHES, *(name for name in methods if name != PRODUCTION)):
+        yield literal(subject, method)
+
+
+def adjusted_cameras(subject: Measured) -> dict[str, TrueCamera]:
+    """What our own bundle adjustment ends at: a reference where there is no truth."""
+    run = sfm_app.reconstruct(subject.photos.folder, subject.out, subject.settings, last="scene")
+    refined = run.scene.cameras if run.scene else {}
+    return {
+        Path(image.name).stem: TrueCamera(refined[image.group].K, _first_radial_term(refined[image.group]))
+        for image in subject.matches.images.values()
+        if image.group in refined
+    }
+
+
+def _first_radial_term(camera: CameraModel) -> float:
+    return float(camera.params[3 if camera.model == "SIMPLE_RADIAL" else 4])
+
+
+def warm_up() -> None:
+    """Compile the kernels: one call of every calibrator, unmeasured."""
+    tracks = make_tracks(TrackOptions(cameras=4), seed=0)
+    inliers = tuple(np.hstack([view.x1, view.x2]) for view in tracks.pairs.values())
+    pairs = CameraPairs(tracks.F, np.ones(len(tracks.F)), tracks.size, tuple(tracks.pairs), inliers)
+    for calibrator in load_plugins().calibrators.values():
+        calibrator.calibrate(pairs, Settings().calibration, 0)

@@ -1,0 +1,56 @@
+"""Rendered photo sets whose lens, path or mixture of cameras is what a calibrator has to find out."""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+
+from benchmarks.common.photo_sets import PhotoSet, TrueCamera
+from sfm_app.synthetic.cameras import ArcOptions, Views, arc, make_camera, orbit
+from sfm_app.synthetic.photo_folder import load_truth, save_truth, write_photo_folder
+from sfm_app.synthetic.scenes import build_scene
+
+SIZE = (960, 640)
+LENSES = (-0.25, -0.1, 0.1)
+"""k1 of COLMAP's SIMPLE_RADIAL."""
+TWO_FOCALS = (1.05, 1.5)
+"""In widths, of two cameras with photos of one size."""
+
+
+def walk(radial: float, seed: int) -> Views:
+    """A hand-held walk; every seed has its own path, and its own camera."""
+    return arc(make_camera(*SIZE, focal_widths=1.05 + 0.1 * seed, radial=radial), seed=seed)
+
+
+def turntable(seed: int) -> Views:
+    """An orbit, which leaves the focal undetermined."""
+    return orbit(make_camera(*SIZE), sweep_deg=80.0 + 20.0 * seed)
+
+
+def two_cameras(seed: int) -> Views:
+    """Every other photo with a longer lens, and nothing in the files says so."""
+    first, second = (make_camera(*SIZE, focal_widths=focal) for focal in TWO_FOCALS)
+    views = arc(first, ArcOptions(photos=14), seed=seed)
+    return views.taken_with(second, sorted(views.cameras)[1::2])
+
+
+KINDS: Mapping[str, Callable[[int], Views]] = {
+    "rendered": partial(walk, 0.0),
+    **{f"rendered k1={k1:+.2f}": partial(walk, k1) for k1 in LENSES},
+    "rendered orbit": turntable,
+    "rendered two cameras": two_cameras,
+}
+
+
+def rendered_sets(seeds: int, cache: Path) -> Iterator[PhotoSet]:
+    """Every kind under so many seeds; folders in the cache that are complete are taken as they are."""
+    for kind, views in KINDS.items():
+        for seed in range(seeds):
+            name = f"{kind} seed {seed}"
+            folder = cache / "photos" / name.replace(" ", "_")
+            yield PhotoSet(name, folder, _truth(views(seed), folder, cache / "truth" / folder.name))
+
+
+def _truth(views: Views, photos: Path, folder: Path) -> dict[str, TrueCamera]:
+    if not folder.exists():  # written last
+        save_truth(write_photo_folder(photos, build_scene(), views), folder)
+    return {Path(name).stem: TrueCamera(camera.K, camera.radial) for name, camera in load_truth(folder).cameras.items()}

@@ -1,0 +1,43 @@
+"""What surfaces have to reach, and whether they do."""
+
+from collections.abc import Mapping, Sequence
+
+from benchmarks.cameras.bars import Bar, least, most
+from benchmarks.common.results import Row
+from benchmarks.surface.sets import REAL, RENDERED
+
+WIDELY_SEEN = ("fountain-P11", "Herz-Jesus-P8")
+"""Sets whose photos show little but the object."""
+TIMED = "fountain-P11"
+"""Of this set, depth maps, mesh and texture together have to be done in time on two cores."""
+ON_BLACK = ("temple16",)
+"""Sets on a black background, of whose photos less than the bar may show anything."""
+BARS: Mapping[str, tuple[Bar, ...]] = {
+    name: (least("accuracy %", 90.0), least("completeness %", 85.0)) for name in RENDERED
+} | {
+    name: (
+        least("worst coverage %", 75.0 if name in WIDELY_SEEN else 50.0),
+        least("worst PSNR dB", 20.0),
+        most("left out: PSNR lower by dB", 2.0),
+        *((most("seconds together", 90.0),) if name == TIMED else ()),
+        *((least("coverage of not black %", 50.0),) if name in ON_BLACK else ()),
+    )
+    for name in REAL
+}
+"""By photo set: shares of a rendered scene's surface; what a photo's camera sees of the model of a real one."""
+
+
+def asked(rows: Sequence[Row]) -> list[Row]:
+    """One row per bar: what was asked, what was measured, whether it is met."""
+    found = []
+    for row in rows:
+        for bar in BARS.get(row["photos"], ()):
+            value = row.get(bar.column)
+            reached = value is not None and (value <= bar.bound if bar.at_most else value >= bar.bound)
+            found.append({
+                "photos": row["photos"],
+                "asked": f"{bar.column} {'at most' if bar.at_most else 'at least'} {bar.bound:g}",
+                "measured": value,
+                "met": "not measured" if value is None else "yes" if reached else "**no**",
+            })  # fmt: skip
+    return found

@@ -1,0 +1,131 @@
+"""Surfaces of `sfm-app`: rendered scenes against their truth, real ones against their photos, and what they cost.
+
+python -m benchmarks.surface DATA --cache CACHE --left-out 3 --parts castle-P19 5 10 19
+python -m benchmarks.surface --sets statue corner --cache CACHE
+python -m benchmarks.surface --sets statue@1 facade@1 corner@1 courtyard --cache CACHE --name surface-fresh
+python -m benchmarks.surface DATA --sets fountain-P11 --cache CACHE --keep --name surface-fountain
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common.command_line import add_pictures, is_wanted, new_parser
+from benchmarks.common.results import RESULTS, Row, document, write
+from benchmarks.surface.measure import against_photos, against_truth, cost, files, left_out
+from benchmarks.surface.photos import placed_photos
+from benchmarks.surface.pictures import model_page, save_page
+from benchmarks.surface.report import page
+from benchmarks.surface.sets import REAL, RENDERED, SurfaceSet, dense_stages, finished_model, part_of, surface_set
+from benchmarks.surface.worker import run_stages
+from sfm_app.cli.options import assigned
+from sfm_app.settings import Settings, merged
+from sfm_app.synthetic.pictures import prepare_model
+
+ABOUT = (
+    "Photos only, through the whole program. Rendered scenes: the mesh is moved onto the truth by the camera centers; "
+    "accuracy: share of its area within 0.5 % of the scene's size of the true surface (size: diagonal of the box "
+    "around all that the photos see); completeness: share of the area of the true surface that two photos see (in the "
+    "photo, not hidden, at less than 80 degrees) with mesh within 1 %; F: harmonic mean; median: of the distances, in "
+    "% of the size. sparse: COLMAP's Poisson surface through the sparse points of the same run, under the trimming "
+    "that suits it best. Real photos: the finished model is rendered into the camera of every photo that has a place, "
+    "lens and all; coverage: share of the photo's pixels that show it; PSNR: on those, after a gain and an offset per "
+    "channel; means over the photos, and the worst photo. left out: photos whose texture was made without them, "
+    "geometry kept; PSNR in them, and how much lower it is than with them. Seconds as in the manifest; MB: most "
+    "memory of a process that did nothing but that stage; together: all stages behind the cameras but the files."
+)
+
+
+def measure(photos: SurfaceSet, out: Path, args: argparse.Namespace) -> Row:
+    """Everything about one set."""
+    again = () if args.keep else dense_stages()
+    said = run_stages(photos.photos, out, ("scene", *dense_stages()), args.settings, again)
+    row: Row = {"photos": photos.name, "method": "sfm-app", **cost(said), "of": photos.count}
+    if row["failed"]:
+        return row
+    settings = Settings.from_mapping(args.settings)
+    model = finished_model(photos.photos, out, settings)
+    names = list(placed_photos(out))
+    row |= {"placed": len(names), "triangles": len(model.surface.faces), **files(out)}
+    row["texture pages"] = len(model.texture.pages) if model.texture else 0
+    row["seconds per photo"] = round(row["seconds together"] / len(names), 2)
+    prepared = prepare_model(model)
+    if is_wanted(args.pictures, photos.name):
+        save_page(model_page(out, names[len(names) // 2], prepared), args.results / f"{args.name}-{photos.name}.png")
+    if photos.truth is not None:
+        return row | against_truth(model.surface, out, photos.truth)
+    row |= against_photos(prepared, out, names)
+    if args.left_out:
+        row |= left_out(photos, out, prepared, args.settings, count=args.left_out, geometry_too=args.geometry_too)
+    return row
+
+
+def measure_parts(whole: SurfaceSet, counts: Sequence[int], cache: Path, settings: Mapping[str, Any]) -> list[Row]:
+    """What more and more photos of a set cost."""
+    rows = []
+    for count in counts:
+        part = part_of(whole, count, cache)
+        out = cache / "surface" / f"{whole.name}-{count}"
+        said = run_stages(part.photos, out, ("scene", *dense_stages()), settings, dense_stages())
+        row: Row = {"photos": part.name, "method": "sfm-app", **cost(said), "of": count}
+        if not row["failed"]:
+            placed = len(placed_photos(out))
+            row |= {"placed": placed, "seconds per photo": round(row["seconds together"] / placed, 2)}
+        rows.append(row)
+        print(json.dumps(row), file=sys.stderr, flush=True)
+    return rows
+
+
+def parser() -> argparse.ArgumentParser:
+    """Give the command line."""
+    parser = new_parser("surface", __doc__)
+    parser.add_argument("data", type=Path, nargs="?", help="folder with NAME/images; rendered scenes need none")
+    parser.add_argument("--cache", type=Path, help="keeps rendered photos and the last run of every set")
+    parser.add_argument("--sets", nargs="*", metavar="SET", help="rendered scenes and names in DATA; all by default")
+    parser.add_argument("--left-out", type=int, default=0, metavar="N", help="photos of each set left out in turn")
+    parser.add_argument("--geometry-too", action="store_true", help="left out of depth maps and mesh, too")
+    parser.add_argument(
+        "--parts", nargs="+", default=[], metavar=("SET", "COUNT"), help="cost of the first COUNT photos"
+    )
+    parser.add_argument("--keep", action="store_true", help="do not do stages again that are up to date")
+    parser.add_argument("--set", dest="assignments", nargs="*", default=[], metavar="TABLE.KEY=VALUE")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    parser.add_argument("--name", default="surface", help="name of the result files")
+    add_pictures(parser, "sets")
+    return parser
+
+
+def arguments() -> argparse.Namespace:
+    """Read the command line, with the sets that are meant and the settings."""
+    args = parser().parse_args()
+    if args.sets is None:
+        args.sets = [*RENDERED, *(REAL if args.data else ())]
+    args.settings = {}
+    for assignment in args.assignments:
+        args.settings = merged(args.settings, assigned(assignment))
+    return args
+
+
+def main() -> None:
+    """Measure all sets, and publish."""
+    args = arguments()
+    with tempfile.TemporaryDirectory(prefix="surface-") as scratch:
+        cache = (args.cache or Path(scratch)).resolve()
+        rows = []
+        for name in args.sets:
+            rows.append(measure(surface_set(name, args.data, cache), cache / "surface" / name, args))
+            print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
+        parts = []
+        if args.parts:
+            whole = surface_set(args.parts[0], args.data, cache)
+            parts = measure_parts(whole, [int(count) for count in args.parts[1:]], cache, args.settings)
+    options = {"settings": args.settings, "left_out": args.left_out, "geometry_too": args.geometry_too}
+    found = document("surface", ABOUT, options, {"sets": list(args.sets), "parts": args.parts}, [*rows, *parts])
+    drawn = [row["photos"] for row in rows if not row["failed"] and is_wanted(args.pictures, row["photos"])]
+    text = page(ABOUT, rows, parts, {name: f"{args.name}-{name}.png" for name in drawn})
+    write(args.results, args.name, found, text)
+    print(text)

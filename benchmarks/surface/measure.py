@@ -1,0 +1,109 @@
+"""The figures of one photo set: cost, files, distance to the truth, likeness to the photos."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+from benchmarks.common.results import Row
+from benchmarks.surface.photos import (
+    Likeness,
+    leave_out,
+    likeness,
+    photo_scores,
+    placed_photo,
+    placed_photos,
+    rendered,
+    spread_out,
+)  # fmt: skip
+from benchmarks.surface.sets import SurfaceSet, dense_stages, finished_model
+from benchmarks.surface.sparse_poisson import sparse_surfaces
+from benchmarks.surface.truth import seen_places, truth_scores
+from benchmarks.surface.worker import Said, run_stages
+from sfm_app.settings import Settings
+from sfm_app.synthetic.photo_folder import Truth
+from sfm_app.synthetic.pictures import PreparedModel, prepare_model
+from sfm_app.types import Surface
+
+FILES = ("glb", "ply", "obj")
+
+
+def cost(said: Mapping[str, Said]) -> Row:
+    """Seconds and memory of the stages behind the cameras, and why they stopped where they did."""
+    failed = next((one.failed for one in said.values() if one.failed), "")
+    row: Row = {"failed": failed, "seconds together": None}
+    for stage in dense_stages():
+        if stage in said:
+            row |= {f"s of {stage}": said[stage].seconds, f"MB {stage}": said[stage].peak_mb}
+    if not failed:
+        timed = [said[stage].seconds or 0.0 for stage in dense_stages() if stage != "files"]
+        row["seconds together"] = round(sum(timed), 1)
+    return row
+
+
+def files(out: Path) -> Row:
+    """Sizes of the model files in kB."""
+    found = {suffix: out / f"model.{suffix}" for suffix in FILES}
+    return {f"kB {suffix}": path.stat().st_size // 1000 for suffix, path in found.items() if path.exists()}
+
+
+def against_truth(surface: Surface, out: Path, truth: Truth) -> Row:
+    """Ours, and the best of what the sparse points give."""
+    centers = {name: image.projection_center() for name, image in placed_photos(out).items()}
+    seen = seen_places(truth)
+    row = truth_scores(surface, centers, truth, seen)
+    row["completeness of 3 photos %"] = truth_scores(surface, centers, truth, seen_places(truth, 3))["completeness %"]
+    rivals = [
+        truth_scores(found, centers, truth, seen) | {"trim": trim}
+        for trim, found in sparse_surfaces(out / "sparse")
+        if len(found.faces)
+    ]
+    best = max(rivals, key=lambda rival: rival["F %"], default={})
+    return row | {f"sparse: {name}": value for name, value in best.items()}
+
+
+def against_photos(model: PreparedModel, out: Path, names: Sequence[str]) -> Row:
+    """Means over all photos that have a place."""
+    return photo_scores(likenesses(model, out, names))
+
+
+def likenesses(model: PreparedModel, out: Path, names: Sequence[str]) -> dict[str, Likeness]:
+    """By photo."""
+    found = {}
+    for name in names:
+        photo = placed_photo(out, name)
+        found[name] = likeness(rendered(model, photo), photo.pixels)
+    return found
+
+
+def left_out(
+    photos: SurfaceSet, out: Path, model: PreparedModel, settings: Mapping[str, Any], *, count: int, geometry_too: bool
+) -> Row:
+    """PSNR in photos that the texture was made without, and by how much it is lower than with them."""
+    names = spread_out(list(placed_photos(out)), count)
+    with_it = likenesses(model, out, names)
+    values, lower = [], []
+    for name in names:
+        target = out.with_name(f"{out.name}-left-out")
+        first = leave_out(out, target, name, geometry_too=geometry_too)
+        stages = dense_stages()[:-1]
+        if first not in stages:
+            return {"left out": f"there is no stage {first}"}
+        stages = stages[stages.index(first) :]
+        said = run_stages(photos.photos, target, stages, settings, again=stages)
+        if any(one.failed for one in said.values()):
+            return {"left out": next(one.failed for one in said.values() if one.failed)}
+        without = prepare_model(finished_model(photos.photos, target, Settings.from_mapping(settings)))
+        # the camera is that of the finished run, in whose frame the copy stands
+        psnr = likenesses(without, out, [name])[name].psnr_db
+        if math.isfinite(psnr) and math.isfinite(with_it[name].psnr_db):
+            values.append(psnr)
+            lower.append(with_it[name].psnr_db - psnr)
+    if not values:
+        return {"left out": "no photo is covered enough"}
+    return {
+        "left out": f"{len(values)} of {len(placed_photos(out))}",
+        "left out: PSNR dB": round(fmean(values), 2),
+        "left out: PSNR lower by dB": round(fmean(lower), 2),
+    }

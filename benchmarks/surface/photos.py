@@ -1,0 +1,137 @@
+"""A finished model beside the photos it was made of: how much of them it covers, and how alike it is there."""
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from benchmarks.common.results import Row
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.model import part_of
+from sfm_app.synthetic.pictures import Picture, PreparedModel, view_along
+
+Pixels = NDArray[np.uint8]
+FloatArray = NDArray[np.float64]
+BLACK = 32
+"""Gray level below which a pixel of a photo on black shows nothing."""
+LEAST_PIXELS = 1000
+"""Covered pixels that a photo's likeness is judged by."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedPhoto:
+    """A photo with its camera as it was found, lens and all."""
+
+    name: str
+    pixels: Pixels
+    """(H, W, 3) RGB."""
+    center: FloatArray
+    """(3,) of the camera."""
+    rays: FloatArray
+    """(H, W, 3) directions in the world that the pixels see."""
+
+
+@dataclass(frozen=True, slots=True)
+class Likeness:
+    """A model rendered into a photo's camera beside that photo."""
+
+    coverage: float
+    """Share of the pixels that show the model, 0..1."""
+    not_black: float
+    """Share of the photo's pixels that are not black: on a black background nothing can be seen."""
+    coverage_not_black: float
+    """Share of those that show the model."""
+    psnr_db: float
+    """On the covered pixels after the rendering's exposure is adjusted; nan where next to nothing is covered."""
+
+
+def placed_photos(out: Path) -> dict[str, "pycolmap.Image"]:
+    """Photos of the finished run that have a place, by name."""
+    model = pycolmap.Reconstruction(out / "sparse")
+    return {image.name: image for image in sorted(model.images.values(), key=lambda i: i.name) if image.has_pose}
+
+
+def placed_photo(out: Path, name: str) -> PlacedPhoto:
+    """One of them with its pixels and its rays."""
+    model = pycolmap.Reconstruction(out / "sparse")
+    image = next(image for image in model.images.values() if image.name == name)
+    camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
+    pixels = np.asarray(Image.open(out / "photos" / name).convert("RGB"))
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    plane = np.asarray(camera.cam_from_img(np.column_stack([x.ravel(), y.ravel()])), np.float64).reshape(-1, 2)
+    rays = np.column_stack([plane, np.ones(len(plane))]) @ pose[:, :3]
+    return PlacedPhoto(name, pixels, -pose[:, :3].T @ pose[:, 3], rays.reshape(camera.height, camera.width, 3))
+
+
+def rendered(model: PreparedModel, photo: PlacedPhoto) -> Picture:
+    """The model as that photo's camera sees it."""
+    return view_along(model, photo.center, photo.rays)
+
+
+def likeness(picture: Picture, photo: Pixels) -> Likeness:
+    """How much of a photo a rendering (of the same size) covers, and how alike they are there."""
+    covered, lit = picture.covered, photo.max(axis=2) >= BLACK
+    psnr = float("nan")
+    if covered.sum() >= LEAST_PIXELS:
+        psnr = psnr_db(picture.colors[covered], photo[covered])
+    on_lit = float(covered[lit].mean()) if lit.any() else 0.0
+    return Likeness(float(covered.mean()), float(lit.mean()), on_lit, psnr)
+
+
+def psnr_db(rendering: Pixels, photo: Pixels) -> float:
+    """Peak signal-to-noise ratio of colors (N, 3) after a gain and an offset per channel took out the exposure."""
+    squares = []
+    for a, b in zip(rendering.T.astype(np.float64), photo.T.astype(np.float64), strict=True):
+        spread = a.var()
+        gain = np.mean((a - a.mean()) * (b - b.mean())) / spread if spread > 0 else 0.0
+        squares.append(np.mean((gain * (a - a.mean()) - (b - b.mean())) ** 2))
+    return float(10.0 * np.log10(255.0**2 / max(float(np.mean(squares)), 1e-9)))
+
+
+def photo_scores(found: Mapping[str, Likeness]) -> Row:
+    """Means over the photos, and the worst of them."""
+    coverage = [100.0 * one.coverage for one in found.values()]
+    psnr = [one.psnr_db for one in found.values() if np.isfinite(one.psnr_db)]
+    return {
+        "coverage %": round(fmean(coverage), 1),
+        "worst coverage %": round(min(coverage), 1),
+        "not black %": round(100.0 * fmean(one.not_black for one in found.values()), 1),
+        "coverage of not black %": round(100.0 * fmean(one.coverage_not_black for one in found.values()), 1),
+        "PSNR dB": round(fmean(psnr), 2) if psnr else None,
+        "worst PSNR dB": round(min(psnr), 2) if psnr else None,
+    }
+
+
+def spread_out(names: list[str], count: int) -> list[str]:
+    """So many of the names, evenly from first to last, without the ends where others are there."""
+    if count >= len(names):
+        return names
+    return [names[round(place)] for place in (np.arange(count) + 0.5) / count * (len(names) - 1)]
+
+
+def leave_out(out: Path, target: Path, name: str, *, geometry_too: bool) -> str:
+    """Copy a finished run and take a photo's place away, as if it had never been found.
+
+    Args:
+        out: the finished run.
+        target: the copy; what lies there is removed.
+        name: of the photo.
+        geometry_too: whether depth maps and mesh have to do without it as well, or the texture only.
+
+    Returns:
+        The stage from which on the program has to run again.
+    """
+    shutil.rmtree(target, ignore_errors=True)
+    skipped = shutil.ignore_patterns("dense") if geometry_too else None
+    shutil.copytree(out, target, symlinks=True, ignore=skipped)
+    places = [target / "sparse"] + ([] if geometry_too else [target / "dense" / "sparse"])
+    for folder in places:
+        model = pycolmap.Reconstruction(folder)
+        others = [image.image_id for image in model.images.values() if image.has_pose and image.name != name]
+        part_of(model, others).write(folder)
+    return "depth_maps" if geometry_too else "texture"

@@ -1,0 +1,47 @@
+"""Surfaces as a page."""
+
+from collections.abc import Mapping, Sequence
+
+from benchmarks.common.results import Row, table
+from benchmarks.surface.bars import asked
+
+TRUTH = (
+    "photos", "placed", "triangles", "accuracy %", "completeness %", "F %", "median %", "within 0.1 %",
+    "completeness of 3 photos %", "sparse: accuracy %", "sparse: completeness %", "sparse: F %", "sparse: median %",
+    "sparse: trim",
+)  # fmt: skip
+PHOTOS = (
+    "photos", "placed", "triangles", "texture pages", "coverage %", "worst coverage %", "not black %",
+    "coverage of not black %",
+    "PSNR dB", "worst PSNR dB", "left out", "left out: PSNR dB", "left out: PSNR lower by dB",
+)  # fmt: skip
+COST = ("photos", "placed", "seconds together", "seconds per photo")
+
+
+def page(about: str, rows: Sequence[Row], parts: Sequence[Row], files_of: Mapping[str, str]) -> str:
+    """Bars first, then all figures; at last the pictures that were drawn, by set."""
+    columns = list(dict.fromkeys(key for row in (*rows, *parts) for key in row))
+    stages = [key for key in columns if key.startswith(("s of ", "MB "))]
+    files = [key for key in columns if key.startswith("kB ")]
+    found = [
+        f"# Surfaces\n\n{about}\n",
+        f"## Asked and measured\n\n{table(asked(rows))}" if asked(rows) else "",
+        _part("Rendered scenes, against the true surface", [row for row in rows if "accuracy %" in row], TRUTH),
+        _part("Real photos, against the model rendered into their cameras", _seen(rows), PHOTOS),
+        _part("Seconds, memory, files", rows, (*COST, *stages, *files)),
+        _part("The same set with fewer and more photos", parts, (*COST, *stages)),
+        _part("Failed", [row for row in rows if row["failed"]], ("photos", "failed")),
+    ]
+    pictures = [f"![{name}]({file})" for name, file in files_of.items()]
+    if pictures:
+        found.append("## Pictures\n\nA photo, the model from its camera, from beside it, and its bare shape.\n")
+    return "\n".join([*(part for part in found if part), *pictures, ""])
+
+
+def _seen(rows: Sequence[Row]) -> list[Row]:
+    return [row for row in rows if "coverage %" in row]
+
+
+def _part(title: str, rows: Sequence[Row], columns: Sequence[str]) -> str:
+    known = [name for name in columns if any(row.get(name) not in (None, "") for row in rows)]
+    return f"## {title}\n\n{table(rows, known)}" if rows else ""

@@ -1,0 +1,81 @@
+"""Photo sets to make surfaces of: rendered ones with their truth, real ones, parts of them; and the finished model."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.common.photo_sets import FORMATS, put
+from sfm_app.api import opened_run
+from sfm_app.pipeline import NAMES, run_stages
+from sfm_app.settings import Settings
+from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
+from sfm_app.synthetic.scenes import WALKS, build_scene, scene_views
+from sfm_app.types.model import Model
+
+RENDERED = ("statue", "facade", "corner")
+REAL = ("fountain-P11", "Herz-Jesus-P8", "castle-P19", "temple16", "kermit11")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceSet:
+    """Photos of one place."""
+
+    name: str
+    photos: Path
+    truth: Truth | None
+    """Of rendered photos."""
+
+    @property
+    def count(self) -> int:
+        """Number of photos."""
+        return sum(path.suffix.lower() in FORMATS for path in self.photos.iterdir())
+
+
+def surface_set(name: str, data: Path | None, cache: Path) -> SurfaceSet:
+    """A scene of the program's own, rendered once into the cache, or DATA/NAME/images.
+
+    Args:
+        name: of a scene, SCENE@SEED for another walk and other noise, or of a folder.
+        data: folder of folders.
+        cache: for what is rendered.
+
+    Raises:
+        ValueError: neither is there.
+    """
+    scene, _, seed = name.partition("@")
+    if scene in WALKS:
+        folder = cache / "rendered" / name
+        return SurfaceSet(name, folder / "photos", _rendered(scene, int(seed or 0), folder))
+    if data is None or not (data / name / "images").is_dir():
+        raise ValueError(f"'{name}' is neither a rendered scene ({', '.join(WALKS)}) nor a folder of DATA")
+    return SurfaceSet(name, data / name / "images", None)
+
+
+def part_of(whole: SurfaceSet, count: int, cache: Path) -> SurfaceSet:
+    """The first photos of a set."""
+    folder = cache / "parts" / f"{whole.name}-{count}"
+    folder.mkdir(parents=True, exist_ok=True)
+    photos = sorted(path for path in whole.photos.iterdir() if path.suffix.lower() in FORMATS)
+    for photo in photos[:count]:
+        put(photo, folder)
+    return SurfaceSet(f"{whole.name} first {count}", folder, None)
+
+
+def finished_model(photos: Path, out: Path, settings: Settings) -> Model:
+    """The textured surface that a finished run holds; with colors of the vertices where there is no texture."""
+    last = "texture" if "texture" in NAMES else "mesh"
+    with opened_run(out, settings, None) as run:
+        found = run_stages(photos, run, last=last)(last)
+    return found if isinstance(found, Model) else Model(found)
+
+
+def dense_stages() -> Sequence[str]:
+    """The stages behind the cameras, in order."""
+    return NAMES[NAMES.index("scene") + 1 :]
+
+
+def _rendered(name: str, seed: int, folder: Path) -> Truth:
+    if not (folder / "truth.json").exists():  # written last
+        options = PhotoOptions(seed=seed)
+        save_truth(write_photo_folder(folder / "photos", build_scene(name), scene_views(name, seed), options), folder)
+    return load_truth(folder)

@@ -1,0 +1,84 @@
+"""A surface against the true one: how much of it is right, and how much of what was seen is there."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.common.results import Row
+from sfm_app.synthetic.cameras import camera_center
+from sfm_app.synthetic.compare import align_centers, sample_surface, sample_triangles, scene_size, surface_distances
+from sfm_app.synthetic.photo_folder import Truth
+from sfm_app.synthetic.render import cast, ray_caster
+from sfm_app.types import Surface
+
+FloatArray = NDArray[np.float64]
+ACCURATE, COMPLETE, FINE = 0.005, 0.01, 0.001
+"""Distances that count as right, as there, and as right in detail, in sizes of the scene."""
+SAMPLES = 40_000
+"""Points that a surface is judged by, evenly over its area."""
+SEEN_BY = 2
+"""Photos that have to see a place before a surface can be asked for: depth takes two."""
+GRAZING_DEG = 80.0
+"""A place seen at more than this angle to its normal is not seen."""
+HIDDEN = 2e-3
+"""How far behind what a photo sees first a place counts as seen by it, in sizes of the scene."""
+
+
+def truth_scores(surface: Surface, centers: Mapping[str, FloatArray], truth: Truth, seen: FloatArray) -> Row:
+    """Accuracy, completeness, their harmonic mean, the median distance, the share that is right in detail; in percent.
+
+    Args:
+        surface: in the frame of the reconstruction; moved onto the truth by the camera centers.
+        centers: (3,) by photo name in that frame.
+        truth: of the rendered photos.
+        seen: (N, 3) places of the true surface from `seen_places`.
+    """
+    names = ("accuracy %", "completeness %", "F %", "median %", "within 0.1 %")
+    if not len(surface.faces):
+        return dict.fromkeys(names)
+    size, aligned = scene_size(truth), align_centers(centers, truth)(surface.vertices)
+    to_truth = surface_distances(sample_surface(aligned, surface.faces, SAMPLES), truth.vertices, truth.faces) / size
+    to_found = surface_distances(seen, aligned, surface.faces) / size
+    accuracy, completeness = float(np.mean(to_truth <= ACCURATE)), float(np.mean(to_found <= COMPLETE))
+    both = 2.0 * accuracy * completeness / max(accuracy + completeness, 1e-9)
+    values = (accuracy, completeness, both, float(np.median(to_truth)), float(np.mean(to_truth <= FINE)))
+    return {name: round(100.0 * value, 3) for name, value in zip(names, values, strict=True)}
+
+
+def seen_places(truth: Truth, photos: int = SEEN_BY, samples: int = 3 * SAMPLES) -> FloatArray:
+    """Places of the true surface, evenly over its area, that so many photos see: in the photo, in front, not hidden.
+
+    Args:
+        truth: of the rendered photos.
+        photos: least number of photos.
+        samples: over the whole surface, with what nobody sees.
+    """
+    caster = ray_caster(truth.vertices, truth.faces)
+    places, normals = _with_normals(truth, samples)
+    slack = HIDDEN * scene_size(truth)
+    counted = np.zeros(len(places), np.int64)
+    for name, pose in truth.cam_from_world.items():
+        center, camera = camera_center(pose), truth.cameras[name]
+        x = places @ pose[:, :3].T + pose[:, 3]
+        plane = x[:, :2] / np.maximum(x[:, 2:], 1e-9)
+        plane = plane * (1.0 + camera.radial * (plane**2).sum(axis=1, keepdims=True))
+        pixel = plane * np.diag(camera.K)[:2] + camera.K[:2, 2]
+        within = (x[:, 2] > 0) & ((pixel >= 0) & (pixel <= [camera.width, camera.height])).all(axis=1)
+        ways = places - center
+        distance = np.linalg.norm(ways, axis=1)
+        facing = -(ways * normals).sum(axis=1) > np.cos(np.radians(GRAZING_DEG)) * distance
+        asked = np.flatnonzero(within & facing)
+        # the ways are as long as the distance, so that t_hit counts in them
+        first = cast(caster, center, ways[asked])["t_hit"].astype(np.float64) * distance[asked]
+        counted[asked[first >= distance[asked] - slack]] += 1
+    return places[counted >= photos]
+
+
+def _with_normals(truth: Truth, samples: int) -> tuple[FloatArray, FloatArray]:
+    """Points on the surface and the normals of their triangles."""
+    places, face = sample_triangles(truth.vertices, truth.faces, samples)
+    corners = truth.vertices[truth.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    unit = cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-12)
+    return places, unit[face]

@@ -1,0 +1,1 @@
+"""The figures of the thesis from our own estimators and calibrators."""

@@ -1,0 +1,125 @@
+"""All calibrators on the same trials of an experiment: errors, answers and times per level."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+import sfm_app
+from benchmarks.common.results import Row
+from benchmarks.thesis.chapter5.fits import Fits, FloatArray
+from benchmarks.thesis.chapter5.panels import rounded
+from benchmarks.thesis.chapter5.setups import Trial
+from sfm_app.selfcal import pair_weights
+from sfm_app.types import Calibration
+
+PRODUCTION = "zero-curves"
+WITHOUT_LENS = "zero-curves without a lens"
+"""The same with `calibration.lens = false`: the camera model of the truth that comes with the VGG sequences."""
+ZERO_CURVES, MULTI_START, PERTURBATION = "zero-curves-thesis", "multi-start", "perturbation"
+GEOMETRIC, NON_ROBUST, KRUPPA = "geometric", "huang-faugeras", "kruppa"
+METHODS = (PRODUCTION, ZERO_CURVES, MULTI_START, PERTURBATION, GEOMETRIC, NON_ROBUST, KRUPPA)
+CAP_PERCENT = 200.0
+"""An answer counts as this far off at most, so that one that ran away does not decide a mean."""
+
+Experiment = Callable[[int], Iterator[Trial]]
+
+
+class Attempt(NamedTuple):
+    """One answer of one calibrator."""
+
+    method: str
+    x: float
+    K: FloatArray | None
+    """(3, 3) found camera matrix; None where there is no answer."""
+    true_K: FloatArray
+    ms: float
+
+
+def ask(method: str, fits: Fits, size: tuple[int, int], seed: int) -> Calibration:
+    """A calibrator by its name, with all that is known about the pairs."""
+    lens = method != WITHOUT_LENS
+    return sfm_app.calibrate_fundamentals(
+        np.array([fit.F for fit in fits.values()]).reshape(-1, 3, 3),
+        size,
+        method if lens else PRODUCTION,
+        weights=pair_weights([len(fit.matches) for fit in fits.values()]),
+        matches=[fit.matches for fit in fits.values()],
+        photos=list(fits),
+        seed=seed,
+        settings=sfm_app.Settings.from_mapping({"calibration": {"lens": lens}}),
+    )
+
+
+def answer_of(method: str, found: Calibration) -> FloatArray | None:
+    """K; for a method of the thesis, which knows no doubt, also the K that its verdict here holds back."""
+    if found.identifiable:
+        return found.K
+    told = [found.evidence.get(name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")]
+    if method in (PRODUCTION, WITHOUT_LENS) or None in told:
+        return None
+    fx, fy, cx, cy = told
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def e_focal(K: FloatArray, true_K: FloatArray) -> float:
+    """Thesis 5.5.3: mean error of fx and fy in percent of the truth."""
+    return float(50.0 * sum(abs(K[k, k] / true_K[k, k] - 1.0) for k in (0, 1)))
+
+
+def e_center(K: FloatArray, true_K: FloatArray) -> float:
+    """Thesis 5.5.3, e_OC: mean error of the optical center's x and y in percent of the truth."""
+    return float(50.0 * sum(abs(K[k, 2] / true_K[k, 2] - 1.0) for k in (0, 1)))
+
+
+def attempts(experiment: Experiment, methods: Sequence[str], seed: int) -> list[Attempt]:
+    """All levels of one seed."""
+    found = []
+    for trial in experiment(seed):
+        for method in methods:
+            start = time.perf_counter()
+            answer = ask(method, trial.fits, trial.size, seed)
+            ms = 1e3 * (time.perf_counter() - start)
+            found.append(Attempt(method, trial.x, answer_of(method, answer), trial.K, ms))
+    return found
+
+
+def contest(experiment: Experiment, tests: dict[str, int], seed: int, pool: Executor, title: str) -> list[Row]:
+    """One row per method and level.
+
+    Args:
+        experiment: yields the trials of a seed; it must survive pickling.
+        tests: number of seeds per method.
+        seed: the first of them.
+        pool: where seeds are tried side by side; the result does not depend on it, but for the times.
+        title: shown while it runs.
+    """
+    seeds = range(max(tests.values(), default=0))
+    lists = [[name for name, count in tests.items() if n < count] for n in seeds]
+    start = time.perf_counter()
+    jobs = [pool.submit(partial(attempts, experiment, names, seed + n)) for n, names in zip(seeds, lists, strict=True)]
+    found = [attempt for job in jobs for attempt in job.result()]
+    print(f"{title}: {len(seeds)} seeds in {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
+    levels = sorted({attempt.x for attempt in found})
+    return [
+        summary(name, x, [attempt for attempt in found if attempt.method == name and attempt.x == x])
+        for name in tests
+        for x in levels
+    ]
+
+
+def summary(method: str, x: float, tries: Sequence[Attempt]) -> Row:
+    """Mean and median errors over the answers, and how many there are."""
+    answers = [(attempt.K, attempt.true_K) for attempt in tries if attempt.K is not None]
+    row: Row = {"method": method, "x": rounded(x), "tests": len(tries), "answered": len(answers) / max(len(tries), 1)}
+    for title, error in (("e_focal", e_focal), ("e_OC", e_center)):
+        errors = [min(error(K, true_K), CAP_PERCENT) for K, true_K in answers]
+        row[title] = rounded(float(np.mean(errors))) if errors else None
+        row[f"{title} median"] = rounded(float(np.median(errors))) if errors else None
+    for name, entry in (("fx", (0, 0)), ("fy", (1, 1)), ("cx", (0, 2)), ("cy", (1, 2))):
+        row[name] = rounded(float(np.median([K[entry] for K, _ in answers]))) if answers else None
+    return row | {"ms": rounded(float(np.median([attempt.ms for attempt in tries])), 4) if tries else None}

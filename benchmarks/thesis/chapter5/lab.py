@@ -1,0 +1,91 @@
+"""What the figures of chapter 5 draw from: data, experiments that several of them share, a folder for the results."""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common.command_line import is_wanted
+from benchmarks.common.figures import pyplot, save
+from benchmarks.common.results import Row, write_csv
+from benchmarks.thesis.chapter5.contests import Experiment, contest
+from benchmarks.thesis.chapter5.sequences import CORNERS, ImageSequence, corner_sequence, photo_sequence
+from benchmarks.thesis.claims import Claim
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A figure or table that is finished."""
+
+    claims: Sequence[Claim] = ()
+    rows: Sequence[Row] = ()
+    """For the JSON document."""
+    note: str = ""
+    """What a reader must know to read it."""
+    tables: str = ""
+    """Markdown below the note."""
+
+
+@dataclass(eq=False)
+class Lab:
+    """The run as a whole."""
+
+    data: Path
+    cache: Path
+    results: Path
+    methods: Sequence[str]
+    tests: int
+    """Seeds per level of a figure."""
+    runs: int
+    """Seeds per sequence of the tables."""
+    most: Mapping[str, int]
+    """At most so many of both for methods that take far longer than the others."""
+    seed: int
+    pool: Executor
+    pictures: Sequence[str] | None = None
+    """Figures that are asked for; none, or where empty all."""
+    _sequences: dict[str, ImageSequence] = field(default_factory=dict)
+    _contests: dict[str, list[Row]] = field(default_factory=dict)
+
+    def sequence(self, name: str) -> ImageSequence:
+        """A real sequence by the thesis's name."""
+        if name not in self._sequences:
+            found = corner_sequence(self.data, name) if name in CORNERS else photo_sequence(self.data, name, self.cache)
+            self._sequences[name] = found
+        return self._sequences[name]
+
+    def contest(
+        self,
+        experiment: Callable[..., Any],
+        sequence: str = "",
+        tests: int | None = None,
+        also: Mapping[str, str] | None = None,
+    ) -> list[Row]:
+        """The rows of an experiment of `setups`; each is run once. `also`: more methods, tested as often as others."""
+        title = f"{experiment.__name__} {sequence}".strip()
+        if title not in self._contests:
+            count = self.tests if tests is None else tests
+            each = {name: min(count, self.most.get(name, count)) for name in self.methods}
+            each |= {name: each[like] for name, like in (also or {}).items() if like in each}
+            bound: Experiment = partial(experiment, self.sequence(sequence)) if sequence else experiment
+            self._contests[title] = contest(bound, each, self.seed, self.pool, title)
+        return self._contests[title]
+
+    @property
+    def fewer(self) -> str:
+        """The methods that have fewer tests or runs, for people."""
+        most = max(self.tests, self.runs)
+        return (
+            ", ".join(f"at most {count} of `{name}`" for name, count in self.most.items() if count < most) or "of all"
+        )
+
+    def keep(self, number: str, figure: Any, rows: Sequence[Row]) -> None:
+        """Write the PNG and the CSV of a figure, where it is asked for."""
+        if not is_wanted(self.pictures, number):
+            pyplot().close(figure)
+            return
+        save(figure, self.results, f"chapter5-figure-{number}")
+        if rows:
+            write_csv(self.results, f"chapter5-figure-{number}", rows)

@@ -1,0 +1,66 @@
+"""Plots side by side, and what they show as rows for a CSV file."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.common.figures import label, pyplot
+from benchmarks.common.results import Row
+
+Values = Sequence[float] | NDArray[np.float64]
+
+
+class Panel(NamedTuple):
+    """Lines over one axis."""
+
+    title: str
+    x: Values
+    lines: Mapping[str, Values]
+    truth: Sequence[float] = ()
+    """Where the right answers lie on the x axis."""
+
+
+def draw(panels: Sequence[Panel], x: str, y: str, *, log: bool = False, columns: int = 0) -> Any:
+    """A figure with the panels in rows of `columns`, or in one row.
+
+    There is a legend in the first panel, and in each whose lines have other names.
+    """
+    across = columns or len(panels)
+    down = -(-len(panels) // across)
+    figure, axes = pyplot().subplots(
+        down, across, figsize=((4.6 if across < 3 else 3.6) * across, 3.3 * down), squeeze=False
+    )
+    for n, (axis, panel) in enumerate(zip(axes.ravel(), panels, strict=True)):
+        for k, (name, values) in enumerate(panel.lines.items()):
+            # a line that an earlier one may hide is thinner and dashed
+            axis.plot(
+                panel.x, values, "--" if k > 1 else "-", label=name, color=f"C{k}", linewidth=2.0 - 0.4 * min(k, 2)
+            )
+        for k, truth in enumerate(panel.truth):
+            axis.axvline(truth, color="0.35", linestyle=":", label="" if k else "truth")
+        label(axis, x, y if n % across == 0 else "", panel.title, log=log)
+        if n == 0 or list(panel.lines) != list(panels[0].lines):
+            axis.legend()
+    return figure
+
+
+def rows_of(panels: Sequence[Panel]) -> list[Row]:
+    """One row per point of every line, to six digits."""
+    return [
+        {"panel": panel.title, "line": name, "x": rounded(x), "y": rounded(y)}
+        for panel in panels
+        for name, values in panel.lines.items()
+        for x, y in zip(panel.x, values, strict=True)
+    ]
+
+
+def lowest(panel: Panel, line: str) -> float:
+    """The x of the lowest point of a line."""
+    return float(panel.x[int(np.nanargmin(panel.lines[line]))])
+
+
+def rounded(value: float, digits: int = 6) -> float:
+    """As many significant digits as anyone will read."""
+    return float(f"{value:.{digits}g}")

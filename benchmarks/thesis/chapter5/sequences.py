@@ -1,0 +1,98 @@
+"""The image sequences of thesis section 5.9 that we have: matches, size and true camera matrices."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import rq
+
+from benchmarks.common.metrics import load_truth
+from benchmarks.thesis.corners import load_corners
+from sfm_app.api import opened_run
+from sfm_app.pipeline import run_stages
+from sfm_app.settings import Settings
+from sfm_app.types import MatchGraph, ViewGraph
+from sfm_app.types.matches import PairId
+
+FloatArray = NDArray[np.float64]
+LEAST_CORNERS = 20
+"""Views that share fewer corners make no pair."""
+CORNERS = {
+    "Corridor": ("Corridor", (512, 512)),
+    "Wadham": ("Wadham-College", (1024, 768)),
+    "Merton1": ("Merton-College-I", (1024, 768)),
+    "Merton2": ("Merton-College-II", (1024, 768)),
+    "Merton3": ("Merton-College-III", (1024, 768)),
+}
+"""Folder under vgg-corners, and the photos' width and height in pixels."""
+PHOTOS = {"Castle-P19": "castle-P19", "Fountain-P11": "fountain-P11"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImageSequence:
+    """Photos of one scene."""
+
+    name: str
+    size: tuple[int, int]
+    Ks: FloatArray
+    """(V, 3, 3) true camera matrix per view."""
+    matches: Mapping[PairId, FloatArray]
+    """Per pair of views (N, 4) x1, y1, x2, y2 in pixels, as an estimator is given them."""
+    Fs: Mapping[PairId, FloatArray]
+    """True (3, 3) fundamental matrices, unit norm; empty where the cameras of the photos are not needed."""
+
+    @property
+    def K(self) -> FloatArray:
+        """(3, 3) of the first view, which is what Table 5.2 calls the truth."""
+        first: FloatArray = self.Ks[0]
+        return first
+
+    def first(self, count: int) -> "ImageSequence":
+        """The same, of the first views alone."""
+        ids = sorted({view for pair in self.matches for view in pair})[:count]
+        kept = {pair: rows for pair, rows in self.matches.items() if set(pair) <= set(ids)}
+        return replace(self, matches=kept)
+
+
+def corner_sequence(data: Path, name: str) -> ImageSequence:
+    """Corners and cameras of a VGG sequence under DATA/vgg-corners, all of whose pairs are used."""
+    folder, size = data / "vgg-corners" / CORNERS[name][0], CORNERS[name][1]
+    Ps = np.array([np.loadtxt(path) for path in sorted(folder.glob("*.P"))])
+    found = {
+        pair: np.hstack(load_corners(folder, pair[0] + 1, pair[1] + 1)) for pair in combinations(range(len(Ps)), 2)
+    }
+    matches = {pair: rows for pair, rows in found.items() if len(rows) >= LEAST_CORNERS}
+    Fs = {(i, j): fundamental_of(Ps[i], Ps[j]) for i, j in matches}
+    return ImageSequence(name, size, np.array([camera_matrix_of(P) for P in Ps]), matches, Fs)
+
+
+def photo_sequence(data: Path, name: str, cache: Path) -> ImageSequence:
+    """Raw matches of the pairs that the program keeps, found under CACHE/NAME or made there from DATA/NAME/images."""
+    place = data / PHOTOS[name]
+    with opened_run(cache / PHOTOS[name], Settings(), None) as run:
+        products = run_stages(place / "images", run, last="view_graph")
+        graph: MatchGraph = products("match_graph")
+        views: ViewGraph = products("view_graph")
+    matches = {pair: np.hstack(graph.points(pair)) for pair, fit in views.fits.items() if not fit.degeneracy}
+    truth = load_truth(place / "cameras.json")
+    first = next(iter(graph.images.values()))
+    return ImageSequence(name, (first.width, first.height), np.array([K for K, _ in truth.values()]), matches, {})
+
+
+def camera_matrix_of(P: FloatArray) -> FloatArray:
+    """(3, 3) K of a projection matrix P ~ K [R | t] (3, 4), positive diagonal, K[2, 2] = 1."""
+    K, _ = rq(P[:, :3])
+    K = K * np.sign(np.diag(K))
+    return np.asarray(K / K[2, 2])
+
+
+def fundamental_of(P1: FloatArray, P2: FloatArray) -> FloatArray:
+    """(3, 3) F of unit norm with x2' F x1 = 0 (Hartley & Zisserman, eq. 9.1)."""
+    center = np.linalg.svd(P1)[2][-1]
+    e2 = P2 @ center
+    cross = np.array([[0, -e2[2], e2[1]], [e2[2], 0, -e2[0]], [-e2[1], e2[0], 0]])
+    F = cross @ P2 @ np.linalg.pinv(P1)
+    return np.asarray(F / np.linalg.norm(F))

@@ -1,0 +1,1 @@
+"""Rendered folders with random trouble."""
