@@ -18,6 +18,7 @@ from benchmarks.common.metrics import (
     pose_errors_deg,
     position_rms_percent,
 )
+from benchmarks.common.outputs import cameras_after, cameras_before
 from benchmarks.common.photo_sets import Step, changed_camera
 from benchmarks.common.results import Row
 from sfm_app.colmap.backend import pycolmap
@@ -163,19 +164,16 @@ def _place(K: NDArray[np.float64], name: str) -> float:
 
 
 def _stated(out: Path) -> tuple[dict[str, Mapping[str, float]], dict[str, str]]:
-    """What calibration.json says about the refined cameras by name, and names of cameras by photo without suffix."""
-    path = out / "calibration.json"
-    found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"camera_of": {}}
-    camera_of = found.get("refined_camera_of", found["camera_of"])
-    deviations = {name: camera["deviations"] for name, camera in found.get("refined", {}).items()}
+    """Deviations of the refined cameras by name, and names of cameras by photo without suffix."""
+    cameras, camera_of = cameras_after(out)
+    deviations = {name: camera["deviations"] for name, camera in cameras.items()}
     return deviations, {Path(photo).stem: name for photo, name in camera_of.items()}
 
 
 def _calibration(out: Path) -> tuple[dict[str, Any], dict[str, str]]:
     """Cameras by name, and names of cameras by photo without suffix."""
-    path = out / "calibration.json"
-    found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"cameras": {}, "camera_of": {}}
-    return found["cameras"], {Path(photo).stem: name for photo, name in found["camera_of"].items()}
+    cameras, camera_of = cameras_before(out)
+    return cameras, {Path(photo).stem: name for photo, name in camera_of.items()}
 
 
 def times(seconds: Mapping[str, float], *, complete: bool) -> Row:

@@ -12,7 +12,7 @@ from benchmarks.cameras.methods import Method, run
 from benchmarks.cameras.worker import OURS
 from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.results import Row
-from sfm_app.staleness import versions
+from sfm_app.engine.staleness import versions
 
 RECORD = "corpus.json"
 """In OUT: what was run, and what it said."""

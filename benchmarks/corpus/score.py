@@ -1,16 +1,16 @@
 """What a run over a set of the corpus is worth: cameras in stated deviations, walks, and what was said of folds."""
 
-import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.cameras.score import PLACES, Model, TruePhoto, read_models
+from benchmarks.common.outputs import cameras_after, cameras_before
 from benchmarks.common.results import Row
 from benchmarks.corpus.trajectory import offset_errors, order_scores
 
@@ -52,10 +52,8 @@ def parameters(out: Path, truth: Mapping[str, TruePhoto], doubt: Doubt) -> list[
     Before adjustment only cameras that are called identifiable count: the others are guesses, and called so. A camera's
     truth is the median over its photos.
     """
-    path = out / "calibration.json"
-    found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     rows = []
-    for stage in _stages(found):
+    for stage in _stages(out):
         photos = [Path(photo).stem for photo in stage.photos if Path(photo).stem in truth]
         if photos:
             true = np.median([truth[photo].K for photo in photos], axis=0)
@@ -76,18 +74,17 @@ class Stage(NamedTuple):
     identifiable: bool
 
 
-def _stages(found: Mapping[str, Any]) -> Iterator[Stage]:
+def _stages(out: Path) -> Iterator[Stage]:
     """Every camera before adjustment, and after it, where mapping may have divided it."""
-    camera_of = found.get("camera_of", {})
+    cameras, camera_of = cameras_before(out)
     for name, photos in _members(camera_of).items():
-        before = found["cameras"][name]
+        before = cameras[name]
         if before["identifiable"]:
             yield Stage(name, photos, "before", np.array(before["K"]), before.get("spread", {}), identifiable=True)
-    for name, photos in _members(found.get("refined_camera_of", camera_of)).items():
-        after = found.get("refined", {}).get(name)
-        if after is not None:
-            K, deviations = np.array(after["K"]), after.get("deviations", {})
-            yield Stage(name, photos, "after", K, deviations, identifiable=_claimed(K, deviations))
+    cameras, camera_of = cameras_after(out)
+    for name, photos in _members(camera_of).items():
+        K, deviations = np.array(cameras[name]["K"]), cameras[name].get("deviations", {})
+        yield Stage(name, photos, "after", K, deviations, identifiable=_claimed(K, deviations))
 
 
 def _members(camera_of: Mapping[str, str]) -> dict[str, tuple[str, ...]]:

@@ -15,7 +15,7 @@ from benchmarks.common.metrics import load_truth
 from sfm_app.api import opened_run
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import fundamental_from_pose
-from sfm_app.pipeline import run_stages
+from sfm_app.pipeline import MATCH_GRAPH, run_stages
 from sfm_app.settings import Settings
 
 FloatArray = NDArray[np.float64]
@@ -90,7 +90,7 @@ def cached_ratio_matches(data: Path, name: str, cache: Path) -> Path:
         print(f"matching {name}", file=sys.stderr)
         cache.mkdir(parents=True, exist_ok=True)
         with opened_run(cache / name, Settings(), None) as run:
-            graph = run_stages(data / name / "images", run, last="match_graph")("match_graph")
+            graph = run_stages(data / name / "images", run, last=MATCH_GRAPH.name)[MATCH_GRAPH]
         truth = load_truth(data / name / "cameras.json")
         arrays: dict[str, FloatArray] = {}
         for ids in graph.matches:

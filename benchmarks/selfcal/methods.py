@@ -13,7 +13,7 @@ from benchmarks.selfcal import view_graph_calibration as rival
 from sfm_app.api import opened_run
 from sfm_app.calibrating import camera_pairs
 from sfm_app.geometry.camera import camera_matrix
-from sfm_app.pipeline import run_stages
+from sfm_app.pipeline import INTRINSICS, MATCH_GRAPH, VIEW_GRAPH, run_stages
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings, merged
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
@@ -64,8 +64,8 @@ def measured(photos: PhotoSet, cache: Path, seed: int = 0) -> Measured:
     settings = Settings.from_mapping({"seed": seed, "workers": 1, "photos": {"cameras": photos.cameras}})
     out = cache / "out" / photos.folder.name
     with opened_run(out, settings, None) as run:
-        products = run_stages(photos.folder, run, last="view_graph")
-        matches, views = products("match_graph"), products("view_graph")
+        products = run_stages(photos.folder, run, last=VIEW_GRAPH.name)
+        matches, views = products[MATCH_GRAPH], products[VIEW_GRAPH]
         seconds = run.workspace.manifest.read()["stages"]["match_graph"]["seconds"]
     return Measured(photos, out, settings, matches, views, seconds)
 
@@ -74,7 +74,7 @@ def production(subject: Measured, overrides: Mapping[str, object] | None = None,
     """The stage `intrinsics`, with everything that the program does there, under other settings where given."""
     settings = Settings.from_mapping(merged(subject.settings.model_dump(), overrides or {}))
     with opened_run(subject.out, settings, None) as run:
-        found = run_stages(subject.photos.folder, run, first="intrinsics", last="intrinsics")("intrinsics")
+        found = run_stages(subject.photos.folder, run, first=INTRINSICS.name, last=INTRINSICS.name)[INTRINSICS]
         seconds = run.workspace.manifest.read()["stages"]["intrinsics"]["seconds"]
     cameras = {Path(image.name).stem: camera_of(image, found) for image in subject.matches.images.values()}
     return Found(label, cameras, seconds, len(subject.views.fits))

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from benchmarks.common.photo_sets import FORMATS, put
 from sfm_app.api import opened_run
-from sfm_app.pipeline import NAMES, run_stages
+from sfm_app.pipeline import NAMES, SCENE, TEXTURE, run_stages
 from sfm_app.settings import Settings
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.scenes import WALKS, build_scene, scene_views
@@ -63,15 +63,13 @@ def part_of(whole: SurfaceSet, count: int, cache: Path) -> SurfaceSet:
 
 def finished_model(photos: Path, out: Path, settings: Settings) -> Model:
     """The textured surface that a finished run holds; with colors of the vertices where there is no texture."""
-    last = "texture" if "texture" in NAMES else "mesh"
     with opened_run(out, settings, None) as run:
-        found = run_stages(photos, run, last=last)(last)
-    return found if isinstance(found, Model) else Model(found)
+        return run_stages(photos, run, last=TEXTURE.name)[TEXTURE]
 
 
 def dense_stages() -> Sequence[str]:
     """The stages behind the cameras, in order."""
-    return NAMES[NAMES.index("scene") + 1 :]
+    return NAMES[NAMES.index(SCENE.name) + 1 :]
 
 
 def _rendered(name: str, seed: int, folder: Path) -> Truth:

@@ -7,7 +7,6 @@ A seed decides a folder. With --keep, what was run with the same program is not 
 """
 
 import argparse
-import json
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
@@ -23,6 +22,7 @@ from benchmarks.cameras.score import TruePhoto, accuracy, read_models
 from benchmarks.cameras.worker import OURS
 from benchmarks.common.command_line import new_parser
 from benchmarks.common.metrics import focal_error_percent
+from benchmarks.common.outputs import cameras_after, cameras_before
 from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.processes import end_of
 from benchmarks.common.results import RESULTS, Row, document, table, write
@@ -113,14 +113,10 @@ def scored(out: Path, truth: Truth) -> Row:
 
 def known_cameras(out: Path, photos: dict[str, TruePhoto], when: str, stated: Sequence[Row] = ()) -> Row:
     """How many photos have a camera that is called known, and how far the worst of them is off, photo by photo."""
-    path = out / "calibration.json"
-    found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"cameras": {}, "camera_of": {}}
-    if when == "before":
-        suffix, cameras = "", {name: c["K"] for name, c in found["cameras"].items() if c["identifiable"]}
-    else:
-        sure = {row["camera"] for row in stated if row["identifiable"] == "yes"}
-        suffix, cameras = " after", {n: c["K"] for n, c in found.get("refined", {}).items() if n in sure}
-    camera_of = found["camera_of"] if when == "before" else found.get("refined_camera_of", found["camera_of"])
+    suffix, (found, camera_of) = ("", cameras_before(out)) if when == "before" else (" after", cameras_after(out))
+    sure = {row["camera"] for row in stated if row["identifiable"] == "yes"}
+    known = {name for name, camera in found.items() if (camera["identifiable"] if when == "before" else name in sure)}
+    cameras = {name: found[name]["K"] for name in known}
     errors = [
         focal_error_percent(np.array(cameras[name]), photos[Path(photo).stem].K)
         for photo, name in camera_of.items()

@@ -12,9 +12,8 @@ from scipy.linalg import rq
 from benchmarks.common.metrics import load_truth
 from benchmarks.thesis.corners import load_corners
 from sfm_app.api import opened_run
-from sfm_app.pipeline import run_stages
+from sfm_app.pipeline import MATCH_GRAPH, VIEW_GRAPH, run_stages
 from sfm_app.settings import Settings
-from sfm_app.types import MatchGraph, ViewGraph
 from sfm_app.types.matches import PairId
 
 FloatArray = NDArray[np.float64]
@@ -73,9 +72,9 @@ def photo_sequence(data: Path, name: str, cache: Path) -> ImageSequence:
     """Raw matches of the pairs that the program keeps, found under CACHE/NAME or made there from DATA/NAME/images."""
     place = data / PHOTOS[name]
     with opened_run(cache / PHOTOS[name], Settings(), None) as run:
-        products = run_stages(place / "images", run, last="view_graph")
-        graph: MatchGraph = products("match_graph")
-        views: ViewGraph = products("view_graph")
+        products = run_stages(place / "images", run, last=VIEW_GRAPH.name)
+        graph = products[MATCH_GRAPH]
+        views = products[VIEW_GRAPH]
     matches = {pair: np.hstack(graph.points(pair)) for pair, fit in views.fits.items() if not fit.degeneracy}
     truth = load_truth(place / "cameras.json")
     first = next(iter(graph.images.values()))

@@ -119,8 +119,8 @@ def left_behind(folder, deviations):
     cameras = {"wide": {"identifiable": True, "K": K.tolist()}, "long": {"identifiable": False, "K": K.tolist()}}
     camera_of = {"a.png": "wide", "b.png": "wide", "c.png": "long"}
     refined = {name: {"deviations": values} for name, values in deviations.items()}
-    document = {"cameras": cameras, "camera_of": camera_of, "refined": refined}
-    (folder / "calibration.json").write_text(json.dumps(document))
+    (folder / "calibration.json").write_text(json.dumps({"cameras": cameras, "camera_of": camera_of}))
+    (folder / "scene.json").write_text(json.dumps({"cameras": refined, "camera_of": camera_of}))
     found = {name: camera_matrix(1004.0, 1010.0, 401.0, 300.0) for name in "ab"} | {
         "c": camera_matrix(1050, 1060, 400, 300)
     }

@@ -76,8 +76,9 @@ def left_behind(folder, before, after):
         }
     }
     refined = {"a": {"K": after[0].tolist(), "deviations": after[1], "determined": []}}
-    document = {"cameras": cameras, "camera_of": {"p.png": "a", "q.png": "a"}, "refined": refined}
-    (folder / "calibration.json").write_text(json.dumps(document))
+    camera_of = {"p.png": "a", "q.png": "a"}
+    for name, found in (("calibration", cameras), ("scene", refined)):
+        (folder / f"{name}.json").write_text(json.dumps({"cameras": found, "camera_of": camera_of}))
     return {name: TruePhoto(K, pose((0, 0, 0)), 800.0) for name in "pq"}
 
 

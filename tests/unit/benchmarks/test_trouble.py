@@ -14,13 +14,12 @@ PHOTOS = {"a": TruePhoto(K, np.eye(3, 4), 640.0), "b": TruePhoto(LONG, np.eye(3,
 
 
 def left_behind(folder, *, identifiable, sd):
-    document = {
-        "cameras": {"640x480": {"identifiable": identifiable, "K": K.tolist(), "spread": {}}},
-        "camera_of": {"a.jpg": "640x480", "b.jpg": "640x480"},
-        "refined": {"640x480": {"K": LONG.tolist(), "deviations": {"fx": sd, "fy": sd}}},
-    }
+    before = {"640x480": {"identifiable": identifiable, "K": K.tolist(), "spread": {}}}
+    after = {"640x480": {"K": LONG.tolist(), "deviations": {"fx": sd, "fy": sd}}}
     folder.mkdir(exist_ok=True)
-    (folder / "calibration.json").write_text(json.dumps(document))
+    for name, cameras in (("calibration", before), ("scene", after)):
+        document = {"cameras": cameras, "camera_of": {"a.jpg": "640x480", "b.jpg": "640x480"}}
+        (folder / f"{name}.json").write_text(json.dumps(document))
 
 
 def test_each_photo_is_held_against_the_camera_that_took_it(tmp_path):

@@ -1,0 +1,27 @@
+"""What a run says about cameras in its output folder."""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+class Cameras(NamedTuple):
+    """Cameras by name, and names of cameras by photo."""
+
+    cameras: dict[str, Any]
+    camera_of: dict[str, str]
+
+
+def cameras_before(out: Path) -> Cameras:
+    """Read what pairs of photos say; empty where the run did not come so far."""
+    return _read(out / "calibration.json")
+
+
+def cameras_after(out: Path) -> Cameras:
+    """Read what bundle adjustment makes of them; empty where the run did not come so far."""
+    return _read(out / "scene.json")
+
+
+def _read(path: Path) -> Cameras:
+    found = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"cameras": {}, "camera_of": {}}
+    return Cameras(found["cameras"], found["camera_of"])
