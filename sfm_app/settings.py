@@ -20,6 +20,7 @@ TOLD, SHOWN = 20, 100
 """Problems that are told, and characters of a wrong value."""
 
 Quality = Literal["draft", "normal", "high"]
+ConstraintForm = Literal["huang-faugeras", "frobenius", "trivedi", "polynomial"]
 
 
 class Section(BaseModel):
@@ -78,6 +79,11 @@ class CalibrationSettings(Section):
 
     calibrator: str = Field("zero-curves", description="name of the calibrator (see `sfm-app plugins`)")
     samples: int = Field(100, ge=10, le=10000, description="samples along one zero curve")
+    constraint_form: ConstraintForm = Field(
+        "huang-faugeras",
+        description="form of the constraint that the thesis's least-squares calibrators minimize: huang-faugeras (5.8), "
+        "frobenius (5.9), trivedi (5.11) or polynomial (5.25)",
+    )
     lens: bool = Field(True, description="look for the radial distortion of the lens")
     center_sigma: float = Field(
         0.15,

@@ -7,7 +7,7 @@ import numpy as np
 from sfm_app.selfcal.inputs import Pairs
 from sfm_app.selfcal.thesis.curves import center_curves, focal_curves, usable
 from sfm_app.selfcal.thesis.meeting_point import meeting_point
-from sfm_app.selfcal.thesis.verdict import Camera, answered
+from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
@@ -29,13 +29,13 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
         seed: unused, nothing is drawn at random.
 
     Returns:
-        As `selfcal.verdict.answered`, which also says what is raised.
+        As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
     """
     del seed
-    return answered(METHOD, pairs, partial(algorithm_4, samples=options.samples))
+    return calibrate_with(METHOD, pairs, partial(algorithm_4, samples=options.samples))
 
 
-def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: int) -> Camera | str:
+def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: int) -> CameraParameters | str:
     """Return the algorithm itself, for an image of width 1 and height `tall`.
 
     The reason where too few curves are usable.
@@ -57,4 +57,4 @@ def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: 
     if center is None:
         return f"{len(curves)} of {len(pairs)} pairs have a usable center curve, 2 are needed"
     evidence["center_support"] = center.support
-    return Camera(float(fx[focal.sample]), focal.value, float(sweep[center.sample]), center.value)
+    return CameraParameters(float(fx[focal.sample]), focal.value, float(sweep[center.sample]), center.value)
