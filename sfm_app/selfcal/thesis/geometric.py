@@ -19,11 +19,11 @@ LEAST_RESIDUAL_PX = 1e-3
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimize (5.8), or another form of it, from K_init with each pair weighted by the inverse of its mean epipolar residual.
+    """Minimize (5.8) from K_init with each pair weighted by the inverse of its mean epipolar residual.
 
     Args:
         pairs: F's and inliers; without inliers the given weights stand in.
-        options: `constraint_form`.
+        options: `constraint_form`, which says whether it is (5.8) or another form.
         seed: unused, nothing is drawn at random.
 
     Returns:

@@ -13,11 +13,11 @@ METHOD = "huang-faugeras"
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimize (5.8), or another form of it, from K_init with equal weights.
+    """Minimize (5.8) from K_init with equal weights.
 
     Args:
         pairs: F's; weights tell which pairs take part (> 0), and count in the verdict only.
-        options: `constraint_form`.
+        options: `constraint_form`, which says whether it is (5.8) or another form.
         seed: unused, nothing is drawn at random.
 
     Returns:

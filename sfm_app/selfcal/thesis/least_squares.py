@@ -40,9 +40,7 @@ def fitted(
     return CameraParameters(*(float(value) for value in found.cameras[0]))
 
 
-def minima(
-    halves: Halves, weights: FloatArray, starts: FloatArray, equations: Equations = DEFAULT
-) -> Minima:
+def minima(halves: Halves, weights: FloatArray, starts: FloatArray, equations: Equations = DEFAULT) -> Minima:
     """Return Levenberg-Marquardt from many starts at once, each on pairs of its own.
 
     Thesis (5.8) sums the terms; Levenberg-Marquardt, which the thesis minimizes it with, sums their squares.

@@ -20,11 +20,11 @@ NORMAL_MAD = 1.4826
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimize (5.8), or another form of it, again and again, with weights from the error discrepancy (thesis Algorithm 3).
+    """Minimize (5.8) again and again, with weights from the error discrepancy (thesis Algorithm 3).
 
     Args:
         pairs: F's; weights tell which pairs take part (> 0), and count in the verdict only.
-        options: `constraint_form`.
+        options: `constraint_form`, which says whether it is (5.8) or another form.
         seed: unused, nothing is drawn at random.
 
     Returns:

@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_app.selfcal.inputs import Pairs
 from sfm_app.selfcal.thesis.curves import center_curves, focal_curves, usable
-from sfm_app.selfcal.thesis.meeting_point import meeting_point
+from sfm_app.selfcal.thesis.meeting_point import meeting_point, meeting_points
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
@@ -16,6 +16,8 @@ FOCAL_RANGE = 3.0
 """Focals are sought up to this many image widths (thesis 5.29)."""
 SIGMA_SHARE = 0.1
 """sigma of rho, as a share of the range that is searched (thesis 5.8.4)."""
+PEAK_RANGE, PEAK_SIGMA = (0.3, FOCAL_RANGE), 0.1
+"""Where peaks are sought and how wide they are, in image widths: small beside the distance between two cameras."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
@@ -40,7 +42,8 @@ def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: 
 
     The reason where too few curves are usable.
 
-    Fills `evidence` with the number of curves and their support at the meeting points.
+    Fills `evidence` with the number of curves and their support at the meeting points. With `focal_peaks`, the number
+    of separate peaks of that support, too: several are several cameras (Figure 5.15), of which the answer is one.
     """
     sweep = np.arange(1, samples + 1) / samples
     fx = FOCAL_RANGE * sweep
@@ -50,6 +53,7 @@ def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: 
     if focal is None:
         return f"{len(curves)} of {len(pairs)} pairs have a usable focal curve, 2 are needed"
     evidence["focal_support"] = focal.support
+    evidence["focal_peaks"] = float(len(meeting_points(curves, fx, PEAK_RANGE, PEAK_SIGMA)))
 
     curves = usable(center_curves(pairs, sweep, (fx[focal.sample], focal.value)), tall)
     evidence["center_curves"] = float(len(curves))
