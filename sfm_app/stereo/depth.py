@@ -40,11 +40,6 @@ class DepthMap:
     normals: NDArray[np.float32]
     """(H, W, 3) unit, camera frame, towards the camera; 0 where the depth is 0."""
 
-    @property
-    def coverage(self) -> float:
-        """Share of the pixels that have a depth."""
-        return float(np.count_nonzero(self.depth) / self.depth.size)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Estimate:
