@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.stereo import DepthMap, Estimate, confirm_depths, match_depths, rank_neighbors, region
+from sfm_app.stereo import DepthEstimate, DepthMap, confirm_depths, match_depths, rank_neighbors, region
 from sfm_app.stereo.view import View
 from sfm_app.types import Rejected
 
@@ -72,7 +72,7 @@ def test_a_photo_without_neighbors_is_a_value_with_a_reason(plane, views):
     same_place = match_depths(views[0], [views[0]], plane.photo, 3, 0.01)
     assert same_place == Rejected("same place")
     empty = np.zeros((180, 240), np.float32)
-    nothing, blank = Estimate(empty, empty), np.zeros((180, 240), np.uint8)
+    nothing, blank = DepthEstimate(empty, empty), np.zeros((180, 240), np.uint8)
     assert isinstance(confirm_depths(views[0], blank, nothing, [(views[1], empty)], 2, 0.01), Rejected)
     assert isinstance(confirm_depths(views[0], blank, nothing, [], 2, 0.01), Rejected)
 
@@ -81,7 +81,7 @@ def test_a_photo_without_neighbors_is_a_value_with_a_reason(plane, views):
 def test_the_less_alike_photos_look_the_more_have_to_agree(plane, views, confidence, needed):
     truth = [plane.depth(view) for view in views]
     # four of three never agree: what is hardly to be seen stays empty in small sets
-    estimate = Estimate(truth[1], np.full_like(truth[1], confidence))
+    estimate = DepthEstimate(truth[1], np.full_like(truth[1], confidence))
     true, false = [(views[j], truth[j]) for j in (0, 2, 3)], [(views[j], 1.5 * truth[j]) for j in (0, 2, 3)]
 
     for agreeing in range(4):
