@@ -37,7 +37,7 @@ SCENERY_POINTS = 8000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UprightCues:
+class Look:
     """What one photo tells about how it was held."""
 
     lines: FloatArray
@@ -46,7 +46,7 @@ class UprightCues:
     """The photo itself, gray and small; None where it could not be read."""
 
 
-PhotoLooks = Mapping[int, "Future[UprightCues]"]
+PhotoLooks = Mapping[int, "Future[Look]"]
 """By photo, when it has been looked at."""
 
 
@@ -138,13 +138,13 @@ def turned(R: FloatArray, turn_deg: int) -> FloatArray:
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ R
 
 
-def lines_of(model: Any, looks: Mapping[int, UprightCues]) -> Segments:
+def lines_of(model: Any, looks: Mapping[int, Look]) -> Segments:
     """Return line segments, in the world, of the photos of a model."""
     with backend("looking along lines in the photos"):
         return joined([_in_world(model, photo, look.lines) for photo, look in looks.items()])
 
 
-def scenery_of(model: Any, looks: Mapping[int, UprightCues]) -> Scenery:
+def scenery_of(model: Any, looks: Mapping[int, Look]) -> Scenery:
     """Return what a model and its photos show."""
     with backend("reading the points"):
         shown = seen_points(model, SCENERY_POINTS)
@@ -152,7 +152,7 @@ def scenery_of(model: Any, looks: Mapping[int, UprightCues]) -> Scenery:
     return Scenery(shown.points, shown.colors.mean(axis=1), shown.seen, pictures)
 
 
-def look_at(path: Path, turn_deg: int = 0) -> UprightCues:
+def look_at(path: Path, turn_deg: int = 0) -> Look:
     """Return lines of a photo, and its brightness once it is upright; nothing where OpenCV cannot read it."""
     try:
         data = np.fromfile(path, np.uint8)  # OpenCV does not open names beyond ASCII on every system
@@ -160,9 +160,9 @@ def look_at(path: Path, turn_deg: int = 0) -> UprightCues:
         data = np.zeros(0, np.uint8)
     read = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if read is None:
-        return UprightCues(np.zeros((0, 4)), None)
+        return Look(np.zeros((0, 4)), None)
     gray = np.asarray(read, np.uint8)
-    return UprightCues(line_segments(gray), np.rot90(small_picture(gray), -turn_deg // 90))
+    return Look(line_segments(gray), np.rot90(small_picture(gray), -turn_deg // 90))
 
 
 def _in_world(model: Any, image_id: int, lines: FloatArray) -> Segments:

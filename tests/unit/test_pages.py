@@ -14,8 +14,8 @@ from sfm_app.settings import QUALITY_PRESETS, Settings
 
 ROOT = Path(__file__).parents[2]
 PAGES = ["README.md", "docs/algorithms.md", "docs/architecture.md", "docs/plugins.md"]
-NOT_OURS = {"--set", "--cache", "--folders", "--sets", "--keep", "--repeat", "--help", "--version"}
-"""Flags of benchmarks, and those that click adds."""
+NOT_OURS = {"--left-out", "--without"}
+"""Flags of benchmarks."""
 
 
 def read(page):
