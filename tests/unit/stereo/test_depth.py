@@ -9,6 +9,8 @@ from sfm_app.stereo import DepthEstimate, DepthMap, confirm_depths, match_depths
 from sfm_app.stereo.view import View
 from sfm_app.types import Rejected
 
+pytestmark = pytest.mark.slow
+
 CENTERS = [(-0.5, 0, 0), (0, 0, 0), (0.5, 0.1, 0), (0.1, 0.5, 0.05)]
 
 
