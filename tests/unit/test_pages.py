@@ -14,7 +14,7 @@ from sfm_app.settings import QUALITY_PRESETS, Settings
 
 ROOT = Path(__file__).parents[2]
 PAGES = ["README.md", "docs/algorithms.md", "docs/architecture.md", "docs/plugins.md"]
-NOT_OURS = {"--left-out", "--without"}
+NOT_OURS = {"--left-out", "--sets", "--without"}
 """Flags of benchmarks."""
 
 
