@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 
 from sfm_app.photos import Follower, TrackedFrame, choose
 
+pytestmark = pytest.mark.slow
+
 SIZE = WIDTH, HEIGHT = 240, 160
 STEP_PX = 0.05 * WIDTH
 
