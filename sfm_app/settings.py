@@ -20,6 +20,7 @@ TOLD, SHOWN = 20, 100
 """Problems that are told, and characters of a wrong value."""
 
 Quality = Literal["draft", "normal", "high"]
+ConstraintForm = Literal["huang-faugeras", "frobenius", "trivedi", "polynomial"]
 
 
 class Section(BaseModel):
@@ -49,7 +50,7 @@ class PhotoSettings(Section):
 class MatchSettings(Section):
     """Features and matches."""
 
-    features: str = Field("sift", description="name of the way to find and match them (see `sfm-app plugins`)")
+    features: str = Field("sift", description="name of the way to find and match features (see `sfm-app plugins`)")
     max_image_size_px: int = Field(
         1600, ge=128, le=16384, description="longer side at which features are found, in pixels"
     )
@@ -62,7 +63,9 @@ class MatchSettings(Section):
 class EpipolarSettings(Section):
     """Fundamental matrices, one per pair of photos."""
 
-    estimator: str = Field("lev-ransac", description="name of the estimator (see `sfm-app plugins`)")
+    estimator: str = Field(
+        "lev-ransac", description="name of the estimator of fundamental matrices (see `sfm-app plugins`)"
+    )
     max_error_px: float = Field(1.5, gt=0, le=100, description="inlier threshold on the Sampson distance, in pixels")
     confidence: float = Field(0.9999, gt=0, lt=1, description="wanted probability that one sample is free of outliers")
     max_trials: int = Field(20000, ge=1, le=10_000_000, description="most minimal samples per pair")
@@ -78,6 +81,11 @@ class CalibrationSettings(Section):
 
     calibrator: str = Field("zero-curves", description="name of the calibrator (see `sfm-app plugins`)")
     samples: int = Field(100, ge=10, le=10000, description="samples along one zero curve")
+    constraint_form: ConstraintForm = Field(
+        "huang-faugeras",
+        description="constraint that the thesis's least-squares calibrators minimize: huang-faugeras (5.8), "
+        "frobenius (5.9), trivedi (5.11) or polynomial (5.25)",
+    )
     lens: bool = Field(True, description="look for the radial distortion of the lens")
     center_sigma: float = Field(
         0.15,

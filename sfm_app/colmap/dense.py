@@ -13,7 +13,7 @@ from sfm_app.colmap.masks import used_pixels
 from sfm_app.colmap.worker_process import finished
 from sfm_app.hashing import digest_files, is_below
 from sfm_app.progress import Progress
-from sfm_app.stereo import DepthMap, Estimate, Kind, View
+from sfm_app.stereo import DepthEstimate, DepthMap, Kind, View
 
 DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
 MASKED = -1.0
@@ -96,15 +96,15 @@ class DenseStore:
         # the depth map is what is written last
         return _map_path(self.dense_dir, DEPTHS, view, kind).is_file()
 
-    def read_estimate(self, view: View) -> Estimate:
+    def read_estimate(self, view: View) -> DepthEstimate:
         confidence = _read_depth_format(self.dense_dir, CONFIDENCES, view, "photometric")
-        return Estimate(read_depth(self.dense_dir, view, "photometric"), confidence)
+        return DepthEstimate(read_depth(self.dense_dir, view, "photometric"), confidence)
 
-    def write_estimate(self, view: View, estimate: Estimate) -> None:
+    def write_estimate(self, view: View, estimate: DepthEstimate) -> None:
         used = used_pixels(self.dense_dir, view)
         if used is not None:
             # sure, so that what is masked is no part of the blank area beside it
-            estimate = Estimate(estimate.depth * used, np.where(used, estimate.confidence, np.float32(1)))
+            estimate = DepthEstimate(estimate.depth * used, np.where(used, estimate.confidence, np.float32(1)))
         _write_depth_format(self.dense_dir, CONFIDENCES, view, estimate.confidence, "photometric")
         _write_depth_format(self.dense_dir, DEPTHS, view, estimate.depth, "photometric")
 

@@ -29,14 +29,6 @@ class TwoViewSeed:
     in_front: float
     """Share of the inliers that lie before both cameras, 0 to 1."""
 
-    @property
-    def score(self) -> float:
-        """What makes a good start: many points, under a wide angle, all on the right side.
-
-        Wrong poses put points behind a camera, so that share counts strongly.
-        """
-        return float(np.count_nonzero(self.usable) * min(self.angle_deg / GOOD_ANGLE_DEG, 1.0) * self.in_front**4)
-
 
 def two_view_seed(E: Array, x1: Array, x2: Array) -> TwoViewSeed:
     """Decompose E and triangulate all its inliers.

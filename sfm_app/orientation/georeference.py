@@ -53,11 +53,6 @@ class Georeference:
     up_deviation_deg: float | None = None
     """Standard deviation of up where it is that of the positions, altitudes included; None where it was given."""
 
-    @property
-    def up_from_gps(self) -> bool:
-        """Whether the positions said which way is up."""
-        return self.up_deviation_deg is not None
-
 
 @dataclass(frozen=True, slots=True)
 class NoGeoreference:

@@ -88,11 +88,6 @@ class Standing:
     not_on_its_side: float
     """Log odds against the other vertical."""
 
-    @property
-    def least_nats(self) -> float:
-        """Log odds of the likelier mistake."""
-        return min(self.not_upside_down, self.not_on_its_side)
-
 
 def stand(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery) -> Standing:
     """Return first the vertical, from how the cameras are held and the ledges; then which end of it is up.

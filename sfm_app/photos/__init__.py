@@ -3,7 +3,7 @@
 from sfm_app.photos.camera_groups import grouped
 from sfm_app.photos.decode import UnreadableError, read_picture, upright
 from sfm_app.photos.duplicates import without_copies
-from sfm_app.photos.feature_tracking import Follower, Look
+from sfm_app.photos.feature_tracking import Follower, TrackedFrame
 from sfm_app.photos.files import list_files, place_of
 from sfm_app.photos.keyframe_selection import choose
 from sfm_app.photos.masks import (
@@ -29,8 +29,8 @@ __all__ = [
     "MASK_HINT",
     "Follower",
     "Glance",
-    "Look",
     "Source",
+    "TrackedFrame",
     "UnreadableError",
     "choose",
     "find_mask",

@@ -46,7 +46,7 @@ def formats() -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Picture:
+class DecodedPhoto:
     """The first picture of a file."""
 
     image: Image.Image
@@ -57,7 +57,7 @@ class Picture:
     """Pictures in the file; they are not counted beyond MOST_FRAMES."""
 
 
-def read_picture(path: Path) -> Picture:
+def read_picture(path: Path) -> DecodedPhoto:
     """Decode a file as a whole.
 
     Raises:
@@ -72,7 +72,7 @@ def read_picture(path: Path) -> Picture:
                 image.load()
             if wrong:
                 raise UnreadableError(DAMAGED)
-            return Picture(image, _exif_of(image), frames)
+            return DecodedPhoto(image, _exif_of(image), frames)
     except UnidentifiedImageError:
         raise UnreadableError(_no_photo(path)) from None
     except UnreadableError:
@@ -130,7 +130,7 @@ def _exif_of(image: Image.Image) -> Image.Exif:
     return exif
 
 
-def upright(picture: Picture) -> Image.Image:
+def upright(picture: DecodedPhoto) -> Image.Image:
     """Return the picture upright by EXIF, in RGB or gray of 8 bits, what is transparent on white."""
     return turned_upright(_eight_bit(picture.image), orientation(picture.exif))
 

@@ -33,7 +33,7 @@ WINDOW_PX, LEVELS = 15, 3
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class TrackedFrame:
     """What is kept of one frame."""
 
     frame: int
@@ -61,13 +61,13 @@ class Follower:
         self._moved = 0.0
         self._recent: deque[float] = deque(maxlen=RECENT)
 
-    def look(self, frame: int, gray: Picture) -> Look:
+    def look(self, frame: int, gray: Picture) -> TrackedFrame:
         """Return the next frame; all are of one size."""
         sharpness = float(cv2.Laplacian(gray, cv2.CV_32F).var())
         self._recent.append(sharpness)
         if self._reference is None or len(self._corners) < FEWEST:
             self._refer(gray)
-            return Look(frame, sharpness, self._passed)
+            return TrackedFrame(frame, sharpness, self._passed)
         self._moved, followed = self._follow(self._reference, gray)
         # blur loses corners that come back: no reason to take such a frame
         blurred = sharpness < BLURRED * float(np.percentile(self._recent, SHARP_PERCENTILE))
@@ -77,7 +77,7 @@ class Follower:
         if part >= (LONGEST if blurred else 1.0):
             self._passed = way
             self._refer(gray)
-        return Look(frame, sharpness, way)
+        return TrackedFrame(frame, sharpness, way)
 
     def _refer(self, gray: Picture) -> None:
         corners = cv2.goodFeaturesToTrack(gray, CORNERS, qualityLevel=0.01, minDistance=max(gray.shape) / 60)

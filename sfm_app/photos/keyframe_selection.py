@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.photos.feature_tracking import BLURRED, Look
+from sfm_app.photos.feature_tracking import BLURRED, TrackedFrame
 
 FloatArray = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ class Choice:
     """Reason and number of frames; each frame that was looked at is chosen or counted once."""
 
 
-def choose(looks: Sequence[Look], most: int) -> Choice:
+def choose(looks: Sequence[TrackedFrame], most: int) -> Choice:
     """Return one frame per step of the way; steps are longer where that would be more than `most` frames.
 
     Args:

@@ -8,7 +8,7 @@ from PIL import Image
 from sfm_app.photos.decode import (
     LOSSY,
     MOST_FRAMES,
-    Picture,
+    DecodedPhoto,
     UnreadableError,
     read_picture,
     room_for,
@@ -39,7 +39,7 @@ def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | U
         return UnusablePhoto(name, str(err))
 
 
-def described(name: str, picture: Picture, options: PhotoSettings) -> Glance | UnusablePhoto:
+def described(name: str, picture: DecodedPhoto, options: PhotoSettings) -> Glance | UnusablePhoto:
     """Return what is known about a photo, and what it looks like."""
     image, exif = picture.image, picture.exif
     turn = turn_deg(exif)

@@ -50,7 +50,7 @@ LEAST_CELLS, LEAST_PHOTOS = 15, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tracks:
+class FeatureTracks:
     """Keypoints that the backbone joins."""
 
     names: Mapping[int, IndexArray]
@@ -69,21 +69,23 @@ class Tracks:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Apart:
+class LookAlikeVerdict:
     """What was found."""
 
     joins: tuple[LookAlikes, ...]
     """Every join of look-alikes."""
     doubtful: tuple[LookAlikes, ...]
     """Joins that could be either: they do not turn as the way does, and little is missing."""
-    tracks: Tracks
+    tracks: FeatureTracks
 
     def strange(self, pair: PairId, rows: IndexArray) -> bool:
         """Return whether a pair that was found later joins look-alikes, too."""
         return bool(self.joins) and self.tracks.contradict(pair, rows, FEW_TRACKED)
 
 
-def tell_apart(matches: MatchGraph, poses: Mapping[PairId, RelativePose], cameras: Mapping[int, Calibration]) -> Apart:
+def tell_apart(
+    matches: MatchGraph, poses: Mapping[PairId, RelativePose], cameras: Mapping[int, Calibration]
+) -> LookAlikeVerdict:
     """Find the pairs that take look-alikes for one thing.
 
     Args:
@@ -96,7 +98,7 @@ def tell_apart(matches: MatchGraph, poses: Mapping[PairId, RelativePose], camera
     tracks = tracks_of(sight, best)
     doubted = [pair for pair, rows in sight.rows.items() if pair not in best and tracks.contradict(pair, rows)]
     if not doubted:
-        return Apart((), (), tracks)
+        return LookAlikeVerdict((), (), tracks)
     trusted = best | {pair for pair, rows in sight.rows.items() if _firm(*tracks.agreement(pair, rows))}
     places = Depths(matches, cameras, poses, sight)
     judged = [_judged(join, trusted, places) for join in joins_of(doubted, trusted)]
@@ -109,10 +111,10 @@ def tell_apart(matches: MatchGraph, poses: Mapping[PairId, RelativePose], camera
         also = [pair for pair in weak if any(_beside(pair, other, close) for other in join.pairs)]
         weak = [pair for pair in weak if pair not in also]
         joins[number] = replace(join, pairs=tuple(sorted((*join.pairs, *also))))
-    return Apart(tuple(joins), doubtful, tracks)
+    return LookAlikeVerdict(tuple(joins), doubtful, tracks)
 
 
-def tracks_of(sight: Sight, pairs: Iterable[PairId]) -> Tracks:
+def tracks_of(sight: Sight, pairs: Iterable[PairId]) -> FeatureTracks:
     """Join the keypoints of pairs to tracks."""
     starts, count = {}, 0
     for photo, seen in sight.seen.items():
@@ -124,7 +126,7 @@ def tracks_of(sight: Sight, pairs: Iterable[PairId]) -> Tracks:
     joined = np.zeros(count, np.bool_)
     joined[first] = joined[second] = True
     names[~joined] = -1
-    return Tracks({photo: names[start : start + len(sight.seen[photo])] for photo, start in starts.items()})
+    return FeatureTracks({photo: names[start : start + len(sight.seen[photo])] for photo, start in starts.items()})
 
 
 def joins_of(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple[PairId, ...]]:

@@ -23,12 +23,11 @@ FloatArray = NDArray[np.float64]
 Find = Callable[[FloatArray, FloatArray, EpipolarSettings, int], tuple[ArrayLike, int] | None]
 """(x1, x2, options, seed) -> F and how many samples were drawn, or None: a search from outside, for `estimate_with`."""
 
+# why a pair is rejected, in the order of the checks
 TOO_FEW_MATCHES = "too few matches"
 NO_MODEL = "no model found"
 TOO_FEW_INLIERS = "too few inliers"
 CHANCE = "inliers no better than chance"
-REASONS = (TOO_FEW_MATCHES, NO_MODEL, TOO_FEW_INLIERS, CHANCE)
-"""Why a pair is rejected, in the order of the checks."""
 
 
 def estimate(

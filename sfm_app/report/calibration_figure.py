@@ -53,7 +53,7 @@ class Panel(NamedTuple):
     pairs: CameraPairs
 
 
-class Plane(NamedTuple):
+class ParameterPlane(NamedTuple):
     """Two of the parameters, in pixels; the others stay where they were found."""
 
     names: tuple[str, str]
@@ -123,12 +123,12 @@ def draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
     part.colorbar(right.images[0], ax=right, label="share of the pairs' votes", shrink=0.8)
 
 
-def focal_plane(camera: Calibration, pairs: Pairs) -> Plane:
+def focal_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
     """Return fx and fy, with the optical center where it was found."""
     unit, (low, high) = _unit(camera), FOCALS_SHOWN
     (fx, _, cx), (_, fy, cy), _ = camera.K
     center = ((cx - camera.width / 2) / unit, (cy - camera.height / 2) / unit)
-    return Plane(
+    return ParameterPlane(
         names=("fx", "fy"),
         title=f"Focal length: every line is what one of {len(pairs)} pairs of photos allows"
         if len(pairs)
@@ -141,11 +141,11 @@ def focal_plane(camera: Calibration, pairs: Pairs) -> Plane:
     )
 
 
-def center_plane(camera: Calibration, pairs: Pairs) -> Plane:
+def center_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
     """Return cx and cy over the whole photo, with the focals as found."""
     unit, u0, v0 = _unit(camera), camera.width / 2, camera.height / 2
     focals = (camera.K[0, 0] / unit, camera.K[1, 1] / unit)
-    return Plane(
+    return ParameterPlane(
         names=("cx", "cy"),
         title="Optical center, in the frame of the photo",
         labels=("across the photo, px", "down the photo, px"),
@@ -156,7 +156,7 @@ def center_plane(camera: Calibration, pairs: Pairs) -> Plane:
     )
 
 
-def draw_plane(axes: "Axes", plane: Plane, camera: Calibration, pairs: Pairs) -> None:
+def draw_plane(axes: "Axes", plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> None:
     """Draw votes, curves and K in one plane."""
     shades = votes(plane, camera, pairs)
     axes.imshow(shades, extent=plane.extent, origin="lower", cmap="inferno", vmin=0, vmax=1, interpolation="bilinear")
@@ -169,7 +169,7 @@ def draw_plane(axes: "Axes", plane: Plane, camera: Calibration, pairs: Pairs) ->
     axes.legend(loc="lower right", labelcolor=CURVE, framealpha=0.6, facecolor="black", edgecolor="none")
 
 
-def draw_curves(axes: "Axes", plane: Plane, extent: tuple[float, float, float, float], samples: int) -> None:
+def draw_curves(axes: "Axes", plane: ParameterPlane, extent: tuple[float, float, float, float], samples: int) -> None:
     """Draw the part of all curves that is in `extent`; the more there are, the fainter."""
     left, right, bottom, top = extent
     x = _steps(left, right, samples)
@@ -178,7 +178,7 @@ def draw_curves(axes: "Axes", plane: Plane, extent: tuple[float, float, float, f
     axes.set(xlim=(left, right), ylim=(bottom, top))
 
 
-def enlarge(axes: "Axes", plane: Plane, camera: Calibration) -> None:
+def enlarge(axes: "Axes", plane: ParameterPlane, camera: Calibration) -> None:
     """Draw the ellipse in a window of its own where it would be too small to see."""
     from matplotlib.patches import Ellipse
 
@@ -204,7 +204,7 @@ def enlarge(axes: "Axes", plane: Plane, camera: Calibration) -> None:
         axes.plot([], [], color=MARK, linewidth=1.6, label=f"{label} (enlarged)")
 
 
-def votes(plane: Plane, camera: Calibration, pairs: Pairs) -> FloatArray:
+def votes(plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> FloatArray:
     """Return (CELLS, CELLS) share of the votes at every point of the plane; rows go from its bottom to its top."""
     left, right, bottom, top = plane.extent
     grid = [values.ravel() for values in np.meshgrid(_steps(left, right, CELLS), _steps(bottom, top, CELLS))]

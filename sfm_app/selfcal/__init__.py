@@ -1,12 +1,22 @@
 """Self-calibration: the camera matrix from fundamental matrices (thesis chapter 5)."""
 
 from sfm_app.selfcal import zero_curves
-from sfm_app.selfcal.cameras.photo_set import CalibrateFunction, Camera, calibrate_photo_set
+from sfm_app.selfcal.cameras.photo_set import CalibratedCamera, CalibrateFunction, calibrate_photo_set
 from sfm_app.selfcal.inputs import pair_weights
 from sfm_app.selfcal.thesis import geometric, huang_faugeras, kruppa, multi_start, perturbation
 from sfm_app.selfcal.thesis import zero_curves as zero_curves_thesis
+from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 
-__all__ = ["CALIBRATORS", "SEVERAL_CAMERAS", "CalibrateFunction", "Camera", "calibrate_photo_set", "pair_weights"]
+__all__ = [
+    "CALIBRATORS",
+    "SEVERAL_CAMERAS",
+    "CalibrateFunction",
+    "CalibratedCamera",
+    "CameraParameters",
+    "calibrate_photo_set",
+    "calibrate_with",
+    "pair_weights",
+]
 
 CALIBRATORS: dict[str, tuple[CalibrateFunction, str]] = {
     zero_curves.METHOD: (

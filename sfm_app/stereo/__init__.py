@@ -1,15 +1,15 @@
 """Depth maps on CPU: pure functions on arrays, and the interface that every way to make depth maps has."""
 
-from sfm_app.stereo.depth import DepthMap, Estimate, confirm_depths, match_depths
+from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
 from sfm_app.stereo.method import DepthStore, DepthTask, Kind, make_on_cpu
 from sfm_app.stereo.neighbors import rank_neighbors
 from sfm_app.stereo.view import View, region
 
 __all__ = [
+    "DepthEstimate",
     "DepthMap",
     "DepthStore",
     "DepthTask",
-    "Estimate",
     "Kind",
     "View",
     "confirm_depths",

@@ -40,14 +40,9 @@ class DepthMap:
     normals: NDArray[np.float32]
     """(H, W, 3) unit, camera frame, towards the camera; 0 where the depth is 0."""
 
-    @property
-    def coverage(self) -> float:
-        """Share of the pixels that have a depth."""
-        return float(np.count_nonzero(self.depth) / self.depth.size)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
+class DepthEstimate:
     """Depths of one photo before other depth maps were asked."""
 
     depth: DepthArray
@@ -57,7 +52,7 @@ class Estimate:
 
 def match_depths(
     view: View, candidates: Sequence[View], load: Callable[[View], GrayImage], count: int, tolerance: float
-) -> Estimate | Rejected:
+) -> DepthEstimate | Rejected:
     """Match a photo with the first `count` candidates that can be rectified with it, and find what suits them all.
 
     Semi-global matching with each neighbor gives depths; where they agree they start PatchMatch with all neighbors.
@@ -101,19 +96,19 @@ def _started(depth: DepthArray) -> PlaneArray:
     return planes
 
 
-def _sampled(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) -> Estimate:
+def _sampled(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) -> DepthEstimate:
     """Return depths and confidences where a view wants them in its pixels."""
     shift = np.float32(sample_px - 0.5)
     inverse = planes[..., 0] + shift * (planes[..., 1] + planes[..., 2])
     known = (planes[..., 0] > 0) & (inverse > 0) & (cost < NO_MATCH)
     depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=known)
-    return Estimate(depth, np.where(known, np.maximum(1 - cost, 0), np.float32(0)))
+    return DepthEstimate(depth, np.where(known, np.maximum(1 - cost, 0), np.float32(0)))
 
 
 def confirm_depths(
     view: View,
     image: GrayImage,
-    estimate: Estimate,
+    estimate: DepthEstimate,
     others: Sequence[tuple[View, DepthArray]],
     min_agreeing: int,
     tolerance: float,

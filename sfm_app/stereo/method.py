@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sfm_app.numerical import FAILURES, reason_of
 from sfm_app.settings import DepthSettings
-from sfm_app.stereo.depth import DepthMap, Estimate, confirm_depths, match_depths
+from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
 from sfm_app.stereo.view import GrayImage, View
 from sfm_app.types import Rejected
 
@@ -28,10 +28,10 @@ class DepthStore(Protocol):
     def has(self, view: View, kind: Kind, /) -> bool:
         """Return whether a map is there."""
 
-    def read_estimate(self, view: View, /) -> Estimate:
+    def read_estimate(self, view: View, /) -> DepthEstimate:
         """Return the photometric map."""
 
-    def write_estimate(self, view: View, estimate: Estimate, /) -> None:
+    def write_estimate(self, view: View, estimate: DepthEstimate, /) -> None:
         """Keep the photometric map."""
 
     def write_maps(self, view: View, maps: DepthMap, /) -> None:

@@ -21,7 +21,7 @@ from sfm_app.texture.photo_consistency import strangers
 from sfm_app.texture.seam_leveling import level
 from sfm_app.texture.store import Store
 from sfm_app.texture.unseen_faces import along_a_curve, block_sizes, square_texels, squares, vertex_colors
-from sfm_app.texture.view_scoring import Hidden, Look, look, sharpness_factors
+from sfm_app.texture.view_scoring import FaceView, Hidden, look, sharpness_factors
 from sfm_app.texture.view_selection import choose_photos
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
@@ -40,7 +40,7 @@ class FaceViews:
     colors: NDArray[np.uint8]
     """(P, T, 3)"""
     sharpness: FloatArray
-    """(P,) as in `Look`; 0 for photos that cannot be read."""
+    """(P,) as in `FaceView`; 0 for photos that cannot be read."""
     rejected: Sequence[Rejected | None]
     """Why photos cannot be read."""
 
@@ -66,7 +66,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plan:
+class TexturePlan:
     """All that is decided before a photo is painted."""
 
     mesh: Facets
@@ -139,10 +139,10 @@ def _look_at_all(views: Sequence[PhotoView], mesh: Facets, store: Store, hidden:
     return FaceViews(worth, colors, sharpness, rejected)
 
 
-def _look_at(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: Hidden) -> Look | Rejected:
+def _look_at(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: Hidden) -> FaceView | Rejected:
     kept = store.recall(name)
     if kept is not None:
-        return Look(kept["worth"], kept["color"], float(kept["sharpness"]))
+        return FaceView(kept["worth"], kept["color"], float(kept["sharpness"]))
     try:
         photo, used = store.photo(view), store.used(view)
     except OSError as err:
@@ -165,7 +165,9 @@ def _believe(looks: FaceViews, mesh: Facets) -> Seen:
     return Seen(worth, colors, gains, int(strange.sum()))
 
 
-def _plan(mesh: Facets, seen: Seen, chosen: IntArray, views: Sequence[PhotoView], options: TextureSettings) -> Plan:
+def _plan(
+    mesh: Facets, seen: Seen, chosen: IntArray, views: Sequence[PhotoView], options: TextureSettings
+) -> TexturePlan:
     charts = make_charts(chosen, np.array([view.row for view in views]), mesh, options.max_atlas_px / 2)
     blocks = block_sizes(int((chosen == NONE).sum()))
     layout, places = pack(charts, blocks, options.max_atlas_px, options.max_pages)
@@ -178,10 +180,10 @@ def _plan(mesh: Facets, seen: Seen, chosen: IntArray, views: Sequence[PhotoView]
     page[~drawn] = cells[:, 0]
     blend = level(blend_weights(chosen, seen.usable, mesh), seen.colors, seen.gains, seen.usable, mesh)
     allowed = _allowed_weight(blend, seen.usable, chosen, mesh)
-    return Plan(mesh, seen, chosen, charts, layout, corners, page, cells, blend, allowed)
+    return TexturePlan(mesh, seen, chosen, charts, layout, corners, page, cells, blend, allowed)
 
 
-def _paint_photo(photo: int, plan: Plan, views: Sequence[PhotoView], store: Store, pages: Pages) -> None:
+def _paint_photo(photo: int, plan: TexturePlan, views: Sequence[PhotoView], store: Store, pages: Pages) -> None:
     """Add one photo to all pages, unless it is there; one photo paints at a time, while others are read."""
     if pages.has[photo]:
         return
@@ -201,7 +203,7 @@ def _paint_photo(photo: int, plan: Plan, views: Sequence[PhotoView], store: Stor
             paint(pixels, view.row, 1.0 / plan.seen.gains[photo], *what, page.owner, page.total)
 
 
-def _shares(photo: int, plan: Plan) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def _shares(photo: int, plan: TexturePlan) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Return triangles that a photo counts for, and its weight and offsets (N, 3, 4) at their corners."""
     mesh, part = plan.mesh, plan.blend.of(photo)
     weight = np.zeros(len(mesh.vertices), np.float32)
@@ -228,7 +230,7 @@ def _allowed_weight(blend: Blend, usable: NDArray[np.bool_], chosen: IntArray, m
     return total
 
 
-def _finish(plan: Plan, canvases: Sequence[Canvas]) -> Model:
+def _finish(plan: TexturePlan, canvases: Sequence[Canvas]) -> Model:
     """Round the pages, color what no photo sees, and fill what lies between the charts."""
     drawn = plan.chosen != NONE
     pages, painted = (list(part) for part in zip(*(finished(page) for page in canvases), strict=True))
@@ -256,7 +258,7 @@ def _finish(plan: Plan, canvases: Sequence[Canvas]) -> Model:
 
 
 def _figures(
-    plan: Plan, views: Sequence[PhotoView], rejected: Sequence[Rejected | None], unseen: int
+    plan: TexturePlan, views: Sequence[PhotoView], rejected: Sequence[Rejected | None], unseen: int
 ) -> dict[str, Any]:
     """Return what the manifest says."""
     covered = sum(width * height for width, height in plan.layout.sizes)

@@ -31,7 +31,7 @@ SHARPNESS_RANGE = (0.2, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Look:
+class FaceView:
     """One photo's view of all triangles."""
 
     worth: NDArray[np.float32]
@@ -44,7 +44,7 @@ class Look:
 
 def look(
     view: PhotoView, photo: NDArray[np.uint8], used: NDArray[np.bool_] | None, mesh: Facets, hidden: Hidden
-) -> Look:
+) -> FaceView:
     """Judge every triangle in one photo.
 
     Args:
@@ -70,7 +70,7 @@ def look(
         touched[mesh.faces[beyond]] = True
         beyond = touched[mesh.faces].any(axis=1)
         worth[beyond] *= RIM_WORTH
-    return Look(worth, color, sharpness(photo, used))
+    return FaceView(worth, color, sharpness(photo, used))
 
 
 def _blocked(

@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache
 from itertools import combinations
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from sfm_app.plugins import load_plugins
 from sfm_app.selfcal import calibrate_photo_set, pair_weights, zero_curves
 from sfm_app.selfcal.cameras import photo_set
-from sfm_app.settings import CalibrationSettings
+from sfm_app.settings import CalibrationSettings, ConstraintForm
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration, CameraPairs, PhotoPairs
 
@@ -102,6 +103,28 @@ def test_finds_the_camera(calibrate, seed):
     assert 0 < error[[0, 1], [0, 1]].max() < 0.05 * 1100
     assert 0 < error[:2, 2].max() < 0.05 * 1000
     assert 0 < found.evidence["support"] <= 1
+
+
+@pytest.mark.parametrize("form", get_args(ConstraintForm))
+@pytest.mark.parametrize("name", ["huang-faugeras", "geometric", "perturbation", "multi-start"])
+def test_every_form_of_the_constraint_finds_the_camera(name, form):
+    options = OPTIONS.model_copy(update={"constraint_form": form})
+    found = CALIBRATORS[name].calibrate(CameraPairs.of(fundamentals(5, 0), SIZE), options, 0)
+
+    assert is_well_formed(found)
+    assert found.identifiable, found.reason
+    np.testing.assert_allclose(found.K, K, rtol=0.02, atol=15)
+    assert np.abs(found.K - K).max() > 0
+
+
+@pytest.mark.parametrize("form", get_args(ConstraintForm))
+@pytest.mark.parametrize("case", UNDETERMINED)
+def test_no_form_of_the_constraint_invents_a_camera(case, form):
+    options = OPTIONS.model_copy(update={"constraint_form": form})
+    found = CALIBRATORS["huang-faugeras"].calibrate(CameraPairs.of(UNDETERMINED[case], SIZE), options, 0)
+
+    assert is_well_formed(found)
+    assert (found.identifiable, found.method) == (False, "guess")
 
 
 @pytest.mark.parametrize("name", CALIBRATORS)

@@ -9,6 +9,8 @@ from sfm_app.api import Run
 from sfm_app.demo import compared, demo_lines, draw
 from sfm_app.types import CameraModel, Model, Scene, Surface, Texture
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def scene(rendered) -> Scene:

@@ -7,6 +7,8 @@ import pytest
 
 from sfm_app.jit import kernel, summing_kernel
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("decorator", [kernel, summing_kernel])
 def test_a_kernel_compiles_where_nothing_can_be_cached(monkeypatch, decorator):

@@ -14,6 +14,8 @@ from sfm_app.plugins import FeatureMethod, hookimpl, load_plugins
 from sfm_app.settings import Settings
 from sfm_app.types import Features, Photo, PhotoSet
 
+pytestmark = pytest.mark.slow
+
 SIZE = 200, 100
 NAMES = ("a b.png", "c.png", "d.png")
 

@@ -5,6 +5,8 @@ import pytest
 
 from sfm_app.parallel import make_executor, ordered_map, worker_count
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("workers", [1, 3])
 def test_results_keep_the_order_of_the_items(workers):

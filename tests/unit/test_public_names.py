@@ -31,6 +31,7 @@ def test_a_method_that_does_not_exist_is_refused_before_any_work(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_the_import_leaves_out_what_an_estimator_does_not_need():
     heavy = {"cv2", "open3d", "pycolmap", "trimesh", "matplotlib", "PIL", "rich"}
     heavy |= {"scipy.optimize", "scipy.sparse", "scipy.spatial"}

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.ransac.sampling.minimal_samples import SAMPLE_SIZE
-from sfm_app.ransac.scoring.robust_costs import squared_distances, squared_sampson
+from sfm_app.ransac.scoring.robust_costs import squared_sampson
 from sfm_app.ransac.solvers.minimal import MOST_MODELS
 
 FloatArray = NDArray[np.float64]
@@ -35,18 +35,6 @@ def false_alarms_of(squared: FloatArray, wrong: FloatArray, threshold: float) ->
         chance = accidental_share(wrong, fraction * threshold)
         tried.append(false_alarms(len(squared), inliers, SAMPLE_SIZE, chance))
     return min(_MOST, len(_FRACTIONS) * MOST_MODELS * min(tried))
-
-
-def is_credible(points: FloatArray, f: FloatArray, threshold: float) -> bool:
-    """Return whether the support of f is more than luck.
-
-    Args:
-        points: (N, 4) distinct matches in random order, N >= 2.
-        f: (9,) model.
-        threshold: largest distance of an inlier.
-    """
-    wrong = squared_mismatches(points, f)
-    return false_alarms_of(squared_distances(points, f), wrong, threshold) <= MOST_FALSE_ALARMS
 
 
 def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> float:

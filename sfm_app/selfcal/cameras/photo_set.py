@@ -39,7 +39,7 @@ BENT = 0.01
 
 
 @dataclass(frozen=True, slots=True)
-class Camera:
+class CalibratedCamera:
     """One camera of the set."""
 
     name: str
@@ -54,7 +54,7 @@ class Camera:
 def calibrate_photo_set(
     pairs: PhotoPairs, calibrate: CalibrateFunction, options: CalibrationSettings, seed: int, *,
     together: bool, split: bool = True,
-) -> list[Camera]:  # fmt: skip
+) -> list[CalibratedCamera]:  # fmt: skip
     """Return every camera of a set of photos, the one with most photos first.
 
     Args:
@@ -69,7 +69,7 @@ def calibrate_photo_set(
     for photo, group in pairs.groups.items():
         groups.setdefault(group, []).append(photo)
     cameras = [
-        Camera(name, tuple(members), _alone(calibrate, pairs.among(members), options, seed))
+        CalibratedCamera(name, tuple(members), _alone(calibrate, pairs.among(members), options, seed))
         for name, members in groups.items()
     ]
     if together:
@@ -88,8 +88,8 @@ def _alone(calibrate: CalibrateFunction, own: CameraPairs, options: CalibrationS
 
 
 def _jointly(
-    cameras: list[Camera], pairs: PhotoPairs, options: CalibrationSettings, seed: int, *, split: bool
-) -> list[Camera]:
+    cameras: list[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings, seed: int, *, split: bool
+) -> list[CalibratedCamera]:
     """Return the cameras as all pairs have them; as each has them alone where the numbers fail."""
     try:
         return _of_all_pairs(cameras, pairs, options, seed) if split else _together(cameras, pairs, options)
@@ -98,7 +98,9 @@ def _jointly(
         return cameras
 
 
-def _of_all_pairs(whole: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings, seed: int) -> list[Camera]:
+def _of_all_pairs(
+    whole: Sequence[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings, seed: int
+) -> list[CalibratedCamera]:
     """Return groups split where their photos disagree, and all cameras from all pairs.
 
     Parts of a group that turn out to have the same focal were one camera after all.
@@ -126,7 +128,9 @@ def _alike(focals: Sequence[float]) -> bool:
     return bool(np.any(np.diff(np.sort(np.log(focals))) < ALIKE))
 
 
-def _split(camera: Camera, number: int, pairs: PhotoPairs, options: CalibrationSettings, seed: int) -> list[Camera]:
+def _split(
+    camera: CalibratedCamera, number: int, pairs: PhotoPairs, options: CalibrationSettings, seed: int
+) -> list[CalibratedCamera]:
     """Return the camera, the several that its photos are of, or one for each photo."""
     if len(camera.photos) < LEAST_TO_SPLIT:
         return [camera]
@@ -165,7 +169,9 @@ def _borne_out(labels: Mapping[int, int], photos: Sequence[PairId]) -> dict[int,
     return {photo: label for photo, label in labels.items() if photo in inside or count[label] == 1}
 
 
-def _parts(camera: Camera, thetas: FloatArray, labels: Mapping[int, int], pairs: PhotoPairs) -> list[Camera]:
+def _parts(
+    camera: CalibratedCamera, thetas: FloatArray, labels: Mapping[int, int], pairs: PhotoPairs
+) -> list[CalibratedCamera]:
     """Return the cameras that a group was divided into.
 
     Photos that no pair gives to one of them are another, not known.
@@ -176,25 +182,31 @@ def _parts(camera: Camera, thetas: FloatArray, labels: Mapping[int, int], pairs:
         members = tuple(photo for photo in camera.photos if labels.get(photo) == part)
         theta[4] = camera.found.radial / np.exp(2.0 * theta[0])
         parts.append(
-            Camera(next(names), members, calibration_of(theta, size, camera.found.method), of_parts=len(thetas))
+            CalibratedCamera(
+                next(names), members, calibration_of(theta, size, camera.found.method), of_parts=len(thetas)
+            )
         )
     rest = tuple(photo for photo in camera.photos if photo not in labels)
-    return [*parts, Camera(next(names), rest, guessed(size, NOBODYS, {}), of_parts=len(thetas))] if rest else parts
+    return (
+        [*parts, CalibratedCamera(next(names), rest, guessed(size, NOBODYS, {}), of_parts=len(thetas))]
+        if rest
+        else parts
+    )
 
 
-def _names(camera: Camera, pairs: PhotoPairs) -> Iterator[str]:
+def _names(camera: CalibratedCamera, pairs: PhotoPairs) -> Iterator[str]:
     """Return names for what becomes of a group; the first keeps its own."""
     taken = set(pairs.groups.values())
     return chain([camera.name], (name for k in count(2) if (name := f"{camera.name} #{k}") not in taken))
 
 
-def _each_its_own(camera: Camera, family: int, pairs: PhotoPairs) -> list[Camera]:
+def _each_its_own(camera: CalibratedCamera, family: int, pairs: PhotoPairs) -> list[CalibratedCamera]:
     """Return a camera, not known yet, for each photo of a group."""
     nothing, names = guessed(pairs.sizes[camera.photos[0]], "", {}), _names(camera, pairs)
-    return [Camera(next(names), (photo,), nothing, family) for photo in sorted(camera.photos)]
+    return [CalibratedCamera(next(names), (photo,), nothing, family) for photo in sorted(camera.photos)]
 
 
-def _unlike_within_bars(whole: Sequence[Camera], pairs: PhotoPairs, seed: int) -> dict[str, int]:
+def _unlike_within_bars(whole: Sequence[CalibratedCamera], pairs: PhotoPairs, seed: int) -> dict[str, int]:
     """Return groups that bars have brought to one size with others, and whose photos are each of a camera of its own.
 
     By name; the number says which have one size.
@@ -224,7 +236,9 @@ def _in_sides(size: tuple[int, int]) -> FloatArray:
     return np.array([[side, 0.0, size[0] / 2], [0.0, side, size[1] / 2], [0.0, 0.0, 1.0]])
 
 
-def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: CalibrationSettings) -> list[Camera]:
+def _together(
+    cameras: Sequence[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings
+) -> list[CalibratedCamera]:
     """Return all cameras from all pairs at once; one camera is what its own pairs say."""
     if len(cameras) <= 1:
         return list(cameras)
@@ -246,13 +260,13 @@ def _together(cameras: Sequence[Camera], pairs: PhotoPairs, options: Calibration
     return [replace(one, found=_less_sure(one, answer)) for one, answer in zip(cameras, answers, strict=True)]
 
 
-def _less_sure(camera: Camera, found: Calibration) -> Calibration:
+def _less_sure(camera: CalibratedCamera, found: Calibration) -> Calibration:
     """Return the answer, as an estimate where the camera is one of many that photos of one size were divided into."""
     many = found.identifiable and camera.of_parts >= MANY
     return roughly(found, PERHAPS_ZOOM.format(count=camera.of_parts)) if many else found
 
 
-def _or_guess(camera: Camera, pairs: PhotoPairs) -> Calibration:
+def _or_guess(camera: CalibratedCamera, pairs: PhotoPairs) -> Calibration:
     """Return what was found; else the K that mapping starts from: EXIF's claim, or 1.2 x the longer side."""
     found = camera.found
     if found.identifiable or found.method == ESTIMATE:
@@ -264,6 +278,6 @@ def _or_guess(camera: Camera, pairs: PhotoPairs) -> Calibration:
     return replace(found, K=guessed_camera_matrix(size, claim), method="exif", radial=0.0, spread={}, held=())
 
 
-def _claim(camera: Camera, pairs: PhotoPairs) -> float:
+def _claim(camera: CalibratedCamera, pairs: PhotoPairs) -> float:
     claims = [pairs.focal_hints_px[photo] for photo in camera.photos if photo in pairs.focal_hints_px]
     return float(np.median(claims)) if claims else float("nan")

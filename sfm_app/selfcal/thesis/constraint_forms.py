@@ -7,16 +7,20 @@ and 0 of E, and d = (s1^2 - s2^2) / (s1^2 + s2^2)::
     polynomial (5.25)        d^2
     Trivedi (5.11)           three values whose sum is d^2
 
-so that on matrices of rank 2 all vanish together with (5.8), (s1 - s2) / s2. `Halves` gives what least squares needs
-and none of these is: smooth equations that change sign at the solution, two for every pair.
+so that on matrices of rank 2 all vanish together with (5.8), (s1 - s2) / s2. The setting `calibration.constraint_form`
+says which of them the least-squares calibrators minimize. (5.8) as it stands has a cone at the solution; `Halves` gives
+what least squares needs: smooth equations that change sign there, two for every pair.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.selfcal.inputs import FloatArray
+from sfm_app.settings import ConstraintForm
 
 _TINY = float(np.finfo(np.float64).tiny)
 LEAST_COMPLEMENT = 1e-6
@@ -36,16 +40,17 @@ def huang_faugeras(E: FloatArray) -> FloatArray:
 
 
 def frobenius_form(E: FloatArray) -> FloatArray:
-    """Return (...,) |2 EE'E - tr(EE') E| / |E|^3 of thesis (5.9), in Frobenius norms."""
+    """Return (..., 9) the entries of (2 EE'E - tr(EE') E) / |E|^3, whose norm is thesis (5.9)."""
     S = E @ np.swapaxes(E, -1, -2)
-    trace = np.trace(S, axis1=-2, axis2=-1)
-    return np.asarray(np.linalg.norm(2 * S @ E - trace[..., None, None] * E, axis=(-2, -1)) / trace**1.5)
+    trace = np.trace(S, axis1=-2, axis2=-1)[..., None, None] + _TINY
+    return np.asarray((2 * S @ E - trace * E) / trace**1.5).reshape(*E.shape[:-2], 9)
 
 
 def polynomial_form(E: FloatArray) -> FloatArray:
-    """Return (...,) 2 tr((EE')^2) / tr(EE')^2 - 1 of thesis (5.25)."""
+    """Return (..., 1) 2 tr((EE')^2) / tr(EE')^2 - 1 of thesis (5.25), which touches zero and does not cross it."""
     S = E @ np.swapaxes(E, -1, -2)
-    return np.asarray(2 * np.sum(S * S, axis=(-2, -1)) / np.trace(S, axis1=-2, axis2=-1) ** 2 - 1.0)
+    trace = np.trace(S, axis1=-2, axis2=-1) + _TINY
+    return np.asarray(2 * np.sum(S * S, axis=(-2, -1)) / trace**2 - 1.0)[..., None]
 
 
 def trivedi(E: FloatArray) -> FloatArray:
@@ -55,7 +60,7 @@ def trivedi(E: FloatArray) -> FloatArray:
     no particular camera.
     """
     S = E @ np.swapaxes(E, -1, -2)
-    trace = np.trace(S, axis1=-2, axis2=-1)[..., None]
+    trace = np.trace(S, axis1=-2, axis2=-1)[..., None] + _TINY
     rest = trace - 2 * np.diagonal(S, axis1=-2, axis2=-1)
     i, j = [0, 0, 1], [1, 2, 2]
     return np.asarray((4 * S[..., i, j] ** 2 - rest[..., i] * rest[..., j]) / trace**2)
@@ -91,6 +96,11 @@ class Halves:
         """Return (..., 3), (..., 3) entries 11, 12, 22 of A and B for cameras (..., 4) of fx, fy, u, v."""
         return _gram(self.U, cameras), _gram(self.V, cameras)
 
+    def essential(self, cameras: FloatArray) -> FloatArray:
+        """Return (..., 3, 3) E = K'FK for cameras (..., 4) of fx, fy, u, v."""
+        left, right = _through(self.U, cameras), _through(self.V, cameras)
+        return np.asarray(np.swapaxes(left * self.s[..., None], -1, -2) @ right)
+
 
 def equations(halves: Halves, cameras: FloatArray) -> FloatArray:
     """Return two smooth equations for every pair whose norm is r = (s1 - s2) / (s1 + s2) of E.
@@ -120,6 +130,42 @@ def huang_faugeras_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
     g = equations(halves, cameras)
     r = np.linalg.norm(g, axis=-1, keepdims=True)
     return np.asarray(2 * g / np.maximum(1.0 - r, LEAST_COMPLEMENT))
+
+
+def frobenius_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
+    """Return (..., 9) equations whose norm is the term of thesis (5.9)."""
+    return frobenius_form(halves.essential(cameras))
+
+
+def trivedi_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
+    """Return (..., 3) the terms of thesis (5.11)."""
+    return trivedi(halves.essential(cameras))
+
+
+def polynomial_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
+    """Return (..., 1) the term of thesis (5.25)."""
+    return polynomial_form(halves.essential(cameras))
+
+
+Equations = Callable[[Halves, FloatArray], FloatArray]
+"""Halves (..., P) and cameras (..., 1, 4) in, (..., P, m) equations out."""
+
+EQUATIONS: Mapping[ConstraintForm, Equations] = MappingProxyType(
+    {
+        "huang-faugeras": huang_faugeras_equations,
+        "frobenius": frobenius_equations,
+        "trivedi": trivedi_equations,
+        "polynomial": polynomial_equations,
+    }
+)
+"""What least squares makes small, by the setting `calibration.constraint_form`."""
+
+
+def _through(basis: FloatArray, cameras: FloatArray) -> FloatArray:
+    """Return (..., 2, 3) rows K'b."""
+    fx, fy, u, v = (cameras[..., column, None] for column in range(4))
+    x, y, z = basis[..., 0], basis[..., 1], basis[..., 2]
+    return np.stack([fx * x, fy * y, u * x + v * y + z], axis=-1)
 
 
 def _gram(basis: FloatArray, cameras: FloatArray) -> FloatArray:

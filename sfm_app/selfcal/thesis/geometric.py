@@ -1,13 +1,15 @@
 """Weights from the epipolar residuals (Mendonca and Cipolla 1999): the thesis's "Geometric" method (5.3)."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.selfcal.inputs import FloatArray, Pairs, checked
+from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations
 from sfm_app.selfcal.thesis.least_squares import fitted
-from sfm_app.selfcal.thesis.verdict import Camera, answered
+from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
@@ -21,14 +23,15 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 
     Args:
         pairs: F's and inliers; without inliers the given weights stand in.
-        options: unused.
+        options: `constraint_form`, which says whether it is (5.8) or another form.
         seed: unused, nothing is drawn at random.
 
     Returns:
-        As `selfcal.verdict.answered`, which also says what is raised.
+        As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
     """
-    del options, seed
-    return answered(METHOD, replace(pairs, weights=residual_weights(pairs)) if pairs.inliers else pairs, _found)
+    del seed
+    weighted = replace(pairs, weights=residual_weights(pairs)) if pairs.inliers else pairs
+    return calibrate_with(METHOD, weighted, partial(_found, equations=EQUATIONS[options.constraint_form]))
 
 
 def residual_weights(pairs: CameraPairs) -> FloatArray:
@@ -49,6 +52,6 @@ def residual_weights(pairs: CameraPairs) -> FloatArray:
     return np.asarray(weights * np.count_nonzero(weights) / total if total > 0 else weights)
 
 
-def _found(pairs: Pairs, tall: float, evidence: dict[str, float]) -> Camera:
+def _found(pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations) -> CameraParameters:
     del evidence
-    return fitted(pairs, Camera.initial(tall), pairs.weights)
+    return fitted(pairs, CameraParameters.initial(tall), pairs.weights, equations)

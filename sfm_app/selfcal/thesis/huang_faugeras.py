@@ -1,8 +1,11 @@
 """The Huang-Faugeras constraint minimized over all pairs alike: the thesis's "non-robust" method (5.5.3)."""
 
+from functools import partial
+
 from sfm_app.selfcal.inputs import Pairs
+from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations
 from sfm_app.selfcal.thesis.least_squares import fitted
-from sfm_app.selfcal.thesis.verdict import Camera, answered
+from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
@@ -14,16 +17,16 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 
     Args:
         pairs: F's; weights tell which pairs take part (> 0), and count in the verdict only.
-        options: unused.
+        options: `constraint_form`, which says whether it is (5.8) or another form.
         seed: unused, nothing is drawn at random.
 
     Returns:
-        As `selfcal.verdict.answered`, which also says what is raised.
+        As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
     """
-    del options, seed
-    return answered(METHOD, pairs, _found)
+    del seed
+    return calibrate_with(METHOD, pairs, partial(_found, equations=EQUATIONS[options.constraint_form]))
 
 
-def _found(pairs: Pairs, tall: float, evidence: dict[str, float]) -> Camera:
+def _found(pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations) -> CameraParameters:
     del evidence
-    return fitted(pairs, Camera.initial(tall), 0.0 * pairs.weights + 1.0)
+    return fitted(pairs, CameraParameters.initial(tall), 0.0 * pairs.weights + 1.0, equations)

@@ -14,7 +14,7 @@ import numpy as np
 from sfm_app.selfcal.inputs import FloatArray, Pairs
 from sfm_app.selfcal.thesis.constraint_forms import Halves
 from sfm_app.selfcal.thesis.least_squares import fitted
-from sfm_app.selfcal.thesis.verdict import Camera, answered
+from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
@@ -32,17 +32,17 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
         seed: unused, nothing is drawn at random.
 
     Returns:
-        As `selfcal.verdict.answered`, which also says what is raised.
+        As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
     """
     del options, seed
-    return answered(METHOD, pairs, _found)
+    return calibrate_with(METHOD, pairs, _found)
 
 
-def _found(pairs: Pairs, tall: float, evidence: dict[str, float]) -> Camera:
+def _found(pairs: Pairs, tall: float, evidence: dict[str, float]) -> CameraParameters:
     focals = focals_of(pairs, (0.5, 0.5 * tall))
     known = focals[np.isfinite(focals)]
     evidence["focal_estimates"] = float(len(known))
-    start = Camera.initial(tall)
+    start = CameraParameters.initial(tall)
     if len(known):
         start = start._replace(fx=float(np.median(known)), fy=float(np.median(known)))
     return fitted(pairs, start, pairs.weights, kruppa_equations)

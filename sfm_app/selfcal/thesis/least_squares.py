@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.selfcal.inputs import FloatArray, Pairs
-from sfm_app.selfcal.thesis.constraint_forms import Halves, huang_faugeras_equations
-from sfm_app.selfcal.thesis.verdict import Camera
+from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations, Halves
+from sfm_app.selfcal.thesis.verdict import CameraParameters
 
-Equations = Callable[[Halves, FloatArray], FloatArray]
-"""Halves (..., P) and cameras (..., 1, 4) in, (..., P, m) equations out."""
+DEFAULT = EQUATIONS["huang-faugeras"]
+"""The form that the thesis chooses (5.5.1)."""
 FIRST_DAMPING = 1e-2
 DAMPING_RANGE = (1e-9, 1e9)
 MOST_STEPS = 60
@@ -32,15 +32,15 @@ class Minima(NamedTuple):
     """(B,) weighted sums of squares there."""
 
 
-def fitted(pairs: Pairs, start: Camera, weights: FloatArray, equations: Equations = huang_faugeras_equations) -> Camera:
+def fitted(
+    pairs: Pairs, start: CameraParameters, weights: FloatArray, equations: Equations = DEFAULT
+) -> CameraParameters:
     """Return local minimum of sum_i w_i |equations_i|^2 / sum_i w_i that is reached from `start`, over all pairs."""
     found = minima(Halves.of(pairs.F)[np.arange(len(pairs))[None]], weights[None], np.array([start]), equations)
-    return Camera(*(float(value) for value in found.cameras[0]))
+    return CameraParameters(*(float(value) for value in found.cameras[0]))
 
 
-def minima(
-    halves: Halves, weights: FloatArray, starts: FloatArray, equations: Equations = huang_faugeras_equations
-) -> Minima:
+def minima(halves: Halves, weights: FloatArray, starts: FloatArray, equations: Equations = DEFAULT) -> Minima:
     """Return Levenberg-Marquardt from many starts at once, each on pairs of its own.
 
     Thesis (5.8) sums the terms; Levenberg-Marquardt, which the thesis minimizes it with, sums their squares.

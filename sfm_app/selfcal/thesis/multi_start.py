@@ -6,10 +6,10 @@ from math import ceil, comb, log
 import numpy as np
 
 from sfm_app.selfcal.inputs import Pairs
-from sfm_app.selfcal.thesis.constraint_forms import Halves
+from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations, Halves
 from sfm_app.selfcal.thesis.kruppa import focals_of
-from sfm_app.selfcal.thesis.least_squares import minima
-from sfm_app.selfcal.thesis.verdict import Camera, answered
+from sfm_app.selfcal.thesis.least_squares import DEFAULT, minima
+from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
@@ -30,17 +30,19 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 
     Args:
         pairs: F's and weights; the weights count in the distribution of the focal and in the residual.
-        options: unused.
+        options: `constraint_form`.
         seed: of the triples and the starts.
 
     Returns:
-        As `selfcal.verdict.answered`, which also says what is raised.
+        As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
     """
-    del options
-    return answered(METHOD, pairs, partial(algorithm_2, seed=seed), SAMPLE)
+    find = partial(algorithm_2, seed=seed, equations=EQUATIONS[options.constraint_form])
+    return calibrate_with(METHOD, pairs, find, SAMPLE)
 
 
-def algorithm_2(pairs: Pairs, tall: float, evidence: dict[str, float], seed: int) -> Camera:
+def algorithm_2(
+    pairs: Pairs, tall: float, evidence: dict[str, float], seed: int, equations: Equations = DEFAULT
+) -> CameraParameters:
     """Return the algorithm itself, for an image of width 1 and height `tall`.
 
     `evidence` gets the distribution and MaxIter.
@@ -57,8 +59,8 @@ def algorithm_2(pairs: Pairs, tall: float, evidence: dict[str, float], seed: int
     # sorted by a property that neither scale nor direction nor place changes: the order of the pairs has no effect
     halves = Halves.of(pairs.F)[np.argsort(pairs.product, kind="stable")]
     triples = np.argsort(rng.random((count, len(pairs))), axis=1)[:, :SAMPLE]
-    found = minima(halves[triples], np.ones(triples.shape), starts)
-    return Camera(*(float(value) for value in found.cameras[np.argmin(found.sums)]))
+    found = minima(halves[triples], np.ones(triples.shape), starts, equations)
+    return CameraParameters(*(float(value) for value in found.cameras[np.argmin(found.sums)]))
 
 
 def number_of_starts(pairs: int) -> int:

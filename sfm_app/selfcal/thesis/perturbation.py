@@ -1,11 +1,13 @@
 """Algorithm 3 of the thesis: pairs that err more than an error of K explains lose their weight (5.7)."""
 
+from functools import partial
+
 import numpy as np
 
 from sfm_app.selfcal.inputs import FloatArray, Pairs
-from sfm_app.selfcal.thesis.constraint_forms import essential
-from sfm_app.selfcal.thesis.least_squares import fitted
-from sfm_app.selfcal.thesis.verdict import Camera, answered
+from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations, essential
+from sfm_app.selfcal.thesis.least_squares import DEFAULT, fitted
+from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
@@ -22,24 +24,26 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 
     Args:
         pairs: F's; weights tell which pairs take part (> 0), and count in the verdict only.
-        options: unused.
+        options: `constraint_form`, which says whether it is (5.8) or another form.
         seed: unused, nothing is drawn at random.
 
     Returns:
-        As `selfcal.verdict.answered`, which also says what is raised.
+        As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
     """
-    del options, seed
-    return answered(METHOD, pairs, algorithm_3)
+    del seed
+    return calibrate_with(METHOD, pairs, partial(algorithm_3, equations=EQUATIONS[options.constraint_form]))
 
 
-def algorithm_3(pairs: Pairs, tall: float, evidence: dict[str, float]) -> Camera:
+def algorithm_3(
+    pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations = DEFAULT
+) -> CameraParameters:
     """Return the algorithm itself, from K_init.
 
     `evidence` gets the number of iterations and the effective number of pairs.
     """
-    camera, weights = Camera.initial(tall), np.ones(len(pairs))
+    camera, weights = CameraParameters.initial(tall), np.ones(len(pairs))
     for iteration in range(1, MOST_ITERATIONS + 1):
-        before, camera = camera, fitted(pairs, camera, weights)
+        before, camera = camera, fitted(pairs, camera, weights, equations)
         evidence |= {"iterations": float(iteration), "weighted_pairs": float(np.sum(weights) ** 2 / np.sum(weights**2))}
         if np.linalg.norm(camera.K - before.K) <= TOLERANCE:
             break

@@ -21,7 +21,7 @@ MIN_PAIRS = 3
 """Four unknowns and two constraints a pair; with two pairs nothing is left to contradict a wrong K."""
 
 
-class Camera(NamedTuple):
+class CameraParameters(NamedTuple):
     """The four parameters of K that the thesis seeks, in image widths from the top left corner."""
 
     fx: float
@@ -30,7 +30,7 @@ class Camera(NamedTuple):
     v: float
 
     @classmethod
-    def initial(cls, tall: float) -> "Camera":
+    def initial(cls, tall: float) -> "CameraParameters":
         """Return K_init of thesis 5.7.2 for an image of width 1 and height `tall`.
 
         53 degrees (not 90, as it says) across.
@@ -43,11 +43,11 @@ class Camera(NamedTuple):
         return camera_matrix(*self)
 
 
-Find = Callable[[Pairs, float, dict[str, float]], Camera | str]
+Find = Callable[[Pairs, float, dict[str, float]], CameraParameters | str]
 """A method: pairs in image widths, height over width, and a table for its figures; K, or why there is none."""
 
 
-def answered(method: str, pairs: CameraPairs, find: Find, sample: int = 0) -> Calibration:
+def calibrate_with(method: str, pairs: CameraPairs, find: Find, sample: int = 0) -> Calibration:
     """Run a method and judge what it finds.
 
     Args:
@@ -80,7 +80,7 @@ def answered(method: str, pairs: CameraPairs, find: Find, sample: int = 0) -> Ca
     return Calibration(camera_matrix(*in_px), width, height, method, identifiable=True, evidence=evidence)
 
 
-def _objection(found: Camera, pairs: Pairs, sample: int, evidence: dict[str, float]) -> str:
+def _objection(found: CameraParameters, pairs: Pairs, sample: int, evidence: dict[str, float]) -> str:
     """Return why the answer is not to be trusted, or nothing; adds support and lead to the evidence."""
     theta = np.array([0.5 * np.log(found.fx * found.fy), found.u, found.v, np.log(found.fy / found.fx)])
     # the wider sigma: these answers are no maxima of the consensus, and must not be held against the last per cent

@@ -6,8 +6,8 @@ import numpy as np
 
 from sfm_app.selfcal.inputs import Pairs
 from sfm_app.selfcal.thesis.curves import center_curves, focal_curves, usable
-from sfm_app.selfcal.thesis.meeting_point import meeting_point
-from sfm_app.selfcal.thesis.verdict import Camera, answered
+from sfm_app.selfcal.thesis.meeting_point import meeting_point, meeting_points
+from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
@@ -16,6 +16,8 @@ FOCAL_RANGE = 3.0
 """Focals are sought up to this many image widths (thesis 5.29)."""
 SIGMA_SHARE = 0.1
 """sigma of rho, as a share of the range that is searched (thesis 5.8.4)."""
+PEAK_RANGE, PEAK_SIGMA = (0.3, FOCAL_RANGE), 0.1
+"""Where peaks are sought and how wide they are, in image widths: small beside the distance between two cameras."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
@@ -29,18 +31,19 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
         seed: unused, nothing is drawn at random.
 
     Returns:
-        As `selfcal.verdict.answered`, which also says what is raised.
+        As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
     """
     del seed
-    return answered(METHOD, pairs, partial(algorithm_4, samples=options.samples))
+    return calibrate_with(METHOD, pairs, partial(algorithm_4, samples=options.samples))
 
 
-def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: int) -> Camera | str:
+def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: int) -> CameraParameters | str:
     """Return the algorithm itself, for an image of width 1 and height `tall`.
 
     The reason where too few curves are usable.
 
-    Fills `evidence` with the number of curves and their support at the meeting points.
+    Fills `evidence` with the number of curves and their support at the meeting points. With `focal_peaks`, the number
+    of separate peaks of that support, too: several are several cameras (Figure 5.15), of which the answer is one.
     """
     sweep = np.arange(1, samples + 1) / samples
     fx = FOCAL_RANGE * sweep
@@ -50,6 +53,7 @@ def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: 
     if focal is None:
         return f"{len(curves)} of {len(pairs)} pairs have a usable focal curve, 2 are needed"
     evidence["focal_support"] = focal.support
+    evidence["focal_peaks"] = float(len(meeting_points(curves, fx, PEAK_RANGE, PEAK_SIGMA)))
 
     curves = usable(center_curves(pairs, sweep, (fx[focal.sample], focal.value)), tall)
     evidence["center_curves"] = float(len(curves))
@@ -57,4 +61,4 @@ def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: 
     if center is None:
         return f"{len(curves)} of {len(pairs)} pairs have a usable center curve, 2 are needed"
     evidence["center_support"] = center.support
-    return Camera(float(fx[focal.sample]), focal.value, float(sweep[center.sample]), center.value)
+    return CameraParameters(float(fx[focal.sample]), focal.value, float(sweep[center.sample]), center.value)

@@ -80,6 +80,7 @@ def test_an_output_folder_that_cannot_be_made_ends_with_exit_code_3(folder, tmp_
     assert (result.exit_code, "cannot write to" in result.stderr) == (3, True)
 
 
+@pytest.mark.slow
 def test_a_read_only_output_folder_ends_with_exit_code_3(folder, tmp_path, as_ordinary_user):
     for name in ("a.jpg", "b.jpg"):
         photo(folder / name)
@@ -113,6 +114,7 @@ def test_wrong_settings_end_with_exit_code_2_before_any_work(folder, tmp_path, f
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_photos_of_different_places_end_with_exit_code_4(unrelated, tmp_path):
     result = call("run", unrelated, "-o", tmp_path / "out", "-q")
 
@@ -134,6 +136,7 @@ def test_config_prints_toml_that_loads(tmp_path):
     assert loaded.depth.max_image_size_px == Settings.from_mapping({"quality": "high"}).depth.max_image_size_px
 
 
+@pytest.mark.slow
 def test_plugins_and_doctor_answer():
     listing = call("plugins").stdout
     found = json.loads(call("doctor", "--json").stdout)
@@ -143,6 +146,7 @@ def test_plugins_and_doctor_answer():
     assert "pycolmap" in found
 
 
+@pytest.mark.slow
 def test_the_module_runs_as_a_program():
     done = subprocess.run([sys.executable, "-m", "sfm_app", "--version"], capture_output=True, text=True, check=True)
 

@@ -9,6 +9,8 @@ from sfm_app.colmap.database import camera_params
 from sfm_app.geometry.bundle import reduce
 from sfm_app.geometry.camera import camera_matrix
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 1000, 800
 PLAIN = [900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")

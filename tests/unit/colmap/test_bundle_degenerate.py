@@ -9,6 +9,8 @@ from sfm_app.colmap.bundle import adjust, adjusted_or_as_it_was
 from sfm_app.colmap.database import opened
 from sfm_app.errors import BackendError, NumericalError
 
+pytestmark = pytest.mark.slow
+
 
 def away(model, share, place):
     """Put some points elsewhere."""

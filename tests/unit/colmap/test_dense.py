@@ -21,8 +21,10 @@ from sfm_app.colmap.dense import (
 from sfm_app.colmap.surface import FUSED, fuse, poisson, read_fused, simplify
 from sfm_app.errors import BackendError
 from sfm_app.progress import Silent
-from sfm_app.stereo import DepthMap, Estimate
+from sfm_app.stereo import DepthEstimate, DepthMap
 from sfm_app.types import Surface
+
+pytestmark = pytest.mark.slow
 
 NORMAL = np.array([0.3, -0.2, 1.0]) / np.linalg.norm([0.3, -0.2, 1.0])
 DISTANCE = 5.0
@@ -108,7 +110,7 @@ def test_maps_come_back_as_they_were(workspace):
 def test_estimates_come_and_go(workspace):
     dense, views = workspace
     store, depth = DenseStore(dense), np.full((90, 120), 3.0, np.float32)
-    store.write_estimate(views[0], Estimate(depth, depth / 4))
+    store.write_estimate(views[0], DepthEstimate(depth, depth / 4))
 
     found = store.read_estimate(views[0])
 

@@ -11,6 +11,8 @@ from sfm_app.colmap.database import opened
 from sfm_app.colmap.global_mapping import global_options
 from sfm_app.errors import BackendError
 
+pytestmark = pytest.mark.slow
+
 UNKNOWN = ("SIMPLE_RADIAL", [900.0, 500, 400, 0])
 KNOWN = ("SIMPLE_RADIAL", [900.0, 500, 400, -0.1])
 TWO_FOCALS = ("OPENCV", [900.0, 800, 500, 400, 0, 0, 0, 0])

@@ -23,7 +23,7 @@ from sfm_app.colmap.surface import FUSED, fuse, read_fused
 from sfm_app.photos import save_used
 from sfm_app.progress import Silent
 from sfm_app.settings import MatchSettings
-from sfm_app.stereo import DepthMap, Estimate
+from sfm_app.stereo import DepthEstimate, DepthMap
 from sfm_app.types import Photo, PhotoSet
 
 SIZE = 240, 160
@@ -113,7 +113,7 @@ def test_without_masks_all_is_used(place, tmp_path):
     depth = np.full((view.height, view.width), 3.0, np.float32)
 
     assert used_pixels(tmp_path, view) is None
-    DenseStore(tmp_path).write_estimate(view, Estimate(depth, depth / 4))
+    DenseStore(tmp_path).write_estimate(view, DepthEstimate(depth, depth / 4))
     write_maps(tmp_path, view, DepthMap(depth, np.zeros((*depth.shape, 3), np.float32)))
     hide_masked(tmp_path, view)
 
@@ -127,7 +127,7 @@ def test_estimates_have_no_depth_where_the_photo_is_masked(dense):
     view = views["sub/2.png"]
     used, depth = used_pixels(folder, view), np.full((view.height, view.width), 3.0, np.float32)
 
-    DenseStore(folder).write_estimate(view, Estimate(depth, np.full_like(depth, 0.05)))
+    DenseStore(folder).write_estimate(view, DepthEstimate(depth, np.full_like(depth, 0.05)))
     found = DenseStore(folder).read_estimate(view)
 
     np.testing.assert_array_equal(found.depth, np.where(used, 3, 0))

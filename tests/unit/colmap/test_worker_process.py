@@ -12,6 +12,8 @@ import pytest
 from sfm_app.colmap.worker_process import relay, started
 from sfm_app.errors import BackendError
 
+pytestmark = pytest.mark.slow
+
 CHILD = """
 import os, signal, sys, time
 from sfm_app.colmap.worker_process import Reported, report, served

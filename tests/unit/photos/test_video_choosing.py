@@ -6,7 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.photos import Follower, Look, choose
+from sfm_app.photos import Follower, TrackedFrame, choose
+
+pytestmark = pytest.mark.slow
 
 SIZE = WIDTH, HEIGHT = 240, 160
 STEP_PX = 0.05 * WIDTH
@@ -150,7 +152,7 @@ def test_the_same_frames_give_the_same_choice(wall):
 @given(st.lists(st.tuples(st.floats(0, 1e5), st.floats(-0.9, 1.2)), min_size=1, max_size=60), st.integers(2, 20))
 def test_any_looks_give_a_choice_in_order(steps, most):
     way = np.maximum(0.0, np.cumsum([step for _, step in steps]) - steps[0][1])
-    looks = [Look(3 * k, sharp, float(at)) for k, ((sharp, _), at) in enumerate(zip(steps, way, strict=True))]
+    looks = [TrackedFrame(3 * k, sharp, float(at)) for k, ((sharp, _), at) in enumerate(zip(steps, way, strict=True))]
 
     choice = choose(looks, most)
 

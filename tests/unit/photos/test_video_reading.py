@@ -9,6 +9,8 @@ import pytest
 
 from sfm_app.photos import UnreadableError, head_of, is_video, opened, video
 
+pytestmark = pytest.mark.slow
+
 SIZE = WIDTH, HEIGHT = 160, 96
 COUNT = 24
 

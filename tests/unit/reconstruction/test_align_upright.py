@@ -17,6 +17,8 @@ from sfm_app.synthetic.cameras import arc, make_camera
 from sfm_app.types import GpsPosition, MatchedImage, MatchGraph
 from sfm_app.workspace import Workspace
 
+pytestmark = pytest.mark.slow
+
 METRES = 8.0
 """Per unit of the synthetic scene."""
 

@@ -23,6 +23,8 @@ from sfm_app.reconstruction.support import Explained, explained_pairs
 from sfm_app.settings import Settings
 from sfm_app.types import ViewGraph
 
+pytestmark = pytest.mark.slow
+
 FOCAL = 1280.0
 AUTO = Settings()
 

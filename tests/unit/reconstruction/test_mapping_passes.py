@@ -17,6 +17,8 @@ from sfm_app.reconstruction.mapping_runs import Attempt
 from sfm_app.reconstruction.support import Explained, explained_pairs
 from sfm_app.types import PoseGraph
 
+pytestmark = pytest.mark.slow
+
 FOCAL = 1280.0
 TRUE = [FOCAL, 512.0, 384.0, 0.0]
 

@@ -10,6 +10,8 @@ from sfm_app.reconstruction.mapping_runs import Attempt, Group, attempts, better
 from sfm_app.reconstruction.support import Explained
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, RelativePose, ViewGraph
 
+pytestmark = pytest.mark.slow
+
 
 def model(photos, points=500):
     return SimpleNamespace(num_reg_images=lambda: photos, num_points3D=lambda: points)

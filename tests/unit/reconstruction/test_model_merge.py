@@ -14,6 +14,8 @@ from sfm_app.reconstruction.mapping_runs import judged
 from sfm_app.reconstruction.model_merge import LEAST_SHARED, join_models, shared_points
 from sfm_app.types import ViewGraph
 
+pytestmark = pytest.mark.slow
+
 ELSEWHERE = Similarity(3.7, Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix(), np.array([5.0, -2.0, 11.0]))
 
 

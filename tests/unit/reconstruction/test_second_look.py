@@ -17,6 +17,8 @@ from sfm_app.reconstruction.support import explained_pairs
 from sfm_app.settings import Settings
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, ViewGraph
 
+pytestmark = pytest.mark.slow
+
 LOST = 6
 
 

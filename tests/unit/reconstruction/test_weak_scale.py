@@ -1,6 +1,10 @@
 from types import SimpleNamespace
 
+import pytest
+
 from sfm_app.reconstruction.weak_scale import LEAST, weakly_joined
+
+pytestmark = pytest.mark.slow
 
 
 def model(*tracks):

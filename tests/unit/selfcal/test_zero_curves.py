@@ -9,6 +9,8 @@ from sfm_app.selfcal.zero_curves import METHOD, calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import CameraPairs
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = CalibrationSettings()
 
 

@@ -19,6 +19,8 @@ from sfm_app.stages import depth_maps
 from sfm_app.stereo import DepthMap
 from sfm_app.types import Rejected
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def scene(tmp_path):

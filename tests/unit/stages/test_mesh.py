@@ -19,6 +19,8 @@ from sfm_app.stereo import DepthMap
 from sfm_app.synthetic.cameras import look_at
 from sfm_app.workspace import Workspace
 
+pytestmark = pytest.mark.slow
+
 DISTANCE, FOCAL, WIDTH, HEIGHT = 4.0, 190.0, 120, 110
 WAYS = np.array([[np.cos(a) * np.cos(e), np.sin(e), np.sin(a) * np.cos(e)] for e in (-0.9, 0, 0.9) for a in range(6)])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_app.calibrating import camera_pairs, of_whole_photo, photo_pairs
-from sfm_app.selfcal import Camera, pair_weights
+from sfm_app.selfcal import CalibratedCamera, pair_weights
 from sfm_app.selfcal.results import guessed
 from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, Rejected, ViewGraph
 
@@ -73,9 +73,9 @@ def test_pixels_are_counted_within_bars_and_the_camera_is_that_of_the_whole_phot
     np.testing.assert_allclose(pairs.inliers[0], plain.inliers[0] - [0, 0, 0, 100])
     np.testing.assert_array_equal(pairs.inliers[1], plain.inliers[1])
 
-    camera = of_whole_photo(Camera("big", (7,), guessed((800, 600), "", {})), image)
+    camera = of_whole_photo(CalibratedCamera("big", (7,), guessed((800, 600), "", {})), image)
 
     assert (camera.found.width, camera.found.height) == (1000, 750)
     np.testing.assert_allclose(camera.found.K, [[960, 0, 400], [0, 960, 400], [0, 0, 1]])
-    whole = Camera("big", (2,), guessed((1000, 750), "", {}))
+    whole = CalibratedCamera("big", (2,), guessed((1000, 750), "", {}))
     assert of_whole_photo(whole, IMAGES[2]) is whole

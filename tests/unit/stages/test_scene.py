@@ -36,6 +36,8 @@ from sfm_app.types import (
 )  # fmt: skip
 from sfm_app.workspace import MAPPING, Workspace
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def synthetic(tmp_path_factory):

@@ -13,6 +13,8 @@ from sfm_app.settings import Settings
 from sfm_app.stages.video_frames import stem_of, video_frames
 from sfm_app.workspace import Workspace
 
+pytestmark = pytest.mark.slow
+
 SIZE = WIDTH, HEIGHT = 160, 96
 
 

@@ -9,6 +9,8 @@ from sfm_app.settings import DepthSettings
 from sfm_app.stereo import DepthTask, make_on_cpu, method, rank_neighbors
 from sfm_app.types import Rejected
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass
 class Memory:

@@ -5,6 +5,8 @@ import pytest
 
 from sfm_app.stereo.patch_match import NO_MATCH, improve_planes
 
+pytestmark = pytest.mark.slow
+
 CENTERS = [(0.5, 0, 0), (-0.4, 0.2, 0), (0, 0.5, 0.3)]
 
 

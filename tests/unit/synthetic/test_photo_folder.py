@@ -10,6 +10,8 @@ from sfm_app.errors import ConfigError, InputError
 from sfm_app.synthetic.cameras import Camera, Views, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, develop, load_truth, save_truth, write_photo_folder
 
+pytestmark = pytest.mark.slow
+
 
 class Counter:
     def __init__(self):

@@ -13,6 +13,8 @@ from sfm_app.synthetic.pictures import (
 from sfm_app.types import Surface
 from sfm_app.types.model import Model, Texture
 
+pytestmark = pytest.mark.slow
+
 CAMERA = Camera(np.array([[20.0, 0, 20.0], [0, 20.0, 10.0], [0, 0, 1]]), 40, 20)
 STRAIGHT = np.eye(3, 4)
 SQUARE = np.array([[0.0, -0.5, 1.0], [1.0, -0.5, 1.0], [1.0, 0.5, 1.0], [0.0, 0.5, 1.0]])

@@ -9,6 +9,8 @@ from sfm_app.synthetic.render import cast, prepare, ray_caster, render_scene
 from sfm_app.synthetic.shapes import box
 from sfm_app.synthetic.textures import Material
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def prepared(still_life):

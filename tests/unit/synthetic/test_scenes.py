@@ -9,6 +9,8 @@ from sfm_app.synthetic.scenes import WALKS, build_scene, scene_views
 from sfm_app.synthetic.shapes import assembled, ball, box, carved, waves
 from sfm_app.synthetic.statue import bust_field
 
+pytestmark = pytest.mark.slow
+
 
 def signed_volume(shape):
     a, b, c = (shape.vertices[shape.faces[:, k]] for k in range(3))

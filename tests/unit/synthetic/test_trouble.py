@@ -19,6 +19,8 @@ from sfm_app.synthetic.trouble import (
     zoomed,
 )
 
+pytestmark = pytest.mark.slow
+
 PLANS = [troubled_folder(seed) for seed in range(120)]
 
 

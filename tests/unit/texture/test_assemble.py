@@ -13,6 +13,8 @@ from sfm_app.settings import TextureSettings
 from sfm_app.texture import texture_surface
 from sfm_app.types import Model
 
+pytestmark = pytest.mark.slow
+
 VIEWS = around()
 BOX = box()
 

@@ -22,6 +22,8 @@ from sfm_app.settings import CalibrationSettings
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import CameraPairs
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = CalibrationSettings()
 SIDE = 1000.0
 TO_SIDES = np.array([[SIDE, 0, 500], [0, SIDE, 375], [0, 0, 1]])

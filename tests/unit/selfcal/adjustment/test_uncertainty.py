@@ -9,6 +9,8 @@ from sfm_app.selfcal.adjustment.structureless_ba import Matches
 from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_of
 from sfm_app.selfcal.results import calibration_of, parameters_of
 
+pytestmark = pytest.mark.slow
+
 SIDE = 1000.0
 TO_SIDES = np.array([[SIDE, 0, 500], [0, SIDE, 375], [0, 0, 1]])
 

@@ -14,6 +14,8 @@ from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import CameraPairs
 
+pytestmark = pytest.mark.slow
+
 MIDDLE = np.array([[1e3, 0, 500], [0, 1e3, 375], [0, 0, 1]])
 UNLIKE = 1000 * np.geomspace(0.7, 1.75, 10)
 """Ten focals, the last 2.5 times the first."""

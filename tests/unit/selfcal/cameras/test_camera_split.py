@@ -7,6 +7,8 @@ from sfm_app.selfcal.cameras.camera_split import separated
 from sfm_app.selfcal.cameras.multi_camera import Tables
 from sfm_app.selfcal.lens import LOG_FOCAL
 
+pytestmark = pytest.mark.slow
+
 MIDDLE = np.array([[1e3, 0, 500], [0, 1e3, 375], [0, 0, 1]])
 
 

@@ -9,6 +9,8 @@ from sfm_app.selfcal.cameras.multi_camera import CameraGroup, Tables, best_place
 from sfm_app.selfcal.lens import LOG_FOCAL
 from sfm_app.settings import CalibrationSettings
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = CalibrationSettings()
 
 

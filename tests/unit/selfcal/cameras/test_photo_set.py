@@ -12,6 +12,8 @@ from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import PhotoPairs
 
+pytestmark = pytest.mark.slow
+
 OPTIONS = CalibrationSettings()
 NO_PAIRS = PhotoPairs(np.empty((0, 3, 3)), np.empty(0), (), (), {}, {})
 

@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.thesis.verdict import Camera, answered
+from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.types import CameraPairs
 
 
 def judged(made, answer):
-    return answered("mine", CameraPairs.of(made.Fs, made.size), lambda *_: answer)
+    return calibrate_with("mine", CameraPairs.of(made.Fs, made.size), lambda *_: answer)
 
 
 def camera_of(made, factor=1.0):
     K = made.K / made.size[0]
-    return Camera(factor * K[0, 0], factor * K[1, 1], K[0, 2], K[1, 2])
+    return CameraParameters(factor * K[0, 0], factor * K[1, 1], K[0, 2], K[1, 2])
 
 
 def test_a_camera_that_the_pairs_support_is_known(views):
@@ -45,7 +45,9 @@ def test_any_camera_that_parallel_axes_fit_is_undecided(views):
 @pytest.mark.parametrize(("sample", "known"), [(0, True), (3, False), (10, False), (12, False)])
 def test_pairs_that_were_fitted_do_not_speak_for_the_answer(views, random_fundamentals, sample, known):
     Fs = np.concatenate([views(3).Fs, random_fundamentals(7)])
-    found = answered("mine", CameraPairs.of(Fs, (1000, 750)), lambda *_: Camera(1.0, 1.0, 0.5, 0.375), sample)
+    found = calibrate_with(
+        "mine", CameraPairs.of(Fs, (1000, 750)), lambda *_: CameraParameters(1.0, 1.0, 0.5, 0.375), sample
+    )
     assert found.identifiable == known
     assert 0.2 < found.evidence["support"] < 0.4
 
@@ -58,9 +60,9 @@ def test_a_method_may_have_no_answer(views):
 def test_two_pairs_are_too_few_to_ask(views):
     made = views(3)
     pairs = CameraPairs.of(made.Fs[:2], made.size)
-    found = answered("mine", pairs, lambda *_: pytest.fail("asked"))
+    found = calibrate_with("mine", pairs, lambda *_: pytest.fail("asked"))
     assert found.reason == "2 usable pairs, 3 are needed"
 
 
 def test_k_init_is_as_wide_as_the_image():
-    np.testing.assert_array_equal(Camera.initial(0.75).K, [[1, 0, 0.5], [0, 1, 0.375], [0, 0, 1]])
+    np.testing.assert_array_equal(CameraParameters.initial(0.75).K, [[1, 0, 0.5], [0, 1, 0.375], [0, 0, 1]])

@@ -36,6 +36,17 @@ def test_focal_and_center_in_x_are_samples_of_the_sweep(views):
     assert found.K[0, 2] / 20 == pytest.approx(round(found.K[0, 2] / 20))
 
 
+def test_two_cameras_are_told_by_their_peaks(views):
+    fine = OPTIONS.model_copy(update={"samples": 200})
+    one = run(views(5, 2, noise=5e-4, focal=1100), fine)
+    pairs = [views(5, 1 + 100 * i, noise=5e-4, focal=focal) for i, focal in enumerate((700, 1500))]
+    Fs = np.concatenate([made.Fs for made in pairs])
+    several = calibrate(CameraPairs.of(Fs, pairs[0].size), fine, 0)
+
+    assert one.evidence["focal_peaks"] == 1
+    assert several.evidence["focal_peaks"] >= 2
+
+
 def test_outlying_curves_are_outvoted(views, random_fundamentals):
     made = views(6, noise=3e-4)
     Fs = made.Fs.copy()

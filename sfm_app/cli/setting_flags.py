@@ -1,0 +1,113 @@
+"""Flags that are settings: type, help, range and default come from the field in `settings.py`."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, TypeVar, get_args
+
+import click
+from pydantic.fields import FieldInfo
+
+from sfm_app.settings import QUALITY_PRESETS, Section, Settings, merged
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+BELOW, ABOVE = {"ge": "{}<=", "gt": "{}<"}, {"le": "<={}", "lt": "<{}"}
+"""How bounds are written, by pydantic's name for them."""
+
+
+@dataclass(frozen=True, slots=True)
+class SettingFlag:
+    """A flag of its own for a setting that is often changed."""
+
+    flag: str
+    setting: str
+    """Its name in the settings file, such as "mesh.faces"."""
+    metavar: str | None = None
+    choice: bool = False
+    """Whether click refuses what is none of the values; otherwise the settings do, and name the table."""
+
+    @property
+    def parameter(self) -> str:
+        """Name of the command's parameter."""
+        return self.flag.removeprefix("--").replace("-", "_")
+
+    def nested(self, value: object) -> dict[str, Any]:
+        """Return the setting as a mapping of settings."""
+        table, _, key = self.setting.rpartition(".")
+        return {table: {key: value}} if table else {key: value}
+
+
+SETTING_FLAGS = (
+    SettingFlag("--seed", "seed"),
+    SettingFlag("--workers", "workers"),
+    SettingFlag("--max-memory", "max_memory_gb", metavar="GB"),
+    SettingFlag("--quality", "quality", choice=True),
+    SettingFlag("--images", "photos.images"),
+    SettingFlag("--masks", "photos.masks"),
+    SettingFlag("--cameras", "photos.cameras"),
+    SettingFlag("--max-frames", "photos.max_frames"),
+    SettingFlag("--keep-low-quality", "photos.keep_low_quality"),
+    SettingFlag("--features", "matching.features"),
+    SettingFlag("--estimator", "epipolar.estimator"),
+    SettingFlag("--calibrator", "calibration.calibrator"),
+    SettingFlag("--mapper", "scene.mapper"),
+    SettingFlag("--faces", "mesh.faces"),
+    SettingFlag("--unseen-faces", "texture.unseen_faces", choice=True),
+)
+
+
+def setting_option(flag: SettingFlag) -> Callable[[Command], Command]:
+    """Return the click option of a setting; None where it is not given."""
+    kind, text = field_of(flag.setting).annotation, help_text(flag.setting)
+    if kind is bool:
+        return click.option(flag.flag, is_flag=True, default=None, help=text)
+    if flag.choice:
+        return click.option(flag.flag, type=click.Choice(get_args(kind)), help=text)
+    return click.option(flag.flag, type=kind if kind in (int, float) else str, metavar=flag.metavar, help=text)
+
+
+def help_text(setting: str) -> str:
+    """Return the description of a setting as a sentence, with its default and its range."""
+    description = field_of(setting).description or ""
+    facts = "; ".join(fact for fact in (default_text(setting), range_text(setting)) if fact)
+    return f"{description[:1].upper()}{description[1:]}." + (f"  [{facts}]" if facts else "")
+
+
+def default_text(setting: str) -> str:
+    """Return the default, one for each quality where the presets differ; empty for none and for switches."""
+    values = {
+        quality: value_of(Settings.from_mapping(merged(preset, {"quality": quality})), setting)
+        for quality, preset in QUALITY_PRESETS.items()
+    }
+    if setting != "quality" and len(set(values.values())) > 1:
+        return "default: " + ", ".join(f"{value} for {quality}" for quality, value in values.items())
+    value = value_of(Settings(), setting)
+    return "" if value == "" or isinstance(value, bool) else f"default: {value}"
+
+
+def range_text(setting: str) -> str:
+    """Return the range of a number, such as "1<=x<=9"; empty where there is none."""
+
+    def written(side: Mapping[str, str]) -> str:
+        bounds = field_of(setting).metadata
+        pairs = ((bound, name) for bound in bounds for name in side if hasattr(bound, name))
+        return "".join(side[name].format(getattr(bound, name)) for bound, name in pairs)
+
+    below, above = written(BELOW), written(ABOVE)
+    return f"{below}x{above}" if below or above else ""
+
+
+def field_of(setting: str) -> FieldInfo:
+    """Return the field of a setting such as "mesh.faces"."""
+    section: type[Section] = Settings
+    *tables, key = setting.split(".")
+    for table in tables:
+        section = type(getattr(section(), table))
+    return section.model_fields[key]
+
+
+def value_of(settings: Section, setting: str) -> Any:
+    """Return the value of a setting such as "mesh.faces"."""
+    value: Any = settings
+    for part in setting.split("."):
+        value = getattr(value, part)
+    return value

@@ -1,0 +1,75 @@
+"""What the pages say of flags, settings, exit codes and layers is what the code has."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from sfm_app import errors
+from sfm_app.cli import main
+from sfm_app.cli.options import assigned
+from sfm_app.errors import SfmError
+from sfm_app.settings import QUALITY_PRESETS, Settings
+
+ROOT = Path(__file__).parents[2]
+PAGES = ["README.md", "docs/algorithms.md", "docs/architecture.md", "docs/plugins.md"]
+NOT_OURS = {"--left-out", "--sets", "--without"}
+"""Flags of benchmarks."""
+
+
+def read(page):
+    return (ROOT / page).read_text(encoding="utf-8")
+
+
+def flags():
+    """Every long flag of every command."""
+    commands = main.commands.values()
+    return {flag for command in commands for parameter in command.params for flag in parameter.opts}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_commands_that_are_printed_have_these_flags(page):
+    """In a span of code or a block, after `sfm-app`, up to the end of the command."""
+    calls = re.findall(r"sfm-app (?:[a-z]+ )[^`\n#|;]*", read(page))
+    printed = {flag for call in calls for flag in re.findall(r"(?<!\S)--[a-z-]+", call)}
+    assert printed <= flags() | {"--help", "--version"}
+
+
+def test_flags_of_the_readme_are_there():
+    printed = set(re.findall(r"`(--[a-z-]+)", read("README.md")))
+    assert len(printed) > 10
+    assert printed - NOT_OURS <= flags()
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_settings_that_are_printed_can_be_set(page):
+    for assignment in re.findall(r"--set ([a-z_]+\.[a-z_]+=[^\s`]+)", read(page)):
+        Settings.from_mapping(assigned(assignment))
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_settings_that_are_named_exist(page):
+    """`table.key` in code, where the table is one of the settings file."""
+    tables = [name for name in Settings.model_fields if name not in ("seed", "workers", "quality", "plugins")]
+    for table, key in re.findall(rf"`({'|'.join(tables)})\.([a-z_]+)`", read(page)):
+        if not (ROOT / "sfm_app" / table / f"{key}.py").exists():
+            assert key in type(getattr(Settings(), table)).model_fields, f"{page}: {table}.{key}"
+
+
+def test_the_presets_are_those_of_the_readme():
+    assert f"--quality {'|'.join(QUALITY_PRESETS)}" in read("README.md")
+
+
+def test_exit_codes_are_those_of_the_errors():
+    printed = {int(code) for code in re.findall(r"^\| (\d+) \|", read("README.md").split("| code |")[1], re.MULTILINE)}
+    kinds = [kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, SfmError)]
+    assert printed == {0, 130} | {kind.exit_code for kind in kinds if kind is not SfmError}
+
+
+def test_layers_are_those_that_import_linter_checks():
+    contracts = tomllib.loads(read("pyproject.toml"))["tool"]["importlinter"]["contracts"]
+    layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
+    printed = re.search(r"Imports go down only;[^\n]*\n\n```\n(.*?)```", read("docs/architecture.md"), re.DOTALL)
+    assert printed is not None
+    assert printed[1].split("\n")[:-1] == layers
