@@ -134,7 +134,7 @@ def how_it_was_adjusted(adjusted: Sequence[Adjusted], names: Mapping[str, str]) 
     """Return what the manifest says about what the last adjustment could not do; empty where that is nothing."""
     main, others = adjusted[0], adjusted[1:]
     cameras = {image.camera_id: names[image.name] for image in posed_images(main.model)}
-    found = {
+    found: dict[str, Json] = {
         "failed": main.trouble,
         "failed_in_other_models": {str(number): one.trouble for number, one in enumerate(others, 1) if one.trouble},
         "cameras_held": [cameras[camera_id] for camera_id in main.held],
