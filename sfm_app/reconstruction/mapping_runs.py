@@ -82,6 +82,7 @@ class NoModel:
 
 
 Tried: TypeAlias = Attempt | NoModel
+"""What came of a mapper."""
 Maker: TypeAlias = Callable[[CancellationToken], list[Tried]]
 """Makes models until a token stops it."""
 
