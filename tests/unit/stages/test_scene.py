@@ -273,7 +273,8 @@ def test_refined_cameras_stand_beside_the_calibration_and_leave_it_valid(tmp_pat
 
 def test_what_is_known_of_refined_cameras_goes_by_their_names():
     images = {
-        key: SimpleNamespace(name=f"{key}.jpg", camera_id=7 if key < 3 else 8, has_pose=key != 4) for key in range(1, 5)
+        key: SimpleNamespace(image_id=key, name=f"{key}.jpg", camera_id=7 if key < 3 else 8, has_pose=key != 4)
+        for key in range(1, 5)
     }
     adjusted = SimpleNamespace(
         model=SimpleNamespace(images=images),
