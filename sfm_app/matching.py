@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -21,6 +20,7 @@ from sfm_app.colmap.features import find_and_match
 from sfm_app.context import RunContext
 from sfm_app.errors import InputError, PluginError
 from sfm_app.hashing import load_arrays
+from sfm_app.numerical import Json
 from sfm_app.parallel import ordered_map
 from sfm_app.photos.masks import read_used
 from sfm_app.plugins import FeatureMethod
@@ -32,7 +32,7 @@ KEPT = 32
 """Photos whose features are held in memory while pairs are matched; the others are read again."""
 
 
-def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Any]:
+def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
     """Find features of photos and match them, in the run's database.
 
     What a killed run has left in the database and in `feature_parts` stays as it is.

@@ -2,12 +2,15 @@
 
 import json
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from sfm_app.errors import NumericalError
+
+Json: TypeAlias = "bool | int | float | str | Sequence[Json] | Mapping[str, Json] | None"
+"""What JSON can hold."""
 
 FAILURES = (NumericalError, ArithmeticError, ValueError, IndexError)
 """What our own computations raise on numbers that they were not made for: no inverse (NumPy's LinAlgError is a

@@ -100,7 +100,7 @@ def cached_ratio_matches(data: Path, name: str, cache: Path) -> Path:
                     zip(("x1", "x2"), graph.points(ids), strict=True)
                 )
                 arrays |= {f"{first}-{second}/{field}": value for field, value in fields.items()}
-        np.savez_compressed(path, **arrays)
+        np.savez_compressed(path, allow_pickle=False, **arrays)
     return path
 
 

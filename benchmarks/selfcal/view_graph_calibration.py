@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.database import SQUARE_PIXELS, camera_params, opened, write_epipolar_fits
+from sfm_app.colmap.database import SQUARE_PIXELS, camera_params, opened
 from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.types import Calibration, MatchGraph, ViewGraph
 
@@ -29,7 +29,7 @@ def view_graph_calibration(
     """
     copy = scratch / "view_graph_calibration.db"
     shutil.copyfile(database, copy)
-    write_epipolar_fits(copy, matches, views.fits)
+    _write_fits(copy, matches, views)
     _forget_cameras(copy)
     options = pycolmap.ViewGraphCalibrationOptions()
     options.random_seed, options.reestimate_relative_pose = seed, False
@@ -43,6 +43,18 @@ def view_graph_calibration(
         }
     copy.unlink()
     return found, seconds
+
+
+def _write_fits(path: Path, matches: MatchGraph, views: ViewGraph) -> None:
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    with opened(path) as database:
+        database.clear_two_view_geometries()
+        for pair, fit in views.fits.items():
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = kinds.PLANAR_OR_PANORAMIC if fit.degeneracy else kinds.UNCALIBRATED
+            geometry.F = fit.F
+            geometry.inlier_matches = np.ascontiguousarray(matches.matches[pair][fit.inliers])
+            database.write_two_view_geometry(*pair, geometry)
 
 
 def _forget_cameras(path: Path) -> None:

@@ -5,17 +5,17 @@ import tempfile
 import threading
 import traceback
 import zlib  # before pycolmap, whose own deflate symbols otherwise break every later use of zlib in this process
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotYet
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import pycolmap
 
 from sfm_app.errors import BackendError, NumericalError, SfmError
-from sfm_app.numerical import FAILURES, reason_of
+from sfm_app.numerical import FAILURES, Json, reason_of
 from sfm_app.progress import Progress
 
 __all__ = [
@@ -31,10 +31,10 @@ ROOM = 1_000_000
 """Bytes that have to be left: more than any program keeps back before it writes."""
 
 zlib.crc32(b"")  # the import above is there for its side effect
-pycolmap.logging.minloglevel = pycolmap.logging.Level.FATAL.value
+_Level = pycolmap.logging.Level
+pycolmap.logging.minloglevel = _Level.FATAL.value
 
-
-LEVELS = tuple(getattr(pycolmap.logging.Level, name).value for name in ("FATAL", "WARNING", "INFO"))
+LEVELS = tuple(level.value for level in (_Level.FATAL, _Level.WARNING, _Level.INFO))
 
 
 def show_log(level: int) -> None:
@@ -133,7 +133,7 @@ def left_running() -> bool:
     return any(thread.name == LEFT for thread in threading.enumerate())
 
 
-def interruptible(call: Callable[["pycolmap.CancellationToken"], None], poll: Callable[[], None]) -> None:
+def interruptible(call: Callable[[pycolmap.CancellationToken], None], poll: Callable[[], None]) -> None:
     """Run a long COLMAP call in a thread, so that Ctrl-C stops it and `poll` can show how far it is."""
     token = pycolmap.CancellationToken()
     with ThreadPoolExecutor(1, thread_name_prefix="colmap") as thread:
@@ -152,7 +152,7 @@ def interruptible(call: Callable[["pycolmap.CancellationToken"], None], poll: Ca
 
 
 def counted(
-    call: Callable[["pycolmap.CancellationToken"], None],
+    call: Callable[[pycolmap.CancellationToken], None],
     done: Callable[[], int],
     label: str,
     total: int,
@@ -173,12 +173,12 @@ def counted(
         progress.finish()
 
 
-def plain(options: dict[str, Any]) -> dict[str, Any]:
+def plain(options: Mapping[object, object]) -> dict[str, Json]:
     """Return COLMAP's options as JSON can hold them: the manifest records all that are in force."""
     return {str(key): _plain(value) for key, value in options.items()}
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Json:
     if isinstance(value, dict):
         return plain(value)
     return value if isinstance(value, bool | int | float | str) else str(value)

@@ -1,14 +1,13 @@
 """COLMAP's own pipeline on our matches, as a process of its own; see `mapping.map_as_colmap_does`."""
 
 from pathlib import Path
-from typing import Any
 
 from sfm_app.colmap.backend import check_written, pycolmap
 from sfm_app.colmap.mapping import largest
-from sfm_app.colmap.worker_process import served
+from sfm_app.colmap.worker_process import MappingTask, served
 
 
-def work(task: dict[str, Any]) -> None:
+def work(task: MappingTask) -> None:
     """Verify the raw matches, map them with COLMAP's defaults, and write the largest model into `model`.
 
     Only seeds and the number of threads differ from the defaults: on several threads no two runs are the same.

@@ -4,13 +4,13 @@ import logging
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sfm_app.colmap.backend import backend, patiently, pycolmap
 from sfm_app.colmap.database import TWO_FOCALS, camera_params, opened
 from sfm_app.colmap.model import somewhere
+from sfm_app.colmap.types import all_cameras, all_points
 from sfm_app.errors import NumericalError
 from sfm_app.geometry.bundle import FX, FY, POSE, Bundle, Reduced, cost, lost_points, moved, reduce
 from sfm_app.numerical import FAILURES, finite_only, reason_of
@@ -44,7 +44,7 @@ FAR = 1.0
 class Adjusted:
     """The refined model and how far its cameras can be trusted."""
 
-    model: Any
+    model: pycolmap.Reconstruction
     deviations: dict[int, dict[str, float]]
     """By camera id, as in `CameraModel`."""
     determined: dict[int, tuple[str, ...]]
@@ -57,7 +57,7 @@ class Adjusted:
     """Points that their rays did not fix when the adjustment began."""
 
 
-def adjust(model: Any, database: Path) -> Adjusted:
+def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
     """Refine cameras, poses, points and tracks in turn; of the cameras as much as the photos determine.
 
     What the bundle says about the cameras, poses and points giving way, is weighed against what cameras usually are.
@@ -68,7 +68,7 @@ def adjust(model: Any, database: Path) -> Adjusted:
         NumericalError: the photos do not bear it; the given model stays as it was.
     """
     model, points = pycolmap.Reconstruction(model), model.num_points3D()
-    for camera in model.cameras.values():
+    for camera in all_cameras(model):
         _generalize(camera)
     drop_endless(model)
     graph = _correspondences(model, database)
@@ -93,7 +93,7 @@ def adjust(model: Any, database: Path) -> Adjusted:
     return Adjusted(model, *_summary(ids, found), held=held, open_points=open_points[0])
 
 
-def adjusted_or_as_it_was(model: Any, database: Path) -> Adjusted:
+def adjusted_or_as_it_was(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
     """Adjust a model; where the numbers fail, return it as mapping left it, with the reason.
 
     Raises:
@@ -108,13 +108,13 @@ def adjusted_or_as_it_was(model: Any, database: Path) -> Adjusted:
         return Adjusted(model, nothing, dict.fromkeys(nothing, ()), trouble=reason_of(err))
 
 
-def drop_endless(model: Any) -> None:
+def drop_endless(model: pycolmap.Reconstruction) -> None:
     """Take away points that lie nowhere, in place."""
-    for point_id in [key for key, point in model.points3D.items() if not somewhere(point.xyz)]:
+    for point_id in [key for key, point in all_points(model) if not somewhere(point.xyz)]:
         model.delete_point3D(point_id)
 
 
-def solve(model: Any) -> None:
+def solve(model: pycolmap.Reconstruction) -> None:
     """Adjust poses and points in place, with one thread: sums over threads come in any order."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
@@ -132,7 +132,7 @@ def solve(model: Any) -> None:
     patiently(pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve)
 
 
-def improve_tracks(model: Any, graph: Any) -> int:
+def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
     """Continue, merge and triangulate tracks, then drop what does not fit; how many observations that changed.
 
     What is added only to be dropped again does not count: near the limits that never ends.
@@ -148,7 +148,7 @@ def improve_tracks(model: Any, graph: Any) -> int:
     return abs(int(model.compute_num_observations() - before))
 
 
-def read_bundle(model: Any) -> tuple[list[int], Bundle]:
+def read_bundle(model: pycolmap.Reconstruction) -> tuple[list[int], Bundle]:
     """Return the ids of the cameras in use, and the model as arrays."""
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
     ids, points = sorted(used_cameras(model)), sorted(model.points3D)
@@ -184,10 +184,10 @@ def best_step(bundle: Bundle, reduced: Reduced, found: Estimate) -> Bundle:
     return min(tried, key=lambda one: cost(one, LOSS_SCALE_PX))
 
 
-def write_bundle(model: Any, ids: list[int], bundle: Bundle) -> None:
+def write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle) -> None:
     """Put arrays in the order of `read_bundle` into the model."""
     for camera_id, params in zip(ids, bundle.params, strict=True):
-        model.cameras[camera_id].params = params
+        model.cameras[camera_id].params = params.tolist()
     for image_id, R, t in zip(sorted(model.reg_image_ids()), bundle.R, bundle.t, strict=True):
         image = model.images[image_id]
         model.frames[image.frame_id].set_cam_from_world(image.camera_id, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
@@ -195,7 +195,7 @@ def write_bundle(model: Any, ids: list[int], bundle: Bundle) -> None:
         model.points3D[point].xyz = xyz
 
 
-def usual_cameras(model: Any, ids: list[int]) -> CameraPriors:
+def usual_cameras(model: pycolmap.Reconstruction, ids: list[int]) -> CameraPriors:
     """Return what is believed about cameras before the bundle is asked."""
     used = used_cameras(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
@@ -204,20 +204,20 @@ def usual_cameras(model: Any, ids: list[int]) -> CameraPriors:
     return CameraPriors(sizes / 2, sizes.max(axis=1), asked)
 
 
-def used_cameras(model: Any) -> Counter[int]:
+def used_cameras(model: pycolmap.Reconstruction) -> Counter[int]:
     """Return how many photos with a pose each camera took, by its id."""
     return Counter(model.images[image_id].camera_id for image_id in sorted(model.reg_image_ids()))
 
 
-def _generalize(camera: Any) -> None:
+def _generalize(camera: pycolmap.Camera) -> None:
     """Change the camera in place to the model that holds all that may be freed; both share the first radial term."""
     if camera.model.name != TWO_FOCALS:
         K, radial = camera.calibration_matrix(), float(camera.params[camera.extra_params_idxs()[0]])
-        camera.model = getattr(pycolmap.CameraModelId, TWO_FOCALS)
+        camera.model = pycolmap.CameraModelId.__members__[TWO_FOCALS]
         camera.params = camera_params(K, TWO_FOCALS, radial)
 
 
-def _correspondences(model: Any, database: Path) -> Any:
+def _correspondences(model: pycolmap.Reconstruction, database: Path) -> pycolmap.CorrespondenceGraph:
     options = pycolmap.DatabaseCacheOptions()
     options.load_all_images = True  # it would leave out those that no pair in the database connects
     options.image_names = {model.images[image_id].name for image_id in model.reg_image_ids()}

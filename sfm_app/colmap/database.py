@@ -6,7 +6,6 @@ import hashlib
 import sqlite3
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +43,7 @@ SQUARE_WITHIN = 0.005
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[Any]:
+def opened(path: Path) -> Iterator[pycolmap.Database]:
     """Provide the database, closed whatever happens."""
     database = pycolmap.Database.open(path)
     try:
@@ -146,7 +145,7 @@ def write_keypoints(path: Path, photo: int, keypoints: NDArray[np.float32]) -> N
         _put_keypoints(database, photo, keypoints)
 
 
-def _put_keypoints(database: Any, photo: int, keypoints: NDArray[np.floating]) -> None:
+def _put_keypoints(database: pycolmap.Database, photo: int, keypoints: NDArray[np.floating]) -> None:
     write = database.update_keypoints if database.exists_keypoints(photo) else database.write_keypoints
     write(photo, np.ascontiguousarray(keypoints, np.float32))
 
@@ -222,16 +221,16 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
             database.update_image(image)
             _write_frame(database, image)
     # pycolmap can only clear all cameras at once, and only while no image refers to one
-    with contextlib.closing(sqlite3.connect(path)) as database, database:
-        database.execute("DELETE FROM cameras WHERE camera_id > ?", (len(ids),))
+    with contextlib.closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("DELETE FROM cameras WHERE camera_id > ?", (len(ids),))
 
 
-def _write_camera(database: Any, camera_id: int, calibration: Calibration) -> None:
+def _write_camera(database: pycolmap.Database, camera_id: int, calibration: Calibration) -> None:
     """Write a camera, new or in the place of another, and the rig of one sensor that COLMAP wants around it."""
     name = camera_model(calibration)
     camera = pycolmap.Camera(
         camera_id=camera_id,
-        model=getattr(pycolmap.CameraModelId, name),
+        model=pycolmap.CameraModelId.__members__[name],
         width=calibration.width,
         height=calibration.height,
         params=camera_params(calibration.K, name, calibration.radial),
@@ -246,7 +245,7 @@ def _write_camera(database: Any, camera_id: int, calibration: Calibration) -> No
     database.write_rig(rig, use_rig_id=True)
 
 
-def _write_frame(database: Any, image: Any) -> None:
+def _write_frame(database: pycolmap.Database, image: pycolmap.Image) -> None:
     """Write the frame of one photo that COLMAP wants around it."""
     frame = pycolmap.Frame(frame_id=image.image_id, rig_id=image.camera_id)
     frame.add_data_id(image.data_id)
@@ -273,9 +272,9 @@ def _pair(pair_id: int) -> PairId:
     return int(first), int(second)
 
 
-def _posed_geometry(pose: RelativePose, matches: NDArray[np.uint32]) -> Any:
+def _posed_geometry(pose: RelativePose, matches: NDArray[np.uint32]) -> pycolmap.TwoViewGeometry:
     geometry = pycolmap.TwoViewGeometry()
-    geometry.config = getattr(pycolmap.TwoViewGeometryConfiguration, KINDS[pose.kind])
+    geometry.config = pycolmap.TwoViewGeometryConfiguration.__members__[KINDS[pose.kind]]
     geometry.E = cross_matrix(pose.t) @ pose.R
     geometry.cam2_from_cam1 = pycolmap.Rigid3d(pycolmap.Rotation3d(pose.R), pose.t)
     geometry.tri_angle = float(np.radians(pose.angle_deg))

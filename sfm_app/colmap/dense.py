@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend, check_written, pycolmap
 from sfm_app.colmap.masks import used_pixels
-from sfm_app.colmap.worker_process import finished
+from sfm_app.colmap.types import all_images
+from sfm_app.colmap.worker_process import UndistortTask, finished
 from sfm_app.hashing import digest_files, is_below
 from sfm_app.progress import Progress
 from sfm_app.stereo import DepthEstimate, DepthMap, Kind, View
@@ -32,8 +33,13 @@ def undistort(
         BackendError: COLMAP cannot read the model or the photos, or cannot write.
     """
     (dense_dir / "images").mkdir(parents=True, exist_ok=True)
-    places = {"dense": str(dense_dir), "model": str(model_dir), "photos": str(photo_dir)}
-    task = {**places, "max_side_px": max_side_px, "workers": workers}
+    task: UndistortTask = {
+        "dense": str(dense_dir),
+        "model": str(model_dir),
+        "photos": str(photo_dir),
+        "max_side_px": max_side_px,
+        "workers": workers,
+    }
     finished("sfm_app.colmap.undistort_process", task, "undistorting photos", progress)
 
 
@@ -41,13 +47,13 @@ def read_views(dense_dir: Path) -> list[View]:
     """Return the undistorted views with the sparse points that they observe, by name."""
     with backend("reading the undistorted model"):
         model = pycolmap.Reconstruction(dense_dir / "sparse")
-        images = sorted(model.images.values(), key=lambda image: image.name)
+        images = sorted(all_images(model), key=lambda image: image.name)
         if not all(is_below(image.name) for image in images):
             raise ValueError(f"{dense_dir} names photos outside of it")
         return [_view(model, image) for image in images if image.has_pose]
 
 
-def _view(model: "pycolmap.Reconstruction", image: "pycolmap.Image") -> View:
+def _view(model: pycolmap.Reconstruction, image: pycolmap.Image) -> View:
     camera = model.cameras[image.camera_id]
     ids = sorted({point.point3D_id for point in image.points2D if point.has_point3D()})
     pose = image.cam_from_world().matrix()

@@ -5,15 +5,15 @@ import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from sfm_app.colmap.backend import counted, plain, pycolmap
 from sfm_app.colmap.database import opened
-from sfm_app.colmap.worker_process import Reported, report, served
+from sfm_app.colmap.worker_process import FeatureTask, Reported, SiftOption, report, served
+from sfm_app.numerical import Json
 from sfm_app.settings import MatchSettings
 
 
-def work(task: dict[str, Any]) -> None:
+def work(task: FeatureTask) -> None:
     """Find features of all photos and match every photo with every other; reports the options in force."""
     database, photo_dir, names = Path(task["database"]), Path(task["photos"]), task["names"]
     options = MatchSettings.model_validate(task["options"])
@@ -26,7 +26,9 @@ def work(task: dict[str, Any]) -> None:
     report(matching=match(database, len(names), options, task["workers"], pairs))
 
 
-def extraction_options(options: MatchSettings, sift: Mapping[str, Any], workers: int) -> Any:
+def extraction_options(
+    options: MatchSettings, sift: Mapping[str, SiftOption], workers: int
+) -> pycolmap.FeatureExtractionOptions:
     """Return COLMAP's, with these options of its SIFT."""
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = options.max_image_size_px
@@ -38,19 +40,25 @@ def extraction_options(options: MatchSettings, sift: Mapping[str, Any], workers:
     return extraction
 
 
-def extract(database: Path, photo_dir: Path, names: Sequence[str], reader: Any, extraction: Any) -> dict[str, Any]:
+def extract(
+    database: Path,
+    photo_dir: Path,
+    names: Sequence[str],
+    reader: pycolmap.ImageReaderOptions,
+    extraction: pycolmap.FeatureExtractionOptions,
+) -> dict[str, Json]:
     """Find SIFT features of all photos."""
     wanted = set(names)
     with opened(database) as before:
         ids = [image.image_id for image in before.read_all_images() if image.name in wanted]
 
-    def call(token: Any) -> None:
+    def call(token: pycolmap.CancellationToken) -> None:
         pycolmap.extract_features(
             database, photo_dir, list(names), reader_options=reader, extraction_options=extraction,
             device=pycolmap.Device.cpu, cancellation_token=token,
         )  # fmt: skip
 
-    def done(reader: Any) -> int:
+    def done(reader: pycolmap.Database) -> int:
         return sum(reader.exists_keypoints(image_id) for image_id in ids)
 
     _counted(call, database, done, "features", len(names))
@@ -59,7 +67,7 @@ def extract(database: Path, photo_dir: Path, names: Sequence[str], reader: Any, 
 
 def match(
     database: Path, photos: int, options: MatchSettings, workers: int, pairs: Sequence[tuple[int, int]] | None
-) -> dict[str, Any]:
+) -> dict[str, Json]:
     """Match these pairs of photos, or every photo with every other."""
     matching = pycolmap.FeatureMatchingOptions()
     matching.skip_geometric_verification = True
@@ -70,19 +78,19 @@ def match(
         _match_pairs(database, matching, pairs)
         return plain(matching.todict())
 
-    def call(token: Any) -> None:
+    def call(token: pycolmap.CancellationToken) -> None:
         pycolmap.match_exhaustive(
             database, matching_options=matching, device=pycolmap.Device.cpu, cancellation_token=token
         )
 
-    def done(reader: Any) -> int:
+    def done(reader: pycolmap.Database) -> int:
         return int(reader.num_matched_image_pairs())
 
     _counted(call, database, done, "matching", math.comb(photos, 2))
     return plain(matching.todict())
 
 
-def _match_pairs(database: Path, matching: Any, pairs: Sequence[tuple[int, int]]) -> None:
+def _match_pairs(database: Path, matching: pycolmap.FeatureMatchingOptions, pairs: Sequence[tuple[int, int]]) -> None:
     """Match these pairs in a copy where photos are named by their ids: COLMAP's lists end names at blanks."""
     with tempfile.TemporaryDirectory(dir=database.parent, prefix=".matching") as folder:
         copy, pairing = Path(folder) / database.name, pycolmap.ImportedPairingOptions()
@@ -96,7 +104,7 @@ def _match_pairs(database: Path, matching: Any, pairs: Sequence[tuple[int, int]]
         pairing.match_list_path = Path(folder) / "pairs.txt"
         pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="ascii")
 
-        def call(token: Any) -> None:
+        def call(token: pycolmap.CancellationToken) -> None:
             pycolmap.match_image_pairs(
                 copy, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu,
                 cancellation_token=token,
@@ -110,7 +118,13 @@ def _match_pairs(database: Path, matching: Any, pairs: Sequence[tuple[int, int]]
             target.write_matches(*pair, rows[pair])
 
 
-def _counted(call: Callable[[Any], None], database: Path, done: Callable[[Any], int], label: str, total: int) -> None:
+def _counted(
+    call: Callable[[pycolmap.CancellationToken], None],
+    database: Path,
+    done: Callable[[pycolmap.Database], int],
+    label: str,
+    total: int,
+) -> None:
     """Run a COLMAP call and say how far it is, as read from the database.
 
     The reader is COLMAP's own SQLite, opened once before the call: a second SQLite in the process (Python's) would drop

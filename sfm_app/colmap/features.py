@@ -3,21 +3,21 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
-from sfm_app.colmap.worker_process import relay, started
+from sfm_app.colmap.worker_process import FeatureTask, SiftOption, relay, started
+from sfm_app.numerical import Json
 from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId
 
-USUAL: Mapping[str, Any] = MappingProxyType({})
+USUAL: Mapping[str, SiftOption] = MappingProxyType({})
 """SIFT as COLMAP has it."""
 
 
 def find_and_match(
     database: Path, photo_dir: Path, names: Sequence[str], options: MatchSettings, workers: int, progress: Progress,
-    mask_dir: Path | None = None, sift: Mapping[str, Any] = USUAL, pairs: Sequence[PairId] | None = None,
-) -> dict[str, Any]:  # fmt: skip
+    mask_dir: Path | None = None, sift: Mapping[str, SiftOption] = USUAL, pairs: Sequence[PairId] | None = None,
+) -> dict[str, Json]:  # fmt: skip
     """Find features of all photos and match every photo with every other; what is in the database stays.
 
     Args:
@@ -37,7 +37,7 @@ def find_and_match(
     Raises:
         BackendError: COLMAP failed.
     """
-    task = {
+    task: FeatureTask = {
         "database": str(database),
         "photos": str(photo_dir),
         "masks": str(mask_dir) if mask_dir else None,

@@ -2,17 +2,16 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from sfm_app.colmap.backend import check_written, pycolmap
 from sfm_app.colmap.mapping import largest
-from sfm_app.colmap.worker_process import served
+from sfm_app.colmap.worker_process import GlobalMappingTask, served
 
 ADJUSTMENTS, GAIN = 2, 1e-3
 """Rounds of adjustment, and the share of its cost that a step must gain."""
 
 
-def work(task: dict[str, Any]) -> None:
+def work(task: GlobalMappingTask) -> None:
     """Write the largest model into `model` in the scratch folder; nothing where there is none."""
     scratch, options = Path(task["scratch"]), global_options(task["seed"], task["names"])
     (scratch / "all").mkdir()
@@ -24,7 +23,7 @@ def work(task: dict[str, Any]) -> None:
         check_written(*(scratch / "model").iterdir())
 
 
-def global_options(seed: int, names: Sequence[str]) -> Any:
+def global_options(seed: int, names: Sequence[str]) -> pycolmap.GlobalPipelineOptions:
     """Return COLMAP's defaults, on our relative poses as they are.
 
     Adjusted roughly, because the last adjustment is ours.
@@ -37,9 +36,8 @@ def global_options(seed: int, names: Sequence[str]) -> Any:
     mapper = options.mapper
     mapper.ba_num_iterations = ADJUSTMENTS
     mapper.bundle_adjustment.ceres.solver_options.function_tolerance = GAIN
-    parts = (options, mapper, mapper.rotation_averaging, mapper.global_positioning, mapper.retriangulation)
-    for part in parts:
-        part.random_seed = seed
+    options.random_seed = mapper.random_seed = mapper.rotation_averaging.random_seed = seed
+    mapper.global_positioning.random_seed = mapper.retriangulation.random_seed = seed
     return options
 
 

@@ -5,13 +5,13 @@ repeated structure that decided whether a model was right.
 """
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from sfm_app.colmap.backend import check_written, pycolmap
 from sfm_app.colmap.database import SQUARE_PIXELS
-from sfm_app.colmap.worker_process import started
+from sfm_app.colmap.types import Cancellation, all_cameras
+from sfm_app.colmap.worker_process import GlobalMappingTask, MappingTask, started
 
 LOCAL_GAIN, GLOBAL_GAIN, GLOBAL_REFINEMENT = 1e-3, 1e-4, 1.3
 """Share of its cost that a step of an adjustment must gain, or it was the last: of a few photos, of all. All are
@@ -22,9 +22,9 @@ POLL_S = 0.1
 
 
 def map_incrementally(
-    database: Path, photo_dir: Path, start: Any, scratch: Path, seed: int, tick: Callable[[], None], token: Any,
-    *, known: bool,
-) -> Any | None:  # fmt: skip
+    database: Path, photo_dir: Path, start: pycolmap.Reconstruction, scratch: Path, seed: int,
+    tick: Callable[[], None], token: pycolmap.CancellationToken, *, known: bool,
+) -> pycolmap.Reconstruction | None:  # fmt: skip
     """Register photo after photo, beginning with the ones in `start`; None when COLMAP gives nothing back.
 
     Args:
@@ -43,7 +43,7 @@ def map_incrementally(
     start.write(scratch / "start")
     check_written(*(scratch / "start").iterdir())
     options = incremental_options(seed, known=known)
-    seek_lens = not known and all(_lens_to_be_found(camera) for camera in start.cameras.values())
+    seek_lens = not known and all(_lens_to_be_found(camera) for camera in all_cameras(start))
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = seek_lens
     models = pycolmap.incremental_mapping(
         database, photo_dir, scratch / "found", options,
@@ -65,7 +65,9 @@ def copy_database(database: Path, scratch: Path) -> None:
     shutil.copyfile(database, scratch / "database.db")
 
 
-def map_globally(photo_dir: Path, names: Sequence[str], scratch: Path, seed: int, token: Any) -> Any | None:
+def map_globally(
+    photo_dir: Path, names: Sequence[str], scratch: Path, seed: int, token: Cancellation
+) -> pycolmap.Reconstruction | None:
     """Find the poses of all these photos at once (GLOMAP: rotations, positions, adjustment).
 
     COLMAP gives no way to stop this, so it runs in a process of its own.
@@ -83,20 +85,27 @@ def map_globally(photo_dir: Path, names: Sequence[str], scratch: Path, seed: int
     Raises:
         BackendError: COLMAP failed.
     """
-    task = {"scratch": str(scratch), "photos": str(photo_dir), "seed": seed, "names": list(names)}
+    task: GlobalMappingTask = {
+        "scratch": str(scratch),
+        "photos": str(photo_dir),
+        "seed": seed,
+        "names": list(names),
+    }
     return _map_apart("sfm_app.colmap.global_mapping", task, "mapping all photos at once", token)
 
 
-def map_as_colmap_does(photo_dir: Path, scratch: Path, seed: int, token: Any) -> Any | None:
+def map_as_colmap_does(
+    photo_dir: Path, scratch: Path, seed: int, token: Cancellation
+) -> pycolmap.Reconstruction | None:
     """Verify the raw matches and map the photos by COLMAP's defaults, with the cameras of the database as first guess.
 
     Nothing of ours but the matches and the guess enters; arguments, result and errors as `map_globally`.
     """
-    task = {"scratch": str(scratch), "photos": str(photo_dir), "seed": seed}
+    task: MappingTask = {"scratch": str(scratch), "photos": str(photo_dir), "seed": seed}
     return _map_apart("sfm_app.colmap.baseline_mapping", task, "mapping photos by its defaults", token)
 
 
-def _map_apart(module: str, task: dict[str, Any], doing: str, token: Any) -> Any | None:
+def _map_apart(module: str, task: MappingTask, doing: str, token: Cancellation) -> pycolmap.Reconstruction | None:
     scratch = Path(task["scratch"])
     try:
         with started(module, task) as process:
@@ -110,7 +119,7 @@ def _map_apart(module: str, task: dict[str, Any], doing: str, token: Any) -> Any
         shutil.rmtree(scratch, ignore_errors=True)
 
 
-def incremental_options(seed: int, *, known: bool = False) -> Any:
+def incremental_options(seed: int, *, known: bool = False) -> pycolmap.IncrementalPipelineOptions:
     """Return COLMAP's defaults, except that small photo sets count and only the model at hand is grown.
 
     Adjustments stop when they gain little, and cameras that are `known` stay as they are: the last adjustment is ours.
@@ -130,7 +139,7 @@ def incremental_options(seed: int, *, known: bool = False) -> Any:
     return options
 
 
-def _lens_to_be_found(camera: Any) -> bool:
+def _lens_to_be_found(camera: pycolmap.Camera) -> bool:
     """Return whether mapping is to seek the lens: a known one stays until the last adjustment, which frees it.
 
     On the first few photos even one distortion term moves more than the noise does, and four run wild.
@@ -138,6 +147,6 @@ def _lens_to_be_found(camera: Any) -> bool:
     return bool(camera.model.name == SQUARE_PIXELS and camera.params[camera.extra_params_idxs()[0]] == 0.0)
 
 
-def largest(models: dict[int, Any]) -> Any | None:
+def largest(models: Mapping[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
     """Return the model with most photos; None of none."""
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)

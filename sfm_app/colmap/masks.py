@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend, pycolmap
+from sfm_app.colmap.types import all_images
 from sfm_app.photos import mask_place, read_used, save_used
 from sfm_app.stereo import View
 
@@ -30,7 +31,7 @@ def mask_undistorter(model_dir: Path, mask_dir: Path, dense_dir: Path) -> Callab
     """
     with backend("reading the model"):
         model = pycolmap.Reconstruction(model_dir)
-        cameras = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+        cameras = {image.name: model.cameras[image.camera_id] for image in all_images(model)}
 
     def undistort(view: View) -> None:
         used = _undistorted(read_used(mask_dir, view.name), cameras[view.name], view)
@@ -45,7 +46,7 @@ def used_pixels(dense_dir: Path, view: View) -> BoolImage | None:
     return read_used(place, view.name) if mask_place(place, view.name).exists() else None
 
 
-def _undistorted(used: BoolImage, camera: "pycolmap.Camera", view: View) -> BoolImage:
+def _undistorted(used: BoolImage, camera: pycolmap.Camera, view: View) -> BoolImage:
     """Return a pixel is used where all is that it shows in part."""
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(view.K).T

@@ -3,13 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend, patiently, pycolmap
 from sfm_app.colmap.database import opened
+from sfm_app.colmap.types import all_images, all_points
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.geometry.two_view_init import TwoViewSeed
 from sfm_app.numerical import finite_only
@@ -23,12 +24,14 @@ ENDLESS = 1e100
 """Coordinates beyond this are no place, and squares of them no numbers."""
 
 
-def somewhere(xyz: NDArray[np.float64]) -> Any:
+def somewhere(xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return whether points (..., 3) lie anywhere: not at infinity, nor where distances are no numbers."""
-    return (np.abs(xyz) < ENDLESS).all(axis=-1)
+    return np.asarray((np.abs(xyz) < ENDLESS).all(axis=-1))
 
 
-def model_from_seed(database: Path, pair: PairId, matches: NDArray[np.uint32], seed: TwoViewSeed) -> Any:
+def model_from_seed(
+    database: Path, pair: PairId, matches: NDArray[np.uint32], seed: TwoViewSeed
+) -> pycolmap.Reconstruction:
     """Return a reconstruction of two photos with our pose and our points.
 
     Args:
@@ -68,10 +71,10 @@ class PlacedView:
     """(2,) fx, fy in pixels."""
 
 
-def placed_views(model: Any, keypoints: Mapping[int, NDArray[np.float64]]) -> dict[int, PlacedView]:
+def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray[np.float64]]) -> dict[int, PlacedView]:
     """Return all photos of a model that have a pose, by id."""
     found = {}
-    for image in _posed(model):
+    for image in posed_images(model):
         camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
         rays = np.asarray(camera.cam_from_img(keypoints[image.image_id]), np.float64).reshape(-1, 2)
         focals = np.diag(camera.calibration_matrix())[:2].copy()
@@ -79,37 +82,39 @@ def placed_views(model: Any, keypoints: Mapping[int, NDArray[np.float64]]) -> di
     return found
 
 
-def photos_of(model: Any) -> list[int]:
+def photos_of(model: pycolmap.Reconstruction) -> list[int]:
     """Return ids of the photos of a model that have a pose, in order."""
-    return [image.image_id for image in _posed(model)]
+    return [image.image_id for image in posed_images(model)]
 
 
-def cameras_of(model: Any) -> dict[int, tuple[NDArray[np.float64], float]]:
+def cameras_of(model: pycolmap.Reconstruction) -> dict[int, tuple[NDArray[np.float64], float]]:
     """Return K (3, 3) and the first radial term of the camera, by photo with a pose."""
     found = {}
-    for image in _posed(model):
+    for image in posed_images(model):
         camera = model.cameras[image.camera_id]
         radial = float(camera.params[camera.extra_params_idxs()[0]])
         found[image.image_id] = np.asarray(camera.calibration_matrix(), np.float64), radial
     return found
 
 
-def color(model: Any, photo_dir: Path, workers: int) -> None:
+def color(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None:
     """Give every point the mean color of its pixels."""
     patiently(lambda: model.extract_colors_for_all_images(photo_dir, num_threads=workers))
 
 
-def part_of(model: Any, photos: Sequence[int]) -> Any:
+def part_of(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.Reconstruction:
     """Return a copy of a model with these photos only, and the points that at least two of them see."""
     part, members = pycolmap.Reconstruction(model), set(photos)
-    for image in _posed(model):
+    for image in posed_images(model):
         if image.image_id not in members:
             part.deregister_frame(image.frame_id)
     part.tear_down()  # with frames that have no pose, no covariance can be estimated
     return part
 
 
-def both(database: Path, first: Any, second: Any, similarity: Similarity) -> Any:
+def both(
+    database: Path, first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, similarity: Similarity
+) -> pycolmap.Reconstruction:
     """Return a model of the photos and points of two that share no photo.
 
     Args:
@@ -127,9 +132,10 @@ def both(database: Path, first: Any, second: Any, similarity: Similarity) -> Any
     model = pycolmap.Reconstruction()
     model.load(cache)
     for one in (other, pycolmap.Reconstruction(first)):
-        for image in _posed(one):
+        for image in posed_images(one):
             camera = model.cameras[image.camera_id]
-            camera.model, camera.params = one.cameras[image.camera_id].model, one.cameras[image.camera_id].params
+            known = one.cameras[image.camera_id]
+            camera.model, camera.params = known.model, known.params.tolist()
             frame = model.frames[model.images[image.image_id].frame_id]
             frame.set_cam_from_world(image.camera_id, image.cam_from_world())
             model.register_frame(frame.frame_id)
@@ -139,22 +145,23 @@ def both(database: Path, first: Any, second: Any, similarity: Similarity) -> Any
     return model
 
 
-def places_of_keypoints(model: Any) -> dict[tuple[int, int], tuple[int, NDArray[np.float64]]]:
+def places_of_keypoints(model: pycolmap.Reconstruction) -> dict[tuple[int, int], tuple[int, NDArray[np.float64]]]:
     """Return number and place (3,) of the point that a keypoint is one of, by photo and row of the keypoint."""
     return {
         (element.image_id, element.point2D_idx): (key, np.asarray(point.xyz, np.float64))
-        for key, point in model.points3D.items()
+        for key, point in all_points(model)
         for element in point.track.elements
     }
 
 
-def _posed(model: Any) -> list[Any]:
-    return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.image_id)
+def posed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
+    """Return the photos of a model that have a pose, in order of ids."""
+    return sorted((image for image in all_images(model) if image.has_pose), key=lambda image: image.image_id)
 
 
-def posed_photos(model: Any) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.float64]]:
+def posed_photos(model: pycolmap.Reconstruction) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.float64]]:
     """Return (3, 4) cam_from_world by id of the photos that have a pose, in order of ids, and the points (P, 3)."""
-    poses = {image.image_id: np.asarray(image.cam_from_world().matrix(), np.float64) for image in _posed(model)}
+    poses = {image.image_id: np.asarray(image.cam_from_world().matrix(), np.float64) for image in posed_images(model)}
     points = np.array([model.points3D[key].xyz for key in sorted(model.points3D)]).reshape(-1, 3)
     return poses, points
 
@@ -171,7 +178,7 @@ class SeenPoints:
     """Per photo with a pose, in order of ids, the points that it sees."""
 
 
-def seen_points(model: Any, most: int) -> SeenPoints:
+def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
     """Return the points of a model, or so many of them, drawn with a fixed seed."""
     keys = [key for key in sorted(model.points3D) if somewhere(model.points3D[key].xyz)]
     chosen = np.sort(np.random.default_rng(0).permutation(len(keys))[:most])
@@ -203,16 +210,16 @@ def sparse_model(model_dir: Path) -> Model:
         low, high = places[confirmed].min(axis=0), places[confirmed].max(axis=0)
         inside = ((places >= low) & (places <= high)).all(axis=1)
         places, colors = places[inside], colors[inside]
-    cameras = tuple(_frustum(image, model.cameras[image.camera_id]) for image in _posed(model))
+    cameras = tuple(_frustum(image, model.cameras[image.camera_id]) for image in posed_images(model))
     return Model(Surface(places, np.zeros((0, 3), np.int64), colors), cameras=cameras)
 
 
-def _frustum(image: Any, camera: Any) -> Frustum:
+def _frustum(image: pycolmap.Image, camera: pycolmap.Camera) -> Frustum:
     K, pose = camera.calibration_matrix(), image.cam_from_world().matrix()
     return Frustum(image.name, np.asarray(K, np.float64), np.asarray(pose, np.float64), camera.width, camera.height)
 
 
-def viewing_rays(model: Any, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
+def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return directions (N, 3) in the world, of any length, that pixels (N, 2) of a photo see."""
     image = model.images[image_id]
     plane = np.asarray(model.cameras[image.camera_id].cam_from_img(x), np.float64).reshape(-1, 2)
@@ -220,19 +227,26 @@ def viewing_rays(model: Any, image_id: int, x: NDArray[np.float64]) -> NDArray[n
     return np.asarray(np.column_stack([plane, np.ones(len(plane))]) @ R)
 
 
-def focal_px(model: Any, image_id: int) -> float:
+def focal_px(model: pycolmap.Reconstruction, image_id: int) -> float:
     """Return focal length of the camera that took a photo, in pixels."""
     return float(model.cameras[model.images[image_id].camera_id].mean_focal_length())
 
 
-def move(model: Any, similarity: Similarity) -> None:
+def move(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
     """Put the model into another frame."""
     rotation = pycolmap.Rotation3d(similarity.R)
     model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.t))
 
 
+class Refined(TypedDict, total=False):
+    """What is known about a refined camera besides COLMAP's model; as in `CameraModel`."""
+
+    deviations: Mapping[str, float | None]
+    determined: Sequence[str]
+
+
 def read_scene(
-    model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str], refined: Mapping[str, Mapping[str, Any]]
+    model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str], refined: Mapping[str, Refined]
 ) -> Scene:
     """Return what the rest of the program needs to know about a model on disk.
 
@@ -240,10 +254,10 @@ def read_scene(
         model_dir: COLMAP's model.
         names: the camera by photo.
         unregistered: why photos have no pose, by photo.
-        refined: "deviations" and "determined" of `CameraModel`, by camera; others are left without.
+        refined: by camera; others are left without.
     """
     model = pycolmap.Reconstruction(model_dir)
-    posed = _posed(model)
+    posed = posed_images(model)
     ids = {names[image.name]: image.camera_id for image in posed}
     return Scene(
         model_dir=model_dir,
@@ -257,7 +271,7 @@ def read_scene(
     )
 
 
-def _camera(camera: Any, refined: Mapping[str, Any]) -> CameraModel:
+def _camera(camera: pycolmap.Camera, refined: Refined) -> CameraModel:
     K = np.asarray(camera.calibration_matrix(), np.float64)
     params = tuple(float(value) for value in camera.params)
     deviations, determined = finite_only(refined.get("deviations", {})), tuple(refined.get("determined", ()))

@@ -7,7 +7,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.worker_process import finished
+from sfm_app.colmap.worker_process import FuseTask, PoissonTask, SimplifyTask, finished
 from sfm_app.types import Surface
 
 FUSED = "fused.ply"
@@ -31,8 +31,15 @@ def fuse(
         target: in any folder.
         cache_gb: memory for the maps of photos; with less, they are read more often.
     """
-    task = {"dense": str(dense_dir), "target": str(target), "min_views": min_views, "box": box.tolist()}
-    finished("sfm_app.colmap.surface_process", {"do": "fuse", "cache_gb": cache_gb, **task}, "fusing depth maps")
+    task: FuseTask = {
+        "do": "fuse",
+        "dense": str(dense_dir),
+        "target": str(target),
+        "min_views": min_views,
+        "box": box.tolist(),
+        "cache_gb": cache_gb,
+    }
+    finished("sfm_app.colmap.surface_process", task, "fusing depth maps")
     target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; nobody asks
 
 
@@ -52,8 +59,13 @@ def poisson(folder: Path, depth: int) -> Surface:
         depth: of the octree, FULL_DEPTH where less; the finest cell is the largest extent of the points over 2^depth.
     """
     path = folder / "poisson.ply"
-    task = {"points": str(folder / FUSED), "target": str(path), "depth": max(depth, FULL_DEPTH)}
-    finished("sfm_app.colmap.surface_process", {"do": "poisson", **task}, "finding the surface")
+    task: PoissonTask = {
+        "do": "poisson",
+        "points": str(folder / FUSED),
+        "target": str(path),
+        "depth": max(depth, FULL_DEPTH),
+    }
+    finished("sfm_app.colmap.surface_process", task, "finding the surface")
     surface = _read(path)
     path.unlink()
     return surface
@@ -72,8 +84,14 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
     """
     given, found = scratch / "fine.ply", scratch / "coarse.ply"
     trimesh.Trimesh(surface.vertices, surface.faces, process=False).export(given)
-    task = {"mesh": str(given), "target": str(found), "share": share, "max_error": max_error}
-    finished("sfm_app.colmap.surface_process", {"do": "simplify", **task}, "simplifying the surface")
+    task: SimplifyTask = {
+        "do": "simplify",
+        "mesh": str(given),
+        "target": str(found),
+        "share": share,
+        "max_error": max_error,
+    }
+    finished("sfm_app.colmap.surface_process", task, "simplifying the surface")
     simple = _read(found)
     given.unlink()
     found.unlink()

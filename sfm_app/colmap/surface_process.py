@@ -5,25 +5,29 @@ many times slower.
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sfm_app.colmap.backend import check_written, pycolmap
-from sfm_app.colmap.worker_process import served
+from sfm_app.colmap.worker_process import FuseTask, PoissonTask, SimplifyTask, served
 
 MAX_NORMAL_ERROR_DEG = 25.0
 BORDER_WEIGHT = 10.0
 """How much dearer it is to move a border than the surface."""
 
 
-def work(task: dict[str, Any]) -> None:
+def work(task: FuseTask | PoissonTask | SimplifyTask) -> None:
     """Do one of the three."""
-    {"fuse": fuse, "poisson": poisson, "simplify": simplify}[task["do"]](task)
+    if task["do"] == "fuse":
+        fuse(task)
+    elif task["do"] == "poisson":
+        poisson(task)
+    else:
+        simplify(task)
     check_written(Path(task["target"]))
 
 
-def fuse(task: dict[str, Any]) -> None:
+def fuse(task: FuseTask) -> None:
     """Fuse the depth maps of a dense workspace into points."""
     options = pycolmap.StereoFusionOptions()
     options.min_num_pixels = task["min_views"]
@@ -36,7 +40,7 @@ def fuse(task: dict[str, Any]) -> None:
     pycolmap.stereo_fusion(Path(task["target"]), Path(task["dense"]), options=options, output_type="ply")
 
 
-def poisson(task: dict[str, Any]) -> None:
+def poisson(task: PoissonTask) -> None:
     """Span a closed surface over points."""
     options = pycolmap.PoissonMeshingOptions()
     options.depth, options.trim = task["depth"], 0.0
@@ -44,7 +48,7 @@ def poisson(task: dict[str, Any]) -> None:
     pycolmap.poisson_meshing(Path(task["points"]), Path(task["target"]), options=options)
 
 
-def simplify(task: dict[str, Any]) -> None:
+def simplify(task: SimplifyTask) -> None:
     """Simplify a surface to fewer triangles."""
     options = pycolmap.MeshSimplificationOptions()
     options.target_face_ratio, options.max_error = task["share"], task["max_error"] ** 2

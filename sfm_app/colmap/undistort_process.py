@@ -1,22 +1,21 @@
 """COLMAP's undistortion; see `dense.undistort`. Its JPEG writer ends the program where the disk is full."""
 
 from pathlib import Path
-from typing import Any
 
 from sfm_app.colmap.backend import check_written, counted, pycolmap
-from sfm_app.colmap.worker_process import Reported, served
+from sfm_app.colmap.worker_process import Reported, UndistortTask, served
 
 JPEG_QUALITY = 98
 
 
-def work(task: dict[str, Any]) -> None:
+def work(task: UndistortTask) -> None:
     """Fill a dense workspace."""
     dense_dir, model_dir = Path(task["dense"]), Path(task["model"])
     options = pycolmap.UndistortCameraOptions()
     options.max_image_size = task["max_side_px"]
     photos = dense_dir / "images"
 
-    def call(token: Any) -> None:
+    def call(token: pycolmap.CancellationToken) -> None:
         pycolmap.undistort_images(
             dense_dir, model_dir, Path(task["photos"]), undistort_options=options, jpeg_quality=JPEG_QUALITY,
             num_threads=task["workers"], cancellation_token=token,

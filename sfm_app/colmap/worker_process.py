@@ -13,15 +13,89 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from typing import IO, Any
+from typing import IO, Any, Literal, TypeAlias, TypedDict, TypeVar
 
 from sfm_app.colmap.backend import log_level, show_log
 from sfm_app.errors import BackendError
+from sfm_app.numerical import Json
 from sfm_app.progress import Progress, Silent
 
 ENDED_EARLY = 1
 REPORTS = 3
 """File descriptor for what a process says to the one that started it."""
+
+SiftOption: TypeAlias = bool | int | float
+"""Value of an option of COLMAP's SIFT."""
+Task = TypeVar("Task", bound=Mapping[str, object])
+"""One of the tasks below, which JSON can hold."""
+
+
+class FeatureTask(TypedDict):
+    """Task of `feature_process`, with the arguments of `features.find_and_match`."""
+
+    database: str
+    photos: str
+    masks: str | None
+    names: list[str]
+    options: dict[str, Any]
+    """`MatchSettings` as they are dumped."""
+    workers: int
+    sift: dict[str, SiftOption]
+    pairs: list[list[int]] | None
+
+
+class MappingTask(TypedDict):
+    """Task of `baseline_mapping`, with the arguments of `mapping.map_as_colmap_does`."""
+
+    scratch: str
+    photos: str
+    seed: int
+
+
+class GlobalMappingTask(MappingTask):
+    """Task of `global_mapping`, with the arguments of `mapping.map_globally`."""
+
+    names: list[str]
+
+
+class UndistortTask(TypedDict):
+    """Task of `undistort_process`, with the arguments of `dense.undistort`."""
+
+    dense: str
+    model: str
+    photos: str
+    max_side_px: int
+    workers: int
+
+
+class FuseTask(TypedDict):
+    """Task of `surface_process`, with the arguments of `surface.fuse`."""
+
+    do: Literal["fuse"]
+    dense: str
+    target: str
+    min_views: int
+    box: list[list[float]]
+    cache_gb: float
+
+
+class PoissonTask(TypedDict):
+    """Task of `surface_process`, with the arguments of `surface.poisson`."""
+
+    do: Literal["poisson"]
+    points: str
+    target: str
+    depth: int
+
+
+class SimplifyTask(TypedDict):
+    """Task of `surface_process`, with the arguments of `surface.simplify`."""
+
+    do: Literal["simplify"]
+    mesh: str
+    target: str
+    share: float
+    max_error: float
 
 
 class Apart:
@@ -30,7 +104,7 @@ class Apart:
     def __init__(self, process: "subprocess.Popen[str]", said: IO[bytes]) -> None:
         self.process, self._said = process, said
 
-    def messages(self) -> Iterator[dict[str, Any]]:
+    def messages(self) -> Iterator[dict[str, Json]]:
         """Yield what it reports, until it ends."""
         for line in self.process.stdout or ():
             if line.endswith("\n"):  # else it was killed as it spoke
@@ -64,7 +138,7 @@ class Apart:
 
 
 @contextlib.contextmanager
-def started(module: str, task: Mapping[str, Any]) -> Iterator[Apart]:
+def started(module: str, task: Mapping[str, object]) -> Iterator[Apart]:
     """Provide a module of ours at work on a task; ended with the block, if it still runs.
 
     Args:
@@ -89,7 +163,7 @@ def started(module: str, task: Mapping[str, Any]) -> Iterator[Apart]:
                 process.kill()
 
 
-def finished(module: str, task: Mapping[str, Any], doing: str, progress: Progress | None = None) -> dict[str, Any]:
+def finished(module: str, task: Mapping[str, object], doing: str, progress: Progress | None = None) -> dict[str, Json]:
     """Return a module of ours to its end; what it has reported comes back.
 
     Args:
@@ -107,7 +181,7 @@ def finished(module: str, task: Mapping[str, Any], doing: str, progress: Progres
     return found
 
 
-def served(work: Callable[[dict[str, Any]], None]) -> None:
+def served(work: Callable[[Task], None]) -> None:
     """Do the task in the worker process, and end when its parent does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one that started it
     os.dup2(sys.stdout.fileno(), REPORTS)
@@ -127,7 +201,7 @@ def served(work: Callable[[dict[str, Any]], None]) -> None:
     work(task)
 
 
-def report(**message: Any) -> None:
+def report(**message: Json) -> None:
     """Send a message from the worker process to its parent."""
     os.write(REPORTS, f"{json.dumps(message)}\n".encode())
 
@@ -151,19 +225,20 @@ class Reported:
         report(finish=True)
 
 
-def relay(process: Apart, progress: Progress) -> dict[str, Any]:
+def relay(process: Apart, progress: Progress) -> dict[str, Json]:
     """Show the progress of a process until it ends; what else it has reported comes back."""
-    found: dict[str, Any] = {}
+    found: dict[str, Json] = {}
     try:
         for message in process.messages():
-            if "start" in message:
-                progress.start(message["start"], message["total"])
-            elif "advance" in message:
-                progress.advance(message["advance"])
-            elif "finish" in message:
-                progress.finish()
-            else:
-                found |= message
+            match message:
+                case {"start": str(label), "total": int(total)}:
+                    progress.start(label, total)
+                case {"advance": int(steps)}:
+                    progress.advance(steps)
+                case {"finish": True}:
+                    progress.finish()
+                case _:
+                    found |= message
     finally:
         progress.finish()
     return found

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -13,10 +12,11 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.model import focal_px, move, photos_of, posed_photos, seen_points, somewhere, viewing_rays
+from sfm_app.colmap.types import Reconstruction
 from sfm_app.context import RunContext
 from sfm_app.errors import NumericalError
 from sfm_app.geometry.similarity import Similarity
-from sfm_app.numerical import FAILURES, reason_of
+from sfm_app.numerical import FAILURES, Json, reason_of
 from sfm_app.orientation.georeference import Georeference, NoGeoreference, georeference, position_at
 from sfm_app.orientation.gravity import LINES, Upright, facing, up_direction, viewer_frame
 from sfm_app.orientation.line_segments import line_segments
@@ -50,7 +50,7 @@ PhotoLooks = Mapping[int, "Future[Look]"]
 """By photo, when it has been looked at."""
 
 
-def look_at_photos(models: Sequence[Any], matches: MatchGraph, run: RunContext) -> PhotoLooks:
+def look_at_photos(models: Sequence[Reconstruction], matches: MatchGraph, run: RunContext) -> PhotoLooks:
     """Begin to look at some photos of every model; the caller goes on meanwhile."""
     looks = {}
     for model in models:
@@ -61,7 +61,9 @@ def look_at_photos(models: Sequence[Any], matches: MatchGraph, run: RunContext) 
     return looks
 
 
-def orient_or_leave(model: Any, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | None = None) -> dict[str, Any]:
+def orient_or_leave(
+    model: Reconstruction, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | None = None
+) -> dict[str, Json]:
     """Put the model upright; where the numbers fail, leave it as it is, and say why."""
     try:
         return orient(model, matches, looks, turn_deg)
@@ -70,7 +72,9 @@ def orient_or_leave(model: Any, matches: MatchGraph, looks: PhotoLooks, turn_deg
         return {"failed": reason_of(err), "unit": "that of mapping", "gps": "not used: it is not known which way is up"}
 
 
-def orient(model: Any, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | None = None) -> dict[str, Any]:
+def orient(
+    model: Reconstruction, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | None = None
+) -> dict[str, Json]:
     """Move the model into the frame of glTF viewers: y up, seen from +z, centered, of size about 1 or in meters.
 
     Args:
@@ -138,13 +142,13 @@ def turned(R: FloatArray, turn_deg: int) -> FloatArray:
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ R
 
 
-def lines_of(model: Any, looks: Mapping[int, Look]) -> Segments:
+def lines_of(model: Reconstruction, looks: Mapping[int, Look]) -> Segments:
     """Return line segments, in the world, of the photos of a model."""
     with backend("looking along lines in the photos"):
         return joined([_in_world(model, photo, look.lines) for photo, look in looks.items()])
 
 
-def scenery_of(model: Any, looks: Mapping[int, Look]) -> Scenery:
+def scenery_of(model: Reconstruction, looks: Mapping[int, Look]) -> Scenery:
     """Return what a model and its photos show."""
     with backend("reading the points"):
         shown = seen_points(model, SCENERY_POINTS)
@@ -165,12 +169,12 @@ def look_at(path: Path, turn_deg: int = 0) -> Look:
     return Look(line_segments(gray), np.rot90(small_picture(gray), -turn_deg // 90))
 
 
-def _in_world(model: Any, image_id: int, lines: FloatArray) -> Segments:
+def _in_world(model: Reconstruction, image_id: int, lines: FloatArray) -> Segments:
     first, second = (viewing_rays(model, image_id, lines[:, ends]) for ends in (slice(0, 2), slice(2, 4)))
     return segment_planes(first, second, image_id, focal_px(model, image_id))
 
 
-def how_it_stands(upright: Upright, front: str) -> dict[str, Any]:
+def how_it_stands(upright: Upright, front: str) -> dict[str, Json]:
     """Return up and front, for the manifest."""
     standing = upright.standing
     return {
@@ -186,7 +190,7 @@ def how_it_stands(upright: Upright, front: str) -> dict[str, Any]:
     }
 
 
-def where_it_stands(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Any]:
+def where_it_stands(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Json]:
     """Return unit and place of the model that `viewer` has moved, for the manifest."""
     if isinstance(gps, NoGeoreference):
         return {"unit": "about the size of the scene", "gps": f"not used: {gps.reason}"}

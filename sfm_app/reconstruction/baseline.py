@@ -12,10 +12,11 @@ from dataclasses import replace
 from sfm_app.colmap.backend import backend, interruptible
 from sfm_app.colmap.database import keep_raw_matches, write_calibrations
 from sfm_app.colmap.mapping import copy_database, map_as_colmap_does
+from sfm_app.colmap.types import Reconstruction
 from sfm_app.context import RunContext
 from sfm_app.errors import BackendError
 from sfm_app.geometry.camera import GUESSED_FOCAL, guessed_camera_matrix
-from sfm_app.reconstruction.mapping_runs import Attempt, judged, no_model
+from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, judged
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, ViewGraph
 from sfm_app.types.epipolar import EpipolarFit
 
@@ -59,12 +60,13 @@ def photos_in(fits: Mapping[PairId, EpipolarFit]) -> set[int]:
     return {photo for pair, fit in fits.items() if not fit.degeneracy for photo in pair}
 
 
-def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Attempt:
+def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Attempt | NoModel:
     """Map all photos as COLMAP does by itself, and judge the model like any other; none where it fails.
 
     Pairs that are not among the matches, such as those of look-alikes, are kept from it, too.
     """
-    scratch, found = run.workspace.root / FOLDER, []
+    scratch = run.workspace.root / FOLDER
+    found: list[Reconstruction | None] = []
     guess = guessed_intrinsics(intrinsics)
     try:
         with backend("mapping photos by its defaults"):
@@ -77,7 +79,7 @@ def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, 
             )
     except BackendError as err:  # what we have is not lost with it
         logger.info("the rival failed: %s", err)
-        return no_model(MAPPER, f"{HOW}: failed, {err}")
+        return NoModel(MAPPER, f"{HOW}: failed, {err}")
     return judged(matches, views, (MAPPER, HOW), found[0], run)
 
 

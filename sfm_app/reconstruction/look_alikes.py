@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from sfm_app.colmap.backend import backend
+from sfm_app.colmap.model import posed_images
+from sfm_app.colmap.types import Reconstruction
+from sfm_app.numerical import Json
 from sfm_app.reconstruction.unregistered import names_of
 from sfm_app.types import LookAlikes, MatchGraph, PairId, PoseGraph, ViewGraph
 
@@ -36,7 +38,7 @@ def with_earlier(graph: PoseGraph, earlier: PoseGraph) -> PoseGraph:
     return replace(graph, dropped=dropped | dict(graph.dropped), look_alikes=earlier.look_alikes + graph.look_alikes)
 
 
-def in_words(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str, Any]]:
+def in_words(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str, Json]]:
     """Return what was told apart, for the manifest."""
     return [
         {
@@ -48,13 +50,13 @@ def in_words(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str,
     ]
 
 
-def jumps(model: Any) -> list[list[str]]:
+def jumps(model: Reconstruction) -> list[list[str]]:
     """Return photos that follow each other by name, but not along the way of all others: where a video may be folded.
 
     Empty where the photos are not in order, so that many steps are long. That is no proof: videos are cut, too.
     """
     with backend("reading poses"):
-        placed = sorted((image.name, image.projection_center()) for image in model.images.values() if image.has_pose)
+        placed = sorted((image.name, image.projection_center()) for image in posed_images(model))
     if len(placed) < LEAST_IN_ORDER:
         return []
     steps = np.linalg.norm(np.diff([center for _, center in placed], axis=0), axis=1)

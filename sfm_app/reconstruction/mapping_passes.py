@@ -19,7 +19,7 @@ from sfm_app.reconstruction.camera_per_photo import (
     with_two,
 )
 from sfm_app.reconstruction.look_alikes import with_earlier, without_look_alikes
-from sfm_app.reconstruction.mapping_runs import Attempt, Group, attempts, better, why
+from sfm_app.reconstruction.mapping_runs import Attempt, Group, NoModel, attempts, better, why
 from sfm_app.reconstruction.model_merge import join_models
 from sfm_app.reconstruction.model_split import sound_parts
 from sfm_app.reconstruction.support import model_poses
@@ -112,7 +112,7 @@ def with_rival(
     rival = map_baseline(matches, views, intrinsics, run)
     outcome = replace(outcome, thin=thin, tried=(*outcome.tried, rival.note))
     both = [attempt for attempt in (main, rival) if attempt is not None]
-    if rival.model is None or better(both) is not rival:
+    if isinstance(rival, NoModel) or better(both) is not rival:
         return outcome
     parts = taken_apart(rival)
     taken = {photo for part in parts for photo in photos_of(part.model)}

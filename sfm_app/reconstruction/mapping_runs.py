@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 
 from sfm_app.colmap.backend import backend, interruptible
 from sfm_app.colmap.mapping import copy_database, map_globally, map_incrementally
 from sfm_app.colmap.model import model_from_seed
+from sfm_app.colmap.types import Cancellation, CancellationToken, Reconstruction
 from sfm_app.context import RunContext
 from sfm_app.errors import BackendError
 from sfm_app.numerical import FAILURES, reason_of
@@ -38,9 +39,6 @@ WELL_KNOWN = 0.01
 """Relative deviation of a focal that mapping leaves alone."""
 INCREMENTAL_FOLDER, GLOBAL_FOLDER = "incremental", "global"
 
-Maker = Callable[[Any], "list[Attempt]"]
-"""What makes models until a token stops it."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Group:
@@ -55,11 +53,10 @@ class Group:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attempt:
-    """What a mapper made of a group, and what it explains."""
+    """A model that a mapper made of a group, and what it explains."""
 
     mapper: str
-    model: Any
-    """COLMAP's reconstruction; None where there is none, or one with too few points."""
+    model: Reconstruction
     explained: dict[PairId, Explained]
     note: str
     """For people: how it was made, and how many photos it holds."""
@@ -67,7 +64,7 @@ class Attempt:
     @property
     def photos(self) -> int:
         """Photos with a pose."""
-        return int(self.model.num_reg_images()) if self.model is not None else 0
+        return self.model.num_reg_images()
 
     @property
     def support(self) -> float:
@@ -75,19 +72,34 @@ class Attempt:
         return support(self.explained)
 
 
+@dataclass(frozen=True, slots=True)
+class NoModel:
+    """Why a mapper gave no model, or one with too few points."""
+
+    mapper: str
+    note: str
+    """As in `Attempt`."""
+
+
+Tried: TypeAlias = Attempt | NoModel
+"""What came of a mapper."""
+Maker: TypeAlias = Callable[[CancellationToken], list[Tried]]
+"""Makes models until a token stops it."""
+
+
 class Stop:
     """Stops a mapper when the whole run is stopped, or when its model is no longer needed."""
 
-    def __init__(self, token: Any) -> None:
+    def __init__(self, token: Cancellation) -> None:
         self.token, self.needless = token, False
 
     @property
     def is_cancelled(self) -> bool:
         """Whether to stop."""
-        return self.needless or bool(self.token.is_cancelled)
+        return self.needless or self.token.is_cancelled
 
 
-def attempts(group: Group, run: RunContext) -> list[Attempt]:
+def attempts(group: Group, run: RunContext) -> list[Tried]:
     """Return what the mappers of the settings make of a group.
 
     Photo by photo from the best seed and all at once, side by side; where neither places most photos, from the next
@@ -112,19 +124,19 @@ def attempts(group: Group, run: RunContext) -> list[Attempt]:
     return found
 
 
-def better(found: Sequence[Attempt]) -> Attempt | None:
+def better(found: Sequence[Tried]) -> Attempt | None:
     """Return the attempt that explains most matches; of equal ones, the one with most photos and points."""
-    models = [attempt for attempt in found if attempt.model is not None]
+    models = [attempt for attempt in found if isinstance(attempt, Attempt)]
     most = max((attempt.support for attempt in models), default=0.0)
     equal = [attempt for attempt in models if attempt.support >= (1.0 - EQUAL) * most]
     return max(equal, key=lambda attempt: (attempt.photos, attempt.model.num_points3D()), default=None)
 
 
-def why(best: Attempt, found: Sequence[Attempt], photos: int) -> str:
+def why(best: Attempt, found: Sequence[Tried], photos: int) -> str:
     """Return why this attempt of several was taken, in a few words."""
     if flawless(best, photos):
         return f"it places all {photos} photos and next to nothing contradicts it"
-    others = [attempt for attempt in found if attempt is not best and attempt.model is not None]
+    others = [attempt for attempt in found if isinstance(attempt, Attempt) and attempt is not best]
     if not others:
         return "nothing else gave a model"
     rival = max(others, key=lambda attempt: attempt.support)
@@ -140,11 +152,11 @@ def flawless(attempt: Attempt, photos: int) -> bool:
 
 
 @contextlib.contextmanager
-def _mapping(group: Group, run: RunContext) -> Iterator[Callable[[Maker], list[Attempt]]]:
+def _mapping(group: Group, run: RunContext) -> Iterator[Callable[[Maker], list[Tried]]]:
     """Provide what makes attempts in a thread that Ctrl-C can stop."""
 
-    def made(make: Maker) -> list[Attempt]:
-        found: list[Attempt] = []
+    def made(make: Maker) -> list[Tried]:
+        found: list[Tried] = []
         run.progress.start("mapping", max(len(group.photos) - 2, 1))
         try:
             interruptible(lambda token: found.extend(make(token)), lambda: None)
@@ -156,12 +168,14 @@ def _mapping(group: Group, run: RunContext) -> Iterator[Callable[[Maker], list[A
         yield made
 
 
-def _first_round(group: Group, seeds: Sequence[Candidate], at_once: bool, run: RunContext, token: Any) -> list[Attempt]:
+def _first_round(
+    group: Group, seeds: Sequence[Candidate], at_once: bool, run: RunContext, token: CancellationToken
+) -> list[Tried]:
     stop = Stop(token)
 
-    def photo_by_photo(seed: Candidate) -> Attempt:
+    def photo_by_photo(seed: Candidate) -> Tried:
         (attempt,) = _from_seed(group, seed, run, token)
-        stop.needless = flawless(attempt, len(group.photos))
+        stop.needless = isinstance(attempt, Attempt) and flawless(attempt, len(group.photos))
         return attempt
 
     with ThreadPoolExecutor(min(run.workers, 2), thread_name_prefix="mapper") as pool:
@@ -169,47 +183,47 @@ def _first_round(group: Group, seeds: Sequence[Candidate], at_once: bool, run: R
         placed = [pool.submit(_all_at_once, group, run, stop)] if at_once else []
         found = [future.result() for future in (*grown, *placed)]
     if stop.needless:
-        found[1:] = [no_model("global", "all at once: not needed") for _ in placed]
+        found[1:] = [NoModel("global", "all at once: not needed") for _ in placed]
     return found
 
 
-def _settled(found: Sequence[Attempt], photos: int) -> bool:
+def _settled(found: Sequence[Tried], photos: int) -> bool:
     """Return whether another seed is unlikely to give more."""
-    counts = [attempt.photos for attempt in found if attempt.photos]
+    counts = [attempt.photos for attempt in found if isinstance(attempt, Attempt)]
     most = max(counts, default=0)
     return most >= ENOUGH * photos or (counts.count(most) > 1 and most >= CONFIRMED * photos)
 
 
-def _all_at_once(group: Group, run: RunContext, stop: Stop) -> Attempt:
+def _all_at_once(group: Group, run: RunContext, stop: Stop) -> Tried:
     names, scratch = names_of(group.photos, group.matches), run.workspace.root / GLOBAL_FOLDER
     try:
         model = None if stop.is_cancelled else map_globally(run.workspace.photos, names, scratch, run.seed, stop)
     except BackendError as err:  # another mapper may do better
         logger.info("the global mapper failed: %s", err)
-        return no_model("global", f"all at once: failed, {err}")
+        return NoModel("global", f"all at once: failed, {err}")
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     return _judged(group, "global", "all at once", model, run)
 
 
-def _from_seed(group: Group, seed: Candidate, run: RunContext, token: Any) -> list[Attempt]:
+def _from_seed(group: Group, seed: Candidate, run: RunContext, token: CancellationToken) -> list[Tried]:
     how = f"from {' + '.join(names_of(seed.pair, group.matches))}"
     rows = group.matches.matches[seed.pair][seed.pose.inliers]
     try:
         points = seed_of(group.matches, seed, group.intrinsics)
     except FAILURES as err:
-        return [Attempt("incremental", None, {}, f"{how}: no points, {reason_of(err)}")]
+        return [NoModel("incremental", f"{how}: no points, {reason_of(err)}")]
     start = model_from_seed(run.workspace.database, seed.pair, rows, points)
     return [_judged(group, "incremental", how, _grown(group, start, run, token), run)]
 
 
-def _completed(group: Group, best: Attempt, run: RunContext, token: Any) -> list[Attempt]:
+def _completed(group: Group, best: Attempt, run: RunContext, token: CancellationToken) -> list[Tried]:
     """Return photos that the global mapper left out may fit into what it made."""
     model = _grown(group, best.model, run, token)
     return [_judged(group, "incremental", "what was left out, photo by photo", model, run)]
 
 
-def _grown(group: Group, start: Any, run: RunContext, token: Any) -> Any:
+def _grown(group: Group, start: Reconstruction, run: RunContext, token: CancellationToken) -> Reconstruction | None:
     place = run.workspace
     return map_incrementally(
         place.database, place.photos, start, place.root / INCREMENTAL_FOLDER, run.seed, run.progress.advance, token,
@@ -223,7 +237,9 @@ def well_known(camera: Calibration) -> bool:
     return camera.identifiable and spread <= WELL_KNOWN * camera.K[0, 0]
 
 
-def judged(matches: MatchGraph, views: ViewGraph, made: tuple[str, str], model: Any, run: RunContext) -> Attempt:
+def judged(
+    matches: MatchGraph, views: ViewGraph, made: tuple[str, str], model: Reconstruction | None, run: RunContext
+) -> Tried:
     """Count what a model explains.
 
     Args:
@@ -234,22 +250,17 @@ def judged(matches: MatchGraph, views: ViewGraph, made: tuple[str, str], model: 
         run: the run.
     """
     mapper, how = made
-    placed = int(model.num_reg_images()) if model is not None else 0
+    placed = model.num_reg_images() if model is not None else 0
     note = f"{how}: {placed} photos"
-    if placed < 2 or model.num_points3D() < run.settings.scene.min_points:
-        return no_model(mapper, note)
+    if model is None or placed < 2 or model.num_points3D() < run.settings.scene.min_points:
+        return NoModel(mapper, note)
     try:
         explained = explained_pairs(model, matches, views, run.settings.epipolar.max_error_px)
     except FAILURES as err:
         logger.info("a model could not be judged", exc_info=err)
-        return no_model(mapper, f"{note}, that could not be judged: {reason_of(err)}")
+        return NoModel(mapper, f"{note}, that could not be judged: {reason_of(err)}")
     return Attempt(mapper, model, explained, note)
 
 
-def no_model(mapper: str, note: str) -> Attempt:
-    """Return an attempt that gave nothing, and why."""
-    return Attempt(mapper, None, {}, note)
-
-
-def _judged(group: Group, mapper: str, how: str, model: Any, run: RunContext) -> Attempt:
+def _judged(group: Group, mapper: str, how: str, model: Reconstruction | None, run: RunContext) -> Tried:
     return judged(group.matches, group.views, (mapper, how), model, run)

@@ -8,7 +8,6 @@ model is in the other's unit and where it stands; the others, and the pairs betw
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,10 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.bundle import adjusted_or_as_it_was
 from sfm_app.colmap.model import both, photos_of, places_of_keypoints
+from sfm_app.colmap.types import Reconstruction
 from sfm_app.context import RunContext
 from sfm_app.geometry.similarity import robust_similarity
-from sfm_app.reconstruction.mapping_runs import Attempt, judged
+from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, judged
 from sfm_app.reconstruction.model_split import sound_parts
 from sfm_app.types import MatchGraph, ViewGraph
 
@@ -68,13 +68,17 @@ def _together(
     model = adjusted_or_as_it_was(model, database).model
     how = f"{first.photos} and {second.photos} photos joined by {len(shared)} points"
     found = judged(matches, views, (first.mapper, how), model, run)
-    if found.photos < first.photos + second.photos or found.support <= first.support + second.support:
+    if (
+        isinstance(found, NoModel)
+        or found.photos < first.photos + second.photos
+        or found.support <= first.support + second.support
+    ):
         return None
     one = len(sound_parts(found.explained, photos_of(found.model))) == 1
     return replace(found, note=how) if one else None
 
 
-def shared_points(first: Any, second: Any, matches: MatchGraph, views: ViewGraph) -> FloatArray:
+def shared_points(first: Reconstruction, second: Reconstruction, matches: MatchGraph, views: ViewGraph) -> FloatArray:
     """Return (N, 6) points that both models know, as the first and as the second has them; each but once."""
     here, there = places_of_keypoints(first), places_of_keypoints(second)
     found = {}

@@ -8,7 +8,6 @@ much, and where all photos have their place they add nothing.
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from sfm_app.calibrating import find_intrinsics
 from sfm_app.colmap.backend import backend
@@ -18,10 +17,11 @@ from sfm_app.context import RunContext
 from sfm_app.errors import SfmError
 from sfm_app.fitting import fit_pairs, graph_of
 from sfm_app.matching import fill_database
+from sfm_app.numerical import Json
 from sfm_app.plugins import SIFT_DSP
 from sfm_app.reconstruction.added_matches import with_added
 from sfm_app.reconstruction.mapping_passes import Outcome, reconstruct
-from sfm_app.reconstruction.mapping_runs import Attempt, better, judged
+from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, better, judged
 from sfm_app.reconstruction.unregistered import names_of
 from sfm_app.types import Intrinsics, MatchGraph, PairId, ViewGraph
 from sfm_app.workspace import Aside
@@ -62,7 +62,7 @@ def look_again(first: Found) -> Found:
     pairs = pairs_to_see(lost, first.matches)
     seen = sorted({photo for pair in pairs for photo in pair})
     run.progress.say(f"{len(lost)} photos have no place: finer features are sought in {len(seen)}")
-    report: dict[str, Any] = {"photos": names_of(lost, first.matches), "pairs": len(pairs)}
+    report: dict[str, Json] = {"photos": names_of(lost, first.matches), "pairs": len(pairs)}
     try:
         second = _seen_again(first, pairs, report)
     except SfmError as err:  # what we have is not lost with it
@@ -99,7 +99,7 @@ def pairs_to_see(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
     return sorted(pairs)
 
 
-def _seen_again(first: Found, pairs: Sequence[PairId], report: dict[str, Any]) -> Found | None:
+def _seen_again(first: Found, pairs: Sequence[PairId], report: dict[str, Json]) -> Found | None:
     """Return all steps from features to models once more; None where nothing new was found."""
     run = _aside(first.run)
     finer = replace(run, workspace=Aside(run.workspace, FEATURES))
@@ -147,6 +147,6 @@ def _is_better(second: Found, first: Found) -> bool:
     return better(models) is models[-1]
 
 
-def _judged_by(found: Found, outcome: Outcome) -> Attempt:
+def _judged_by(found: Found, outcome: Outcome) -> Attempt | NoModel:
     main = outcome.models[0]
     return judged(found.matches, found.views, (main.mapper, main.note), main.model, found.run)

@@ -6,12 +6,12 @@ both cameras. Points, tracks and reprojection errors differ with the mapper; thi
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.colmap.model import placed_views
+from sfm_app.colmap.types import Reconstruction
 from sfm_app.posegraph.pair_pose import in_front, ray_angles_deg
 from sfm_app.posegraph.refine import pose_distances
 from sfm_app.types import MatchGraph, PairId, RelativePose, ViewGraph
@@ -36,7 +36,9 @@ class Explained:
     """Those of them that do not lie right."""
 
 
-def explained_pairs(model: Any, matches: MatchGraph, views: ViewGraph, max_error_px: float) -> dict[PairId, Explained]:
+def explained_pairs(
+    model: Reconstruction, matches: MatchGraph, views: ViewGraph, max_error_px: float
+) -> dict[PairId, Explained]:
     """Return what a model makes of every pair of its photos.
 
     Args:
@@ -54,7 +56,9 @@ def explained_pairs(model: Any, matches: MatchGraph, views: ViewGraph, max_error
     return found
 
 
-def model_poses(model: Any, matches: MatchGraph, max_error_px: float, least: int) -> dict[PairId, RelativePose]:
+def model_poses(
+    model: Reconstruction, matches: MatchGraph, max_error_px: float, least: int
+) -> dict[PairId, RelativePose]:
     """Give relative poses as a model has them, of all pairs of its photos with at least so many matches that lie right.
 
     Args:
@@ -88,7 +92,7 @@ class _PlacedPair:
         return np.asarray((distances <= max_error_px) & in_front(self.rays, self.R, self.t), bool)
 
 
-def _placed_pairs(model: Any, matches: MatchGraph) -> Iterator[tuple[PairId, _PlacedPair]]:
+def _placed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[PairId, _PlacedPair]]:
     placed = placed_views(model, matches.keypoints)
     for pair, rows in matches.matches.items():
         if pair[0] not in placed or pair[1] not in placed:

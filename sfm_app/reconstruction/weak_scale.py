@@ -4,12 +4,12 @@ Of two photos nobody knows how far apart they are. A photo finds its distance fr
 see; where a part shares hardly one with the rest, its rays may meet well and its size still be anybody's guess.
 """
 
-from typing import Any
-
 import numpy as np
 from scipy.sparse import csr_array
 
 from sfm_app.colmap.backend import backend
+from sfm_app.colmap.model import posed_images
+from sfm_app.colmap.types import Reconstruction, all_points
 
 LEAST = 5
 """Points that two placed photos and the next one see, below which the scale between them is open: a pose takes three,
@@ -17,14 +17,14 @@ two more contradict a wrong one. Of the photo sets only temple16 with every seco
 off) and dinoSparseRing (2) have less; right models of castle-P19 and temple16 have 8."""
 
 
-def weakly_joined(model: Any) -> list[list[str]]:
+def weakly_joined(model: Reconstruction) -> list[list[str]]:
     """Give names of photos, part by part, whose distance from first part of a model hangs on fewer than `LEAST` points.
 
     Photos join one after the other, each time the one that sees most points which two of those before it see.
     """
     with backend("reading points"):
-        names = {image.image_id: image.name for image in model.images.values() if image.has_pose}
-        tracks = [{element.image_id for element in point.track.elements} for point in model.points3D.values()]
+        names = {image.image_id: image.name for image in posed_images(model)}
+        tracks = [{element.image_id for element in point.track.elements} for _, point in all_points(model)]
     photos = sorted(names)
     seen = _seen(tracks, photos)
     parts: list[list[str]] = [[]]

@@ -5,17 +5,17 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from sfm_app.atomic_io import can_go_on, mark_unfinished, replacing
 from sfm_app.colmap.backend import backend, check_written
 from sfm_app.colmap.bundle import Adjusted, adjusted_or_as_it_was
-from sfm_app.colmap.model import color, photos_of, read_scene, sparse_model
+from sfm_app.colmap.model import Refined, color, photos_of, posed_images, read_scene, sparse_model
+from sfm_app.colmap.types import Reconstruction
 from sfm_app.context import RunContext
 from sfm_app.diagnosis import why_no_depth, why_no_scene
 from sfm_app.errors import ReconstructionError
 from sfm_app.hashing import digest_files
-from sfm_app.numerical import json_text
+from sfm_app.numerical import Json, json_text
 from sfm_app.reconstruction import Found, Outcome, look_again, reconstruct
 from sfm_app.reconstruction.align_upright import look_at_photos, orient_or_leave
 from sfm_app.reconstruction.look_alikes import in_words, jumps
@@ -132,7 +132,7 @@ def with_depth(
     return replace(outcome, models=tuple(kept))
 
 
-def how_it_was_made(outcome: Outcome) -> dict[str, Any]:
+def how_it_was_made(outcome: Outcome) -> dict[str, Json]:
     """Return what the manifest says about relative poses and mapping."""
     poses, main = outcome.graph.poses.values(), outcome.models[0]
     dropped = list(outcome.graph.dropped.values())
@@ -153,11 +153,11 @@ def how_it_was_made(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def how_it_was_adjusted(adjusted: Sequence[Adjusted], names: Mapping[str, str]) -> dict[str, Any]:
+def how_it_was_adjusted(adjusted: Sequence[Adjusted], names: Mapping[str, str]) -> dict[str, Json]:
     """Return what the manifest says about what the last adjustment could not do; empty where that is nothing."""
     main, others = adjusted[0], adjusted[1:]
-    cameras = {image.camera_id: names[image.name] for image in main.model.images.values() if image.has_pose}
-    found = {
+    cameras = {image.camera_id: names[image.name] for image in posed_images(main.model)}
+    found: dict[str, Json] = {
         "failed": main.trouble,
         "failed_in_other_models": {str(number): one.trouble for number, one in enumerate(others, 1) if one.trouble},
         "cameras_held": [cameras[camera_id] for camera_id in main.held],
@@ -166,7 +166,7 @@ def how_it_was_adjusted(adjusted: Sequence[Adjusted], names: Mapping[str, str]) 
     return {key: value for key, value in found.items() if value}
 
 
-def write_models(models: list[Any], run: RunContext) -> None:
+def write_models(models: list[Reconstruction], run: RunContext) -> None:
     """Put the main model into OUT/sparse and the others into OUT/other_models/1, 2, ..., each as a whole."""
     place = run.workspace
     shutil.rmtree(place.other_models, ignore_errors=True)
@@ -175,7 +175,7 @@ def write_models(models: list[Any], run: RunContext) -> None:
     write_model(models[0], place.sparse)
 
 
-def write_model(model: Any, target: Path) -> None:
+def write_model(model: Reconstruction, target: Path) -> None:
     """Put a model into a folder as a whole."""
     beside = target.with_name(f".{target.name}")
     shutil.rmtree(beside, ignore_errors=True)
@@ -187,9 +187,9 @@ def write_model(model: Any, target: Path) -> None:
     beside.rename(target)
 
 
-def refined_by_name(adjusted: Adjusted, names: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+def refined_by_name(adjusted: Adjusted, names: Mapping[str, str]) -> dict[str, Refined]:
     """Return what is known about the refined cameras besides COLMAP's model, by name of the camera."""
-    cameras = {names[image.name]: image.camera_id for image in adjusted.model.images.values() if image.has_pose}
+    cameras = {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
     return {
         name: {"deviations": adjusted.deviations[camera_id], "determined": adjusted.determined[camera_id]}
         for name, camera_id in cameras.items()

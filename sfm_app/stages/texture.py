@@ -55,13 +55,13 @@ class Files:
     def used(self, view: PhotoView) -> NDArray[np.bool_] | None:
         return None if self.mask_dir is None else read_used(self.mask_dir, view.name)
 
-    def recall(self, name: str) -> dict[str, NDArray[Any]] | None:
+    def recall(self, name: str) -> dict[str, NDArray[np.generic]] | None:
         try:
             return load_arrays(self._path(name))
         except Exception:  # not there, or damaged, of which decoders make whatever they like
             return None
 
-    def keep(self, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+    def keep(self, name: str, arrays: Mapping[str, NDArray[np.generic]]) -> None:
         with replacing(self._path(name)) as path:
             np.savez(path, allow_pickle=False, **arrays)
 

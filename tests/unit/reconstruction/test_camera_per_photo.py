@@ -18,7 +18,7 @@ from sfm_app.reconstruction.camera_per_photo import (
     with_two,
 )
 from sfm_app.reconstruction.mapping_passes import reconstruct
-from sfm_app.reconstruction.mapping_runs import Attempt
+from sfm_app.reconstruction.mapping_runs import Attempt, NoModel
 from sfm_app.reconstruction.support import Explained, explained_pairs
 from sfm_app.settings import Settings
 from sfm_app.types import ViewGraph
@@ -166,7 +166,7 @@ def zoom(monkeypatch, synthetic):
             return [Attempt("incremental", model, explained, f"{len(names)} cameras")]
 
         monkeypatch.setattr(module, "attempts", attempts)
-        monkeypatch.setattr(module, "map_baseline", lambda *_: Attempt("colmap", None, {}, "no rival"))
+        monkeypatch.setattr(module, "map_baseline", lambda *_: NoModel("colmap", "no rival"))
         monkeypatch.setattr(module, "with_two", lambda *_: None)
         monkeypatch.setattr(module, "MOST_PASSES", 1)
         return asked

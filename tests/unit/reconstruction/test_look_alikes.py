@@ -54,7 +54,7 @@ def test_the_photos_of_a_join_fall_into_two_places(matches):
 def model(places):
     def image(number, x):
         return SimpleNamespace(
-            name=f"{number:02d}.jpg", has_pose=True, projection_center=lambda: np.array([x, 0.0, 0.0])
+            image_id=number, name=f"{number:02d}.jpg", has_pose=True, projection_center=lambda: np.array([x, 0.0, 0.0])
         )
 
     return SimpleNamespace(images={number: image(number, x) for number, x in enumerate(places)})

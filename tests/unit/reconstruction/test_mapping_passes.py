@@ -13,7 +13,7 @@ from sfm_app.errors import BackendError
 from sfm_app.reconstruction import baseline
 from sfm_app.reconstruction import mapping_passes as module
 from sfm_app.reconstruction.mapping_passes import learned_intrinsics, reconstruct, taken_apart
-from sfm_app.reconstruction.mapping_runs import Attempt
+from sfm_app.reconstruction.mapping_runs import Attempt, NoModel
 from sfm_app.reconstruction.support import Explained, explained_pairs
 from sfm_app.types import PoseGraph
 
@@ -46,12 +46,12 @@ def mapped(monkeypatch, synthetic):
             seen.append((group.photos, group.intrinsics))
             model = left.pop(0)
             if model is None:
-                return [Attempt("incremental", None, {}, "nothing")]
+                return [NoModel("incremental", "nothing")]
             explained = explained_pairs(model, synthetic.matches, synthetic.views, 1.5)
             return [Attempt("incremental", model, explained, f"{model.num_reg_images()} photos")]
 
         monkeypatch.setattr(module, "attempts", attempts)
-        monkeypatch.setattr(module, "map_baseline", lambda *_: Attempt("colmap", None, {}, "no rival"))
+        monkeypatch.setattr(module, "map_baseline", lambda *_: NoModel("colmap", "no rival"))
         return seen
 
     return make

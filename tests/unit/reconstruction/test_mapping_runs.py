@@ -6,7 +6,7 @@ import pytest
 
 from sfm_app.errors import BackendError
 from sfm_app.reconstruction import mapping_runs as module
-from sfm_app.reconstruction.mapping_runs import Attempt, Group, attempts, better, why
+from sfm_app.reconstruction.mapping_runs import Attempt, Group, NoModel, attempts, better, why
 from sfm_app.reconstruction.support import Explained
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, RelativePose, ViewGraph
 
@@ -42,7 +42,7 @@ def test_of_equal_ones_the_one_with_more_photos_and_then_with_more_points():
 
 
 def test_what_gave_no_model_is_never_better():
-    nothing = Attempt("incremental", None, {}, "")
+    nothing = NoModel("incremental", "")
 
     assert better([]) is None and better([nothing]) is None
     assert better([nothing, attempt(2, 0)]).photos == 2
@@ -104,8 +104,12 @@ def try_out(run, cameras, monkeypatch):
     return make
 
 
+def placed(attempt):
+    return 0 if isinstance(attempt, NoModel) else attempt.photos
+
+
 def summary(found):
-    return [(attempt.mapper, attempt.photos) for attempt in found]
+    return [(attempt.mapper, placed(attempt)) for attempt in found]
 
 
 def test_both_mappers_are_tried_and_one_good_model_is_enough(try_out):
@@ -130,7 +134,7 @@ def test_a_model_of_all_photos_that_matches_contradict_is_not_flawless(try_out):
 
 
 def test_why_a_model_was_taken_is_said():
-    best, rival, nothing = attempt(10, 1000), attempt(9, 900), Attempt("global", None, {}, "")
+    best, rival, nothing = attempt(10, 1000), attempt(9, 900), NoModel("global", "")
     contradicted = Attempt("global", model(10), {(0, 1): Explained(90, 100, 10)}, "")
 
     assert why(best, [best, nothing], 10) == "it places all 10 photos and next to nothing contradicts it"
@@ -146,7 +150,7 @@ def test_a_global_mapper_that_fails_leaves_the_other_model(try_out):
 
 
 @pytest.mark.parametrize(
-    ("grown", "at_once", "placed"),
+    ("grown", "at_once", "counts"),
     [
         ([10, 3], 2, [10, 0]),  # nothing better can come
         ([2, 3], 9, [2, 9, 0]),  # nor after the other mapper
@@ -157,11 +161,10 @@ def test_a_global_mapper_that_fails_leaves_the_other_model(try_out):
         ([0, 0, 0, 0, 0, 10], 0, [0, 0, 0, 0, 0, 0]),  # no more seeds than allowed
     ],
 )
-def test_seeds_are_tried_until_one_grows(try_out, grown, at_once, placed):
+def test_seeds_are_tried_until_one_grows(try_out, grown, at_once, counts):
     found, _ = try_out(grown, at_once, max_init_pairs=5)
 
-    assert [attempt.photos for attempt in found] == placed
-    assert all(attempt.model is None for attempt in found if not attempt.photos)
+    assert [placed(attempt) for attempt in found] == counts
 
 
 @pytest.mark.parametrize("late", ["global", "incremental"])
@@ -199,8 +202,7 @@ def test_without_seeds_all_photos_can_still_be_placed_at_once(try_out):
 def test_a_model_with_too_few_points_is_none(try_out):
     found, _ = try_out([10], at_once=10, points=29)
 
-    assert [attempt.model for attempt in found] == [None] * len(found)
-    assert [attempt.support for attempt in found] == [0.0] * len(found)
+    assert all(isinstance(attempt, NoModel) for attempt in found)
     assert [attempt.note for attempt in found[:2]] == ["from 1.jpg + 2.jpg: 10 photos", "all at once: 10 photos"]
     assert len(try_out([10], at_once=10, points=30)[0]) == 2
 

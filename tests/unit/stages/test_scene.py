@@ -274,7 +274,8 @@ def test_what_the_model_does_not_hold_is_written_down(tmp_path):
 
 def test_what_is_known_of_refined_cameras_goes_by_their_names():
     images = {
-        key: SimpleNamespace(name=f"{key}.jpg", camera_id=7 if key < 3 else 8, has_pose=key != 4) for key in range(1, 5)
+        key: SimpleNamespace(image_id=key, name=f"{key}.jpg", camera_id=7 if key < 3 else 8, has_pose=key != 4)
+        for key in range(1, 5)
     }
     adjusted = SimpleNamespace(
         model=SimpleNamespace(images=images),
