@@ -6,6 +6,8 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.numerical import MAD_TO_SIGMA
+
 FloatArray = NDArray[np.float64]
 
 MAX_TRIPLES = 500
@@ -68,7 +70,7 @@ def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
             best, residual = score, distance
     if not np.isfinite(best):
         raise ValueError("fewer than 3 points, or all on a line: they fix no rotation")
-    agreeing = residual <= max(2.5 * 1.4826 * best, np.sort(residual)[2])
+    agreeing = residual <= max(2.5 * MAD_TO_SIGMA * best, np.sort(residual)[2])
     return umeyama(a[agreeing], b[agreeing])
 
 

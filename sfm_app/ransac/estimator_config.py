@@ -1,4 +1,7 @@
-"""What an estimator is made of: sampler, solver, score, verifier, stopping rule, final fit."""
+"""What an estimator is made of: sampler, solver, score, verifier, stopping rule, final fit.
+
+The stages of thesis Figure 3.7 and section 4.4, each a part that can be exchanged.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass

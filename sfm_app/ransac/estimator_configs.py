@@ -13,10 +13,11 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.ransac.estimate import estimate
 from sfm_app.ransac.estimator_config import Recipe
 from sfm_app.ransac.refine.final_refit import refit_sampson
-from sfm_app.ransac.scoring.leverage import MAD_TO_SIGMA, prior_validity
+from sfm_app.ransac.scoring.leverage import prior_validity
 from sfm_app.ransac.scoring.mlesac import mlesac
 from sfm_app.ransac.scoring.res_ransac import residual_validity
 from sfm_app.ransac.scoring.robust_costs import lmeds, msac, msac_linear, ransac, squared_distances
@@ -28,6 +29,7 @@ from sfm_app.types import EpipolarFit, Rejected
 FloatArray = NDArray[np.float64]
 
 _LMEDS_SIGMAS = 2.5
+"""Robust standard deviations within which matches are inliers of LMedS (Rousseeuw and Leroy 1987)."""
 
 
 def refit_to_median(points: FloatArray, F: FloatArray, _threshold: float) -> FloatArray:

@@ -1,4 +1,7 @@
-"""The K that most pairs agree on: the highest peak of the joint consensus, and what speaks for and against it."""
+"""The K that most pairs agree on: the highest peak of the joint consensus, and what speaks for and against it.
+
+Thesis 5.8.4 carried from a plane to all of K; what speaks for and against the answer is ours.
+"""
 
 from dataclasses import dataclass
 
@@ -20,16 +23,20 @@ from sfm_app.selfcal.consensus.peak_search import FOCAL_RANGE, SIGMAS, Peak, Pro
 from sfm_app.selfcal.inputs import FloatArray
 
 SQUARE_PIXELS = (LOG_FOCAL, CENTER_U, CENTER_V)
+"""Places in theta that are sought when pixels are square."""
 ANY_PIXELS = (*SQUARE_PIXELS, LOG_ASPECT)
+"""Places in theta that are sought when they need not be."""
 LOG_ASPECTS = tuple(np.linspace(-0.6, 0.6, 9))
-"""log fy/fx on the grid: 0.55 to 1.8."""
+"""log fy/fx on the grid: 0.55 to 1.8. Chosen by hand; not measured on their own."""
 ASPECT_GAIN = float(np.log(50))
-"""Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square."""
+"""Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square. docs/algorithms.md,
+Self-calibration, 1. Chosen by hand; not measured on its own."""
 PERHAPS_ASPECT_GAIN = float(np.log(50 * 0.05))
 """Votes from which on square pixels are less than 95 % sure. Of 47 answers with square pixels on the photo sets and on
 folders 0 to 170 of `benchmarks/accuracy/trouble.py`, one had more (1.55), and its pixels were not square."""
 MAX_LOG_FOCAL_SPREAD = 0.1
-"""Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess."""
+"""Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess.
+docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured on its own."""
 IDENTIFIED_LOG_FOCAL_SPREAD = 0.02
 """Largest standard deviation of log f that counts as known: with 0.025 one focal of twenty is off by 5 %, and what is
 called identifiable should not be. Between this and the limit above the answer is an estimate: a better start than a
@@ -41,9 +48,10 @@ the side or on one plane; then few votes may be missing, or what turned these pa
 the same 109 cameras eight are short of both: off by 43, 10, 6, 4, 4, 1, 0.3 and 0.2 %; no other of them whose deviation
 is below 0.02 is off by more than 2.5 %."""
 IDENTIFIED_OF_MANY = 0.015
-"""The same where every photo has a focal of its own: the worst of them is further off than one."""
+"""The same where every photo has a focal of its own: the worst of them is further off than one. docs/algorithms.md,
+Self-calibration, 6. Chosen by hand; not measured on its own."""
 EDGE = 1.02
-"""A focal within this factor of an end of the range has run there."""
+"""A focal within this factor of an end of the range has run there. Chosen by hand; not measured on its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
