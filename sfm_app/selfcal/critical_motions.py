@@ -1,6 +1,6 @@
 """Why a set of pairs leaves the focal open: motions for which E = K'FK has equal singular values at any focal.
 
-Sturm (1999), to whom thesis 5.4 refers; to tell them by the poses that were found is ours.
+Sturm (1999); the degenerate motions of thesis 5.4. To tell them by the poses that were found is ours.
 """
 
 import numpy as np

@@ -63,7 +63,7 @@ SWEEPS = 5
 own."""
 LONGEST_STEP = 1.0
 """Of log f in one step: a camera that wants more after mapping has placed the photos is not determined by them. Chosen
-on no set: it is more than the prior's standard deviation, and none of six sets that were run reached it."""
+by hand, on no set: it is more than the prior's standard deviation, and none of six sets that were run reached it."""
 FOCALS = (0.05, 100.0)
 """In longer sides: a view of 169 degrees, and one of half a degree. What lies outside has run away. docs/algorithms.md,
 Bundle adjustment. Chosen by hand; not measured on their own."""

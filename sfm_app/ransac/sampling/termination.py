@@ -23,7 +23,8 @@ _SURE = 1400.0
 """Samples to wait are the square of this over z (docs/algorithms.md, Fundamental matrices). Chosen on the Strecha sets;
 `python benchmarks/accuracy/fundamental.py --real DATA --ablation` has the search without it beside it."""
 _MOST = 3000.0
-"""Samples to wait where the evidence is poor, z below 26. Chosen with `_SURE`."""
+"""Samples to wait where the evidence is poor, z below 26. Chosen with `_SURE` (docs/algorithms.md, Fundamental
+matrices)."""
 _LEAST_IN_DOUBT = 250.0
 """A quarter of them are samples of the rest; a motion that holds two thirds of it is in one of 17 of these. Chosen on
 pairs with two motions: `python benchmarks/accuracy/fundamental.py --two-motions 100`."""

@@ -16,7 +16,8 @@ from sfm_app.ransac.verification.pretests import BLOCK, PreTest
 FloatArray = NDArray[np.float64]
 
 FIRST = cast("int", np.int64(0))
-"""Where blocks begin. A plain 0 is a type of its own to numba, and kernels are compiled for it once more."""
+"""Where blocks begin: 0, by definition. A plain 0 is a type of its own to numba, and kernels are compiled for it once
+more."""
 
 RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS, GEMAN_MCCLURE = range(6)
 """Kinds of `Loss`: one for each penalty below."""

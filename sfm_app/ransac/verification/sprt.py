@@ -22,7 +22,7 @@ FIRST_EPSILON, FIRST_DELTA = 0.1, 0.01
 docs/algorithms.md, Fundamental matrices. Chosen by hand; not measured on their own."""
 MODEL_COST = {7: 160.0, 8: 160.0}
 """t_M: time for a sample and its models over the time to check one match, by sample size; measured (1.1 us, 7 ns). The
-command is not on record."""
+command is not on record; the figure stands in docs/algorithms.md, Fundamental matrices."""
 MODELS_PER_SAMPLE = {7: 2.45, 8: 1.0}
 """m_S, by sample size; measured. The command is not on record; the thesis prints 2.3 (4.4.4)."""
 

@@ -1,6 +1,6 @@
 """From first ideas of the cameras to what their matches say: adjust, ask what the evidence frees, adjust again.
 
-Ours; the thesis calibrates from fundamental matrices alone. Of its 5.8 it has the key pairs.
+Ours; the thesis calibrates from fundamental matrices alone.
 """
 
 from collections.abc import Sequence

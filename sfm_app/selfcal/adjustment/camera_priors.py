@@ -41,7 +41,7 @@ WIDE = {CENTER: 0.15, ASPECT: 0.25, LENS: 0.2}
 """The same where the parameter is freed. docs/algorithms.md, Self-calibration, 3. Chosen by hand; not measured on their
 own."""
 COLUMNS = {CENTER: [CENTER_U, CENTER_U + 1], ASPECT: [LOG_ASPECT], LENS: [KAPPA]}
-"""Places in the parameters of a camera."""
+"""Places in the parameters of a camera, by definition in `lens`."""
 UNDETERMINED = 0.5
 """A parameter whose narrow prior the pairs do not make narrower than this stays at its usual value. docs/algorithms.md,
 Self-calibration, 3. Chosen by hand; not measured on its own."""

@@ -1,6 +1,6 @@
 """How far a fit may be trusted: covariances, standard deviations in pixels, and which pairs say most.
 
-Ours; resampling by leaving out is the jackknife (Efron 1982).
+Ours; to leave out photos is the jackknife (Efron 1982). Key pairs are what chapter 6 of the thesis asks for.
 """
 
 import numpy as np

@@ -46,7 +46,7 @@ CLEAR_LEAD_SHARE, FEW_ASTRAY = 0.2, 0.8
 """A focal a quarter away that loses less than this share of the votes is hardly told from the right one, by walks to
 the side or on one plane; then few votes may be missing, or what turned these pairs astray has pulled at the others. Of
 the same 109 cameras eight are short of both: off by 43, 10, 6, 4, 4, 1, 0.3 and 0.2 %; no other of them whose deviation
-is below 0.02 is off by more than 2.5 %."""
+is below 0.02 is off by more than 2.5 %. docs/algorithms.md, Self-calibration, 5."""
 IDENTIFIED_OF_MANY = 0.015
 """The same where every photo has a focal of its own: the worst of them is further off than one. docs/algorithms.md,
 Self-calibration, 6. Chosen by hand; not measured on its own."""
@@ -80,7 +80,7 @@ class Answer:
         return "its pixels may not be square" if doubtful else ""
 
     def doubt_of_focal(self, weights: FloatArray) -> str:
-        """Why an answer to pairs of these weights (P,) is an estimate though its deviation is small, or nothing."""
+        """Return why an answer to pairs of these weights (P,) is an estimate though its deviation is small, or nothing."""
         mass = float(np.sum(self.votes))
         doubtful = self.lead < CLEAR_LEAD_SHARE * mass and mass < FEW_ASTRAY * float(np.sum(weights))
         return "many pairs fit other focals nearly as well, and some fit none" if doubtful else ""

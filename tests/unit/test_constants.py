@@ -1,0 +1,92 @@
+"""Constants of the two methods say where their numbers come from; modules, which equation or paper they are."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+import sfm_app
+
+PACKAGE = Path(sfm_app.__file__).parent
+MODULES = sorted(path for room in ("ransac", "selfcal") for path in (PACKAGE / room).rglob("*.py"))
+NAME = re.compile(r"_?[A-Z][A-Z0-9_]*")
+YEAR = r"\b(?:18|19|20)\d\d\b"
+POINTER = re.compile(rf"[Tt]hesis|\bEq\. |{YEAR}|\b[Oo]urs\b")
+"""The thesis, an equation of it, a paper, or nobody else."""
+SOURCE = re.compile(
+    rf"[Tt]hesis|\bEq\. |{YEAR}|docs/algorithms\.md|benchmarks/|"
+    r"by hand|\b[Bb]y definition\b|\bCounted\b|double precision"
+)
+"""The thesis, a paper, a page or command with the measurement, a definition, rounding, or that it is a guess."""
+
+
+def named(path):
+    """A module as the tests call it."""
+    return path.relative_to(PACKAGE).as_posix()
+
+
+def constants(text):
+    """Every module-level constant that holds numbers, with its docstring; numbered places are no quantities."""
+    body, found = ast.parse(text).body, {}
+    for statement, after in zip(body, [*body[1:], None], strict=True):
+        if not isinstance(statement, ast.Assign | ast.AnnAssign) or statement.value is None:
+            continue
+        targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
+        names = [node.id for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)]
+        if not any(NAME.fullmatch(name) for name in names) or not holds_numbers(statement.value):
+            continue
+        is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+        found[", ".join(names)] = " ".join(str(after.value.value).split()) if is_text else ""
+    return found
+
+
+def holds_numbers(value):
+    if isinstance(value, ast.Call) and isinstance(value.func, ast.Name) and value.func.id == "range":
+        return False
+    return any(isinstance(node, ast.Constant) and type(node.value) in (int, float) for node in ast.walk(value))
+
+
+def silent(text):
+    """Names of the constants whose docstring names no source, or that have none."""
+    return [name for name, about in constants(text).items() if not SOURCE.search(about)]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=named)
+def test_every_constant_says_where_it_comes_from(path):
+    assert silent(path.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize("path", MODULES, ids=named)
+def test_every_module_says_which_equation_or_paper_it_is(path):
+    about = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    assert POINTER.search(about), f"{named(path)}: neither a section of the thesis nor a paper, nor that it is ours"
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("BARE = 3.0", ["BARE"]),
+        ("A, _B = 1, 2.5", ["A, _B"]),
+        ('MUTE = 3.0\n"""Thresholds."""', ["MUTE"]),
+        ("TABLE = {7: 160.0}", ["TABLE"]),
+        ("SCALED: float = 2 * np.log(50)", ["SCALED"]),
+        ('PAPER = 2.5\n"""Of LMedS (Rousseeuw and Leroy 1987)."""', []),
+        ('GUESS = 2.5\n"""Chosen by hand; not measured on its own."""', []),
+        ("X, Y = range(2)\nWORD = 'seven'\nlower = 3", []),
+    ],
+)
+def test_constants_without_a_source_are_found(text, names):
+    assert silent(text) == names
+
+
+def test_a_number_that_all_packages_share_stands_in_one_place():
+    holders = [
+        named(path)
+        for path in PACKAGE.rglob("*.py")
+        if any(
+            isinstance(node, ast.Constant) and node.value == 1.4826
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        )
+    ]
+    assert holders == ["numerical.py"]
