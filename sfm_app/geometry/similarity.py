@@ -75,7 +75,7 @@ def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
 
 
 def _triples(count: int) -> NDArray[np.intp]:
-    """All triples of so many points, or `MAX_TRIPLES` of them, drawn with a fixed seed."""
+    """List all triples of so many points, or `MAX_TRIPLES` of them, drawn with a fixed seed."""
     rng = np.random.default_rng(0)
     if count > MOST_LISTED:
         return np.array([rng.choice(count, 3, replace=False) for _ in range(MAX_TRIPLES)], np.intp)

@@ -1,8 +1,8 @@
 """The estimators of thesis chapter 4, each as the parts it is made of.
 
 All of them are the same loop with another sampler, solver, score, verifier or stopping rule; where a part is not
-named it is the plain one (see `loop.Recipe`). The threshold T is `max_error_px`; the thesis takes 1.96 px for a noise
-of 1 px.
+named it is the plain one (see `estimator_config.Recipe`). The threshold T is `max_error_px`; the thesis takes 1.96 px
+for a noise of 1 px.
 """
 
 import math

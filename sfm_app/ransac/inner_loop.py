@@ -25,7 +25,7 @@ class Draws(NamedTuple):
     """How hypotheses are made."""
 
     sample_size: int
-    """7 or 8, see `minimal`."""
+    """7 or 8, see `solvers.minimal`."""
     oriented: bool
     """Whether models that put a sampled point behind a camera are dropped."""
     batch: int

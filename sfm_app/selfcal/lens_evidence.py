@@ -2,8 +2,8 @@
 
 Ours; the choice of models by marginal likelihood is MacKay's (1992).
 
-As for pairs (`priors`): each part of a camera has a narrow prior about its usual value and a wide one, and is freed
-where the evidence for the wide one (the marginal likelihood, by Laplace's approximation) outweighs how rare such
+As for pairs (`camera_priors`): each part of a camera has a narrow prior about its usual value and a wide one, and is
+freed where the evidence for the wide one (the marginal likelihood, by Laplace's approximation) outweighs how rare such
 cameras are. Freed or not, the prior stays in the estimate: what the photos do not determine stays where it usually is.
 """
 

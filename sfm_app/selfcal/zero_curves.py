@@ -2,7 +2,7 @@
 
 Beyond the thesis: the center is sought together with the focal (cropped photos), fy/fx and a lens are freed where the
 photos ask for it, every parameter comes with a standard deviation, and an answer that the pairs do not determine is not
-given. The consensus of the pairs finds the camera from nothing; the adjustment of `refine` makes it exact.
+given. The consensus of the pairs finds the camera from nothing; the adjustment of `calibrate_pairs` makes it exact.
 """
 
 from dataclasses import dataclass, replace

@@ -8,7 +8,7 @@ import pytest
 
 import sfm_app
 
-PACKAGE = Path(sfm_app.__file__).parent
+PACKAGE, ROOT = Path(sfm_app.__file__).parent, Path(__file__).parents[2]
 MODULES = sorted(path for room in ("ransac", "selfcal") for path in (PACKAGE / room).rglob("*.py"))
 NAME = re.compile(r"_?[A-Z][A-Z0-9_]*")
 YEAR = r"\b(?:18|19|20)\d\d\b"
@@ -55,6 +55,17 @@ def silent(text):
 @pytest.mark.parametrize("path", MODULES, ids=named)
 def test_every_constant_says_where_it_comes_from(path):
     assert silent(path.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize("path", MODULES, ids=named)
+def test_what_a_constant_refers_to_is_there(path):
+    page = (ROOT / "docs" / "algorithms.md").read_text(encoding="utf-8")
+    for name, about in constants(path.read_text(encoding="utf-8")).items():
+        for section, number in re.findall(r"docs/algorithms\.md, ([A-Z][A-Za-z' -]+)(?:, (\d))?", about):
+            assert section in page, f"{name}: {section}"
+            assert not number or f"**{number}. " in page, f"{name}: {section}, {number}"
+        for file in re.findall(r"\b(?:benchmarks|docs)/[\w/-]+\.(?:py|md)\b", about):
+            assert (ROOT / file).is_file(), f"{name}: {file}"
 
 
 @pytest.mark.parametrize("path", MODULES, ids=named)

@@ -5,7 +5,7 @@ chance.
 
 Matches on a line of one view leave two parameters of F free, on a line of both views four. Any so many other matches
 fix them, mismatches too: what counts is matches off the line, more of them than accident gives. In the same way what
-tells a real epipole is matches off the dominant plane (see `planes`).
+tells a real epipole is matches off the dominant plane (see `dominant_plane`).
 """
 
 import numpy as np
@@ -51,7 +51,7 @@ def find_degeneracy(
         points: (N, 4) matches in random order.
         F: (3, 3) the model.
         inliers: (N,) at least 3 of them.
-        wrong: (M,) squared distances of mismatches to F, from `chance.squared_mismatches`.
+        wrong: (M,) squared distances of mismatches to F, from `a_contrario.squared_mismatches`.
         threshold: largest distance of an inlier.
         centers: (4,) the origin of `points` in a frame that both views share, in the same units.
 

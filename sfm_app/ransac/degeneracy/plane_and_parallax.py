@@ -32,7 +32,7 @@ def with_another_epipole(
         points: (N, 4) in random order.
         F: (3, 3).
         threshold: largest distance of an inlier.
-        measure: the penalty.
+        loss: the penalty.
         pretest: the test that a model has to pass; not one with a random start.
         state: random generator.
     """

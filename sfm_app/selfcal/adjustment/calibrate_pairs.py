@@ -55,7 +55,7 @@ class Fit:
     matches: Matches
     state: State
     free: BoolArray
-    """(C, 4) which parameters the evidence freed, see `priors`."""
+    """(C, 4) which parameters the evidence freed, see `camera_priors`."""
     prior: Prior
     priors: CameraPriors
     held: BoolArray | None = None
@@ -105,7 +105,7 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], prio
         matches: inliers about the middle of the photos.
         Fs: (P, 3, 3) in the same frame and units; begin the poses.
         starts: (C, 5) each, first ideas of the cameras.
-        usual: what is known before.
+        priors: what is known before.
     """
     few = matches.thinned(FEW_MATCHES)
     best = _best([_begun(few, Fs, thetas, priors, square=True) for thetas in starts])

@@ -72,7 +72,7 @@ class State:
     thetas: FloatArray
     """(C, 5) parameters of the cameras, see `lens`."""
     poses: FloatArray
-    """(P, 12), see `pose_steps.essential`."""
+    """(P, 12), see `pose_manifold.essential`."""
     weights: FloatArray
     """(P,) in [0, 1]: how well a pair agrees with the others."""
     sigma: float

@@ -26,12 +26,13 @@ ROUNDS = 20
 """Most times all photos are asked for their camera. Chosen by hand; not measured on its own."""
 LEAST_GAIN = 0.15
 """Share of the smaller camera's votes that two must win against one. Chosen on 120 random scenes of one camera (as for
-`own_cameras`; at most 0.02), and on rendered folders of `benchmarks/accuracy/trouble.py`, seeds 0 to 64: two cameras
-and zooms have 0.22 to 0.70. Of the photo sets of one camera, none of which was looked at before, 0.05 at most, but for
-a single photo of kitchen25."""
+`camera_per_photo`; at most 0.02), and on rendered folders of `benchmarks/accuracy/trouble.py`, seeds 0 to 64: two
+cameras and zooms have 0.22 to 0.70. Of the photo sets of one camera, none of which was looked at before, 0.05 at most,
+but for a single photo of kitchen25."""
 CLEARLY, LEAST_PHOTOS = 2.5, 2
 """The gain in its standard deviations from which on the photos are of two cameras; below, they may be. The folders have
-2.8 to 7.9. One photo alone is left to `split`. Chosen on them, `benchmarks/accuracy/trouble.py`, seeds 0 to 64."""
+2.8 to 7.9. One photo alone is left to `camera_split`. Chosen on them, `benchmarks/accuracy/trouble.py`, seeds 0 to
+64."""
 
 
 class TwoCameras(NamedTuple):

@@ -80,7 +80,7 @@ class Answer:
         return "its pixels may not be square" if doubtful else ""
 
     def doubt_of_focal(self, weights: FloatArray) -> str:
-        """Return why an answer to pairs of these weights (P,) is an estimate though its deviation is small, or nothing."""
+        """Return why an answer to pairs of these weights (P,) is an estimate despite a small deviation, or nothing."""
         mass = float(np.sum(self.votes))
         doubtful = self.lead < CLEAR_LEAD_SHARE * mass and mass < FEW_ASTRAY * float(np.sum(weights))
         return "many pairs fit other focals nearly as well, and some fit none" if doubtful else ""
@@ -102,7 +102,7 @@ class Answer:
         return disagreement(self.votes, weights) or indecision(self.lead, self.votes)
 
     def scatter(self, consensus: Consensus, seed: int) -> FloatArray:
-        """Return (B, 4) the peak under resampled pairs, see `evidence.resampled`."""
+        """Return (B, 4) the peak under resampled pairs, see `peak_evidence.resampled`."""
         return resampled(consensus, self.theta, self.free, self.sigma, seed)
 
     def deviation(self, values: FloatArray) -> float:
