@@ -1,7 +1,8 @@
-"""Constants of the two methods say where their numbers come from; modules, which equation or paper they are."""
+"""Constants say where their numbers come from, and modules of the two methods which equation or paper they are."""
 
 import ast
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,9 @@ import pytest
 import sfm_app
 
 PACKAGE, ROOT = Path(sfm_app.__file__).parent, Path(__file__).parents[2]
-MODULES = sorted(path for room in ("ransac", "selfcal") for path in (PACKAGE / room).rglob("*.py"))
+METHODS = ("ransac", "selfcal")
+ROOMS = (*METHODS, "geometry", "posegraph")
+"""Whose constants are asked; who writes down the sources of another package enters it here."""
 NAME = re.compile(r"_?[A-Z][A-Z0-9_]*")
 YEAR = r"\b(?:18|19|20)\d\d\b"
 POINTER = re.compile(rf"[Tt]hesis|\bEq\. |{YEAR}|\b[Oo]urs\b")
@@ -21,6 +24,10 @@ SOURCE = re.compile(
 """The thesis, a paper, a page or command with the measurement, a definition, rounding, or that it is a guess."""
 
 
+def modules(rooms):
+    return sorted(path for room in rooms for path in (PACKAGE / room).rglob("*.py"))
+
+
 def named(path):
     """A module as the tests call it."""
     return path.relative_to(PACKAGE).as_posix()
@@ -28,8 +35,8 @@ def named(path):
 
 def constants(text):
     """Every module-level constant that holds numbers, with its docstring; numbered places are no quantities."""
-    body, found = ast.parse(text).body, {}
-    for statement, after in zip(body, [*body[1:], None], strict=True):
+    found = {}
+    for statement, after in pairwise([*ast.parse(text).body, None]):
         if not isinstance(statement, ast.Assign | ast.AnnAssign) or statement.value is None:
             continue
         targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
@@ -52,12 +59,12 @@ def silent(text):
     return [name for name, about in constants(text).items() if not SOURCE.search(about)]
 
 
-@pytest.mark.parametrize("path", MODULES, ids=named)
+@pytest.mark.parametrize("path", modules(ROOMS), ids=named)
 def test_every_constant_says_where_it_comes_from(path):
     assert silent(path.read_text(encoding="utf-8")) == []
 
 
-@pytest.mark.parametrize("path", MODULES, ids=named)
+@pytest.mark.parametrize("path", modules(ROOMS), ids=named)
 def test_what_a_constant_refers_to_is_there(path):
     page = (ROOT / "docs" / "algorithms.md").read_text(encoding="utf-8")
     for name, about in constants(path.read_text(encoding="utf-8")).items():
@@ -68,7 +75,7 @@ def test_what_a_constant_refers_to_is_there(path):
             assert (ROOT / file).is_file(), f"{name}: {file}"
 
 
-@pytest.mark.parametrize("path", MODULES, ids=named)
+@pytest.mark.parametrize("path", modules(METHODS), ids=named)
 def test_every_module_says_which_equation_or_paper_it_is(path):
     about = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
     assert POINTER.search(about), f"{named(path)}: neither a section of the thesis nor a paper, nor that it is ours"
