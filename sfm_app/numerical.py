@@ -1,4 +1,4 @@
-"""What computations fail with, and values that are no numbers."""
+"""What computations fail with, values that are no numbers, and a constant that all packages share."""
 
 import json
 import math
@@ -15,6 +15,9 @@ Json: TypeAlias = "bool | int | float | str | Sequence[Json] | Mapping[str, Json
 FAILURES = (NumericalError, ArithmeticError, ValueError, IndexError)
 """What our own computations raise on numbers that they were not made for: no inverse (NumPy's LinAlgError is a
 ValueError), a division by zero, the largest of nothing. Where a run can go on without the result, it does."""
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation, 1 / Phi^-1(3/4) (Rousseeuw and Leroy
+1987), with the digits that the thesis prints (5.7.2)."""
 
 
 def reason_of(err: Exception) -> str:

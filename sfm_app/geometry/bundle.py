@@ -14,18 +14,21 @@ FloatArray = NDArray[np.float64]
 FX, FY, CX, CY, K1, K2, P1, P2 = range(8)
 """Places in the parameters of a camera: those of COLMAP's OPENCV."""
 LEAST = 1e-6
-"""Added to the diagonal: a photo without an observation left has no place, but is no reason to fail."""
+"""Added to the diagonal: a photo without an observation left has no place, but is no reason to fail. Chosen by hand;
+not measured on its own."""
 CAMERA, POSE = 8, 6
-"""Numbers of parameters of a camera and of a pose."""
+"""Numbers of parameters of a camera and of a pose. By definition."""
 FLAT = 1e-11
 """Share of a point's information that has to be left along every direction, or the direction counts as open: rays that
-all but coincide leave this much of depth by rounding. Two rays 1.5 degrees apart leave 2e-4. No set was asked."""
+all but coincide leave this much of depth by rounding. Two rays 1.5 degrees apart leave 2e-4. No set was asked.
+docs/algorithms.md, Bundle adjustment."""
 USUAL_NOISE_PX, USUAL_COUNT = 0.25, 4.0
 """Noise of a coordinate of a keypoint, and how many measurements knowing it is worth: where hardly more is observed
 than is sought, what is left over says nothing. The usual noise of SIFT; beside thousands of observations it does not
-count."""
+count. docs/algorithms.md, Bundle adjustment."""
 LOST_PX, ENDLESS = 1e4, 1e60
-"""Predictions that far off, and derivatives that large, are no measurements any more; what a lost observation costs."""
+"""Predictions that far off, and derivatives that large, are no measurements any more; what a lost observation costs.
+docs/algorithms.md, Bundle adjustment. Chosen by hand; not measured on their own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,10 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 GUESSED_FOCAL = 1.2
-"""Focal of a camera about which nothing is known, in units of the longer side; COLMAP guesses the same."""
+"""Focal of a camera about which nothing is known, in units of the longer side: COLMAP's guess, by definition."""
 
 NEWTON_STEPS, LEAST_SLOPE = 10, 0.2
-"""Of the search for a ray through a lens; the slope that it divides by is 0 where the lens folds."""
+"""Of the search for a ray through a lens; the slope that it divides by is 0 where the lens folds. Chosen by hand; not
+measured on their own."""
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:

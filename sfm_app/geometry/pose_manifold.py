@@ -8,7 +8,7 @@ from sfm_app.jit import kernel
 FloatArray = NDArray[np.float64]
 
 POSE = 5
-"""Parameters of a relative pose: three of rotation, two of direction."""
+"""Parameters of a relative pose: three of rotation, two of direction. Counted."""
 
 
 @kernel

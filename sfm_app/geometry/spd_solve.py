@@ -8,12 +8,14 @@ from sfm_app.errors import NumericalError
 FloatArray = NDArray[np.float64]
 
 BLOCK = 8
+"""Rows that are eliminated at once, without BLAS. Chosen by hand for speed."""
 LEAST = 1e-13
 """Eigenvalues below this, of a matrix scaled to a unit diagonal, are what rounding leaves of none: some hundred sums of
-doubles."""
+doubles. docs/algorithms.md, Where numbers end."""
 OPEN = 1e-10
 """What has to be left of a pivot for a solution to move along it: less multiplies the rounding of all that comes after
-by more than a million. Neither figure was chosen on a set: both follow from what doubles hold."""
+by more than a million. Neither figure was chosen on a set: both follow from what doubles hold. docs/algorithms.md,
+Where numbers end."""
 
 NO_NUMBER = "a matrix holds what is no number", "this is a bug; please report it with OUT/log.txt"
 

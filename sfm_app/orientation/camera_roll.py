@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.unit_vectors import least_direction, unit
+from sfm_app.numerical import MAD_TO_SIGMA
 
 FloatArray = NDArray[np.float64]
 
@@ -142,7 +143,7 @@ def _normal_matrix(up: FloatArray, rotations: FloatArray, roll_deg: float) -> Fl
 def _uncertainty(up: FloatArray, rotations: FloatArray, roll_deg: float) -> tuple[float, float]:
     """Return robust spread of the roll in degrees, and the standard deviation of `up`."""
     _, roll, _ = _tilts(up, rotations)
-    spread = float(1.4826 * np.median(np.degrees(np.abs(np.arcsin(np.clip(roll, -1.0, 1.0))))))
+    spread = float(MAD_TO_SIGMA * np.median(np.degrees(np.abs(np.arcsin(np.clip(roll, -1.0, 1.0))))))
     information = np.linalg.eigvalsh(_normal_matrix(up, rotations, roll_deg))[1]  # of the less certain of two tilts
     return spread, float(np.degrees(1.0 / np.sqrt(max(information, 1e-12))))
 

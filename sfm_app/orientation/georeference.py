@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.similarity import Similarity, robust_similarity
 from sfm_app.geometry.unit_vectors import basis_across
+from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.types import GpsPosition
 
 FloatArray = NDArray[np.float64]
@@ -144,7 +145,7 @@ def _along_ground(
 ) -> Georeference | NoGeoreference:
     axes = basis_across(up)
     z, w = _complex(cameras @ axes.T), _complex(enu)
-    spread = float(1.4826 * np.median(np.abs(w - (np.median(w.real) + 1j * np.median(w.imag)))))
+    spread = float(MAD_TO_SIGMA * np.median(np.abs(w - (np.median(w.real) + 1j * np.median(w.imag)))))
     limit = max(GPS_M, GPS_SHARE * spread)
     agreeing = _agreeing(z, w, limit)
     a, b = _line(z[agreeing], w[agreeing])
@@ -214,6 +215,6 @@ def _up_of(cameras: FloatArray, enu: FloatArray, positions: Sequence[GpsPosition
         return None
     moved = fit(cameras)
     narrow = np.sqrt(np.linalg.eigvalsh(np.cov(moved.T))[1])
-    residual = 1.4826 * np.median(np.linalg.norm(moved - enu, axis=1))
+    residual = MAD_TO_SIGMA * np.median(np.linalg.norm(moved - enu, axis=1))
     deviation_deg = float(np.degrees(residual / max(narrow * np.sqrt(len(moved)), 1e-12)))
     return (np.asarray(fit.R[2]), deviation_deg) if deviation_deg < UP_DEG else None

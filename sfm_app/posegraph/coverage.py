@@ -16,12 +16,13 @@ IndexArray = NDArray[np.int64]
 
 CELLS = 12
 """Cells along the longer side of a photo. 16 find the same on oats23 and books21; with 24 one wrong pair enters the
-backbone of oats23, and nothing is found there."""
+backbone of oats23, and nothing is found there. docs/algorithms.md, Look-alikes."""
 CONFIRMED = 2
-"""A point of a photo is known to the set when so many photos besides the partner have it."""
+"""A point of a photo is known to the set when so many photos besides the partner have it. Chosen by hand; not measured
+on its own."""
 NEARLY_BEST = 0.9
 """A pair belongs to the backbone when it covers so much of what the weakest pair on the best way between its photos
-covers. On oats23 and books21 equal things in different places reach 0.84 at most."""
+covers. On oats23 and books21 equal things in different places reach 0.84 at most. docs/algorithms.md, Look-alikes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

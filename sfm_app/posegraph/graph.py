@@ -23,19 +23,21 @@ Map = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
 """Results of a function in the order of its arguments, computed in parallel; the text labels a progress bar."""
 
 LEAST_IN_FRONT = 0.75
-"""A pair with a smaller share of its inliers before both cameras has a wrong pose, or matches that are."""
+"""A pair with a smaller share of its inliers before both cameras has a wrong pose, or matches that are. Chosen by hand;
+not measured on its own."""
 AGREEMENT_DEG, GUESSED_DEG, SPREADS = 5.0, 15.0, 4.0
 """A pair may be this far from the rotations of its photos, further where a camera is a guess, or so many times as far
-as most pairs are."""
+as most pairs are. docs/algorithms.md, From K to relative poses. Chosen by hand; not measured on their own."""
 ENOUGH = 100.0
-"""From so many inliers on, more of them make a pair hardly more believable."""
+"""From so many inliers on, more of them make a pair hardly more believable. docs/algorithms.md, From K to relative
+poses. Chosen by hand; not measured on its own."""
 FLAT = 0.1
-"""How much a pair counts whose matches lie on a plane: two poses explain it, and often the wrong one is taken.
-
-Chosen on kitchen25, where such pairs outvoted those that join its two halves; nothing changes on castle-P19,
-fountain-P11 and temple16."""
+"""How much a pair counts whose matches lie on a plane: two poses explain it, and often the wrong one is taken. Chosen
+on kitchen25, where such pairs outvoted those that join its two halves; nothing changes on castle-P19, fountain-P11 and
+temple16. All sets: benchmarks/accuracy/chosen_on.py."""
 WEAK = 2.0
-"""A pair with fewer than so many times the least inliers needs a loop of other pairs to bear it out."""
+"""A pair with fewer than so many times the least inliers needs a loop of other pairs to bear it out.
+docs/algorithms.md, From K to relative poses. Chosen by hand; not measured on its own."""
 CONTRADICTS, BEHIND, TOO_FEW = "contradicts other pairs", "points behind a camera", "too few matches fit the cameras"
 NO_NUMBERS = "its pose cannot be computed"
 UNCONFIRMED = "few matches, and no other pair bears it out"

@@ -15,15 +15,21 @@ from sfm_app.types import RelativePose
 FloatArray = NDArray[np.float64]
 
 SAMPLES = 200
+"""Samples of two matches, each with a direction (docs/algorithms.md, From K to relative poses). Chosen by hand; not
+measured on its own."""
 AS_MANY = 0.9
 """A pose whose rotation runs away is believed with the rotation of others, if it keeps that share of its inliers: a
-long lens does not say how far the camera has turned."""
+long lens does not say how far the camera has turned. docs/algorithms.md, From K to relative poses. Chosen by hand; not
+measured on its own."""
 HELD_ROUNDS, HELD_SIGMA = 8, 0.2
-"""Least squares with new weights, so often; scale of the loss in thresholds."""
+"""Least squares with new weights, so often; scale of the loss in thresholds. Chosen by hand; not measured on their
+own."""
 NEAR = 3.0
-"""While the rotation is that of others, matches count within this many thresholds."""
+"""While the rotation is that of others, matches count within this many thresholds. Chosen by hand; not measured on its
+own."""
 LEAST_IN_FRONT, MOST_TURN_DEG = 0.95, 2.0
-"""A pose found so is believed when that much of it lies before both cameras and it kept the rotation it was given."""
+"""A pose found so is believed when that much of it lies before both cameras and it kept the rotation it was given. On
+the photo sets with truth none of the pairs found so was wrong (docs/algorithms.md, From K to relative poses)."""
 
 
 def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> RelativePose | None:

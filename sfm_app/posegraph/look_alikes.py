@@ -32,21 +32,25 @@ IndexArray = NDArray[np.int64]
 
 ALIKE, LOOP, EITHER = "alike", "loop", "either"
 LEAST_TRACKED, FEW_TRACKED = 30, 15
-"""Matches with both ends on tracks, below which a pair is not asked, and not even beside known look-alikes."""
+"""Matches with both ends on tracks, below which a pair is not asked, and not even beside known look-alikes.
+docs/algorithms.md, Look-alikes. Chosen by hand; not measured on their own."""
 SAME_TRACK = 0.02
 """A pair with a smaller share of these on one track contradicts the backbone. On oats23 and books21 look-alikes have 0;
-of kitti51, castle-P19, temple16 and five more sets none is below 0.07; where kitchen1000 closes a loop, some have 0."""
+of kitti51, castle-P19, temple16 and five more sets none is below 0.07; where kitchen1000 closes a loop, some have 0.
+docs/algorithms.md, Look-alikes."""
 FIRM = 0.1
-"""From this share on a pair is borne out."""
+"""From this share on a pair is borne out. Chosen by hand; not measured on its own."""
 LOW, MISSING, MISSING_ALL_THE_SAME = 25.0, 0.2, 0.3
 """Such pairs join look-alikes when the quarter of the photos that miss least (percentile) lack a larger share of the
 cells expected; the second limit is for pairs that turn as the way between them does. 0.30 on oats23, 0.28 on books21;
-0.12 where the video kitchen1000 (every 15th) closes a loop. Shares over all photos are no measure: 0.37, 0.33, 0.25."""
+0.12 where the video kitchen1000 (every 15th) closes a loop. Shares over all photos are no measure: 0.37, 0.33, 0.25.
+docs/algorithms.md, Look-alikes."""
 TURNED_ALIKE_DEG = 3.0
 """Median angle between the rotations of such pairs and the way, below which they agree: 1 degree for that loop, 9 on
-oats23 and 58 on books21."""
+oats23 and 58 on books21. docs/algorithms.md, Look-alikes."""
 LEAST_CELLS, LEAST_PHOTOS = 15, 3
-"""Expected cells of a photo, and such photos of a join, below which what is missing says nothing."""
+"""Expected cells of a photo, and such photos of a join, below which what is missing says nothing. Chosen by hand; not
+measured on their own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

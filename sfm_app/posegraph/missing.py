@@ -25,15 +25,16 @@ Scales = dict[int, float]
 
 MOST_DEG, MOST_SCALE = 20.0, 1.5
 """From within such an angle, and so much nearer or farther, a point is found again. 30 degrees and 2 say the same on
-oats23 and books21."""
+oats23 and books21. docs/algorithms.md, Look-alikes."""
 BORDER = 0.05
-"""Of the width and height: what lands so near the border may be outside."""
+"""Of the width and height: what lands so near the border may be outside. Chosen by hand; not measured on its own."""
 WIDE_RAD = 0.2
-"""Depths from wider angles count no more."""
+"""Depths from wider angles count no more. Chosen by hand; not measured on its own."""
 TOGETHER = 8
-"""Points that two pairs of a photo have in common: fewer do not tell their scales."""
+"""Points that two pairs of a photo have in common: fewer do not tell their scales. Chosen by hand; not measured on its
+own."""
 SOME = 2
-"""Points: a cell of a photo with fewer of them expects nothing."""
+"""Points: a cell of a photo with fewer of them expects nothing. Chosen by hand; not measured on its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

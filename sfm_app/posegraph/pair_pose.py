@@ -16,16 +16,18 @@ from sfm_app.types import Calibration, EpipolarFit, RelativePose
 FloatArray = NDArray[np.float64]
 
 MANY = 0.95
-"""A pair is planar, or a rotation, when this share of its inliers says so."""
+"""A pair is planar, or a rotation, when this share of its inliers says so. docs/algorithms.md, From K to relative
+poses. Chosen by hand; not measured on its own."""
 SAMPLE = 200
-"""Points that choose among the four poses of an essential matrix."""
+"""Points that choose among the four poses of an essential matrix. Chosen by hand; not measured on its own."""
 LEAST = 8
-"""Inliers, below which a pair says nothing about its pose."""
+"""Inliers, below which a pair says nothing about its pose. Chosen by hand; not measured on its own."""
 BEFORE_BOTH, BETTER = 0.9, 0.01
 """A pose from another start than F's own has that share of its inliers before both cameras, and costs less by that
-share."""
+share. Chosen by hand; not measured on their own."""
 ROTATION_ROUNDS, ROTATION_DEG = 10, 5.0
-"""Rays of a wider angle than this are not explained by a rotation: the search for it is spared."""
+"""Rays of a wider angle than this are not explained by a rotation: the search for it is spared. Chosen by hand; not
+measured on their own."""
 
 
 class Pair:

@@ -14,10 +14,15 @@ FloatArray = NDArray[np.float64]
 
 SIGMAS_PX = (0.5, 0.2)
 """Scales of Cauchy's loss, one after the other. Keypoints are good to about 0.2 px; with a wider scale the mismatches
-that a second structure explains pull the pose to a compromise between both."""
+that a second structure explains pull the pose to a compromise between both. docs/algorithms.md, From K to relative
+poses."""
 STEPS = 12
+"""Most steps at either scale. Chosen by hand; not measured on its own."""
 FIRST_DAMPING, MOST_DAMPING, GAIN = 1e-4, 1e6, 1e-6
+"""Of Levenberg and Marquardt's steps, relative to the diagonal, and the relative decrease of the cost that ends them.
+Chosen by hand; not measured on their own."""
 _STEP = 1e-6
+"""By which parameters move for a difference. Chosen by hand; not measured on its own."""
 
 
 def refined(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:

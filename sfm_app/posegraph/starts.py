@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 FloatArray = NDArray[np.float64]
 
 LEAST_PLANAR = 8
-"""Matches; a homography has eight parameters, two to a match, and half of them should be to spare."""
+"""Matches; a homography has eight parameters, two to a match, and half of them should be to spare. Counted."""
 TURNS_DEG = (-55.0, -30.0, -12.0, 12.0, 30.0, 55.0)
 """About the scene. On the 30 pairs of a long-lens orbit (dinoSparseRing, K given) these lead to the best pose that 24
-turns from -60 to 60 lead to; the choice rests on that set alone, and only adds starts elsewhere."""
+turns from -60 to 60 lead to; the choice rests on that set alone, and only adds starts elsewhere. docs/algorithms.md,
+From K to relative poses."""
 
 
 def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:

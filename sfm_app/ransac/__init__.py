@@ -1,12 +1,18 @@
 """Robust estimation of fundamental matrices (thesis, chapter 4).
 
-An estimator is a `recipe.Recipe`: what it samples, solves, scores and verifies with, when it stops, how it refits.
-`loop.search` runs it, `verdict.estimate` judges what it found, and `verdict.estimate_with` what other libraries find.
-`lev_ransac` is the estimator that the program uses, `recipes` has the others.
+An estimator is an `estimator_config.Recipe`: what it samples, solves, scores and verifies with, when it stops, how it
+refits. `loop.search` runs it, `estimate.estimate` judges what it found, and `estimate.estimate_with` what other
+libraries find. `lev_ransac` is the estimator that the program uses, `estimator_configs` has the others.
 
-From the sample to the answer: `points`, `sampling`, `minimal`, `verification`, `sprt`, `scoring`, `mixture`, `search`,
-`leverage`, `residuals`, `stopping`, `best`, `loop`, `planes`, `parallax`, `refit`, `reprojection`, `refits`, `chance`,
-`degeneracy`; below them `design` and `eigen`.
+From matches to the answer, in the order of a run:
+
+1. `points`, checked and scaled.
+2. `loop` and `inner_loop`: draw (`sampling`), solve (`solvers`), test and score (`verification`, `scoring`), until
+   `sampling.stopping` or `sampling.termination` says enough; `best_model` is what has won so far.
+3. `refine`: the last fit.
+4. `estimate`: is it chance (`verification.a_contrario`), and does it determine F (`degeneracy`)?
+
+docs/symbols.md has the symbols of the thesis and their names here.
 """
 
 from collections.abc import Callable

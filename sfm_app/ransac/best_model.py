@@ -1,4 +1,7 @@
-"""The best model of a search, and what the next one has to beat."""
+"""The best model of a search, and what the next one has to beat.
+
+Thesis 4.7.5, lines 6 and 7 of Algorithm 1 (F*, Q*). Two scores at once, and bars by the kind of the sample, are ours.
+"""
 
 import math
 
@@ -6,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.ransac.estimator_config import Recipe
+from sfm_app.ransac.inner_loop import GUIDED, UNGUIDED
 from sfm_app.ransac.scoring.robust_costs import penalty, squared_distances
 from sfm_app.ransac.verification.pretests import LENIENCE, OPEN
 
@@ -19,11 +23,11 @@ class Best:
     """
 
     f: FloatArray
-    """(9,) entries of F, norm 1."""
+    """(9,) entries of F, norm 1; F* of the thesis."""
     to_beat: FloatArray
-    """(2,) penalties that models of samples have to stay below, by kind (see `search.next_better`)."""
+    """(2,) bars, by kind of sample: penalties that models have to stay below (see `inner_loop.next_better`)."""
     samples: FloatArray
-    """(2, 9) the models that hold these penalties."""
+    """(2, 9) the models of samples that were last below their bars."""
 
     def __init__(self, points: FloatArray, threshold: float, recipe: Recipe) -> None:
         self._points, self._threshold, self._recipe = points, threshold, recipe
@@ -40,17 +44,35 @@ class Best:
         """Return the share of all matches that are within the threshold."""
         return float(np.mean(squared_distances(self._points, self.f) <= self._threshold**2))
 
-    def meets(self, kind: int) -> bool:
-        """Update the best model; return whether it changed."""
+    def update(self, kind: int) -> bool:
+        """Update the best model and the bars by the sample that was below the bar of its kind.
+
+        With one score the sample is the new best model, and its penalty the bar of both kinds. With two scores it has
+        to win once it is optimized; the kinds then have bars of their own.
+
+        Returns:
+            Whether the best model changed.
+        """
         if self._fine is None:
             self._replace(self.samples[kind].copy(), float(self.to_beat[kind]))
+            self._set_one_bar()
             return True
         if not self.challenged_by(self.samples[kind].reshape(3, 3)):
             return False
-        # what the others have to come up to is another model now
-        count = len(self._points)
-        self.to_beat[1] = count * self.loss.worst - LENIENCE * (count * self.loss.worst - self.to_beat[0])
+        self._set_bar_of_unguided()
         return True
+
+    def _set_one_bar(self) -> None:
+        """Set both bars to the penalty of the best model."""
+        self.to_beat[:] = self._lowest
+
+    def _set_bar_of_unguided(self) -> None:
+        """Set the bar of unguided samples to `LENIENCE` of the support that the best guided sample has.
+
+        Support is what the penalty lies below that of a model which nothing agrees with.
+        """
+        nothing = len(self._points) * self.loss.worst
+        self.to_beat[UNGUIDED] = nothing - LENIENCE * (nothing - self.to_beat[GUIDED])
 
     def _replace(self, model: FloatArray, found: float) -> None:
         """Replace the best model by that of a sample, or by what local optimization makes of it."""
@@ -61,7 +83,6 @@ class Best:
             if score < found:
                 self.f, self._lowest = improved, score
         self._measure_anew()
-        self.to_beat[:] = self._lowest
 
     def challenged_by(self, F: FloatArray) -> bool:
         """Return whether F (3, 3), locally optimized, is the best model by the finer penalty."""

@@ -1,4 +1,8 @@
-"""From the best model of a search to the answer: a fit with its evidence, or a rejection with its reason."""
+"""From the best model of a search to the answer: a fit with its evidence, or a rejection with its reason.
+
+Ours: the thesis ends with F*. What is judged comes from thesis 4.2 (distances), 4.3 (the last fit) and Moisan and
+Stival (2004).
+"""
 
 import math
 from collections.abc import Callable

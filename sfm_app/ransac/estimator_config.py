@@ -1,4 +1,7 @@
-"""What an estimator is made of: sampler, solver, score, verifier, stopping rule, final fit."""
+"""What an estimator is made of: sampler, solver, score, verifier, stopping rule, final fit.
+
+The stages of thesis Figure 3.7 and section 4.4, each a part that can be exchanged.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,7 +28,7 @@ class Recipe:
     """What sets one estimator apart from the next: sampler, solver, score, verifier, stopping rule, final fit."""
 
     score: Score
-    """The penalty that the best model has least of (see `scoring` and `mixture`)."""
+    """The penalty that the best model has least of (see `scoring.robust_costs` and `scoring.mlesac`)."""
     finish: Refine
     """The final fit, from the best model of the loop."""
     sample_size: int = SAMPLE_SIZE
@@ -49,7 +52,7 @@ class Recipe:
     stop_on_convergence: bool = False
     """End when the priors have converged (thesis 4.18)."""
     patience: Callable[[FloatArray, FloatArray, float], float] | None = None
-    """(points, F, threshold) -> samples without a better model that end the search (see `evidence`)."""
+    """(points, F, threshold) -> samples without a better model that end the search (see `sampling.termination`)."""
     improve: Refine | None = None
     """Local optimization of every new best model of a sample."""
     fine_score: Score | None = None

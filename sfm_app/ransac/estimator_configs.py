@@ -1,8 +1,8 @@
 """The estimators of thesis chapter 4, each as the parts it is made of.
 
 All of them are the same loop with another sampler, solver, score, verifier or stopping rule; where a part is not
-named it is the plain one (see `loop.Recipe`). The threshold T is `max_error_px`; the thesis takes 1.96 px for a noise
-of 1 px.
+named it is the plain one (see `estimator_config.Recipe`). The threshold T is `max_error_px`; the thesis takes 1.96 px
+for a noise of 1 px.
 """
 
 import math
@@ -13,10 +13,11 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.ransac.estimate import estimate
 from sfm_app.ransac.estimator_config import Recipe
 from sfm_app.ransac.refine.final_refit import refit_sampson
-from sfm_app.ransac.scoring.leverage import MAD_TO_SIGMA, prior_validity
+from sfm_app.ransac.scoring.leverage import prior_validity
 from sfm_app.ransac.scoring.mlesac import mlesac
 from sfm_app.ransac.scoring.res_ransac import residual_validity
 from sfm_app.ransac.scoring.robust_costs import lmeds, msac, msac_linear, ransac, squared_distances
@@ -28,6 +29,7 @@ from sfm_app.types import EpipolarFit, Rejected
 FloatArray = NDArray[np.float64]
 
 _LMEDS_SIGMAS = 2.5
+"""Robust standard deviations within which matches are inliers of LMedS (Rousseeuw and Leroy 1987)."""
 
 
 def refit_to_median(points: FloatArray, F: FloatArray, _threshold: float) -> FloatArray:
@@ -76,7 +78,8 @@ RECIPES: Mapping[str, tuple[Recipe, str]] = {
         "least median of squares, for up to half outliers",
     ),
 }
-"""Name, recipe, and one line about it."""
+"""Name, recipe, and one line about it. RES-RANSAC draws a tenth of its trials before it has priors (thesis 4.6.2);
+LMedS is for half outliers (4.4.1)."""
 
 
 class Classical:

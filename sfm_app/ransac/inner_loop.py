@@ -1,4 +1,7 @@
-"""The inner loop: draw, solve and score until something better than the best turns up."""
+"""The inner loop: draw, solve and score until something better than the best turns up.
+
+Thesis 4.7.5, lines 3 to 6 of Algorithm 1.
+"""
 
 from typing import NamedTuple
 
@@ -12,13 +15,17 @@ from sfm_app.ransac.solvers.minimal import MOST_MODELS, is_oriented, models_thro
 from sfm_app.ransac.verification.pretests import PreTest
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+GUIDED, UNGUIDED = range(2)
+"""Kinds of samples: those that the priors draw (all of them where there are no priors), and those drawn besides."""
 
 
 class Draws(NamedTuple):
     """How hypotheses are made."""
 
     sample_size: int
-    """7 or 8, see `minimal`."""
+    """7 or 8, see `solvers.minimal`."""
     oriented: bool
     """Whether models that put a sampled point behind a camera are dropped."""
     batch: int
@@ -44,17 +51,18 @@ def next_better(
     state: RandomState,
     best: FloatArray,
 ) -> int:
-    """Draw samples until one of its models has a smaller penalty than the best of its kind.
+    """Draw samples until a model of one has a smaller penalty than the best of its kind.
 
-    Samples that owe nothing to the priors are a kind of their own. A second motion, or what a wrong model took for
-    outliers, would never be found in competition with samples that the priors have made nearly perfect.
+    Lines 4 to 6 of Algorithm 1. Samples that owe nothing to the priors are a kind of their own: a second motion, or
+    what a wrong model took for outliers, would never be found in competition with samples that the priors have made
+    nearly perfect.
 
     Args:
         points: (N, 4) matches in random order, N >= the sample size; twice over, (2 N, 4), for a pre-test with a random
             start, so that any N rows on end are all of them.
         draws: how samples are drawn and models made.
-        measure: the penalty.
-        pretests: the tests that a model has to pass, by the kind of its sample: 0, or 1 for those besides the priors.
+        loss: the penalty.
+        pretests: the tests that a model has to pass, by the kind of its sample: `GUIDED`, `UNGUIDED`.
         to_beat: (2,) smallest penalty so far of each kind; lowered.
         limit: most samples.
         state: random generator.
@@ -63,21 +71,12 @@ def next_better(
     Returns:
         Number of samples drawn.
     """
-    guided, count = draws.guided_share, draws.priors.shape[0]
-    guided_or_rest = guided + draws.rest_share if draws.rest[-1] >= draws.sample_size else guided
+    count = draws.priors.shape[0]
     sample = np.empty(draws.sample_size, dtype=np.int64)
     models = np.empty((MOST_MODELS, 9))
     better = False
     for trial in range(1, limit + 1):
-        lot = uniform(state) if 0.0 < guided < 1.0 else 0.0
-        kind, drawn = 0, False
-        if lot < guided:
-            drawn = draw_weighted(state, draws.priors, sample)
-        elif guided > 0.0:
-            kind = 1
-            drawn = lot < guided_or_rest and draw_weighted(state, draws.rest, sample)
-        if not drawn:
-            draw_uniform(state, count, sample)
+        kind = draw_sample(draws, state, sample)
         pretest = pretests[kind]
         for k in range(models_through(points, sample, models)):
             if draws.oriented and not is_oriented(points, sample, models[k]):
@@ -91,3 +90,29 @@ def next_better(
         if better and trial % draws.batch == 0:
             return trial
     return limit
+
+
+@kernel
+def draw_sample(draws: Draws, state: RandomState, sample: IntArray) -> int:
+    """Draw one sample by the priors, from the rest, or uniformly, and return its kind.
+
+    A lot decides between the three. What cannot be drawn by weights, because too few matches hold them all, is drawn
+    uniformly, and so is everything as long as there are no priors.
+
+    Args:
+        draws: the shares of the three, and the weights.
+        state: random generator.
+        sample: (m,) filled with indices.
+    """
+    guided = draws.guided_share
+    guided_or_rest = guided + draws.rest_share if draws.rest[-1] >= draws.sample_size else guided
+    lot = uniform(state) if 0.0 < guided < 1.0 else 0.0
+    kind, drawn = GUIDED, False
+    if lot < guided:
+        drawn = draw_weighted(state, draws.priors, sample)
+    elif guided > 0.0:
+        kind = UNGUIDED
+        drawn = lot < guided_or_rest and draw_weighted(state, draws.rest, sample)
+    if not drawn:
+        draw_uniform(state, draws.priors.shape[0], sample)
+    return kind

@@ -19,7 +19,7 @@ from sfm_app.settings import EpipolarSettings
 FloatArray = NDArray[np.float64]
 
 _EXPLAINED = 2.0
-"""Thresholds within which a match counts as explained by the best model."""
+"""Thresholds within which a match counts as explained by the best model. Chosen by hand; not measured on its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,18 +77,18 @@ class _Search:
         return Hypothesis(self.best.f.reshape(3, 3), self.trials)
 
     def _draw(self) -> bool:
-        """Return samples until one is better or something else has to be decided; whether there is a new best model."""
+        """Draw samples until one is better or something else has to be decided; return whether the best changed."""
         left = min(self.limit - self.trials, self.test.review, self.patience - self.idle)
         if self.trials < self.first_priors:
             left = min(left, self.first_priors - self.trials)
         best, before = self.best, self.best.to_beat.copy()
-        parts = self.draws, best.loss, (self.test.pretest, self.test.lenient)
+        parts = self.draws, best.loss, (self.test.pretest, self.test.lenient)  # guided, unguided
         drawn = next_better(self.circle, *parts, best.to_beat, int(left), self.state, best.samples)
         self.trials += drawn
         self.idle += drawn
         self.test.learn(drawn)
         improved = np.flatnonzero(best.to_beat < before).tolist()
-        better = any([best.meets(kind) for kind in improved])  # noqa: C419  both kinds are to be met
+        better = any([best.update(kind) for kind in improved])  # noqa: C419  both kinds are to be asked
         if better:
             seen = best.inlier_share()
             self.idle, self.share = 0, self.recipe.assumed_share or max(self.share, seen)
@@ -104,7 +104,7 @@ class _Search:
         self.first_priors = math.ceil(self.recipe.guided_after * self.limit)
 
     def _guide(self, better: bool) -> bool:
-        """Return priors from a new best model; whether they say that the search is over."""
+        """Set the priors after a new best model; return whether they say that the search is over."""
         recipe = self.recipe
         if recipe.validity is None or not self.best or self.trials < self.first_priors:
             return False

@@ -1,4 +1,7 @@
-"""Self-calibration: the camera matrix from fundamental matrices (thesis chapter 5)."""
+"""Self-calibration: the camera matrix from fundamental matrices (thesis chapter 5).
+
+docs/symbols.md has the symbols of the thesis and their names here.
+"""
 
 from sfm_app.selfcal import zero_curves
 from sfm_app.selfcal.cameras.photo_set import CalibratedCamera, CalibrateFunction, calibrate_photo_set

@@ -1,5 +1,7 @@
 """From pixels to rays through a lens with one radial term.
 
+Ours; the thesis has no lens.
+
 The lens is COLMAP's SIMPLE_RADIAL: x_d = x_u (1 + k1 r_u^2) about the optical center, r_u in focal lengths. While the
 focal is sought, the lens is held as kappa = k1 / f^2, with f and lengths in longer sides: how far it moves a point of
 the photo must not depend on the focal that is tried.
@@ -15,9 +17,10 @@ FloatArray = NDArray[np.float64]
 LOG_FOCAL, CENTER_U, CENTER_V, LOG_ASPECT, KAPPA = range(5)
 """Places in the parameters of a camera: log f with f = sqrt(fx fy), center from the middle, log fy/fx, kappa."""
 LEAST_SLOPE = 0.2
-"""Once the lens squeezes radii by this much it goes on evenly: it must not fold."""
+"""Once the lens squeezes radii by this much it goes on evenly: it must not fold. Chosen by hand; not measured on its
+own."""
 NEWTON_STEPS = 20
-"""Most; three or four are enough but for the strongest pincushions."""
+"""Most; three or four are enough but for the strongest pincushions. Chosen by hand; not measured on its own."""
 
 
 @kernel

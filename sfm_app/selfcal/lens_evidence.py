@@ -1,7 +1,9 @@
 """What a whole bundle of photos says about its cameras, and how much of that is believed.
 
-As for pairs (`priors`): each part of a camera has a narrow prior about its usual value and a wide one, and is freed
-where the evidence for the wide one (the marginal likelihood, by Laplace's approximation) outweighs how rare such
+Ours; the choice of models by marginal likelihood is MacKay's (1992).
+
+As for pairs (`camera_priors`): each part of a camera has a narrow prior about its usual value and a wide one, and is
+freed where the evidence for the wide one (the marginal likelihood, by Laplace's approximation) outweighs how rare such
 cameras are. Freed or not, the prior stays in the estimate: what the photos do not determine stays where it usually is.
 """
 
@@ -45,22 +47,30 @@ PARTS = (
     Part("k2", (K2,), 0.01, 0.2, 0.3, False),
     Part("p1 p2", (P1, P2), 0.0002, 0.002, 0.05, True),
 )
+"""The priors of center, aspect and k1 are those of `camera_priors`; k2, p1 and p2: docs/algorithms.md, Bundle
+adjustment. Chosen by hand; not measured on their own."""
 FOCAL_SPREAD = 0.7
-"""Prior standard deviation of log f about what mapping found: none to speak of."""
+"""Prior standard deviation of log f about what mapping found: none to speak of. Chosen by hand; not measured on its
+own."""
 UNDETERMINED = 0.5
-"""A part whose prior the photos do not make narrower than this stays as it is: freeing it adds more than it removes."""
+"""A part whose prior the photos do not make narrower than this stays as it is: freeing it adds more than it removes.
+docs/algorithms.md, Bundle adjustment. Chosen by hand; not measured on its own."""
 FEW = 2.0
-"""So much further off are cameras of few photos, whose misfit does not average out."""
+"""So much further off are cameras of few photos, whose misfit does not average out. docs/algorithms.md, Bundle
+adjustment. Chosen by hand; not measured on its own."""
 SWEEPS = 5
-"""At most so many times all cameras are asked which of their parts are free."""
+"""At most so many times all cameras are asked which of their parts are free. Chosen by hand; not measured on its
+own."""
 LONGEST_STEP = 1.0
 """Of log f in one step: a camera that wants more after mapping has placed the photos is not determined by them. Chosen
-on no set: it is more than the prior's standard deviation, and none of six sets that were run reached it."""
+by hand, on no set: it is more than the prior's standard deviation, and none of six sets that were run reached it."""
 FOCALS = (0.05, 100.0)
-"""In longer sides: a view of 169 degrees, and one of half a degree. What lies outside has run away."""
+"""In longer sides: a view of 169 degrees, and one of half a degree. What lies outside has run away. docs/algorithms.md,
+Bundle adjustment. Chosen by hand; not measured on their own."""
 MISFIT = 4.0
 """Errors of cameras, in what independent noise in the observations explains: lenses are not quite of the model's form,
-neighboring observations err alike. Measured on photos with known cameras."""
+neighboring observations err alike. Chosen on the photo sets with known cameras (docs/algorithms.md, Bundle
+adjustment)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

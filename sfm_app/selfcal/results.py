@@ -1,4 +1,7 @@
-"""What a calibrator hands back."""
+"""What a calibrator hands back.
+
+Ours; the thesis gives a K in any case.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace

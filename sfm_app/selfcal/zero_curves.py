@@ -2,7 +2,7 @@
 
 Beyond the thesis: the center is sought together with the focal (cropped photos), fy/fx and a lens are freed where the
 photos ask for it, every parameter comes with a standard deviation, and an answer that the pairs do not determine is not
-given. The consensus of the pairs finds the camera from nothing; the adjustment of `refine` makes it exact.
+given. The consensus of the pairs finds the camera from nothing; the adjustment of `calibrate_pairs` makes it exact.
 """
 
 from dataclasses import dataclass, replace
@@ -26,25 +26,32 @@ from sfm_app.types import Calibration, CameraPairs
 
 METHOD = "zero-curves"
 MIN_PAIRS = 3
-"""Each F gives two constraints; below three pairs nothing is left to contradict a wrong K."""
+"""Each F gives two constraints; below three pairs nothing is left to contradict a wrong K. Counted, by definition of
+the constraint (thesis 5.2.4)."""
 FEW_PAIRS = 3
-"""So many pairs fit almost any center: without their matches it is held where uncropped photos have it."""
+"""So many pairs fit almost any center: without their matches it is held where uncropped photos have it. Chosen by hand;
+not measured on its own."""
 UNCROPPED_SIGMA = 0.02
-"""Standard deviation of the center of such photos about the middle, in widths."""
+"""Standard deviation of the center of such photos about the middle, in widths. Chosen by hand; not measured on its
+own."""
 VOTES_SIGMA, KEPT = 0.01, 0.8
 """A camera that keeps less than this share of the votes (of this width) that the peak of the consensus has follows
 matches that most pairs contradict. On fourteen sets and variants right adjustments keep 0.97 to 1, the one that many
-wrong F's pulled away (fox50) 0.35; without that set the bound would be the same."""
+wrong F's pulled away (fox50) 0.35; without that set the bound would be the same. Which sets:
+benchmarks/accuracy/chosen_on.py."""
 ENOUGH_PAIRS = 6.0
-"""Effective pairs that must agree on the peak to contradict: twelve constraints on five parameters of a camera.
-With three pairs (merton1) the peak's center is anywhere."""
+"""Effective pairs that must agree on the peak to contradict: twelve constraints on five parameters of a camera. With
+three pairs (merton1) the peak's center is anywhere. docs/algorithms.md, Self-calibration, 2. Chosen by hand; not
+measured on its own."""
 AGREES = 0.1
 """Pairs with r below this at the peak are then listened to, and no others; on the same sets 0.03 and 0.05 move no focal
-by more than 0.1 %."""
+by more than 0.1 %. Chosen on those sets, benchmarks/accuracy/chosen_on.py."""
 ANOTHER_FOCAL = 1.25
-"""Times by which focals of the consensus and of the matches may differ."""
+"""Times by which focals of the consensus and of the matches may differ. docs/algorithms.md, Self-calibration, 5. Chosen
+by hand; not measured on its own."""
 ELSEWHERE = float(np.log(1.1))
-"""A consensus on straightened photos that lies this far in log f from the adjusted camera is tried as a start."""
+"""A consensus on straightened photos that lies this far in log f from the adjusted camera is tried as a start. Chosen
+by hand; not measured on its own."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:

@@ -16,8 +16,11 @@ from sfm_app.ransac.verification.pretests import PreTest
 FloatArray = NDArray[np.float64]
 
 _SAMPLES = 100
+"""Samples of two matches off the plane. Chosen by hand; not measured on its own."""
 _LEAST_INLIERS = 8
+"""Fewer do not tell which plane they lie on. Chosen by hand; not measured on its own."""
 _MOST_INLIERS = 300
+"""Inliers that the plane is sought among. Chosen by hand; not measured on its own."""
 
 
 def with_another_epipole(
@@ -29,7 +32,7 @@ def with_another_epipole(
         points: (N, 4) in random order.
         F: (3, 3).
         threshold: largest distance of an inlier.
-        measure: the penalty.
+        loss: the penalty.
         pretest: the test that a model has to pass; not one with a random start.
         state: random generator.
     """

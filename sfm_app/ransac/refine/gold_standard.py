@@ -19,10 +19,12 @@ from sfm_app.geometry.epipolar import homogeneous, nearest_rank_two, unit_norm
 FloatArray = NDArray[np.float64]
 
 _SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e12
+"""Of Levenberg and Marquardt's steps, relative to the curvature. Chosen by hand; not measured on their own."""
 _ENOUGH = 1e-9
-"""Relative decrease of the cost under which the search ends."""
+"""Relative decrease of the cost under which the search ends. Chosen by hand; not measured on its own."""
 _FLOOR = 1e-12
-"""Least curvature, relative to the largest: some matches leave a direction of F free."""
+"""Least curvature, relative to the largest: some matches leave a direction of F free. Chosen by hand; not measured on
+its own."""
 
 
 def refine_reprojection(

@@ -1,33 +1,57 @@
-"""Non-linear refinement of F on the Sampson distance, over its seven degrees of freedom.
+"""Non-linear refinement of F on the Sampson distance (thesis 4.3, Eq. 4.2), over its seven degrees of freedom.
 
-F = U diag(1, s, 0) V' with rotations U and V: three parameters each and s, rank 2 at every step and no spare scale
-(Bartoli and Sturm 2004). U turns to U exp([a]x), V to V exp([b]x).
-
-All fits are reweighted least squares: weigh the matches by their distances, take one Levenberg-Marquardt step that
-lowers sum_i w_i r_i^2, weigh again. For a cost that is a concave function of r^2, as all robust ones are, such a step
-lowers the cost itself as well.
+The parameters are those of `rank_two`. All fits are reweighted least squares: weigh the matches by their distances,
+take one Levenberg-Marquardt step that lowers sum_i w_i r_i^2, weigh again. For a cost that is a concave function of
+r^2, as all robust ones are, such a step lowers the cost itself as well.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel, summing_kernel
+from sfm_app.ransac.refine.rank_two import compose, factors, tangent, turned
 from sfm_app.ransac.scoring.leverage import mad_sigma
 from sfm_app.ransac.scoring.robust_costs import FIRST, distances_of_block, squared_distances
 from sfm_app.ransac.solvers.design_matrix import LANES, add_products, gather, mirror, weighted_gram
-from sfm_app.ransac.solvers.eigenvalues import symmetric_eigen
 
 FloatArray = NDArray[np.float64]
 
 _FIRST_DAMPING, _SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-12, 1e12
+"""Of Levenberg and Marquardt's steps, relative to the curvature. Chosen by hand; not measured on their own."""
 _ENOUGH = 1e-9
-"""Relative decrease of the cost under which the search ends."""
+"""Relative decrease of the cost under which the search ends. Chosen by hand; not measured on its own."""
 _ENOUGH_LIKELIHOOD = 1e-4
+"""The same where the weights follow the noise. Chosen by hand; not measured on its own."""
 _NEGLIGIBLE = 1e-3
-"""Weight below which a match is left out of a step."""
+"""Weight below which a match is left out of a step. Chosen by hand; not measured on its own."""
 _LEAST_SIGMA = 0.02
-"""In thresholds: matches that are nearly perfect must not shut out all others."""
-_MOST_SHARE = 0.999
+"""In thresholds: matches that are nearly perfect must not shut out all others. Chosen by hand; not measured on its own.
+"""
+_FIRST_SHARE, _MOST_SHARE = 0.9, 0.999
+"""Inliers among the matches within reach: where expectation maximization begins, and what it stays below. Chosen by
+hand; not measured on their own."""
+_FIRST_ROUNDS = 6
+"""Rounds of expectation maximization before the first step; one before each later step. Chosen by hand; not measured
+on its own."""
+_LEAST_CURVATURE = 1e-9
+"""Over the largest: what damping multiplies at least, where some matches leave a direction of F free. Chosen by hand;
+not measured on its own."""
+
+
+class Weighing(NamedTuple):
+    """How matches are weighed by their squared distances: by a robust cost, or by a mixture of two densities."""
+
+    is_mixture: bool = False
+    softness: float = 0.0
+    """1 / c^2 of the robust cost r^2 / (1 + r^2 / c^2); 0 for least squares. Not used by the mixture."""
+    squared_reach: float = 0.0
+    """Mixture: squared distance within which matches count, and over which the outliers are spread evenly."""
+    largest_variance: float = 0.0
+    """Mixture: bound of the inliers' variance."""
+    first_variance: float = 0.0
+    """Mixture: where expectation maximization begins."""
 
 
 def refine_sampson(
@@ -45,8 +69,8 @@ def refine_sampson(
     Returns:
         (3, 3), rank 2, its largest singular value 1.
     """
-    law = np.array([scale**-2, 0.0, 0.0, 0.0])
-    return _reweighted(points, *factors(F), law, most_steps, enough, np.empty((10, 10)))
+    weighing = Weighing(softness=float(scale**-2))
+    return _reweighted(points, *factors(F), weighing, most_steps, enough, np.empty((10, 10)))
 
 
 def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach: float, most_steps: int) -> FloatArray:
@@ -66,11 +90,17 @@ def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach
         (3, 3), rank 2, its largest singular value 1.
     """
     U, s, V = factors(F)
-    squared = squared_distances(points, _compose(U, s, V))
+    squared = squared_distances(points, compose(U, s, V))
     inside = squared[squared <= threshold * threshold]
     sigma = mad_sigma(np.sqrt(inside)) if len(inside) else threshold
-    law = np.array([0.0, (reach * threshold) ** 2, threshold**2, min(sigma, threshold) ** 2])
-    return _reweighted(points, U, s, V, law, most_steps, _ENOUGH_LIKELIHOOD, np.empty((10, 10)))
+    squared_reach = float((reach * threshold) ** 2)
+    weighing = Weighing(
+        is_mixture=squared_reach > 0.0,  # of a threshold too small to square nothing but least squares is left
+        squared_reach=squared_reach,
+        largest_variance=float(threshold**2),
+        first_variance=float(min(sigma, threshold) ** 2),
+    )
+    return _reweighted(points, U, s, V, weighing, most_steps, _ENOUGH_LIKELIHOOD, np.empty((10, 10)))
 
 
 def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
@@ -84,7 +114,7 @@ def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
         (3, 3), rank 2.
     """
     U, s, V = factors(fit_algebraic(points, weights))
-    return _compose(U, s, V).reshape(3, 3)
+    return compose(U, s, V).reshape(3, 3)
 
 
 def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
@@ -94,83 +124,33 @@ def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 @kernel
-def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
-    """Return rotations U and V and the number s of the nearest rank 2 matrix U diag(1, s, 0) V', up to its scale."""
-    gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            for k in range(3):
-                gram[i, j] += F[k, i] * F[k, j]
-    symmetric_eigen(gram, values, vectors)
-    U, V = np.empty((3, 3)), np.empty((3, 3))
-    for k in range(2):
-        for i in range(3):
-            V[i, k] = vectors[i, 2 - k]
-        for i in range(3):
-            U[i, k] = F[i, 0] * V[0, k] + F[i, 1] * V[1, k] + F[i, 2] * V[2, k]
-    first = _normalize(U, FIRST)
-    _turn_away(U)  # what rounding left where s is small
-    second = _normalize(U, 1)
-    if not second > 1e-12 * first:  # rank 1: any direction will do
-        least = 0
-        for i in range(1, 3):
-            least = i if abs(U[i, 0]) < abs(U[least, 0]) else least
-        for i in range(3):
-            U[i, 1] = 1.0 if i == least else 0.0
-        _turn_away(U)
-        _normalize(U, 1)
-    for i in range(3):  # the third columns meet the singular value 0: they make rotations of both
-        j, k = (i + 1) % 3, (i + 2) % 3
-        U[i, 2] = U[j, 0] * U[k, 1] - U[k, 0] * U[j, 1]
-        V[i, 2] = V[j, 0] * V[k, 1] - V[k, 0] * V[j, 1]
-    return U, second / first, V
-
-
-@kernel
-def _normalize(U: FloatArray, k: int) -> float:
-    """Return column k over its length; the length."""
-    length = np.sqrt(U[0, k] * U[0, k] + U[1, k] * U[1, k] + U[2, k] * U[2, k])
-    for i in range(3):
-        U[i, k] /= length
-    return float(length)
-
-
-@kernel
-def _turn_away(U: FloatArray) -> None:
-    """Make the second column perpendicular to the first, a unit vector."""
-    dot = U[0, 0] * U[0, 1] + U[1, 0] * U[1, 1] + U[2, 0] * U[2, 1]
-    for i in range(3):
-        U[i, 1] -= dot * U[i, 0]
-
-
-@kernel
 def _reweighted(
-    points: FloatArray, U: FloatArray, s: float, V: FloatArray, law: FloatArray, most_steps: int, enough: float,
+    points: FloatArray, U: FloatArray, s: float, V: FloatArray, weighing: Weighing, most_steps: int, enough: float,
     gram: FloatArray,
 ) -> FloatArray:  # fmt: skip
-    """Return loop of all fits; `law` says how matches are weighed: 1 / c^2, 0, 0, 0 for a robust cost, or else 0, the
-    squares of the reach, of the largest sigma and of the first sigma for a mixture. `gram` (10, 10) is for work: the
-    compiler would spell out all sums of a matrix whose size it knows.
+    """Weigh and step in turn until a step lowers the cost by less than its share `enough`.
+
+    `gram` (10, 10) is for work: the compiler would spell out all sums of a matrix whose size it knows.
     """
     count = points.shape[0]
     weights, squared, trial = np.empty(count), np.empty(count), np.empty(count)
     normal, right, step = np.empty((7, 7)), np.empty(7), np.empty(7)
-    f = _compose(U, s, V)
+    f = compose(U, s, V)
     distances_of_block(points, f, FIRST, squared)
-    damping, mixture, share = _FIRST_DAMPING, law[1] > 0.0, 0.9
-    variance = law[3]
+    damping, variance, share = _FIRST_DAMPING, weighing.first_variance, _FIRST_SHARE
     for n in range(most_steps):
-        if mixture:
-            variance, share = _weigh_by_mixture(squared, law, variance, share, 6 if n == 0 else 1, weights)
+        if weighing.is_mixture:
+            rounds = _FIRST_ROUNDS if n == 0 else 1
+            variance, share = _weigh_by_mixture(squared, weighing, variance, share, rounds, weights)
         else:
-            _weigh_robustly(squared, law[0], weights)
+            _weigh_robustly(squared, weighing.softness, weights)
         cost = new_cost = _weighted_sum(squared, weights)
         _normal_equations(points, f, weights, U, s, V, gram, normal, right)
         improved = False
         while not improved and damping < _LARGEST_DAMPING:
             if _solve(normal, right, damping, step):
-                U_new, V_new, s_new = _turned(U, step[0:3]), _turned(V, step[3:6]), s + step[6]
-                new = _compose(U_new, s_new, V_new)
+                U_new, V_new, s_new = turned(U, step[0:3]), turned(V, step[3:6]), s + step[6]
+                new = compose(U_new, s_new, V_new)
                 distances_of_block(points, new, FIRST, trial)
                 new_cost = _weighted_sum(trial, weights)
                 improved = new_cost < cost
@@ -194,10 +174,10 @@ def _weigh_robustly(squared: FloatArray, softness: float, weights: FloatArray) -
 
 @kernel
 def _weigh_by_mixture(
-    squared: FloatArray, law: FloatArray, variance: float, share: float, rounds: int, weights: FloatArray
+    squared: FloatArray, weighing: Weighing, variance: float, share: float, rounds: int, weights: FloatArray
 ) -> tuple[float, float]:
-    """Return probability of each match to be an inlier; the inliers' variance and share that follow from these."""
-    reach, largest = law[1], law[2]
+    """Weigh matches by their probability to be inliers; return the inliers' variance and share that follow."""
+    reach, largest = weighing.squared_reach, weighing.largest_variance
     for _ in range(rounds):
         inlier, outlier = share * np.sqrt(2.0 / (np.pi * variance)), (1.0 - share) / np.sqrt(reach)
         near, total, moment = 0, 0.0, 0.0
@@ -242,7 +222,7 @@ def _normal_equations(
         add_products(rows, count, gram)
     mirror(gram)
     basis = np.empty((7, 9))
-    _tangent(U, s, V, basis)
+    tangent(U, s, V, basis)
     _project(gram, basis, normal, right)
 
 
@@ -273,30 +253,6 @@ def _derivatives(block: FloatArray, count: int, f: FloatArray, rows: FloatArray)
 
 
 @kernel
-def _compose(U: FloatArray, s: float, V: FloatArray) -> FloatArray:
-    f = np.empty(9)
-    for i in range(3):
-        for j in range(3):
-            f[3 * i + j] = U[i, 0] * V[j, 0] + s * U[i, 1] * V[j, 1]
-    return f
-
-
-@kernel
-def _tangent(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
-    """Write dF over the seven parameters, one row each: U [e_k]x S V', -U S [e_k]x V', u2 v2'."""
-    for i in range(3):
-        for j in range(3):
-            k = 3 * i + j
-            basis[0, k] = U[i, 2] * s * V[j, 1]
-            basis[1, k] = -U[i, 2] * V[j, 0]
-            basis[2, k] = U[i, 1] * V[j, 0] - U[i, 0] * s * V[j, 1]
-            basis[3, k] = s * U[i, 1] * V[j, 2]
-            basis[4, k] = -U[i, 0] * V[j, 2]
-            basis[5, k] = U[i, 0] * V[j, 1] - s * U[i, 1] * V[j, 0]
-            basis[6, k] = U[i, 1] * V[j, 1]
-
-
-@kernel
 def _project(gram: FloatArray, basis: FloatArray, normal: FloatArray, right: FloatArray) -> None:
     """Project normal equations over the nine entries, whose gradient is the last row, to the seven parameters."""
     part = np.empty(9)
@@ -324,7 +280,7 @@ def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArr
     for j in range(7):
         largest = max(largest, normal[j, j])
     for j in range(7):
-        lower[j, j] += damping * max(normal[j, j], 1e-9 * largest)
+        lower[j, j] += damping * max(normal[j, j], _LEAST_CURVATURE * largest)
     for j in range(7):
         for k in range(j):
             for n in range(k):
@@ -344,20 +300,3 @@ def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArr
             step[j] -= lower[k, j] * step[k]
         step[j] /= lower[j, j]
     return True
-
-
-@kernel
-def _turned(R: FloatArray, w: FloatArray) -> FloatArray:
-    """Return R exp([w]x), by Rodrigues."""
-    angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
-    a = np.sin(angle) / angle if angle > 1e-8 else 1.0
-    b = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-8 else 0.5
-    turned = np.empty((3, 3))
-    for i in range(3):
-        # row r of R times exp([w]x) = r - a (w x r) + b w x (w x r), because r [w]x = -(w x r)
-        x, y, z = R[i, 0], R[i, 1], R[i, 2]
-        cx, cy, cz = w[1] * z - w[2] * y, w[2] * x - w[0] * z, w[0] * y - w[1] * x
-        turned[i, 0] = x - a * cx + b * (w[1] * cz - w[2] * cy)
-        turned[i, 1] = y - a * cy + b * (w[2] * cx - w[0] * cz)
-        turned[i, 2] = z - a * cz + b * (w[0] * cy - w[1] * cx)
-    return turned

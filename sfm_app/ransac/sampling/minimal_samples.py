@@ -14,13 +14,21 @@ IntArray = NDArray[np.int64]
 RandomState = NDArray[np.uint64]
 
 SAMPLE_SIZE = 7
+"""Matches of a minimal sample: F has seven degrees of freedom (thesis 4.3.1)."""
 
 _STEP = np.uint64(0x9E3779B97F4A7C15)
+"""Increment of the state of splitmix64: 2^64 over the golden ratio (Steele, Lea and Flood 2014)."""
 _MIX1 = np.uint64(0xBF58476D1CE4E5B9)
+"""First multiplier of splitmix64 (Steele, Lea and Flood 2014)."""
 _MIX2 = np.uint64(0x94D049BB133111EB)
+"""Second multiplier of splitmix64 (Steele, Lea and Flood 2014)."""
 _S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(11)
+"""Shifts of splitmix64 (Steele, Lea and Flood 2014), and the last one, which leaves the 53 bits of a double."""
 _TO_UNIT = 2.0**-53
+"""From 53 random bits to [0, 1) in double precision."""
 _MOST_REDRAWS = 100
+"""Draws of a match that the sample holds already, before weights are given up. Chosen by hand; not measured on its
+own."""
 
 
 def random_state(seed: int) -> RandomState:

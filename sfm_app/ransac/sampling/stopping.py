@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 CONVERGED = 0.05
-"""G of the thesis: priors that changed less than this, in sum, have converged."""
+"""G of the thesis (4.7.4, Eq. 4.18): priors that changed less than this, in sum, have converged."""
 
 
 def trials_needed(success: float, confidence: float, log_missed: float = 0.0) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
+from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.ransac.scoring.robust_costs import select, squared_distances
 from sfm_app.ransac.solvers.design_matrix import quadratic_forms, weighted_gram
 
@@ -20,16 +21,17 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 PARAMETERS = 8
+"""p of Eq. 3.16 and 4.17: the directions perpendicular to the unit vector f (docs/algorithms.md, Fundamental
+matrices)."""
 _LEAST_VARIANCE = 1e-24
-"""Of residuals in units of the points' spread: perfect matches are left with the rounding of their coordinates."""
+"""Of residuals in units of the points' spread: perfect matches are left with the rounding of their coordinates. Double
+precision leaves 1e-16 of them, squared 1e-32; the margin was chosen by hand."""
 _LEAST_FREEDOM = 2.0**-52
-"""Of 1 - h."""
+"""Of 1 - h: the distance of 1 to the next number in double precision."""
 _LEAST_SUPPORT = 1e-14
-"""Of a direction, over that of the best supported one."""
+"""Of a direction, over that of the best supported one. Double precision leaves 1e-16; the margin was chosen by hand."""
 _FAR = 700.0
-"""Exponent from which the exponential is 0 for all purposes."""
-MAD_TO_SIGMA = 1.4826
-"""Median absolute deviation to standard deviation, for a Gaussian."""
+"""Exponent from which the exponential is 0 for all purposes: in double precision exp(-746) is 0."""
 
 
 def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArray:

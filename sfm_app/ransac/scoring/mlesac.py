@@ -20,8 +20,12 @@ FloatArray = NDArray[np.float64]
 SIGMAS = 1.96
 """Standard deviations of the inliers in a threshold (thesis 3.3.6)."""
 _NEGLIGIBLE = 1e-12
+"""Density of an inlier, over that of the outliers at most, from which on a match costs what an outlier does. Chosen by
+hand; not measured on its own."""
 _MOST_STEPS = 100
+"""Of expectation maximization. Chosen by hand; not measured on its own."""
 _SETTLED = 1e-5
+"""A change of gamma that ends expectation maximization. Chosen by hand; not measured on its own."""
 
 
 def mlesac(points: FloatArray, threshold: float, best: FloatArray | None) -> Loss:

@@ -13,6 +13,7 @@ from sfm_app.ransac.scoring.robust_costs import squared_distances
 FloatArray = NDArray[np.float64]
 
 BINS = 100
+"""Bins of the histogram, each a hundredth of the median wide (thesis 4.6.1)."""
 
 
 def residual_validity(points: FloatArray, f: FloatArray, _threshold: float) -> FloatArray:

@@ -16,13 +16,16 @@ from sfm_app.ransac.verification.pretests import BLOCK, PreTest
 FloatArray = NDArray[np.float64]
 
 FIRST = cast("int", np.int64(0))
-"""Where blocks begin. A plain 0 is a type of its own to numba, and kernels are compiled for it once more."""
+"""Where blocks begin: 0, by definition. A plain 0 is a type of its own to numba, and kernels are compiled for it once
+more."""
 
 RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS, GEMAN_MCCLURE = range(6)
+"""Kinds of `Loss`: one for each penalty below."""
 
 
 _FEW = 16
-"""Matches whose distances are taken at once where the pre-test looks often."""
+"""Matches whose distances are taken at once where the pre-test looks often. Chosen by hand for speed: no result depends
+on it."""
 
 
 class Loss(NamedTuple):

@@ -1,4 +1,7 @@
-"""Eigenvalues of small symmetric matrices inside kernels, where a call to LAPACK costs more than the work itself."""
+"""Eigenvalues of small symmetric matrices inside kernels, where a call to LAPACK costs more than the work itself.
+
+Jacobi's rotations (Golub and Van Loan 2013, 8.5).
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,8 +11,10 @@ from sfm_app.jit import kernel
 FloatArray = NDArray[np.float64]
 
 _MOST_SWEEPS = 30
+"""Sweeps over all rotations; convergence is quadratic (Golub and Van Loan 2013). Chosen by hand; not measured on its
+own."""
 _SETTLED = 1e-32
-"""Squares of the off-diagonal entries over those of the diagonal ones."""
+"""Squares of the off-diagonal entries over those of the diagonal ones: 1e-16, what double precision leaves, squared."""
 
 
 @kernel

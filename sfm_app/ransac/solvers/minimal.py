@@ -11,8 +11,12 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MOST_MODELS = 3
+"""Real roots of the cubic det F = 0 (thesis 4.3.1)."""
 _RANK_TOLERANCE = 1e-9
+"""Pivot over the largest one below which the constraints depend on each other. Chosen by hand; not measured on its
+own."""
 _SQUARINGS = 6
+"""Of C'C: each doubles the exponent of the ratio of its eigenvalues, to 64. Chosen by hand; not measured on its own."""
 
 
 @kernel

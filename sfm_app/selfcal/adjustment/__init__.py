@@ -1,0 +1,1 @@
+"""Cameras adjusted to the matches of pairs, and how far to trust them. Ours."""

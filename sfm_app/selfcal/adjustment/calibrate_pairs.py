@@ -1,4 +1,7 @@
-"""From first ideas of the cameras to what their matches say: adjust, ask what the evidence frees, adjust again."""
+"""From first ideas of the cameras to what their matches say: adjust, ask what the evidence frees, adjust again.
+
+Ours; the thesis calibrates from fundamental matrices alone.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,19 +31,21 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 FEW_MATCHES = 100
-"""Of one pair, until the cameras have nearly arrived."""
+"""Of one pair, until the cameras have nearly arrived. Chosen by hand; not measured on its own."""
 FIRST_ROUNDS, LAST_ROUNDS = 8, 12
-"""Before starts are compared, and with all matches."""
+"""Before starts are compared, and with all matches. Chosen by hand; not measured on their own."""
 POSE_MATCHES = 30
-"""Enough to tell which of the four poses of an E is the right one."""
+"""Enough to tell which of the four poses of an E is the right one. Chosen by hand; not measured on its own."""
 CHOICES = 3
-"""Times the evidence is asked again after an adjustment."""
+"""Times the evidence is asked again after an adjustment. Chosen by hand; not measured on its own."""
 JACKKNIFE_GROUPS = 8
+"""Groups of neighboring photos that are left out in turn (docs/algorithms.md, Self-calibration, 4). Chosen by hand; not
+measured on its own."""
 LEAST_PHOTOS, LEAST_LEFT = 6, 4.0
-"""Photos, and weight of the remaining pairs, below which leaving photos out says more about
-what is missing than about errors."""
+"""Photos, and weight of the remaining pairs, below which leaving photos out says more about what is missing than about
+errors. docs/algorithms.md, Self-calibration, 4. Chosen by hand; not measured on their own."""
 REFIT_REACH = 3.0
-"""Scale of the robust refit of an F, in sigma."""
+"""Scale of the robust refit of an F, in sigma. As `two_view_cost.REACH`. Chosen by hand; not measured on its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +55,7 @@ class Fit:
     matches: Matches
     state: State
     free: BoolArray
-    """(C, 4) which parameters the evidence freed, see `priors`."""
+    """(C, 4) which parameters the evidence freed, see `camera_priors`."""
     prior: Prior
     priors: CameraPriors
     held: BoolArray | None = None
@@ -100,7 +105,7 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], prio
         matches: inliers about the middle of the photos.
         Fs: (P, 3, 3) in the same frame and units; begin the poses.
         starts: (C, 5) each, first ideas of the cameras.
-        usual: what is known before.
+        priors: what is known before.
     """
     few = matches.thinned(FEW_MATCHES)
     best = _best([_begun(few, Fs, thetas, priors, square=True) for thetas in starts])

@@ -1,5 +1,7 @@
 """What is believed about a camera before a photo is seen, and how far the pairs may change that.
 
+Ours; the choice of models by marginal likelihood is MacKay's (1992).
+
 Most photos are uncropped, their pixels square, their lens nearly straight; some are not. So center, aspect and lens
 each have two priors: a narrow one about the usual value, and a wide one. A parameter is freed only where the evidence
 for the wide prior (the marginal likelihood, by Laplace's approximation) outweighs how rare such photos are; otherwise
@@ -25,25 +27,35 @@ BoolArray = NDArray[np.bool_]
 CENTER, ASPECT, LENS, FOCAL = range(4)
 """Places in `free`: what may be freed from its usual value."""
 NAMES = ("center", "aspect", "k1", "focal")
+"""What `held` calls them."""
 USUAL_FOCAL, FOCAL_SPREAD = np.log(1.2), 0.7
-"""Mean and standard deviation of log f, f in longer sides, where nobody claims one."""
+"""Mean and standard deviation of log f, f in longer sides, where nobody claims one. The mean is COLMAP's guess; the
+deviation, a factor of two, was chosen by hand."""
 HINT_SPREAD = 0.05
-"""Of a claimed focal: EXIF rounds millimeters, and the sensor's size to 35 mm."""
+"""Of a claimed focal: EXIF rounds millimeters, and the sensor's size to 35 mm. Chosen by hand; not measured on its
+own."""
 NARROW = {CENTER: 0.012, ASPECT: 0.002, LENS: 0.005}
-"""Standard deviations about the usual value: of the center in longer sides, of log fy/fx, of k1."""
+"""Standard deviations about the usual value: of the center in longer sides, of log fy/fx, of k1. docs/algorithms.md,
+Self-calibration, 3. Chosen by hand; not measured on their own."""
 WIDE = {CENTER: 0.15, ASPECT: 0.25, LENS: 0.2}
+"""The same where the parameter is freed. docs/algorithms.md, Self-calibration, 3. Chosen by hand; not measured on their
+own."""
 COLUMNS = {CENTER: [CENTER_U, CENTER_U + 1], ASPECT: [LOG_ASPECT], LENS: [KAPPA]}
-"""Places in the parameters of a camera."""
+"""Places in the parameters of a camera, by definition in `lens`."""
 UNDETERMINED = 0.5
-"""A parameter whose narrow prior the pairs do not make narrower than this stays at its usual value."""
+"""A parameter whose narrow prior the pairs do not make narrower than this stays at its usual value. docs/algorithms.md,
+Self-calibration, 3. Chosen by hand; not measured on its own."""
 STAYS = 1e-3
-"""What then becomes of that prior's deviation."""
+"""What then becomes of that prior's deviation. Chosen by hand; not measured on its own."""
 LEAST_SPARE = 0.25
-"""Share of the constraints that must be left to contradict the cameras, or nothing more is freed."""
+"""Share of the constraints that must be left to contradict the cameras, or nothing more is freed. Three pairs fit
+almost any center (docs/algorithms.md, Self-calibration, 3). Chosen by hand; not measured on its own."""
 STRAIGHT = 1e-6
-"""The same of k1 where nobody wants to know about it."""
+"""Deviation of k1, and share of the photos that have one, where distortion is not estimated: none to speak of. Chosen
+by hand; not measured on its own."""
 FREE_SHARE = {CENTER: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
-"""Share of photo sets in which the wide prior is the right one; for FOCAL, in which a claim is wrong."""
+"""Share of photo sets in which the wide prior is the right one; for FOCAL, in which a claim is wrong.
+docs/algorithms.md, Self-calibration, 3. Chosen by hand; not measured on their own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

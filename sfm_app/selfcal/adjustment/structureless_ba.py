@@ -1,5 +1,8 @@
 """Cameras and relative poses of all pairs adjusted to their matches at once: bundle adjustment without points.
 
+Ours. Bundle adjustment and Schur's complement: Triggs and others (2000). What the weights do for pairs, Eq. 5.23 and
+5.24 of the thesis do in its Algorithm 3.
+
 Every pair has its own relative pose, which is eliminated (Schur complement): what is left of a pair is what it says
 about the cameras, one Hessian and one gradient. A pair whose matches are right but whose geometry is not (repeated
 facades, another camera, a zoom) pulls at the cameras far harder than its noise allows; it is recognized by that and
@@ -9,32 +12,43 @@ weighs less.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.pose_manifold import POSE, moved
 from sfm_app.geometry.spd_solve import solve_each
+from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.selfcal.adjustment.two_view_cost import CAMERA, distances, pair_costs, pair_systems
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 MOST_MATCHES = 1000
-"""Of one pair; more of them are not independent, and would let one pair outvote all others."""
+"""Of one pair; more of them are not independent, and would let one pair outvote all others. With 300 errors and
+deviations are half as large again (docs/algorithms.md, Self-calibration, Tried and left out)."""
 CONFLICT = 3.0
-"""A pair that would gain this much log-likelihood from cameras of its own is worth a quarter (chi^2 = 6 of 2)."""
+"""A pair that would gain this much log-likelihood from cameras of its own is worth a quarter. By definition of chi^2
+with two degrees of freedom noise alone gains as much once in twenty times: exp(-3)."""
 ALONE = np.array([0.3, 0.15, 0.15, 0.2, 0.2])
-"""How far such cameras of its own may lie away: standard deviations of log f, u, v, log a, kappa."""
+"""How far such cameras of its own may lie away: standard deviations of log f, u, v, log a, kappa. Chosen by hand; not
+measured on their own."""
 LOWER_QUARTILE = 0.288
-"""Of that gain, where two degrees of freedom are noise (chi^2 / 2)."""
+"""Of that gain, where two degrees of freedom are noise: by definition of chi^2, -ln(3/4)."""
 LEAST_SIGMA_PX = 0.1
+"""Least standard deviation of a distance: synthetic matches without noise would weigh without bound. Chosen by hand;
+not measured on its own."""
 FEW_PHOTOS, CAUTION = 5, 0.25
 """A camera of fewer photos answers to what no model holds (a lens, a wall that is not quite still) with a focal and a
-center of its own: what its pairs say counts as if their noise were twice as large."""
+center of its own: what its pairs say counts as if their noise were twice as large. Chosen by hand; not measured on
+their own."""
 ROUNDS = 25
+"""Most rounds of weights and step. Chosen by hand; not measured on its own."""
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e8
+"""Of Levenberg and Marquardt's steps, relative to the diagonal. Chosen by hand; not measured on their own."""
 ARRIVED = 2e-5
+"""Largest change of a camera's parameter that ends the rounds. Chosen by hand; not measured on its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +72,7 @@ class State:
     thetas: FloatArray
     """(C, 5) parameters of the cameras, see `lens`."""
     poses: FloatArray
-    """(P, 12), see `pose_steps.essential`."""
+    """(P, 12), see `pose_manifold.essential`."""
     weights: FloatArray
     """(P,) in [0, 1]: how well a pair agrees with the others."""
     sigma: float
@@ -153,7 +167,7 @@ class Matches:
         found = np.abs(distances(self.points, self.ends, state.thetas, self.cameras, state.poses))
         found *= np.repeat(np.sqrt(counts / np.maximum(counts - POSE, 1)), counts)
         agreeing = np.repeat(state.weights > 0.5, counts)
-        return max(1.4826 * float(np.median(found[agreeing])) if agreeing.any() else 0.0, self.least_sigma)
+        return max(MAD_TO_SIGMA * float(np.median(found[agreeing])) if agreeing.any() else 0.0, self.least_sigma)
 
     def scattered(self, information: Information, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Sum over the pairs, times `factors` (P,): (5C, 5C) and (5C,) in the parameters of all cameras."""
@@ -198,29 +212,69 @@ def _system(matches: Matches, state: State) -> tuple[FloatArray, FloatArray]:
 
 
 def _information(system: tuple[FloatArray, FloatArray]) -> Information:
-    H, g, _, _ = _reduced(*system, 0.0)
-    gains = 0.5 * np.einsum("pi,pi->p", g, solve_each(H + np.diag(np.tile(ALONE**-2.0, 2)), g[..., None])[..., 0])
-    return Information(H, g, gains)
+    """Return what the pairs say about their cameras, and the gains g = b' H^-1 b / 2 (see `_weighed`)."""
+    H, b, _, _ = _eliminate_poses(*system, 0.0)
+    gains = 0.5 * np.einsum("pi,pi->p", b, solve_each(H + np.diag(np.tile(ALONE**-2.0, 2)), b[..., None])[..., 0])
+    return Information(H, b, gains)
 
 
 def _weighed(state: State, system: tuple[FloatArray, FloatArray]) -> State:
+    """Weigh every pair by the log-likelihood g that it would gain from cameras of its own::
+
+        g = b' H^-1 b / 2,      w = (1 + g / (3 s))^-2,      s = max(1, lower quartile of all g / 0.288)
+
+    H and b are the pair's Hessian and negative gradient in its cameras, the poses eliminated, with the prior `ALONE`.
+    Where only noise speaks, g is half of a chi^2 of two degrees of freedom, whose lower quartile is 0.288. w is the
+    derivative of Geman and McClure's cost (1987) g / (1 + g / (3 s)): least squares, reweighted, of a bounded say.
+    """
     gains = _information(system).gains
     scale = max(1.0, float(np.quantile(gains, 0.25)) / LOWER_QUARTILE) if len(gains) else 1.0
     return replace(state, weights=(1.0 + gains / (CONFLICT * scale)) ** -2, scale=scale)
 
 
-def _reduced(A: FloatArray, b: FloatArray, damping: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return Schur complement of the poses; also what gives their steps: V^-1 W' and V^-1 b_pose."""
+class Eliminated(NamedTuple):
+    """Normal equations of P pairs in their cameras alone, and what gives the poses once the cameras have moved."""
+
+    hessians: FloatArray
+    """(P, 10, 10) U - W V^-1 W'."""
+    gradients: FloatArray
+    """(P, 10) b_cameras - W V^-1 b_pose."""
+    pose_by_cameras: FloatArray
+    """(P, 5, 10) V^-1 W': the pose's step less this much of the cameras' step."""
+    pose_alone: FloatArray
+    """(P, 5) V^-1 b_pose: the pose's step if the cameras stay."""
+
+    def pose_steps(self, camera_steps: FloatArray) -> FloatArray:
+        """Return (P, 5) steps of the poses after those of the cameras (P, 10): back substitution."""
+        return np.asarray(self.pose_alone - (self.pose_by_cameras @ camera_steps[..., None])[..., 0], np.float64)
+
+
+def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> Eliminated:
+    """Take the poses out of the systems of all pairs by Schur's complement::
+
+        A = | U   W |     (U - W V^-1 W') d_cameras = b_cameras - W V^-1 b_pose
+            | W'  V |
+
+    Args:
+        A: (P, 15, 15) Hessians of two cameras and a pose, from `two_view_cost.pair_systems`.
+        b: (P, 15) their negative gradients.
+        damping: of V, relative to its diagonal.
+    """
     n = 2 * CAMERA
     V = A[:, n:, n:].copy()
     diagonal = np.arange(V.shape[-1])
     # few or degenerate matches leave a pose open: what is added must count beside the largest entry
     least = 1e-9 + 1e-12 * np.max(V[:, diagonal, diagonal], axis=1, keepdims=True)
     V[:, diagonal, diagonal] += damping * V[:, diagonal, diagonal] + least
-    back, own = np.split(np.linalg.solve(V, np.concatenate([A[:, n:, :n], b[:, n:, None]], axis=2)), [n], axis=2)
-    H = A[:, :n, :n] - A[:, :n, n:] @ back
-    g = b[:, :n] - (A[:, :n, n:] @ own)[..., 0]
-    return H, g, back, own[..., 0]
+    solved = np.linalg.solve(V, np.concatenate([A[:, n:, :n], b[:, n:, None]], axis=2))
+    pose_by_cameras, pose_alone = np.split(solved, [n], axis=2)
+    W = A[:, :n, n:]
+    return Eliminated(
+        hessians=A[:, :n, :n] - W @ pose_by_cameras,
+        gradients=b[:, :n] - (W @ pose_alone)[..., 0],
+        pose_by_cameras=pose_by_cameras,
+        pose_alone=pose_alone[..., 0],
+    )
 
 
 def _stepped(
@@ -230,22 +284,23 @@ def _stepped(
     factors = matches.trust * state.weights / state.scale
     cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
     while damping < MOST_DAMPING:
-        trial = _tried(matches, state, prior, system, damping)
+        trial = _step_of(matches, state, prior, system, damping)
         if float(factors @ matches.costs(trial)) + prior.cost(trial.thetas) <= cost:
             return trial, max(0.1 * damping, LEAST_DAMPING)
         damping *= 10.0
     return state, damping
 
 
-def _tried(
+def _step_of(
     matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
 ) -> State:
-    reduced, gradients, back, own = _reduced(*system, damping)
-    H, g = matches.scattered(Information(reduced, gradients, np.empty(0)), matches.trust * state.weights / state.scale)
+    """Return the state after one damped step: the cameras by all pairs and the prior, then each pose by its pair."""
+    reduced = _eliminate_poses(*system, damping)
+    said = Information(reduced.hessians, reduced.gradients, np.empty(0))
+    H, g = matches.scattered(said, matches.trust * state.weights / state.scale)
     H += np.diag(prior.precision.ravel())
     g += (prior.precision * (prior.mean - state.thetas)).ravel()
     step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
-    cameras = step[matches.cameras].reshape(-1, 2 * CAMERA)
-    turns = own - (back @ cameras[..., None])[..., 0]
+    turns = reduced.pose_steps(step[matches.cameras].reshape(-1, 2 * CAMERA))
     poses = np.array([moved(pose, turn) for pose, turn in zip(state.poses, turns, strict=True)]).reshape(-1, 12)
     return replace(state, thetas=state.thetas + step, poses=poses)

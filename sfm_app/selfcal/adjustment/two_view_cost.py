@@ -5,7 +5,8 @@ is Sampson's in pixels of the photo as it is, so that a lens which is undone doe
 
     r = C / |dC/d(x1, y1, x2, y2)|,      C = q2' E q1,      q = ray of a pixel
 
-Matches that fit badly are worth less: r^2 / (1 + r^2 / c^2) with c = 3 sigma (Geman and McClure 1987).
+That is Eq. 4.2 of the thesis for rays, with E of Eq. 5.7; to adjust cameras by it is ours. Matches that fit badly are
+worth less: r^2 / (1 + r^2 / c^2) with c = 3 sigma (Geman and McClure 1987).
 """
 
 import numpy as np
@@ -19,17 +20,22 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 CAMERA = 5
-"""Parameters of one camera."""
+"""Parameters of one camera. Counted: log f, u, v, log a, kappa, by definition in `lens`."""
 PAIR = 2 * CAMERA + POSE
+"""Parameters of a pair: two cameras and a pose, by definition."""
 REACH = 3.0
-"""c, in sigma."""
+"""c, in sigma. docs/algorithms.md, Self-calibration, 2. Chosen by hand; not measured on its own."""
 HOPELESS = 1e60
-"""Squared distances in sigma^2, or derivatives, above this are no numbers any more."""
+"""Squared distances in sigma^2, or derivatives, above this are no numbers any more. Squares of it are finite in double
+precision."""
 _STEP = 1e-6
+"""By which parameters move for a difference: curvature leaves an error of about 1e-6 of it, rounding in double
+precision 1e-10. Chosen by hand; not measured on its own."""
 
 
 @kernel
 def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
+    """Return r of the rays p of view 1 and q of view 2, each (7,) as `lens.ray` writes it."""
     l0 = E[0, 0] * p[0] + E[0, 1] * p[1] + E[0, 2]
     l1 = E[1, 0] * p[0] + E[1, 1] * p[1] + E[1, 2]
     l2 = E[2, 0] * p[0] + E[2, 1] * p[1] + E[2, 2]
@@ -97,56 +103,100 @@ def pair_systems(
         camera, all that concerns it stands in the first five rows and columns.
     """
     A, b = np.zeros((len(poses), PAIR, PAIR)), np.zeros((len(poses), PAIR))
-    # index 0 is the point itself, 1 to 5 one parameter moved
+    # derivatives are differences: index 0 is the thing itself, 1 to 5 what it is with one parameter moved
     lenses, Es = np.empty((2, 1 + CAMERA, 5)), np.empty((1 + POSE, 3, 3))
     rays, J = np.empty((2, 1 + CAMERA, 7)), np.empty(PAIR)
-    step = np.zeros(POSE)
     for k in range(len(poses)):
         shared = cameras[k, 0] == cameras[k, 1]
         J[:] = 0.0
-        essential(poses[k], Es[0])
-        for j in range(POSE):
-            step[j] = _STEP
-            essential(moved(poses[k], step), Es[1 + j])
-            step[j] = 0.0
+        _write_poses(poses[k], Es)
         for view in range(2):
-            theta = thetas[cameras[k, view]].copy()
-            camera_of(theta, lenses[view, 0])
-            for j in range(CAMERA):
-                kept = theta[j]
-                theta[j] = kept + _STEP
-                camera_of(theta, lenses[view, 1 + j])
-                theta[j] = kept
+            _write_cameras(thetas[cameras[k, view]], lenses[view])
         for i in range(ends[k], ends[k + 1]):
             for view in range(2):
-                x, y, guess = matches[i, 2 * view], matches[i, 2 * view + 1], -1.0
-                for j in range(1 + CAMERA):
-                    ray(x, y, lenses[view, j], guess, rays[view, j])
-                    guess = rays[view, 0, 6]
-            r = _distance(rays[0, 0], rays[1, 0], Es[0]) / sigma
-            for j in range(CAMERA):
-                if shared:
-                    J[j] = (_distance(rays[0, 1 + j], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
-                else:
-                    J[j] = (_distance(rays[0, 1 + j], rays[1, 0], Es[0]) / sigma - r) / _STEP
-                    J[CAMERA + j] = (_distance(rays[0, 0], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
-            for j in range(POSE):
-                J[2 * CAMERA + j] = (_distance(rays[0, 0], rays[1, 0], Es[1 + j]) / sigma - r) / _STEP
-            # at an epipole the distance has no gradient to be divided by
-            total = r * r
-            for j in range(PAIR):
-                total += abs(J[j])
-            if total < HOPELESS:
+                _write_rays(matches[i, 2 * view], matches[i, 2 * view + 1], lenses[view], rays[view])
+            r = _write_derivatives(rays, Es, sigma, shared, J)
+            if _are_numbers(r, J):
                 _add(A[k], b[k], J, r, (1.0 + r * r / REACH**2) ** -2)
-    for k in range(len(poses)):
-        for i in range(PAIR):
-            for j in range(i):
-                A[k, j, i] = A[k, i, j]
+        _mirror(A[k])
     return A, b
 
 
 @kernel
+def _write_poses(pose: FloatArray, Es: FloatArray) -> None:
+    """Write E of a pose, and with each of its five parameters moved, into `Es` (6, 3, 3)."""
+    step = np.zeros(POSE)
+    essential(pose, Es[0])
+    for j in range(POSE):
+        step[j] = _STEP
+        essential(moved(pose, step), Es[1 + j])
+        step[j] = 0.0
+
+
+@kernel
+def _write_cameras(theta: FloatArray, lenses: FloatArray) -> None:
+    """Write the camera of the parameters (5,), and with each of them moved, into `lenses` (6, 5)."""
+    trial = theta.copy()
+    camera_of(trial, lenses[0])
+    for j in range(CAMERA):
+        kept = trial[j]
+        trial[j] = kept + _STEP
+        camera_of(trial, lenses[1 + j])
+        trial[j] = kept
+
+
+@kernel
+def _write_rays(x: float, y: float, lenses: FloatArray, rays: FloatArray) -> None:
+    """Write the ray of a pixel through each of `lenses` (6, 5) into `rays` (6, 7); the first begins the others."""
+    guess = -1.0
+    for j in range(1 + CAMERA):
+        ray(x, y, lenses[j], guess, rays[j])
+        guess = rays[0, 6]
+
+
+@kernel
+def _write_derivatives(rays: FloatArray, Es: FloatArray, sigma: float, shared: bool, J: FloatArray) -> float:
+    """Return the distance r of one match in sigma, and write dr over the fifteen parameters into `J` (15,).
+
+    Args:
+        rays: (2, 6, 7) from `_write_rays`, per view.
+        Es: (6, 3, 3) from `_write_poses`.
+        sigma: standard deviation of a distance.
+        shared: whether both views are of one camera: then both rays move with its parameters, in the first five.
+        J: filled; where shared, 5 to 9 stay as they are.
+    """
+    r = _distance(rays[0, 0], rays[1, 0], Es[0]) / sigma
+    for j in range(CAMERA):
+        if shared:
+            J[j] = (_distance(rays[0, 1 + j], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
+        else:
+            J[j] = (_distance(rays[0, 1 + j], rays[1, 0], Es[0]) / sigma - r) / _STEP
+            J[CAMERA + j] = (_distance(rays[0, 0], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
+    for j in range(POSE):
+        J[2 * CAMERA + j] = (_distance(rays[0, 0], rays[1, 0], Es[1 + j]) / sigma - r) / _STEP
+    return float(r)
+
+
+@kernel
+def _are_numbers(r: float, J: FloatArray) -> bool:
+    """Return whether a distance and its derivatives are numbers: at an epipole there is no gradient to divide by."""
+    total = r * r
+    for j in range(PAIR):
+        total += abs(J[j])
+    return bool(total < HOPELESS)
+
+
+@kernel
+def _mirror(A: FloatArray) -> None:
+    """Copy the lower triangle to the upper one."""
+    for i in range(PAIR):
+        for j in range(i):
+            A[j, i] = A[i, j]
+
+
+@kernel
 def _add(A: FloatArray, b: FloatArray, J: FloatArray, r: float, weight: float) -> None:
+    """Add what one match says: weight J'J to the lower triangle of A, -weight J'r to b."""
     for i in range(PAIR):
         scaled = weight * J[i]
         b[i] -= scaled * r

@@ -1,0 +1,1 @@
+"""Which photos of a set share a camera. Ours."""

@@ -18,19 +18,25 @@ from sfm_app.selfcal.lens import LOG_FOCAL
 from sfm_app.types import PairId
 
 SIGMA = 0.03
-"""Width of the votes, in units of r: 3 % of focal still agree, 10 % do not."""
+"""Width of the votes, in units of r: 3 % of focal still agree, 10 % do not. Chosen by hand; not measured on its own."""
 FAIR_SHARE = 0.5
-"""Share of its votes that a photo must get to belong to a peak, or to name a focal."""
+"""Share of its votes that a photo must get to belong to a peak, or to name a focal. Chosen by hand; not measured on its
+own."""
 OTHER_FOCAL = 0.05
-"""A difference in log f from which on it is another camera."""
+"""A difference in log f from which on it is another camera. Chosen by hand; not measured on its own."""
 CLEARLY = 0.25
-"""Share of a photo's votes by which another focal must beat that of the peak."""
+"""Share of a photo's votes by which another focal must beat that of the peak. docs/algorithms.md, Self-calibration, 6.
+Chosen by hand; not measured on its own."""
 LEAST_GAIN = 0.25
-"""The same of the photos of all other cameras together, for a split to be worth it."""
+"""The same of the photos of all other cameras together, for a split to be worth it. Chosen by hand; not measured on its
+own."""
 REACH, TRIALS = 1.1, 111
-"""Focals that a photo is asked about: up to three times longer or shorter."""
+"""Focals that a photo is asked about: up to three times longer or shorter. Chosen by hand; not measured on their
+own."""
 MOST_PEAKS = 4
+"""Peaks of the consensus that cameras are begun from. Chosen by hand; not measured on its own."""
 ROUNDS = 10
+"""Most times all photos are asked for their camera. Chosen by hand; not measured on its own."""
 
 
 def separated(

@@ -1,5 +1,7 @@
 """Several cameras in one set of photos: one K each, from the pairs within cameras and between them.
 
+Ours, on the constraint of thesis 5.2.4 for two cameras; the thesis leaves several devices to later work (5.8.4).
+
 A camera that its own pairs determine is known. The focals of the others are found together, on a grid, as the choice
 that most pairs agree on (max-sum message passing; E = K2'F K1 has two equal singular values for the right two focals),
 and then everything is adjusted to the matches at once.
@@ -32,14 +34,18 @@ from sfm_app.types import Calibration, CameraPairs, PairId
 IndexArray = NDArray[np.int64]
 
 FOCALS = 41
-"""Focals on the grid of a camera, each 7 % above the one before."""
+"""Focals on the grid of a camera, each 7 % above the one before. docs/algorithms.md, Self-calibration, 6. Chosen by
+hand; not measured on its own."""
 MESSAGE_ROUNDS, DAMPING = 30, 0.5
+"""Most rounds of max-sum message passing, and the share of the message before that a new one keeps. Chosen by hand; not
+measured on their own."""
 FAIR_SHARE, BORNE_OUT, NOT_ALL = 0.5, 0.8, "not all of its photos bear it out"
 """Shares of their votes that every photo, and all together, must give to a camera that photos of one size were divided
 into. Chosen on folders 0 to 179 and 1000 to 1020 of `python -m benchmarks.trouble`: two cameras get 0.86 to 0.93
 (0.57 and 0.69 with a moving object), those of a zoom and those over 5 % off 0.44 to 0.76."""
 LEAST_PAIRS = 2
-"""Pairs that a camera needs: two constraints find its focal, two more contradict a wrong one."""
+"""Pairs that a camera needs: two constraints find its focal, two more contradict a wrong one. Counted: by definition of
+the constraint (thesis 5.2.4)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

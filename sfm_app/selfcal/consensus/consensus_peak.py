@@ -1,4 +1,7 @@
-"""The K that most pairs agree on: the highest peak of the joint consensus, and what speaks for and against it."""
+"""The K that most pairs agree on: the highest peak of the joint consensus, and what speaks for and against it.
+
+Thesis 5.8.4 carried from a plane to all of K; what speaks for and against the answer is ours.
+"""
 
 from dataclasses import dataclass
 
@@ -20,16 +23,20 @@ from sfm_app.selfcal.consensus.peak_search import FOCAL_RANGE, SIGMAS, Peak, Pro
 from sfm_app.selfcal.inputs import FloatArray
 
 SQUARE_PIXELS = (LOG_FOCAL, CENTER_U, CENTER_V)
+"""Places in theta that are sought when pixels are square."""
 ANY_PIXELS = (*SQUARE_PIXELS, LOG_ASPECT)
+"""Places in theta that are sought when they need not be."""
 LOG_ASPECTS = tuple(np.linspace(-0.6, 0.6, 9))
-"""log fy/fx on the grid: 0.55 to 1.8."""
+"""log fy/fx on the grid: 0.55 to 1.8. Chosen by hand; not measured on their own."""
 ASPECT_GAIN = float(np.log(50))
-"""Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square."""
+"""Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square. docs/algorithms.md,
+Self-calibration, 1. Chosen by hand; not measured on its own."""
 PERHAPS_ASPECT_GAIN = float(np.log(50 * 0.05))
 """Votes from which on square pixels are less than 95 % sure. Of 47 answers with square pixels on the photo sets and on
 folders 0 to 170 of `python -m benchmarks.trouble`, one had more (1.55), and its pixels were not square."""
 MAX_LOG_FOCAL_SPREAD = 0.1
-"""Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess."""
+"""Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess.
+docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured on its own."""
 IDENTIFIED_LOG_FOCAL_SPREAD = 0.02
 """Largest standard deviation of log f that counts as known: with 0.025 one focal of twenty is off by 5 %, and what is
 called identifiable should not be. Between this and the limit above the answer is an estimate: a better start than a
@@ -39,11 +46,12 @@ CLEAR_LEAD_SHARE, FEW_ASTRAY = 0.2, 0.8
 """A focal a quarter away that loses less than this share of the votes is hardly told from the right one, by walks to
 the side or on one plane; then few votes may be missing, or what turned these pairs astray has pulled at the others. Of
 the same 109 cameras eight are short of both: off by 43, 10, 6, 4, 4, 1, 0.3 and 0.2 %; no other of them whose deviation
-is below 0.02 is off by more than 2.5 %."""
+is below 0.02 is off by more than 2.5 %. docs/algorithms.md, Self-calibration, 5."""
 IDENTIFIED_OF_MANY = 0.015
-"""The same where every photo has a focal of its own: the worst of them is further off than one."""
+"""The same where every photo has a focal of its own: the worst of them is further off than one. docs/algorithms.md,
+Self-calibration, 6. Chosen by hand; not measured on its own."""
 EDGE = 1.02
-"""A focal within this factor of an end of the range has run there."""
+"""A focal within this factor of an end of the range has run there. Chosen by hand; not measured on its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +80,7 @@ class Answer:
         return "its pixels may not be square" if doubtful else ""
 
     def doubt_of_focal(self, weights: FloatArray) -> str:
-        """Return why an answer, to pairs of weights (P,), is an estimate though its deviation is small, or nothing."""
+        """Return why an answer to pairs of these weights (P,) is an estimate despite a small deviation, or nothing."""
         mass = float(np.sum(self.votes))
         doubtful = self.lead < CLEAR_LEAD_SHARE * mass and mass < FEW_ASTRAY * float(np.sum(weights))
         return "many pairs fit other focals nearly as well, and some fit none" if doubtful else ""
@@ -94,7 +102,7 @@ class Answer:
         return disagreement(self.votes, weights) or indecision(self.lead, self.votes)
 
     def scatter(self, consensus: Consensus, seed: int) -> FloatArray:
-        """Return (B, 4) the peak under resampled pairs, see `evidence.resampled`."""
+        """Return (B, 4) the peak under resampled pairs, see `peak_evidence.resampled`."""
         return resampled(consensus, self.theta, self.free, self.sigma, seed)
 
     def deviation(self, values: FloatArray) -> float:

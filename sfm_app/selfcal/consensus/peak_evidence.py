@@ -1,4 +1,7 @@
-"""What speaks for a peak of the joint consensus: how many pairs, against which rivals, how stable."""
+"""What speaks for a peak of the joint consensus: how many pairs, against which rivals, how stable.
+
+Ours; the bootstrap is Rubin's (1981), the effective sample size Kish's (1965).
+"""
 
 from collections.abc import Sequence
 
@@ -9,22 +12,32 @@ from sfm_app.selfcal.consensus.peak_search import SIGMAS, Profile
 from sfm_app.selfcal.inputs import FloatArray
 
 OWN_SIGMA_RANGE = (0.005, 0.02)
-"""The last width of the consensus follows the data within these bounds, in units of r."""
+"""The last width of the consensus follows the data within these bounds, in units of r. Chosen by hand; not measured on
+their own."""
 OWN_SIGMA_FACTOR = 1.5
-"""In medians of r: half of the agreeing pairs then speak with more than half their weight."""
+"""In medians of r: half of the agreeing pairs then speak with more than half their weight. docs/algorithms.md,
+Self-calibration, 1. Chosen by hand; not measured on its own."""
 MIN_AGREEING = 2.25
-"""Effective number of pairs that must agree; three parameters satisfy one and a half pairs whatever these say."""
+"""Effective number of pairs that must agree; three parameters satisfy one and a half pairs whatever these say.
+docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured on its own."""
 MIN_SUPPORT = 0.12
-"""Share of the votes that K must win; many pairs without any common K give up to 0.06."""
+"""Share of the votes that K must win; many pairs without any common K give up to 0.06. docs/algorithms.md,
+Self-calibration, 5. The command that gave 0.06 is not on record."""
 RIVAL_RATIO = 1.25
-"""A K with a focal this many times longer or shorter is another answer."""
+"""A K with a focal this many times longer or shorter is another answer. docs/algorithms.md, Self-calibration, 5. Chosen
+by hand; not measured on its own."""
 MIN_LEAD = 0.5
-"""Votes by which K must lead every other focal."""
+"""Votes by which K must lead every other focal. docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured
+on its own."""
 MIN_LEAD_SHARE = 0.03
-"""The same as a share of the votes for K: many pairs that hardly tell focals apart do not add up to knowledge."""
+"""The same as a share of the votes for K: many pairs that hardly tell focals apart do not add up to knowledge.
+docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured on its own."""
 RESAMPLES = 25
+"""Of the Bayesian bootstrap (docs/algorithms.md, Self-calibration, without matches). Chosen by hand; not measured on
+its own."""
 STABLE_SIGMA = 0.01
-"""Resampled fits use at least this width: below it they snap to single pairs."""
+"""Resampled fits use at least this width: below it they snap to single pairs. Chosen by hand; not measured on its
+own."""
 
 
 def own_sigma(consensus: Consensus, theta: FloatArray) -> float:

@@ -1,4 +1,7 @@
-"""The highest peak of the joint consensus: a coarse grid over K, then local searches from its best cells."""
+"""The highest peak of the joint consensus: a coarse grid over K, then local searches from its best cells.
+
+Ours, in place of the search along zero curves of thesis 5.8.4 (Eq. 5.33).
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,15 +12,20 @@ from sfm_app.selfcal.consensus.consensus import Consensus
 from sfm_app.selfcal.inputs import FloatArray
 
 FOCAL_RANGE = (0.3, 5.0)
-"""Focals that are tried, in units of the longer side: 118 to 11 degrees of view."""
+"""Focals that are tried, in units of the longer side: 118 to 11 degrees of view. docs/algorithms.md, Self-calibration,
+5. Chosen by hand; not measured on their own."""
 FOCALS = 29
-"""Focals on the grid, each 10 % above the one before."""
+"""Focals on the grid, each 10 % above the one before. Chosen by hand; not measured on its own."""
 CENTER_REACH = 0.4
-"""Centers are tried up to this far from the middle, in units of the longer side."""
+"""Centers are tried up to this far from the middle, in units of the longer side. Chosen by hand; not measured on its
+own."""
 CENTER_STEP = 0.08
+"""Between centers on the grid, in the same units. Chosen by hand; not measured on its own."""
 SIGMAS = (0.05, 0.02)
-"""Widths of the consensus, in units of r: the first finds a peak, the second refines it and compares it with others."""
+"""Widths of the consensus, in units of r: the first finds a peak, the second refines it and compares it with others.
+docs/algorithms.md, Self-calibration, 1. Chosen by hand; not measured on their own."""
 MOST_STARTS = 4
+"""Tops of the grid that a local search begins from. Chosen by hand; not measured on its own."""
 
 
 class Peak(NamedTuple):

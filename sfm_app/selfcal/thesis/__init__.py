@@ -1,0 +1,1 @@
+"""The calibrators of thesis chapter 5 as printed, but for misprints."""

@@ -7,9 +7,10 @@ from sfm_app.selfcal.inputs import FloatArray, Pairs
 from sfm_app.selfcal.thesis.roots import ComplexArray, swept_roots
 
 ROOT_IS_ZERO = 1e-9
-"""A real part below this, in image widths, counts as zero: such roots are spurious."""
+"""A real part below this, in image widths, counts as zero: such roots are spurious. Chosen by hand; not measured on its
+own."""
 MAX_OUT_OF_RANGE = 0.5
-"""A curve with a larger share of samples out of range is degenerate (thesis 5.35)."""
+"""A curve with a larger share of samples out of range is degenerate (thesis 5.8.4, Eq. 5.35)."""
 
 
 def focal_curves(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> FloatArray:

@@ -14,13 +14,18 @@ from sfm_app.selfcal.thesis.verdict import CameraParameters
 DEFAULT = EQUATIONS["huang-faugeras"]
 """The form that the thesis chooses (5.5.1)."""
 FIRST_DAMPING = 1e-2
+"""Of Levenberg and Marquardt's steps, relative to the diagonal. Chosen by hand; not measured on its own."""
 DAMPING_RANGE = (1e-9, 1e9)
+"""Within which damping stays. Chosen by hand; not measured on their own."""
 MOST_STEPS = 60
+"""Of one search. Chosen by hand; not measured on its own."""
 LONGEST_STEP = 0.5
-"""In any parameter, of which the focals are taken as logarithms."""
+"""In any parameter, of which the focals are taken as logarithms. Chosen by hand; not measured on its own."""
 DIFFERENCE = 1e-7
+"""By which parameters move for a derivative: near the root of what double precision leaves. Chosen by hand; not
+measured on its own."""
 FINISHED = 1e-9
-"""A step that lowers the sum by a smaller share has arrived."""
+"""A step that lowers the sum by a smaller share has arrived. Chosen by hand; not measured on its own."""
 
 
 class Minima(NamedTuple):

@@ -8,9 +8,11 @@ from sfm_app.jit import kernel
 from sfm_app.selfcal.inputs import FloatArray
 
 SEPARATION = 1.25
-"""Peaks whose focals sqrt(fx fy) differ by a smaller factor are one."""
+"""Peaks whose focals sqrt(fx fy) differ by a smaller factor are one. docs/algorithms.md, The thesis's methods. Chosen
+by hand; not measured on its own."""
 LEAST_SHARE = 0.5
-"""A peak has at least this share of the highest one's support; what curves meet in by chance mostly has less."""
+"""A peak has at least this share of the highest one's support; what curves meet in by chance mostly has less.
+docs/algorithms.md, The thesis's methods. Chosen by hand; not measured on its own."""
 
 
 class Meeting(NamedTuple):

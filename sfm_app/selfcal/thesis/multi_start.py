@@ -15,14 +15,17 @@ from sfm_app.types import Calibration, CameraPairs
 
 METHOD = "multi-start"
 SAMPLE = 3
-"""Pairs in a minimal set."""
+"""Pairs in a minimal set: for four unknowns (thesis 5.6.3, Eq. 5.14)."""
 CONFIDENCE = 0.95
+"""Probability that any one triple is drawn (thesis 5.6.3)."""
 MOST_STARTS = 4000
-"""MaxIter grows with the cube of the number of pairs; from 21 pairs on it is cut here."""
+"""MaxIter grows with the cube of the number of pairs; from 22 pairs on it is cut here (docs/algorithms.md, The thesis's
+methods). Chosen by hand; not measured on its own."""
 FOCAL_RANGE = (0.1, 3.0)
-"""Focals that count, in image widths: thesis (5.29) ends at 3."""
+"""Focals that count, in image widths: thesis (5.29) ends at 3. The lower end was chosen by hand."""
 USUAL_FOCAL = (1.0, 0.5)
-"""Mean and standard deviation in image widths where no pair has a focal of its own."""
+"""Mean and standard deviation in image widths where no pair has a focal of its own. The mean is that of K_init (thesis
+5.7.2); the deviation was chosen by hand."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:

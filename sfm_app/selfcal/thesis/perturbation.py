@@ -4,6 +4,7 @@ from functools import partial
 
 import numpy as np
 
+from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.selfcal.inputs import FloatArray, Pairs
 from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations, essential
 from sfm_app.selfcal.thesis.least_squares import DEFAULT, fitted
@@ -13,10 +14,10 @@ from sfm_app.types import Calibration, CameraPairs
 
 METHOD = "perturbation"
 MOST_ITERATIONS = 4
+"""maxIter of Algorithm 3 (thesis 5.7.2)."""
 TOLERANCE = 1e-6
-"""T of Algorithm 3: a change of K, in image widths, that ends the iterations."""
-NORMAL_MAD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+"""T of Algorithm 3: a change of K, in image widths, that ends the iterations. Chosen by hand; not measured on its
+own."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
@@ -69,8 +70,8 @@ def error_discrepancies(F: FloatArray, K: FloatArray, change: FloatArray) -> Flo
 
 
 def discrepancy_weights(discrepancies: FloatArray) -> FloatArray:
-    """Return thesis (5.24): exp(-ED / (1.4826 MAD)); equal weights where the discrepancies do not scatter."""
-    scale = NORMAL_MAD * float(np.median(np.abs(discrepancies - np.median(discrepancies))))
+    """Return thesis (5.24): exp(-ED / s), s = 1.4826 MAD; equal weights where the discrepancies do not scatter."""
+    scale = MAD_TO_SIGMA * float(np.median(np.abs(discrepancies - np.median(discrepancies))))
     if scale == 0:
         return np.ones(len(discrepancies))
     # the smallest discrepancy is common to all and says nothing about any: without it all weights may underflow

@@ -18,7 +18,8 @@ from sfm_app.selfcal.results import guessed
 from sfm_app.types import Calibration, CameraPairs
 
 MIN_PAIRS = 3
-"""Four unknowns and two constraints a pair; with two pairs nothing is left to contradict a wrong K."""
+"""Four unknowns and two constraints a pair; with two pairs nothing is left to contradict a wrong K. Counted, by
+definition of the constraint (thesis 5.2.4)."""
 
 
 class CameraParameters(NamedTuple):

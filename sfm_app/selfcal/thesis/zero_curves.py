@@ -13,7 +13,7 @@ from sfm_app.types import Calibration, CameraPairs
 
 METHOD = "zero-curves-thesis"
 FOCAL_RANGE = 3.0
-"""Focals are sought up to this many image widths (thesis 5.29)."""
+"""Focals are sought up to this many image widths (thesis 5.8.3, Eq. 5.29)."""
 SIGMA_SHARE = 0.1
 """sigma of rho, as a share of the range that is searched (thesis 5.8.4)."""
 PEAK_RANGE, PEAK_SIGMA = (0.3, FOCAL_RANGE), 0.1

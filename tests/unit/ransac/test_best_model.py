@@ -9,6 +9,7 @@ import pytest
 
 from sfm_app.ransac.best_model import Best
 from sfm_app.ransac.estimator_config import Recipe
+from sfm_app.ransac.inner_loop import GUIDED, UNGUIDED
 from sfm_app.ransac.points import prepare
 from sfm_app.ransac.scoring.robust_costs import geman_mcclure, msac, penalty, ransac, squared_distances
 from sfm_app.ransac.verification.pretests import OPEN
@@ -45,10 +46,10 @@ def best_of(recipe):
     return Best(POINTS, THRESHOLD, recipe)
 
 
-def meet(best, F, score, kind=0):
+def meet(best, F, score, kind=GUIDED):
     """What the loop does once a sample of that kind has given a better model."""
     best.samples[kind], best.to_beat[kind] = F.reshape(9), score_of(F, score)
-    return best.meets(kind)
+    return best.update(kind)
 
 
 def test_there_is_none_at_first():
@@ -103,11 +104,11 @@ def test_a_model_of_the_rest_needs_half_the_support_of_the_best_sample_once_the_
 
     assert meet(best, ROUGH, TWO.score)
     assert nothing - best.to_beat[1] == pytest.approx((nothing - score_of(ROUGH, TWO.score)) / 2)
-    assert meet(best, BAD, TWO.score, kind=1)  # its improvement wins; samples of all matches have their own bar
+    assert meet(best, BAD, TWO.score, kind=UNGUIDED)  # its improvement wins; samples of all matches have their own bar
     assert best.to_beat[0] == score_of(ROUGH, TWO.score)
     np.testing.assert_allclose(best.f, ROUGH.reshape(9), atol=1e-15)
     assert nothing - best.to_beat[1] == pytest.approx((nothing - score_of(ROUGH, TWO.score)) / 2)
-    assert meet(best, GOOD, TWO.score, kind=1)
+    assert meet(best, GOOD, TWO.score, kind=UNGUIDED)
     np.testing.assert_allclose(best.f, GOOD.reshape(9), atol=1e-15)
 
 
@@ -123,7 +124,7 @@ def test_the_finer_score_decides_between_improved_models():
     for scores in ((coarse, fine), (fine, coarse), (fine, fine)):
         best = Best(points, 1.0, replace(ONE, score=scores[0], fine_score=scores[1]))
         best.samples[0], best.to_beat[0] = middle / np.linalg.norm(middle), 50.0
-        best.meets(0)
+        best.update(GUIDED)
         won[scores] = best.challenged_by(shift.reshape(3, 3))
     assert won == {(coarse, fine): True, (fine, coarse): False, (fine, fine): True}
 

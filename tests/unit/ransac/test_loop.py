@@ -260,8 +260,8 @@ def test_patience_is_asked_about_the_best_model_after_the_least_trials(scripted)
     np.testing.assert_array_equal(asked, [found.F, found.F])
 
 
-@pytest.mark.parametrize(("improved", "met"), [([0], [0]), ([1], [1]), ([0, 1], [0, 1]), ([], [])])
-def test_only_kinds_of_samples_that_improved_are_met(monkeypatch, improved, met):
+@pytest.mark.parametrize(("improved", "asked"), [([0], [0]), ([1], [1]), ([0, 1], [0, 1]), ([], [])])
+def test_only_kinds_of_samples_that_improved_are_asked(monkeypatch, improved, asked):
     seen, m = [], scene()
 
     def script(_points, _draws, _measure, _gates, to_beat, limit, _state, best):
@@ -269,16 +269,16 @@ def test_only_kinds_of_samples_that_improved_are_met(monkeypatch, improved, met)
             best[improved], to_beat[improved] = np.ones(9) / 3, 1.0
         return limit
 
-    def meets(best, kind):
+    def update(best, kind):
         seen.append(kind)
         assert best.samples[kind].any()
         best.to_beat[:] = 0.5  # as a new best model does: the bar of the other kind falls too
         return True
 
     monkeypatch.setattr(loop, "next_better", script)
-    monkeypatch.setattr(loop.Best, "meets", meets)
+    monkeypatch.setattr(loop.Best, "update", update)
     search(m, options(max_trials=120), 0, replace(PLAIN, least_trials=50, patience=always(200)))
-    assert seen == met
+    assert seen == asked
 
 
 def test_first_priors_come_at_their_share_of_the_trials(scripted):
