@@ -12,15 +12,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sfm_app.atomic_io import save_files
-from sfm_app.context import RunContext
 from sfm_app.errors import ConfigError, InputError
-from sfm_app.parallel import make_executor, worker_count
 from sfm_app.plugins import load_plugins
 from sfm_app.progress import Progress, Silent
 from sfm_app.ransac import check_points
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.parallel import make_executor, worker_count
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Intrinsics, Rejected, Scene
-from sfm_app.workspace import Workspace
 
 PathLike = str | os.PathLike[str]
 

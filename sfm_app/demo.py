@@ -11,6 +11,7 @@ from PIL import Image
 from sfm_app.api import Run, reconstruct
 from sfm_app.errors import InputError
 from sfm_app.progress import Progress
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages.texture import read_texture
 from sfm_app.synthetic.cameras import Camera, arc, camera_center, make_camera
@@ -23,9 +24,8 @@ from sfm_app.synthetic.compare import (
 )
 from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.pictures import beside_photo
-from sfm_app.synthetic.scenes import build_scene
+from sfm_app.synthetic.scenes.scene_catalog import build_scene
 from sfm_app.types import Model, Scene
-from sfm_app.workspace import Workspace
 
 SIZE = (960, 640)
 """Of the photos, and of each of the four views in the picture, in pixels."""

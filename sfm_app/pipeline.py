@@ -6,12 +6,12 @@ from functools import partial
 from pathlib import Path
 
 from sfm_app.colmap.model import sparse_model
-from sfm_app.context import RunContext
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage, go_on_hint, undamaged
 from sfm_app.errors import InputError
-from sfm_app.parallel import ordered_map
 from sfm_app.photos import read_source
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.parallel import ordered_map
 from sfm_app.stages import depth_maps, export, intrinsics, match_graph, mesh, photos, scene, texture, view_graph
 from sfm_app.types import Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surface, ViewGraph
 

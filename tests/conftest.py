@@ -11,7 +11,7 @@ from PIL import Image
 
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera, orbit
 from sfm_app.synthetic.photo_folder import load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.scenes import build_scene
+from sfm_app.synthetic.scenes.scene_catalog import build_scene
 from sfm_app.types import Frustum, Model, Surface, Texture
 
 

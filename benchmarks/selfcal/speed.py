@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.common.results import Row
 from benchmarks.selfcal.coverage import estimated
 from benchmarks.selfcal.methods import PRODUCTION, WITHOUT_MATCHES, Measured
-from sfm_app.calibrating import camera_pairs
+from sfm_app.estimation.calibrating import camera_pairs
 from sfm_app.plugins import load_plugins
 from sfm_app.selfcal.inputs import prepare
 from sfm_app.selfcal.thesis.zero_curves import algorithm_4

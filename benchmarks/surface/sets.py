@@ -9,7 +9,7 @@ from sfm_app.api import opened_run
 from sfm_app.pipeline import NAMES, SCENE, TEXTURE, run_stages
 from sfm_app.settings import Settings
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.scenes import WALKS, build_scene, scene_views
+from sfm_app.synthetic.scenes.scene_catalog import WALKS, build_scene, scene_views
 from sfm_app.types.model import Model
 
 RENDERED = ("statue", "facade", "corner")

@@ -8,8 +8,8 @@ from sfm_app.colmap.backend import has_cuda
 from sfm_app.engine.staleness import versions
 from sfm_app.errors import SfmError
 from sfm_app.meshing.open3d import load_open3d
-from sfm_app.parallel import worker_count
 from sfm_app.plugins import load_plugins
+from sfm_app.runtime.parallel import worker_count
 
 GIGABYTE = 2**30
 ENOUGH_DISK = 2 * GIGABYTE

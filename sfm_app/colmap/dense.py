@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend, check_written, pycolmap
 from sfm_app.colmap.masks import used_pixels
+from sfm_app.colmap.processes.worker_process import UndistortTask, finished
 from sfm_app.colmap.types import all_images
-from sfm_app.colmap.worker_process import UndistortTask, finished
 from sfm_app.hashing import digest_files, is_below
 from sfm_app.progress import Progress
 from sfm_app.stereo import DepthEstimate, DepthMap, Kind, View
@@ -40,7 +40,7 @@ def undistort(
         "max_side_px": max_side_px,
         "workers": workers,
     }
-    finished("sfm_app.colmap.undistort_process", task, "undistorting photos", progress)
+    finished("sfm_app.colmap.processes.undistort_process", task, "undistorting photos", progress)
 
 
 def read_views(dense_dir: Path) -> list[View]:

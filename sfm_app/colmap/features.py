@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-from sfm_app.colmap.worker_process import FeatureTask, SiftOption, relay, started
+from sfm_app.colmap.processes.worker_process import FeatureTask, SiftOption, relay, started
 from sfm_app.numerical import Json
 from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
@@ -47,7 +47,7 @@ def find_and_match(
         "sift": dict(sift),
         "pairs": None if pairs is None else [list(pair) for pair in pairs],
     }
-    with started("sfm_app.colmap.feature_process", task) as process:
+    with started("sfm_app.colmap.processes.feature_process", task) as process:
         found = relay(process, progress)
         process.check("matching photos" if found else "finding features")
     return found

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from sfm_app.colmap.backend import check_written, pycolmap
 from sfm_app.colmap.database import SQUARE_PIXELS
+from sfm_app.colmap.processes.worker_process import GlobalMappingTask, MappingTask, started
 from sfm_app.colmap.types import Cancellation, all_cameras
-from sfm_app.colmap.worker_process import GlobalMappingTask, MappingTask, started
 
 LOCAL_GAIN, GLOBAL_GAIN, GLOBAL_REFINEMENT = 1e-3, 1e-4, 1.3
 """Share of its cost that a step of an adjustment must gain, or it was the last: of a few photos, of all. All are
@@ -91,7 +91,7 @@ def map_globally(
         "seed": seed,
         "names": list(names),
     }
-    return _map_apart("sfm_app.colmap.global_mapping", task, "mapping all photos at once", token)
+    return _map_apart("sfm_app.colmap.processes.global_mapping", task, "mapping all photos at once", token)
 
 
 def map_as_colmap_does(
@@ -102,7 +102,7 @@ def map_as_colmap_does(
     Nothing of ours but the matches and the guess enters; arguments, result and errors as `map_globally`.
     """
     task: MappingTask = {"scratch": str(scratch), "photos": str(photo_dir), "seed": seed}
-    return _map_apart("sfm_app.colmap.baseline_mapping", task, "mapping photos by its defaults", token)
+    return _map_apart("sfm_app.colmap.processes.baseline_mapping", task, "mapping photos by its defaults", token)
 
 
 def _map_apart(module: str, task: MappingTask, doing: str, token: Cancellation) -> pycolmap.Reconstruction | None:

@@ -7,7 +7,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from sfm_app.colmap.backend import backend
-from sfm_app.colmap.worker_process import FuseTask, PoissonTask, SimplifyTask, finished
+from sfm_app.colmap.processes.worker_process import FuseTask, PoissonTask, SimplifyTask, finished
 from sfm_app.types import Surface
 
 FUSED = "fused.ply"
@@ -39,7 +39,7 @@ def fuse(
         "box": box.tolist(),
         "cache_gb": cache_gb,
     }
-    finished("sfm_app.colmap.surface_process", task, "fusing depth maps")
+    finished("sfm_app.colmap.processes.surface_process", task, "fusing depth maps")
     target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; nobody asks
 
 
@@ -65,7 +65,7 @@ def poisson(folder: Path, depth: int) -> Surface:
         "target": str(path),
         "depth": max(depth, FULL_DEPTH),
     }
-    finished("sfm_app.colmap.surface_process", task, "finding the surface")
+    finished("sfm_app.colmap.processes.surface_process", task, "finding the surface")
     surface = _read(path)
     path.unlink()
     return surface
@@ -91,7 +91,7 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
         "share": share,
         "max_error": max_error,
     }
-    finished("sfm_app.colmap.surface_process", task, "simplifying the surface")
+    finished("sfm_app.colmap.processes.surface_process", task, "simplifying the surface")
     simple = _read(found)
     given.unlink()
     found.unlink()

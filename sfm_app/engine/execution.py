@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 from itertools import dropwhile
 
 from sfm_app.colmap.backend import check_written
-from sfm_app.context import RunContext
-from sfm_app.cost_estimate import plan_within
 from sfm_app.engine.run_log import logged, peak_memory_mb
 from sfm_app.engine.stage import Product, Products, Stage
 from sfm_app.engine.staleness import OTHER_PHOTOS, fingerprint_of, made_with, manifest_head, why_again
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
-from sfm_app.manifest import StageRecord
 from sfm_app.photos import Source
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.cost_estimate import plan_within
+from sfm_app.runtime.manifest import StageRecord
 from sfm_app.types import PhotoSet
 
 logger = logging.getLogger("sfm_app")

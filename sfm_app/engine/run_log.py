@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from sfm_app.context import RunContext
+from sfm_app.runtime.context import RunContext
 
 logger = logging.getLogger("sfm_app")
 

@@ -5,10 +5,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Generic, TypeVar, cast
 
-from sfm_app.context import RunContext
 from sfm_app.errors import DamagedProductError, InputError
 from sfm_app.photos import Source
-from sfm_app.workspace import Workspace
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import Workspace
 
 Product = TypeVar("Product")
 Product_co = TypeVar("Product_co", covariant=True)

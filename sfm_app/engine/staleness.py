@@ -6,9 +6,9 @@ from importlib.metadata import version
 from typing import Any
 
 from sfm_app.colmap.backend import versions as colmap_versions
-from sfm_app.context import RunContext
 from sfm_app.engine.stage import Stage
 from sfm_app.hashing import fingerprint
+from sfm_app.runtime.context import RunContext
 
 OTHER_PHOTOS = "the photos have changed"
 CHANGES = 3

@@ -3,9 +3,7 @@
 from sfm_app.photos.camera_groups import grouped
 from sfm_app.photos.decode import UnreadableError, read_picture, upright
 from sfm_app.photos.duplicates import without_copies
-from sfm_app.photos.feature_tracking import Follower, TrackedFrame
 from sfm_app.photos.files import list_files, place_of
-from sfm_app.photos.keyframe_selection import choose
 from sfm_app.photos.masks import (
     MASK_HINT,
     find_mask,
@@ -22,8 +20,10 @@ from sfm_app.photos.quality_filter import screened
 from sfm_app.photos.source import Source, read_source
 from sfm_app.photos.staging import lay_out, stored_names
 from sfm_app.photos.thumbnail_stats import Glance
-from sfm_app.photos.video import opened
-from sfm_app.photos.video_formats import head_of, is_video
+from sfm_app.photos.video.feature_tracking import Follower, TrackedFrame
+from sfm_app.photos.video.keyframe_selection import choose
+from sfm_app.photos.video.video_formats import head_of, is_video
+from sfm_app.photos.video.video_reader import opened
 
 __all__ = [
     "MASK_HINT",

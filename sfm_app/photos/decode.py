@@ -15,7 +15,7 @@ from PIL import Image, UnidentifiedImageError, features
 
 from sfm_app.photos.exif import EXIF_IFD, GPS_IFD, orientation, printable
 from sfm_app.photos.tiff import complaints
-from sfm_app.photos.video_formats import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
+from sfm_app.photos.video.video_formats import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
 """What is always read."""

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from sfm_app.errors import InputError
-from sfm_app.photos.video_formats import ENDINGS
+from sfm_app.photos.video.video_formats import ENDINGS
 
 HINT = "name the folder that holds the photos"
 VIDEOS = "MP4, MOV, MKV, WebM, AVI and MPEG are read: copy the file again, or save it as MP4"

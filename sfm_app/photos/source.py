@@ -10,7 +10,7 @@ from sfm_app.errors import ConfigError, InputError
 from sfm_app.hashing import fingerprint
 from sfm_app.photos.files import list_files, place_of
 from sfm_app.photos.masks import list_masks
-from sfm_app.photos.video_formats import head_of, is_video
+from sfm_app.photos.video.video_formats import head_of, is_video
 from sfm_app.settings import PhotoSettings, Settings
 from sfm_app.types import PhotoSet
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.model import focal_px, move, photos_of, posed_photos, seen_points, somewhere, viewing_rays
 from sfm_app.colmap.types import Reconstruction
-from sfm_app.context import RunContext
 from sfm_app.errors import NumericalError
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.numerical import FAILURES, Json, reason_of
@@ -23,6 +22,7 @@ from sfm_app.orientation.line_segments import line_segments
 from sfm_app.orientation.up_cues import small_picture
 from sfm_app.orientation.up_direction import Scenery, odds
 from sfm_app.orientation.vanishing_points import Segments, joined, segment_planes
+from sfm_app.runtime.context import RunContext
 from sfm_app.types import GpsPosition, MatchGraph
 
 logger = logging.getLogger("sfm_app")

@@ -13,10 +13,10 @@ from sfm_app.colmap.backend import backend, interruptible
 from sfm_app.colmap.database import keep_raw_matches, write_calibrations
 from sfm_app.colmap.mapping import copy_database, map_as_colmap_does
 from sfm_app.colmap.types import Reconstruction
-from sfm_app.context import RunContext
 from sfm_app.errors import BackendError
 from sfm_app.geometry.camera import GUESSED_FOCAL, guessed_camera_matrix
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, judged
+from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, ViewGraph
 from sfm_app.types.epipolar import EpipolarFit
 

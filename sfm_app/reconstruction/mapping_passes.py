@@ -8,7 +8,6 @@ import numpy as np
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
 from sfm_app.colmap.model import cameras_of, part_of, photos_of
-from sfm_app.context import RunContext
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
 from sfm_app.reconstruction.baseline import guessed_intrinsics, leaves_many_out, map_baseline, why_thin
 from sfm_app.reconstruction.camera_per_photo import (
@@ -24,6 +23,7 @@ from sfm_app.reconstruction.model_merge import join_models
 from sfm_app.reconstruction.model_split import sound_parts
 from sfm_app.reconstruction.support import model_poses
 from sfm_app.reconstruction.unregistered import names_of
+from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
 
 LEARNED_FROM = 3

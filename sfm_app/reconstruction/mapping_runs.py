@@ -15,12 +15,12 @@ from sfm_app.colmap.backend import backend, interruptible
 from sfm_app.colmap.mapping import copy_database, map_globally, map_incrementally
 from sfm_app.colmap.model import model_from_seed
 from sfm_app.colmap.types import Cancellation, CancellationToken, Reconstruction
-from sfm_app.context import RunContext
 from sfm_app.errors import BackendError
 from sfm_app.numerical import FAILURES, reason_of
 from sfm_app.reconstruction.initial_pairs import Candidate, rank_seeds, seed_of
 from sfm_app.reconstruction.support import Explained, explained_pairs, support
 from sfm_app.reconstruction.unregistered import names_of
+from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph, ViewGraph
 
 logger = logging.getLogger("sfm_app")

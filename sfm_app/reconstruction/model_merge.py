@@ -16,10 +16,10 @@ from sfm_app.colmap.backend import backend
 from sfm_app.colmap.bundle import adjusted_or_as_it_was
 from sfm_app.colmap.model import both, photos_of, places_of_keypoints
 from sfm_app.colmap.types import Reconstruction
-from sfm_app.context import RunContext
 from sfm_app.geometry.similarity import robust_similarity
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, judged
 from sfm_app.reconstruction.model_split import sound_parts
+from sfm_app.runtime.context import RunContext
 from sfm_app.types import MatchGraph, ViewGraph
 
 FloatArray = NDArray[np.float64]

@@ -9,22 +9,22 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
-from sfm_app.calibrating import find_intrinsics
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import read_features, write_match_graph
 from sfm_app.colmap.model import photos_of
-from sfm_app.context import RunContext
 from sfm_app.errors import SfmError
-from sfm_app.fitting import fit_pairs, graph_of
-from sfm_app.matching import fill_database
+from sfm_app.estimation.calibrating import find_intrinsics
+from sfm_app.estimation.fitting import fit_pairs, graph_of
+from sfm_app.estimation.matching import fill_database
 from sfm_app.numerical import Json
 from sfm_app.plugins import SIFT_DSP
 from sfm_app.reconstruction.added_matches import with_added
 from sfm_app.reconstruction.mapping_passes import Outcome, reconstruct
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, better, judged
 from sfm_app.reconstruction.unregistered import names_of
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import Aside
 from sfm_app.types import Intrinsics, MatchGraph, PairId, ViewGraph
-from sfm_app.workspace import Aside
 
 FOLDER, FEATURES = "second_look", "features"
 LOOSE_RATIO = 0.85

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sfm_app.calibrating import camera_pairs
 from sfm_app.errors import ConfigError
+from sfm_app.estimation.calibrating import camera_pairs
 from sfm_app.report.words import center_text, focal_text, held_text, lens_text, verdict
 from sfm_app.selfcal.consensus.consensus import Consensus
 from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare

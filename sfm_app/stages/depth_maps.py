@@ -22,12 +22,12 @@ from sfm_app.colmap.dense import (
     write_fusion_views,
 )
 from sfm_app.colmap.masks import mask_undistorter
-from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.hashing import fingerprint
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.stereo import DepthTask, View, rank_neighbors
 from sfm_app.types import Rejected, Scene
-from sfm_app.workspace import Workspace
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 

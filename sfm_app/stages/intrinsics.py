@@ -3,12 +3,12 @@
 import json
 
 from sfm_app.atomic_io import replacing
-from sfm_app.calibrating import find_intrinsics
-from sfm_app.context import RunContext
+from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.hashing import digest_files
 from sfm_app.numerical import json_text
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, ViewGraph
-from sfm_app.workspace import Workspace
 
 
 def make(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:

@@ -3,11 +3,11 @@
 from sfm_app.atomic_io import is_made_from
 from sfm_app.colmap.backend import backend
 from sfm_app.colmap.database import create_database, digest_matches, is_sound, read_match_graph, remove_database
-from sfm_app.context import RunContext
-from sfm_app.diagnosis import NOTHING_MATCHED, why_no_scene
-from sfm_app.matching import fill_database
+from sfm_app.estimation.diagnosis import NOTHING_MATCHED, why_no_scene
+from sfm_app.estimation.matching import fill_database
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import MatchGraph, PhotoSet
-from sfm_app.workspace import Workspace
 
 
 def make(photos: PhotoSet, run: RunContext) -> MatchGraph:

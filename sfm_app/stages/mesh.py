@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from sfm_app.atomic_io import is_made_from, replacing
 from sfm_app.colmap.dense import map_file, read_color, read_depth, read_views
 from sfm_app.colmap.surface import FUSED, fuse, poisson, read_fused, simplify
-from sfm_app.context import RunContext
-from sfm_app.cost_estimate import cache_gb
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.triangles import median_edge, vertex_normals
 from sfm_app.hashing import digest_files, load_arrays
@@ -24,12 +22,14 @@ from sfm_app.meshing import (
     sample_colors,
     trim,
 )
-from sfm_app.parallel import ordered_map
 from sfm_app.progress import track
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.cost_estimate import cache_gb
+from sfm_app.runtime.parallel import ordered_map
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import MeshSettings
 from sfm_app.stereo import View, region
 from sfm_app.types import Surface
-from sfm_app.workspace import Workspace
 
 SURFACE = "surface.npz"
 WHOLE = "fused.txt"

@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.atomic_io import replacing
-from sfm_app.context import RunContext
-from sfm_app.cost_estimate import megapixels_within
 from sfm_app.errors import InputError
 from sfm_app.hashing import digest_files, is_below
 from sfm_app.photos import (
@@ -33,10 +31,12 @@ from sfm_app.photos import (
     unused_masks,
     without_copies,
 )
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.cost_estimate import megapixels_within
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import PhotoSettings
 from sfm_app.stages.video_frames import video_frames
 from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
-from sfm_app.workspace import Workspace
 
 
 def make(source: Source, run: RunContext) -> PhotoSet:

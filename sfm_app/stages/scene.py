@@ -11,9 +11,8 @@ from sfm_app.colmap.backend import backend, check_written
 from sfm_app.colmap.bundle import Adjusted, adjusted_or_as_it_was
 from sfm_app.colmap.model import Refined, color, photos_of, posed_images, read_scene, sparse_model
 from sfm_app.colmap.types import Reconstruction
-from sfm_app.context import RunContext
-from sfm_app.diagnosis import why_no_depth, why_no_scene
 from sfm_app.errors import ReconstructionError
+from sfm_app.estimation.diagnosis import why_no_depth, why_no_scene
 from sfm_app.hashing import digest_files
 from sfm_app.numerical import Json, json_text
 from sfm_app.reconstruction import Found, Outcome, look_again, reconstruct
@@ -21,8 +20,9 @@ from sfm_app.reconstruction.align_upright import look_at_photos, orient_or_leave
 from sfm_app.reconstruction.look_alikes import in_words, jumps
 from sfm_app.reconstruction.unregistered import left_out, names_of
 from sfm_app.reconstruction.weak_scale import weakly_joined
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import MAPPING, Aside, Workspace
 from sfm_app.types import Intrinsics, MatchGraph, Scene, ViewGraph
-from sfm_app.workspace import MAPPING, Aside, Workspace
 
 POINTS = "points"
 """Name of the files with the points and cameras."""

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.atomic_io import can_go_on, mark_unfinished, replacing
-from sfm_app.context import RunContext
 from sfm_app.hashing import digest_files, fingerprint, load_arrays
 from sfm_app.meshing.occlusion import Occluders
 from sfm_app.photos import read_used, without_masked
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.texture import PhotoView, photo_view, texture_surface
 from sfm_app.types import Model, Scene, Surface, Texture
-from sfm_app.workspace import Workspace
 
 TEXTURE = "texture.npz"
 PARTS = "parts"

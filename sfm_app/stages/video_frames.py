@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from sfm_app.atomic_io import replacing
-from sfm_app.context import RunContext
 from sfm_app.errors import InputError
 from sfm_app.photos import Follower, UnreadableError, choose, opened
 from sfm_app.progress import track
+from sfm_app.runtime.context import RunContext
 
 HINT = "walk around while you film, slowly, and keep the thing in view"
 DAMAGED = "play it to see whether it is whole; save it as MP4 with H.264"

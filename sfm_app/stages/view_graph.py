@@ -5,12 +5,12 @@ import shutil
 import numpy as np
 
 from sfm_app.atomic_io import replacing
-from sfm_app.context import RunContext
-from sfm_app.diagnosis import why_no_scene
-from sfm_app.fitting import fit_pairs, graph_of
+from sfm_app.estimation.diagnosis import why_no_scene
+from sfm_app.estimation.fitting import fit_pairs, graph_of
 from sfm_app.hashing import digest_files, load_arrays
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import MatchGraph, ViewGraph
-from sfm_app.workspace import Workspace
 
 
 def make(matches: MatchGraph, run: RunContext) -> ViewGraph:

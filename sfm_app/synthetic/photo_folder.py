@@ -13,9 +13,9 @@ from PIL import Image
 
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.progress import Progress, Silent, track
-from sfm_app.synthetic.bodies import SyntheticScene
 from sfm_app.synthetic.cameras import Camera, Views, camera_center
 from sfm_app.synthetic.render import GAMMA, prepare, render_scene
+from sfm_app.synthetic.scenes.bodies import SyntheticScene
 
 FloatArray = NDArray[np.float64]
 TRUTH_FILE, SURFACE_FILE = "truth.json", "surface.ply"

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.meshing.open3d import load_open3d
-from sfm_app.synthetic.bodies import SyntheticScene
 from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
-from sfm_app.synthetic.textures import mixture
+from sfm_app.synthetic.scenes.bodies import SyntheticScene
+from sfm_app.synthetic.scenes.textures import mixture
 
 FloatArray = NDArray[np.float64]
 NO_HIT = 0xFFFFFFFF

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.errors import InputError
-from sfm_app.synthetic.bodies import SyntheticScene
 from sfm_app.synthetic.cameras import (
     ArcOptions,
     Camera,
@@ -29,7 +28,8 @@ from sfm_app.synthetic.cameras import (
 )
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, develop
 from sfm_app.synthetic.render import PreparedScene, cast, prepare, render_scene
-from sfm_app.synthetic.strewn import faded, heap_of_things, moving_thing, panelled, twins, wall
+from sfm_app.synthetic.scenes.bodies import SyntheticScene
+from sfm_app.synthetic.scenes.strewn import faded, heap_of_things, moving_thing, panelled, twins, wall
 
 FloatArray = NDArray[np.float64]
 Random = np.random.Generator

@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.triangles import select_faces
 from sfm_app.settings import TextureSettings
+from sfm_app.texture.appearance.exposure import photo_gains
+from sfm_app.texture.appearance.photo_consistency import strangers
+from sfm_app.texture.appearance.view_scoring import FaceView, Hidden, look, sharpness_factors
 from sfm_app.texture.atlas import Pages
 from sfm_app.texture.blending import Blend, blend_weights
 from sfm_app.texture.charts import Charts, make_charts, without_specks
-from sfm_app.texture.exposure import photo_gains
 from sfm_app.texture.facets import NONE, Facets, IntArray, facets
 from sfm_app.texture.packing import Layout, pack
 from sfm_app.texture.painting import Canvas, canvas, fill_background, finished, paint
-from sfm_app.texture.photo_consistency import strangers
 from sfm_app.texture.seam_leveling import level
 from sfm_app.texture.store import Store
 from sfm_app.texture.unseen_faces import along_a_curve, block_sizes, square_texels, squares, vertex_colors
-from sfm_app.texture.view_scoring import FaceView, Hidden, look, sharpness_factors
 from sfm_app.texture.view_selection import choose_photos
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture

@@ -6,9 +6,9 @@ from PIL import Image
 
 from sfm_app.api import opened_run
 from sfm_app.colmap.database import create_database, read_match_graph
+from sfm_app.estimation.matching import fill_database
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.matching import fill_database
 from sfm_app.photos import save_used
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings

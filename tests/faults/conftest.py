@@ -10,7 +10,7 @@ import pytest
 
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
-from sfm_app.synthetic.scenes import build_scene
+from sfm_app.synthetic.scenes.scene_catalog import build_scene
 
 QUICK = ("--quality", "draft", "--set", "depth.max_image_size_px=240", "--faces", "3000", "-q", "--workers", "2")
 

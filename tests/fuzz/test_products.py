@@ -8,16 +8,16 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from sfm_app.context import RunContext
 from sfm_app.engine.stage import Products
 from sfm_app.engine.staleness import why_again
 from sfm_app.errors import SfmError
-from sfm_app.manifest import StageRecord
 from sfm_app.photos import read_source
 from sfm_app.pipeline import NAMES, STAGES, stored_model
 from sfm_app.plugins import load_plugins
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.manifest import StageRecord
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.workspace import Workspace
 
 from .mutations import ANYTHING, damaged, text_values
 
@@ -277,7 +277,7 @@ def test_links_out_of_the_output_folder_are_refused(kept, name):
 
 
 def test_parts_of_a_killed_run_that_are_damaged_are_made_again(tmp_path):
-    from sfm_app.fitting import read_part, write_part
+    from sfm_app.estimation.fitting import read_part, write_part
     from sfm_app.types import EpipolarFit, Rejected
 
     fit = EpipolarFit(np.eye(3), np.ones(40, bool), np.ones(40), 7, 0.3)

@@ -13,10 +13,10 @@ from sfm_app.cli import main
 from sfm_app.colmap.database import read_match_graph
 from sfm_app.colmap.dense import read_depth, read_views
 from sfm_app.pipeline import NAMES
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages.texture import read_texture
 from sfm_app.types import Photo, PhotoSet
-from sfm_app.workspace import Workspace
 
 SIZE = (128, 96)
 

@@ -13,7 +13,7 @@ from sfm_app.cli import main
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera, panorama
 from sfm_app.synthetic.compare import focal_error_percent
 from sfm_app.synthetic.photo_folder import PhotoOptions, write_photo_folder
-from sfm_app.synthetic.scenes import build_scene
+from sfm_app.synthetic.scenes.scene_catalog import build_scene
 
 CAMERA = make_camera(480, 360)
 QUICK = PhotoOptions(supersampling=1)

@@ -13,7 +13,7 @@ from filelock import FileLock
 from PIL import Image, features
 
 from sfm_app.cli import main
-from sfm_app.workspace import LOCK
+from sfm_app.runtime.workspace import LOCK
 
 SIZE = (128, 96)
 USED = "used"

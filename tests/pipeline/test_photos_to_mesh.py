@@ -17,12 +17,12 @@ import sfm_app
 from sfm_app.cli import main
 from sfm_app.colmap.dense import DenseStore
 from sfm_app.pipeline import NAMES
+from sfm_app.runtime.workspace import LOCK, Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages.texture import PARTS, Files
 from sfm_app.synthetic.cameras import camera_center
 from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_error
 from sfm_app.texture import atlas
-from sfm_app.workspace import LOCK, Workspace
 
 DRAFT = Settings.from_mapping({"quality": "draft", "depth": {"max_image_size_px": 480}})
 

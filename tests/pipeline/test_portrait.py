@@ -10,7 +10,7 @@ import sfm_app
 from sfm_app.settings import Settings
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera
 from sfm_app.synthetic.photo_folder import write_photo_folder
-from sfm_app.synthetic.scenes import build_scene
+from sfm_app.synthetic.scenes.scene_catalog import build_scene
 
 SENSOR_FROM_UPRIGHT = {90: [[0, 1, 0], [-1, 0, 0], [0, 0, 1]], 270: [[0, -1, 0], [1, 0, 0], [0, 0, 1]]}
 """By how far the picture has to be turned clockwise to be upright."""

@@ -9,8 +9,8 @@ import pytest
 from sfm_app.colmap.backend import backend, pycolmap
 from sfm_app.errors import BackendError, ConfigError, NumericalError
 from sfm_app.geometry.similarity import robust_similarity
-from sfm_app.manifest import Manifest, StageRecord
 from sfm_app.numerical import FAILURES, finite_only, json_text, reason_of
+from sfm_app.runtime.manifest import Manifest, StageRecord
 from sfm_app.types import Calibration
 
 OURS = {

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from sfm_app.colmap.worker_process import relay, started
+from sfm_app.colmap.processes.worker_process import relay, started
 from sfm_app.errors import BackendError
 
 pytestmark = pytest.mark.slow
 
 CHILD = """
 import os, signal, sys, time
-from sfm_app.colmap.worker_process import Reported, report, served
+from sfm_app.colmap.processes.worker_process import Reported, report, served
 
 def work(task):
     {work}
@@ -106,7 +106,7 @@ def test_a_process_is_ended_with_the_block(child):
 
 def test_a_process_ends_when_the_one_that_started_it_is_killed(child):
     parent = (
-        "import sys; from sfm_app.colmap.worker_process import started\n"
+        "import sys; from sfm_app.colmap.processes.worker_process import started\n"
         "with started(sys.argv[1], {}) as process:\n"
         "    for message in process.messages(): print(message['me'], flush=True)"
     )

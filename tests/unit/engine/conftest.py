@@ -4,10 +4,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from sfm_app.context import RunContext
-from sfm_app.parallel import make_executor
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.parallel import make_executor
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.workspace import Workspace
 
 
 @pytest.fixture

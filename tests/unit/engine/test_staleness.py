@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from sfm_app.engine.stage import Stage
 from sfm_app.engine.staleness import fingerprint_of, made_with, manifest_head, value_of, why_again
-from sfm_app.manifest import StageRecord
+from sfm_app.runtime.manifest import StageRecord
 from sfm_app.settings import Settings
 
 STAGE = Stage("match_graph", (), ("matching", "photos.cameras", "seed"), ("x.txt",), None, None, None)

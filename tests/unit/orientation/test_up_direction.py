@@ -16,7 +16,7 @@ from sfm_app.orientation.up_cues import (
 from sfm_app.orientation.up_direction import CUES, MOST, Cue, Scenery, odds, stand
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at, pixel_rays
 from sfm_app.synthetic.render import GAMMA, cast, prepare, render_scene
-from sfm_app.synthetic.scenes import build_scene, scene_views
+from sfm_app.synthetic.scenes.scene_catalog import build_scene, scene_views
 
 UP = np.array([0.0, 1.0, 0.0])
 VIEW_AXIS = np.array([0.0, 0.0, 1.0])

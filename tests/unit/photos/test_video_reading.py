@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm_app.photos import UnreadableError, head_of, is_video, opened, video
+from sfm_app.photos import UnreadableError, head_of, is_video, opened
+from sfm_app.photos.video.video_reader import video_reader as video
 
 pytestmark = pytest.mark.slow
 

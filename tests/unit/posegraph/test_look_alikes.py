@@ -9,7 +9,7 @@ from sfm_app.posegraph.coverage import backbone
 from sfm_app.posegraph.graph import LOOKS_ALIKE
 from sfm_app.posegraph.look_alikes import joins_of, tell_apart
 from sfm_app.synthetic.cameras import look_at
-from sfm_app.synthetic.look_alikes import gathered, matched
+from sfm_app.synthetic.scenes.look_alikes import gathered, matched
 from sfm_app.types import EpipolarFit, Intrinsics, ViewGraph
 
 

@@ -14,9 +14,9 @@ from sfm_app.colmap.database import opened
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.progress import Silent
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchedImage, MatchGraph, ViewGraph
-from sfm_app.workspace import Workspace
 
 FOCAL, WIDTH, HEIGHT = 1280.0, 1024, 768
 

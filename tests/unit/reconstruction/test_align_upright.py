@@ -13,9 +13,9 @@ from sfm_app.orientation.georeference import enu_m, position_at
 from sfm_app.orientation.gravity import up_direction
 from sfm_app.reconstruction import align_upright
 from sfm_app.reconstruction.align_upright import look_at, look_at_photos, orient, orient_or_leave, turned
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.synthetic.cameras import arc, make_camera
 from sfm_app.types import GpsPosition, MatchedImage, MatchGraph
-from sfm_app.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 

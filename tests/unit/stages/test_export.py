@@ -2,13 +2,13 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from sfm_app.context import RunContext
 from sfm_app.formats import EXPORTERS
 from sfm_app.formats.pages import JPEG_QUALITY
 from sfm_app.plugins import load_plugins
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import export
-from sfm_app.workspace import Workspace
 
 
 @pytest.fixture

@@ -8,16 +8,16 @@ import pytest
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import map_file, read_views, write_fusion_views, write_maps
-from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.triangles import edges_of, vertex_normals
-from sfm_app.parallel import make_executor
 from sfm_app.plugins import load_plugins
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.parallel import make_executor
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import mesh
 from sfm_app.stereo import DepthMap
 from sfm_app.synthetic.cameras import look_at
-from sfm_app.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.calibrating import camera_pairs, of_whole_photo, photo_pairs
+from sfm_app.estimation.calibrating import camera_pairs, of_whole_photo, photo_pairs
 from sfm_app.selfcal import CalibratedCamera, pair_weights
 from sfm_app.selfcal.results import guessed
 from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, Rejected, ViewGraph

@@ -6,14 +6,14 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from sfm_app.context import RunContext
 from sfm_app.errors import InputError
-from sfm_app.parallel import make_executor
 from sfm_app.photos import read_source
 from sfm_app.plugins import load_plugins
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.parallel import make_executor
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import photos
-from sfm_app.workspace import Workspace
 
 
 def pixels(seed=0):

@@ -13,13 +13,14 @@ from sfm_app.colmap import bundle
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import opened
 from sfm_app.colmap.model import part_of, photos_of
-from sfm_app.context import RunContext
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.plugins import load_plugins
 from sfm_app.reconstruction import Outcome
 from sfm_app.reconstruction.mapping_runs import Attempt
 from sfm_app.reconstruction.support import Explained
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.workspace import MAPPING, Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import scene
 from sfm_app.types import (
@@ -34,7 +35,6 @@ from sfm_app.types import (
     Scene,
     ViewGraph,
 )  # fmt: skip
-from sfm_app.workspace import MAPPING, Workspace
 
 pytestmark = pytest.mark.slow
 

@@ -6,12 +6,12 @@ import pytest
 from PIL import Image
 
 from sfm_app.photos import save_used
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import texture
 from sfm_app.stages.texture import Files, read_photo, read_texture, save_texture, surface_digest
 from sfm_app.texture import PhotoView
 from sfm_app.types import CameraModel, Model, Surface, Texture
-from sfm_app.workspace import Workspace
 
 POSE = np.eye(3, 4)
 SURFACE = Surface(np.eye(3), np.array([[0, 1, 2]]), np.full((3, 3), 9, np.uint8))

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.context import RunContext
 from sfm_app.errors import InputError
-from sfm_app.parallel import make_executor
 from sfm_app.plugins import load_plugins
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.parallel import make_executor
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages.video_frames import stem_of, video_frames
-from sfm_app.workspace import Workspace
 
 pytestmark = pytest.mark.slow
 

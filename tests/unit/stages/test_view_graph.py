@@ -1,15 +1,15 @@
 import numpy as np
 import pytest
 
-from sfm_app import fitting
-from sfm_app.context import RunContext
-from sfm_app.parallel import make_executor
+from sfm_app.estimation import fitting
 from sfm_app.plugins import load_plugins
 from sfm_app.ransac.degeneracy.watermark import ONLY_A_LOGO
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.parallel import make_executor
+from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import view_graph
 from sfm_app.types import MatchedImage, MatchGraph
-from sfm_app.workspace import Workspace
 
 rng = np.random.default_rng(7)
 STAMP = rng.uniform([480, 440], [620, 465], (40, 2))

@@ -3,11 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.synthetic.bodies import Body, SyntheticScene
 from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera, pixel_rays
 from sfm_app.synthetic.render import cast, prepare, ray_caster, render_scene
-from sfm_app.synthetic.shapes import box
-from sfm_app.synthetic.textures import Material
+from sfm_app.synthetic.scenes.bodies import Body, SyntheticScene
+from sfm_app.synthetic.scenes.shapes import box
+from sfm_app.synthetic.scenes.textures import Material
 
 pytestmark = pytest.mark.slow
 

@@ -3,11 +3,11 @@ import pytest
 
 from sfm_app.errors import ConfigError
 from sfm_app.synthetic.cameras import PastOptions, camera_center, make_camera, past, pixel_rays
-from sfm_app.synthetic.corner import PLASTER, corner
 from sfm_app.synthetic.render import GAMMA, cast, prepare, ray_caster, render_scene
-from sfm_app.synthetic.scenes import WALKS, build_scene, scene_views
-from sfm_app.synthetic.shapes import assembled, ball, box, carved, waves
-from sfm_app.synthetic.statue import bust_field
+from sfm_app.synthetic.scenes.corner import PLASTER, corner
+from sfm_app.synthetic.scenes.scene_catalog import WALKS, build_scene, scene_views
+from sfm_app.synthetic.scenes.shapes import assembled, ball, box, carved, waves
+from sfm_app.synthetic.scenes.statue import bust_field
 
 pytestmark = pytest.mark.slow
 

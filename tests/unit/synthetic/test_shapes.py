@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from sfm_app.errors import ConfigError
-from sfm_app.synthetic.scenes import SCENES, build_scene
-from sfm_app.synthetic.shapes import arch, ball, box, ground, revolved, torus
+from sfm_app.synthetic.scenes.scene_catalog import SCENES, build_scene
+from sfm_app.synthetic.scenes.shapes import arch, ball, box, ground, revolved, torus
 
 VASE = np.array([[0.0, 0.0], [0.3, 0.0], [0.2, 0.5], [0.4, 1.0], [0.0, 1.0]])
 

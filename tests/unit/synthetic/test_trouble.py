@@ -5,9 +5,9 @@ import pytest
 from PIL import Image
 
 from sfm_app.errors import InputError
-from sfm_app.synthetic.bodies import Body
 from sfm_app.synthetic.cameras import Views, camera_center, make_camera, pixel_rays
-from sfm_app.synthetic.strewn import faded, moving_thing, twins
+from sfm_app.synthetic.scenes.bodies import Body
+from sfm_app.synthetic.scenes.strewn import faded, moving_thing, twins
 from sfm_app.synthetic.trouble import (
     KINDS,
     PHOTOS,

@@ -11,17 +11,17 @@ from painted_box import around, box
 
 from sfm_app.errors import ReconstructionError
 from sfm_app.texture import PhotoView, photo_view
+from sfm_app.texture.appearance.exposure import photo_gains
+from sfm_app.texture.appearance.median import median
+from sfm_app.texture.appearance.photo_consistency import strangers
+from sfm_app.texture.appearance.view_scoring import sharpness, sharpness_factors
 from sfm_app.texture.blending import blend_weights
 from sfm_app.texture.charts import Charts, components, folds, without_specks
-from sfm_app.texture.exposure import photo_gains
 from sfm_app.texture.facets import NONE, facets
-from sfm_app.texture.median import median
 from sfm_app.texture.packing import MARGIN, pack
 from sfm_app.texture.painting import canvas, fill_background
-from sfm_app.texture.photo_consistency import strangers
 from sfm_app.texture.seam_leveling import level, solve_ties
 from sfm_app.texture.unseen_faces import along_a_curve, block_sizes, square_texels, squares
-from sfm_app.texture.view_scoring import sharpness, sharpness_factors
 from sfm_app.texture.view_selection import PRICE_OF_DETAIL, choose_photos
 from sfm_app.texture.views import project, sample
 from sfm_app.types import CameraModel, Surface

@@ -1,0 +1,1 @@
+"""Parts of COLMAP that run as processes of their own."""

@@ -1,0 +1,138 @@
+"""COLMAP's SIFT features and raw matches, on CPU, without its geometric verification; see `features.py`."""
+
+import math
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from sfm_app.colmap.backend import counted, plain, pycolmap
+from sfm_app.colmap.database import opened
+from sfm_app.colmap.processes.worker_process import FeatureTask, Reported, SiftOption, report, served
+from sfm_app.numerical import Json
+from sfm_app.settings import MatchSettings
+
+
+def work(task: FeatureTask) -> None:
+    """Find features of all photos and match every photo with every other; reports the options in force."""
+    database, photo_dir, names = Path(task["database"]), Path(task["photos"]), task["names"]
+    options = MatchSettings.model_validate(task["options"])
+    reader = pycolmap.ImageReaderOptions()
+    if task["masks"]:
+        reader.mask_path = Path(task["masks"])
+    extraction = extraction_options(options, task["sift"], task["workers"])
+    report(extraction=extract(database, photo_dir, names, reader, extraction))
+    pairs = None if task["pairs"] is None else [(int(a), int(b)) for a, b in task["pairs"]]
+    report(matching=match(database, len(names), options, task["workers"], pairs))
+
+
+def extraction_options(
+    options: MatchSettings, sift: Mapping[str, SiftOption], workers: int
+) -> pycolmap.FeatureExtractionOptions:
+    """Return COLMAP's, with these options of its SIFT."""
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.max_image_size = options.max_image_size_px
+    extraction.num_threads = workers
+    extraction.use_gpu = False
+    extraction.sift.max_num_features = options.max_features
+    for name, value in sift.items():
+        setattr(extraction.sift, name, value)
+    return extraction
+
+
+def extract(
+    database: Path,
+    photo_dir: Path,
+    names: Sequence[str],
+    reader: pycolmap.ImageReaderOptions,
+    extraction: pycolmap.FeatureExtractionOptions,
+) -> dict[str, Json]:
+    """Find SIFT features of all photos."""
+    wanted = set(names)
+    with opened(database) as before:
+        ids = [image.image_id for image in before.read_all_images() if image.name in wanted]
+
+    def call(token: pycolmap.CancellationToken) -> None:
+        pycolmap.extract_features(
+            database, photo_dir, list(names), reader_options=reader, extraction_options=extraction,
+            device=pycolmap.Device.cpu, cancellation_token=token,
+        )  # fmt: skip
+
+    def done(reader: pycolmap.Database) -> int:
+        return sum(reader.exists_keypoints(image_id) for image_id in ids)
+
+    _counted(call, database, done, "features", len(names))
+    return plain(extraction.todict())
+
+
+def match(
+    database: Path, photos: int, options: MatchSettings, workers: int, pairs: Sequence[tuple[int, int]] | None
+) -> dict[str, Json]:
+    """Match these pairs of photos, or every photo with every other."""
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.skip_geometric_verification = True
+    matching.num_threads = workers
+    matching.use_gpu = False
+    matching.sift.max_ratio = options.max_ratio
+    if pairs is not None:
+        _match_pairs(database, matching, pairs)
+        return plain(matching.todict())
+
+    def call(token: pycolmap.CancellationToken) -> None:
+        pycolmap.match_exhaustive(
+            database, matching_options=matching, device=pycolmap.Device.cpu, cancellation_token=token
+        )
+
+    def done(reader: pycolmap.Database) -> int:
+        return int(reader.num_matched_image_pairs())
+
+    _counted(call, database, done, "matching", math.comb(photos, 2))
+    return plain(matching.todict())
+
+
+def _match_pairs(database: Path, matching: pycolmap.FeatureMatchingOptions, pairs: Sequence[tuple[int, int]]) -> None:
+    """Match these pairs in a copy where photos are named by their ids: COLMAP's lists end names at blanks."""
+    with tempfile.TemporaryDirectory(dir=database.parent, prefix=".matching") as folder:
+        copy, pairing = Path(folder) / database.name, pycolmap.ImportedPairingOptions()
+        shutil.copyfile(database, copy)
+        with opened(copy) as renamed:
+            renamed.clear_two_view_geometries()
+            renamed.clear_matches()
+            for image in renamed.read_all_images():
+                image.name = str(image.image_id)
+                renamed.update_image(image)
+        pairing.match_list_path = Path(folder) / "pairs.txt"
+        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="ascii")
+
+        def call(token: pycolmap.CancellationToken) -> None:
+            pycolmap.match_image_pairs(
+                copy, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu,
+                cancellation_token=token,
+            )  # fmt: skip
+
+        _counted(call, copy, lambda reader: int(reader.num_matched_image_pairs()), "matching", len(pairs))
+        with opened(copy) as found:
+            rows = {pair: found.read_matches(*pair) for pair in pairs}
+    with opened(database) as target:
+        for pair in (pair for pair in pairs if not target.exists_matches(*pair)):
+            target.write_matches(*pair, rows[pair])
+
+
+def _counted(
+    call: Callable[[pycolmap.CancellationToken], None],
+    database: Path,
+    done: Callable[[pycolmap.Database], int],
+    label: str,
+    total: int,
+) -> None:
+    """Run a COLMAP call and say how far it is, as read from the database.
+
+    The reader is COLMAP's own SQLite, opened once before the call: a second SQLite in the process (Python's) would drop
+    the locks of the first whenever it closes the file, and COLMAP aborts.
+    """
+    with opened(database) as reader:
+        counted(call, lambda: done(reader), label, total, Reported())
+
+
+if __name__ == "__main__":
+    served(work)

@@ -1,0 +1,61 @@
+"""COLMAP's fusion, Poisson's surface and simplification; see `surface.py`. None of them could be stopped otherwise.
+
+All run on one thread: with more, the result depends on which thread comes first, and where cores are shared they are
+many times slower.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from sfm_app.colmap.backend import check_written, pycolmap
+from sfm_app.colmap.processes.worker_process import FuseTask, PoissonTask, SimplifyTask, served
+
+MAX_NORMAL_ERROR_DEG = 25.0
+BORDER_WEIGHT = 10.0
+"""How much dearer it is to move a border than the surface."""
+
+
+def work(task: FuseTask | PoissonTask | SimplifyTask) -> None:
+    """Do one of the three."""
+    if task["do"] == "fuse":
+        fuse(task)
+    elif task["do"] == "poisson":
+        poisson(task)
+    else:
+        simplify(task)
+    check_written(Path(task["target"]))
+
+
+def fuse(task: FuseTask) -> None:
+    """Fuse the depth maps of a dense workspace into points."""
+    options = pycolmap.StereoFusionOptions()
+    options.min_num_pixels = task["min_views"]
+    # The depths have been checked already; normals from disparities are noisier than those of COLMAP's PatchMatch.
+    options.max_normal_error = MAX_NORMAL_ERROR_DEG
+    low, high = np.array(task["box"], np.float32)
+    options.bounding_box = (low, high)
+    options.use_cache, options.cache_size = True, task["cache_gb"]  # else all maps of all photos are in memory at once
+    options.num_threads = 1
+    pycolmap.stereo_fusion(Path(task["target"]), Path(task["dense"]), options=options, output_type="ply")
+
+
+def poisson(task: PoissonTask) -> None:
+    """Span a closed surface over points."""
+    options = pycolmap.PoissonMeshingOptions()
+    options.depth, options.trim = task["depth"], 0.0
+    options.num_threads = 1
+    pycolmap.poisson_meshing(Path(task["points"]), Path(task["target"]), options=options)
+
+
+def simplify(task: SimplifyTask) -> None:
+    """Simplify a surface to fewer triangles."""
+    options = pycolmap.MeshSimplificationOptions()
+    options.target_face_ratio, options.max_error = task["share"], task["max_error"] ** 2
+    options.boundary_weight = BORDER_WEIGHT
+    options.num_threads = 1
+    pycolmap.simplify_mesh(Path(task["mesh"]), Path(task["target"]), options)
+
+
+if __name__ == "__main__":
+    served(work)

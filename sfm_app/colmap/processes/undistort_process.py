@@ -1,0 +1,32 @@
+"""COLMAP's undistortion; see `dense.undistort`. Its JPEG writer ends the program where the disk is full."""
+
+from pathlib import Path
+
+from sfm_app.colmap.backend import check_written, counted, pycolmap
+from sfm_app.colmap.processes.worker_process import Reported, UndistortTask, served
+
+JPEG_QUALITY = 98
+
+
+def work(task: UndistortTask) -> None:
+    """Fill a dense workspace."""
+    dense_dir, model_dir = Path(task["dense"]), Path(task["model"])
+    options = pycolmap.UndistortCameraOptions()
+    options.max_image_size = task["max_side_px"]
+    photos = dense_dir / "images"
+
+    def call(token: pycolmap.CancellationToken) -> None:
+        pycolmap.undistort_images(
+            dense_dir, model_dir, Path(task["photos"]), undistort_options=options, jpeg_quality=JPEG_QUALITY,
+            num_threads=task["workers"], cancellation_token=token,
+        )  # fmt: skip
+
+    def done() -> int:
+        return sum(path.is_file() for path in photos.rglob("*"))
+
+    counted(call, done, "undistorting", pycolmap.Reconstruction(model_dir).num_reg_images(), Reported())
+    check_written(*(path for path in dense_dir.rglob("*") if path.is_file()))
+
+
+if __name__ == "__main__":
+    served(work)

@@ -1,0 +1,78 @@
+"""Cameras of all photos from the fundamental matrices of their pairs, by whatever calibrator."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_app.estimation.diagnosis import of_fits, votes
+from sfm_app.runtime.context import RunContext
+from sfm_app.selfcal import CalibratedCamera, calibrate_photo_set, pair_weights
+from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
+
+
+def find_intrinsics(
+    matches: MatchGraph, views: ViewGraph, run: RunContext
+) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
+    """Find K and lens of every camera, and which photos are whose; what is not identifiable falls back to a guess."""
+    options = run.settings.calibration
+    calibrator = run.plugins.calibrator(options.calibrator)
+    pairs = photo_pairs(list(matches.images.values()), matches, views)
+    # a group that the user made is not split
+    split = run.settings.photos.cameras == "auto"
+    cameras = calibrate_photo_set(
+        pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split
+    )
+    cameras = [of_whole_photo(camera, matches.images[camera.photos[0]]) for camera in cameras]
+    intrinsics = Intrinsics(
+        cameras={camera.name: explained(camera, views) for camera in cameras},
+        camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
+        photos={image.id: image.name for image in matches.images.values()},
+    )
+    return intrinsics, cameras
+
+
+def explained(camera: CalibratedCamera, views: ViewGraph) -> Calibration:
+    """Return what was found; where that is nothing, with what the pairs are that could not be asked."""
+    kinds = votes(views, camera.photos)
+    if camera.found.identifiable or not kinds.total() > kinds[""]:
+        return camera.found
+    return replace(camera.found, reason=f"{camera.found.reason}; {of_fits(views, camera.photos).message}")
+
+
+def of_whole_photo(camera: CalibratedCamera, image: MatchedImage) -> CalibratedCamera:
+    """Return a camera in pixels of its photos, where it was found in those of the pictures within their bars."""
+    if image.shown is None:
+        return camera
+    K = camera.found.K.copy()
+    K[:2, 2] += image.shown[:2]
+    return replace(camera, found=replace(camera.found, K=K, width=image.width, height=image.height))
+
+
+def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> PhotoPairs:
+    """Return what is known about all pairs of these photos that are not degenerate, in pixels of the pictures within
+    bars.
+    """
+    shown = {image.id: image.shown for image in images if image.shown}
+    ids = {image.id for image in images}
+    fits = {pair: fit for pair, fit in views.fits.items() if ids.issuperset(pair) and not fit.degeneracy}
+    return PhotoPairs(
+        Fs=np.array([fit.F for fit in fits.values()], np.float64).reshape(-1, 3, 3),
+        weights=pair_weights(np.array([fit.inlier_count for fit in fits.values()], np.int64)),
+        photos=tuple(fits),
+        inliers=tuple(np.hstack(matches.points(pair))[fit.inliers] for pair, fit in fits.items()),
+        sizes={image.id: image.shown[2:] if image.shown else (image.width, image.height) for image in images},
+        groups={image.id: image.group for image in images},
+        focal_hints_px={image.id: image.exif_focal_px * _share_shown(image) for image in images if image.exif_focal_px},
+        brought_to={image.id: (image.width, image.height) for image in images if image.shown},
+    ).moved({photo: frame[:2] for photo, frame in shown.items()})
+
+
+def _share_shown(image: MatchedImage) -> float:
+    """Return longer side of the picture within bars over that of the photo, which EXIF's claim was reckoned with."""
+    return max(image.shown[2:]) / max(image.width, image.height) if image.shown else 1.0
+
+
+def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> CameraPairs:
+    """Return what a calibrator gets to know about the photos of one camera."""
+    return photo_pairs(images, matches, views).among([image.id for image in images])

@@ -1,0 +1,112 @@
+"""Fundamental matrices of pairs of photos, by whatever estimator; what a killed run has fitted stays."""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.atomic_io import can_go_on, mark_unfinished, replacing
+from sfm_app.hashing import load_arrays
+from sfm_app.numerical import FAILURES
+from sfm_app.progress import track
+from sfm_app.ransac.degeneracy.watermark import covers, find_stationary, fit_moving
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.parallel import ordered_map
+from sfm_app.settings import Settings
+from sfm_app.types import EpipolarFit, MatchGraph, PairId, Rejected, ViewGraph
+
+logger = logging.getLogger("sfm_app")
+
+BoolArray = NDArray[np.bool_]
+
+
+Fitted = tuple[EpipolarFit | Rejected, int]
+"""What became of a pair, and how many of its matches stand still in the picture."""
+
+PART = 64
+"""Pairs that are kept together, so that a run that is killed has to do no more again."""
+
+
+def fit_pairs(matches: MatchGraph, pairs: Sequence[PairId], run: RunContext) -> dict[PairId, Fitted]:
+    """Fit every pair on its own, seeded by the run's seed and its ids.
+
+    What is done lies in `view_graph_parts` until the caller removes it: a run that was killed goes on where it stopped.
+    """
+    options = run.settings.epipolar
+    estimator = run.plugins.estimator(options.estimator)
+
+    def fit_pair(pair: PairId) -> Fitted:
+        try:
+            return fit_numbers(pair)
+        except FAILURES as err:
+            logger.info("pair %s could not be fitted", pair, exc_info=err)
+            return Rejected("the computation failed"), 0
+
+    def fit_numbers(pair: PairId) -> Fitted:
+        seed = int(np.random.SeedSequence([run.seed, *pair]).generate_state(1)[0])
+        points, still = matches.points(pair), stationary_matches(matches, pair, run.settings)
+        if not still.any():
+            return estimator.fit(*points, options, seed), 0
+        image = matches.images[pair[0]]
+        wide = covers(points[0][still], matches.keypoints[image.id], (image.width, image.height))
+        return fit_moving(estimator.fit, points, still, wide, options, seed), int(np.count_nonzero(still))
+
+    return in_parts(fit_pair, pairs, run)
+
+
+def graph_of(found: Mapping[PairId, Fitted]) -> ViewGraph:
+    """Return pairs with a geometry, and those without."""
+    return ViewGraph(
+        fits={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, EpipolarFit)},
+        rejected={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, Rejected)},
+    )
+
+
+def in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run: RunContext) -> dict[PairId, Fitted]:
+    """Return what `fit_pair` makes of every pair, in their order; parts that are complete are kept as they come."""
+    folder = run.workspace.view_graph_parts
+    if not can_go_on(folder, run.fingerprint):
+        mark_unfinished(folder, run.fingerprint)
+    parts = {folder / f"{first:06d}.npz": pairs[first : first + PART] for first in range(0, len(pairs), PART)}
+    known = {path: read_part(path, part) for path, part in parts.items()}
+    left = [pair for path, part in parts.items() if known[path] is None for pair in part]
+    fitted = ordered_map(run.executor, fit_pair, left, ahead=2 * run.workers)
+    results = track(run.progress, fitted, "epipolar geometry", len(left))
+    found: dict[PairId, Fitted] = {}
+    for path, part in parts.items():
+        done = known[path]
+        if done is None:
+            done = dict(zip(part, results, strict=False))
+            write_part(path, done)
+        found |= done
+    return {pair: found[pair] for pair in pairs}
+
+
+def write_part(path: Path, found: Mapping[PairId, Fitted]) -> None:
+    """Keep some pairs."""
+    still = np.array([[*pair, count] for pair, (_, count) in found.items()], np.int64)
+    with replacing(path) as beside:
+        np.savez(beside, allow_pickle=False, still=still, **graph_of(found).to_arrays())
+
+
+def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, Fitted] | None:
+    """Return what `write_part` has kept; None where there is nothing, or nothing sound."""
+    try:
+        arrays = load_arrays(path)
+        graph = ViewGraph.from_arrays(arrays)
+        every: dict[PairId, EpipolarFit | Rejected] = {**graph.fits, **graph.rejected}
+        still = {(int(a), int(b)): int(count) for a, b, count in arrays["still"]}
+        return {pair: (every[pair], still[pair]) for pair in pairs}
+    except Exception:  # whatever decoders make of damaged bytes
+        return None
+
+
+def stationary_matches(matches: MatchGraph, pair: PairId, settings: Settings) -> BoolArray:
+    """Return which matches of a pair stay in one place; none where the photos differ in size."""
+    first, second = (matches.images[key] for key in pair)
+    if (first.width, first.height) != (second.width, second.height):
+        return np.zeros(len(matches.matches[pair]), bool)
+    shrunk = max(first.width, first.height) / settings.matching.max_image_size_px
+    return find_stationary(*matches.points(pair), unit_px=max(1.0, shrunk))

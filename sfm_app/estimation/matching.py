@@ -1,0 +1,205 @@
+"""Features of photos and matches of pairs, found by whatever way has been chosen, in COLMAP's database.
+
+COLMAP's SIFT fills the database by itself. Any other way is two functions; here they get pictures of the right size,
+and what they say is checked, freed of what is masked, brought to the photos' pixels and written down.
+"""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.atomic_io import can_go_on, mark_unfinished, replacing
+from sfm_app.colmap.backend import backend
+from sfm_app.colmap.database import photo_names, unmatched, write_keypoints, write_matches
+from sfm_app.colmap.features import find_and_match
+from sfm_app.errors import InputError, PluginError
+from sfm_app.hashing import load_arrays
+from sfm_app.numerical import Json
+from sfm_app.photos.masks import read_used
+from sfm_app.plugins import FeatureMethod
+from sfm_app.progress import track
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.parallel import ordered_map
+from sfm_app.settings import MatchSettings
+from sfm_app.types import Features, PairId
+
+KEPT = 32
+"""Photos whose features are held in memory while pairs are matched; the others are read again."""
+
+
+def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
+    """Find features of photos and match them, in the run's database.
+
+    What a killed run has left in the database and in `feature_parts` stays as it is.
+
+    Args:
+        method: of finding and matching.
+        run: its database knows the photos, which are laid out.
+        pairs: ids of photos that are matched, the smaller one first, and nothing is found in others; None: all photos,
+            every one with every other.
+
+    Returns:
+        What was in force, for the manifest.
+
+    Raises:
+        PluginError: the method raises, or says what cannot be.
+        BackendError: COLMAP failed.
+    """
+    place, options = run.workspace, run.settings.matching
+    names = photo_names(place.database)
+    if pairs is not None:
+        names = {photo: names[photo] for photo in sorted({photo for pair in pairs for photo in pair})}
+    if method.sift is not None:
+        return find_and_match(
+            place.database, place.photos, list(names.values()), options, run.workers, run.progress, run.mask_dir,
+            method.sift, pairs,
+        )  # fmt: skip
+    if not can_go_on(place.feature_parts, run.fingerprint):
+        mark_unfinished(place.feature_parts, run.fingerprint)
+    _find(method, names, run)
+    _match(method, pairs_of(names) if pairs is None else pairs, run)
+    shutil.rmtree(place.feature_parts)
+    return {"method": method.name, "max_image_size": options.max_image_size_px, "max_features": options.max_features}
+
+
+def pairs_of(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
+    """Return every photo with every other, the smaller id first."""
+    ids = sorted(photos)
+    return [(first, second) for place, first in enumerate(ids) for second in ids[place + 1 :]]
+
+
+def _find(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> None:
+    """Leave the features of every photo in its part, and its keypoints in the database."""
+
+    def find(photo: int) -> tuple[int, NDArray[np.float32]]:
+        features, to_photo, size = found_in(method, names[photo], run)
+        keypoints = features.keypoints * to_photo
+        if run.mask_dir is not None:
+            used = read_used(run.mask_dir, names[photo])
+            column, row = np.clip(keypoints.astype(np.int64), 0, np.array(size) - 1).T
+            seen = used[row, column]
+            features, keypoints = features.only(seen), keypoints[seen]
+        rows = np.arange(min(len(keypoints), run.settings.matching.max_features))
+        _save(features.only(rows), part_of(photo, run))
+        return photo, keypoints[rows].astype(np.float32)
+
+    left = [photo for photo in names if not part_of(photo, run).exists()]
+    found = track(run.progress, ordered_map(run.executor, find, left, run.workers), "features", len(left))
+    for photo, keypoints in found:
+        with backend("writing keypoints"):
+            write_keypoints(run.workspace.database, photo, keypoints)
+
+
+def found_in(
+    method: FeatureMethod, name: str, run: RunContext
+) -> tuple[Features, NDArray[np.float64], tuple[int, int]]:
+    """Return what a method finds in one photo, by how much its keypoints have to be scaled, and the photo's size."""
+    options = run.settings.matching
+    pixels = read_pixels(run.workspace.photos / name)
+    height, width = pixels.shape[:2]
+    longer = max(width, height)
+    if longer > options.max_image_size_px:
+        scale = options.max_image_size_px / longer
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
+    shown = pixels.shape[1], pixels.shape[0]
+    features = _checked(method, name, shown, _asked(method, name, pixels, options))
+    return features, np.array([width / shown[0], height / shown[1]]), (width, height)
+
+
+def read_pixels(path: Path) -> NDArray[np.uint8]:
+    """Return (H, W, 3) RGB of a photo as it is laid out.
+
+    Raises:
+        InputError: it cannot be read any more.
+    """
+    data = np.fromfile(path, np.uint8)
+    read = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
+    if read is None:
+        raise InputError(f"{path} cannot be read any more", hint="run again with --from photos")
+    return np.asarray(read, np.uint8)
+
+
+def _asked(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
+    if method.find is None:
+        raise PluginError(f"the features '{method.name}' have no `find`")
+    try:
+        return method.find(pixels, options)
+    except Exception as err:  # whatever a foreign function raises
+        raise _broken(method, f"failed on {name}: {type(err).__name__}: {err}") from err
+
+
+def _checked(method: FeatureMethod, name: str, size: tuple[int, int], features: Features) -> Features:
+    """Return the features, if they can be those of a picture of this size."""
+    points = np.asarray(features.keypoints, np.float64)
+    if features.size != size:
+        raise _broken(method, f"say that {name} has {features.size} pixels instead of {size}")
+    if points.ndim != 2 or points.shape[1] != 2 or any(len(value) != len(points) for value in features.values.values()):
+        raise _broken(method, f"have arrays of other shapes than (N, 2) and (N, ...) for {name}")
+    if not (np.isfinite(points).all() and (points >= 0).all() and (points <= size).all()):
+        raise _broken(method, f"put keypoints outside of {name}")
+    return Features(size, points, features.values)
+
+
+def _broken(method: FeatureMethod, what: str) -> PluginError:
+    return PluginError(f"the features '{method.name}' {what}", hint="choose others with --features")
+
+
+def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> None:
+    """Write the matches of every pair into the database; of pairs without any, that they have none."""
+    options, database = run.settings.matching, run.workspace.database
+    read = lru_cache(max(KEPT, 2 * run.workers))(lambda photo: _load(part_of(photo, run)))
+
+    def match(pair: PairId) -> tuple[PairId, NDArray[np.uint32]]:
+        return pair, matches_between(method, (read(pair[0]), read(pair[1])), options)
+
+    left = unmatched(database, pairs)
+    found = track(run.progress, ordered_map(run.executor, match, left, 2 * run.workers), "matching", len(left))
+    for pair, rows in found:
+        with backend("writing matches"):
+            write_matches(database, pair, rows)
+
+
+def matches_between(
+    method: FeatureMethod, pair: tuple[Features, Features], options: MatchSettings
+) -> NDArray[np.uint32]:
+    """Return (M, 2) rows of two photos' features that a method takes for the same; none where a photo has none."""
+    if method.match is None:
+        raise PluginError(f"the features '{method.name}' have no `match`")
+    if not len(pair[0]) or not len(pair[1]):
+        return np.zeros((0, 2), np.uint32)
+    try:
+        rows = np.asarray(method.match(*pair, options))
+    except Exception as err:  # as above
+        raise _broken(method, f"failed to match two photos: {type(err).__name__}: {err}") from err
+    if rows.size == 0:
+        return np.zeros((0, 2), np.uint32)
+    if rows.ndim != 2 or rows.shape[1] != 2 or not np.issubdtype(rows.dtype, np.integer):
+        raise _broken(method, "have matches that are no (M, 2) integers")
+    for column, features in zip(rows.T, pair, strict=True):
+        if column.min() < 0 or column.max() >= len(features) or len(np.unique(column)) < len(column):
+            raise _broken(method, "match a keypoint twice, or one that is not there")
+    return rows.astype(np.uint32)
+
+
+def part_of(photo: int, run: RunContext) -> Path:
+    """Return where the features of a photo are kept until all are matched."""
+    return run.workspace.feature_parts / f"{photo:06d}.npz"
+
+
+def _save(features: Features, path: Path) -> None:
+    values = {f"value_{name}": value for name, value in features.values.items()}
+    with replacing(path) as beside:
+        np.savez(beside, allow_pickle=False, size=np.array(features.size), keypoints=features.keypoints, **values)
+
+
+def _load(path: Path) -> Features:
+    arrays = load_arrays(path)
+    values = {name.removeprefix("value_"): value for name, value in arrays.items() if name.startswith("value_")}
+    width, height = arrays["size"]
+    return Features((int(width), int(height)), arrays["keypoints"], values)

@@ -1,0 +1,93 @@
+"""Which frames of a video become photos: one for every step of the picture, the sharpest one thereabouts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.photos.video.feature_tracking import BLURRED, TrackedFrame
+
+FloatArray = NDArray[np.float64]
+
+NEAR, FAR = 0.25, 0.5
+"""The sharpest frame is looked for within so many steps to either side; further away where all of these are blurred."""
+GAP = 1.5
+"""Steps between frames that may pass without one where there are blurred ones only."""
+HARDLY_MOVED, LESS_SHARP, TOO_MANY = "hardly moved on", "less sharp than a neighbor", "more than max_frames"
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The frames that were chosen, in rising order, and why the others were not."""
+
+    frames: tuple[int, ...]
+    left_out: dict[str, int]
+    """Reason and number of frames; each frame that was looked at is chosen or counted once."""
+
+
+def choose(looks: Sequence[TrackedFrame], most: int) -> Choice:
+    """Return one frame per step of the way; steps are longer where that would be more than `most` frames.
+
+    Args:
+        looks: of all frames that were looked at, in their order.
+        most: frames, >= 2.
+    """
+    way = np.array([look.way for look in looks], np.float64)
+    sharpness = np.array([look.sharpness for look in looks], np.float64)
+    if not len(way):
+        return Choice((), {})
+    every, near = sharpest(way, sharpness, 1.0)
+    chosen = every
+    if len(every) > most:
+        chosen, near = sharpest(way, sharpness, float(way.max()) / (most - 1) * (1 - 1e-12))
+    others = set(range(len(looks))) - set(chosen)
+    too_many = others & set(every)
+    less_sharp = (others & near) - too_many
+    counts = {
+        HARDLY_MOVED: len(others) - len(too_many) - len(less_sharp),
+        LESS_SHARP: len(less_sharp),
+        TOO_MANY: len(too_many),
+    }
+    return Choice(tuple(looks[k].frame for k in chosen), {reason: count for reason, count in counts.items() if count})
+
+
+def sharpest(way: FloatArray, sharpness: FloatArray, spacing: float) -> tuple[list[int], set[int]]:
+    """Return the sharpest frame around every multiple of a spacing, and all those that it was chosen from.
+
+    Args:
+        way: (N,) steps.
+        sharpness: (N,).
+        spacing: steps, >= 1.
+    """
+    chosen: list[int] = []
+    candidates: set[int] = set()
+    for target in np.arange(0.0, way.max() + 1e-9, spacing):
+        moment = int(np.argmax(way >= min(target, way.max())))
+        if chosen and moment <= chosen[-1]:
+            continue
+        first = chosen[-1] + 1 if chosen else 0
+        near = _around(way, moment, target, NEAR, first)
+        sharp = BLURRED * sharpness[_around(way, moment, target, 1.0, 0)].max()
+        best = _best(sharpness, near)
+        if sharpness[best] < sharp:
+            best = _best(sharpness, _around(way, moment, target, FAR, first))
+        candidates.update(map(int, near))
+        if sharpness[best] >= sharp or not chosen or way[best] - way[chosen[-1]] >= GAP:
+            chosen.append(best)
+    return chosen, candidates
+
+
+def _best(sharpness: FloatArray, frames: NDArray[np.int64]) -> int:
+    return int(frames[np.argmax(sharpness[frames])])
+
+
+def _around(way: FloatArray, moment: int, target: float, reach: float, first: int) -> NDArray[np.int64]:
+    """Return frames about a moment, one after the other, whose way lies within reach of the target."""
+    outside = np.abs(way - target) > reach
+    outside[:first] = True
+    before = np.flatnonzero(outside[:moment])
+    after = np.flatnonzero(outside[moment + 1 :])
+    start = int(before[-1]) + 1 if len(before) else 0
+    end = moment + 1 + int(after[0]) if len(after) else len(way)
+    return np.arange(max(start, first), end, dtype=np.int64)

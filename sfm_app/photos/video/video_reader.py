@@ -1,0 +1,145 @@
+"""Reading a video frame by frame. One regular file is opened by FFmpeg, and nothing that it may name: no network."""
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.photos.decode import UnreadableError
+from sfm_app.photos.video.video_formats import head_of, is_video
+
+Picture = NDArray[np.uint8]
+
+SMALL_PX = 480
+"""Longer side of the pictures that frames are chosen by."""
+LOOKS_PER_S = 30
+"""More frames in a second are not looked at one by one."""
+FASTEST = 240
+"""Frames per second; files that claim more do not know."""
+CUT_SHORT = 0.95
+"""A file that ends before this share of its length is cut off or damaged."""
+JPEG_QUALITY = 95
+
+FFMPEG = {
+    "OPENCV_FFMPEG_CAPTURE_OPTIONS": "protocol_whitelist;file|format_whitelist;mov,matroska,webm,avi,mpeg,mpegts",
+    "OPENCV_FFMPEG_LOGLEVEL": "-8",
+}
+"""OpenCV reads these when it opens a file. Without the first, FFmpeg follows lists and patterns of other files."""
+
+
+@contextmanager
+def opened(path: Path) -> Iterator["Video"]:
+    """Provide a video, open for one reading; what FFmpeg has to say about it is not shown.
+
+    Raises:
+        UnreadableError: it is none, or nothing in it can be read.
+    """
+    place = path.resolve()  # FFmpeg takes a name with a colon for a protocol, unless it is absolute
+    if not is_video(head_of(place)):
+        raise UnreadableError("not a video")
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        with _environment(FFMPEG):
+            software = (cv2.CAP_PROP_HW_ACCELERATION, cv2.VIDEO_ACCELERATION_NONE)  # the same bytes everywhere
+            capture = cv2.VideoCapture(str(place), cv2.CAP_FFMPEG, software)
+        if not capture.isOpened():
+            raise UnreadableError("damaged, cut off, or of an unknown kind")
+        yield Video(capture)
+        capture.release()
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+
+
+class Video:
+    """An open video, upright as its rotation says; frames are numbered from 0."""
+
+    def __init__(self, capture: cv2.VideoCapture) -> None:
+        self._capture = capture
+        self.rate = max(0.0, capture.get(cv2.CAP_PROP_FPS))
+        """Frames per second as the file says; 0 where it does not."""
+        self.claimed = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
+        """Frames as the file says, which need not be true."""
+        self.frames = 0
+        """Frames that were read so far."""
+        self.seconds = 0.0
+        """When the last of them is shown."""
+        self.black = 0
+        """Frames that were looked at and are black all over: so OpenCV gives those that are interlaced."""
+
+    @property
+    def stride(self) -> int:
+        """Every which frame is looked at."""
+        return max(1, round(self.rate / LOOKS_PER_S)) if self.rate <= FASTEST else 1
+
+    @property
+    def looks(self) -> int:
+        """About how many frames will be looked at."""
+        return max(1, self.claimed // self.stride)
+
+    @property
+    def cut_short(self) -> bool:
+        """Whether the file ended before its time; known once all frames were read."""
+        if not (self.rate and self.claimed):
+            return False
+        # by time, for counts are made from a rate that may be wrong, and then both are
+        return self.seconds + 2 / self.rate < CUT_SHORT * self.claimed / self.rate
+
+    def small_frames(self) -> Iterator[tuple[int, Picture]]:
+        """Yield small gray pictures of the frames that are looked at, with their numbers."""
+        size: tuple[int, int] | None = None
+        for number in self._grabbed():
+            if number % self.stride:
+                continue
+            found, picture = self._capture.retrieve()
+            if not found:
+                continue
+            if not picture.any():
+                self.black += 1
+                continue
+            if size is None:
+                shrunk = min(1.0, SMALL_PX / max(picture.shape[:2]))
+                size = max(1, round(picture.shape[1] * shrunk)), max(1, round(picture.shape[0] * shrunk))
+            yield number, _gray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+
+    def jpegs(self, numbers: Sequence[int]) -> Iterator[tuple[int, bytes]]:
+        """Yield frames at full size as JPEG, with their numbers, in rising order; fewer where the file has changed."""
+        wanted = set(numbers)
+        for number in self._grabbed():
+            if number in wanted:
+                found, picture = self._capture.retrieve()
+                if found:
+                    yield number, cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes()
+                wanted.remove(number)
+            if not wanted:
+                return
+
+    def _grabbed(self) -> Iterator[int]:
+        """Yield numbers of the frames, one after the other; each may be retrieved while it is the last one."""
+        while self._capture.grab():
+            self.frames += 1
+            self.seconds = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            yield self.frames - 1
+
+
+def _gray(picture: NDArray[np.uint8]) -> Picture:
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.ndim == 3 else picture, np.uint8)
+
+
+@contextmanager
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
+    """Set these variables, and restore them afterwards."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value

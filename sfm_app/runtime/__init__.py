@@ -1,0 +1,1 @@
+"""What every part of a run shares: its context, output folder and manifest, workers, and what it may cost."""

@@ -1,0 +1,90 @@
+"""What a stage gets besides its inputs: settings, workers, progress, and a place to note what it counted."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from sfm_app.atomic_io import save_files
+from sfm_app.plugins import Plugins
+from sfm_app.progress import Progress, Silent, track
+from sfm_app.runtime.cost_estimate import SHARE_OF_MACHINE, machine_memory_mb
+from sfm_app.runtime.parallel import make_executor, ordered_map
+from sfm_app.runtime.workspace import Workspace
+from sfm_app.settings import Settings
+from sfm_app.types import Model
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+STANDARD_FORMATS = ("ply", "glb")
+"""What every run writes its models as; `sfm-app export` makes others of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunContext:
+    """One run of the program, or, from `for_stage` on, one stage of it."""
+
+    settings: Settings
+    workspace: Workspace
+    plugins: Plugins
+    executor: Executor
+    workers: int
+    progress: Progress = field(default_factory=Silent)
+    fingerprint: str = ""
+    """Hash of everything that the stage's result depends on."""
+    statistics: dict[str, Any] = field(default_factory=dict)
+    """What the stage has counted so far, for the manifest; no part of a product is read from here."""
+
+    def for_stage(self, fingerprint: str) -> "RunContext":
+        """Return the same run for a stage that has counted nothing yet."""
+        return replace(self, fingerprint=fingerprint, statistics={})
+
+    @property
+    def seed(self) -> int:
+        """The run's seed; parts derive theirs from it and from their own ids."""
+        return self.settings.seed
+
+    @property
+    def memory_mb(self) -> float:
+        """Most memory that may be held."""
+        return 1000 * self.settings.max_memory_gb or SHARE_OF_MACHINE * machine_memory_mb()
+
+    @contextmanager
+    def with_workers(self, workers: int) -> Iterator["RunContext"]:
+        """Provide the same run with so many workers, which end with the block."""
+        with make_executor(workers) as executor:
+            yield replace(self, workers=workers, executor=executor)
+
+    @property
+    def mask_dir(self) -> Path | None:
+        """Where the masks of all photos lie once they are laid out; None where no masks are given."""
+        return self.workspace.masks if self.settings.photos.masks else None
+
+    def map(self, function: Callable[[Item], Result], items: Sequence[Item], label: str) -> list[Result]:
+        """Return results in the order of the items, computed in parallel, with a progress bar."""
+        results = ordered_map(self.executor, function, items, ahead=2 * self.workers)
+        return list(track(self.progress, results, label, len(items)))
+
+    @contextmanager
+    def step(self, label: str) -> Iterator[None]:
+        """Show that a long piece of work, which cannot say how far it is, is under way."""
+        yield from track(self.progress, [None], label, 1)
+
+    def record(self, **figures: Any) -> None:
+        """Note figures of the stage for the manifest; plain numbers, strings, lists and dicts."""
+        self.statistics.update(figures)
+
+    def model_paths(self, name: str) -> tuple[Path, ...]:
+        """Return where a model of this name is in the output folder."""
+        return tuple(self.workspace.root / f"{name}.{suffix}" for suffix in STANDARD_FORMATS)
+
+    def write_model(self, model: Model, name: str) -> tuple[Path, ...]:
+        """Write a model into the output folder in every standard format and note how large the files are."""
+        paths = self.model_paths(name)
+        for suffix in STANDARD_FORMATS:
+            save_files(self.plugins.exporter(suffix).write(model, name), self.workspace.root)
+        self.record(bytes={path.name: path.stat().st_size for path in paths})
+        return paths

@@ -1,0 +1,254 @@
+"""The output folder: where things lie in it, whose it is, and who is at work there."""
+
+import contextlib
+import errno
+import os
+import platform
+import tempfile
+from collections.abc import Iterator
+from datetime import datetime
+from itertools import chain
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from sfm_app.atomic_io import UNFINISHED
+from sfm_app.errors import InputError
+from sfm_app.runtime.manifest import MANIFEST, Manifest
+
+DATABASE, CALIBRATION, SCENE = "database.db", "calibration.json", "scene.json"
+FOLDERS = ("photos", "frames", "masks", "sparse", "other_models", "dense", "surface", "texture")
+WRITTEN = (*FOLDERS, DATABASE, CALIBRATION, SCENE)
+"""What a run removes before it writes it."""
+LOCK, HOLDER = ".lock", ".held-by.txt"
+LOG, PARTS, FEATURES, MAPPING = "log.txt", "view_graph_parts", "feature_parts", ".mapping"
+FOLLOWED = (*WRITTEN, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING)
+"""What a run writes to without replacing it: a link would lead it out of the folder."""
+PHOTO_SET, VIEW_GRAPH = "photos.json", "view_graph.npz"
+
+
+class Workspace:
+    """One output folder."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.manifest = Manifest(root)
+
+    @property
+    def photos(self) -> Path:
+        """Upright photos that COLMAP can read: links where the file is fine, copies where not."""
+        return self.root / "photos"
+
+    @property
+    def frames(self) -> Path:
+        """The chosen frames of a video."""
+        return self.root / "frames"
+
+    @property
+    def frames_marker(self) -> Path:
+        """Beside the frames until they are read: which were chosen, and what from."""
+        return self.root / "frames.unfinished.json"
+
+    @property
+    def masks(self) -> Path:
+        """Masks of the photos, upright and of their size, where masks are given."""
+        return self.root / "masks"
+
+    @property
+    def database(self) -> Path:
+        return self.root / DATABASE
+
+    @property
+    def photo_set(self) -> Path:
+        return self.root / PHOTO_SET
+
+    @property
+    def view_graph(self) -> Path:
+        return self.root / VIEW_GRAPH
+
+    @property
+    def calibration(self) -> Path:
+        return self.root / CALIBRATION
+
+    @property
+    def scene(self) -> Path:
+        """What is known about the scene besides COLMAP's model: refined cameras, and why photos have no place."""
+        return self.root / SCENE
+
+    @property
+    def sparse(self) -> Path:
+        return self.root / "sparse"
+
+    @property
+    def other_models(self) -> Path:
+        """COLMAP models of photos that do not hang together with the main one, numbered from 1."""
+        return self.root / "other_models"
+
+    @property
+    def dense(self) -> Path:
+        """COLMAP's dense workspace: undistorted photos, depth and normal maps."""
+        return self.root / "dense"
+
+    @property
+    def surface(self) -> Path:
+        """Fused points, and the surface through them."""
+        return self.root / "surface"
+
+    @property
+    def texture(self) -> Path:
+        """The surface with its texture."""
+        return self.root / "texture"
+
+    @property
+    def database_marker(self) -> Path:
+        """Beside the database while it is filled: what it is filled from."""
+        return self.root / f"database.{UNFINISHED}"
+
+    @property
+    def feature_parts(self) -> Path:
+        """Features of photos while they are found and matched."""
+        return self.root / FEATURES
+
+    @property
+    def view_graph_parts(self) -> Path:
+        """Fundamental matrices while they are estimated."""
+        return self.root / PARTS
+
+    @property
+    def log(self) -> Path:
+        return self.root / LOG
+
+    def create(self) -> None:
+        """Make the folder and prove that it can be written to.
+
+        Raises:
+            InputError: it cannot, or it holds what a run would write over, or links through which it would write.
+        """
+        known = any((self.root / name).exists() for name in (LOCK, MANIFEST))
+        foreign = [] if known else [name for name in WRITTEN if (self.root / name).exists()]
+        if foreign:
+            raise InputError(
+                f"{self.root / foreign[0]} is there, and no run has made it", hint="name another output folder with -o"
+            )
+        link = next(self._links(), None)
+        if link:
+            raise InputError(f"{link} is a link, and no run has made it", hint="name another output folder with -o")
+        try:
+            self.root.mkdir(parents=True, exist_ok=True)
+        except OSError as err:
+            raise _cannot_write(self.root, err) from err
+        self._check_writable()
+
+    def _check_writable(self) -> None:
+        try:
+            with tempfile.TemporaryFile(dir=self.root):
+                pass
+        except OSError as err:
+            if err.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            raise _cannot_write(self.root, err) from err
+
+    def _links(self) -> Iterator[Path]:
+        """Yield links that no run has made; those of the photos are replaced when they are laid out."""
+        for path in (self.root / name for name in FOLLOWED):
+            if path.is_symlink():
+                yield path
+            elif path.name != self.photos.name:
+                yield from (below for below in path.rglob("*") if below.is_symlink())
+
+    def keep_apart(self, photos: Path, what: str = "photos") -> None:
+        """Check that a run would not write over its photos, or its masks.
+
+        Raises:
+            InputError: it would.
+        """
+        folder, out = photos.resolve(), self.root.resolve()
+        if folder == out:
+            raise InputError(f"{photos} cannot be the {what} and the output", hint="name another output folder with -o")
+        if any(folder.is_relative_to(out / name) for name in WRITTEN):
+            raise InputError(
+                f"{photos} lies where the run in {self.root} keeps its own files",
+                hint="name another output folder with -o",
+            )
+
+    @contextlib.contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other runs out; the system lets go of it when this process ends, however it ends.
+
+        Raises:
+            InputError: another run is at work here.
+        """
+        holder = self.root / HOLDER
+        lock = FileLock(self.root / LOCK, timeout=0)
+        try:
+            lock.acquire()
+        except Timeout:
+            raise InputError(
+                f"another run is at work in {self.root}: {_said(holder)}",
+                hint="wait for it, end it, or name another output folder with -o",
+            ) from None
+        try:
+            started = datetime.now().astimezone().isoformat(" ", "seconds")
+            holder.write_text(f"process {os.getpid()} on {platform.node()} since {started}\n", encoding="utf-8")
+            yield
+        finally:
+            with contextlib.suppress(OSError):  # the folder may be gone, or closed: the run says so itself
+                holder.unlink(missing_ok=True)
+            lock.release()
+
+    def check_there(self) -> None:
+        """Check that the folder of a run at work is still there, and open.
+
+        What the run has written there since it was removed is marked as its own: the next one must not take it for
+        foreign.
+
+        Raises:
+            InputError: it is gone, or nothing can be written there.
+        """
+        if not (self.root / LOCK).exists():
+            left = {path.name for path in self.root.iterdir()} if self.root.is_dir() else set()
+            if left and left <= {*FOLLOWED, PHOTO_SET, VIEW_GRAPH}:
+                (self.root / LOCK).touch()
+            raise InputError(f"{self.root} was removed while the run was at work", hint="run again")
+        self._check_writable()
+
+    def discard_unfinished(self) -> None:
+        """Let no run go on with what a stage has left half done."""
+        markers = (self.root.glob(f"{folder}/{UNFINISHED}") for folder in ("*", "*/*"))
+        for path in (self.database_marker, self.frames_marker, *chain(*markers)):
+            path.unlink(missing_ok=True)
+
+
+class Aside(Workspace):
+    """A folder within the output folder, for another hypothesis about the same photos.
+
+    Args:
+        of: whose photos and masks they are.
+        name: of the folder.
+    """
+
+    def __init__(self, of: Workspace, name: str) -> None:
+        super().__init__(of.root / name)
+        self.of = of
+
+    @property
+    def photos(self) -> Path:
+        return self.of.photos
+
+    @property
+    def masks(self) -> Path:
+        return self.of.masks
+
+
+def _cannot_write(folder: Path, err: OSError) -> InputError:
+    return InputError(
+        f"cannot write to {folder}: {err.strerror}",
+        hint="make it writable, and the same command goes on; or name another output folder with -o",
+    )
+
+
+def _said(file: Path) -> str:
+    try:
+        return file.read_text(encoding="utf-8").strip() or "it has just begun"
+    except (OSError, UnicodeDecodeError):
+        return "it has just begun"

@@ -1,0 +1,1 @@
+"""What is rendered: scenes of known shape."""

@@ -1,0 +1,45 @@
+"""What a synthetic scene is made of."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.synthetic.scenes.shapes import Shape
+from sfm_app.synthetic.scenes.textures import Material
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """One thing in a scene. Bodies of one material still differ in every stain: their place in the scene seeds them."""
+
+    shape: Shape
+    material: Material
+
+
+@dataclass(frozen=True, slots=True)
+class SyntheticScene:
+    """Bodies under a fixed light; y up, scene units are about meters."""
+
+    name: str
+    bodies: tuple[Body, ...]
+    to_light: tuple[float, float, float] = (0.45, 0.75, 0.5)
+    """Direction towards the sun, any length."""
+    sun: float = 0.95
+    """Brightness of the sun on a surface that faces it."""
+    sky: float = 0.5
+    """Brightness of the sky on a surface that faces up."""
+
+    @property
+    def vertices(self) -> FloatArray:
+        """(V, 3) of all bodies."""
+        return np.concatenate([body.shape.vertices for body in self.bodies])
+
+    @property
+    def faces(self) -> NDArray[np.int64]:
+        """(T, 3) vertex indices of all bodies."""
+        counts = [len(body.shape.vertices) for body in self.bodies]
+        starts = np.cumsum([0, *counts[:-1]])
+        return np.concatenate([body.shape.faces + start for body, start in zip(self.bodies, starts, strict=True)])

@@ -1,0 +1,51 @@
+"""Synthetic scenes by name, and the photos that people would take of them."""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import TypeVar
+
+from sfm_app.errors import ConfigError
+from sfm_app.synthetic.cameras import Views, arc, make_camera
+from sfm_app.synthetic.scenes.bodies import SyntheticScene
+from sfm_app.synthetic.scenes.corner import corner, corner_views
+from sfm_app.synthetic.scenes.courtyard import courtyard
+from sfm_app.synthetic.scenes.facade import facade, facade_views
+from sfm_app.synthetic.scenes.small_scenes import heap, poster
+from sfm_app.synthetic.scenes.statue import statue, statue_views
+
+SCENES: Mapping[str, Callable[[], SyntheticScene]] = MappingProxyType({
+    "courtyard": courtyard, "poster": poster, "heap": heap, "statue": statue, "facade": facade, "corner": corner,
+})  # fmt: skip
+WALKS: Mapping[str, Callable[[int], Views]] = MappingProxyType({
+    "courtyard": lambda seed: arc(make_camera(960, 640), seed=seed),
+    "statue": lambda seed: statue_views(make_camera(800, 1152, focal_widths=1.35), seed),
+    "facade": lambda seed: facade_views(make_camera(1152, 768), seed),
+    "corner": lambda seed: corner_views(make_camera(1152, 768, focal_widths=0.9), seed),
+})  # fmt: skip
+"""By scene: a walk with a camera that suits it; the seed changes the steps."""
+
+Item = TypeVar("Item")
+
+
+def build_scene(name: str = "courtyard") -> SyntheticScene:
+    """Return the scene of that name.
+
+    Raises:
+        ConfigError: there is none; names the known ones.
+    """
+    return _named(name, SCENES)()
+
+
+def scene_views(name: str = "courtyard", seed: int = 0) -> Views:
+    """Return the photos of the walk through that scene.
+
+    Raises:
+        ConfigError: there is none; names the known ones.
+    """
+    return _named(name, WALKS)(seed)
+
+
+def _named(name: str, known: Mapping[str, Item]) -> Item:
+    if name not in known:
+        raise ConfigError(f"no synthetic scene is named '{name}'", hint=f"known: {', '.join(known)}")
+    return known[name]

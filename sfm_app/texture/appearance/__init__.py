@@ -1,0 +1,1 @@
+"""What the photos show of every triangle, and how well."""

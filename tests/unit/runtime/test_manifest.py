@@ -1,0 +1,69 @@
+import json
+
+import pytest
+
+from sfm_app.runtime.manifest import Manifest, StageRecord
+
+
+@pytest.fixture
+def manifest(tmp_path):
+    return Manifest(tmp_path)
+
+
+def finish(manifest, name="photos", print_of_inputs="abc", files=("a.txt",)):
+    manifest.finish(name, StageRecord(print_of_inputs, 1.0, {"usable": 2}, manifest.sizes(files)), {"program": "test"})
+
+
+def is_current(manifest, stage, print_of_inputs):
+    record = manifest.record(stage)
+    return record is not None and record.fingerprint == print_of_inputs and not manifest.changed_files(record)
+
+
+def test_a_finished_stage_is_current_until_its_inputs_change(manifest):
+    (manifest.root / "a.txt").write_text("1234")
+    finish(manifest)
+
+    assert is_current(manifest, "photos", "abc")
+    assert not is_current(manifest, "photos", "other")
+    assert not is_current(manifest, "match_graph", "abc")
+
+
+@pytest.mark.parametrize("damage", ["cut", "removed"])
+def test_a_stage_whose_file_changed_is_not_current(manifest, damage):
+    path = manifest.root / "a.txt"
+    path.write_text("1234")
+    finish(manifest)
+    if damage == "cut":
+        path.write_text("12")
+    else:
+        path.unlink()
+
+    assert not is_current(manifest, "photos", "abc")
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"stages": {"photos": 3}}', '{"stages": {"photos": {"odd": 1}}}'])
+def test_a_broken_manifest_counts_as_none(manifest, text):
+    (manifest.root / "manifest.json").write_text(text)
+
+    assert manifest.record("photos") is None
+
+
+def test_forgotten_stages_leave_the_others(manifest):
+    (manifest.root / "a.txt").write_text("1234")
+    for name in ("photos", "scene"):
+        finish(manifest, name)
+    manifest.forget(("scene", "mesh"))
+
+    assert manifest.record("scene") is None
+    assert manifest.record("photos") is not None
+    assert json.loads((manifest.root / "manifest.json").read_text())["program"] == "test"
+
+
+def test_the_database_may_grow_but_not_vanish(manifest):
+    (manifest.root / "database.db").write_text("1234")
+    finish(manifest, files=("database.db",))
+    (manifest.root / "database.db").write_text("123456")
+
+    assert is_current(manifest, "photos", "abc")
+    (manifest.root / "database.db").unlink()
+    assert not is_current(manifest, "photos", "abc")
