@@ -7,6 +7,7 @@ cam2_from_cam1.
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,7 +93,7 @@ def cached_ratio_matches(data: Path, name: str, cache: Path) -> Path:
         with opened_run(cache / name, Settings(), None) as run:
             graph = run_stages(data / name / "images", run, last=MATCH_GRAPH.name)[MATCH_GRAPH]
         truth = load_truth(data / name / "cameras.json")
-        arrays: dict[str, FloatArray] = {}
+        arrays: dict[str, Any] = {}
         for ids in graph.matches:
             first, second = (Path(graph.images[key].name).stem for key in ids)
             if first in truth and second in truth and len(graph.matches[ids]):
