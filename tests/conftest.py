@@ -7,12 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from hypothesis import settings
 from PIL import Image
 
 from sfm_app.synthetic.cameras import ArcOptions, arc, make_camera, orbit
 from sfm_app.synthetic.photo_folder import load_truth, save_truth, write_photo_folder
 from sfm_app.synthetic.scenes.scene_catalog import build_scene
 from sfm_app.types import Frustum, Model, Surface, Texture
+
+# how long an example takes says how busy the machine is
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 
 @pytest.fixture(scope="session")
