@@ -68,6 +68,10 @@ GROUPS: Mapping[str, Group] = {
         ("reichstag10",), "120 random scenes of cameras",
         "docs/algorithms.md, Several cameras; the random scenes alone give the same thresholds",
     ),
+    "when a focal counts as known: its deviation, its lead and the votes it wins": Group(
+        ("selfcal.consensus.consensus_peak",), (), "benchmarks.trouble, seeds 0 to 180, 1000 to 1035 and 2000 to 2139",
+        "consensus_peak.py; seeds 3000 to 3199 were run afterwards",
+    ),
     "two cameras of one size": Group(
         ("selfcal.cameras.two_cameras", "selfcal.cameras.focal_grid"), ("kitchen25",),
         "120 random scenes; trouble.py, seeds 0 to 64",
