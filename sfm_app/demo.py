@@ -71,7 +71,7 @@ def run_demo(out: Path, settings: Settings, progress: Progress) -> DemoResult:
     """
     start = time.perf_counter()
     progress.stage("rendering photos of a scene with a known camera")
-    truth = render_photos(out, progress)
+    truth = _render_photos(out, progress)
     rendered = time.perf_counter()
     run = reconstruct(out / "photos", out / "model", settings, progress=progress)
     done = time.perf_counter()
@@ -82,7 +82,7 @@ def run_demo(out: Path, settings: Settings, progress: Progress) -> DemoResult:
     return compared(run, run.scene, model, truth, (rendered - start, done - rendered), out)
 
 
-def render_photos(out: Path, progress: Progress) -> Truth:
+def _render_photos(out: Path, progress: Progress) -> Truth:
     """Return the photo folder and its truth beside it; kept when they are there already."""
     views = arc(make_camera(*SIZE))
     names = set(views.cam_from_world)

@@ -115,7 +115,7 @@ def run_lines(run: Run) -> list[str]:
     lines.append(f"photos      {summary['photos']['usable']} usable")
     lines += [f"            {line}" for line in photo_lines(summary["photos"])]
     if summary["masks"] is not None:
-        lines += mask_lines(summary["masks"], summary["photos"]["usable"])
+        lines += _mask_lines(summary["masks"], summary["photos"]["usable"])
     if summary["pairs"]["kept"] is not None:
         rejected = ", ".join(f"{count} {reason}" for reason, count in summary["pairs"]["rejected"].items())
         lines.append(
@@ -158,7 +158,7 @@ def photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
         yield f"left out: {some(names)}: {reason}"
 
 
-def mask_lines(masks: Mapping[str, Any], photos: int) -> Iterator[str]:
+def _mask_lines(masks: Mapping[str, Any], photos: int) -> Iterator[str]:
     """Yield how many photos have a mask, and which files are of none of them."""
     yield f"masks       {masks['photos']} of {photos} photos"
     if masks["unused"]:

@@ -79,11 +79,11 @@ def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
             raise NumericalError("a camera has no focal length")
         reduced = reduce(bundle, LOSS_SCALE_PX)
         open_points.append(reduced.open_points)
-        found = estimate(bundle.params, reduced, usual_cameras(model, ids))
-        write_bundle(model, ids, best_step(bundle, reduced, found))
+        found = estimate(bundle.params, reduced, _usual_cameras(model, ids))
+        _write_bundle(model, ids, _best_step(bundle, reduced, found))
         if found.step > FAR:
             solve(model)
-        changed = improve_tracks(model, graph)
+        changed = _improve_tracks(model, graph)
         if model.num_points3D() <= LEAST_LEFT * points:
             raise NumericalError(f"it left {model.num_points3D()} of {points} points")
         if found.step < STEP and changed < CHANGED * len(bundle.x):
@@ -132,7 +132,7 @@ def solve(model: pycolmap.Reconstruction) -> None:
     patiently(pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve)
 
 
-def improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
+def _improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
     """Continue, merge and triangulate tracks, then drop what does not fit; how many observations that changed.
 
     What is added only to be dropped again does not count: near the limits that never ends.
@@ -167,7 +167,7 @@ def read_bundle(model: pycolmap.Reconstruction) -> tuple[list[int], Bundle]:
     )
 
 
-def best_step(bundle: Bundle, reduced: Reduced, found: Estimate) -> Bundle:
+def _best_step(bundle: Bundle, reduced: Reduced, found: Estimate) -> Bundle:
     """Return the bundle with the estimated cameras.
 
     Poses and points follow, where that is no worse than if they stayed.
@@ -184,7 +184,7 @@ def best_step(bundle: Bundle, reduced: Reduced, found: Estimate) -> Bundle:
     return min(tried, key=lambda one: cost(one, LOSS_SCALE_PX))
 
 
-def write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle) -> None:
+def _write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle) -> None:
     """Put arrays in the order of `read_bundle` into the model."""
     for camera_id, params in zip(ids, bundle.params, strict=True):
         model.cameras[camera_id].params = params.tolist()
@@ -195,7 +195,7 @@ def write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle)
         model.points3D[point].xyz = xyz
 
 
-def usual_cameras(model: pycolmap.Reconstruction, ids: list[int]) -> CameraPriors:
+def _usual_cameras(model: pycolmap.Reconstruction, ids: list[int]) -> CameraPriors:
     """Return what is believed about cameras before the bundle is asked."""
     used = used_cameras(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)

@@ -110,7 +110,7 @@ class _Execution:
             inputs[stage.name] = self.fingerprints[stage.name]
         redone = photos.name if self.first == photos.name else ""
         ahead = list(dropwhile(lambda name: not redone and reasons[name] is None, reasons))
-        with planned(self.products[photos], ahead, self.run) as run:
+        with _planned(self.products[photos], ahead, self.run) as run:
             for stage in later:
                 again = reasons[stage.name]
                 self.do(stage, f"after {redone}" if redone and again in (None, OTHER_PHOTOS) else again, run)
@@ -163,7 +163,7 @@ class _Execution:
 
 
 @contextmanager
-def planned(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> Iterator[RunContext]:
+def _planned(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> Iterator[RunContext]:
     """Say what these stages will cost, and provide a run with as many workers as the memory allows.
 
     Raises:

@@ -46,14 +46,14 @@ def fit_pairs(matches: MatchGraph, pairs: Sequence[PairId], run: RunContext) -> 
 
     def fit_numbers(pair: PairId) -> Fitted:
         seed = int(np.random.SeedSequence([run.seed, *pair]).generate_state(1)[0])
-        points, still = matches.points(pair), stationary_matches(matches, pair, run.settings)
+        points, still = matches.points(pair), _stationary_matches(matches, pair, run.settings)
         if not still.any():
             return estimator.fit(*points, options, seed), 0
         image = matches.images[pair[0]]
         wide = covers(points[0][still], matches.keypoints[image.id], (image.width, image.height))
         return fit_moving(estimator.fit, points, still, wide, options, seed), int(np.count_nonzero(still))
 
-    return in_parts(fit_pair, pairs, run)
+    return _in_parts(fit_pair, pairs, run)
 
 
 def graph_of(found: Mapping[PairId, Fitted]) -> ViewGraph:
@@ -64,7 +64,7 @@ def graph_of(found: Mapping[PairId, Fitted]) -> ViewGraph:
     )
 
 
-def in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run: RunContext) -> dict[PairId, Fitted]:
+def _in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run: RunContext) -> dict[PairId, Fitted]:
     """Return what `fit_pair` makes of every pair, in their order; parts that are complete are kept as they come."""
     folder = run.workspace.view_graph_parts
     if not can_go_on(folder, run.fingerprint):
@@ -103,7 +103,7 @@ def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, Fitted] | Non
         return None
 
 
-def stationary_matches(matches: MatchGraph, pair: PairId, settings: Settings) -> BoolArray:
+def _stationary_matches(matches: MatchGraph, pair: PairId, settings: Settings) -> BoolArray:
     """Return which matches of a pair stay in one place; none where the photos differ in size."""
     first, second = (matches.images[key] for key in pair)
     if (first.width, first.height) != (second.width, second.height):

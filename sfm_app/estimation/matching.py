@@ -77,7 +77,7 @@ def _find(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> N
     """Leave the features of every photo in its part, and its keypoints in the database."""
 
     def find(photo: int) -> tuple[int, NDArray[np.float32]]:
-        features, to_photo, size = found_in(method, names[photo], run)
+        features, to_photo, size = _found_in(method, names[photo], run)
         keypoints = features.keypoints * to_photo
         if run.mask_dir is not None:
             used = read_used(run.mask_dir, names[photo])
@@ -95,7 +95,7 @@ def _find(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> N
             write_keypoints(run.workspace.database, photo, keypoints)
 
 
-def found_in(
+def _found_in(
     method: FeatureMethod, name: str, run: RunContext
 ) -> tuple[Features, NDArray[np.float64], tuple[int, int]]:
     """Return what a method finds in one photo, by how much its keypoints have to be scaled, and the photo's size."""
@@ -156,7 +156,7 @@ def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> N
     read = lru_cache(max(KEPT, 2 * run.workers))(lambda photo: _load(part_of(photo, run)))
 
     def match(pair: PairId) -> tuple[PairId, NDArray[np.uint32]]:
-        return pair, matches_between(method, (read(pair[0]), read(pair[1])), options)
+        return pair, _matches_between(method, (read(pair[0]), read(pair[1])), options)
 
     left = unmatched(database, pairs)
     found = track(run.progress, ordered_map(run.executor, match, left, 2 * run.workers), "matching", len(left))
@@ -165,7 +165,7 @@ def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> N
             write_matches(database, pair, rows)
 
 
-def matches_between(
+def _matches_between(
     method: FeatureMethod, pair: tuple[Features, Features], options: MatchSettings
 ) -> NDArray[np.uint32]:
     """Return (M, 2) rows of two photos' features that a method takes for the same; none where a photo has none."""

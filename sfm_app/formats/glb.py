@@ -131,10 +131,10 @@ def cameras(glb: Glb, model: Model) -> list[int]:
     mesh = glb.add("meshes", {"name": "cameras", "primitives": [primitive]})
     nodes = [glb.add("nodes", {"name": "cameras", "mesh": mesh})]
     near = 0.1 * frustum_depth(np.array([center(camera) for camera in model.cameras]), model.surface.vertices)
-    return nodes + [glb.add("nodes", camera_node(glb, camera, near)) for camera in model.cameras]
+    return nodes + [glb.add("nodes", _camera_node(glb, camera, near)) for camera in model.cameras]
 
 
-def camera_node(glb: Glb, camera: Frustum, near: float) -> dict[str, Any]:
+def _camera_node(glb: Glb, camera: Frustum, near: float) -> dict[str, Any]:
     """Return a camera of glTF where the photo was taken; its center is in the middle, as glTF knows no other."""
     lens = {
         "yfov": float(2 * np.arctan(camera.height / (2 * camera.K[1, 1]))),

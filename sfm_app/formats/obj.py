@@ -42,7 +42,7 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
     check(model)
     texture = model.texture if len(model.surface.faces) else None
     beside = re.sub(r"\s", "_", name)  # names with blanks end at the blank for many a reader
-    text = ["# sfm_app\n", *vertex_lines(model, with_colors=texture is None)]
+    text = ["# sfm_app\n", *_vertex_lines(model, with_colors=texture is None)]
     files: dict[str, bytes] = {}
     if texture is None:
         if len(model.surface.faces):
@@ -51,14 +51,14 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
     else:
         used = pages_in_use(texture.page)
         pages = {page: f"{beside}_{page}.jpg" for page in used}
-        text += [f"mtllib {beside}.mtl\n", *textured_lines(model, texture, used)]
+        text += [f"mtllib {beside}.mtl\n", *_textured_lines(model, texture, used)]
         materials = (MATERIAL.format(name=f"page_{page}") + f"map_Kd {file}\n" for page, file in pages.items())
         files[f"{beside}.mtl"] = "\n".join(materials).encode()
         files |= {file: jpeg(texture.pages[page]) for page, file in pages.items()}
     return {f"{name}.obj": "".join(text).encode(), **files}
 
 
-def vertex_lines(model: Model, *, with_colors: bool) -> Iterator[str]:
+def _vertex_lines(model: Model, *, with_colors: bool) -> Iterator[str]:
     """Yield vertices, with colors behind the coordinates as MeshLab began it, normals, points and lines."""
     vertices, colors, lines = with_cameras(model)
     place = f"%.{decimals(model.surface.vertices)}f"
@@ -73,7 +73,7 @@ def vertex_lines(model: Model, *, with_colors: bool) -> Iterator[str]:
     yield rows("l %d %d\n", lines + 1)
 
 
-def textured_lines(model: Model, texture: Texture, pages: list[int]) -> Iterator[str]:
+def _textured_lines(model: Model, texture: Texture, pages: list[int]) -> Iterator[str]:
     """Yield places in the texture, each once, and the triangles page by page."""
     steps = np.round(10**DIGITS * texture.uv.reshape(-1, 2).astype(np.float64)).astype(np.int64)
     steps[:, 1] = 10**DIGITS - steps[:, 1]  # 0 is at the bottom in OBJ

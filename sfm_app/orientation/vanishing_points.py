@@ -95,7 +95,7 @@ def joined(parts: list[Segments]) -> Segments:
     )
 
 
-def misses_deg(direction: FloatArray, segments: Segments) -> FloatArray:
+def _misses_deg(direction: FloatArray, segments: Segments) -> FloatArray:
     """Return (N,) angle in the photo between each segment and the line from its middle to the vanishing point.
 
     [0, 90].
@@ -131,7 +131,7 @@ def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
     Segments on the horizon fit all horizontal directions, and vertical ones are no witnesses: both stay out.
     """
     on_horizon = np.abs(along(segments.normals, up)) > np.cos(np.radians(APART_DEG))
-    level = segments.take(~on_horizon & (misses_deg(up, segments) > APART_DEG / 2))
+    level = segments.take(~on_horizon & (_misses_deg(up, segments) > APART_DEG / 2))
     if len(level) < LEAST_SEGMENTS:
         return None
     e1, e2 = basis_across(up)
@@ -177,7 +177,7 @@ def square_frame(up: FloatArray, level: FloatArray, segments: Segments) -> tuple
 
 def _rotation_equations(frame: FloatArray, segments: Segments, width_deg: float) -> tuple[FloatArray, FloatArray]:
     """Return the normal equations of the rotation vector, per photo (P, 3, 3) and (P, 3)."""
-    misses = np.array([misses_deg(axis, segments) for axis in frame])
+    misses = np.array([_misses_deg(axis, segments) for axis in frame])
     axes = frame[np.argmin(misses, axis=0)]
     away = np.maximum(np.linalg.norm(np.cross(segments.middles, axes), axis=1), LEAST_SINE)
     weights = segments.lengths * np.exp(-0.5 * (misses.min(axis=0) / width_deg) ** 2) / away**2
@@ -211,14 +211,14 @@ def cap(axis: FloatArray, radius_deg: float, step_deg: float) -> FloatArray:
 
 
 def _support(direction: FloatArray, segments: Segments, width_deg: float) -> float:
-    weights = np.exp(-0.5 * (misses_deg(direction, segments) / width_deg) ** 2)
+    weights = np.exp(-0.5 * (_misses_deg(direction, segments) / width_deg) ** 2)
     return float((segments.lengths * weights).sum())
 
 
 def _matrices(direction: FloatArray, segments: Segments, width_deg: float) -> FloatArray:
     """Return (P, 3, 3) per photo the sum of n n' of its segments, weighted for least squares of the misses."""
     away = np.maximum(np.linalg.norm(np.cross(segments.middles, direction), axis=1), LEAST_SINE)
-    weights = segments.lengths * np.exp(-0.5 * (misses_deg(direction, segments) / width_deg) ** 2) / away**2
+    weights = segments.lengths * np.exp(-0.5 * (_misses_deg(direction, segments) / width_deg) ** 2) / away**2
     n = segments.normals
     return _per_photo(segments, weights[:, None, None] * n[:, :, None] * n[:, None])
 
@@ -232,7 +232,7 @@ def _per_photo(segments: Segments, values: FloatArray) -> FloatArray:
 
 def _judged(found: FloatArray, tried: FloatArray, support: FloatArray, segments: Segments) -> Vanishing | None:
     """Return the direction with what speaks for it, if it stands out from those that were tried far from it."""
-    running = misses_deg(found, segments) < WIDTHS_DEG[0]
+    running = _misses_deg(found, segments) < WIDTHS_DEG[0]
     share = float(segments.lengths[running].sum() / segments.lengths.sum())
     away = axis_angle_deg(tried, found) > APART_DEG
     if away.all():  # refined out of where it was sought

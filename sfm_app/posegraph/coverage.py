@@ -45,10 +45,10 @@ def sight_of(matches: MatchGraph, poses: Mapping[PairId, RelativePose]) -> Sight
     for pair, found in rows.items():
         for photo, column in zip(pair, found.T, strict=True):
             seen[photo][np.unique(column)] += 1
-    return Sight(rows, seen, {photo: cells_of(matches, photo) for photo in photos})
+    return Sight(rows, seen, {photo: _cells_of(matches, photo) for photo in photos})
 
 
-def cells_of(matches: MatchGraph, photo: int) -> IndexArray:
+def _cells_of(matches: MatchGraph, photo: int) -> IndexArray:
     """Return (K,) numbers of the cells in which the keypoints of a photo lie."""
     image = matches.images[photo]
     columns, lines = (matches.keypoints[photo] // (max(image.width, image.height) / CELLS)).astype(np.int64).T

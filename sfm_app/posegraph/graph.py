@@ -88,7 +88,7 @@ def build_pose_graph(
         dropped[pair] = LOOKS_ALIKE
         del poses[pair]
     rotations, angles = averaged(poses, {pair for pair, fit in views.fits.items() if fit.degeneracy})
-    for pair in contradicting(poses, angles):
+    for pair in _contradicting(poses, angles):
         dropped[pair] = CONTRADICTS
         del poses[pair]
 
@@ -101,13 +101,13 @@ def build_pose_graph(
         except FAILURES:  # the reason that it has no pose already stands
             return None
 
-    left = [pair for pair in without_pose(matches.matches, poses) if dropped.get(pair) != LOOKS_ALIKE]
+    left = [pair for pair in _without_pose(matches.matches, poses) if dropped.get(pair) != LOOKS_ALIKE]
     for pair, pose in zip(left, run_map(again, left, "pairs again"), strict=True):
         if pose is not None and not apart.strange(pair, matches.matches[pair][pose.inliers]):
             poses[pair] = pose
             dropped.pop(pair, None)
     poses = dict(sorted(poses.items()))
-    for pair in unconfirmed(poses, WEAK * options.min_inliers):
+    for pair in _unconfirmed(poses, WEAK * options.min_inliers):
         dropped[pair] = UNCONFIRMED
         del poses[pair]
     stayed = (replace(join, pairs=tuple(pair for pair in join.pairs if pair in poses)) for join in apart.doubtful)
@@ -125,13 +125,13 @@ def with_model(graph: PoseGraph, photos: Collection[int], poses: Mapping[PairId,
     return replace(graph, poses=entered, dropped=left, groups=_groups(entered))
 
 
-def without_pose(pairs: Iterable[PairId], poses: Mapping[PairId, RelativePose]) -> list[PairId]:
+def _without_pose(pairs: Iterable[PairId], poses: Mapping[PairId, RelativePose]) -> list[PairId]:
     """Return pairs that have no pose, of photos that those with one connect."""
     group = {photo: number for number, photos in enumerate(_groups(poses)) for photo in photos}
     return [pair for pair in pairs if pair not in poses and group.get(pair[0], -1) == group.get(pair[1], -2)]
 
 
-def contradicting(poses: Mapping[PairId, RelativePose], angles: Mapping[PairId, float]) -> list[PairId]:
+def _contradicting(poses: Mapping[PairId, RelativePose], angles: Mapping[PairId, float]) -> list[PairId]:
     """Return pairs that are further from the rotations of their photos, in degrees, than they may be."""
     typical = SPREADS * float(np.median(list(angles.values()) or [0.0]))
     limits = {
@@ -156,7 +156,7 @@ def averaged(
     return average_rotations({pair: pose.R for pair, pose in poses.items()}, weights)
 
 
-def unconfirmed(poses: Mapping[PairId, RelativePose], firm: float) -> list[PairId]:
+def _unconfirmed(poses: Mapping[PairId, RelativePose], firm: float) -> list[PairId]:
     """Return pairs with fewer than `firm` inliers that no loop of three photos bears out.
 
     With these a place that only looks like another is joined to it, and no other pair is there to contradict.

@@ -63,7 +63,7 @@ def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> Relat
     return found if found.in_front >= LEAST_IN_FRONT and found.kind != "rotation" else None
 
 
-def epipolar_normals(pair: Pair, R: FloatArray) -> FloatArray:
+def _epipolar_normals(pair: Pair, R: FloatArray) -> FloatArray:
     """Return (N, 3) what the direction of translation is at right angles to, for each match, R given."""
     h1 = np.column_stack([pair.rays[:, :2], np.ones(len(pair.rays))]) @ R.T
     h2 = np.column_stack([pair.rays[:, 2:], np.ones(len(pair.rays))])
@@ -72,7 +72,7 @@ def epipolar_normals(pair: Pair, R: FloatArray) -> FloatArray:
 
 def held_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
     """Return (3,) direction of translation near t that makes a robust sum of squared distances small, R held."""
-    normals = epipolar_normals(pair, R)
+    normals = _epipolar_normals(pair, R)
     best = t
     for _ in range(HELD_ROUNDS):
         distances = pose_distances(pair.rays, pair.focals, R, best) / (HELD_SIGMA * pair.max_error_px)
@@ -90,7 +90,7 @@ def sampled_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> Fl
 
     The best of many through two matches.
     """
-    normals = epipolar_normals(pair, R)
+    normals = _epipolar_normals(pair, R)
     picks = rng.integers(len(normals), size=(SAMPLES, 2))
     found = np.cross(normals[picks[:, 0]], normals[picks[:, 1]])
     lengths = np.linalg.norm(found, axis=1)

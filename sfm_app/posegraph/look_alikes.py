@@ -99,7 +99,7 @@ def tell_apart(
     """
     sight = sight_of(matches, poses)
     best = backbone(coverages(sight))
-    tracks = tracks_of(sight, best)
+    tracks = _tracks_of(sight, best)
     doubted = [pair for pair, rows in sight.rows.items() if pair not in best and tracks.contradict(pair, rows)]
     if not doubted:
         return LookAlikeVerdict((), (), tracks)
@@ -118,7 +118,7 @@ def tell_apart(
     return LookAlikeVerdict(tuple(joins), doubtful, tracks)
 
 
-def tracks_of(sight: Sight, pairs: Iterable[PairId]) -> FeatureTracks:
+def _tracks_of(sight: Sight, pairs: Iterable[PairId]) -> FeatureTracks:
     """Join the keypoints of pairs to tracks."""
     starts, count = {}, 0
     for photo, seen in sight.seen.items():

@@ -99,12 +99,14 @@ def estimated(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
     R, t = pair.start(fit)
     if not pair.trusted:
         return pair.pose(R, t, fit.inliers)
-    R, t = best_of_starts(pair, fit, (R, t))
+    R, t = _best_of_starts(pair, fit, (R, t))
     inliers = pair.inliers(R, t)
     return pair.pose(R, t, inliers) if np.count_nonzero(inliers) >= LEAST else None
 
 
-def best_of_starts(pair: Pair, fit: EpipolarFit, start: tuple[FloatArray, FloatArray]) -> tuple[FloatArray, FloatArray]:
+def _best_of_starts(
+    pair: Pair, fit: EpipolarFit, start: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray]:
     """Return the pose that the inliers of F fit best, of those that lie before both cameras.
 
     That of F's own start stays unless another one is clearly better and loses no inliers: of the two poses that a plane
@@ -114,13 +116,13 @@ def best_of_starts(pair: Pair, fit: EpipolarFit, start: tuple[FloatArray, FloatA
     best = refined(used, focals, *start)
     if not len(used):
         return best
-    lowest, most = pose_cost(used, focals, *best), int(np.count_nonzero(pair.inliers(*best)))
+    lowest, most = _pose_cost(used, focals, *best), int(np.count_nonzero(pair.inliers(*best)))
     if in_front(used, *best).mean() < BEFORE_BOTH:
         lowest, most = np.inf, 0
     planar = planar_starts(used) if fit.degeneracy == "planar" else ()
     for other in (*turned_starts(used, pair.essential(fit)), *planar):
         R, t = refined(used, focals, *other)
-        cost, count = pose_cost(used, focals, R, t), int(np.count_nonzero(pair.inliers(R, t)))
+        cost, count = _pose_cost(used, focals, R, t), int(np.count_nonzero(pair.inliers(R, t)))
         if cost < (1.0 - BETTER) * lowest and count >= most:
             t = t if np.mean(in_front(used, R, t)) >= 0.5 else -t
             if in_front(used, R, t).mean() >= BEFORE_BOTH:
@@ -128,7 +130,7 @@ def best_of_starts(pair: Pair, fit: EpipolarFit, start: tuple[FloatArray, FloatA
     return best
 
 
-def pose_cost(used: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> float:
+def _pose_cost(used: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> float:
     """Return what `refined` makes small in the end."""
     return float(np.sum(np.log1p((pose_distances(used, focals, R, t) / SIGMAS_PX[-1]) ** 2)))
 

@@ -32,7 +32,7 @@ _LMEDS_SIGMAS = 2.5
 """Robust standard deviations within which matches are inliers of LMedS (Rousseeuw and Leroy 1987)."""
 
 
-def refit_to_median(points: FloatArray, F: FloatArray, _threshold: float) -> FloatArray:
+def _refit_to_median(points: FloatArray, F: FloatArray, _threshold: float) -> FloatArray:
     """Refit to the matches within 2.5 robust standard deviations: LMedS knows the scale by itself."""
     squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
     return refit_sampson(points, F, _LMEDS_SIGMAS * median_sigma(squared))
@@ -74,7 +74,7 @@ RECIPES: Mapping[str, tuple[Recipe, str]] = {
     "ransac-sprt": (replace(RANSAC, verifier=Sprt), "ransac with Wald's sequential test of hypotheses"),
     "ransac-tdd": (replace(RANSAC, verifier=RandomisedTdd), "ransac with the T(1,1) test of hypotheses"),
     "lmeds": (
-        replace(RANSAC, score=lmeds, assumed_share=0.5, finish=refit_to_median),
+        replace(RANSAC, score=lmeds, assumed_share=0.5, finish=_refit_to_median),
         "least median of squares, for up to half outliers",
     ),
 }

@@ -42,7 +42,7 @@ matrices). What the fit is worth: `python benchmarks/accuracy/fundamental.py --r
 instead; the numbers were chosen by hand."""
 
 
-def optimize_locally(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+def _optimize_locally(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
     """Fit by 8 points to the matches within twice the threshold, then Sampson steps, coarse and fine, on all around.
 
     A model through seven noisy matches misses many true ones by more than the threshold; from the wider set it reaches
@@ -57,7 +57,7 @@ def optimize_locally(points: FloatArray, F: FloatArray, threshold: float) -> Flo
     return F
 
 
-def refit_to_all(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+def _refit_to_all(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
     """Return maximum likelihood on all matches within three thresholds, whose noise it measures."""
     return refine_mixture(points, F, threshold=threshold, reach=_REACH, most_steps=_FINAL_STEPS)
 
@@ -73,9 +73,9 @@ PRODUCTION = Recipe(
     least_trials=100,
     patience=samples_to_wait,
     oriented=True,
-    improve=optimize_locally,
+    improve=_optimize_locally,
     recover=with_another_epipole,
-    finish=refit_to_all,
+    finish=_refit_to_all,
 )
 """The shares, the batch and the patience were chosen on the Strecha sets and on synthetic pairs of thesis 4.8 and with
 two motions. `python benchmarks/accuracy/fundamental.py --real DATA --ablation` leaves out one part at a time; fresh

@@ -99,7 +99,7 @@ def orient(
     turns = [matches.images[photo].turn_deg for photo in poses]
     R = np.array([turned(rotation, turn) for rotation, turn in zip(matrices[:, :, :3], turns, strict=True)])
     found = {photo: looks[photo].result() for photo in poses if photo in looks}
-    upright = up_direction(R, centers, scenery_of(model, found), lines_of(model, found), turn_deg)
+    upright = up_direction(R, centers, _scenery_of(model, found), _lines_of(model, found), turn_deg)
     positions = [matches.images[key].gps for key in poses]
     gps = _georeference(centers, positions, upright)
     meters = None
@@ -113,7 +113,7 @@ def orient(
         raise NumericalError("the frame of the viewer holds what is no number")
     with backend("turning the model upright"):
         move(model, viewer)
-    entry = how_it_stands(upright, front) | where_it_stands(viewer, gps)
+    entry = _how_it_stands(upright, front) | _where_it_stands(viewer, gps)
     logger.info("orientation: %s", entry)
     return entry
 
@@ -142,13 +142,13 @@ def turned(R: FloatArray, turn_deg: int) -> FloatArray:
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ R
 
 
-def lines_of(model: Reconstruction, looks: Mapping[int, Look]) -> Segments:
+def _lines_of(model: Reconstruction, looks: Mapping[int, Look]) -> Segments:
     """Return line segments, in the world, of the photos of a model."""
     with backend("looking along lines in the photos"):
         return joined([_in_world(model, photo, look.lines) for photo, look in looks.items()])
 
 
-def scenery_of(model: Reconstruction, looks: Mapping[int, Look]) -> Scenery:
+def _scenery_of(model: Reconstruction, looks: Mapping[int, Look]) -> Scenery:
     """Return what a model and its photos show."""
     with backend("reading the points"):
         shown = seen_points(model, SCENERY_POINTS)
@@ -174,7 +174,7 @@ def _in_world(model: Reconstruction, image_id: int, lines: FloatArray) -> Segmen
     return segment_planes(first, second, image_id, focal_px(model, image_id))
 
 
-def how_it_stands(upright: Upright, front: str) -> dict[str, Json]:
+def _how_it_stands(upright: Upright, front: str) -> dict[str, Json]:
     """Return up and front, for the manifest."""
     standing = upright.standing
     return {
@@ -190,7 +190,7 @@ def how_it_stands(upright: Upright, front: str) -> dict[str, Json]:
     }
 
 
-def where_it_stands(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Json]:
+def _where_it_stands(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Json]:
     """Return unit and place of the model that `viewer` has moved, for the manifest."""
     if isinstance(gps, NoGeoreference):
         return {"unit": "about the size of the scene", "gps": f"not used: {gps.reason}"}

@@ -82,8 +82,8 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
     best = _pass(matches, views, intrinsics, run)
     matches, views = without_look_alikes(matches, views, best.graph)
     best = with_rival(best, matches, views, intrinsics, run)
-    best = with_other_focals(best, matches, views, intrinsics, run)
-    best = with_own_cameras(best, matches, views, intrinsics, run)
+    best = _with_other_focals(best, matches, views, intrinsics, run)
+    best = _with_own_cameras(best, matches, views, intrinsics, run)
     for number in range(2, MOST_PASSES + 1):
         if not best.models or not worth_another(best, best.intrinsics, matches):
             break
@@ -97,7 +97,7 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
             again, passes=number, thin=best.thin, graph=graph, tried=tried, one_camera_each=best.one_camera_each
         )
         matches, views = without_look_alikes(matches, views, best.graph)
-    return with_joined(best, matches, views, run)
+    return _with_joined(best, matches, views, run)
 
 
 def with_rival(
@@ -123,7 +123,7 @@ def with_rival(
     return replace(outcome, models=tuple(models), graph=graph, reason=why(rival, both, len(matches.images)))
 
 
-def with_other_focals(
+def _with_other_focals(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
     """Return outcome, or, where the guessed focal leaves many photos without a place, that of the best other guess."""
@@ -140,7 +140,7 @@ def with_other_focals(
     return outcome
 
 
-def with_own_cameras(
+def _with_own_cameras(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
     """Return the outcome, or, where photos of one size explain more with a camera each, that."""
@@ -177,7 +177,7 @@ def _with_two_cameras(
     return replace(own, tried=tried)
 
 
-def with_joined(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
+def _with_joined(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
     """Return the outcome, its models joined where they share points."""
     if len(outcome.models) < 2:
         return outcome

@@ -134,7 +134,7 @@ def better(found: Sequence[Tried]) -> Attempt | None:
 
 def why(best: Attempt, found: Sequence[Tried], photos: int) -> str:
     """Return why this attempt of several was taken, in a few words."""
-    if flawless(best, photos):
+    if _flawless(best, photos):
         return f"it places all {photos} photos and next to nothing contradicts it"
     others = [attempt for attempt in found if isinstance(attempt, Attempt) and attempt is not best]
     if not others:
@@ -144,7 +144,7 @@ def why(best: Attempt, found: Sequence[Tried], photos: int) -> str:
     return f"it explains {counts[0]} matches with {best.photos} photos, the next best {counts[1]} with {rival.photos}"
 
 
-def flawless(attempt: Attempt, photos: int) -> bool:
+def _flawless(attempt: Attempt, photos: int) -> bool:
     """Return whether a model holds all photos and next to nothing contradicts it."""
     inliers = sum(pair.inliers for pair in attempt.explained.values())
     against = sum(pair.contradicted for pair in attempt.explained.values())
@@ -175,7 +175,7 @@ def _first_round(
 
     def photo_by_photo(seed: Candidate) -> Tried:
         (attempt,) = _from_seed(group, seed, run, token)
-        stop.needless = isinstance(attempt, Attempt) and flawless(attempt, len(group.photos))
+        stop.needless = isinstance(attempt, Attempt) and _flawless(attempt, len(group.photos))
         return attempt
 
     with ThreadPoolExecutor(min(run.workers, 2), thread_name_prefix="mapper") as pool:

@@ -99,7 +99,7 @@ def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
         for part, panel in zip(figure.subfigures(len(shown), 1, squeeze=False)[:, 0], shown, strict=True):
             many = f"Camera {panel.name}, one of {len(panels)}.\n" if len(panels) > 1 else ""
             part.suptitle(many + in_words(panel.camera), fontsize=10.5, x=0.02, ha="left")
-            draw_camera(part, panel)
+            _draw_camera(part, panel)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=130, metadata=SUFFIXES[path.suffix.lower()])
 
@@ -110,7 +110,7 @@ def in_words(camera: Calibration) -> str:
     return "\n".join(fill(text, 150) for text in texts if text).replace("+-", "±")
 
 
-def draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
+def _draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
     """Draw both planes of one camera."""
     camera = panel.camera
     straight = without_lens(panel.pairs, camera)
@@ -119,7 +119,7 @@ def draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
     left.axline((0.0, 0.0), slope=1.0, color=GUIDE, linewidth=0.8, linestyle=":", label="square pixels")
     right.plot(camera.width / 2, camera.height / 2, "+", color=GUIDE, markersize=9, label="middle of the photo")
     for axes, plane in ((left, focal_plane(camera, pairs)), (right, center_plane(camera, pairs))):
-        draw_plane(axes, plane, camera, pairs)
+        _draw_plane(axes, plane, camera, pairs)
     part.colorbar(right.images[0], ax=right, label="share of the pairs' votes", shrink=0.8)
 
 
@@ -156,20 +156,20 @@ def center_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
     )
 
 
-def draw_plane(axes: "Axes", plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> None:
+def _draw_plane(axes: "Axes", plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> None:
     """Draw votes, curves and K in one plane."""
     shades = votes(plane, camera, pairs)
     axes.imshow(shades, extent=plane.extent, origin="lower", cmap="inferno", vmin=0, vmax=1, interpolation="bilinear")
-    draw_curves(axes, plane, plane.extent, SAMPLES)
+    _draw_curves(axes, plane, plane.extent, SAMPLES)
     marker, label = ("o", "found") if camera.identifiable else ("X", "a guess")
     axes.plot(*plane.found, marker, markersize=12, fillstyle="none", color=MARK, markeredgewidth=1.6, label=label)
     axes.set(title=plane.title, xlabel=plane.labels[0], ylabel=plane.labels[1], aspect="equal")
     if camera.identifiable and min(plane.spread) > 0:
-        enlarge(axes, plane, camera)
+        _enlarge(axes, plane, camera)
     axes.legend(loc="lower right", labelcolor=CURVE, framealpha=0.6, facecolor="black", edgecolor="none")
 
 
-def draw_curves(axes: "Axes", plane: ParameterPlane, extent: tuple[float, float, float, float], samples: int) -> None:
+def _draw_curves(axes: "Axes", plane: ParameterPlane, extent: tuple[float, float, float, float], samples: int) -> None:
     """Draw the part of all curves that is in `extent`; the more there are, the fainter."""
     left, right, bottom, top = extent
     x = _steps(left, right, samples)
@@ -178,7 +178,7 @@ def draw_curves(axes: "Axes", plane: ParameterPlane, extent: tuple[float, float,
     axes.set(xlim=(left, right), ylim=(bottom, top))
 
 
-def enlarge(axes: "Axes", plane: ParameterPlane, camera: Calibration) -> None:
+def _enlarge(axes: "Axes", plane: ParameterPlane, camera: Calibration) -> None:
     """Draw the ellipse in a window of its own where it would be too small to see."""
     from matplotlib.patches import Ellipse
 
@@ -190,7 +190,7 @@ def enlarge(axes: "Axes", plane: ParameterPlane, camera: Calibration) -> None:
         window = (x - reach, x + reach, y - np.sign(top - bottom) * reach, y + np.sign(top - bottom) * reach)
         target = axes.inset_axes((0.63, 0.63, 0.35, 0.35))
         target.set_facecolor("#20123a")
-        draw_curves(target, plane, window, ENLARGED_SAMPLES)
+        _draw_curves(target, plane, window, ENLARGED_SAMPLES)
         target.tick_params(colors=CURVE, labelsize=7)
         target.locator_params(nbins=3)
         axes.indicate_inset_zoom(target, edgecolor=GUIDE)

@@ -53,24 +53,24 @@ def make(dense_dir: Path, run: RunContext) -> Surface:
     place, options = run.workspace.surface, run.settings.mesh
     place.mkdir(exist_ok=True)
     views = [view for view in read_views(dense_dir) if map_file(dense_dir, view).exists()]
-    points = fused_points(dense_dir, views, run)
+    points = _fused_points(dense_dir, views, run)
     depth = octree_depth(points, options.poisson_depth)
     with run.step("finding the surface"):
-        raw = nonempty(poisson(place, depth), "the fused points span no surface")
+        raw = _nonempty(poisson(place, depth), "the fused points span no surface")
     colored, support = looked_at(raw, dense_dir, views, run)
-    least = SURE * photos_needed(views, run)
+    least = SURE * _photos_needed(views, run)
     trimmed = trim(colored, support, options.max_gap_triangles, least) if options.trim else colored
-    detailed = nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
+    detailed = _nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
     run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
     with run.step("simplifying"):
-        surface = nonempty(make_manifold(simplified(detailed, options, place)), "the surface has no extent")
+        surface = _nonempty(make_manifold(simplified(detailed, options, place)), "the surface has no extent")
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
     with replacing(place / SURFACE) as path:
         np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
     return surface
 
 
-def nonempty(surface: Surface, otherwise: str) -> Surface:
+def _nonempty(surface: Surface, otherwise: str) -> Surface:
     """Return the surface, which has triangles.
 
     Raises:
@@ -92,7 +92,7 @@ def digest(place: Workspace) -> str:
     return digest_files(place.surface, SURFACE)
 
 
-def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.float64]:
+def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.float64]:
     """Give (N, 3) points of all depth maps together, fused anew only where a depth map, or their folder, is younger."""
     if not views:
         raise ReconstructionError("no photo has a depth map", hint=HINT)
@@ -104,7 +104,7 @@ def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray
     sound = target.exists() and is_made_from(whole, digest_files(place, FUSED))
     if not sound or target.stat().st_mtime_ns <= youngest:
         with run.step("fusing depth maps"), replacing(target) as path:
-            fuse(dense_dir, photos_needed(views, run), region(views), path, cache_gb(run.memory_mb))
+            fuse(dense_dir, _photos_needed(views, run), region(views), path, cache_gb(run.memory_mb))
         whole.write_text(digest_files(place, FUSED), encoding="utf-8")
     points, _ = read_fused(place)
     run.record(fused_points=len(points))
@@ -115,7 +115,7 @@ def fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray
     return points
 
 
-def photos_needed(views: list[View], run: RunContext) -> int:
+def _photos_needed(views: list[View], run: RunContext) -> int:
     """Return how many photos have to see a fused point."""
     return min(1 + run.settings.depth.min_agreeing, len(views))
 

@@ -46,14 +46,14 @@ def make(source: Source, run: RunContext) -> PhotoSet:
         InputError: the source is missing, fewer than two photos are usable, or a mask is not.
     """
     if not source.video:
-        return read_photos(source, source.path, list(source.files), run)
+        return _read_photos(source, source.path, list(source.files), run)
     with video_frames(source.path, run) as folder:
-        return read_photos(source, folder, list_files(folder, run.workspace.root), run)
+        return _read_photos(source, folder, list_files(folder, run.workspace.root), run)
 
 
 def load(source: Source, run: RunContext) -> PhotoSet:
     """Read photos.json back; what is gone of what was laid out, or was damaged, is laid out again."""
-    return read_photo_set(run.workspace.frames if source.video else source.path, source.mask_dir, run)
+    return _read_photo_set(run.workspace.frames if source.video else source.path, source.mask_dir, run)
 
 
 def digest(place: Workspace) -> str:
@@ -61,7 +61,7 @@ def digest(place: Workspace) -> str:
     return digest_files(place.root, place.photo_set.name)
 
 
-def read_photos(source: Source, folder: Path, names: Sequence[str], run: RunContext) -> PhotoSet:
+def _read_photos(source: Source, folder: Path, names: Sequence[str], run: RunContext) -> PhotoSet:
     """Look at these files of a folder and lay the usable photos out for COLMAP; errors as `make`."""
     options = within_memory(run)
     found = run.map(partial(read_photo, folder, options=options), names, "photos")
@@ -72,7 +72,7 @@ def read_photos(source: Source, folder: Path, names: Sequence[str], run: RunCont
     unusable = sorted(unusable + blackened + needless, key=lambda photo: photo.name)
     if len(photos) < 2:
         raise InputError(
-            too_few(folder, len(photos), unusable), hint="two photos of one place are the least; 10 to 50 work best"
+            _too_few(folder, len(photos), unusable), hint="two photos of one place are the least; 10 to 50 work best"
         )
     named = tuple(stored_names(grouped(photos, options.cameras)))
     photo_set = PhotoSet(folder, named, tuple(unusable), source.mask_dir)
@@ -80,8 +80,8 @@ def read_photos(source: Source, folder: Path, names: Sequence[str], run: RunCont
         shutil.rmtree(place, ignore_errors=True)
     run.map(partial(laid_out, folder=folder, target=run.workspace.photos), photo_set.photos, "laying photos out")
     if photo_set.masks is not None:
-        lay_out_masks(photo_set, photo_set.masks, list(source.masks), run)
-    save_photo_set(photo_set, run)
+        _lay_out_masks(photo_set, photo_set.masks, list(source.masks), run)
+    _save_photo_set(photo_set, run)
     run.record(usable=len(photos), cameras=len(photo_set.groups), unusable={p.name: p.reason for p in unusable})
     run.record(notes={photo.path: list(photo.notes) for photo in photos if photo.notes})
     run.record(gps=sum(photo.gps is not None for photo in photos))
@@ -126,7 +126,7 @@ def masked(
     return kept, [photo for photo in found if isinstance(photo, UnusablePhoto)]
 
 
-def lay_out_masks(photo_set: PhotoSet, masks: Path, names: Sequence[str], run: RunContext) -> None:
+def _lay_out_masks(photo_set: PhotoSet, masks: Path, names: Sequence[str], run: RunContext) -> None:
     """Put a mask of every photo into the workspace, and count them."""
     lay_out = partial(lay_out_mask, folder=photo_set.folder, masks=masks, target=run.workspace.masks)
     run.map(lay_out, photo_set.photos, "laying masks out")
@@ -148,7 +148,7 @@ def laid_out(photo: Photo, *, folder: Path, target: Path) -> None:
         ) from err
 
 
-def save_photo_set(photos: PhotoSet, run: RunContext) -> None:
+def _save_photo_set(photos: PhotoSet, run: RunContext) -> None:
     """Write photos.json, with hashes of the copies."""
     known = {"photos": [asdict(photo) for photo in photos.photos], "unusable": [asdict(p) for p in photos.unusable]}
     copies = {photo.name: _copy_digest(photo, run) for photo in photos.photos}
@@ -162,7 +162,7 @@ def _copy_digest(photo: Photo, run: RunContext) -> str | None:
     return digest_files(run.workspace.photos, photo.name) if place.is_file() and not place.is_symlink() else None
 
 
-def read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoSet:
+def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoSet:
     """Read photos.json back, and lay out what is missing."""
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
     photos = tuple(_photo(entry) for entry in values["photos"])
@@ -185,7 +185,7 @@ def _photo(entry: Mapping[str, Any]) -> Photo:
     return Photo(**{**entry, **known, "notes": tuple(entry.get("notes", ()))})
 
 
-def too_few(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:
+def _too_few(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:
     """Return why there is nothing to reconstruct, in one line."""
     reasons = Counter("copies of another" if "same picture" in photo.reason else photo.reason for photo in unusable)
     seen = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())

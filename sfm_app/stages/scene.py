@@ -37,7 +37,7 @@ def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Run
     aside = mapping_run(run)
     first = Found(reconstruct(matches, views, intrinsics, aside), matches, views, intrinsics, aside)
     try:
-        scene = adjusted_scene(look_again(first), run)
+        scene = _adjusted_scene(look_again(first), run)
     except ReconstructionError:  # any other end, such as Ctrl-C or a full disk: the same command goes on with it
         shutil.rmtree(aside.workspace.root, ignore_errors=True)
         raise
@@ -66,14 +66,14 @@ def mapping_run(run: RunContext) -> RunContext:
     return replace(run, workspace=place)
 
 
-def adjusted_scene(found: Found, run: RunContext) -> Scene:
+def _adjusted_scene(found: Found, run: RunContext) -> Scene:
     """Adjust the models, put them upright, write them down and count them.
 
     Raises:
         ReconstructionError: no model holds depth.
     """
     matches, views, intrinsics = found.matches, found.views, found.intrinsics
-    outcome = with_depth(found.outcome, matches, views, intrinsics, run)
+    outcome = _with_depth(found.outcome, matches, views, intrinsics, run)
     looks = look_at_photos([attempt.model for attempt in outcome.models], matches, run)
     adjusted = [adjusted_or_as_it_was(attempt.model, found.run.workspace.database) for attempt in outcome.models]
     models = [found.model for found in adjusted]
@@ -98,7 +98,7 @@ def adjusted_scene(found: Found, run: RunContext) -> Scene:
         observations=scene.observations,
         mean_reprojection_px=round(scene.mean_reprojection_px, 4),
         orientation=orientations[0],
-        adjustment=how_it_was_adjusted(adjusted, names),
+        adjustment=_how_it_was_adjusted(adjusted, names),
         **how_it_was_made(outcome),
         look_alikes=in_words(outcome.graph.look_alikes, matches),
         perhaps_look_alikes=in_words(outcome.graph.doubtful, matches),
@@ -108,7 +108,7 @@ def adjusted_scene(found: Found, run: RunContext) -> Scene:
     return scene
 
 
-def with_depth(
+def _with_depth(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
     """Drop the models of photos that hold no depth: these could be anything.
@@ -153,7 +153,7 @@ def how_it_was_made(outcome: Outcome) -> dict[str, Json]:
     }
 
 
-def how_it_was_adjusted(adjusted: Sequence[Adjusted], names: Mapping[str, str]) -> dict[str, Json]:
+def _how_it_was_adjusted(adjusted: Sequence[Adjusted], names: Mapping[str, str]) -> dict[str, Json]:
     """Return what the manifest says about what the last adjustment could not do; empty where that is nothing."""
     main, others = adjusted[0], adjusted[1:]
     cameras = {image.camera_id: names[image.name] for image in posed_images(main.model)}

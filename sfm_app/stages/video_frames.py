@@ -48,7 +48,7 @@ def video_frames(source: Path, run: RunContext) -> Iterator[Path]:
         shutil.rmtree(run.workspace.frames, ignore_errors=True)
         with replacing(run.workspace.frames_marker) as path:
             path.write_text(json.dumps(asdict(chosen)), encoding="utf-8")
-    write_frames(source, chosen.frames, run)
+    _write_frames(source, chosen.frames, run)
     run.record(video=chosen.counts)
     yield run.workspace.frames
     run.workspace.frames_marker.unlink()
@@ -97,7 +97,7 @@ def chosen_from(source: Path, run: RunContext) -> Chosen:
     return Chosen(run.fingerprint, choice.frames, counts)
 
 
-def write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None:
+def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None:
     """Write the frames that are not there yet."""
     for half in run.workspace.frames.glob(".*"):  # of a run that was killed while it wrote
         half.unlink()

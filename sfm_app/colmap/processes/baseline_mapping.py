@@ -14,7 +14,7 @@ def work(task: MappingTask) -> None:
     """
     scratch, seed = Path(task["scratch"]), task["seed"]
     database = scratch / "database.db"
-    verify(database, seed)
+    _verify(database, seed)
     (scratch / "all").mkdir()
     options = pycolmap.IncrementalPipelineOptions()
     options.extract_colors = False
@@ -27,7 +27,7 @@ def work(task: MappingTask) -> None:
         check_written(*(scratch / "model").iterdir())
 
 
-def verify(database: Path, seed: int) -> None:
+def _verify(database: Path, seed: int) -> None:
     """Replace all two-view geometries by what COLMAP's geometric verification makes of the raw matches."""
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.ransac.random_seed = seed

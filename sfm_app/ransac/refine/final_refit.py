@@ -18,7 +18,7 @@ Refit = Callable[[FloatArray, FloatArray, float], FloatArray]
 """(points, F, threshold) -> the final F."""
 
 
-def refit_eight_point(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+def _refit_eight_point(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
     """Apply the 8-point algorithm (thesis 4.3.2)."""
     inliers = _inliers(points, F, threshold)
     return F if len(inliers) < 8 else fit_eight_point(inliers, np.ones(len(inliers)))
@@ -27,19 +27,19 @@ def refit_eight_point(points: FloatArray, F: FloatArray, threshold: float) -> Fl
 def refit_sampson(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
     """Minimize the Sampson distance (thesis 4.2)."""
     inliers = _inliers(points, F, threshold)
-    return refine_sampson(inliers, refit_eight_point(points, F, threshold)) if len(inliers) >= 8 else F
+    return refine_sampson(inliers, _refit_eight_point(points, F, threshold)) if len(inliers) >= 8 else F
 
 
-def refit_reprojection(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+def _refit_reprojection(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
     """Minimize the reprojection distance (thesis 4.3), from the least squares on its first order."""
     inliers = _inliers(points, F, threshold)
     return F if len(inliers) < 8 else refine_reprojection(inliers, refit_sampson(points, F, threshold))
 
 
 REFITS: dict[str, Refit] = {
-    "eight-point": refit_eight_point,
+    "eight-point": _refit_eight_point,
     "sampson": refit_sampson,
-    "reprojection": refit_reprojection,
+    "reprojection": _refit_reprojection,
 }
 """What `EpipolarSettings.refit` may name besides "auto"."""
 

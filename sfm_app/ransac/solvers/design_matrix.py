@@ -45,7 +45,7 @@ def gather(points: FloatArray, weights: FloatArray, start: int, block: FloatArra
 
 
 @kernel
-def design_columns(block: FloatArray, count: int, rows: FloatArray) -> None:
+def _design_columns(block: FloatArray, count: int, rows: FloatArray) -> None:
     """Write the rows of A for the matches of a block (see `gather`), times sqrt(weight), as columns (9, LANES)."""
     for n in range(count):
         x1, y1, x2, y2, root = block[0, n], block[1, n], block[2, n], block[3, n], block[4, n]
@@ -87,7 +87,7 @@ def _add_gram(points: FloatArray, weights: FloatArray, gram: FloatArray) -> None
     start = FIRST
     while start < points.shape[0]:
         count, start = gather(points, weights, start, block)
-        design_columns(block, count, rows)
+        _design_columns(block, count, rows)
         add_products(rows, count, gram)
     mirror(gram)
 
@@ -102,7 +102,7 @@ def quadratic_forms(points: FloatArray, whitening: FloatArray) -> FloatArray:
     while start < count:
         first = start
         filled, start = gather(points, ones, start, block)
-        design_columns(block, filled, rows)
+        _design_columns(block, filled, rows)
         for k in range(whitening.shape[1]):
             for n in range(filled):
                 dots[n] = 0.0

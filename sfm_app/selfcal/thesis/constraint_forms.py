@@ -134,17 +134,17 @@ def huang_faugeras_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
     return np.asarray(2 * g / np.maximum(1.0 - r, LEAST_COMPLEMENT))
 
 
-def frobenius_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
+def _frobenius_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
     """Return (..., 9) equations whose norm is the term of thesis (5.9)."""
     return frobenius_form(halves.essential(cameras))
 
 
-def trivedi_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
+def _trivedi_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
     """Return (..., 3) the terms of thesis (5.11)."""
     return trivedi(halves.essential(cameras))
 
 
-def polynomial_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
+def _polynomial_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
     """Return (..., 1) the term of thesis (5.25)."""
     return polynomial_form(halves.essential(cameras))
 
@@ -155,9 +155,9 @@ Equations = Callable[[Halves, FloatArray], FloatArray]
 EQUATIONS: Mapping[ConstraintForm, Equations] = MappingProxyType(
     {
         "huang-faugeras": huang_faugeras_equations,
-        "frobenius": frobenius_equations,
-        "trivedi": trivedi_equations,
-        "polynomial": polynomial_equations,
+        "frobenius": _frobenius_equations,
+        "trivedi": _trivedi_equations,
+        "polynomial": _polynomial_equations,
     }
 )
 """What least squares makes small, by the setting `calibration.constraint_form`."""

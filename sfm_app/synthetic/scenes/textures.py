@@ -116,7 +116,7 @@ def bricks(a: float, b: float, seed: int) -> tuple[float, float]:
 
 
 @kernel
-def ramp(x: float, low: float, high: float) -> float:
+def _ramp(x: float, low: float, high: float) -> float:
     """Return 0 below `low`, 1 above `high`, straight between."""
     return min(1.0, max(0.0, (x - low) / (high - low)))
 
@@ -150,16 +150,16 @@ def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
     row = math.floor(band)
     inside = band - row
     turn = (math.atan2(p[2], p[0]) / (2.0 * math.pi) + 0.5) * 24.0
-    line = 1.0 - ramp(min(inside, 1.0 - inside), 0.03, 0.06)
+    line = 1.0 - _ramp(min(inside, 1.0 - inside), 0.03, 0.06)
     part = turn - math.floor(turn)
     kind = row % 4
     if kind == 0:
         return 1.0, line
     if kind == 1:  # zigzag
-        return ramp(abs(2.0 * part - 1.0) - inside, -0.05, 0.05), line
+        return _ramp(abs(2.0 * part - 1.0) - inside, -0.05, 0.05), line
     if kind == 2:  # rays and dots of uneven size
         reach = 0.22 + 0.2 * lattice(math.floor(turn), row, 5, 17)
-        return 1.0 - ramp(math.hypot(part - 0.5, inside - 0.5) - reach, -0.04, 0.04), line
+        return 1.0 - _ramp(math.hypot(part - 0.5, inside - 0.5) - reach, -0.04, 0.04), line
     steps = math.floor(4.0 * part)  # meander
     wall = (steps == 0.0) or (steps == 2.0 and inside > 0.3) or (inside > 0.75 and steps < 3.0)
     return 1.0 if wall else 0.0, line
@@ -178,34 +178,34 @@ def mixture(
     broad = octaves(p, 3.0 * scale, 0.5, max(footprint, 0.7 * scale), seed + 40)
     bright = 1.0 + contrast * (1.7 * fine + 0.4 * broad)
     if kind == 0:  # stone: stains and dark pores
-        second = ramp(broad + 0.6 * fine, -0.3, 0.9)
-        joint = 0.8 * ramp(octaves(p, 0.09 * scale, 0.75, footprint, seed + 60), 0.3, 0.55)
+        second = _ramp(broad + 0.6 * fine, -0.3, 0.9)
+        joint = 0.8 * _ramp(octaves(p, 0.09 * scale, 0.75, footprint, seed + 60), 0.3, 0.55)
     elif kind <= 2:
         border, name = tiles(kind, p, n, scale, seed)
         blur = footprint / scale
-        joint = 1.0 - ramp(border, 0.04 - 0.5 * blur, 0.06 + 0.5 * blur)
+        joint = 1.0 - _ramp(border, 0.04 - 0.5 * blur, 0.06 + 0.5 * blur)
         second = name + 0.4 * fine
         bright *= 0.8 + 0.4 * ((7.0 * name) % 1.0)
     elif kind == 3:
         second, joint = ceramic(p, scale)
-        second *= 1.0 - 0.25 * ramp(fine, 0.1, 0.5)
+        second *= 1.0 - 0.25 * _ramp(fine, 0.1, 0.5)
     elif kind == 4:  # wood: rings about the z axis, bent by noise; planks by height
         r = math.hypot(p[0] + 0.3 * scale * broad, p[1] - 2.0 * scale) / scale
         rings = 6.0 * r + 1.5 * octaves((p[0], p[1], 0.2 * p[2]), 0.5 * scale, 0.6, footprint, seed)
         second = 0.5 + 0.5 * math.sin(2.0 * math.pi * rings) + 0.3 * fine
         plank = 2.0 * p[1] / scale
-        joint = 1.0 - ramp(min(plank - math.floor(plank), math.floor(plank) + 1.0 - plank), 0.02, 0.05)
+        joint = 1.0 - _ramp(min(plank - math.floor(plank), math.floor(plank) + 1.0 - plank), 0.02, 0.05)
         bright *= 0.8 + 0.4 * lattice(math.floor(plank), 3, 0, seed)
     elif kind == 5:  # marble: thin veins where bent planes cross the body
         wave = (p[0] + 0.7 * p[1] + 0.4 * p[2]) / scale + 2.2 * octaves(p, scale, 0.6, footprint, seed)
         second = (1.0 - abs(math.sin(math.pi * wave))) ** 3
-        joint = 0.5 * ramp(octaves(p, 0.5 * scale, 0.6, footprint, seed + 80), 0.3, 0.7)
+        joint = 0.5 * _ramp(octaves(p, 0.5 * scale, 0.6, footprint, seed + 80), 0.3, 0.7)
     elif kind == 6:
         border, name = tiles(kind, p, n, scale, seed)
-        second, joint = name, 1.0 - ramp(border, 0.0, 0.14)
+        second, joint = name, 1.0 - _ramp(border, 0.0, 0.14)
         bright *= 0.7 + 0.6 * ((5.0 * name) % 1.0)
     else:  # stripes around the y axis, worn off in places
         turn = (math.atan2(p[2], p[0]) / (2.0 * math.pi) + 0.5) * 8.0
         second = float(math.floor(turn) % 2)
-        joint = 0.8 * ramp(broad + fine, 0.25, 0.5)
+        joint = 0.8 * _ramp(broad + fine, 0.25, 0.5)
     return min(1.0, max(0.0, second)), joint, max(0.15, bright)
