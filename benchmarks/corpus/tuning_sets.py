@@ -38,7 +38,7 @@ GROUPS: Mapping[str, Group] = {
         "rendered planes, panoramas and logos", "docs/algorithms.md, All estimators: looked at on all real sets",
     ),
     "photos left out, bare photos": Group(
-        ("photos", "diagnosis"), FIRST_EIGHT, "rendered walls", "docs/algorithms.md, Why there is no scene",
+        ("photos", "estimation.diagnosis"), FIRST_EIGHT, "rendered walls", "docs/algorithms.md, Why there is no scene",
     ),
     "self-calibration: consensus, weights, priors, verdict": Group(
         ("selfcal",), FIRST_EIGHT, "rendered walks, lenses and orbits; synthetic calibrations",

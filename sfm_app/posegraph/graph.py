@@ -34,7 +34,7 @@ poses. Chosen by hand; not measured on its own."""
 FLAT = 0.1
 """How much a pair counts whose matches lie on a plane: two poses explain it, and often the wrong one is taken. Chosen
 on kitchen25, where such pairs outvoted those that join its two halves; nothing changes on castle-P19, fountain-P11 and
-temple16. All sets: benchmarks/accuracy/chosen_on.py."""
+temple16. All sets: benchmarks/corpus/tuning_sets.py."""
 WEAK = 2.0
 """A pair with fewer than so many times the least inliers needs a loop of other pairs to bear it out.
 docs/algorithms.md, From K to relative poses. Chosen by hand; not measured on its own."""

@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 
 COARSE, FINE = 0.25, 0.1
 """Scales c in thresholds. Chosen on the 156 raw pairs of the Strecha sets (docs/algorithms.md, Fundamental matrices);
-`python benchmarks/accuracy/fundamental.py --real DATA --ablation` has one score and other scores beside them."""
+`python -m benchmarks.fundamental --real DATA --ablation` has one score and other scores beside them."""
 _WIDE, _AROUND = 2.0, 4.0
 """Thresholds within which matches take part in the 8-point fit, and in the Sampson steps after it. docs/algorithms.md,
 Fundamental matrices. Chosen on the Strecha sets together with the other constants of lev-ransac; not measured on their
@@ -38,7 +38,7 @@ _LOCAL_MATCHES, _LOCAL_STEPS, _ENOUGH = 1000, (5, 3), 1e-3
 1000 were chosen on the Strecha sets with six seeds; the others by hand, not measured on their own."""
 _REACH, _FINAL_STEPS = 3.0, 12
 """Thresholds within which matches take part in the last fit, and its most steps (docs/algorithms.md, Fundamental
-matrices). What the fit is worth: `python benchmarks/accuracy/fundamental.py --real DATA --ablation`, least squares
+matrices). What the fit is worth: `python -m benchmarks.fundamental --real DATA --ablation`, least squares
 instead; the numbers were chosen by hand."""
 
 
@@ -78,7 +78,7 @@ PRODUCTION = Recipe(
     finish=_refit_to_all,
 )
 """The shares, the batch and the patience were chosen on the Strecha sets and on synthetic pairs of thesis 4.8 and with
-two motions. `python benchmarks/accuracy/fundamental.py --real DATA --ablation` leaves out one part at a time; fresh
+two motions. `python -m benchmarks.fundamental --real DATA --ablation` leaves out one part at a time; fresh
 seeds and other sets stand in benchmarks/README.md."""
 
 

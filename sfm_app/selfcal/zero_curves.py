@@ -38,14 +38,14 @@ VOTES_SIGMA, KEPT = 0.01, 0.8
 """A camera that keeps less than this share of the votes (of this width) that the peak of the consensus has follows
 matches that most pairs contradict. On fourteen sets and variants right adjustments keep 0.97 to 1, the one that many
 wrong F's pulled away (fox50) 0.35; without that set the bound would be the same. Which sets:
-benchmarks/accuracy/chosen_on.py."""
+benchmarks/corpus/tuning_sets.py."""
 ENOUGH_PAIRS = 6.0
 """Effective pairs that must agree on the peak to contradict: twelve constraints on five parameters of a camera. With
 three pairs (merton1) the peak's center is anywhere. docs/algorithms.md, Self-calibration, 2. Chosen by hand; not
 measured on its own."""
 AGREES = 0.1
 """Pairs with r below this at the peak are then listened to, and no others; on the same sets 0.03 and 0.05 move no focal
-by more than 0.1 %. Chosen on those sets, benchmarks/accuracy/chosen_on.py."""
+by more than 0.1 %. Chosen on those sets, benchmarks/corpus/tuning_sets.py."""
 ANOTHER_FOCAL = 1.25
 """Times by which focals of the consensus and of the matches may differ. docs/algorithms.md, Self-calibration, 5. Chosen
 by hand; not measured on its own."""

@@ -18,7 +18,7 @@ YEAR = r"\b(?:18|19|20)\d\d\b"
 POINTER = re.compile(rf"[Tt]hesis|\bEq\. |{YEAR}|\b[Oo]urs\b")
 """The thesis, an equation of it, a paper, or nobody else."""
 SOURCE = re.compile(
-    rf"[Tt]hesis|\bEq\. |{YEAR}|docs/algorithms\.md|benchmarks/|"
+    rf"[Tt]hesis|\bEq\. |{YEAR}|docs/algorithms\.md|benchmarks[/.]|"
     r"by hand|\b[Bb]y definition\b|\bCounted\b|double precision"
 )
 """The thesis, a paper, a page or command with the measurement, a definition, rounding, or that it is a guess."""
@@ -73,6 +73,8 @@ def test_what_a_constant_refers_to_is_there(path):
             assert not number or f"**{number}. " in page, f"{name}: {section}, {number}"
         for file in re.findall(r"\b(?:benchmarks|docs)/[\w/-]+\.(?:py|md)\b", about):
             assert (ROOT / file).is_file(), f"{name}: {file}"
+        for command in re.findall(r"\bpython -m (benchmarks(?:\.\w+)+)", about):
+            assert (ROOT / command.replace(".", "/") / "__main__.py").is_file(), f"{name}: {command}"
 
 
 @pytest.mark.parametrize("path", modules(METHODS), ids=named)

@@ -21,13 +21,13 @@ FloatArray = NDArray[np.float64]
 
 _SURE = 1400.0
 """Samples to wait are the square of this over z (docs/algorithms.md, Fundamental matrices). Chosen on the Strecha sets;
-`python benchmarks/accuracy/fundamental.py --real DATA --ablation` has the search without it beside it."""
+`python -m benchmarks.fundamental --real DATA --ablation` has the search without it beside it."""
 _MOST = 3000.0
 """Samples to wait where the evidence is poor, z below 26. Chosen with `_SURE` (docs/algorithms.md, Fundamental
 matrices)."""
 _LEAST_IN_DOUBT = 250.0
 """A quarter of them are samples of the rest; a motion that holds two thirds of it is in one of 17 of these. Chosen on
-pairs with two motions: `python benchmarks/accuracy/fundamental.py --two-motions 100`."""
+pairs with two motions: `python -m benchmarks.fundamental --two-motions 100`."""
 _LEAST_INLIERS = 8
 """Fewer are no evidence: one more than seven, through which a model always goes. Chosen by hand; not measured on its
 own."""

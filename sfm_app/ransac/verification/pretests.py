@@ -24,7 +24,7 @@ BLOCK = 64
 
 LENIENCE = 0.5
 """Support that a model besides the priors must have, over that of the best sample, to be looked at. Chosen with the
-other constants of lev-ransac (benchmarks/accuracy/chosen_on.py); not measured on its own."""
+other constants of lev-ransac (benchmarks/corpus/tuning_sets.py); not measured on its own."""
 _BAIL_OUT_SIGMAS = 3.0
 """Standard deviations of the hypergeometric count that a hypothesis may fall short by (Capel 2005): one good one of a
 thousand falls."""

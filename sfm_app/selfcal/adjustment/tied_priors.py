@@ -22,7 +22,7 @@ from sfm_app.selfcal.lens import LOG_FOCAL
 TIE = 0.3
 """Standard deviation of log f among the photos of one folder. Of reichstag10's ten cameras it is 0.31; photos about
 which no pair says anything follow the others. The set that it was compared with is named in
-benchmarks/accuracy/chosen_on.py."""
+benchmarks/corpus/tuning_sets.py."""
 LEAST = 2
 """Photos that are tied; one alone has nobody to follow. By definition."""
 

@@ -26,17 +26,17 @@ on its own."""
 FITS = 0.88
 """A camera that wins this share of all votes leaves nothing to be explained: of fountain-P11 and Herz-Jesus-P8 it wins
 0.94, of ten cameras brought to one size 0.68, of one camera with four pairs in ten wrong 0.5 to 0.7. What it was chosen
-on: benchmarks/accuracy/chosen_on.py."""
+on: benchmarks/corpus/tuning_sets.py."""
 LEAST_GAIN, LEAST_GAIN_OF_SEVERAL = 0.05, 0.02
 """Share of all votes that cameras of their own must win on held pairs: against one camera, and against several, where
 it is certain already that the photos are not of one. Chosen on 120 random scenes of one camera (lens, crop, up to two
 pixels of noise, up to 40 % wrong pairs, orbits; at most 0.08 with six photos, 0.00 with ten and sixteen) and on
 reichstag10 brought to one size (0.12 to 0.15); without it, ten random cameras say the same (0.17). Of the other photo
-sets, none of which was looked at before, 0.01 at most. All sets: benchmarks/accuracy/chosen_on.py."""
+sets, none of which was looked at before, 0.01 at most. All sets: benchmarks/corpus/tuning_sets.py."""
 CLEARLY, FEW_PAIRS = 2.5, 10.0
 """In standard deviations of that gain, pairs taken as independent, how much it must be; and what few pairs need more,
 divided by their number. The same scenes: at most 3.0 with six photos; reichstag10 3.6 to 3.7. Chosen with them. All
-sets: benchmarks/accuracy/chosen_on.py."""
+sets: benchmarks/corpus/tuning_sets.py."""
 LEAST_EACH = 3.0
 """Photos that each of several cameras must have on average: more cameras than that are a sign of each its own. Chosen
 by hand; not measured on its own."""

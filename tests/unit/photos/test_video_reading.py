@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sfm_app.photos import UnreadableError, head_of, is_video, opened
-from sfm_app.photos.video.video_reader import video_reader as video
+from sfm_app.photos.video import video_reader as video
 
 pytestmark = pytest.mark.slow
 
