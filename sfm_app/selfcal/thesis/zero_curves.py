@@ -17,8 +17,8 @@ FOCAL_RANGE = 3.0
 SIGMA_SHARE = 0.1
 """sigma of rho, as a share of the range that is searched (thesis 5.8.4)."""
 PEAK_RANGE, PEAK_SIGMA = (0.3, FOCAL_RANGE), 0.1
-"""Where peaks are sought and how wide they are, in image widths: small beside the distance between two cameras. Chosen by
-hand; not measured on its own."""
+"""Where peaks are sought and how wide they are, in image widths: small beside the distance between two cameras. Chosen
+by hand; not measured on its own."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
