@@ -7,6 +7,7 @@ to lie right, and structure that repeats. On real photos that alone halves the e
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.damping import DampingRange, damped_step
 from sfm_app.geometry.pose_manifold import POSE, essential, moved
 from sfm_app.jit import kernel
 
@@ -18,9 +19,10 @@ that a second structure explains pull the pose to a compromise between both. doc
 poses."""
 STEPS = 12
 """Most steps at either scale. Chosen by hand; not measured on its own."""
-FIRST_DAMPING, MOST_DAMPING, GAIN = 1e-4, 1e6, 1e-6
-"""Of Levenberg and Marquardt's steps, relative to the diagonal, and the relative decrease of the cost that ends them.
-Chosen by hand; not measured on their own."""
+DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e6)
+"""Of Levenberg and Marquardt's steps. Chosen by hand; not measured on its own."""
+GAIN = 1e-6
+"""Relative decrease of the cost that ends them. Chosen by hand; not measured on its own."""
 _STEP = 1e-6
 """By which parameters move for a difference. Chosen by hand; not measured on its own."""
 
@@ -98,20 +100,20 @@ def _system(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float
 
 
 def _descended(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
-    cost, damping = _cost(rays, focals, pose, sigma), FIRST_DAMPING
+    cost, damping = _cost(rays, focals, pose, sigma), DAMPING.first
+
+    def attempt(tried: float) -> tuple[FloatArray, float] | None:
+        step = np.asarray(np.linalg.solve(A + np.diag(tried * np.diag(A) + 1e-9), b), np.float64)
+        trial = moved(pose, step)
+        lower = _cost(rays, focals, trial, sigma)
+        return (trial, lower) if lower < cost else None
+
     for _ in range(STEPS):
         A, b = _system(rays, focals, pose, sigma)
-        while damping < MOST_DAMPING:
-            step = np.asarray(np.linalg.solve(A + np.diag(damping * np.diag(A) + 1e-9), b), np.float64)
-            trial = moved(pose, step)
-            lower = _cost(rays, focals, trial, sigma)
-            if lower < cost:
-                break
-            damping *= 10.0
-        else:
-            return pose
-        arrived = cost - lower < GAIN * cost
-        pose, cost, damping = trial, lower, max(0.1 * damping, 1e-9)
-        if arrived:
+        found, damping = damped_step(attempt, damping, DAMPING)
+        if found is None:
+            break
+        before, (pose, cost) = cost, found
+        if before - cost < GAIN * before:
             break
     return pose

@@ -13,13 +13,14 @@ near an epipole, where depth is undetermined, do not hold back the rest. Time an
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.damping import DampingRange, damped_step
 from sfm_app.geometry.distances import nearest_exact_matches
 from sfm_app.geometry.epipolar import homogeneous, nearest_rank_two, unit_norm
 
 FloatArray = NDArray[np.float64]
 
-_SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e12
-"""Of Levenberg and Marquardt's steps, relative to the curvature. Chosen by hand; not measured on their own."""
+DAMPING = DampingRange(first=1e-4, least=1e-12, most=1e12)
+"""Of Levenberg and Marquardt's steps. Chosen by hand; not measured on its own."""
 _ENOUGH = 1e-9
 """Relative decrease of the cost under which the search ends. Chosen by hand; not measured on its own."""
 _FLOOR = 1e-12
@@ -47,21 +48,25 @@ def refine_reprojection(
     softness = 1.0 / (scale * scale)
     F = unit_norm(nearest_rank_two(unit_norm(F)))
     moves = _moves(points, F)
-    cost, damping = _cost(moves, softness), 1e-4
+    cost, damping = _cost(moves, softness), DAMPING.first
+
+    def attempt(tried: float) -> tuple[FloatArray, FloatArray, float] | None:
+        step = np.linalg.solve(normal + tried * np.diag(curvature), right)
+        trial = unit_norm(nearest_rank_two(F + (step @ basis).reshape(3, 3)))
+        reached = _moves(points, trial)
+        lower = _cost(reached, softness)
+        return (trial, reached, lower) if lower < cost else None
+
     for _ in range(most_steps):
+        if not 0 < cost < np.inf:
+            break
         basis = _tangent(F)
         normal, right = _normal_equations(points, F, moves, softness, basis)
-        curvature, improved, before = np.maximum(np.diag(normal), _FLOOR * np.diag(normal).max()), False, cost
-        while not improved and 0 < before < np.inf and damping < _LARGEST_DAMPING:
-            step = np.linalg.solve(normal + damping * np.diag(curvature), right)
-            trial = unit_norm(nearest_rank_two(F + (step @ basis).reshape(3, 3)))
-            moves = _moves(points, trial)
-            cost = _cost(moves, softness)
-            improved = cost < before
-            damping = max(damping * 0.1, _SMALLEST_DAMPING) if improved else damping * 10.0
-        if not improved:
+        curvature = np.maximum(np.diag(normal), _FLOOR * np.diag(normal).max())
+        found, damping = damped_step(attempt, damping, DAMPING)
+        if found is None:
             break
-        F = trial
+        before, (F, moves, cost) = cost, found
         if before - cost <= _ENOUGH * before:
             break
     return F

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.damping import DampingRange, damped_step
 from sfm_app.geometry.pose_manifold import POSE, moved
 from sfm_app.geometry.spd_solve import solve_each
 from sfm_app.numerical import MAD_TO_SIGMA
@@ -45,7 +46,7 @@ center of its own: what its pairs say counts as if their noise were twice as lar
 their own."""
 ROUNDS = 25
 """Most rounds of weights and step. Chosen by hand; not measured on its own."""
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-4, 1e-9, 1e8
+DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e8)
 """Of Levenberg and Marquardt's steps, relative to the diagonal. Chosen by hand; not measured on their own."""
 ARRIVED = 2e-5
 """Largest change of a camera's parameter that ends the rounds. Chosen by hand; not measured on its own."""
@@ -185,7 +186,7 @@ def evenly(rows: FloatArray, most: int) -> FloatArray:
 
 def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) -> State:
     """Weigh the pairs anew and take a step of Levenberg and Marquardt, until the cameras stand still."""
-    damping = FIRST_DAMPING
+    damping = DAMPING.first
     for _ in range(rounds):
         system = _system(matches, state)
         state = _weighed(state, system)
@@ -283,12 +284,13 @@ def _stepped(
     """Return one step that lowers the cost, damped as far as that needs, and the damping for the next."""
     factors = matches.trust * state.weights / state.scale
     cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
-    while damping < MOST_DAMPING:
-        trial = _step_of(matches, state, prior, system, damping)
-        if float(factors @ matches.costs(trial)) + prior.cost(trial.thetas) <= cost:
-            return trial, max(0.1 * damping, LEAST_DAMPING)
-        damping *= 10.0
-    return state, damping
+
+    def attempt(tried: float) -> State | None:
+        trial = _step_of(matches, state, prior, system, tried)
+        return trial if float(factors @ matches.costs(trial)) + prior.cost(trial.thetas) <= cost else None
+
+    found, damping = damped_step(attempt, damping, DAMPING)
+    return found or state, damping
 
 
 def _step_of(
