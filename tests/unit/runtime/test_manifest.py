@@ -2,6 +2,7 @@ import json
 
 import pytest
 
+from sfm_app.errors import InputError
 from sfm_app.runtime.manifest import Manifest, StageRecord
 
 
@@ -67,3 +68,19 @@ def test_the_database_may_grow_but_not_vanish(manifest):
     assert is_current(manifest, "photos", "abc")
     (manifest.root / "database.db").unlink()
     assert not is_current(manifest, "photos", "abc")
+
+
+@pytest.mark.parametrize("found", [None, 1, "2"])
+def test_a_run_of_another_version_is_refused_in_one_line(manifest, found):
+    finish(manifest)
+    manifest.check_format()
+    known = json.loads(manifest.path.read_text())
+    manifest.path.write_text(json.dumps({**known, "format": found}))
+
+    with pytest.raises(InputError, match="made by another version") as err:
+        manifest.check_format()
+    assert "-o" in err.value.hint and "\n" not in str(err.value)
+
+
+def test_a_folder_without_a_run_has_no_format(manifest):
+    manifest.check_format()
