@@ -192,13 +192,25 @@ def _scores(
 
 
 def moved(bundle: Bundle, params: FloatArray, poses: FloatArray, points: FloatArray) -> Bundle:
-    """Return the bundle with other cameras (C, 8), and with changed poses (I, 6) and points (P, 3)."""
+    """Return the bundle with other cameras, and with changed poses and points.
+
+    Args:
+        bundle: what is moved; it stays as it is.
+        params: (C, 8) the new cameras, see `Bundle.params`.
+        poses: (I, 6) changes: a rotation vector in the camera's axes, and a shift of t.
+        points: (P, 3) shifts of the points.
+    """
     R = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ bundle.R
     return replace(bundle, params=params, R=R, t=bundle.t + poses[:, 3:], X=bundle.X + points)
 
 
 def cost(bundle: Bundle, scale_px: float) -> float:
-    """Return half the sum of the loss of `reduce`; what is lost counts as LOST_PX off."""
+    """Return half the sum of the loss of `reduce`; what is lost counts as LOST_PX off.
+
+    Args:
+        bundle: the model.
+        scale_px: s of the loss, in pixels, > 0.
+    """
     with np.errstate(all="ignore"):
         r = bundle.x - project(bundle)[0]
         squares = np.einsum("ni,ni->n", r, r)
@@ -207,8 +219,11 @@ def cost(bundle: Bundle, scale_px: float) -> float:
 
 
 def in_sight(bundle: Bundle, r: FloatArray) -> NDArray[np.bool_]:
-    """Return (N,) which observations, with residuals r (N, 2), are of points before their camera, and not hopelessly
-    off.
+    """Return (N,) which observations are of points before their camera, and not hopelessly off.
+
+    Args:
+        bundle: the model.
+        r: (N, 2) residuals in pixels.
     """
     with np.errstate(all="ignore"):
         depth = np.einsum("nj,nj->n", bundle.R[bundle.photo, 2], bundle.X[bundle.point]) + bundle.t[bundle.photo, 2]

@@ -12,7 +12,14 @@ measured on their own."""
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
-    """Return (3, 3) camera matrix without skew, in the unit of its arguments."""
+    """Return (3, 3) camera matrix without skew, in the unit of its arguments.
+
+    Args:
+        fx: focal length along x.
+        fy: focal length along y.
+        cx: optical center, along x.
+        cy: optical center, along y.
+    """
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 

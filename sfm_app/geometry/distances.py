@@ -26,10 +26,16 @@ def algebraic_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray
     Unlike the others it has no unit, and it changes with the origin and the scale of the coordinates: give it points
     and F in the frame that is meant, such as that of `hartley_normalization`.
 
-    Args and errors as in `sampson_distance`.
+    Args:
+        F: (3, 3), any scale.
+        x1: (N, 2) points in any frame.
+        x2: (N, 2) points, row by row the partners of x1.
 
     Returns:
         (N,) >= 0; inf where F is zero.
+
+    Raises:
+        ValueError: the shapes are not as above.
     """
     algebraic, _, _ = _constraint(F, x1, x2)
     return _ratio(np.abs(algebraic), np.full(len(algebraic), np.linalg.norm(np.asarray(F, dtype=np.float64))))
@@ -38,10 +44,16 @@ def algebraic_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray
 def symmetric_epipolar_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
     """Return root mean square of a match's distances to its two epipolar lines (HZ 11.10, thesis 4.1).
 
-    Args and errors as in `sampson_distance`.
+    Args:
+        F: (3, 3), any scale.
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
 
     Returns:
         (N,) distances in pixels, >= 0; inf where an epipolar line vanishes.
+
+    Raises:
+        ValueError: the shapes are not as above.
     """
     algebraic, line1, line2 = _constraint(F, x1, x2)
     to1 = _ratio(np.abs(algebraic), np.hypot(line1[:, 0], line1[:, 1]))
@@ -76,10 +88,16 @@ def reprojection_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatAr
     With P1, P2 the `canonical_cameras` of F that is the term of thesis 4.3 before squaring; every other pair of cameras
     with this F gives the same (HZ 12.5). The global minimum, see `nearest_exact_matches`.
 
-    Args and errors as in `sampson_distance`.
+    Args:
+        F: (3, 3), any scale.
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
 
     Returns:
         (N,) distances in pixels, >= 0; inf where no match fits F.
+
+    Raises:
+        ValueError: the shapes are not as above.
     """
     return np.asarray(np.linalg.norm(_shortest_moves(F, x1, x2), axis=1))
 
@@ -89,10 +107,16 @@ def nearest_exact_matches(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> tuple[F
 
     Optimal triangulation in the images (HZ 12.5).
 
-    Args and errors as in `sampson_distance`.
+    Args:
+        F: (3, 3), any scale.
+        x1: (N, 2) pixels.
+        x2: (N, 2) pixels, row by row the partners of x1.
 
     Returns:
         (N, 2), (N, 2) pixels; where several are equally near (both points on the epipoles of a bad match), one of them.
+
+    Raises:
+        ValueError: the shapes are not as above.
     """
     moves = _shortest_moves(F, x1, x2)
     return np.asarray(x1, dtype=np.float64) + moves[:, :2], np.asarray(x2, dtype=np.float64) + moves[:, 2:]

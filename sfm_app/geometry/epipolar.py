@@ -18,7 +18,15 @@ def homogeneous(x: ArrayLike) -> FloatArray:
 
 
 def homogeneous_pair(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return both views of N matches as (N, 3); ValueError for other shapes, and where the rows do not pair up."""
+    """Return both views of N matches as (N, 3).
+
+    Args:
+        x1: (N, 2) points.
+        x2: (N, 2) points, row by row the partners of x1.
+
+    Raises:
+        ValueError: other shapes, or rows that do not pair up.
+    """
     h1, h2 = homogeneous(x1), homogeneous(x2)
     if len(h1) != len(h2):
         raise ValueError(f"x1 and x2 must pair up, got {len(h1)} and {len(h2)} points")
@@ -127,6 +135,12 @@ def cross_matrix(v: ArrayLike) -> FloatArray:
 
 def fundamental_from_pose(K1: ArrayLike, K2: ArrayLike, R: ArrayLike, t: ArrayLike) -> FloatArray:
     """Return F of two cameras with x1 ~ K1 X and x2 ~ K2 (R X + t) (HZ 9.12), Frobenius norm 1.
+
+    Args:
+        K1: (3, 3) camera matrix of view 1.
+        K2: (3, 3) camera matrix of view 2.
+        R: (3, 3) rotation of view 2 from view 1.
+        t: (3,) translation, any length but zero.
 
     Raises:
         ValueError: t is zero: without a baseline there is no epipolar geometry.

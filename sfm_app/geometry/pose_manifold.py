@@ -13,7 +13,12 @@ POSE = 5
 
 @kernel
 def essential(pose: FloatArray, E: FloatArray) -> None:
-    """Write [t]x R of a pose (12,): R by rows, then the unit vector t."""
+    """Write the essential matrix [t]x R of a pose.
+
+    Args:
+        pose: (12,) R by rows, then the unit vector t.
+        E: (3, 3), written to.
+    """
     x, y, z = pose[9], pose[10], pose[11]
     for j in range(3):
         E[0, j] = y * pose[6 + j] - z * pose[3 + j]
@@ -23,7 +28,12 @@ def essential(pose: FloatArray, E: FloatArray) -> None:
 
 @kernel
 def moved(pose: FloatArray, step: FloatArray) -> FloatArray:
-    """Return the pose (12,) after a step (5,): R turned by exp([w]x), t along two directions across it."""
+    """Return the pose (12,) after a step: R turned by exp([w]x), t along two directions across it.
+
+    Args:
+        pose: (12,) R by rows, then the unit vector t.
+        step: (5,) w in radians, then how far t goes along each direction.
+    """
     wx, wy, wz = step[0], step[1], step[2]
     angle = np.sqrt(wx * wx + wy * wy + wz * wz)
     sine = np.sin(angle) / angle if angle > 1e-12 else 1.0

@@ -41,7 +41,12 @@ class Similarity:
 
 
 def umeyama(a: FloatArray, b: FloatArray) -> Similarity:
-    """Return the similarity that takes points a (N, 3) to b (N, 3) with least squared error (Umeyama 1991); N >= 3."""
+    """Return the similarity that takes points to others with least squared error (Umeyama 1991).
+
+    Args:
+        a: (N, 3) points, N >= 3.
+        b: (N, 3) where they are to lie, row by row.
+    """
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
     u, s, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a))
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -51,10 +56,14 @@ def umeyama(a: FloatArray, b: FloatArray) -> Similarity:
 
 
 def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
-    """Return the similarity that takes most of the points a (N, 3) to b (N, 3), not led astray by wrong ones.
+    """Return the similarity that takes most of the points to others, not led astray by wrong ones.
 
     Least median of squares over triples, then Umeyama on the points that agree with the best triple (Rousseeuw 1984;
     the threshold is 2.5 robust standard deviations).
+
+    Args:
+        a: (N, 3) points.
+        b: (N, 3) where they are to lie, row by row; some may be wrong.
 
     Raises:
         ValueError: fewer than 3 points, or all lie on a line.

@@ -82,7 +82,12 @@ def inverses_of_positive(S: FloatArray) -> FloatArray:
 
 
 def solve_each(S: FloatArray, B: FloatArray) -> FloatArray:
-    """Return S^-1 B of many small systems (..., n, n) and (..., n, k); see `solve_positive`."""
+    """Return S^-1 B of many small systems; see `solve_positive`.
+
+    Args:
+        S: (..., n, n), symmetric, positive but for rounding.
+        B: (..., n, k) right-hand sides.
+    """
     return np.asarray(np.linalg.solve(lifted(S, OPEN, 1.0), B), np.float64)
 
 

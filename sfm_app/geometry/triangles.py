@@ -33,19 +33,34 @@ def edges_of(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
 
 
 def areas(vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """Return (T,) areas of the triangles."""
+    """Return (T,) areas of the triangles.
+
+    Args:
+        vertices: (V, 3) points.
+        faces: (T, 3) rows of `vertices`.
+    """
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.asarray(0.5 * np.linalg.norm(across, axis=1))
 
 
 def median_edge(vertices: FloatArray, faces: IndexArray) -> float:
-    """Return median length of the edges."""
+    """Return median length of the edges.
+
+    Args:
+        vertices: (V, 3) points.
+        faces: (T, 3) rows of `vertices`.
+    """
     edges, _ = edges_of(faces)
     return float(np.median(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)))
 
 
 def select_faces(surface: Surface, keep: NDArray[np.bool_]) -> Surface:
-    """Return the marked triangles (T,) with the vertices that they use, in the old order."""
+    """Return the marked triangles with the vertices that they use, in the old order.
+
+    Args:
+        surface: T triangles and their vertices.
+        keep: (T,) the marks.
+    """
     used, faces = np.unique(surface.faces[keep], return_inverse=True)
     return Surface(surface.vertices[used], faces.reshape(-1, 3).astype(np.int64), surface.colors[used])

@@ -29,9 +29,15 @@ def triangulate(P1: Array, P2: Array, x1: Array, x2: Array) -> Array:
 
 
 def triangulation_angle_deg(X: Array, center1: Array, center2: Array) -> Array:
-    """Return angle at which the two rays to each point meet: X (N, 3), camera centers (3,).
+    """Return angle at which the two rays to each point meet.
 
-    (N,) degrees in [0, 180].
+    Args:
+        X: (N, 3) points.
+        center1: (3,) camera center of view 1, in the frame of the points.
+        center2: (3,) camera center of view 2.
+
+    Returns:
+        (N,) degrees in [0, 180].
     """
     ray1, ray2 = X - center1, X - center2
     with np.errstate(invalid="ignore"):

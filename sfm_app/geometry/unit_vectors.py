@@ -14,7 +14,12 @@ def unit(vectors: ArrayLike) -> FloatArray:
 
 
 def axis_angle_deg(first: ArrayLike, second: ArrayLike) -> FloatArray:
-    """Return angle between the lines along vectors (..., 3), whichever way they point; degrees in [0, 90]."""
+    """Return angle between the lines along vectors, whichever way they point; degrees in [0, 90].
+
+    Args:
+        first: (..., 3) vectors of any length but zero.
+        second: (..., 3) the same; both broadcast.
+    """
     a, b = unit(first), unit(second)
     # the cross product keeps its digits where the arc cosine loses them
     sine = np.linalg.norm(np.cross(a, b), axis=-1)
@@ -22,12 +27,22 @@ def axis_angle_deg(first: ArrayLike, second: ArrayLike) -> FloatArray:
 
 
 def along(vectors: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return components (N,) of vectors (N, 3) along an axis (3,); not by BLAS, whose digits depend on its threads."""
+    """Return components (N,) of vectors along an axis; not by BLAS, whose digits depend on its threads.
+
+    Args:
+        vectors: (N, 3).
+        axis: (3,), of length 1 for components in the unit of the vectors.
+    """
     return np.asarray(np.einsum("ni,i->n", vectors, axis))
 
 
 def across(vector: ArrayLike, axis: FloatArray) -> FloatArray:
-    """Return what of vectors (..., 3) is at right angles to a unit axis (3,)."""
+    """Return what of vectors is at right angles to an axis.
+
+    Args:
+        vector: (..., 3) one vector or many.
+        axis: (3,) unit vector.
+    """
     values = np.asarray(vector, np.float64)
     return np.asarray(values - (values @ axis)[..., None] * axis)
 
@@ -40,6 +55,11 @@ def basis_across(axis: FloatArray) -> FloatArray:
 
 
 def least_direction(matrix: FloatArray, like: FloatArray) -> FloatArray:
-    """Return eigenvector (3,) of the smallest eigenvalue of a symmetric (3, 3), on the side of `like`."""
+    """Return eigenvector (3,) of the smallest eigenvalue.
+
+    Args:
+        matrix: (3, 3), symmetric.
+        like: (3,) direction on whose side the result lies.
+    """
     found: FloatArray = np.linalg.eigh(matrix)[1][:, 0]
     return found if found @ like >= 0 else -found

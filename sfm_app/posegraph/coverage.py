@@ -38,7 +38,12 @@ class Sight:
 
 
 def sight_of(matches: MatchGraph, poses: Mapping[PairId, RelativePose]) -> Sight:
-    """Return inliers of all pairs, counted by keypoint, and the cells of all keypoints."""
+    """Return inliers of all pairs, counted by keypoint, and the cells of all keypoints.
+
+    Args:
+        matches: keypoints and raw matches.
+        poses: relative poses by pair, with their inliers.
+    """
     rows = {pair: matches.matches[pair][pose.inliers].astype(np.int64) for pair, pose in poses.items()}
     photos = sorted({photo for pair in poses for photo in pair})
     seen = {photo: np.zeros(len(matches.keypoints[photo]), np.int64) for photo in photos}

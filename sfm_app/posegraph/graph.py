@@ -116,7 +116,13 @@ def build_pose_graph(
 
 
 def with_model(graph: PoseGraph, photos: Collection[int], poses: Mapping[PairId, RelativePose]) -> PoseGraph:
-    """Return the graph with the relative poses of a model instead of those that it had between the model's photos."""
+    """Return the graph with the relative poses of a model instead of those that it had between the model's photos.
+
+    Args:
+        graph: the graph so far; it stays as it is.
+        photos: those of the model.
+        poses: relative poses of the model by pair.
+    """
     kept = {pair: pose for pair, pose in graph.poses.items() if not (pair[0] in photos and pair[1] in photos)}
     gone = sorted(graph.poses.keys() - kept.keys() - poses.keys())
     dropped = dict(graph.dropped) | dict.fromkeys(gone, CONTRADICTS)

@@ -71,7 +71,13 @@ def _epipolar_normals(pair: Pair, R: FloatArray) -> FloatArray:
 
 
 def held_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Return (3,) direction of translation near t that makes a robust sum of squared distances small, R held."""
+    """Return (3,) direction of translation near t that makes a robust sum of squared distances small, R held.
+
+    Args:
+        pair: matches and cameras.
+        R: (3, 3) rotation of view 2 from view 1; it stays.
+        t: (3,) unit vector to start from.
+    """
     normals = _epipolar_normals(pair, R)
     best = t
     for _ in range(HELD_ROUNDS):
@@ -89,6 +95,11 @@ def sampled_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> Fl
     """Return (3,) direction of translation that most matches agree with, R given.
 
     The best of many through two matches.
+
+    Args:
+        pair: matches and cameras.
+        R: (3, 3) rotation of view 2 from view 1; it stays.
+        rng: draws the samples; its state moves on.
     """
     normals = _epipolar_normals(pair, R)
     picks = rng.integers(len(normals), size=(SAMPLES, 2))

@@ -61,13 +61,24 @@ class FeatureTracks:
     """By photo (K,) the track of each keypoint; -1 where no pair of the backbone has it."""
 
     def agreement(self, pair: PairId, rows: IndexArray) -> tuple[int, int]:
-        """Count the matches of a pair that have both ends on the same track, and those with both on any."""
+        """Count the matches of a pair that have both ends on the same track, and those with both on any.
+
+        Args:
+            pair: two photos.
+            rows: (N, 2) keypoints that match, one column for each photo.
+        """
         first, second = (self.names[photo][column] for photo, column in zip(pair, rows.T, strict=True))
         tracked = (first >= 0) & (second >= 0)
         return int(np.count_nonzero(tracked & (first == second))), int(np.count_nonzero(tracked))
 
     def contradict(self, pair: PairId, rows: IndexArray, least: int = LEAST_TRACKED) -> bool:
-        """Return whether a pair, with so many tracked matches, joins what the backbone keeps apart."""
+        """Return whether a pair joins what the backbone keeps apart.
+
+        Args:
+            pair: two photos.
+            rows: (N, 2) keypoints that match, one column for each photo.
+            least: with fewer tracked matches the answer is no.
+        """
         same, tracked = self.agreement(pair, rows)
         return tracked >= least and same <= SAME_TRACK * tracked
 
@@ -83,7 +94,12 @@ class LookAlikeVerdict:
     tracks: FeatureTracks
 
     def strange(self, pair: PairId, rows: IndexArray) -> bool:
-        """Return whether a pair that was found later joins look-alikes, too."""
+        """Return whether a pair that was found later joins look-alikes, too.
+
+        Args:
+            pair: two photos.
+            rows: (N, 2) keypoints that match, one column for each photo.
+        """
         return bool(self.joins) and self.tracks.contradict(pair, rows, FEW_TRACKED)
 
 
@@ -137,6 +153,10 @@ def joins_of(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple
     """Group doubted pairs that claim the same.
 
     Both their ends are the same photo, or photos that a trusted pair joins.
+
+    Args:
+        doubted: pairs to group.
+        trusted: pairs whose two photos count as one place.
     """
     close = {frozenset(pair) for pair in trusted}
     waiting, found = sorted(doubted), []

@@ -72,7 +72,12 @@ class Depths:
         return self.rays[photo]
 
     def ends(self, photo: int, other: int) -> Ends:
-        """Return depths of a photo's points from one pair."""
+        """Return depths of a photo's points from one pair.
+
+        Args:
+            photo: the photo, as named in `poses`.
+            other: the other photo of the pair; the two have a pose, in either order.
+        """
         if (photo, other) in self.known:
             return self.known[photo, other]
         pair = (min(photo, other), max(photo, other))

@@ -64,7 +64,14 @@ class Pair:
         return second.K.T @ fit.F @ first.K
 
     def pose(self, R: FloatArray, t: FloatArray, inliers: NDArray[np.bool_], *, guided: bool = False) -> RelativePose:
-        """Return a pose with what its inliers say about it."""
+        """Return a pose with what its inliers say about it.
+
+        Args:
+            R: (3, 3) rotation of view 2 from view 1.
+            t: (3,) unit vector along its translation.
+            inliers: (M,) which matches agree with the pose.
+            guided: whether the rotation came from other pairs.
+        """
         used = self.rays[inliers]
         front = in_front(used, R, t)
         angle_deg = float(np.median(ray_angles_deg(used[front], R))) if front.any() else 0.0
@@ -77,11 +84,23 @@ class Pair:
         )  # fmt: skip
 
     def inliers(self, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
-        """Return (M,) which matches lie within the threshold of a pose."""
+        """Return (M,) which matches lie within the threshold of a pose.
+
+        Args:
+            R: (3, 3) rotation of view 2 from view 1.
+            t: (3,) unit vector along its translation.
+        """
         return pose_distances(self.rays, self.focals, R, t) <= self.max_error_px
 
     def kind(self, used: FloatArray, R: FloatArray, t: FloatArray, angle_deg: float) -> str:
-        """Return what the inliers of a pose are of: see `RelativePose.kind`."""
+        """Return what the inliers of a pose are of: see `RelativePose.kind`.
+
+        Args:
+            used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
+            R: (3, 3) rotation of view 2 from view 1.
+            t: (3,) unit vector along its translation.
+            angle_deg: median angle between the two rays of a match.
+        """
         unit = float(self.focals.mean())
         within = OFF_PLANE * self.max_error_px
         if angle_deg < ROTATION_DEG and np.mean(turn_distances(used, self.focals, R) <= within) >= MANY:
@@ -95,6 +114,10 @@ def estimated(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
     """Return the relative pose behind a fundamental matrix; None where too few matches agree with any.
 
     Where a camera is a guess, E is wrong by as much as the guess, and the inliers of F stay what they are.
+
+    Args:
+        pair: matches and cameras.
+        fit: the fundamental matrix and its inliers.
     """
     R, t = pair.start(fit)
     if not pair.trusted:
@@ -152,13 +175,24 @@ def depths(used: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, 
 
 
 def in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
-    """Return (N,) which points lie before both cameras; arguments as in `depths`."""
+    """Return (N,) which points lie before both cameras.
+
+    Args:
+        used: (N, 4) points of the plane z = 1, view 1 and view 2.
+        R: (3, 3) rotation of view 2 from view 1.
+        t: (3,) translation.
+    """
     first, second = depths(used, R, t)
     return (first > 0) & (second > 0)
 
 
 def ray_angles_deg(used: FloatArray, R: FloatArray) -> FloatArray:
-    """Return (N,) degrees between the two rays of each match: the triangulation angles, where t fits."""
+    """Return (N,) degrees between the two rays of each match: the triangulation angles, where t fits.
+
+    Args:
+        used: (N, 4) points of the plane z = 1, view 1 and view 2.
+        R: (3, 3) rotation of view 2 from view 1.
+    """
     h1, h2 = _homogeneous(used[:, :2]) @ R.T, _homogeneous(used[:, 2:])
     sine = np.linalg.norm(np.cross(h1, h2), axis=1)
     return np.asarray(np.degrees(np.arctan2(sine, (h1 * h2).sum(axis=1))), np.float64)
@@ -168,6 +202,11 @@ def turn_distances(used: FloatArray, focals: FloatArray, R: FloatArray) -> Float
     """Give (N,) pixels in view 2 between matches and what rotation nearest to R that explains most of them predicts.
 
     Rays are turned onto their partners (Kabsch), those that fit counting most.
+
+    Args:
+        used: (N, 4) points of the plane z = 1, view 1 and view 2.
+        focals: (4,) fx, fy of view 1 and of view 2, in pixels.
+        R: (3, 3) rotation of view 2 from view 1, to start from.
     """
     h1, h2 = (_unit(_homogeneous(used[:, view : view + 2])) for view in (0, 2))
     focal = float(focals.mean())

@@ -43,7 +43,14 @@ def refined(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) 
 
 
 def pose_distances(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Return (N,) Sampson distances in pixels, >= 0, of matches to a relative pose; arguments as in `refined`."""
+    """Return (N,) Sampson distances in pixels, >= 0, of matches to a relative pose.
+
+    Args:
+        rays: (N, 4) matches as points of the plane z = 1, view 1 and view 2.
+        focals: (4,) fx, fy of view 1 and of view 2, in pixels.
+        R: (3, 3) rotation of view 2 from view 1.
+        t: (3,) unit vector along its translation.
+    """
     pose = np.concatenate([R.ravel(), t])
     return np.abs(_distances(rays, focals, pose))
 

@@ -84,7 +84,12 @@ def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) ->
 
 
 def agreeing_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArray[np.bool_]]:
-    """Return (L, 3) numbers of the edges of every loop of three photos, and (L,) whether their rotations agree."""
+    """Return (L, 3) numbers of the edges of every loop of three photos, and (L,) whether their rotations agree.
+
+    Args:
+        edges: (E, 2) numbers of photos, the smaller first.
+        turns: (E, 3, 3) rotation of photo 2 from photo 1.
+    """
     loops = np.array(list(_loops(edges.tolist())), np.int64).reshape(-1, 3)
     if not len(loops):
         return loops, np.zeros(0, np.bool_)

@@ -83,5 +83,12 @@ seeds and other sets stand in benchmarks/README.md."""
 
 
 def fit_lev_ransac(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-    """Return the production estimator. See `estimate`."""
+    """Run the production estimator. See `estimate`.
+
+    Args:
+        x1: (N, 2) pixels in photo 1.
+        x2: (N, 2) pixels in photo 2, row by row the partners of x1.
+        options: threshold, confidence, most samples, fewest inliers.
+        seed: same seed, same result.
+    """
     return estimate(x1, x2, options, seed, PRODUCTION)

@@ -32,7 +32,14 @@ class Hypothesis:
 
 
 def search(matches: Matches, options: EpipolarSettings, seed: int, recipe: Recipe) -> Hypothesis | None:
-    """Draw samples, by the priors, until one of the stopping rules holds (thesis, Algorithm 1)."""
+    """Draw samples, by the priors, until one of the stopping rules holds (thesis, Algorithm 1).
+
+    Args:
+        matches: the distinct matches of a pair.
+        options: threshold, confidence, most samples.
+        seed: same seed, same result.
+        recipe: the estimator.
+    """
     if len(matches.points) < recipe.sample_size:
         return None
     return _Search(matches, options, seed, recipe).run()

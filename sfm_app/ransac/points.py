@@ -83,6 +83,11 @@ def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
 
     SIFT gives a keypoint once per orientation, so that one match may come several times. Repeats would count as support
     and make samples degenerate. The random order lets a scorer stop early: its first points are a fair sample.
+
+    Args:
+        x1: (N, 2) pixels in photo 1.
+        x2: (N, 2) pixels in photo 2, row by row the partners of x1.
+        seed: of the random order.
     """
     stacked = np.hstack([x1, x2])
     # One key per match: a projection on incommensurable numbers is equal for equal rows and sorts faster than rows do.

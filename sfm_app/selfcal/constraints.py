@@ -53,7 +53,12 @@ def singular_value_ratio(pair: FloatArray, fx: float, fy: float, u: float, v: fl
 
 
 def focal_polynomials(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> FloatArray:
-    """Return thesis (5.27): a^2 - 4p as a quartic in fy^2, for every pair and every swept fx, with the center fixed.
+    """Return thesis (5.27): a^2 - 4p as a quartic in fy^2, with the center fixed.
+
+    Args:
+        pairs: P fundamental matrices.
+        fx: (S,) swept values, in the units of the pairs.
+        center: u, v in the same units.
 
     Returns:
         (P, S, 5) coefficients, lowest power first; all zero where the constraint holds for any fy.
@@ -76,7 +81,12 @@ def focal_polynomials(pairs: Pairs, fx: FloatArray, center: tuple[float, float])
 
 
 def center_polynomials(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
-    """Return thesis (5.28): a^2 - 4p as an octic in v, for every pair and every swept u, with both focals fixed.
+    """Return thesis (5.28): a^2 - 4p as an octic in v, with both focals fixed.
+
+    Args:
+        pairs: P fundamental matrices.
+        u: (S,) swept values, in the units of the pairs.
+        focal: fx, fy in the same units.
 
     Returns:
         (P, S, 9) coefficients, lowest power first; all zero where the constraint holds for any v.

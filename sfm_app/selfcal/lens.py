@@ -25,7 +25,12 @@ NEWTON_STEPS = 20
 
 @kernel
 def camera_of(theta: FloatArray, camera: FloatArray) -> None:
-    """Write fx, fy, u, v, k1 of the parameters (5,) into `camera` (5,)."""
+    """Write fx, fy, u, v, k1 of a camera.
+
+    Args:
+        theta: (5,) log f, u, v, log a, kappa.
+        camera: (5,), written to.
+    """
     f, half = np.exp(theta[0]), np.exp(0.5 * theta[3])
     camera[0], camera[1], camera[2], camera[3] = f / half, f * half, theta[1], theta[2]
     camera[4] = theta[4] * f * f
@@ -33,7 +38,13 @@ def camera_of(theta: FloatArray, camera: FloatArray) -> None:
 
 @kernel
 def undone(radius: float, k1: float, guess: float) -> float:
-    """Return r_u of the distorted radius r_d, in focal lengths, by Newton from a guess."""
+    """Return r_u of a distorted radius, in focal lengths, by Newton.
+
+    Args:
+        radius: r_d in focal lengths, >= 0.
+        k1: of the lens.
+        guess: r_u to start from.
+    """
     if k1 == 0.0 or radius < 1e-9:
         return radius
     if k1 < 0.0:
@@ -53,9 +64,14 @@ def undone(radius: float, k1: float, guess: float) -> float:
 
 @kernel
 def ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -> None:
-    """Write the point (a, b) of the plane z = 1 that pixel (x, y) sees, into `out` (7,): a, b, its derivatives, r_u.
+    """Write the point (a, b) of the plane z = 1 that a pixel sees, its derivatives, and r_u.
 
-    `guess` is r_u of a camera nearby, or negative.
+    Args:
+        x: of the pixel, in the units of the camera.
+        y: likewise.
+        camera: (5,) fx, fy, u, v, k1.
+        guess: r_u of a camera nearby, or negative.
+        out: (7,), written to: a, b, da/dx, da/dy, db/dx, db/dy, r_u.
     """
     a, b = (x - camera[2]) / camera[0], (y - camera[3]) / camera[1]
     r2 = a * a + b * b
@@ -74,7 +90,12 @@ def ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -
 
 @kernel
 def straightened(points: FloatArray, theta: FloatArray) -> FloatArray:
-    """Return (N, 2) where points (N, 2) would lie without the lens, in the units of the points."""
+    """Return (N, 2) where points would lie without the lens.
+
+    Args:
+        points: (N, 2) about the middle of the photo.
+        theta: (5,) parameters of the camera, in the same units.
+    """
     camera, out, straight = np.empty(5), np.empty(7), np.empty_like(points)
     camera_of(theta, camera)
     for i in range(len(points)):

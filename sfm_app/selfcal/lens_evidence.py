@@ -129,6 +129,11 @@ def estimate(params: FloatArray, reduced: Reduced, priors: CameraPriors) -> Esti
     The deviations are those of all parts, about the value that was chosen, even where that is the present one, and over
     all choices of freed parts. Where photos pull at the cameras in different directions (a zoom, a moving shutter,
     look-alikes), they are at least as large as that scatter makes them (a sandwich with photos as clusters).
+
+    Args:
+        params: (C, 8) cameras as in `Bundle`.
+        reduced: the cost about these cameras.
+        priors: what is believed about them before.
     """
     T = _by_logarithms(params)
     weight = (MISFIT * reduced.noise_px) ** -2.0

@@ -19,7 +19,13 @@ ESTIMATE = "estimate"
 
 
 def guessed(size: tuple[int, int], reason: str, evidence: Mapping[str, float]) -> Calibration:
-    """Return the usual guess with the reason why nothing better is known."""
+    """Return the usual guess with the reason why nothing better is known.
+
+    Args:
+        size: (width, height) of the photos in pixels.
+        reason: why nothing better is known, for the user.
+        evidence: numbers by name, to go with the answer.
+    """
     K = guessed_camera_matrix(size)
     return Calibration(K, *size, GUESS, identifiable=False, reason=reason, evidence=dict(evidence))
 
@@ -27,7 +33,14 @@ def guessed(size: tuple[int, int], reason: str, evidence: Mapping[str, float]) -
 def calibration_of(
     theta: NDArray[np.float64], size: tuple[int, int], method: str, unit_px: float | None = None
 ) -> Calibration:
-    """Return answer from the parameters (5,) of `lens`, about the middle, in units of the longer side unless told."""
+    """Return answer from the parameters of `lens`, about the middle of the photo.
+
+    Args:
+        theta: (5,) log f, u, v, log a, kappa.
+        size: (width, height) of the photo in pixels.
+        method: name of what found them.
+        unit_px: pixels per unit of theta; the longer side where None.
+    """
     unit = float(max(size)) if unit_px is None else unit_px
     focal, half = float(np.exp(theta[LOG_FOCAL])), float(np.exp(0.5 * theta[LOG_ASPECT]))
     cx, cy = unit * theta[CENTER_U] + size[0] / 2, unit * theta[CENTER_V] + size[1] / 2
@@ -36,12 +49,22 @@ def calibration_of(
 
 
 def roughly(found: Calibration, reason: str) -> Calibration:
-    """Return the answer as an estimate that is not relied on, where there is a reason for that; else as it is."""
+    """Return the answer as an estimate that is not relied on, where there is a reason for that; else as it is.
+
+    Args:
+        found: the answer.
+        reason: why it is not relied on, for the user; empty for none.
+    """
     return replace(found, identifiable=False, method=ESTIMATE, reason=reason) if reason else found
 
 
 def parameters_of(found: Calibration, unit_px: float) -> NDArray[np.float64]:
-    """Return the parameters (5,) that `calibration_of` was made from."""
+    """Return the parameters (5,) that `calibration_of` was made from.
+
+    Args:
+        found: the answer.
+        unit_px: pixels per unit of the parameters.
+    """
     focal = found.focal_px / unit_px
     u, v = (found.K[0, 2] - found.width / 2) / unit_px, (found.K[1, 2] - found.height / 2) / unit_px
     return np.array([np.log(focal), u, v, np.log(found.K[1, 1] / found.K[0, 0]), found.radial / focal**2])

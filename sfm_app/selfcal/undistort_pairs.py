@@ -18,7 +18,12 @@ REACH_PX = 3.0
 
 
 def without_lens(pairs: CameraPairs, camera: Calibration) -> CameraPairs:
-    """Return the inliers straightened and every F fitted to them anew; the pairs themselves where no lens is known."""
+    """Return the inliers straightened and every F fitted to them anew; the pairs themselves where no lens is known.
+
+    Args:
+        pairs: P fundamental matrices in pixels, with or without their inliers.
+        camera: the camera of all photos.
+    """
     if camera.radial == 0.0 or not pairs.inliers:
         return pairs
     side, middle = float(max(pairs.size)), np.array(pairs.size) / 2
@@ -35,5 +40,10 @@ def without_lens(pairs: CameraPairs, camera: Calibration) -> CameraPairs:
 
 
 def straight_points(points: FloatArray, theta: FloatArray) -> FloatArray:
-    """Return (N, 2) points without the lens of the camera theta (5,), in the same units about the middle."""
+    """Return (N, 2) points without the lens of a camera.
+
+    Args:
+        points: (N, 2) about the middle of the photo.
+        theta: (5,) parameters of the camera, see `lens`, in the same units.
+    """
     return np.asarray(straightened(np.ascontiguousarray(points, np.float64), theta), np.float64)

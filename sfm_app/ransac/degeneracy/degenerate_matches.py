@@ -116,8 +116,12 @@ def _dominant_line(x: FloatArray, y: FloatArray, width: float) -> tuple[float, f
 
 
 def is_rotation(H: FloatArray, points: FloatArray, centers: FloatArray) -> bool:
-    """Return whether H = K R K^-1 for one focal length and an optical center in the middle of where both views have
-    points.
+    """Return whether H = K R K^-1 for one focal length, and a center in the middle of where both views have points.
+
+    Args:
+        H: (3, 3) homography, view 2 from view 1, in the frame of the points.
+        points: (N, 4) matches.
+        centers: (4,) the origin of `points` in a frame that both views share, in the same units.
     """
     placed = points + centers
     low, high = np.quantile(np.vstack([placed[:, :2], placed[:, 2:]]), _EXTENT, axis=0)

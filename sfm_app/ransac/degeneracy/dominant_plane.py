@@ -160,7 +160,12 @@ def _sampled_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatAr
 
 
 def transfer_distance(H: FloatArray, points: FloatArray) -> FloatArray:
-    """Return (N,) |x2 - H x1| / sqrt(2): about the distance of the match (x1, x2) in 4D to those that fit H exactly."""
+    """Return (N,) |x2 - H x1| / sqrt(2): about the distance of the match (x1, x2) in 4D to those that fit H exactly.
+
+    Args:
+        H: (3, 3) homography, view 2 from view 1.
+        points: (N, 4) matches, in the same frame.
+    """
     return np.sqrt(_squared_transfer(points, H))
 
 

@@ -63,7 +63,13 @@ def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> Boo
 
 
 def covers(points: FloatArray, keypoints: FloatArray, size: tuple[int, int]) -> bool:
-    """Return whether points (N, 2) lie all over what a photo of `size` (width, height) shows, its keypoints (M, 2)."""
+    """Return whether points lie all over what a photo shows.
+
+    Args:
+        points: (N, 2) pixels.
+        keypoints: (M, 2) pixels of all keypoints of the photo.
+        size: (width, height) of the photo in pixels.
+    """
     return len(_cells(points, size)) > WIDE * len(_cells(keypoints, size))
 
 

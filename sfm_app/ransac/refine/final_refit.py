@@ -25,7 +25,13 @@ def _refit_eight_point(points: FloatArray, F: FloatArray, threshold: float) -> F
 
 
 def refit_sampson(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Minimize the Sampson distance (thesis 4.2)."""
+    """Minimize the Sampson distance (thesis 4.2).
+
+    Args:
+        points: (N, 4) matches.
+        F: (3, 3) the model to start from.
+        threshold: largest distance of an inlier, in the units of the points.
+    """
     inliers = _inliers(points, F, threshold)
     return refine_sampson(inliers, _refit_eight_point(points, F, threshold)) if len(inliers) >= 8 else F
 
@@ -48,6 +54,10 @@ def last_fit(name: str, own: Refit) -> Refit:
     """Return the estimator's own fit, and unless the name is "auto" the fit of that name to its inliers.
 
     The own fit comes first in any case: its inliers are better than those of the best sample.
+
+    Args:
+        name: "auto", or a name in `REFITS`.
+        own: the estimator's own fit.
     """
     if name == "auto":
         return own

@@ -70,7 +70,13 @@ def _turn_away(U: FloatArray) -> None:
 
 @kernel
 def compose(U: FloatArray, s: float, V: FloatArray) -> FloatArray:
-    """Return (9,) the entries of U diag(1, s, 0) V' by rows."""
+    """Return (9,) the entries of U diag(1, s, 0) V' by rows.
+
+    Args:
+        U: (3, 3) rotation.
+        s: second singular value; the first is 1.
+        V: (3, 3) rotation.
+    """
     f = np.empty(9)
     for i in range(3):
         for j in range(3):
@@ -80,7 +86,14 @@ def compose(U: FloatArray, s: float, V: FloatArray) -> FloatArray:
 
 @kernel
 def tangent(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
-    """Write dF over the seven parameters, one row each: U [e_k]x S V', -U S [e_k]x V', u2 v2'."""
+    """Write dF over the seven parameters, one row each: U [e_k]x S V', -U S [e_k]x V', u2 v2'.
+
+    Args:
+        U: (3, 3) rotation.
+        s: second singular value; the first is 1.
+        V: (3, 3) rotation.
+        basis: (7, 9), written to.
+    """
     for i in range(3):
         for j in range(3):
             k = 3 * i + j
@@ -95,7 +108,12 @@ def tangent(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
 
 @kernel
 def turned(R: FloatArray, w: FloatArray) -> FloatArray:
-    """Return R exp([w]x), by Rodrigues."""
+    """Return R exp([w]x), by Rodrigues.
+
+    Args:
+        R: (3, 3) rotation.
+        w: (3,) rotation vector in radians.
+    """
     angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
     a = np.sin(angle) / angle if angle > 1e-8 else 1.0
     b = (1.0 - np.cos(angle)) / (angle * angle) if angle > 1e-8 else 0.5

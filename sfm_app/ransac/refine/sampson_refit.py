@@ -118,7 +118,12 @@ def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the first half of `fit_eight_point`: (3, 3) of norm 1 with the least algebraic error, of any rank."""
+    """Return the first half of `fit_eight_point`: (3, 3) of norm 1 with the least algebraic error, of any rank.
+
+    Args:
+        points: (N, 4), of magnitude about 1.
+        weights: (N,) >= 0, at least eight positive ones.
+    """
     _, vectors = np.linalg.eigh(weighted_gram(points, weights))
     return np.ascontiguousarray(vectors[:, 0]).reshape(3, 3)
 

@@ -48,7 +48,13 @@ def uniform(state: RandomState) -> float:
 
 @kernel
 def draw_uniform(state: RandomState, count: int, sample: IntArray) -> None:
-    """Fill `sample` with distinct indices below `count`, which is at least its length."""
+    """Fill a sample with distinct indices.
+
+    Args:
+        state: of the generator; it moves on.
+        count: indices lie below it; at least the sample's length.
+        sample: (m,), written to.
+    """
     for k in range(sample.shape[0]):
         fresh = False
         while not fresh:

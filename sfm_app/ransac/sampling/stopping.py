@@ -26,8 +26,13 @@ def trials_needed(success: float, confidence: float, log_missed: float = 0.0) ->
 
 
 def have_converged(before: NDArray[np.float64], after: NDArray[np.float64], limit: float = CONVERGED) -> bool:
-    """Return whether the priors, each normalized to sum 1, moved less than `limit` in sum (thesis 4.18).
+    """Return whether the priors, each normalized to sum 1, moved less than a limit in sum (thesis 4.18).
 
     The printed sum grows with the number of matches; as probabilities that sum to 1 it lies in [0, 2] for any number.
+
+    Args:
+        before: (N,) priors >= 0, of any sum but zero.
+        after: (N,) the new ones.
+        limit: of the sum of the changes, in [0, 2].
     """
     return bool(np.abs(after / after.sum() - before / before.sum()).sum() < limit)

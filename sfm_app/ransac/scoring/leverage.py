@@ -108,9 +108,13 @@ def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: B
 
 @kernel
 def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
-    """Return how far the fit would move without each match (thesis 3.16 and 4.17.
+    """Return how far the fit would move without each match (thesis 3.16 and 4.17).
 
-    The square of d_i is missing in print).
+    The square of d_i is missing in print.
+
+    Args:
+        studentised: (N,) from `studentised_residuals`.
+        leverage: (N,) from `leverages`, in [0, 1].
     """
     distances = np.empty(studentised.shape[0])
     for i in range(studentised.shape[0]):
@@ -121,7 +125,12 @@ def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
 
 @kernel
 def priors(distances: FloatArray, sigma: float) -> FloatArray:
-    """Return p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels)."""
+    """Return p(v_i) = exp(-D_i^2 / (2 sigma^2)), largest value 1 (thesis 4.7.3; the constant factor cancels).
+
+    Args:
+        distances: (N,) Cook's distances, >= 0.
+        sigma: of the Gaussian, in their units; 0 leaves only the smallest.
+    """
     least, probable = np.inf, np.empty(distances.shape[0])
     for i in range(distances.shape[0]):
         least = min(least, distances[i])

@@ -29,7 +29,13 @@ _SETTLED = 1e-5
 
 
 def mlesac(points: FloatArray, threshold: float, best: FloatArray | None) -> Loss:
-    """Return penalty above, with the share gamma of inliers that the best model shows, one half before there is one."""
+    """Return penalty above, with the share gamma of inliers that the best model shows, one half before there is one.
+
+    Args:
+        points: (N, 4) matches.
+        threshold: largest distance of an inlier, in the units of the points.
+        best: (9,) entries of the best model; None before there is one.
+    """
     sigma, width = threshold / SIGMAS, window(points)
     gamma = 0.5 if best is None else inlier_share(squared_distances(points, best), sigma, width)
     odds = (1 - gamma) / gamma * sigma * math.sqrt(2 * math.pi) / width

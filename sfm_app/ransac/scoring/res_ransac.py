@@ -17,7 +17,13 @@ BINS = 100
 
 
 def residual_validity(points: FloatArray, f: FloatArray, _threshold: float) -> FloatArray:
-    """Return p(v_i) of every match (N, 4) from its Sampson distance to the best model f (9,)."""
+    """Return p(v_i) of every match from its Sampson distance to the best model.
+
+    Args:
+        points: (N, 4) matches.
+        f: (9,) entries of F by rows.
+        _threshold: not looked at, as every such function gets it.
+    """
     return validity_of(np.sqrt(squared_distances(points, f)))
 
 

@@ -47,36 +47,72 @@ Score = Callable[[FloatArray, float, FloatArray | None], Loss]
 
 
 def ransac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return 1 for every match beyond the threshold, else 0 (thesis 3.20, 4.4)."""
+    """Return 1 for every match beyond the threshold, else 0 (thesis 3.20, 4.4).
+
+    Args:
+        _points: not looked at, as every score gets them.
+        threshold: largest distance of an inlier, in the units of the points.
+        _best: not looked at.
+    """
     return Loss(RANSAC, threshold * threshold, threshold * threshold, 1.0)
 
 
 def msac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the squared distance, at most the squared threshold (Torr and Zisserman 2000)."""
+    """Return the squared distance, at most the squared threshold (Torr and Zisserman 2000).
+
+    Args:
+        _points: not looked at, as every score gets them.
+        threshold: largest distance of an inlier, in the units of the points.
+        _best: not looked at.
+    """
     return Loss(MSAC, threshold * threshold, threshold * threshold, threshold * threshold)
 
 
 def msac_linear(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the distance, at most the threshold (thesis 4.5 as printed)."""
+    """Return the distance, at most the threshold (thesis 4.5 as printed).
+
+    Args:
+        _points: not looked at, as every score gets them.
+        threshold: largest distance of an inlier, in the units of the points.
+        _best: not looked at.
+    """
     return Loss(MSAC_LINEAR, threshold * threshold, threshold * threshold, threshold)
 
 
 def lmeds(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the median of the squared distances (Rousseeuw 1984; thesis 4.4.1); the threshold only counts inliers."""
+    """Return the median of the squared distances (Rousseeuw 1984; thesis 4.4.1).
+
+    Args:
+        _points: not looked at, as every score gets them.
+        threshold: largest distance of an inlier; only counts these.
+        _best: not looked at.
+    """
     return Loss(LMEDS, threshold * threshold, np.inf, np.inf)
 
 
 def geman_mcclure(_points: FloatArray, threshold: float, _best: FloatArray | None, *, scale: float) -> Loss:
-    """Return r^2 / (r^2 + c^2), c being `scale` thresholds.
+    """Return r^2 / (r^2 + c^2): no edge, and close matches count most (Geman and McClure 1987).
 
-    No edge, and close matches count most (Geman and McClure 1987).
+    Args:
+        _points: not looked at, as every score gets them.
+        threshold: largest distance of an inlier, in the units of the points.
+        _best: not looked at.
+        scale: c in thresholds, > 0.
     """
     return Loss(GEMAN_MCCLURE, threshold * threshold, np.inf, 1.0, (scale * threshold) ** -2)
 
 
 @kernel
 def squared_sampson(f: FloatArray, x1: float, y1: float, x2: float, y2: float) -> float:
-    """Return squared Sampson distance (thesis 4.2) of one match to f, the nine entries of F by rows."""
+    """Return squared Sampson distance (thesis 4.2) of one match.
+
+    Args:
+        f: (9,) entries of F by rows.
+        x1: of the point in view 1.
+        y1: likewise.
+        x2: of its partner in view 2.
+        y2: likewise.
+    """
     ax, ay, az = f[0] * x1 + f[1] * y1 + f[2], f[3] * x1 + f[4] * y1 + f[5], f[6] * x1 + f[7] * y1 + f[8]
     bx, by = f[0] * x2 + f[3] * y2 + f[6], f[1] * x2 + f[4] * y2 + f[7]
     algebraic = x2 * ax + y2 * ay + az
@@ -86,7 +122,12 @@ def squared_sampson(f: FloatArray, x1: float, y1: float, x2: float, y2: float) -
 
 @kernel
 def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
-    """Return (N,) squared Sampson distances of all matches (N, 4)."""
+    """Return (N,) squared Sampson distances of all matches.
+
+    Args:
+        points: (N, 4) matches.
+        f: (9,) entries of F by rows.
+    """
     squared = np.empty(points.shape[0])
     distances_of_block(points, f, FIRST, squared)
     return squared
@@ -94,7 +135,14 @@ def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
 
 @kernel
 def distances_of_block(points: FloatArray, f: FloatArray, start: int, squared: FloatArray) -> None:
-    """Write the squared Sampson distances of as many matches as `squared` has room for, from row `start` on."""
+    """Write the squared Sampson distances of as many matches as there is room for.
+
+    Args:
+        points: (N, 4) matches.
+        f: (9,) entries of F by rows.
+        start: row of the first match.
+        squared: (n,), written to; n <= N - start.
+    """
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
     for i in range(squared.shape[0]):  # spelt out: several matches at once in the lanes of the processor
         x1, y1, x2, y2 = points[start + i, 0], points[start + i, 1], points[start + i, 2], points[start + i, 3]
@@ -208,7 +256,12 @@ def _median_of_squares(points: FloatArray, f: FloatArray, to_beat: float) -> flo
 
 @kernel
 def select(values: FloatArray, rank: int) -> float:
-    """Return the value that sorting would put at `rank`, by Hoare's quickselect; reorders `values`."""
+    """Return the value that sorting would put at `rank`, by Hoare's quickselect.
+
+    Args:
+        values: (N,) numbers; they are reordered.
+        rank: in [0, N), 0 for the smallest.
+    """
     low, high = 0, values.shape[0] - 1
     while low < high:
         pivot, i, j = values[(low + high) // 2], low, high

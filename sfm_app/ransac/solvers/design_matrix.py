@@ -18,7 +18,12 @@ LANES = 64
 
 @kernel
 def design_row(point: FloatArray, row: FloatArray) -> None:
-    """Write x2 (x) x1 into `row` (9,): the coefficients of the entries of F, by rows, in x2' F x1 = 0."""
+    """Write x2 (x) x1: the coefficients of the entries of F, by rows, in x2' F x1 = 0.
+
+    Args:
+        point: (4,) match x1, y1, x2, y2.
+        row: (9,), written to.
+    """
     for i in range(3):
         from2 = point[2 + i] if i < 2 else 1.0
         row[3 * i] = from2 * point[0]
@@ -28,7 +33,13 @@ def design_row(point: FloatArray, row: FloatArray) -> None:
 
 @kernel
 def gather(points: FloatArray, weights: FloatArray, start: int, block: FloatArray) -> tuple[int, int]:
-    """Return next matches of positive weight, from row `start` on, as columns x1, y1, x2, y2, sqrt(weight) of `block`.
+    """Return next matches of positive weight, as columns x1, y1, x2, y2, sqrt(weight) of `block`.
+
+    Args:
+        points: (N, 4) matches.
+        weights: (N,) >= 0.
+        start: row to begin at.
+        block: (5, LANES), written to.
 
     Returns:
         Number of columns filled, and the row to go on from.
@@ -56,7 +67,13 @@ def _design_columns(block: FloatArray, count: int, rows: FloatArray) -> None:
 
 @summing_kernel
 def add_products(rows: FloatArray, count: int, gram: FloatArray) -> None:
-    """Add the sums over n of rows[j, n] rows[k, n], n < count, to gram[j, k] for all k <= j."""
+    """Add the sums over n of rows[j, n] rows[k, n] to gram[j, k] for all k <= j.
+
+    Args:
+        rows: (9, LANES) columns of the design matrix, each on end.
+        count: how many n count, from 0 on.
+        gram: (9, 9), added to.
+    """
     for j in range(rows.shape[0]):
         for k in range(j + 1):
             total = 0.0
@@ -74,7 +91,12 @@ def mirror(gram: FloatArray) -> None:
 
 
 def weighted_gram(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return (9, 9) matrix A' W A of the matches (N, 4), with weights (N,) >= 0."""
+    """Return (9, 9) matrix A' W A of the matches.
+
+    Args:
+        points: (N, 4) matches.
+        weights: (N,) >= 0.
+    """
     gram = np.zeros((9, 9))
     _add_gram(points, weights, gram)
     return gram
@@ -94,7 +116,12 @@ def _add_gram(points: FloatArray, weights: FloatArray, gram: FloatArray) -> None
 
 @kernel
 def quadratic_forms(points: FloatArray, whitening: FloatArray) -> FloatArray:
-    """Return (N,) squared lengths of the rows of A after `whitening` (9, p)."""
+    """Return (N,) squared lengths of the rows of A after whitening.
+
+    Args:
+        points: (N, 4) matches.
+        whitening: (9, p) factor that rows of A are multiplied by.
+    """
     count = points.shape[0]
     forms, ones = np.zeros(count), np.ones(count)
     block, rows, dots = np.empty((5, LANES)), np.empty((9, LANES)), np.empty(LANES)

@@ -129,6 +129,11 @@ def is_oriented(points: FloatArray, sample: IntArray, f: FloatArray) -> bool:
 
     For such points e2 x x2 and F x1, the same line up to scale, point the same way for all matches or opposite for all.
     Wrong models rarely pass, and need not be scored.
+
+    Args:
+        points: (N, 4) matches.
+        sample: (m,) rows of `points`.
+        f: (9,) entries of F by rows.
     """
     largest = -1.0  # e2 is perpendicular to the columns of F: the most stable cross product of two of them
     e2 = np.empty(3)
@@ -153,7 +158,15 @@ def is_oriented(points: FloatArray, sample: IntArray, f: FloatArray) -> bool:
 
 @kernel
 def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArray) -> int:
-    """Return real roots of c0 + c1 z + c2 z^2 + c3 z^3 into `roots` (3,); 1 or 3 of them, or 0 if c3 is 0."""
+    """Write the real roots of c0 + c1 z + c2 z^2 + c3 z^3 and return their number: 1 or 3, or 0 if c3 is 0.
+
+    Args:
+        c0: constant coefficient.
+        c1: coefficient of z.
+        c2: coefficient of z^2.
+        c3: coefficient of z^3.
+        roots: (3,), written to.
+    """
     if c3 == 0.0:
         return 0
     a, b, c = c2 / c3, c1 / c3, c0 / c3

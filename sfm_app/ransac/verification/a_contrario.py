@@ -88,15 +88,25 @@ def _shifted(points: FloatArray, f: FloatArray, shifts: int) -> FloatArray:
 
 
 def accidental_share(wrong: FloatArray, threshold: float) -> float:
-    """Return probability that a wrong match agrees with a model, in (0, 1), from the squared distances of mismatches.
+    """Return probability that a wrong match agrees with a model, in (0, 1).
 
     Measured, not modeled: it knows the extent of the photos, where their points cluster, and where the epipoles are.
+
+    Args:
+        wrong: (M,) squared distances of mismatches to the model.
+        threshold: largest distance of an inlier, in the same units.
     """
     return (int(np.count_nonzero(wrong <= threshold * threshold)) + 1.0) / (len(wrong) + 2.0)
 
 
 def log_binomial_tail(count: int, least: int, chance: float) -> float:
-    """Return upper bound of log P(Binomial(count, chance) >= least), for a chance in (0, 1) (Chernoff 1952)."""
+    """Return upper bound of log P(Binomial(count, chance) >= least) (Chernoff 1952).
+
+    Args:
+        count: number of trials, > 0.
+        least: successes asked for.
+        chance: probability of one success, in (0, 1).
+    """
     share = least / count
     if share <= chance:
         return 0.0

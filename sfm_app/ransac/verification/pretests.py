@@ -42,7 +42,13 @@ class PreTest(NamedTuple):
 
 
 def pretest(least_inliers: IntArray, stride: int, *, random_start: bool) -> PreTest:
-    """Make a pre-test that has counted nothing."""
+    """Make a pre-test that has counted nothing.
+
+    Args:
+        least_inliers: (T,) inliers that must be seen by each look; empty for no test.
+        stride: matches between two looks, > 0.
+        random_start: begin at a random match for every hypothesis, not at the first.
+    """
     return PreTest(least_inliers, stride, random_start, np.zeros(2, dtype=np.int64))
 
 
@@ -66,7 +72,12 @@ class Verifier(Protocol):
         """Expect this share of inliers, that of the best model."""
 
     def trials_needed(self, share: float, confidence: float) -> float:
-        """Return samples, those already drawn included, that hold with this probability a clean one which passes."""
+        """Return samples, those already drawn included, that hold with this probability a clean one which passes.
+
+        Args:
+            share: share of inliers, in [0, 1].
+            confidence: wanted probability, in (0, 1).
+        """
 
 
 class FullVerification:
@@ -78,11 +89,19 @@ class FullVerification:
         self.count, self.sample_size = count, sample_size
         self.pretest = self.lenient = OPEN
 
-    def learn(self, trials: int) -> None: ...
+    def learn(self, trials: int) -> None:
+        """Take no notice of samples that were drawn and tested."""
 
-    def expect(self, share: float) -> None: ...
+    def expect(self, share: float) -> None:
+        """Take no notice of the best model's share of inliers."""
 
     def trials_needed(self, share: float, confidence: float) -> float:
+        """Return samples that hold with this probability a clean one.
+
+        Args:
+            share: share of inliers, in [0, 1].
+            confidence: wanted probability, in (0, 1).
+        """
         return trials_needed(share**self.sample_size, confidence)
 
 
@@ -90,6 +109,7 @@ class BailOut(FullVerification):
     """Leave a hypothesis that falls behind the best one (Capel 2005), seen on the matches in their random order."""
 
     def expect(self, share: float) -> None:
+        """Make both tests for this share of inliers, that of the best model."""
         least = bail_out_table(self.count, share)
         self.pretest = pretest(least, BLOCK, random_start=False)
         self.lenient = pretest((LENIENCE * least).astype(np.int64), BLOCK, random_start=False)
@@ -108,6 +128,12 @@ class RandomisedTdd(FullVerification):
         self.pretest = self.lenient = pretest(np.arange(1, self.d + 1), 1, random_start=True)
 
     def trials_needed(self, share: float, confidence: float) -> float:
+        """Return samples that hold with this probability a clean one which passes.
+
+        Args:
+            share: share of inliers, in [0, 1].
+            confidence: wanted probability, in (0, 1).
+        """
         return trials_needed(share ** (self.sample_size + self.d), confidence)
 
 
@@ -116,6 +142,10 @@ def bail_out_table(count: int, inlier_share: float) -> IntArray:
 
     A hypothesis as good as the best one has a share `inlier_share` of inliers; in the first m of N matches their
     number is hypergeometric, and falls short of the figures given here about once in a thousand times.
+
+    Args:
+        count: number of matches.
+        inlier_share: that of the best model, in [0, 1].
 
     Returns:
         (blocks,) counts.

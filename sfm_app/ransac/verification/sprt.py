@@ -93,6 +93,11 @@ def design(epsilon: float, delta: float, sample_size: int) -> SequentialTest:
     """Return the fastest test for these probabilities: A = t_M C / m_S + 1 + log A.
 
     A larger A wastes matches on bad models, a smaller one wastes samples because good models fall.
+
+    Args:
+        epsilon: share of inliers of a good model, in (0, 1].
+        delta: that of a bad one; a test needs 0 < delta < epsilon.
+        sample_size: matches in a sample, 7 or 8.
     """
     epsilon = min(epsilon, _MOST_EPSILON)
     if not 0 < delta < epsilon:
@@ -133,15 +138,22 @@ class Sprt:
         return float((inliers + FIRST_DELTA * _PRIOR_WEIGHT) / (checked + _PRIOR_WEIGHT))
 
     def learn(self, trials: int) -> None:
+        """Count samples that were drawn and tested; where delta has changed the test is made anew."""
         self._trials += trials
         if abs(self._delta() - self._test.delta) > _MOVED * self._test.delta:
             self._renew(self._test.epsilon)
 
     def expect(self, share: float) -> None:
+        """Make the test anew for this share of inliers, that of the best model."""
         self._renew(share)
 
     def trials_needed(self, share: float, confidence: float) -> float:
-        """Return 3.19 over all tests that were in use: each left a clean sample standing with its own probability."""
+        """Return 3.19 over all tests that were in use: each left a clean sample standing with its own probability.
+
+        Args:
+            share: share of inliers, in [0, 1].
+            confidence: wanted probability, in (0, 1).
+        """
         clean = share**self._sample_size
         missed, drawn = 0.0, 0  # log-probability that all samples so far were unclean, or clean but rejected
         for test, trials in self._past:

@@ -126,7 +126,13 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], prio
 
 
 def of_all_pairs(fit: Fit, matches: Matches, Fs: FloatArray) -> Fit:
-    """Return the same cameras with a pose for every pair, also for those that they were not adjusted to."""
+    """Return the same cameras with a pose for every pair, also for those that they were not adjusted to.
+
+    Args:
+        fit: cameras adjusted to some of the pairs.
+        matches: inliers of all P pairs.
+        Fs: (P, 3, 3) in the frame and units of the matches; begin the poses.
+    """
     if len(matches.cameras) == len(fit.matches.cameras):
         return fit
     state = replace(fit.state, poses=_poses(matches, Fs, fit.state.thetas), weights=np.ones(len(Fs)))

@@ -72,9 +72,12 @@ class CameraPriors:
     """False: every lens is taken as straight."""
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
-        """Return the prior when `free` (C, 4) says what is freed and `held` (C, 4) what stays at its usual value.
+        """Return the prior for a choice of what is freed.
 
-        `thetas` (C, 5) turn k1 into kappa.
+        Args:
+            free: (C, 4) what is freed.
+            thetas: (C, 5) parameters of the cameras; they turn k1 into kappa.
+            held: (C, 4) what stays at its usual value; nothing where None.
         """
         mean, deviation = np.zeros((len(self.sides), CAMERA)), np.empty((len(self.sides), CAMERA))
         hinted = ~free[:, FOCAL] & np.isfinite(self.hints)
@@ -145,9 +148,13 @@ class Evidence:
         return fit + volume + self.priors.log_odds(free), step, covariance
 
     def choices(self, free: BoolArray, camera: int) -> list[BoolArray]:
-        """Return all choices for one camera, the others as in `free` (C, 4); those that free less come first.
+        """Return all choices for one camera; those that free less come first.
 
         What would leave hardly a constraint to contradict it is no choice: three pairs fit almost any center.
+
+        Args:
+            free: (C, 4) the choices for the other cameras.
+            camera: row of the one.
         """
         trials: list[BoolArray] = []
         for switches in sorted(product((False, True), repeat=free.shape[1]), key=sum):
@@ -201,10 +208,16 @@ class Evidence:
     def alternatives(
         self, free: BoolArray, camera: int, step: FloatArray, covariance: FloatArray
     ) -> list["Alternative"]:
-        """Give all choices for one camera, the others as in `free`, whose posterior has this mean step and covariance.
+        """Give all choices for one camera, and what each would make of it.
 
         What the pairs and the other cameras say about this one is its marginal posterior without its prior: five
         parameters, whatever the number of cameras.
+
+        Args:
+            free: (C, 4) the choices for all cameras.
+            camera: row of the one.
+            step: (5C,) mean step of the posterior under `free`.
+            covariance: (5C, 5C) of the same posterior.
         """
         block = slice(CAMERA * camera, CAMERA * (camera + 1))
         prior, share = self.priors.prior(free, self.thetas), spare(free, self.pairs)
@@ -228,6 +241,10 @@ def spare(free: BoolArray, pairs: float) -> float:
     """Return share of the constraints that is left to contradict the cameras, in [0.1, 1].
 
     A pair gives two. The fewer are left, the less the pairs' scatter about the fit says about their errors.
+
+    Args:
+        free: (C, 4) what is freed.
+        pairs: effective number of pairs, >= 0.
     """
     sought = len(free) + 2 * np.count_nonzero(free[:, CENTER]) + np.count_nonzero(free[:, [ASPECT, LENS]])
     return max(1.0 - sought / max(2.0 * pairs, 1e-9), 0.1)

@@ -171,7 +171,12 @@ class Matches:
         return max(MAD_TO_SIGMA * float(np.median(found[agreeing])) if agreeing.any() else 0.0, self.least_sigma)
 
     def scattered(self, information: Information, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Sum over the pairs, times `factors` (P,): (5C, 5C) and (5C,) in the parameters of all cameras."""
+        """Sum over the pairs: (5C, 5C) and (5C,) in the parameters of all cameras.
+
+        Args:
+            information: of P pairs.
+            factors: (P,) what each pair is multiplied by.
+        """
         rows = (CAMERA * self.cameras[:, :, None] + np.arange(CAMERA)).reshape(-1, 2 * CAMERA)
         H, b = np.zeros((CAMERA * self.count,) * 2), np.zeros(CAMERA * self.count)
         np.add.at(H, (rows[:, :, None], rows[:, None, :]), factors[:, None, None] * information.hessians)
@@ -180,12 +185,24 @@ class Matches:
 
 
 def evenly(rows: FloatArray, most: int) -> FloatArray:
-    """Return at most so many rows, evenly chosen."""
+    """Return at most so many rows, evenly chosen.
+
+    Args:
+        rows: (N, ...) array.
+        most: rows to keep, > 0.
+    """
     return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
 
 
 def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) -> State:
-    """Weigh the pairs anew and take a step of Levenberg and Marquardt, until the cameras stand still."""
+    """Weigh the pairs anew and take a step of Levenberg and Marquardt, until the cameras stand still.
+
+    Args:
+        matches: inliers of P pairs.
+        state: where to begin.
+        prior: on the parameters of the cameras.
+        rounds: most steps, > 0.
+    """
     damping = DAMPING.first
     for _ in range(rounds):
         system = _system(matches, state)
@@ -199,12 +216,22 @@ def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) 
 
 
 def reweighted(matches: Matches, state: State) -> State:
-    """Weigh every pair by what it would gain from cameras of its own."""
+    """Weigh every pair by what it would gain from cameras of its own.
+
+    Args:
+        matches: inliers of P pairs.
+        state: where it stands; only the weights and their scale change.
+    """
     return _weighed(state, _system(matches, state))
 
 
 def informed(matches: Matches, state: State) -> Information:
-    """Eliminate the poses."""
+    """Eliminate the poses: return what each pair says about the cameras.
+
+    Args:
+        matches: inliers of P pairs.
+        state: cameras and poses.
+    """
     return _information(_system(matches, state))
 
 

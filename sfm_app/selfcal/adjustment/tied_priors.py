@@ -35,7 +35,13 @@ class Tied(CameraPriors):
     """(C,) number of the family of a camera; -1: it is of none."""
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
-        """Give the prior; the mean of a family is that of its cameras in `thetas`, drawn towards the usual focal."""
+        """Give the prior; the mean of a family is that of its cameras, drawn towards the usual focal.
+
+        Args:
+            free: (C, 4) what is freed.
+            thetas: (C, 5) parameters of the cameras.
+            held: (C, 4) what stays at its usual value; nothing where None.
+        """
         plain = CameraPriors.prior(self, free, thetas, held)
         mean, precision = plain.mean.copy(), plain.precision.copy()
         claimed = ~free[:, FOCAL] & np.isfinite(self.hints)

@@ -79,7 +79,13 @@ def pair_costs(
 ) -> FloatArray:
     """Return (P,) half the sum over the matches of a pair of their robust squared distances, in sigma^2.
 
-    Arguments as in `distances`; sigma is the standard deviation of one.
+    Args:
+        matches: (M, 4) of all pairs, one after the other.
+        ends: (P + 1,) where each pair begins, and the end of the last.
+        thetas: (C, 5) parameters of the cameras.
+        cameras: (P, 2) camera of view 1 and of view 2.
+        poses: (P, 12), see `essential`.
+        sigma: standard deviation of a distance, in the units of the matches.
     """
     found = distances(matches, ends, thetas, cameras, poses)
     costs = np.zeros(len(poses))
@@ -96,7 +102,13 @@ def pair_systems(
 ) -> tuple[FloatArray, FloatArray]:
     """Return Gauss-Newton systems of all pairs in their fifteen parameters: camera 1, camera 2, pose.
 
-    Arguments as in `distances`; sigma is the standard deviation of one.
+    Args:
+        matches: (M, 4) of all pairs, one after the other.
+        ends: (P + 1,) where each pair begins, and the end of the last.
+        thetas: (C, 5) parameters of the cameras.
+        cameras: (P, 2) camera of view 1 and of view 2.
+        poses: (P, 12), see `essential`.
+        sigma: standard deviation of a distance, in the units of the matches.
 
     Returns:
         (P, 15, 15) approximate Hessians of the costs and (P, 15) their negative gradients; where both views are of one

@@ -43,7 +43,13 @@ def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> Float
 
 
 def spread_of(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, float]:
-    """Return standard deviations of fx, fy, cx, cy in pixels and of k1, from the covariance (5, 5) of one camera."""
+    """Return standard deviations of fx, fy, cx, cy in pixels and of k1.
+
+    Args:
+        theta: (5,) parameters of the camera.
+        cov: (5, 5) their covariance.
+        unit_px: pixels per unit of theta.
+    """
     focal, squared = float(np.exp(theta[LOG_FOCAL])) * unit_px, float(np.exp(2.0 * theta[LOG_FOCAL]))
     half = float(np.exp(0.5 * theta[LOG_ASPECT]))
     # rows: how fx, fy, cx, cy, k1 change with log f, u, v, log a, kappa
@@ -60,6 +66,10 @@ def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:
     """Return pairs that agree with the cameras, those that say most about them first.
 
     Views that differ in more than place.
+
+    Args:
+        fit: cameras adjusted to P pairs.
+        photos: (P,) the two photos of each; may be empty.
     """
     if not photos:
         return ()

@@ -40,7 +40,12 @@ class FocalGrid:
         self.grid = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
 
     def places(self, cameras: IndexArray, rows: IndexArray) -> IndexArray:
-        """Return (C,) places on the grid on which these pairs agree, when photo k is of `cameras[k]`."""
+        """Return (C,) places on the grid on which these pairs agree.
+
+        Args:
+            cameras: camera of each photo, counted from 0.
+            rows: the pairs that are asked.
+        """
         one = np.einsum("pgg->g", self.votes[rows]) - 0.5 * ((self.grid - USUAL_FOCAL) / FOCAL_SPREAD) ** 2
         priors = -0.5 * ((self.grid - self.grid[np.argmax(one)]) / TIE) ** 2
         if np.max(cameras) == 0:
@@ -67,7 +72,12 @@ class FocalGrid:
         return float(np.sum(self.given(self.places(cameras, np.arange(len(self.votes)))[cameras])))
 
     def held(self, cameras: IndexArray, fold: IndexArray) -> FloatArray:
-        """Return (P,) votes of every pair for cameras that the pairs of the other folds agree on."""
+        """Return (P,) votes of every pair for cameras that the pairs of the other folds agree on.
+
+        Args:
+            cameras: camera of each photo, counted from 0.
+            fold: (P,) number of the fold of each pair.
+        """
         found = np.zeros(len(self.votes))
         for number in np.unique(fold):
             out = fold == number

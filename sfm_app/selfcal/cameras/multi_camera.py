@@ -137,7 +137,14 @@ class Tables:
         self.packed, self.members, self.weights = ready.packed, members[ready.kept], ready.weights
 
     def votes(self, pair: int, first: FloatArray, second: FloatArray, sigma: float) -> FloatArray:
-        """Return (A, B) w exp(-r / sigma) for cameras (A, 5) of view 1 and (B, 5) of view 2."""
+        """Return (A, B) w exp(-r / sigma) for all pairs of cameras.
+
+        Args:
+            pair: row of the pair.
+            first: (A, 5) cameras of view 1.
+            second: (B, 5) cameras of view 2.
+            sigma: width of a vote, in units of r, > 0.
+        """
         return np.asarray(self.weights[pair] * np.exp(-_ratios(self.packed[pair], first, second) / sigma), np.float64)
 
 

@@ -48,7 +48,12 @@ class Consensus:
         return Consensus(self.pairs, self.center_sigma, weights)
 
     def at(self, thetas: FloatArray, sigma: float) -> FloatArray:
-        """Return (N,) supports plus log-priors at the rows of `thetas` (N, 4)."""
+        """Return (N,) supports plus log-priors.
+
+        Args:
+            thetas: (N, 4) parameters of K.
+            sigma: width of a vote, in units of r, > 0.
+        """
         return np.asarray(_values(self._packed, self.weights, self.center_sigma, thetas, sigma))
 
     def ratios(self, theta: FloatArray) -> FloatArray:
@@ -56,10 +61,15 @@ class Consensus:
         return np.asarray(_ratios(self._packed, theta))
 
     def climb(self, start: FloatArray, free: Sequence[int], sigmas: Sequence[float]) -> tuple[FloatArray, float]:
-        """Return the local maximum reached from `start` by moving the entries `free` of theta, through falling sigmas.
+        """Return the local maximum reached from a start by moving some entries of theta, through falling sigmas.
 
         Nelder-Mead, because the consensus has a cusp wherever a pair is satisfied exactly. For every sigma it runs a
         second time, from the end of the first with a tenth of its steps: a simplex can stall on a ridge.
+
+        Args:
+            start: (4,) theta to begin at.
+            free: places in theta that may move.
+            sigmas: falling widths of a vote, at least one.
 
         Returns:
             theta (4,) and the value there, at the last sigma.

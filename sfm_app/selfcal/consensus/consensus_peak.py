@@ -102,7 +102,12 @@ class Answer:
         return disagreement(self.votes, weights) or indecision(self.lead, self.votes)
 
     def scatter(self, consensus: Consensus, seed: int) -> FloatArray:
-        """Return (B, 4) the peak under resampled pairs, see `peak_evidence.resampled`."""
+        """Return (B, 4) the peak under resampled pairs, see `peak_evidence.resampled`.
+
+        Args:
+            consensus: of all pairs.
+            seed: same seed, same result.
+        """
         return resampled(consensus, self.theta, self.free, self.sigma, seed)
 
     def deviation(self, values: FloatArray) -> float:
@@ -138,7 +143,12 @@ def _examined(consensus: Consensus, ends: list[Peak], profile: Profile, free: tu
 
 
 def vagueness(log_focal_spread: float, *, one_of_many: bool = False) -> str:
-    """Return why an answer to which there is no objection is an estimate and not knowledge, or nothing."""
+    """Return why an answer to which there is no objection is an estimate and not knowledge, or nothing.
+
+    Args:
+        log_focal_spread: standard deviation of log f.
+        one_of_many: whether every photo has a focal of its own; a smaller spread is asked for then.
+    """
     vague = log_focal_spread > (IDENTIFIED_OF_MANY if one_of_many else IDENTIFIED_LOG_FOCAL_SPREAD)
     return f"the focal is uncertain by {100 * log_focal_spread:.0f} %" if vague else ""
 

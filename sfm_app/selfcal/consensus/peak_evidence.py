@@ -41,7 +41,12 @@ own."""
 
 
 def own_sigma(consensus: Consensus, theta: FloatArray) -> float:
-    """Return the width that fits the scatter of the agreeing pairs: 1.5 times the weighted median of their r."""
+    """Return the width that fits the scatter of the agreeing pairs: 1.5 times the weighted median of their r.
+
+    Args:
+        consensus: of all pairs.
+        theta: (4,) the peak.
+    """
     r = consensus.ratios(theta)
     agreeing = r < SIGMAS[0]
     if not np.any(agreeing):
@@ -53,7 +58,13 @@ def own_sigma(consensus: Consensus, theta: FloatArray) -> float:
 
 
 def votes(consensus: Consensus, theta: FloatArray, sigma: float) -> FloatArray:
-    """Return (P,) what each pair gives to K: w_i exp(-r_i / sigma)."""
+    """Return (P,) what each pair gives to K: w_i exp(-r_i / sigma).
+
+    Args:
+        consensus: of P pairs.
+        theta: (4,) parameters of K.
+        sigma: width of a vote, in units of r, > 0.
+    """
     return np.asarray(consensus.weights * np.exp(-consensus.ratios(theta) / sigma))
 
 
@@ -64,7 +75,12 @@ def effective_count(votes: FloatArray) -> float:
 
 
 def disagreement(given: FloatArray, weights: FloatArray) -> str:
-    """Return why votes (P,) out of `weights` (P,) do not make a camera, or nothing."""
+    """Return why votes do not make a camera, or nothing.
+
+    Args:
+        given: (P,) votes for K.
+        weights: (P,) the most that each pair can give.
+    """
     count, support = effective_count(given), float(np.sum(given) / np.sum(weights))
     if count >= MIN_AGREEING and support >= MIN_SUPPORT:
         return ""
@@ -72,7 +88,12 @@ def disagreement(given: FloatArray, weights: FloatArray) -> str:
 
 
 def indecision(lead: float, given: FloatArray) -> str:
-    """Return why a lead over the best rival is not enough beside the votes (P,) for K, or nothing."""
+    """Return why a lead over the best rival is not enough, or nothing.
+
+    Args:
+        lead: votes by which K leads.
+        given: (P,) votes for K.
+    """
     if lead >= max(MIN_LEAD, MIN_LEAD_SHARE * float(np.sum(given))):
         return ""
     return "the pairs fit other focals as well or better (too little rotation, parallel axes, or an orbit)"
@@ -89,6 +110,13 @@ def best_rival(
 
     It is climbed to from `theta` and, where a profile is given, from the best cell of the grid for that focal. Where
     the consensus does not depend on the focal (orbits, parallel axes) it equals the value at theta.
+
+    Args:
+        consensus: of all pairs.
+        theta: (4,) the peak.
+        free: places in theta that may move; the focal stays in any case.
+        sigmas: falling widths of a vote.
+        profile: best cells of the grid, from `scan`.
     """
     adapted = [index for index in free if index != LOG_FOCAL]
     values = []
@@ -106,6 +134,13 @@ def resampled(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigm
     """Return (RESAMPLES, 4) the peak under randomly reweighted pairs: the Bayesian bootstrap (Rubin 1981).
 
     Weights instead of draws, because three pairs drawn with replacement are often one pair three times.
+
+    Args:
+        consensus: of all pairs.
+        theta: (4,) the peak, where every climb starts.
+        free: places in theta that may move.
+        sigma: width of a vote, in units of r.
+        seed: same seed, same result.
     """
     rng = np.random.default_rng(seed)
     weights = consensus.weights
@@ -118,17 +153,29 @@ def resampled(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigm
 
 
 def deviation(values: FloatArray, count: float, parameters: int) -> float:
-    """Return the deviation over resampled peaks of what `count` effective pairs say about one of `parameters` unknowns.
+    """Return the deviation of an unknown over resampled peaks, as large as the pairs justify.
 
     A pair gives two constraints. With three pairs and three unknowns half of the scatter has gone into the fit, and the
     resampled peaks scatter too little by the same share: the usual correction for degrees of freedom.
+
+    Args:
+        values: (B,) one unknown at each peak, B >= 2.
+        count: effective number of pairs.
+        parameters: number of unknowns.
     """
     spare = max(count - 0.5 * parameters, 0.5)
     return float(np.std(values, ddof=1) * np.sqrt(max(count, 1.0) / spare))
 
 
 def spread_px(thetas: FloatArray, unit_px: float, count: float, parameters: int) -> dict[str, float]:
-    """Return standard deviations of fx, fy, cx, cy, in pixels; see `deviation`."""
+    """Return standard deviations of fx, fy, cx, cy, in pixels; see `deviation`.
+
+    Args:
+        thetas: (B, 4) resampled peaks, B >= 2.
+        unit_px: pixels per unit of theta.
+        count: effective number of pairs.
+        parameters: number of unknowns.
+    """
     focal, half = np.exp(thetas[:, LOG_FOCAL]) * unit_px, np.exp(0.5 * thetas[:, LOG_ASPECT])
     columns = {"fx": focal / half, "fy": focal * half}
     columns |= {"cx": thetas[:, CENTER_U] * unit_px, "cy": thetas[:, CENTER_V] * unit_px}

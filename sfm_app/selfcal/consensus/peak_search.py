@@ -47,7 +47,12 @@ class Profile(NamedTuple):
 
 
 def scan(consensus: Consensus, log_aspects: Sequence[float]) -> Profile:
-    """Look at every cell of the grid."""
+    """Look at every cell of the grid over K.
+
+    Args:
+        consensus: of all pairs.
+        log_aspects: log fy/fx of the grid.
+    """
     focals = np.geomspace(*FOCAL_RANGE, FOCALS)
     centers = np.arange(-CENTER_REACH, CENTER_REACH + CENTER_STEP / 2, CENTER_STEP)
     cells = np.meshgrid(np.log(focals), centers, centers, np.asarray(log_aspects), indexing="ij")
@@ -59,7 +64,13 @@ def scan(consensus: Consensus, log_aspects: Sequence[float]) -> Profile:
 
 
 def peaks(consensus: Consensus, profile: Profile, free: Sequence[int]) -> list[Peak]:
-    """Return where the best local maxima of the profile lead to, highest first."""
+    """Return where the best local maxima of the profile lead to, highest first.
+
+    Args:
+        consensus: of all pairs.
+        profile: from `scan`.
+        free: places in theta that may move.
+    """
     padded = np.concatenate([[-np.inf], profile.values, [-np.inf]])
     is_top = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
     tops = np.flatnonzero(is_top)

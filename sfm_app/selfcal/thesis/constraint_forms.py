@@ -30,7 +30,12 @@ by hand; not measured on its own."""
 
 
 def essential(F: FloatArray, K: FloatArray) -> FloatArray:
-    """Return (..., 3, 3) E = K'FK (thesis 5.7)."""
+    """Return (..., 3, 3) E = K'FK (thesis 5.7).
+
+    Args:
+        F: (..., 3, 3) fundamental matrices.
+        K: (3, 3) camera matrix of both views.
+    """
     return np.asarray(K.T @ F @ K)
 
 
@@ -128,7 +133,12 @@ def equations(halves: Halves, cameras: FloatArray) -> FloatArray:
 
 
 def huang_faugeras_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
-    """Give (..., 2) as `equations`, lengthened so that norm is (s1 - s2) / s2 = 2 r / (1 - r), the term of (5.8)."""
+    """Give (..., 2) as `equations`, lengthened so that norm is (s1 - s2) / s2 = 2 r / (1 - r), the term of (5.8).
+
+    Args:
+        halves: (...,) fundamental matrices.
+        cameras: (..., 4) fx, fy, u, v; its leading axes broadcast with those of `halves`.
+    """
     g = equations(halves, cameras)
     r = np.linalg.norm(g, axis=-1, keepdims=True)
     return np.asarray(2 * g / np.maximum(1.0 - r, LEAST_COMPLEMENT))

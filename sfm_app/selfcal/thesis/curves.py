@@ -16,6 +16,11 @@ MAX_OUT_OF_RANGE = 0.5
 def focal_curves(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> FloatArray:
     """Return Z^f of thesis (5.29), (5.31): fy at every swept fx.
 
+    Args:
+        pairs: P fundamental matrices.
+        fx: (S,) swept values, in the units of the pairs.
+        center: u, v in the same units.
+
     Returns:
         (P, S) fy; 0 where no root has a non-zero real part. Not clipped to a range: `degeneracy` wants to see it.
     """
@@ -28,17 +33,33 @@ def focal_curves(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> F
 
 
 def center_curves(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
-    """Return Z^oc of thesis (5.30): v at every swept u; as `focal_curves`."""
+    """Return Z^oc of thesis (5.30): (P, S) v at every swept u; as `focal_curves`.
+
+    Args:
+        pairs: P fundamental matrices.
+        u: (S,) swept values, in the units of the pairs.
+        focal: fx, fy in the same units.
+    """
     return _chosen(swept_roots(center_polynomials(pairs, u, focal)))
 
 
 def degeneracy(curves: FloatArray, upper: float) -> FloatArray:
-    """Return thesis (5.35): per curve, the share of its samples that lie out of (0, upper)."""
+    """Return thesis (5.35): per curve, the share of its samples that lie out of range.
+
+    Args:
+        curves: (P, S) values.
+        upper: the range is (0, upper).
+    """
     return np.asarray(np.mean((curves <= ROOT_IS_ZERO) | (curves >= upper), axis=1))
 
 
 def usable(curves: FloatArray, upper: float) -> FloatArray:
-    """Return the curves that are not degenerate."""
+    """Return the curves that are not degenerate.
+
+    Args:
+        curves: (P, S) values.
+        upper: end of their range, see `degeneracy`.
+    """
     return curves[degeneracy(curves, upper) <= MAX_OUT_OF_RANGE]
 
 

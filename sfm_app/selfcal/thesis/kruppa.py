@@ -53,6 +53,10 @@ def kruppa_ratios(halves: Halves, cameras: FloatArray) -> FloatArray:
     """Return (..., 3) the ratios a^2 B11 / A22, -ab B12 / A12, b^2 B22 / A11: equal for the right camera.
 
     NaN for 0 / 0.
+
+    Args:
+        halves: (...,) fundamental matrices.
+        cameras: (..., 4) fx, fy, u, v; its leading axes broadcast with those of `halves`.
     """
     left, right = _sides(halves, cameras)
     return np.asarray(np.divide(left, right, out=np.full(left.shape, np.nan), where=right != 0))
@@ -86,6 +90,10 @@ def focals_of(pairs: Pairs, center: tuple[float, float]) -> FloatArray:
     The equations that hold with the off-diagonal entries are linear in f^2 once the trivial root f = 1 is divided out;
     they fail where the optical axes lie in one plane. The third is quadratic. Of the solutions of both that one is
     taken which satisfies all three best.
+
+    Args:
+        pairs: P fundamental matrices.
+        center: u, v in the units of the pairs.
 
     Returns:
         (P,) in the units of the pairs; NaN where the equations hold for any focal, or for none.

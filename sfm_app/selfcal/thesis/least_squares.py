@@ -40,7 +40,14 @@ class Minima(NamedTuple):
 def fitted(
     pairs: Pairs, start: CameraParameters, weights: FloatArray, equations: Equations = DEFAULT
 ) -> CameraParameters:
-    """Return local minimum of sum_i w_i |equations_i|^2 / sum_i w_i that is reached from `start`, over all pairs."""
+    """Return local minimum of sum_i w_i |equations_i|^2 / sum_i w_i that is reached from `start`, over all pairs.
+
+    Args:
+        pairs: P fundamental matrices.
+        start: where the search begins.
+        weights: (P,) w_i >= 0.
+        equations: form of the constraint.
+    """
     found = minima(Halves.of(pairs.F)[np.arange(len(pairs))[None]], weights[None], np.array([start]), equations)
     return CameraParameters(*(float(value) for value in found.cameras[0]))
 

@@ -46,11 +46,16 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 def algorithm_2(
     pairs: Pairs, tall: float, evidence: dict[str, float], seed: int, equations: Equations = DEFAULT
 ) -> CameraParameters:
-    """Return the algorithm itself, for an image of width 1 and height `tall`.
-
-    `evidence` gets the distribution and MaxIter.
+    """Estimate the camera as the thesis writes.
 
     Residual(s) is that of the triple: the thesis writes that other pairs play no part, and that this costs accuracy.
+
+    Args:
+        pairs: P fundamental matrices in image widths.
+        tall: height of the photos in widths.
+        evidence: filled with the distribution and MaxIter.
+        seed: same seed, same result.
+        equations: form of the constraint.
     """
     rng = np.random.default_rng(seed)
     count = number_of_starts(len(pairs))
@@ -76,7 +81,12 @@ def number_of_starts(pairs: int) -> int:
 
 
 def focal_distribution(pairs: Pairs, tall: float) -> tuple[float, float]:
-    """Return thesis (5.12), (5.13): weighted mean and standard deviation of the pairs' own focals, in image widths."""
+    """Return thesis (5.12), (5.13): weighted mean and standard deviation of the pairs' own focals, in image widths.
+
+    Args:
+        pairs: P fundamental matrices in image widths.
+        tall: height of the photos in widths.
+    """
     focals = focals_of(pairs, (0.5, 0.5 * tall))
     known = (focals > FOCAL_RANGE[0]) & (focals < FOCAL_RANGE[1])
     if not np.any(known):

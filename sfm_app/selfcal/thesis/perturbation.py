@@ -38,9 +38,13 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 def algorithm_3(
     pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations = DEFAULT
 ) -> CameraParameters:
-    """Return the algorithm itself, from K_init.
+    """Estimate the camera as the thesis writes, from K_init.
 
-    `evidence` gets the number of iterations and the effective number of pairs.
+    Args:
+        pairs: P fundamental matrices in image widths.
+        tall: height of the photos in widths.
+        evidence: filled with the number of iterations and the effective number of pairs.
+        equations: form of the constraint.
     """
     camera, weights = CameraParameters.initial(tall), np.ones(len(pairs))
     for iteration in range(1, MOST_ITERATIONS + 1):

@@ -39,12 +39,15 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 
 
 def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: int) -> CameraParameters | str:
-    """Return the algorithm itself, for an image of width 1 and height `tall`.
+    """Estimate the camera as the thesis writes, or give the reason where too few curves are usable.
 
-    The reason where too few curves are usable.
+    Several `focal_peaks` are several cameras (Figure 5.15), of which the answer is one.
 
-    Fills `evidence` with the number of curves and their support at the meeting points. With `focal_peaks`, the number
-    of separate peaks of that support, too: several are several cameras (Figure 5.15), of which the answer is one.
+    Args:
+        pairs: P fundamental matrices in image widths.
+        tall: height of the photos in widths.
+        evidence: filled with the number of curves, their support where they meet, and the peaks of that.
+        samples: of a sweep, > 0.
     """
     sweep = np.arange(1, samples + 1) / samples
     fx = FOCAL_RANGE * sweep
