@@ -100,7 +100,7 @@ def create_database(path: Path, photos: PhotoSet) -> None:
     Feature extraction would do it too, but numbers photos as its threads finish with them: not twice the same.
 
     Args:
-        path: database, made if it is missing.
+        path: database file, made if it is missing.
         photos: usable photos, in groups of one camera.
     """
     with opened(path) as database:
@@ -117,7 +117,7 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
     """Return keypoints and raw matches of every photo in the database.
 
     Args:
-        path: database.
+        path: database file.
         photos: those it was made from.
     """
     by_name = {photo.name: photo for photo in photos.photos}
@@ -146,7 +146,7 @@ def unmatched(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
     """Return those of the pairs that nobody has matched yet, with or without success.
 
     Args:
-        path: database.
+        path: database file.
         pairs: ids, the smaller one first.
     """
     with opened(path) as database:
@@ -157,7 +157,7 @@ def write_keypoints(path: Path, photo: int, keypoints: NDArray[np.float32]) -> N
     """Enter the keypoints of a photo, or replace them.
 
     Args:
-        path: database.
+        path: database file.
         photo: id.
         keypoints: (N, 2) pixels.
     """
@@ -174,7 +174,7 @@ def write_matches(path: Path, pair: PairId, rows: NDArray[np.uint32]) -> None:
     """Enter the matches of a pair that has none.
 
     Args:
-        path: database.
+        path: database file.
         pair: ids, the smaller one first.
         rows: (M, 2) keypoint indices.
     """
@@ -188,7 +188,7 @@ def write_match_graph(path: Path, matches: MatchGraph) -> None:
     Its cameras are guesses, one for each group of photos, until `write_calibrations` replaces them.
 
     Args:
-        path: database; what is there is lost.
+        path: database file; what is there is lost.
         matches: keypoints and raw matches.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -221,7 +221,7 @@ def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
     """Replace all two-view geometries by our relative poses, with the essential matrices they stand for.
 
     Args:
-        path: database.
+        path: database file.
         matches: raw matches; inliers are rows of them.
         graph: relative poses.
     """
@@ -235,7 +235,7 @@ def keep_raw_matches(path: Path, pairs: Collection[PairId]) -> None:
     """Remove all two-view geometries, and the matches of all other pairs.
 
     Args:
-        path: database.
+        path: database file.
         pairs: whose matches stay.
     """
     with opened(path) as database:
@@ -251,7 +251,7 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
     as prior knowledge, a guess does not.
 
     Args:
-        path: database.
+        path: database file.
         matches: all photos.
         intrinsics: cameras, and which photo has which.
     """

@@ -83,7 +83,7 @@ def read_gray(dense_dir: Path, view: View) -> NDArray[np.uint8]:
     """Return the undistorted photo of a view, (H, W).
 
     Args:
-        dense_dir: dense workspace.
+        dense_dir: folder with undistorted photos and their maps.
         view: an undistorted photo.
     """
     # imdecode, because OpenCV does not open names beyond ASCII on every system
@@ -95,7 +95,7 @@ def read_color(dense_dir: Path, view: View) -> NDArray[np.uint8]:
     """Return the undistorted photo of a view, (H, W, 3) RGB.
 
     Args:
-        dense_dir: dense workspace.
+        dense_dir: folder with undistorted photos and their maps.
         view: an undistorted photo.
     """
     image = cv2.imdecode(np.fromfile(dense_dir / "images" / view.name, np.uint8), cv2.IMREAD_COLOR_RGB)
@@ -106,7 +106,7 @@ def map_file(dense_dir: Path, view: View) -> Path:
     """Return where the confirmed depths of a view are, if it has any.
 
     Args:
-        dense_dir: dense workspace.
+        dense_dir: folder with undistorted photos and their maps.
         view: an undistorted photo.
     """
     return _map_path(dense_dir, "depth_maps", view, "geometric")
@@ -165,7 +165,7 @@ def read_depth(dense_dir: Path, view: View, kind: Kind) -> NDArray[np.float32]:
     """Read a depth map, (H, W), 0 where unknown, MASKED where the photo is masked.
 
     Args:
-        dense_dir: dense workspace.
+        dense_dir: folder with undistorted photos and their maps.
         view: an undistorted photo.
         kind: photometric or geometric.
     """
@@ -176,7 +176,7 @@ def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
     """Write the confirmed depths and the normals of a view, as COLMAP's fusion expects them.
 
     Args:
-        dense_dir: dense workspace.
+        dense_dir: folder with undistorted photos and their maps.
         view: an undistorted photo.
         maps: depths (H, W) and normals (H, W, 3).
     """
@@ -191,7 +191,7 @@ def hide_masked(dense_dir: Path, view: View) -> None:
     """Put MASKED into the confirmed depths of a view where it is masked, whoever has made them.
 
     Args:
-        dense_dir: dense workspace.
+        dense_dir: folder with undistorted photos and their maps.
         view: an undistorted photo, masked or not.
     """
     used, file = used_pixels(dense_dir, view), map_file(dense_dir, view)
@@ -204,7 +204,7 @@ def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
     """Remove what is of no use once the geometric maps are there.
 
     Args:
-        dense_dir: dense workspace.
+        dense_dir: folder with undistorted photos and their maps.
         views: all undistorted photos.
     """
     for view in views:
@@ -216,7 +216,7 @@ def write_fusion_views(dense_dir: Path, views: Sequence[View]) -> None:
     """Write down for COLMAP's fusion which views have maps.
 
     Args:
-        dense_dir: dense workspace.
+        dense_dir: folder with undistorted photos and their maps.
         views: all undistorted photos.
     """
     config = "".join(f"{view.name}\n" for view in views if map_file(dense_dir, view).exists())

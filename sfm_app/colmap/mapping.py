@@ -99,7 +99,7 @@ def map_as_colmap_does(
 ) -> pycolmap.Reconstruction | None:
     """Verify the raw matches and map the photos by COLMAP's defaults, with the cameras of the database as first guess.
 
-    Nothing of ours but the matches and the guess enters; arguments, result and errors as `map_globally`.
+    Nothing of ours but the matches and the guess enters; result and errors as `map_globally`.
 
     Args:
         photo_dir: folder with the photos.

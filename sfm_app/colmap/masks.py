@@ -44,7 +44,7 @@ def used_pixels(dense_dir: Path, view: View) -> BoolImage | None:
     """Return (H, W) which pixels of an undistorted photo may be used; None where no masks are given.
 
     Args:
-        dense_dir: dense workspace.
+        dense_dir: folder with undistorted photos and their maps.
         view: an undistorted photo.
     """
     place = dense_dir / MASKS

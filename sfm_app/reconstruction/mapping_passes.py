@@ -113,10 +113,7 @@ def with_rival(
 
     Args:
         outcome: models from relative poses.
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-        intrinsics: cameras from pairs.
-        run: the run.
+        matches, views, intrinsics, run: as in `reconstruct`.
     """
     main = outcome.main
     thin = why_thin(main, intrinsics, matches, views)

@@ -29,8 +29,7 @@ def ordered_map(
     When the caller stops early or an item fails, what has not begun is cancelled.
 
     Args:
-        executor: its workers run the function.
-        function: applied to each item.
+        executor, function: its workers apply the function to each item.
         items: drawn only as they are needed.
         ahead: most items under way; at least 1.
     """

@@ -101,7 +101,7 @@ def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | No
     """Note what share of each photo has a depth, and why photos have none.
 
     Args:
-        dense_dir: dense workspace.
+        dense_dir: folder with undistorted photos and their maps.
         views: all undistorted photos.
         found: per view why it has no depth; None where it has.
         run: the run.

@@ -129,7 +129,7 @@ def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunCont
 
     Args:
         surface: as Poisson reconstruction leaves it.
-        dense_dir: dense workspace.
+        dense_dir: folder with undistorted photos and their maps.
         views: photos with a depth map.
         run: the run.
     """

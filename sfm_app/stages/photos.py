@@ -127,8 +127,7 @@ def masked(
 
     Args:
         glances: photos that are worth their time.
-        folder: where they are read from.
-        source: knows the masks.
+        folder, source: where the photos are read from, and their masks.
         run: the run.
 
     Raises:
