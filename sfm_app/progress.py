@@ -14,7 +14,7 @@ class Progress(Protocol):
 
         Args:
             name: of the stage.
-            note: why it was skipped; empty where it begins.
+            note: why it is skipped or done again; empty where it is new.
         """
 
     def stage_done(self, seconds: float) -> None:

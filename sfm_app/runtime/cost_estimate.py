@@ -114,8 +114,6 @@ def plan_within(
 ) -> Plan:
     """Return the plan with the most workers that holds no more memory than allowed; with one worker if none does.
 
-    With one where that is too much.
-
     Args:
         photos, settings, limit_mb: as in `plan_of`.
         workers: the most that may work at once.
