@@ -204,7 +204,13 @@ def calibrate_fundamentals(
 
 @contextmanager
 def opened_run(out: Path, settings: Settings, progress: Progress | None) -> Iterator[RunContext]:
-    """Provide a run with its workers, which end with it."""
+    """Provide a run with its workers, which end with it.
+
+    Args:
+        out: output folder.
+        settings: of the run.
+        progress: where it tells how far it is; None for silence.
+    """
     plugins = load_plugins(installed=settings.plugins)
     plugins.estimator(settings.epipolar.estimator)  # unknown names are refused before any work is done
     plugins.calibrator(settings.calibration.calibrator)

@@ -36,7 +36,12 @@ def can_go_on(folder: Path, made_from: str) -> bool:
 
 
 def is_made_from(marker: Path, made_from: str) -> bool:
-    """Return whether a file says so."""
+    """Return whether a marker holds this fingerprint.
+
+    Args:
+        marker: text file; may be missing.
+        made_from: fingerprint of the inputs.
+    """
     try:
         return marker.read_text(encoding="utf-8") == made_from
     except (OSError, UnicodeDecodeError):
@@ -44,7 +49,12 @@ def is_made_from(marker: Path, made_from: str) -> bool:
 
 
 def mark_unfinished(folder: Path, made_from: str) -> None:
-    """Mark a folder, made if it is missing, as one in which a killed run can go on."""
+    """Mark a folder as one in which a killed run can go on.
+
+    Args:
+        folder: made if it is missing.
+        made_from: fingerprint of the inputs.
+    """
     with replacing(folder / UNFINISHED) as path:
         path.write_text(made_from, encoding="utf-8")
 
@@ -55,7 +65,12 @@ def mark_finished(folder: Path) -> None:
 
 
 def save_files(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:
-    """Write files, each complete or not at all, the first one last: it names the others."""
+    """Write files, each complete or not at all, the first one last: it names the others.
+
+    Args:
+        files: contents by file name.
+        folder: where they go.
+    """
     paths = tuple(folder / name for name in files)
     for path, data in reversed(list(zip(paths, files.values(), strict=True))):
         with replacing(path) as beside:

@@ -66,6 +66,11 @@ class DemoResult:
 def run_demo(out: Path, settings: Settings, progress: Progress) -> DemoResult:
     """Render OUT/photos, reconstruct them into OUT/model, compare, and draw OUT/model.png.
 
+    Args:
+        out: output folder.
+        settings: of the reconstruction.
+        progress: where the run tells how far it is.
+
     Raises:
         SfmError: see `sfm_app.errors`.
     """
@@ -94,7 +99,16 @@ def _render_photos(out: Path, progress: Progress) -> Truth:
 
 
 def compared(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[float, float], out: Path) -> DemoResult:
-    """Set what was found beside what is true."""
+    """Set what was found beside what is true.
+
+    Args:
+        run: the finished run.
+        scene: cameras and poses that it found.
+        model: surface and texture that it found.
+        truth: what was rendered.
+        seconds: spent on rendering, and on the reconstruction.
+        out: output folder.
+    """
     refined = next(iter(scene.cameras.values())).K
     found = run.calibration.K if run.calibration else refined
     centers = {name: camera_center(pose) for name, pose in scene.cam_from_world.items()}
@@ -122,7 +136,13 @@ def compared(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[
 
 
 def draw(model: Model, scene: Scene, out: Path) -> None:
-    """Draw OUT/model.png: a photo and the model from where it was taken; below, the model from beside and its back."""
+    """Draw OUT/model.png: a photo and the model from where it was taken; below, the model from beside and its back.
+
+    Args:
+        model: the finished model.
+        scene: cameras and poses of the photos.
+        out: folder with the photos, where the picture goes, too.
+    """
     names = sorted(scene.cam_from_world)
     name = names[len(names) // 2]
     found = scene.cameras[scene.camera_of[name]]

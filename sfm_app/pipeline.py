@@ -104,7 +104,15 @@ STAGES, NAMES = PIPELINE.stages, PIPELINE.names
 def run_stages(
     photo_dir: Path, run: RunContext, first: str = "", last: str = "files", wanted: Sequence[Stage[object]] = ()
 ) -> Products:
-    """Turn a folder of photos, or a video, into products, up to stage `last`; the rest as `Pipeline.run`."""
+    """Turn a folder of photos, or a video, into products.
+
+    Args:
+        photo_dir: folder or video.
+        run: the run.
+        first: stage from which on everything is done again; empty for none.
+        last: stage to stop after.
+        wanted: stages whose products are read before it ends.
+    """
     options, place = run.settings.photos, run.workspace
     place.keep_apart(photo_dir)
     if options.masks:
@@ -115,6 +123,10 @@ def run_stages(
 
 def stored_model(run: RunContext, *, points: bool = False) -> Model:
     """Return the finished model, or the points and cameras, that a run left behind; nothing is computed.
+
+    Args:
+        run: the finished run.
+        points: whether the points and cameras are asked for, not the textured surface.
 
     Raises:
         InputError: the run has not come so far (says which stage is missing), or its files are gone or damaged.

@@ -190,10 +190,12 @@ class BuiltIns:
 
     @hookimpl
     def sfm_estimators(self) -> Iterable[Estimator]:
+        """Return the estimators of fundamental matrices."""
         return [Estimator(name, fit, summary) for name, (fit, summary) in ESTIMATORS.items()]
 
     @hookimpl
     def sfm_calibrators(self) -> Iterable[Calibrator]:
+        """Return the calibrators."""
         return [
             Calibrator(name, calibrate, summary, together=name == SEVERAL_CAMERAS)
             for name, (calibrate, summary) in CALIBRATORS.items()
@@ -201,6 +203,7 @@ class BuiltIns:
 
     @hookimpl
     def sfm_features(self) -> Iterable[FeatureMethod]:
+        """Return COLMAP's SIFT, plain and with domain size pooling."""
         return [
             FeatureMethod(SIFT, summary="COLMAP's SIFT", sift={}),
             FeatureMethod(SIFT_DSP, summary=SIFT_DSP_SUMMARY, sift=SIFT_DSP_OPTIONS),
@@ -208,10 +211,12 @@ class BuiltIns:
 
     @hookimpl
     def sfm_exporters(self) -> Iterable[Exporter]:
+        """Return the file formats for models."""
         return [Exporter(name, write, summary) for name, (write, summary) in EXPORTERS.items()]
 
     @hookimpl
     def sfm_depth_methods(self) -> Iterable[DepthMethod]:
+        """Return the depth maps made on the CPU."""
         return [DepthMethod(CPU, _make_on_cpu, "semi-global matching and PatchMatch, on every machine")]
 
 
@@ -274,6 +279,10 @@ def load_plugins(modules: Sequence[ModuleType | object] = (), *, installed: bool
 
     Without arguments the answer is found once per process: the search through all installed packages takes
     milliseconds, an estimator's work on an easy pair does not. `installed_plugins.cache_clear()` makes it look again.
+
+    Args:
+        modules: plug-ins beside the installed ones.
+        installed: whether installed plug-ins count, too.
 
     Raises:
         PluginError: a hook is misspelt, a plug-in does not import, or two things share a name.

@@ -10,7 +10,12 @@ class Progress(Protocol):
     """What a display of progress has to offer; the command line has one on stderr, a library call none."""
 
     def stage(self, name: str, note: str = "") -> None:
-        """Announce a stage that begins (note empty), or was skipped, with the reason as note."""
+        """Announce a stage that begins or was skipped.
+
+        Args:
+            name: of the stage.
+            note: why it is skipped or done again; empty where it is new.
+        """
 
     def stage_done(self, seconds: float) -> None:
         """Announce the end of the stage that began last, after so many seconds."""
@@ -19,7 +24,12 @@ class Progress(Protocol):
         """Say something that people should know before they wait."""
 
     def start(self, label: str, total: int) -> None:
-        """Start work of `total` steps."""
+        """Start work of several steps.
+
+        Args:
+            label: what is done, for people.
+            total: number of steps.
+        """
 
     def advance(self, steps: int = 1) -> None:
         """Count so many more steps as done."""
@@ -31,21 +41,42 @@ class Progress(Protocol):
 class Silent:
     """Shows nothing."""
 
-    def stage(self, name: str, note: str = "") -> None: ...
+    def stage(self, name: str, note: str = "") -> None:
+        """Show nothing.
 
-    def stage_done(self, seconds: float) -> None: ...
+        Args:
+            name, note: not used.
+        """
 
-    def say(self, text: str) -> None: ...
+    def stage_done(self, seconds: float) -> None:
+        """Show nothing."""
 
-    def start(self, label: str, total: int) -> None: ...
+    def say(self, text: str) -> None:
+        """Show nothing."""
 
-    def advance(self, steps: int = 1) -> None: ...
+    def start(self, label: str, total: int) -> None:
+        """Show nothing.
 
-    def finish(self) -> None: ...
+        Args:
+            label, total: not used.
+        """
+
+    def advance(self, steps: int = 1) -> None:
+        """Show nothing."""
+
+    def finish(self) -> None:
+        """Show nothing."""
 
 
 def track(progress: Progress, items: Iterable[Item], label: str, total: int) -> Iterator[Item]:
-    """Yield the items and count each one once it has been dealt with."""
+    """Yield the items and count each one once it has been dealt with.
+
+    Args:
+        progress: where they are counted.
+        items: what is worked on, in order.
+        label: what is done, for people.
+        total: number of items.
+    """
     progress.start(label, total)
     try:
         for item in items:

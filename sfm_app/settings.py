@@ -180,6 +180,10 @@ class Settings(Section):
     def from_mapping(cls, values: Mapping[str, Any], where: str = "settings") -> "Settings":
         """Check nested values on top of the preset they name.
 
+        Args:
+            values: settings by name, tables nested.
+            where: source of the values, for the error message.
+
         Raises:
             ConfigError: a key is unknown, or a value has the wrong type or lies out of range; names the first TOLD.
         """
@@ -197,7 +201,12 @@ class Settings(Section):
 
     @classmethod
     def from_toml(cls, path: Path, overrides: Mapping[str, Any] | None = None) -> "Settings":
-        """Read a settings file and lay `overrides` (nested, from flags) over it."""
+        """Read a settings file and lay other values over it.
+
+        Args:
+            path: TOML file.
+            overrides: nested values from flags; they win.
+        """
         return cls.from_mapping(merged(read_toml(path), overrides or {}), where=str(path))
 
     def to_toml(self) -> str:
@@ -240,7 +249,12 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def merged(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested mappings laid over each other; `high` wins."""
+    """Return nested mappings laid over each other.
+
+    Args:
+        low: values that count where the other has none.
+        high: values that win.
+    """
     result = dict(low)
     for key, value in high.items():
         below = result.get(key)

@@ -134,7 +134,12 @@ def left_running() -> bool:
 
 
 def interruptible(call: Callable[[pycolmap.CancellationToken], None], poll: Callable[[], None]) -> None:
-    """Run a long COLMAP call in a thread, so that Ctrl-C stops it and `poll` can show how far it is."""
+    """Run a long COLMAP call in a thread, so that Ctrl-C stops it.
+
+    Args:
+        call: ends early once its token is cancelled.
+        poll: called twice a second, to show how far it is.
+    """
     token = pycolmap.CancellationToken()
     with ThreadPoolExecutor(1, thread_name_prefix="colmap") as thread:
         future = thread.submit(call, token)
@@ -158,7 +163,15 @@ def counted(
     total: int,
     progress: Progress,
 ) -> None:
-    """Run as `interruptible` does, with a bar: `done` says how many of `total` steps are finished."""
+    """Run as `interruptible` does, with a bar.
+
+    Args:
+        call: ends early once its token is cancelled.
+        done: says how many steps are finished.
+        label: what is done, for people.
+        total: number of steps.
+        progress: shows the bar.
+    """
     seen = 0
 
     def poll() -> None:

@@ -64,6 +64,10 @@ def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
     The cameras make that step, poses and points follow (COLMAP's solver helps where the way is long), tracks are
     completed and cleaned, and all starts again.
 
+    Args:
+        model: as mapping left it; not changed.
+        database: has all keypoints and matches.
+
     Raises:
         NumericalError: the photos do not bear it; the given model stays as it was.
     """
@@ -95,6 +99,9 @@ def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
 
 def adjusted_or_as_it_was(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
     """Adjust a model; where the numbers fail, return it as mapping left it, with the reason.
+
+    Args:
+        model, database: as in `adjust`.
 
     Raises:
         BackendError: COLMAP failed.

@@ -98,6 +98,10 @@ def create_database(path: Path, photos: PhotoSet) -> None:
     """Enter photos and cameras in a fixed order.
 
     Feature extraction would do it too, but numbers photos as its threads finish with them: not twice the same.
+
+    Args:
+        path: database file, made if it is missing.
+        photos: usable photos, in groups of one camera.
     """
     with opened(path) as database:
         for camera_id, members in enumerate(photos.groups.values(), start=1):
@@ -110,7 +114,12 @@ def create_database(path: Path, photos: PhotoSet) -> None:
 
 
 def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
-    """Return keypoints and raw matches of every photo in the database."""
+    """Return keypoints and raw matches of every photo in the database.
+
+    Args:
+        path: database file.
+        photos: those it was made from.
+    """
     by_name = {photo.name: photo for photo in photos.photos}
     with opened(path) as database:
         images, keypoints = {}, {}
@@ -134,13 +143,24 @@ def photo_names(path: Path) -> dict[int, str]:
 
 
 def unmatched(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
-    """Return those of the pairs that nobody has matched yet, with or without success."""
+    """Return those of the pairs that nobody has matched yet, with or without success.
+
+    Args:
+        path: database file.
+        pairs: ids, the smaller one first.
+    """
     with opened(path) as database:
         return [pair for pair in pairs if not database.exists_matches(*pair)]
 
 
 def write_keypoints(path: Path, photo: int, keypoints: NDArray[np.float32]) -> None:
-    """Enter the keypoints of a photo, or replace them."""
+    """Enter the keypoints of a photo, or replace them.
+
+    Args:
+        path: database file.
+        photo: id.
+        keypoints: (N, 2) pixels.
+    """
     with opened(path) as database:
         _put_keypoints(database, photo, keypoints)
 
@@ -151,7 +171,13 @@ def _put_keypoints(database: pycolmap.Database, photo: int, keypoints: NDArray[n
 
 
 def write_matches(path: Path, pair: PairId, rows: NDArray[np.uint32]) -> None:
-    """Enter the matches of a pair that has none."""
+    """Enter the matches of a pair that has none.
+
+    Args:
+        path: database file.
+        pair: ids, the smaller one first.
+        rows: (M, 2) keypoint indices.
+    """
     with opened(path) as database:
         database.write_matches(*pair, np.ascontiguousarray(rows, np.uint32))
 
@@ -160,6 +186,10 @@ def write_match_graph(path: Path, matches: MatchGraph) -> None:
     """Make a database of the photos, keypoints and raw matches of a match graph, under the same ids.
 
     Its cameras are guesses, one for each group of photos, until `write_calibrations` replaces them.
+
+    Args:
+        path: database file; what is there is lost.
+        matches: keypoints and raw matches.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_database(path)
@@ -188,7 +218,13 @@ def read_features(path: Path) -> tuple[dict[int, NDArray[np.float64]], dict[Pair
 
 
 def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
-    """Replace all two-view geometries by our relative poses, with the essential matrices they stand for."""
+    """Replace all two-view geometries by our relative poses, with the essential matrices they stand for.
+
+    Args:
+        path: database file.
+        matches: raw matches; inliers are rows of them.
+        graph: relative poses.
+    """
     with opened(path) as database:
         database.clear_two_view_geometries()
         for pair, pose in graph.poses.items():
@@ -196,7 +232,12 @@ def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
 
 
 def keep_raw_matches(path: Path, pairs: Collection[PairId]) -> None:
-    """Remove all two-view geometries, and the matches of all other pairs."""
+    """Remove all two-view geometries, and the matches of all other pairs.
+
+    Args:
+        path: database file.
+        pairs: whose matches stay.
+    """
     with opened(path) as database:
         database.clear_two_view_geometries()
         for pair in {_pair(pair_id) for pair_id in database.read_all_matches()[0]}.difference(pairs):
@@ -208,6 +249,11 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
 
     Cameras are numbered by their first photo, whatever the database held before. A K that the photos determine counts
     as prior knowledge, a guess does not.
+
+    Args:
+        path: database file.
+        matches: all photos.
+        intrinsics: cameras, and which photo has which.
     """
     used = {image.id: intrinsics.name_of(image) for image in matches.images.values()}
     ids = {name: number for number, name in enumerate(dict.fromkeys(used[key] for key in sorted(used)), start=1)}
@@ -260,7 +306,13 @@ def camera_model(calibration: Calibration) -> str:
 
 
 def camera_params(K: NDArray[np.float64], camera_model: str, radial: float = 0.0) -> list[float]:
-    """Return COLMAP's parameters for a camera matrix and a first radial term."""
+    """Return COLMAP's parameters of a camera.
+
+    Args:
+        K: (3, 3) camera matrix, pixels.
+        camera_model: COLMAP's name of it.
+        radial: first radial term.
+    """
     fx, fy, cx, cy = (float(K[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
     if camera_model == SQUARE_PIXELS:
         return [(fx * fy) ** 0.5, cx, cy, radial]

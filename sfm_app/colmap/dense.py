@@ -29,6 +29,14 @@ def undistort(
 ) -> None:
     """Write photos without distortion and the model that fits them into a dense workspace.
 
+    Args:
+        model_dir: COLMAP model.
+        photo_dir: folder with the photos.
+        dense_dir: dense workspace; made if it is missing.
+        max_side_px: longer sides are scaled down to it.
+        workers: threads.
+        progress: shows a bar.
+
     Raises:
         BackendError: COLMAP cannot read the model or the photos, or cannot write.
     """
@@ -72,20 +80,35 @@ def _view(model: pycolmap.Reconstruction, image: pycolmap.Image) -> View:
 
 
 def read_gray(dense_dir: Path, view: View) -> NDArray[np.uint8]:
-    """Return the undistorted photo of a view, (H, W)."""
+    """Return the undistorted photo of a view, (H, W).
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: an undistorted photo.
+    """
     # imdecode, because OpenCV does not open names beyond ASCII on every system
     image = cv2.imdecode(np.fromfile(dense_dir / "images" / view.name, np.uint8), cv2.IMREAD_GRAYSCALE)
     return np.asarray(image, np.uint8)
 
 
 def read_color(dense_dir: Path, view: View) -> NDArray[np.uint8]:
-    """Return the undistorted photo of a view, (H, W, 3) RGB."""
+    """Return the undistorted photo of a view, (H, W, 3) RGB.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: an undistorted photo.
+    """
     image = cv2.imdecode(np.fromfile(dense_dir / "images" / view.name, np.uint8), cv2.IMREAD_COLOR_RGB)
     return np.asarray(image, np.uint8)
 
 
 def map_file(dense_dir: Path, view: View) -> Path:
-    """Return where the confirmed depths of a view are, if it has any."""
+    """Return where the confirmed depths of a view are, if it has any.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: an undistorted photo.
+    """
     return _map_path(dense_dir, "depth_maps", view, "geometric")
 
 
@@ -96,17 +119,31 @@ class DenseStore:
         self.dense_dir = dense_dir
 
     def photo(self, view: View) -> NDArray[np.uint8]:
+        """Return the photo without distortion, (H, W)."""
         return read_gray(self.dense_dir, view)
 
     def has(self, view: View, kind: Kind) -> bool:
+        """Return whether a depth map is there.
+
+        Args:
+            view: an undistorted photo.
+            kind: photometric or geometric.
+        """
         # the depth map is what is written last
         return _map_path(self.dense_dir, DEPTHS, view, kind).is_file()
 
     def read_estimate(self, view: View) -> DepthEstimate:
+        """Read the photometric map of a view."""
         confidence = _read_depth_format(self.dense_dir, CONFIDENCES, view, "photometric")
         return DepthEstimate(read_depth(self.dense_dir, view, "photometric"), confidence)
 
     def write_estimate(self, view: View, estimate: DepthEstimate) -> None:
+        """Keep the photometric map of a view, without depth where the photo is masked.
+
+        Args:
+            view: an undistorted photo.
+            estimate: depths and how sure they are.
+        """
         used = used_pixels(self.dense_dir, view)
         if used is not None:
             # sure, so that what is masked is no part of the blank area beside it
@@ -115,16 +152,34 @@ class DenseStore:
         _write_depth_format(self.dense_dir, DEPTHS, view, estimate.depth, "photometric")
 
     def write_maps(self, view: View, maps: DepthMap) -> None:
+        """Keep the geometric maps of a view.
+
+        Args:
+            view: an undistorted photo.
+            maps: confirmed depths, and normals.
+        """
         write_maps(self.dense_dir, view, maps)
 
 
 def read_depth(dense_dir: Path, view: View, kind: Kind) -> NDArray[np.float32]:
-    """Read a depth map, (H, W), 0 where unknown, MASKED where the photo is masked."""
+    """Read a depth map, (H, W), 0 where unknown, MASKED where the photo is masked.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: an undistorted photo.
+        kind: photometric or geometric.
+    """
     return _read_depth_format(dense_dir, DEPTHS, view, kind)
 
 
 def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
-    """Write the confirmed depths and the normals of a view, as COLMAP's fusion expects them."""
+    """Write the confirmed depths and the normals of a view, as COLMAP's fusion expects them.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: an undistorted photo.
+        maps: depths (H, W) and normals (H, W, 3).
+    """
     # pycolmap takes (H, W, 3) but stores the bytes as they come, where COLMAP keeps x, y and z in planes.
     planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
     with backend(f"writing the normal map of {view.name}"), _whole(_map_path(dense_dir, NORMALS, view)) as path:
@@ -133,7 +188,12 @@ def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
 
 
 def hide_masked(dense_dir: Path, view: View) -> None:
-    """Put MASKED into the confirmed depths of a view where it is masked, whoever has made them."""
+    """Put MASKED into the confirmed depths of a view where it is masked, whoever has made them.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: an undistorted photo, masked or not.
+    """
     used, file = used_pixels(dense_dir, view), map_file(dense_dir, view)
     if used is not None and file.exists():
         depth = read_depth(dense_dir, view, "geometric")
@@ -141,14 +201,24 @@ def hide_masked(dense_dir: Path, view: View) -> None:
 
 
 def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
-    """Remove what is of no use once the geometric maps are there."""
+    """Remove what is of no use once the geometric maps are there.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        views: all undistorted photos.
+    """
     for view in views:
         for folder in (DEPTHS, NORMALS, CONFIDENCES):
             _map_path(dense_dir, folder, view, "photometric").unlink(missing_ok=True)
 
 
 def write_fusion_views(dense_dir: Path, views: Sequence[View]) -> None:
-    """Write down for COLMAP's fusion which views have maps."""
+    """Write down for COLMAP's fusion which views have maps.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        views: all undistorted photos.
+    """
     config = "".join(f"{view.name}\n" for view in views if map_file(dense_dir, view).exists())
     (dense_dir / "stereo" / "fusion.cfg").write_text(config, encoding="utf-8")
 

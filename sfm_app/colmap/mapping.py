@@ -99,7 +99,11 @@ def map_as_colmap_does(
 ) -> pycolmap.Reconstruction | None:
     """Verify the raw matches and map the photos by COLMAP's defaults, with the cameras of the database as first guess.
 
-    Nothing of ours but the matches and the guess enters; arguments, result and errors as `map_globally`.
+    Nothing of ours but the matches and the guess enters; result and errors as `map_globally`.
+
+    Args:
+        photo_dir: folder with the photos.
+        scratch, seed, token: as in `map_globally`.
     """
     task: MappingTask = {"scratch": str(scratch), "photos": str(photo_dir), "seed": seed}
     return _map_apart("sfm_app.colmap.processes.baseline_mapping", task, "mapping photos by its defaults", token)
@@ -123,6 +127,10 @@ def incremental_options(seed: int, *, known: bool = False) -> pycolmap.Increment
     """Return COLMAP's defaults, except that small photo sets count and only the model at hand is grown.
 
     Adjustments stop when they gain little, and cameras that are `known` stay as they are: the last adjustment is ours.
+
+    Args:
+        seed: of COLMAP's own sampling.
+        known: whether cameras stay as they are.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2

@@ -41,7 +41,12 @@ def mask_undistorter(model_dir: Path, mask_dir: Path, dense_dir: Path) -> Callab
 
 
 def used_pixels(dense_dir: Path, view: View) -> BoolImage | None:
-    """Return (H, W) which pixels of an undistorted photo may be used; None where no masks are given."""
+    """Return (H, W) which pixels of an undistorted photo may be used; None where no masks are given.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        view: an undistorted photo.
+    """
     place = dense_dir / MASKS
     return read_used(place, view.name) if mask_place(place, view.name).exists() else None
 

@@ -72,7 +72,12 @@ class PlacedView:
 
 
 def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray[np.float64]]) -> dict[int, PlacedView]:
-    """Return all photos of a model that have a pose, by id."""
+    """Return all photos of a model that have a pose, by id.
+
+    Args:
+        model: COLMAP's reconstruction.
+        keypoints: (N, 2) pixels by photo.
+    """
     found = {}
     for image in posed_images(model):
         camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
@@ -98,12 +103,23 @@ def cameras_of(model: pycolmap.Reconstruction) -> dict[int, tuple[NDArray[np.flo
 
 
 def color(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None:
-    """Give every point the mean color of its pixels."""
+    """Give every point the mean color of its pixels.
+
+    Args:
+        model: changed in place.
+        photo_dir: folder with the photos.
+        workers: threads.
+    """
     patiently(lambda: model.extract_colors_for_all_images(photo_dir, num_threads=workers))
 
 
 def part_of(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.Reconstruction:
-    """Return a copy of a model with these photos only, and the points that at least two of them see."""
+    """Return a copy of a model with some photos only, and the points that at least two of them see.
+
+    Args:
+        model: stays as it is.
+        photos: ids of those to keep.
+    """
     part, members = pycolmap.Reconstruction(model), set(photos)
     for image in posed_images(model):
         if image.image_id not in members:
@@ -179,7 +195,12 @@ class SeenPoints:
 
 
 def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
-    """Return the points of a model, or so many of them, drawn with a fixed seed."""
+    """Return the points of a model, or some of them, drawn with a fixed seed.
+
+    Args:
+        model: COLMAP's reconstruction, colored.
+        most: number of points to keep.
+    """
     keys = [key for key in sorted(model.points3D) if somewhere(model.points3D[key].xyz)]
     chosen = np.sort(np.random.default_rng(0).permutation(len(keys))[:most])
     found = [model.points3D[keys[k]] for k in chosen]
@@ -220,7 +241,13 @@ def _frustum(image: pycolmap.Image, camera: pycolmap.Camera) -> Frustum:
 
 
 def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return directions (N, 3) in the world, of any length, that pixels (N, 2) of a photo see."""
+    """Return directions (N, 3) in the world, of any length, that pixels of a photo see.
+
+    Args:
+        model: COLMAP's reconstruction.
+        image_id: a photo with a pose.
+        x: (N, 2) pixels.
+    """
     image = model.images[image_id]
     plane = np.asarray(model.cameras[image.camera_id].cam_from_img(x), np.float64).reshape(-1, 2)
     R = image.cam_from_world().matrix()[:, :3]
@@ -228,12 +255,22 @@ def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.fl
 
 
 def focal_px(model: pycolmap.Reconstruction, image_id: int) -> float:
-    """Return focal length of the camera that took a photo, in pixels."""
+    """Return focal length of the camera that took a photo, in pixels.
+
+    Args:
+        model: COLMAP's reconstruction.
+        image_id: the photo.
+    """
     return float(model.cameras[model.images[image_id].camera_id].mean_focal_length())
 
 
 def move(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
-    """Put the model into another frame."""
+    """Put the model into another frame.
+
+    Args:
+        model: changed in place.
+        similarity: from its frame into the new one.
+    """
     rotation = pycolmap.Rotation3d(similarity.R)
     model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.t))
 

@@ -76,7 +76,12 @@ class Pipeline:
             return _Execution(self, source, run, first).through(stages, wanted)
 
     def forget(self, name: str, run: RunContext) -> None:
-        """Take a stage out of the manifest, and those that build on its files; nobody builds on those of the photos."""
+        """Take a stage out of the manifest, and those that build on its files; nobody builds on those of the photos.
+
+        Args:
+            name: of the stage.
+            run: the run.
+        """
         alone = name == self.photos.name
         run.workspace.manifest.forget((name,) if alone else self.names[self.names.index(name) :])
 

@@ -15,7 +15,7 @@ class LogFile(logging.FileHandler):
     """A log that says nothing of a full disk: the run does."""
 
     def handleError(self, record: logging.LogRecord) -> None:
-        pass
+        """Do nothing: the run itself reports a full disk."""
 
 
 @contextmanager

@@ -63,13 +63,22 @@ class Products:
         return cast(Product, self._known[stage.name])
 
     def keep(self, stage: Stage[Product], product: Product) -> None:
-        """Take in what a stage has just made."""
+        """Take in what a stage has just made.
+
+        Args:
+            stage: which has just ended.
+            product: what it returned.
+        """
         self._known[stage.name] = product
 
 
 @contextmanager
 def undamaged(stage: Stage[object], run: RunContext) -> Iterator[None]:
     """Check what a stage has left, and read it.
+
+    Args:
+        stage: the one whose files are read in the block.
+        run: has the files and the manifest.
 
     Raises:
         DamagedProductError: it is not as it was left, or cannot be read.

@@ -16,12 +16,23 @@ CHANGES = 3
 
 
 def fingerprint_of(stage: Stage[object], inputs: Sequence[str], run: RunContext) -> str:
-    """Return hash of everything that a stage's result depends on: its inputs, its settings, the versions."""
+    """Return hash of everything that a stage's result depends on: its inputs, its settings, the versions.
+
+    Args:
+        stage: whose result it is.
+        inputs: fingerprints of what it takes.
+        run: settings and versions.
+    """
     return fingerprint(stage.name, made_with(stage, run), inputs)
 
 
 def made_with(stage: Stage[object], run: RunContext) -> dict[str, Any]:
-    """Return the values of a stage's settings, and the versions of what computes the result."""
+    """Return the values of a stage's settings, and the versions of what computes the result.
+
+    Args:
+        stage: names the settings it depends on.
+        run: has the settings.
+    """
     values = run.settings.model_dump()
     return {"settings": {key: value_of(values, key) for key in stage.settings}, "versions": versions()}
 
@@ -58,7 +69,12 @@ def _changes(before: Any, now: Mapping[str, Any], name: str = "") -> Iterator[st
 
 
 def value_of(values: Any, key: str) -> Any:
-    """Return a value of nested mappings by its dotted name; None where there is none."""
+    """Return a value of nested mappings by its dotted name; None where there is none.
+
+    Args:
+        values: nested mappings.
+        key: dotted name, such as `mesh.faces`.
+    """
     for name in key.split("."):
         values = values.get(name) if isinstance(values, Mapping) else None
     return values

@@ -14,7 +14,13 @@ from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, Ma
 def find_intrinsics(
     matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
-    """Find K and lens of every camera, and which photos are whose; what is not identifiable falls back to a guess."""
+    """Find K and lens of every camera, and which photos are whose; what is not identifiable falls back to a guess.
+
+    Args:
+        matches: keypoints and raw matches.
+        views: fundamental matrices.
+        run: the run.
+    """
     options = run.settings.calibration
     calibrator = run.plugins.calibrator(options.calibrator)
     pairs = photo_pairs(list(matches.images.values()), matches, views)
@@ -33,7 +39,12 @@ def find_intrinsics(
 
 
 def explained(camera: CalibratedCamera, views: ViewGraph) -> Calibration:
-    """Return what was found; where that is nothing, with what the pairs are that could not be asked."""
+    """Return what was found; where that is nothing, with what the pairs are that could not be asked.
+
+    Args:
+        camera: found or not, with its photos.
+        views: fundamental matrices.
+    """
     kinds = votes(views, camera.photos)
     if camera.found.identifiable or not kinds.total() > kinds[""]:
         return camera.found
@@ -41,7 +52,12 @@ def explained(camera: CalibratedCamera, views: ViewGraph) -> Calibration:
 
 
 def of_whole_photo(camera: CalibratedCamera, image: MatchedImage) -> CalibratedCamera:
-    """Return a camera in pixels of its photos, where it was found in those of the pictures within their bars."""
+    """Return a camera in pixels of its photos, where it was found in those of the pictures within their bars.
+
+    Args:
+        camera: as calibration found it.
+        image: one of its photos.
+    """
     if image.shown is None:
         return camera
     K = camera.found.K.copy()
@@ -50,8 +66,14 @@ def of_whole_photo(camera: CalibratedCamera, image: MatchedImage) -> CalibratedC
 
 
 def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> PhotoPairs:
-    """Return what is known about all pairs of these photos that are not degenerate, in pixels of the pictures within
+    """Return what is known about the pairs of some photos that are not degenerate, in pixels of pictures within bars.
+
     bars.
+
+    Args:
+        images: the photos.
+        matches: keypoints and raw matches.
+        views: fundamental matrices.
     """
     shown = {image.id: image.shown for image in images if image.shown}
     ids = {image.id for image in images}
@@ -74,5 +96,11 @@ def _share_shown(image: MatchedImage) -> float:
 
 
 def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> CameraPairs:
-    """Return what a calibrator gets to know about the photos of one camera."""
+    """Return what a calibrator gets to know about the photos of one camera.
+
+    Args:
+        images: photos of the camera.
+        matches: keypoints and raw matches.
+        views: fundamental matrices.
+    """
     return photo_pairs(images, matches, views).among([image.id for image in images])

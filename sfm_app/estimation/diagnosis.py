@@ -125,7 +125,12 @@ def why_no_depth(
 
 
 def votes(views: ViewGraph, photos: Collection[int]) -> Counter[str]:
-    """Return inliers of the pairs among some photos by what leaves their F open, "" where nothing does."""
+    """Return inliers of the pairs among some photos by what leaves their F open, "" where nothing does.
+
+    Args:
+        views: fundamental matrices.
+        photos: ids; both photos of a pair have to be among them.
+    """
     found: Counter[str] = Counter()
     for pair in _among(views, photos):
         found[views.fits[pair].degeneracy] += views.fits[pair].inlier_count
@@ -133,7 +138,12 @@ def votes(views: ViewGraph, photos: Collection[int]) -> Counter[str]:
 
 
 def of_fits(views: ViewGraph, photos: Collection[int]) -> Diagnosis:
-    """Return what the pairs among some photos, at least one of them, have against a reconstruction."""
+    """Return what the pairs among some photos have against a reconstruction.
+
+    Args:
+        views: fundamental matrices.
+        photos: ids; at least one pair among them has a fit.
+    """
     kinds, pairs = votes(views, photos), _among(views, photos)
     if kinds[""] < kinds.total() / 2:
         kind = max(DEGENERATE, key=lambda kind: kinds[kind])

@@ -33,6 +33,11 @@ def fit_pairs(matches: MatchGraph, pairs: Sequence[PairId], run: RunContext) -> 
     """Fit every pair on its own, seeded by the run's seed and its ids.
 
     What is done lies in `view_graph_parts` until the caller removes it: a run that was killed goes on where it stopped.
+
+    Args:
+        matches: keypoints and raw matches.
+        pairs: ids of those to fit.
+        run: the run.
     """
     options = run.settings.epipolar
     estimator = run.plugins.estimator(options.estimator)
@@ -85,14 +90,24 @@ def _in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run
 
 
 def write_part(path: Path, found: Mapping[PairId, Fitted]) -> None:
-    """Keep some pairs."""
+    """Keep some pairs.
+
+    Args:
+        path: file that appears complete or not at all.
+        found: fit, or why there is none, and number of stationary matches.
+    """
     still = np.array([[*pair, count] for pair, (_, count) in found.items()], np.int64)
     with replacing(path) as beside:
         np.savez(beside, allow_pickle=False, still=still, **graph_of(found).to_arrays())
 
 
 def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, Fitted] | None:
-    """Return what `write_part` has kept; None where there is nothing, or nothing sound."""
+    """Return what `write_part` has kept; None where there is nothing, or nothing sound.
+
+    Args:
+        path: file; may be missing or damaged.
+        pairs: all that it has to hold.
+    """
     try:
         arrays = load_arrays(path)
         graph = ViewGraph.from_arrays(arrays)

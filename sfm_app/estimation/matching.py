@@ -188,7 +188,12 @@ def _matches_between(
 
 
 def part_of(photo: int, run: RunContext) -> Path:
-    """Return where the features of a photo are kept until all are matched."""
+    """Return where the features of a photo are kept until all are matched.
+
+    Args:
+        photo: id.
+        run: the run.
+    """
     return run.workspace.feature_parts / f"{photo:06d}.npz"
 
 

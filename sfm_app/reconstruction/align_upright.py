@@ -51,7 +51,13 @@ PhotoLooks = Mapping[int, "Future[Look]"]
 
 
 def look_at_photos(models: Sequence[Reconstruction], matches: MatchGraph, run: RunContext) -> PhotoLooks:
-    """Begin to look at some photos of every model; the caller goes on meanwhile."""
+    """Begin to look at some photos of every model; the caller goes on meanwhile.
+
+    Args:
+        models: of the scene; no two hold the same photo.
+        matches: knows the names and turns of photos.
+        run: has the photos and the workers.
+    """
     looks = {}
     for model in models:
         posed = photos_of(model)
@@ -64,7 +70,11 @@ def look_at_photos(models: Sequence[Reconstruction], matches: MatchGraph, run: R
 def orient_or_leave(
     model: Reconstruction, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | None = None
 ) -> dict[str, Json]:
-    """Put the model upright; where the numbers fail, leave it as it is, and say why."""
+    """Put the model upright; where the numbers fail, leave it as it is, and say why.
+
+    Args:
+        model, matches, looks, turn_deg: as in `orient`.
+    """
     try:
         return orient(model, matches, looks, turn_deg)
     except FAILURES as err:
@@ -137,7 +147,12 @@ def is_sound(similarity: Similarity) -> bool:
 
 
 def turned(R: FloatArray, turn_deg: int) -> FloatArray:
-    """Return (3, 3) cam_from_world of a photo once it is turned clockwise by a multiple of 90 degrees."""
+    """Return (3, 3) cam_from_world of a photo once it is turned clockwise.
+
+    Args:
+        R: (3, 3) rotation cam_from_world before.
+        turn_deg: multiple of 90 degrees.
+    """
     cosine, sine = round(np.cos(np.radians(turn_deg))), round(np.sin(np.radians(turn_deg)))
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ R
 
@@ -157,7 +172,12 @@ def _scenery_of(model: Reconstruction, looks: Mapping[int, Look]) -> Scenery:
 
 
 def look_at(path: Path, turn_deg: int = 0) -> Look:
-    """Return lines of a photo, and its brightness once it is upright; nothing where OpenCV cannot read it."""
+    """Return lines of a photo, and its brightness once it is upright; nothing where OpenCV cannot read it.
+
+    Args:
+        path: photo file.
+        turn_deg: by how much it has to be turned clockwise to stand upright, a multiple of 90.
+    """
     try:
         data = np.fromfile(path, np.uint8)  # OpenCV does not open names beyond ASCII on every system
     except OSError:

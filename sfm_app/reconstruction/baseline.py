@@ -64,6 +64,12 @@ def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, 
     """Map all photos as COLMAP does by itself, and judge the model like any other; none where it fails.
 
     Pairs that are not among the matches, such as those of look-alikes, are kept from it, too.
+
+    Args:
+        matches: keypoints and raw matches.
+        views: fundamental matrices.
+        intrinsics: cameras from pairs; only those of EXIF are used.
+        run: the run.
     """
     scratch = run.workspace.root / FOLDER
     found: list[Reconstruction | None] = []
@@ -87,6 +93,11 @@ def leaves_many_out(model: Attempt | None, intrinsics: Intrinsics, views: ViewGr
     """Say whether a guess of the focal may be why photos that match others have no place.
 
     Not asked where some camera is known, or where the photos are many: then a pass costs more than it promises.
+
+    Args:
+        model: the main one; None where there is none.
+        intrinsics: cameras from pairs.
+        views: fundamental matrices.
     """
     connected = photos_in(views.fits)
     known = any(camera.estimated or camera.method == "exif" for camera in intrinsics.cameras.values())
@@ -95,7 +106,12 @@ def leaves_many_out(model: Attempt | None, intrinsics: Intrinsics, views: ViewGr
 
 
 def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> Intrinsics:
-    """Replace every camera by a guess of the focal, in longer sides; what EXIF claims stays."""
+    """Replace every camera by a guess of the focal; what EXIF claims stays.
+
+    Args:
+        intrinsics: cameras from pairs.
+        sides: the guess, in longer sides of the photo.
+    """
     cameras = {
         name: camera if camera.method == "exif" else _guess(camera, sides)
         for name, camera in intrinsics.cameras.items()

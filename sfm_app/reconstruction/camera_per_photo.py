@@ -45,6 +45,11 @@ def with_one_each(model: Attempt, found: Intrinsics, matches: MatchGraph) -> Int
     """Give every photo of a camera that pairs do not determine one of its own; None where there is none to divide.
 
     Its focal is as yet a guess: what mapping found for all of them together.
+
+    Args:
+        model: mapped with shared cameras.
+        found: those cameras.
+        matches: all photos.
     """
     focals = {photo: float(K[0, 0] * K[1, 1]) ** 0.5 for photo, (K, _) in cameras_of(model.model).items()}
     placed = photos_of(model.model)
@@ -68,6 +73,11 @@ def with_two(model: Attempt, each: Intrinsics, matches: MatchGraph) -> Intrinsic
     """Give photos of one size that have a camera each two cameras between them; None where there is nothing to divide.
 
     What mapping found of their focals is divided where it leaves the widest gap, a size at a time.
+
+    Args:
+        model: mapped with a camera for each photo.
+        each: those cameras.
+        matches: all photos.
     """
     of_size: dict[tuple[int, int], dict[str, float]] = {}
     for photo, (K, _) in cameras_of(model.model).items():
@@ -88,14 +98,24 @@ def with_two(model: Attempt, each: Intrinsics, matches: MatchGraph) -> Intrinsic
 
 
 def explains_as_much(two: Attempt | None, own: Attempt) -> bool:
-    """Say whether two cameras do as well as one for each photo."""
+    """Say whether two cameras do as well as one for each photo.
+
+    Args:
+        two: model with two cameras; None where there is none.
+        own: model with a camera for each photo.
+    """
     if two is None or two.photos < own.photos or two.support < (1.0 - EQUAL) * own.support:
         return False
     return _share_against(two) <= _share_against(own) + AS_GOOD
 
 
 def explains_more(own: Attempt | None, shared: Attempt) -> bool:
-    """Say whether cameras of their own explain more matches, and place more photos or take away what contradicts."""
+    """Say whether cameras of their own explain more matches, and place more photos or take away what contradicts.
+
+    Args:
+        own: model with a camera for each photo; None where there is none.
+        shared: model with one camera for all.
+    """
     if own is None or own.photos < shared.photos or own.support <= shared.support:
         return False
     return own.photos > shared.photos or _share_against(own) <= FEWER * _share_against(shared)

@@ -32,7 +32,15 @@ class Candidate:
 def rank_seeds(
     matches: MatchGraph, graph: PoseGraph, intrinsics: Intrinsics, photos: Sequence[int], min_angle_deg: float
 ) -> list[Candidate]:
-    """Return pairs within a group of photos: many points all over the photos, under a wide angle, in accord with K."""
+    """Return candidates for the first pair, best first: many points all over the photos, wide angles, in accord with K.
+
+    Args:
+        matches: keypoints and raw matches.
+        graph: relative poses.
+        intrinsics: cameras from pairs.
+        photos: ids of the group that both photos are from.
+        min_angle_deg: least median triangulation angle, degrees.
+    """
     members, found = set(photos), []
     for pair, pose in graph.poses.items():
         if members.issuperset(pair) and pose.kind != "rotation" and pose.angle_deg >= min_angle_deg:
@@ -45,7 +53,13 @@ def rank_seeds(
 
 
 def seed_of(matches: MatchGraph, candidate: Candidate, intrinsics: Intrinsics) -> TwoViewSeed:
-    """Return the points of a candidate, triangulated."""
+    """Return the points of a candidate, triangulated.
+
+    Args:
+        matches: keypoints and raw matches.
+        candidate: pair and pose.
+        intrinsics: cameras from pairs.
+    """
     pose, cameras = candidate.pose, [intrinsics.camera(matches.images[photo]) for photo in candidate.pair]
     points = matches.points(candidate.pair)
     x1, x2 = (rays(x[pose.inliers], camera.K, camera.radial) for x, camera in zip(points, cameras, strict=True))
@@ -53,14 +67,25 @@ def seed_of(matches: MatchGraph, candidate: Candidate, intrinsics: Intrinsics) -
 
 
 def agreement(pair: PairId, cameras: Sequence[Calibration]) -> float:
-    """Return 1 for a pair that agrees with the camera its consensus found, little for one that does not."""
+    """Return 1 for a pair that agrees with the camera its consensus found, little for one that does not.
+
+    Args:
+        pair: ids of two photos.
+        cameras: those of the two photos.
+    """
     first, second = cameras
     unknown = first is not second or not first.key_pairs
     return 1.0 if unknown or pair in first.key_pairs else DISSENT
 
 
 def coverage(matches: MatchGraph, pair: PairId, pose: RelativePose) -> float:
-    """Return share of the cells of both photos that hold an inlier, as far as these are enough to fill them; 0 to 1."""
+    """Return share of the cells of both photos that hold an inlier, as far as these are enough to fill them; 0 to 1.
+
+    Args:
+        matches: keypoints and raw matches.
+        pair: ids of two photos.
+        pose: knows the inliers.
+    """
     shares = []
     for photo, x in zip(pair, matches.points(pair), strict=True):
         image = matches.images[photo]

@@ -23,6 +23,11 @@ def without_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph)
     """Return matches and fundamental matrices without those of look-alikes.
 
     These speak neither for a model nor against it.
+
+    Args:
+        matches: keypoints and raw matches.
+        views: fundamental matrices.
+        graph: knows the pairs of look-alikes.
     """
     gone = {pair for join in graph.look_alikes for pair in join.pairs}
     if not gone:
@@ -33,13 +38,23 @@ def without_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph)
 
 
 def with_earlier(graph: PoseGraph, earlier: PoseGraph) -> PoseGraph:
-    """Return a pose graph that knows, too, what an earlier one told apart for it."""
+    """Return a pose graph that knows, too, what an earlier one told apart for it.
+
+    Args:
+        graph: of this pass.
+        earlier: of the pass before it.
+    """
     dropped = {pair: earlier.dropped[pair] for join in earlier.look_alikes for pair in join.pairs}
     return replace(graph, dropped=dropped | dict(graph.dropped), look_alikes=earlier.look_alikes + graph.look_alikes)
 
 
 def in_words(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str, Json]]:
-    """Return what was told apart, for the manifest."""
+    """Return what was told apart, for the manifest.
+
+    Args:
+        joins: pairs of look-alikes, by the places they mix up.
+        matches: knows the photos' names.
+    """
     return [
         {
             "pairs": len(join.pairs),
@@ -65,7 +80,12 @@ def jumps(model: Reconstruction) -> list[list[str]]:
 
 
 def sides(pairs: Sequence[PairId], matches: MatchGraph) -> tuple[list[int], list[int]]:
-    """Return the photos of the two places: those of the pair with most matches are on different sides, and so on."""
+    """Return the photos of the two places: those of the pair with most matches are on different sides, and so on.
+
+    Args:
+        pairs: look-alikes; at least one.
+        matches: raw matches of these pairs.
+    """
     counts = {pair: len(matches.matches[pair]) for pair in pairs}
     here: set[int] = set()
     there: set[int] = set()

@@ -76,6 +76,12 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
     Where the evidence is thin, a rival is mapped beside it, and the model that explains more goes on. Where cameras
     were guesses, or photos of the main group stayed out, the cameras that mapping found are taken for a second pass:
     with them, relative poses are right that were not before. So it goes on while the passes get better.
+
+    Args:
+        matches: keypoints and raw matches.
+        views: fundamental matrices.
+        intrinsics: cameras from pairs.
+        run: the run.
     """
     with backend("entering photos"):
         write_match_graph(run.workspace.database, matches)
@@ -103,7 +109,12 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
 def with_rival(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """Return the outcome, or, where it is thin and a rival explains more, that of the rival."""
+    """Return the outcome, or, where it is thin and a rival explains more, that of the rival.
+
+    Args:
+        outcome: models from relative poses.
+        matches, views, intrinsics, run: as in `reconstruct`.
+    """
     main = outcome.main
     thin = why_thin(main, intrinsics, matches, views)
     if not thin:
@@ -195,6 +206,11 @@ def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph)
     """Return whether the cameras that mapping found may show more.
 
     They are news, or photos of the main group stayed out.
+
+    Args:
+        outcome: of the last pass; has a model.
+        intrinsics: cameras that it was mapped with.
+        matches: all photos.
     """
     main = outcome.models[0]
     placed = photos_of(main.model)
@@ -208,7 +224,13 @@ def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph)
 
 
 def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGraph) -> Intrinsics:
-    """Return the cameras as a model has them."""
+    """Return the cameras as a model has them.
+
+    Args:
+        model: knows the cameras of its photos.
+        intrinsics: cameras of all other photos.
+        matches: all photos.
+    """
     with backend("reading cameras"):
         found = cameras_of(model.model)
     cameras = dict(intrinsics.cameras)

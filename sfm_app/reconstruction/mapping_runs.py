@@ -105,6 +105,10 @@ def attempts(group: Group, run: RunContext) -> list[Tried]:
     Photo by photo from the best seed and all at once, side by side; where neither places most photos, from the next
     seeds. What is tried never depends on which mapper is done first: a model photo by photo that leaves nothing to be
     wished for makes the other one needless, whether or not it is there.
+
+    Args:
+        group: photos that hang together, with their matches and poses.
+        run: the run.
     """
     options = run.settings.scene
     at_once = options.mapper != "incremental" and len(group.photos) >= LEAST_GLOBAL
@@ -133,7 +137,13 @@ def better(found: Sequence[Tried]) -> Attempt | None:
 
 
 def why(best: Attempt, found: Sequence[Tried], photos: int) -> str:
-    """Return why this attempt of several was taken, in a few words."""
+    """Return why this attempt of several was taken, in a few words.
+
+    Args:
+        best: the one that was taken.
+        found: all attempts.
+        photos: number of photos in the group.
+    """
     if _flawless(best, photos):
         return f"it places all {photos} photos and next to nothing contradicts it"
     others = [attempt for attempt in found if isinstance(attempt, Attempt) and attempt is not best]

@@ -79,7 +79,13 @@ def _together(
 
 
 def shared_points(first: Reconstruction, second: Reconstruction, matches: MatchGraph, views: ViewGraph) -> FloatArray:
-    """Return (N, 6) points that both models know, as the first and as the second has them; each but once."""
+    """Return (N, 6) points that both models know, as the first and as the second has them; each but once.
+
+    Args:
+        first, second: models that share no photo.
+        matches: keypoints and raw matches.
+        views: fundamental matrices; only their inliers count.
+    """
     here, there = places_of_keypoints(first), places_of_keypoints(second)
     found = {}
     for a, b in _between(views, {photo for photo, _ in here}, {photo for photo, _ in there}):

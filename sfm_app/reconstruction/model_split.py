@@ -18,6 +18,10 @@ def sound_parts(explained: Mapping[PairId, Explained], photos: Iterable[int]) ->
 
     Pairs are taken strongest first; two parts become one when the matches between them that the model explains
     outnumber the inliers of fundamental matrices between them that it does not.
+
+    Args:
+        explained: what the model makes of each pair.
+        photos: ids of the photos to divide.
     """
     part = {photo: frozenset([photo]) for photo in photos}
     worth = {pair: found.matches - found.contradicted for pair, found in explained.items()}

@@ -82,7 +82,12 @@ def lost_photos(found: Found) -> list[int]:
 
 
 def pairs_to_see(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
-    """Return pairs of lost photos with each other and with their likely neighbors."""
+    """Return pairs of lost photos with each other and with their likely neighbors.
+
+    Args:
+        lost: ids of photos without a place.
+        matches: raw matches of all photos.
+    """
     every = sorted(matches.images)
     if len(every) <= ALL_PAIRS:
         return [(a, b) for k, a in enumerate(every) for b in every[k + 1 :] if a in lost or b in lost]

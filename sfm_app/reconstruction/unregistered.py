@@ -50,5 +50,10 @@ def _edges(photo: int, views: ViewGraph) -> Iterator[tuple[int, int]]:
 
 
 def names_of(photos: Sequence[int], matches: MatchGraph) -> list[str]:
-    """Return names of photos."""
+    """Return names of photos.
+
+    Args:
+        photos: ids.
+        matches: knows the names.
+    """
     return [matches.images[photo].name for photo in photos]

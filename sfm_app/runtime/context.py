@@ -64,7 +64,13 @@ class RunContext:
         return self.workspace.masks if self.settings.photos.masks else None
 
     def map(self, function: Callable[[Item], Result], items: Sequence[Item], label: str) -> list[Result]:
-        """Return results in the order of the items, computed in parallel, with a progress bar."""
+        """Return results in the order of the items, computed in parallel, with a progress bar.
+
+        Args:
+            function: applied to each item.
+            items: its arguments.
+            label: what is done, for people.
+        """
         results = ordered_map(self.executor, function, items, ahead=2 * self.workers)
         return list(track(self.progress, results, label, len(items)))
 
@@ -82,7 +88,12 @@ class RunContext:
         return tuple(self.workspace.root / f"{name}.{suffix}" for suffix in STANDARD_FORMATS)
 
     def write_model(self, model: Model, name: str) -> tuple[Path, ...]:
-        """Write a model into the output folder in every standard format and note how large the files are."""
+        """Write a model into the output folder in every standard format and note how large the files are.
+
+        Args:
+            model: the finished model.
+            name: of the files, without suffix.
+        """
         paths = self.model_paths(name)
         for suffix in STANDARD_FORMATS:
             save_files(self.plugins.exporter(suffix).write(model, name), self.workspace.root)

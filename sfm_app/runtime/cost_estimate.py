@@ -112,9 +112,12 @@ def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb:
 def plan_within(
     photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float, stages: Iterable[str]
 ) -> Plan:
-    """Return the plan with the most workers, up to so many, that holds no more memory.
+    """Return the plan with the most workers that holds no more memory than allowed; with one worker if none does.
 
-    With one where that is too much.
+    Args:
+        photos, settings, limit_mb: as in `plan_of`.
+        workers: the most that may work at once.
+        stages: names of those that are to be run.
     """
     chosen, names = list(photos), list(stages)
     plans = (plan_of(chosen, settings, number, limit_mb) for number in range(workers, 0, -1))

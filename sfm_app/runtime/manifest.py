@@ -87,7 +87,13 @@ class Manifest:
             self.write(manifest)
 
     def finish(self, stage: str, record: StageRecord, head: Mapping[str, Any]) -> None:
-        """Enter a finished stage; `head` (settings, versions, ...) replaces the rest of the manifest."""
+        """Enter a finished stage.
+
+        Args:
+            stage: its name.
+            record: what is known about its run and its files.
+            head: settings, versions, ...; replaces the rest of the manifest.
+        """
         entry = json.loads(json_text(asdict(record)))
         stages = self.read().get("stages", {}) | {stage: {**entry, CHECK: fingerprint(entry)}}
         self.write({"format": FORMAT, **head, "stages": stages})

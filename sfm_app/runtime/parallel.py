@@ -24,9 +24,14 @@ def make_executor(workers: int) -> Executor:
 def ordered_map(
     executor: Executor, function: Callable[[Item], Result], items: Iterable[Item], ahead: int
 ) -> Iterator[Result]:
-    """Yield results in the order of the items, with at most `ahead` items under way, so that memory stays bounded.
+    """Yield results in the order of the items, with few under way, so that memory stays bounded.
 
     When the caller stops early or an item fails, what has not begun is cancelled.
+
+    Args:
+        executor, function: its workers apply the function to each item.
+        items: drawn only as they are needed.
+        ahead: most items under way; at least 1.
     """
     waiting: list[Future[Result]] = []
     try:

@@ -56,18 +56,22 @@ class Workspace:
 
     @property
     def database(self) -> Path:
+        """COLMAP's database: photos, keypoints and matches."""
         return self.root / DATABASE
 
     @property
     def photo_set(self) -> Path:
+        """What is known about the photos."""
         return self.root / PHOTO_SET
 
     @property
     def view_graph(self) -> Path:
+        """Fundamental matrices."""
         return self.root / VIEW_GRAPH
 
     @property
     def calibration(self) -> Path:
+        """Cameras from pairs."""
         return self.root / CALIBRATION
 
     @property
@@ -77,6 +81,7 @@ class Workspace:
 
     @property
     def sparse(self) -> Path:
+        """COLMAP model of the main scene."""
         return self.root / "sparse"
 
     @property
@@ -116,6 +121,7 @@ class Workspace:
 
     @property
     def log(self) -> Path:
+        """What the last runs did, with the traceback of an error."""
         return self.root / LOG
 
     def create(self) -> None:
@@ -158,6 +164,10 @@ class Workspace:
 
     def keep_apart(self, photos: Path, what: str = "photos") -> None:
         """Check that a run would not write over its photos, or its masks.
+
+        Args:
+            photos: folder or file with them.
+            what: their name in the error message.
 
         Raises:
             InputError: it would.
@@ -233,10 +243,12 @@ class Aside(Workspace):
 
     @property
     def photos(self) -> Path:
+        """Those of the run itself."""
         return self.of.photos
 
     @property
     def masks(self) -> Path:
+        """Those of the run itself."""
         return self.of.masks
 
 

@@ -38,6 +38,10 @@ CONFIRMING = 2
 def make(scene: Scene, run: RunContext) -> Path:
     """Give every photo that has neighbors a depth and a normal map; a run that was killed goes on where it stopped.
 
+    Args:
+        scene: cameras, poses and points.
+        run: the run.
+
     Returns:
         The dense workspace.
 
@@ -74,7 +78,14 @@ def digest(place: Workspace) -> str:
 
 
 def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None:
-    """Undistort photos and masks, unless a killed run has left a workspace with the same model and other inputs."""
+    """Undistort photos and masks, unless a killed run has left a workspace with the same model and other inputs.
+
+    Args:
+        scene: cameras, poses and points.
+        dense_dir: dense workspace to fill.
+        method: name of the depth method.
+        run: the run.
+    """
     model = [(file.name, blake2b(file.read_bytes()).hexdigest()) for file in sorted(scene.model_dir.glob("*.bin"))]
     made_from = fingerprint(run.fingerprint, method, model)
     if not can_go_on(dense_dir, made_from):
@@ -88,6 +99,12 @@ def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None
 
 def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | None], run: RunContext) -> None:
     """Note what share of each photo has a depth, and why photos have none.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+        views: all undistorted photos.
+        found: per view why it has no depth; None where it has.
+        run: the run.
 
     Raises:
         ReconstructionError: none has.

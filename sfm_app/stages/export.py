@@ -12,7 +12,12 @@ NAME = "model"
 
 
 def make(model: Model, run: RunContext) -> tuple[Path, ...]:
-    """Write the finished model in every standard format; the last one is the one to open."""
+    """Write the finished model in every standard format; the last one is the one to open.
+
+    Args:
+        model: the textured surface.
+        run: the run.
+    """
     paths = run.write_model(model, NAME)
     if model.texture is not None:
         sizes = [[page.shape[1], page.shape[0]] for page in model.texture.pages]

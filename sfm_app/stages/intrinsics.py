@@ -12,7 +12,13 @@ from sfm_app.types import Calibration, Intrinsics, MatchGraph, ViewGraph
 
 
 def make(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
-    """Find the cameras, write them down and count them."""
+    """Find the cameras, write them down and count them.
+
+    Args:
+        matches: keypoints and raw matches.
+        views: fundamental matrices.
+        run: the run.
+    """
     intrinsics, cameras = find_intrinsics(matches, views, run)
     run.record(
         cameras={name: _summary(camera) for name, camera in intrinsics.cameras.items()},

@@ -15,6 +15,10 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
 
     What a killed run has found of the same photos stays.
 
+    Args:
+        photos: usable photos, laid out in the workspace.
+        run: the run.
+
     Raises:
         ReconstructionError: no two photos have matches.
     """
@@ -42,6 +46,10 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
 
 def load(photos: PhotoSet, run: RunContext) -> MatchGraph:
     """Read the match graph back from the database.
+
+    Args:
+        photos: those the database was made from.
+        run: the run.
 
     Raises:
         ValueError: the database is torn; COLMAP would end the program.

@@ -46,6 +46,10 @@ SURE = 2 / 3
 def make(dense_dir: Path, run: RunContext) -> Surface:
     """Span a surface over the fused points, keep what the photos confirm, and simplify it.
 
+    Args:
+        dense_dir: dense workspace with depth maps.
+        run: the run.
+
     Raises:
         ReconstructionError: the depth maps do not give a surface; says why.
         BackendError: COLMAP failed.
@@ -121,7 +125,14 @@ def _photos_needed(views: list[View], run: RunContext) -> int:
 
 
 def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> tuple[Surface, Support]:
-    """Return the surface in the colors of the photos, and what they say about each of its vertices."""
+    """Return the surface in the colors of the photos, and what they say about each of its vertices.
+
+    Args:
+        surface: as Poisson reconstruction leaves it.
+        dense_dir: folder with undistorted photos and their maps.
+        views: photos with a depth map.
+        run: the run.
+    """
     normals = vertex_normals(surface.vertices, surface.faces)
     tolerance = run.settings.depth.consistency
 
@@ -139,7 +150,13 @@ def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunCont
 
 
 def simplified(surface: Surface, options: MeshSettings, scratch: Path) -> Surface:
-    """Simplify to as few triangles as the error allows, and no more than asked for."""
+    """Simplify to as few triangles as the error allows, and no more than asked for.
+
+    Args:
+        surface: detailed triangles.
+        options: largest error, and most triangles.
+        scratch: folder for temporary files.
+    """
     simple = surface
     if options.max_error_edges:
         edge = median_edge(surface.vertices, surface.faces)

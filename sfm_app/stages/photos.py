@@ -42,6 +42,10 @@ from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
 def make(source: Source, run: RunContext) -> PhotoSet:
     """Look at every file of a folder, or at the frames of a video, and lay the usable photos out for COLMAP.
 
+    Args:
+        source: folder or video.
+        run: the run.
+
     Raises:
         InputError: the source is missing, fewer than two photos are usable, or a mask is not.
     """
@@ -52,7 +56,12 @@ def make(source: Source, run: RunContext) -> PhotoSet:
 
 
 def load(source: Source, run: RunContext) -> PhotoSet:
-    """Read photos.json back; what is gone of what was laid out, or was damaged, is laid out again."""
+    """Read photos.json back; what is gone of what was laid out, or was damaged, is laid out again.
+
+    Args:
+        source: what the photos were read from.
+        run: the run.
+    """
     return _read_photo_set(run.workspace.frames if source.video else source.path, source.mask_dir, run)
 
 
@@ -98,7 +107,12 @@ def within_memory(run: RunContext) -> PhotoSettings:
 
 
 def chosen(glances: list[Glance], *, keep_low_quality: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
-    """Return the photos that are worth their time, and the others."""
+    """Return the photos that are worth their time, and the others.
+
+    Args:
+        glances: photos, with what a look at each has shown.
+        keep_low_quality: whether blurred and repeated ones stay.
+    """
     if keep_low_quality:
         return [glance.photo for glance in glances], []
     useful, useless = screened(glances)
@@ -110,6 +124,11 @@ def masked(
     glances: list[Glance], folder: Path, source: Source, run: RunContext
 ) -> tuple[list[Glance], list[UnusablePhoto]]:
     """Return the photos with their masks, and those of which nothing is left.
+
+    Args:
+        glances: photos that are worth their time.
+        folder, source: where the photos are read from, and their masks.
+        run: the run.
 
     Raises:
         InputError: a mask cannot be used, or no photo has one.
@@ -136,6 +155,11 @@ def _lay_out_masks(photo_set: PhotoSet, masks: Path, names: Sequence[str], run: 
 
 def laid_out(photo: Photo, *, folder: Path, target: Path) -> None:
     """Put one photo into the workspace.
+
+    Args:
+        photo: what is known about it.
+        folder: where it is read from.
+        target: folder of laid-out photos.
 
     Raises:
         InputError: it has changed since it was looked at.

@@ -31,6 +31,12 @@ POINTS = "points"
 def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
     """Map the photos and adjust everything; the largest model goes on, the others are kept beside it.
 
+    Args:
+        matches: keypoints and raw matches.
+        views: fundamental matrices.
+        intrinsics: cameras from pairs.
+        run: the run.
+
     Raises:
         ReconstructionError: no pair of photos grows into a model; says what was seen.
     """
@@ -167,7 +173,12 @@ def _how_it_was_adjusted(adjusted: Sequence[Adjusted], names: Mapping[str, str])
 
 
 def write_models(models: list[Reconstruction], run: RunContext) -> None:
-    """Put the main model into OUT/sparse and the others into OUT/other_models/1, 2, ..., each as a whole."""
+    """Put the main model into OUT/sparse and the others into OUT/other_models/1, 2, ..., each as a whole.
+
+    Args:
+        models: the main one first; at least one.
+        run: the run.
+    """
     place = run.workspace
     shutil.rmtree(place.other_models, ignore_errors=True)
     for number, model in enumerate(models[1:], start=1):
@@ -176,7 +187,12 @@ def write_models(models: list[Reconstruction], run: RunContext) -> None:
 
 
 def write_model(model: Reconstruction, target: Path) -> None:
-    """Put a model into a folder as a whole."""
+    """Put a model into a folder as a whole.
+
+    Args:
+        model: COLMAP's reconstruction.
+        target: folder, replaced if it is there.
+    """
     beside = target.with_name(f".{target.name}")
     shutil.rmtree(beside, ignore_errors=True)
     beside.mkdir(parents=True)
@@ -188,7 +204,12 @@ def write_model(model: Reconstruction, target: Path) -> None:
 
 
 def refined_by_name(adjusted: Adjusted, names: Mapping[str, str]) -> dict[str, Refined]:
-    """Return what is known about the refined cameras besides COLMAP's model, by name of the camera."""
+    """Return what is known about the refined cameras besides COLMAP's model, by name of the camera.
+
+    Args:
+        adjusted: the model with the deviations of its cameras.
+        names: camera of each photo, by photo name.
+    """
     cameras = {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
     return {
         name: {"deviations": adjusted.deviations[camera_id], "determined": adjusted.determined[camera_id]}
@@ -197,7 +218,12 @@ def refined_by_name(adjusted: Adjusted, names: Mapping[str, str]) -> dict[str, R
 
 
 def write_scene(scene: Scene, run: RunContext) -> None:
-    """Write scene.json: what COLMAP's model does not hold."""
+    """Write scene.json: what COLMAP's model does not hold.
+
+    Args:
+        scene: what was found.
+        run: the run.
+    """
     known = {
         "cameras": {name: camera.to_dict() for name, camera in scene.cameras.items()},
         "camera_of": dict(scene.camera_of),

@@ -28,6 +28,11 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
     """Paint the surface with the photos at full size.
 
     A run that was killed goes on where it stopped.
+
+    Args:
+        scene: cameras and poses.
+        surface: triangles without a texture.
+        run: the run.
     """
     views, parts = photo_views(scene), run.workspace.texture / PARTS
     cameras = [(view.name, view.row.tolist(), view.width, view.height) for view in views]
@@ -50,18 +55,27 @@ class Files:
         self.photo_dir, self.folder, self.mask_dir = photo_dir, folder, mask_dir
 
     def photo(self, view: PhotoView) -> NDArray[np.uint8]:
+        """Return (height, width, 3) RGB of a view, with nothing seen where it is masked."""
         return read_photo(self.photo_dir, view, self.used(view))
 
     def used(self, view: PhotoView) -> NDArray[np.bool_] | None:
+        """Return (height, width) which pixels of a photo may be used; None where no masks are given."""
         return None if self.mask_dir is None else read_used(self.mask_dir, view.name)
 
     def recall(self, name: str) -> dict[str, NDArray[np.generic]] | None:
+        """Return the arrays that were kept under a name, if they are there and sound."""
         try:
             return load_arrays(self._path(name))
         except Exception:  # not there, or damaged, of which decoders make whatever they like
             return None
 
     def keep(self, name: str, arrays: Mapping[str, NDArray[np.generic]]) -> None:
+        """Keep arrays in a file that appears complete or not at all.
+
+        Args:
+            name: what they are kept under.
+            arrays: by their own names.
+        """
         with replacing(self._path(name)) as path:
             np.savez(path, allow_pickle=False, **arrays)
 
@@ -85,7 +99,10 @@ def photo_views(scene: Scene) -> list[PhotoView]:
 def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
     """Return (height, width, 3) RGB of a photo at the size of the view; smaller ones are averaged, not picked.
 
-    Where a mask says which pixels may be used, nothing is seen of the others.
+    Args:
+        photo_dir: folder with the photos.
+        view: name and size of the photo.
+        used: (H, W) pixels of the photo that may be seen; None for all.
     """
     with Image.open(photo_dir / view.name) as image:
         photo = image.convert("RGB")
@@ -97,7 +114,12 @@ def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None 
 
 
 def save_texture(model: Model, run: RunContext) -> None:
-    """Write texture/texture.npz."""
+    """Write texture/texture.npz.
+
+    Args:
+        model: surface and texture.
+        run: the run.
+    """
     surface, texture = model.surface, model.texture
     stored: dict[str, Any] = {"vertices": surface.vertices, "faces": surface.faces, "colors": surface.colors}
     if texture is not None:

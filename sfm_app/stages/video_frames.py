@@ -39,6 +39,10 @@ def video_frames(source: Path, run: RunContext) -> Iterator[Path]:
 
     A run that is killed before the block ends without an error does not choose again.
 
+    Args:
+        source: video file.
+        run: the run.
+
     Raises:
         InputError: the video cannot be read, or shows too little.
     """
@@ -65,7 +69,12 @@ def kept(run: RunContext) -> Chosen | None:
 
 
 def chosen_from(source: Path, run: RunContext) -> Chosen:
-    """Look at the whole video and choose."""
+    """Look at the whole video and choose.
+
+    Args:
+        source: video file.
+        run: the run.
+    """
     most = run.settings.photos.max_frames
     try:
         with opened(source) as video:

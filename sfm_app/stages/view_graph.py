@@ -16,6 +16,10 @@ from sfm_app.types import MatchGraph, ViewGraph
 def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
     """Fit every pair on its own, and count why pairs fell.
 
+    Args:
+        matches: keypoints and raw matches.
+        run: the run.
+
     Raises:
         ReconstructionError: no pair has a usable epipolar geometry.
     """

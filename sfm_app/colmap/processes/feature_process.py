@@ -29,7 +29,13 @@ def work(task: FeatureTask) -> None:
 def extraction_options(
     options: MatchSettings, sift: Mapping[str, SiftOption], workers: int
 ) -> pycolmap.FeatureExtractionOptions:
-    """Return COLMAP's, with these options of its SIFT."""
+    """Return COLMAP's options for finding features.
+
+    Args:
+        options: photo size, and most features.
+        sift: options of its SIFT, by name.
+        workers: threads.
+    """
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = options.max_image_size_px
     extraction.num_threads = workers
@@ -47,7 +53,15 @@ def extract(
     reader: pycolmap.ImageReaderOptions,
     extraction: pycolmap.FeatureExtractionOptions,
 ) -> dict[str, Json]:
-    """Find SIFT features of all photos."""
+    """Find SIFT features of all photos; returns the options in force.
+
+    Args:
+        database: holds the photos; keypoints are entered.
+        photo_dir: folder with the photos.
+        names: of the photos.
+        reader: knows the masks.
+        extraction: see `extraction_options`.
+    """
     wanted = set(names)
     with opened(database) as before:
         ids = [image.image_id for image in before.read_all_images() if image.name in wanted]
@@ -68,7 +82,15 @@ def extract(
 def match(
     database: Path, photos: int, options: MatchSettings, workers: int, pairs: Sequence[tuple[int, int]] | None
 ) -> dict[str, Json]:
-    """Match these pairs of photos, or every photo with every other."""
+    """Match pairs of photos; returns the options in force.
+
+    Args:
+        database: holds the keypoints; matches are entered.
+        photos: how many there are.
+        options: largest ratio of distances.
+        workers: threads.
+        pairs: ids of photos; None for every photo with every other.
+    """
     matching = pycolmap.FeatureMatchingOptions()
     matching.skip_geometric_verification = True
     matching.num_threads = workers

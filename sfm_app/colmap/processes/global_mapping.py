@@ -27,6 +27,10 @@ def global_options(seed: int, names: Sequence[str]) -> pycolmap.GlobalPipelineOp
     """Return COLMAP's defaults, on our relative poses as they are.
 
     Adjusted roughly, because the last adjustment is ours.
+
+    Args:
+        seed: of COLMAP's own sampling.
+        names: photos to place.
     """
     options = pycolmap.GlobalPipelineOptions()
     options.image_names = list(names)

@@ -209,24 +209,44 @@ def report(**message: Json) -> None:
 class Reported:
     """Progress that goes to the one that started the process."""
 
-    def stage(self, name: str, note: str = "") -> None: ...
+    def stage(self, name: str, note: str = "") -> None:
+        """Show nothing: stages are the parent's.
 
-    def stage_done(self, seconds: float) -> None: ...
+        Args:
+            name, note: not used.
+        """
 
-    def say(self, text: str) -> None: ...
+    def stage_done(self, seconds: float) -> None:
+        """Show nothing."""
+
+    def say(self, text: str) -> None:
+        """Show nothing."""
 
     def start(self, label: str, total: int) -> None:
+        """Send the start of work to the parent.
+
+        Args:
+            label: what is done, for people.
+            total: number of steps.
+        """
         report(start=label, total=total)
 
     def advance(self, steps: int = 1) -> None:
+        """Send so many finished steps to the parent."""
         report(advance=steps)
 
     def finish(self) -> None:
+        """Send the end of the work to the parent."""
         report(finish=True)
 
 
 def relay(process: Apart, progress: Progress) -> dict[str, Json]:
-    """Show the progress of a process until it ends; what else it has reported comes back."""
+    """Show the progress of a process until it ends; what else it has reported comes back.
+
+    Args:
+        process: the one that works.
+        progress: where it is shown.
+    """
     found: dict[str, Json] = {}
     try:
         for message in process.messages():
