@@ -82,7 +82,7 @@ def unused_masks(names: Sequence[str], photos: Sequence[Photo]) -> list[str]:
 
 
 def lay_out_mask(photo: Photo, folder: Path, masks: Path, target: Path) -> None:
-    """Put the mask of a photo into a folder, upright and at the photo's size; all white where it has none.
+    """Put the mask of a photo into a folder, as the photo is laid out; all white where it has none.
 
     COLMAP passes over photos without a mask when it is given any.
 
