@@ -54,7 +54,12 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
 
 
 def k_text(K: Any, spread: Mapping[str, float] = MappingProxyType({})) -> str:
-    """Return focals and center in pixels, with standard deviations where there are some."""
+    """Return focals and center in pixels, with standard deviations where there are some.
+
+    Args:
+        K: (3, 3) in pixels.
+        spread: standard deviations in pixels, by "fx", "fy", "cx", "cy"; those not stated are left out.
+    """
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     parts = (
         f"{name} {value:.1f}" + (f" +- {spread[name]:.1f}" if name in spread else "") for name, value in values.items()

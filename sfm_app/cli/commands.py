@@ -39,6 +39,7 @@ class Commands(click.Group):
     """Turns errors into one line and an exit code, in one place."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
+        """Run the command line; at its end leave at once where a part of the work still runs."""
         try:
             return super().main(*args, **kwargs)
         finally:
@@ -48,6 +49,7 @@ class Commands(click.Group):
                 os._exit(INTERRUPTED)
 
     def invoke(self, ctx: click.Context) -> Any:
+        """Run one command and turn its errors into one line and an exit code."""
         try:
             return super().invoke(ctx)
         except SfmError as err:
@@ -71,7 +73,13 @@ def told(err: OSError) -> tuple[str, str]:
 
 
 def fail(message: str, hint: str, code: int) -> None:
-    """Say what went wrong and what to do about it, and end."""
+    """Say what went wrong and what to do about it, and end.
+
+    Args:
+        message: what went wrong.
+        hint: what to do about it; may be empty.
+        code: exit code, > 0.
+    """
     click.echo(f"error: {shown(message)}" + (f"\nhint: {shown(hint)}" if hint else ""), err=True)
     sys.exit(code)
 

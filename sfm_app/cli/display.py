@@ -44,25 +44,41 @@ class Terminal:
         self.task: TaskID | None = None
 
     def stage(self, name: str, note: str = "") -> None:
+        """Print the title of a stage.
+
+        Args:
+            name: of the stage.
+            note: why it was skipped; empty where it begins.
+        """
         steps = list(STAGE_TITLES)
         number = f"{steps.index(name) + 1}/{len(steps)} " if name in steps else ""
         self.console.print(f"{number}{STAGE_TITLES.get(name, name)}{f' [dim]({escape(note)})[/dim]' if note else ''}")
 
     def stage_done(self, seconds: float) -> None:
+        """Print how many seconds the stage took."""
         self.console.print(f"    [dim]{seconds:.1f} s[/dim]")
 
     def say(self, text: str) -> None:
+        """Print a text as it is."""
         self.console.print(escape(text))
 
     def start(self, label: str, total: int) -> None:
+        """Show a bar for work that begins.
+
+        Args:
+            label: what is done.
+            total: steps of the work.
+        """
         self.task = self.bars.add_task(escape(label), total=total)
         self.bars.start()
 
     def advance(self, steps: int = 1) -> None:
+        """Move the bar on by so many steps."""
         if self.task is not None:
             self.bars.advance(self.task, steps)
 
     def finish(self) -> None:
+        """Take the bar away."""
         if self.task is not None:
             self.bars.stop()
             self.bars.remove_task(self.task)
@@ -178,7 +194,12 @@ def texture_text(mesh: Mapping[str, Any]) -> str:
 
 
 def written(run: Run, stage: str) -> list[Path]:
-    """Return the model files that a stage wrote and that are still there, the one to open first."""
+    """Return the model files that a stage wrote and that are still there, the one to open first.
+
+    Args:
+        run: with its manifest.
+        stage: name of the stage.
+    """
     names = run.manifest.get("stages", {}).get(stage, {}).get("counts", {}).get("bytes", {})
     return [run.out / name for name in reversed(names) if (run.out / name).exists()]
 

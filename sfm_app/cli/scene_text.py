@@ -44,7 +44,12 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the scene, for people; arguments as in `scene_summary`."""
+    """Yield the scene, for people.
+
+    Args:
+        scene: what the stage gave.
+        counts: what it counted.
+    """
     summary = scene_summary(scene, counts)
     yield (
         f"scene       {summary['registered']} of {summary['of']} photos placed, {scene.points} points, "

@@ -106,7 +106,12 @@ def field_of(setting: str) -> FieldInfo:
 
 
 def value_of(settings: Section, setting: str) -> Any:
-    """Return the value of a setting such as "mesh.faces"."""
+    """Return the value of a setting.
+
+    Args:
+        settings: all of them.
+        setting: its path, such as "mesh.faces".
+    """
     value: Any = settings
     for part in setting.split("."):
         value = getattr(value, part)

@@ -51,8 +51,11 @@ def center(camera: Frustum) -> FloatArray:
 
 
 def frustum_corners(camera: Frustum, depth: float) -> FloatArray:
-    """Return (5, 3) the camera's center and, at this depth, the corners of its picture from the top left one on,
-    clockwise.
+    """Return (5, 3) the camera's center and the corners of its picture, clockwise from the top left one on.
+
+    Args:
+        camera: posed, without distortion.
+        depth: distance of the picture along the optical axis, > 0.
     """
     pixels = [(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]
     rays = np.linalg.solve(camera.K, np.column_stack([np.array(pixels, np.float64), np.ones(4)]).T).T
@@ -64,6 +67,10 @@ def frustum_depth(centers: FloatArray, points: FloatArray) -> float:
     """Return how deep the frusta are drawn.
 
     A third of the usual distance between neighboring cameras, within bounds.
+
+    Args:
+        centers: (C, 3) of the cameras.
+        points: (N, 3) of the scene.
     """
     size = max(scene_size(centers), scene_size(points)) or 1.0
     apart = np.linalg.norm(centers[:, None] - centers[None], axis=2)

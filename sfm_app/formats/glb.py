@@ -55,7 +55,13 @@ def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
 
 
 def textured(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
-    """Return one primitive and one material per page."""
+    """Add a picture and a material per page, and return one primitive for each.
+
+    Args:
+        glb: the file; it gets images, materials and vertices.
+        model: with its surface.
+        texture: of the model.
+    """
     surface, normals = model.surface, unit_normals(model.surface)
     sampler = glb.add("samplers", {"magFilter": LINEAR, "minFilter": MIPMAPS, "wrapS": CLAMPED, "wrapT": CLAMPED})
     primitives = []
@@ -74,7 +80,12 @@ def textured(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
 
 
 def colored(glb: Glb, model: Model) -> dict[str, Any]:
-    """Return triangles, or points where there are none, with a color per vertex."""
+    """Return triangles, or points where there are none, with a color per vertex.
+
+    Args:
+        glb: the file; it gets a material and vertices.
+        model: with a color per vertex.
+    """
     surface = model.surface
     normals = unit_normals(surface) if len(surface.faces) else None
     attributes = shape(glb, surface.vertices, normals) | {"COLOR_0": glb.add_vertices(linear_colors(surface.colors))}
@@ -85,13 +96,27 @@ def colored(glb: Glb, model: Model) -> dict[str, Any]:
 
 
 def shape(glb: Glb, vertices: NDArray[np.float64], normals: NDArray[np.float64] | None) -> dict[str, int]:
-    """Add where vertices are and where they face."""
+    """Add where vertices are and where they face; gives the accessors' numbers by name.
+
+    Args:
+        glb: the file.
+        vertices: (V, 3).
+        normals: (V, 3) unit vectors; None where there are none.
+    """
     attributes = {"POSITION": glb.add_vertices(vertices.astype(np.float32), bounds=True)}
     return attributes if normals is None else attributes | {"NORMAL": glb.add_vertices(normals.astype(np.float32))}
 
 
 def photographed(glb: Glb, name: str, **base: Any) -> int:
-    """Return a material that shows its colors as they are; both sides, since an open surface has no inside to hide."""
+    """Add a material that shows its colors as they are; gives its number.
+
+    Both sides, since an open surface has no inside to hide.
+
+    Args:
+        glb: the file.
+        name: of the material.
+        **base: color or texture, as glTF's pbrMetallicRoughness has it.
+    """
     return glb.add(
         "materials",
         {
@@ -115,9 +140,14 @@ def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def cameras(glb: Glb, model: Model) -> list[int]:
-    """Return the cameras twice: as lines that every viewer draws, and as glTF's cameras, to look through.
+    """Add the cameras twice: as lines that every viewer draws, and as glTF's cameras, to look through.
 
-    Numbers of nodes.
+    Args:
+        glb: the file.
+        model: with its cameras, at least one.
+
+    Returns:
+        numbers of their nodes.
     """
     corners, lines = camera_lines(model)
     color = linear_colors(np.array(CAMERA_COLOR, np.uint8))

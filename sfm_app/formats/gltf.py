@@ -25,7 +25,12 @@ class Glb:
         self._length = 0
 
     def add(self, table: str, entry: dict[str, Any]) -> int:
-        """Put an entry into a table of the tree ("meshes", "nodes", ...); gives its number."""
+        """Put an entry into a table of the tree; gives its number.
+
+        Args:
+            table: "meshes", "nodes", ...
+            entry: as the tree has it.
+        """
         entries = self.tree.setdefault(table, [])
         entries.append(entry)
         return len(entries) - 1
@@ -39,9 +44,11 @@ class Glb:
         return view
 
     def add_vertices(self, values: NDArray[np.float32], *, bounds: bool = False) -> int:
-        """Return an attribute of vertices (N, 2 or 3), with its bounds if glTF asks for them.
+        """Add an attribute of vertices; gives the accessor's number.
 
-        Gives the accessor's number.
+        Args:
+            values: (N, 2) or (N, 3), one row per vertex.
+            bounds: whether lowest and highest values are stated, as glTF asks for positions.
         """
         entry = self._accessor(values, VERTICES)
         if bounds:
@@ -49,7 +56,12 @@ class Glb:
         return self.add("accessors", entry)
 
     def add_indices(self, values: NDArray[np.int64], vertices: int) -> int:
-        """Return numbers of vertices, as small as fits; gives the accessor's number."""
+        """Add numbers of vertices, as small as fits; gives the accessor's number.
+
+        Args:
+            values: numbers of vertices, of any shape.
+            vertices: how many there are.
+        """
         small = values.ravel().astype(np.uint16 if vertices <= RESTART else np.uint32)
         return self.add("accessors", self._accessor(small, INDICES))
 

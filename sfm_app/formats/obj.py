@@ -88,7 +88,12 @@ def _textured_lines(model: Model, texture: Texture, pages: list[int]) -> Iterato
 
 
 def rows(form: str, values: NDArray[np.generic]) -> str:
-    """Return every row of an array (N, C) as text; one format for many is ten times faster than one per row."""
+    """Return every row of an array (N, C) as text; one format for many is ten times faster than one per row.
+
+    Args:
+        form: of one row, for the % operator, with C places.
+        values: (N, C).
+    """
     parts = (values[start : start + CHUNK] for start in range(0, len(values), CHUNK))
     return "".join(form * len(part) % tuple(part.ravel().tolist()) for part in parts)
 

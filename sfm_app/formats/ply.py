@@ -54,7 +54,12 @@ def triangles(faces: NDArray[np.int64]) -> NDArray[np.void]:
 
 
 def table(kinds: list[tuple[str, str]], columns: Columns) -> NDArray[np.void]:
-    """Return rows of named columns."""
+    """Return rows of named columns.
+
+    Args:
+        kinds: name and NumPy type of each column.
+        columns: arrays (N, C) side by side, as many columns in all as names.
+    """
     rows = np.empty(len(columns[0]), kinds)
     values = [column[:, i] for column in columns for i in range(column.shape[1])]
     for (key, _), column in zip(kinds, values, strict=True):

@@ -16,9 +16,13 @@ MARGIN = 1.1
 
 
 def octree_depth(points: NDArray[np.float64], most: int) -> int:
-    """Give greatest depth, at most `most`, at which cells of Poisson's octree that hold points (N, 3) share them out.
+    """Give the greatest depth at which cells of Poisson's octree that hold points share them out.
 
     Finer cells, most of them with one point or none, would only model the noise, at four times the triangles per level.
+
+    Args:
+        points: (N, 3).
+        most: largest depth, >= 1.
     """
     extent = MARGIN * np.ptp(points, axis=0).max(initial=0.0) if len(points) else 0.0
     if extent == 0.0:
@@ -33,7 +37,12 @@ def octree_depth(points: NDArray[np.float64], most: int) -> int:
 
 
 def drop_islands(surface: Surface, min_share: float) -> Surface:
-    """Drop connected parts that have less than a share in [0, 1] of all triangles."""
+    """Drop connected parts that have too few triangles.
+
+    Args:
+        surface: with all its parts.
+        min_share: of all triangles, in [0, 1].
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

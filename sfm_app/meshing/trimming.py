@@ -110,9 +110,15 @@ def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], 
 
 
 def drop_doubtful(surface: Surface, support: FloatArray, confirmed: NDArray[np.int32], least: float) -> FloatArray:
-    """Take the support from connected parts that fewer photos than `least` confirm on average.
+    """Take the support from connected parts that too few photos confirm on average.
 
     Crumbs around outlines are like that: chance agreement of two or three photos, and the gaps between them bridged.
+
+    Args:
+        surface: its edges connect the parts.
+        support: (V,) positive where photos confirm the surface.
+        confirmed: (V,) photos that confirm each vertex.
+        least: photos on average, >= 0.
     """
     from scipy.sparse.csgraph import connected_components
 
@@ -124,7 +130,13 @@ def drop_doubtful(surface: Surface, support: FloatArray, confirmed: NDArray[np.i
 
 
 def smooth_support(surface: Surface, support: FloatArray, steps: int) -> FloatArray:
-    """Return (V,) support after `steps` averages over the vertex and its neighbors: the border loses its fringe."""
+    """Return (V,) support averaged over the vertex and its neighbors: the border loses its fringe.
+
+    Args:
+        surface: its edges are used.
+        support: (V,) positive where photos confirm the surface.
+        steps: averages, >= 0.
+    """
     edges, _ = edges_of(surface.faces)
     graph = _graph(edges, len(support))
     neighbors = np.maximum(np.bincount(edges.ravel(), minlength=len(support)), 1)

@@ -50,11 +50,17 @@ class Eye:
 
 
 def judge(points: FloatArray, normals: FloatArray, eye: Eye, tolerance: float) -> NDArray[np.uint8]:
-    """Judge points (N, 3) with unit normals (N, 3): CONFIRMED, SEEN_THROUGH, EMPTY or SILENT.
+    """Judge points on a surface: CONFIRMED, SEEN_THROUGH, EMPTY or SILENT.
 
     A point is confirmed where the depths around it reach its own within the relative tolerance and it faces the photo;
     it is seen through where all of them lie well behind it. The map is empty where it faces the photo and there are no
     depths around it. About hidden points, and where it is masked, it is silent.
+
+    Args:
+        points: (N, 3) in the world.
+        normals: (N, 3) unit vectors.
+        eye: the photo.
+        tolerance: relative difference in depth.
     """
     verdict = np.zeros(len(points), np.uint8)
     _judge(points, normals, eye.projection, eye.center, eye.depth, np.array([eye.sample_px, tolerance]), verdict)

@@ -100,6 +100,10 @@ def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
     """Return (N, 3) meters east, north and up of an origin; up is 0 where either altitude is unknown.
 
     To the first order in the angles, with the ellipsoid's radii at the origin: 1 m off over 5 km.
+
+    Args:
+        positions: on earth; those without altitude have up 0.
+        origin: where (0, 0, 0) is.
     """
     meridian, parallel = _radii_m(origin)
     turn = [(position.longitude_deg - origin.longitude_deg + 180.0) % 360.0 - 180.0 for position in positions]
@@ -113,7 +117,12 @@ def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
 
 
 def position_at(enu: FloatArray, origin: GpsPosition) -> GpsPosition:
-    """Return the position so many meters (3,) east, north and up of an origin; `enu_m` backwards."""
+    """Return the position so many meters from an origin; `enu_m` backwards.
+
+    Args:
+        enu: (3,) meters east, north and up.
+        origin: where (0, 0, 0) is.
+    """
     meridian, parallel = _radii_m(origin)
     longitude = (origin.longitude_deg + float(np.degrees(enu[0] / parallel)) + 180.0) % 360.0 - 180.0
     altitude = None if origin.altitude_m is None else origin.altitude_m + float(enu[2])

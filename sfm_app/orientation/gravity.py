@@ -56,7 +56,12 @@ class Upright:
         return float(axis_angle_deg(self.up, self.roll.up))
 
     def turned_to(self, up: FloatArray, deviation_deg: float) -> "Upright":
-        """Return the same, with up as GPS has it: heights know their sign."""
+        """Return the same, with up as GPS has it: heights know their sign.
+
+        Args:
+            up: (3,) unit vector in the world.
+            deviation_deg: its standard deviation, degrees.
+        """
         sure = Standing(self.roll, self.standing.evidence, np.inf, np.inf)
         return replace(self, up=up, level=None, found_by=GPS, deviation_deg=deviation_deg, standing=sure)
 
@@ -99,6 +104,11 @@ def facing(upright: Upright, rotations: FloatArray, points: FloatArray) -> tuple
     """Return horizontal direction (3,) that should point to the viewer, and what says so: `LINES`, `WALL` or `CAMERAS`.
 
     Towards the cameras; where lines or walls have a main direction near that, exactly along it.
+
+    Args:
+        upright: which way is up.
+        rotations: (N, 3, 3) of cam_from_world.
+        points: (P, 3) in the world.
     """
     up = upright.up
     towards = unit(across(-rotations[:, 2].mean(axis=0), up))

@@ -101,6 +101,13 @@ def low_is_near(
     """Return correlation of log depth with height in the photo, over the points that it sees; mean over the photos.
 
     The ground comes nearer towards the lower border; facades seen from the street lean away. In [-1, 1].
+
+    Args:
+        up: (3,) unit vector in the world.
+        rotations: (N, 3, 3) of cam_from_world.
+        centers: (N, 3) of the cameras.
+        points: (P, 3) in the world.
+        seen: per photo the points that it sees.
     """
     found = []
     for R, center, chosen in zip(rotations, centers, seen, strict=True):
@@ -121,6 +128,10 @@ def tops_are_seen(up: FloatArray, surfaces: Surfaces) -> float:
     """Return mean upward component of the normals: free space and those who look are above floors, steps and sills.
 
     In [-1, 1].
+
+    Args:
+        up: (3,) unit vector in the world.
+        surfaces: pieces around the points.
     """
     return float(along(surfaces.normals, up).mean()) if len(surfaces.normals) else 0.0
 
@@ -128,9 +139,11 @@ def tops_are_seen(up: FloatArray, surfaces: Surfaces) -> float:
 def tops_are_bright(up: FloatArray, surfaces: Surfaces) -> float:
     """Return correlation of brightness with the upward component of the normal, both against what is around.
 
-    Light from above.
+    Light from above. In [-1, 1].
 
-    In [-1, 1].
+    Args:
+        up: (3,) unit vector in the world.
+        surfaces: pieces around the points.
     """
     if not len(surfaces.normals):
         return 0.0
@@ -146,6 +159,11 @@ def ledges_are_lit(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDA
 
     Under ledges, eaves and things on the ground lies shadow with a sharp border to the lit top above it, and skylines
     are brighter above; the ways back to light are gentle. Across, it is 0 within 0.06. In [-1, 1].
+
+    Args:
+        up: (3,) unit vector in the world.
+        rotations: (N, 3, 3) of cam_from_world.
+        pictures: per photo (H, W) gray as the sensor lies; None where there is none.
     """
     found = []
     for R, picture in zip(rotations, pictures, strict=True):
@@ -162,6 +180,11 @@ def sky_is_above(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArr
     """Return share of even and bright pixels at the upper border less that at the lower one; mean over the photos.
 
     In [-1, 1].
+
+    Args:
+        up: (3,) unit vector in the world.
+        rotations: (N, 3, 3) of cam_from_world.
+        pictures: per photo (H, W) gray as the sensor lies; None where there is none.
     """
     found = []
     for R, picture in zip(rotations, pictures, strict=True):

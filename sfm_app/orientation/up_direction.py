@@ -45,7 +45,12 @@ class Cue:
     """Its variance within a scene, times the number of points."""
 
     def nats(self, value: float, points: int) -> float:
-        """Return log odds of up against down: both are normal, with opposite means."""
+        """Return log odds of up against down: both are normal, with opposite means.
+
+        Args:
+            value: of the cue; above 0 speaks for up.
+            points: pieces of surface that it comes from.
+        """
         variance = self.deviation**2 + self.noise / max(points, 1)
         return float(np.clip(2.0 * self.mean * value / variance, -MOST, MOST))
 

@@ -126,9 +126,12 @@ def vanishing_near(start: FloatArray, segments: Segments) -> Vanishing | None:
 def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
     """Return the horizontal direction (3,) that most segments run along, with those at right angles to it.
 
-    None as above.
+    None where none stands out. Segments on the horizon fit all horizontal directions, and vertical ones are no
+    witnesses: both stay out.
 
-    Segments on the horizon fit all horizontal directions, and vertical ones are no witnesses: both stay out.
+    Args:
+        up: (3,) unit vector in the world.
+        segments: of all photos.
     """
     on_horizon = np.abs(along(segments.normals, up)) > np.cos(np.radians(APART_DEG))
     level = segments.take(~on_horizon & (_misses_deg(up, segments) > APART_DEG / 2))
@@ -152,6 +155,11 @@ def square_frame(up: FloatArray, level: FloatArray, segments: Segments) -> tuple
 
     Horizontal edges say as much about up as vertical ones, and columns taper where cornices do not. Gauss-Newton on
     the rotation with Welsch's weights: a rotation by w moves the miss n'd of a segment along d by n'(w x d).
+
+    Args:
+        up: (3,) unit vector near the first direction.
+        level: (3,) unit vector near the second, at right angles to `up`.
+        segments: of all photos.
 
     Returns:
         (3, 3), its rows the directions, and the standard deviation of the first in degrees, see `Vanishing`.
@@ -189,7 +197,12 @@ def _rotation_equations(frame: FloatArray, segments: Segments, width_deg: float)
 
 
 def refined(direction: FloatArray, segments: Segments) -> FloatArray:
-    """Return the nearby direction that makes the weighted squares of the misses least."""
+    """Return the nearby direction that makes the weighted squares of the misses least.
+
+    Args:
+        direction: (3,) unit vector to start from.
+        segments: of all photos.
+    """
     for width_deg in WIDTHS_DEG:
         for _ in range(10):
             before = direction
@@ -200,7 +213,13 @@ def refined(direction: FloatArray, segments: Segments) -> FloatArray:
 
 
 def cap(axis: FloatArray, radius_deg: float, step_deg: float) -> FloatArray:
-    """Return (N, 3) unit vectors evenly spread around an axis (3,), up to an angle from it."""
+    """Return (N, 3) unit vectors evenly spread around an axis.
+
+    Args:
+        axis: (3,) unit vector.
+        radius_deg: largest angle from it, degrees.
+        step_deg: angle between neighbors, about, degrees.
+    """
     e1, e2 = basis_across(axis)
     found = [axis[None]]
     for polar in np.radians(np.arange(step_deg, radius_deg + 1e-9, step_deg)):

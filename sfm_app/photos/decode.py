@@ -136,12 +136,22 @@ def upright(picture: DecodedPhoto) -> Image.Image:
 
 
 def turned_upright(image: Image.Image, turned: int) -> Image.Image:
-    """Return the image after its EXIF orientation is undone."""
+    """Return the image after its EXIF orientation is undone.
+
+    Args:
+        image: as the file has it.
+        turned: EXIF orientation, 1 to 8; another number turns nothing.
+    """
     return image.transpose(ORIENTATIONS[turned]) if turned in ORIENTATIONS else image
 
 
 def turned_back(upright: Image.Image, turn_deg: int) -> Image.Image:
-    """Return what has to be turned clockwise by so much to be upright."""
+    """Return what has to be turned clockwise to be upright.
+
+    Args:
+        upright: image as people see it.
+        turn_deg: degrees clockwise: 0, 90, 180 or 270.
+    """
     return upright.transpose(TURNS[turn_deg]) if turn_deg else upright
 
 

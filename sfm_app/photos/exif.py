@@ -38,7 +38,12 @@ def camera_name(exif: Image.Exif) -> str:
 
 
 def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
-    """Return focal length in pixels by the one for 35 mm film; None where it is missing or cannot be true."""
+    """Return focal length in pixels by the one for 35 mm film; None where it is missing or cannot be true.
+
+    Args:
+        exif: of the photo.
+        longer_side: of the photo, pixels.
+    """
     try:
         focal = float(exif.get_ifd(EXIF_IFD).get(FOCAL_35MM)) * longer_side / FULL_FRAME_WIDTH_MM  # type: ignore[arg-type]
     except (TypeError, ValueError, ZeroDivisionError):

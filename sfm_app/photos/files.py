@@ -50,7 +50,12 @@ def _no_folder(path: Path) -> InputError:
 
 
 def place_of(folder: Path, name: str) -> Path | str:
-    """Return where a file really is, links followed, or why it is not opened."""
+    """Return where a file really is, links followed, or why it is not opened.
+
+    Args:
+        folder: of the photos; nothing outside it is opened.
+        name: path inside the folder.
+    """
     root, place = folder.resolve(), folder / name
     if Path(name).name.startswith("."):
         return "hidden"

@@ -33,6 +33,11 @@ BoolImage = NDArray[np.bool_]
 def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
     """Return names of all files below the folder of masks, as `list_files` has them, without photos and output.
 
+    Args:
+        masks: folder of the masks.
+        photos: folder of the photos.
+        out: output folder; may lie in that of the masks.
+
     Raises:
         InputError: there is no such folder, or it is that of the photos.
     """
@@ -46,6 +51,11 @@ def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
 
 def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
     """Return the photo with its mask, if it has one; unusable where all of it is masked.
+
+    Args:
+        photo: as it was read.
+        folder: of the photos.
+        masks: folder of the masks.
 
     Raises:
         InputError: the mask cannot be used; says why.
@@ -61,15 +71,26 @@ def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
 
 
 def unused_masks(names: Sequence[str], photos: Sequence[Photo]) -> list[str]:
-    """Return which files of the folder of masks are the mask of no photo; hidden ones are nobody's."""
+    """Return which files of the folder of masks are the mask of no photo; hidden ones are nobody's.
+
+    Args:
+        names: from `list_masks`.
+        photos: those of the run, with their masks.
+    """
     used = {photo.mask for photo in photos}
     return [name for name in names if name not in used and not PurePosixPath(name).name.startswith(".")]
 
 
 def lay_out_mask(photo: Photo, folder: Path, masks: Path, target: Path) -> None:
-    """Put the mask of a photo below `target`, upright and at the photo's size; all white where it has none.
+    """Put the mask of a photo into a folder, as the photo is laid out; all white where it has none.
 
     COLMAP passes over photos without a mask when it is given any.
+
+    Args:
+        photo: with its mask, if it has one.
+        folder: of the photos.
+        masks: folder of the masks.
+        target: folder that gets it.
 
     Raises:
         InputError: as `find_mask`.
@@ -80,27 +101,50 @@ def lay_out_mask(photo: Photo, folder: Path, masks: Path, target: Path) -> None:
 
 
 def mask_place(target: Path, name: str) -> Path:
-    """Return where the mask of the photo of this name is staged."""
+    """Return where the mask of a photo is staged.
+
+    Args:
+        target: folder of the staged masks.
+        name: of the photo.
+    """
     return target / f"{name}{ENDING}"
 
 
 def save_used(target: Path, name: str, used: BoolImage) -> None:
-    """Write which pixels of a photo may be used as a mask of black and white."""
+    """Write which pixels of a photo may be used as a mask of black and white.
+
+    Args:
+        target: folder of the staged masks.
+        name: of the photo.
+        used: (H, W) as the photo is laid out.
+    """
     place = mask_place(target, name)
     place.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(_painted(used)).save(place, "PNG", compress_level=1)
 
 
 def read_used(target: Path, name: str) -> BoolImage:
-    """Return (H, W) what `save_used` wrote; OSError where it cannot be read."""
+    """Return (H, W) what `save_used` wrote.
+
+    Args:
+        target: folder of the staged masks.
+        name: of the photo.
+
+    Raises:
+        OSError: it cannot be read.
+    """
     with Image.open(mask_place(target, name)) as image:
         return np.asarray(image) > 0
 
 
 def without_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uint8]:
-    """Return a photo (H, W, 3) whose masked pixels take the color of the nearest one that may be used.
+    """Return a photo whose masked pixels take the color of the nearest one that may be used.
 
     Then neither interpolation nor a smaller size brings back what is masked.
+
+    Args:
+        pixels: (H, W, 3) RGB.
+        used: (H, W) which of them may be used.
     """
     if used.all() or not used.any():
         return pixels

@@ -28,7 +28,13 @@ LINKED = ("JPEG", "MPO", "PNG")
 
 
 def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | UnusablePhoto:
-    """Decode one file to know that it is a whole photo, what camera took it, and what it looks like."""
+    """Decode one file to know that it is a whole photo, what camera took it, and what it looks like.
+
+    Args:
+        folder: of the photos.
+        name: path inside the folder.
+        options: least and largest size.
+    """
     place = place_of(folder, name)
     if isinstance(place, str):
         return UnusablePhoto(name, place)
@@ -40,7 +46,13 @@ def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | U
 
 
 def described(name: str, picture: DecodedPhoto, options: PhotoSettings) -> Glance | UnusablePhoto:
-    """Return what is known about a photo, and what it looks like."""
+    """Return what is known about a photo, and what it looks like.
+
+    Args:
+        name: path inside the folder.
+        picture: what the file holds.
+        options: least and largest size.
+    """
     image, exif = picture.image, picture.exif
     turn = turn_deg(exif)
     size = image.size[::-1] if orientation(exif) >= 5 and not turn else image.size
@@ -79,6 +91,11 @@ def _shown(seen: Image.Image, photo: Photo) -> Frame | None:
 
 
 def scaled(size: tuple[int, int], most_px: float) -> tuple[int, int]:
-    """Return width and height of a picture with not more pixels than that."""
+    """Return width and height of a picture shrunk to at most so many pixels.
+
+    Args:
+        size: width and height in pixels.
+        most_px: pixels in all, >= 1.
+    """
     share = min(1.0, (most_px / (size[0] * size[1])) ** 0.5)
     return max(1, int(size[0] * share)), max(1, int(size[1] * share))

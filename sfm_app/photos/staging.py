@@ -36,7 +36,12 @@ def stored_names(photos: Iterable[Photo]) -> Iterator[Photo]:
 
 
 def lay_out(photo: Photo, folder: Path, target: Path) -> None:
-    """Put one photo below `target`.
+    """Put one photo where COLMAP reads it.
+
+    Args:
+        photo: as it was read.
+        folder: of the photos.
+        target: folder that gets the link or copy.
 
     Raises:
         OSError: the target cannot be written.

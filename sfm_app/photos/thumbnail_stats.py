@@ -37,7 +37,12 @@ class Glance:
 
 
 def glance(photo: Photo, upright: Image.Image) -> Glance:
-    """Look at a photo."""
+    """Measure blur and flat areas of a photo, and make it small.
+
+    Args:
+        photo: what is known of it.
+        upright: its picture as people see it.
+    """
     gray = upright.convert("L")
     return Glance(photo, small_picture(gray), blur_of(gray), flat_share(gray))
 

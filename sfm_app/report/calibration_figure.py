@@ -75,7 +75,14 @@ def check_figure(path: Path) -> None:
 
 
 def draw_intrinsics(path: Path, matches: MatchGraph, views: ViewGraph, found: Intrinsics) -> None:
-    """Draw the cameras of a run, those with most pairs of their own first; see `draw_calibration`."""
+    """Draw the cameras of a run, those with most pairs of their own first.
+
+    Args:
+        path: as for `draw_calibration`.
+        matches: the photos of the run.
+        views: fundamental matrices of their pairs.
+        found: the cameras.
+    """
     images = list(matches.images.values())
     groups = {name: [image for image in images if found.name_of(image) == name] for name in found.cameras}
     panels = [Panel(n, c, camera_pairs(groups[n], matches, views)) for n, c in found.cameras.items() if groups[n]]
@@ -124,7 +131,12 @@ def _draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
 
 
 def focal_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
-    """Return fx and fy, with the optical center where it was found."""
+    """Return fx and fy, with the optical center where it was found.
+
+    Args:
+        camera: what was found, in pixels.
+        pairs: of this camera, without lens distortion.
+    """
     unit, (low, high) = _unit(camera), FOCALS_SHOWN
     (fx, _, cx), (_, fy, cy), _ = camera.K
     center = ((cx - camera.width / 2) / unit, (cy - camera.height / 2) / unit)
@@ -142,7 +154,12 @@ def focal_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
 
 
 def center_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
-    """Return cx and cy over the whole photo, with the focals as found."""
+    """Return cx and cy over the whole photo, with the focals as found.
+
+    Args:
+        camera: what was found, in pixels.
+        pairs: of this camera, without lens distortion.
+    """
     unit, u0, v0 = _unit(camera), camera.width / 2, camera.height / 2
     focals = (camera.K[0, 0] / unit, camera.K[1, 1] / unit)
     return ParameterPlane(
@@ -205,7 +222,13 @@ def _enlarge(axes: "Axes", plane: ParameterPlane, camera: Calibration) -> None:
 
 
 def votes(plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> FloatArray:
-    """Return (CELLS, CELLS) share of the votes at every point of the plane; rows go from its bottom to its top."""
+    """Return (CELLS, CELLS) share of the votes at every point of the plane; rows go from its bottom to its top.
+
+    Args:
+        plane: which two intrinsics vary.
+        camera: what was found, in pixels.
+        pairs: of this camera, without lens distortion.
+    """
     left, right, bottom, top = plane.extent
     grid = [values.ravel() for values in np.meshgrid(_steps(left, right, CELLS), _steps(bottom, top, CELLS))]
     fixed = {"fx": camera.K[0, 0], "fy": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2]}

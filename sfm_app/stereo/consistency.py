@@ -72,7 +72,13 @@ def count_agreeing(
 ) -> NDArray[np.uint8]:
     """Return how many other depth maps confirm each depth of a view, (H, W).
 
-    A map confirms a depth when the point, seen from there, has a depth within the relative tolerance of the map's.
+    A map confirms a depth when the point, seen from there, has a depth within the tolerance of the map's.
+
+    Args:
+        view: the photo.
+        depth: (H, W) of the photo; 0 where unknown.
+        others: other photos with their depth maps.
+        tolerance: relative difference in depth that passes.
     """
     agreeing = np.zeros(depth.shape, np.uint8)
     K_inv = np.linalg.inv(view.K)
@@ -84,7 +90,12 @@ def count_agreeing(
 
 
 def without_specks(depth: DepthArray, tolerance: float) -> DepthArray:
-    """Return depth map without small patches in which depths differ by less than the tolerance from pixel to pixel."""
+    """Return depth map without small patches in which depths differ by less than the tolerance from pixel to pixel.
+
+    Args:
+        depth: (H, W); 0 where unknown.
+        tolerance: relative difference in depth.
+    """
     known = depth > 0
     if not known.any():
         return depth

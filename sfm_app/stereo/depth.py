@@ -53,9 +53,16 @@ class DepthEstimate:
 def match_depths(
     view: View, candidates: Sequence[View], load: Callable[[View], GrayImage], count: int, tolerance: float
 ) -> DepthEstimate | Rejected:
-    """Match a photo with the first `count` candidates that can be rectified with it, and find what suits them all.
+    """Match a photo with the first candidates that can be rectified with it, and find what suits them all.
 
     Semi-global matching with each neighbor gives depths; where they agree they start PatchMatch with all neighbors.
+
+    Args:
+        view: the photo.
+        candidates: possible neighbors, best first.
+        load: gives the gray photo of a view.
+        count: neighbors at most.
+        tolerance: relative difference within which depths agree.
     """
     image = load(view)
     # images have their values at the pixels' centers
@@ -117,6 +124,14 @@ def confirm_depths(
 
     Enough is `min_agreeing`; one more where the photos look little alike and beside broad empty places, three more
     where they hardly do, and never in skies.
+
+    Args:
+        view: the photo.
+        image: (H, W) gray photo.
+        estimate: from `match_depths`.
+        others: other photos with their depth maps.
+        min_agreeing: maps, >= 1.
+        tolerance: relative difference within which depths agree.
     """
     if not others:
         return Rejected("no other depth map to compare with")

@@ -17,6 +17,11 @@ MIN_PARALLAX_PX = 1.0
 def disparities(left: GrayImage, right: GrayImage, count: int) -> NDArray[np.float32]:
     """Return semi-global matching (Hirschmueller, PAMI 2008; OpenCV's block variant) in [0, count), to sub-pixels.
 
+    Args:
+        left: (H, W) rectified.
+        right: (H, W) rectified.
+        count: pixels, a multiple of 16.
+
     Returns:
         (H, W) disparity of the left image in pixels; -1 where left and right disagree by more than a pixel, where a
         second disparity is nearly as good, and on small specks.
@@ -42,6 +47,12 @@ def depths_from_disparities(
     disparity: NDArray[np.float32], rectification: Rectification, reference: View, neighbor: View
 ) -> tuple[DepthArray, DepthArray]:
     """Bring a rectified disparity map back into the reference.
+
+    Args:
+        disparity: (H, W) of the left canvas in pixels; < 0 where unknown.
+        rectification: of the two views.
+        reference: the view of the left canvas.
+        neighbor: the view of the right one.
 
     Returns:
         (H, W) depth of the reference's pixels, 0 where unknown or not seen by the neighbor, and (H, W) the parallax

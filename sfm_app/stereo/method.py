@@ -26,16 +26,31 @@ class DepthStore(Protocol):
         """Return the photo without distortion, (H, W)."""
 
     def has(self, view: View, kind: Kind, /) -> bool:
-        """Return whether a map is there."""
+        """Return whether a map is there.
+
+        Args:
+            view: the photo.
+            kind: before or after the check against other photos.
+        """
 
     def read_estimate(self, view: View, /) -> DepthEstimate:
         """Return the photometric map."""
 
     def write_estimate(self, view: View, estimate: DepthEstimate, /) -> None:
-        """Keep the photometric map."""
+        """Keep the photometric map.
+
+        Args:
+            view: the photo.
+            estimate: its map.
+        """
 
     def write_maps(self, view: View, maps: DepthMap, /) -> None:
-        """Keep the geometric maps."""
+        """Keep the geometric maps.
+
+        Args:
+            view: the photo.
+            maps: depth and normals.
+        """
 
 
 class Map(Protocol):

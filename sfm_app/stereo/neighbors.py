@@ -13,11 +13,15 @@ BEST_ANGLE_DEG = 8.0
 
 
 def rank_neighbors(views: Sequence[View], count: int) -> list[list[int]]:
-    """Return, for every view, the indices of the views that serve it best, best first, at most `count`.
+    """Return, for every view, the indices of the views that serve it best, best first.
 
     Greedy coverage: the next neighbor is the one that adds most to the sparse points of the view. A point adds its
     weight (triangulation angle, difference in scale), up to halved for each time that it is covered already, so that
     the choice spreads over the photo instead of crowding on one side.
+
+    Args:
+        views: all photos, with their sparse points.
+        count: at most so many per view.
     """
     return [_rank(view, views, count) for view in views]
 
@@ -43,9 +47,12 @@ def _rank(view: View, views: Sequence[View], count: int) -> list[int]:
 
 
 def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
-    """Return (N,) in [0, 1].
+    """Return (N,) in [0, 1]: how well points can be matched between two views, from their angle and scale.
 
-    How well world points (N, 3) can be matched between two views, from their angle and scale.
+    Args:
+        view: one view.
+        other: the other one.
+        points: (N, 3) in the world.
     """
     angle_deg = triangulation_angles_deg(view.center, other.center, points)
     spread_deg = np.where(angle_deg < BEST_ANGLE_DEG, BEST_ANGLE_DEG / 3, 1.25 * BEST_ANGLE_DEG)
@@ -57,7 +64,13 @@ def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
 
 
 def triangulation_angles_deg(center1: FloatArray, center2: FloatArray, points: FloatArray) -> NDArray[np.float64]:
-    """Return (N,) angles in degrees under which points (N, 3) see two centers (3,)."""
+    """Return (N,) angles in degrees under which points see two centers.
+
+    Args:
+        center1: (3,) of one camera.
+        center2: (3,) of the other.
+        points: (N, 3).
+    """
     ray1, ray2 = points - center1, points - center2
     # atan2 keeps small angles exact, where arccos of a rounded cosine does not
     sine = np.linalg.norm(np.cross(ray1, ray2), axis=1)

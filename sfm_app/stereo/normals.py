@@ -32,7 +32,12 @@ def fit_planes(depth: DepthArray) -> PlaneArray:
 
 
 def normals_of(planes: PlaneArray, view: View) -> NDArray[np.float32]:
-    """Return (H, W, 3) unit normals in the camera frame that point to the camera; 0 where the inverse depth is 0."""
+    """Return (H, W, 3) unit normals in the camera frame that point to the camera; 0 where the inverse depth is 0.
+
+    Args:
+        planes: (H, W, 3) inverse depth and its slopes per pixel, from `fit_planes`.
+        view: the photo.
+    """
     q, qu, qv = (planes[..., k].astype(np.float64) for k in range(3))
     row, col = np.indices(q.shape) + view.sample_px
     # n'K^-1 (u, v, 1) = q + qu (u - u0) + qv (v - v0) for all u, v

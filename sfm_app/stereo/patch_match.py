@@ -51,6 +51,13 @@ def improve_planes(
     half of the neighbors, because the others may see something in front. Weights in the window fall with the distance
     and with the difference in gray from the middle.
 
+    Args:
+        planes: (H, W, 3) inverse depth and its slopes per pixel; changed.
+        view: the photo.
+        image: (H, W) gray photo.
+        others: neighbors and their gray photos.
+        sweeps: how many, >= 0.
+
     Returns:
         (H, W) cost in [0, 2]; 2 where nothing is known.
     """

@@ -49,7 +49,13 @@ class Rectification:
     disparities: int
 
     def warp(self, reference: GrayImage, neighbor: GrayImage, views: tuple[View, View]) -> tuple[GrayImage, GrayImage]:
-        """Warp both photos to the canvas, black where they have no pixels; photos may be smaller than their views."""
+        """Warp both photos to the canvas, black where they have no pixels.
+
+        Args:
+            reference: (H, W) gray; may be smaller than its view.
+            neighbor: the same for the other photo.
+            views: reference and neighbor.
+        """
         left = self._warp(reference, views[0], 0.0)
         return left, self._warp(neighbor, views[1], self.offset_px)
 
@@ -74,6 +80,10 @@ def rectify(reference: View, neighbor: View) -> Rectification | Rejected:
 
     The canvas shows what both photos see of the depths that the reference's sparse points span, at the
     reference's resolution; at less where the disparities would exceed `MAX_DISPARITIES` or its area `MAX_GROWTH`.
+
+    Args:
+        reference: the view of the left canvas, with its sparse points.
+        neighbor: the view of the right one.
     """
     rotation = _rectified_rotation(reference, neighbor)
     if rotation is None:

@@ -58,9 +58,11 @@ class View:
 
 
 def region(views: Sequence[View], margin: float = 0.2) -> FloatArray:
-    """Return box (2, 3) around the sparse points.
+    """Return (2, 3) lowest and highest coordinates of the sparse points, without the strays, widened.
 
-    Lowest and highest coordinates, without the strays, widened by a share.
+    Args:
+        views: with their sparse points.
+        margin: share of the longest side added at every side.
     """
     points = np.concatenate([view.points for view in views])
     low, high = np.percentile(points, [1, 99], axis=0)

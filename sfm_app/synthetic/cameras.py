@@ -38,12 +38,21 @@ class Views:
 
     @classmethod
     def of(cls, camera: Camera, poses: Sequence[FloatArray]) -> "Views":
-        """Return one camera at poses (3, 4), the photos named view_00.jpg and so on."""
+        """Return one camera at several poses, the photos named view_00.jpg and so on.
+
+        Args:
+            camera: of all photos.
+            poses: (3, 4) cam_from_world each.
+        """
         named = {f"view_{k:02d}.jpg": pose for k, pose in enumerate(poses)}
         return cls(dict.fromkeys(named, camera), named)
 
     def taken_with(self, camera: Camera, photos: Collection[str]) -> "Views":
         """Return the same views, these photos taken with another camera.
+
+        Args:
+            camera: the other one.
+            photos: names of photos among the views.
 
         Raises:
             ConfigError: a photo is not among the views.
@@ -122,7 +131,13 @@ def make_camera(
 
 
 def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Views:
-    """Return hand-held photos along an arc in front of the scene (towards +z, y up), named view_00.jpg and so on."""
+    """Return hand-held photos along an arc in front of the scene (towards +z, y up), named view_00.jpg and so on.
+
+    Args:
+        camera: of all photos.
+        options: the walk; the usual one where None.
+        seed: same seed, same steps.
+    """
     options = options or ArcOptions()
     rng = np.random.default_rng([seed, 11])
     count = options.photos
@@ -164,7 +179,13 @@ class PastOptions:
 
 
 def past(camera: Camera, options: PastOptions | None = None, seed: int = 0) -> Views:
-    """Return hand-held photos along a wall in the plane z = 0, from left to right, named view_00.jpg and so on."""
+    """Return hand-held photos along a wall in the plane z = 0, from left to right, named view_00.jpg and so on.
+
+    Args:
+        camera: of all photos.
+        options: the walk; the usual one where None.
+        seed: same seed, same steps.
+    """
     options = options or PastOptions()
     rng = np.random.default_rng([seed, 13])
     count = options.photos
@@ -225,7 +246,12 @@ def panorama(
 
 
 def look_at(center: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> FloatArray:
-    """Return (3, 4) cam_from_world of a camera at `center` (3,) that looks at `aim` (3,), world y up.
+    """Return (3, 4) cam_from_world of a camera that looks at a point, world y up.
+
+    Args:
+        center: (3,) where the camera stands.
+        aim: (3,) what it looks at.
+        roll_deg: degrees about its optical axis.
 
     Raises:
         ValueError: the camera looks straight up or down, so that its roll is undefined.
@@ -245,7 +271,12 @@ def camera_center(cam_from_world: FloatArray) -> FloatArray:
 
 
 def axis_rotation(axis: FloatArray, angle_deg: float) -> FloatArray:
-    """Return (3, 3) rotation about a unit axis (3,), right-handed (Rodrigues)."""
+    """Return (3, 3) rotation about an axis, right-handed (Rodrigues).
+
+    Args:
+        axis: (3,) unit vector.
+        angle_deg: degrees.
+    """
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     angle = math.radians(angle_deg)

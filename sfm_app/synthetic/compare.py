@@ -38,7 +38,13 @@ def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
 def center_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
     """Return e_OC of thesis section 5.5.3: mean error of the optical center's x and y in percent of the truth.
 
-    As above.
+    Args:
+        K: (3, 3) that was found.
+        truth: of the photo folder.
+        photo: whose camera K belongs to; needed where there are several cameras.
+
+    Raises:
+        ValueError: the photos have several cameras and none is named.
     """
     true = truth.cameras[photo].K if photo else truth.K
     return float(50.0 * sum(abs(K[i, 2] / true[i, 2] - 1.0) for i in (0, 1)))
@@ -79,7 +85,15 @@ def surface_accuracy(
 ) -> float:
     """Return share of a reconstructed surface, by area, that lies within `tolerance` scene sizes of the true one.
 
-    Arguments and errors as for `surface_error`.
+    Args:
+        vertices: (V, 3) in the reconstruction's frame.
+        faces: (T, 3) vertex indices.
+        centers: camera center (3,) by photo name, in the frame of `vertices`.
+        truth: of the photo folder.
+        tolerance: share of the scene's size, > 0.
+
+    Raises:
+        ValueError: as for `surface_error`.
     """
     return float(np.mean(_distances_to_truth(vertices, faces, centers, truth) <= tolerance))
 
@@ -93,7 +107,17 @@ def surface_coverage(
 ) -> float:
     """Give share of what photos see of the true surface that has reconstructed surface within `tolerance` scene sizes.
 
-    Weighted as the photos see it: evenly over their pixels. Arguments and errors as for `surface_error`.
+    Weighted as the photos see it: evenly over their pixels.
+
+    Args:
+        vertices: (V, 3) in the reconstruction's frame.
+        faces: (T, 3) vertex indices.
+        centers: camera center (3,) by photo name, in the frame of `vertices`.
+        truth: of the photo folder.
+        tolerance: share of the scene's size, > 0.
+
+    Raises:
+        ValueError: as for `surface_error`.
     """
     aligned = align_centers(centers, truth)(vertices)
     if not _area(aligned, faces).sum() > 0:
@@ -121,6 +145,10 @@ def seen_points(truth: Truth) -> FloatArray:
 def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity:
     """Return the similarity that takes found camera centers to the true ones, not led astray by wrong photos.
 
+    Args:
+        centers: camera center (3,) by photo name, in the reconstruction's frame.
+        truth: of the photo folder.
+
     Raises:
         ValueError: fewer than 3 common photos, or all centers lie on a line.
     """
@@ -136,6 +164,12 @@ def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity
 def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0) -> FloatArray:
     """Return (count, 3) points spread evenly over the triangles.
 
+    Args:
+        vertices: (V, 3).
+        faces: (T, 3) vertex indices.
+        count: points to draw.
+        seed: same seed, same points.
+
     Raises:
         ValueError: the surface has no area.
     """
@@ -145,7 +179,14 @@ def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: in
 def sample_triangles(
     vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0
 ) -> tuple[FloatArray, IndexArray]:
-    """Sample a surface as `sample_surface` does, with the triangle (count,) of each point."""
+    """Sample a surface as `sample_surface` does, with the triangle (count,) of each point.
+
+    Args:
+        vertices: (V, 3).
+        faces: (T, 3) vertex indices.
+        count: points to draw.
+        seed: same seed, same points.
+    """
     area = _area(vertices, faces)
     if not area.sum() > 0:
         raise ValueError("the surface has no area")
@@ -160,7 +201,13 @@ def sample_triangles(
 
 
 def surface_distances(points: FloatArray, vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """Return (N,) distance of points (N, 3) to the nearest place on the triangles; in single precision."""
+    """Return (N,) distance of points to the nearest place on the triangles; in single precision.
+
+    Args:
+        points: (N, 3).
+        vertices: (V, 3).
+        faces: (T, 3) vertex indices.
+    """
     queries = load_open3d().core.Tensor(points.astype(np.float32))
     return np.asarray(ray_caster(vertices, faces).compute_distance(queries).numpy(), dtype=np.float64)
 

@@ -172,8 +172,11 @@ class Tracks:
 def make_pair(options: PairOptions, seed: int) -> TwoViews:
     """Return a random convergent camera pair and its matches, as in thesis section 4.8.
 
-    Both images get Gaussian noise; then a uniform value is added to the outliers in image 2. The outliers stand at
-    random rows.
+    Both images get Gaussian noise; then a uniform value is added in image 2 to the outliers, which are random rows.
+
+    Args:
+        options: sizes, noise and outliers.
+        seed: same seed, same pair.
 
     Raises:
         ConfigError: the options leave no convergent setup.
@@ -198,8 +201,11 @@ def make_pair(options: PairOptions, seed: int) -> TwoViews:
 def make_tracks(options: TrackOptions, seed: int) -> Tracks:
     """Draw cameras of one random K around a common pose, and points that all of them see, as in thesis 5.5.3.
 
-    The thesis speaks of perturbed locations; the orientations are perturbed too, since cameras that only shift
-    leave K undetermined.
+    The orientations are perturbed like the locations, since cameras that only shift leave K undetermined.
+
+    Args:
+        options: sizes, noise and outliers.
+        seed: same seed, same tracks.
 
     Raises:
         ConfigError: the options leave no convergent setup.
@@ -247,7 +253,12 @@ def pair_matches(
 
 
 def random_rotation(rng: np.random.Generator, max_angle_deg: float) -> FloatArray:
-    """Return (3, 3) rotation about a uniformly random axis by a uniformly random angle up to the given one."""
+    """Return (3, 3) rotation about a uniformly random axis by a uniformly random angle.
+
+    Args:
+        rng: where the draws come from.
+        max_angle_deg: degrees, >= 0.
+    """
     return axis_rotation(_direction(rng), rng.uniform(0.0, max_angle_deg))
 
 

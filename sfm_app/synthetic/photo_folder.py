@@ -96,9 +96,16 @@ def write_photo_folder(
     options: PhotoOptions | None = None,
     progress: Progress | None = None,
 ) -> Truth:
-    """Render one JPEG without EXIF per view into `folder`, which is made where it is missing.
+    """Render one JPEG without EXIF per view into a folder.
 
     The truth is not written: it belongs outside the photo folder, see `save_truth`.
+
+    Args:
+        folder: made where it is missing.
+        scene: what is photographed.
+        views: with which cameras and from where.
+        options: quality and noise of the photos; the usual ones where None.
+        progress: told about every photo.
 
     Raises:
         InputError: the folder cannot be written.
@@ -118,7 +125,13 @@ def write_photo_folder(
 
 
 def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Blur, gamma and sensor noise: linear RGB (height, width, 3) to 8 bits."""
+    """Blur the image, then apply gamma and sensor noise: linear RGB to 8 bits.
+
+    Args:
+        image: (H, W, 3) linear RGB, about 0..1.
+        options: blur and noise.
+        rng: where the noise comes from.
+    """
     if options.blur_px > 0:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), options.blur_px), dtype=np.float64)
     levels = 255.0 * np.clip(image, 0.0, 1.0) ** (1.0 / GAMMA)
@@ -127,7 +140,12 @@ def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) 
 
 
 def save_truth(truth: Truth, folder: Path) -> None:
-    """Write truth.json (x ~ K d(R X + t), d the lens) and surface.ply into `folder`, not into that of the photos."""
+    """Write truth.json (x ~ K d(R X + t), d the lens) and surface.ply.
+
+    Args:
+        truth: of the photo folder.
+        folder: made where it is missing; not that of the photos.
+    """
     images = []
     for name, pose in truth.cam_from_world.items():
         width, height, K, radial = _values(truth.cameras[name])

@@ -74,7 +74,13 @@ def render_model(model: Model | PreparedModel, camera: Camera, cam_from_world: F
 
 
 def view_along(model: Model | PreparedModel, origin: FloatArray, directions: FloatArray) -> Picture:
-    """Render as `render_model` does, for any lens: rays from origin (3,) along directions (H, W, 3) of any length."""
+    """Render as `render_model` does, for any lens: one ray per pixel.
+
+    Args:
+        model: in the frame of the rays.
+        origin: (3,) where all rays start.
+        directions: (H, W, 3) of any length, one per pixel.
+    """
     prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
     shape = directions.shape[:2]
     if prepared.rays is None:
@@ -94,7 +100,10 @@ def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: F
 
     Reddish where seen from inside.
 
-    Arguments as for `render_model`.
+    Args:
+        model: in the frame of `cam_from_world`.
+        camera: intrinsics, size and distortion.
+        cam_from_world: (3, 4) pose.
     """
     prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
     shape = camera.height, camera.width
@@ -139,7 +148,13 @@ def beside_photo(photo: Colors, model: Model | PreparedModel, camera: Camera, ca
 
 
 def walked_around(pose: FloatArray, surface: Surface, angle_deg: float) -> FloatArray:
-    """Return the pose of somebody who walked around what a camera looks at, in a frame with y up."""
+    """Return the pose of somebody who walked around what a camera looks at, in a frame with y up.
+
+    Args:
+        pose: (3, 4) cam_from_world of that camera.
+        surface: what it looks at; its median depth is the middle of the walk.
+        angle_deg: degrees about y.
+    """
     R, t = pose[:, :3], pose[:, 3]
     depth = float(np.median(surface.vertices @ R[2] + t[2]))
     middle = R.T @ (np.array([0.0, 0.0, depth]) - t)

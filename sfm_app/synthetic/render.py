@@ -91,7 +91,12 @@ def render_scene(
 
 
 def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
-    """Return open3D's RaycastingScene of one mesh; it works in single precision."""
+    """Return open3D's RaycastingScene of one mesh; it works in single precision.
+
+    Args:
+        vertices: (V, 3).
+        faces: (T, 3) vertex indices.
+    """
     open3d = load_open3d()
     caster = open3d.t.geometry.RaycastingScene()
     tensor = open3d.core.Tensor
@@ -100,9 +105,12 @@ def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
 
 
 def cast(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, NDArray[Any]]:
-    """Return first hits of rays from `origin` (3,) or (N, 3) along `directions` (N, 3), by Open3D's names.
+    """Return first hits of rays, by Open3D's names; t_hit is inf where there is none.
 
-    T_hit inf: none.
+    Args:
+        caster: from `ray_caster`.
+        origin: (3,), or (N, 3) one per ray.
+        directions: (N, 3) of any length; t_hit counts in it.
     """
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3] = origin
@@ -145,10 +153,12 @@ def _openness(caster: Any, vertices: FloatArray, normals: FloatArray) -> FloatAr
 
 @kernel
 def shade(hits: Any, tables: Any, total: NDArray[np.float64]) -> None:
-    """Add the color of every ray to `total` (N, 3), linear RGB.
+    """Add the color of every ray to `total`.
 
-    `hits`: directions (N, 3), primitive ids (N,), barycentric uv (N, 2), pixel size at the hit (N,), in sunlight (N,).
-    `tables`: faces, vertex table, material per face, materials and lights of `PreparedScene`.
+    Args:
+        hits: directions (N, 3), primitive ids (N,), barycentric uv (N, 2), pixel size there (N,), in sunlight (N,).
+        tables: faces, vertex table, material per face, materials and lights of `PreparedScene`.
+        total: (N, 3) linear RGB, changed in place.
     """
     directions, ids, uvs, pixel, lit = hits
     faces, vertex_table, face_material, materials, lights = tables

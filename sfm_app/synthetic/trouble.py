@@ -106,7 +106,11 @@ def troubled_folder(seed: int) -> TroubledFolder:
 
 
 def write_troubled_folder(folder: Path, plan: TroubledFolder) -> Truth:
-    """Render one JPEG per view into `folder`, which is made where it is missing; the truth is not written.
+    """Render one JPEG per view into a folder; the truth is not written.
+
+    Args:
+        folder: made where it is missing.
+        plan: from `troubled_folder`.
 
     Raises:
         InputError: the folder cannot be written.
@@ -131,7 +135,13 @@ def write_troubled_folder(folder: Path, plan: TroubledFolder) -> Truth:
 
 
 def smeared(image: FloatArray, length_px: float, direction: float) -> FloatArray:
-    """Return the image (H, W, 3) of a camera that turned during the exposure: averaged along a line."""
+    """Return the image of a camera that turned during the exposure: averaged along a line.
+
+    Args:
+        image: (H, W, 3) linear RGB.
+        length_px: of the line; below 1 nothing is done.
+        direction: of the line, radians from x to y.
+    """
     if length_px < 1:
         return image
     steps = np.linspace(-0.5, 0.5, 2 * math.ceil(length_px) + 1) * length_px
@@ -152,7 +162,15 @@ Seen = tuple[PreparedScene, FloatArray]
 
 
 def in_front(image: FloatArray, still: Seen, moving: Seen, camera: Camera, supersampling: int) -> FloatArray:
-    """Return the image of the still scene with what moves where that is nearer; it casts no shadow."""
+    """Return the image of the still scene with what moves where that is nearer; it casts no shadow.
+
+    Args:
+        image: (H, W, 3) linear RGB of the still scene.
+        still: scene and pose of the camera in it.
+        moving: the same for what moves.
+        camera: of the image.
+        supersampling: rays per pixel in x and in y, >= 1.
+    """
     depth = []
     for scene, pose in (still, moving):
         directions = pixel_rays(camera) @ pose[:, :3]
@@ -164,7 +182,12 @@ def in_front(image: FloatArray, still: Seen, moving: Seen, camera: Camera, super
 
 
 def pose_after(cam_from_world: FloatArray, world_from_thing: FloatArray) -> FloatArray:
-    """Return (3, 4) pose of the camera in the frame of a thing."""
+    """Return (3, 4) pose of the camera in the frame of a thing.
+
+    Args:
+        cam_from_world: (3, 4) pose of the camera.
+        world_from_thing: (3, 4) place of the thing.
+    """
     R, t = cam_from_world[:, :3], cam_from_world[:, 3]
     return np.column_stack([R @ world_from_thing[:, :3], R @ world_from_thing[:, 3] + t])
 
@@ -201,14 +224,24 @@ def _camera(drawn: set[str], rng: Random) -> Camera:
 
 
 def bent(camera: Camera, bend: float) -> Camera:
-    """Return the camera with a lens that pushes the farthest corner outwards by this share of its distance."""
+    """Return the camera with a lens that pushes the farthest corner outwards.
+
+    Args:
+        camera: of any lens; it is replaced.
+        bend: share of the corner's distance; < 0: inwards.
+    """
     corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
     seen = (corners - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
     return replace(camera, radial=bend / float((seen**2).sum(axis=1).max()))
 
 
 def zoomed(camera: Camera, factor: float) -> Camera:
-    """Return the camera with a longer or shorter lens, which bends lines as before."""
+    """Return the camera with a longer or shorter lens, which bends lines as before.
+
+    Args:
+        camera: before.
+        factor: of the focal length, > 0.
+    """
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= factor
     return replace(camera, K=K, radial=camera.radial * factor**2)

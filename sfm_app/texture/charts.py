@@ -108,7 +108,12 @@ def _find_folds(
 
 
 def components(group: NDArray[np.int64], neighbors: IntArray) -> tuple[IntArray, int]:
-    """Find connected triangles of equal group: (T,) number of component, -1 where the group is -1, and their count."""
+    """Find connected triangles of equal group: (T,) number of component, -1 where the group is -1, and their count.
+
+    Args:
+        group: (T,) triangles of one chart have one number; -1 where there is none.
+        neighbors: (T, 3) triangle across each edge; -1 where there is none.
+    """
     of = np.full(len(group), NONE, np.int32)
     return of, _flood(group, neighbors, of)
 

@@ -27,10 +27,12 @@ class Facets:
 
     @property
     def vertices(self) -> FloatArray:
+        """(V, 3)."""
         return self.surface.vertices
 
     @property
     def faces(self) -> NDArray[np.int64]:
+        """(T, 3) vertex indices."""
         return self.surface.faces
 
 
@@ -52,6 +54,12 @@ def facets(surface: Surface) -> Facets:
 
 
 def at_vertices(values: FloatArray, faces: NDArray[np.int64], size: int) -> FloatArray:
-    """Return (V,) sum over the corners of triangles of one value per triangle (T,) or per corner (T, 3)."""
+    """Return (V,) sum over the corners of triangles.
+
+    Args:
+        values: (T,) one per triangle, or (T, 3) one per corner.
+        faces: (T, 3) vertex indices.
+        size: how many vertices there are.
+    """
     per_corner = np.broadcast_to(values[:, None] if values.ndim == 1 else values, faces.shape)
     return np.asarray(np.bincount(faces.ravel(), per_corner.ravel(), size), np.float64)

@@ -195,9 +195,13 @@ def finished(page: Canvas) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
 
 
 def fill_background(page: NDArray[np.uint8], painted: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Return texels that nobody owns take the mean color of what is painted in the smallest block around them.
+    """Fill texels that nobody owns with the mean color of what is painted in the smallest block around them.
 
     Blocks are those of mip maps, so a page made smaller by a viewer keeps its colors up to the rim of the charts.
+
+    Args:
+        page: (H, W, 3) RGB.
+        painted: (H, W) where a texel is owned.
     """
     if painted.all() or min(page.shape[:2]) < 2:
         return page

@@ -25,4 +25,9 @@ class Store(Protocol):
         """Return what was kept under a name, if anything was."""
 
     def keep(self, name: str, /, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Keep arrays under a name in place of what was there, complete or not at all."""
+        """Keep arrays under a name in place of what was there, complete or not at all.
+
+        Args:
+            name: of the group.
+            arrays: by name.
+        """

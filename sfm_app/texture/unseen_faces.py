@@ -63,7 +63,13 @@ def block_sizes(triangles: int) -> NDArray[np.int32]:
 
 
 def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int) -> NDArray[np.int64]:
-    """Return (N, 3) page, x and y of the square of each triangle, row by row through the blocks."""
+    """Return (N, 3) page, x and y of the square of each triangle, row by row through the blocks.
+
+    Args:
+        places: (B, 3) page, left and top of each block, in texels.
+        sizes: (B, 2) from `block_sizes`.
+        triangles: how many need a square.
+    """
     found: list[NDArray[np.int64]] = []
     for number, ((page, left, top), (width, _)) in enumerate(zip(places, sizes, strict=True)):
         count = min(triangles - number * BLOCK * BLOCK, BLOCK * BLOCK)

@@ -40,7 +40,12 @@ class PhotoView:
         return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3], np.float64)
 
     def scaled(self, width: int, height: int) -> "PhotoView":
-        """Return the same view in a photo of another size."""
+        """Return the same view in a photo of another size.
+
+        Args:
+            width: pixels, > 0.
+            height: pixels, > 0.
+        """
         sx, sy = width / self.width, height / self.height
         fx, fy, cx, cy, *rest = self.lens
         return replace(self, lens=(fx * sx, fy * sy, cx * sx, cy * sy, *rest), width=width, height=height)
@@ -48,6 +53,11 @@ class PhotoView:
 
 def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> PhotoView:
     """Return the view of a registered photo.
+
+    Args:
+        name: of the photo.
+        camera: of the model OPENCV.
+        cam_from_world: (3, 4) [R | t].
 
     Raises:
         ReconstructionError: the camera has another model than OPENCV, to which every run adjusts its cameras.
@@ -62,6 +72,12 @@ def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, fl
     """Return pixel of a world point, and its depth.
 
     0 where the point is behind the camera or beyond what the lens maps.
+
+    Args:
+        camera: (20,) from `PhotoView.row`.
+        x: in the world.
+        y: in the world.
+        z: in the world.
     """
     depth = camera[16] * x + camera[17] * y + camera[18] * z + camera[19]
     if depth <= 0.0:
@@ -80,7 +96,14 @@ def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, fl
 
 @kernel
 def sample(photo: NDArray[np.uint8], x: float, y: float, channel: int) -> float:
-    """Return bilinear value at a pixel position; the border's value beyond the border."""
+    """Return bilinear value at a pixel position; the border's value beyond the border.
+
+    Args:
+        photo: (H, W, 3) RGB.
+        x: pixels across; centers at +0.5.
+        y: pixels down; centers at +0.5.
+        channel: 0, 1 or 2.
+    """
     height, width = photo.shape[0], photo.shape[1]
     x = min(max(x - 0.5, 0.0), width - 1.0)
     y = min(max(y - 0.5, 0.0), height - 1.0)

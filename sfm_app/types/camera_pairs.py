@@ -31,7 +31,13 @@ class CameraPairs:
 
     @classmethod
     def of(cls, Fs: ArrayLike, size: tuple[int, int], weights: ArrayLike | None = None) -> "CameraPairs":
-        """Make pairs from matrices alone, all trusted alike unless `weights` (P,) says otherwise."""
+        """Make pairs from matrices alone.
+
+        Args:
+            Fs: (P, 3, 3) in pixels, x2' F x1 = 0, any scale.
+            size: width and height of the photos in pixels.
+            weights: (P,) >= 0; all trusted alike where None.
+        """
         matrices = np.asarray(Fs, np.float64)
         return cls(matrices, np.ones(len(matrices)) if weights is None else np.asarray(weights, np.float64), size)
 

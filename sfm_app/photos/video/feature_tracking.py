@@ -62,7 +62,12 @@ class Follower:
         self._recent: deque[float] = deque(maxlen=RECENT)
 
     def look(self, frame: int, gray: Picture) -> TrackedFrame:
-        """Return the next frame; all are of one size."""
+        """Measure the next frame: how sharp it is, and how far the picture has moved on.
+
+        Args:
+            frame: its number.
+            gray: (H, W); all frames are of one size.
+        """
         sharpness = float(cv2.Laplacian(gray, cv2.CV_32F).var())
         self._recent.append(sharpness)
         if self._reference is None or len(self._corners) < FEWEST:

@@ -47,7 +47,12 @@ def corner() -> SyntheticScene:
 
 
 def corner_views(camera: Camera, seed: int = 0) -> Views:
-    """Return 14 hand-held photos from the other half of the room."""
+    """Return 14 hand-held photos from the other half of the room.
+
+    Args:
+        camera: of all photos.
+        seed: same seed, same steps.
+    """
     walk = ArcOptions(
         photos=14, sweep_deg=70.0, distance=(1.9, 2.9), height=(1.0, 1.9), aim=(0.0, 0.95, -0.9), aim_spread=0.3,
         roll_deg=4.0,

@@ -49,7 +49,12 @@ def facade() -> SyntheticScene:
 
 
 def facade_views(camera: Camera, seed: int = 0) -> Views:
-    """Return 12 hand-held photos along the street."""
+    """Return 12 hand-held photos along the street.
+
+    Args:
+        camera: of all photos.
+        seed: same seed, same steps.
+    """
     return past(camera, PastOptions(length=8.5, distance=(6.6, 8.4), height=(1.3, 2.6), aim=(2.5, 3.5)), seed)
 
 

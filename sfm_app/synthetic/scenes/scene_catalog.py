@@ -39,6 +39,10 @@ def build_scene(name: str = "courtyard") -> SyntheticScene:
 def scene_views(name: str = "courtyard", seed: int = 0) -> Views:
     """Return the photos of the walk through that scene.
 
+    Args:
+        name: of a scene in `WALKS`.
+        seed: same seed, same steps.
+
     Raises:
         ConfigError: there is none; names the known ones.
     """

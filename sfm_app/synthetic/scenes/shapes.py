@@ -29,13 +29,26 @@ class Shape:
     def moved(
         self, to: tuple[float, float, float] = (0.0, 0.0, 0.0), turn_deg: float = 0.0, tilt_deg: float = 0.0
     ) -> "Shape":
-        """Tilt about x, then turn about y (right-handed, degrees), then move."""
+        """Tilt about x, then turn about y, then move.
+
+        Args:
+            to: translation along x, y and z.
+            turn_deg: about y, right-handed.
+            tilt_deg: about x, right-handed.
+        """
         R = axis_rotation(np.array([0.0, 1.0, 0.0]), turn_deg) @ axis_rotation(np.array([1.0, 0.0, 0.0]), tilt_deg)
         return Shape(self.vertices @ R.T + to, self.faces, self.normals @ R.T, self.texture)
 
 
 def box(width: float, height: float, depth: float, spacing: float = 0.15) -> Shape:
-    """Return a box centered in x and z that stands on y = 0, its sides cut into squares of about `spacing`."""
+    """Return a box centered in x and z that stands on y = 0, its sides cut into squares.
+
+    Args:
+        width: along x.
+        height: along y.
+        depth: along z.
+        spacing: side of a square, about.
+    """
     size = np.array([width, height, depth])
     parts = []
     for axis in range(3):
@@ -73,14 +86,26 @@ def revolved(
 
 
 def torus(radius: float, tube: float, span_deg: float = 360.0) -> Shape:
-    """Return a ring of round section about the y axis, centered at the origin."""
+    """Return a ring of round section about the y axis, centered at the origin.
+
+    Args:
+        radius: from the axis to the middle of the tube.
+        tube: radius of the tube.
+        span_deg: how far around, in degrees.
+    """
     angle = np.linspace(0.0, 2.0 * math.pi, 25)
     section = np.column_stack([radius + tube * np.cos(angle), tube * np.sin(angle)])
     return revolved(section, segments=max(8, round(span_deg / 5.0)), span_deg=span_deg)
 
 
 def arch(radius: float, thickness: float, depth: float) -> Shape:
-    """Make half a ring of square section standing on y = 0 across x, its back at z = 0."""
+    """Make half a ring of square section standing on y = 0 across x, its back at z = 0.
+
+    Args:
+        radius: of the opening.
+        thickness: of the ring, outwards.
+        depth: along z.
+    """
     inner, outer = radius, radius + thickness
     section = np.array([[inner, 0.0], [outer, 0.0], [outer, depth], [inner, depth], [inner, 0.0]])
     lying = revolved(section, segments=40, span_deg=180.0, sharp=True)
@@ -91,7 +116,14 @@ def arch(radius: float, thickness: float, depth: float) -> Shape:
 
 
 def ball(radius: float, segments: int = 96, bumps: float = 0.0, seed: int = 0) -> Shape:
-    """Return a sphere around the origin; `bumps` is the depth of random dents as a share of the radius."""
+    """Return a sphere around the origin.
+
+    Args:
+        radius: before the dents.
+        segments: steps around the axis.
+        bumps: depth of random dents as a share of the radius.
+        seed: same seed, same dents.
+    """
     angle = np.linspace(-0.5, 0.5, segments // 2 + 1) * math.pi
     round_ball = _turned(np.column_stack([np.cos(angle), np.sin(angle)]), segments, 360.0, (0, 0.0))
     dents = waves(round_ball[0], seed)
@@ -99,7 +131,12 @@ def ball(radius: float, segments: int = 96, bumps: float = 0.0, seed: int = 0) -
 
 
 def waves(points: FloatArray, seed: int) -> FloatArray:
-    """Return smooth noise of unit variance at points (N, 3): cosines of 24 directions, 0.7 to 3 units long."""
+    """Return (N,) smooth noise of unit variance: cosines of 24 directions, 0.7 to 3 units long.
+
+    Args:
+        points: (N, 3).
+        seed: same seed, same noise.
+    """
     rng = np.random.default_rng([seed, 7])
     vectors = rng.normal(size=(24, 3)) * np.linspace(2.0, 9.0, 24)[:, None]
     found = np.cos(points @ vectors.T + rng.uniform(0.0, 2.0 * math.pi, 24)).sum(axis=1) / math.sqrt(12.0)
@@ -143,7 +180,14 @@ def assembled(parts: Sequence[Shape]) -> Shape:
 
 
 def ground(x: tuple[float, float], z: tuple[float, float], unevenness: float, spacing: float = 0.1) -> Shape:
-    """Return an uneven floor around y = 0, its heights within about +-unevenness."""
+    """Return an uneven floor around y = 0.
+
+    Args:
+        x: from and to.
+        z: from and to.
+        unevenness: largest height, about.
+        spacing: side of a square, about.
+    """
     xs, zs = (np.linspace(a, b, 1 + max(1, round((b - a) / spacing))) for a, b in (x, z))
     grid, faces = _grid(zs, xs)
     height = np.sin(1.3 * grid[:, 1] + 0.7) * np.sin(1.7 * grid[:, 0] + 2.1) + 0.5 * np.sin(3.1 * grid.sum(axis=1))

@@ -55,7 +55,13 @@ def statue() -> SyntheticScene:
 
 
 def statue_views(camera: Camera, seed: int = 0, photos: int = 22) -> Views:
-    """Return hand-held photos all round."""
+    """Return hand-held photos all round.
+
+    Args:
+        camera: of all photos.
+        seed: same seed, same steps.
+        photos: how many, >= 2.
+    """
     walk = ArcOptions(
         photos=photos, sweep_deg=344.0, distance=(3.3, 4.3), height=(1.0, 2.9), aim=(0.0, 1.2, 0.0), aim_spread=0.2,
         roll_deg=5.0,

@@ -86,7 +86,12 @@ def alike(copies: list[Shape]) -> Shape:
 
 
 def faded(scene: SyntheticScene, strength: float) -> SyntheticScene:
-    """Return the scene with colors that differ by this share of what they did: plain things, few features."""
+    """Return the scene with colors that differ less: plain things, few features.
+
+    Args:
+        scene: before.
+        strength: share in [0, 1] of the differences that stays.
+    """
     return replace(scene, bodies=tuple(Body(body.shape, _pale(body.material, strength)) for body in scene.bodies))
 
 

@@ -43,7 +43,14 @@ class Material:
 
 @kernel
 def lattice(ix: int, iy: int, iz: int, seed: int) -> float:
-    """Return a number in [0, 1) that belongs to a lattice point; wraps after 2^32."""
+    """Return a number in [0, 1) that belongs to a lattice point; wraps after 2^32.
+
+    Args:
+        ix: step along x.
+        iy: step along y.
+        iz: step along z.
+        seed: another seed, other numbers.
+    """
     h = uint32(ix) * uint32(0x8DA6B343) ^ uint32(iy) * uint32(0xD8163841)
     h = uint32(h ^ uint32(iz) * uint32(0xCB1AB31F) ^ uint32(seed) * uint32(0x165667B1))
     h = uint32((h ^ (h >> uint32(15))) * uint32(0x2C1B3C6D))
@@ -54,7 +61,14 @@ def lattice(ix: int, iy: int, iz: int, seed: int) -> float:
 
 @kernel
 def value_noise(x: float, y: float, z: float, seed: int) -> float:
-    """Return smooth noise in [-1, 1) on the unit lattice (Perlin's interpolation of lattice values)."""
+    """Return smooth noise in [-1, 1) on the unit lattice (Perlin's interpolation of lattice values).
+
+    Args:
+        x: in lattice steps.
+        y: in lattice steps.
+        z: in lattice steps.
+        seed: another seed, another noise.
+    """
     fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
     ix, iy, iz = int(fx), int(fy), int(fz)
     u, v, w = x - fx, y - fy, z - fz
@@ -71,7 +85,12 @@ def value_noise(x: float, y: float, z: float, seed: int) -> float:
 def octaves(p: tuple[float, float, float], size: float, gain: float, footprint: float, seed: int) -> float:
     """Return noise summed over halving sizes, from `size` down to the size of a pixel; about -1..1.
 
-    `footprint` is the pixel's size on the surface; octaves fade out between twice that size and that size.
+    Args:
+        p: place (x, y, z).
+        size: of the broadest noise, > 0.
+        gain: amplitude of each octave over the one before, in (0, 1).
+        footprint: size of a pixel on the surface; octaves fade out between twice that size and that size.
+        seed: another seed, another noise.
     """
     total = 0.0
     amplitude = 1.0
@@ -90,6 +109,11 @@ def cells(a: float, b: float, seed: int) -> tuple[float, float]:
     """Return random cells in the plane.
 
     Distance to the border of the cell, in cells, and a number in [0, 1) that names it.
+
+    Args:
+        a: across, in cells.
+        b: up, in cells.
+        seed: another seed, other cells.
     """
     ia, ib = math.floor(a), math.floor(b)
     first, second, name = 9.0, 9.0, 0.0
@@ -107,7 +131,13 @@ def cells(a: float, b: float, seed: int) -> tuple[float, float]:
 
 @kernel
 def bricks(a: float, b: float, seed: int) -> tuple[float, float]:
-    """Return bricks twice as long as high, in running bond: as `cells`, in brick heights."""
+    """Return bricks twice as long as high, in running bond: as `cells`, in brick heights.
+
+    Args:
+        a: along the row, in brick heights.
+        b: up, in brick heights.
+        seed: another seed, other names.
+    """
     row = math.floor(b)
     a = 0.5 * a + 0.5 * (row % 2.0)
     column = math.floor(a)
@@ -128,6 +158,13 @@ def tiles(
     """Return bricks on upright walls (1), slabs on the ground (2), leaves along the axis they face most (6).
 
     As `cells`.
+
+    Args:
+        kind: 1, 2 or 6, as above.
+        p: place on the body before it was moved.
+        n: unit normal there.
+        scale: size of a tile, > 0.
+        seed: another seed, other tiles.
     """
     if kind == 6:
         if abs(n[1]) >= max(abs(n[0]), abs(n[2])):
@@ -145,6 +182,10 @@ def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
     """Return Greek pottery: share of the second color (glaze), share of the thin lines.
 
     Bands by height, figures by angle.
+
+    Args:
+        p: place on the body before it was moved.
+        scale: height of a band, > 0.
     """
     band = p[1] / scale
     row = math.floor(band)
@@ -171,7 +212,11 @@ def mixture(
 ) -> tuple[float, float, float]:
     """Return share of the second color, share of the joint color, and brightness (about 1) at a place of a body.
 
-    `row` is `Material.row()`, `p` the place and `n` the unit normal on the body before it was moved.
+    Args:
+        row: from `Material.row()`.
+        p: place on the body before it was moved.
+        n: unit normal there.
+        footprint: size of a pixel on the surface.
     """
     kind, scale, contrast, seed = int(row[0]), row[1], row[2], int(row[3])
     fine = octaves(p, 0.4 * scale, 0.72, footprint, seed + 20)

@@ -8,9 +8,13 @@ from sfm_app.jit import kernel
 
 @kernel
 def median(values: NDArray[np.float64], count: int) -> float:
-    """Return the median of the first `count` >= 1 values, which it sorts in place.
+    """Return the median of the first values, which it sorts in place.
 
     NumPy's sort takes seconds to compile.
+
+    Args:
+        values: (N,) changed.
+        count: how many count, 1 to N.
     """
     for k in range(1, count):
         value, at = values[k], k

@@ -89,7 +89,12 @@ def _blocked(
 
 
 def sharpness(photo: NDArray[np.uint8], used: NDArray[np.bool_] | None = None) -> float:
-    """Return ratio of the energies of the Laplacian at full and at half size, where the photo may be used; >= 0."""
+    """Return ratio of the energies of the Laplacian at full and at half size, where the photo may be used; >= 0.
+
+    Args:
+        photo: (H, W, 3) RGB.
+        used: (H, W) which pixels may be used; all where None.
+    """
     gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
     half = cv2.resize(gray, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
     fine, coarse = (_energy(part, used) for part in (gray, half))
