@@ -9,6 +9,7 @@ from sfm_app.colmap.backend import versions as colmap_versions
 from sfm_app.engine.stage import Stage
 from sfm_app.hashing import fingerprint
 from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.manifest import PROGRAM
 
 OTHER_PHOTOS = "the photos have changed"
 CHANGES = 3
@@ -82,7 +83,7 @@ def value_of(values: Any, key: str) -> Any:
 
 def manifest_head(run: RunContext) -> dict[str, Any]:
     """Return what the manifest says besides the stages."""
-    return {"program": "sfm-app", "versions": versions(), "settings": run.settings.model_dump()}
+    return {"program": PROGRAM, "versions": versions(), "settings": run.settings.model_dump()}
 
 
 def versions() -> dict[str, str]:

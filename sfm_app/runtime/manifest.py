@@ -11,7 +11,7 @@ from sfm_app.errors import InputError
 from sfm_app.hashing import fingerprint
 from sfm_app.numerical import json_text
 
-MANIFEST = "manifest.json"
+MANIFEST, PROGRAM = "manifest.json", "sfm-app"
 FORMAT = 2
 """Raised when what stages leave can no longer be read by an earlier or later program."""
 CHECK = "check"
@@ -61,7 +61,7 @@ class Manifest:
             InputError: another version has made it.
         """
         found = self.read()
-        if found.get("stages") and found.get("format") != FORMAT:
+        if found.get("stages") and found.get("program") == PROGRAM and found.get("format") != FORMAT:
             raise InputError(
                 f"the run in {self.root} was made by another version of sfm-app",
                 hint="name another output folder with -o, or remove this one",

@@ -75,12 +75,14 @@ def test_a_run_of_another_version_is_refused_in_one_line(manifest, found):
     finish(manifest)
     manifest.check_format()
     known = json.loads(manifest.path.read_text())
-    manifest.path.write_text(json.dumps({**known, "format": found}))
+    manifest.path.write_text(json.dumps({**known, "format": found, "program": "sfm-app"}))
 
     with pytest.raises(InputError, match="made by another version") as err:
         manifest.check_format()
     assert "-o" in err.value.hint and "\n" not in str(err.value)
 
 
-def test_a_folder_without_a_run_has_no_format(manifest):
+def test_a_folder_without_a_run_of_ours_has_no_format(manifest):
+    manifest.check_format()
+    manifest.write({"program": "another", "format": 1, "stages": {"photos": {}}})
     manifest.check_format()
