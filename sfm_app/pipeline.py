@@ -125,8 +125,7 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
     """Return the finished model, or the points and cameras, that a run left behind; nothing is computed.
 
     Args:
-        run: the finished run.
-        points: whether the points and cameras are asked for, not the textured surface.
+        run, points: the finished run; whether points and cameras are asked for, not the textured surface.
 
     Raises:
         InputError: the run has not come so far (says which stage is missing), or its files are gone or damaged.

@@ -30,9 +30,7 @@ def undistort(
     """Write photos without distortion and the model that fits them into a dense workspace.
 
     Args:
-        model_dir: COLMAP model.
-        photo_dir: folder with the photos.
-        dense_dir: dense workspace; made if it is missing.
+        model_dir, photo_dir, dense_dir: COLMAP model; the photos; dense workspace, made if it is missing.
         max_side_px: longer sides are scaled down to it.
         workers: threads.
         progress: shows a bar.

@@ -289,8 +289,7 @@ def read_scene(
 
     Args:
         model_dir: COLMAP's model.
-        names: the camera by photo.
-        unregistered: why photos have no pose, by photo.
+        names, unregistered: by photo, its camera, and why it has no pose.
         refined: by camera; others are left without.
     """
     model = pycolmap.Reconstruction(model_dir)

@@ -17,9 +17,7 @@ def find_intrinsics(
     """Find K and lens of every camera, and which photos are whose; what is not identifiable falls back to a guess.
 
     Args:
-        matches: keypoints and raw matches.
-        views: fundamental matrices.
-        run: the run.
+        matches, views, run: keypoints and raw matches; fundamental matrices; the run.
     """
     options = run.settings.calibration
     calibrator = run.plugins.calibrator(options.calibrator)

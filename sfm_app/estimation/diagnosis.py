@@ -75,8 +75,7 @@ def why_no_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) 
     """Return the main reason why photos cannot be reconstructed.
 
     Args:
-        matches: all photos and their matches.
-        views: what became of the pairs; empty where no two photos have matches.
+        matches, views: all photos; what became of the pairs, empty where no two photos have matches.
         options: those under which features were looked for.
     """
     if views.fits:

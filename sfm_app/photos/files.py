@@ -17,8 +17,7 @@ def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: S
     Hidden folders and links to folders are not entered and count as one file. The output folder is left out.
 
     Args:
-        folder: of photos.
-        out: output folder; may lie in it.
+        folder, out: of photos; output folder, which may lie in it.
         listed_in: text file that names those to look at, one per line, as seen from the folder; all where None.
         closed: other folders that are left out, like that for the output.
 
@@ -53,8 +52,7 @@ def place_of(folder: Path, name: str) -> Path | str:
     """Return where a file really is, links followed, or why it is not opened.
 
     Args:
-        folder: of the photos; nothing outside it is opened.
-        name: path inside the folder.
+        folder, name: of the photos, nothing outside it is opened; path inside the folder.
     """
     root, place = folder.resolve(), folder / name
     if Path(name).name.startswith("."):

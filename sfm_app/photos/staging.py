@@ -39,9 +39,7 @@ def lay_out(photo: Photo, folder: Path, target: Path) -> None:
     """Put one photo where COLMAP reads it.
 
     Args:
-        photo: as it was read.
-        folder: of the photos.
-        target: folder that gets the link or copy.
+        photo, folder, target: as it was read; of the photos; folder that gets the link or copy.
 
     Raises:
         OSError: the target cannot be written.

@@ -134,8 +134,7 @@ def focal_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
     """Return fx and fy, with the optical center where it was found.
 
     Args:
-        camera: what was found, in pixels.
-        pairs: of this camera, without lens distortion.
+        camera, pairs: what was found, in pixels; pairs of it, without lens distortion.
     """
     unit, (low, high) = _unit(camera), FOCALS_SHOWN
     (fx, _, cx), (_, fy, cy), _ = camera.K

@@ -114,12 +114,10 @@ def make_camera(
     """Return a camera about which a guess goes wrong: its optical center is not the middle of the photo.
 
     Args:
-        width: pixels, >= 16.
-        height: pixels, >= 16.
+        width, height: pixels, >= 16.
         focal_widths: fx as a share of the width, > 0.
         center: optical center as shares of width and height.
-        aspect: fy / fx, > 0.
-        radial: k1 as in `Camera`.
+        aspect, radial: fy / fx, > 0; k1 as in `Camera`.
 
     Raises:
         ConfigError: a value is out of range.

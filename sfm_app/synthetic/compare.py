@@ -64,8 +64,7 @@ def surface_error(
     missing: see `surface_coverage`.
 
     Args:
-        vertices: (V, 3) in the reconstruction's frame.
-        faces: (T, 3) vertex indices.
+        vertices, faces: (V, 3) in the reconstruction's frame, and (T, 3) vertex indices.
         centers: camera center (3,) by photo name in the frame of `vertices`; at least 3 photos of the truth.
         truth: of the photo folder.
         samples: points drawn evenly from the surface (fixed seed).

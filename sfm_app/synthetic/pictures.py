@@ -96,9 +96,7 @@ def view_along(model: Model | PreparedModel, origin: FloatArray, directions: Flo
 
 
 def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
-    """Return the bare shape in gray, each triangle lit by itself, so that every bump shows.
-
-    Reddish where seen from inside.
+    """Return the bare shape in gray, each triangle lit by itself, so that every bump shows; reddish from inside.
 
     Args:
         model: in the frame of `cam_from_world`.

@@ -75,9 +75,7 @@ def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, fl
 
     Args:
         camera: (20,) from `PhotoView.row`.
-        x: in the world.
-        y: in the world.
-        z: in the world.
+        x, y, z: in the world.
     """
     depth = camera[16] * x + camera[17] * y + camera[18] * z + camera[19]
     if depth <= 0.0:

@@ -30,8 +30,7 @@ def choose(looks: Sequence[TrackedFrame], most: int) -> Choice:
     """Return one frame per step of the way; steps are longer where that would be more than `most` frames.
 
     Args:
-        looks: of all frames that were looked at, in their order.
-        most: frames, >= 2.
+        looks, most: of all frames that were looked at, in their order; frames, >= 2.
     """
     way = np.array([look.way for look in looks], np.float64)
     sharpness = np.array([look.sharpness for look in looks], np.float64)
@@ -56,8 +55,7 @@ def sharpest(way: FloatArray, sharpness: FloatArray, spacing: float) -> tuple[li
     """Return the sharpest frame around every multiple of a spacing, and all those that it was chosen from.
 
     Args:
-        way: (N,) steps.
-        sharpness: (N,).
+        way, sharpness: (N,) steps, and (N,).
         spacing: steps, >= 1.
     """
     chosen: list[int] = []

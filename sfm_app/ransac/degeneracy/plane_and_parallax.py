@@ -29,8 +29,7 @@ def with_another_epipole(
     """Return the best model that shares the dominant plane of F's inliers; None without a plane and two matches off it.
 
     Args:
-        points: (N, 4) in random order.
-        F: (3, 3).
+        points, F: (N, 4) in random order, and (3, 3).
         threshold: largest distance of an inlier.
         loss: the penalty.
         pretest: the test that a model has to pass; not one with a random start.

@@ -56,8 +56,7 @@ def distances(
         matches: (M, 4) of all pairs, one after the other.
         ends: (P + 1,) where each pair begins, and the end of the last.
         thetas: (C, 5) parameters of the cameras.
-        cameras: (P, 2) camera of view 1 and of view 2.
-        poses: (P, 12), see `essential`.
+        cameras, poses: (P, 2) camera of view 1 and of view 2; (P, 12), see `essential`.
     """
     E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
     p, q = np.empty(7), np.empty(7)

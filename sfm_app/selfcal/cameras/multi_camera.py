@@ -218,8 +218,7 @@ def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> 
     same from what each camera wants by itself, which loops of messages do not always outdo.
 
     Args:
-        own: (C, G) what each camera gains by itself.
-        between: (G, G) what two cameras i < j gain together, by (i, j).
+        own, between: (C, G) what each camera gains by itself; (G, G) what two, i < j, gain together, by (i, j).
     """
     tables = {(i, j): table for (i, j), table in between.items()} | {(j, i): t.T for (i, j), t in between.items()}
     messages = {edge: np.zeros(own.shape[1]) for edge in tables}
