@@ -52,7 +52,7 @@ GROUPS: Mapping[str, Group] = {
         "docs/algorithms.md, Mapping; sets are not written down",
     ),
     "bundle adjustment: priors, misfit, settling": Group(
-        ("geometry.bundle", "selfcal.lens_evidence", "colmap.bundle"), WITH_TRUTH, "",
+        ("bundle_adjustment.normal_equations", "bundle_adjustment.lens_evidence", "colmap.bundle"), WITH_TRUTH, "",
         "docs/algorithms.md, Bundle adjustment; rendered folders only checked it",
     ),
     "upright: cues, lines, roll": Group(

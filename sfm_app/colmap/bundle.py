@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from sfm_app.bundle_adjustment.lens_evidence import PARTS, LensEstimate, LensPriors, estimate
+from sfm_app.bundle_adjustment.normal_equations import FX, FY, POSE, Bundle, Reduced, cost, lost_points, moved, reduce
 from sfm_app.colmap.backend import backend, patiently, pycolmap
 from sfm_app.colmap.database import TWO_FOCALS, camera_params, opened
 from sfm_app.colmap.model import somewhere
 from sfm_app.colmap.types import all_cameras, all_points
 from sfm_app.errors import NumericalError
-from sfm_app.geometry.bundle import FX, FY, POSE, Bundle, Reduced, cost, lost_points, moved, reduce
 from sfm_app.numerical import FAILURES, finite_only, reason_of
-from sfm_app.selfcal.lens_evidence import PARTS, CameraPriors, Estimate, estimate
 
 logger = logging.getLogger("sfm_app")
 
@@ -174,7 +174,7 @@ def read_bundle(model: pycolmap.Reconstruction) -> tuple[list[int], Bundle]:
     )
 
 
-def _best_step(bundle: Bundle, reduced: Reduced, found: Estimate) -> Bundle:
+def _best_step(bundle: Bundle, reduced: Reduced, found: LensEstimate) -> Bundle:
     """Return the bundle with the estimated cameras.
 
     Poses and points follow, where that is no worse than if they stayed.
@@ -202,13 +202,13 @@ def _write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle
         model.points3D[point].xyz = xyz
 
 
-def _usual_cameras(model: pycolmap.Reconstruction, ids: list[int]) -> CameraPriors:
+def _usual_cameras(model: pycolmap.Reconstruction, ids: list[int]) -> LensPriors:
     """Return what is believed about cameras before the bundle is asked."""
     used = used_cameras(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
     many = np.array([used[camera_id] >= PHOTOS_TO_ASK for camera_id in ids])
     asked = many[:, None] | np.array([part.name == "k1" for part in PARTS])
-    return CameraPriors(sizes / 2, sizes.max(axis=1), asked)
+    return LensPriors(sizes / 2, sizes.max(axis=1), asked)
 
 
 def used_cameras(model: pycolmap.Reconstruction) -> Counter[int]:
@@ -232,7 +232,7 @@ def _correspondences(model: pycolmap.Reconstruction, database: Path) -> pycolmap
         return pycolmap.DatabaseCache.create(db, options).correspondence_graph
 
 
-def _summary(ids: list[int], found: Estimate) -> tuple[dict[int, dict[str, float]], dict[int, tuple[str, ...]]]:
+def _summary(ids: list[int], found: LensEstimate) -> tuple[dict[int, dict[str, float]], dict[int, tuple[str, ...]]]:
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
     deviations = {
         camera_id: finite_only(dict(zip(names, map(float, values), strict=True)))

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from sfm_app.bundle_adjustment.normal_equations import reduce
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import LOSS_SCALE_PX, adjust, read_bundle, solve
 from sfm_app.colmap.database import camera_params
-from sfm_app.geometry.bundle import reduce
 from sfm_app.geometry.camera import camera_matrix
 
 pytestmark = pytest.mark.slow

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.geometry.bundle import Bundle, project, reduce
-from sfm_app.selfcal.lens_evidence import PARTS, CameraPriors, estimate
+from sfm_app.bundle_adjustment.lens_evidence import PARTS, LensPriors, estimate
+from sfm_app.bundle_adjustment.normal_equations import Bundle, project, reduce
 
 SIZE = np.array([1000.0, 800.0])
 PLAIN = (900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0)
@@ -51,7 +51,7 @@ def asked(*cameras):
     """All about some cameras, of others only k1."""
     only_k1 = np.array([name == "k1" for name in NAMES])
     rows = np.array([only_k1 | bool(all_of) for all_of in cameras])
-    return CameraPriors(np.tile(SIZE / 2, (len(rows), 1)), np.full(len(rows), SIZE.max()), rows)
+    return LensPriors(np.tile(SIZE / 2, (len(rows), 1)), np.full(len(rows), SIZE.max()), rows)
 
 
 def answer(bundle, *cameras):

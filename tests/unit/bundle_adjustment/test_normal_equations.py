@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.geometry.bundle import LOST_PX, Bundle, cost, in_sight, lost_points, project, reduce
+from sfm_app.bundle_adjustment.normal_equations import LOST_PX, Bundle, cost, in_sight, lost_points, project, reduce
 
 CAMERA = np.array([[900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]])
 SCALE_PX = 0.5

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.bundle import CAMERA, CX, CY, FX, FY, K1, K2, P1, P2, Reduced
+from sfm_app.bundle_adjustment.normal_equations import CAMERA, CX, CY, FX, FY, K1, K2, P1, P2, Reduced
 from sfm_app.geometry.spd_solve import inverse_of_positive, inverses_of_positive
 from sfm_app.selfcal.adjustment.camera_priors import ASPECT, CENTER, FREE_SHARE, LENS, NARROW, WIDE
 
@@ -74,7 +74,7 @@ adjustment)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CameraPriors:
+class LensPriors:
     """What is believed about the cameras before the bundle is asked, one row each."""
 
     centers: FloatArray
@@ -106,7 +106,7 @@ class CameraPriors:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Estimate:
+class LensEstimate:
     """Where the cameras are most probably."""
 
     params: FloatArray
@@ -123,7 +123,7 @@ class Estimate:
     """(C,) cameras that would have run away: they stay, and nothing about them counts as determined."""
 
 
-def estimate(params: FloatArray, reduced: Reduced, priors: CameraPriors) -> Estimate:
+def estimate(params: FloatArray, reduced: Reduced, priors: LensPriors) -> LensEstimate:
     """Return the most probable cameras, with the most probable choice of freed parts; undetermined parts stay.
 
     The deviations are those of all parts, about the value that was chosen, even where that is the present one, and over
@@ -155,7 +155,7 @@ def estimate(params: FloatArray, reduced: Reduced, priors: CameraPriors) -> Esti
     moved, held = _moved(params, step.reshape(params.shape), priors.sides)
     deviations[held] = np.maximum(deviations[held], _unknown(params, priors)[held])
     determined[held] = False
-    return Estimate(
+    return LensEstimate(
         np.where(held[:, None], params, moved), deviations, free & determined, determined,
         float(np.max(largest.reshape(params.shape)[~held], initial=0.0)), held,
     )  # fmt: skip
@@ -182,12 +182,12 @@ def _posterior(
 
 
 def _determined(covariance: FloatArray, precision: FloatArray) -> BoolArray:
-    """Return (C, 5) as in `Estimate`."""
+    """Return (C, 5) as in `LensEstimate`."""
     narrower = np.sqrt(np.diag(covariance)).reshape(precision.shape) < UNDETERMINED * precision**-0.5
     return np.stack([narrower[:, list(part.places)].all(axis=1) for part in PARTS], axis=1)
 
 
-def _choose(H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors) -> BoolArray:
+def _choose(H: FloatArray, g: FloatArray, away: FloatArray, priors: LensPriors) -> BoolArray:
     """Return the most probable choice (C, 5) for each camera, the others as in the sweep before, until none changes."""
     free, everything = np.zeros((len(away), len(PARTS)), np.bool_), np.ones_like(away, np.bool_)
     for _ in range(SWEEPS):
@@ -202,7 +202,7 @@ def _choose(H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors
     return free
 
 
-def _best(H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors, camera: int) -> BoolArray:
+def _best(H: FloatArray, g: FloatArray, away: FloatArray, priors: LensPriors, camera: int) -> BoolArray:
     """Return the most probable choice (5,) for one camera; of equals the one that frees less."""
     trials = np.array(sorted(product((False, True), repeat=len(PARTS)), key=sum))
     trials = trials[~np.any(trials & ~priors.asked[camera], axis=1)]
@@ -211,7 +211,7 @@ def _best(H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors, 
 
 
 def _about(
-    step: FloatArray, H: FloatArray, g: FloatArray, away: FloatArray, priors: CameraPriors, free: BoolArray
+    step: FloatArray, H: FloatArray, g: FloatArray, away: FloatArray, priors: LensPriors, free: BoolArray
 ) -> FloatArray:
     """Return (8C, 8C) mean squares of the cameras about a step, over all choices for each, the others as in `free`.
 
@@ -254,7 +254,7 @@ def _alternatives(
         away: from the camera to its usual values.
         side: longer side of its photos.
     """
-    precision = CameraPriors(np.zeros((len(trials), 2)), np.full(len(trials), side), trials).precision(trials)
+    precision = LensPriors(np.zeros((len(trials), 2)), np.full(len(trials), side), trials).precision(trials)
     covariance = inverses_of_positive(H + precision[:, :, None] * np.eye(CAMERA))
     pull = g + precision * away
     share = np.array([part.share for part in PARTS])
@@ -290,7 +290,7 @@ def _moved(params: FloatArray, step: FloatArray, sides: FloatArray) -> tuple[Flo
     return moved, ~priors | (np.abs(step[:, LOG_FOCAL]) > LONGEST_STEP)
 
 
-def _unknown(params: FloatArray, priors: CameraPriors) -> FloatArray:
+def _unknown(params: FloatArray, priors: LensPriors) -> FloatArray:
     """Return (C, 8) standard deviations of cameras about which the photos say nothing."""
     deviations = priors.precision(np.ones((len(params), len(PARTS)), np.bool_)) ** -0.5
     deviations[:, [FX, FY]] = FOCAL_SPREAD * params[:, [FX, FY]]
