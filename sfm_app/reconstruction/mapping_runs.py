@@ -34,7 +34,7 @@ LEAST_GLOBAL = 3
 EQUAL = 0.01
 """Models that explain as many matches but for this share count as equal; of them, the one with most points is taken."""
 CONTRADICTED = 0.01
-"""Share of the inliers of fundamental matrices that may contradict a model which leaves nothing to be wished for."""
+"""Share of the inliers of fundamental matrices that may contradict a complete model before others are tried."""
 WELL_KNOWN = 0.01
 """Relative deviation of a focal that mapping leaves alone."""
 INCREMENTAL_FOLDER, GLOBAL_FOLDER = "incremental", "global"
@@ -103,8 +103,8 @@ def attempts(group: Group, run: RunContext) -> list[Tried]:
     """Return what the mappers of the settings make of a group.
 
     Photo by photo from the best seed and all at once, side by side; where neither places most photos, from the next
-    seeds. What is tried never depends on which mapper is done first: a model photo by photo that leaves nothing to be
-    wished for makes the other one needless, whether or not it is there.
+    seeds. What is tried never depends on which mapper is done first: a complete, uncontradicted
+    model photo by photo cancels the global mapper, whether or not it is done.
 
     Args:
         group: photos that hang together, with their matches and poses.

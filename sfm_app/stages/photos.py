@@ -168,7 +168,7 @@ def laid_out(photo: Photo, *, folder: Path, target: Path) -> None:
         lay_out(photo, folder, target)
     except UnreadableError as err:
         raise InputError(
-            f"{photo.path} has changed while it was read: {err}", hint="run again when the folder is as it shall be"
+            f"{photo.path} has changed while it was read: {err}", hint="run again once its files are restored"
         ) from err
 
 

@@ -124,7 +124,7 @@ def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> Non
     except UnreadableError as err:
         raise InputError(f"cannot read {source}: {err}", hint=DAMAGED) from err
     if written < len(missing):
-        raise InputError(f"{source} has changed while it was read", hint="run again when it is as it shall be")
+        raise InputError(f"{source} has changed while it was read", hint="run again once it is restored")
 
 
 def stem_of(source: Path) -> str:
