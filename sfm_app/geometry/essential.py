@@ -62,7 +62,9 @@ def relative_pose(E: Array, x1: Array, x2: Array) -> tuple[Array, Array, Array, 
     found = []
     for R, t in decompose_essential(E):
         X = triangulate(np.eye(3, 4), np.column_stack([R, t]), x1, x2)
-        in_front = (X[:, 2] > 0) & ((X @ R.T + t)[:, 2] > 0)
+        known = np.isfinite(X[:, 2])
+        with np.errstate(invalid="ignore"):  # some BLAS warn of points at infinity, others do not
+            in_front = known & (X[:, 2] > 0) & ((X @ R.T + t)[:, 2] > 0)
         found.append((int(np.count_nonzero(in_front)), R, t, X, in_front))
     _, R, t, X, in_front = max(found, key=lambda pose: pose[0])
     return R, t, X, in_front

@@ -94,3 +94,12 @@ def test_a_seed_tells_a_narrow_and_a_contradictory_pair():
     assert 7 < wide.angle_deg < 12 and wide.in_front == 1
     assert 0.3 < narrow.angle_deg < 0.6
     assert contradictory.in_front == pytest.approx(1 - 20 / 60, abs=0.05)
+
+
+def test_points_at_infinity_are_in_front_of_no_camera(monkeypatch):
+    points = np.array([[np.inf] * 3, [0.1, 0.2, 3.0]])
+    monkeypatch.setattr("sfm_app.geometry.essential.triangulate", lambda *_: points)
+
+    in_front = relative_pose(cross([0.0, 0.0, 1.0]), np.zeros((2, 2)), np.zeros((2, 2)))[3]
+
+    assert in_front.tolist() == [False, True]
