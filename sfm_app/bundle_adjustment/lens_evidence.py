@@ -1,20 +1,19 @@
 """What a whole bundle of photos says about its cameras, and how much of that is believed.
 
-Ours; the choice of models by marginal likelihood is MacKay's (1992).
+Ours; the choice by marginal likelihood is that of `geometry.model_selection`.
 
 As for pairs (`camera_priors`): each part of a camera has a narrow prior about its usual value and a wide one, and is
-freed where the evidence for the wide one (the marginal likelihood, by Laplace's approximation) outweighs how rare such
-cameras are. Freed or not, the prior stays in the estimate: what the photos do not determine stays where it usually is.
+freed where the evidence for the wide one outweighs how rare such cameras are. Freed or not, the prior stays in the estimate: what the photos do not determine stays where it usually is.
 """
 
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.bundle_adjustment.normal_equations import CAMERA, CX, CY, FX, FY, K1, K2, P1, P2, Reduced
-from sfm_app.geometry.spd_solve import inverse_of_positive, inverses_of_positive
+from sfm_app.geometry.model_selection import NormalPriors, binary_choices, cavity, posteriors
+from sfm_app.geometry.spd_solve import inverse_of_positive
 from sfm_app.selfcal.adjustment.camera_priors import ASPECT, CENTER, FREE_SHARE, LENS, NARROW, WIDE
 
 FloatArray = NDArray[np.float64]
@@ -93,6 +92,19 @@ class LensPriors:
             deviation[:, list(part.places)] = sigma[:, None]
         return np.asarray(deviation**-2.0, np.float64)
 
+    def of_choices(self, trials: BoolArray, camera: int, away: FloatArray) -> NormalPriors:
+        """Return the priors of one camera under each of K choices.
+
+        Args:
+            trials: (K, 5) the choices.
+            camera: row of the camera.
+            away: (8,) from it to its usual values.
+        """
+        alike = LensPriors(np.zeros((len(trials), 2)), np.full(len(trials), self.sides[camera]), trials)
+        share = np.array([part.share for part in PARTS])
+        log_odds = np.sum(np.log(np.where(trials, share, 1.0 - share)), axis=1)
+        return NormalPriors(alike.precision(trials), np.tile(away, (len(trials), 1)), log_odds)
+
     def away(self, params: FloatArray) -> FloatArray:
         """Return (C, 8) from the cameras to their usual values.
 
@@ -145,7 +157,7 @@ def estimate(params: FloatArray, reduced: Reduced, priors: LensPriors) -> LensEs
     determined = priors.asked & _determined(covariance, precision)
     changing = spread(determined | (priors.asked & ~np.array([part.stays for part in PARTS])))
     step, own = _posterior(H, g, precision, away, changing)
-    about = _about(step, H, g, away, priors, free)
+    about = _mean_squares(step, H, g, away, priors, free)
     photos = weight * _product(reduced.scores, T)
     variances = np.maximum(
         np.sum(_product(T, about) * T, axis=1), np.sum(_product(photos, _product(covariance, T.T)) ** 2, axis=0)
@@ -188,80 +200,43 @@ def _determined(covariance: FloatArray, precision: FloatArray) -> BoolArray:
 
 
 def _choose(H: FloatArray, g: FloatArray, away: FloatArray, priors: LensPriors) -> BoolArray:
-    """Return the most probable choice (C, 5) for each camera, the others as in the sweep before, until none changes."""
+    """Return the most probable choice (C, 5).
+
+    In one sweep all cameras are asked, with the choices for the others as they were before it. `camera_priors` asks
+    one after the other: a posterior of all for each of them, which is too slow for hundreds of cameras.
+    """
     free, everything = np.zeros((len(away), len(PARTS)), np.bool_), np.ones_like(away, np.bool_)
     for _ in range(SWEEPS):
         before, precision = free, priors.precision(free)
         step, covariance = _posterior(H, g, precision, away, everything)
         free = np.empty_like(before)
         for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
-            said = _without_prior(covariance[np.ix_(own, own)], step[own], precision[camera], away[camera])
-            free[camera] = _best(*said, away[camera], priors, camera)
+            trials = binary_choices(len(PARTS))
+            trials = trials[~np.any(trials & ~priors.asked[camera], axis=1)]
+            said = cavity(covariance[np.ix_(own, own)], step[own], precision[camera], away[camera])
+            found = posteriors(*said, priors.of_choices(trials, camera, away[camera]))
+            free[camera] = trials[np.argmax(found.log_evidence)]
         if np.array_equal(free, before):
             break
     return free
 
 
-def _best(H: FloatArray, g: FloatArray, away: FloatArray, priors: LensPriors, camera: int) -> BoolArray:
-    """Return the most probable choice (5,) for one camera; of equals the one that frees less."""
-    trials = np.array(sorted(product((False, True), repeat=len(PARTS)), key=sum))
-    trials = trials[~np.any(trials & ~priors.asked[camera], axis=1)]
-    value, _, _ = _alternatives(trials, H, g, away, priors.sides[camera])
-    return np.asarray(trials[np.argmax(value)], np.bool_)
-
-
-def _about(
+def _mean_squares(
     step: FloatArray, H: FloatArray, g: FloatArray, away: FloatArray, priors: LensPriors, free: BoolArray
 ) -> FloatArray:
     """Return (8C, 8C) mean squares of the cameras about a step, over all choices for each, the others as in `free`.
 
-    Also over choices that the photos were not asked about: what nobody asked is no better known for that.
+    Choices that the photos were not asked about count, too: a part is no better known because nobody asked.
     """
     precision = priors.precision(free)
     mean, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
     found = covariance + np.outer(mean - step, mean - step)
-    trials = np.array(list(product((False, True), repeat=len(PARTS))))
     for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
         block = np.ix_(own, own)
-        own_H, own_g = _without_prior(covariance[block], mean[own], precision[camera], away[camera])
-        value, steps, covariances = _alternatives(trials, own_H, own_g, away[camera], priors.sides[camera])
-        odds = np.exp(value - value.max())
-        odds /= odds.sum()
-        off = steps - step[own]
-        found[block] = np.einsum("t,tij->ij", odds, covariances) + np.einsum("t,ti,tj->ij", odds, off, off)
+        said = cavity(covariance[block], mean[own], precision[camera], away[camera])
+        choices = priors.of_choices(binary_choices(len(PARTS)), camera, away[camera])
+        found[block] = posteriors(*said, choices).mean_squares(step[own])
     return found
-
-
-def _without_prior(
-    covariance: FloatArray, mean: FloatArray, precision: FloatArray, away: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return what the photos and the other cameras say about one camera.
-
-    Its marginal posterior without its own prior.
-    """
-    marginal = inverses_of_positive(covariance)
-    return marginal - np.diag(precision), marginal @ mean - precision * away
-
-
-def _alternatives(
-    trials: BoolArray, H: FloatArray, g: FloatArray, away: FloatArray, side: float
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return log-probabilities (K,) of choices (K, 5) for one camera, mean steps (K, 8) and covariances (K, 8, 8).
-
-    Args:
-        trials: the choices.
-        H, g: what the photos say, without a prior.
-        away: from the camera to its usual values.
-        side: longer side of its photos.
-    """
-    precision = LensPriors(np.zeros((len(trials), 2)), np.full(len(trials), side), trials).precision(trials)
-    covariance = inverses_of_positive(H + precision[:, :, None] * np.eye(CAMERA))
-    pull = g + precision * away
-    share = np.array([part.share for part in PARTS])
-    value = 0.5 * np.einsum("ti,tij,tj->t", pull, covariance, pull) - 0.5 * np.sum(precision * away**2, axis=1)
-    value += 0.5 * np.sum(np.log(precision), axis=1) + 0.5 * np.linalg.slogdet(covariance)[1]
-    value += np.sum(np.log(np.where(trials, share, 1.0 - share)), axis=1)
-    return value, np.einsum("tij,tj->ti", covariance, pull), covariance
 
 
 def _by_logarithms(params: FloatArray) -> FloatArray:

@@ -1,21 +1,19 @@
 """What is believed about a camera before a photo is seen, and how far the pairs may change that.
 
-Ours; the choice of models by marginal likelihood is MacKay's (1992).
+Ours; the choice by marginal likelihood is that of `geometry.model_selection`.
 
 Most photos are uncropped, their pixels square, their lens nearly straight; some are not. So center, aspect and lens
 each have two priors: a narrow one about the usual value, and a wide one. A parameter is freed only where the evidence
-for the wide prior (the marginal likelihood, by Laplace's approximation) outweighs how rare such photos are; otherwise
-it stays near its usual value. A focal that EXIF claims is one more narrow prior, which loses against pairs that
+for the wide prior outweighs how rare such photos are; otherwise it stays near its usual value. A focal that EXIF claims is one more narrow prior, which loses against pairs that
 contradict it.
 """
 
 from dataclasses import dataclass
-from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.model_selection import NormalPriors, Posteriors, binary_choices, cavity, posteriors
 from sfm_app.geometry.spd_solve import inverses_of_positive
 from sfm_app.selfcal.adjustment.structureless_ba import Prior
 from sfm_app.selfcal.adjustment.two_view_cost import CAMERA
@@ -105,19 +103,6 @@ class CameraPriors:
         return total
 
 
-class Alternative(NamedTuple):
-    """One choice for one camera."""
-
-    free: BoolArray
-    """(C, 4) of all cameras."""
-    value: float
-    """Log-probability, up to a constant."""
-    step: FloatArray
-    """(5,) mean step of this camera."""
-    covariance: FloatArray
-    """(5, 5) of this camera."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
     """What all pairs together say about a step d of the cameras from `thetas`: -g'd + d'Hd / 2."""
@@ -147,8 +132,8 @@ class Evidence:
         volume = 0.5 * float(np.sum(np.log(precision))) + 0.5 * float(np.linalg.slogdet(covariance)[1])
         return fit + volume + self.priors.log_odds(free), step, covariance
 
-    def choices(self, free: BoolArray, camera: int) -> list[BoolArray]:
-        """Return all choices for one camera; those that free less come first.
+    def choices(self, free: BoolArray, camera: int) -> BoolArray:
+        """Return (K, C, 4) all choices for one camera; those that free less come first.
 
         What would leave hardly a constraint to contradict it is no choice: three pairs fit almost any center.
 
@@ -156,22 +141,26 @@ class Evidence:
             free: (C, 4) the choices for the other cameras.
             camera: row of the one.
         """
-        trials: list[BoolArray] = []
-        for switches in sorted(product((False, True), repeat=free.shape[1]), key=sum):
-            trial = free.copy()
-            trial[camera] = switches
-            if not trials or spare(trial, self.pairs) >= LEAST_SPARE:
-                trials.append(trial)
-        return trials
+        switches = binary_choices(free.shape[1])
+        trials = np.repeat(free[None], len(switches), axis=0)
+        trials[:, camera] = switches
+        allowed = [k == 0 or spare(trial, self.pairs) >= LEAST_SPARE for k, trial in enumerate(trials)]
+        return np.asarray(trials[allowed], np.bool_)
 
     def best(self, free: BoolArray) -> BoolArray:
-        """Return the most probable choice: one camera after the other, the rest as they are, until none changes."""
+        """Return the most probable choice.
+
+        One camera after the other is asked, with the choices for the others as they stand, until none changes.
+
+        Args:
+            free: (C, 4) where to begin.
+        """
         while True:
             before = free
             for camera in range(len(free)):
                 _, step, covariance = self.posterior(free)
-                found = self.alternatives(free, camera, step, covariance)
-                free = max(found, key=lambda alternative: alternative.value).free
+                trials, found = self.alternatives(free, camera, step, covariance)
+                free = trials[np.argmax(found.log_evidence)]
             if np.array_equal(free, before):
                 return free
 
@@ -189,29 +178,25 @@ class Evidence:
         return found
 
     def covariance(self, free: BoolArray) -> FloatArray:
-        """Return (5C, 5C) of the cameras about `thetas`, over all choices.
+        """Return (5C, 5C) mean squares of the cameras about `thetas`, over all choices for each camera.
 
-        What is nearly free is nearly as uncertain.
+        A parameter that is nearly freed is nearly as uncertain as a freed one.
+
+        Args:
+            free: (C, 4) the choices for the other cameras.
         """
         _, step, covariance = self.posterior(free)
         total = covariance.copy()
         for camera in range(len(free)):
-            found = self.alternatives(free, camera, step, covariance)
-            odds = np.exp(np.array([one.value for one in found]) - max(one.value for one in found))
+            _, found = self.alternatives(free, camera, step, covariance)
             block = slice(CAMERA * camera, CAMERA * (camera + 1))
-            total[block, block] = sum(
-                share * (one.covariance + np.outer(one.step, one.step))
-                for share, one in zip(odds / odds.sum(), found, strict=True)
-            )
+            total[block, block] = found.mean_squares(np.zeros(CAMERA))
         return total
 
     def alternatives(
         self, free: BoolArray, camera: int, step: FloatArray, covariance: FloatArray
-    ) -> list["Alternative"]:
-        """Give all choices for one camera, and what each would make of it.
-
-        What the pairs and the other cameras say about this one is its marginal posterior without its prior: five
-        parameters, whatever the number of cameras.
+    ) -> tuple[BoolArray, Posteriors]:
+        """Return all choices (K, C, 4) for one camera, and its posterior under each.
 
         Args:
             free: (C, 4) the choices for all cameras.
@@ -220,21 +205,20 @@ class Evidence:
             covariance: (5C, 5C) of the same posterior.
         """
         block = slice(CAMERA * camera, CAMERA * (camera + 1))
-        prior, share = self.priors.prior(free, self.thetas), spare(free, self.pairs)
-        own = inverses_of_positive(covariance[block, block])
-        H = own - np.diag(prior.precision[camera])
-        g = own @ step[block] - prior.precision[camera] * (prior.mean - self.thetas)[camera]
-        found = []
-        for trial in self.choices(free, camera):
-            other = self.priors.prior(trial, self.thetas)
-            precision, away = other.precision[camera], (other.mean - self.thetas)[camera]
-            scale = spare(trial, self.pairs) / share
-            mine = inverses_of_positive(scale * H + np.diag(precision))
-            pull = scale * g + precision * away
-            value = 0.5 * float(pull @ mine @ pull) - 0.5 * float(precision @ away**2) + self.priors.log_odds(trial)
-            value += 0.5 * float(np.sum(np.log(precision))) + 0.5 * float(np.linalg.slogdet(mine)[1])
-            found.append(Alternative(trial, value, mine @ pull, mine))
-        return found
+        prior, trials = self.priors.prior(free, self.thetas), self.choices(free, camera)
+        away = prior.mean - self.thetas
+        H, g = cavity(covariance[block, block], step[block], prior.precision[camera], away[camera])
+        others = [self.priors.prior(trial, self.thetas) for trial in trials]
+        scale = np.array([spare(trial, self.pairs) for trial in trials]) / spare(free, self.pairs)
+        found = posteriors(
+            scale[:, None, None] * H, scale[:, None] * g,
+            NormalPriors(
+                np.array([other.precision[camera] for other in others]),
+                np.array([(other.mean - self.thetas)[camera] for other in others]),
+                np.array([self.priors.log_odds(trial) for trial in trials]),
+            ),
+        )  # fmt: skip
+        return trials, found
 
 
 def spare(free: BoolArray, pairs: float) -> float:
