@@ -32,6 +32,16 @@ def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
             return dict(stored)
 
 
+def digest_file(path: Path) -> str:
+    """Return hash of the bytes of a file.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "blake2b").hexdigest()
+
+
 def digest_files(root: Path, *names: str) -> str:
     """Return hash of the names and bytes of files and of what lies in folders, links left out.
 
@@ -41,9 +51,7 @@ def digest_files(root: Path, *names: str) -> str:
     found = hashlib.blake2b(digest_size=16)
     for name in names:
         for path in _files(root / name):
-            with path.open("rb") as file:
-                content = hashlib.file_digest(file, "blake2b").hexdigest()
-            found.update(f"{path.relative_to(root).as_posix()!r} {content}\n".encode())
+            found.update(f"{path.relative_to(root).as_posix()!r} {digest_file(path)}\n".encode())
     return found.hexdigest()
 
 

@@ -192,10 +192,11 @@ def write_match_graph(path: Path, matches: MatchGraph) -> None:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_database(path)
-    groups = list(dict.fromkeys(image.group for _, image in sorted(matches.images.items())))
+    groups = dict.fromkeys(image.group for _, image in sorted(matches.images.items()))
+    numbers = {group: number for number, group in enumerate(groups, start=1)}
     with opened(path) as database:
         for photo, known in sorted(matches.images.items()):
-            camera_id, size = 1 + groups.index(known.group), (known.width, known.height)
+            camera_id, size = numbers[known.group], (known.width, known.height)
             if not database.exists_camera(camera_id):
                 _write_camera(database, camera_id, Calibration(guessed_camera_matrix(size), *size, "guess", False))
             image = pycolmap.Image(name=known.name, camera_id=camera_id, image_id=photo)

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from importlib.metadata import version
 from typing import Any
 
@@ -86,6 +87,7 @@ def manifest_head(run: RunContext) -> dict[str, Any]:
     return {"program": PROGRAM, "versions": versions(), "settings": run.settings.model_dump()}
 
 
+@cache
 def versions() -> dict[str, str]:
     """Return versions of what computes the result."""
     parts = ("sfm-app", "numpy", "numba", "opencv-contrib-python-headless", "open3d")

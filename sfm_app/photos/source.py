@@ -1,13 +1,12 @@
 """What the user has given: a folder of photos or a video, perhaps masks, and hashes of every file."""
 
-import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from stat import S_ISREG
 
 from sfm_app.errors import ConfigError, InputError
-from sfm_app.hashing import fingerprint
+from sfm_app.hashing import digest_file, fingerprint
 from sfm_app.photos.files import list_files, place_of
 from sfm_app.photos.masks import list_masks
 from sfm_app.photos.video.video_formats import head_of, is_video
@@ -106,8 +105,7 @@ def read_source(path: Path, out: Path, options: PhotoSettings, spread: Spread) -
 def digest(file: Path) -> str:
     """Return hash of the bytes of a file."""
     try:
-        with file.open("rb") as opened:
-            return hashlib.file_digest(opened, "blake2b").hexdigest()
+        return digest_file(file)
     except OSError:
         return "unreadable"
 

@@ -206,21 +206,8 @@ def report(**message: Json) -> None:
     os.write(REPORTS, f"{json.dumps(message)}\n".encode())
 
 
-class Reported:
-    """Progress that goes to the one that started the process."""
-
-    def stage(self, name: str, note: str = "") -> None:
-        """Show nothing: stages are the parent's.
-
-        Args:
-            name, note: not used.
-        """
-
-    def stage_done(self, seconds: float) -> None:
-        """Show nothing."""
-
-    def say(self, text: str) -> None:
-        """Show nothing."""
+class Reported(Silent):
+    """Progress that goes to the one that started the process; stages are that one's own."""
 
     def start(self, label: str, total: int) -> None:
         """Send the start of work to the parent.
