@@ -68,6 +68,7 @@ def dense(place, tmp_path):
     return tmp_path, {view.name: view for view in views}
 
 
+@pytest.mark.slow
 def test_no_keypoint_lies_in_what_is_masked(place, tmp_path):
     """The photos are in the database before features are looked for, as in every run."""
     root, used = place

@@ -49,6 +49,7 @@ def left_out(*images):
 SHARP = [scene(seed) for seed in range(4)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoil", [lambda i: i.filter(ImageFilter.GaussianBlur(14)), lambda i: smeared(i, 45)])
 def test_a_photo_blurred_beyond_use_is_left_out(spoil):
     assert left_out(*SHARP, spoil(scene(9))) == {4: "blurred beyond use"}

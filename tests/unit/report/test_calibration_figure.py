@@ -35,6 +35,7 @@ def prepared(panel):
     return prepare(panel.pairs, unit_px=float(max(width, height)), origin_px=(width / 2, height / 2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "start"), [("a.png", b"\x89PNG"), ("b.SVG", b"<?xml"), ("c.pdf", b"%PDF")])
 def test_the_suffix_names_the_format_and_the_bytes_do_not_change(panel, tmp_path, name, start):
     places = [tmp_path / folder / name for folder in ("one", "two")]
@@ -89,6 +90,7 @@ def test_a_guess_is_drawn_without_pairs(panel, tmp_path):
     assert "no pair of photos is from this camera alone" in (tmp_path / "guess.svg").read_text()
 
 
+@pytest.mark.slow
 def test_of_many_cameras_the_first_are_drawn(panel, tmp_path):
     for count in (1, MOST_CAMERAS + 1):
         draw_calibration(tmp_path / f"{count}.svg", [panel._replace(name=f"camera-{k}") for k in range(count)])

@@ -216,9 +216,8 @@ def with_other_pairs(shots, seed):
     return CameraPairs(Fs, pair_weights([len(x) for x in inliers]), right.pairs.size, ids, inliers), right.Ks[0]
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_wrong_pairs_do_not_pull_a_camera_away_however_many_they_are(shots, seed, monkeypatch):
-    pairs, K = with_other_pairs(shots, seed)
+def test_wrong_pairs_do_not_pull_a_camera_away_however_many_they_are(shots, monkeypatch):
+    pairs, K = with_other_pairs(shots, seed=0)
 
     found = calibrate(pairs, OPTIONS, 0)
 

@@ -74,6 +74,7 @@ def test_ground_faces_up_and_is_uneven():
     assert np.allclose(np.ptp(floor.vertices[:, [0, 2]], axis=0), [2.0, 4.0])
 
 
+@pytest.mark.slow
 def test_a_poster_is_flat_and_all_scenes_have_their_names():
     assert np.ptp(build_scene("poster").vertices[:, 2]) < 0.2
     assert [build_scene(name).name for name in SCENES] == list(SCENES)
