@@ -46,8 +46,8 @@ NOISE = (1, 2, 3, 4)
 """Other seeds of the program as it is."""
 COLUMNS = ("constant", "AUC@5, halved", "AUC@5, doubled", "worst", "focal %, halved", "focal %, doubled")
 
-Figures = dict[str, dict[str, float]]
-"""By folder."""
+Figures = dict[str, dict[str, Any]]
+"""By folder: numbers, or why there are none."""
 
 
 def prepare(data: Path, cache: Path) -> None:

@@ -4,6 +4,7 @@ import ast
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from importlib.util import decode_source, spec_from_file_location
@@ -59,13 +60,20 @@ def assignments(tree: ast.Module) -> Iterator[tuple[str, ast.Assign | ast.AnnAss
 
 def is_compiled(constant: Constant) -> bool:
     """Return whether a kernel may hold the constant, so that cached machine code would hide a change of it."""
-    names = set(constant.names.split(", "))
-    for path in (ROOT / "sfm_app").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.FunctionDef) and any("kernel" in ast.dump(mark) for mark in node.decorator_list):
-                if names & {inner.id for inner in ast.walk(node) if isinstance(inner, ast.Name)}:
-                    return True
-    return False
+    return not kernel_names().isdisjoint(constant.names.split(", "))
+
+
+@cache
+def kernel_names() -> frozenset[str]:
+    """Return all names that stand in a kernel."""
+    trees = (ast.parse(path.read_text(encoding="utf-8")) for path in (ROOT / "sfm_app").rglob("*.py"))
+    kernels = (
+        node
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef) and any("kernel" in ast.dump(mark) for mark in node.decorator_list)
+    )
+    return frozenset(node.id for kernel in kernels for node in ast.walk(kernel) if isinstance(node, ast.Name))
 
 
 def scale(value: Any, factor: float) -> Any:
@@ -101,7 +109,7 @@ class ScaledLoader(SourceFileLoader):
         super().__init__(fullname, path)
         self.names, self.factor = names, factor
 
-    def get_code(self, fullname: str) -> CodeType:
+    def get_code(self, fullname: str) -> CodeType:  # noqa: ARG002 -- the loader's own name
         """Compile the module, the constant's value wrapped in a call of `scale`."""
         tree = ast.parse(decode_source(self.get_data(self.path)))
         for names, statement, _ in assignments(tree):
@@ -122,13 +130,8 @@ class ScaledFinder(MetaPathFinder):
     def __init__(self, constant: Constant, factor: float) -> None:
         self.constant, self.factor = constant, factor
 
-    def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        """Return how to load the module; None for all others.
-
-        Args:
-            fullname: dotted name.
-            path, target: not used.
-        """
+    def find_spec(self, fullname: str, *_: object) -> ModuleSpec | None:
+        """Return how to load the module of this dotted name; None for all others."""
         if fullname != self.constant.module:
             return None
         file = str(ROOT / self.constant.path)

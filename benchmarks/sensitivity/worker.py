@@ -23,7 +23,8 @@ def measure(folder: Path, seed: int) -> dict[str, float]:
         folder: holds what `command.prepare` has left.
         seed: of the run.
     """
-    from benchmarks.sensitivity.problem import Problem, figures  # noqa: PLC0415 -- imports the program
+    # here, because it imports the program
+    from benchmarks.sensitivity.problem import Problem, figures
 
     problem: Problem = pickle.loads((folder / "problem.pickle").read_bytes())  # noqa: S301 -- our own
     return figures(problem, seed)
@@ -44,7 +45,7 @@ def main() -> None:
     for folder in sorted(path.parent for path in Path(cache).glob("*/problem.pickle")):
         try:
             found[folder.name] = measure(folder, seed)
-        except Exception as err:  # noqa: BLE001 -- a constant that breaks the program is a result
+        except Exception as err:  # a constant that breaks the program is a result
             found[folder.name] = {"failed": f"{type(err).__name__}: {err}"}
     print(json.dumps(found))
 
