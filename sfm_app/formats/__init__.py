@@ -1,4 +1,4 @@
-"""Model files: every writer takes a `Model` and a name, and gives the bytes of its files by their names."""
+"""Model files: every writer takes a `Model` and a name, and returns the bytes of its files by file name."""
 
 from collections.abc import Callable, Mapping
 
@@ -12,6 +12,6 @@ EXPORTERS: dict[str, tuple[Callable[[Model, str], Mapping[str, bytes]], str]] = 
     "glb": (write_glb, "binary glTF 2.0, textured, all in one file; web viewers, game engines, Blender"),
     "obj": (write_obj, "Wavefront OBJ with MTL and JPEG pages, textured; everything else"),
 }
-"""By name, which is the suffix of the file to open: writer and summary."""
+"""Writer and summary by format name, which is the suffix of the file to open."""
 
 __all__ = ["EXPORTERS"]

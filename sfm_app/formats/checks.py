@@ -1,4 +1,4 @@
-"""What every file format asks of a model."""
+"""Checks and normals that all file formats share."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from sfm_app.types import Model, Surface
 
 
 def check(model: Model) -> None:
-    """Refuse what no file can hold.
+    """Check that a model can be written.
 
     Raises:
         ReconstructionError: there is neither a triangle nor a point, or coordinates are not finite.
@@ -19,13 +19,13 @@ def check(model: Model) -> None:
             "there is nothing to write: the model has no points", hint="take more photos with more overlap"
         )
     if not np.isfinite(model.surface.vertices).all():
-        raise ReconstructionError("the model has points that lie nowhere", hint="run again from the stage `scene`")
+        raise ReconstructionError("coordinates of the model are not finite", hint="run again from the stage `scene`")
 
 
 def unit_normals(surface: Surface) -> NDArray[np.float64]:
-    """Return (V, 3) normals of length 1 also where triangles without area leave a corner without one.
+    """Return (V, 3) unit normals; (0, 1, 0) where triangles without area do not define one.
 
-    GlTF asks for it.
+    glTF requires unit normals.
     """
     normals = vertex_normals(surface.vertices, surface.faces)
     normals[np.linalg.norm(normals, axis=1) < 0.5] = (0.0, 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""Cameras drawn into a scene."""
+"""Wire frames of cameras in a scene."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,13 @@ CAMERA_COLOR = (255, 96, 32)
 """sRGB of the cameras: an orange that walls, trees and skies do not have."""
 
 FRUSTUM_EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
-"""Lines between the camera's center (0) and the corners of its picture (1 to 4)."""
+"""Lines between the camera's center (0) and the corners of its image (1 to 4)."""
 
 DOTS = 12
-"""Per edge, where a format has no lines."""
+"""Dots per edge, for formats without lines."""
 
 LEAST_SHARE, MOST_SHARE = 0.01, 0.1
-"""How deep a frustum is drawn, in sizes of the scene: it can be seen, and does not hide what it stands before."""
+"""Smallest and largest depth of a frustum, relative to the scene: visible, but without hiding the scene."""
 
 
 def camera_lines(model: Model) -> tuple[FloatArray, IndexArray]:
@@ -33,7 +33,7 @@ def camera_lines(model: Model) -> tuple[FloatArray, IndexArray]:
 
 
 def camera_dots(model: Model) -> tuple[FloatArray, NDArray[np.uint8]]:
-    """Return the cameras of a model as dotted wire frames: places (D, 3) and colors (D, 3)."""
+    """Return the cameras of a model as dotted wire frames: points (D, 3) and colors (D, 3)."""
     corners, lines = camera_lines(model)
     along = np.linspace(0.0, 1.0, DOTS, endpoint=False)[:, None, None]
     dots = ((1 - along) * corners[lines[:, 0]] + along * corners[lines[:, 1]]).reshape(-1, 3)
@@ -41,21 +41,21 @@ def camera_dots(model: Model) -> tuple[FloatArray, NDArray[np.uint8]]:
 
 
 def painted(count: int) -> NDArray[np.uint8]:
-    """Return the cameras' color for so many vertices."""
+    """Return the color of cameras for `count` vertices."""
     return np.tile(np.array(CAMERA_COLOR, np.uint8), (count, 1))
 
 
 def center(camera: Frustum) -> FloatArray:
-    """Return where a camera stands: (3,)."""
+    """Return the center of a camera, (3,)."""
     return np.asarray(-camera.cam_from_world[:, :3].T @ camera.cam_from_world[:, 3])
 
 
 def frustum_corners(camera: Frustum, depth: float) -> FloatArray:
-    """Return (5, 3) the camera's center and the corners of its picture, clockwise from the top left one on.
+    """Return (5, 3) the camera's center and the corners of its image, clockwise from the top left.
 
     Args:
         camera: posed, without distortion.
-        depth: distance of the picture along the optical axis, > 0.
+        depth: distance of the image along the optical axis, > 0.
     """
     pixels = [(0, 0), (camera.width, 0), (camera.width, camera.height), (0, camera.height)]
     rays = np.linalg.solve(camera.K, np.column_stack([np.array(pixels, np.float64), np.ones(4)]).T).T
@@ -64,9 +64,7 @@ def frustum_corners(camera: Frustum, depth: float) -> FloatArray:
 
 
 def frustum_depth(centers: FloatArray, points: FloatArray) -> float:
-    """Return how deep the frusta are drawn.
-
-    A third of the usual distance between neighboring cameras, within bounds.
+    """Return the depth of the frusta: a third of the median distance between neighboring cameras, within bounds.
 
     Args:
         centers: (C, 3) of the cameras.
@@ -80,13 +78,13 @@ def frustum_depth(centers: FloatArray, points: FloatArray) -> float:
 
 
 def scene_size(points: FloatArray) -> float:
-    """Return diagonal of the box that holds nine of ten coordinates along each axis."""
+    """Return the diagonal of the box that contains nine of ten coordinates along each axis."""
     low, high = np.percentile(points, [5, 95], axis=0)
     return float(np.linalg.norm(high - low))
 
 
 def with_cameras(model: Model) -> tuple[FloatArray, NDArray[np.uint8], IndexArray]:
-    """Return vertices of a model and behind them the corners of its cameras, their colors, and the cameras' lines."""
+    """Return the vertices of a model followed by the corners of its cameras, their colors, and the cameras' lines."""
     corners, lines = camera_lines(model)
     surface = model.surface
     colors = np.concatenate([surface.colors, painted(len(corners))])

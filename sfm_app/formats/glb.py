@@ -1,10 +1,10 @@
 """Binary glTF 2.0: one file that web viewers, game engines and Blender open.
 
-Photographed colors carry their light already, and a viewer that lights them once more makes them darker on one side
-and pale on the other. So the material is KHR_materials_unlit: three.js, Babylon.js, model-viewer, Blender and others
-show the colors as the photos have them. Where the extension is unknown the material is a rough, matt surface, lit by
-the normals, which are there for that and for relighting. It is not listed as required: nobody has to refuse the file.
-Without a material a viewer would take glTF's default, which is metal and looks black.
+Photographed colors already contain the lighting, and a viewer that lights them again makes one side darker and the
+other paler. So the material is KHR_materials_unlit: three.js, Babylon.js, model-viewer, Blender and others show the
+original colors. Viewers without the extension show a rough, matte surface, lit by means of the normals, which also
+allow relighting. The extension is not listed as required, so no viewer has to refuse the file. Without a material,
+viewers would use glTF's default, which is metallic and looks black.
 """
 
 from collections.abc import Mapping
@@ -24,11 +24,11 @@ POINTS, LINES = 0, 1
 LINEAR, MIPMAPS, CLAMPED = 9729, 9987, 33071
 
 FLIP = np.diag([1.0, -1.0, -1.0])
-"""COLMAP's camera looks along +z with y down, that of glTF along -z with y up."""
+"""COLMAP's camera looks along +z with y down, glTF's camera along -z with y up."""
 
 
 def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
-    """Return triangles with their texture or with a color per vertex; else points; and the cameras, if there are any.
+    """Write triangles with a texture or a color per vertex, or else points; and the cameras, if any.
 
     Args:
         model: what to write.
@@ -55,7 +55,7 @@ def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
 
 
 def textured(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
-    """Add a picture and a material per page, and return one primitive for each.
+    """Add an image and a material per page, and return one primitive for each.
 
     Args:
         glb: the file; it gets images, materials and vertices.
@@ -80,7 +80,7 @@ def textured(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
 
 
 def colored(glb: Glb, model: Model) -> dict[str, Any]:
-    """Return triangles, or points where there are none, with a color per vertex.
+    """Add triangles, or points if there are none, with a color per vertex, and return the primitive.
 
     Args:
         glb: the file; it gets a material and vertices.
@@ -96,26 +96,26 @@ def colored(glb: Glb, model: Model) -> dict[str, Any]:
 
 
 def shape(glb: Glb, vertices: NDArray[np.float64], normals: NDArray[np.float64] | None) -> dict[str, int]:
-    """Add where vertices are and where they face; gives the accessors' numbers by name.
+    """Add positions and normals of vertices; return the accessors' numbers by attribute.
 
     Args:
         glb: the file.
         vertices: (V, 3).
-        normals: (V, 3) unit vectors; None where there are none.
+        normals: (V, 3) unit vectors, or None.
     """
     attributes = {"POSITION": glb.add_vertices(vertices.astype(np.float32), bounds=True)}
     return attributes if normals is None else attributes | {"NORMAL": glb.add_vertices(normals.astype(np.float32))}
 
 
 def photographed(glb: Glb, name: str, **base: Any) -> int:
-    """Add a material that shows its colors as they are; gives its number.
+    """Add an unlit material and return its number.
 
-    Both sides, since an open surface has no inside to hide.
+    It is double-sided, because both sides of an open surface can be seen.
 
     Args:
         glb: the file.
         name: of the material.
-        **base: color or texture, as glTF's pbrMetallicRoughness has it.
+        **base: color or texture, as in glTF's pbrMetallicRoughness.
     """
     return glb.add(
         "materials",
@@ -131,8 +131,8 @@ def photographed(glb: Glb, name: str, **base: Any) -> int:
 def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return linear light in [0, 1] of 8-bit sRGB colors, same shape (IEC 61966-2-1).
 
-    glTF multiplies colors of vertices into the light as they are, so they have to be linear, while photos are sRGB.
-    Floats: 8 linear bits show steps in the shadows, and not every reader knows 16.
+    glTF requires linear vertex colors, while photos are sRGB. Values are floats, because 8 linear bits show steps in
+    the shadows, and not every reader supports 16 bits.
     """
     value = np.arange(256) / 255.0
     light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
@@ -140,14 +140,14 @@ def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def cameras(glb: Glb, model: Model) -> list[int]:
-    """Add the cameras twice: as lines that every viewer draws, and as glTF's cameras, to look through.
+    """Add the cameras twice: as lines that every viewer draws, and as glTF cameras to look through.
 
     Args:
         glb: the file.
         model: with its cameras, at least one.
 
     Returns:
-        numbers of their nodes.
+        The numbers of their nodes.
     """
     corners, lines = camera_lines(model)
     color = linear_colors(np.array(CAMERA_COLOR, np.uint8))
@@ -165,7 +165,7 @@ def cameras(glb: Glb, model: Model) -> list[int]:
 
 
 def _camera_node(glb: Glb, camera: Frustum, near: float) -> dict[str, Any]:
-    """Return a camera of glTF where the photo was taken; its center is in the middle, as glTF knows no other."""
+    """Add a glTF camera at the photo's pose and return its node; its principal point is central, as glTF requires."""
     lens = {
         "yfov": float(2 * np.arctan(camera.height / (2 * camera.K[1, 1]))),
         "aspectRatio": float(camera.width / camera.K[0, 0] * camera.K[1, 1] / camera.height),

@@ -1,4 +1,4 @@
-"""The container of binary glTF 2.0 (ISO/IEC 12113): a tree in JSON, and one buffer of arrays behind it."""
+"""The container of binary glTF 2.0 (ISO/IEC 12113): a JSON tree, followed by one buffer of arrays."""
 
 import json
 import struct
@@ -9,15 +9,15 @@ from numpy.typing import NDArray
 
 MAGIC, VERSION, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 2, 0x4E4F534A, 0x004E4942
 VERTICES, INDICES = 34962, 34963
-"""What a view of the buffer holds, in OpenGL's numbers."""
+"""Types of buffer views, by their OpenGL constants."""
 COMPONENTS = {np.dtype(np.uint16): 5123, np.dtype(np.uint32): 5125, np.dtype(np.float32): 5126}
 SHAPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
 RESTART = 0xFFFF
-"""The largest 16-bit number is no index: OpenGL starts a new strip at it."""
+"""The largest 16-bit number cannot be an index: OpenGL reserves it as the primitive-restart index."""
 
 
 class Glb:
-    """A file in the making: `tree` is the JSON, the methods add to it and to the buffer, `to_bytes` ends it."""
+    """A file being built: methods add to the JSON `tree` and to the buffer, `to_bytes` returns the file."""
 
     def __init__(self, **tree: Any) -> None:
         self.tree: dict[str, Any] = {"asset": {"version": "2.0", "generator": "sfm_app"}, **tree}
@@ -25,18 +25,18 @@ class Glb:
         self._length = 0
 
     def add(self, table: str, entry: dict[str, Any]) -> int:
-        """Put an entry into a table of the tree; gives its number.
+        """Add an entry to a table of the tree and return its number.
 
         Args:
             table: "meshes", "nodes", ...
-            entry: as the tree has it.
+            entry: the JSON object.
         """
         entries = self.tree.setdefault(table, [])
         entries.append(entry)
         return len(entries) - 1
 
     def add_view(self, data: bytes, **entry: int) -> int:
-        """Put bytes into the buffer, at a multiple of 4 as every type of component allows; gives the view's number."""
+        """Add bytes to the buffer, aligned to 4 bytes for all component types, and return the view's number."""
         view = self.add("bufferViews", {"buffer": 0, "byteOffset": self._length, "byteLength": len(data), **entry})
         padded = data + bytes(-len(data) % 4)
         self._parts.append(padded)
@@ -44,11 +44,11 @@ class Glb:
         return view
 
     def add_vertices(self, values: NDArray[np.float32], *, bounds: bool = False) -> int:
-        """Add an attribute of vertices; gives the accessor's number.
+        """Add a vertex attribute and return the accessor's number.
 
         Args:
             values: (N, 2) or (N, 3), one row per vertex.
-            bounds: whether lowest and highest values are stated, as glTF asks for positions.
+            bounds: whether to include the lowest and highest values, which glTF requires for positions.
         """
         entry = self._accessor(values, VERTICES)
         if bounds:
@@ -56,11 +56,11 @@ class Glb:
         return self.add("accessors", entry)
 
     def add_indices(self, values: NDArray[np.int64], vertices: int) -> int:
-        """Add numbers of vertices, as small as fits; gives the accessor's number.
+        """Add vertex indices in the smallest type that fits and return the accessor's number.
 
         Args:
-            values: numbers of vertices, of any shape.
-            vertices: how many there are.
+            values: vertex indices, of any shape.
+            vertices: number of vertices.
         """
         small = values.ravel().astype(np.uint16 if vertices <= RESTART else np.uint32)
         return self.add("accessors", self._accessor(small, INDICES))

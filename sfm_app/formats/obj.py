@@ -1,4 +1,4 @@
-"""Wavefront OBJ with its materials (MTL) and pages of texture (JPEG) beside it."""
+"""Wavefront OBJ, with materials (MTL) and texture pages (JPEG) in separate files."""
 
 import re
 from collections.abc import Iterator, Mapping
@@ -12,36 +12,34 @@ from sfm_app.formats.pages import jpeg, pages_in_use
 from sfm_app.types import Model, Texture
 
 DIGITS = 6
-"""Coordinates are exact to this many digits of the size of the model, places in the texture to as many decimals."""
+"""Significant digits of coordinates relative to the model's size, and decimals of texture coordinates."""
 
 ACROSS = 10 ** (DIGITS + 1)
-"""Makes one number of a place in the texture."""
+"""Base that combines both texture coordinates, as integers, into one key."""
 
 CHUNK = 50_000
-"""Rows that are formatted at once: Python numbers take several times the memory of their text."""
+"""Rows formatted at once; Python numbers take several times the memory of their text."""
 
 MATERIAL = "newmtl {name}\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nd 1\nillum 0\n"
-"""`illum 0` shows the colors as they are: photos carry their light already."""
+"""`illum 0` shows the colors unlit: photos already contain the lighting."""
 
 
 def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
-    """Return triangles with normals and their texture or a color per vertex.
-
-    Else points; and cameras, if any, as lines.
+    """Write triangles with normals and a texture or a color per vertex, or else points; and cameras, if any, as lines.
 
     Args:
         model: what to write.
         name: of the files, without suffix.
 
     Returns:
-        The OBJ; where the model has a texture, also the MTL and a JPEG per page.
+        The OBJ; if the model has a texture, also the MTL and a JPEG per page.
 
     Raises:
         ReconstructionError: the model is empty or not finite.
     """
     check(model)
     texture = model.texture if len(model.surface.faces) else None
-    beside = re.sub(r"\s", "_", name)  # names with blanks end at the blank for many a reader
+    beside = re.sub(r"\s", "_", name)  # many readers end file names at a blank
     text = ["# sfm_app\n", *_vertex_lines(model, with_colors=texture is None)]
     files: dict[str, bytes] = {}
     if texture is None:
@@ -59,7 +57,7 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
 
 
 def _vertex_lines(model: Model, *, with_colors: bool) -> Iterator[str]:
-    """Yield vertices, with colors behind the coordinates as MeshLab began it, normals, points and lines."""
+    """Yield vertices, with colors after the coordinates as in MeshLab, normals, points and lines."""
     vertices, colors, lines = with_cameras(model)
     place = f"%.{decimals(model.surface.vertices)}f"
     values, form = [vertices], [place] * 3
@@ -74,7 +72,7 @@ def _vertex_lines(model: Model, *, with_colors: bool) -> Iterator[str]:
 
 
 def _textured_lines(model: Model, texture: Texture, pages: list[int]) -> Iterator[str]:
-    """Yield places in the texture, each once, and the triangles page by page."""
+    """Yield texture coordinates, each once, and the triangles page by page."""
     steps = np.round(10**DIGITS * texture.uv.reshape(-1, 2).astype(np.float64)).astype(np.int64)
     steps[:, 1] = 10**DIGITS - steps[:, 1]  # 0 is at the bottom in OBJ
     keys, numbers = np.unique(steps @ np.array([ACROSS, 1]), return_inverse=True)
@@ -88,10 +86,10 @@ def _textured_lines(model: Model, texture: Texture, pages: list[int]) -> Iterato
 
 
 def rows(form: str, values: NDArray[np.generic]) -> str:
-    """Return every row of an array (N, C) as text; one format for many is ten times faster than one per row.
+    """Return the rows of an array (N, C) as text; formatting many at once is ten times faster than one by one.
 
     Args:
-        form: of one row, for the % operator, with C places.
+        form: format of one row for the % operator, with C fields.
         values: (N, C).
     """
     parts = (values[start : start + CHUNK] for start in range(0, len(values), CHUNK))
@@ -99,5 +97,5 @@ def rows(form: str, values: NDArray[np.generic]) -> str:
 
 
 def decimals(vertices: NDArray[np.float64]) -> int:
-    """Return decimals that give `DIGITS` digits of the size of the model."""
+    """Return the number of decimals that gives `DIGITS` significant digits of the model's size."""
     return max(0, DIGITS - int(np.floor(np.log10(scene_size(vertices) or 1.0))))

@@ -1,4 +1,4 @@
-"""Pages of texture, and the vertices that lie on them."""
+"""Texture pages as JPEG, and the vertices of their triangles."""
 
 import io
 
@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 IndexArray = NDArray[np.int64]
 
 JPEG_QUALITY = 90
-"""Of the pages of texture, by the scale of libjpeg: below it blocks begin to show, above it files grow fast."""
+"""Quality of texture pages on libjpeg's scale: lower values show blocks, higher ones make much larger files."""
 
 
 def jpeg(page: NDArray[np.uint8]) -> bytes:
-    """Return a page of texture (H, W, 3) as JPEG, with colors as sharp as brightness.
+    """Return a texture page (H, W, 3) as JPEG, without chroma subsampling.
 
-    JPEG's usual half resolution for colors smears them across the borders of charts: on the page of a brick wall it
-    costs 3 dB, and files of the same size are 1.5 dB nearer to the page with full resolution and less quality.
+    JPEG's usual chroma subsampling smears colors across the borders of charts: on the page of a brick wall it costs
+    3 dB. At equal file size, full resolution with lower quality is 1.5 dB closer to the page.
     """
     from PIL import Image
 
@@ -25,15 +25,15 @@ def jpeg(page: NDArray[np.uint8]) -> bytes:
 
 
 def split_corners(faces: IndexArray, uv: NDArray[np.float32]) -> tuple[IndexArray, NDArray[np.float32], IndexArray]:
-    """Return one vertex per place on the surface and in the texture: those on borders of charts become several.
+    """Divide vertices on chart borders, so that each vertex has one texture coordinate.
 
     Args:
         faces: (T, 3) vertex indices.
-        uv: (T, 3, 2) places of their corners in the texture.
+        uv: (T, 3, 2) texture coordinates of their corners.
 
     Returns:
-        For each of N new vertices the old one (N,) and its place in the texture (N, 2), and the faces (T, 3) of new
-        ones; in the order of the old ones.
+        For each of N new vertices, in the order of the old ones: the old vertex (N,) and the texture coordinates
+        (N, 2); and the faces (T, 3) of new vertices.
     """
     at, place = faces.ravel(), np.ascontiguousarray(uv, np.float32).reshape(-1, 2)
     order = np.lexsort((place[:, 1], place[:, 0], at))
@@ -46,5 +46,5 @@ def split_corners(faces: IndexArray, uv: NDArray[np.float32]) -> tuple[IndexArra
 
 
 def pages_in_use(pages: NDArray[np.int32]) -> list[int]:
-    """Return numbers of the pages that triangles lie on, in order."""
+    """Return the numbers of the pages that triangles lie on, ascending."""
     return [int(page) for page in np.unique(pages)]

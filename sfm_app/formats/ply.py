@@ -1,4 +1,4 @@
-"""PLY, the Stanford polygon format, binary: what every program for point clouds and scanned surfaces opens."""
+"""Binary PLY, the Stanford polygon format, which all programs for point clouds and scanned surfaces open."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,13 +19,13 @@ Columns = list[NDArray[Any]]
 
 
 def write_ply(model: Model, name: str) -> Mapping[str, bytes]:
-    """Return triangles with normals and a color per vertex; or points, and behind them the cameras as dotted frusta.
+    """Write triangles with normals and a color per vertex, or points followed by the cameras as dotted frusta.
 
-    Dots, because readers differ in what they make of a file with points and edges or points and triangles, and some
-    then show no points at all. A cloud of colored points is the same for everyone.
+    Cameras are dots, because readers differ on files with points and edges or points and triangles, and some then show
+    no points. All of them show a cloud of colored points in the same way.
 
     Args:
-        model: what to write; PLY has no common way to hold a texture, or the cameras of a surface: left out.
+        model: what to write; PLY has no common way to store a texture, or cameras beside a surface: left out.
         name: of the file, without suffix.
 
     Returns:
@@ -47,18 +47,18 @@ def write_ply(model: Model, name: str) -> Mapping[str, bytes]:
 
 
 def triangles(faces: NDArray[np.int64]) -> NDArray[np.void]:
-    """Return rows of three numbers of vertices."""
+    """Return rows of three vertex indices."""
     rows = np.empty(len(faces), [("count", "u1"), ("vertex_indices", "<i4", 3)])
     rows["count"], rows["vertex_indices"] = 3, faces
     return rows
 
 
 def table(kinds: list[tuple[str, str]], columns: Columns) -> NDArray[np.void]:
-    """Return rows of named columns.
+    """Build rows with named columns.
 
     Args:
         kinds: name and NumPy type of each column.
-        columns: arrays (N, C) side by side, as many columns in all as names.
+        columns: arrays (N, C), one column per name in total.
     """
     rows = np.empty(len(columns[0]), kinds)
     values = [column[:, i] for column in columns for i in range(column.shape[1])]
@@ -68,7 +68,7 @@ def table(kinds: list[tuple[str, str]], columns: Columns) -> NDArray[np.void]:
 
 
 def header(elements: Mapping[str, NDArray[np.void]]) -> str:
-    """Return what the rows of each element hold."""
+    """Return the header, which describes the rows of each element."""
     lines = ["ply", "format binary_little_endian 1.0", "comment sfm_app"]
     for element, rows in elements.items():
         lines.append(f"element {element} {len(rows)}")

@@ -1,4 +1,4 @@
-"""From a raw surface to a clean mesh: what photos confirm, with smooth borders, as a manifold, colored."""
+"""From a raw surface to a clean mesh: confirmed by photos, with smooth borders, manifold and colored."""
 
 from sfm_app.meshing.components import drop_islands, octree_depth
 from sfm_app.meshing.manifold import make_manifold

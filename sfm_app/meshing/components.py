@@ -1,4 +1,4 @@
-"""How fine a surface through points may be, and which of its parts stay.
+"""The resolution of Poisson reconstruction, and the removal of small connected parts.
 
 SciPy is imported where it is used: a program that only estimates fundamental matrices starts without it.
 """
@@ -16,9 +16,9 @@ MARGIN = 1.1
 
 
 def octree_depth(points: NDArray[np.float64], most: int) -> int:
-    """Give the greatest depth at which cells of Poisson's octree that hold points share them out.
+    """Return the greatest depth at which the occupied cells of Poisson's octree hold enough points.
 
-    Finer cells, most of them with one point or none, would only model the noise, at four times the triangles per level.
+    Finer cells, most with at most one point, would only model noise, with four times the triangles per level.
 
     Args:
         points: (N, 3).
@@ -40,8 +40,8 @@ def drop_islands(surface: Surface, min_share: float) -> Surface:
     """Drop connected parts that have too few triangles.
 
     Args:
-        surface: with all its parts.
-        min_share: of all triangles, in [0, 1].
+        surface: any.
+        min_share: smallest share of all triangles that is kept, in [0, 1].
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -1,4 +1,4 @@
-"""A mesh that every program can work with: no degenerate or doubled triangles, a manifold with one orientation."""
+"""Repair of a mesh: no degenerate or duplicate triangles, an oriented manifold."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,8 @@ def make_manifold(surface: Surface) -> Surface:
 
     Every edge then has one triangle, or two that run along it in opposite directions; those at a vertex form one fan.
 
-    What is degenerate, not finite or doubled goes; of more than two triangles at an edge, and of two with the same
-    direction, the smallest go; vertices where fans only touch are split.
+    Degenerate, non-finite and duplicate triangles are removed. Where more than two triangles share an edge, or two run
+    along it in the same direction, the smallest are removed. Vertices where fans only touch are split.
     """
     surface = select_faces(surface, _proper(surface))
     while len(surface.faces):
@@ -28,7 +28,7 @@ def make_manifold(surface: Surface) -> Surface:
 
 
 def _proper(surface: Surface) -> NDArray[np.bool_]:
-    """Return (T,) triangles that are finite and have a height, each set of corners once."""
+    """Mark triangles that are finite and not degenerate, each set of corners once, (T,)."""
     corners = surface.vertices[surface.faces]
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     area = areas(surface.vertices, surface.faces)
@@ -41,7 +41,7 @@ def _proper(surface: Surface) -> NDArray[np.bool_]:
 
 
 def _crowded(surface: Surface) -> NDArray[np.bool_]:
-    """Return (T,) the smallest triangle at every edge that has too many, or two with the same direction."""
+    """Mark the smallest triangle at every edge with too many triangles or two in the same direction, (T,)."""
     edges, edge_of = edges_of(surface.faces)
     forward = surface.faces < np.roll(surface.faces, -1, axis=1)
     uses = np.stack([np.bincount(edge_of[way], minlength=len(edges)) for way in (forward, ~forward)])

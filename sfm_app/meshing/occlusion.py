@@ -1,4 +1,4 @@
-"""What a camera sees of a surface."""
+"""Occlusion of points on a surface by the surface."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +7,7 @@ from sfm_app.meshing.open3d import load_open3d
 
 
 class Occluders:
-    """The triangles that stand between points and cameras."""
+    """Triangles that may hide points from cameras."""
 
     def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
         """Prepare for ray casting.
@@ -25,7 +25,7 @@ class Occluders:
 
         Args:
             center: (3,) of the camera.
-            slack: length of the first part of the way that does not count; the points' own triangles are there.
+            slack: length of the start of each ray that is ignored, because the point's own triangles are there.
             points: (N, 3).
         """
         way = center - points

@@ -1,4 +1,4 @@
-"""Loading Open3D: slowly imported, talkative, and in need of a library that bare Linux machines lack."""
+"""Import of Open3D, which is slow, logs much, and needs a library that minimal Linux systems lack."""
 
 import ctypes
 import functools
@@ -10,11 +10,11 @@ import libusb_package
 
 @functools.cache
 def load_open3d() -> Any:
-    """Import Open3D, quiet, with the libusb that its wheel expects on the system.
+    """Import Open3D, with little logging and with the libusb that its wheel expects on the system.
 
     Call it inside the functions that need Open3D: the import takes more than a second.
     """
-    # Open3D links to libusb-1.0.so.0; once a library of that name is in the process, the linker looks no further.
+    # Open3D links to libusb-1.0.so.0; a library of that name that is already loaded is used.
     library = libusb_package.get_library_path()
     if library is not None:
         ctypes.CDLL(str(library), mode=ctypes.RTLD_GLOBAL)

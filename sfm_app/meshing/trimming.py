@@ -1,4 +1,4 @@
-"""Where a surface ends: small gaps in what is measured are bridged, and the border is cut along a smooth line.
+"""Trimming of a surface: small gaps in its support are bridged, and the border is cut along a smooth line.
 
 SciPy is imported where it is used: a program that only estimates fundamental matrices starts without it.
 """
@@ -17,18 +17,18 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 SMOOTHING = 20
-"""Averages over neighbors that take the fringe off the border."""
+"""Iterations of averaging over neighbors that smooth the border."""
 MAX_FREE = 0.1
-"""A gap is not bridged where photos see through this share of it: then it is the way around an edge, not a hole."""
+"""A gap is not bridged if photos see through this share of it: then it is free space beside an edge, not a hole."""
 
 MIN_SHARE = 0.25
-"""Of the photos that should see a vertex so many confirm it; the depth maps of the others are empty there. Flakes of
-sky beside outlines are never seen through, and the more photos, the more of them are confirmed by one or two."""
+"""Smallest share of photos that confirm a vertex among those that confirm it or have an empty depth map there. Flakes
+of sky beside outlines are never seen through, and with more photos, one or two confirm more of them."""
 
 
 @dataclass(slots=True, eq=False)
 class Support:
-    """How many photos confirm each vertex of a surface, see through it, and know nothing where it should be."""
+    """Counts of photos that confirm each vertex of a surface, see through it, or have an empty depth map there."""
 
     confirmed: NDArray[np.int32]
     """(V,)."""
@@ -39,11 +39,11 @@ class Support:
 
     @classmethod
     def none(cls, count: int) -> "Support":
-        """Make the arrays of `count` vertices that no photo sees yet."""
+        """Make the zero counts of `count` vertices."""
         return cls(*(np.zeros(count, np.int32) for _ in range(3)))
 
     def add(self, verdict: NDArray[np.uint8]) -> None:
-        """Add what one photo says, see `judge`."""
+        """Add the verdict of one photo, from `judge`."""
         self.confirmed += verdict == CONFIRMED
         self.through += verdict == SEEN_THROUGH
         self.empty += verdict == EMPTY
@@ -55,16 +55,16 @@ class Support:
 
     @property
     def believed(self) -> NDArray[np.bool_]:
-        """(V,) whether enough of the photos that would see a vertex confirm it."""
+        """(V,) whether enough of the photos that should see a vertex confirm it."""
         enough = self.confirmed >= MIN_SHARE * (self.confirmed + self.empty)
         return np.asarray((self.confirmed > 0) & ~self.free & enough)
 
 
 def trim(surface: Surface, support: Support, max_gap_triangles: float, least: float) -> Surface:
-    """Keep what photos confirm and do not see through, and the small gaps in it; the border is a smooth line.
+    """Keep the parts that photos confirm and do not see through, bridge small gaps, and smooth the border.
 
     Args:
-        surface: closed, as Poisson gives it.
+        surface: closed, from Poisson reconstruction.
         support: of its vertices.
         max_gap_triangles: as for `bridge_gaps`.
         least: as for `drop_doubtful`.
@@ -76,16 +76,16 @@ def trim(surface: Surface, support: Support, max_gap_triangles: float, least: fl
 
 
 def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], max_width: float) -> FloatArray:
-    """Return support the unsupported patches that are small and not mostly seen through.
+    """Add support to unsupported patches that are small and hardly seen through.
 
     Args:
         surface: closed or open.
         support: (V,) positive where photos confirm the surface, negative where none does.
         free: (V,) where photos see through the surface.
-        max_width: of a patch that is bridged, in edges of the surface around it; it may be longer than wide.
+        max_width: largest width of a bridged patch, in edge lengths of its rim; its length is not limited.
 
     Returns:
-        (V,) support, 1 on the patches bridged.
+        (V,) support, 1 on bridged patches.
     """
     from scipy.sparse.csgraph import connected_components, dijkstra
 
@@ -110,15 +110,15 @@ def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], 
 
 
 def drop_doubtful(surface: Surface, support: FloatArray, confirmed: NDArray[np.int32], least: float) -> FloatArray:
-    """Take the support from connected parts that too few photos confirm on average.
+    """Remove the support of connected parts that too few photos confirm on average.
 
-    Crumbs around outlines are like that: chance agreement of two or three photos, and the gaps between them bridged.
+    Examples are fragments around outlines: two or three photos agree by chance, and the gaps between are bridged.
 
     Args:
-        surface: its edges connect the parts.
+        surface: its edges define the connected parts.
         support: (V,) positive where photos confirm the surface.
         confirmed: (V,) photos that confirm each vertex.
-        least: photos on average, >= 0.
+        least: smallest mean number of photos, >= 0.
     """
     from scipy.sparse.csgraph import connected_components
 
@@ -130,12 +130,12 @@ def drop_doubtful(surface: Surface, support: FloatArray, confirmed: NDArray[np.i
 
 
 def smooth_support(surface: Surface, support: FloatArray, steps: int) -> FloatArray:
-    """Return (V,) support averaged over the vertex and its neighbors: the border loses its fringe.
+    """Average the support over each vertex and its neighbors, (V,), to smooth the border.
 
     Args:
         surface: its edges are used.
         support: (V,) positive where photos confirm the surface.
-        steps: averages, >= 0.
+        steps: iterations, >= 0.
     """
     edges, _ = edges_of(surface.faces)
     graph = _graph(edges, len(support))
@@ -179,9 +179,9 @@ def cut(surface: Surface, support: FloatArray) -> Surface:
 
 
 def _split(faces: IndexArray, middle: IndexArray, inside: NDArray[np.bool_]) -> IndexArray:
-    """Return triangles whose corners are inside, and what is left of those with one or two.
+    """Return triangles with all corners inside, and the inner parts of those with one or two.
 
-    `middle` (T, 3) on ab, bc, ca.
+    `middle` (T, 3) holds the new vertices on the edges ab, bc, ca.
     """
     parts = [faces[inside.all(axis=1)]]
     count = inside.sum(axis=1)

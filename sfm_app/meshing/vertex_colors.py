@@ -14,7 +14,7 @@ ColorImage = NDArray[np.uint8]
 
 @dataclass(slots=True, eq=False)
 class Paint:
-    """Colors gathered photo by photo, and how much they weigh."""
+    """Weighted sums of colors over photos, and the sums of their weights."""
 
     total: NDArray[np.float32]
     """(V, 3) weighted sum of the colors."""
@@ -23,16 +23,16 @@ class Paint:
 
     @classmethod
     def none(cls, count: int) -> "Paint":
-        """Make the arrays of `count` vertices without a color yet."""
+        """Make the zero sums of `count` vertices."""
         return cls(np.zeros((count, 3), np.float32), np.zeros(count, np.float32))
 
     def add(self, other: "Paint") -> None:
-        """Add what another photo says."""
+        """Add the colors of another photo."""
         self.total += other.total
         self.weight += other.weight
 
     def over(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """Return (V, 3) the mean of the photos; vertices that no photo shows keep what they have in `colors`."""
+        """Return (V, 3) mean colors of the photos; vertices that no photo shows keep their color from `colors`."""
         mean = self.total / np.maximum(self.weight, np.finfo(np.float32).tiny)[:, None]
         return np.where(self.weight[:, None] > 0, np.rint(mean), colors).astype(np.uint8)
 
@@ -40,16 +40,16 @@ class Paint:
 def sample_colors(
     points: FloatArray, normals: FloatArray, verdict: NDArray[np.uint8], eye: Eye, image: ColorImage
 ) -> Paint:
-    """Return what one photo adds.
+    """Sample colors of one photo at the points that it confirms.
 
-    Its colors where it confirms the points, weighted by the pixels that a patch there gets.
+    The weight of a color is the area of a unit patch at the point, in pixels.
 
     Args:
         points: (N, 3).
         normals: (N, 3) unit.
-        verdict: (N,) what `judge` says about them.
+        verdict: (N,) from `judge`.
         eye: the photo's camera.
-        image: (H, W, 3), what its depth map covers, at any size.
+        image: (H, W, 3) the same field of view as the depth map, at any size.
     """
     paint = Paint.none(len(points))
     scale = np.array(image.shape[:2]) / eye.depth.shape

@@ -1,4 +1,4 @@
-"""What a photo says about points in space: its depth map confirms them, sees through them, is empty, or silent."""
+"""Visibility of points in a photo: its depth map confirms them, sees through them, is empty, or is no evidence."""
 
 from dataclasses import dataclass
 
@@ -15,12 +15,12 @@ SILENT, CONFIRMED, SEEN_THROUGH, EMPTY = 0, 1, 2, 3
 MIN_COSINE = 0.1
 """Least cosine between a surface's normal and the ray to the photo that confirms it."""
 THROUGH = 3.0
-"""What a photo sees lies this many tolerances behind a point that it sees through."""
+"""A photo sees through a point if its depths lie at least this many tolerances behind the point."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Eye:
-    """A posed photo without distortion and what it knows of depth."""
+    """A posed photo without distortion, and its depth map."""
 
     K: FloatArray
     """(3, 3) camera matrix in pixels."""
@@ -29,9 +29,9 @@ class Eye:
     t: FloatArray
     """(3,) translation of cam_from_world."""
     depth: DepthArray
-    """0 where unknown, negative where the photo is masked and says nothing."""
+    """0 where unknown, negative where the photo is masked and gives no evidence."""
     sample_px: float
-    """Where inside its pixel a depth is taken, in x and y; 0.5 is the pixel's center."""
+    """Position inside the pixel at which a depth is sampled, in x and y; 0.5 is the pixel's center."""
 
     @property
     def projection(self) -> FloatArray:
@@ -52,9 +52,9 @@ class Eye:
 def judge(points: FloatArray, normals: FloatArray, eye: Eye, tolerance: float) -> NDArray[np.uint8]:
     """Judge points on a surface: CONFIRMED, SEEN_THROUGH, EMPTY or SILENT.
 
-    A point is confirmed where the depths around it reach its own within the relative tolerance and it faces the photo;
-    it is seen through where all of them lie well behind it. The map is empty where it faces the photo and there are no
-    depths around it. About hidden points, and where it is masked, it is silent.
+    A point is CONFIRMED if it faces the photo and the surrounding depths agree with its own within the relative
+    tolerance. It is SEEN_THROUGH if all four surrounding depths lie well behind it. It is EMPTY if it faces the photo
+    and no depth around it is known. Hidden points and points in masked areas are SILENT.
 
     Args:
         points: (N, 3) in the world.
@@ -97,7 +97,7 @@ def _judge(
                     low, high, known = min(low, d), max(high, d), known + 1
                     near = near or abs(d - z) <= tolerance * z
                 masked += d < 0
-        # on a slope the four depths bracket the point's; across a step they do not belong together
+        # on a slope the four depths bracket the point's; across a step they are of different surfaces
         between = low <= z <= high and high - low <= 2.0 * THROUGH * tolerance * z
         if known == 0 and masked > 0:
             continue

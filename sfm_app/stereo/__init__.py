@@ -1,4 +1,4 @@
-"""Depth maps on CPU: pure functions on arrays, and the interface that every way to make depth maps has."""
+"""Depth maps on CPU: pure functions on arrays, and the interface of every depth-map method."""
 
 from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
 from sfm_app.stereo.method import DepthStore, DepthTask, Kind, make_on_cpu

@@ -10,26 +10,26 @@ from sfm_app.jit import kernel
 from sfm_app.stereo.view import DepthArray, FloatArray, View
 
 MIN_PATCH = 2e-4
-"""Smaller connected patches, as a share of the photo, are chance: errors agree, but not over an area."""
+"""Smallest patch kept, as a share of the photo: wrong depths agree by chance, but not over a connected area."""
 LEVELS = 16
-"""Steps that the tolerance is cut into where depths become whole numbers."""
+"""Integer levels per tolerance when depths are quantized for the speckle filter."""
 
 
 def merge_hypotheses(
     depths: NDArray[np.float32], parallaxes: NDArray[np.float32], tolerance: float
 ) -> tuple[DepthArray, NDArray[np.uint8]]:
-    """Return one depth per pixel from those that the neighbors gave.
+    """Fuse the depths from all neighbors into one depth per pixel.
 
-    The depth with the heaviest company within the tolerance wins; the company is averaged. A depth weighs the square of
-    its parallax, which is inversely proportional to its variance.
+    At each pixel, the largest-weight group of depths within the tolerance of one of them wins and is averaged. The
+    weight of a depth is its squared parallax, which is inversely proportional to its variance.
 
     Args:
-        depths: (N, H, W), 0 where a neighbor gave none.
+        depths: (N, H, W), 0 where unknown.
         parallaxes: (N, H, W) in pixels.
         tolerance: largest relative difference of depths that agree.
 
     Returns:
-        (H, W) depth, 0 where no neighbor gave any, and (H, W) how many neighbors agree with it.
+        (H, W) depth, 0 where no neighbor has one, and (H, W) number of neighbors that agree with it.
     """
     depth = np.zeros(depths.shape[1:], np.float32)
     support = np.zeros(depths.shape[1:], np.uint8)
@@ -59,7 +59,7 @@ def _merge(
                     if other > 0 and abs(other - z) <= tolerance * z:
                         w = parallaxes[j, row, col] ** 2
                         weight += w
-                        mean += w / other  # noise of disparities is noise of inverse depths
+                        mean += w / other  # disparity noise is inverse-depth noise
                         members += 1
                 if weight > heaviest:
                     heaviest = weight
@@ -70,15 +70,15 @@ def _merge(
 def count_agreeing(
     view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
 ) -> NDArray[np.uint8]:
-    """Return how many other depth maps confirm each depth of a view, (H, W).
+    """Count the other depth maps that confirm each depth of a view, (H, W).
 
-    A map confirms a depth when the point, seen from there, has a depth within the tolerance of the map's.
+    A map confirms a point if the point's depth in the other view is within the tolerance of the map's depth there.
 
     Args:
         view: the photo.
         depth: (H, W) of the photo; 0 where unknown.
         others: other photos with their depth maps.
-        tolerance: relative difference in depth that passes.
+        tolerance: largest relative difference in depth.
     """
     agreeing = np.zeros(depth.shape, np.uint8)
     K_inv = np.linalg.inv(view.K)
@@ -90,7 +90,7 @@ def count_agreeing(
 
 
 def without_specks(depth: DepthArray, tolerance: float) -> DepthArray:
-    """Return depth map without small patches in which depths differ by less than the tolerance from pixel to pixel.
+    """Remove small patches in which depths differ by less than the tolerance from pixel to pixel.
 
     Args:
         depth: (H, W); 0 where unknown.
@@ -101,7 +101,7 @@ def without_specks(depth: DepthArray, tolerance: float) -> DepthArray:
         return depth
     logarithm = np.log(np.where(known, depth, depth[known].min()), dtype=np.float32)
     levels = 1 + (logarithm - logarithm.min()) * (LEVELS / tolerance)
-    # 16 bits: what is farther than that is far
+    # OpenCV needs 16 bits; depths beyond that range share one level
     patches = np.where(known, np.clip(levels, 1, 32000), -32000).astype(np.int16)
     cv2.filterSpeckles(patches, -32000, int(MIN_PATCH * depth.size), LEVELS)
     return np.where(patches > 0, depth, np.float32(0))

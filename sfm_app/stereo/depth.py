@@ -1,4 +1,4 @@
-"""Depth maps of a photo: matched with its neighbors, then checked against their depth maps."""
+"""The depth map of a photo: matched with neighboring photos, then checked against their depth maps."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -21,15 +21,15 @@ from sfm_app.types import Rejected
 SWEEPS = 1
 """The second improves a hundredth of the pixels and takes as long as the first."""
 WEAK = 0.3
-"""Correlation below which there is next to nothing to be seen: in skies depths agree by chance at most, on plain walls
-semi-global matching bridges what is between the windows in every photo alike."""
+"""Correlation below which there is hardly any texture: in skies depths agree only by chance, and on plain walls
+semi-global matching interpolates between the windows in the same way in every photo."""
 WEAK_NEED = 3
-"""That many more depth maps have to agree there; where there are not so many, it stays empty."""
+"""Additional depth maps that have to agree at such a correlation; with too few maps, the depth is dropped."""
 UNSURE = 0.5
 """Correlation below which one more depth map has to agree."""
 
 CLIPPED_GRAY = 4
-"""Within so many levels of black or of white nothing is seen, and what matching finds there comes from beside it."""
+"""Gray levels from black or white within which pixels are clipped: their depths come from neighboring pixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,29 +43,29 @@ class DepthMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthEstimate:
-    """Depths of one photo before other depth maps were asked."""
+    """Depths of one photo before the check against other depth maps."""
 
     depth: DepthArray
     confidence: NDArray[np.float32]
-    """(H, W) in [0, 1]: how well the better half of the neighbors look alike there; 0 where the depth is 0."""
+    """(H, W) in [0, 1]: mean correlation with the better half of the neighbors; 0 where the depth is 0."""
 
 
 def match_depths(
     view: View, candidates: Sequence[View], load: Callable[[View], GrayImage], count: int, tolerance: float
 ) -> DepthEstimate | Rejected:
-    """Match a photo with the first candidates that can be rectified with it, and find what suits them all.
+    """Match a photo with the first candidates that can be rectified with it, and combine the results.
 
-    Semi-global matching with each neighbor gives depths; where they agree they start PatchMatch with all neighbors.
+    Semi-global matching with each neighbor gives depths; the merged depths initialize PatchMatch with all neighbors.
 
     Args:
         view: the photo.
         candidates: possible neighbors, best first.
-        load: gives the gray photo of a view.
+        load: returns the gray photo of a view.
         count: neighbors at most.
         tolerance: relative difference within which depths agree.
     """
     image = load(view)
-    # images have their values at the pixels' centers
+    # gray values are sampled at pixel centers
     centered = replace(view, sample_px=0.5)
     used: list[tuple[View, GrayImage]] = []
     found: list[tuple[DepthArray, DepthArray]] = []
@@ -91,20 +91,20 @@ def match_depths(
 
 
 def clipped(image: GrayImage) -> NDArray[np.bool_]:
-    """Return (H, W) whether a photo is black or blown out at a pixel and around it."""
+    """Return (H, W) whether the 3x3 mean around a pixel is nearly black or white."""
     around = cv2.blur(image, (3, 3))
     return np.asarray((around <= CLIPPED_GRAY) | (around >= 255 - CLIPPED_GRAY))
 
 
 def _started(depth: DepthArray) -> PlaneArray:
-    """Return planes at the depths themselves, with the slopes of what is around them."""
+    """Return planes with the exact depth of each pixel and the slopes fitted to its surroundings."""
     planes = fit_planes(depth)
     planes[..., 0] = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
     return planes
 
 
 def _sampled(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) -> DepthEstimate:
-    """Return depths and confidences where a view wants them in its pixels."""
+    """Sample depths and confidences at the position inside the pixel that a view asks for."""
     shift = np.float32(sample_px - 0.5)
     inverse = planes[..., 0] + shift * (planes[..., 1] + planes[..., 2])
     known = (planes[..., 0] > 0) & (inverse > 0) & (cost < NO_MATCH)
@@ -120,10 +120,10 @@ def confirm_depths(
     min_agreeing: int,
     tolerance: float,
 ) -> DepthMap | Rejected:
-    """Keep the depths that enough other maps confirm, cut at outlines; drop specks, bridge plain walls, add normals.
+    """Keep depths that enough other maps confirm; remove spill and specks, fill plain walls, add normals.
 
-    Enough is `min_agreeing`; one more where the photos look little alike and beside broad empty places, three more
-    where they hardly do, and never in skies.
+    The required number is `min_agreeing`; one more at low correlation and next to broad gaps; three more at very low
+    correlation. Depths in skies are always dropped.
 
     Args:
         view: the photo.

@@ -1,4 +1,4 @@
-"""Depths that spill over the outline of a thing onto what is beside it."""
+"""Depths of an object that spill over its outline onto the background."""
 
 import cv2
 import numpy as np
@@ -8,28 +8,28 @@ from sfm_app.stereo.patch_match import BORDER
 from sfm_app.stereo.view import DepthArray, GrayImage
 
 REACH_PX = BORDER + 1
-"""A window with its middle so far beside an outline still holds a pixel of it; where there is nothing else to be seen,
-that pixel alone decides."""
+"""A window centered this far from an outline still contains a pixel of it; on a textureless background that pixel
+alone decides."""
 SURROUNDINGS_PX = 4 * REACH_PX + 1
-"""Side of the square around a pixel in which it is compared with what has a depth and what has none."""
+"""Side of the square around a pixel that is compared with it: pixels with a depth, and pixels without one."""
 NOISE_GRAY = 3.0
-"""Least standard deviation of grays: noise, and traces of compression."""
+"""Smallest standard deviation of gray levels: sensor noise and compression artifacts."""
 ODDS = 8.0
-"""So many times more likely has a pixel's gray to be among those without a depth than among those with one."""
+"""Smallest likelihood ratio of a pixel's gray, pixels without a depth over pixels with one, that removes its depth."""
 LEAST_PX = 5
-"""Pixels that say what the surroundings look like."""
+"""Fewest pixels that determine the gray distribution of the surroundings."""
 ANY_GRAY = 0.5 * np.log(2.0 * np.pi) - np.log(256.0)
-"""Log likelihood of a gray where nothing is known: all are alike. Things as thin as their rims are such."""
+"""Log likelihood of a gray under the uniform distribution, for objects so thin that they consist of rim only."""
 
 
 def without_spill(depth: DepthArray, image: GrayImage) -> DepthArray:
-    """Return the depth map without rims that look like the empty side, not like the surface that they continue.
+    """Remove rim depths whose gray resembles the empty side rather than the surface that they extend.
 
-    Skies and plain backgrounds have no depth of their own, but a window of correlation that reaches a thing in front
-    of them finds that thing's: a seam as wide as half the window, in every photo alike, so that no check between photos
-    takes it off. The pixels themselves tell: grays with a depth, away from the rim, and grays without one are each
-    taken as normally distributed around a pixel. Next to gaps in a plain surface both look the same, and nothing goes;
-    nor does it next to gaps narrower than two rims, which lie in surfaces rather than beside them.
+    Skies and plain backgrounds have no depth of their own, but a correlation window that reaches an object in front
+    of them finds the object's depth. The result is a seam half a window wide. It is the same in every photo, so no
+    check between photos removes it. The gray levels decide: around a pixel, those with a depth, away from the rim, and
+    those without one are each modeled as normally distributed. Next to gaps in a plain surface both distributions are
+    the same, and nothing is removed. Gaps narrower than two rims are ignored: they lie within surfaces.
 
     Args:
         depth: (H, W), 0 where unknown.
@@ -44,7 +44,7 @@ def without_spill(depth: DepthArray, image: GrayImage) -> DepthArray:
 
 
 def rims(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return (H, W) the pixels with a depth that lie within `REACH_PX` of an empty place broader than two rims."""
+    """Mark pixels with a depth within `REACH_PX` of a gap that is broader than two rims, (H, W)."""
     away = cv2.distanceTransform(1 - _broad(~known).view(np.uint8), cv2.DIST_L2, 3)
     return np.asarray(known & (away <= REACH_PX))
 
@@ -55,9 +55,9 @@ def _broad(empty: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _log_likelihood(gray: NDArray[np.float32], among: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Return (H, W) of each pixel's gray among the marked pixels around it.
+    """Return (H, W) log likelihood of each pixel's gray, given the marked pixels around it.
 
-    Nan, which compares as false, if there are few.
+    NaN, which compares as false, where too few are marked.
     """
     side = (SURROUNDINGS_PX, SURROUNDINGS_PX)
     marked = among.astype(np.float32)

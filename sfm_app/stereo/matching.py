@@ -1,4 +1,4 @@
-"""Disparities of rectified photos, and the depths they stand for."""
+"""Disparities of rectified photos, and the corresponding depths."""
 
 import cv2
 import numpy as np
@@ -11,11 +11,11 @@ from sfm_app.stereo.view import DepthArray, FloatArray, GrayImage, View
 BLOCK_PX = 3
 NO_DISPARITY = -1.0
 MIN_PARALLAX_PX = 1.0
-"""Less says nothing about the depth: next to the epipole, and far away."""
+"""Smaller parallaxes, near the epipole and far away, do not determine the depth."""
 
 
 def disparities(left: GrayImage, right: GrayImage, count: int) -> NDArray[np.float32]:
-    """Return semi-global matching (Hirschmueller, PAMI 2008; OpenCV's block variant) in [0, count), to sub-pixels.
+    """Compute subpixel disparities in [0, count) by semi-global matching (Hirschmueller, PAMI 2008; OpenCV's variant).
 
     Args:
         left: (H, W) rectified.
@@ -37,7 +37,7 @@ def disparities(left: GrayImage, right: GrayImage, count: int) -> NDArray[np.flo
         uniquenessRatio=10,
         speckleWindowSize=100,
         speckleRange=2,
-        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # five directions take a third longer and give no more
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,  # five directions take a third longer without better results
     )
     sixteenths = matcher.compute(left, right)
     return np.where(sixteenths < 0, NO_DISPARITY, sixteenths / 16.0).astype(np.float32)
@@ -46,7 +46,7 @@ def disparities(left: GrayImage, right: GrayImage, count: int) -> NDArray[np.flo
 def depths_from_disparities(
     disparity: NDArray[np.float32], rectification: Rectification, reference: View, neighbor: View
 ) -> tuple[DepthArray, DepthArray]:
-    """Bring a rectified disparity map back into the reference.
+    """Lift a rectified disparity map to depths of the reference.
 
     Args:
         disparity: (H, W) of the left canvas in pixels; < 0 where unknown.
@@ -114,7 +114,7 @@ def _lift(
                 continue
             p0 = (z * (P[0, 0] * x + P[0, 1] * y + P[0, 2]) + P[0, 3]) / p2
             p1 = (z * (P[1, 0] * x + P[1, 1] * y + P[1, 2]) + P[1, 3]) / p2
-            # beyond the neighbor's border the matcher only guesses from what is beside
+            # beyond the neighbor's border the matcher only extrapolates
             if 2 < p0 < size[3] - 2 and 2 < p1 < size[2] - 2:
                 depth[row, col] = z
                 parallax[row, col] = shift
@@ -122,7 +122,7 @@ def _lift(
 
 @kernel
 def _interpolated(disparity: NDArray[np.float32], u: float, v: float) -> float:
-    """Return bilinear where the surface is continuous, else the nearest value; -1 where there is none."""
+    """Return the bilinear value where the surface is continuous, else the nearest one; -1 where there is none."""
     height, width = disparity.shape
     i, j = int(np.floor(v)), int(np.floor(u))
     if i < 0 or j < 0 or i + 1 >= height or j + 1 >= width:

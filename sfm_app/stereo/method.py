@@ -1,4 +1,4 @@
-"""What a way to make depth maps gets and gives, and the one that runs on every machine."""
+"""The interface of depth-map methods, and the method that runs on every machine."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ Kind = Literal["photometric", "geometric"]
 
 
 class DepthStore(Protocol):
-    """Where photos come from and maps go; a map appears complete or not at all."""
+    """Reads photos and keeps maps; a map appears complete or not at all."""
 
     def photo(self, view: View, /) -> GrayImage:
         """Return the photo without distortion, (H, W)."""
@@ -54,7 +54,7 @@ class DepthStore(Protocol):
 
 
 class Map(Protocol):
-    """Results in the order of the items, computed in parallel, with progress under a label."""
+    """Applies a function to items in parallel and returns the results in order; a label names the progress."""
 
     def __call__(
         self, function: Callable[[int], Rejected | None], items: Sequence[int], label: str, /
@@ -63,13 +63,13 @@ class Map(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DepthTask:
-    """What has to be done. Maps that are there already come from the same inputs and settings and can stay."""
+    """The input of a depth-map method. Existing maps come from the same inputs and settings and are reused."""
 
     folder: Path
     """COLMAP's dense workspace with the undistorted photos and their model."""
     views: Sequence[View]
     ranked: Sequence[Sequence[int]]
-    """Per view the views that serve it best, best first."""
+    """For each view, the indices of its neighbors, best first."""
     options: DepthSettings
     store: DepthStore
     map: Map
@@ -79,7 +79,7 @@ def make_on_cpu(task: DepthTask) -> list[Rejected | None]:
     """Match every photo with its neighbors, then keep what the depth maps of other photos confirm.
 
     Returns:
-        For every view why it has no maps, or None.
+        For every view the reason why it has no maps, or None.
     """
     everything = range(len(task.views))
     matched = task.map(partial(_match, task=task), everything, "matching depths")

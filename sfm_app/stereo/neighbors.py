@@ -1,4 +1,4 @@
-"""Which other photos a photo is matched with."""
+"""Selection of the neighbors that a photo is matched with."""
 
 from collections.abc import Sequence
 
@@ -13,15 +13,15 @@ BEST_ANGLE_DEG = 8.0
 
 
 def rank_neighbors(views: Sequence[View], count: int) -> list[list[int]]:
-    """Return, for every view, the indices of the views that serve it best, best first.
+    """Return for every view the indices of its best neighbors, best first.
 
     Greedy coverage: the next neighbor is the one that adds most to the sparse points of the view. A point adds its
-    weight (triangulation angle, difference in scale), up to halved for each time that it is covered already, so that
-    the choice spreads over the photo instead of crowding on one side.
+    weight (triangulation angle, difference in scale), reduced by up to half for each neighbor that already covers it.
+    So the neighbors cover the whole photo instead of crowding on one side.
 
     Args:
         views: all photos, with their sparse points.
-        count: at most so many per view.
+        count: most neighbors per view.
     """
     return [_rank(view, views, count) for view in views]
 
@@ -47,7 +47,7 @@ def _rank(view: View, views: Sequence[View], count: int) -> list[int]:
 
 
 def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
-    """Return (N,) in [0, 1]: how well points can be matched between two views, from their angle and scale.
+    """Return (N,) in [0, 1]: how well points can be matched between two views, by angle and scale.
 
     Args:
         view: one view.
@@ -64,7 +64,7 @@ def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:
 
 
 def triangulation_angles_deg(center1: FloatArray, center2: FloatArray, points: FloatArray) -> NDArray[np.float64]:
-    """Return (N,) angles in degrees under which points see two centers.
+    """Return (N,) angles in degrees between the rays from points to two centers.
 
     Args:
         center1: (3,) of one camera.

@@ -8,21 +8,21 @@ from sfm_app.stereo.patch_match import PlaneArray
 from sfm_app.stereo.view import DepthArray, FloatArray, View
 
 SIGMA_PX = 2.5
-"""How fast the weight of a pixel falls off; smaller keeps more detail, larger takes more noise out of the normals."""
+"""Standard deviation of the weights in the window; smaller keeps more detail, larger makes smoother normals."""
 RADIUS_PX = 5
 MAX_STEP = 0.02
 """Relative depth difference beyond which a pixel belongs to another surface."""
 MIN_WEIGHT = 0.25
-"""Least share of the window that has to be filled."""
+"""Smallest share of the window's weight that must have a depth."""
 
 
 def fit_planes(depth: DepthArray) -> PlaneArray:
-    """Return plane through the surroundings of every pixel, by least squares.
+    """Fit a plane to the surroundings of every pixel, by least squares.
 
     A plane n'X = 1 has the inverse depth n'x at the ray x = K^-1 (u, v, 1), which is linear in n and in the noise.
 
     Returns:
-        (H, W, 3) inverse depth at the pixel and its slopes per pixel; 0 where there is no depth or little around it.
+        (H, W, 3) inverse depth at the pixel and its slopes per pixel; 0 where the depth is unknown or isolated.
     """
     planes = np.zeros((*depth.shape, 3), np.float32)
     steps = np.arange(-RADIUS_PX, RADIUS_PX + 1)
@@ -59,7 +59,7 @@ def _fit(depth: DepthArray, window: FloatArray, planes: PlaneArray) -> None:
 
 @kernel
 def _slopes(depth: DepthArray, row: int, col: int, window: FloatArray) -> tuple[float, float, float]:
-    """Return weighted fit of the inverse depth g0 + gu du + gv dv, (du, dv) in pixels from (col, row); g0 = 0: none."""
+    """Fit the inverse depth g0 + gu du + gv dv, (du, dv) in pixels from (col, row); g0 = 0 where undetermined."""
     height, width = depth.shape
     z = depth[row, col]
     n, su, sv, suu, suv, svv, q, qu, qv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

@@ -1,8 +1,8 @@
-"""A plane for every pixel, passed on from pixel to pixel where the photos like it better.
+"""A plane for every pixel, propagated to neighboring pixels where it lowers the matching cost.
 
 Bleyer, Rhemann, Rother: PatchMatch stereo. BMVC 2011; Schoenberger et al.: Pixelwise view selection for unstructured
-multi-view stereo. ECCV 2016 (the weighted correlation). Semi-global matching sees the world as steps and widens what
-stands in front; started from its depths, one or two sweeps find slanted surfaces and the true borders.
+multi-view stereo. ECCV 2016 (the weighted correlation). Semi-global matching prefers fronto-parallel surfaces and
+widens the foreground. Initialized with its depths, one or two sweeps find slanted surfaces and the true borders.
 """
 
 from collections.abc import Sequence
@@ -15,51 +15,51 @@ from sfm_app.jit import kernel
 from sfm_app.stereo.view import FloatArray, GrayImage, View
 
 PlaneArray = NDArray[np.float32]
-"""(H, W, 3): inverse depth q and its slopes, q + qu du + qv dv at (du, dv) pixels beside; q = 0 where unknown."""
+"""(H, W, 3): inverse depth q and its slopes, q + qu du + qv dv at (du, dv) pixels away; q = 0 where unknown."""
 
 REACH = 2
 STRIDE_PX = 2
-"""The window has (2 REACH + 1)^2 pixels, so far apart."""
+"""The window has (2 REACH + 1)^2 pixels with this spacing."""
 SIDE = 2 * REACH + 1
 BORDER = REACH * STRIDE_PX
 SIGMA_PX = 4.0
 FALLOFF_GRAY = 12.0
-"""Pixels that differ so much in gray from the middle weigh 1/e: they may belong to something else."""
+"""Difference in gray from the center pixel at which the weight is 1/e: the pixel may be of another object."""
 NOISE_GRAY = 2.0
-"""Standard deviation of gray that is no texture."""
+"""Standard deviation of gray levels without texture."""
 NO_MATCH = 2.0
-"""The cost where no neighbor sees the pixel; worse than any."""
+"""The cost where no neighbor sees the pixel; no correlation costs more."""
 MIN_GAIN = 0.01
-"""A plane that is better by less is not taken: noise alone would make flat areas rough."""
+"""Smallest decrease of the cost that replaces a plane; without it, noise would make flat areas rough."""
 STEP_PX = 0.3
-"""Largest random change that is tried, in pixels of parallax."""
+"""Largest random change of a trial plane, in pixels of parallax."""
 SLOPE = 0.2
-"""The same for the slopes, as a share of it per pixel."""
+"""Largest random change of the slopes, as a share of `STEP_PX` per pixel."""
 SAME_PX, SAME_SLOPE = 0.1, 0.03
-"""Parallax within which two planes count as one, at the pixel and per pixel beside it."""
+"""Parallax within which two planes count as equal, at the pixel and per pixel of distance."""
 MIN_AREA, MAX_AREA = 0.1, 8.0
-"""Areas of a pixel in the neighbor between which it can be compared."""
+"""Smallest and largest area of a warped pixel in the neighbor, in pixels, at which the two are compared."""
 
 
 def improve_planes(
     planes: PlaneArray, view: View, image: GrayImage, others: Sequence[tuple[View, GrayImage]], sweeps: int
 ) -> NDArray[np.float32]:
-    """Improve planes about the pixels' centers in place: down and to the right, then back, and so on.
+    """Improve planes about the pixel centers in place: sweep down and to the right, then back, and so on.
 
-    A pixel tries the planes of the two pixels that the sweep has just left, and small changes of its own. A plane costs
-    1 - the normalized cross-correlation of the pixel's window with its image in a neighbor, the mean over the better
-    half of the neighbors, because the others may see something in front. Weights in the window fall with the distance
-    and with the difference in gray from the middle.
+    A pixel tries the planes of its two preceding neighbors in the sweep, and small random changes of its own plane. The
+    cost of a plane is 1 - the normalized cross-correlation of the pixel's window with its image in a neighboring photo,
+    averaged over the better half of the photos, because the others may be occluded. Weights in the window fall with the
+    distance and with the difference in gray from the center.
 
     Args:
         planes: (H, W, 3) inverse depth and its slopes per pixel; changed.
         view: the photo.
         image: (H, W) gray photo.
         others: neighbors and their gray photos.
-        sweeps: how many, >= 0.
+        sweeps: number of sweeps, >= 0.
 
     Returns:
-        (H, W) cost in [0, 2]; 2 where nothing is known.
+        (H, W) cost in [0, 2]; 2 where unknown.
     """
     height, width = (max(photo.shape[side] for _, photo in others) for side in (0, 1))
     stack = np.zeros((len(others), height, width), np.float32)
@@ -90,7 +90,7 @@ def _sweep(
     best, trial = np.empty(3), np.empty(3)
     for k in range(BORDER, height - BORDER):
         row = k if step == 1 else height - 1 - k
-        # every row has its own random numbers (a linear congruential generator of Knuth's)
+        # every row has its own random numbers (Knuth's linear congruential generator)
         state = np.uint64(2 * row + 1) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(sweep)
         for m in range(BORDER, width - BORDER):
             col = m if step == 1 else width - 1 - m
@@ -129,7 +129,7 @@ def _sweep(
 def _read_window(
     image: GrayImage, row: int, col: int, falloff: Any, weights: NDArray[np.float32], grays: NDArray[np.float32]
 ) -> tuple[float, float]:
-    """Fill in weights, of sum 1, and gray values around a pixel; gives their weighted mean and variance."""
+    """Fill in weights, of sum 1, and gray values around a pixel; return the weighted mean and variance."""
     near, alike = falloff
     middle = np.int64(image[row, col])  # int() of an unsigned number stays unsigned
     total, mean, square = 0.0, 0.0, 0.0
@@ -151,7 +151,7 @@ def _read_window(
 
 @kernel
 def _inverse_depth_per_px(row: int, col: int, q: float, projections: FloatArray) -> float:
-    """Return the change of the inverse depth that moves the pixel by one pixel in the neighbor where it moves most."""
+    """Return the change of inverse depth that moves the image by one pixel in the neighbor where it moves most."""
     most = 1e-12
     x, y = col + 0.5, row + 0.5
     for k in range(len(projections)):
@@ -168,7 +168,7 @@ def _inverse_depth_per_px(row: int, col: int, q: float, projections: FloatArray)
 def _better(
     row: int, col: int, trial: FloatArray, best: FloatArray, lowest: float, window: Any, others: Any, costs: FloatArray
 ) -> float:
-    """Replace the best plane where the trial is better; gives the lower cost."""
+    """Replace the best plane if the trial costs less by `MIN_GAIN`; return the lowest cost."""
     if trial[0] <= 0:
         return lowest
     found = _cost(row, col, trial, window, others, costs)
@@ -191,7 +191,7 @@ def _cost(row: int, col: int, plane: FloatArray, window: Any, others: Any, costs
             continue
         u = (P[0, 0] * x + P[0, 1] * y + P[0, 2] + P[0, 3] * q) / w
         v = (P[1, 0] * x + P[1, 1] * y + P[1, 2] + P[1, 3] * q) / w
-        # within a window the plane's homography is affine
+        # within a window the plane's homography is nearly affine
         wu, wv = P[2, 0] + P[2, 3] * plane[1], P[2, 1] + P[2, 3] * plane[2]
         uu = (P[0, 0] + P[0, 3] * plane[1] - u * wu) / w
         uv = (P[0, 1] + P[0, 3] * plane[2] - u * wv) / w
@@ -221,7 +221,7 @@ def _cost(row: int, col: int, plane: FloatArray, window: Any, others: Any, costs
 
 @kernel
 def _correlation(stack: NDArray[np.float32], start: int, stride: int, affine: Any, window: Any) -> float:
-    """Return weighted normalized cross-correlation of a window and its image; noise on both sides lowers it."""
+    """Return the weighted normalized cross-correlation of a window and its image; both variances include noise."""
     weights, grays, mean, variance = window
     u, v = np.float32(affine[0]), np.float32(affine[1])
     uu, uv, vu, vv = np.float32(affine[2]), np.float32(affine[3]), np.float32(affine[4]), np.float32(affine[5])
@@ -234,7 +234,7 @@ def _correlation(stack: NDArray[np.float32], start: int, stride: int, affine: An
             x, y = u + a * uu + b * uv, v + a * vu + b * vv
             column, line = np.int32(x), np.int32(y)
             fx, fy = x - np.float32(column), y - np.float32(line)
-            # unsigned indices spare the test for negative ones, a third of the time
+            # unsigned indices need no test for negative values, which takes a third of the time
             above = np.uint64(start + line * stride + column)
             below = above + np.uint64(stride)
             upper = stack[above] + fx * (stack[above + np.uint64(1)] - stack[above])

@@ -1,9 +1,8 @@
-"""Plain walls: areas of even color whose known depths lie on one plane are that plane, between what is known.
+"""Plain walls: areas of uniform color whose known depths lie on one plane are filled with that plane.
 
-Where a photo shows nothing but one color there is nothing to match, and what matching finds there is scattered and
-rough. People paint flat things evenly, so that a plane says more than each pixel does (Gallup, Frahm, Pollefeys:
-Piecewise planar and non-planar stereo for urban scene reconstruction. CVPR 2010). Nothing is carried on beyond the
-known depths, and skies have none.
+Areas of one color cannot be matched: their depths are sparse and noisy. Flat objects are often painted uniformly, so a
+plane is more accurate than depths of single pixels (Gallup, Frahm, Pollefeys: Piecewise planar and non-planar stereo
+for urban scene reconstruction. CVPR 2010). Planes are not extrapolated beyond the known depths; skies have none.
 """
 
 import cv2
@@ -14,23 +13,23 @@ from sfm_app.stereo.view import DepthArray, FloatArray, GrayImage
 
 BLUR_PX = 1.5
 MAX_SLOPE = 2.5
-"""Gray levels per pixel of the blurred photo within an area."""
+"""Largest gradient of the blurred photo within an area, in gray levels per pixel."""
 MIN_AREA = 0.002
-"""Of an area, as a share of the photo; smaller gaps are closed by the surface."""
+"""Smallest area, as a share of the photo; the surface reconstruction closes smaller gaps."""
 MIN_KNOWN = 0.1
 """Least share of an area that has a depth."""
 MIN_ON_PLANE = 0.8
 """Least share of the known depths that lie on the plane."""
 SAMPLES, SAMPLED_PIXELS = 100, 2000
 CELLS = 6
-"""Along each side of an area: known depths are averaged in cells, which tells a bend from noise."""
+"""Cells along each side of an area: averages of known depths in cells separate curvature from noise."""
 CELL_PIXELS = 25
 MAX_BEND = 0.3
-"""Largest root mean square over the cells, in tolerances."""
+"""Largest root mean square of the cells' mean residuals, in tolerances."""
 
 
 def bridge_even_areas(depth: DepthArray, image: GrayImage, tolerance: float) -> DepthArray:
-    """Put areas of even color on their planes, as far as known depths reach around them.
+    """Replace depths in areas of uniform color by planes, within the convex hull of the known depths.
 
     Args:
         depth: (H, W) depths that other photos confirm, 0 where unknown.
@@ -38,7 +37,7 @@ def bridge_even_areas(depth: DepthArray, image: GrayImage, tolerance: float) -> 
         tolerance: largest relative difference of depths that agree.
 
     Returns:
-        (H, W) depth; pixels of other areas are as before.
+        (H, W) depth, unchanged in other areas.
     """
     bridged = depth.copy()
     _, labels, stats, _ = cv2.connectedComponentsWithStats(_even(image).view(np.uint8), connectivity=4)
@@ -58,7 +57,7 @@ def _even(image: GrayImage) -> NDArray[np.bool_]:
 
 
 def _bridge(depth: DepthArray, area: NDArray[np.bool_], tolerance: float) -> None:
-    """Replace the depths of an area, in its box, where it is a plane."""
+    """Replace the depths of an area, in its bounding box, if they lie on a plane."""
     known = area & (depth > 0)
     if np.count_nonzero(known) < max(MIN_KNOWN * np.count_nonzero(area), CELL_PIXELS):
         return
@@ -79,12 +78,12 @@ def _bridge(depth: DepthArray, area: NDArray[np.bool_], tolerance: float) -> Non
 
 
 def _consensus_plane(A: FloatArray, inverse: FloatArray, tolerance: float) -> FloatArray:
-    """Return inverse depth as a linear function of column and row, (3,): the one that most pixels agree with."""
+    """Estimate inverse depth as a linear function of column and row, (3,), by consensus of the pixels."""
     rng = np.random.default_rng(0)
     some = rng.integers(0, len(A), SAMPLED_PIXELS)
     best, most = np.array([np.median(inverse), 0.0, 0.0]), 0
     for triple in rng.integers(0, len(A), (SAMPLES, 3)):
-        if abs(np.linalg.det(A[triple])) < 1.0:  # on a line
+        if abs(np.linalg.det(A[triple])) < 1.0:  # collinear
             continue
         plane = np.linalg.solve(A[triple], inverse[triple])
         agreeing = int(np.count_nonzero(np.abs(A[some] @ plane / inverse[some] - 1.0) < tolerance))
@@ -99,7 +98,7 @@ def _consensus_plane(A: FloatArray, inverse: FloatArray, tolerance: float) -> Fl
 
 
 def _bend(row: NDArray[np.int64], col: NDArray[np.int64], residual: FloatArray, shape: tuple[int, ...]) -> float:
-    """Return root mean square of the mean residuals of cells."""
+    """Return the root mean square of the cells' mean residuals."""
     cell = row * CELLS // shape[0] * CELLS + col * CELLS // shape[1]
     count = np.bincount(cell, minlength=CELLS**2)
     full = count >= CELL_PIXELS

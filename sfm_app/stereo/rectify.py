@@ -1,8 +1,8 @@
-"""Two posed photos on canvases whose rows are epipolar planes and whose columns are angles from the baseline.
+"""Rectification of two posed photos: rows are epipolar planes, columns are angles from the baseline.
 
 Pollefeys, Koch, Van Gool: A simple and efficient rectification method for general motion. ICCV 1999; here on the sphere
-of directions. Planar rectification stretches photos without limit towards the epipole; this one serves motion in any
-direction, forward and backward as well as sideways.
+of directions. Planar rectification stretches photos without limit towards the epipole; this one handles motion in any
+direction: forward, backward and sideways.
 """
 
 from dataclasses import dataclass
@@ -15,25 +15,25 @@ from sfm_app.types import Rejected
 
 MAX_DISPARITIES = 256
 MAX_GROWTH = 2.0
-"""Largest area of the canvas in areas of the photo."""
+"""Largest area of the canvas, relative to the photo."""
 DISPARITY_STEP = 16
-"""OpenCV wants multiples of this."""
+"""OpenCV requires multiples of this."""
 MIN_POINTS = 5
 MARGIN_PX = 4.0
 """Disparities searched beyond those of the sparse points, at either end."""
 NEARER = 2.0
-"""How much closer than the nearest sparse points the surface may come."""
+"""Largest triangulation angle searched, relative to the nearest sparse points: near surfaces lack features."""
 BORDER_SAMPLES = 33
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rectification:
-    """How the reference (left) and its neighbor (right) come onto one canvas.
+    """The mapping of the reference (left) and its neighbor (right) to rectified canvases.
 
-    A direction at the angle theta from the baseline, in the plane at the angle phi about it, comes to the row
+    A direction at the angle theta from the baseline, in the plane at the angle phi about it, maps to the row
     ``(phi - phi_min) * rows_per_rad`` and the column ``(theta_max - theta) * columns_per_rad + disparities`` of the
-    left canvas, `offset_px` further in the right one. So the disparity of a point is its triangulation angle times
-    `columns_per_rad`, less `offset_px`, and lies in [0, disparities).
+    left canvas, `offset_px` further right in the right one. So the disparity of a point is its triangulation angle
+    times `columns_per_rad`, less `offset_px`, and lies in [0, disparities).
     """
 
     rotation: FloatArray
@@ -44,7 +44,7 @@ class Rectification:
     columns_per_rad: float
     rows_per_rad: float
     size: tuple[int, int]
-    """Width and height of both canvases in pixels; the first `disparities` columns are room that OpenCV needs."""
+    """Width and height of both canvases in pixels; OpenCV needs the first `disparities` columns as padding."""
     offset_px: float
     disparities: int
 
@@ -53,7 +53,7 @@ class Rectification:
 
         Args:
             reference: (H, W) gray; may be smaller than its view.
-            neighbor: the same for the other photo.
+            neighbor: the other photo, with the same conditions.
             views: reference and neighbor.
         """
         left = self._warp(reference, views[0], 0.0)
@@ -68,18 +68,18 @@ class Rectification:
         cos, sin = np.cos(theta).astype(np.float32), np.sin(theta).astype(np.float32)
         across = np.sin(phi).astype(np.float32), np.cos(phi).astype(np.float32)
         x, y, w = (cos * row[0] + sin * (across[0] * row[1] + across[1] * row[2]) for row in M)
-        ahead = (w > 1e-6) & (sin > 0)  # beyond the end of the baseline everything comes once more, mirrored
-        # OpenCV has pixel centers at whole numbers
+        ahead = (w > 1e-6) & (sin > 0)  # beyond the end of the baseline the photo appears again, mirrored
+        # OpenCV has pixel centers at integers
         u = np.where(ahead, x / np.where(ahead, w, 1), -9) - np.float32(0.5)
         v = np.where(ahead, y / np.where(ahead, w, 1), -9) - np.float32(0.5)
         return np.asarray(cv2.remap(image, u, v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_CONSTANT), np.uint8)
 
 
 def rectify(reference: View, neighbor: View) -> Rectification | Rejected:
-    """Lay the rows of a canvas along the epipolar planes, whatever the direction of the baseline.
+    """Compute canvases whose rows lie along the epipolar planes, for any direction of the baseline.
 
-    The canvas shows what both photos see of the depths that the reference's sparse points span, at the
-    reference's resolution; at less where the disparities would exceed `MAX_DISPARITIES` or its area `MAX_GROWTH`.
+    The canvas covers the overlap of both photos for the depths that the reference's sparse points span. It has the
+    reference's resolution, or less if the disparities would exceed `MAX_DISPARITIES` or its area `MAX_GROWTH`.
 
     Args:
         reference: the view of the left canvas, with its sparse points.
@@ -87,7 +87,7 @@ def rectify(reference: View, neighbor: View) -> Rectification | Rejected:
     """
     rotation = _rectified_rotation(reference, neighbor)
     if rotation is None:
-        return Rejected("same place")
+        return Rejected("the photos were taken from the same place")
     angles = _triangulation_angles(reference, neighbor, rotation)
     if len(angles) < MIN_POINTS:
         return Rejected("too few sparse points")
@@ -125,7 +125,7 @@ def _rectified_rotation(reference: View, neighbor: View) -> FloatArray | None:
     if length == 0:
         return None
     x = baseline / length
-    # the half plane phi = 0 holds the reference's axis; where the motion is along it, its row direction instead
+    # the half plane phi = 0 contains the reference's optical axis or, for motion along it, its y axis
     z = max((reference.R[2], reference.R[1]), key=lambda axis: float(np.linalg.norm(np.cross(axis, x))) > 1e-3)
     z = z - (z @ x) * x
     z /= np.linalg.norm(z)
@@ -133,12 +133,12 @@ def _rectified_rotation(reference: View, neighbor: View) -> FloatArray | None:
 
 
 def _directions(rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return angle theta from the x axis and phi about it, from the z axis, of rays (N, 3)."""
+    """Return for rays (N, 3) the angle theta from the x axis, and the angle phi about it, from the z axis."""
     return np.arctan2(np.hypot(rays[:, 1], rays[:, 2]), rays[:, 0]), np.arctan2(rays[:, 1], rays[:, 2])
 
 
 def _triangulation_angles(reference: View, neighbor: View, rotation: FloatArray) -> FloatArray:
-    """Return (N,) angles, in radians, under which the reference's sparse points in front of both see the baseline."""
+    """Return (N,) triangulation angles, in radians, of the reference's sparse points in front of both."""
     ahead = (reference.depths > 0) & (reference.points @ neighbor.R[2] + neighbor.t[2] > 0)
     points = reference.points[ahead]
     return np.asarray(
@@ -148,10 +148,10 @@ def _triangulation_angles(reference: View, neighbor: View, rotation: FloatArray)
 
 
 def _angle_range(angles: FloatArray, room: float) -> tuple[float, float]:
-    """Return largest and smallest triangulation angle of the surface; sparse points rarely reach its ends.
+    """Return the largest and smallest triangulation angle to search; sparse points rarely reach the extremes.
 
-    Least of all the near one: pavements at one's feet have few features. It is sought as far as `room`, what can be
-    searched without making the photos smaller, allows.
+    The margin is larger at the near end, because close pavement has few features. `room` is the range of angles that
+    can be searched without downsampling the photos.
     """
     low, high = np.percentile(angles, [1, 99])
     margin = 0.15 * (high - low) + 0.02 * high
@@ -160,7 +160,7 @@ def _angle_range(angles: FloatArray, room: float) -> tuple[float, float]:
 
 
 def _bounds(rotation: FloatArray, view: View) -> FloatArray:
-    """Return lowest and highest theta and phi, (2, 2), in a photo; all of phi where it shows an end of the baseline."""
+    """Return lowest and highest theta and phi of a photo, (2, 2); the full range of phi if it contains an epipole."""
     s, e = np.linspace(0, 1, BORDER_SAMPLES), np.ones(BORDER_SAMPLES)
     border = np.concatenate([np.stack(side, -1) for side in ((s, 0 * e), (s, e), (0 * e, s), (e, s))])
     pixels = np.column_stack([border * [view.width, view.height], np.ones(len(border))])

@@ -1,7 +1,7 @@
-"""Areas of a photo in which nothing can be seen: plain walls, or skies and what else has no surface.
+"""Textureless areas of a photo: plain walls, which have a surface, and skies, which have none.
 
-Semi-global matching carries depths from their borders into both, in every photo alike, so that photos taken close to
-each other agree. They agree across a wall as a whole, but only along the rim of a sky: an area is one or the other.
+Semi-global matching extends depths from the borders into both kinds of area in the same way in every photo, so photos
+taken close to each other agree. They agree across a whole wall, but only along the rim of a sky.
 """
 
 import cv2
@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 BLANK = 0.1
-"""Correlation below which photos have nothing in common; noise alone reaches half of it."""
+"""Correlation below which photos are unrelated; noise alone reaches half of it."""
 SPECK_PX = 5
-"""Side of the square whose majority decides; noise correlates by chance here and there."""
+"""Side of the square for majority voting, because noise correlates by chance in places."""
 MIN_SHARE = 0.03
-"""Of walls, other photos confirm a twelfth and more; of skies, a hundredth at most."""
+"""Other photos confirm a twelfth or more of a wall, but at most a hundredth of a sky."""
 
 
 def without_surface(confidence: NDArray[np.float32], confirmed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return (H, W) the blank areas next to nothing of which is confirmed.
+    """Mark blank areas of which almost nothing is confirmed, (H, W).
 
     Args:
         confidence: (H, W) in [0, 1], 0 where there is no depth.
@@ -27,5 +27,5 @@ def without_surface(confidence: NDArray[np.float32], confirmed: NDArray[np.bool_
     count, areas = cv2.connectedComponents(blank, connectivity=4)
     size = np.maximum(np.bincount(areas.ravel(), minlength=count), 1)
     share = np.bincount(areas.ravel(), confirmed.ravel(), count) / size
-    share[0] = 1.0  # all that is not blank
+    share[0] = 1.0  # label 0: everything that is not blank
     return np.asarray(share < MIN_SHARE)[areas]

@@ -1,4 +1,4 @@
-"""What stereo knows about a photo besides its pixels."""
+"""Camera, pose and sparse points of a photo."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -39,7 +39,7 @@ class View:
     points: FloatArray = field(default_factory=_no_points)
     """(M, 3) those points in the world."""
     sample_px: float = 0.5
-    """Where inside its pixel a depth is taken, in x and y: 0.5 is the pixel's center, 0 its top-left corner."""
+    """Position of a depth inside its pixel, in x and y: 0.5 is the pixel's center, 0 its top-left corner."""
 
     @property
     def center(self) -> FloatArray:
@@ -58,7 +58,7 @@ class View:
 
 
 def region(views: Sequence[View], margin: float = 0.2) -> FloatArray:
-    """Return (2, 3) lowest and highest coordinates of the sparse points, without the strays, widened.
+    """Return (2, 3) lowest and highest coordinates of the sparse points without outliers, plus a margin.
 
     Args:
         views: with their sparse points.

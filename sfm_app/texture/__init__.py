@@ -1,4 +1,4 @@
-"""Pictures on a surface, from the photos that show it best."""
+"""Texture of a surface, from the photos that show it best."""
 
 from sfm_app.texture.appearance.view_scoring import Hidden
 from sfm_app.texture.assemble import Spread, texture_surface

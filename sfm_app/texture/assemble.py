@@ -1,4 +1,4 @@
-"""From a surface and photos to a textured surface: the steps of the texture in their order."""
+"""From a surface and photos to a textured surface: the steps of texturing in order."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,36 +28,36 @@ from sfm_app.types import Model, Rejected, Surface, Texture
 
 FloatArray = NDArray[np.float64]
 Spread = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
-"""Results of a function for all items, in order; may run in parallel. The last argument says what is being done."""
+"""Applies a function to all items, possibly in parallel, and returns results in order; the label names the progress."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceViews:
-    """What the photos show of the triangles."""
+    """The views of all triangles in all photos."""
 
     worth: NDArray[np.float32]
     """(P, T) pixels times cosine; 0 where a photo does not see a triangle."""
     colors: NDArray[np.uint8]
     """(P, T, 3)"""
     sharpness: FloatArray
-    """(P,) as in `FaceView`; 0 for photos that cannot be read."""
+    """(P,) from `FaceView`; 0 for photos that cannot be read."""
     rejected: Sequence[Rejected | None]
-    """Why photos cannot be read."""
+    """(P,) reason why a photo cannot be read, or None."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """What the photos show of the triangles, and which of them may be believed."""
+    """The views of all triangles, weighted by sharpness, with gains and outliers."""
 
     worth: NDArray[np.float32]
-    """(P, T) pixels times cosine times sharpness; 0 where a photo does not see a triangle, negative where it shows
-    something else."""
+    """(P, T) pixels times cosine times sharpness factor; 0 where a photo does not see a triangle, negative for
+    outliers, which show something other than the surface."""
     colors: NDArray[np.uint8]
     """(P, T, 3)"""
     gains: FloatArray
     """(P, 3)"""
     strange: int
-    """Triangles, over all photos, that show something else."""
+    """Number of outliers: views of triangles that show something other than the surface."""
 
     @property
     def usable(self) -> NDArray[np.bool_]:
@@ -67,7 +67,7 @@ class Seen:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TexturePlan:
-    """All that is decided before a photo is painted."""
+    """Everything that is computed before photos are painted."""
 
     mesh: Facets
     seen: Seen
@@ -76,14 +76,14 @@ class TexturePlan:
     charts: Charts
     layout: Layout
     corners: FloatArray
-    """(T, 3, 2) texels of the corners of the triangles that photos see."""
+    """(T, 3, 2) corners in texels, of the triangles that photos see."""
     page: IntArray
     """(T,) page of each triangle."""
     squares: NDArray[np.int64]
     """(U, 3) page, x, y of the squares of the triangles that no photo sees."""
     blend: Blend
     allowed: NDArray[np.float32]
-    """(T, 3) sum of the weights, at each corner, of the photos that may be used for the triangle."""
+    """(T, 3) sum of weights at each corner over the photos that may be used for the triangle."""
 
 
 def texture_surface(
@@ -94,13 +94,13 @@ def texture_surface(
     Args:
         surface: triangles in the frame of the views.
         views: the registered photos.
-        store: gives photos, and keeps what was done with each, so that a killed run can go on.
+        store: reads photos, and keeps the results of each, so that a killed run can continue.
         hidden: the occlusion test for this surface.
-        options: pages, and what happens to triangles that no photo sees.
-        spread: runs work for each photo.
+        options: size and number of pages, and treatment of triangles that no photo sees.
+        spread: applies a function to all photos.
 
     Returns:
-        The surface with its texture, cut if asked for and with colors from the photos; and figures for the manifest.
+        The surface with texture and colors from the photos, cut if the options say so; and figures for the manifest.
     """
     mesh = facets(surface)
     looks = _look_at_all(views, mesh, store, hidden, spread)
@@ -153,7 +153,7 @@ def _look_at(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: Hid
 
 
 def _believe(looks: FaceViews, mesh: Facets) -> Seen:
-    """Even out what the photos say, in place, and mark what only one of them says."""
+    """Adjust the worths by sharpness, in place, estimate gains, and mark outliers by negative worths."""
     worth, colors = looks.worth, looks.colors
     read = looks.sharpness > 0
     sharp = np.zeros(len(read))
@@ -184,7 +184,7 @@ def _plan(
 
 
 def _paint_photo(photo: int, plan: TexturePlan, views: Sequence[PhotoView], store: Store, pages: Pages) -> None:
-    """Add one photo to all pages, unless it is there; one photo paints at a time, while others are read."""
+    """Add one photo to all pages, unless they contain it; photos are read in parallel and painted one at a time."""
     if pages.has[photo]:
         return
     triangles, shares = _shares(photo, plan)
@@ -204,7 +204,7 @@ def _paint_photo(photo: int, plan: TexturePlan, views: Sequence[PhotoView], stor
 
 
 def _shares(photo: int, plan: TexturePlan) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return triangles that a photo counts for, and its weight and offsets (N, 3, 4) at their corners."""
+    """Return the triangles that a photo contributes to, and its weight and offsets (N, 3, 4) at their corners."""
     mesh, part = plan.mesh, plan.blend.of(photo)
     weight = np.zeros(len(mesh.vertices), np.float32)
     offset = np.zeros((len(mesh.vertices), 3), np.float32)
@@ -231,7 +231,7 @@ def _allowed_weight(blend: Blend, usable: NDArray[np.bool_], chosen: IntArray, m
 
 
 def _finish(plan: TexturePlan, canvases: Sequence[Canvas]) -> Model:
-    """Round the pages, color what no photo sees, and fill what lies between the charts."""
+    """Round the pages, color triangles that no photo sees, and fill the space between charts."""
     drawn = plan.chosen != NONE
     pages, painted = (list(part) for part in zip(*(finished(page) for page in canvases), strict=True))
     corner_colors = np.zeros((len(drawn), 3, 3))
@@ -260,7 +260,7 @@ def _finish(plan: TexturePlan, canvases: Sequence[Canvas]) -> Model:
 def _figures(
     plan: TexturePlan, views: Sequence[PhotoView], rejected: Sequence[Rejected | None], unseen: int
 ) -> dict[str, Any]:
-    """Return what the manifest says."""
+    """Return the figures for the manifest."""
     covered = sum(width * height for width, height in plan.layout.sizes)
     return {
         "charts": len(plan.charts.photo),

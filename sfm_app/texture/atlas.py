@@ -1,4 +1,4 @@
-"""All pages of a texture while photos are painted on them; what is on them is kept now and then."""
+"""The pages of a texture while photos are painted on them, with periodic checkpoints."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -12,16 +12,16 @@ from sfm_app.texture.store import Store
 
 KEPT = "pages"
 EVERY_S = 10.0
-"""A killed run loses at most the photos of the last so many seconds."""
+"""Shortest time between checkpoints, in seconds; a killed run loses the photos since the last one."""
 MOST_OF_THE_TIME = 0.05
-"""Share of the time that goes into keeping: large pages are kept less often."""
+"""Largest share of the time spent on checkpoints; large pages are saved less often."""
 
 
 class Pages:
-    """Canvases with the sums of the photos; these are whole numbers, so the order of the photos does not matter."""
+    """Canvases with sums over photos; sums of integers do not depend on the order of the photos."""
 
     def __init__(self, canvases: Sequence[Canvas], photos: int, store: Store) -> None:
-        """Fill empty canvases with what a killed run has kept."""
+        """Fill empty canvases from the checkpoint of a killed run."""
         self.canvases, self.has = canvases, np.zeros(photos, np.bool_)
         self._store, self._lock = store, Lock()
         kept = store.recall(KEPT)
@@ -33,7 +33,7 @@ class Pages:
 
     @contextmanager
     def painting(self, photo: int) -> Iterator[Sequence[Canvas]]:
-        """Provide the canvases, for one photo at a time; afterwards they have it."""
+        """Provide the canvases to one photo at a time, and mark it as painted afterwards."""
         with self._lock:
             yield self.canvases
             self.has[photo] = True

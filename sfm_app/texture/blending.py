@@ -1,8 +1,8 @@
-"""Near a seam both photos count: weights of the photos at the vertices, and offsets that level them out.
+"""Blending near seams: weights of the photos at the vertices, and offsets that remove color differences.
 
-A vertex takes each photo by the share of its triangles that show it; shares spread over a few rings of vertices, as
-far as the other photo sees them. Where two photos meet at a vertex their colors there should be equal: offsets that
-change slowly over the chart make them so (Lempitsky & Ivanov 2007; Waechter et al. 2014, section 3.2).
+The weight of a photo at a vertex starts as the share of the vertex's triangles that it colors. It is diffused over a
+few rings of vertices, as far as the photo sees them. Where two photos meet at a vertex, their colors should be equal:
+offsets that vary slowly over the chart make them so (Lempitsky & Ivanov 2007; Waechter et al. 2014, section 3.2).
 """
 
 from dataclasses import dataclass
@@ -15,31 +15,31 @@ from sfm_app.texture.facets import NONE, Facets, IntArray, at_vertices
 FloatArray = NDArray[np.float64]
 
 RINGS = 3
-"""Of vertices on either side of a seam over which photos blend."""
+"""Rings of vertices on either side of a seam over which photos are blended."""
 FAINT = 0.02
-"""Weights below are dropped."""
+"""Smaller weights are dropped."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Blend:
-    """Nodes: a photo at a vertex. Those of photo p are the rows starts[p] to starts[p + 1]."""
+    """Nodes, each a photo at a vertex. Those of photo p are the rows starts[p] to starts[p + 1] - 1."""
 
     starts: NDArray[np.int64]
     """(P + 1,)"""
     vertex: NDArray[np.int64]
     """(N,) ascending within a photo."""
     weight: NDArray[np.float32]
-    """(N,) share of the photo at the vertex; a vertex's sum to 1."""
+    """(N,) weight of the photo at the vertex; the weights at each vertex sum to 1."""
     offset: NDArray[np.float32]
-    """(N, 3) gray levels that the photo gets there after its gain."""
+    """(N, 3) gray levels added to the photo at the vertex after gain correction."""
 
     def of(self, photo: int) -> slice:
-        """Return rows of a photo."""
+        """Return the rows of a photo."""
         return slice(int(self.starts[photo]), int(self.starts[photo + 1]))
 
 
 def blend_weights(chosen: IntArray, usable: NDArray[np.bool_], mesh: Facets) -> Blend:
-    """Spread the photos over their seams.
+    """Compute weights of the photos that blend them across seams.
 
     Args:
         chosen: (T,) photo of each triangle, -1 for none.
@@ -67,7 +67,7 @@ def blend_weights(chosen: IntArray, usable: NDArray[np.bool_], mesh: Facets) -> 
 
 
 def _spread(share: FloatArray, edges: NDArray[np.int64], degree: NDArray[np.int64]) -> FloatArray:
-    """Mix half of the own value with half of the mean of the vertices beside."""
+    """Average each value with the mean of its neighboring vertices."""
     one, other = edges[:, 0], edges[:, 1]
     around = np.bincount(one, share[other], len(share)) + np.bincount(other, share[one], len(share))
     return np.asarray(0.5 * share + 0.5 * around / degree, np.float64)

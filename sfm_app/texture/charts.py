@@ -1,7 +1,7 @@
-"""Charts: connected triangles of one photo, laid out as they lie in that photo.
+"""Charts: connected triangles of one photo, laid out by their projection in that photo.
 
-The photo is the parametrization: nothing is stretched, and a texel is a pixel. Triangles that a photo sees cannot
-cover each other in it, but for those at the rim of what hides others; these get charts of their own.
+The photo is the parametrization: nothing is stretched, and a texel is a pixel. Triangles that a photo sees do not
+overlap in it, except at the rims of occluders; overlapping triangles get charts of their own.
 """
 
 from dataclasses import dataclass
@@ -16,32 +16,32 @@ from sfm_app.texture.views import project
 FloatArray = NDArray[np.float64]
 
 MOST_LAYERS = 4
-"""Of triangles over each other in one photo; what still overlaps then shows the same pixels twice."""
+"""Layers of overlapping triangles that are separated; further ones share their pixels."""
 SMALL = 12
-"""Charts of fewer triangles go over to the photo of a neighboring chart that sees them, too."""
+"""Charts of fewer triangles take the photo of a neighboring chart, if it sees them."""
 ROUNDS = 3
 EDGE = 1e-6
-"""Barycentric coordinates below count as on the edge."""
+"""Points with a smaller barycentric coordinate count as on the edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Charts:
-    """Which triangles lie on which chart, and where in the chart's photo."""
+    """The chart of each triangle, and its position in the chart's photo."""
 
     of: IntArray
     """(T,) chart of each triangle, -1 for none."""
     photo: IntArray
     """(C,) photo of each chart."""
     corners: FloatArray
-    """(T, 3, 2) place of the corners in the photo, in its pixels."""
+    """(T, 3, 2) corners in the photo, in pixels."""
 
 
 def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: float) -> Charts:
-    """Return charts from one photo per triangle.
+    """Build charts from one photo per triangle.
 
     Args:
         chosen: (T,) photo of each triangle, -1 for none.
-        cameras: (P, 20) rows of the views.
+        cameras: (P, 20) from `PhotoView.row`.
         mesh: the surface.
         tile_px: charts are cut at multiples of this in the photo, so that each fits on a page.
     """
@@ -62,11 +62,11 @@ def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: fl
 
 
 def folds(of: IntArray, count: int, corners: FloatArray) -> NDArray[np.bool_]:
-    """Return (T,) triangles that cover others of the same chart.
+    """Mark triangles that overlap others of the same chart, (T,).
 
     Args:
         of: (T,) chart of each triangle, -1 for none.
-        count: how many charts there are.
+        count: number of charts.
         corners: (T, 3, 2) pixels.
     """
     order = np.argsort(of, kind="stable")[np.count_nonzero(of == NONE) :]
@@ -80,7 +80,7 @@ def folds(of: IntArray, count: int, corners: FloatArray) -> NDArray[np.bool_]:
 def _find_folds(
     order: NDArray[np.int64], starts: NDArray[np.int64], corners: FloatArray, folded: NDArray[np.bool_]
 ) -> None:
-    """Draw each chart pixel by pixel; who comes second to a pixel lies over the first."""
+    """Draw each chart pixel by pixel; a triangle that reaches an occupied pixel is folded."""
     for c in range(len(starts) - 1):
         left = top = np.inf
         right = bottom = -np.inf
@@ -108,23 +108,23 @@ def _find_folds(
 
 
 def components(group: NDArray[np.int64], neighbors: IntArray) -> tuple[IntArray, int]:
-    """Find connected triangles of equal group: (T,) number of component, -1 where the group is -1, and their count.
+    """Find connected triangles of equal group: (T,) component, -1 where the group is -1, and number of components.
 
     Args:
-        group: (T,) triangles of one chart have one number; -1 where there is none.
-        neighbors: (T, 3) triangle across each edge; -1 where there is none.
+        group: (T,) only triangles of equal numbers are connected; -1 for none.
+        neighbors: (T, 3) triangle across each edge, -1 for none.
     """
     of = np.full(len(group), NONE, np.int32)
     return of, _flood(group, neighbors, of)
 
 
 def without_specks(chosen: IntArray, usable: NDArray[np.bool_], neighbors: IntArray) -> IntArray:
-    """Give charts of a few triangles the photo of a neighbor that may be used for all of them.
+    """Give small charts the photo of a neighboring chart that may be used for all their triangles.
 
     Args:
         chosen: (T,) photo of each triangle, -1 for none.
         usable: (P, T) whether a photo may be used for a triangle.
-        neighbors: (T, 3) triangles beside each triangle.
+        neighbors: (T, 3) triangle across each edge, -1 for none.
     """
     chosen = chosen.copy()
     for _ in range(ROUNDS):
@@ -181,7 +181,7 @@ def _absorb(
     neighbors: IntArray,
     chosen: IntArray,
 ) -> int:
-    """Return small components take the neighboring photo with the longest common border; how many did."""
+    """Give small components the neighboring photo with the longest common border; return how many changed."""
     absorbed = 0
     border = np.zeros(len(usable), np.int64)
     for c in range(len(sizes)):

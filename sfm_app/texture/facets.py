@@ -1,4 +1,4 @@
-"""The triangles of a surface and what lies beside each of them."""
+"""The triangles of a surface and their neighbors."""
 
 from dataclasses import dataclass
 
@@ -15,11 +15,11 @@ NONE = -1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Facets:
-    """A surface with tables that the texture needs again and again."""
+    """A surface with tables that several steps of texturing use."""
 
     surface: Surface
     neighbors: IntArray
-    """(T, 3) the triangle across edge k, from corner k to corner k + 1; -1 at borders and where more than two meet."""
+    """(T, 3) triangle across edge k, from corner k to corner k + 1; -1 at borders and where more than two meet."""
     edges: NDArray[np.int64]
     """(E, 2) vertices of every edge, each once, smaller first."""
     spacing: float
@@ -37,7 +37,7 @@ class Facets:
 
 
 def facets(surface: Surface) -> Facets:
-    """Look up the neighbors of all triangles."""
+    """Build the tables of neighbors and edges."""
     starts, ends = surface.faces.ravel(), np.roll(surface.faces, -1, axis=1).ravel()
     key = np.minimum(starts, ends) * np.int64(len(surface.vertices)) + np.maximum(starts, ends)
     order = np.argsort(key, kind="stable")
@@ -54,12 +54,12 @@ def facets(surface: Surface) -> Facets:
 
 
 def at_vertices(values: FloatArray, faces: NDArray[np.int64], size: int) -> FloatArray:
-    """Return (V,) sum over the corners of triangles.
+    """Sum values of triangle corners at each vertex, (V,).
 
     Args:
         values: (T,) one per triangle, or (T, 3) one per corner.
         faces: (T, 3) vertex indices.
-        size: how many vertices there are.
+        size: number of vertices V.
     """
     per_corner = np.broadcast_to(values[:, None] if values.ndim == 1 else values, faces.shape)
     return np.asarray(np.bincount(faces.ravel(), per_corner.ravel(), size), np.float64)

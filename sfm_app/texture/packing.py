@@ -1,7 +1,7 @@
-"""Charts onto pages, like bricks in a falling-block game (Levy et al., SIGGRAPH 2002, section 4).
+"""Packing of charts onto pages, as in Tetris (Levy et al., SIGGRAPH 2002, section 4).
 
-Each chart comes with the profile of its upper and lower side and is set down where it rests on the horizon of what
-lies there already, as high up on the page as possible. Tall charts come first.
+Each chart has a profile of its upper and lower side. It is placed on the horizon of the charts already on the page, as
+close to the top as possible. Tall charts come first.
 """
 
 from dataclasses import dataclass
@@ -16,25 +16,25 @@ from sfm_app.texture.facets import NONE, IntArray
 FloatArray = NDArray[np.float64]
 
 CELL = 4
-"""Texels per step of the profiles."""
+"""Side of a cell of the profiles, in texels."""
 MARGIN = 2
-"""Texels around a chart that belong to it."""
+"""Width of the margin around a chart that belongs to it, in texels."""
 FILL = 0.7
-"""Share of a page that charts usually cover."""
+"""Expected share of a page that charts cover."""
 TIGHTER = 0.95
-"""Scale of the next try, where the charts do not fit."""
+"""Factor on the scale for the next attempt if the charts do not fit."""
 LEAST_SCALE = 0.05
-"""A picture this small is none: rather more pages."""
+"""Below this scale the texture would be too coarse; pages are added instead."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Layout:
-    """Where the charts lie."""
+    """The positions of the charts on the pages."""
 
     page: IntArray
     """(C,) page of each chart."""
     shift: IntArray
-    """(C, 2) whole texels from the photo's pixels (times `scale`) to the page's."""
+    """(C, 2) integer offset in texels from the photo's pixels (times `scale`) to the page."""
     scale: float
     """Texels per pixel of the photos, <= 1."""
     sizes: tuple[tuple[int, int], ...]
@@ -42,13 +42,13 @@ class Layout:
 
 
 def pack(charts: Charts, blocks: IntArray, max_atlas_px: int, max_pages: int) -> tuple[Layout, IntArray]:
-    """Lay charts, and rectangles beside them, onto as few pages as possible; smaller where they do not fit.
+    """Place charts and additional rectangles on few pages; reduce the scale of the charts if they do not fit.
 
     Args:
         charts: their triangles in pixels of the photos.
-        blocks: (B, 2) widths and heights of rectangles, which are never scaled.
+        blocks: (B, 2) widths and heights of rectangles in texels, which are never scaled.
         max_atlas_px: longest side of a page.
-        max_pages: most pages, unless the margins of tiny charts alone need more.
+        max_pages: largest number of pages, exceeded only if the charts do not fit at `LEAST_SCALE`.
 
     Returns:
         The layout of the charts, and (B, 3) page, x and y of the rectangles.
@@ -65,7 +65,7 @@ def pack(charts: Charts, blocks: IntArray, max_atlas_px: int, max_pages: int) ->
 
 
 def _area(charts: Charts) -> float:
-    """Return the square pixels under all charts."""
+    """Return the area of all charts in square pixels."""
     a, b, c = (charts.corners[:, k] for k in range(3))
     turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     return float(np.sum(np.abs(turn[charts.of != NONE])) / 2)
@@ -101,9 +101,7 @@ def _try_to_pack(
 def _profiles(
     charts: Charts, scale: float
 ) -> tuple[IntArray, IntArray, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return origin in texels (C, 2), size in cells (C, 2), start of each chart's columns (C + 1,), and the two
-    profiles.
-    """
+    """Return origins in texels (C, 2), sizes in cells (C, 2), starts of columns (C + 1,), lower and upper profiles."""
     count = len(charts.photo)
     drawn = np.flatnonzero(charts.of != NONE)
     of, corners = charts.of[drawn], charts.corners[drawn] * scale
@@ -124,7 +122,7 @@ def _profiles(
 def _outline(
     of: IntArray, corners: FloatArray, starts: NDArray[np.int64], low: NDArray[np.int64], high: NDArray[np.int64]
 ) -> None:
-    """Widen the profiles of the charts by each triangle and its margin, column by column."""
+    """Widen the profiles of the charts to contain each triangle and its margin, column by column."""
     for f in range(len(of)):
         first, columns = starts[of[f]], starts[of[f] + 1] - starts[of[f]]
         left = min(corners[f, 0, 0], corners[f, 1, 0], corners[f, 2, 0]) - MARGIN
@@ -158,7 +156,7 @@ def _set_down(
     horizon: NDArray[np.int64],
     place: IntArray,
 ) -> bool:
-    """Place every chart; False when one does not fit on any page."""
+    """Place every chart; return False if one does not fit on any page."""
     pages, width = horizon.shape
     for c in order:
         first, columns = starts[c], starts[c + 1] - starts[c]

@@ -1,8 +1,8 @@
-"""Pixels of the photos into the texels of the pages.
+"""Painting of photos onto the texels of the pages.
 
-First every texel gets an owner: the triangle that it lies in or, in the margin of a chart, the nearest one. Then each
-photo adds its share to the texels of the triangles that it counts for: the texel's point on the surface is projected
-through pose and lens, and the photo is read there; nothing is resampled twice.
+First every texel gets an owner: the triangle that contains it or, in the margin of a chart, the nearest one. Then each
+photo adds its share to the texels of the triangles that it contributes to. The texel's point on the surface is
+projected through pose and lens, and the photo is sampled there, so photos are resampled only once.
 """
 
 from dataclasses import dataclass
@@ -19,27 +19,27 @@ FloatArray = NDArray[np.float64]
 
 FINE = 256
 INSET_PX, MOST_INSET = 1.5, 0.3
-"""Where a photo stops seeing the surface, its pixels mix with what lies behind: texels closer to such an edge repeat
-what lies this far inside, or this share of the triangle's height."""
+"""At an edge where the visible surface ends, pixels mix with the background. Texels closer to it than this distance in
+texels, or this share of the triangle's height, repeat the color at that distance."""
 ANYTHING = -9.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Canvas:
-    """A page under way."""
+    """A page that is being painted."""
 
     owner: IntArray
     """(H, W) triangle that a texel belongs to, -1 for none."""
     total: IntArray
-    """(H, W, 3) sum of what the photos gave, in 1 / FINE gray levels: whole numbers add up alike in any order."""
+    """(H, W, 3) weighted sum over photos, in 1 / FINE gray levels; sums of integers do not depend on the order."""
 
 
 def canvas(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatArray) -> Canvas:
-    """Return an empty page whose texels have owners.
+    """Make an empty page whose texels have owners.
 
     Args:
-        size: (width, height).
-        triangles: (N,) the page's triangles.
+        size: (width, height) of the page.
+        triangles: (N,) indices of the page's triangles.
         corners: (T, 3, 2) texels.
     """
     owner = np.full((size[1], size[0]), NONE, np.int32)
@@ -101,12 +101,12 @@ def paint(
     Args:
         photo: (height, width, 3) RGB.
         camera: (20,) lens and pose of the photo at this size.
-        brightness: (3,) factors, one over the photo's gains.
-        triangles: (N,) those of the page that the photo counts for.
+        brightness: (3,) factors, the inverse of the photo's gains.
+        triangles: (N,) indices of the page's triangles that the photo contributes to.
         corners: (T, 3, 2) texels.
         points: (N, 3, 3) corners in the scene.
-        shares: (N, 3, 4) at each corner the weight of the photo, and the gray levels to add to its channels.
-        rims: (N, 3) whether the edge from corner k to k + 1 is where the photo stops seeing the surface.
+        shares: (N, 3, 4) weight of the photo at each corner, and offsets of its channels in gray levels.
+        rims: (N, 3) whether the photo sees no triangle across the edge from corner k to k + 1.
         owner: (H, W) of the page.
         total: (H, W, 3) of the page.
     """
@@ -130,7 +130,7 @@ def paint(
                     part[1], part[2] = (dx * cy - dy * cx) / turn, (bx * dy - by * dx) / turn
                 else:
                     part[1] = part[2] = 0.0
-                # thin triangles must not throw the points of their margin far away
+                # margins of thin triangles must not be extrapolated far
                 part[1], part[2] = min(max(part[1], -1.0), 2.0), min(max(part[2], -1.0), 2.0)
                 part[0] = 1.0 - part[1] - part[2]
                 _keep_off(part, least)
@@ -150,7 +150,7 @@ def _add(
     share: NDArray[np.float32],
     texel: IntArray,
 ) -> None:
-    """Add what a photo shows at a position to a texel; weight and offset are those at the nearest inner point."""
+    """Add the color of a photo at a position to a texel, with weight and offset clamped to the triangle."""
     inner = 0.0
     for k in range(3):
         part[k] = max(part[k], 0.0)
@@ -167,7 +167,7 @@ def _add(
 
 @kernel
 def _set_insets(corner: FloatArray, rim: NDArray[np.bool_], double_area: float, least: FloatArray) -> None:
-    """Set the least barycentric coordinates of a triangle's texels: away from rims, anything elsewhere."""
+    """Set lower bounds of barycentric coordinates that keep texels away from rims; other edges have none."""
     for k in range(3):
         a, b = (k + 1) % 3, (k + 2) % 3
         length = np.hypot(corner[b, 0] - corner[a, 0], corner[b, 1] - corner[a, 1])
@@ -177,7 +177,7 @@ def _set_insets(corner: FloatArray, rim: NDArray[np.bool_], double_area: float, 
 
 @kernel
 def _keep_off(part: FloatArray, least: FloatArray) -> None:
-    """Raise barycentric coordinates to what they have to be at least, at the cost of the others."""
+    """Raise barycentric coordinates to their lower bounds, and reduce the others so that the sum stays 1."""
     for k in range(3):
         lack = least[k] - part[k]
         if lack > 0.0:
@@ -188,20 +188,20 @@ def _keep_off(part: FloatArray, least: FloatArray) -> None:
 
 
 def finished(page: Canvas) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Return the page as 8-bit RGB, black where nobody owns it, and where it is owned."""
+    """Return the page as 8-bit RGB, black at texels without an owner, and (H, W) whether a texel has one."""
     levels = page.total + FINE // 2
-    levels //= FINE  # in place: a page has as many as two hundred megabytes of sums
+    levels //= FINE  # in place, because the sums of a page may take two hundred megabytes
     return np.clip(levels, 0, 255, out=levels).astype(np.uint8), page.owner != NONE
 
 
 def fill_background(page: NDArray[np.uint8], painted: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Fill texels that nobody owns with the mean color of what is painted in the smallest block around them.
+    """Fill texels without an owner with the mean painted color of the smallest block around them that has one.
 
-    Blocks are those of mip maps, so a page made smaller by a viewer keeps its colors up to the rim of the charts.
+    The blocks are those of mipmaps, so a page downsampled by a viewer keeps its colors up to the rims of the charts.
 
     Args:
         page: (H, W, 3) RGB.
-        painted: (H, W) where a texel is owned.
+        painted: (H, W) whether a texel has an owner.
     """
     if painted.all() or min(page.shape[:2]) < 2:
         return page

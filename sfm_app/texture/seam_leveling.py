@@ -1,4 +1,4 @@
-"""Offsets that make photos equal where they meet; see `blending`."""
+"""Offsets that make colors of photos equal at seams; see `blending`."""
 
 from dataclasses import replace
 
@@ -11,16 +11,16 @@ from sfm_app.texture.facets import Facets, at_vertices
 FloatArray = NDArray[np.float64]
 
 STIFFNESS = 4.0
-"""Of the offsets along a chart, beside 1 for the difference at a seam."""
+"""Weight of differences of offsets along a chart, relative to 1 for differences at seams."""
 HOLD = 1e-3
-"""Weight of "no offset"."""
+"""Weight of the prior that offsets are zero."""
 STEPS = 100
 ENOUGH = 1e-2
-"""Of the residual of the offsets, relative to the beginning."""
+"""Norm of the preconditioned residual at which the solver stops, relative to its initial value."""
 
 
 def level(blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets) -> Blend:
-    """Return the blend with the offsets that least squares give it.
+    """Estimate the offsets of a blend by least squares.
 
     Args:
         blend: weights of the photos at the vertices.
@@ -43,14 +43,14 @@ def level(blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: ND
 def solve_ties(
     one: NDArray[np.int64], other: NDArray[np.int64], weights: FloatArray, hold: float | FloatArray, right: FloatArray
 ) -> FloatArray:
-    """Return (N, C) x with (graph Laplacian + hold) x = right, by conjugate gradients.
+    """Return (N, C) x that solves (graph Laplacian + hold) x = right, by conjugate gradients.
 
     Args:
-        one: (E,) node at one end of each tie.
+        one: (E,) node at one end of each edge of the graph.
         other: (E,) node at the other end.
-        weights: (E,) of the ties.
-        hold: what is added to the diagonal, > 0 somewhere in each connected part; a number or (N,).
-        right: (N, C).
+        weights: (E,) of the edges.
+        hold: added to the diagonal, > 0 somewhere in each connected part; a number or (N,).
+        right: (N, C) right-hand sides.
     """
     from scipy.sparse import coo_matrix, diags
 
@@ -84,11 +84,12 @@ def _ratio(above: FloatArray, below: FloatArray) -> FloatArray:
 def _gaps(
     blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], FloatArray]:
-    """Find where two photos meet at a vertex.
+    """Find nodes where two photos meet at a vertex, and their color differences.
 
-    Node, the vertex's heaviest node, and how much brighter (M, 3) that one is.
+    Colors are compared on the triangles at the vertex that both photos may be used for; pairs without any are left out.
 
-    Compared are the triangles at the vertex that both photos may be used for; nodes without any are left out.
+    Returns:
+        (M,) node, (M,) node of the largest weight at its vertex, and (M, 3) color of the latter minus the former.
     """
     others, heads = _meetings(blend, len(mesh.vertices))
     photo_of = np.repeat(np.arange(len(usable)), np.diff(blend.starts))
@@ -112,7 +113,7 @@ def _gaps(
 
 
 def _meetings(blend: Blend, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return every node beside the heaviest one of its vertex, and that one."""
+    """Return all nodes except the one of the largest weight at each vertex, and for each the one it is paired with."""
     order = np.lexsort((-blend.weight, blend.vertex))
     heads = np.full(size, -1, np.int64)
     ranked = blend.vertex[order]
@@ -123,7 +124,7 @@ def _meetings(blend: Blend, size: int) -> tuple[NDArray[np.int64], NDArray[np.in
 
 
 def _ties(blend: Blend, mesh: Facets) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return pairs of nodes of one photo at the two ends of an edge."""
+    """Return pairs of nodes of the same photo at the two ends of an edge."""
     start, end = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     node = np.full(len(mesh.vertices), -1, np.int64)
     for photo in range(len(blend.starts) - 1):

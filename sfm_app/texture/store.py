@@ -1,4 +1,4 @@
-"""Where photos come from, and what outlasts a killed run."""
+"""The interface for reading photos and for keeping intermediate results of a run."""
 
 from collections.abc import Mapping
 from typing import Any, Protocol
@@ -10,24 +10,24 @@ from sfm_app.texture.views import PhotoView
 
 
 class Store(Protocol):
-    """Photos, and arrays under a name; what is kept comes from the same inputs and settings and can be used again."""
+    """Reads photos, and keeps arrays by name; kept arrays come from the same inputs and settings and can be reused."""
 
     def photo(self, view: PhotoView, /) -> NDArray[np.uint8]:
         """Return (height, width, 3) RGB of a view at the view's size; OSError where it cannot be read."""
 
     def used(self, view: PhotoView, /) -> NDArray[np.bool_] | None:
-        """Return (height, width) which pixels of a photo at full size may be used; None where all may.
+        """Return (height, width) which pixels of a photo at full size may be used; None if all may.
 
-        Photos show nothing of the others: these have the color of one that may be used. OSError as above.
+        The other pixels have the color of a usable pixel in `photo`. OSError where the mask cannot be read.
         """
 
     def recall(self, name: str, /) -> Mapping[str, NDArray[Any]] | None:
-        """Return what was kept under a name, if anything was."""
+        """Return the arrays kept under a name; None if there are none."""
 
     def keep(self, name: str, /, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Keep arrays under a name in place of what was there, complete or not at all.
+        """Keep arrays under a name, replacing previous ones, complete or not at all.
 
         Args:
-            name: of the group.
+            name: of the group of arrays.
             arrays: by name.
         """

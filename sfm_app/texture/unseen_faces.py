@@ -1,4 +1,4 @@
-"""Triangles that no photo sees: colored like what is around them, or cut away."""
+"""Colors and texels of triangles that no photo sees, from the surrounding triangles."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,20 +9,20 @@ from sfm_app.texture.seam_leveling import solve_ties
 FloatArray = NDArray[np.float64]
 
 CELL = 2
-"""Texels on a side of the square that an unseen triangle gets: bilinear reading inside it is exact."""
+"""Side of the square of an unseen triangle, in texels; bilinear interpolation inside it is exact."""
 BLOCK = 64
-"""Most such squares beside each other."""
+"""Largest number of squares along a side of a block."""
 CURVE_BITS = 12
 HOLD = 1e-4
-"""Weight of the color that an unseen vertex had before, beside 1 for each neighbor: for parts that no photo sees."""
+"""Weight of the previous color of an unseen vertex, relative to 1 per neighbor, for parts that no photo sees."""
 
 
 def vertex_colors(mesh: Facets, seen: NDArray[np.bool_], corner_colors: FloatArray) -> FloatArray:
-    """Return colors of all vertices, spread from the triangles that photos see over those that none does.
+    """Compute colors of all vertices, diffused from the triangles that photos see to the others.
 
     Args:
-        mesh: the surface; its colors stay where nothing seen is connected.
-        seen: (T,)
+        mesh: the surface; its colors stay in parts that no photo sees.
+        seen: (T,) whether a photo sees the triangle.
         corner_colors: (S, 3, 3) RGB at the corners of the seen triangles.
 
     Returns:
@@ -53,7 +53,7 @@ def vertex_colors(mesh: Facets, seen: NDArray[np.bool_], corner_colors: FloatArr
 
 
 def block_sizes(triangles: int) -> NDArray[np.int32]:
-    """Return (B, 2) width and height in texels of the rectangles that hold a square for each of so many triangles."""
+    """Return (B, 2) widths and heights in texels of blocks that hold one square per triangle."""
     sizes = []
     for start in range(0, triangles, BLOCK * BLOCK):
         count = min(triangles - start, BLOCK * BLOCK)
@@ -68,7 +68,7 @@ def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int)
     Args:
         places: (B, 3) page, left and top of each block, in texels.
         sizes: (B, 2) from `block_sizes`.
-        triangles: how many need a square.
+        triangles: number of triangles.
     """
     found: list[NDArray[np.int64]] = []
     for number, ((page, left, top), (width, _)) in enumerate(zip(places, sizes, strict=True)):
@@ -79,9 +79,9 @@ def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int)
 
 
 def along_a_curve(points: FloatArray) -> NDArray[np.int64]:
-    """Return order (N,) of points (N, 3) in which most have those near them beside them (Morton 1966).
+    """Return the Morton order (N,) of points (N, 3), in which nearby points are mostly adjacent (Morton 1966).
 
-    Squares beside each other then have like colors, and lossy compression of the page does little harm.
+    Adjacent squares then have similar colors, and lossy compression of the page does little harm.
     """
     low = points.min(axis=0, initial=np.inf)
     span = max(float(np.max(points.max(axis=0, initial=-np.inf) - low, initial=0.0)), 1e-300)
@@ -96,7 +96,7 @@ def along_a_curve(points: FloatArray) -> NDArray[np.int64]:
 def square_texels(corner_colors: FloatArray) -> NDArray[np.uint8]:
     """Return (N, 2, 2, 3) texels whose bilinear interpolation gives colors (N, 3, 3) at the corners.
 
-    The first corner lies on the top-left texel's center, the second on the right one's, the third on the lower one's.
+    The corners lie on texel centers: the first top left, the second top right, the third bottom left.
     """
     a, b, c = (corner_colors[:, k] for k in range(3))
     texels = np.stack([np.stack([a, b], axis=1), np.stack([c, b + c - a], axis=1)], axis=1)

@@ -1,7 +1,7 @@
-"""One photo for every triangle: good ones, and few seams.
+"""Choice of one photo per triangle, with good views and few seams.
 
-A Markov random field over the triangles (Lempitsky & Ivanov, CVPR 2007; Waechter et al., ECCV 2014): a triangle pays
-for a worse photo, an edge pays its length when its two triangles take different photos. Solved by sequential
+A Markov random field over the triangles (Lempitsky & Ivanov, CVPR 2007; Waechter et al., ECCV 2014): the unary cost of
+a triangle grows with the loss of detail, and an edge between different photos costs its length. Solved by sequential
 tree-reweighted message passing (Kolmogorov, PAMI 2006), then improved triangle by triangle.
 """
 
@@ -14,17 +14,17 @@ from sfm_app.texture.facets import NONE, Facets, IntArray
 FloatArray = NDArray[np.float64]
 
 CANDIDATES = 8
-"""Best photos of a triangle that are considered."""
+"""Number of best photos considered for each triangle."""
 PRICE_OF_DETAIL = 0.35
-"""Of a photo with 1/e of the best one's pixels, beside 1 for a seam as long as the triangle's edge."""
+"""Cost of a photo with 1/e of the best photo's worth, relative to 1 for a seam as long as the triangle's edge."""
 MOST_LOST = 3.0
-"""Natural logarithm beyond which a photo is no worse."""
+"""Upper bound of the loss, the natural logarithm of the best worth over the photo's worth."""
 ROUNDS = 12
 TINY = 1e-30
 
 
 def choose_photos(worth: NDArray[np.float32], mesh: Facets) -> IntArray:
-    """Return the photo that colors each triangle.
+    """Choose the photo that colors each triangle.
 
     Args:
         worth: (P, T) of each photo for each triangle, at most 0 where it must not be used.
@@ -54,7 +54,7 @@ def choose_photos(worth: NDArray[np.float32], mesh: Facets) -> IntArray:
 
 
 def _relative_size(mesh: Facets) -> FloatArray:
-    """Return (T,) square root of the area of a triangle over that of one with three usual edges."""
+    """Return (T,) square root of each triangle's area relative to an equilateral one with median edges."""
     corners = mesh.vertices[mesh.faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     usual = np.sqrt(3.0) / 4.0 * max(mesh.spacing, 1e-300) ** 2
@@ -62,21 +62,21 @@ def _relative_size(mesh: Facets) -> FloatArray:
 
 
 def _edge_prices(mesh: Facets) -> NDArray[np.float32]:
-    """Return (T, 3) length of the edges from corner k to k + 1 in usual edges."""
+    """Return (T, 3) lengths of the edges from corner k to k + 1, in median edge lengths."""
     corners = mesh.vertices[mesh.faces]
     lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
     return np.asarray(lengths / max(mesh.spacing, 1e-300), np.float32)
 
 
 def _places_at_neighbors(neighbors: IntArray) -> IntArray:
-    """Return (T, 3) at which place of its neighbor's row a triangle stands."""
+    """Return (T, 3) the column of each triangle in its neighbor's row of `neighbors`."""
     own = np.arange(len(neighbors))[:, None, None]
     return np.asarray(np.argmax(neighbors[neighbors] == own, axis=2), np.int32)
 
 
 @kernel
 def _keep_best(worth: NDArray[np.float32], labels: IntArray, values: NDArray[np.float32]) -> None:
-    """Keep the photos of most worth for each triangle, best first; equals in their order."""
+    """Keep the photos of largest worth for each triangle, best first; ties go to the lower index."""
     photos, triangles = worth.shape
     kept = labels.shape[1]
     for p in range(photos):
@@ -100,7 +100,7 @@ def _pass_messages(
     messages: NDArray[np.float32],
     forward: bool,
 ) -> None:
-    """Pass messages once; messages[f, k] is what neighbor k of f says about the labels of f."""
+    """Pass messages once; messages[f, k] is the message from neighbor k of f about the labels of f."""
     triangles, kept = labels.shape
     belief = np.empty(kept)
     for step in range(triangles):
@@ -141,7 +141,7 @@ def _decode(
     messages: NDArray[np.float32],
     chosen: IntArray,
 ) -> None:
-    """Choose label after label, given those before and what the messages say about those behind."""
+    """Choose labels in order, given the previous labels and the messages from later triangles."""
     for f in range(len(labels)):
         least = np.inf
         for m in range(labels.shape[1]):
@@ -163,7 +163,7 @@ def _decode(
 def _improve(
     labels: IntArray, cost: NDArray[np.float32], neighbors: IntArray, price: NDArray[np.float32], chosen: IntArray
 ) -> int:
-    """Let every triangle take what suits it best beside its neighbors; how many changed."""
+    """Give every triangle the best label, given those of its neighbors; return how many changed."""
     changed = 0
     for f in range(len(labels)):
         least, best = np.inf, chosen[f]

@@ -1,4 +1,4 @@
-"""Photos as the texture sees them: a lens, a pose, and a kernel that projects through both."""
+"""Views for texturing: lens and pose of a photo, and kernels that project and sample."""
 
 from dataclasses import dataclass, replace
 
@@ -14,7 +14,7 @@ FloatArray = NDArray[np.float64]
 LENS = 8
 """COLMAP's OPENCV parameters fx, fy, cx, cy, k1, k2, p1, p2 come first in a camera row; the pose [R | t] follows."""
 LEAST_SLOPE = 0.1
-"""Where the distorted radius grows more slowly than this with the true one, the lens is about to fold."""
+"""Smallest derivative of the distorted radius by the undistorted one; below it, the distortion is near its fold."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,11 +36,11 @@ class PhotoView:
 
     @property
     def center(self) -> FloatArray:
-        """(3,) where the camera stands."""
+        """(3,) center of projection in the world."""
         return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3], np.float64)
 
     def scaled(self, width: int, height: int) -> "PhotoView":
-        """Return the same view in a photo of another size.
+        """Return the same view for a photo of another size.
 
         Args:
             width: pixels, > 0.
@@ -60,7 +60,7 @@ def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> Ph
         cam_from_world: (3, 4) [R | t].
 
     Raises:
-        ReconstructionError: the camera has another model than OPENCV, to which every run adjusts its cameras.
+        ReconstructionError: the camera has a model other than OPENCV, which every run uses for its cameras.
     """
     if camera.model != "OPENCV":
         raise ReconstructionError(f"the texture cannot use a camera of the model {camera.model}")
@@ -69,9 +69,9 @@ def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> Ph
 
 @kernel
 def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return pixel of a world point, and its depth.
+    """Project a world point: return its pixel and depth.
 
-    0 where the point is behind the camera or beyond what the lens maps.
+    All are 0 if the point is behind the camera or outside the valid range of the distortion.
 
     Args:
         camera: (20,) from `PhotoView.row`.
@@ -94,7 +94,7 @@ def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, fl
 
 @kernel
 def sample(photo: NDArray[np.uint8], x: float, y: float, channel: int) -> float:
-    """Return bilinear value at a pixel position; the border's value beyond the border.
+    """Return the bilinear value at a pixel position, clamped to the photo.
 
     Args:
         photo: (H, W, 3) RGB.

@@ -2,7 +2,7 @@
 
 Each photo multiplies every channel by a gain: log c[f, p] = log a[f] + g[p] + noise, for triangle f and photo p. The
 colors a of the surface are eliminated, the gains g come from iteratively reweighted least squares (Cauchy), so that
-shadows, highlights and people who walk through count little.
+shadows, highlights and passers-by have little weight.
 """
 
 import numpy as np
@@ -15,25 +15,25 @@ from sfm_app.texture.appearance.median import median
 FloatArray = NDArray[np.float64]
 
 SAMPLES = 30_000
-"""Triangles that are looked at, spread evenly."""
+"""Approximate number of sampled triangles, evenly spaced."""
 DARKEST, BRIGHTEST = 8, 247
-"""Gray levels outside are close to clipping and say nothing about the gain."""
+"""Gray levels outside this range are nearly clipped and do not determine the gain."""
 NOISE = 0.05
-"""Of log colors; what deviates by more counts less and less."""
+"""Scale of the Cauchy weights, in log colors; larger deviations are downweighted."""
 ROUNDS = 15
 PRIOR = 0.01
-"""Weight of "no gain", as a share of the mean weight of a photo: holds what the photos do not determine."""
+"""Weight of "no gain", as a share of the mean weight of a photo: keeps undetermined gains at 1."""
 
 
 def photo_gains(colors: NDArray[np.uint8], seen: NDArray[np.bool_]) -> FloatArray:
-    """Return gain of every photo and channel; their geometric mean is 1.
+    """Estimate the gain of every photo and channel; the geometric mean of the gains is 1.
 
     Args:
         colors: (P, T, 3) RGB of the triangles in the photos.
         seen: (P, T) whether a photo sees a triangle.
 
     Returns:
-        (P, 3); dividing a photo by its gains makes it agree with the others.
+        (P, 3) gains; dividing a photo by its gains makes it consistent with the others.
     """
     shared = np.flatnonzero(seen.sum(axis=0) > 1)
     picked = shared[:: max(1, len(shared) // SAMPLES)]

@@ -8,13 +8,13 @@ from sfm_app.jit import kernel
 
 @kernel
 def median(values: NDArray[np.float64], count: int) -> float:
-    """Return the median of the first values, which it sorts in place.
+    """Sort the first values in place and return their median.
 
-    NumPy's sort takes seconds to compile.
+    It replaces NumPy's sort, which takes seconds to compile.
 
     Args:
         values: (N,) changed.
-        count: how many count, 1 to N.
+        count: number of first values used, 1 to N.
     """
     for k in range(1, count):
         value, at = values[k], k

@@ -1,7 +1,7 @@
-"""Photos that show something else than the surface: passers-by, cars, leaves, reflections.
+"""Outlier views, which show something other than the surface: passers-by, cars, leaves, reflections.
 
-Where at least three photos see a triangle, the color that lies far from the middle of the others is not the
-surface's. A single triangle may deviate by chance, a person covers many: deviations are averaged over neighbors.
+Where at least three photos see a triangle, a color far from their median is not the surface's. A single triangle may
+deviate by chance, but a person covers many triangles, so deviations are averaged over neighbors.
 After Sinha et al. 2008 and Waechter et al. 2014 (section 3.1), with medians in place of their Gaussian.
 """
 
@@ -13,19 +13,19 @@ from sfm_app.texture.appearance.median import median
 from sfm_app.texture.facets import NONE, IntArray
 
 LEAST_VIEWS = 3
-"""Two photos that disagree do not say which of them is right."""
+"""If only two photos disagree, it is unknown which of them is right."""
 LEVELS = 10.0
-"""Gray levels that colors of one triangle may differ by without a reason."""
+"""Normal difference between colors of one triangle, in gray levels."""
 OUTLYING = 3.0
-"""Times the usual deviation of a triangle, beyond which a photo is left out."""
+"""Deviation beyond which a photo is left out, relative to the usual deviation of a triangle."""
 ROUNDS = 4
-"""Of averaging over neighbors: about as many triangles make a stranger."""
+"""Rounds of averaging over neighbors: about the number of adjacent triangles that make an outlier."""
 
 
 def strangers(
     colors: NDArray[np.uint8], gains: NDArray[np.float64], seen: NDArray[np.bool_], neighbors: IntArray
 ) -> NDArray[np.bool_]:
-    """Return which photos show something else at which triangles.
+    """Mark photos at the triangles where they show something other than the surface.
 
     Args:
         colors: (P, T, 3) RGB of the triangles in the photos.
@@ -57,7 +57,7 @@ def _deviations(
     seen: NDArray[np.bool_],
     score: NDArray[np.float32],
 ) -> None:
-    """Write the largest deviation over the channels from the median photo, over the usual deviation."""
+    """Write the largest deviation from the median color over all channels, divided by the usual deviation."""
     photos, triangles = seen.shape
     level, far = np.empty(photos), np.empty(photos)
     for f in range(triangles):
@@ -107,7 +107,7 @@ def _average(
 
 @kernel
 def _mark(score: NDArray[np.float32], seen: NDArray[np.bool_], neighbors: IntArray, found: NDArray[np.bool_]) -> None:
-    """Mark triangles that deviate, and those beside them, which a stranger may cover in part."""
+    """Mark triangles that deviate, and their neighbors, which the outlier may cover in part."""
     for f in range(len(score)):
         if not seen[f]:
             continue
@@ -120,7 +120,7 @@ def _mark(score: NDArray[np.float32], seen: NDArray[np.bool_], neighbors: IntArr
 
 @kernel
 def _spare_the_last(found: NDArray[np.bool_], seen: NDArray[np.bool_]) -> None:
-    """Keep all photos where hardly any would be left: they agree on nothing, and none is the stranger."""
+    """Keep all photos of a triangle where at most half would remain: without agreement none is an outlier."""
     for f in range(found.shape[1]):
         left = total = 0
         for p in range(len(found)):

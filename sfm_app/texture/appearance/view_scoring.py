@@ -1,4 +1,4 @@
-"""What one photo shows of every triangle: whether it sees it, how well, and in which color."""
+"""Views of the triangles in one photo: which triangles it sees, how well, and in which colors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ from sfm_app.texture.views import PhotoView, project, sample
 
 FloatArray = NDArray[np.float64]
 Hidden = Callable[[FloatArray, float, FloatArray], NDArray[np.bool_]]
-"""For a camera at (3,) and the slack next to a point: which of (N, 3) points are hidden."""
+"""Takes a camera center (3,), the slack at a point, and points (N, 3); returns whether each is hidden, (N,)."""
 
 SLACK = 1.0
-"""Of the occlusion test, in median edges: the surface's own roughness hides nothing."""
+"""Slack of the occlusion test, in median edge lengths, so that the surface's roughness hides nothing."""
 MIN_COSINE = 0.1
-"""A triangle seen more obliquely than this is not seen: its few pixels would be smeared over it."""
+"""Smallest cosine of the viewing angle; from more oblique views, few pixels would be stretched over the triangle."""
 BORDER_PX = 2.0
-"""Pixels at the rim of a photo that are not used: resampling and demosaicing end there."""
+"""Width of the unused border of a photo, where resampling and demosaicing are incomplete."""
 RIM_RINGS, RIM_WORTH = 2, 0.5
-"""Each ring of triangles next to those that a photo does not see is worth so much less: where the surface is a pixel
-off, they show what lies before or behind it."""
+"""Rings of triangles next to those that a photo does not see, and the factor on their worth per ring: where the
+surface is off by a pixel, they show the foreground or background."""
 MASK_RIM_PX = 1.0
-"""A triangle with a masked pixel so near is not seen: colors are read between pixels."""
+"""A triangle this close to a masked pixel is not used, because colors are interpolated between pixels."""
 SHARPNESS_RANGE = (0.2, 1.0)
 
 
@@ -39,13 +39,13 @@ class FaceView:
     color: NDArray[np.uint8]
     """(T, 3) mean RGB; 0 where not seen."""
     sharpness: float
-    """Energy of the finest detail relative to that of twice its size; falls with blur, hardly varies with content."""
+    """Energy of the finest detail relative to that at half size; decreases with blur, hardly depends on content."""
 
 
 def look(
     view: PhotoView, photo: NDArray[np.uint8], used: NDArray[np.bool_] | None, mesh: Facets, hidden: Hidden
 ) -> FaceView:
-    """Judge every triangle in one photo.
+    """Score every triangle in one photo.
 
     Args:
         view: lens and pose.
@@ -76,7 +76,7 @@ def look(
 def _blocked(
     candidates: NDArray[np.int64], mesh: Facets, hidden: Callable[[FloatArray], NDArray[np.bool_]]
 ) -> NDArray[np.bool_]:
-    """Return which of the triangles (N,) are hidden, at the center or at two corners."""
+    """Mark triangles that are hidden at the center or at two corners, (N,)."""
     corners = mesh.faces[candidates]
     covered = np.zeros(len(mesh.vertices), np.bool_)
     covered[corners] = True
@@ -89,7 +89,7 @@ def _blocked(
 
 
 def sharpness(photo: NDArray[np.uint8], used: NDArray[np.bool_] | None = None) -> float:
-    """Return ratio of the energies of the Laplacian at full and at half size, where the photo may be used; >= 0.
+    """Return the ratio of Laplacian energies at full and at half size, >= 0, over usable pixels.
 
     Args:
         photo: (H, W, 3) RGB.
@@ -111,7 +111,7 @@ def _energy(gray: NDArray[np.uint8], used: NDArray[np.bool_] | None) -> float:
 
 
 def sharpness_factors(sharpness_of: NDArray[np.float64]) -> FloatArray:
-    """Return (P,) factors for the worth of each photo, 1 for a photo as sharp as the median one."""
+    """Return (P,) factors on the worth of each photo, 1 for the median sharpness."""
     middle = float(np.median(sharpness_of)) if len(sharpness_of) else 0.0
     relative = sharpness_of / middle if middle > 0 else np.ones(len(sharpness_of))
     return np.asarray(np.clip(relative, *SHARPNESS_RANGE), np.float64)
@@ -126,7 +126,7 @@ def _measure(
     worth: NDArray[np.float32],
     color: NDArray[np.uint8],
 ) -> None:
-    """Write area in pixels times cosine, and mean color, of the triangles that face the camera within the photo."""
+    """Write area in pixels times cosine, and mean color, of triangles within the photo that face the camera."""
     height, width = photo.shape[0], photo.shape[1]
     x, y, corner = np.empty(4), np.empty(4), np.empty((4, 3))
     for f in range(len(faces)):
@@ -143,7 +143,7 @@ def _measure(
         if not inside:
             continue
         cosine = _cosine(camera, corner)
-        # y runs down in the photo: what is counter-clockwise from outside has a negative area here
+        # y points down in the photo: triangles counterclockwise from outside have a negative area
         area = -0.5 * ((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0]))
         if cosine < MIN_COSINE or area <= 0.0:
             continue
@@ -167,7 +167,7 @@ def _drop_masked(
 
     Args:
         camera: lens and pose.
-        masked: (height + 1, width + 1) how many pixels above and to the left of each are masked.
+        masked: (height + 1, width + 1) integral image of masked pixels, above and to the left of each.
         vertices: of the surface.
         faces: of the surface.
         worth: (T,) positive only for triangles within the photo.
@@ -194,7 +194,7 @@ def _drop_masked(
 
 @kernel
 def _span(corner: FloatArray, top: float, bottom: float) -> tuple[float, float]:
-    """Return least and greatest x of a triangle (3, 2) between two heights; empty (inf, -inf) where it is not there."""
+    """Return the smallest and largest x of a triangle (3, 2) between two heights; (inf, -inf) if they miss it."""
     left, right = np.inf, -np.inf
     for k in range(3):
         ax, ay, bx, by = corner[k, 0], corner[k, 1], corner[(k + 1) % 3, 0], corner[(k + 1) % 3, 1]
@@ -213,11 +213,11 @@ def _span(corner: FloatArray, top: float, bottom: float) -> tuple[float, float]:
 
 @kernel
 def _cosine(camera: FloatArray, corner: FloatArray) -> float:
-    """Return between the triangle's normal and the way from its center to the camera."""
+    """Return the cosine between the triangle's normal and the direction from its center to the camera."""
     ax, ay, az = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     bx, by, bz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-    # the camera's own axes times its translation give the way without the center
+    # -R'(R X + t) is the direction to the camera; its center need not be computed
     wx = wy = wz = 0.0
     for row in range(3):
         at = 8 + 4 * row

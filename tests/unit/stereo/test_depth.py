@@ -72,7 +72,7 @@ def test_same_input_gives_the_same_bytes(plane, views, matched):
 def test_a_photo_without_neighbors_is_a_value_with_a_reason(plane, views):
     assert match_depths(views[0], [], plane.photo, 3, 0.01) == Rejected("no photo shares enough points")
     same_place = match_depths(views[0], [views[0]], plane.photo, 3, 0.01)
-    assert same_place == Rejected("same place")
+    assert same_place == Rejected("the photos were taken from the same place")
     empty = np.zeros((180, 240), np.float32)
     nothing, blank = DepthEstimate(empty, empty), np.zeros((180, 240), np.uint8)
     assert isinstance(confirm_depths(views[0], blank, nothing, [(views[1], empty)], 2, 0.01), Rejected)
