@@ -7,8 +7,8 @@ GUESSED_FOCAL = 1.2
 """Focal length of an unknown camera, in units of the longer side of its photo: COLMAP's guess, by definition."""
 
 NEWTON_STEPS, LEAST_SLOPE = 10, 0.2
-"""Steps of Newton's method in `rays`, and the least slope that it divides by: the slope is 0 where the lens folds. Chosen
-by hand; not measured on their own."""
+"""Steps of Newton's method in `rays`, and the least slope that it divides by: the slope is 0 where the lens folds.
+Chosen by hand; not measured on their own."""
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:

@@ -25,7 +25,7 @@ def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
 
 
 def edges_of(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
-    """Return all edges once, (E, 2) with the lower vertex first, and (T, 3) their rows for ab, bc, ca of each triangle."""
+    """Return every edge once, (E, 2) with the lower vertex first, and (T, 3) their numbers per triangle: ab, bc, ca."""
     ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     size = int(faces.max(initial=0)) + 1
     keys, at = np.unique(ends[:, 0] * size + ends[:, 1], return_inverse=True)

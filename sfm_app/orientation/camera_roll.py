@@ -24,8 +24,8 @@ MOST, MOST_DOWN = 4.5, 3.0
 the pitch where it looks steeply down, as people do at things on floors and tables."""
 
 TURNED = (0.0, 3.0, 6.0, 3.0)
-"""Prior cost, -log odds, of all photos being turned by 0, 90, 180, 270 degrees: one folder in twenty lies on either side,
-one in 400 is upside down (phones held the other way round, their EXIF lost)."""
+"""Prior cost, -log odds, of all photos being turned by 0, 90, 180, 270 degrees: one folder in twenty lies on either
+side, one in 400 is upside down (phones held the other way round, EXIF lost)."""
 
 ODD_ONE = 1.0
 """Prior cost, -log odds, of one photo being turned differently from the others."""
@@ -60,8 +60,8 @@ def ups_from_roll(rotations: FloatArray, centers: FloatArray) -> tuple[Roll, ...
 
     Roll alone does not distinguish portrait photos of a wall from landscape photos of the same wall lying on its side,
     so two weaker cues are added: people look about horizontally, and they walk rather than climb. The directions that
-    the photos propose are refined by weighted least squares, and the best is chosen. Opposite turns have opposite directions, unless
-    cameras look steeply down.
+    the photos propose are refined by weighted least squares, and the best is chosen. Opposite turns have opposite
+    directions, unless cameras look steeply down.
 
     Args:
         rotations: (N, 3, 3) cam_from_world, N >= 1; camera axes x right, y down, z forward.
@@ -81,13 +81,13 @@ def _best(turn: int, proposals: FloatArray, rotations: FloatArray, centers: Floa
 
 
 def _up_axes(rotations: FloatArray) -> FloatArray:
-    """Return (4, N, 3) up in the world by each photo, if a clockwise turn by 0, 90, 180, 270 degrees makes it upright."""
+    """Return (4, N, 3) up in the world by each photo, if a clockwise turn by 0, 90, 180, 270 degrees sets it upright."""
     x, y = rotations[:, 0], rotations[:, 1]
     return np.stack([-y, -x, y, x])
 
 
 def _proposals(rotations: FloatArray) -> list[FloatArray]:
-    """Return candidates for up per turn of the set: the mean over its photos, and the directions of some single photos."""
+    """Return candidates for up per turn of the set: the mean over its photos, and the directions of some of them."""
     axes = _up_axes(rotations)
     chosen = np.unique(np.linspace(0, len(rotations) - 1, 12).astype(int))
     return [

@@ -155,9 +155,9 @@ def tops_are_bright(up: FloatArray, surfaces: Surfaces) -> float:
 def ledges_are_lit(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
     """Return the share of rising minus that of falling brightness slopes along `up`, by power, in [-1, 1].
 
-    The mean over the photos. Shadow under ledges, eaves and things on the ground has a sharp border to the lit top above
-    it, and skylines are brighter above; transitions back to light are gradual. Perpendicular to `up` it is 0 within
-    0.06.
+    The mean over the photos. Shadow under ledges, eaves and things on the ground has a sharp border to the lit top
+    above it, and skylines are brighter above; transitions back to light are gradual. Perpendicular to `up` it is 0
+    within 0.06.
 
     Args:
         up: (3,) unit vector in the world.
