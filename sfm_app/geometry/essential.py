@@ -25,8 +25,8 @@ def essential_from_fundamental(F: Array, K1: Array, K2: Array) -> Array:
 def nearest_essential(E: Array) -> Array:
     """Return the essential matrix nearest to E (3, 3), with singular values (1, 1, 0).
 
-    Noise makes the singular values of E unequal; those of the nearest essential matrix in the Frobenius norm are twice
-    their mean and a zero (Hartley & Zisserman, 2nd ed., section 11.7.3). Its scale is then set to 1.
+    Noise makes the singular values of E unequal; in the nearest essential matrix in the Frobenius norm their mean
+    replaces both, and the third is 0 (Hartley & Zisserman, 2nd ed., section 11.7.3). Its scale is then set to 1.
     """
     U, _, Vt = np.linalg.svd(E)
     nearest: Array = U @ np.diag([1.0, 1.0, 0.0]) @ Vt

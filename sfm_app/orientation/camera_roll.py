@@ -81,7 +81,7 @@ def _best(turn: int, proposals: FloatArray, rotations: FloatArray, centers: Floa
 
 
 def _up_axes(rotations: FloatArray) -> FloatArray:
-    """Return (4, N, 3) up in the world by each photo, if a clockwise turn by 0, 90, 180, 270 degrees sets it upright."""
+    """Return (4, N, 3) up in the world by each photo, if a clockwise turn by 0, 90, 180, 270 degrees rights it."""
     x, y = rotations[:, 0], rotations[:, 1]
     return np.stack([-y, -x, y, x])
 

@@ -62,8 +62,8 @@ CUES: Mapping[str, Cue] = {
     "ledges are lit": Cue(0.18, 0.17),
     "sky is above": Cue(0.20, 0.27),
 }
-"""Estimated on eight photo sets, three rendered ones and seven of corners only; the figures of the others decide each
-set alike. The noise exceeds 1 because neighboring points share it."""
+"""Estimated on eight photo sets, three rendered ones and seven of corners only; figures from the others decide each
+set the same way. The noise exceeds 1 because neighboring points share it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
