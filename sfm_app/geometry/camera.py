@@ -4,41 +4,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 GUESSED_FOCAL = 1.2
-"""Focal of a camera about which nothing is known, in units of the longer side: COLMAP's guess, by definition."""
+"""Focal length of an unknown camera, in units of the longer side of its photo: COLMAP's guess, by definition."""
 
 NEWTON_STEPS, LEAST_SLOPE = 10, 0.2
-"""Of the search for a ray through a lens; the slope that it divides by is 0 where the lens folds. Chosen by hand; not
-measured on their own."""
+"""Steps of Newton's method in `rays`, and the least slope that it divides by: the slope is 0 where the lens folds.
+Chosen by hand; not measured on their own."""
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
-    """Return (3, 3) camera matrix without skew, in the unit of its arguments.
+    """Return the (3, 3) camera matrix without skew, in the unit of its arguments.
 
     Args:
         fx: focal length along x.
         fy: focal length along y.
-        cx: optical center, along x.
-        cy: optical center, along y.
+        cx: x of the principal point.
+        cy: y of the principal point.
     """
     return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) -> NDArray[np.float64]:
-    """Return (3, 3): square pixels, the optical center in the middle, and the given focal or the usual guess.
+    """Return the (3, 3) matrix of a camera with square pixels, a centered principal point and a given or guessed focal.
 
     Args:
         size: (width, height) in pixels.
-        focal_px: 1.2 times the longer side where None.
+        focal_px: focal length; 1.2 times the longer side if None.
     """
     focal = GUESSED_FOCAL * max(size) if focal_px is None else focal_px
     return camera_matrix(focal, focal, size[0] / 2, size[1] / 2)
 
 
 def rays(x: NDArray[np.float64], K: NDArray[np.float64], radial: float = 0.0) -> NDArray[np.float64]:
-    """Return (N, 2) points of the plane z = 1 that pixels see through a lens x_d = x_u (1 + radial r_u^2).
+    """Undistort pixels to (N, 2) points of the plane z = 1, for a lens x_d = x_u (1 + radial r_u^2).
 
-    Newton's search from the distorted radius. A barrel lens folds where r (1 + radial r^2) stops growing with r; what
-    lies beyond is taken to lie there.
+    Uses Newton's method from the distorted radius. A barrel lens folds where r (1 + radial r^2) stops growing with r;
+    pixels beyond the fold are mapped to it.
 
     Args:
         x: (N, 2) pixels.

@@ -1,7 +1,7 @@
-"""Levenberg and Marquardt's damping (Marquardt 1963), for every adjustment that is written in Python.
+"""Damping of Levenberg-Marquardt steps (Marquardt 1963), for every adjustment written in Python.
 
-The kernels of `ransac.refine.sampson_refit` and the many starts at once of `selfcal.thesis.least_squares` do the same
-inside their loops.
+The kernels of `ransac.refine.sampson_refit`, and `selfcal.thesis.least_squares` with its many simultaneous starts, do
+the same inside their loops.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from typing import NamedTuple, TypeVar
 Trial = TypeVar("Trial")
 
 MORE, LESS = 10.0, 0.1
-"""Factors after a step that fails, and after one that is taken. The usual ones (Marquardt 1963)."""
+"""Factors of the damping after a rejected and after an accepted step. The usual ones (Marquardt 1963)."""
 
 
 class DampingRange(NamedTuple):
@@ -19,21 +19,21 @@ class DampingRange(NamedTuple):
     first: float
     least: float
     most: float
-    """From here on no step is tried."""
+    """No step is tried with this damping or more."""
 
 
 def damped_step(
     attempt: Callable[[float], Trial | None], damping: float, limits: DampingRange
 ) -> tuple[Trial | None, float]:
-    """Find a step that lowers the cost, damped as far as that needs.
+    """Find a step that lowers the cost, raising the damping until one does.
 
     Args:
-        attempt: takes a damping; gives what the step leads to, or None where it does not lower the cost.
-        damping: to begin with, > 0.
-        limits: between which it stays.
+        attempt: takes a damping; returns the result of the step, or None if it does not lower the cost.
+        damping: initial damping, > 0.
+        limits: range of the damping.
 
     Returns:
-        What the step leads to, None where none is good, and the damping for the next.
+        The result of the step, None if no step lowers the cost, and the damping for the next step.
     """
     while damping < limits.most:
         trial = attempt(damping)

@@ -1,7 +1,7 @@
 """How far a match is from an epipolar geometry: the four error measures of thesis section 4.2.
 
-`algebraic_distance` is what linear fits make small, `symmetric_epipolar_distance` looks at points and lines,
-`sampson_distance` is the first order of `reprojection_distance`, which is the distance itself: the length of the
+Linear fits minimize `algebraic_distance`; `symmetric_epipolar_distance` is measured from points to lines;
+`sampson_distance` is the first-order approximation of `reprojection_distance`, the distance itself: the length of the
 shortest move of both points, in 4D, that makes the match exact. Points are (N, 2) pixels, ``x2' F x1 = 0``.
 """
 
@@ -17,14 +17,15 @@ _EPS = float(np.finfo(float).eps)
 _TINY = float(np.finfo(float).tiny)
 """The smallest normal number in double precision."""
 _MOST_STEPS = 100
-"""Bisection alone would be done after 60; Newton's steps need 3 to 6. Chosen by hand; not measured on its own."""
+"""Most steps of the root search: bisection alone needs 60, Newton's method 3 to 6. Chosen by hand; not measured on
+its own."""
 
 
 def algebraic_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
     """Return |x2' F x1| with F of Frobenius norm 1 and points (x, y, 1): |A b| per match (thesis 2.28 and 4.2).
 
-    Unlike the others it has no unit, and it changes with the origin and the scale of the coordinates: give it points
-    and F in the frame that is meant, such as that of `hartley_normalization`.
+    Unlike the other distances it has no unit, and it depends on the origin and scale of the coordinates: pass points
+    and F in the intended frame, such as that of `hartley_normalization`.
 
     Args:
         F: (3, 3), any scale.
@@ -42,7 +43,7 @@ def algebraic_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray
 
 
 def symmetric_epipolar_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
-    """Return root mean square of a match's distances to its two epipolar lines (HZ 11.10, thesis 4.1).
+    """Return the root mean square of a match's distances to its two epipolar lines (HZ 11.10, thesis 4.1).
 
     Args:
         F: (3, 3), any scale.
@@ -62,7 +63,7 @@ def symmetric_epipolar_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> F
 
 
 def sampson_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
-    """Return first-order distance of each match to the epipolar constraint (HZ 11.9 and thesis 4.2, before squaring)::
+    """Return the first-order distance of matches to the epipolar constraint (HZ 11.9, thesis 4.2, before squaring)::
 
         |x2' F x1| / sqrt((F x1)_1^2 + (F x1)_2^2 + (F' x2)_1^2 + (F' x2)_2^2)
 
@@ -83,10 +84,10 @@ def sampson_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
 
 
 def reprojection_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
-    """Return distance of each match in 4D to the nearest exact one: sqrt(d(x1, P1 X)^2 + d(x2, P2 X)^2), least over X.
+    """Return the 4D distance of each match to the nearest exact one: min over X of sqrt(d(x1, P1 X)^2 + d(x2, P2 X)^2).
 
-    With P1, P2 the `canonical_cameras` of F that is the term of thesis 4.3 before squaring; every other pair of cameras
-    with this F gives the same (HZ 12.5). The global minimum, see `nearest_exact_matches`.
+    With the `canonical_cameras` P1, P2 of F this is the term of thesis 4.3 before squaring; every other pair of cameras
+    with this F gives the same value (HZ 12.5). The minimum is global, see `nearest_exact_matches`.
 
     Args:
         F: (3, 3), any scale.
@@ -103,9 +104,9 @@ def reprojection_distance(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatAr
 
 
 def nearest_exact_matches(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Return the matches nearest to the given ones that fulfill x2' F x1 = 0.
+    """Return the matches nearest to the given ones that satisfy x2' F x1 = 0.
 
-    Optimal triangulation in the images (HZ 12.5).
+    This is optimal triangulation in the images (HZ 12.5).
 
     Args:
         F: (3, 3), any scale.
@@ -140,7 +141,7 @@ def _shortest_moves(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
     k = _multiplier(c, g, d, float(s[0]))[:, None]
     stretch = 1.0 + k * d
     z = -k * g / stretch
-    # what rounding, or a bad match on both epipoles, leaves of q is taken up along the weakest axis
+    # a step along the weakest axis removes what rounding, or a bad match on both epipoles, leaves of q
     rest, weakest = _phi(c, g, d, k), np.argmin(d, axis=1)[:, None]
     slope = np.take_along_axis(g / stretch, weakest, axis=1)[:, 0]
     root = np.sqrt(np.maximum(slope**2 + 2.0 * s[0] * rest, 0.0))
@@ -153,7 +154,7 @@ def _shortest_moves(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> FloatArray:
 
 
 def _multiplier(c: FloatArray, g: FloatArray, d: FloatArray, a: float) -> FloatArray:
-    """Return (N,) root of phi between 0 and 1/a."""
+    """Find the root (N,) of phi between 0 and 1/a."""
     low, high = np.zeros(len(c)), np.full(len(c), (1.0 - 4.0 * _EPS) / max(a, _TINY))
     k = low.copy()
     for _ in range(_MOST_STEPS):
@@ -175,7 +176,7 @@ def _phi(c: FloatArray, g: FloatArray, d: FloatArray, k: FloatArray) -> FloatArr
 
 
 def _constraint(F: ArrayLike, x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return algebraic error x2' F x1 and the epipolar lines in view 1 and view 2."""
+    """Return the algebraic error x2' F x1 and the epipolar lines in view 1 and view 2."""
     matrix = np.asarray(F, dtype=np.float64)
     if matrix.shape != (3, 3):
         raise ValueError(f"F must have shape (3, 3), got {matrix.shape}")

@@ -1,4 +1,4 @@
-"""The epipolar geometry of two views: the 8-point algorithm, and what follows from F.
+"""The epipolar geometry of two views: the 8-point algorithm, and quantities that follow from F.
 
 ``x2' F x1 = 0`` throughout. Points are (N, 2) pixels. Hartley and Zisserman, Multiple View Geometry, 2nd edition (HZ).
 """
@@ -51,15 +51,15 @@ def hartley_normalization(x: ArrayLike) -> FloatArray:
 
 
 def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) -> FloatArray:
-    """Return normalized 8-point algorithm (thesis 4.3.2): algebraic least squares, then the nearest matrix of rank 2.
+    """Estimate F by the normalized 8-point algorithm (thesis 4.3.2): algebraic least squares, then the nearest rank 2.
 
     Args:
         x1: (N, 2) pixels, N >= 8.
         x2: (N, 2) pixels, the partners.
-        weights: (N,) >= 0, how much each squared algebraic error counts; all 1 when left out.
+        weights: (N,) >= 0, how much each squared algebraic error counts; all 1 if None.
 
     Returns:
-        (3, 3), rank 2, Frobenius norm 1. With matches that do not determine F (all on one plane), one of the solutions.
+        (3, 3), rank 2, Frobenius norm 1. If the matches do not determine F (all on one plane), one of the solutions.
 
     Raises:
         ValueError: wrong shapes, fewer than 8 matches, or all points of a view coincide.
@@ -105,11 +105,11 @@ def epipoles(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
 
 
 def canonical_cameras(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Give two cameras with this F, P1 = [I|0] and P2 = [[e2]x F + e2 v' | e2] (thesis 2.34 with lambda = 1, HZ 9.10).
+    """Return cameras with this F, P1 = [I|0] and P2 = [[e2]x F + e2 v' | e2] (thesis 2.34 with lambda = 1, HZ 9.10).
 
-    v is free: it says which plane of the scene lies at infinity. With F of norm 1, singular values s1 >= s2, and
+    v is free: it selects the plane of the scene that lies at infinity. With F of norm 1, singular values s1 >= s2, and
     v = sqrt(s1 s2) e1 the left 3 x 3 of P2 has the singular values s1, sqrt(s1 s2), s2: invertible, and as well
-    conditioned as F lets it be. With pixels s1 / s2 is large; give F of centered points with coordinates near 1.
+    conditioned as F lets it be. In pixels s1 / s2 is large: pass the F of centered points with coordinates near 1.
 
     Args:
         F: (3, 3), rank 2, any scale.

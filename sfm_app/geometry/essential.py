@@ -1,4 +1,4 @@
-"""Essential matrices and the relative pose inside them."""
+"""Essential matrices and the relative poses that they encode."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,8 @@ def essential_from_fundamental(F: Array, K1: Array, K2: Array) -> Array:
 def nearest_essential(E: Array) -> Array:
     """Return the essential matrix nearest to E (3, 3), with singular values (1, 1, 0).
 
-    Noise leaves E with unequal singular values; the nearest essential matrix in the Frobenius norm has their mean twice
-    and a zero (Hartley & Zisserman, 2nd ed., section 11.7.3). Its scale is then set to 1.
+    Noise makes the singular values of E unequal; in the nearest essential matrix in the Frobenius norm their mean
+    replaces both, and the third is 0 (Hartley & Zisserman, 2nd ed., section 11.7.3). Its scale is then set to 1.
     """
     U, _, Vt = np.linalg.svd(E)
     nearest: Array = U @ np.diag([1.0, 1.0, 0.0]) @ Vt
@@ -34,10 +34,10 @@ def nearest_essential(E: Array) -> Array:
 
 
 def decompose_essential(E: Array) -> list[tuple[Array, Array]]:
-    """Return the four poses (R, t) of view 2 from view 1 that E allows (thesis Eq. 2.32 with its signs set right).
+    """Return the four poses (R, t) of view 2 from view 1 that E allows (thesis Eq. 2.32 with corrected signs).
 
-    The thesis's U W V' is a rotation only if det(U) det(V) = 1, which an SVD does not promise: both are turned into
-    rotations first. t has length 1; the scale is not observable.
+    The thesis's U W V' is a rotation only if det(U) det(V) = 1, which an SVD does not guarantee, so both are
+    made rotations first. t has length 1; the scale is not observable.
     """
     U, _, Vt = np.linalg.svd(E)
     U = U * np.sign(np.linalg.det(U))
@@ -48,7 +48,7 @@ def decompose_essential(E: Array) -> list[tuple[Array, Array]]:
 
 
 def relative_pose(E: Array, x1: Array, x2: Array) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-    """Return the one of the four poses that has most points before both cameras.
+    """Choose the one of the four poses of E with most points in front of both cameras.
 
     Args:
         E: (3, 3) essential matrix.
@@ -57,7 +57,7 @@ def relative_pose(E: Array, x1: Array, x2: Array) -> tuple[Array, Array, Array, 
 
     Returns:
         R (3, 3) and t (3,) of view 2 from view 1; X (N, 3) points in the frame of view 1; in_front (N,) whether a point
-        lies before both cameras.
+        lies in front of both cameras.
     """
     found = []
     for R, t in decompose_essential(E):

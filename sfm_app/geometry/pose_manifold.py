@@ -1,4 +1,4 @@
-"""Relative poses in kernels: twelve numbers, R by rows and then the unit vector t; five degrees of freedom."""
+"""Relative poses for kernels: twelve numbers, R by rows and then the unit vector t; five degrees of freedom."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,11 +28,11 @@ def essential(pose: FloatArray, E: FloatArray) -> None:
 
 @kernel
 def moved(pose: FloatArray, step: FloatArray) -> FloatArray:
-    """Return the pose (12,) after a step: R turned by exp([w]x), t along two directions across it.
+    """Return the pose (12,) after a step: R turned by exp([w]x), t moved in its tangent plane.
 
     Args:
         pose: (12,) R by rows, then the unit vector t.
-        step: (5,) w in radians, then how far t goes along each direction.
+        step: (5,) w in radians, then the move of t along two unit vectors perpendicular to it.
     """
     wx, wy, wz = step[0], step[1], step[2]
     angle = np.sqrt(wx * wx + wy * wy + wz * wz)
@@ -47,7 +47,7 @@ def moved(pose: FloatArray, step: FloatArray) -> FloatArray:
         out[3 + j] = cosine * b + sine * (wz * a - wx * c) + versine * dot * wy
         out[6 + j] = cosine * c + sine * (wx * b - wy * a) + versine * dot * wz
     x, y, z = pose[9], pose[10], pose[11]
-    # two unit vectors across t (Duff et al. 2017)
+    # two unit vectors perpendicular to t (Duff et al. 2017)
     sign = 1.0 if z >= 0.0 else -1.0
     p = -1.0 / (sign + z)
     q = x * y * p

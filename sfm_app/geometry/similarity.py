@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 MAX_TRIPLES = 500
 """Triples of points that are tried. Chosen by hand; not measured on its own."""
 MOST_LISTED = 60
-"""Points up to which all triples are listed before some are drawn; of a thousand there are 166 million. Chosen by hand;
+"""Most points whose triples are all listed before some are drawn; a thousand points have 166 million. Chosen by hand;
 not measured on its own."""
 
 
@@ -28,11 +28,11 @@ class Similarity:
     """(3,)."""
 
     def __call__(self, points: FloatArray) -> FloatArray:
-        """Move points (N, 3)."""
+        """Apply the similarity to points (N, 3)."""
         return np.asarray(self.scale * points @ self.R.T + self.t)
 
     def after(self, first: "Similarity") -> "Similarity":
-        """Return the similarity that does `first`, then this one."""
+        """Return the similarity that applies `first`, then this one."""
         return Similarity(self.scale * first.scale, self.R @ first.R, self.scale * self.R @ first.t + self.t)
 
     def inverse(self) -> "Similarity":
@@ -41,11 +41,11 @@ class Similarity:
 
 
 def umeyama(a: FloatArray, b: FloatArray) -> Similarity:
-    """Return the similarity that takes points to others with least squared error (Umeyama 1991).
+    """Fit the similarity that maps points to others with least squared error (Umeyama 1991).
 
     Args:
         a: (N, 3) points, N >= 3.
-        b: (N, 3) where they are to lie, row by row.
+        b: (N, 3) points that they should map to, row by row.
     """
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
     u, s, vt = np.linalg.svd((b - mean_b).T @ (a - mean_a))
@@ -56,14 +56,14 @@ def umeyama(a: FloatArray, b: FloatArray) -> Similarity:
 
 
 def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
-    """Return the similarity that takes most of the points to others, not led astray by wrong ones.
+    """Fit the similarity that maps most of the points to others, robust to wrong ones.
 
     Least median of squares over triples, then Umeyama on the points that agree with the best triple (Rousseeuw 1984;
     the threshold is 2.5 robust standard deviations).
 
     Args:
         a: (N, 3) points.
-        b: (N, 3) where they are to lie, row by row; some may be wrong.
+        b: (N, 3) points that they should map to, row by row; some may be wrong.
 
     Raises:
         ValueError: fewer than 3 points, or all lie on a line.
@@ -75,18 +75,18 @@ def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
         if _on_a_line(a[triple]) or _on_a_line(b[triple]):
             continue
         distance = np.linalg.norm(umeyama(a[triple], b[triple])(a) - b, axis=1)
-        # of n points 3 fit by construction, so the median has to look beyond them
+        # 3 of the points fit by construction, so the score is the residual one rank above the median
         score = float(np.sort(distance)[min(count - 1, count // 2 + 1)])
         if score < best:
             best, residual = score, distance
     if not np.isfinite(best):
-        raise ValueError("fewer than 3 points, or all on a line: they fix no rotation")
+        raise ValueError("fewer than 3 points, or all on a line: they do not determine a rotation")
     agreeing = residual <= max(2.5 * MAD_TO_SIGMA * best, np.sort(residual)[2])
     return umeyama(a[agreeing], b[agreeing])
 
 
 def _triples(count: int) -> NDArray[np.intp]:
-    """List all triples of so many points, or `MAX_TRIPLES` of them, drawn with a fixed seed."""
+    """List all triples of `count` points, or `MAX_TRIPLES` of them, drawn with a fixed seed."""
     rng = np.random.default_rng(0)
     if count > MOST_LISTED:
         return np.array([rng.choice(count, 3, replace=False) for _ in range(MAX_TRIPLES)], np.intp)

@@ -1,4 +1,4 @@
-"""Linear systems of positive matrices, also where these are all but singular; no sum depends on LAPACK's threads."""
+"""Linear systems with positive definite, even nearly singular matrices; no sum depends on LAPACK's threads."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,21 +10,21 @@ FloatArray = NDArray[np.float64]
 BLOCK = 8
 """Rows that are eliminated at once, without BLAS. Chosen by hand for speed."""
 LEAST = 1e-13
-"""Eigenvalues below this, of a matrix scaled to a unit diagonal, are what rounding leaves of none: some hundred sums of
+"""Eigenvalues below this, of a matrix scaled to a unit diagonal, are zeros with rounding errors: some hundred sums of
 doubles. docs/algorithms.md, Where numbers end."""
 OPEN = 1e-10
-"""What has to be left of a pivot for a solution to move along it: less multiplies the rounding of all that comes after
-by more than a million. Neither figure was chosen on a set: both follow from what doubles hold. docs/algorithms.md,
-Where numbers end."""
+"""Share of a pivot that elimination must leave for a solution to move along it: a smaller pivot multiplies the rounding
+of all later steps by more than a million. Neither figure was chosen on a set: both follow from the precision of
+doubles. docs/algorithms.md, Where numbers end."""
 
-NO_NUMBER = "a matrix holds what is no number", "this is a bug; please report it with OUT/log.txt"
+NO_NUMBER = "a matrix has infinite or NaN entries", "this is a bug; please report it with OUT/log.txt"
 
 
 def lifted(S: FloatArray, least: float = LEAST, to: float = LEAST) -> FloatArray:
-    """Lift eigenvalues below `least` to `to`; positive matrices stay as they are.
+    """Lift eigenvalues below `least` to `to`; matrices without any are returned unchanged.
 
-    Eigenvalues are those of the matrix scaled to a unit diagonal, so that units do not matter. Where they become LEAST
-    the inverse says that nothing is known along such a direction; where 1, a solution hardly moves along it.
+    Eigenvalues are those of the matrix scaled to a unit diagonal, so that units do not matter. With `to` = LEAST the
+    inverse is nearly infinite along such a direction; with `to` = 1 a solution hardly moves along it.
 
     Args:
         S: (..., n, n), symmetric.
@@ -32,7 +32,7 @@ def lifted(S: FloatArray, least: float = LEAST, to: float = LEAST) -> FloatArray
         to: in [least, 1].
 
     Raises:
-        NumericalError: it holds what is no number.
+        NumericalError: S has infinite or NaN entries.
     """
     if not np.isfinite(S).all():
         raise NumericalError(*NO_NUMBER)
@@ -48,55 +48,55 @@ def lifted(S: FloatArray, least: float = LEAST, to: float = LEAST) -> FloatArray
 
 
 def solve_positive(S: FloatArray, B: FloatArray) -> FloatArray:
-    """Return S^-1 B by Gauss and Jordan's elimination in small blocks, without pivots.
+    """Compute S^-1 B by Gauss-Jordan elimination in small blocks, without pivoting.
 
-    Along what S does not determine, the answer stays near 0.
+    Along directions that S does not determine, the solution stays near 0.
 
     Args:
-        S: (n, n), symmetric and positive definite, but for rounding.
+        S: (n, n), symmetric and positive definite up to rounding.
         B: (n, k).
 
     Raises:
-        NumericalError: S holds what is no number.
+        NumericalError: S has infinite or NaN entries.
     """
     return _eliminated(S, B, OPEN, 1.0)
 
 
 def inverse_of_positive(S: FloatArray) -> FloatArray:
-    """Return S^-1 of a symmetric (n, n), positive definite but for rounding; symmetric again, with a positive diagonal.
+    """Invert a symmetric (n, n), positive definite up to rounding; the inverse is symmetric, with a positive diagonal.
 
     Raises:
-        NumericalError: S holds what is no number.
+        NumericalError: S has infinite or NaN entries.
     """
     inverse = _eliminated(S, np.eye(len(S)), LEAST, LEAST)
     return 0.5 * (inverse + inverse.T)
 
 
 def inverses_of_positive(S: FloatArray) -> FloatArray:
-    """Invert many small positive matrices (..., n, n).
+    """Invert many small positive definite matrices (..., n, n).
 
     Raises:
-        NumericalError: S holds what is no number.
+        NumericalError: S has infinite or NaN entries.
     """
     return np.asarray(np.linalg.inv(lifted(S)), np.float64)
 
 
 def solve_each(S: FloatArray, B: FloatArray) -> FloatArray:
-    """Return S^-1 B of many small systems; see `solve_positive`.
+    """Compute S^-1 B for many small systems; see `solve_positive`.
 
     Args:
-        S: (..., n, n), symmetric, positive but for rounding.
+        S: (..., n, n), symmetric and positive definite up to rounding.
         B: (..., n, k) right-hand sides.
     """
     return np.asarray(np.linalg.solve(lifted(S, OPEN, 1.0), B), np.float64)
 
 
 def without_negative(S: FloatArray, before: FloatArray) -> FloatArray:
-    """Return the nearest S (n, n) that knows nothing along directions where rounding has left less than nothing.
+    """Return the nearest positive semidefinite matrix (n, n): eigenvalues that rounding made negative become 0.
 
     Args:
-        S: what elimination has left.
-        before: (n,) the diagonal as it was before: what rounding is relative to.
+        S: (n, n), symmetric, left by elimination.
+        before: (n,) its diagonal before elimination, which rounding is relative to.
     """
     scale = np.sqrt(np.where(before > 0.0, before, 1.0))
     pairs = scale[:, None] * scale
@@ -109,7 +109,7 @@ def without_negative(S: FloatArray, before: FloatArray) -> FloatArray:
 def _eliminated(S: FloatArray, B: FloatArray, least: float, to: float) -> FloatArray:
     n = len(S)
     M = np.hstack([S, B])
-    # how large a pivot was before elimination says when only rounding is left of it
+    # a pivot is only rounding if it is tiny relative to its value before elimination
     before = np.sqrt(np.where(np.diag(S) > 0.0, np.diag(S), 1.0))
     for start in range(0, n, BLOCK):
         pivot = slice(start, min(start + BLOCK, n))
@@ -122,9 +122,7 @@ def _eliminated(S: FloatArray, B: FloatArray, least: float, to: float) -> FloatA
 
 
 def _pivot(block: FloatArray, before: FloatArray, least: float, to: float) -> FloatArray:
-    """Return the block, lifted where elimination has left nothing but rounding of what stood there `before` (n,),
-    squared.
-    """
+    """Lift eigenvalues of which only rounding is left; `before` (n,) is the root of the diagonal before elimination."""
     if not np.isfinite(block).all():
         raise NumericalError(*NO_NUMBER)
     scale = before[:, None] * before

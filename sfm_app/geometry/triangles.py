@@ -10,7 +10,7 @@ IndexArray = NDArray[np.int64]
 
 
 def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """Return (V, 3) unit normals, each the mean over the triangles at the vertex by their area; 0 where there are none.
+    """Return (V, 3) unit normals, means over the triangles at each vertex weighted by area; 0 at unused vertices.
 
     Args:
         vertices: (V, 3).
@@ -25,7 +25,7 @@ def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
 
 
 def edges_of(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
-    """Return every edge once, (E, 2) with the lower vertex first, and (T, 3) the edges ab, bc, ca of each triangle."""
+    """Return every edge once, (E, 2) with the lower vertex first, and (T, 3) their numbers per triangle: ab, bc, ca."""
     ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     size = int(faces.max(initial=0)) + 1
     keys, at = np.unique(ends[:, 0] * size + ends[:, 1], return_inverse=True)
@@ -33,11 +33,11 @@ def edges_of(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
 
 
 def areas(vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """Return (T,) areas of the triangles.
+    """Return the areas (T,) of triangles.
 
     Args:
         vertices: (V, 3) points.
-        faces: (T, 3) rows of `vertices`.
+        faces: (T, 3) vertex indices.
     """
     corners = vertices[faces]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -45,22 +45,22 @@ def areas(vertices: FloatArray, faces: IndexArray) -> FloatArray:
 
 
 def median_edge(vertices: FloatArray, faces: IndexArray) -> float:
-    """Return median length of the edges.
+    """Return the median length of the edges.
 
     Args:
         vertices: (V, 3) points.
-        faces: (T, 3) rows of `vertices`.
+        faces: (T, 3) vertex indices.
     """
     edges, _ = edges_of(faces)
     return float(np.median(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)))
 
 
 def select_faces(surface: Surface, keep: NDArray[np.bool_]) -> Surface:
-    """Return the marked triangles with the vertices that they use, in the old order.
+    """Return the marked triangles with the vertices that they use, in the same order.
 
     Args:
         surface: T triangles and their vertices.
-        keep: (T,) the marks.
+        keep: (T,) True for the triangles to keep.
     """
     used, faces = np.unique(surface.faces[keep], return_inverse=True)
     return Surface(surface.vertices[used], faces.reshape(-1, 3).astype(np.int64), surface.colors[used])

@@ -1,4 +1,4 @@
-"""Points from two views."""
+"""Triangulation of points from two views."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,7 +7,7 @@ Array = NDArray[np.float64]
 
 
 def triangulate(P1: Array, P2: Array, x1: Array, x2: Array) -> Array:
-    """Return linear triangulation (thesis Eq. 2.33): the null vector of x x PX = 0 in both views.
+    """Compute points by linear triangulation (thesis Eq. 2.33): the null vector of x x PX = 0 in both views.
 
     Args:
         P1: (3, 4) projection matrix of view 1.
@@ -20,7 +20,7 @@ def triangulate(P1: Array, P2: Array, x1: Array, x2: Array) -> Array:
     """
     rows = [x1[:, :1] * P1[2] - P1[0], x1[:, 1:] * P1[2] - P1[1], x2[:, :1] * P2[2] - P2[0], x2[:, 1:] * P2[2] - P2[1]]
     A = np.stack(rows, axis=1)
-    A /= np.linalg.norm(A, axis=2, keepdims=True)  # every equation counts alike
+    A /= np.linalg.norm(A, axis=2, keepdims=True)  # all equations get the same weight
     X = np.linalg.svd(A)[2][:, 3]
     with np.errstate(divide="ignore", invalid="ignore"):
         points: Array = X[:, :3] / X[:, 3:]
@@ -29,7 +29,7 @@ def triangulate(P1: Array, P2: Array, x1: Array, x2: Array) -> Array:
 
 
 def triangulation_angle_deg(X: Array, center1: Array, center2: Array) -> Array:
-    """Return angle at which the two rays to each point meet.
+    """Return the angle between the two rays to each point.
 
     Args:
         X: (N, 3) points.

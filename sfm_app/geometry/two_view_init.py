@@ -11,7 +11,7 @@ from sfm_app.geometry.triangulation import triangulation_angle_deg
 Array = NDArray[np.float64]
 
 GOOD_ANGLE_DEG = 12.0
-"""From here on a wider angle no longer makes a better seed: depth is well determined, and matches get rarer.
+"""Wider angles than this make no better seed: depth is well determined already, and matches get rarer.
 docs/algorithms.md, Mapping. Chosen by hand; not measured on its own."""
 
 
@@ -24,18 +24,18 @@ class TwoViewSeed:
     points: Array
     """(N, 3), one per inlier, in the order given."""
     usable: NDArray[np.bool_]
-    """(N,) before both cameras, and seen under an angle that fixes its depth."""
+    """(N,) whether a point is in front of both cameras and its triangulation angle determines its depth."""
     angle_deg: float
-    """Median triangulation angle of the points before both cameras."""
+    """Median triangulation angle of the points in front of both cameras."""
     in_front: float
-    """Share of the inliers that lie before both cameras, 0 to 1."""
+    """Share of the inliers that lie in front of both cameras, 0 to 1."""
 
 
 def two_view_seed(E: Array, x1: Array, x2: Array) -> TwoViewSeed:
     """Decompose E and triangulate all its inliers.
 
     Args:
-        E: (3, 3) with x2' E x1 = 0; the essential matrix nearest to it counts.
+        E: (3, 3) with x2' E x1 = 0; the nearest essential matrix is used.
         x1: (N, 2) inliers as points of the plane z = 1, see `geometry.camera.rays`.
         x2: (N, 2) partners.
     """

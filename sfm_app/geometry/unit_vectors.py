@@ -14,11 +14,11 @@ def unit(vectors: ArrayLike) -> FloatArray:
 
 
 def axis_angle_deg(first: ArrayLike, second: ArrayLike) -> FloatArray:
-    """Return angle between the lines along vectors, whichever way they point; degrees in [0, 90].
+    """Return the angle between the lines along vectors, ignoring their signs, in degrees in [0, 90].
 
     Args:
         first: (..., 3) vectors of any length but zero.
-        second: (..., 3) the same; both broadcast.
+        second: (..., 3) likewise; the two are broadcast.
     """
     a, b = unit(first), unit(second)
     # the cross product keeps its digits where the arc cosine loses them
@@ -27,7 +27,7 @@ def axis_angle_deg(first: ArrayLike, second: ArrayLike) -> FloatArray:
 
 
 def along(vectors: FloatArray, axis: FloatArray) -> FloatArray:
-    """Return components (N,) of vectors along an axis; not by BLAS, whose digits depend on its threads.
+    """Return the components (N,) of vectors along an axis, without BLAS, whose rounding depends on its threads.
 
     Args:
         vectors: (N, 3).
@@ -37,7 +37,7 @@ def along(vectors: FloatArray, axis: FloatArray) -> FloatArray:
 
 
 def across(vector: ArrayLike, axis: FloatArray) -> FloatArray:
-    """Return what of vectors is at right angles to an axis.
+    """Return the component of vectors perpendicular to an axis.
 
     Args:
         vector: (..., 3) one vector or many.
@@ -48,18 +48,18 @@ def across(vector: ArrayLike, axis: FloatArray) -> FloatArray:
 
 
 def basis_across(axis: FloatArray) -> FloatArray:
-    """Return (2, 3) rows e1, e2 with e1 x e2 = axis, a unit vector (3,)."""
+    """Return orthonormal rows e1, e2 (2, 3) with e1 x e2 = axis, a unit vector (3,)."""
     least = np.eye(3)[int(np.argmin(np.abs(axis)))]
     e1 = unit(across(least, axis))
     return np.stack([e1, np.cross(axis, e1)])
 
 
 def least_direction(matrix: FloatArray, like: FloatArray) -> FloatArray:
-    """Return eigenvector (3,) of the smallest eigenvalue.
+    """Return the eigenvector (3,) of the smallest eigenvalue.
 
     Args:
         matrix: (3, 3), symmetric.
-        like: (3,) direction on whose side the result lies.
+        like: (3,) direction; the sign of the result is such that their dot product is not negative.
     """
     found: FloatArray = np.linalg.eigh(matrix)[1][:, 0]
     return found if found @ like >= 0 else -found

@@ -1,7 +1,7 @@
-"""Which way is up, from how photographers hold cameras.
+"""The up direction, from how photographers hold cameras.
 
-They hold them level: the x axes of the cameras are horizontal, and up is the direction most nearly at right angles to
-all of them. Some turn the camera by 90 degrees, for one photo or for all, and the file does not always say so; some do
+Most hold them level: the x axes of the cameras are horizontal, and up is the direction most nearly perpendicular to all
+of them. Some turn the camera by 90 degrees, for one photo or for all, and the file does not always record it; some do
 not hold it level at all.
 """
 
@@ -17,21 +17,21 @@ from sfm_app.numerical import MAD_TO_SIGMA
 FloatArray = NDArray[np.float64]
 
 ROLLS_DEG, PITCH_DEG = (4.0, 12.0, 30.0), 20.0
-"""Standard deviations, sideways of careful, careless and wild photographers, and along the view of all."""
+"""Standard deviations of roll, for careful, careless and wild photographers, and of pitch, for all."""
 
 MOST, MOST_DOWN = 4.5, 3.0
-"""What one photo at most counts against a direction: three standard deviations, so that wild photos are outvoted; and
-less where it looks steeply down, as people do at what lies on floors and tables."""
+"""Largest cost of the roll or pitch of one photo: three standard deviations, so that outliers are outvoted; and that of
+the pitch where it looks steeply down, as people do at things on floors and tables."""
 
 TURNED = (0.0, 3.0, 6.0, 3.0)
-"""Evidence, as -log of odds, that it takes to believe that all photos are turned by 0, 90, 180, 270 degrees: one folder
-in twenty lies on either side, one in 400 is upside down (telephones held the other way round, their EXIF lost)."""
+"""Prior cost, -log odds, of all photos being turned by 0, 90, 180, 270 degrees: one folder in twenty lies on either
+side, one in 400 is upside down (phones held the other way round, EXIF lost)."""
 
 ODD_ONE = 1.0
-"""The same for one photo that is turned otherwise than the others."""
+"""Prior cost, -log odds, of one photo being turned differently from the others."""
 
 VOICES = 8
-"""Photos of one walk are no independent witnesses: more than so many count as so many."""
+"""Largest effective number of photos, since those of one walk are not independent."""
 
 CLIMB = 0.1
 """Half of all walks go up and down by less than this share of their way."""
@@ -41,27 +41,27 @@ STEPS = 20
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Roll:
-    """What the cameras say about up."""
+    """An up direction, from how the cameras were held."""
 
     up: FloatArray
     """(3,) unit vector in the world."""
     turn_deg: int
-    """By how much most photos have to be turned clockwise to stand upright: 0, 90, 180 or 270."""
+    """Clockwise turn that makes most photos upright: 0, 90, 180 or 270."""
     spread_deg: float
     """Robust standard deviation of the cameras' roll; large where nobody held them level."""
     deviation_deg: float
-    """Standard deviation of `up` in its worst direction, as the spread of roll and pitch has it."""
+    """Standard deviation of `up` in its worst direction, from the assumed deviations of roll and pitch."""
     cost: float
-    """-log likelihood of the poses, and of people turning their photos so."""
+    """-log likelihood of the poses, plus the prior cost of the turns."""
 
 
 def ups_from_roll(rotations: FloatArray, centers: FloatArray) -> tuple[Roll, ...]:
-    """Return, for photos turned by 0, 90, 180, 270 degrees, the direction for which they are held most nearly level.
+    """Estimate up for photos turned by 0, 90, 180, 270 degrees: the direction that makes them most nearly level.
 
-    Roll alone does not tell portrait photos of a wall from landscape photos of the same wall lying on its side, so
-    two weaker signs join in: people look about horizontally, and they walk rather than climb. Of the directions that
-    the photos propose the best is refined by weighted least squares. Opposite turns have opposite directions, unless
-    cameras look steeply down.
+    Roll alone does not distinguish portrait photos of a wall from landscape photos of the same wall lying on its side,
+    so two weaker cues are added: people look about horizontally, and they walk rather than climb. The directions that
+    the photos propose are refined by weighted least squares, and the best is chosen. Opposite turns have opposite
+    directions, unless cameras look steeply down.
 
     Args:
         rotations: (N, 3, 3) cam_from_world, N >= 1; camera axes x right, y down, z forward.
@@ -81,13 +81,13 @@ def _best(turn: int, proposals: FloatArray, rotations: FloatArray, centers: Floa
 
 
 def _up_axes(rotations: FloatArray) -> FloatArray:
-    """Return (4, N, 3) what is up in each photo if it is upright once turned by 0, 90, 180, 270 degrees clockwise."""
+    """Return (4, N, 3) up in the world by each photo, if a clockwise turn by 0, 90, 180, 270 degrees rights it."""
     x, y = rotations[:, 0], rotations[:, 1]
     return np.stack([-y, -x, y, x])
 
 
 def _proposals(rotations: FloatArray) -> list[FloatArray]:
-    """Return, per turn of the set, the mean of its photos' up directions, and some of them alone."""
+    """Return candidates for up per turn of the set: the mean over its photos, and the directions of some of them."""
     axes = _up_axes(rotations)
     chosen = np.unique(np.linspace(0, len(rotations) - 1, 12).astype(int))
     return [
@@ -97,14 +97,14 @@ def _proposals(rotations: FloatArray) -> list[FloatArray]:
 
 
 def _tilts(up: FloatArray, rotations: FloatArray) -> tuple[NDArray[np.intp], FloatArray, FloatArray]:
-    """Return, per photo, its turn (0 to 3) and the sines of roll and pitch against `up`."""
+    """Return, per photo, its turn (0 to 3) and the sines of roll and pitch relative to `up`."""
     turns = np.argmax(_up_axes(rotations) @ up, axis=0)
     level = np.where((turns % 2 == 0)[:, None], rotations[:, 0], rotations[:, 1])
     return turns, level @ up, rotations[:, 2] @ up
 
 
 def _cost(up: FloatArray, turn: int, rotations: FloatArray, roll_deg: float) -> float:
-    """Return -log likelihood of the poses if the set as a whole is turned by `turn` quarters."""
+    """Return the -log likelihood of the poses if the set as a whole is turned by `turn` quarters."""
     turns, roll, pitch = _tilts(up, rotations)
     sideways = np.minimum(_squares(roll, roll_deg), MOST)
     along_view = np.minimum(_squares(pitch, PITCH_DEG), np.where(pitch < 0, MOST_DOWN, MOST))
@@ -113,14 +113,14 @@ def _cost(up: FloatArray, turn: int, rotations: FloatArray, roll_deg: float) -> 
 
 
 def _climbing(up: FloatArray, centers: FloatArray) -> float:
-    """Return -log likelihood of how much of the cameras' spread is height: Cauchy, since a few do climb."""
+    """Return the -log likelihood of the share of height in the cameras' spread: Cauchy, since a few people climb."""
     spread = centers - centers.mean(axis=0)
     total = float((spread**2).sum())
     return float(np.log1p(((spread @ up) ** 2).sum() / (total * CLIMB**2))) if total > 0 else 0.0
 
 
 def _refined(up: FloatArray, rotations: FloatArray, roll_deg: float) -> FloatArray:
-    """Return least squares of roll and pitch with Welsch's weights on each photo, from `up` on."""
+    """Refine `up` by least squares of roll and pitch with Welsch weights for each photo."""
     for _ in range(STEPS):
         before = up
         up = least_direction(_normal_matrix(up, rotations, roll_deg), up)
@@ -130,7 +130,7 @@ def _refined(up: FloatArray, rotations: FloatArray, roll_deg: float) -> FloatArr
 
 
 def _normal_matrix(up: FloatArray, rotations: FloatArray, roll_deg: float) -> FloatArray:
-    """Return (3, 3) information about up: sum of the axes' a a' that should be level, over their variances."""
+    """Return the information matrix (3, 3) of up: the sum of a a' / variance over the axes a that should be level."""
     turns, roll, pitch = _tilts(up, rotations)
     level = np.where((turns % 2 == 0)[:, None], rotations[:, 0], rotations[:, 1])
     matrix = np.zeros((3, 3))
@@ -141,10 +141,10 @@ def _normal_matrix(up: FloatArray, rotations: FloatArray, roll_deg: float) -> Fl
 
 
 def _uncertainty(up: FloatArray, rotations: FloatArray, roll_deg: float) -> tuple[float, float]:
-    """Return robust spread of the roll in degrees, and the standard deviation of `up`."""
+    """Return the robust spread of the roll and the standard deviation of `up`, in degrees."""
     _, roll, _ = _tilts(up, rotations)
     spread = float(MAD_TO_SIGMA * np.median(np.degrees(np.abs(np.arcsin(np.clip(roll, -1.0, 1.0))))))
-    information = np.linalg.eigvalsh(_normal_matrix(up, rotations, roll_deg))[1]  # of the less certain of two tilts
+    information = np.linalg.eigvalsh(_normal_matrix(up, rotations, roll_deg))[1]  # of the less certain tilt
     return spread, float(np.degrees(1.0 / np.sqrt(max(information, 1e-12))))
 
 

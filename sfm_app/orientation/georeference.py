@@ -1,4 +1,4 @@
-"""Where on earth a reconstruction stands, and how large it is, from GPS positions of its photos."""
+"""Place, heading and scale of a reconstruction on Earth, from the GPS positions of its photos."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,19 +18,19 @@ EQUATOR_M, FLATTENING = 6378137.0, 1.0 / 298.257223563
 """WGS84."""
 
 GPS_M, GPS_SHARE = 10.0, 0.15
-"""Largest residual that passes for the error of consumer GPS: in meters, or as a share of how far the photos spread."""
+"""Largest residual that consumer GPS explains: in meters, or as a share of the spread of the photos if that is more."""
 
 CHANCE = 1e-3
-"""Probability at most that positions which know nothing of the cameras fit as well."""
+"""Largest probability that positions unrelated to the cameras fit as well."""
 
 SCALE_DEVIATION = 0.1
 """Largest relative standard deviation of the scale."""
 
 LEAST_PHOTOS, AGREEING = 3, 0.6
-"""Distinct positions, and their share, that must agree."""
+"""Least number of distinct positions, and their least share, that must agree."""
 
 UP_DEG = 2.0
-"""GPS that fixes up this well is believed where up is otherwise only guessed from the cameras' roll."""
+"""Largest standard deviation, in degrees, with which up from GPS replaces up from the cameras' roll."""
 
 MAX_PAIRS = 500
 
@@ -42,17 +42,17 @@ class Georeference:
     enu_from_world: Similarity
     """To meters east, north and up of `origin`."""
     origin: GpsPosition
-    """Where (0, 0, 0) of those meters is; without altitude, up counts from the cameras' median height."""
+    """Position of (0, 0, 0) in that frame; without altitude, heights are relative to the cameras' median height."""
     photos: int
-    """Distinct positions that agree."""
+    """Number of distinct positions that agree."""
     of: int
-    """Distinct positions there are."""
+    """Number of distinct positions."""
     rms_m: float
-    """Root mean square residual of the agreeing positions along the ground."""
+    """Root mean square horizontal residual of the agreeing positions."""
     scale_deviation: float
     """Relative standard deviation of the scale."""
     up_deviation_deg: float | None = None
-    """Standard deviation of up where it is that of the positions, altitudes included; None where it was given."""
+    """Standard deviation of up if it comes from the positions and their altitudes; None if up was given."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +70,13 @@ def georeference(
 ) -> Georeference | NoGeoreference:
     """Find scale, heading and place from the positions of the photos, if these agree with the cameras.
 
-    GPS is off by 3 to 10 m along the ground and by twice that in height, so up stays as it is, and the positions are
-    used along the ground only: w = a z + b in complex numbers, by RANSAC over pairs, then least squares. Only where up
-    is unsure and the positions fix it well in space, theirs is taken.
+    GPS is off by 3 to 10 m horizontally and by twice that in height, so the given up is kept and only the horizontal
+    positions are used: w = a z + b in complex numbers, by RANSAC over pairs, then least squares. Only if up is unsure
+    and the positions determine it well in space, up is taken from them.
 
     Args:
         centers: (N, 3) camera centers.
-        positions: per photo, None where there is none.
+        positions: per photo; None if it has none.
         up: (3,) unit vector in the world.
         up_is_sure: whether `up` rests on more than the cameras' roll.
     """
@@ -99,7 +99,7 @@ def georeference(
 def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
     """Return (N, 3) meters east, north and up of an origin; up is 0 where either altitude is unknown.
 
-    To the first order in the angles, with the ellipsoid's radii at the origin: 1 m off over 5 km.
+    First-order in the angles, with the ellipsoid's radii at the origin: the error is 1 m over 5 km.
 
     Args:
         positions: on earth; those without altitude have up 0.
@@ -117,7 +117,7 @@ def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
 
 
 def position_at(enu: FloatArray, origin: GpsPosition) -> GpsPosition:
-    """Return the position so many meters from an origin; `enu_m` backwards.
+    """Return the position at an offset in meters from an origin; the inverse of `enu_m`.
 
     Args:
         enu: (3,) meters east, north and up.
@@ -130,7 +130,7 @@ def position_at(enu: FloatArray, origin: GpsPosition) -> GpsPosition:
 
 
 def _radii_m(origin: GpsPosition) -> tuple[float, float]:
-    """Return radius of curvature along the meridian, and of the circle of latitude, both at the origin's altitude."""
+    """Return the radius of curvature along the meridian and the radius of the parallel, at the origin's altitude."""
     latitude = np.radians(origin.latitude_deg)
     squared = FLATTENING * (2.0 - FLATTENING)
     across = EQUATOR_M / np.sqrt(1.0 - squared * np.sin(latitude) ** 2)
@@ -140,7 +140,7 @@ def _radii_m(origin: GpsPosition) -> tuple[float, float]:
 
 
 def _middle(positions: Sequence[GpsPosition]) -> GpsPosition:
-    """Return median position; its altitude is the median of those that are known."""
+    """Return the median position; its altitude is the median of the known ones."""
     first = positions[0].longitude_deg
     turn = np.median([(position.longitude_deg - first + 180.0) % 360.0 - 180.0 for position in positions])
     longitude = (first + float(turn) + 180.0) % 360.0 - 180.0
@@ -166,10 +166,11 @@ def _along_ground(
     extent = float(np.std(w[agreeing]))
     unexplained = min((rms / extent) ** 2, 1.0) if extent > 0 else 1.0
     deviation = np.sqrt(unexplained / max(1.0 - unexplained, 1e-12) / (2 * (used - 2)))
-    # for positions that know nothing of the cameras, `unexplained` has the distribution u^(n-2): Beta(n - 2, 1)
+    # for positions unrelated to the cameras, `unexplained` has the distribution function u^(n-2): Beta(n - 2, 1)
     if unexplained ** (used - 2) > CHANCE or deviation > SCALE_DEVIATION:
         return NoGeoreference(
-            f"{used} GPS positions that spread over {extent:.0f} m and miss the cameras by {rms:.1f} m fix no scale"
+            f"{used} GPS positions that spread over {extent:.0f} m and miss the cameras by {rms:.1f} m "
+            "do not determine a scale"
         )
     scale = float(np.abs(a))
     turn = a / scale
@@ -180,12 +181,12 @@ def _along_ground(
 
 
 def _complex(points: FloatArray) -> NDArray[np.complex128]:
-    """Return points (N, 2 or 3) along the ground as x + iy."""
+    """Return the horizontal components of points (N, 2 or 3) as x + iy."""
     return np.asarray(points[:, 0] + 1j * points[:, 1], np.complex128)
 
 
 def _agreeing(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float) -> NDArray[np.bool_]:
-    """Return which positions agree with the pair that most agree with: least sum of squares, none above the limit's."""
+    """Find the inliers of the best pair by truncated squared residuals, then refit until they no longer change."""
     pairs = np.array(list(combinations(range(len(z)), 2)), np.intp)
     if len(pairs) > MAX_PAIRS:
         pairs = np.random.default_rng(0).permutation(pairs)[:MAX_PAIRS]
@@ -208,14 +209,14 @@ def _agreeing(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float
 
 
 def _line(z: NDArray[np.complex128], w: NDArray[np.complex128]) -> tuple[complex, complex]:
-    """Return a and b of w = a z + b with least squared error."""
+    """Fit a and b of w = a z + b by least squares."""
     around = z - z.mean()
     a = complex(np.vdot(around, w - w.mean()) / max(float(np.vdot(around, around).real), 1e-300))
     return a, complex(w.mean() - a * z.mean())
 
 
 def _up_of(cameras: FloatArray, enu: FloatArray, positions: Sequence[GpsPosition]) -> tuple[FloatArray, float] | None:
-    """Find up (3,) in the world from positions in space, and its deviation; None where that is not within `UP_DEG`."""
+    """Estimate up (3,) in the world and its deviation from positions in space; None if it is not within `UP_DEG`."""
     if any(position.altitude_m is None for position in positions) or len(positions) < 5:
         return None
     try:

@@ -1,4 +1,4 @@
-"""How a reconstructed scene stands: which way is up, and which side faces the viewer."""
+"""Orientation of a reconstructed scene: which way is up, and which side faces the viewer."""
 
 from dataclasses import dataclass, replace
 
@@ -18,45 +18,45 @@ LINES, ROLL, GROUND, GPS = "vanishing lines", "camera roll", "ground plane", "GP
 WALL, CAMERAS = "wall", "cameras"
 
 UNSURE_DEG = 5.0
-"""Cameras whose roll deviates by more say less about up than the plane that they stand on."""
+"""Spread of the cameras' roll above which the ground plane is better evidence for up."""
 
 FLOOR_DEG, WALL_DEG = (0.0, 20.0), (80.0, 90.0)
-"""How far from up the normals of floors and of walls are."""
+"""Ranges of the angle between up and the normals of floors, and of walls."""
 
 SQUARE_WITHIN_DEG = 30.0
-"""The front is turned to the viewer when it is this near; a view across a corner stays one."""
+"""Largest angle by which a front is turned to face the viewer; a view of a corner is kept."""
 
 MIDDLE = (0.2, 0.8)
-"""Quantiles of the points between which the middle of the scene is half way."""
+"""Quantiles of the points; the middle of the scene is halfway between them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Upright:
-    """Which way is up, and why."""
+    """The up direction of a scene, and its evidence."""
 
     up: FloatArray
     """(3,) unit vector in the world."""
     level: FloatArray | None
-    """(3,) main horizontal direction of the lines, at right angles to `up`; None where there is none."""
+    """(3,) main horizontal direction of the lines, perpendicular to `up`; None if none was found."""
     found_by: str
-    """`LINES`, `ROLL`, `GROUND` or `GPS`."""
+    """Source of `up`: `LINES`, `ROLL`, `GROUND` or `GPS`."""
     deviation_deg: float
-    """Standard deviation of `up`, in degrees, as its evidence has it."""
+    """Standard deviation of `up` in degrees, estimated from its evidence."""
     standing: Standing
-    """Which way up the photos are, and how sure that is."""
+    """Which way up the photos are, and the odds of that."""
 
     @property
     def roll(self) -> Roll:
-        """What the cameras alone say about up, once it is known which way up the photos are."""
+        """Up from the cameras alone, for the turn of the photos that was chosen."""
         return self.standing.roll
 
     @property
     def off_roll_deg(self) -> float:
-        """Angle between `up` and what the cameras alone say, in degrees."""
+        """Angle between `up` and up from the cameras alone, in degrees."""
         return float(axis_angle_deg(self.up, self.roll.up))
 
     def turned_to(self, up: FloatArray, deviation_deg: float) -> "Upright":
-        """Return the same, with up as GPS has it: heights know their sign.
+        """Return a copy with up from GPS, whose sign is certain.
 
         Args:
             up: (3,) unit vector in the world.
@@ -69,15 +69,14 @@ class Upright:
 def up_direction(
     rotations: FloatArray, centers: FloatArray, scenery: Scenery, segments: Segments, turn_deg: int | None = None
 ) -> Upright:
-    """Find up from the vertical lines of the scene near where the cameras' roll has it; else from roll or the ground.
+    """Find up from vertical lines near the up direction of the cameras' roll, or else from the ground or the roll.
 
     Args:
         rotations: (N, 3, 3) cam_from_world of the photos, N >= 1.
         centers: (N, 3) camera centers.
-        scenery: what the photos show; tells the ways up apart in which they may have been taken.
+        scenery: what the photos show; decides which way up they were taken.
         segments: lines in the photos; may be empty.
-        turn_deg: by how much the photos have to be turned clockwise to stand upright: 0, 90, 180 or 270; None where
-            nobody knows.
+        turn_deg: clockwise turn that makes the photos upright: 0, 90, 180 or 270; None if unknown.
     """
     rolls = ups_from_roll(rotations, centers)
     if turn_deg is None:
@@ -91,7 +90,7 @@ def up_direction(
         if level is None:
             return Upright(lines.direction, None, LINES, lines.deviation_deg, standing)
         frame, deviation_deg = square_frame(lines.direction, level, segments)
-        # verticals alone and all edges together err in their own ways: the gap between them says by how much
+        # verticals alone and all edges together have different errors: the gap between them is a measure of both
         gap_deg = float(axis_angle_deg(frame[0], lines.direction))
         return Upright(frame[0], frame[1], LINES, float(np.hypot(deviation_deg, gap_deg)), standing)
     ground = dominant_plane(scenery.points, roll.up, FLOOR_DEG) if roll.spread_deg > UNSURE_DEG else None
@@ -101,9 +100,9 @@ def up_direction(
 
 
 def facing(upright: Upright, rotations: FloatArray, points: FloatArray) -> tuple[FloatArray, str]:
-    """Return horizontal direction (3,) that should point to the viewer, and what says so: `LINES`, `WALL` or `CAMERAS`.
+    """Choose the horizontal direction (3,) that points to the viewer, and its source: `LINES`, `WALL` or `CAMERAS`.
 
-    Towards the cameras; where lines or walls have a main direction near that, exactly along it.
+    It points to the cameras; if lines or walls have a main direction near that, exactly along it.
 
     Args:
         upright: which way is up.
@@ -126,16 +125,16 @@ def facing(upright: Upright, rotations: FloatArray, points: FloatArray) -> tuple
 
 
 def viewer_frame(up: FloatArray, towards: FloatArray, points: FloatArray, meters: float | None = None) -> Similarity:
-    """Return the similarity into the frame of glTF viewers: y up, z to the viewer, the points about 0.
+    """Return the similarity into the frame of glTF viewers: y up, z to the viewer, the points around the origin.
 
     Args:
         up: (3,) unit vector in the world.
-        towards: (3,) unit vector at right angles to it, see `facing`.
+        towards: (3,) unit vector perpendicular to it, see `facing`.
         points: (P, 3) of the scene.
-        meters: per unit of the world; where None, four of five points come to lie within 1 of the middle.
+        meters: per unit of the world; if None, four of five points will lie within 1 of the middle.
     """
     R = np.stack([np.cross(up, towards), up, towards])
-    # The median would follow the points to where most of them happen to be, the whole box the farthest few.
+    # The median would follow the densest points, the bounding box the farthest few.
     turned = points @ R.T
     center = np.mean(np.quantile(turned, MIDDLE, axis=0), axis=0)
     size = float(np.percentile(np.linalg.norm(turned - center, axis=1), 80))

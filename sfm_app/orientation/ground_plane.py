@@ -1,4 +1,4 @@
-"""The plane that most points of a scene lie on, among those that lean as the one looked for."""
+"""The plane that most points of a scene lie on, among planes of a given inclination."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from sfm_app.geometry.unit_vectors import along, axis_angle_deg, least_direction
 FloatArray = NDArray[np.float64]
 
 TRIPLES, MOST_POINTS = 1000, 4000
-"""Samples of three points that are drawn, and points that they are judged by."""
+"""Number of samples of three points, and of the points that score them."""
 
 NEAR = 0.01
 """Points within this share of the scene's size lie on the plane."""
@@ -21,20 +21,20 @@ LEAST_SHARE = 0.15
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
-    """Where many points lie."""
+    """A plane that many points lie on."""
 
     normal: FloatArray
-    """(3,) unit vector on the side of the axis that was asked about."""
+    """(3,) unit vector on the side of the given axis."""
     share: float
-    """Of the points, 0 to 1."""
+    """Share of the points that lie on it, 0 to 1."""
     deviation_deg: float
-    """Standard deviation of the normal, as the points' scatter has it."""
+    """Standard deviation of the normal, from the scatter of the points."""
 
 
 def dominant_plane(points: FloatArray, axis: FloatArray, between_deg: tuple[float, float]) -> Plane | None:
-    """Return the plane with most points whose normal is so far from an axis: floors (0, 25), walls (80, 90).
+    """Find the plane with most points whose normal is at a given angle to an axis: floors (0, 20), walls (80, 90).
 
-    RANSAC with a fixed seed, then least squares on the points near the plane; None where no plane has enough of them.
+    RANSAC with a fixed seed, then least squares on the points near the plane; None if no plane has enough of them.
 
     Args:
         points: (N, 3), of any scale.

@@ -5,16 +5,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 LONGER_SIDE_PX = 1000
-"""Photos are shrunk to this size: longer edges, less noise, and no need for more."""
+"""Photos are shrunk to this size, which makes edges longer and noise smaller."""
 
 SHORTEST, MOST_SEGMENTS = 0.025, 400
 """Shortest segment as a share of the photo's longer side, and how many of the longest are kept."""
 
 
 def line_segments(gray: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return segments of a gray photo (H, W): (N, 4) x1, y1, x2, y2 in its pixels, longest first.
+    """Find line segments in a gray photo (H, W): (N, 4) x1, y1, x2, y2 in its pixels, longest first.
 
-    LSD (von Gioi, Jakubowicz, Morel and Randall 2010).
+    Uses LSD (von Gioi, Jakubowicz, Morel and Randall 2010).
     """
     longer = max(gray.shape)
     shrink = min(1.0, LONGER_SIDE_PX / longer)

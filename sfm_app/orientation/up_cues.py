@@ -1,6 +1,6 @@
-"""What tells top from bottom in a scene whose vertical is known: each cue is a number, above 0 if `up` is up.
+"""Cues that tell top from bottom in a scene whose vertical is known.
 
-All of them change sign with `up`.
+Each cue is a number that is positive if `up` is up; all of them change sign with `up`.
 """
 
 from collections.abc import Sequence
@@ -18,13 +18,13 @@ LEAST_POINTS = 10
 """Points that a photo must see for its depths to count."""
 
 LITTLE_DEPTH = 0.05
-"""Spread of log depth below which it is the shape of a thing far away rather than the way to it."""
+"""Spread of log depth below which it shows the shape of a distant thing rather than the ground in front of it."""
 
 NEIGHBORS, AROUND = 12, 60
-"""Points that a piece of surface is laid through, and whose mean a normal and its brightness are compared with."""
+"""Neighbors that a surface patch is fitted to, and those whose mean its normal and brightness are compared with."""
 
 FLAT = 0.2
-"""Largest ratio of the two smaller variances of points on a piece of surface."""
+"""Largest ratio of the two smaller variances of the points of a surface patch."""
 
 PICTURE_PX = 256
 """Longer side of the small photos: wide enough for ledges and window sills, too small for texture."""
@@ -33,25 +33,25 @@ BLUR_PX = 2.0
 """Blur before slopes are taken."""
 
 BLACK, BROAD_PX, BORDER_PX = 20, 15, 6
-"""Areas so dark and so broad are a background without light, whose border is no ledge; and how wide that border is."""
+"""Gray level and width of an unlit background, whose border is not a ledge, and the width of that border."""
 
 NO_CHANGE = 1e-6
-"""Root mean square of normals or log brightness below which they are all the same, and digits are all that is left."""
+"""Root mean square of differences of normals or log brightness below which they are only rounding."""
 
 EVEN, BLUR_SKY_PX, LEAST_SKY = 1.5, 1.0, 40
-"""Slope in gray levels per pixel below which a picture is even, its blur, and the darkest sky."""
+"""Of sky: largest slope in gray levels per pixel, the blur before slopes are taken, and the least gray level."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surfaces:
-    """Pieces of surface around points."""
+    """Surface patches around points."""
 
     normals: FloatArray
     """(N, 3) unit vectors on the side of the cameras."""
     bends: FloatArray
-    """(N, 3) what the normals differ by from those around."""
+    """(N, 3) normals minus the mean normal of their neighborhood."""
     shades: FloatArray
-    """(N,) what log brightness differs by from that around."""
+    """(N,) log brightness minus its mean over the neighborhood."""
 
 
 def small_picture(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -64,12 +64,12 @@ def small_picture(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def surfaces_of(
     points: FloatArray, brightness: FloatArray, seen: Sequence[NDArray[np.int64]], centers: FloatArray
 ) -> Surfaces:
-    """Return planes through the neighbors of each point, where these lie on one.
+    """Fit a plane to the neighbors of each point, and keep those that are flat.
 
     Args:
         points: (P, 3).
         brightness: (P,) 0 to 255.
-        seen: per photo the points that it sees.
+        seen: per photo, the indices of the points that it sees.
         centers: (N, 3) camera centers of the photos.
     """
     from scipy.spatial import cKDTree
@@ -98,16 +98,16 @@ def low_is_near(
     points: FloatArray,
     seen: Sequence[NDArray[np.int64]],
 ) -> float:
-    """Return correlation of log depth with height in the photo, over the points that it sees; mean over the photos.
+    """Return the correlation of log depth with height in the photo, averaged over the photos, in [-1, 1].
 
-    The ground comes nearer towards the lower border; facades seen from the street lean away. In [-1, 1].
+    The ground gets nearer towards the lower border; facades seen from the street lean away.
 
     Args:
         up: (3,) unit vector in the world.
         rotations: (N, 3, 3) of cam_from_world.
         centers: (N, 3) of the cameras.
         points: (P, 3) in the world.
-        seen: per photo the points that it sees.
+        seen: per photo, the indices of the points that it sees.
     """
     found = []
     for R, center, chosen in zip(rotations, centers, seen, strict=True):
@@ -125,25 +125,25 @@ def low_is_near(
 
 
 def tops_are_seen(up: FloatArray, surfaces: Surfaces) -> float:
-    """Return mean upward component of the normals: free space and those who look are above floors, steps and sills.
+    """Return the mean upward component of the normals, in [-1, 1].
 
-    In [-1, 1].
+    Floors, steps and sills are seen from above.
 
     Args:
         up: (3,) unit vector in the world.
-        surfaces: pieces around the points.
+        surfaces: patches around the points.
     """
     return float(along(surfaces.normals, up).mean()) if len(surfaces.normals) else 0.0
 
 
 def tops_are_bright(up: FloatArray, surfaces: Surfaces) -> float:
-    """Return correlation of brightness with the upward component of the normal, both against what is around.
+    """Return the correlation of brightness and upward component of the normal, both relative to their neighborhood.
 
-    Light from above. In [-1, 1].
+    Light comes from above. In [-1, 1].
 
     Args:
         up: (3,) unit vector in the world.
-        surfaces: pieces around the points.
+        surfaces: patches around the points.
     """
     if not len(surfaces.normals):
         return 0.0
@@ -153,17 +153,16 @@ def tops_are_bright(up: FloatArray, surfaces: Surfaces) -> float:
 
 
 def ledges_are_lit(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
-    """Return share of the power of slopes of brightness along `up` that rise, less that which fall.
+    """Return the share of rising minus that of falling brightness slopes along `up`, by power, in [-1, 1].
 
-    Mean over the photos.
-
-    Under ledges, eaves and things on the ground lies shadow with a sharp border to the lit top above it, and skylines
-    are brighter above; the ways back to light are gentle. Across, it is 0 within 0.06. In [-1, 1].
+    The mean over the photos. Shadow under ledges, eaves and things on the ground has a sharp border to the lit top
+    above it, and skylines are brighter above; transitions back to light are gradual. Perpendicular to `up` it is 0
+    within 0.06.
 
     Args:
         up: (3,) unit vector in the world.
         rotations: (N, 3, 3) of cam_from_world.
-        pictures: per photo (H, W) gray as the sensor lies; None where there is none.
+        pictures: per photo (H, W) gray, in the orientation of the sensor; None if there is none.
     """
     found = []
     for R, picture in zip(rotations, pictures, strict=True):
@@ -177,14 +176,14 @@ def ledges_are_lit(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDA
 
 
 def sky_is_above(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
-    """Return share of even and bright pixels at the upper border less that at the lower one; mean over the photos.
+    """Return the share of even, bright pixels near the upper border minus that near the lower, in [-1, 1].
 
-    In [-1, 1].
+    The mean over the photos.
 
     Args:
         up: (3,) unit vector in the world.
         rotations: (N, 3, 3) of cam_from_world.
-        pictures: per photo (H, W) gray as the sensor lies; None where there is none.
+        pictures: per photo (H, W) gray, in the orientation of the sensor; None if there is none.
     """
     found = []
     for R, picture in zip(rotations, pictures, strict=True):
@@ -210,6 +209,6 @@ def _black_background(gray: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def _slope(gray: NDArray[np.float32], axis: FloatArray) -> NDArray[np.float32]:
-    """Return (H - 2, W - 2) derivative along an axis (x, y, ...) in the picture, in gray levels per pixel."""
+    """Return the (H - 2, W - 2) derivative along an axis (x, y, ...) in the picture, in gray levels per pixel."""
     down, right = gray[2:, 1:-1] - gray[:-2, 1:-1], gray[1:-1, 2:] - gray[1:-1, :-2]
     return np.asarray(0.5 * (axis[0] * right + axis[1] * down), np.float32)

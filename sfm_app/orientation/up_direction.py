@@ -1,8 +1,8 @@
-"""Which way up a scene stands, where how the cameras were held leaves it open.
+"""Which way up a scene is, where the roll of the cameras does not decide it.
 
-How cameras are held gives one vertical for photos that are upright or upside down, and one for photos on their side.
-Which of the two is taken, and which of its ends is up, is a matter of odds: how rarely people turn all their photos,
-times what the scene and the photos show.
+The roll gives one vertical for photos that are upright or upside down, and one for photos on their side. Which of the
+two is right, and which of its ends is up, is decided by odds: the prior odds of people turning all their photos, times
+the evidence of the scene and the photos.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,19 +24,19 @@ from sfm_app.orientation.up_cues import (
 FloatArray = NDArray[np.float64]
 
 MOST = 3.0
-"""Nats that one cue says at most: each of them is wrong in one place of twenty (a vault, a stage, snow)."""
+"""Largest evidence of one cue, in nats: each of them is wrong in one place of twenty (a vault, a stage, snow)."""
 
 LEDGES, LEDGES_MOST = 10.0, 4.0
-"""Nats for an axis per unit of `ledges_are_lit`, and at most. The other cues are as large sideways: along a wall depth,
-normals and light change from side to side."""
+"""Nats for an axis per unit of `ledges_are_lit`, and their maximum. The other cues are as large sideways: along a wall,
+depth, normals and light change from side to side."""
 
 HIGHEST_NATS = 14.0
-"""Odds above a million to one are not told apart."""
+"""Odds above a million to one are not distinguished."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cue:
-    """How a cue turns out in scenes that stand upright."""
+    """Distribution of a cue over upright scenes."""
 
     mean: float
     deviation: float
@@ -45,11 +45,11 @@ class Cue:
     """Its variance within a scene, times the number of points."""
 
     def nats(self, value: float, points: int) -> float:
-        """Return log odds of up against down: both are normal, with opposite means.
+        """Return the log odds of up against down; the cue is normal under both, with opposite means.
 
         Args:
-            value: of the cue; above 0 speaks for up.
-            points: pieces of surface that it comes from.
+            value: of the cue; positive is evidence for up.
+            points: number of surface patches that it comes from.
         """
         variance = self.deviation**2 + self.noise / max(points, 1)
         return float(np.clip(2.0 * self.mean * value / variance, -MOST, MOST))
@@ -62,8 +62,8 @@ CUES: Mapping[str, Cue] = {
     "ledges are lit": Cue(0.18, 0.17),
     "sky is above": Cue(0.20, 0.27),
 }
-"""From eight photo sets, three rendered ones and seven of corners only; each set alone would be decided alike by the
-figures of the others. Neighboring points share noise, hence more than 1."""
+"""Estimated on eight photo sets, three rendered ones and seven of corners only; figures from the others decide each
+set the same way. The noise exceeds 1 because neighboring points share it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,33 +75,33 @@ class Scenery:
     brightness: FloatArray
     """(P,) 0 to 255."""
     seen: tuple[NDArray[np.int64], ...]
-    """Per photo the points that it sees."""
+    """Per photo, the indices of the points that it sees."""
     pictures: tuple[NDArray[np.uint8] | None, ...]
-    """Per photo its `small_picture`; None where it was not looked at."""
+    """Per photo its `small_picture`; None if it was not read."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Standing:
-    """Which way up a scene stands, and how sure that is."""
+    """Which way up a scene is, and the odds of that."""
 
     roll: Roll
-    """How the cameras were held, then."""
+    """The estimate from roll that was chosen."""
     evidence: Mapping[str, float]
-    """By cue, nats (log odds) for up against down; below 0 where it says that up is down."""
+    """By cue, log odds of up against down, in nats; negative if the cue contradicts."""
     not_upside_down: float
-    """Log odds against the opposite of up, how cameras are held included."""
+    """Log odds of up against its opposite, including how cameras are held."""
     not_on_its_side: float
-    """Log odds against the other vertical."""
+    """Log odds of the vertical against the other one."""
 
 
 def stand(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery) -> Standing:
-    """Return first the vertical, from how the cameras are held and the ledges; then which end of it is up.
+    """Choose first the vertical, from how the cameras are held and the ledges; then which end of it is up.
 
     Args:
-        rolls: what the cameras say if most photos are turned by 0, 90, 180, 270 degrees; opposites share a vertical.
+        rolls: estimates for photos turned by 0, 90, 180, 270 degrees, see `ups_from_roll`; opposites share a vertical.
         rotations: (N, 3, 3) cam_from_world of the photos.
         centers: (N, 3) camera centers.
-        scenery: what they show.
+        scenery: what the photos show.
     """
     surfaces = surfaces_of(scenery.points, scenery.brightness, scenery.seen, centers)
     ledges = [ledges_are_lit(roll.up, rotations, scenery.pictures) for roll in rolls[:2]]

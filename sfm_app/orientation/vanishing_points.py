@@ -1,7 +1,7 @@
 """Directions in which many straight lines of a scene run: vertical edges, the horizontals of a facade.
 
 A line segment in a photo and the camera center span a plane; the direction of the line in the world lies in it. So a
-segment is the plane's unit normal, and segments of all photos of a scene with known poses vote together.
+segment is represented by the unit normal of the plane, and the segments of all photos with known poses vote together.
 """
 
 from dataclasses import dataclass
@@ -15,22 +15,23 @@ from sfm_app.geometry.unit_vectors import along, axis_angle_deg, basis_across, l
 FloatArray = NDArray[np.float64]
 
 SEARCH_DEG, STEP_DEG, WIDTHS_DEG = 28.0, 2.0, (2.0, 1.0, 0.5)
-"""Radius and step of the search, and how near a segment is to a direction that it supports: coarse, then finer."""
+"""Radius and step of the search, and the widths within which segments support a direction, from coarse to fine."""
 
 PRIOR_DEG = 25.0
 """Standard deviation of the true direction from where the search starts."""
 
 STANDS_OUT, LEVEL_STANDS_OUT = 2.0, 1.4
-"""Support that a direction needs, over that of nine in ten of those far from it; a horizontal one, with its partner."""
+"""Least ratio of the support of a direction to the 90th percentile of those far from it; the second is for a horizontal
+direction together with its perpendicular."""
 
 LEAST_SHARE, LEAST_SEGMENTS = 0.05, 12
-"""Share of all lengths and number of segments that it needs."""
+"""Least share of the total length, and least number of segments, that a direction needs."""
 
 APART_DEG = 8.0
-"""Directions nearer than this are one."""
+"""Directions closer than this are the same."""
 
 LEAST_SINE = 0.05
-"""Of the angle between a segment and its vanishing point; nearer ones say little, and must not count without end."""
+"""Least sine of the angle between a segment and its vanishing point: bounds the weight of closer segments."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,21 +43,21 @@ class Segments:
     middles: FloatArray
     """(N, 3) unit directions from the camera center to the segments' middles."""
     lengths: FloatArray
-    """(N,) in pixels: what they count."""
+    """(N,) in pixels: their weights."""
     photos: NDArray[np.int64]
-    """(N,) number of the photo each lies in."""
+    """(N,) number of the photo of each segment."""
 
     def __len__(self) -> int:
         return len(self.normals)
 
     def take(self, chosen: NDArray[np.bool_]) -> "Segments":
-        """Return some of them."""
+        """Return the chosen segments."""
         return Segments(self.normals[chosen], self.middles[chosen], self.lengths[chosen], self.photos[chosen])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Vanishing:
-    """A direction in which lines run."""
+    """A direction that many lines share."""
 
     direction: FloatArray
     """(3,) unit vector."""
@@ -65,11 +66,11 @@ class Vanishing:
     share: float
     """Length of the segments that run along it, as a share of all."""
     contrast: float
-    """Its support over that of nine in ten directions far from it."""
+    """Its support over the 90th percentile of those far from it."""
 
 
 def segment_planes(first: FloatArray, second: FloatArray, photo: int, scale_px: float) -> Segments:
-    """Return segments of one photo from the rays (N, 3), in the world, to their two ends.
+    """Build the segments of one photo from the rays (N, 3), in the world, to their two ends.
 
     Args:
         first: (N, 3) directions from the camera center to one end of each.
@@ -84,7 +85,7 @@ def segment_planes(first: FloatArray, second: FloatArray, photo: int, scale_px: 
 
 
 def joined(parts: list[Segments]) -> Segments:
-    """Return all segments of several photos."""
+    """Join the segments of several photos."""
     if not parts:
         return Segments(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
     return Segments(
@@ -96,19 +97,16 @@ def joined(parts: list[Segments]) -> Segments:
 
 
 def _misses_deg(direction: FloatArray, segments: Segments) -> FloatArray:
-    """Return (N,) angle in the photo between each segment and the line from its middle to the vanishing point.
-
-    [0, 90].
-    """
+    """Return (N,) angles in [0, 90] between each segment and the line from its middle to the vanishing point."""
     sine = np.abs(along(segments.normals, direction))
     away = np.linalg.norm(np.cross(segments.middles, direction), axis=1)
     return np.asarray(np.degrees(np.arcsin(np.clip(sine / np.maximum(away, 1e-9), 0.0, 1.0))), np.float64)
 
 
 def vanishing_near(start: FloatArray, segments: Segments) -> Vanishing | None:
-    """Return the direction within `SEARCH_DEG` of `start` that most segments run along; None where none stands out.
+    """Find the direction within `SEARCH_DEG` of `start` that most segments run along; None if none stands out.
 
-    An exhaustive search on a grid, then Welsch's weights around the best of it, ever narrower.
+    The best direction of a grid is refined with Welsch weights of decreasing width.
 
     Args:
         start: (3,) unit vector.
@@ -124,10 +122,9 @@ def vanishing_near(start: FloatArray, segments: Segments) -> Vanishing | None:
 
 
 def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
-    """Return the horizontal direction (3,) that most segments run along, with those at right angles to it.
+    """Find the horizontal direction (3,) that most segments are parallel or perpendicular to; None if none stands out.
 
-    None where none stands out. Segments on the horizon fit all horizontal directions, and vertical ones are no
-    witnesses: both stay out.
+    Segments on the horizon fit all horizontal directions, and vertical ones fit none: both are left out.
 
     Args:
         up: (3,) unit vector in the world.
@@ -151,18 +148,18 @@ def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
 
 
 def square_frame(up: FloatArray, level: FloatArray, segments: Segments) -> tuple[FloatArray, float]:
-    """Return three directions at right angles near up, level and up x level that the segments run along most exactly.
+    """Fit three perpendicular directions, near up, level and up x level, to the segments along them.
 
-    Horizontal edges say as much about up as vertical ones, and columns taper where cornices do not. Gauss-Newton on
-    the rotation with Welsch's weights: a rotation by w moves the miss n'd of a segment along d by n'(w x d).
+    Horizontal edges determine up as well as vertical ones, and columns taper where cornices do not. Gauss-Newton on
+    the rotation with Welsch weights: a rotation by w changes the residual n'd of a segment along d by n'(w x d).
 
     Args:
         up: (3,) unit vector near the first direction.
-        level: (3,) unit vector near the second, at right angles to `up`.
+        level: (3,) unit vector near the second, perpendicular to `up`.
         segments: of all photos.
 
     Returns:
-        (3, 3), its rows the directions, and the standard deviation of the first in degrees, see `Vanishing`.
+        (3, 3) with the directions as rows, and the standard deviation of the first in degrees, see `Vanishing`.
     """
     frame = np.stack([up, level, np.cross(up, level)])
     for width_deg in WIDTHS_DEG:
@@ -197,7 +194,7 @@ def _rotation_equations(frame: FloatArray, segments: Segments, width_deg: float)
 
 
 def refined(direction: FloatArray, segments: Segments) -> FloatArray:
-    """Return the nearby direction that makes the weighted squares of the misses least.
+    """Refine a direction by least squares of its weighted residuals.
 
     Args:
         direction: (3,) unit vector to start from.
@@ -213,12 +210,12 @@ def refined(direction: FloatArray, segments: Segments) -> FloatArray:
 
 
 def cap(axis: FloatArray, radius_deg: float, step_deg: float) -> FloatArray:
-    """Return (N, 3) unit vectors evenly spread around an axis.
+    """Return (N, 3) unit vectors spread evenly over a spherical cap around an axis.
 
     Args:
         axis: (3,) unit vector.
         radius_deg: largest angle from it, degrees.
-        step_deg: angle between neighbors, about, degrees.
+        step_deg: approximate angle between neighbors, degrees.
     """
     e1, e2 = basis_across(axis)
     found = [axis[None]]
@@ -235,7 +232,7 @@ def _support(direction: FloatArray, segments: Segments, width_deg: float) -> flo
 
 
 def _matrices(direction: FloatArray, segments: Segments, width_deg: float) -> FloatArray:
-    """Return (P, 3, 3) per photo the sum of n n' of its segments, weighted for least squares of the misses."""
+    """Return (P, 3, 3), per photo the sum of n n' over its segments, weighted for least squares of the residuals."""
     away = np.maximum(np.linalg.norm(np.cross(segments.middles, direction), axis=1), LEAST_SINE)
     weights = segments.lengths * np.exp(-0.5 * (_misses_deg(direction, segments) / width_deg) ** 2) / away**2
     n = segments.normals
@@ -243,18 +240,18 @@ def _matrices(direction: FloatArray, segments: Segments, width_deg: float) -> Fl
 
 
 def _per_photo(segments: Segments, values: FloatArray) -> FloatArray:
-    """Return sums of values (N, ...) over the segments of each photo."""
+    """Sum values (N, ...) over the segments of each photo."""
     sums = np.zeros((int(segments.photos.max(initial=-1)) + 1, *values.shape[1:]))
     np.add.at(sums, segments.photos, values)
     return sums
 
 
 def _judged(found: FloatArray, tried: FloatArray, support: FloatArray, segments: Segments) -> Vanishing | None:
-    """Return the direction with what speaks for it, if it stands out from those that were tried far from it."""
+    """Return the direction with its evidence, if it stands out from the tried ones far from it."""
     running = _misses_deg(found, segments) < WIDTHS_DEG[0]
     share = float(segments.lengths[running].sum() / segments.lengths.sum())
     away = axis_angle_deg(tried, found) > APART_DEG
-    if away.all():  # refined out of where it was sought
+    if away.all():  # refined out of the region of the search
         return None
     contrast = float(support[~away].max()) / max(float(np.percentile(support[away], 90)), 1e-12)
     enough = np.count_nonzero(running) >= LEAST_SEGMENTS and share >= LEAST_SHARE and contrast >= STANDS_OUT
@@ -269,6 +266,6 @@ def _direction_deviation_deg(found: FloatArray, segments: Segments) -> float:
 
 
 def _jackknife(moves: FloatArray) -> float:
-    """Return standard deviation from how far the answer moves without each photo: those of one photo err together."""
+    """Return the jackknife standard deviation, leaving out photos: the segments of one photo err together."""
     n = len(moves)
     return float(np.sqrt((n - 1) / n * (moves**2).sum())) if n > 1 else float("inf")

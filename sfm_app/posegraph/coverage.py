@@ -1,7 +1,7 @@
-"""How much of what two photos show they have in common, and which pairs that makes the backbone of a photo set.
+"""The share of their content that two photos have in common, and the backbone of pairs that have most of it.
 
 Neighbors on a walk share most of what the rest of the set knows about either of them. Photos of equal things in
-different places share the things, however many matches these give, and nothing around them.
+different places share only the things, however many matches these give, and nothing around them.
 """
 
 from collections.abc import Mapping
@@ -15,30 +15,31 @@ from sfm_app.types import MatchGraph, PairId, RelativePose
 IndexArray = NDArray[np.int64]
 
 CELLS = 12
-"""Cells along the longer side of a photo. 16 find the same on oats23 and books21; with 24 one wrong pair enters the
+"""Cells along the longer side of a photo. 16 give the same on oats23 and books21; with 24 one wrong pair enters the
 backbone of oats23, and nothing is found there. docs/algorithms.md, Look-alikes."""
 CONFIRMED = 2
-"""A point of a photo is known to the set when so many photos besides the partner have it. Chosen by hand; not measured
-on its own."""
+"""A keypoint is known to the set if it has partners in this many photos besides that of the pair. Chosen by hand; not
+measured on its own."""
 NEARLY_BEST = 0.9
-"""A pair belongs to the backbone when it covers so much of what the weakest pair on the best way between its photos
-covers. On oats23 and books21 equal things in different places reach 0.84 at most. docs/algorithms.md, Look-alikes."""
+"""A pair belongs to the backbone if its coverage is at least this share of that of the weakest pair on the best path
+between its photos. On oats23 and books21 equal things in different places reach 0.84 at most. docs/algorithms.md,
+Look-alikes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """What the pairs say about the keypoints of all photos."""
+    """Inliers of all pairs, and the keypoints and cells of the photos that they are in."""
 
     rows: Mapping[PairId, IndexArray]
-    """By pair (N, 2) keypoints in photo 1 and photo 2: its inliers."""
+    """By pair, (N, 2) keypoints of its inliers in photo 1 and photo 2."""
     seen: Mapping[int, IndexArray]
-    """By photo (K,) in how many other photos each keypoint has a partner."""
+    """By photo, (K,) number of other photos in which each keypoint has a partner."""
     cells: Mapping[int, IndexArray]
-    """By photo (K,) the cell in which each keypoint lies."""
+    """By photo, (K,) number of the cell of each keypoint."""
 
 
 def sight_of(matches: MatchGraph, poses: Mapping[PairId, RelativePose]) -> Sight:
-    """Return inliers of all pairs, counted by keypoint, and the cells of all keypoints.
+    """Collect the inliers of all pairs, their counts by keypoint, and the cells of all keypoints.
 
     Args:
         matches: keypoints and raw matches.
@@ -54,14 +55,14 @@ def sight_of(matches: MatchGraph, poses: Mapping[PairId, RelativePose]) -> Sight
 
 
 def _cells_of(matches: MatchGraph, photo: int) -> IndexArray:
-    """Return (K,) numbers of the cells in which the keypoints of a photo lie."""
+    """Return the numbers (K,) of the cells in which the keypoints of a photo lie."""
     image = matches.images[photo]
     columns, lines = (matches.keypoints[photo] // (max(image.width, image.height) / CELLS)).astype(np.int64).T
     return np.asarray(lines * (CELLS + 1) + columns, np.int64)
 
 
 def coverages(sight: Sight) -> dict[PairId, float]:
-    """Return which share of the cells with something known a pair covers, mean over its two photos, 0 to 1."""
+    """Return by pair the share of the known cells that it covers, mean over its two photos, 0 to 1."""
     found = {}
     for pair, rows in sight.rows.items():
         shares = []
@@ -77,7 +78,7 @@ def coverages(sight: Sight) -> dict[PairId, float]:
 
 
 def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
-    """Return pairs of the tree of greatest coverage, and those that are nearly as good as the way along it."""
+    """Return the pairs of the maximum spanning tree of coverage, and those nearly as good as the path along it."""
     near: dict[int, list[tuple[int, float]]] = {photo: [] for pair in covered for photo in pair}
     group = {photo: photo for photo in near}
     for a, b in sorted(covered, key=lambda pair: (-covered[pair], pair)):
@@ -97,7 +98,7 @@ def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
 
 
 def _widest(root: int, near: Mapping[int, list[tuple[int, float]]]) -> dict[int, float]:
-    """Return, by photo, the weakest coverage on the way from the root along the tree."""
+    """Return, by photo, the weakest coverage on the path from the root along the tree."""
     found, waiting = {root: np.inf}, [root]
     while waiting:
         photo = waiting.pop()

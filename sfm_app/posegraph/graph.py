@@ -23,20 +23,21 @@ Map = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
 """Results of a function in the order of its arguments, computed in parallel; the text labels a progress bar."""
 
 LEAST_IN_FRONT = 0.75
-"""A pair with a smaller share of its inliers before both cameras has a wrong pose, or matches that are. Chosen by hand;
-not measured on its own."""
+"""A pair with a smaller share of its inliers in front of both cameras has a wrong pose or wrong matches. Chosen by
+hand; not measured on its own."""
 AGREEMENT_DEG, GUESSED_DEG, SPREADS = 5.0, 15.0, 4.0
-"""A pair may be this far from the rotations of its photos, further where a camera is a guess, or so many times as far
-as most pairs are. docs/algorithms.md, From K to relative poses. Chosen by hand; not measured on their own."""
+"""Largest angle between the rotation of a pair and those of its photos, the same if a camera is a guess, and the limit
+as a multiple of the median angle; the larger limit holds. docs/algorithms.md, From K to relative poses. Chosen by hand;
+not measured on their own."""
 ENOUGH = 100.0
-"""From so many inliers on, more of them make a pair hardly more believable. docs/algorithms.md, From K to relative
-poses. Chosen by hand; not measured on its own."""
+"""Number of inliers above which the weight of a pair hardly grows. docs/algorithms.md, From K to relative poses. Chosen
+by hand; not measured on its own."""
 FLAT = 0.1
-"""How much a pair counts whose matches lie on a plane: two poses explain it, and often the wrong one is taken. Chosen
+"""Weight factor of a pair whose matches lie on a plane: two poses explain it, and often the wrong one is chosen. Chosen
 on kitchen25, where such pairs outvoted those that join its two halves; nothing changes on castle-P19, fountain-P11 and
 temple16. All sets: benchmarks/corpus/tuning_sets.py."""
 WEAK = 2.0
-"""A pair with fewer than so many times the least inliers needs a loop of other pairs to bear it out.
+"""A pair with fewer inliers than this multiple of the minimum must be confirmed by a loop of other pairs.
 docs/algorithms.md, From K to relative poses. Chosen by hand; not measured on its own."""
 CONTRADICTS, BEHIND, TOO_FEW = "contradicts other pairs", "points behind a camera", "too few matches fit the cameras"
 NO_NUMBERS = "its pose cannot be computed"
@@ -46,26 +47,26 @@ LOOKS_ALIKE = "equal things in different places"
 
 @dataclass(frozen=True, slots=True)
 class PoseGraphOptions:
-    """How pairs are judged."""
+    """Options for estimating and rejecting pairs."""
 
     max_error_px: float
     """Largest Sampson distance of an inlier."""
     min_inliers: int
     """A pair with fewer is dropped."""
     seed: int
-    """Of the run."""
+    """Seed of the run."""
 
 
 def build_pose_graph(
     matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, options: PoseGraphOptions, run_map: Map
 ) -> PoseGraph:
-    """Give relative poses of all pairs, without those that contradict the others, with those that the others bear out.
+    """Build the graph of relative poses: without pairs that contradict others, with rejected pairs that others recover.
 
     Args:
         matches: keypoints and raw matches.
         views: fundamental matrices.
         intrinsics: cameras.
-        options: see there.
+        options: thresholds and seed.
         run_map: computes pairs in parallel.
     """
 
@@ -98,11 +99,11 @@ def build_pose_graph(
         R = rotations[pair[1]] @ rotations[pair[0]].T
         try:
             return guided_pose(known, R, options.min_inliers, seed) if known.trusted else None
-        except FAILURES:  # the reason that it has no pose already stands
+        except FAILURES:  # the reason that it has no pose is already recorded
             return None
 
     left = [pair for pair in _without_pose(matches.matches, poses) if dropped.get(pair) != LOOKS_ALIKE]
-    for pair, pose in zip(left, run_map(again, left, "pairs again"), strict=True):
+    for pair, pose in zip(left, run_map(again, left, "relative poses by known rotations"), strict=True):
         if pose is not None and not apart.strange(pair, matches.matches[pair][pose.inliers]):
             poses[pair] = pose
             dropped.pop(pair, None)
@@ -116,10 +117,10 @@ def build_pose_graph(
 
 
 def with_model(graph: PoseGraph, photos: Collection[int], poses: Mapping[PairId, RelativePose]) -> PoseGraph:
-    """Return the graph with the relative poses of a model instead of those that it had between the model's photos.
+    """Return the graph with the relative poses between the photos of a model replaced by those of the model.
 
     Args:
-        graph: the graph so far; it stays as it is.
+        graph: the graph so far; it is not changed.
         photos: those of the model.
         poses: relative poses of the model by pair.
     """
@@ -132,13 +133,13 @@ def with_model(graph: PoseGraph, photos: Collection[int], poses: Mapping[PairId,
 
 
 def _without_pose(pairs: Iterable[PairId], poses: Mapping[PairId, RelativePose]) -> list[PairId]:
-    """Return pairs that have no pose, of photos that those with one connect."""
+    """Return the pairs without a pose whose photos are connected by pairs with one."""
     group = {photo: number for number, photos in enumerate(_groups(poses)) for photo in photos}
     return [pair for pair in pairs if pair not in poses and group.get(pair[0], -1) == group.get(pair[1], -2)]
 
 
 def _contradicting(poses: Mapping[PairId, RelativePose], angles: Mapping[PairId, float]) -> list[PairId]:
-    """Return pairs that are further from the rotations of their photos, in degrees, than they may be."""
+    """Return the pairs whose angles to the rotations of their photos, in degrees, exceed the limit."""
     typical = SPREADS * float(np.median(list(angles.values()) or [0.0]))
     limits = {
         pair: max(typical, GUESSED_DEG if poses[pair].kind == "uncalibrated" else AGREEMENT_DEG) for pair in angles
@@ -149,11 +150,11 @@ def _contradicting(poses: Mapping[PairId, RelativePose], angles: Mapping[PairId,
 def averaged(
     poses: Mapping[PairId, RelativePose], flat: Collection[PairId] = ()
 ) -> tuple[dict[int, FloatArray], dict[PairId, float]]:
-    """Return rotations of photos, and how far pairs are from them, with pairs counting by their inliers.
+    """Average the rotations of pairs, weighted by inliers, to those of photos; return these and how far pairs are off.
 
     Args:
         poses: of pairs.
-        flat: pairs whose matches lie on one plane, or otherwise leave F open: they count little.
+        flat: pairs whose matches lie on one plane, or otherwise do not determine F: they get little weight.
     """
     weights = {
         pair: pose.inlier_count / (1.0 + pose.inlier_count / ENOUGH) * (FLAT if pair in flat else 1.0)
@@ -163,9 +164,9 @@ def averaged(
 
 
 def _unconfirmed(poses: Mapping[PairId, RelativePose], firm: float) -> list[PairId]:
-    """Return pairs with fewer than `firm` inliers that no loop of three photos bears out.
+    """Return the pairs with fewer than `firm` inliers that no loop of three photos confirms.
 
-    With these a place that only looks like another is joined to it, and no other pair is there to contradict.
+    Such pairs may join places that only look alike, with no other pair to contradict them.
     """
     photos = sorted({photo for pair in poses for photo in pair})
     edges = np.searchsorted(photos, np.array(list(poses), np.int64).reshape(-1, 2))

@@ -1,4 +1,4 @@
-"""Photos that hang together."""
+"""Groups of photos that pairs connect."""
 
 from collections.abc import Iterable
 
@@ -6,11 +6,11 @@ from sfm_app.types import PairId
 
 
 def connected_groups(pairs: Iterable[PairId], photos: Iterable[int] = ()) -> list[set[int]]:
-    """Return photos that hang together through pairs, the largest group first.
+    """Group the photos that pairs connect, the largest group first.
 
     Args:
-        pairs: what joins photos.
-        photos: are groups of their own where no pair joins them.
+        pairs: connections between two photos.
+        photos: form groups of their own if no pair connects them.
     """
     groups = [{photo} for photo in photos]
     for pair in pairs:

@@ -1,7 +1,7 @@
-"""Matches looked at again with what the other pairs know: the rotation is given, only the direction is sought.
+"""Poses re-estimated with the rotation known from other pairs, so that only the direction of translation is sought.
 
-F of few matches on a facade catches whatever lies right by accident. With the rotation known from loops of other pairs
-two matches fix the direction, and what agrees then is the scene.
+F of few matches on a facade also fits mismatches that lie right by accident. With the rotation known from loops of
+other pairs, two matches determine the direction, and the matches that then agree are of the scene.
 """
 
 import numpy as np
@@ -15,31 +15,32 @@ from sfm_app.types import RelativePose
 FloatArray = NDArray[np.float64]
 
 SAMPLES = 200
-"""Samples of two matches, each with a direction (docs/algorithms.md, From K to relative poses). Chosen by hand; not
-measured on its own."""
+"""Samples of two matches, each of which gives a direction (docs/algorithms.md, From K to relative poses). Chosen by
+hand; not measured on its own."""
 AS_MANY = 0.9
-"""A pose whose rotation runs away is believed with the rotation of others, if it keeps that share of its inliers: a
-long lens does not say how far the camera has turned. docs/algorithms.md, From K to relative poses. Chosen by hand; not
-measured on its own."""
+"""A pose whose rotation diverges is accepted with the rotation of the other pairs, if that keeps this share of its
+inliers: a long lens does not determine how far the camera has turned. docs/algorithms.md, From K to relative poses.
+Chosen by hand; not measured on its own."""
 HELD_ROUNDS, HELD_SIGMA = 8, 0.2
-"""Least squares with new weights, so often; scale of the loss in thresholds. Chosen by hand; not measured on their
-own."""
+"""Rounds of reweighted least squares with fixed rotation, and the scale of the loss in thresholds. Chosen by hand; not
+measured on their own."""
 NEAR = 3.0
-"""While the rotation is that of others, matches count within this many thresholds. Chosen by hand; not measured on its
-own."""
+"""With the rotation of the other pairs, matches within this many thresholds are used. Chosen by hand; not measured on
+its own."""
 LEAST_IN_FRONT, MOST_TURN_DEG = 0.95, 2.0
-"""A pose found so is believed when that much of it lies before both cameras and it kept the rotation it was given. On
-the photo sets with truth none of the pairs found so was wrong (docs/algorithms.md, From K to relative poses)."""
+"""A guided pose is accepted if at least this share of its inliers lies in front of both cameras and its rotation
+changed by at most this angle. On the photo sets with truth none of the pairs found so was wrong (docs/algorithms.md,
+From K to relative poses)."""
 
 
 def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> RelativePose | None:
-    """Return the pose of a pair whose rotation is known; None where its matches do not bear it out.
+    """Estimate the pose of a pair whose rotation is known; None if its matches do not confirm it.
 
     Args:
         pair: matches and cameras.
-        R: (3, 3) rotation of view 2 from view 1, as all other pairs have it.
-        min_inliers: a pose with fewer is none.
-        seed: of the sampling.
+        R: (3, 3) rotation of view 2 from view 1, known from the other pairs.
+        min_inliers: least number of inliers of a pose.
+        seed: seed of the sampling.
     """
     if len(pair.rays) < min_inliers:
         return None
@@ -64,18 +65,18 @@ def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> Relat
 
 
 def _epipolar_normals(pair: Pair, R: FloatArray) -> FloatArray:
-    """Return (N, 3) what the direction of translation is at right angles to, for each match, R given."""
+    """Return (N, 3), for each match the vector that the translation is perpendicular to, given R."""
     h1 = np.column_stack([pair.rays[:, :2], np.ones(len(pair.rays))]) @ R.T
     h2 = np.column_stack([pair.rays[:, 2:], np.ones(len(pair.rays))])
     return np.asarray(np.cross(h1, h2), np.float64)
 
 
 def held_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Return (3,) direction of translation near t that makes a robust sum of squared distances small, R held.
+    """Refine the direction of translation (3,) by robust least squares of the distances, with R fixed.
 
     Args:
         pair: matches and cameras.
-        R: (3, 3) rotation of view 2 from view 1; it stays.
+        R: (3, 3) rotation of view 2 from view 1; it is kept fixed.
         t: (3,) unit vector to start from.
     """
     normals = _epipolar_normals(pair, R)
@@ -92,13 +93,13 @@ def held_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
 
 
 def sampled_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> FloatArray | None:
-    """Return (3,) direction of translation that most matches agree with, R given.
+    """Estimate the direction of translation (3,) that most matches agree with, given R.
 
-    The best of many through two matches.
+    It is the best of `SAMPLES` directions from two matches each; None if no sample gives one.
 
     Args:
         pair: matches and cameras.
-        R: (3, 3) rotation of view 2 from view 1; it stays.
+        R: (3, 3) rotation of view 2 from view 1; it is kept fixed.
         rng: draws the samples; its state moves on.
     """
     normals = _epipolar_normals(pair, R)

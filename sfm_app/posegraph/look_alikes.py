@@ -1,17 +1,18 @@
-"""Equal things in different places, told apart before anything is mapped.
+"""Detection of equal things in different places, before mapping.
 
-Two equal cans on a table have a relative pose as good as any, and its rotation may be that of the rest. What tells
-them apart is the way between them: photo by photo along the pairs that share most of what they show (`coverage`),
-points of the first can leave the view, and those of the second are others. So
+Photos of two equal cans on a table have a relative pose as good as any, and its rotation may agree with the other
+pairs. The path between the cans distinguishes them: along the pairs that share most of their content (`coverage`), the
+points of the first can leave the view, and those of the second are new ones. Therefore
 
-1. the pairs of the backbone join matches to tracks;
-2. a pair, many matches of which lie on such tracks and next to none on the same one, contradicts the backbone: it
-   closes a loop, or joins look-alikes;
-3. such pairs between the same two places are judged together: if they were one place, what lies around the things would
-   have matches, too (`missing`). A loop has them.
+1. the pairs of the backbone join matches into tracks;
+2. a pair with many matches on such tracks, but hardly any with both ends on the same track, contradicts the backbone:
+   it closes a loop, or joins look-alikes;
+3. such pairs between the same two places are judged together: if they were one place, the surroundings of the things
+   would have matches, too (`missing`). In a loop they have.
 
-Zach et al. 2010 and Heinly et al. 2014 ask for missing matches; Wilson and Snavely 2013 and Yan et al. 2017 ask how
-tracks and ways of photos hang together. Both are needed: a wide step misses much, a loop leaves its tracks.
+Zach et al. 2010 and Heinly et al. 2014 test for missing matches; Wilson and Snavely 2013 and Yan et al. 2017 test how
+tracks and paths of photos are connected. Both are needed: a wide baseline misses many matches, and a loop loses its
+tracks.
 """
 
 from collections.abc import Iterable, Mapping
@@ -32,36 +33,37 @@ IndexArray = NDArray[np.int64]
 
 ALIKE, LOOP, EITHER = "alike", "loop", "either"
 LEAST_TRACKED, FEW_TRACKED = 30, 15
-"""Matches with both ends on tracks, below which a pair is not asked, and not even beside known look-alikes.
+"""Least number of matches with both ends on tracks for a pair to be tested, and for one beside known look-alikes.
 docs/algorithms.md, Look-alikes. Chosen by hand; not measured on their own."""
 SAME_TRACK = 0.02
-"""A pair with a smaller share of these on one track contradicts the backbone. On oats23 and books21 look-alikes have 0;
-of kitti51, castle-P19, temple16 and five more sets none is below 0.07; where kitchen1000 closes a loop, some have 0.
-docs/algorithms.md, Look-alikes."""
+"""A pair with at most this share of its tracked matches on the same track contradicts the backbone. On oats23 and
+books21 look-alikes have 0; no pair of kitti51, castle-P19, temple16 and five more sets is below 0.07; where kitchen1000
+closes a loop, some have 0. docs/algorithms.md, Look-alikes."""
 FIRM = 0.1
-"""From this share on a pair is borne out. Chosen by hand; not measured on its own."""
+"""A pair with at least this share of its tracked matches on the same track is confirmed. Chosen by hand; not measured
+on its own."""
 LOW, MISSING, MISSING_ALL_THE_SAME = 25.0, 0.2, 0.3
-"""Such pairs join look-alikes when the quarter of the photos that miss least (percentile) lack a larger share of the
-cells expected; the second limit is for pairs that turn as the way between them does. 0.30 on oats23, 0.28 on books21;
-0.12 where the video kitchen1000 (every 15th) closes a loop. Shares over all photos are no measure: 0.37, 0.33, 0.25.
-docs/algorithms.md, Look-alikes."""
+"""Contradicting pairs join look-alikes if this percentile, over the photos, of the share of expected cells that are
+missing exceeds the limit; the second limit is for pairs whose rotation agrees with the path between them. It is 0.30 on
+oats23, 0.28 on books21; 0.12 where the video kitchen1000 (every 15th) closes a loop. Shares over all photos do not
+separate them: 0.37, 0.33, 0.25. docs/algorithms.md, Look-alikes."""
 TURNED_ALIKE_DEG = 3.0
-"""Median angle between the rotations of such pairs and the way, below which they agree: 1 degree for that loop, 9 on
-oats23 and 58 on books21. docs/algorithms.md, Look-alikes."""
+"""Largest median angle between the rotations of such pairs and of the path at which they agree: 1 degree for that loop,
+9 on oats23 and 58 on books21. docs/algorithms.md, Look-alikes."""
 LEAST_CELLS, LEAST_PHOTOS = 15, 3
-"""Expected cells of a photo, and such photos of a join, below which what is missing says nothing. Chosen by hand; not
-measured on their own."""
+"""Least number of expected cells of a photo, and of such photos of a join, for missing cells to be evidence. Chosen by
+hand; not measured on their own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FeatureTracks:
-    """Keypoints that the backbone joins."""
+    """Tracks of the keypoints that the backbone joins."""
 
     names: Mapping[int, IndexArray]
-    """By photo (K,) the track of each keypoint; -1 where no pair of the backbone has it."""
+    """By photo, (K,) number of the track of each keypoint; -1 if no pair of the backbone has it."""
 
     def agreement(self, pair: PairId, rows: IndexArray) -> tuple[int, int]:
-        """Count the matches of a pair that have both ends on the same track, and those with both on any.
+        """Count the matches of a pair that have both ends on the same track, and those with both ends on any.
 
         Args:
             pair: two photos.
@@ -72,7 +74,7 @@ class FeatureTracks:
         return int(np.count_nonzero(tracked & (first == second))), int(np.count_nonzero(tracked))
 
     def contradict(self, pair: PairId, rows: IndexArray, least: int = LEAST_TRACKED) -> bool:
-        """Return whether a pair joins what the backbone keeps apart.
+        """Return whether a pair joins points that the backbone keeps on different tracks.
 
         Args:
             pair: two photos.
@@ -85,16 +87,16 @@ class FeatureTracks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LookAlikeVerdict:
-    """What was found."""
+    """Look-alikes that were found, and joins that may be."""
 
     joins: tuple[LookAlikes, ...]
     """Every join of look-alikes."""
     doubtful: tuple[LookAlikes, ...]
-    """Joins that could be either: they do not turn as the way does, and little is missing."""
+    """Joins that may be look-alikes or loops: their rotation disagrees with the path, but few matches are missing."""
     tracks: FeatureTracks
 
     def strange(self, pair: PairId, rows: IndexArray) -> bool:
-        """Return whether a pair that was found later joins look-alikes, too.
+        """Return whether a pair that was estimated later joins look-alikes, too.
 
         Args:
             pair: two photos.
@@ -106,7 +108,7 @@ class LookAlikeVerdict:
 def tell_apart(
     matches: MatchGraph, poses: Mapping[PairId, RelativePose], cameras: Mapping[int, Calibration]
 ) -> LookAlikeVerdict:
-    """Find the pairs that take look-alikes for one thing.
+    """Find the pairs that match look-alikes as if they were one thing.
 
     Args:
         matches: keypoints and raw matches.
@@ -135,7 +137,7 @@ def tell_apart(
 
 
 def _tracks_of(sight: Sight, pairs: Iterable[PairId]) -> FeatureTracks:
-    """Join the keypoints of pairs to tracks."""
+    """Join the keypoints of pairs into tracks."""
     starts, count = {}, 0
     for photo, seen in sight.seen.items():
         starts[photo], count = count, count + len(seen)
@@ -150,9 +152,9 @@ def _tracks_of(sight: Sight, pairs: Iterable[PairId]) -> FeatureTracks:
 
 
 def joins_of(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple[PairId, ...]]:
-    """Group doubted pairs that claim the same.
+    """Group doubted pairs that join the same two places.
 
-    Both their ends are the same photo, or photos that a trusted pair joins.
+    At both ends, their photos are the same or joined by a trusted pair.
 
     Args:
         doubted: pairs to group.
@@ -183,7 +185,7 @@ def _firm(same: int, tracked: int) -> bool:
 
 
 def _judged(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> tuple[LookAlikes, str]:
-    """Return a join with what it misses, and whether it is one of look-alikes, a loop, or either."""
+    """Judge whether a join is of look-alikes, a loop, or either; return it with its share of missing cells."""
     counts = []
     for photo in sorted({photo for pair in join for photo in pair}):
         friends, claimed = ({sum(pair) - photo for pair in pairs if photo in pair} for pairs in (trusted, join))
@@ -199,7 +201,7 @@ def _judged(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> t
 
 
 def _turned_deg(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> float:
-    """Return median angle between the rotations of pairs and those along the trusted ones."""
+    """Return the median angle between the rotations of pairs and those along the trusted ones."""
     poses = {pair: places.poses[pair] for pair in sorted(trusted)}
     weights = {pair: float(pose.inlier_count) for pair, pose in poses.items()}
     turns, _ = average_rotations({pair: pose.R for pair, pose in poses.items()}, weights)

@@ -1,9 +1,9 @@
-"""Matches that are missing: what two photos would have in common if their relative pose were that of one place.
+"""Missing matches: the points that two photos would share if their relative pose were right.
 
-A photo's points have depths from other pairs. Put into the scale of a pair, they land in its other photo, or outside.
-Where the photos stand close to each other, what lands inside must have matches there (Zach et al. 2010, Heinly et al.
-2014). One pair alone may miss much, since matching is blind at places; all pairs of a photo that claim the same join
-miss little together.
+The points of a photo have depths from other pairs. In the scale of the pair in question, they project into its other
+photo, or outside. If the photos are close to each other, points that project inside must have matches there (Zach et
+al. 2010, Heinly et al. 2014). One pair alone may miss many, since matching fails in places; all pairs of a photo that
+claim the same join miss few together.
 """
 
 from collections.abc import Iterable, Mapping
@@ -24,29 +24,30 @@ Poses = Mapping[PairId, RelativePose]
 Scales = dict[int, float]
 
 MOST_DEG, MOST_SCALE = 20.0, 1.5
-"""From within such an angle, and so much nearer or farther, a point is found again. 30 degrees and 2 say the same on
+"""Largest change of viewing angle, and of scale, at which a point is matched again. 30 degrees and 2 give the same on
 oats23 and books21. docs/algorithms.md, Look-alikes."""
 BORDER = 0.05
-"""Of the width and height: what lands so near the border may be outside. Chosen by hand; not measured on its own."""
+"""Share of width and height: points that project this near the border may be outside. Chosen by hand; not measured on
+its own."""
 WIDE_RAD = 0.2
-"""Depths from wider angles count no more. Chosen by hand; not measured on its own."""
+"""Depths from wider angles get no more weight. Chosen by hand; not measured on its own."""
 TOGETHER = 8
-"""Points that two pairs of a photo have in common: fewer do not tell their scales. Chosen by hand; not measured on its
-own."""
+"""Least number of points that two pairs of a photo must share to determine their relative scale. Chosen by hand; not
+measured on its own."""
 SOME = 2
-"""Points: a cell of a photo with fewer of them expects nothing. Chosen by hand; not measured on its own."""
+"""A cell of a photo with fewer expected points expects no match. Chosen by hand; not measured on its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ends:
-    """What the depths of a photo come from: one pair of it."""
+    """Depths of the keypoints of a photo, from one of its pairs."""
 
     rows: IndexArray
     """(N,) keypoints of the photo."""
     logs: FloatArray
     """(N,) logarithms of their depths; the pair's baseline is 1."""
     weights: FloatArray
-    """(N,) by the angles of their rays."""
+    """(N,) weights, by the angles of their rays."""
 
 
 class Depths:
@@ -65,14 +66,14 @@ class Depths:
         self.known: dict[tuple[int, int], Ends] = {}
 
     def rays_of(self, photo: int) -> FloatArray:
-        """Return (K, 2) keypoints on the plane z = 1."""
+        """Return the keypoints of a photo as (K, 2) points of the plane z = 1."""
         if photo not in self.rays:
             camera = self.cameras[photo]
             self.rays[photo] = rays(self.matches.keypoints[photo], camera.K, camera.radial)
         return self.rays[photo]
 
     def ends(self, photo: int, other: int) -> Ends:
-        """Return depths of a photo's points from one pair.
+        """Return the depths of a photo's points from one pair.
 
         Args:
             photo: the photo, as named in `poses`.
@@ -95,14 +96,12 @@ class Depths:
         return self.known[photo, other]
 
     def of_photo(self, photo: int, trusted: Iterable[int], doubted: Iterable[int]) -> tuple[FloatArray, Scales]:
-        """Return (K,) logarithms of depths from trusted pairs, NaN where there is none.
-
-        What leads to the scale of each pair.
+        """Return (K,) logarithms of depths from trusted pairs, NaN if there is none, and the log scale of each pair.
 
         Args:
             photo: whose keypoints.
-            trusted: photos whose pairs with it say how deep its points lie.
-            doubted: photos whose pairs with it get a scale only.
+            trusted: photos whose pairs with it determine the depths.
+            doubted: photos whose pairs with it only get a scale.
         """
         total = np.zeros((2, len(self.matches.keypoints[photo])))
         scales: Scales = {}
@@ -125,11 +124,11 @@ class Depths:
             return np.where(total[1] > 0, total[0] / total[1], np.nan), scales
 
     def expected(self, photo: int, other: int, points: IndexArray, logs: FloatArray) -> IndexArray:
-        """Return those of a photo's points that the other one must show, if their pair is right.
+        """Return the points of a photo that the other one must show if their pair is right.
 
         Args:
             photo: whose points.
-            other: where they should be.
+            other: photo that should show them.
             points: (N,) keypoints.
             logs: (N,) logarithms of their depths in the scale of the pair.
         """
@@ -150,12 +149,12 @@ class Depths:
 
 
 def missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int], places: Depths) -> tuple[int, int]:
-    """Return cells of a photo that pairs claim to be seen in other photos, and those of them where none has a match.
+    """Count the cells of a photo that other photos should show if pairs are right, and those of them without a match.
 
     Args:
         photo: whose cells.
-        joined: photos that the pairs in question join it to.
-        trusted: photos whose pairs with it are beyond doubt.
+        joined: photos of the pairs in question with it.
+        trusted: photos whose pairs with it are trusted.
         places: depths and poses.
     """
     sight, others = places.sight, sorted(joined)

@@ -1,4 +1,4 @@
-"""One pair of photos: from F and two cameras to a relative pose, and what kind of pair it is."""
+"""The relative pose of one pair of photos from F and two cameras, and the kind of the pair."""
 
 from collections.abc import Sequence
 
@@ -16,22 +16,23 @@ from sfm_app.types import Calibration, EpipolarFit, RelativePose
 FloatArray = NDArray[np.float64]
 
 MANY = 0.95
-"""A pair is planar, or a rotation, when this share of its inliers says so. docs/algorithms.md, From K to relative
+"""A pair is planar, or a rotation, if this share of its inliers fits that. docs/algorithms.md, From K to relative
 poses. Chosen by hand; not measured on its own."""
 SAMPLE = 200
-"""Points that choose among the four poses of an essential matrix. Chosen by hand; not measured on its own."""
+"""Number of points that decide between the four poses of an essential matrix. Chosen by hand; not measured on its
+own."""
 LEAST = 8
-"""Inliers, below which a pair says nothing about its pose. Chosen by hand; not measured on its own."""
+"""Least number of inliers that determine the pose of a pair. Chosen by hand; not measured on its own."""
 BEFORE_BOTH, BETTER = 0.9, 0.01
-"""A pose from another start than F's own has that share of its inliers before both cameras, and costs less by that
-share. Chosen by hand; not measured on their own."""
+"""A pose from a start other than that of F needs this share of its inliers in front of both cameras, and a cost lower
+by this share. Chosen by hand; not measured on their own."""
 ROTATION_ROUNDS, ROTATION_DEG = 10, 5.0
-"""Rays of a wider angle than this are not explained by a rotation: the search for it is spared. Chosen by hand; not
+"""Rounds of reweighted fits of a rotation, and the median angle of rays above which none is tried. Chosen by hand; not
 measured on their own."""
 
 
 class Pair:
-    """The matches of a pair, seen through its cameras.
+    """The matches of a pair as rays of its cameras.
 
     Args:
         points: x1, x2, each (M, 2) pixels: all matches of the pair.
@@ -49,22 +50,22 @@ class Pair:
         self.trusted = all(camera.estimated or camera.method == "exif" for camera in cameras)
 
     def start(self, fit: EpipolarFit) -> tuple[FloatArray, FloatArray]:
-        """Return R and t as F and the cameras have them."""
+        """Return R and t from F and the cameras, before refinement."""
         inliers, E = self.rays[fit.inliers], self.essential(fit)
         chosen = inliers[np.linspace(0, len(inliers) - 1, min(len(inliers), SAMPLE)).astype(np.int64)]
         poses = decompose_essential(nearest_essential(E))
         return max(poses, key=lambda pose: int(np.count_nonzero(in_front(chosen, *pose))))
 
     def essential(self, fit: EpipolarFit) -> FloatArray:
-        """Return E as F and the cameras have it, with what noise has made of its singular values."""
+        """Return E from F and the cameras, with singular values that are unequal because of noise."""
         first, second = self.cameras
-        if first.radial or second.radial:  # F knows no lens
+        if first.radial or second.radial:  # F does not model distortion
             inliers = self.rays[fit.inliers]
             return eight_point(inliers[:, :2], inliers[:, 2:])
         return second.K.T @ fit.F @ first.K
 
     def pose(self, R: FloatArray, t: FloatArray, inliers: NDArray[np.bool_], *, guided: bool = False) -> RelativePose:
-        """Return a pose with what its inliers say about it.
+        """Return a pose with the statistics of its inliers.
 
         Args:
             R: (3, 3) rotation of view 2 from view 1.
@@ -93,7 +94,7 @@ class Pair:
         return pose_distances(self.rays, self.focals, R, t) <= self.max_error_px
 
     def kind(self, used: FloatArray, R: FloatArray, t: FloatArray, angle_deg: float) -> str:
-        """Return what the inliers of a pose are of: see `RelativePose.kind`.
+        """Return the kind of a pose by its inliers, see `RelativePose.kind`.
 
         Args:
             used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
@@ -111,9 +112,9 @@ class Pair:
 
 
 def estimated(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
-    """Return the relative pose behind a fundamental matrix; None where too few matches agree with any.
+    """Estimate the relative pose of a fundamental matrix; None if too few matches agree with it.
 
-    Where a camera is a guess, E is wrong by as much as the guess, and the inliers of F stay what they are.
+    If a camera is a guess, E is wrong by as much as the guess, and the inliers of F are kept.
 
     Args:
         pair: matches and cameras.
@@ -130,10 +131,10 @@ def estimated(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
 def _best_of_starts(
     pair: Pair, fit: EpipolarFit, start: tuple[FloatArray, FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the pose that the inliers of F fit best, of those that lie before both cameras.
+    """Return the refined pose that the inliers of F fit best, of those with the points in front of both cameras.
 
-    That of F's own start stays unless another one is clearly better and loses no inliers: of the two poses that a plane
-    allows, the wrong one loses what lies off the plane.
+    The pose from F itself is kept unless another one is clearly better and loses no inliers: of the two poses that a
+    plane allows, the wrong one loses the matches off the plane.
     """
     used, focals = pair.rays[fit.inliers], pair.focals
     best = refined(used, focals, *start)
@@ -154,12 +155,12 @@ def _best_of_starts(
 
 
 def _pose_cost(used: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> float:
-    """Return what `refined` makes small in the end."""
+    """Return the cost that `refined` minimizes at its last scale."""
     return float(np.sum(np.log1p((pose_distances(used, focals, R, t) / SIGMAS_PX[-1]) ** 2)))
 
 
 def depths(used: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return (N,) depths along the rays of view 1 and view 2 of the points where they pass each other closest.
+    """Return the depths (N,) in view 1 and (N,) in view 2 at which the two rays of each match are closest.
 
     Args:
         used: (N, 4) points of the plane z = 1, view 1 and view 2.
@@ -175,7 +176,7 @@ def depths(used: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, 
 
 
 def in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
-    """Return (N,) which points lie before both cameras.
+    """Return (N,) whether each point is in front of both cameras.
 
     Args:
         used: (N, 4) points of the plane z = 1, view 1 and view 2.
@@ -187,7 +188,7 @@ def in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_
 
 
 def ray_angles_deg(used: FloatArray, R: FloatArray) -> FloatArray:
-    """Return (N,) degrees between the two rays of each match: the triangulation angles, where t fits.
+    """Return (N,) degrees between the two rays of each match: the triangulation angles if t fits.
 
     Args:
         used: (N, 4) points of the plane z = 1, view 1 and view 2.
@@ -199,9 +200,9 @@ def ray_angles_deg(used: FloatArray, R: FloatArray) -> FloatArray:
 
 
 def turn_distances(used: FloatArray, focals: FloatArray, R: FloatArray) -> FloatArray:
-    """Give (N,) pixels in view 2 between matches and what rotation nearest to R that explains most of them predicts.
+    """Return residuals (N,), in pixels of view 2, of the rotation near R that explains most matches.
 
-    Rays are turned onto their partners (Kabsch), those that fit counting most.
+    Rays are rotated onto their partners (Kabsch), with robust weights.
 
     Args:
         used: (N, 4) points of the plane z = 1, view 1 and view 2.

@@ -1,7 +1,7 @@
 """The five degrees of freedom of a relative pose, fitted to matches with known cameras.
 
-F has seven parameters, a relative pose five: with K known, the other two stop explaining noise, mismatches that happen
-to lie right, and structure that repeats. On real photos that alone halves the error of the direction of translation.
+F has seven parameters, a relative pose five: with K known, the other two no longer fit noise, mismatches that happen to
+lie right, and repeated structure. On real photos that alone halves the error of the direction of translation.
 """
 
 import numpy as np
@@ -14,25 +14,25 @@ from sfm_app.jit import kernel
 FloatArray = NDArray[np.float64]
 
 SIGMAS_PX = (0.5, 0.2)
-"""Scales of Cauchy's loss, one after the other. Keypoints are good to about 0.2 px; with a wider scale the mismatches
-that a second structure explains pull the pose to a compromise between both. docs/algorithms.md, From K to relative
-poses."""
+"""Scales of the Cauchy loss, used one after the other. Keypoints are good to about 0.2 px; with a wider scale the
+mismatches that a second structure explains pull the pose to a compromise between both. docs/algorithms.md, From K to
+relative poses."""
 STEPS = 12
-"""Most steps at either scale. Chosen by hand; not measured on its own."""
+"""Largest number of steps at each scale. Chosen by hand; not measured on its own."""
 DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e6)
-"""Of Levenberg and Marquardt's steps. Chosen by hand; not measured on its own."""
+"""Damping of the Levenberg-Marquardt steps. Chosen by hand; not measured on its own."""
 GAIN = 1e-6
-"""Relative decrease of the cost that ends them. Chosen by hand; not measured on its own."""
+"""Relative decrease of the cost below which they end. Chosen by hand; not measured on its own."""
 _STEP = 1e-6
-"""By which parameters move for a difference. Chosen by hand; not measured on its own."""
+"""Step of the parameters for finite differences. Chosen by hand; not measured on its own."""
 
 
 def refined(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the pose near (R, t) that makes a robust sum of squared Sampson distances small (Levenberg and Marquardt).
+    """Refine the pose (R, t) by robust least squares of Sampson distances (Levenberg-Marquardt).
 
     Args:
         rays: (N, 4) matches as points of the plane z = 1, view 1 and view 2.
-        focals: (4,) fx, fy of view 1 and of view 2: what makes distances pixels.
+        focals: (4,) fx, fy of view 1 and of view 2, in pixels.
         R: (3, 3) rotation of view 2 from view 1.
         t: (3,) direction of its translation.
     """
@@ -43,7 +43,7 @@ def refined(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) 
 
 
 def pose_distances(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
-    """Return (N,) Sampson distances in pixels, >= 0, of matches to a relative pose.
+    """Return the Sampson distances (N,) of matches to a relative pose, in pixels, >= 0.
 
     Args:
         rays: (N, 4) matches as points of the plane z = 1, view 1 and view 2.
@@ -86,7 +86,7 @@ def _cost(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) 
 
 @kernel
 def _system(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Return (5, 5) approximate Hessian and (5,) negative gradient of half the cost."""
+    """Return the approximate Hessian (5, 5) and the negative gradient (5,) of half the cost."""
     Es, J, step = np.empty((1 + POSE, 3, 3)), np.empty(POSE), np.zeros(POSE)
     A, b = np.zeros((POSE, POSE)), np.zeros(POSE)
     essential(pose, Es[0])

@@ -1,9 +1,9 @@
-"""The rotations of all photos from those of pairs: what pairs that are wrong contradict.
+"""The rotations of all photos from those of pairs, and how far each pair contradicts them.
 
-A pair that joins two facades which look alike has a relative pose as good as any by its own matches. Going round a
-loop of photos tells: the rotations along it must multiply to none. All loops are asked at once by rotation averaging
-(Hartley et al. 2013; Chatterjee and Govindu 2013): find the R_i that make the angles of R_j' R_ij R_i small, first
-their sum, which many wrong pairs do not move far, then a robust sum of squares, which they do not move at all.
+A pair that joins two facades which look alike has a relative pose as good as any by its own matches. Loops of photos
+reveal it: the rotations along a loop must multiply to the identity. Rotation averaging (Hartley et al. 2013; Chatterjee
+and Govindu 2013) tests all loops at once: find the R_i that minimize the angles of R_j' R_ij R_i, first their sum,
+which many wrong pairs do not move far, then a robust sum of squares, which they do not move at all.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,29 +18,29 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 LOOP_DEG = 5.0
-"""Three rotations that go round a loop agree when what is left of them is smaller. Chosen by hand; not measured on its
+"""The three rotations of a loop agree if the angle of their product is smaller. Chosen by hand; not measured on its
 own."""
 SCALE_DEG = 3.0
-"""Of the robust sum of squares (Geman and McClure). docs/algorithms.md, From K to relative poses. Chosen by hand; not
-measured on its own."""
+"""Scale of the robust sum of squares (Geman and McClure). docs/algorithms.md, From K to relative poses. Chosen by hand;
+not measured on its own."""
 SUM_ROUNDS, SQUARE_ROUNDS = 15, 50
-"""Of the sum of angles, and of the robust sum of squares after it. Chosen by hand; not measured on their own."""
+"""Rounds of the sum of angles, and of the robust sum of squares after it. Chosen by hand; not measured on their own."""
 LEAST_ANGLE, ARRIVED = 1e-3, 1e-7
-"""In radians: smaller angles do not count for more; smaller steps end the search. Chosen by hand; not measured on their
+"""In radians: smaller angles get no more weight; smaller steps end the search. Chosen by hand; not measured on their
 own."""
 
 
 def average_rotations(
     relative: Mapping[PairId, FloatArray], weights: Mapping[PairId, float]
 ) -> tuple[dict[int, FloatArray], dict[PairId, float]]:
-    """Return rotations of all photos, and how far each pair is from them.
+    """Estimate the rotations of all photos, and the angle of each pair to them.
 
     Args:
         relative: by pair (3, 3), the rotation of photo 2 from photo 1.
         weights: by pair, > 0.
 
     Returns:
-        By photo (3, 3), from the world, in which the first photo of each group stands straight; by pair, degrees.
+        By photo, (3, 3) from the world, whose axes are those of the first photo of each group; by pair, degrees.
     """
     if not relative:
         return {}, {}
@@ -66,7 +66,7 @@ def average_rotations(
 
 
 def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
-    """Return (E,) in (0, 1]: which share of the loops of three through each pair agrees; 1 where there is no loop.
+    """Return (E,), in (0, 1], the share of the loops of three through each pair that agree; 1 if there is no loop.
 
     Args:
         edges: (E, 2) numbers of photos, the smaller first.
@@ -99,7 +99,7 @@ def agreeing_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, ND
 
 
 def _loops(edges: Sequence[Sequence[int]]) -> Iterator[tuple[int, int, int]]:
-    """Yield numbers of the edges a-b, b-c and a-c of every three photos a < b < c that all meet."""
+    """Yield numbers of the edges a-b, b-c and a-c of every three photos a < b < c that are all connected."""
     number = {(a, b): k for k, (a, b) in enumerate(edges)}
     after: dict[int, list[int]] = {}
     for a, b in number:
@@ -109,7 +109,7 @@ def _loops(edges: Sequence[Sequence[int]]) -> Iterator[tuple[int, int, int]]:
 
 
 def _along_tree(count: int, edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
-    """Return (count, 3, 3) rotations that the strongest edges give, from the first photo of every group on."""
+    """Return (count, 3, 3) rotations along the strongest edges, from the first photo of every group on."""
     group, near = list(range(count)), [[] for _ in range(count)]  # type: ignore[var-annotated]
     for k in np.argsort(-strengths, kind="stable"):
         a, b = edges[k].tolist()
@@ -133,13 +133,13 @@ def _along_tree(count: int, edges: IndexArray, turns: FloatArray, strengths: Flo
 
 
 def _left_over(rotations: FloatArray, edges: IndexArray, turns: FloatArray) -> FloatArray:
-    """Return (E, 3) rotation vectors of R_j' R_ij R_i."""
+    """Return the rotation vectors (E, 3) of R_j' R_ij R_i."""
     around = np.einsum("nji,njk,nkl->nil", rotations[edges[:, 1]], turns, rotations[edges[:, 0]])
     return np.asarray(Rotation.from_matrix(around).as_rotvec(), np.float64)
 
 
 def _steps(count: int, edges: IndexArray, left: FloatArray, factors: FloatArray) -> FloatArray:
-    """Return (count, 3) weighted least squares of step_j - step_i = left over; the free turn of each group stays 0."""
+    """Fit steps (count, 3) by weighted least squares of step_j - step_i = left; the free turn of each group stays 0."""
     i, j = edges.T
     L, b = 1e-9 * factors.max() * np.eye(count), np.zeros((count, 3))
     np.add.at(L, (i, i), factors)

@@ -1,8 +1,8 @@
-"""Relative poses to begin a fit with, where F does not show how far the camera has turned.
+"""Initial relative poses of a fit, where F does not determine how far the camera has turned.
 
-Through a long lens, matches fix how the epipolar lines run and hardly where they meet: E = K2' F K1 then has a rotation
-that noise has chosen, and the fit that begins there ends in a valley beside the right one. But the lines of both views
-fix everything except that turn, if camera 2 looks at what camera 1 looked at. So all turns are tried.
+With a long lens, matches determine the directions of the epipolar lines, but hardly where they meet: the rotation
+of E = K2' F K1 is then due to noise, and a fit that starts there ends in a wrong local minimum. But the lines of both
+views determine everything except that turn, if camera 2 looks at what camera 1 looked at. So several turns are tried.
 """
 
 from collections.abc import Iterator
@@ -15,15 +15,16 @@ from scipy.spatial.transform import Rotation
 FloatArray = NDArray[np.float64]
 
 LEAST_PLANAR = 8
-"""Matches; a homography has eight parameters, two to a match, and half of them should be to spare. Counted."""
+"""Least number of matches: a homography has eight parameters, a match determines two, and half should be redundant.
+Counted."""
 TURNS_DEG = (-55.0, -30.0, -12.0, 12.0, 30.0, 55.0)
-"""About the scene. On the 30 pairs of a long-lens orbit (dinoSparseRing, K given) these lead to the best pose that 24
-turns from -60 to 60 lead to; the choice rests on that set alone, and only adds starts elsewhere. docs/algorithms.md,
-From K to relative poses."""
+"""Turns about the scene. On the 30 pairs of a long-lens orbit (dinoSparseRing, K given) these lead to the best pose
+that 24 turns from -60 to 60 lead to; the choice rests on that set alone, and only adds starts elsewhere.
+docs/algorithms.md, From K to relative poses."""
 
 
 def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield R and t of the cameras that would see these matches if they lay on one plane: up to four.
+    """Yield up to four R and t that explain the matches if their points lie on one plane.
 
     Args:
         used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
@@ -44,7 +45,7 @@ def planar_starts(used: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
 
 
 def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield R and t, for every turn, of a camera that has turned about the middle of the scene.
+    """Yield R and t of a camera that has turned about the middle of the scene, for every turn of `TURNS_DEG`.
 
     Args:
         used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
@@ -61,6 +62,6 @@ def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray,
     axis = np.append(g1 / lengths[0], 0.0)
     for turn_deg in TURNS_DEG:
         R = (Rotation.from_rotvec([0.0, 0.0, roll]) * Rotation.from_rotvec(np.radians(turn_deg) * axis)).as_matrix()
-        t = lengths[1] / lengths[0] * second - R @ first  # where the middle of the scene stays in the middle
+        t = lengths[1] / lengths[0] * second - R @ first  # the middle of the scene stays in the middle
         if np.linalg.norm(t) > 1e-9:
             yield np.asarray(R, np.float64), t / np.linalg.norm(t)

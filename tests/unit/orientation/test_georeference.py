@@ -85,7 +85,7 @@ def test_photos_from_one_spot_have_no_scale(seed):
 
     found = georeference(centers, positions, up)
 
-    assert not found and "fix no scale" in found.reason
+    assert not found and "do not determine a scale" in found.reason
 
 
 @pytest.mark.parametrize("seed", range(5))
