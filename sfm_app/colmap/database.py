@@ -188,8 +188,7 @@ def write_match_graph(path: Path, matches: MatchGraph) -> None:
     Its cameras are guesses, one for each group of photos, until `write_calibrations` replaces them.
 
     Args:
-        path: database file; an existing one is replaced.
-        matches: keypoints and raw matches.
+        path, matches: database file, which is replaced if it exists; keypoints and raw matches.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_database(path)
@@ -251,9 +250,7 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
     determine is marked as a prior focal length, a guess is not.
 
     Args:
-        path: database file.
-        matches: all photos.
-        intrinsics: cameras, and the camera of each photo.
+        path, matches, intrinsics: database file; all photos; cameras, and the camera of each photo.
     """
     used = {image.id: intrinsics.name_of(image) for image in matches.images.values()}
     ids = {name: number for number, name in enumerate(dict.fromkeys(used[key] for key in sorted(used)), start=1)}

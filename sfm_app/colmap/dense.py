@@ -29,9 +29,7 @@ def undistort(
     """Write undistorted photos and the matching model into a dense workspace.
 
     Args:
-        model_dir: COLMAP model.
-        photo_dir: folder with the photos.
-        dense_dir: dense workspace, created if it is missing.
+        model_dir, photo_dir, dense_dir: COLMAP model; the photos; dense workspace, created if it is missing.
         max_side_px: longest side of an undistorted photo; larger photos are scaled down.
         workers: threads.
         progress: shows a bar.

@@ -289,8 +289,7 @@ def read_scene(
 
     Args:
         model_dir: COLMAP's model.
-        names: names of cameras, by photo.
-        unregistered: reasons why photos have no pose, by photo.
+        names, unregistered: the name of its camera, by photo; the reason why it has no pose, by photo.
         refined: deviations and determined parameters, by camera; may lack cameras.
     """
     model = pycolmap.Reconstruction(model_dir)

@@ -109,7 +109,7 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
 def with_rival(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """Try a rival where the evidence is weak, and return the outcome with the model that explains more.
+    """Map a rival where the evidence is weak, and return the outcome with the model that explains more.
 
     Args:
         outcome: models from relative poses.
@@ -137,7 +137,7 @@ def with_rival(
 def _with_other_focals(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """Try other guesses of the focal where many photos are unregistered, and return the best outcome."""
+    """Map with other guesses of the focal where many photos are unregistered, and return the best outcome."""
     main = outcome.main
     if not leaves_many_out(main, intrinsics, views):
         return outcome
@@ -154,7 +154,7 @@ def _with_other_focals(
 def _with_own_cameras(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """Try a camera for each photo where shared ones explain too little, and return the better outcome."""
+    """Map with a camera for each photo where shared ones explain too little, and return the better outcome."""
     main = outcome.main
     if main is None or not may_have_one_each(main, intrinsics, views, run.settings):
         return outcome
@@ -176,7 +176,7 @@ def _with_own_cameras(
 def _with_two_cameras(
     own: Outcome, matches: MatchGraph, views: ViewGraph, each: Intrinsics, run: RunContext
 ) -> Outcome:
-    """Try two cameras instead of one for each photo, and return their outcome if they explain as much."""
+    """Map with two cameras instead of one for each photo, and return their outcome if they explain as much."""
     between = with_two(own.models[0], each, matches)
     if between is None:
         return own
