@@ -1,4 +1,4 @@
-"""The last adjustment's own arithmetic: poses and points eliminated, covariance of the cameras, what of a lens to free.
+"""Arithmetic of the last bundle adjustment: reduced normal equations, camera covariances, evidence for lens parameters.
 
-COLMAP finds the minimum (`colmap.bundle`); what it does not give is said here.
+COLMAP finds the minimum (`colmap.bundle`); this package computes what COLMAP does not provide.
 """

@@ -1,4 +1,4 @@
-"""What all observations of a model together say about its cameras, with poses and points eliminated."""
+"""Normal equations of bundle adjustment, reduced to the cameras by eliminating points and poses."""
 
 from dataclasses import dataclass, replace
 
@@ -12,33 +12,33 @@ from sfm_app.geometry.spd_solve import solve_positive, without_negative
 FloatArray = NDArray[np.float64]
 
 FX, FY, CX, CY, K1, K2, P1, P2 = range(8)
-"""Places in the parameters of a camera: those of COLMAP's OPENCV."""
+"""Indices of the parameters of a camera, as in COLMAP's OPENCV model."""
 LEAST = 1e-6
-"""Added to the diagonal: a photo without an observation left has no place, but is no reason to fail. Chosen by hand;
+"""Added to the diagonal, so that a photo with no observation left does not make the system singular. Chosen by hand;
 not measured on its own."""
 CAMERA, POSE = 8, 6
 """Numbers of parameters of a camera and of a pose. By definition."""
 FLAT = 1e-11
-"""Share of a point's information that has to be left along every direction, or the direction counts as open: rays that
-all but coincide leave this much of depth by rounding. Two rays 1.5 degrees apart leave 2e-4. No set was asked.
-docs/algorithms.md, Bundle adjustment."""
+"""Share of a point's information below which a direction counts as undetermined: rounding leaves this much of the depth
+of rays that nearly coincide. Two rays 1.5 degrees apart leave 2e-4. Chosen on no set. docs/algorithms.md, Bundle
+adjustment."""
 USUAL_NOISE_PX, USUAL_COUNT = 0.25, 4.0
-"""Noise of a coordinate of a keypoint, and how many measurements knowing it is worth: where hardly more is observed
-than is sought, what is left over says nothing. The usual noise of SIFT; beside thousands of observations it does not
-count. docs/algorithms.md, Bundle adjustment."""
+"""Prior noise of a keypoint coordinate (the usual noise of SIFT), and its weight as a number of measurements. It
+matters where there are hardly more observations than unknowns; beside thousands of observations it does not count.
+docs/algorithms.md, Bundle adjustment."""
 LOST_PX, ENDLESS = 1e4, 1e60
-"""Predictions that far off, and derivatives that large, are no measurements any more; what a lost observation costs.
-docs/algorithms.md, Bundle adjustment. Chosen by hand; not measured on their own."""
+"""Residual and derivative above which an observation is lost, i.e. not used; the residual is also what a lost
+observation costs. docs/algorithms.md, Bundle adjustment. Chosen by hand; not measured on their own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bundle:
-    """Cameras, posed photos, points, and where the points were seen."""
+    """Cameras, posed photos, points, and observations of the points."""
 
     params: FloatArray
     """(C, 8) fx, fy, cx, cy in pixels, k1, k2, p1, p2."""
     camera: NDArray[np.int64]
-    """(I,) row of the camera that took a photo."""
+    """(I,) row of the camera of each photo."""
     R: FloatArray
     """(I, 3, 3) rotations, camera from world."""
     t: FloatArray
@@ -46,40 +46,41 @@ class Bundle:
     X: FloatArray
     """(P, 3) points."""
     photo: NDArray[np.int64]
-    """(N,) row of the photo of an observation."""
+    """(N,) row of the photo of each observation."""
     point: NDArray[np.int64]
-    """(N,) row of its point."""
+    """(N,) row of the point of each observation."""
     x: FloatArray
-    """(N, 2) where it was seen, in pixels."""
+    """(N, 2) observed positions, in pixels."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reduced:
-    """The cost about the cameras as they are, poses and points giving way: cost - g'd + d'Hd / 2."""
+    """Cost as a function of a change d of the cameras, minimized over poses and points: cost - g'd + d'Hd / 2."""
 
     H: FloatArray
-    """(8C, 8C) in the order of `Bundle.params`."""
+    """(8C, 8C) Hessian, in the order of `Bundle.params`."""
     g: FloatArray
-    """(8C,)"""
+    """(8C,) negative gradient."""
     noise_px: float
-    """Standard deviation of a coordinate, from what the best linear step leaves over."""
+    """Standard deviation of a coordinate, from the residuals after the best linear step."""
     pose_step: FloatArray
-    """(6I,) best change of the poses when the cameras stay."""
+    """(6I,) best change of the poses with fixed cameras."""
     pose_give: FloatArray
-    """(6I, 8C) how much less they change per change of the cameras."""
+    """(6I, 8C) decrease of that change per change of the cameras."""
     point_step: FloatArray
-    """(3P,) best change of the points when all else stays."""
+    """(3P,) best change of the points with fixed poses and cameras."""
     point_give: sparse.csr_array
-    """(3P, 6I + 8C) how much less they change per change of poses and cameras."""
+    """(3P, 6I + 8C) decrease of that change per change of poses and cameras."""
     lost: int
-    """Observations that say nothing: behind their camera, or where numbers end."""
+    """Number of observations that are not used: behind their camera, or not finite."""
     scores: FloatArray
-    """(I, 8C) what the observations of each photo ask of the cameras, poses and points giving way; they add up to g."""
+    """(I, 8C) contributions of each photo's observations to g, with poses and points eliminated; they add up to g."""
     open_points: int
-    """Points that their rays do not fix: at infinity, or seen from one place only. They stay along what is open."""
+    """Number of points that their rays do not determine: at infinity, or seen from one position only. They do not move
+    along undetermined directions."""
 
     def follow(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return changes of poses (I, 6) and points (P, 3) that go best with a change of the cameras (C, 8)."""
+        """Return the best changes of poses (I, 6) and points (P, 3) for a given change of the cameras (C, 8)."""
         poses = self.pose_step - np.einsum("ij,j->i", self.pose_give, cameras.ravel())
         points = self.point_step - self.point_give @ np.concatenate([poses, cameras.ravel()])
         return poses.reshape(-1, POSE), points.reshape(-1, 3)
@@ -88,7 +89,7 @@ class Reduced:
 def project(bundle: Bundle) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return predictions (N, 2), and their derivatives by camera (N, 2, 8), pose (N, 2, 6) and point (N, 2, 3).
 
-    Poses change by a rotation vector about the world's axes turned into the camera, and by a shift of t.
+    A pose changes by a rotation vector in the camera's axes, applied to R from the left, and by a shift of t.
     """
     fx, fy, cx, cy, k1, k2, p1, p2 = bundle.params[bundle.camera[bundle.photo]].T
     R = bundle.R[bundle.photo]
@@ -119,12 +120,12 @@ def project(bundle: Bundle) -> tuple[FloatArray, FloatArray, FloatArray, FloatAr
 
 
 def reduce(bundle: Bundle, scale_px: float) -> Reduced:
-    """Eliminate points, then poses (Schur's complement), in Gauss and Newton's approximation.
+    """Eliminate points, then poses (Schur complement), in the Gauss-Newton approximation.
 
     The covariance of the cameras is noise^2 H^-1.
 
     Args:
-        bundle: the model; what it says about the cameras is right where poses and points fit best.
+        bundle: the model; the result is accurate where poses and points minimize the cost.
         scale_px: s of the loss s^2 (sqrt(1 + |r|^2 / s^2) - 1), which is COLMAP's SOFT_L1.
     """
     r, by_view, by_point, seen = _linearized(bundle, scale_px)
@@ -175,9 +176,9 @@ def _scores(
     system: tuple[sparse.csr_array, sparse.csr_array, sparse.csr_array],
     pose_give: FloatArray, left_over: FloatArray, photo: NDArray[np.int64], photos: int,
 ) -> FloatArray:  # fmt: skip
-    """Give (I, 8C) as in `Reduced`, from derivatives by views and points, and what poses and points leave over (2N,).
+    """Return the scores (I, 8C), from derivatives by views and points, and residuals (2N,) after poses and points.
 
-    One camera after the other, so that many cameras take no more memory than one.
+    The cameras are processed one by one, so that many of them take no more memory than one.
     """
     J, Jp, A = system
     cameras = pose_give.shape[1]
@@ -192,10 +193,10 @@ def _scores(
 
 
 def moved(bundle: Bundle, params: FloatArray, poses: FloatArray, points: FloatArray) -> Bundle:
-    """Return the bundle with other cameras, and with changed poses and points.
+    """Return the bundle with new cameras, and with changed poses and points.
 
     Args:
-        bundle: what is moved; it stays as it is.
+        bundle: bundle to change; not changed in place.
         params: (C, 8) the new cameras, see `Bundle.params`.
         poses: (I, 6) changes: a rotation vector in the camera's axes, and a shift of t.
         points: (P, 3) shifts of the points.
@@ -205,7 +206,7 @@ def moved(bundle: Bundle, params: FloatArray, poses: FloatArray, points: FloatAr
 
 
 def cost(bundle: Bundle, scale_px: float) -> float:
-    """Return half the sum of the loss of `reduce`; what is lost counts as LOST_PX off.
+    """Return half the sum of the loss of `reduce`; lost observations count with a residual of LOST_PX.
 
     Args:
         bundle: the model.
@@ -219,7 +220,7 @@ def cost(bundle: Bundle, scale_px: float) -> float:
 
 
 def in_sight(bundle: Bundle, r: FloatArray) -> NDArray[np.bool_]:
-    """Return (N,) which observations are of points before their camera, and not hopelessly off.
+    """Return (N,) which observations are of points in front of their camera, with residuals below LOST_PX.
 
     Args:
         bundle: the model.
@@ -231,16 +232,16 @@ def in_sight(bundle: Bundle, r: FloatArray) -> NDArray[np.bool_]:
 
 
 def lost_points(bundle: Bundle) -> NDArray[np.bool_]:
-    """Return (P,) which points have an observation that is not in sight."""
+    """Return (P,) which points have a lost observation."""
     with np.errstate(all="ignore"):
         r = bundle.x - project(bundle)[0]
     return np.bincount(bundle.point[~in_sight(bundle, r)], minlength=len(bundle.X)) > 0
 
 
 def _linearized(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Return weighted residuals (N, 2), derivatives by view (N, 2, 14) and point (N, 2, 3), and what counts.
+    """Return weighted residuals (N, 2), derivatives by view (N, 2, 14) and point (N, 2, 3), and which are used (N,).
 
-    The rest are 0: a point behind its camera, or in the plane of it, would pull at all that is near.
+    The others are 0: points behind their camera, or in its principal plane, would distort all that is near.
     """
     with np.errstate(all="ignore"):
         predicted, by_camera, by_pose, by_point = project(bundle)
@@ -253,9 +254,9 @@ def _linearized(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray
 
 
 def _whiten(by_point: FloatArray, point: NDArray[np.int64], points: int) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Give (P, 3, 3) W such that derivatives by W^-T X are orthonormal over the observations of a point, and its rank.
+    """Return W (P, 3, 3) that makes derivatives by W^-T X orthonormal over the observations of a point, and its rank.
 
-    Along directions that the observations leave open, W is 0: nothing depends on them.
+    Along directions that the observations do not determine, W is 0.
     """
     H = np.zeros((points, 3, 3))
     products = np.einsum("nki,nkj->nij", by_point, by_point)
@@ -265,7 +266,7 @@ def _whiten(by_point: FloatArray, point: NDArray[np.int64], points: int) -> tupl
     diagonal = np.einsum("pii->pi", H)
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     unit = H / (scale[:, :, None] * scale[:, None, :])
-    # the pivots of Cholesky's decomposition
+    # the pivots of the Cholesky decomposition
     second = unit[:, 1, 1] - unit[:, 1, 0] ** 2
     across = unit[:, 2, 1] - unit[:, 2, 0] * unit[:, 1, 0]
     third = unit[:, 2, 2] - unit[:, 2, 0] ** 2 - across**2 / np.maximum(second, FLAT)
@@ -281,16 +282,14 @@ def _whiten(by_point: FloatArray, point: NDArray[np.int64], points: int) -> tupl
 
 
 def _block_diagonal(blocks: FloatArray) -> sparse.csr_array:
-    """Return (3P, 3P) from (P, 3, 3)."""
+    """Return the block-diagonal matrix (3P, 3P) of blocks (P, 3, 3)."""
     P = len(blocks)
     columns = np.repeat(3 * np.arange(P)[:, None] + np.arange(3), 3, axis=0)
     return sparse.csr_array((blocks.ravel(), columns.ravel(), 3 * np.arange(3 * P + 1)), shape=(3 * P, 3 * P))
 
 
 def _gauge(bundle: Bundle) -> NDArray[np.int64]:
-    """Return columns of the poses that are free when the first photo stays, and the distance to the photo farthest from
-    it.
-    """
+    """Return the free pose columns when the gauge is fixed: the first photo, and one coordinate of the farthest one."""
     centers = -np.einsum("nji,nj->ni", bundle.R, bundle.t)
     far = int(np.argmax(np.linalg.norm(centers - centers[0], axis=1)))
     relative = bundle.R[far] @ (centers[0] - centers[far])
@@ -299,7 +298,7 @@ def _gauge(bundle: Bundle) -> NDArray[np.int64]:
 
 
 def _sparse(blocks: FloatArray, columns: NDArray[np.int64], width: int) -> sparse.csr_array:
-    """Return (2N, width) from (N, 2, k) blocks that stand in the same k columns (N, k) of two rows each."""
+    """Return the sparse matrix (2N, width) of blocks (N, 2, k), each in two rows and the k columns (N, k) given."""
     N, _, k = blocks.shape
     places = np.repeat(columns, 2, axis=0).ravel()
     return sparse.csr_array((blocks.ravel(), places, k * np.arange(2 * N + 1)), shape=(2 * N, width))

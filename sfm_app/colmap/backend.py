@@ -1,4 +1,4 @@
-"""pycolmap, imported once and safely, and the one edge at which its errors become ours."""
+"""Safe import of pycolmap, and translation of its errors into ours."""
 
 import contextlib
 import tempfile
@@ -26,11 +26,11 @@ __all__ = [
 Result = TypeVar("Result")
 
 LEFT, POLL_S = "colmap-alone", 0.2
-"""Name of threads that nobody waits for, and how often one looks whether they are done."""
+"""Name of the threads that nothing waits for, and the interval at which they are polled."""
 ROOM = 1_000_000
-"""Bytes that have to be left: more than any program keeps back before it writes."""
+"""Free bytes that the disk must have: more than any program buffers before it writes."""
 
-zlib.crc32(b"")  # the import above is there for its side effect
+zlib.crc32(b"")  # zlib is imported for its side effect
 _Level = pycolmap.logging.Level
 pycolmap.logging.minloglevel = _Level.FATAL.value
 
@@ -38,13 +38,13 @@ LEVELS = tuple(level.value for level in (_Level.FATAL, _Level.WARNING, _Level.IN
 
 
 def show_log(level: int) -> None:
-    """Let COLMAP speak on stderr: 0 not at all, 1 warnings, 2 everything."""
+    """Set what COLMAP logs to stderr: 0 nothing, 1 warnings, 2 everything."""
     pycolmap.logging.minloglevel = LEVELS[min(level, 2)]
     pycolmap.logging.alsologtostderr = level > 0
 
 
 def log_level() -> int:
-    """Return what `show_log` has set last."""
+    """Return the level that `show_log` last set."""
     return LEVELS.index(pycolmap.logging.minloglevel)
 
 
@@ -54,13 +54,13 @@ def has_cuda() -> bool:
 
 
 def versions() -> dict[str, str]:
-    """Return what the manifest notes about COLMAP."""
+    """Return the versions of pycolmap and COLMAP, for the manifest."""
     return {"pycolmap": pycolmap.__version__, "colmap": pycolmap.COLMAP_version.split(" ")[-1]}
 
 
 @contextlib.contextmanager
 def backend(doing: str) -> Iterator[None]:
-    """Turn whatever COLMAP raises into a BackendError that says what was being done; an error of ours is not COLMAP's.
+    """Turn COLMAP's exceptions into a BackendError that names the operation; our own errors pass through.
 
     Raises:
         BackendError: COLMAP failed.
@@ -81,9 +81,9 @@ def backend(doing: str) -> Iterator[None]:
 
 
 def _is_ours(err: Exception) -> bool:
-    """Return whether Python code other than that which calls COLMAP has raised an error.
+    """Return whether an error was raised by Python code other than our calls of COLMAP.
 
-    Pycolmap itself has no frames.
+    A traceback has no frames of pycolmap itself.
     """
     if isinstance(err, np.linalg.LinAlgError | ArithmeticError):
         return True
@@ -91,15 +91,15 @@ def _is_ours(err: Exception) -> bool:
     where = str(frames[-1].f_globals.get("__name__", ""))
     if where.startswith(("sfm_app.colmap.", "pycolmap")):
         return False
-    called = len(frames) > 2  # the first is that of `backend`, the second holds the block
+    called = len(frames) > 2  # the first frame is that of `backend`, the second that of the `with` block
     return called and where.startswith(("sfm_app.", "numpy.", "scipy.", "cv2"))
 
 
 def check_written(*files: Path) -> None:
-    """Check that files which COLMAP has written could have been longer: it does not say when the disk is full.
+    """Check that the disk is not full after COLMAP has written files: COLMAP does not report it.
 
     Raises:
-        OSError: nothing more can be written, and why.
+        OSError: the disk takes no more bytes.
     """
     longest = max((file.stat().st_size for file in files), default=0)
     with tempfile.TemporaryFile(dir=files[0].parent) as probe:
@@ -108,9 +108,9 @@ def check_written(*files: Path) -> None:
 
 
 def patiently(call: Callable[[], Result]) -> Result:
-    """Run a COLMAP call that nobody can stop, so that Ctrl-C is heard at once; then the call is left behind.
+    """Run a COLMAP call that cannot be stopped, so that Ctrl-C takes effect at once.
 
-    See `left_running`.
+    After Ctrl-C the call goes on in its daemon thread; see `left_running`.
     """
     found: Future[Result] = Future()
 
@@ -129,7 +129,7 @@ def patiently(call: Callable[[], Result]) -> Result:
 
 
 def left_running() -> bool:
-    """Return whether a call of COLMAP is still at work: then a program must end without waiting for it."""
+    """Return whether an abandoned COLMAP call is still running; the program must then exit without waiting for it."""
     return any(thread.name == LEFT for thread in threading.enumerate())
 
 
@@ -138,7 +138,7 @@ def interruptible(call: Callable[[pycolmap.CancellationToken], None], poll: Call
 
     Args:
         call: ends early once its token is cancelled.
-        poll: called twice a second, to show how far it is.
+        poll: called twice a second, to show progress.
     """
     token = pycolmap.CancellationToken()
     with ThreadPoolExecutor(1, thread_name_prefix="colmap") as thread:
@@ -163,12 +163,12 @@ def counted(
     total: int,
     progress: Progress,
 ) -> None:
-    """Run as `interruptible` does, with a bar.
+    """Run a long COLMAP call as `interruptible` does, with a progress bar.
 
     Args:
         call: ends early once its token is cancelled.
-        done: says how many steps are finished.
-        label: what is done, for people.
+        done: returns the number of finished steps.
+        label: text beside the bar.
         total: number of steps.
         progress: shows the bar.
     """
@@ -187,7 +187,7 @@ def counted(
 
 
 def plain(options: Mapping[object, object]) -> dict[str, Json]:
-    """Return COLMAP's options as JSON can hold them: the manifest records all that are in force."""
+    """Return COLMAP's options as JSON values; the manifest records all of them."""
     return {str(key): _plain(value) for key, value in options.items()}
 
 

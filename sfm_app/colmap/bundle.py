@@ -1,4 +1,4 @@
-"""The last adjustment: cameras, poses, points and tracks, until nothing changes."""
+"""The last bundle adjustment: refines cameras, poses, points and tracks until they no longer change."""
 
 import logging
 from collections import Counter
@@ -19,57 +19,58 @@ from sfm_app.numerical import FAILURES, finite_only, reason_of
 logger = logging.getLogger("sfm_app")
 
 PHOTOS_TO_ASK = 5
-"""With fewer photos, what the camera model does not hold (a lens, a zoom) moves a camera more than the noise does; only
-its focal and k1 are then sought."""
+"""Photos of a camera below which only its focal and k1 are refined: with fewer, effects that the camera model leaves
+out (a lens, a zoom) change its parameters more than the noise does."""
 
 LOSS_SCALE_PX = 0.5
-"""Of COLMAP's SOFT_L1: some twice the noise of SIFT keypoints. Poses are better than with 1, COLMAP's own."""
+"""Scale of COLMAP's SOFT_L1 loss: about twice the noise of SIFT keypoints. Poses are better than with COLMAP's 1."""
 
 MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
 """COLMAP's own limits for a point: largest reprojection error, least angle between its rays."""
 
 ROUNDS, CHANGED, STEP = 6, 0.0005, 0.2
-"""At most so many rounds; fewer when less than this share of the observations changes, and no camera by more than this
-share of its standard deviation."""
+"""Largest number of rounds. They end early when less than this share of the observations changes, and no camera
+parameter by more than this share of its standard deviation."""
 
 LEAST_LEFT = 0.1
-"""Share of the points that an adjustment must leave: what drops more has gone astray, and is not taken. Chosen on no
-set; none of six that were run fell below it."""
+"""Smallest share of the points that an adjustment must keep; one that drops more has diverged and is rejected. Chosen
+on no set; none of six that were run fell below it."""
 
 FAR = 1.0
-"""Beyond so many standard deviations a linear step does not arrive, and COLMAP's solver settles poses and points."""
+"""Step of the cameras, in standard deviations, above which the linear step of poses and points is too inaccurate and
+COLMAP's solver refines them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjusted:
-    """The refined model and how far its cameras can be trusted."""
+    """The refined model, and the uncertainty of its cameras."""
 
     model: pycolmap.Reconstruction
     deviations: dict[int, dict[str, float]]
-    """By camera id, as in `CameraModel`."""
+    """Standard deviations by camera id, as in `CameraModel`."""
     determined: dict[int, tuple[str, ...]]
-    """By camera id, as in `CameraModel`."""
+    """Parameters that the photos determine, by camera id, as in `CameraModel`."""
     trouble: str = ""
-    """Why there was no adjustment: the model is then as it was given, and nothing is known about deviations."""
+    """Why the adjustment failed, empty where it did not; the model is then the given one, without deviations."""
     held: tuple[int, ...] = ()
-    """Ids of cameras that ran away from the photos' say, and so stayed where they were."""
+    """Ids of cameras whose estimate diverged; they keep their parameters."""
     open_points: int = 0
-    """Points that their rays did not fix when the adjustment began."""
+    """Points that their rays did not determine when the adjustment began."""
 
 
 def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
-    """Refine cameras, poses, points and tracks in turn; of the cameras as much as the photos determine.
+    """Refine cameras, poses, points and tracks in turn; only camera parameters that the photos determine are freed.
 
-    What the bundle says about the cameras, poses and points giving way, is weighed against what cameras usually are.
-    The cameras make that step, poses and points follow (COLMAP's solver helps where the way is long), tracks are
-    completed and cleaned, and all starts again.
+    In each round, poses and points are eliminated, and the likelihood of the cameras is weighed against their priors.
+    The cameras make the resulting step. Poses and points follow linearly; after a long step COLMAP's solver refines
+    them. Then tracks are completed and filtered.
 
     Args:
-        model: as mapping left it; not changed.
+        model: result of mapping; not changed.
         database: has all keypoints and matches.
 
     Raises:
-        NumericalError: the photos do not bear it; the given model stays as it was.
+        NumericalError: the adjustment diverges; the given model is unchanged.
     """
     model, points = pycolmap.Reconstruction(model), model.num_points3D()
     for camera in all_cameras(model):
@@ -98,7 +99,7 @@ def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
 
 
 def adjusted_or_as_it_was(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
-    """Adjust a model; where the numbers fail, return it as mapping left it, with the reason.
+    """Adjust a model; where that fails numerically, return the given model with the reason.
 
     Args:
         model, database: as in `adjust`.
@@ -116,13 +117,13 @@ def adjusted_or_as_it_was(model: pycolmap.Reconstruction, database: Path) -> Adj
 
 
 def drop_endless(model: pycolmap.Reconstruction) -> None:
-    """Take away points that lie nowhere, in place."""
+    """Remove points at infinity, in place."""
     for point_id in [key for key, point in all_points(model) if not somewhere(point.xyz)]:
         model.delete_point3D(point_id)
 
 
 def solve(model: pycolmap.Reconstruction) -> None:
-    """Adjust poses and points in place, with one thread: sums over threads come in any order."""
+    """Adjust poses and points in place, on one thread: the order of sums over several threads is not fixed."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
@@ -140,9 +141,9 @@ def solve(model: pycolmap.Reconstruction) -> None:
 
 
 def _improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
-    """Continue, merge and triangulate tracks, then drop what does not fit; how many observations that changed.
+    """Continue, merge and triangulate tracks, filter them, and return by how many observations their number changed.
 
-    What is added only to be dropped again does not count: near the limits that never ends.
+    Observations that are added and filtered again do not count: near the limits they come and go forever.
     """
     before = model.compute_num_observations()
     observations = pycolmap.ObservationManager(model, graph)
@@ -175,11 +176,9 @@ def read_bundle(model: pycolmap.Reconstruction) -> tuple[list[int], Bundle]:
 
 
 def _best_step(bundle: Bundle, reduced: Reduced, found: LensEstimate) -> Bundle:
-    """Return the bundle with the estimated cameras.
+    """Return the bundle with the estimated cameras, and with poses and points moved if that does not raise the cost.
 
-    Poses and points follow, where that is no worse than if they stayed.
-
-    A point that would end up behind a camera stays, too: along an open ray a linear step knows no end.
+    A point that would move behind a camera stays: along an undetermined direction a linear step has no bound.
     """
     nowhere = np.zeros((len(bundle.R), POSE)), np.zeros_like(bundle.X)
     poses, points = reduced.follow(found.params - bundle.params)
@@ -192,7 +191,7 @@ def _best_step(bundle: Bundle, reduced: Reduced, found: LensEstimate) -> Bundle:
 
 
 def _write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle) -> None:
-    """Put arrays in the order of `read_bundle` into the model."""
+    """Write arrays in the order of `read_bundle` into the model."""
     for camera_id, params in zip(ids, bundle.params, strict=True):
         model.cameras[camera_id].params = params.tolist()
     for image_id, R, t in zip(sorted(model.reg_image_ids()), bundle.R, bundle.t, strict=True):
@@ -203,7 +202,7 @@ def _write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle
 
 
 def _usual_cameras(model: pycolmap.Reconstruction, ids: list[int]) -> LensPriors:
-    """Return what is believed about cameras before the bundle is asked."""
+    """Return the priors of the cameras, before any evidence from the bundle."""
     used = used_cameras(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
     many = np.array([used[camera_id] >= PHOTOS_TO_ASK for camera_id in ids])
@@ -212,12 +211,12 @@ def _usual_cameras(model: pycolmap.Reconstruction, ids: list[int]) -> LensPriors
 
 
 def used_cameras(model: pycolmap.Reconstruction) -> Counter[int]:
-    """Return how many photos with a pose each camera took, by its id."""
+    """Return the number of posed photos of each camera, by its id."""
     return Counter(model.images[image_id].camera_id for image_id in sorted(model.reg_image_ids()))
 
 
 def _generalize(camera: pycolmap.Camera) -> None:
-    """Change the camera in place to the model that holds all that may be freed; both share the first radial term."""
+    """Change the camera in place to the model with all parameters that may be freed; keep its first radial term."""
     if camera.model.name != TWO_FOCALS:
         K, radial = camera.calibration_matrix(), float(camera.params[camera.extra_params_idxs()[0]])
         camera.model = pycolmap.CameraModelId.__members__[TWO_FOCALS]
@@ -226,7 +225,7 @@ def _generalize(camera: pycolmap.Camera) -> None:
 
 def _correspondences(model: pycolmap.Reconstruction, database: Path) -> pycolmap.CorrespondenceGraph:
     options = pycolmap.DatabaseCacheOptions()
-    options.load_all_images = True  # it would leave out those that no pair in the database connects
+    options.load_all_images = True  # else photos that no pair in the database connects would be missing
     options.image_names = {model.images[image_id].name for image_id in model.reg_image_ids()}
     with opened(database) as db:
         return pycolmap.DatabaseCache.create(db, options).correspondence_graph

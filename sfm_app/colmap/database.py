@@ -1,4 +1,4 @@
-"""COLMAP's SQLite database: photos and cameras in, keypoints and matches out, our relative poses and K back in."""
+"""COLMAP's SQLite database: write photos, cameras and relative poses, read keypoints and matches."""
 
 import contextlib
 import ctypes
@@ -25,10 +25,10 @@ from sfm_app.types import (
 )  # fmt: skip
 
 SQUARE_PIXELS = "SIMPLE_RADIAL"
-"""f, cx, cy, k: what is mapped with where K has one focal; a second radial term runs wild on the first few photos."""
+"""f, cx, cy, k: the model used in mapping where K has one focal; a second radial term diverges on the first photos."""
 
 TWO_FOCALS = "OPENCV"
-"""fx, fy, cx, cy, k1, k2, p1, p2: COLMAP's smallest model that holds a camera matrix with two focals and a lens."""
+"""fx, fy, cx, cy, k1, k2, p1, p2: COLMAP's smallest model with two focals and lens distortion."""
 
 KINDS = {
     "calibrated": "CALIBRATED",
@@ -39,25 +39,25 @@ KINDS = {
 """COLMAP's names for the kinds of relative poses."""
 
 SQUARE_WITHIN = 0.005
-"""fy/fx of square pixels: calibrators leave it this near to 1 where the photos do not ask for more."""
+"""Largest |fy/fx - 1| of square pixels: calibrators give no more where the photos show no other aspect."""
 
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[pycolmap.Database]:
-    """Provide the database, closed whatever happens."""
+    """Provide the database, and close it in any case."""
     database = pycolmap.Database.open(path)
     try:
         yield database
     finally:
         try:
             database.close()
-        except RuntimeError:  # a full disk; its destructor would try once more, and end the program
+        except RuntimeError:  # the disk is full; the destructor would close it once more, which ends the program
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(database))
             raise
 
 
 def is_sound(path: Path) -> bool:
-    """Return whether SQLite finds nothing torn in a database; what a killed run left half done it takes back."""
+    """Return whether SQLite finds a database intact, after rolling back what a killed run left unfinished."""
     if not path.is_file():
         return False
     try:
@@ -73,11 +73,11 @@ MATCHES = (
     "SELECT image_id, rows, cols, data FROM keypoints ORDER BY image_id",
     "SELECT pair_id, rows, cols, data FROM matches ORDER BY pair_id",
 )
-"""What stays as it is once the photos are matched."""
+"""Queries for what no longer changes once the photos are matched."""
 
 
 def digest_matches(path: Path) -> str:
-    """Return hash of photos, keypoints and matches."""
+    """Return the hash of photos, keypoints and matches."""
     found = hashlib.blake2b(digest_size=16)
     with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as connection:
         for query in MATCHES:
@@ -89,7 +89,7 @@ def digest_matches(path: Path) -> str:
 
 
 def remove_database(path: Path) -> None:
-    """Take away a database with what SQLite keeps beside it."""
+    """Remove a database and the files that SQLite keeps beside it."""
     for suffix in ("", "-wal", "-shm", "-journal"):
         path.with_name(path.name + suffix).unlink(missing_ok=True)
 
@@ -97,11 +97,11 @@ def remove_database(path: Path) -> None:
 def create_database(path: Path, photos: PhotoSet) -> None:
     """Enter photos and cameras in a fixed order.
 
-    Feature extraction would do it too, but numbers photos as its threads finish with them: not twice the same.
+    Feature extraction would enter them in the order in which its threads finish, which differs from run to run.
 
     Args:
-        path: database file, made if it is missing.
-        photos: usable photos, in groups of one camera.
+        path: database file, created if it is missing.
+        photos: usable photos, grouped by camera.
     """
     with opened(path) as database:
         for camera_id, members in enumerate(photos.groups.values(), start=1):
@@ -118,7 +118,7 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
 
     Args:
         path: database file.
-        photos: those it was made from.
+        photos: the photos that the database was made from.
     """
     by_name = {photo.name: photo for photo in photos.photos}
     with opened(path) as database:
@@ -137,13 +137,13 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
 
 
 def photo_names(path: Path) -> dict[int, str]:
-    """Return names of all photos by their ids."""
+    """Return the names of all photos by id."""
     with opened(path) as database:
         return {entry.image_id: entry.name for entry in sorted(database.read_all_images(), key=lambda e: e.image_id)}
 
 
 def unmatched(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
-    """Return those of the pairs that nobody has matched yet, with or without success.
+    """Return the pairs that have no entry of matches in the database, not even an empty one.
 
     Args:
         path: database file.
@@ -183,12 +183,12 @@ def write_matches(path: Path, pair: PairId, rows: NDArray[np.uint32]) -> None:
 
 
 def write_match_graph(path: Path, matches: MatchGraph) -> None:
-    """Make a database of the photos, keypoints and raw matches of a match graph, under the same ids.
+    """Make a database of the photos, keypoints and raw matches of a match graph, with the same ids.
 
     Its cameras are guesses, one for each group of photos, until `write_calibrations` replaces them.
 
     Args:
-        path, matches: database file, what is there is lost; keypoints and raw matches.
+        path, matches: database file, which is replaced if it exists; keypoints and raw matches.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     remove_database(path)
@@ -209,7 +209,7 @@ def write_match_graph(path: Path, matches: MatchGraph) -> None:
 
 
 def read_features(path: Path) -> tuple[dict[int, NDArray[np.float64]], dict[PairId, NDArray[np.uint32]]]:
-    """Return keypoints (N, 2) of every photo that has some, and the raw matches of pairs."""
+    """Return keypoints (N, 2) of every photo that has any, and the raw matches of pairs."""
     with opened(path) as database:
         found = {image.image_id: database.read_keypoints(image.image_id) for image in database.read_all_images()}
         pair_ids, rows = database.read_all_matches()
@@ -218,11 +218,11 @@ def read_features(path: Path) -> tuple[dict[int, NDArray[np.float64]], dict[Pair
 
 
 def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
-    """Replace all two-view geometries by our relative poses, with the essential matrices they stand for.
+    """Replace all two-view geometries by our relative poses and their essential matrices.
 
     Args:
         path: database file.
-        matches: raw matches; inliers are rows of them.
+        matches: raw matches, whose rows the inliers select.
         graph: relative poses.
     """
     with opened(path) as database:
@@ -232,11 +232,11 @@ def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
 
 
 def keep_raw_matches(path: Path, pairs: Collection[PairId]) -> None:
-    """Remove all two-view geometries, and the matches of all other pairs.
+    """Remove all two-view geometries, and all matches but those of the given pairs.
 
     Args:
         path: database file.
-        pairs: whose matches stay.
+        pairs: pairs whose matches are kept.
     """
     with opened(path) as database:
         database.clear_two_view_geometries()
@@ -245,13 +245,13 @@ def keep_raw_matches(path: Path, pairs: Collection[PairId]) -> None:
 
 
 def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) -> None:
-    """Replace all cameras by ours, each with its K and lens, and give every photo its camera.
+    """Replace all cameras by ours, with K and lens, and assign one to every photo.
 
-    Cameras are numbered by their first photo, whatever the database held before. A K that the photos determine counts
-    as prior knowledge, a guess does not.
+    Cameras are numbered in the order of their first photos, whatever the database held before. A K that the photos
+    determine is marked as a prior focal length, a guess is not.
 
     Args:
-        path, matches, intrinsics: database file; all photos; cameras, and which photo has which.
+        path, matches, intrinsics: database file; all photos; cameras, and the camera of each photo.
     """
     used = {image.id: intrinsics.name_of(image) for image in matches.images.values()}
     ids = {name: number for number, name in enumerate(dict.fromkeys(used[key] for key in sorted(used)), start=1)}
@@ -270,7 +270,7 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
 
 
 def _write_camera(database: pycolmap.Database, camera_id: int, calibration: Calibration) -> None:
-    """Write a camera, new or in the place of another, and the rig of one sensor that COLMAP wants around it."""
+    """Write or replace a camera, and the rig of one sensor that COLMAP requires for it."""
     name = camera_model(calibration)
     camera = pycolmap.Camera(
         camera_id=camera_id,
@@ -290,14 +290,14 @@ def _write_camera(database: pycolmap.Database, camera_id: int, calibration: Cali
 
 
 def _write_frame(database: pycolmap.Database, image: pycolmap.Image) -> None:
-    """Write the frame of one photo that COLMAP wants around it."""
+    """Write the frame of a single photo, which COLMAP requires for it."""
     frame = pycolmap.Frame(frame_id=image.image_id, rig_id=image.camera_id)
     frame.add_data_id(image.data_id)
     database.write_frame(frame, use_frame_id=True)
 
 
 def camera_model(calibration: Calibration) -> str:
-    """Return COLMAP's name of the smallest camera model that holds what is known."""
+    """Return COLMAP's name of the smallest camera model for a calibration."""
     K = calibration.K
     square = "aspect" in calibration.held or abs(K[1, 1] / K[0, 0] - 1.0) < SQUARE_WITHIN
     return SQUARE_PIXELS if square else TWO_FOCALS
@@ -308,7 +308,7 @@ def camera_params(K: NDArray[np.float64], camera_model: str, radial: float = 0.0
 
     Args:
         K: (3, 3) camera matrix, pixels.
-        camera_model: COLMAP's name of it.
+        camera_model: COLMAP's name of the model.
         radial: first radial term.
     """
     fx, fy, cx, cy = (float(K[row, column]) for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))

@@ -18,20 +18,19 @@ from sfm_app.stereo import DepthEstimate, DepthMap, Kind, View
 
 DEPTHS, NORMALS, CONFIDENCES = "depth_maps", "normal_maps", "confidence_maps"
 MASKED = -1.0
-"""In place of the depth where a photo is masked. COLMAP's fusion takes it for none; `sfm_app.meshing` does not take it
-for empty space."""
+"""Depth of a masked pixel. COLMAP's fusion reads it as no depth; `sfm_app.meshing` does not read it as empty space."""
 MAPS = ("sparse", "images", f"stereo/{DEPTHS}", f"stereo/{NORMALS}")
-"""What a finished workspace is read from."""
+"""Folders from which a finished workspace is read."""
 
 
 def undistort(
     model_dir: Path, photo_dir: Path, dense_dir: Path, max_side_px: int, workers: int, progress: Progress
 ) -> None:
-    """Write photos without distortion and the model that fits them into a dense workspace.
+    """Write undistorted photos and the matching model into a dense workspace.
 
     Args:
-        model_dir, photo_dir, dense_dir: COLMAP model; the photos; dense workspace, made if it is missing.
-        max_side_px: longer sides are scaled down to it.
+        model_dir, photo_dir, dense_dir: COLMAP model; the photos; dense workspace, created if it is missing.
+        max_side_px: longest side of an undistorted photo; larger photos are scaled down.
         workers: threads.
         progress: shows a bar.
 
@@ -101,7 +100,7 @@ def read_color(dense_dir: Path, view: View) -> NDArray[np.uint8]:
 
 
 def map_file(dense_dir: Path, view: View) -> Path:
-    """Return where the confirmed depths of a view are, if it has any.
+    """Return the path of the confirmed depths of a view, whether or not it exists.
 
     Args:
         dense_dir: folder with undistorted photos and their maps.
@@ -111,23 +110,23 @@ def map_file(dense_dir: Path, view: View) -> Path:
 
 
 class DenseStore:
-    """The photos and maps of a dense workspace, as `sfm_app.stereo.DepthStore` has them."""
+    """The photos and maps of a dense workspace; implements `sfm_app.stereo.DepthStore`."""
 
     def __init__(self, dense_dir: Path) -> None:
         self.dense_dir = dense_dir
 
     def photo(self, view: View) -> NDArray[np.uint8]:
-        """Return the photo without distortion, (H, W)."""
+        """Return the undistorted photo, (H, W)."""
         return read_gray(self.dense_dir, view)
 
     def has(self, view: View, kind: Kind) -> bool:
-        """Return whether a depth map is there.
+        """Return whether a depth map exists.
 
         Args:
             view: an undistorted photo.
             kind: photometric or geometric.
         """
-        # the depth map is what is written last
+        # the depth map is written last
         return _map_path(self.dense_dir, DEPTHS, view, kind).is_file()
 
     def read_estimate(self, view: View) -> DepthEstimate:
@@ -136,21 +135,21 @@ class DenseStore:
         return DepthEstimate(read_depth(self.dense_dir, view, "photometric"), confidence)
 
     def write_estimate(self, view: View, estimate: DepthEstimate) -> None:
-        """Keep the photometric map of a view, without depth where the photo is masked.
+        """Write the photometric map of a view, without depth where the photo is masked.
 
         Args:
             view: an undistorted photo.
-            estimate: depths and how sure they are.
+            estimate: depths and their confidences.
         """
         used = used_pixels(self.dense_dir, view)
         if used is not None:
-            # sure, so that what is masked is no part of the blank area beside it
+            # full confidence, so that masked pixels do not become part of a blank area beside them
             estimate = DepthEstimate(estimate.depth * used, np.where(used, estimate.confidence, np.float32(1)))
         _write_depth_format(self.dense_dir, CONFIDENCES, view, estimate.confidence, "photometric")
         _write_depth_format(self.dense_dir, DEPTHS, view, estimate.depth, "photometric")
 
     def write_maps(self, view: View, maps: DepthMap) -> None:
-        """Keep the geometric maps of a view.
+        """Write the geometric maps of a view.
 
         Args:
             view: an undistorted photo.
@@ -178,7 +177,7 @@ def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
         view: an undistorted photo.
         maps: depths (H, W) and normals (H, W, 3).
     """
-    # pycolmap takes (H, W, 3) but stores the bytes as they come, where COLMAP keeps x, y and z in planes.
+    # pycolmap takes (H, W, 3) but stores the bytes unchanged, while COLMAP keeps x, y and z in planes.
     planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
     with backend(f"writing the normal map of {view.name}"), _whole(_map_path(dense_dir, NORMALS, view)) as path:
         pycolmap.NormalMap.from_array(planes).write(path)
@@ -186,7 +185,7 @@ def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
 
 
 def hide_masked(dense_dir: Path, view: View) -> None:
-    """Put MASKED into the confirmed depths of a view where it is masked, whoever has made them.
+    """Write MASKED into the confirmed depths of a view where the photo is masked, whichever method made them.
 
     Args:
         dense_dir: folder with undistorted photos and their maps.
@@ -199,7 +198,7 @@ def hide_masked(dense_dir: Path, view: View) -> None:
 
 
 def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
-    """Remove what is of no use once the geometric maps are there.
+    """Remove the photometric maps, which the geometric maps replace.
 
     Args:
         dense_dir: folder with undistorted photos and their maps.
@@ -211,7 +210,7 @@ def drop_estimates(dense_dir: Path, views: Sequence[View]) -> None:
 
 
 def write_fusion_views(dense_dir: Path, views: Sequence[View]) -> None:
-    """Write down for COLMAP's fusion which views have maps.
+    """Write the list of views that have maps, for COLMAP's fusion.
 
     Args:
         dense_dir: folder with undistorted photos and their maps.
@@ -222,7 +221,7 @@ def write_fusion_views(dense_dir: Path, views: Sequence[View]) -> None:
 
 
 def digest_maps(dense_dir: Path) -> str:
-    """Return hash of what the maps of a finished workspace are read from."""
+    """Return the hash of the files from which a finished workspace is read."""
     return digest_files(dense_dir, *MAPS)
 
 
@@ -246,7 +245,7 @@ def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind = "geometric"
 
 @contextmanager
 def _whole(target: Path) -> Iterator[Path]:
-    """Provide a path beside `target`, which it becomes when everything is written."""
+    """Provide a temporary path beside `target`, and rename it to `target` once everything is written."""
     target.parent.mkdir(parents=True, exist_ok=True)
     beside = target.with_name(f".{target.name}")
     yield beside

@@ -1,4 +1,4 @@
-"""SIFT features and raw matches of all photos: a process of its own fills the database."""
+"""SIFT features and raw matches of all photos, written into the database by a separate process."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,28 +11,28 @@ from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId
 
 USUAL: Mapping[str, SiftOption] = MappingProxyType({})
-"""SIFT as COLMAP has it."""
+"""No options: COLMAP's defaults."""
 
 
 def find_and_match(
     database: Path, photo_dir: Path, names: Sequence[str], options: MatchSettings, workers: int, progress: Progress,
     mask_dir: Path | None = None, sift: Mapping[str, SiftOption] = USUAL, pairs: Sequence[PairId] | None = None,
 ) -> dict[str, Json]:  # fmt: skip
-    """Find features of all photos and match every photo with every other; what is in the database stays.
+    """Find features of all photos and match every photo with every other; existing features and matches stay.
 
     Args:
-        database: knows the photos.
-        photo_dir: holds them.
-        names: of the photos.
-        options: of features and matches.
+        database: database file with the photos.
+        photo_dir: folder with the photos.
+        names: names of the photos.
+        options: settings of features and matches.
         workers: threads.
-        progress: shown progress.
+        progress: shows a bar.
         mask_dir: has a mask of every photo, `name.png`: no keypoints where it is black.
-        sift: options of COLMAP's SIFT that are not to be its defaults.
-        pairs: of photos that are matched, instead of all.
+        sift: options of COLMAP's SIFT that differ from its defaults.
+        pairs: pairs of photos to match, instead of all.
 
     Returns:
-        The options in force, for the manifest.
+        The effective options, for the manifest.
 
     Raises:
         BackendError: COLMAP failed.

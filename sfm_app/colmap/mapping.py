@@ -1,7 +1,7 @@
-"""COLMAP's two mappers on our relative poses: photo after photo from a seed that we built, or all photos at once.
+"""COLMAP's two mappers on our relative poses: photo by photo from our seed, or all photos at once.
 
-Both run on one thread each: COLMAP's sums over several threads come out differently every time, and on sets with
-repeated structure that decided whether a model was right.
+Each runs on one thread: COLMAP's sums over several threads differ from run to run, and on sets with repeated structure
+that decided whether a model was right.
 """
 
 import shutil
@@ -14,10 +14,10 @@ from sfm_app.colmap.processes.worker_process import GlobalMappingTask, MappingTa
 from sfm_app.colmap.types import Cancellation, all_cameras
 
 LOCAL_GAIN, GLOBAL_GAIN, GLOBAL_REFINEMENT = 1e-3, 1e-4, 1.3
-"""Share of its cost that a step of an adjustment must gain, or it was the last: of a few photos, of all. All are
-adjusted again when the model has grown by the third."""
+"""An adjustment ends at a step that lowers its cost by less than this share: local and global adjustments. Third, the
+factor by which the model grows between global adjustments."""
 KNOWN_LOCAL_GAIN, KNOWN_GLOBAL_GAIN, KNOWN_GLOBAL_REFINEMENT = 1e-2, 1e-3, 2.0
-"""The same where K is known: poses and points alone converge in a few steps, and the last adjustment is ours."""
+"""The same three where K is known: poses and points alone converge in a few steps, and the last adjustment is ours."""
 POLL_S = 0.1
 
 
@@ -25,14 +25,14 @@ def map_incrementally(
     database: Path, photo_dir: Path, start: pycolmap.Reconstruction, scratch: Path, seed: int,
     tick: Callable[[], None], token: pycolmap.CancellationToken, *, known: bool,
 ) -> pycolmap.Reconstruction | None:  # fmt: skip
-    """Register photo after photo, beginning with the ones in `start`; None when COLMAP gives nothing back.
+    """Register photo by photo, beginning with those in `start`; return None when COLMAP gives no model.
 
     Args:
         database: photos, keypoints, two-view geometries, K.
-        photo_dir: COLMAP wants to know it.
+        photo_dir: folder with the photos; COLMAP requires it.
         start: a reconstruction with at least two posed photos.
-        scratch: a folder of ours that is emptied first and gone afterwards.
-        seed: of COLMAP's own sampling.
+        scratch: a folder that is emptied first and removed afterwards.
+        seed: seed of COLMAP's own sampling.
         tick: called before every further photo.
         token: stops the mapping.
         known: whether the cameras are known too well for mapping to improve them.
@@ -54,11 +54,11 @@ def map_incrementally(
 
 
 def copy_database(database: Path, scratch: Path) -> None:
-    """Copy the database for a mapper in a process of its own: two mappers that open one file lock each other out.
+    """Copy the database for a mapper in a separate process: two mappers that open one file lock each other out.
 
     Args:
-        database: photos, keypoints, matches, two-view geometries, K; nobody may have it open.
-        scratch: a folder of ours that is emptied first.
+        database: photos, keypoints, matches, two-view geometries, K; must not be open anywhere.
+        scratch: a folder that is emptied first.
     """
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir(parents=True)
@@ -70,17 +70,17 @@ def map_globally(
 ) -> pycolmap.Reconstruction | None:
     """Find the poses of all these photos at once (GLOMAP: rotations, positions, adjustment).
 
-    COLMAP gives no way to stop this, so it runs in a process of its own.
+    COLMAP has no way to stop this, so it runs in a separate process.
 
     Args:
-        photo_dir: COLMAP wants to know it.
+        photo_dir: folder with the photos; COLMAP requires it.
         names: photos to place.
-        scratch: a folder of ours from `copy_database`; gone afterwards.
-        seed: of COLMAP's own sampling.
+        scratch: a folder from `copy_database`; removed afterwards.
+        seed: seed of COLMAP's own sampling.
         token: stops the mapping.
 
     Returns:
-        The model; None where it was stopped, or found nothing.
+        The model; None where the mapper was stopped or found none.
 
     Raises:
         BackendError: COLMAP failed.
@@ -99,7 +99,7 @@ def map_as_colmap_does(
 ) -> pycolmap.Reconstruction | None:
     """Verify the raw matches and map the photos by COLMAP's defaults, with the cameras of the database as first guess.
 
-    Nothing of ours but the matches and the guess enters; result and errors as `map_globally`.
+    Only the raw matches and the guess are ours. The result and the errors are those of `map_globally`.
 
     Args:
         photo_dir: folder with the photos.
@@ -124,13 +124,13 @@ def _map_apart(module: str, task: MappingTask, doing: str, token: Cancellation) 
 
 
 def incremental_options(seed: int, *, known: bool = False) -> pycolmap.IncrementalPipelineOptions:
-    """Return COLMAP's defaults, except that small photo sets count and only the model at hand is grown.
+    """Return COLMAP's defaults, except that two photos make a model and only the given model is extended.
 
-    Adjustments stop when they gain little, and cameras that are `known` stay as they are: the last adjustment is ours.
+    Adjustments stop when they gain little, and `known` cameras are held fixed: the last adjustment is ours.
 
     Args:
-        seed: of COLMAP's own sampling.
-        known: whether cameras stay as they are.
+        seed: seed of COLMAP's own sampling.
+        known: whether cameras are held fixed.
     """
     options = pycolmap.IncrementalPipelineOptions()
     options.min_model_size = 2
@@ -148,13 +148,13 @@ def incremental_options(seed: int, *, known: bool = False) -> pycolmap.Increment
 
 
 def _lens_to_be_found(camera: pycolmap.Camera) -> bool:
-    """Return whether mapping is to seek the lens: a known one stays until the last adjustment, which frees it.
+    """Return whether mapping has to estimate the lens: a known one is held fixed until the last adjustment.
 
-    On the first few photos even one distortion term moves more than the noise does, and four run wild.
+    On the first few photos even one distortion term varies more than the noise explains, and four diverge.
     """
     return bool(camera.model.name == SQUARE_PIXELS and camera.params[camera.extra_params_idxs()[0]] == 0.0)
 
 
 def largest(models: Mapping[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
-    """Return the model with most photos; None of none."""
+    """Return the model with most photos; None if there is no model."""
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)

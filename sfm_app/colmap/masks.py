@@ -1,4 +1,4 @@
-"""Masks in COLMAP's dense workspace: without distortion and at the size of the photos there."""
+"""Masks in COLMAP's dense workspace: undistorted, at the size of the photos there."""
 
 from collections.abc import Callable
 from math import ceil
@@ -15,7 +15,8 @@ from sfm_app.stereo import View
 
 MASKS = "masks"
 REACH_PX = 2
-"""Pixels around what is masked that are not used either: colors are read between four pixels, half a pixel aside."""
+"""Width of the border around masked pixels that is not used either: colors are interpolated between four pixels, at
+most half a pixel aside."""
 
 BoolImage = NDArray[np.bool_]
 """(H, W)."""
@@ -25,8 +26,8 @@ def mask_undistorter(model_dir: Path, mask_dir: Path, dense_dir: Path) -> Callab
     """Return a function that writes the mask of an undistorted photo.
 
     Args:
-        model_dir: model with the photos' lenses.
-        mask_dir: masks of the photos as they are laid out.
+        model_dir: model with the cameras of the photos.
+        mask_dir: masks of the original photos.
         dense_dir: workspace with the undistorted photos.
     """
     with backend("reading the model"):
@@ -41,7 +42,7 @@ def mask_undistorter(model_dir: Path, mask_dir: Path, dense_dir: Path) -> Callab
 
 
 def used_pixels(dense_dir: Path, view: View) -> BoolImage | None:
-    """Return (H, W) which pixels of an undistorted photo may be used; None where no masks are given.
+    """Return (H, W) which pixels of an undistorted photo may be used; None if it has no mask.
 
     Args:
         dense_dir: folder with undistorted photos and their maps.
@@ -52,7 +53,7 @@ def used_pixels(dense_dir: Path, view: View) -> BoolImage | None:
 
 
 def _undistorted(used: BoolImage, camera: pycolmap.Camera, view: View) -> BoolImage:
-    """Return a pixel is used where all is that it shows in part."""
+    """Return (H, W) the mask of an undistorted photo: a pixel is used if all original pixels under it are."""
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(view.K).T
     with backend(f"undistorting the mask of {view.name}"):
@@ -65,6 +66,6 @@ def _undistorted(used: BoolImage, camera: pycolmap.Camera, view: View) -> BoolIm
 
 
 def _shrunk(used: BoolImage, reach: int) -> BoolImage:
-    """Return the mask without pixels that are so near to an unused one."""
+    """Return the mask without pixels that have an unused one within `reach` pixels."""
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray(cv2.erode(used.view(np.uint8), square)) > 0

@@ -1,4 +1,4 @@
-"""COLMAP's sparse model: built from our two-view seed, moved to another frame, and read for the summary."""
+"""COLMAP's sparse model: build it from our two-view seed, divide, merge and transform it, and read it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,15 +17,15 @@ from sfm_app.numerical import finite_only
 from sfm_app.types import CameraModel, Frustum, Model, PairId, Scene, Surface
 
 CONFIRMED = 100
-"""From so many points with three photos on, their box says how far the scene goes."""
+"""Points seen by three or more photos from which on their bounding box limits the scene."""
 
 
 ENDLESS = 1e100
-"""Coordinates beyond this are no place, and squares of them no numbers."""
+"""Largest coordinate of a finite point: squares of much larger ones overflow."""
 
 
 def somewhere(xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return whether points (..., 3) lie anywhere: not at infinity, nor where distances are no numbers."""
+    """Return (...) which points (..., 3) are finite, and near enough that their distances do not overflow."""
     return np.asarray((np.abs(xyz) < ENDLESS).all(axis=-1))
 
 
@@ -38,7 +38,7 @@ def model_from_seed(
         database: holds photos, keypoints and two-view geometries.
         pair: ids of the two photos.
         matches: (N, 2) keypoint indices, one row per point of the seed.
-        seed: pose and points; only its usable points enter.
+        seed: pose and points; only its usable points are added.
     """
     with opened(database) as db:
         cache = pycolmap.DatabaseCache.create(db, pycolmap.DatabaseCacheOptions())
@@ -59,12 +59,12 @@ def model_from_seed(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedView:
-    """A photo with a place, and what its keypoints see."""
+    """A posed photo and the rays of its keypoints."""
 
     R: NDArray[np.float64]
-    """(3, 3) rotation from the world."""
+    """(3, 3) rotation, camera from world."""
     t: NDArray[np.float64]
-    """(3,)"""
+    """(3,) translation, camera from world."""
     rays: NDArray[np.float64]
     """(N, 2) keypoints on the plane z = 1."""
     focals: NDArray[np.float64]
@@ -76,7 +76,7 @@ def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray
 
     Args:
         model: COLMAP's reconstruction.
-        keypoints: (N, 2) pixels by photo.
+        keypoints: (N, 2) pixels, by photo id.
     """
     found = {}
     for image in posed_images(model):
@@ -88,12 +88,12 @@ def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray
 
 
 def photos_of(model: pycolmap.Reconstruction) -> list[int]:
-    """Return ids of the photos of a model that have a pose, in order."""
+    """Return the ids of the posed photos of a model, in order."""
     return [image.image_id for image in posed_images(model)]
 
 
 def cameras_of(model: pycolmap.Reconstruction) -> dict[int, tuple[NDArray[np.float64], float]]:
-    """Return K (3, 3) and the first radial term of the camera, by photo with a pose."""
+    """Return K (3, 3) and the first radial term of the camera of every posed photo, by photo id."""
     found = {}
     for image in posed_images(model):
         camera = model.cameras[image.camera_id]
@@ -114,11 +114,11 @@ def color(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None
 
 
 def part_of(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.Reconstruction:
-    """Return a copy of a model with some photos only, and the points that at least two of them see.
+    """Return a copy of a model with only the given photos, and the points that at least two of them see.
 
     Args:
-        model: stays as it is.
-        photos: ids of those to keep.
+        model: not changed.
+        photos: ids of the photos to keep.
     """
     part, members = pycolmap.Reconstruction(model), set(photos)
     for image in posed_images(model):
@@ -131,13 +131,13 @@ def part_of(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.R
 def both(
     database: Path, first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, similarity: Similarity
 ) -> pycolmap.Reconstruction:
-    """Return a model of the photos and points of two that share no photo.
+    """Return one model with the photos and points of two models that share no photo.
 
     Args:
         database: holds photos, keypoints and two-view geometries.
-        first: stays where it is, and its cameras are taken where both have one.
-        second: likewise.
-        similarity: moves the second.
+        first: gives the frame, and the parameters of cameras that are in both models; not changed.
+        second: not changed.
+        similarity: from the frame of the second model into that of the first.
     """
     other = pycolmap.Reconstruction(second)
     move(other, similarity)
@@ -162,7 +162,7 @@ def both(
 
 
 def places_of_keypoints(model: pycolmap.Reconstruction) -> dict[tuple[int, int], tuple[int, NDArray[np.float64]]]:
-    """Return number and place (3,) of the point that a keypoint is one of, by photo and row of the keypoint."""
+    """Return the id and position (3,) of the 3D point of each keypoint in a track, by photo and keypoint index."""
     return {
         (element.image_id, element.point2D_idx): (key, np.asarray(point.xyz, np.float64))
         for key, point in all_points(model)
@@ -171,12 +171,12 @@ def places_of_keypoints(model: pycolmap.Reconstruction) -> dict[tuple[int, int],
 
 
 def posed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    """Return the photos of a model that have a pose, in order of ids."""
+    """Return the posed photos of a model, in order of ids."""
     return sorted((image for image in all_images(model) if image.has_pose), key=lambda image: image.image_id)
 
 
 def posed_photos(model: pycolmap.Reconstruction) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.float64]]:
-    """Return (3, 4) cam_from_world by id of the photos that have a pose, in order of ids, and the points (P, 3)."""
+    """Return (3, 4) cam_from_world of the posed photos by id, in order of ids, and the points (P, 3)."""
     poses = {image.image_id: np.asarray(image.cam_from_world().matrix(), np.float64) for image in posed_images(model)}
     points = np.array([model.points3D[key].xyz for key in sorted(model.points3D)]).reshape(-1, 3)
     return poses, points
@@ -184,22 +184,22 @@ def posed_photos(model: pycolmap.Reconstruction) -> tuple[dict[int, NDArray[np.f
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenPoints:
-    """Points of a model, and which photos see them."""
+    """Points of a model, and the photos that see them."""
 
     points: NDArray[np.float64]
     """(P, 3)"""
     colors: NDArray[np.uint8]
     """(P, 3)"""
     seen: tuple[NDArray[np.int64], ...]
-    """Per photo with a pose, in order of ids, the points that it sees."""
+    """For each posed photo, in order of ids, the rows of the points that it sees."""
 
 
 def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
-    """Return the points of a model, or some of them, drawn with a fixed seed.
+    """Return the finite points of a model, or a sample of them drawn with a fixed seed.
 
     Args:
         model: COLMAP's reconstruction, colored.
-        most: number of points to keep.
+        most: largest number of points.
     """
     keys = [key for key in sorted(model.points3D) if somewhere(model.points3D[key].xyz)]
     chosen = np.sort(np.random.default_rng(0).permutation(len(keys))[:most])
@@ -216,10 +216,10 @@ def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
 
 
 def sparse_model(model_dir: Path) -> Model:
-    """Return the colored points of a model on disk, and its photos where they were taken, in order of ids.
+    """Return the colored points of a model on disk, and its posed photos as frusta, in order of ids.
 
-    Points that two photos see have no third one to confirm them, and the wrong ones among them lie far out, where they
-    make the scene a dot in its viewer: outside the box of the confirmed points they are left out.
+    No third photo confirms points that only two photos see. Wrong ones among them lie far away and would shrink the
+    scene to a dot in a viewer, so points outside the bounding box of the confirmed points are left out.
     """
     with backend("reading the sparse model"):
         model = pycolmap.Reconstruction(model_dir)
@@ -241,11 +241,11 @@ def _frustum(image: pycolmap.Image, camera: pycolmap.Camera) -> Frustum:
 
 
 def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return directions (N, 3) in the world, of any length, that pixels of a photo see.
+    """Return the viewing directions (N, 3) of pixels of a photo in the world, of any length.
 
     Args:
         model: COLMAP's reconstruction.
-        image_id: a photo with a pose.
+        image_id: id of a posed photo.
         x: (N, 2) pixels.
     """
     image = model.images[image_id]
@@ -255,28 +255,28 @@ def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.fl
 
 
 def focal_px(model: pycolmap.Reconstruction, image_id: int) -> float:
-    """Return focal length of the camera that took a photo, in pixels.
+    """Return the focal length of the camera of a photo, in pixels.
 
     Args:
         model: COLMAP's reconstruction.
-        image_id: the photo.
+        image_id: id of the photo.
     """
     return float(model.cameras[model.images[image_id].camera_id].mean_focal_length())
 
 
 def move(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
-    """Put the model into another frame.
+    """Move a model into another frame.
 
     Args:
         model: changed in place.
-        similarity: from its frame into the new one.
+        similarity: from the frame of the model into the new one.
     """
     rotation = pycolmap.Rotation3d(similarity.R)
     model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.t))
 
 
 class Refined(TypedDict, total=False):
-    """What is known about a refined camera besides COLMAP's model; as in `CameraModel`."""
+    """Facts about a refined camera that COLMAP's model does not hold; as in `CameraModel`."""
 
     deviations: Mapping[str, float | None]
     determined: Sequence[str]
@@ -285,12 +285,12 @@ class Refined(TypedDict, total=False):
 def read_scene(
     model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str], refined: Mapping[str, Refined]
 ) -> Scene:
-    """Return what the rest of the program needs to know about a model on disk.
+    """Read a model on disk as the scene that later stages use.
 
     Args:
         model_dir: COLMAP's model.
-        names, unregistered: by photo, its camera, and why it has no pose.
-        refined: by camera; others are left without.
+        names, unregistered: the name of its camera, by photo; the reason why it has no pose, by photo.
+        refined: deviations and determined parameters, by camera; may lack cameras.
     """
     model = pycolmap.Reconstruction(model_dir)
     posed = posed_images(model)

@@ -1,4 +1,4 @@
-"""COLMAP's fusion of depth maps, Poisson's surface through the fused points, and fewer triangles for it."""
+"""COLMAP's fusion of depth maps, Poisson surface reconstruction from the fused points, and mesh simplification."""
 
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from sfm_app.types import Surface
 
 FUSED = "fused.ply"
 FULL_DEPTH = 5
-"""Poisson's least depth: with less, what little there is becomes coarser still."""
+"""Smallest depth of Poisson's octree: with less, small surfaces become too coarse."""
 
 
 def fuse(
@@ -22,14 +22,14 @@ def fuse(
     target: Path,
     cache_gb: float = 2.0,
 ) -> None:
-    """Fuse the geometric maps of these views into the PLY file `target`.
+    """Fuse the geometric maps of a dense workspace into the PLY file `target`.
 
     Args:
-        dense_dir: dense workspace; `dense.write_fusion_views` has said which of its views have maps.
-        min_views: photos that have to see a point.
+        dense_dir: dense workspace; `dense.write_fusion_views` has listed the views that have maps.
+        min_views: smallest number of photos that see a point.
         box: (2, 3) lowest and highest coordinates that are kept.
-        target: in any folder.
-        cache_gb: memory for the maps of photos; with less, they are read more often.
+        target: PLY file, in any folder.
+        cache_gb: memory for depth and normal maps; with less, they are read more often.
     """
     task: FuseTask = {
         "do": "fuse",
@@ -40,7 +40,7 @@ def fuse(
         "cache_gb": cache_gb,
     }
     finished("sfm_app.colmap.processes.surface_process", task, "fusing depth maps")
-    target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; nobody asks
+    target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; not used
 
 
 def read_fused(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -55,8 +55,9 @@ def poisson(folder: Path, depth: int) -> Surface:
     """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points, with their colors.
 
     Args:
-        folder: of the fused points.
-        depth: of the octree, FULL_DEPTH where less; the finest cell is the largest extent of the points over 2^depth.
+        folder: folder with the fused points.
+        depth: depth of the octree, raised to the smallest one; the finest cell is the largest extent of the points
+            over 2^depth.
     """
     path = folder / "poisson.ply"
     task: PoissonTask = {
@@ -74,13 +75,13 @@ def poisson(folder: Path, depth: int) -> Surface:
 def simplify(surface: Surface, share: float, max_error: float, scratch: Path) -> Surface:
     """Collapse edges, cheapest first by their quadric error (Garland and Heckbert, SIGGRAPH 1997).
 
-    Each vertex has the mean color of those that it stands for.
+    Each vertex has the mean color of the vertices that it replaces.
 
     Args:
         surface: a manifold; its borders are kept.
-        share: of the triangles at which it stops, in (0, 1].
-        max_error: largest root of the summed squared distances of a vertex from the planes that it stands for; 0: any.
-        scratch: folder for two files that go again.
+        share: share of the triangles at which simplification stops, in (0, 1].
+        max_error: largest root of the summed squared distances of a vertex from the planes it replaces; 0: unlimited.
+        scratch: folder for two temporary files.
     """
     given, found = scratch / "fine.ply", scratch / "coarse.ply"
     trimesh.Trimesh(surface.vertices, surface.faces, process=False).export(given)
@@ -99,9 +100,9 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
 
 
 def _mean_colors(surface: Surface, vertices: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Return (V, 3) mean color of the old vertices to which each new one (V, 3) is nearest.
+    """Return (V, 3) mean colors of the old vertices whose nearest new vertex (V, 3) is each one.
 
-    Pycolmap 4.2 reads no colors.
+    They are computed here because pycolmap 4.2 reads no colors.
     """
     from scipy.spatial import cKDTree
 

@@ -1,4 +1,4 @@
-"""COLMAP's objects by name, for code that passes them on, and the types that pycolmap's stubs leave out."""
+"""Names for COLMAP's types, for code that passes them on, and the types that pycolmap's stubs leave out."""
 
 from collections.abc import Iterable
 from typing import Protocol
@@ -10,14 +10,14 @@ CancellationToken = pycolmap.CancellationToken
 
 
 class Cancellation(Protocol):
-    """Tells a mapper to stop: COLMAP's token, or one of ours."""
+    """Token that tells a mapper to stop: COLMAP's, or one of ours."""
 
     @property
     def is_cancelled(self) -> bool:
         """Whether to stop."""
 
 
-# In the stubs of pycolmap 4.2 the views of COLMAP's maps have no types of what they hold.
+# The stubs of pycolmap 4.2 do not type the elements of COLMAP's maps.
 
 
 def all_cameras(model: pycolmap.Reconstruction) -> Iterable[pycolmap.Camera]:

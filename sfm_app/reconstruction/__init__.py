@@ -1,9 +1,9 @@
-"""From relative poses to a COLMAP model: what happens between knowing K and the last bundle adjustment.
+"""From relative poses to a COLMAP model: all steps between calibration and the last bundle adjustment.
 
-`mapping_passes` is the table of contents: map every group of photos, learn from the result, map again where that helps.
-`initial_pairs` ranks pairs to start from, `mapping_runs` runs COLMAP's two mappers, `support` judges what they made by
-the matches it explains, `model_split` cuts what hangs together by contradictions only, `second_look` seeks finer
-features (`added_matches`) where photos found no place, `unregistered` says why they have none.
+`mapping_passes` is the table of contents: map every group of photos, learn cameras from the model, map again where that
+helps. `initial_pairs` ranks pairs to start from, `mapping_runs` runs COLMAP's two mappers, and `support` scores their
+models by the matches they explain. `model_split` cuts joins that more matches contradict than support, `second_look`
+adds finer features (`added_matches`) for unregistered photos, and `unregistered` says why photos have no pose.
 """
 
 from sfm_app.reconstruction.mapping_passes import Outcome, reconstruct

@@ -1,4 +1,4 @@
-"""Matches of two kinds of features of the same photos, put together."""
+"""Merge matches of two kinds of features of the same photos."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 Rows = NDArray[np.uint32]
 
 SAME_PX = 0.5
-"""Keypoints nearer than this are one, so that tracks go on from one kind to the other; what SIFT's own noise is."""
+"""Keypoints nearer than this count as one, so that tracks continue across kinds; about the noise of SIFT."""
 
 
 def with_added(
@@ -21,16 +21,16 @@ def with_added(
 ) -> tuple[MatchGraph, tuple[PairId, ...]]:
     """Add keypoints and matches of another kind.
 
-    What is there keeps its place and number. Of the added matches only those enter whose keypoints have no match in the
-    other photo yet.
+    Existing keypoints keep their positions and indices. An added match enters only if neither of its keypoints has a
+    match in the other photo yet.
 
     Args:
-        matches: what is there.
-        keypoints: (N, 2) pixels of the added ones, by photo.
-        added: (M, 2) rows of those.
+        matches: existing keypoints and matches.
+        keypoints: (N, 2) pixels of the added keypoints, by photo.
+        added: (M, 2) indices of added keypoints, by pair.
 
     Returns:
-        All together, and the pairs that have more than before.
+        The merged match graph, and the pairs that have gained matches.
     """
     every, numbers = dict(matches.keypoints), {}
     for photo, found in keypoints.items():
@@ -47,7 +47,7 @@ def with_added(
 
 
 def _merged(known: FloatArray, found: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Return all keypoints of a photo, and the number of each one that was found."""
+    """Return all keypoints of a photo, and the index of each added one among them."""
     numbers = len(known) + np.arange(len(found))
     if len(known) and len(found):
         away, nearest = cKDTree(known).query(found)
@@ -56,6 +56,6 @@ def _merged(known: FloatArray, found: FloatArray) -> tuple[FloatArray, NDArray[n
 
 
 def _once(rows: Rows) -> Rows:
-    """Return rows whose keypoints do not occur in an earlier row, in both photos."""
+    """Return the rows whose keypoints, in either photo, occur in no earlier row."""
     first = [np.isin(np.arange(len(rows)), np.unique(rows[:, side], return_index=True)[1]) for side in (0, 1)]
     return rows[first[0] & first[1]]

@@ -1,4 +1,4 @@
-"""How the finished scene is put before the viewer: upright, centered, and in meters where GPS says how large it is."""
+"""Orientation of the finished scene for viewers: upright, centered, and in meters where GPS gives the scale."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -30,31 +30,31 @@ logger = logging.getLogger("sfm_app")
 FloatArray = NDArray[np.float64]
 
 LOOKED_AT = 10
-"""Photos that are looked at, spread over the set."""
+"""Number of photos per model that are searched for cues, spread over the set."""
 
 SCENERY_POINTS = 8000
-"""Points that say which way up they are; more say no more."""
+"""Number of points used to find the up direction; more of them do not improve it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Look:
-    """What one photo tells about how it was held."""
+    """Cues to the up direction from one photo."""
 
     lines: FloatArray
-    """(N, 4) line segments in its pixels."""
+    """(N, 4) line segments in pixels of the photo."""
     picture: NDArray[np.uint8] | None
-    """The photo itself, gray and small; None where it could not be read."""
+    """The photo itself, gray and small; None if it could not be read."""
 
 
 PhotoLooks = Mapping[int, "Future[Look]"]
-"""By photo, when it has been looked at."""
+"""Futures of the cues, by photo."""
 
 
 def look_at_photos(models: Sequence[Reconstruction], matches: MatchGraph, run: RunContext) -> PhotoLooks:
-    """Begin to look at some photos of every model; the caller goes on meanwhile.
+    """Start to extract cues from some photos of every model, in the background.
 
     Args:
-        models: of the scene; no two hold the same photo.
+        models: models of the scene; no two hold the same photo.
         matches: knows the names and turns of photos.
         run: has the photos and the workers.
     """
@@ -70,7 +70,7 @@ def look_at_photos(models: Sequence[Reconstruction], matches: MatchGraph, run: R
 def orient_or_leave(
     model: Reconstruction, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | None = None
 ) -> dict[str, Json]:
-    """Put the model upright; where the numbers fail, leave it as it is, and say why.
+    """Turn the model upright; where that fails numerically, leave it unchanged and return the reason.
 
     Args:
         model, matches, looks, turn_deg: as in `orient`.
@@ -90,14 +90,14 @@ def orient(
     Args:
         model: COLMAP's model, colored; changed in place.
         matches: knows the photos' names and GPS positions.
-        looks: at photos.
-        turn_deg: by how much the photos have to be turned clockwise to stand upright; None where nobody knows.
+        looks: cues of photos.
+        turn_deg: angle by which the photos have to be turned clockwise to stand upright; None if unknown.
 
     Returns:
-        How it was done, for the manifest.
+        The orientation and its evidence, for the manifest.
 
     Raises:
-        NumericalError: it has no points, or none of them lies anywhere.
+        NumericalError: the model has no finite points.
     """
     with backend("reading the model"):
         poses, points = posed_photos(model)
@@ -120,7 +120,7 @@ def orient(
     towards, front = facing(upright, R, points)
     viewer = viewer_frame(upright.up, towards, points, meters)
     if not is_sound(viewer):
-        raise NumericalError("the frame of the viewer holds what is no number")
+        raise NumericalError("the frame of the viewer is not finite")
     with backend("turning the model upright"):
         move(model, viewer)
     entry = _how_it_stands(upright, front) | _where_it_stands(viewer, gps)
@@ -142,15 +142,15 @@ def _georeference(
 
 
 def is_sound(similarity: Similarity) -> bool:
-    """Return whether a similarity takes numbers to numbers, and back."""
+    """Return whether a similarity is finite and invertible."""
     return bool(np.isfinite(similarity.R).all() and np.isfinite(similarity.t).all() and 0.0 < similarity.scale < np.inf)
 
 
 def turned(R: FloatArray, turn_deg: int) -> FloatArray:
-    """Return (3, 3) cam_from_world of a photo once it is turned clockwise.
+    """Return the rotation (3, 3) cam_from_world of a photo that is turned clockwise.
 
     Args:
-        R: (3, 3) rotation cam_from_world before.
+        R: (3, 3) rotation cam_from_world of the photo before.
         turn_deg: multiple of 90 degrees.
     """
     cosine, sine = round(np.cos(np.radians(turn_deg))), round(np.sin(np.radians(turn_deg)))
@@ -158,13 +158,13 @@ def turned(R: FloatArray, turn_deg: int) -> FloatArray:
 
 
 def _lines_of(model: Reconstruction, looks: Mapping[int, Look]) -> Segments:
-    """Return line segments, in the world, of the photos of a model."""
-    with backend("looking along lines in the photos"):
+    """Return the line segments of the photos of a model, in the world frame."""
+    with backend("computing viewing rays of line segments"):
         return joined([_in_world(model, photo, look.lines) for photo, look in looks.items()])
 
 
 def _scenery_of(model: Reconstruction, looks: Mapping[int, Look]) -> Scenery:
-    """Return what a model and its photos show."""
+    """Return points of a model and its small photos, as evidence for the up direction."""
     with backend("reading the points"):
         shown = seen_points(model, SCENERY_POINTS)
     pictures = tuple(looks[photo].picture if photo in looks else None for photo in photos_of(model))
@@ -172,11 +172,11 @@ def _scenery_of(model: Reconstruction, looks: Mapping[int, Look]) -> Scenery:
 
 
 def look_at(path: Path, turn_deg: int = 0) -> Look:
-    """Return lines of a photo, and its brightness once it is upright; nothing where OpenCV cannot read it.
+    """Return the line segments of a photo, and a small upright copy of it; empty if OpenCV cannot read the photo.
 
     Args:
         path: photo file.
-        turn_deg: by how much it has to be turned clockwise to stand upright, a multiple of 90.
+        turn_deg: angle by which it has to be turned clockwise to stand upright, a multiple of 90.
     """
     try:
         data = np.fromfile(path, np.uint8)  # OpenCV does not open names beyond ASCII on every system
@@ -195,7 +195,7 @@ def _in_world(model: Reconstruction, image_id: int, lines: FloatArray) -> Segmen
 
 
 def _how_it_stands(upright: Upright, front: str) -> dict[str, Json]:
-    """Return up and front, for the manifest."""
+    """Return the up and front directions and their evidence, for the manifest."""
     standing = upright.standing
     return {
         "up": upright.found_by,
@@ -211,7 +211,7 @@ def _how_it_stands(upright: Upright, front: str) -> dict[str, Json]:
 
 
 def _where_it_stands(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Json]:
-    """Return unit and place of the model that `viewer` has moved, for the manifest."""
+    """Return the unit and georeference of the model that `viewer` has moved, for the manifest."""
     if isinstance(gps, NoGeoreference):
         return {"unit": "about the size of the scene", "gps": f"not used: {gps.reason}"}
     enu_from_model = gps.enu_from_world.after(viewer.inverse())

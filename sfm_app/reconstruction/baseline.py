@@ -1,8 +1,8 @@
-"""Rival hypotheses: what else is tried where the evidence for a model is thin, so that the better one counts.
+"""Rival hypotheses: other models that are tried where the evidence for ours is weak.
 
-A camera that the pairs do not determine, photos left out, matches that contradict: each says that another beginning may
-explain more. The rival is COLMAP's own pipeline, from the usual guess of the camera and its own verification of the
-matches. It knows nothing of our fundamental matrices, cameras and poses, and so shares none of their mistakes.
+Cameras that the pairs do not determine, unregistered photos and contradicting matches are signs that another start may
+explain more. The rival is COLMAP's own pipeline, with the usual guess of the camera and its own verification of the
+matches. It uses none of our fundamental matrices, cameras and poses, and so shares none of their errors.
 """
 
 import logging
@@ -25,23 +25,23 @@ logger = logging.getLogger("sfm_app")
 FOLDER = "rival"
 MAPPER, HOW = "colmap", "as COLMAP does by itself"
 LEFT_OUT, MANY = 0.25, 60
-"""Share of the photos without a place from which on other focals are tried, and photos from which on they are not."""
+"""Share of unregistered photos above which other focals are tried, and number of photos above which they are not."""
 CONTRADICTED = 0.05
-"""Share of the inliers of fundamental matrices that contradict a model, from which on another may be better. Right
-models of the Strecha sets, cropped and squeezed, have 0.1 to 3 %."""
+"""Share of the inliers of fundamental matrices that contradict a model, above which a rival is tried. Right models of
+the Strecha sets, cropped and squeezed, have 0.1 to 3 %."""
 
 
 def why_thin(model: Attempt | None, intrinsics: Intrinsics, matches: MatchGraph, views: ViewGraph) -> str:
-    """Say why another hypothesis is worth trying, in a few words; empty where the evidence is good.
+    """Return why a rival is worth trying, in a few words; empty where the evidence is good.
 
     Args:
-        model: the main one so far.
+        model: the main model so far.
         intrinsics: cameras from pairs.
         matches: all photos.
         views: fundamental matrices.
     """
     if model is None:
-        return "nothing was placed"
+        return "no photo was placed"
     refused = {intrinsics.name_of(image) for image in matches.images.values()} - {
         name for name, camera in intrinsics.cameras.items() if camera.estimated
     }
@@ -61,14 +61,14 @@ def photos_in(fits: Mapping[PairId, EpipolarFit]) -> set[int]:
 
 
 def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Attempt | NoModel:
-    """Map all photos as COLMAP does by itself, and judge the model like any other; none where it fails.
+    """Map all photos with COLMAP's own pipeline, and score the model like any other.
 
-    Pairs that are not among the matches, such as those of look-alikes, are kept from it, too.
+    Pairs that are not among the matches, such as those of look-alikes, are removed from its database, too.
 
     Args:
         matches: keypoints and raw matches.
         views: fundamental matrices.
-        intrinsics: cameras from pairs; only those of EXIF are used.
+        intrinsics: cameras from pairs; only those with a focal from EXIF are used.
         run: the run.
     """
     scratch = run.workspace.root / FOLDER
@@ -83,19 +83,19 @@ def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, 
                 lambda token: found.append(map_as_colmap_does(run.workspace.photos, scratch, run.seed, token)),
                 lambda: None,
             )
-    except BackendError as err:  # what we have is not lost with it
+    except BackendError as err:  # our own model is not lost with it
         logger.info("the rival failed: %s", err)
         return NoModel(MAPPER, f"{HOW}: failed, {err}")
     return judged(matches, views, (MAPPER, HOW), found[0], run)
 
 
 def leaves_many_out(model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph) -> bool:
-    """Say whether a guess of the focal may be why photos that match others have no place.
+    """Return whether a wrong guess of the focal may be why photos that match others are unregistered.
 
-    Not asked where some camera is known, or where the photos are many: then a pass costs more than it promises.
+    This is not so where any camera is known. Where there are many photos, a pass costs more than it promises.
 
     Args:
-        model: the main one; None where there is none.
+        model: the main model, if there is one.
         intrinsics: cameras from pairs.
         views: fundamental matrices.
     """
@@ -106,11 +106,11 @@ def leaves_many_out(model: Attempt | None, intrinsics: Intrinsics, views: ViewGr
 
 
 def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> Intrinsics:
-    """Replace every camera by a guess of the focal; what EXIF claims stays.
+    """Replace every camera by a guess, except those with a focal from EXIF.
 
     Args:
         intrinsics: cameras from pairs.
-        sides: the guess, in longer sides of the photo.
+        sides: guess of the focal, in longer sides of the photo.
     """
     cameras = {
         name: camera if camera.method == "exif" else _guess(camera, sides)

@@ -1,7 +1,7 @@
-"""One camera for each photo, as a rival hypothesis: a zoom, or several devices, that no pair of photos gave away.
+"""One camera for each photo, as a rival hypothesis: a zoom, or several devices, that the pairs do not reveal.
 
-Photos of one size are taken for one camera until their pairs contradict it. Pairs of a camera that moves forward or
-round one point never do. A model does: with one focal for all photos, matches that agree pair by pair do not lie right.
+Photos of one size count as one camera until their pairs contradict that. Pairs of a camera that moves forward or round
+one point never do. A model does: with one focal for all photos, it contradicts matches that are right pair by pair.
 """
 
 from collections.abc import Collection, Iterable, Mapping
@@ -17,22 +17,24 @@ from sfm_app.settings import Settings
 from sfm_app.types import Calibration, Intrinsics, MatchedImage, MatchGraph, ViewGraph
 
 LEAST, MOST = 5, 60
-"""Photos: of fewer, cameras of their own fit almost anything; of more, it costs more than it promises."""
+"""Range of the number of photos: with fewer, a camera per photo fits almost anything; with more, a pass costs more than
+it promises."""
 FEWER = 0.5
-"""Share of the contradictions that cameras of their own may leave, or they are not what was wrong. Chosen on
-folders 0 to 180 of `python -m benchmarks.trouble`."""
+"""Largest share of the contradictions that may remain with a camera per photo; else shared cameras were not the cause.
+Chosen on folders 0 to 180 of `python -m benchmarks.trouble`."""
 AS_GOOD = 0.002
-"""So much larger a share may contradict two cameras for all photos; right ones leave up to so much, see above."""
+"""Largest increase of the contradicted share with two cameras, compared to a camera per photo: right cameras leave up
+to this share."""
 
 
 def may_have_one_each(model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph, settings: Settings) -> bool:
-    """Say whether photos of one size may have a camera each: matches contradict the model, or many have no place in it.
+    """Return whether photos of one size may have a camera each: matches contradict the model, or it lacks many photos.
 
     Args:
-        model: the main one so far.
+        model: the main model so far.
         intrinsics: cameras from pairs.
         views: fundamental matrices.
-        settings: who says which photos are of one camera is believed.
+        settings: a user's choice of which photos share a camera is kept.
     """
     if model is None or settings.photos.cameras != "auto":
         return False
@@ -42,13 +44,13 @@ def may_have_one_each(model: Attempt | None, intrinsics: Intrinsics, views: View
 
 
 def with_one_each(model: Attempt, found: Intrinsics, matches: MatchGraph) -> Intrinsics | None:
-    """Give every photo of a camera that pairs do not determine one of its own; None where there is none to divide.
+    """Give each photo its own camera where pairs do not determine the shared one; return None if none is divided.
 
-    Its focal is as yet a guess: what mapping found for all of them together.
+    The focal of a new camera is the one that mapping found for the shared camera, as a guess.
 
     Args:
         model: mapped with shared cameras.
-        found: those cameras.
+        found: the shared cameras.
         matches: all photos.
     """
     focals = {photo: float(K[0, 0] * K[1, 1]) ** 0.5 for photo, (K, _) in cameras_of(model.model).items()}
@@ -70,13 +72,13 @@ def with_one_each(model: Attempt, found: Intrinsics, matches: MatchGraph) -> Int
 
 
 def with_two(model: Attempt, each: Intrinsics, matches: MatchGraph) -> Intrinsics | None:
-    """Give photos of one size that have a camera each two cameras between them; None where there is nothing to divide.
+    """Replace the cameras of photos of one size by two; return None if no size can be divided.
 
-    What mapping found of their focals is divided where it leaves the widest gap, a size at a time.
+    For each size, the focals that mapping found are divided at their widest gap.
 
     Args:
         model: mapped with a camera for each photo.
-        each: those cameras.
+        each: the cameras of the photos.
         matches: all photos.
     """
     of_size: dict[tuple[int, int], dict[str, float]] = {}
@@ -98,10 +100,10 @@ def with_two(model: Attempt, each: Intrinsics, matches: MatchGraph) -> Intrinsic
 
 
 def explains_as_much(two: Attempt | None, own: Attempt) -> bool:
-    """Say whether two cameras do as well as one for each photo.
+    """Return whether two cameras explain the matches as well as one for each photo.
 
     Args:
-        two: model with two cameras; None where there is none.
+        two: model with two cameras, if there is one.
         own: model with a camera for each photo.
     """
     if two is None or two.photos < own.photos or two.support < (1.0 - EQUAL) * own.support:
@@ -110,10 +112,10 @@ def explains_as_much(two: Attempt | None, own: Attempt) -> bool:
 
 
 def explains_more(own: Attempt | None, shared: Attempt) -> bool:
-    """Say whether cameras of their own explain more matches, and place more photos or take away what contradicts.
+    """Return whether a camera per photo explains more matches, and registers more photos or removes contradictions.
 
     Args:
-        own: model with a camera for each photo; None where there is none.
+        own: model with a camera for each photo, if there is one.
         shared: model with one camera for all.
     """
     if own is None or own.photos < shared.photos or own.support <= shared.support:
@@ -122,13 +124,13 @@ def explains_more(own: Attempt | None, shared: Attempt) -> bool:
 
 
 def _share_against(model: Attempt) -> float:
-    """Return share of the inliers of fundamental matrices that contradict a model."""
+    """Return the share of the inliers of fundamental matrices that contradict a model."""
     inliers = sum(pair.inliers for pair in model.explained.values())
     return sum(pair.contradicted for pair in model.explained.values()) / max(inliers, 1)
 
 
 def _divided(focals: Mapping[str, float]) -> list[list[str]]:
-    """Return names in two parts, divided at the widest gap between focals; nothing where that leaves one alone."""
+    """Return names in two parts, divided at the widest gap between focals; empty if a part has only one name."""
     names = sorted(focals, key=lambda name: (focals[name], name))
     if len(names) < LEAST:
         return []
@@ -137,7 +139,7 @@ def _divided(focals: Mapping[str, float]) -> list[list[str]]:
 
 
 def _names(name: str, taken: Collection[str]) -> Iterable[str]:
-    """Yield the name itself, and others like it that nobody has."""
+    """Yield the name itself, then numbered variants of it that are not taken."""
     yield name
     number = 2
     while True:

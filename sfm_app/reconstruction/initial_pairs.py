@@ -11,13 +11,13 @@ from sfm_app.geometry.two_view_init import GOOD_ANGLE_DEG, TwoViewSeed, two_view
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose
 
 DISSENT = 0.1
-"""What counts of a seed whose pair contradicts the camera matrix that other pairs agree on."""
+"""Weight of a seed whose pair contradicts the camera matrix that other pairs agree on."""
 FLAT = 0.5
-"""What counts of one whose points lie on a plane, or whose camera moved along its axis: its pose is less certain."""
+"""Weight of a seed whose points lie on a plane, or whose camera moved along its axis: its pose is less certain."""
 FORWARD = 0.95
-"""Share of the translation along the camera's axis that counts as such."""
+"""Share of the translation along the camera's axis above which the motion counts as forward."""
 GRID = 8
-"""Photos are looked at in so many cells across and down: points everywhere make a better start than a clump."""
+"""Number of cells across and down a photo, for its coverage: spread points make a better start than a cluster."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,14 +32,14 @@ class Candidate:
 def rank_seeds(
     matches: MatchGraph, graph: PoseGraph, intrinsics: Intrinsics, photos: Sequence[int], min_angle_deg: float
 ) -> list[Candidate]:
-    """Return candidates for the first pair, best first: many points all over the photos, wide angles, in accord with K.
+    """Return candidates for the first pair, best first: many well-spread points, wide angles, consistent with K.
 
     Args:
         matches: keypoints and raw matches.
         graph: relative poses.
         intrinsics: cameras from pairs.
-        photos: ids of the group that both photos are from.
-        min_angle_deg: least median triangulation angle, degrees.
+        photos: ids of the group; both photos of a candidate belong to it.
+        min_angle_deg: smallest median triangulation angle, degrees.
     """
     members, found = set(photos), []
     for pair, pose in graph.poses.items():
@@ -53,7 +53,7 @@ def rank_seeds(
 
 
 def seed_of(matches: MatchGraph, candidate: Candidate, intrinsics: Intrinsics) -> TwoViewSeed:
-    """Return the points of a candidate, triangulated.
+    """Return the pose and triangulated points of a candidate.
 
     Args:
         matches: keypoints and raw matches.
@@ -67,11 +67,11 @@ def seed_of(matches: MatchGraph, candidate: Candidate, intrinsics: Intrinsics) -
 
 
 def agreement(pair: PairId, cameras: Sequence[Calibration]) -> float:
-    """Return 1 for a pair that agrees with the camera its consensus found, little for one that does not.
+    """Return the weight of a pair: 1 unless it contradicts the camera that other pairs agree on.
 
     Args:
         pair: ids of two photos.
-        cameras: those of the two photos.
+        cameras: cameras of the two photos.
     """
     first, second = cameras
     unknown = first is not second or not first.key_pairs
@@ -79,12 +79,12 @@ def agreement(pair: PairId, cameras: Sequence[Calibration]) -> float:
 
 
 def coverage(matches: MatchGraph, pair: PairId, pose: RelativePose) -> float:
-    """Return share of the cells of both photos that hold an inlier, as far as these are enough to fill them; 0 to 1.
+    """Return the share of cells with an inlier, of those that the inliers could fill; geometric mean of both photos.
 
     Args:
         matches: keypoints and raw matches.
         pair: ids of two photos.
-        pose: knows the inliers.
+        pose: relative pose of the pair, with its inliers.
     """
     shares = []
     for photo, x in zip(pair, matches.points(pair), strict=True):

@@ -1,4 +1,4 @@
-"""Look-alikes that were told apart: what mapping gets to see of them, and what people do."""
+"""Look-alikes that were recognized: hide their matches from mapping, and report them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,16 +13,16 @@ from sfm_app.reconstruction.unregistered import names_of
 from sfm_app.types import LookAlikes, MatchGraph, PairId, PoseGraph, ViewGraph
 
 LEAST_IN_ORDER = 30
-"""Photos, below which their order says nothing: temple16 is numbered in two arcs."""
+"""Number of photos below which their order is no evidence: temple16 is numbered in two arcs."""
 JUMP, MOST_JUMPS = 5.0, 0.1
-"""A step is a jump when it is so many times the median step; with a larger share of jumps the photos are in no order.
-Not chosen on any set; the usual order of castle-P19, fountain-P11, Herz-Jesus-P8, kitti51 and oats23 has no jump."""
+"""Length of a jump, in median steps; with a larger share of jumps the photos count as unordered. Not chosen on any set;
+the usual order of castle-P19, fountain-P11, Herz-Jesus-P8, kitti51 and oats23 has no jump."""
 
 
 def without_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph) -> tuple[MatchGraph, ViewGraph]:
     """Return matches and fundamental matrices without those of look-alikes.
 
-    These speak neither for a model nor against it.
+    Pairs of look-alikes are evidence neither for a model nor against it.
 
     Args:
         matches: keypoints and raw matches.
@@ -38,21 +38,21 @@ def without_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph)
 
 
 def with_earlier(graph: PoseGraph, earlier: PoseGraph) -> PoseGraph:
-    """Return a pose graph that knows, too, what an earlier one told apart for it.
+    """Return a pose graph with the look-alikes of an earlier pass added to its own.
 
     Args:
-        graph: of this pass.
-        earlier: of the pass before it.
+        graph: pose graph of this pass.
+        earlier: pose graph of the pass before it.
     """
     dropped = {pair: earlier.dropped[pair] for join in earlier.look_alikes for pair in join.pairs}
     return replace(graph, dropped=dropped | dict(graph.dropped), look_alikes=earlier.look_alikes + graph.look_alikes)
 
 
 def in_words(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str, Json]]:
-    """Return what was told apart, for the manifest.
+    """Return the recognized look-alikes, for the manifest.
 
     Args:
-        joins: pairs of look-alikes, by the places they mix up.
+        joins: pairs of look-alikes, grouped by the places that they confuse.
         matches: knows the photos' names.
     """
     return [
@@ -66,9 +66,9 @@ def in_words(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str,
 
 
 def jumps(model: Reconstruction) -> list[list[str]]:
-    """Return photos that follow each other by name, but not along the way of all others: where a video may be folded.
+    """Return successive photos, by name, that are much farther apart than others: a video may be folded there.
 
-    Empty where the photos are not in order, so that many steps are long. That is no proof: videos are cut, too.
+    Empty where many steps are long, because the photos are then unordered. A jump is no proof: videos may be cut, too.
     """
     with backend("reading poses"):
         placed = sorted((image.name, image.projection_center()) for image in posed_images(model))
@@ -80,7 +80,7 @@ def jumps(model: Reconstruction) -> list[list[str]]:
 
 
 def sides(pairs: Sequence[PairId], matches: MatchGraph) -> tuple[list[int], list[int]]:
-    """Return the photos of the two places: those of the pair with most matches are on different sides, and so on.
+    """Return the photos at either place: each pair, those with most matches first, puts its photos on opposite sides.
 
     Args:
         pairs: look-alikes; at least one.

@@ -1,4 +1,4 @@
-"""Map every group of photos; learn cameras from the model, and map again where that may help."""
+"""Map every group of photos, learn cameras from the model, and map again where that may help."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,14 +27,14 @@ from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
 
 LEARNED_FROM = 3
-"""Photos: fewer do not teach a camera, and in fewer no other group is mapped beside the main one."""
+"""Smallest number of photos from which a camera is learned, and in a group that is mapped besides the main one."""
 MOST_PASSES = 4
-"""Passes over all pairs. On dinoSparseRing with learned features the second finds a focal of 3272 (true 3318), and the
-third places all photos with it."""
+"""Largest number of passes over all pairs. On dinoSparseRing with learned features the second finds a focal of 3272
+(true 3318), and the third places all photos with it."""
 OTHER_FOCALS = (0.6, 2.4, 4.8)
-"""Guesses of the focal beside the usual one, in longer sides: steps of two from end to end of what cameras have."""
+"""Guesses of the focal besides the usual one, in longer sides: steps of a factor of two over the range of cameras."""
 MOVED = 0.01
-"""A focal that mapping moved by more than this share is worth a second look at the pairs."""
+"""Relative change of a focal in mapping above which another pass over the pairs is worth it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,40 +42,40 @@ class Outcome:
     """Models of all groups, before the last adjustment."""
 
     models: tuple[Attempt, ...]
-    """The main one first."""
+    """The main model first."""
     graph: PoseGraph
     intrinsics: Intrinsics
-    """As the mapping had them."""
+    """Cameras that the models were mapped with."""
     tried: tuple[str, ...]
-    """Every attempt, for people."""
+    """Notes on all attempts, for people."""
     reason: str = ""
-    """Why the main model's mapper was chosen."""
+    """Why the attempt behind the main model was chosen."""
     cuts: tuple[str, ...] = ()
-    """What was taken apart because matches contradict the join."""
+    """Names of the photos of each part of a model that was cut because matches contradict the join."""
     passes: int = 1
     thin: str = ""
     """Why a rival was tried; empty where the evidence was good."""
     one_camera_each: str = ""
-    """What came of a camera for each photo, where one for all explains too little: "taken", "left", or "two" cameras
-    that explain as much; empty: not tried."""
+    """Result of trying a camera for each photo: "taken", "left" (rejected), or "two" where two cameras explain as much;
+    empty if it was not tried."""
 
     @property
     def main(self) -> Attempt | None:
-        """The main model."""
+        """The main model, if there is one."""
         return self.models[0] if self.models else None
 
     @property
     def support(self) -> float:
-        """Of the main model; 0 without one."""
+        """Support of the main model; 0 without one."""
         return self.models[0].support if self.models else 0.0
 
 
 def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:
-    """Return models of all photos that hang together; none where no pair grows into one.
+    """Return models of all connected groups of photos; none where no pair grows into a model.
 
-    Where the evidence is thin, a rival is mapped beside it, and the model that explains more goes on. Where cameras
-    were guesses, or photos of the main group stayed out, the cameras that mapping found are taken for a second pass:
-    with them, relative poses are right that were not before. So it goes on while the passes get better.
+    Where the evidence for a model is weak, a rival is mapped, and the model that explains more is kept. Where cameras
+    were guesses, or photos of the main group are missing, a second pass starts from the cameras that mapping found,
+    which correct relative poses that were wrong before. Passes are repeated as long as they improve the model.
 
     Args:
         matches: keypoints and raw matches.
@@ -109,7 +109,7 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
 def with_rival(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """Return the outcome, or, where it is thin and a rival explains more, that of the rival.
+    """Map a rival where the evidence is weak, and return the outcome with the model that explains more.
 
     Args:
         outcome: models from relative poses.
@@ -137,7 +137,7 @@ def with_rival(
 def _with_other_focals(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """Return outcome, or, where the guessed focal leaves many photos without a place, that of the best other guess."""
+    """Map with other guesses of the focal where many photos are unregistered, and return the best outcome."""
     main = outcome.main
     if not leaves_many_out(main, intrinsics, views):
         return outcome
@@ -154,7 +154,7 @@ def _with_other_focals(
 def _with_own_cameras(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """Return the outcome, or, where photos of one size explain more with a camera each, that."""
+    """Map with a camera for each photo where shared ones explain too little, and return the better outcome."""
     main = outcome.main
     if main is None or not may_have_one_each(main, intrinsics, views, run.settings):
         return outcome
@@ -176,7 +176,7 @@ def _with_own_cameras(
 def _with_two_cameras(
     own: Outcome, matches: MatchGraph, views: ViewGraph, each: Intrinsics, run: RunContext
 ) -> Outcome:
-    """Return the outcome of a camera for each photo, or, where two explain as much, that of two."""
+    """Map with two cameras instead of one for each photo, and return their outcome if they explain as much."""
     between = with_two(own.models[0], each, matches)
     if between is None:
         return own
@@ -189,7 +189,7 @@ def _with_two_cameras(
 
 
 def _with_joined(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
-    """Return the outcome, its models joined where they share points."""
+    """Return the outcome with models joined where they share points."""
     if len(outcome.models) < 2:
         return outcome
     models = join_models(outcome.models, matches, views, run)
@@ -203,12 +203,12 @@ def _with_joined(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: R
 
 
 def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
-    """Return whether the cameras that mapping found may show more.
+    """Return whether another pass with the cameras that mapping found may improve the model.
 
-    They are news, or photos of the main group stayed out.
+    That is so if these cameras differ from those of the last pass, or if photos of the main group are missing.
 
     Args:
-        outcome: of the last pass; has a model.
+        outcome: outcome of the last pass; has a model.
         intrinsics: cameras that it was mapped with.
         matches: all photos.
     """
@@ -224,11 +224,11 @@ def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph)
 
 
 def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGraph) -> Intrinsics:
-    """Return the cameras as a model has them.
+    """Return the cameras with those of a model's photos replaced by what mapping found.
 
     Args:
-        model: knows the cameras of its photos.
-        intrinsics: cameras of all other photos.
+        model: gives the cameras of its photos.
+        intrinsics: cameras before mapping, of all photos.
         matches: all photos.
     """
     with backend("reading cameras"):
@@ -273,15 +273,15 @@ def _pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Ru
 
 
 def taken_apart(attempt: Attempt) -> list[Attempt]:
-    """Return a model as it is, or the parts of it that more matches join than contradict.
+    """Divide a model where more matches contradict than support its joins; return it unchanged if it has one part.
 
-    Lonely photos are left out.
+    Single photos are left out, and so are small parts beside the largest one.
     """
     parts = sound_parts(attempt.explained, photos_of(attempt.model))
     if len(parts) == 1:
         return [attempt]
     kept = [part for number, part in enumerate(parts) if len(part) >= (2 if number == 0 else LEARNED_FROM)]
-    with backend("taking a model apart"):
+    with backend("dividing a model"):
         return [_part(attempt, part) for part in kept]
 
 
@@ -292,9 +292,9 @@ def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
 
 
 def _graph_of(models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph, run: RunContext) -> PoseGraph:
-    """Return the pose graph as models have it that were made without it.
+    """Return the pose graph with relative poses from models that were not mapped from it.
 
-    Later steps complete their tracks along its pairs.
+    Later steps complete the tracks of these models along its pairs.
     """
     epipolar = run.settings.epipolar
     for attempt in models:

@@ -1,4 +1,4 @@
-"""COLMAP's two mappers on one group of photos, side by side, and the better of what they made."""
+"""COLMAP's two mappers on one group of photos, side by side, and the choice of the better model."""
 
 import contextlib
 import logging
@@ -26,23 +26,23 @@ from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph
 logger = logging.getLogger("sfm_app")
 
 ENOUGH = 0.9
-"""A model with this share of its group ends the search for a better seed."""
+"""A model with this share of the photos of its group ends the search for a better seed."""
 CONFIRMED = 0.5
-"""So does this share when two seeds agree on how many photos can be placed."""
+"""This share is enough when two seeds agree on how many photos can be placed."""
 LEAST_GLOBAL = 3
-"""Photos: of two, positions have no scale to agree on."""
+"""Smallest number of photos for the global mapper: the positions of two photos do not determine a scale."""
 EQUAL = 0.01
-"""Models that explain as many matches but for this share count as equal; of them, the one with most points is taken."""
+"""Models whose supports differ by less than this share count as equal; the one with most photos and points is taken."""
 CONTRADICTED = 0.01
 """Share of the inliers of fundamental matrices that may contradict a complete model before others are tried."""
 WELL_KNOWN = 0.01
-"""Relative deviation of a focal that mapping leaves alone."""
+"""Relative standard deviation of a focal up to which mapping holds it fixed."""
 INCREMENTAL_FOLDER, GLOBAL_FOLDER = "incremental", "global"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Group:
-    """Photos that hang together, and all that is known about them."""
+    """A connected group of photos, with their matches, geometry and cameras."""
 
     photos: Sequence[int]
     matches: MatchGraph
@@ -53,22 +53,22 @@ class Group:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attempt:
-    """A model that a mapper made of a group, and what it explains."""
+    """A model that a mapper made of a group, and the matches that it explains."""
 
     mapper: str
     model: Reconstruction
     explained: dict[PairId, Explained]
     note: str
-    """For people: how it was made, and how many photos it holds."""
+    """How it was made, and how many photos it holds; for people."""
 
     @property
     def photos(self) -> int:
-        """Photos with a pose."""
+        """Number of posed photos."""
         return self.model.num_reg_images()
 
     @property
     def support(self) -> float:
-        """See `support.support`."""
+        """Score of the model, see `support.support`."""
         return support(self.explained)
 
 
@@ -82,13 +82,13 @@ class NoModel:
 
 
 Tried: TypeAlias = Attempt | NoModel
-"""What came of a mapper."""
+"""Result of a mapper."""
 Maker: TypeAlias = Callable[[CancellationToken], list[Tried]]
-"""Makes models until a token stops it."""
+"""Function that makes models until a token stops it."""
 
 
 class Stop:
-    """Stops a mapper when the whole run is stopped, or when its model is no longer needed."""
+    """Token that stops a mapper when the whole run is stopped, or when its model is no longer needed."""
 
     def __init__(self, token: Cancellation) -> None:
         self.token, self.needless = token, False
@@ -100,14 +100,14 @@ class Stop:
 
 
 def attempts(group: Group, run: RunContext) -> list[Tried]:
-    """Return what the mappers of the settings make of a group.
+    """Return the results of the mappers on a group.
 
-    Photo by photo from the best seed and all at once, side by side; where neither places most photos, from the next
-    seeds. What is tried never depends on which mapper is done first: a complete, uncontradicted
-    model photo by photo cancels the global mapper, whether or not it is done.
+    The incremental mapper from the best seed and the global mapper run side by side. Where neither places most photos,
+    the next seeds are tried. The results do not depend on which mapper ends first: a complete, uncontradicted
+    incremental model discards the global one, whether or not that is finished.
 
     Args:
-        group: photos that hang together, with their matches and poses.
+        group: a connected group of photos, with their matches and poses.
         run: the run.
     """
     options = run.settings.scene
@@ -129,7 +129,7 @@ def attempts(group: Group, run: RunContext) -> list[Tried]:
 
 
 def better(found: Sequence[Tried]) -> Attempt | None:
-    """Return the attempt that explains most matches; of equal ones, the one with most photos and points."""
+    """Return the attempt with the largest support; among equal ones, the one with most photos and points."""
     models = [attempt for attempt in found if isinstance(attempt, Attempt)]
     most = max((attempt.support for attempt in models), default=0.0)
     equal = [attempt for attempt in models if attempt.support >= (1.0 - EQUAL) * most]
@@ -137,10 +137,10 @@ def better(found: Sequence[Tried]) -> Attempt | None:
 
 
 def why(best: Attempt, found: Sequence[Tried], photos: int) -> str:
-    """Return why this attempt of several was taken, in a few words.
+    """Return why an attempt was chosen among several, in a few words.
 
     Args:
-        best: the one that was taken.
+        best: the chosen attempt.
         found: all attempts.
         photos: number of photos in the group.
     """
@@ -155,7 +155,7 @@ def why(best: Attempt, found: Sequence[Tried], photos: int) -> str:
 
 
 def _flawless(attempt: Attempt, photos: int) -> bool:
-    """Return whether a model holds all photos and next to nothing contradicts it."""
+    """Return whether a model holds all photos, and hardly any inliers contradict it."""
     inliers = sum(pair.inliers for pair in attempt.explained.values())
     against = sum(pair.contradicted for pair in attempt.explained.values())
     return attempt.photos == photos and against <= CONTRADICTED * inliers
@@ -163,7 +163,7 @@ def _flawless(attempt: Attempt, photos: int) -> bool:
 
 @contextlib.contextmanager
 def _mapping(group: Group, run: RunContext) -> Iterator[Callable[[Maker], list[Tried]]]:
-    """Provide what makes attempts in a thread that Ctrl-C can stop."""
+    """Provide a function that makes attempts in a thread that Ctrl-C can stop."""
 
     def made(make: Maker) -> list[Tried]:
         found: list[Tried] = []
@@ -198,7 +198,7 @@ def _first_round(
 
 
 def _settled(found: Sequence[Tried], photos: int) -> bool:
-    """Return whether another seed is unlikely to give more."""
+    """Return whether another seed is unlikely to place more photos."""
     counts = [attempt.photos for attempt in found if isinstance(attempt, Attempt)]
     most = max(counts, default=0)
     return most >= ENOUGH * photos or (counts.count(most) > 1 and most >= CONFIRMED * photos)
@@ -228,7 +228,7 @@ def _from_seed(group: Group, seed: Candidate, run: RunContext, token: Cancellati
 
 
 def _completed(group: Group, best: Attempt, run: RunContext, token: CancellationToken) -> list[Tried]:
-    """Return photos that the global mapper left out may fit into what it made."""
+    """Continue the global mapper's model photo by photo, with the photos that it left out."""
     model = _grown(group, best.model, run, token)
     return [_judged(group, "incremental", "what was left out, photo by photo", model, run)]
 
@@ -242,7 +242,7 @@ def _grown(group: Group, start: Reconstruction, run: RunContext, token: Cancella
 
 
 def well_known(camera: Calibration) -> bool:
-    """Return whether a focal is known too well for the first few photos of a mapping to improve it."""
+    """Return whether a focal is known so well that the first few photos of a mapping cannot improve it."""
     spread = camera.spread.get("fx", np.inf)
     return camera.identifiable and spread <= WELL_KNOWN * camera.K[0, 0]
 
@@ -250,13 +250,13 @@ def well_known(camera: Calibration) -> bool:
 def judged(
     matches: MatchGraph, views: ViewGraph, made: tuple[str, str], model: Reconstruction | None, run: RunContext
 ) -> Tried:
-    """Count what a model explains.
+    """Count the matches that a model explains.
 
     Args:
         matches: keypoints and raw matches.
         views: fundamental matrices.
         made: name of the mapper, and how it was used.
-        model: COLMAP's reconstruction; None where there is none.
+        model: COLMAP's reconstruction, if there is one.
         run: the run.
     """
     mapper, how = made

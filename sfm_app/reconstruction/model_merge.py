@@ -1,8 +1,8 @@
-"""Models that see the same points, joined by a similarity.
+"""Join models that see the same points by a similarity.
 
 Mapping ends where the next photo shares too little with the photos before it. Two models that grew from either end may
-still share points: matches between their photos, of which each model knows the place. Three of them say how large one
-model is in the other's unit and where it stands; the others, and the pairs between them, say whether it is so.
+still share points: matches between their photos that both models have triangulated. Three such points determine the
+similarity between the models; the others, and the pairs between the models, verify it.
 """
 
 from collections.abc import Iterator
@@ -25,16 +25,16 @@ from sfm_app.types import MatchGraph, ViewGraph
 FloatArray = NDArray[np.float64]
 
 LEAST_SHARED = 8
-"""Points that both models know, below which nothing is joined: three fix a similarity, twice as many may be wrong."""
+"""Smallest number of shared points for a join: three determine a similarity, twice as many may be wrong."""
 
 
 def join_models(
     models: tuple[Attempt, ...], matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> tuple[Attempt, ...]:
-    """Join what can be joined to the first model; the others stay as they are.
+    """Join to the first model all others that can be joined; the rest stay unchanged.
 
     Args:
-        models: the main one first; no two hold the same photo.
+        models: the main model first; no two hold the same photo.
         matches: keypoints and raw matches.
         views: fundamental matrices; their inliers are the points that models may share.
         run: the run.
@@ -54,7 +54,7 @@ def join_models(
 def _together(
     first: Attempt, second: Attempt, matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> Attempt | None:
-    """Join both models; None where they share too little, or matches contradict it."""
+    """Join both models; return None where they share too few points, or matches contradict the join."""
     shared = shared_points(first.model, second.model, matches, views)
     if len(shared) < LEAST_SHARED:
         return None
@@ -79,12 +79,12 @@ def _together(
 
 
 def shared_points(first: Reconstruction, second: Reconstruction, matches: MatchGraph, views: ViewGraph) -> FloatArray:
-    """Return (N, 6) points that both models know, as the first and as the second has them; each but once.
+    """Return (N, 6) points that both models hold, in the frame of the first and of the second; each only once.
 
     Args:
         first, second: models that share no photo.
         matches: keypoints and raw matches.
-        views: fundamental matrices; only their inliers count.
+        views: fundamental matrices; only their inliers are used.
     """
     here, there = places_of_keypoints(first), places_of_keypoints(second)
     found = {}

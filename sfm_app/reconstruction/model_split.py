@@ -1,7 +1,7 @@
-"""Parts of a model that hang together only against the evidence.
+"""Divide a model where its joins contradict the evidence.
 
 Facades that look alike join places that are apart. Such a join rests on few matches and leaves many others
-unexplained: those of pairs that see the places as they are.
+unexplained: those of pairs that see the true layout.
 """
 
 from collections.abc import Iterable, Mapping
@@ -10,17 +10,17 @@ from sfm_app.reconstruction.support import Explained
 from sfm_app.types import PairId
 
 LEAST_MATCHES = 16
-"""Matches, below which a pair holds nothing together."""
+"""Smallest number of matches with which a pair can join two parts."""
 
 
 def sound_parts(explained: Mapping[PairId, Explained], photos: Iterable[int]) -> list[tuple[int, ...]]:
-    """Return photos in parts that more matches join than contradict, largest part first.
+    """Return photos in parts whose joins more matches support than contradict, largest part first.
 
     Pairs are taken strongest first; two parts become one when the matches between them that the model explains
     outnumber the inliers of fundamental matrices between them that it does not.
 
     Args:
-        explained: what the model makes of each pair.
+        explained: explained and contradicting matches of each pair.
         photos: ids of the photos to divide.
     """
     part = {photo: frozenset([photo]) for photo in photos}

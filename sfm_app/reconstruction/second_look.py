@@ -1,8 +1,8 @@
-"""A second look at photos without a place: finer features for them and their likely neighbors, then all over again.
+"""A second look at unregistered photos: finer features for them and likely neighbors, then another reconstruction.
 
-On plain things and over wide steps the usual features find little. Features that follow the shape of their surroundings
-(affine shape, domain-size pooling), fainter ones and looser matches find more there; for all photos they would cost too
-much, and where all photos have their place they add nothing.
+On plain objects and over wide baselines the usual features find little. Features adapted to their surroundings (affine
+shape, domain-size pooling), a lower contrast threshold and a looser ratio test find more there. For all photos they
+would cost too much, and where all photos are registered they add nothing.
 """
 
 from collections import Counter
@@ -32,29 +32,30 @@ LOOSE_RATIO = 0.85
 links 19, 22, 31 and 43 matches are right at 0.8 (of 33, 30, 39, 51), and 26, 29, 45 and 55 at 0.85 (of 58, 52, 81, 77):
 9 + 6 photos in two models become 15 in one."""
 ALL_PAIRS = 30
-"""Up to so many photos, those without a place are matched with all others."""
+"""Up to this number of photos, unregistered ones are matched with all others."""
 NEIGHBORS, IN_ORDER = 8, 2
-"""Else with so many that have most raw matches with them, and with so many before and after them by name."""
+"""In larger sets, each is matched with this number of photos with most raw matches, and with this number before and
+after it by name."""
 MANY, FEW_LOST = 60, 0.05
-"""Of so many photos or more, a smaller share without a place is not worth mapping all again."""
+"""In sets of at least this many photos, a smaller share of unregistered ones is not worth another reconstruction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """Models, and what they were made of."""
+    """Models, and the matches, geometry and cameras they were made from."""
 
     outcome: Outcome
     matches: MatchGraph
     views: ViewGraph
     intrinsics: Intrinsics
     run: RunContext
-    """Its workspace holds the database of these matches."""
+    """Run whose workspace holds the database of these matches."""
 
 
 def look_again(first: Found) -> Found:
-    """Look again at the photos that the main model does not hold; what was found first stays unless more find a place.
+    """Look again at photos missing in the main model, and return the new result if it registers more of them.
 
-    Whatever fails on the way costs nothing but the attempt.
+    If the attempt fails, the first result is kept.
     """
     run, lost = first.run, lost_photos(first)
     if not lost or run.settings.matching.features == SIFT_DSP or not run.settings.scene.second_look:
@@ -65,7 +66,7 @@ def look_again(first: Found) -> Found:
     report: dict[str, Json] = {"photos": names_of(lost, first.matches), "pairs": len(pairs)}
     try:
         second = _seen_again(first, pairs, report)
-    except SfmError as err:  # what we have is not lost with it
+    except SfmError as err:  # the first result is not lost with it
         report["failed"], second = str(err), None
     placed = [_placed(one.outcome) for one in (first, second) if one is not None]
     taken = second is not None and _is_better(second, first)
@@ -74,7 +75,7 @@ def look_again(first: Found) -> Found:
 
 
 def lost_photos(found: Found) -> list[int]:
-    """Return photos that the main model does not hold; none where they are too few of too many."""
+    """Return the photos missing in the main model; none where their share of a large set is too small."""
     models, images = found.outcome.models, found.matches.images
     placed = set(photos_of(models[0].model)) if models else set()
     lost = sorted(images.keys() - placed)
@@ -85,7 +86,7 @@ def pairs_to_see(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
     """Return pairs of lost photos with each other and with their likely neighbors.
 
     Args:
-        lost: ids of photos without a place.
+        lost: ids of unregistered photos.
         matches: raw matches of all photos.
     """
     every = sorted(matches.images)
@@ -105,7 +106,7 @@ def pairs_to_see(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
 
 
 def _seen_again(first: Found, pairs: Sequence[PairId], report: dict[str, Json]) -> Found | None:
-    """Return all steps from features to models once more; None where nothing new was found."""
+    """Run all steps from features to models once more; return None if no pair has gained matches."""
     run = _aside(first.run)
     finer = replace(run, workspace=Aside(run.workspace, FEATURES))
     with backend("looking for finer features"):
@@ -127,13 +128,13 @@ def _seen_again(first: Found, pairs: Sequence[PairId], report: dict[str, Json]) 
 
 
 def _mostly_known(found: Found) -> bool:
-    """Return whether at least half of the photos have a camera that pairs determine: more pairs then change little."""
+    """Return whether pairs determine the cameras of at least half of the photos; more pairs then change little."""
     images = found.matches.images.values()
     return 2 * sum(found.intrinsics.camera(image).estimated for image in images) >= len(images)
 
 
 def _aside(run: RunContext) -> RunContext:
-    """Return the run in a folder of its own, where what a killed run left is taken up again."""
+    """Return the run with a separate workspace folder, in which a killed run is resumed."""
     place = Aside(run.workspace, FOLDER)
     loose = run.settings.matching.model_copy(update={"max_ratio": max(LOOSE_RATIO, run.settings.matching.max_ratio)})
     settings = run.settings.model_copy(update={"matching": loose})
@@ -145,7 +146,7 @@ def _placed(outcome: Outcome) -> int:
 
 
 def _is_better(second: Found, first: Found) -> bool:
-    """Return whether the second main model places more photos, and explains more of all matches that are known now."""
+    """Return whether the second main model places more photos, and explains more of all matches, old and new."""
     if not second.outcome.models or _placed(second.outcome) <= _placed(first.outcome):
         return False
     models = [_judged_by(second, found.outcome) for found in (first, second) if found.outcome.models]

@@ -1,7 +1,7 @@
-"""How well a model explains the matches: a score that does not ask how the model was made.
+"""Score how well a model explains the matches, independently of how the model was made.
 
-Every pair of photos with a place is asked how many of its raw matches lie on the epipolar lines of the model, before
-both cameras. Points, tracks and reprojection errors differ with the mapper; this does not.
+For every pair of posed photos, the raw matches are counted that lie on the epipolar lines of the model, in front of
+both cameras. Points, tracks and reprojection errors depend on the mapper; this count does not.
 """
 
 from collections.abc import Iterator, Mapping
@@ -19,27 +19,27 @@ from sfm_app.types import MatchGraph, PairId, RelativePose, ViewGraph
 FloatArray = NDArray[np.float64]
 
 GENEROUS = 2.0
-"""A match is explained within so many thresholds of an inlier: models are not adjusted to each pair."""
+"""Largest error of an explained match, in inlier thresholds: models are not adjusted to each pair."""
 ENOUGH = 100.0
-"""From so many matches on, more of them say little more about a pair."""
+"""Number of matches at which the support of a pair reaches half of its limit; beyond it, more matches add little."""
 
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """What a model makes of the matches of a pair."""
+    """Numbers of matches of a pair that a model explains or contradicts."""
 
     matches: int
-    """Raw matches that lie right."""
+    """Raw matches that the model explains."""
     inliers: int
-    """Inliers of its fundamental matrix."""
+    """Inliers of the fundamental matrix of the pair."""
     contradicted: int
-    """Those of them that do not lie right."""
+    """Inliers that the model does not explain."""
 
 
 def explained_pairs(
     model: Reconstruction, matches: MatchGraph, views: ViewGraph, max_error_px: float
 ) -> dict[PairId, Explained]:
-    """Return what a model makes of every pair of its photos.
+    """Return how well a model explains every pair of its photos.
 
     Args:
         model: COLMAP's reconstruction.
@@ -59,11 +59,11 @@ def explained_pairs(
 def model_poses(
     model: Reconstruction, matches: MatchGraph, max_error_px: float, least: int
 ) -> dict[PairId, RelativePose]:
-    """Give relative poses as a model has them, of all pairs of its photos with at least so many matches that lie right.
+    """Return the relative poses of a model for all pairs of its photos with enough explained matches.
 
     Args:
         model, matches, max_error_px: as in `explained_pairs`.
-        least: a pair with fewer is left out.
+        least: smallest number of explained matches of a pair.
     """
     found = {}
     for pair, seen in _placed_pairs(model, matches):
@@ -76,18 +76,18 @@ def model_poses(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PlacedPair:
-    """The raw matches of two photos with a place."""
+    """The raw matches of two posed photos."""
 
     rays: FloatArray
-    """(M, 4) on the plane z = 1 of view 1 and of view 2."""
+    """(M, 4) matches on the planes z = 1 of view 1 and of view 2."""
     focals: FloatArray
-    """(4,)"""
+    """(4,) fx, fy of view 1 and of view 2, in pixels."""
     R: FloatArray
     t: FloatArray
-    """Of view 2 from view 1; t of length 1, or nothing."""
+    """Rotation and translation, view 2 from view 1; t has length 1, or is 0 for equal positions."""
 
     def right(self, max_error_px: float) -> NDArray[np.bool_]:
-        """Return (M,) which of them lie on their epipolar lines, before both cameras."""
+        """Return (M,) which matches lie on their epipolar lines, in front of both cameras."""
         distances = pose_distances(self.rays, self.focals, self.R, self.t)
         return np.asarray((distances <= max_error_px) & in_front(self.rays, self.R, self.t), bool)
 
@@ -106,9 +106,6 @@ def _placed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[
 
 
 def support(explained: Mapping[PairId, Explained]) -> float:
-    """Return one figure for a model.
-
-    Matches that it explains, pairs with many of them counting little more than others.
-    """
+    """Return the score of a model: its explained matches, of which each further one of a pair counts less."""
     counts = np.array([pair.matches for pair in explained.values()], np.float64)
     return float(np.sum(counts / (1.0 + counts / ENOUGH)))

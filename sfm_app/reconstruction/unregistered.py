@@ -1,4 +1,4 @@
-"""Why photos have no place."""
+"""Reasons why photos have no pose."""
 
 from collections.abc import Iterator, Sequence
 
@@ -8,14 +8,14 @@ from sfm_app.types import MatchGraph, PoseGraph, ViewGraph
 def left_out(
     posed: set[int], others: Sequence[Sequence[int]], matches: MatchGraph, views: ViewGraph, graph: PoseGraph
 ) -> dict[str, str]:
-    """Return the reason for every photo that the main model does not hold, by name.
+    """Return why each photo is missing in the main model, by name.
 
     Args:
         posed: photos of the main model.
-        others: photos of the other models.
+        others: photos of each of the other models.
         matches: all photos.
         views: fundamental matrices.
-        graph: relative poses that agree with each other.
+        graph: consistent relative poses, and why others were dropped.
     """
     reasons = {}
     for photo, image in matches.images.items():
@@ -37,7 +37,7 @@ def _reason(photo: int, posed: set[int], views: ViewGraph, graph: PoseGraph) -> 
         nearest = max(to_posed, key=lambda other: (to_posed[other], -other))
         contradiction = graph.dropped.get((min(photo, nearest), max(photo, nearest)))
         because = f", but that pair was dropped: {contradiction}" if contradiction else ""
-        return f"could not be placed: {to_posed[nearest]} inliers with the nearest photo that was{because}"
+        return f"could not be placed: {to_posed[nearest]} inliers with the nearest placed photo{because}"
     return (
         "shares inliers only with photos that have no place either" if edges else "shares no scene with any other photo"
     )
@@ -50,7 +50,7 @@ def _edges(photo: int, views: ViewGraph) -> Iterator[tuple[int, int]]:
 
 
 def names_of(photos: Sequence[int], matches: MatchGraph) -> list[str]:
-    """Return names of photos.
+    """Return the names of photos.
 
     Args:
         photos: ids.

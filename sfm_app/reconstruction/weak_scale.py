@@ -1,7 +1,7 @@
-"""Parts of a model whose scale hangs on a few points.
+"""Find parts of a model whose scale depends on a few points.
 
-Of two photos nobody knows how far apart they are. A photo finds its distance from two others by points that all three
-see; where a part shares hardly one with the rest, its rays may meet well and its size still be anybody's guess.
+Two photos do not determine the distance between them. The relative scale of a third photo comes from points that all
+three see. Where a part shares hardly any of them with the rest, its points may fit well and its scale still be wrong.
 """
 
 import numpy as np
@@ -12,15 +12,15 @@ from sfm_app.colmap.model import posed_images
 from sfm_app.colmap.types import Reconstruction, all_points
 
 LEAST = 5
-"""Points that two placed photos and the next one see, below which the scale between them is open: a pose takes three,
-two more contradict a wrong one. Of the photo sets only temple16 with every second photo (0; its centers are a third
-off) and dinoSparseRing (2) have less; right models of castle-P19 and temple16 have 8."""
+"""Number of points seen by two placed photos and the next one, below which the scale between them is undetermined: a
+pose takes three, two more contradict a wrong one. Of the photo sets only temple16 with every second photo (0; its
+centers are a third off) and dinoSparseRing (2) have fewer; right models of castle-P19 and temple16 have 8."""
 
 
 def weakly_joined(model: Reconstruction) -> list[list[str]]:
-    """Give names of photos, part by part, whose distance from first part of a model hangs on fewer than `LEAST` points.
+    """Return the names of photos in parts whose scale against the first part depends on too few points.
 
-    Photos join one after the other, each time the one that sees most points which two of those before it see.
+    Photos join one by one: next is the one that sees most points which at least two joined photos see.
     """
     with backend("reading points"):
         names = {image.image_id: image.name for image in posed_images(model)}
@@ -36,7 +36,7 @@ def weakly_joined(model: Reconstruction) -> list[list[str]]:
 
 
 def _seen(tracks: list[set[int]], photos: list[int]) -> csr_array:
-    """Return (N, P) 1 where a point is seen by a photo."""
+    """Return the matrix (N, P) with 1 where a point is seen by a photo."""
     place = {photo: k for k, photo in enumerate(photos)}
     columns = [place[photo] for track in tracks for photo in sorted(track)]
     ends = np.cumsum([0, *map(len, tracks)])
@@ -44,7 +44,7 @@ def _seen(tracks: list[set[int]], photos: list[int]) -> csr_array:
 
 
 def _joining(seen: csr_array) -> list[tuple[int, int]]:
-    """Return photos from the third on as they join, each with the points by which it does."""
+    """Return the photos from the third on in joining order, each with its number of shared points."""
     points, photos = seen.shape
     if photos < 3 or points == 0:
         return []

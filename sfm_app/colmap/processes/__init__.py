@@ -1,1 +1,1 @@
-"""Parts of COLMAP that run as processes of their own."""
+"""Parts of COLMAP that run in separate processes."""

@@ -1,4 +1,4 @@
-"""COLMAP's own pipeline on our matches, as a process of its own; see `mapping.map_as_colmap_does`."""
+"""COLMAP's own pipeline on our matches, as a separate process; see `mapping.map_as_colmap_does`."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from sfm_app.colmap.processes.worker_process import MappingTask, served
 def work(task: MappingTask) -> None:
     """Verify the raw matches, map them with COLMAP's defaults, and write the largest model into `model`.
 
-    Only seeds and the number of threads differ from the defaults: on several threads no two runs are the same.
+    Only seeds and the number of threads differ from the defaults: on several threads, results differ between runs.
     """
     scratch, seed = Path(task["scratch"]), task["seed"]
     database = scratch / "database.db"
@@ -28,7 +28,7 @@ def work(task: MappingTask) -> None:
 
 
 def _verify(database: Path, seed: int) -> None:
-    """Replace all two-view geometries by what COLMAP's geometric verification makes of the raw matches."""
+    """Replace all two-view geometries by those of COLMAP's geometric verification of the raw matches."""
     geometry = pycolmap.TwoViewGeometryOptions()
     geometry.ransac.random_seed = seed
     verifier = pycolmap.GeometricVerifierOptions()

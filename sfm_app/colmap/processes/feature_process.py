@@ -14,7 +14,7 @@ from sfm_app.settings import MatchSettings
 
 
 def work(task: FeatureTask) -> None:
-    """Find features of all photos and match every photo with every other; reports the options in force."""
+    """Find features of all photos, match every photo with every other, and report the effective options."""
     database, photo_dir, names = Path(task["database"]), Path(task["photos"]), task["names"]
     options = MatchSettings.model_validate(task["options"])
     reader = pycolmap.ImageReaderOptions()
@@ -32,8 +32,8 @@ def extraction_options(
     """Return COLMAP's options for finding features.
 
     Args:
-        options: photo size, and most features.
-        sift: options of its SIFT, by name.
+        options: largest photo size and largest number of features.
+        sift: options of COLMAP's SIFT, by name.
         workers: threads.
     """
     extraction = pycolmap.FeatureExtractionOptions()
@@ -53,13 +53,13 @@ def extract(
     reader: pycolmap.ImageReaderOptions,
     extraction: pycolmap.FeatureExtractionOptions,
 ) -> dict[str, Json]:
-    """Find SIFT features of all photos; returns the options in force.
+    """Find SIFT features of all photos, and return the effective options.
 
     Args:
         database: holds the photos; keypoints are entered.
         photo_dir: folder with the photos.
-        names: of the photos.
-        reader: knows the masks.
+        names: names of the photos.
+        reader: COLMAP's options for reading photos and masks.
         extraction: see `extraction_options`.
     """
     wanted = set(names)
@@ -82,14 +82,14 @@ def extract(
 def match(
     database: Path, photos: int, options: MatchSettings, workers: int, pairs: Sequence[tuple[int, int]] | None
 ) -> dict[str, Json]:
-    """Match pairs of photos; returns the options in force.
+    """Match pairs of photos, and return the effective options.
 
     Args:
         database: holds the keypoints; matches are entered.
-        photos: how many there are.
-        options: largest ratio of distances.
+        photos: number of photos.
+        options: largest ratio of descriptor distances.
         workers: threads.
-        pairs: ids of photos; None for every photo with every other.
+        pairs: ids of the photos of each pair; None for every photo with every other.
     """
     matching = pycolmap.FeatureMatchingOptions()
     matching.skip_geometric_verification = True
@@ -113,7 +113,7 @@ def match(
 
 
 def _match_pairs(database: Path, matching: pycolmap.FeatureMatchingOptions, pairs: Sequence[tuple[int, int]]) -> None:
-    """Match these pairs in a copy where photos are named by their ids: COLMAP's lists end names at blanks."""
+    """Match pairs in a copy of the database whose photos are named by ids: COLMAP's lists end names at blanks."""
     with tempfile.TemporaryDirectory(dir=database.parent, prefix=".matching") as folder:
         copy, pairing = Path(folder) / database.name, pycolmap.ImportedPairingOptions()
         shutil.copyfile(database, copy)
@@ -147,10 +147,10 @@ def _counted(
     label: str,
     total: int,
 ) -> None:
-    """Run a COLMAP call and say how far it is, as read from the database.
+    """Run a COLMAP call, and show its progress as read from the database.
 
     The reader is COLMAP's own SQLite, opened once before the call: a second SQLite in the process (Python's) would drop
-    the locks of the first whenever it closes the file, and COLMAP aborts.
+    the locks of the first whenever it closes the file, and COLMAP would abort.
     """
     with opened(database) as reader:
         counted(call, lambda: done(reader), label, total, Reported())

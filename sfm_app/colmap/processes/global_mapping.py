@@ -1,4 +1,4 @@
-"""COLMAP's global mapper as a process of its own; see `mapping.map_globally`."""
+"""COLMAP's global mapper, as a separate process; see `mapping.map_globally`."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,11 +8,11 @@ from sfm_app.colmap.mapping import largest
 from sfm_app.colmap.processes.worker_process import GlobalMappingTask, served
 
 ADJUSTMENTS, GAIN = 2, 1e-3
-"""Rounds of adjustment, and the share of its cost that a step must gain."""
+"""Rounds of adjustment, and the share of the cost that a step must gain, else the adjustment ends."""
 
 
 def work(task: GlobalMappingTask) -> None:
-    """Write the largest model into `model` in the scratch folder; nothing where there is none."""
+    """Write the largest model into `model` in the scratch folder, or nothing if there is none."""
     scratch, options = Path(task["scratch"]), global_options(task["seed"], task["names"])
     (scratch / "all").mkdir()
     models = pycolmap.global_mapping(scratch / "database.db", Path(task["photos"]), scratch / "all", options)
@@ -24,12 +24,12 @@ def work(task: GlobalMappingTask) -> None:
 
 
 def global_options(seed: int, names: Sequence[str]) -> pycolmap.GlobalPipelineOptions:
-    """Return COLMAP's defaults, on our relative poses as they are.
+    """Return COLMAP's defaults, except that our relative poses are used unchanged.
 
-    Adjusted roughly, because the last adjustment is ours.
+    COLMAP's adjustment is coarse, because the last adjustment is ours.
 
     Args:
-        seed: of COLMAP's own sampling.
+        seed: seed of COLMAP's own sampling.
         names: photos to place.
     """
     options = pycolmap.GlobalPipelineOptions()

@@ -1,6 +1,6 @@
-"""COLMAP's fusion, Poisson's surface and simplification; see `surface.py`. None of them could be stopped otherwise.
+"""COLMAP's fusion, Poisson meshing and simplification; see `surface.py`. Only a separate process can be stopped.
 
-All run on one thread: with more, the result depends on which thread comes first, and where cores are shared they are
+All run on one thread: with more, the result depends on the order of the threads, and where cores are shared they are
 many times slower.
 """
 
@@ -13,11 +13,11 @@ from sfm_app.colmap.processes.worker_process import FuseTask, PoissonTask, Simpl
 
 MAX_NORMAL_ERROR_DEG = 25.0
 BORDER_WEIGHT = 10.0
-"""How much dearer it is to move a border than the surface."""
+"""Weight of the error at a border, relative to the error of the surface."""
 
 
 def work(task: FuseTask | PoissonTask | SimplifyTask) -> None:
-    """Do one of the three."""
+    """Do the task that its entry `do` names."""
     if task["do"] == "fuse":
         fuse(task)
     elif task["do"] == "poisson":
@@ -31,7 +31,7 @@ def fuse(task: FuseTask) -> None:
     """Fuse the depth maps of a dense workspace into points."""
     options = pycolmap.StereoFusionOptions()
     options.min_num_pixels = task["min_views"]
-    # The depths have been checked already; normals from disparities are noisier than those of COLMAP's PatchMatch.
+    # The depths have been checked before; normals from disparities are noisier than those of COLMAP's PatchMatch.
     options.max_normal_error = MAX_NORMAL_ERROR_DEG
     low, high = np.array(task["box"], np.float32)
     options.bounding_box = (low, high)
@@ -41,7 +41,7 @@ def fuse(task: FuseTask) -> None:
 
 
 def poisson(task: PoissonTask) -> None:
-    """Span a closed surface over points."""
+    """Span a closed surface over points (Poisson)."""
     options = pycolmap.PoissonMeshingOptions()
     options.depth, options.trim = task["depth"], 0.0
     options.num_threads = 1

@@ -1,4 +1,4 @@
-"""COLMAP's undistortion; see `dense.undistort`. Its JPEG writer ends the program where the disk is full."""
+"""COLMAP's undistortion; see `dense.undistort`. Its JPEG writer ends the process when the disk is full."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ JPEG_QUALITY = 98
 
 
 def work(task: UndistortTask) -> None:
-    """Fill a dense workspace."""
+    """Write undistorted photos and their model into a dense workspace."""
     dense_dir, model_dir = Path(task["dense"]), Path(task["model"])
     options = pycolmap.UndistortCameraOptions()
     options.max_image_size = task["max_side_px"]

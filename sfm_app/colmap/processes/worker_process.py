@@ -1,7 +1,7 @@
-"""Parts of COLMAP in processes of their own: some cannot be stopped, and some end the program they run in.
+"""Separate processes for parts of COLMAP that cannot be stopped, or that may end the process they run in.
 
-COLMAP aborts where its database cannot be written, and a decoder may crash on a photo. In a process of its own that is
-an error like any other. It ends when the program that started it ends, however that ends: nothing goes on writing.
+COLMAP aborts where its database cannot be written, and a decoder may crash on a photo. In a separate process that is an
+error like any other. The process ends with its parent, however that ends, so that nothing goes on writing.
 """
 
 import contextlib
@@ -22,12 +22,12 @@ from sfm_app.progress import Progress, Silent
 
 ENDED_EARLY = 1
 REPORTS = 3
-"""File descriptor for what a process says to the one that started it."""
+"""File descriptor for messages of a worker process to its parent."""
 
 SiftOption: TypeAlias = bool | int | float
 """Value of an option of COLMAP's SIFT."""
 Task = TypeVar("Task", bound=Mapping[str, object])
-"""One of the tasks below, which JSON can hold."""
+"""One of the tasks below; its values are valid JSON."""
 
 
 class FeatureTask(TypedDict):
@@ -38,7 +38,7 @@ class FeatureTask(TypedDict):
     masks: str | None
     names: list[str]
     options: dict[str, Any]
-    """`MatchSettings` as they are dumped."""
+    """Dump of `MatchSettings`."""
     workers: int
     sift: dict[str, SiftOption]
     pairs: list[list[int]] | None
@@ -99,28 +99,28 @@ class SimplifyTask(TypedDict):
 
 
 class Apart:
-    """A running process."""
+    """A running worker process."""
 
     def __init__(self, process: "subprocess.Popen[str]", said: IO[bytes]) -> None:
         self.process, self._said = process, said
 
     def messages(self) -> Iterator[dict[str, Json]]:
-        """Yield what it reports, until it ends."""
+        """Yield the messages of the process, until it ends."""
         for line in self.process.stdout or ():
-            if line.endswith("\n"):  # else it was killed as it spoke
+            if line.endswith("\n"):  # else the process was killed while writing it
                 yield json.loads(line)
 
     def ended(self, wait_s: float) -> bool:
-        """Return whether it has ended, or does so within that time."""
+        """Return whether the process has ended, or ends within that time."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(wait_s)
         return self.process.poll() is not None
 
     def check(self, doing: str) -> None:
-        """Wait for its end, and see that it went well.
+        """Wait for the process to end, and check that it succeeded.
 
         Raises:
-            BackendError: it failed, or it was ended.
+            BackendError: the process failed, or it was killed.
         """
         code = self.process.wait()
         if not code:
@@ -133,21 +133,22 @@ class Apart:
         self._said.seek(0)
         lines = self._said.read().decode(errors="replace").split("\n")
         last = next((line.strip() for line in reversed(lines) if line.strip()), f"it ended with {code}")
-        why = last if code > 0 else f"it crashed ({signal.Signals(-code).name})"  # what it says then is addresses
+        # after a crash, the last line of the output is a stack address
+        why = last if code > 0 else f"it crashed ({signal.Signals(-code).name})"
         raise BackendError(f"COLMAP failed while {doing}: {why}", hint="run again with -v to see what COLMAP says")
 
 
 @contextlib.contextmanager
 def started(module: str, task: Mapping[str, object]) -> Iterator[Apart]:
-    """Provide a module of ours at work on a task; ended with the block, if it still runs.
+    """Start a worker process on a task, and provide it; it is killed at the end of the block if it still runs.
 
     Args:
-        module: calls `served`.
-        task: as JSON can hold it.
+        module: module that calls `served`.
+        task: task of the process; valid JSON.
     """
-    command = [sys.executable, "-P", "-m", module]  # -P: nothing is imported from the folder that one happens to be in
+    command = [sys.executable, "-P", "-m", module]  # -P: nothing is imported from the current folder
     loud = log_level()
-    # what it says goes to a file: nobody empties a pipe while it runs, and a full one would make it wait for ever
+    # the output goes to a file: nothing reads a pipe while the process runs, and a full pipe would block it forever
     with (
         tempfile.TemporaryFile() as said,
         subprocess.Popen(  # noqa: S603 - our module
@@ -155,7 +156,7 @@ def started(module: str, task: Mapping[str, object]) -> Iterator[Apart]:
         ) as process,
     ):
         try:
-            with contextlib.suppress(BrokenPipeError):  # it has failed already: `check` says how
+            with contextlib.suppress(BrokenPipeError):  # the process has failed already; `check` reports why
                 print(json.dumps({"log_level": loud, **task}), file=process.stdin, flush=True)
             yield Apart(process, said)
         finally:
@@ -164,13 +165,13 @@ def started(module: str, task: Mapping[str, object]) -> Iterator[Apart]:
 
 
 def finished(module: str, task: Mapping[str, object], doing: str, progress: Progress | None = None) -> dict[str, Json]:
-    """Return a module of ours to its end; what it has reported comes back.
+    """Run a worker process to its end, and return what it has reported.
 
     Args:
-        module: calls `served`.
-        task: as JSON can hold it.
-        doing: what errors call it.
-        progress: shown progress.
+        module: module that calls `served`.
+        task: task of the process; valid JSON.
+        doing: description of the work, for error messages.
+        progress: shows the progress of the process.
 
     Raises:
         BackendError: COLMAP failed.
@@ -183,9 +184,9 @@ def finished(module: str, task: Mapping[str, object], doing: str, progress: Prog
 
 def served(work: Callable[[Task], None]) -> None:
     """Do the task in the worker process, and end when its parent does."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one that started it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     os.dup2(sys.stdout.fileno(), REPORTS)
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints is no report
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output of libraries must not mix with the reports
     line = sys.stdin.readline()
     if not line:
         return
@@ -207,19 +208,19 @@ def report(**message: Json) -> None:
 
 
 class Reported(Silent):
-    """Progress that goes to the one that started the process; stages are that one's own."""
+    """Progress that is sent to the parent process; only the parent has stages."""
 
     def start(self, label: str, total: int) -> None:
         """Send the start of work to the parent.
 
         Args:
-            label: what is done, for people.
+            label: text beside the bar.
             total: number of steps.
         """
         report(start=label, total=total)
 
     def advance(self, steps: int = 1) -> None:
-        """Send so many finished steps to the parent."""
+        """Send a number of finished steps to the parent."""
         report(advance=steps)
 
     def finish(self) -> None:
@@ -228,11 +229,11 @@ class Reported(Silent):
 
 
 def relay(process: Apart, progress: Progress) -> dict[str, Json]:
-    """Show the progress of a process until it ends; what else it has reported comes back.
+    """Show the progress of a process until it ends, and return its other messages.
 
     Args:
-        process: the one that works.
-        progress: where it is shown.
+        process: the worker process.
+        progress: shows its progress.
     """
     found: dict[str, Json] = {}
     try:

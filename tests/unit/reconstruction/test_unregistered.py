@@ -34,7 +34,7 @@ def test_every_photo_without_a_place_has_a_reason():
     reasons = left_out({1, 2}, [(7, 8, 9)], photos(9), views, pose_graph())
 
     assert reasons == {
-        "3.jpg": "could not be placed: 20 inliers with the nearest photo that was",
+        "3.jpg": "could not be placed: 20 inliers with the nearest placed photo",
         "4.jpg": "shares inliers only with photos that have no place either",
         "5.jpg": "shares inliers only with photos that have no place either",
         "6.jpg": "shares no scene with any other photo",
@@ -49,7 +49,7 @@ def test_a_photo_whose_nearest_pair_was_dropped_says_why():
     dropped = {(1, 3): BEHIND, (2, 3): CONTRADICTS, (1, 5): TOO_FEW}
 
     reasons = left_out({1, 2}, [], photos(5), views, pose_graph(dropped))
-    near = "inliers with the nearest photo that was"
+    near = "inliers with the nearest placed photo"
 
     assert reasons == {
         "3.jpg": f"could not be placed: 20 {near}, but that pair was dropped: {CONTRADICTS}",

@@ -117,7 +117,7 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
     assert 0.1 < found.mean_reprojection_px < 0.5
     assert found.unregistered == {
         **{name[key]: "belongs to another model, of 3 photos" for key in (5, 6, 7)},
-        name[8]: "could not be placed: 20 inliers with the nearest photo that was, "
+        name[8]: "could not be placed: 20 inliers with the nearest placed photo, "
         "but that pair was dropped: contradicts other pairs",
     }
     assert run.statistics["registered"] == 4 and run.statistics["of"] == 8
