@@ -115,7 +115,7 @@ def plan_within(
     """Return the plan with the most workers that stays within the memory limit; with one worker if none does.
 
     Args:
-        photos, settings, limit_mb: as in `plan_of`.
+        photos, settings, limit_mb: photos in use; settings in force; most memory.
         workers: the most that may work at once.
         stages: names of those that will run.
     """
