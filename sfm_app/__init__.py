@@ -1,4 +1,4 @@
-"""A folder of photos about which nothing is known becomes a 3D model.
+"""Reconstruct a 3D model from a folder of uncalibrated photos.
 
 run = sfm_app.reconstruct("photos/", "out/")
 cal = sfm_app.calibrate_photos("photos/")

@@ -27,7 +27,7 @@ PathLike = str | os.PathLike[str]
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """What a finished run leaves behind."""
+    """The results of a finished run."""
 
     out: Path
     calibration: Intrinsics | None
@@ -48,23 +48,23 @@ def reconstruct(
 ) -> Run:  # fmt: skip
     """Turn a folder of photos, or a video, into a mesh: OUT/model.ply and OUT/model.glb.
 
-    What lies in `out` already and is up to date is not done again.
+    Stages whose results in `out` are up to date are skipped.
 
     Args:
         photos: folder with photos of one place, or a video; nothing about the camera needs to be known.
-        out: output folder; made if it is not there.
-        settings: defaults where None.
-        first: do everything from this stage on again.
+        out: output folder; created if it does not exist.
+        settings: None for the defaults.
+        first: redo everything from this stage on.
         last: stop after this stage.
-        progress: shown progress; none by default.
+        progress: display of progress; silent by default.
 
     Raises:
-        SfmError: see `sfm_app.errors`; carries what went wrong and what to do.
+        SfmError: see `sfm_app.errors`; its message and hint say what went wrong and what to do.
     """
-    from sfm_app import pipeline  # loads COLMAP, which an estimator alone can do without
+    from sfm_app import pipeline  # loads COLMAP, which an estimator alone does not need
 
     with opened_run(Path(out), settings or Settings(), progress) as run:
-        run.plugins.depth_method(run.settings.depth.method)  # refused now, not when half of the work is done
+        run.plugins.depth_method(run.settings.depth.method)  # fail now, not halfway through the work
         wanted = (pipeline.INTRINSICS, pipeline.SCENE, pipeline.FILES)
         products = pipeline.run_stages(Path(photos), run, first, last, wanted)
         manifest = run.workspace.manifest.read()
@@ -83,29 +83,29 @@ def reconstruct(
 def export_model(
     out: PathLike, file_format: str = "", target: PathLike | None = None, *, points: bool = False
 ) -> tuple[Path, ...]:
-    """Write the model of a finished run in another format, or to another place; nothing is computed anew.
+    """Write the model of a finished run in another format, or to another place; nothing is recomputed.
 
     Args:
         out: output folder of the run.
-        file_format: "ply", "glb", "obj", or another that `sfm-app plugins` lists; that of `target` where empty.
-        target: file to write; OUT/model.FORMAT, or OUT/points.FORMAT, where None.
-        points: the points and cameras of the sparse reconstruction instead of the model.
+        file_format: "ply", "glb", "obj", or another that `sfm-app plugins` lists; empty for the suffix of `target`.
+        target: file to write; None for OUT/model.FORMAT, or OUT/points.FORMAT.
+        points: export the points and cameras of the sparse reconstruction instead of the model.
 
     Returns:
-        The files: first the one to open, then those that it needs beside it.
+        The files: first the one to open, then those that it refers to.
 
     Raises:
-        ConfigError: no format has that name, or the target is named like another one.
-        InputError: the run has not come so far, or the target cannot be written.
+        ConfigError: no format has that name, or the suffix of `target` belongs to another one.
+        InputError: the run has not made the model yet, or the target cannot be written.
     """
-    from sfm_app.pipeline import stored_model  # loads COLMAP, as above
+    from sfm_app.pipeline import stored_model  # loads COLMAP
 
     plugins = load_plugins()
     place = Path(target) if target is not None else Path(out)
     named = place.suffix.removeprefix(".").lower() if target is not None and not place.is_dir() else ""
     exporter = plugins.exporter(file_format or named)
     if file_format and named in plugins.exporters and named != file_format:
-        raise ConfigError(f"{place.name} is no name for {file_format}", hint=f"name it {place.stem}.{file_format}")
+        raise ConfigError(f"{place.name} does not end in .{file_format}", hint=f"name it {place.stem}.{file_format}")
     if place.is_dir():
         place /= "points" if points else "model"
     with opened_run(Path(out), Settings(), None) as run:
@@ -127,19 +127,19 @@ def calibrate_photos(
 
     Args:
         photos: folder with photos, or a video.
-        settings: defaults where None.
-        out: keeps features and matches there for a later run; a temporary folder where None.
-        figure: PNG, SVG or PDF file in which the pairs' votes and zero curves are drawn; none where None.
-        progress: shown progress; none by default.
+        settings: None for the defaults.
+        out: folder that keeps features and matches for a later run; None for a temporary one.
+        figure: PNG, SVG or PDF file to draw the pairs' votes and zero curves into; None for no figure.
+        progress: display of progress; silent by default.
 
     Raises:
         SfmError: see `sfm_app.errors`.
     """
-    from sfm_app import pipeline  # as above
+    from sfm_app import pipeline  # loads COLMAP
     from sfm_app.report import check_figure, draw_intrinsics
 
     if figure is not None:
-        check_figure(Path(figure))  # said before minutes of work
+        check_figure(Path(figure))  # fail before minutes of work
     with (
         tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch,
         opened_run(Path(out or scratch), settings or Settings(), progress) as run,
@@ -159,13 +159,13 @@ def estimate_fundamental(
 
     Args:
         x1: (N, 2) pixels in photo 1.
-        x2: (N, 2) pixels in photo 2, row by row the partners of x1.
+        x2: (N, 2) pixels in photo 2; row i matches row i of x1.
         method: name of an estimator; `sfm-app plugins` lists them.
         seed: same seed, same result.
-        settings: the table `epipolar` holds the threshold and the limits.
+        settings: their table `epipolar` holds the threshold and the limits.
 
     Returns:
-        EpipolarFit, or Rejected (falsy) with the reason when no geometry is supported by the matches.
+        EpipolarFit, or Rejected (falsy) with the reason when the matches support no geometry.
 
     Raises:
         ValueError: shapes differ or values are not finite.
@@ -180,18 +180,18 @@ def calibrate_fundamentals(
     weights: ArrayLike | None = None, matches: Sequence[ArrayLike] = (), photos: Sequence[tuple[int, int]] = (),
     seed: int = 0, settings: Settings | None = None,
 ) -> Calibration:  # fmt: skip
-    """Find the camera matrix that a set of fundamental matrices has in common.
+    """Find the camera matrix that a set of fundamental matrices shares.
 
     Args:
         Fs: (P, 3, 3) fundamental matrices in pixels, of pairs taken with one camera.
         size: (width, height) of the photos in pixels.
         method: name of a calibrator; `sfm-app plugins` lists them.
-        weights: (P,) > 0, how far each matrix is trusted; equal where None.
-        matches: per matrix (N, 4) x1, y1, x2, y2 in pixels, the matches it rests on; they show the lens and say how
-            exact each matrix is.
-        photos: per matrix the numbers of its two photos.
+        weights: (P,) > 0, weight of each matrix; None for equal weights.
+        matches: per matrix (N, 4) x1, y1, x2, y2 in pixels, the matches behind it; they reveal the lens distortion and
+            the accuracy of each matrix.
+        photos: per matrix the ids of its two photos.
         seed: same seed, same result.
-        settings: the table `calibration` holds the limits.
+        settings: their table `calibration` holds the limits.
 
     Raises:
         ValueError: shapes are wrong or values are not finite.
@@ -204,12 +204,12 @@ def calibrate_fundamentals(
 
 @contextmanager
 def opened_run(out: Path, settings: Settings, progress: Progress | None) -> Iterator[RunContext]:
-    """Provide a run with its workers, which end with it.
+    """Provide a run with its workers, which stop when the block ends.
 
     Args:
         out: output folder.
         settings: of the run.
-        progress: where it tells how far it is; None for silence.
+        progress: display of progress; None for silence.
     """
     plugins = load_plugins(installed=settings.plugins)
     plugins.estimator(settings.epipolar.estimator)  # unknown names are refused before any work is done

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, and folders that a killed run can go on filling."""
+"""Atomic writes of files, and markers of folders that the run after a killed one can go on filling."""
 
 import contextlib
 import os
@@ -7,12 +7,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 UNFINISHED = "unfinished.txt"
-"""In a folder while a stage fills it: what it is filled from. It says whether a killed run can go on there."""
+"""Marker in a folder that a stage is filling: the fingerprint of the inputs, by which a killed run can resume."""
 
 
 @contextlib.contextmanager
 def replacing(target: Path) -> Iterator[Path]:
-    """Provide a path beside `target` to write to; it takes the target's place when the block ends without an error."""
+    """Provide a path beside `target`, which replaces it when the block ends without an error."""
     target.parent.mkdir(parents=True, exist_ok=True)
     beside = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
     try:
@@ -23,7 +23,7 @@ def replacing(target: Path) -> Iterator[Path]:
 
 
 def can_go_on(folder: Path, made_from: str) -> bool:
-    """Return whether a killed run was filling this folder from the same inputs; if not, what is there is removed.
+    """Return whether a killed run was filling this folder from the same inputs; remove the folder if not.
 
     Args:
         folder: may be missing.
@@ -49,10 +49,10 @@ def is_made_from(marker: Path, made_from: str) -> bool:
 
 
 def mark_unfinished(folder: Path, made_from: str) -> None:
-    """Mark a folder as one in which a killed run can go on.
+    """Mark a folder as unfinished, so that a killed run can resume there.
 
     Args:
-        folder: made if it is missing.
+        folder: created if it is missing.
         made_from: fingerprint of the inputs.
     """
     with replacing(folder / UNFINISHED) as path:
@@ -60,12 +60,12 @@ def mark_unfinished(folder: Path, made_from: str) -> None:
 
 
 def mark_finished(folder: Path) -> None:
-    """Mark a folder as complete; the next run fills it anew."""
+    """Mark a folder as complete; the next run that fills it starts afresh."""
     (folder / UNFINISHED).unlink()
 
 
 def save_files(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:
-    """Write files, each complete or not at all, the first one last: it names the others.
+    """Write files, each atomically, the first one last because it refers to the others.
 
     Args:
         files: contents by file name.

@@ -1,4 +1,4 @@
-"""A rendered photo folder with a known camera and a known surface, reconstructed and compared with the truth."""
+"""The demo: photos of a known scene are rendered, reconstructed and compared with the ground truth."""
 
 import time
 from dataclasses import asdict, dataclass
@@ -28,7 +28,7 @@ from sfm_app.synthetic.scenes.scene_catalog import build_scene
 from sfm_app.types import Model, Scene
 
 SIZE = (960, 640)
-"""Of the photos, and of each of the four views in the picture, in pixels."""
+"""Width and height of the photos, and of each of the four views in the picture, in pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ def run_demo(out: Path, settings: Settings, progress: Progress) -> DemoResult:
     Args:
         out: output folder.
         settings: of the reconstruction.
-        progress: where the run tells how far it is.
+        progress: display of progress.
 
     Raises:
         SfmError: see `sfm_app.errors`.
@@ -88,7 +88,7 @@ def run_demo(out: Path, settings: Settings, progress: Progress) -> DemoResult:
 
 
 def _render_photos(out: Path, progress: Progress) -> Truth:
-    """Return the photo folder and its truth beside it; kept when they are there already."""
+    """Return the ground truth of the photos in OUT/photos, which are rendered if they are missing."""
     views = arc(make_camera(*SIZE))
     names = set(views.cam_from_world)
     if (out / "truth.json").exists() and {path.name for path in (out / "photos").glob("*.jpg")} == names:
@@ -99,13 +99,13 @@ def _render_photos(out: Path, progress: Progress) -> Truth:
 
 
 def compared(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[float, float], out: Path) -> DemoResult:
-    """Set what was found beside what is true.
+    """Measure how close the reconstruction came to the ground truth.
 
     Args:
         run: the finished run.
-        scene: cameras and poses that it found.
-        model: surface and texture that it found.
-        truth: what was rendered.
+        scene: its cameras and poses.
+        model: its surface and texture.
+        truth: the rendered scene.
         seconds: spent on rendering, and on the reconstruction.
         out: output folder.
     """
@@ -136,12 +136,12 @@ def compared(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[
 
 
 def draw(model: Model, scene: Scene, out: Path) -> None:
-    """Draw OUT/model.png: a photo and the model from where it was taken; below, the model from beside and its back.
+    """Draw OUT/model.png: a photo and the model from the same pose; below, the model from the side and from behind.
 
     Args:
         model: the finished model.
         scene: cameras and poses of the photos.
-        out: folder with the photos, where the picture goes, too.
+        out: output folder, which has the photos and gets the picture.
     """
     names = sorted(scene.cam_from_world)
     name = names[len(names) // 2]
@@ -152,7 +152,7 @@ def draw(model: Model, scene: Scene, out: Path) -> None:
 
 
 def demo_lines(result: DemoResult) -> list[str]:
-    """Return the result for people."""
+    """Return the result as lines of text."""
     pages = " and ".join(f"{width} x {height}" for width, height in result.pages_px)
     return [
         f"true camera     {k_text(result.true_K)}",

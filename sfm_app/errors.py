@@ -5,18 +5,18 @@
     SfmError                    anything below                                   exit 1
     ├── ConfigError             a setting is unknown, mistyped or out of range   exit 2
     ├── InputError              photos or files are missing or unreadable        exit 3
-    │   └── DamagedProductError what a stage has left can no longer be read
+    │   └── DamagedProductError the files of a stage can no longer be read
     ├── ReconstructionError     the photos do not support a reconstruction       exit 4
     ├── BackendError            COLMAP failed; its own error is the cause        exit 5
     ├── PluginError             a plug-in is broken or clashes with another      exit 6
-    └── NumericalError          our own numbers failed: no inverse, no number    exit 7
+    └── NumericalError          our own computation failed: singular matrix, NaN exit 7
 """
 
 from typing import ClassVar
 
 
 class SfmError(Exception):
-    """What went wrong, in one line, and what the user can do about it.
+    """Base class: what went wrong, in one line, and what the user can do about it.
 
     Args:
         message: one line.
@@ -48,17 +48,17 @@ class InputError(SfmError):
 
 
 class DamagedProductError(InputError):
-    """What a stage has left in the output folder can no longer be read.
+    """The files of a stage in the output folder can no longer be read.
 
     Args:
         message: one line.
         hint: what to do, one line.
-        stage: that has to be done again.
+        stage: name of the stage that has to run again.
     """
 
     def __init__(self, message: str, hint: str, stage: str) -> None:
         super().__init__(message, hint)
-        self.args = (message, hint, stage)  # as above
+        self.args = (message, hint, stage)  # for pickling
         self.stage = stage
 
 
@@ -81,6 +81,6 @@ class PluginError(SfmError):
 
 
 class NumericalError(SfmError):
-    """Our own numbers failed: a matrix without an inverse, a value that is no number."""
+    """Our own computation failed, as on a singular matrix or a NaN."""
 
     exit_code = 7

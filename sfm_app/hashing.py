@@ -1,4 +1,4 @@
-"""What lies on disk and may have been damaged since: hashes of it, and arrays read with limits."""
+"""Hashes of files, and reading of arrays within limits, since files may have been damaged."""
 
 import hashlib
 import json
@@ -11,22 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_BYTES, MOST_INFLATED = 1_000_000_000, 200
-"""Arrays of ours are larger, or more times as large as their file, but not both; deflate can do 1000 with zeros."""
+"""A file is refused if its arrays exceed both: this many bytes, and this many times the size of the file. Our own
+exceed one at most; deflate reaches 1000 times with zeros."""
 
 
 def load_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an .npz file; no objects, which would be code.
+    """Return the arrays of an .npz file; pickled objects, which could run code, are refused.
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it holds something else, or far more than its size allows. Damaged files raise much else.
+        ValueError: it holds something else, or exceeds the limits. Damaged files raise many other errors.
     """
     # opened here, because NumPy leaves a damaged file open
     with path.open("rb") as file:
         with ZipFile(file) as members:
             inflated = sum(member.file_size for member in members.infolist())
         if inflated > max(MOST_BYTES, MOST_INFLATED * path.stat().st_size):
-            raise ValueError(f"{path} holds {inflated} bytes")
+            raise ValueError(f"{path} is refused: it inflates to {inflated} bytes")
         file.seek(0)
         with np.load(file, allow_pickle=False) as stored:
             return dict(stored)
@@ -43,10 +44,10 @@ def digest_file(path: Path) -> str:
 
 
 def digest_files(root: Path, *names: str) -> str:
-    """Return hash of the names and bytes of files and of what lies in folders, links left out.
+    """Return a hash of the names and bytes of files, and of all files in folders, except links.
 
     Raises:
-        FileNotFoundError: one of them is gone.
+        FileNotFoundError: one of them is missing.
     """
     found = hashlib.blake2b(digest_size=16)
     for name in names:
@@ -56,15 +57,13 @@ def digest_files(root: Path, *names: str) -> str:
 
 
 def fingerprint(*parts: Any) -> str:
-    """Return hash of JSON-able parts, independent of the order of keys."""
+    """Return a hash of JSON-able parts, independent of the order of keys."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
 
 def is_below(name: str) -> bool:
-    """Return whether a name leads to a place below the folder that it is joined to, as far as one can tell from the
-    name.
-    """
+    """Return whether a name stays below the folder that it is joined to, judging by the name alone."""
     path = PurePath(name)
     return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
 

@@ -1,4 +1,4 @@
-"""The one place that says how numeric kernels become machine code.
+"""How numeric kernels are compiled to machine code, in one place.
 
 Kernels release the GIL, so pairs run in parallel threads, and their machine code is cached beside the source, so
 only the first run on a machine compiles.
@@ -18,9 +18,9 @@ def kernel(function: Function) -> Function:
 
 
 def summing_kernel(function: Function) -> Function:
-    """Return a kernel whose sums may run in several lanes: some times faster, the same bytes on one kind of processor.
+    """Compile a kernel whose sums may be vectorized: several times faster, the same bytes on one kind of processor.
 
-    Nothing else is relaxed: no assumptions about infinities or NaN, no approximate division.
+    Nothing else is relaxed: there are no assumptions about infinities or NaN, and no approximate division.
     """
     return _compiled(function, fastmath={"reassoc", "nsz"})
 
@@ -29,14 +29,14 @@ def _compiled(function: Function, *, fastmath: bool | set[str]) -> Function:
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": fastmath, "no_cfunc_wrapper": True}
     try:
         compiled: Function = numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # no folder to cache in can be written: compile anew in every process
+    except RuntimeError:  # no folder for the cache is writable: compile in every process
         return cast(Function, numba.njit(**options)(function))
     _forget_unreadable(compiled)
     return compiled
 
 
 def _forget_unreadable(compiled: Any) -> None:
-    """Let a kernel compile anew where its cache names classes that are gone: an upgrade leaves old caches behind."""
+    """Let a kernel be recompiled where its cache refers to classes that no longer exist, as after an upgrade."""
     cache_file = compiled._cache._cache_file
     load = cache_file._load_index
 

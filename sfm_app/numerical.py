@@ -1,4 +1,4 @@
-"""What computations fail with, values that are no numbers, and a constant that all packages share."""
+"""Errors of computations, values that are not finite, and a constant that all packages share."""
 
 import json
 import math
@@ -13,26 +13,26 @@ Json: TypeAlias = "bool | int | float | str | Sequence[Json] | Mapping[str, Json
 """What JSON can hold."""
 
 FAILURES = (NumericalError, ArithmeticError, ValueError, IndexError)
-"""What our own computations raise on numbers that they were not made for: no inverse (NumPy's LinAlgError is a
-ValueError), a division by zero, the largest of nothing. Where a run can go on without the result, it does."""
+"""What our own computations raise on degenerate input: a singular matrix (NumPy's LinAlgError is a ValueError), a
+division by zero, the maximum of an empty array. Where a run can do without the result, it goes on."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation, 1 / Phi^-1(3/4) (Rousseeuw and Leroy
 1987), with the digits that the thesis prints (5.7.2)."""
 
 
 def reason_of(err: Exception) -> str:
-    """Return what an error says, in one line."""
+    """Return the last line of an error's message; the name of its class where there is none."""
     lines = str(err).strip().splitlines()
     return lines[-1] if lines else type(err).__name__
 
 
 def finite_only(values: Mapping[str, float | None]) -> dict[str, float]:
-    """Return the entries that are numbers."""
+    """Return the entries that are finite."""
     return {name: value for name, value in values.items() if value is not None and np.isfinite(value)}
 
 
 def json_text(value: Any) -> str:
-    """Return plain values as JSON; what is infinite or no number becomes null, which every reader understands."""
+    """Return plain values as JSON; infinities and NaN become null, which every reader understands."""
     return json.dumps(_plain(value), indent=1, allow_nan=False) + "\n"
 
 

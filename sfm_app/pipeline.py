@@ -109,9 +109,9 @@ def run_stages(
     Args:
         photo_dir: folder or video.
         run: the run.
-        first: stage from which on everything is done again; empty for none.
+        first: stage from which on everything is redone; empty for none.
         last: stage to stop after.
-        wanted: stages whose products are read before it ends.
+        wanted: stages whose products are loaded before returning.
     """
     options, place = run.settings.photos, run.workspace
     place.keep_apart(photo_dir)
@@ -122,13 +122,13 @@ def run_stages(
 
 
 def stored_model(run: RunContext, *, points: bool = False) -> Model:
-    """Return the finished model, or the points and cameras, that a run left behind; nothing is computed.
+    """Read the finished model, or the points and cameras, of a run; nothing is computed.
 
     Args:
-        run, points: the finished run; whether points and cameras are asked for, not the textured surface.
+        run, points: the finished run; whether to read the points and cameras instead of the textured surface.
 
     Raises:
-        InputError: the run has not come so far (says which stage is missing), or its files are gone or damaged.
+        InputError: a stage has not run yet (the message names it), or its files are missing or damaged.
     """
     place = run.workspace
     if not place.manifest.read().get("stages"):

@@ -1,4 +1,4 @@
-"""Plug-ins: typed hooks, and one registry that the built-ins enter through the same door.
+"""Plug-ins: typed hooks, and one registry in which the built-ins are registered like any other plug-in.
 
 A plug-in is an installed package with an entry point in the group ``sfm_app``; its module holds functions marked with
 `hookimpl` that are named as in `Hooks`.
@@ -59,15 +59,15 @@ class Calibrate(Protocol):
 class FindFeatures(Protocol):
     """Finds the features of one picture, the best first; the same picture gives the same bytes, in any thread.
 
-    The picture is (H, W, 3) RGB of 8 bits, at most `max_image_size_px` long: the caller has shrunk the photo, brings
-    the keypoints back to its pixels, leaves out masked ones and all beyond `max_features`.
+    The picture is (H, W, 3) RGB of 8 bits, at most `max_image_size_px` long. The caller downscales the photo, scales
+    the keypoints back to its pixels, and drops masked ones and those beyond `max_features`.
     """
 
     def __call__(self, picture: NDArray[np.uint8], options: MatchSettings, /) -> Features: ...
 
 
 class MatchFeatures(Protocol):
-    """Matches the features of two pictures: (M, 2) rows of theirs, each at most once; same features, same result."""
+    """Matches the features of two pictures: returns (M, 2) rows, each at most once; same features, same result."""
 
     def __call__(self, first: Features, second: Features, options: MatchSettings, /) -> NDArray[np.integer[Any]]: ...
 
@@ -89,11 +89,11 @@ class Calibrator:
     calibrate: Calibrate
     summary: str = ""
     together: bool = False
-    """Whether groups that disagree are split, and pairs between cameras used, by the program's own method."""
+    """Whether the program's own method then splits groups that disagree, and uses pairs between cameras."""
 
 
 class WriteModel(Protocol):
-    """Makes model files, by their names: first the one to open, `name` with the format as suffix, then those beside it.
+    """Makes model files by name: first the one to open (`name` with the format as suffix), then those it refers to.
 
     Takes a surface with a texture (pages of pictures), a surface with a color per vertex, or points and cameras; the
     same model gives the same bytes. ReconstructionError where the model is empty.
@@ -107,13 +107,13 @@ class Exporter:
     """A file format for models."""
 
     name: str
-    """Of the format: the suffix, without dot, of the file to open."""
+    """Name of the format: the suffix, without dot, of the file to open."""
     write: WriteModel
     summary: str = ""
 
 
 class MakeDepthMaps(Protocol):
-    """Leaves geometric depth and normal maps in the workspace; says for every view why it has none, or None."""
+    """Writes geometric depth and normal maps to the workspace; returns for every view why it has none, or None."""
 
     def __call__(self, task: "DepthTask", /) -> list[Rejected | None]: ...
 
@@ -150,7 +150,7 @@ class FeatureMethod:
     unavailable: Callable[[], str] = _always
     """Why it cannot run on this machine; empty where it can."""
     sift: Mapping[str, bool | int | float] | None = None
-    """Where there are no functions: options of COLMAP's SIFT extraction that are not to be its defaults."""
+    """In place of functions: options of COLMAP's SIFT extraction that differ from its defaults."""
 
     def __post_init__(self) -> None:
         functions = [self.find, self.match].count(None)
@@ -247,11 +247,11 @@ class Plugins:
         method = _named(self.features, name, "way to find features")
         if reason := method.unavailable():
             hint = f"'{SIFT}' runs everywhere"
-            raise ConfigError(f"the features '{name}' cannot be found here: {reason}", hint=hint)
+            raise ConfigError(f"the features '{name}' cannot be used here: {reason}", hint=hint)
         return method
 
     def depth_method(self, name: str) -> tuple[DepthMethod, str]:
-        """Return the way to make depth maps of that name, or with "auto" the best that runs here; and why this one.
+        """Return the way to make depth maps of that name, or with "auto" the best that runs here, and why this one.
 
         Raises:
             ConfigError: no method has that name, or it cannot run on this machine.
@@ -264,7 +264,7 @@ class Plugins:
                     hint=f"'{AUTO}' takes what this machine can do, '{CPU}' runs everywhere",
                 )
             return method, "asked for"
-        # whoever installs another method wants it used
+        # an installed method is meant to be used
         others = [method for method in self.depth_methods.values() if method.name != CPU]
         reasons = {method.name: method.unavailable() for method in others}
         for method in others:
@@ -275,14 +275,14 @@ class Plugins:
 
 
 def load_plugins(modules: Sequence[ModuleType | object] = (), *, installed: bool = True) -> Plugins:
-    """Register the built-ins, the given modules and, unless told otherwise, every installed plug-in.
+    """Register the built-ins, the given modules and, if wanted, every installed plug-in.
 
-    Without arguments the answer is found once per process: the search through all installed packages takes
-    milliseconds, an estimator's work on an easy pair does not. `installed_plugins.cache_clear()` makes it look again.
+    Without arguments the result is cached for the process: the search through all installed packages takes
+    milliseconds, longer than an estimator needs for an easy pair. `installed_plugins.cache_clear()` resets it.
 
     Args:
-        modules: plug-ins beside the installed ones.
-        installed: whether installed plug-ins count, too.
+        modules: plug-ins besides the installed ones.
+        installed: whether to register the installed plug-ins, too.
 
     Raises:
         PluginError: a hook is misspelt, a plug-in does not import, or two things share a name.
@@ -305,7 +305,7 @@ def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
         if installed:
             manager.load_setuptools_entrypoints(GROUP)
         manager.check_pending()
-    except Exception as err:  # whatever a foreign module raises on import
+    except Exception as err:  # a plug-in may raise anything on import
         raise PluginError(
             f"a plug-in does not load: {err}", hint="update or uninstall it; hooks: sfm_app.plugins.Hooks"
         ) from err

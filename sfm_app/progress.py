@@ -1,4 +1,4 @@
-"""How long work tells the outside where it stands, without knowing what shows it."""
+"""The interface through which long work reports its progress, whatever displays it."""
 
 from collections.abc import Iterable, Iterator
 from typing import Protocol, TypeVar
@@ -7,7 +7,7 @@ Item = TypeVar("Item")
 
 
 class Progress(Protocol):
-    """What a display of progress has to offer; the command line has one on stderr, a library call none."""
+    """Interface of a display of progress; the command line has one on stderr, a library call none."""
 
     def stage(self, name: str, note: str = "") -> None:
         """Announce a stage that begins or was skipped.
@@ -18,10 +18,10 @@ class Progress(Protocol):
         """
 
     def stage_done(self, seconds: float) -> None:
-        """Announce the end of the stage that began last, after so many seconds."""
+        """Announce the end of the current stage, with its duration in seconds."""
 
     def say(self, text: str) -> None:
-        """Say something that people should know before they wait."""
+        """Show a message."""
 
     def start(self, label: str, total: int) -> None:
         """Start work of several steps.
@@ -32,14 +32,14 @@ class Progress(Protocol):
         """
 
     def advance(self, steps: int = 1) -> None:
-        """Count so many more steps as done."""
+        """Count more steps as done."""
 
     def finish(self) -> None:
         """Finish the work that was started last."""
 
 
 class Silent:
-    """Shows nothing."""
+    """A display that shows nothing."""
 
     def stage(self, name: str, note: str = "") -> None:
         """Show nothing.
@@ -69,7 +69,7 @@ class Silent:
 
 
 def track(progress: Progress, items: Iterable[Item], label: str, total: int) -> Iterator[Item]:
-    """Yield the items and count each one once it has been dealt with.
+    """Yield the items and count each one when the caller is done with it.
 
     Args:
         progress: where they are counted.

@@ -1,6 +1,6 @@
 """Every option of the program: typed, with unit, range and one line of help; TOML in and out.
 
-A setting comes, in rising order, from its default, from the quality preset, from the TOML file, from a flag.
+The sources of a setting, in rising priority: its default, the quality preset, the TOML file, a flag.
 """
 
 import difflib
@@ -15,16 +15,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from sfm_app.errors import ConfigError
 
 MOST_TOML_BYTES = 20_000
-"""A file with every setting has a fifth of it; a megabyte of dots takes minutes to read."""
+"""Most bytes of a settings file. One with every setting has a fifth; a megabyte of dots takes minutes to parse."""
 TOLD, SHOWN = 20, 100
-"""Problems that are told, and characters of a wrong value."""
+"""Most problems that an error lists, and most characters of a wrong value that it shows."""
 
 Quality = Literal["draft", "normal", "high"]
 ConstraintForm = Literal["huang-faugeras", "frobenius", "trivedi", "polynomial"]
 
 
 class Section(BaseModel):
-    """One table of the settings file: frozen, and it refuses what it does not know."""
+    """One table of the settings file: frozen, and unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -34,7 +34,7 @@ class PhotoSettings(Section):
 
     images: str = Field("", description="text file that names the photos to use, one per line; all where empty")
     masks: str = Field(
-        "", description="folder of masks: what is black in its sub/a.jpg.png is not used of sub/a.jpg; none where empty"
+        "", description="folder of masks: what is black in sub/a.jpg.png is left out of sub/a.jpg; none where empty"
     )
     cameras: Literal["auto", "single", "folder", "each"] = Field(
         "auto",
@@ -43,7 +43,7 @@ class PhotoSettings(Section):
     )
     max_frames: int = Field(100, ge=2, le=2000, description="most frames of a video that are used")
     keep_low_quality: bool = Field(False, description="use copies, blurred photos and screenshots, too")
-    max_megapixels: float = Field(64.0, ge=0.1, le=178, description="larger photos are scaled down to so many")
+    max_megapixels: float = Field(64.0, ge=0.1, le=178, description="larger photos are scaled down to this size")
     min_side_px: int = Field(64, ge=16, le=4096, description="photos with a shorter side are left out, in pixels")
 
 
@@ -56,7 +56,7 @@ class MatchSettings(Section):
     )
     max_features: int = Field(8192, ge=100, le=100000, description="most features per photo")
     max_ratio: float = Field(
-        0.8, gt=0, le=1, description="nearest over second nearest descriptor distance; 1 switches it off; SIFT's"
+        0.8, gt=0, le=1, description="largest nearest over second nearest descriptor distance, for SIFT; 1: no limit"
     )
 
 
@@ -67,12 +67,12 @@ class EpipolarSettings(Section):
         "lev-ransac", description="name of the estimator of fundamental matrices (see `sfm-app plugins`)"
     )
     max_error_px: float = Field(1.5, gt=0, le=100, description="inlier threshold on the Sampson distance, in pixels")
-    confidence: float = Field(0.9999, gt=0, lt=1, description="wanted probability that one sample is free of outliers")
+    confidence: float = Field(0.9999, gt=0, lt=1, description="required probability that a sample is free of outliers")
     max_trials: int = Field(20000, ge=1, le=10_000_000, description="most minimal samples per pair")
     min_inliers: int = Field(16, ge=8, le=10000, description="a pair with fewer inliers is rejected")
     refit: Literal["auto", "eight-point", "sampson", "reprojection"] = Field(
         "auto",
-        description="distance that one more fit to the inliers makes small; auto: the estimator's own fit is the last",
+        description="error that a final refit to the inliers minimizes; auto: no refit after the estimator's own",
     )
 
 
@@ -86,12 +86,12 @@ class CalibrationSettings(Section):
         description="constraint that the thesis's least-squares calibrators minimize: huang-faugeras (5.8), "
         "frobenius (5.9), trivedi (5.11) or polynomial (5.25)",
     )
-    lens: bool = Field(True, description="look for the radial distortion of the lens")
+    lens: bool = Field(True, description="estimate the radial distortion of the lens")
     center_sigma: float = Field(
         0.15,
         gt=0,
         le=10,
-        description="soft prior: standard deviation of the optical center about the middle, in widths",
+        description="soft prior: standard deviation of the optical center about the middle, in image widths",
     )
 
 
@@ -108,10 +108,10 @@ class SceneSettings(Section):
     )
     min_points: int = Field(30, ge=6, le=10000, description="a model with fewer points counts as failed")
     second_look: bool = Field(
-        True, description="seek finer features in photos that found no place, and in their neighbors, and map again"
+        True, description="find finer features in unplaced photos and their neighbors, and map again"
     )
     photo_rotation_deg: Literal["auto", 0, 90, 180, 270] = Field(
-        "auto", description="by how much most photos have to be turned clockwise to be upright, in degrees"
+        "auto", description="clockwise rotation that makes most photos upright, in degrees"
     )
 
 
@@ -142,16 +142,16 @@ class MeshSettings(Section):
         0.003, ge=0, le=1, description="connected parts with a smaller share of the triangles are dropped"
     )
     max_error_edges: float = Field(
-        0.15, ge=0, le=10, description="simplification may move the surface so far, in edges of Poisson's triangles"
+        0.15, ge=0, le=10, description="most that simplification may move the surface, in edges of Poisson's triangles"
     )
     faces: int = Field(200_000, ge=100, le=50_000_000, description="most triangles of the finished mesh")
 
 
 class TextureSettings(Section):
-    """The pictures on the surface."""
+    """The texture of the surface."""
 
     max_atlas_px: int = Field(4096, ge=256, le=16384, description="longest side of a page of texture, in pixels")
-    max_pages: int = Field(4, ge=1, le=64, description="most pages; where the photos show more, it is scaled down")
+    max_pages: int = Field(4, ge=1, le=64, description="most pages of texture; more detail is scaled down to fit")
     unseen_faces: Literal["color", "cut"] = Field(
         "color", description="triangles that no photo sees: color: painted like what is around them; cut: left out"
     )
@@ -164,9 +164,9 @@ class Settings(Section):
     workers: int = Field(0, ge=0, le=1024, description="parallel workers; 0: one per core")
     quality: Quality = Field("normal", description="preset for image sizes and mesh resolution")
     max_memory_gb: float = Field(
-        0.0, ge=0, le=4096, description="most memory that is used, in GB; 0: as much as the machine has, less a fifth"
+        0.0, ge=0, le=4096, description="most memory that is used, in GB; 0: four fifths of what the machine has"
     )
-    plugins: bool = Field(True, description="load installed plug-ins; false: nothing but what the program itself has")
+    plugins: bool = Field(True, description="load installed plug-ins; false: only the program's own methods")
     photos: PhotoSettings = PhotoSettings()
     matching: MatchSettings = MatchSettings()
     epipolar: EpipolarSettings = EpipolarSettings()
@@ -178,14 +178,14 @@ class Settings(Section):
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any], where: str = "settings") -> "Settings":
-        """Check nested values on top of the preset they name.
+        """Check nested values on top of the preset that they name.
 
         Args:
             values: settings by name, tables nested.
             where: source of the values, for the error message.
 
         Raises:
-            ConfigError: a key is unknown, or a value has the wrong type or lies out of range; names the first TOLD.
+            ConfigError: a key is unknown, or a value has the wrong type or is out of range; lists the first few.
         """
         preset = QUALITY_PRESETS.get(str(values.get("quality", "normal")), {})
         try:
@@ -201,7 +201,7 @@ class Settings(Section):
 
     @classmethod
     def from_toml(cls, path: Path, overrides: Mapping[str, Any] | None = None) -> "Settings":
-        """Read a settings file and lay other values over it.
+        """Read a settings file, with some values overridden.
 
         Args:
             path: TOML file.
@@ -232,7 +232,7 @@ QUALITY_PRESETS: dict[str, dict[str, Any]] = {
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file, or say what is wrong with it."""
+    """Read a TOML file; ConfigError where it is not valid."""
     hint = "`sfm-app config` prints a valid one"
     try:
         with path.open("rb") as file:
@@ -244,15 +244,15 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"cannot read {path}: {err.strerror}") from err
     except RecursionError:
         raise ConfigError(f"{path} is no settings file: it is nested too deeply", hint=hint) from None
-    except ValueError as err:  # no TOML, no UTF-8, numbers of thousands of digits
+    except ValueError as err:  # not TOML, not UTF-8, numbers of thousands of digits
         raise ConfigError(f"{path} is not a TOML file: {err}", hint=hint) from err
 
 
 def merged(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
-    """Return nested mappings laid over each other.
+    """Return two nested mappings merged into one.
 
     Args:
-        low: values that count where the other has none.
+        low: values that are used where `high` has none.
         high: values that win.
     """
     result = dict(low)
@@ -277,7 +277,7 @@ def _problem(error: dict[str, Any]) -> tuple[str, str]:
 def _shown(value: object) -> str:
     try:
         text = repr(value)
-    except (RecursionError, ValueError):  # nested deeply; numbers of thousands of digits
+    except (RecursionError, ValueError):  # deeply nested values, numbers of thousands of digits
         text = f"a {type(value).__name__}"
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 

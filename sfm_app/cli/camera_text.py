@@ -1,4 +1,4 @@
-"""What a run says about its cameras: for people, and plain."""
+"""Summaries of a run's cameras: lines of text, and plain values for --json."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -9,15 +9,15 @@ from sfm_app.types import Intrinsics
 
 KEY_PAIRS = 3
 PHOTOS = 4
-"""So many are named to people; --json has all."""
+"""Most key pairs and photos that the text names; --json has all."""
 
 
 SOURCES = {"exif": "EXIF's claim", "guess": "a guess", "estimate": "an estimate"}
-"""What a camera that the photos do not determine is instead, by its method."""
+"""Where the values of an undetermined camera come from, by its method."""
 
 
 def intrinsics_summary(intrinsics: Intrinsics) -> dict[str, Any]:
-    """Return calibrations, plain, for --json."""
+    """Return the calibrations as plain values for --json."""
     names = intrinsics.photos
     cameras = {
         name: {"field_of_view_deg": [round(angle, 2) for angle in field_of_view_deg(camera)], **camera.to_dict()}
@@ -29,7 +29,7 @@ def intrinsics_summary(intrinsics: Intrinsics) -> dict[str, Any]:
 
 
 def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
-    """Return calibrations, for people."""
+    """Return the calibrations as lines of text."""
     many = len(intrinsics.cameras) > 1
     lines = []
     for name, camera in intrinsics.cameras.items():
@@ -54,11 +54,11 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
 
 
 def k_text(K: Any, spread: Mapping[str, float] = MappingProxyType({})) -> str:
-    """Return focals and center in pixels, with standard deviations where there are some.
+    """Return focals and center in pixels, with standard deviations where they are known.
 
     Args:
         K: (3, 3) in pixels.
-        spread: standard deviations in pixels, by "fx", "fy", "cx", "cy"; those not stated are left out.
+        spread: standard deviations in pixels, by "fx", "fy", "cx", "cy"; any may be missing.
     """
     values = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     parts = (

@@ -1,4 +1,4 @@
-"""The commands."""
+"""The commands of `sfm-app`."""
 
 import errno
 import os
@@ -32,18 +32,18 @@ from sfm_app.plugins import load_plugins
 
 INTERRUPTED = 130
 FULL = {errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", errno.ENOSPC)}
-"""What the system calls a disk that is full, for all or for this user."""
+"""Error numbers of a full disk, of a file that is too large, and of an exhausted quota."""
 
 
 class Commands(click.Group):
-    """Turns errors into one line and an exit code, in one place."""
+    """Command group that turns errors into one line and an exit code."""
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
-        """Run the command line; at its end leave at once where a part of the work still runs."""
+        """Run the command line; end the process at once where a call of COLMAP still runs."""
         try:
             return super().main(*args, **kwargs)
         finally:
-            if left_running():  # at an end that waits, or takes away what the call works on, it would crash
+            if left_running():  # a normal exit frees what the call works on, and crashes
                 sys.stdout.flush()
                 sys.stderr.flush()
                 os._exit(INTERRUPTED)
@@ -65,15 +65,15 @@ class Commands(click.Group):
 
 
 def told(err: OSError) -> tuple[str, str]:
-    """Return what the system has refused, and what to do about it."""
+    """Return the message and the hint for an error of the operating system."""
     if err.errno in FULL:
-        return f"the disk is full ({err.strerror})", "make room; the same command goes on where this one stopped"
+        return f"the disk is full ({err.strerror})", "free some space; the same command resumes where this one stopped"
     where = err.filename or "a file of this run"
-    return f"{err.strerror or err}: {where}", "when that is mended, the same command goes on"
+    return f"{err.strerror or err}: {where}", "fix that, and run the same command again to resume"
 
 
 def fail(message: str, hint: str, code: int) -> None:
-    """Say what went wrong and what to do about it, and end.
+    """Print an error and its hint, and exit.
 
     Args:
         message: what went wrong.
@@ -87,8 +87,8 @@ def fail(message: str, hint: str, code: int) -> None:
 @click.group(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="sfm-app")
 def main() -> None:
-    """Turn a folder of photos, or a video, about which nothing is known into a 3D model."""
-    warnings.filterwarnings("ignore", module=r"PIL\b")  # what is wrong with a photo is said once, and in our words
+    """Turn a folder of uncalibrated photos, or a video, into a 3D model."""
+    warnings.filterwarnings("ignore", module=r"PIL\b")  # we report problems with photos ourselves, once
 
 
 @main.command()
@@ -96,14 +96,14 @@ def main() -> None:
 @click.option(
     "-o", "--out", type=click.Path(path_type=Path), help="Output folder.  [default: PHOTOS-model beside PHOTOS]"
 )
-@click.option("--from", "first", type=click.Choice(NAMES), default=None, help="Do everything from this stage on again.")
+@click.option("--from", "first", type=click.Choice(NAMES), default=None, help="Redo everything from this stage on.")
 @click.option("--until", "last", type=click.Choice(NAMES), default="files", help="Stop after this stage.")
 @settings_options
 @output_options
 def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: Any) -> None:
     """Reconstruct PHOTOS, a folder or a video: camera, poses and a mesh as OUT/model.ply and OUT/model.glb.
 
-    What lies in OUT and is up to date is not done again: an interrupted run goes on where it stopped.
+    Stages whose results in OUT are up to date are skipped, so an interrupted run resumes where it stopped.
     """
     settings = settings_from(flags)
     out = out or photos.resolve().with_name(f"{photos.resolve().name}-model")
@@ -117,7 +117,7 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
 @click.option(
     "--figure",
     type=click.Path(path_type=Path),
-    help="Draw what the pairs of photos say into this PNG, SVG or PDF file.",
+    help="Draw the pairs' votes and zero curves into this PNG, SVG or PDF file.",
 )
 @settings_options
 @output_options
@@ -130,26 +130,28 @@ def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any)
 
 @main.command()
 @click.argument("out", type=click.Path(path_type=Path))
-@click.option("--format", "file_format", default="", help="ply, glb, obj, ...  [default: as FILE is named]")
+@click.option("--format", "file_format", default="", help="ply, glb, obj, ...  [default: the suffix of FILE]")
 @click.option(
     "-o", "--output", "target", type=click.Path(path_type=Path), help="File to write.  [default: OUT/model.FORMAT]"
 )
-@click.option("--points", is_flag=True, help="The sparse points and the cameras instead of the model.")
+@click.option("--points", is_flag=True, help="Export the sparse points and the cameras instead of the model.")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 def export(out: Path, file_format: str, target: Path | None, points: bool, as_json: bool) -> None:
-    """Write the model of the run in OUT in another format, without computing anything anew."""
+    """Write the model of the run in OUT in another format, without recomputing anything."""
     if not file_format and not (target and target.suffix):
-        raise ConfigError("no format is named", hint=f"--format {'|'.join(load_plugins().exporters)}, or -o model.obj")
+        raise ConfigError("no format is given", hint=f"--format {'|'.join(load_plugins().exporters)}, or -o model.obj")
     files = export_model(out, file_format, target, points=points)
     print_json([str(path) for path in files]) if as_json else print_lines(file_lines(files))
 
 
 @main.command()
-@click.option("-o", "--out", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Where.")
+@click.option(
+    "-o", "--out", type=click.Path(path_type=Path), default=Path("demo"), show_default=True, help="Output folder."
+)
 @settings_options
 @output_options
 def demo(out: Path, **flags: Any) -> None:
-    """Render photos of a known scene, reconstruct them and say how close it came."""
+    """Render photos of a known scene, reconstruct them and print the errors."""
     result = run_demo(out, settings_from(flags), Terminal(quiet=flags["quiet"]))
     print_json(result.to_dict()) if flags["as_json"] else print_lines(demo_lines(result))
 
@@ -157,7 +159,7 @@ def demo(out: Path, **flags: Any) -> None:
 @main.command()
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 def doctor(as_json: bool) -> None:
-    """Say what this machine has and lacks."""
+    """Show what this machine has and lacks."""
     found = examine()
     print_json(found) if as_json else print_lines(table(found))
 
@@ -165,7 +167,7 @@ def doctor(as_json: bool) -> None:
 @main.command()
 @settings_options
 def config(**flags: Any) -> None:
-    """Print all settings as TOML, with what the other options change."""
+    """Print all settings as TOML, including the changes by other options."""
     print_lines(settings_from(flags).to_toml().splitlines())
 
 

@@ -29,7 +29,7 @@ STAGE_TITLES = {
 
 MEGABYTE, KILOBYTE = 1e6, 1e3
 NAMED = 5
-"""Files of one kind that are named; the manifest has all."""
+"""Most files of one kind that are named; the manifest has all."""
 
 
 class Terminal:
@@ -48,7 +48,7 @@ class Terminal:
 
         Args:
             name: of the stage.
-            note: why it was skipped; empty where it begins.
+            note: why it is skipped or done again; may be empty.
         """
         steps = list(STAGE_TITLES)
         number = f"{steps.index(name) + 1}/{len(steps)} " if name in steps else ""
@@ -73,12 +73,12 @@ class Terminal:
         self.bars.start()
 
     def advance(self, steps: int = 1) -> None:
-        """Move the bar on by so many steps."""
+        """Move the bar forward by some steps."""
         if self.task is not None:
             self.bars.advance(self.task, steps)
 
     def finish(self) -> None:
-        """Take the bar away."""
+        """Remove the bar."""
         if self.task is not None:
             self.bars.stop()
             self.bars.remove_task(self.task)
@@ -96,12 +96,12 @@ def print_lines(lines: list[str]) -> None:
 
 
 def shown(text: str) -> str:
-    """Return a text in which names of files cannot move the cursor, nor break the line."""
+    """Return a text with unprintable characters escaped: a file's name could move the cursor or break the line."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def run_summary(run: Run) -> dict[str, Any]:
-    """Return the figures of a run, plain, for --json."""
+    """Return the figures of a run as plain values for --json."""
     stages = run.manifest.get("stages", {})
     counts = {name: stage["counts"] for name, stage in stages.items()}
     photos = counts.get("photos", {})
@@ -125,7 +125,7 @@ def run_summary(run: Run) -> dict[str, Any]:
 
 
 def run_lines(run: Run) -> list[str]:
-    """Return the figures of a run, for people."""
+    """Return the figures of a run as lines of text."""
     summary = run_summary(run)
     lines = list(video_lines(summary["video"])) if "video" in summary else []
     lines.append(f"photos      {summary['photos']['usable']} usable")
@@ -164,7 +164,7 @@ def video_lines(video: Mapping[str, Any]) -> Iterator[str]:
 
 
 def photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what was left out, reason by reason, and what people should know about the others."""
+    """Yield the notes on photos that are used, and the photos left out by reason."""
     by_reason: dict[str, list[str]] = {}
     for name, reason in photos["unusable"].items():
         by_reason.setdefault(reason, []).append(name)
@@ -175,10 +175,10 @@ def photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _mask_lines(masks: Mapping[str, Any], photos: int) -> Iterator[str]:
-    """Yield how many photos have a mask, and which files are of none of them."""
+    """Yield how many photos have a mask, and which mask files belong to no photo."""
     yield f"masks       {masks['photos']} of {photos} photos"
     if masks["unused"]:
-        yield f"            of no photo that is used: {some(masks['unused'])}"
+        yield f"            without a photo that is used: {some(masks['unused'])}"
 
 
 def some(names: Sequence[str]) -> str:
@@ -188,13 +188,13 @@ def some(names: Sequence[str]) -> str:
 
 
 def texture_text(mesh: Mapping[str, Any]) -> str:
-    """Return the pages of texture, where there are some."""
+    """Return the size of the texture's pages and their JPEG quality; empty without a texture."""
     pages = " and ".join(f"{width} x {height}" for width, height in mesh.get("pages_px", ()))
     return f", texture {pages} px, JPEG of quality {mesh['jpeg_quality']}" if pages else ""
 
 
 def written(run: Run, stage: str) -> list[Path]:
-    """Return the model files that a stage wrote and that are still there, the one to open first.
+    """Return the existing model files that a stage wrote, the one to open first.
 
     Args:
         run: with its manifest.
@@ -205,18 +205,18 @@ def written(run: Run, stage: str) -> list[Path]:
 
 
 def file_lines(paths: Sequence[Path]) -> list[str]:
-    """Return files with their sizes."""
+    """Return one line per file, with its size."""
     return [f"{path}  {size_text(path.stat().st_size)}" for path in paths]
 
 
 def size_text(size: int) -> str:
-    """Return bytes as people read them."""
+    """Return a number of bytes with a suitable unit."""
     if size < KILOBYTE:
         return f"{size} bytes"
     return f"{size / MEGABYTE:.1f} MB" if size >= MEGABYTE else f"{size / KILOBYTE:.0f} kB"
 
 
 def table(rows: Mapping[str, str]) -> list[str]:
-    """Return two columns."""
+    """Return lines with names and texts in two aligned columns."""
     width = max(map(len, rows), default=0)
     return [f"{name:{width}}  {text}" for name, text in rows.items()]

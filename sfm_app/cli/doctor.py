@@ -16,7 +16,7 @@ ENOUGH_DISK = 2 * GIGABYTE
 
 
 def examine() -> dict[str, str]:
-    """Return one line per thing looked at."""
+    """Return the state of the machine and of the installed parts, one line each."""
     disk = shutil.disk_usage(Path.cwd()).free
     return {
         "python": f"{platform.python_version()} on {platform.system()} {platform.machine()}",
@@ -63,7 +63,7 @@ def _plugins() -> str:
     return ", ".join(
         f"{len(parts)} {name}"
         for name, parts in (
-            ("ways to find features", found.features),
+            ("feature methods", found.features),
             ("estimators", found.estimators),
             ("calibrators", found.calibrators),
             ("formats", found.exporters),

@@ -24,19 +24,19 @@ def settings_options(command: Command) -> Command:
         *(setting_option(flag) for flag in SETTING_FLAGS),
         click.option("--no-plugins", is_flag=True, help=f"Do not {without}."),
         click.option("--set", "assignments", multiple=True, metavar="TABLE.KEY=VALUE", help="Any other setting."),
-        click.option("-v", "--verbose", count=True, help="Show what COLMAP says; -vv shows all of it."),
+        click.option("-v", "--verbose", count=True, help="Show COLMAP's warnings; -vv shows all of its log."),
     )
     return reduce(lambda wrapped, option: option(wrapped), reversed(options), command)
 
 
 def output_options(command: Command) -> Command:
-    """Return --json and -q."""
+    """Add --json and -q."""
     command = click.option("-q", "--quiet", is_flag=True, help="No progress.")(command)
     return click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")(command)
 
 
 def settings_from(flags: Mapping[str, Any]) -> Settings:
-    """Return settings from the shared options; flags win over the file."""
+    """Return settings from the shared options; flags override the file."""
     show_log(flags["verbose"])
     overrides: dict[str, Any] = {"plugins": False} if flags["no_plugins"] else {}
     for flag in SETTING_FLAGS:
@@ -50,7 +50,7 @@ def settings_from(flags: Mapping[str, Any]) -> Settings:
 
 
 def assigned(text: str) -> dict[str, Any]:
-    """Return TABLE.KEY=VALUE as nested settings; ConfigError where it is something else."""
+    """Return TABLE.KEY=VALUE as nested settings; ConfigError where it is malformed."""
     name, equals, value = text.partition("=")
     if not equals:
         raise ConfigError(f"--set {text}: no '=' in it", hint="write --set depth.neighbors=6")

@@ -1,4 +1,4 @@
-"""What a run says about its scene: for people, and plain."""
+"""Summaries of a run's scene: lines of text, and plain values for --json."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -7,10 +7,10 @@ from sfm_app.cli.camera_text import k_text
 from sfm_app.types import Scene
 
 NAMES = 4
-"""Photos of another model that are named."""
+"""Most photos of a group that are named."""
 MAPPERS = {"incremental": "photo after photo", "global": "all at once", "colmap": "as COLMAP does by itself"}
 CONTRADICTED = 0.1
-"""From this share of the matches on, people are told."""
+"""Share of contradicted matches above which the text warns."""
 ONE_EACH = {
     "taken": "one camera for all photos of a size does not explain them: each has its own (a zoom, or several devices)",
     "two": "one camera for all photos of a size does not explain them, two do",
@@ -18,15 +18,15 @@ ONE_EACH = {
 }
 DOUBTS = ("look_alikes", "perhaps_look_alikes", "jumps", "weakly_joined")
 UNSURE_ODDS = 10.0
-"""Below these odds to one that up is up, too."""
+"""Odds (to one) that the model is upright, below which the text warns."""
 
 
 def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scene, plain, for --json.
+    """Return the scene as plain values for --json.
 
     Args:
-        scene: what the stage gave.
-        counts: what it counted.
+        scene: product of the stage.
+        counts: figures of the stage in the manifest.
     """
     kept = (
         "mapper", "mapper_reason", "pairs", "pairs_dropped", "cut_apart", "other_models", "adjustment", "orientation",
@@ -44,11 +44,11 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the scene, for people.
+    """Yield the scene as lines of text.
 
     Args:
-        scene: what the stage gave.
-        counts: what it counted.
+        scene: product of the stage.
+        counts: figures of the stage in the manifest.
     """
     summary = scene_summary(scene, counts)
     yield (
@@ -59,7 +59,7 @@ def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
     named = {name for names in summary.get("other_models", ()) for name in names}
     for name, reason in scene.unregistered.items():
         if name not in named:
-            yield f"            no place for {name}: {reason}"
+            yield f"            not placed: {name}: {reason}"
     many = len(scene.cameras) > 1
     for name, camera in scene.cameras.items():
         yield f"            camera {f'{name} ' if many else ''}refined: {k_text(camera.K, camera.deviations)}"
@@ -71,14 +71,14 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
         because = f": {counts['mapper_reason']}" if counts.get("mapper_reason") else ""
         yield f"mapped {MAPPERS[summary['mapper']]}{because}"
         if counts.get("rival_tried_because"):
-            yield f"COLMAP's own way was tried beside ours: {counts['rival_tried_because']}"
+            yield f"COLMAP's own mapper was tried, too: {counts['rival_tried_because']}"
         if counts.get("one_camera_each") in ONE_EACH:
             yield ONE_EACH[counts["one_camera_each"]]
         yield from _second_look(counts.get("second_look", {}))
         if dropped:
             yield f"pairs of photos left out because they do not fit the others: {dropped}"
     for photos in summary.get("cut_apart", ()):
-        yield f"cut apart, because more matches contradict the join than bear it out: {photos}"
+        yield f"split, because more matches contradict the connection than support it: {photos}"
     yield from _doubts(summary)
     for number, names in enumerate(summary.get("other_models", ()), start=1):
         yield f"another model of {len(names)} photos in other_models/{number}: {_some(names)}"
@@ -91,29 +91,29 @@ def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]
     yield from _badly_adjusted(summary.get("adjustment", {}))
     orientation = summary.get("orientation", {})
     if orientation.get("failed"):
-        yield f"it stands as mapping left it, neither upright nor in meters: {orientation['failed']}"
+        yield f"frame as left by mapping, neither upright nor in meters: {orientation['failed']}"
     elif orientation:
         deviation = orientation["up_deviation_deg"]
-        sure = f"to about {max(deviation, 0.1):.1f} degrees" if deviation is not None else "nobody knows how exactly"
+        sure = f"to about {max(deviation, 0.1):.1f} degrees" if deviation is not None else "with unknown accuracy"
         yield f"upright by {orientation['up']}, {sure}; in {_unit(orientation)}"
         yield from _perhaps_not_upright(orientation)
 
 
 def _second_look(found: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what finer features have brought."""
+    """Yield the result of mapping again with finer features."""
     if found:
         before, after = found["placed"][0], found["placed"][-1]
         brought = f"{after} photos placed instead of {before}" if found["taken"] else "no more photos placed"
         failed = f" (it failed: {found['failed']})" if found.get("failed") else ""
-        yield f"finer features were sought for {len(found['photos'])} photos without a place: {brought}{failed}"
+        yield f"finer features were sought in {len(found['photos'])} unplaced photos: {brought}{failed}"
 
 
 def _badly_adjusted(adjustment: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what the last adjustment could not do."""
+    """Yield warnings about the last bundle adjustment."""
     if adjustment.get("failed"):
         yield (
             f"beware: the last adjustment failed ({adjustment['failed']}); cameras and poses are as mapping left them, "
-            "how far off they may be is unknown"
+            "and their errors are unknown"
         )
     for number, reason in adjustment.get("failed_in_other_models", {}).items():
         yield f"beware: the last adjustment of other_models/{number} failed ({reason})"
@@ -122,26 +122,26 @@ def _badly_adjusted(adjustment: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _doubts(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what looks alike, where the model may be folded, and what parts of it have a size of their own."""
+    """Yield warnings about look-alikes, possible folds, and parts whose scale is weakly determined."""
     for join in summary.get("look_alikes", ()):
         here, there = (_some(names) for names in join["between"])
         yield (
-            f"look-alikes told apart, {join['pairs']} pairs of photos: {here} | {there} "
+            f"look-alikes separated, {join['pairs']} pairs of photos: {here} | {there} "
             f"({100 * join['missing']:.0f} % of what they would share in one place is missing)"
         )
     for join in summary.get("perhaps_look_alikes", ()):
         here, there = (_some(names) for names in join["between"])
         yield (
             f"beware: a loop, or look-alikes: {join['pairs']} pairs take {here} and {there} for one place, "
-            "and the photos between them do not bear it out"
+            "but the photos between them do not confirm it"
         )
     for names in summary.get("weakly_joined", ()):
         yield (
-            f"beware: hardly a point says how far {_some(names)} {'are' if len(names) > 1 else 'is'} from the rest; "
-            "photos between them help"
+            f"beware: hardly any point determines how far {_some(names)} {'are' if len(names) > 1 else 'is'} from "
+            "the rest; photos between them help"
         )
     for before, after in summary.get("jumps", ()):
-        yield f"beware: a jump from {before} to {after}, which follow each other: in a video a sign of look-alikes"
+        yield f"beware: a jump from {before} to {after}, which are consecutive: in a video, a sign of look-alikes"
 
 
 def _some(names: Sequence[str]) -> str:
@@ -150,7 +150,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def _perhaps_not_upright(orientation: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what to do if the model stands the wrong way up, where that is well possible."""
+    """Yield a warning where the model may not be upright, with the setting that corrects it."""
     mistakes = {"up_sign_odds": ("stand upside down", (180,)), "up_axis_odds": ("lie on its side", (90, 270))}
     for key, (what, turns) in mistakes.items():
         odds = orientation.get(key, UNSURE_ODDS)

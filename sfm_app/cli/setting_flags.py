@@ -11,19 +11,19 @@ from sfm_app.settings import QUALITY_PRESETS, Section, Settings, merged
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 BELOW, ABOVE = {"ge": "{}<=", "gt": "{}<"}, {"le": "<={}", "lt": "<{}"}
-"""How bounds are written, by pydantic's name for them."""
+"""Formats of bounds, by pydantic's name for them."""
 
 
 @dataclass(frozen=True, slots=True)
 class SettingFlag:
-    """A flag of its own for a setting that is often changed."""
+    """A command-line flag for a setting that is often changed."""
 
     flag: str
     setting: str
     """Its name in the settings file, such as "mesh.faces"."""
     metavar: str | None = None
     choice: bool = False
-    """Whether click refuses what is none of the values; otherwise the settings do, and name the table."""
+    """Whether click checks the value; otherwise `Settings` does, and its error names the table."""
 
     @property
     def parameter(self) -> str:
@@ -56,7 +56,7 @@ SETTING_FLAGS = (
 
 
 def setting_option(flag: SettingFlag) -> Callable[[Command], Command]:
-    """Return the click option of a setting; None where it is not given."""
+    """Return the click option of a setting; its value is None where it is not given."""
     kind, text = field_of(flag.setting).annotation, help_text(flag.setting)
     if kind is bool:
         return click.option(flag.flag, is_flag=True, default=None, help=text)
@@ -73,7 +73,7 @@ def help_text(setting: str) -> str:
 
 
 def default_text(setting: str) -> str:
-    """Return the default, one for each quality where the presets differ; empty for none and for switches."""
+    """Return the default, one for each quality where the presets differ; empty for empty values and switches."""
     values = {
         quality: value_of(Settings.from_mapping(merged(preset, {"quality": quality})), setting)
         for quality, preset in QUALITY_PRESETS.items()

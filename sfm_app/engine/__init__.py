@@ -1,1 +1,1 @@
-"""What runs stages, whatever they do: which are up to date, how they get their products, what disturbed them."""
+"""Running stages: which are up to date, how they get their inputs, and what interfered with them."""

@@ -1,4 +1,4 @@
-"""The loop that runs stages: what is up to date is skipped, what is damaged is done again, and all is written down."""
+"""The loop that runs stages: it skips what is up to date, redoes what is damaged and records everything."""
 
 import logging
 import time
@@ -26,37 +26,37 @@ class Pipeline:
     """Stages in order."""
 
     photos: Stage[PhotoSet]
-    """The first stage, which takes what the user has given."""
+    """The first stage, which reads the user's photos or video."""
     later: tuple[Stage[object], ...]
 
     @property
     def stages(self) -> tuple[Stage[object], ...]:
-        """All of them."""
+        """All stages, in order."""
         return (self.photos, *self.later)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of all stages."""
         return tuple(stage.name for stage in self.stages)
 
     def until(self, last: str) -> tuple[Stage[object], ...]:
-        """Return the stages up to one, by its name."""
+        """Return the stages up to and including the one of this name."""
         return self.stages[: self.names.index(last) + 1]
 
     def run(
         self, source: Source, run: RunContext, first: str = "", last: str = "", wanted: Sequence[Stage[object]] = ()
     ) -> Products:
-        """Run what is not up to date; stages whose files are damaged are done again, too.
+        """Run the stages that are not up to date, and those whose files are damaged.
 
         Args:
-            source: what the user has given.
+            source: the user's photos or video.
             run: the run.
-            first: stage from which on everything is done again.
-            last: stage to stop after; the last one where empty.
-            wanted: stages whose products are read before it ends.
+            first: stage from which on everything is redone.
+            last: stage to stop after; empty for the last one.
+            wanted: stages whose products are loaded before returning.
 
         Raises:
-            SfmError: see errors.py; what was finished before stays valid.
+            SfmError: see errors.py; stages that finished before stay valid.
         """
         for name in filter(None, (first, last)):
             if name not in self.names:
@@ -76,7 +76,7 @@ class Pipeline:
             return _Execution(self, source, run, first).through(stages, wanted)
 
     def forget(self, name: str, run: RunContext) -> None:
-        """Take a stage out of the manifest, and those that build on its files; nobody builds on those of the photos.
+        """Remove a stage and all later ones from the manifest; the photos stage alone, as no other needs its files.
 
         Args:
             name: of the stage.
@@ -88,26 +88,26 @@ class Pipeline:
 
 @dataclass(slots=True, eq=False)
 class _Execution:
-    """One way through the stages."""
+    """One pass through the stages."""
 
     pipeline: Pipeline
     source: Source
     run: RunContext
     first: str
-    """Stage from which on everything is done again; empty: none."""
+    """Stage from which on everything is redone; empty for none."""
     fingerprints: dict[str, str] = field(default_factory=dict)
-    """By stage: hash of all that its result depends on, and what later stages depend on instead of it."""
+    """By stage: hash of everything that its result depends on."""
     products: Products = field(init=False)
 
     def __post_init__(self) -> None:
         self.products = Products(self.run, self.source)
 
     def through(self, stages: Sequence[Stage[object]], wanted: Sequence[Stage[object]]) -> Products:
-        """Run these stages where they are not up to date, and read the products that are wanted."""
+        """Run these stages where they are not up to date, and load the wanted products."""
         photos, later = self.pipeline.photos, stages[1:]
         again = self.why(photos, (self.source.fingerprint,))
         self.do(photos, again, self.run)
-        # what else changed in the folder does not matter
+        # later stages do not depend on changes to other files in the folder
         inputs = {photos.name: self.source.content(self.products[photos])}
         reasons: dict[str, str | None] = {}
         for stage in later:
@@ -126,13 +126,13 @@ class _Execution:
         return self.products
 
     def why(self, stage: Stage[object], inputs: Sequence[str]) -> str | None:
-        """Say why a stage is done again, as `why_again` does; keeps the fingerprint of what it depends on."""
+        """Return why a stage has to run, None if it is up to date; keep the fingerprint of what it depends on."""
         self.fingerprints[stage.name] = fingerprint_of(stage, inputs, self.run)
         again = why_again(stage, self.fingerprints[stage.name], self.run)
         return "as asked" if again is None and stage.name == self.first else again
 
     def do(self, stage: Stage[Product], again: str | None, run: RunContext) -> None:
-        """Run a stage, unless there is no reason to (None), and enter it in the manifest."""
+        """Run a stage and enter it in the manifest, unless it is up to date (`again` is None)."""
         if again is None:
             run.progress.stage(stage.name, "up to date")
             return
@@ -154,7 +154,7 @@ class _Execution:
         self.products.keep(stage, product)
 
     def made(self, stage: Stage[Product], run: RunContext) -> Product:
-        """Return what a stage makes, if nothing from outside has disturbed it."""
+        """Return the product of a stage, if its photos and the output folder stayed the same meanwhile."""
         photos = self.pipeline.photos
         try:
             product = stage.make(self.products, run)
@@ -172,7 +172,7 @@ def _planned(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> Iterato
     """Say what these stages will cost, and provide a run with as many workers as the memory allows.
 
     Raises:
-        ConfigError: the photos need more than the user allows.
+        ConfigError: the photos need more memory than the user allows.
     """
     if not ahead:
         yield run
@@ -190,17 +190,17 @@ def _planned(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> Iterato
 
 
 def disturbed(source: Source, photos: PhotoSet | None, run: RunContext, by: Exception | None = None) -> None:
-    """Check whether something from outside has disturbed a stage, and perhaps made it fail.
+    """Check that nothing outside the program has interfered with a stage.
 
     Args:
-        source: what the user has given.
-        photos: that are used; None where nobody knows yet.
+        source: the user's photos or video.
+        photos: the photos in use; None if they are not known yet.
         run: the run.
-        by: how the stage has failed, if it has.
+        by: the error of the stage, if it has failed.
 
     Raises:
-        InputError: the output folder, or a photo, is not there any more, or is another one.
-        OSError: the disk is full; COLMAP does not always say so.
+        InputError: the output folder or a photo is missing or was replaced.
+        OSError: the disk is full, which COLMAP does not always report.
     """
     run.workspace.check_there()
     try:

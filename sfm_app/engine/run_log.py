@@ -1,4 +1,4 @@
-"""The log in the output folder, and how much memory the process has held."""
+"""The log in the output folder, and the peak memory of the process."""
 
 import logging
 import re
@@ -12,7 +12,7 @@ logger = logging.getLogger("sfm_app")
 
 
 class LogFile(logging.FileHandler):
-    """A log that says nothing of a full disk: the run does."""
+    """A log file that ignores write errors: the run itself reports a full disk."""
 
     def handleError(self, record: logging.LogRecord) -> None:
         """Do nothing: the run itself reports a full disk."""
@@ -36,7 +36,7 @@ def logged(run: RunContext) -> Iterator[None]:
 
 
 def peak_memory_mb() -> int | None:
-    """Return the most memory that this process has held; None where the system is not Linux."""
+    """Return the peak memory of this process in MB; None where the system is not Linux."""
     status = Path("/proc/self/status")
     found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text(encoding="utf-8")) if status.exists() else None
     return int(found[1]) // 1024 if found else None

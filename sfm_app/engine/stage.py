@@ -24,20 +24,20 @@ class Stage(Generic[Product_co]):
     settings: tuple[str, ...]
     """Settings, or tables of them, that its result depends on."""
     files: tuple[str, ...]
-    """What it leaves in the output folder; nobody else writes there."""
+    """Its files and folders in the output folder; nothing else writes them."""
     make: Callable[["Products", RunContext], Product_co]
     load: Callable[["Products", RunContext], Product_co]
-    """Reads back what `make` has left."""
+    """Reads the product that `make` has written."""
     digest: Callable[[Workspace], str]
-    """Hashes what `load` reads; it is compared before anything is read: COLMAP hangs or ends on damaged files."""
+    """Hashes what `load` reads; checked before anything is read, because COLMAP hangs or ends on damaged files."""
 
 
 class Products:
-    """Products by their stages; those of stages that were skipped are loaded when they are asked for.
+    """Products by stage; those of skipped stages are loaded on first use.
 
     Args:
-        run: where they are loaded from.
-        source: what the user has given; not needed to load what later stages have left.
+        run: has the files to load them from.
+        source: the user's photos or video; None where no product that depends on them is loaded.
     """
 
     def __init__(self, run: RunContext, source: Source | None = None) -> None:
@@ -46,7 +46,7 @@ class Products:
 
     @property
     def source(self) -> Source:
-        """What the user has given."""
+        """The user's photos or video."""
         if self._source is None:
             raise ValueError("the photos of a finished run are not read again")
         return self._source
@@ -55,7 +55,7 @@ class Products:
         """Return the product of a stage.
 
         Raises:
-            DamagedProductError: what the stage has left is not as it was, or cannot be read.
+            DamagedProductError: the files of the stage have changed, or cannot be read.
         """
         if stage.name not in self._known:
             with undamaged(stage, self._run):
@@ -63,39 +63,39 @@ class Products:
         return cast(Product, self._known[stage.name])
 
     def keep(self, stage: Stage[Product], product: Product) -> None:
-        """Take in what a stage has just made.
+        """Keep the product that a stage has just made.
 
         Args:
-            stage: which has just ended.
-            product: what it returned.
+            stage: the stage.
+            product: its product.
         """
         self._known[stage.name] = product
 
 
 @contextmanager
 def undamaged(stage: Stage[object], run: RunContext) -> Iterator[None]:
-    """Check what a stage has left, and read it.
+    """Check the files of a stage, and turn errors of reading them in the block into one that names the stage.
 
     Args:
         stage: the one whose files are read in the block.
         run: has the files and the manifest.
 
     Raises:
-        DamagedProductError: it is not as it was left, or cannot be read.
+        DamagedProductError: the files have changed, or cannot be read.
     """
     try:
         record = run.workspace.manifest.record(stage.name)
         if record is None or record.digest != stage.digest(run.workspace):
-            raise ValueError(f"the files of stage `{stage.name}` are not as it left them")
+            raise ValueError(f"the files of stage `{stage.name}` have changed since it wrote them")
         yield
     except InputError:
         raise
-    except Exception as err:  # whatever decoders make of damaged bytes
+    except Exception as err:  # decoders of damaged bytes raise all kinds of errors
         what = f"is not complete: {err.filename} is gone" if isinstance(err, FileNotFoundError) else "is damaged"
         left = f"what stage `{stage.name}` left in {run.workspace.root} {what}"
         raise DamagedProductError(left, go_on_hint(run), stage.name) from err
 
 
 def go_on_hint(run: RunContext) -> str:
-    """Say which command completes a run."""
-    return f"`sfm-app run PHOTOS -o {run.workspace.root}` goes on where it stopped"
+    """Say which command resumes a run."""
+    return f"`sfm-app run PHOTOS -o {run.workspace.root}` resumes where it stopped"

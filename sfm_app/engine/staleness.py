@@ -1,4 +1,4 @@
-"""What a stage's result depends on: photos, settings, versions. And why a stage has to be done again."""
+"""What a stage's result depends on (photos, settings, versions), and why a stage has to run again."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -14,22 +14,22 @@ from sfm_app.runtime.manifest import PROGRAM
 
 OTHER_PHOTOS = "the photos have changed"
 CHANGES = 3
-"""So many are named."""
+"""Most changes that are named."""
 
 
 def fingerprint_of(stage: Stage[object], inputs: Sequence[str], run: RunContext) -> str:
-    """Return hash of everything that a stage's result depends on: its inputs, its settings, the versions.
+    """Return a hash of everything that a stage's result depends on: its inputs, its settings, the versions.
 
     Args:
-        stage: whose result it is.
-        inputs: fingerprints of what it takes.
-        run: settings and versions.
+        stage: the stage.
+        inputs: fingerprints of its inputs.
+        run: has the settings.
     """
     return fingerprint(stage.name, made_with(stage, run), inputs)
 
 
 def made_with(stage: Stage[object], run: RunContext) -> dict[str, Any]:
-    """Return the values of a stage's settings, and the versions of what computes the result.
+    """Return the values of a stage's settings, and the versions of the program and its libraries.
 
     Args:
         stage: names the settings it depends on.
@@ -40,11 +40,11 @@ def made_with(stage: Stage[object], run: RunContext) -> dict[str, Any]:
 
 
 def why_again(stage: Stage[object], inputs: str, run: RunContext) -> str | None:
-    """Return why a stage has to be done; empty where it never was, None where it is up to date.
+    """Return why a stage has to run; empty if it never ran, None if it is up to date.
 
     Args:
-        stage: perhaps to be done.
-        inputs: its `fingerprint_of`.
+        stage: the stage.
+        inputs: fingerprint of everything that its result depends on now.
         run: the run.
     """
     record = run.workspace.manifest.record(stage.name)
@@ -60,7 +60,7 @@ def why_again(stage: Stage[object], inputs: str, run: RunContext) -> str | None:
 
 
 def _changes(before: Any, now: Mapping[str, Any], name: str = "") -> Iterator[str]:
-    """Yield values that are others now, by their dotted names."""
+    """Yield the values that have changed, with their dotted names."""
     for key, new in now.items():
         old = before.get(key) if isinstance(before, Mapping) else None
         inner = f"{name}.{key}".removeprefix(".").removeprefix("settings.").removeprefix("versions.")
@@ -83,12 +83,12 @@ def value_of(values: Any, key: str) -> Any:
 
 
 def manifest_head(run: RunContext) -> dict[str, Any]:
-    """Return what the manifest says besides the stages."""
+    """Return the entries of the manifest other than the stages."""
     return {"program": PROGRAM, "versions": versions(), "settings": run.settings.model_dump()}
 
 
 @cache
 def versions() -> dict[str, str]:
-    """Return versions of what computes the result."""
+    """Return the versions of the program and of the libraries that compute the result."""
     parts = ("sfm-app", "numpy", "numba", "opencv-contrib-python-headless", "open3d")
     return {name: version(name) for name in parts} | colmap_versions()

@@ -1,1 +1,1 @@
-"""Features, matches, fundamental matrices and cameras of many photos, by any method, and why they give no scene."""
+"""Features, matches, fundamental matrices and cameras by the chosen methods, and diagnoses of unusable photos."""

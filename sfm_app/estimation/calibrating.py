@@ -1,4 +1,4 @@
-"""Cameras of all photos from the fundamental matrices of their pairs, by whatever calibrator."""
+"""Cameras of all photos from the fundamental matrices of their pairs, by the chosen calibrator."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +14,7 @@ from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, Ma
 def find_intrinsics(
     matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> tuple[Intrinsics, Sequence[CalibratedCamera]]:
-    """Find K and lens of every camera, and which photos are whose; what is not identifiable falls back to a guess.
+    """Find K and lens of every camera, and the camera of every photo; unidentifiable cameras fall back to a guess.
 
     Args:
         matches, views, run: keypoints and raw matches; fundamental matrices; the run.
@@ -22,7 +22,7 @@ def find_intrinsics(
     options = run.settings.calibration
     calibrator = run.plugins.calibrator(options.calibrator)
     pairs = photo_pairs(list(matches.images.values()), matches, views)
-    # a group that the user made is not split
+    # groups that the user defined are not split
     split = run.settings.photos.cameras == "auto"
     cameras = calibrate_photo_set(
         pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split
@@ -37,10 +37,10 @@ def find_intrinsics(
 
 
 def explained(camera: CalibratedCamera, views: ViewGraph) -> Calibration:
-    """Return what was found; where that is nothing, with what the pairs are that could not be asked.
+    """Return the calibration; if it failed because most pairs are degenerate, its reason says how.
 
     Args:
-        camera: found or not, with its photos.
+        camera: the calibrated camera with its photos.
         views: fundamental matrices.
     """
     kinds = votes(views, camera.photos)
@@ -50,10 +50,10 @@ def explained(camera: CalibratedCamera, views: ViewGraph) -> Calibration:
 
 
 def of_whole_photo(camera: CalibratedCamera, image: MatchedImage) -> CalibratedCamera:
-    """Return a camera in pixels of its photos, where it was found in those of the pictures within their bars.
+    """Return a camera in pixels of the whole photo, if it was found in those of the picture inside the bars.
 
     Args:
-        camera: as calibration found it.
+        camera: as returned by calibration.
         image: one of its photos.
     """
     if image.shown is None:
@@ -64,9 +64,7 @@ def of_whole_photo(camera: CalibratedCamera, image: MatchedImage) -> CalibratedC
 
 
 def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> PhotoPairs:
-    """Return what is known about the pairs of some photos that are not degenerate, in pixels of pictures within bars.
-
-    bars.
+    """Return the pairs of some photos that are not degenerate, in pixels of the pictures inside their bars.
 
     Args:
         images: the photos.
@@ -89,12 +87,12 @@ def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGrap
 
 
 def _share_shown(image: MatchedImage) -> float:
-    """Return longer side of the picture within bars over that of the photo, which EXIF's claim was reckoned with."""
+    """Return the longer side of the picture inside its bars over that of the photo, to which EXIF's focal refers."""
     return max(image.shown[2:]) / max(image.width, image.height) if image.shown else 1.0
 
 
 def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> CameraPairs:
-    """Return what a calibrator gets to know about the photos of one camera.
+    """Return the input of a calibrator for the photos of one camera.
 
     Args:
         images: photos of the camera.

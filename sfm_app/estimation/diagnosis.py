@@ -1,7 +1,7 @@
-"""Why photos give no scene: one sentence and what to do about it, from what the early stages counted.
+"""Diagnosis of photos that give no scene: one sentence and a hint, from the counts of the early stages.
 
-Pairs say what they are (see `ransac.degeneracy`, `ransac.stationary`), some of them wrongly; here they vote, each with
-its inliers. A whole set is a panorama when most of what it has in common is.
+Pairs are classified one by one (see `ransac.degeneracy`, `ransac.stationary`), some of them wrongly. Here they vote,
+weighted by their inliers: a set is a panorama when most of its inliers are in pairs classified as rotations.
 """
 
 from collections import Counter
@@ -20,7 +20,7 @@ from sfm_app.types import MatchedImage, MatchGraph, PairId, ViewGraph
 Cause = Literal["copies", "texture", "logo", "nothing", "rotation", "planar", "collinear", "unclear"]
 
 NOTHING_MATCHED = ViewGraph({}, {})
-"""Where no two photos have matches."""
+"""The view graph where no two photos have matches."""
 
 BARE_PX = 800.0
 """Pixels per feature above which a photo shows hardly any texture: sensor noise on a white wall gives one per 1100 or
@@ -29,7 +29,7 @@ PLANE_PHOTOS = 3
 """Photos of a plane from which a parameter of the camera follows: m views of an unknown plane give 2 m equations for
 the plane's 4 unknowns and those of the camera (Triggs 1998)."""
 LEAST_PARALLAX = 0.01
-"""Share of all inliers that has to show parallax. Panoramas taken for something else have 0.2 % (mismatches), frames of
+"""Share of all inliers that has to show parallax. Misclassified panoramas have 0.2 % (mismatches), frames of
 a video that hardly moves 15 %."""
 
 STEP = "take each photo from another place, a step or two from the last"
@@ -50,7 +50,7 @@ DEGENERATE: dict[Cause, str] = {
     "planar": "everything lies in one plane",
     "collinear": "all that the photos have in common lies on one line",
 }
-"""What pairs without a determined F have in common."""
+"""Descriptions of the degeneracies that leave F undetermined."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +75,8 @@ def why_no_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) 
     """Return the main reason why photos cannot be reconstructed.
 
     Args:
-        matches, views: all photos; what became of the pairs, empty where no two photos have matches.
-        options: those under which features were looked for.
+        matches, views: all photos with their matches; fits and rejections of the pairs, empty without matches.
+        options: settings with which features were found.
     """
     if views.fits:
         return of_fits(views, set(matches.images))
@@ -99,16 +99,16 @@ def why_no_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) 
 def why_no_depth(
     matches: MatchGraph, views: ViewGraph, photos: Collection[int], options: EpipolarSettings, *, camera_known: bool
 ) -> Diagnosis | None:
-    """Return why a model of these photos could be wrong without showing it; None where they hold depth.
+    """Return why a model of these photos could be wrong with small residuals; None where they have parallax.
 
-    Pairs without parallax fit any epipole, and with a wrong K a rotation looks like parallax. A plane leaves F open but
-    not E: where the camera is known, or photos enough to find it from the plane, it can be reconstructed.
+    Pairs without parallax fit any epipole, and with a wrong K a rotation looks like parallax. A plane leaves F
+    undetermined but not E: it can be reconstructed if the camera is known, or calibrated from enough photos of it.
 
     Args:
         matches: all photos and their matches.
-        views: what became of the pairs.
-        photos: ids of those that have a place in the model.
-        options: those under which the pairs were fitted.
+        views: fits and rejections of the pairs.
+        photos: ids of those in the model.
+        options: settings with which the pairs were fitted.
         camera_known: whether K rests on more than a guess.
     """
     kinds = votes(views, photos)
@@ -124,7 +124,7 @@ def why_no_depth(
 
 
 def votes(views: ViewGraph, photos: Collection[int]) -> Counter[str]:
-    """Return inliers of the pairs among some photos by what leaves their F open, "" where nothing does.
+    """Count the inliers of the pairs among some photos by degeneracy, "" where F is determined.
 
     Args:
         views: fundamental matrices.
@@ -137,7 +137,7 @@ def votes(views: ViewGraph, photos: Collection[int]) -> Counter[str]:
 
 
 def of_fits(views: ViewGraph, photos: Collection[int]) -> Diagnosis:
-    """Return what the pairs among some photos have against a reconstruction.
+    """Return why the fitted pairs among some photos do not allow a reconstruction.
 
     Args:
         views: fundamental matrices.

@@ -1,4 +1,4 @@
-"""Fundamental matrices of pairs of photos, by whatever estimator; what a killed run has fitted stays."""
+"""Fundamental matrices of pairs of photos, by the chosen estimator; fits of a killed run are reused."""
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -23,20 +23,20 @@ BoolArray = NDArray[np.bool_]
 
 
 Fitted = tuple[EpipolarFit | Rejected, int]
-"""What became of a pair, and how many of its matches stand still in the picture."""
+"""Fit of a pair, or why there is none, and how many of its matches are stationary in the picture."""
 
 PART = 64
-"""Pairs that are kept together, so that a run that is killed has to do no more again."""
+"""Pairs per file; after a killed run, finished pairs outside complete files are fitted again."""
 
 
 def fit_pairs(matches: MatchGraph, pairs: Sequence[PairId], run: RunContext) -> dict[PairId, Fitted]:
     """Fit every pair on its own, seeded by the run's seed and its ids.
 
-    What is done lies in `view_graph_parts` until the caller removes it: a run that was killed goes on where it stopped.
+    Finished pairs stay in `view_graph_parts` until the caller removes it, so that a killed run can resume.
 
     Args:
         matches: keypoints and raw matches.
-        pairs: ids of those to fit.
+        pairs: the pairs to fit.
         run: the run.
     """
     options = run.settings.epipolar
@@ -62,7 +62,7 @@ def fit_pairs(matches: MatchGraph, pairs: Sequence[PairId], run: RunContext) -> 
 
 
 def graph_of(found: Mapping[PairId, Fitted]) -> ViewGraph:
-    """Return pairs with a geometry, and those without."""
+    """Return the view graph of fitted and rejected pairs."""
     return ViewGraph(
         fits={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, EpipolarFit)},
         rejected={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, Rejected)},
@@ -70,7 +70,7 @@ def graph_of(found: Mapping[PairId, Fitted]) -> ViewGraph:
 
 
 def _in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run: RunContext) -> dict[PairId, Fitted]:
-    """Return what `fit_pair` makes of every pair, in their order; parts that are complete are kept as they come."""
+    """Return the result of `fit_pair` for every pair, in order; each part is written to a file once it is complete."""
     folder = run.workspace.view_graph_parts
     if not can_go_on(folder, run.fingerprint):
         mark_unfinished(folder, run.fingerprint)
@@ -90,10 +90,10 @@ def _in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run
 
 
 def write_part(path: Path, found: Mapping[PairId, Fitted]) -> None:
-    """Keep some pairs.
+    """Write the results of some pairs.
 
     Args:
-        path: file that appears complete or not at all.
+        path: file, written atomically.
         found: fit, or why there is none, and number of stationary matches.
     """
     still = np.array([[*pair, count] for pair, (_, count) in found.items()], np.int64)
@@ -102,11 +102,11 @@ def write_part(path: Path, found: Mapping[PairId, Fitted]) -> None:
 
 
 def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, Fitted] | None:
-    """Return what `write_part` has kept; None where there is nothing, or nothing sound.
+    """Return what `write_part` has written; None where the file is missing or damaged.
 
     Args:
         path: file; may be missing or damaged.
-        pairs: all that it has to hold.
+        pairs: those that it has to hold.
     """
     try:
         arrays = load_arrays(path)
@@ -114,12 +114,12 @@ def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, Fitted] | Non
         every: dict[PairId, EpipolarFit | Rejected] = {**graph.fits, **graph.rejected}
         still = {(int(a), int(b)): int(count) for a, b, count in arrays["still"]}
         return {pair: (every[pair], still[pair]) for pair in pairs}
-    except Exception:  # whatever decoders make of damaged bytes
+    except Exception:  # decoders of damaged bytes raise all kinds of errors
         return None
 
 
 def _stationary_matches(matches: MatchGraph, pair: PairId, settings: Settings) -> BoolArray:
-    """Return which matches of a pair stay in one place; none where the photos differ in size."""
+    """Return a mask of the matches of a pair that are stationary in the picture; none if the photos differ in size."""
     first, second = (matches.images[key] for key in pair)
     if (first.width, first.height) != (second.width, second.height):
         return np.zeros(len(matches.matches[pair]), bool)

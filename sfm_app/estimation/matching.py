@@ -1,7 +1,7 @@
-"""Features of photos and matches of pairs, found by whatever way has been chosen, in COLMAP's database.
+"""Features of photos and matches of pairs, found by the chosen method, in COLMAP's database.
 
-COLMAP's SIFT fills the database by itself. Any other way is two functions; here they get pictures of the right size,
-and what they say is checked, freed of what is masked, brought to the photos' pixels and written down.
+COLMAP's SIFT fills the database by itself. Any other method is two functions. They get pictures of the right size;
+their results are checked, scaled to the photos' pixels, freed of masked points and written to the database.
 """
 
 import shutil
@@ -35,19 +35,19 @@ KEPT = 32
 def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
     """Find features of photos and match them, in the run's database.
 
-    What a killed run has left in the database and in `feature_parts` stays as it is.
+    Results of a killed run in the database and in `feature_parts` are reused.
 
     Args:
         method: of finding and matching.
-        run: its database knows the photos, which are laid out.
-        pairs: ids of photos that are matched, the smaller one first, and nothing is found in others; None: all photos,
-            every one with every other.
+        run: its database lists the photos, which are laid out.
+        pairs: the pairs to match, the smaller id first; features are found in their photos only. None for all pairs of
+            all photos.
 
     Returns:
-        What was in force, for the manifest.
+        The options in force, for the manifest.
 
     Raises:
-        PluginError: the method raises, or says what cannot be.
+        PluginError: the method raises, or returns invalid results.
         BackendError: COLMAP failed.
     """
     place, options = run.workspace, run.settings.matching
@@ -68,13 +68,13 @@ def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId
 
 
 def pairs_of(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
-    """Return every photo with every other, the smaller id first."""
+    """Return all pairs of photos, the smaller id first."""
     ids = sorted(photos)
     return [(first, second) for place, first in enumerate(ids) for second in ids[place + 1 :]]
 
 
 def _find(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> None:
-    """Leave the features of every photo in its part, and its keypoints in the database."""
+    """Write the features of every photo to its part, and its keypoints to the database."""
 
     def find(photo: int) -> tuple[int, NDArray[np.float32]]:
         features, to_photo, size = _found_in(method, names[photo], run)
@@ -98,7 +98,7 @@ def _find(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> N
 def _found_in(
     method: FeatureMethod, name: str, run: RunContext
 ) -> tuple[Features, NDArray[np.float64], tuple[int, int]]:
-    """Return what a method finds in one photo, by how much its keypoints have to be scaled, and the photo's size."""
+    """Return the features of one photo, the scale (x, y) that takes them to its pixels, and its size."""
     options = run.settings.matching
     pixels = read_pixels(run.workspace.photos / name)
     height, width = pixels.shape[:2]
@@ -116,12 +116,12 @@ def read_pixels(path: Path) -> NDArray[np.uint8]:
     """Return (H, W, 3) RGB of a photo as it is laid out.
 
     Raises:
-        InputError: it cannot be read any more.
+        InputError: it can no longer be read.
     """
     data = np.fromfile(path, np.uint8)
     read = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if read is None:
-        raise InputError(f"{path} cannot be read any more", hint="run again with --from photos")
+        raise InputError(f"{path} can no longer be read", hint="run again with --from photos")
     return np.asarray(read, np.uint8)
 
 
@@ -130,15 +130,15 @@ def _asked(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options:
         raise PluginError(f"the features '{method.name}' have no `find`")
     try:
         return method.find(pixels, options)
-    except Exception as err:  # whatever a foreign function raises
+    except Exception as err:  # a plug-in may raise anything
         raise _broken(method, f"failed on {name}: {type(err).__name__}: {err}") from err
 
 
 def _checked(method: FeatureMethod, name: str, size: tuple[int, int], features: Features) -> Features:
-    """Return the features, if they can be those of a picture of this size."""
+    """Return the features after checking that they are valid for a picture of this size."""
     points = np.asarray(features.keypoints, np.float64)
     if features.size != size:
-        raise _broken(method, f"say that {name} has {features.size} pixels instead of {size}")
+        raise _broken(method, f"report a size of {features.size} for {name} instead of {size}")
     if points.ndim != 2 or points.shape[1] != 2 or any(len(value) != len(points) for value in features.values.values()):
         raise _broken(method, f"have arrays of other shapes than (N, 2) and (N, ...) for {name}")
     if not (np.isfinite(points).all() and (points >= 0).all() and (points <= size).all()):
@@ -151,7 +151,7 @@ def _broken(method: FeatureMethod, what: str) -> PluginError:
 
 
 def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> None:
-    """Write the matches of every pair into the database; of pairs without any, that they have none."""
+    """Write the matches of every pair into the database, also where there are none."""
     options, database = run.settings.matching, run.workspace.database
     read = lru_cache(max(KEPT, 2 * run.workers))(lambda photo: _load(part_of(photo, run)))
 
@@ -168,27 +168,27 @@ def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> N
 def _matches_between(
     method: FeatureMethod, pair: tuple[Features, Features], options: MatchSettings
 ) -> NDArray[np.uint32]:
-    """Return (M, 2) rows of two photos' features that a method takes for the same; none where a photo has none."""
+    """Return (M, 2) rows of the matching features of two photos; none where a photo has no features."""
     if method.match is None:
         raise PluginError(f"the features '{method.name}' have no `match`")
     if not len(pair[0]) or not len(pair[1]):
         return np.zeros((0, 2), np.uint32)
     try:
         rows = np.asarray(method.match(*pair, options))
-    except Exception as err:  # as above
+    except Exception as err:  # a plug-in may raise anything
         raise _broken(method, f"failed to match two photos: {type(err).__name__}: {err}") from err
     if rows.size == 0:
         return np.zeros((0, 2), np.uint32)
     if rows.ndim != 2 or rows.shape[1] != 2 or not np.issubdtype(rows.dtype, np.integer):
-        raise _broken(method, "have matches that are no (M, 2) integers")
+        raise _broken(method, "have matches that are not (M, 2) integers")
     for column, features in zip(rows.T, pair, strict=True):
         if column.min() < 0 or column.max() >= len(features) or len(np.unique(column)) < len(column):
-            raise _broken(method, "match a keypoint twice, or one that is not there")
+            raise _broken(method, "match a keypoint twice, or one that does not exist")
     return rows.astype(np.uint32)
 
 
 def part_of(photo: int, run: RunContext) -> Path:
-    """Return where the features of a photo are kept until all are matched.
+    """Return the file that keeps the features of a photo until all are matched.
 
     Args:
         photo: id.

@@ -1,4 +1,4 @@
-"""What people look at: figures of what a run found, and the words for them."""
+"""Figures and texts about the cameras of a run."""
 
 from sfm_app.report.calibration_figure import check_figure, draw_intrinsics
 from sfm_app.report.words import field_of_view_deg, held_text, lens_text

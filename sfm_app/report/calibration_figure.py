@@ -1,7 +1,7 @@
-"""Where the zero curves of all pairs meet, drawn: thesis Figure 5.13, with the votes behind the curves.
+"""The figure of the zero curves of all pairs: thesis Figure 5.13, with the votes behind the curves.
 
-One row per camera. Left: the two focals, with the optical center where it was found; right: the optical center, with
-the focals as found. Bright is where many pairs agree.
+One row per camera. Left: the plane of the two focals, with the optical center at its estimate. Right: the plane of the
+optical center, with the focals at their estimates. Many pairs agree where it is bright.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,12 +29,12 @@ SUFFIXES = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"Creati
 CELLS = 160
 """Votes are counted on a grid of this many cells a side."""
 SAMPLES = 400
-"""Samples along each curve: where a curve is steep, few leave it ragged."""
+"""Samples along each curve; with fewer, steep curves look ragged."""
 ENLARGED_SAMPLES = 60
 JUMP = 0.05
 """A curve that rises by this share of the plane from one sample to the next has changed to another root."""
 SIGMA = 0.05
-"""Width of a vote, in units of r as in `Consensus`: the wider one of the search; the other hardly shows."""
+"""Width of a vote, in units of r as in `Consensus`: the wider one of the search; the narrower is hardly visible."""
 FOCALS_SHOWN = (0.15, 2.2)
 """Range of the focals around the one found, as multiples of it."""
 MOST_CAMERAS = 4
@@ -54,7 +54,7 @@ class Panel(NamedTuple):
 
 
 class ParameterPlane(NamedTuple):
-    """Two of the parameters, in pixels; the others stay where they were found."""
+    """Two of the parameters, in pixels; the others are fixed at their estimates."""
 
     names: tuple[str, str]
     title: str
@@ -69,7 +69,7 @@ class ParameterPlane(NamedTuple):
 
 
 def check_figure(path: Path) -> None:
-    """Raise ConfigError unless the name ends as one of the formats that can be written."""
+    """Raise ConfigError unless the suffix of the name is a supported format."""
     if path.suffix.lower() not in SUFFIXES:
         raise ConfigError(f"figure {path.name}: cannot write '{path.suffix}'", hint=f"use {', '.join(SUFFIXES)}")
 
@@ -93,7 +93,7 @@ def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
     """Draw the votes and curves of every camera into a file; the same calibration gives the same bytes.
 
     Args:
-        path: its suffix names the format, see `check_figure`; the folder is made where it is missing.
+        path: its suffix names the format, see `check_figure`; the folder is created if it is missing.
         panels: the first `MOST_CAMERAS` are drawn.
     """
     from matplotlib import rc_context
@@ -112,7 +112,7 @@ def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
 
 
 def in_words(camera: Calibration) -> str:
-    """Return what was found, a line for each thing."""
+    """Return a calibration in words, one line per property."""
     texts = (verdict(camera), focal_text(camera), center_text(camera), lens_text(camera), held_text(camera))
     return "\n".join(fill(text, 150) for text in texts if text).replace("+-", "±")
 
@@ -131,10 +131,11 @@ def _draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
 
 
 def focal_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
-    """Return fx and fy, with the optical center where it was found.
+    """Return the plane of fx and fy, with the optical center at its estimate.
 
     Args:
-        camera, pairs: what was found, in pixels; pairs of it, without lens distortion.
+        camera: the calibration, in pixels.
+        pairs: of this camera, without lens distortion.
     """
     unit, (low, high) = _unit(camera), FOCALS_SHOWN
     (fx, _, cx), (_, fy, cy), _ = camera.K
@@ -153,10 +154,10 @@ def focal_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
 
 
 def center_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
-    """Return cx and cy over the whole photo, with the focals as found.
+    """Return the plane of cx and cy over the whole photo, with the focals at their estimates.
 
     Args:
-        camera: what was found, in pixels.
+        camera: the calibration, in pixels.
         pairs: of this camera, without lens distortion.
     """
     unit, u0, v0 = _unit(camera), camera.width / 2, camera.height / 2
@@ -212,7 +213,7 @@ def _enlarge(axes: "Axes", plane: ParameterPlane, camera: Calibration) -> None:
         axes.indicate_inset_zoom(target, edgecolor=GUIDE)
     label = f"{DEVIATIONS:.0f} standard deviations"
     if plane.names[0] == "fx" and ("aspect" in camera.held or camera.K[0, 0] == camera.K[1, 1]):
-        # pixels are taken to be square: fx and fy can be wrong only together
+        # pixels are assumed square: fx and fy have the same error
         target.plot((x - dx, x + dx), (y - dy, y + dy), color=MARK, linewidth=1.8, label=label)
     else:
         target.add_patch(Ellipse((x, y), 2 * dx, 2 * dy, fill=False, edgecolor=MARK, linewidth=1.4, label=label))
@@ -225,7 +226,7 @@ def votes(plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> FloatArra
 
     Args:
         plane: which two intrinsics vary.
-        camera: what was found, in pixels.
+        camera: the calibration, in pixels.
         pairs: of this camera, without lens distortion.
     """
     left, right, bottom, top = plane.extent
@@ -255,7 +256,7 @@ def _steps(start: float, stop: float, count: int) -> FloatArray:
 
 
 def _unbroken(curves: FloatArray, low: float, high: float) -> FloatArray:
-    """Return curves without what lies outside of the range, and without the jumps from one root to another."""
+    """Return the curves with NaN outside of the range and at jumps from one root to another."""
     inside = np.where((curves > low) & (curves < high), curves, np.nan)
     jumps = np.abs(np.diff(inside, axis=1)) > JUMP * (high - low)
     inside[:, 1:][jumps] = np.nan

@@ -10,11 +10,11 @@ HELD = {
     "aspect": "square pixels",
     "k1": "a lens that bends no lines",
 }
-"""What is usual, by what the photos do not determine."""
+"""The usual value, by the parameter that the photos do not determine."""
 
 
 def field_of_view_deg(camera: Calibration) -> tuple[float, float]:
-    """Return how much the camera sees from left to right and from top to bottom, in degrees; the lens is left out."""
+    """Return the horizontal and the vertical field of view in degrees, without lens distortion."""
     (fx, _, cx), (_, fy, cy), _ = camera.K
     across = np.arctan2([cx, camera.width - cx], fx)
     down = np.arctan2([cy, camera.height - cy], fy)
@@ -22,7 +22,7 @@ def field_of_view_deg(camera: Calibration) -> tuple[float, float]:
 
 
 def verdict(camera: Calibration) -> str:
-    """Return whether K is known, and if not, why, and what it is instead."""
+    """Return whether K is known; if not, why, and where the given values come from."""
     if camera.identifiable:
         return "Known: the photos agree on this camera."
     source = SOURCES.get(camera.method, camera.method)
@@ -41,7 +41,7 @@ def focal_text(camera: Calibration) -> str:
 
 
 def center_text(camera: Calibration) -> str:
-    """Say where the optical center is, from the middle of the photo."""
+    """Return the position of the optical center relative to the middle of the photo."""
     right, below = camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2
     if max(abs(right), abs(below)) < 0.5:
         return "Optical center in the middle of the photo."
@@ -51,7 +51,7 @@ def center_text(camera: Calibration) -> str:
 
 
 def lens_text(camera: Calibration) -> str:
-    """Return the radial term, or nothing where none was found for certain."""
+    """Return the radial distortion; empty where there is none or the photos do not determine it."""
     if camera.radial == 0.0 or "k1" in camera.held:
         return ""
     shape = "outwards (barrel)" if camera.radial < 0 else "inwards (pincushion)"
@@ -60,10 +60,10 @@ def lens_text(camera: Calibration) -> str:
 
 
 def held_text(camera: Calibration) -> str:
-    """Return what is taken to be as usual, or nothing."""
+    """Return which parameters are assumed to have their usual values; empty for none."""
     if not camera.held or not camera.identifiable:
         return ""
-    return "Taken to be as usual, as far as the photos allow: " + ", ".join(HELD.get(n, n) for n in camera.held) + "."
+    return "Assumed, since the photos do not determine it: " + ", ".join(HELD.get(n, n) for n in camera.held) + "."
 
 
 def _deviation(camera: Calibration, name: str) -> str:

@@ -1,1 +1,1 @@
-"""What every part of a run shares: its context, output folder and manifest, workers, and what it may cost."""
+"""What every part of a run shares: its context, output folder and manifest, workers, and its cost estimate."""

@@ -1,4 +1,4 @@
-"""What a stage gets besides its inputs: settings, workers, progress, and a place to note what it counted."""
+"""What a stage gets besides its inputs: settings, workers, progress, and a place to record its figures."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
@@ -20,12 +20,12 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 STANDARD_FORMATS = ("ply", "glb")
-"""What every run writes its models as; `sfm-app export` makes others of them."""
+"""Formats in which every run writes its models; `sfm-app export` writes others."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunContext:
-    """One run of the program, or, from `for_stage` on, one stage of it."""
+    """One run of the program, or one stage of it."""
 
     settings: Settings
     workspace: Workspace
@@ -49,18 +49,18 @@ class RunContext:
 
     @property
     def memory_mb(self) -> float:
-        """Most memory that may be held."""
+        """Most memory in MB that the run may use."""
         return 1000 * self.settings.max_memory_gb or SHARE_OF_MACHINE * machine_memory_mb()
 
     @contextmanager
     def with_workers(self, workers: int) -> Iterator["RunContext"]:
-        """Provide the same run with so many workers, which end with the block."""
+        """Provide the same run with another number of workers, which stop when the block ends."""
         with make_executor(workers) as executor:
             yield replace(self, workers=workers, executor=executor)
 
     @property
     def mask_dir(self) -> Path | None:
-        """Where the masks of all photos lie once they are laid out; None where no masks are given."""
+        """Folder of the laid-out masks of all photos; None where no masks are given."""
         return self.workspace.masks if self.settings.photos.masks else None
 
     def map(self, function: Callable[[Item], Result], items: Sequence[Item], label: str) -> list[Result]:
@@ -76,7 +76,7 @@ class RunContext:
 
     @contextmanager
     def step(self, label: str) -> Iterator[None]:
-        """Show that a long piece of work, which cannot say how far it is, is under way."""
+        """Show that a long piece of work without measurable progress is under way."""
         yield from track(self.progress, [None], label, 1)
 
     def record(self, **figures: Any) -> None:
@@ -84,7 +84,7 @@ class RunContext:
         self.statistics.update(figures)
 
     def model_paths(self, name: str) -> tuple[Path, ...]:
-        """Return where a model of this name is in the output folder."""
+        """Return the paths of a model of this name in the output folder."""
         return tuple(self.workspace.root / f"{name}.{suffix}" for suffix in STANDARD_FORMATS)
 
     def write_model(self, model: Model, name: str) -> tuple[Path, ...]:

@@ -1,4 +1,4 @@
-"""What a run will cost, before it is spent: minutes and memory, by photos, pairs and settings; and how both are held.
+"""Estimates of the minutes and the memory of a run from photos, pairs and settings, and plans within a memory limit.
 
 The figures come from photos of 12 megapixels on one core of a server of 2023 (`python -m benchmarks.hundred`). Other
 machines differ by a factor of two, and so do other scenes.
@@ -15,7 +15,7 @@ from sfm_app.types import Photo
 
 MEGA = 1e6
 SHARE_OF_MACHINE = 0.8
-"""Of its memory, where nobody says how much may be used."""
+"""Share of the machine's memory that a run may use where no limit is set."""
 FEATURES_PER_MP = 4500
 """Photos with little texture have fewer."""
 
@@ -25,7 +25,7 @@ ALONE = ("scene", "mesh")
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What a run is expected to cost with so many workers."""
+    """Expected cost of a run with a number of workers."""
 
     photos: int
     pairs: int
@@ -36,11 +36,11 @@ class Plan:
     """Most memory at any moment, by stage."""
 
     def minutes(self, stages: Iterable[str]) -> float:
-        """Return how long these stages take."""
+        """Return how many minutes these stages take."""
         return sum(self.core_seconds[name] / (1 if name in ALONE else self.workers) for name in stages) / 60
 
     def peak_mb(self, stages: Iterable[str]) -> float:
-        """Return the most memory that these stages hold."""
+        """Return the most memory in MB that these stages hold."""
         return max((self.memory_mb[name] for name in stages), default=0.0)
 
     def text(self, stages: Iterable[str]) -> str:
@@ -53,27 +53,27 @@ class Plan:
 
 
 def megapixels_within(limit_mb: float) -> float:
-    """Return how large a photo may be that is painted with by one worker."""
+    """Return the most megapixels of a photo with which one worker can texture the surface."""
     return max(2.0, (limit_mb - 1650) / 8)
 
 
 def cache_gb(limit_mb: float) -> float:
-    """Return what fusion may keep of depth maps; the points and the surface want memory, too.
+    """Return the size of fusion's cache of depth maps in GB; the points and the surface need memory, too.
 
-    It takes what it needs, 28 MB per megapixel of depth maps. Where that is more than it may keep, it reads all maps
-    again and again: 200 photos were not done after half an hour with 2 GB.
+    Fusion needs 28 MB per megapixel of depth maps. Where the cache is smaller, it reads all maps again and again:
+    200 photos were not done after half an hour with 2 GB.
     """
     return min(64.0, max(0.25, (limit_mb - 1500) / 1000))
 
 
 def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float = math.inf) -> Plan:
-    """Estimate the costs of all stages behind the photos.
+    """Estimate the costs of all stages after the photos stage.
 
     Args:
         photos: that are used.
         settings: in force.
         workers: that work at once.
-        limit_mb: memory that they may have; fusion keeps less where there is little.
+        limit_mb: most memory; fusion caches less where it is small.
     """
     sizes = [(photo.width, photo.height) for photo in photos]
     count, pairs = len(sizes), math.comb(len(sizes), 2)
@@ -112,12 +112,12 @@ def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb:
 def plan_within(
     photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float, stages: Iterable[str]
 ) -> Plan:
-    """Return the plan with the most workers that holds no more memory than allowed; with one worker if none does.
+    """Return the plan with the most workers that stays within the memory limit; with one worker if none does.
 
     Args:
-        photos, settings, limit_mb: as in `plan_of`.
+        photos, settings, limit_mb: photos in use; settings in force; most memory.
         workers: the most that may work at once.
-        stages: names of those that are to be run.
+        stages: names of those that will run.
     """
     chosen, names = list(photos), list(stages)
     plans = (plan_of(chosen, settings, number, limit_mb) for number in range(workers, 0, -1))
@@ -125,7 +125,7 @@ def plan_within(
 
 
 def machine_memory_mb() -> float:
-    """Return what this machine, or the container that this is, has; infinite where the system does not say."""
+    """Return the memory of this machine or container in MB; infinite where the system does not say."""
     found = [math.inf]
     for path, unit in (("/proc/meminfo", 1 / 1000), ("/sys/fs/cgroup/memory.max", 1 / MEGA)):
         try:
@@ -138,12 +138,12 @@ def machine_memory_mb() -> float:
 
 
 def _megapixels(size: tuple[int, int], longest: int) -> float:
-    """Return the megapixels of a photo that is scaled down to that longer side."""
+    """Return the megapixels of a photo after it is scaled down to a longest side."""
     scale = min(1.0, longest / max(size))
     return size[0] * size[1] * scale**2 / MEGA
 
 
 def _rounded(minutes: float) -> int:
-    """Round to one digit, or to two that say something."""
+    """Round to a multiple of 1, 5 or 10, depending on the size."""
     step = 1 if minutes < 10 else 5 if minutes < 60 else 10
     return max(1, round(minutes / step) * step)

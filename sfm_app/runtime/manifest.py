@@ -13,22 +13,22 @@ from sfm_app.numerical import json_text
 
 MANIFEST, PROGRAM = "manifest.json", "sfm-app"
 FORMAT = 2
-"""Raised when what stages leave can no longer be read by an earlier or later program."""
+"""Version of the stages' files; raised when other versions of the program can no longer read them."""
 CHECK = "check"
-"""In a record: hash of the rest. What was changed by hand, or is half of it, is no record."""
+"""Key in a record: hash of the rest. A record that was edited or cut off is ignored."""
 MOST_BYTES = 64_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class StageRecord:
-    """What the manifest says about one finished stage."""
+    """Entry of the manifest for one finished stage."""
 
     fingerprint: str
     """Hash of everything that the stage's result depends on."""
     seconds: float
     counts: Mapping[str, Any] = field(default_factory=dict)
     files: Mapping[str, int] = field(default_factory=dict)
-    """What the stage wrote, with the size in bytes; -1 for folders, and for the database, which readers may tidy up."""
+    """What the stage wrote, with the size in bytes; -1 for folders and the database, whose size readers may change."""
     peak_mb: int | None = None
     """Most memory that the process had held by the end of the stage, in MB; None where the system does not say."""
     made_with: Mapping[str, Any] = field(default_factory=dict)
@@ -38,14 +38,14 @@ class StageRecord:
 
 
 class Manifest:
-    """`manifest.json` of an output folder, and the sizes of the files that it speaks of."""
+    """`manifest.json` of an output folder, and the sizes of the files that it lists."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self.path = root / MANIFEST
 
     def read(self) -> dict[str, Any]:
-        """Return what was written last; empty when there is none or it cannot be read (then everything is redone)."""
+        """Return the manifest; empty when it is missing or cannot be read (then everything is redone)."""
         try:
             if self.path.stat().st_size > MOST_BYTES:
                 return {}
@@ -55,10 +55,10 @@ class Manifest:
         return found if isinstance(found, dict) and isinstance(found.get("stages", {}), dict) else {}
 
     def check_format(self) -> None:
-        """Check that this program can read what a run has left.
+        """Check that this program can read the files of the run.
 
         Raises:
-            InputError: another version has made it.
+            InputError: another version of the program wrote them.
         """
         found = self.read()
         if found.get("stages") and found.get("program") == PROGRAM and found.get("format") != FORMAT:
@@ -68,7 +68,7 @@ class Manifest:
             )
 
     def record(self, stage: str) -> StageRecord | None:
-        """Return the record of a finished stage, if the manifest has one, just as it was written."""
+        """Return the record of a finished stage; None where there is none, or it was altered."""
         entry = self.read().get("stages", {}).get(stage)
         try:
             return StageRecord(**entry) if entry.pop(CHECK) == fingerprint(entry) else None
@@ -76,11 +76,11 @@ class Manifest:
             return None
 
     def changed_files(self, record: StageRecord) -> list[str]:
-        """Return files of a finished stage that are gone or have another size."""
+        """Return the files of a finished stage that are missing or have another size."""
         return [name for name, size in record.files.items() if _size(self.root / name) != size]
 
     def forget(self, stages: tuple[str, ...]) -> None:
-        """Take stages out of the manifest before their files are touched, so that it is never ahead of the files."""
+        """Remove stages from the manifest before their files are touched, so that it never lists what is not there."""
         manifest = self.read()
         known = manifest.get("stages", {})
         if any(known.pop(stage, None) for stage in stages):
@@ -104,7 +104,7 @@ class Manifest:
             path.write_text(json_text(manifest), encoding="utf-8")
 
     def sizes(self, files: tuple[str, ...]) -> dict[str, int]:
-        """Return sizes of what a stage wrote, as its record holds them."""
+        """Return the sizes of a stage's files, as its record holds them."""
         found = {name: _size(self.root / name) for name in files}
         return {name: size for name, size in found.items() if size is not None}
 

@@ -10,28 +10,28 @@ Result = TypeVar("Result")
 
 
 def worker_count(wanted: int) -> int:
-    """Return how many workers `wanted` stands for; 0 is one per core that this process may use."""
+    """Return the number of workers; 0 stands for one per core that this process may use."""
     if wanted > 0:
         return wanted
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def make_executor(workers: int) -> Executor:
-    """Give threads: the heavy work (numba kernels, OpenCV, COLMAP) releases the GIL, and nothing has to be pickled."""
+    """Make a thread pool: the heavy work (numba, OpenCV, COLMAP) releases the GIL, and nothing has to be pickled."""
     return ThreadPoolExecutor(max_workers=workers, thread_name_prefix="sfm")
 
 
 def ordered_map(
     executor: Executor, function: Callable[[Item], Result], items: Iterable[Item], ahead: int
 ) -> Iterator[Result]:
-    """Yield results in the order of the items, with few under way, so that memory stays bounded.
+    """Yield results in the order of the items, with few of them in flight, so that memory stays bounded.
 
-    When the caller stops early or an item fails, what has not begun is cancelled.
+    When the caller stops early or an item fails, the calls that have not begun are canceled.
 
     Args:
         executor, function: its workers apply the function to each item.
         items: drawn only as they are needed.
-        ahead: most items under way; at least 1.
+        ahead: most items in flight; at least 1.
     """
     waiting: list[Future[Result]] = []
     try:

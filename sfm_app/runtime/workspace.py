@@ -1,4 +1,4 @@
-"""The output folder: where things lie in it, whose it is, and who is at work there."""
+"""The output folder: its layout, whether a run made it, and the lock that keeps other runs out."""
 
 import contextlib
 import errno
@@ -19,11 +19,11 @@ from sfm_app.runtime.manifest import MANIFEST, Manifest
 DATABASE, CALIBRATION, SCENE = "database.db", "calibration.json", "scene.json"
 FOLDERS = ("photos", "frames", "masks", "sparse", "other_models", "dense", "surface", "texture")
 WRITTEN = (*FOLDERS, DATABASE, CALIBRATION, SCENE)
-"""What a run removes before it writes it."""
+"""Names of files and folders that a run removes before it writes them."""
 LOCK, HOLDER = ".lock", ".held-by.txt"
 LOG, PARTS, FEATURES, MAPPING = "log.txt", "view_graph_parts", "feature_parts", ".mapping"
 FOLLOWED = (*WRITTEN, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING)
-"""What a run writes to without replacing it: a link would lead it out of the folder."""
+"""Names that a run writes to without replacing them: a link there would lead it out of the folder."""
 PHOTO_SET, VIEW_GRAPH = "photos.json", "view_graph.npz"
 
 
@@ -36,7 +36,7 @@ class Workspace:
 
     @property
     def photos(self) -> Path:
-        """Upright photos that COLMAP can read: links where the file is fine, copies where not."""
+        """Upright photos that COLMAP can read: links where it can read the file itself, else copies."""
         return self.root / "photos"
 
     @property
@@ -46,7 +46,7 @@ class Workspace:
 
     @property
     def frames_marker(self) -> Path:
-        """Beside the frames until they are read: which were chosen, and what from."""
+        """Marker beside the frames until they are read: which were chosen, and from which inputs."""
         return self.root / "frames.unfinished.json"
 
     @property
@@ -71,12 +71,12 @@ class Workspace:
 
     @property
     def calibration(self) -> Path:
-        """Cameras from pairs."""
+        """Cameras calibrated from pairs."""
         return self.root / CALIBRATION
 
     @property
     def scene(self) -> Path:
-        """What is known about the scene besides COLMAP's model: refined cameras, and why photos have no place."""
+        """What is known about the scene besides COLMAP's model: refined cameras, and why photos are not placed."""
         return self.root / SCENE
 
     @property
@@ -86,7 +86,7 @@ class Workspace:
 
     @property
     def other_models(self) -> Path:
-        """COLMAP models of photos that do not hang together with the main one, numbered from 1."""
+        """COLMAP models of photos that are not connected to the main one, numbered from 1."""
         return self.root / "other_models"
 
     @property
@@ -106,7 +106,7 @@ class Workspace:
 
     @property
     def database_marker(self) -> Path:
-        """Beside the database while it is filled: what it is filled from."""
+        """Marker beside the database while it is filled: fingerprint of the inputs."""
         return self.root / f"database.{UNFINISHED}"
 
     @property
@@ -125,16 +125,16 @@ class Workspace:
         return self.root / LOG
 
     def create(self) -> None:
-        """Make the folder and prove that it can be written to.
+        """Make the folder and check that it is writable.
 
         Raises:
-            InputError: it cannot, or it holds what a run would write over, or links through which it would write.
+            InputError: it is not, or it holds files that a run would overwrite, or links that it would write through.
         """
         known = any((self.root / name).exists() for name in (LOCK, MANIFEST))
         foreign = [] if known else [name for name in WRITTEN if (self.root / name).exists()]
         if foreign:
             raise InputError(
-                f"{self.root / foreign[0]} is there, and no run has made it", hint="name another output folder with -o"
+                f"{self.root / foreign[0]} exists, and no run has made it", hint="name another output folder with -o"
             )
         link = next(self._links(), None)
         if link:
@@ -155,7 +155,7 @@ class Workspace:
             raise _cannot_write(self.root, err) from err
 
     def _links(self) -> Iterator[Path]:
-        """Yield links that no run has made; those of the photos are replaced when they are laid out."""
+        """Yield links that no run has made; links to photos are left out, since laying out replaces them."""
         for path in (self.root / name for name in FOLLOWED):
             if path.is_symlink():
                 yield path
@@ -170,11 +170,13 @@ class Workspace:
             what: their name in the error message.
 
         Raises:
-            InputError: it would.
+            InputError: it would overwrite them.
         """
         folder, out = photos.resolve(), self.root.resolve()
         if folder == out:
-            raise InputError(f"{photos} cannot be the {what} and the output", hint="name another output folder with -o")
+            raise InputError(
+                f"{photos} cannot be both the {what} and the output", hint="name another output folder with -o"
+            )
         if any(folder.is_relative_to(out / name) for name in WRITTEN):
             raise InputError(
                 f"{photos} lies where the run in {self.root} keeps its own files",
@@ -183,7 +185,7 @@ class Workspace:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Keep other runs out; the system lets go of it when this process ends, however it ends.
+        """Hold the lock that keeps other runs out; the system releases it when this process ends, however it ends.
 
         Raises:
             InputError: another run is at work here.
@@ -202,18 +204,18 @@ class Workspace:
             holder.write_text(f"process {os.getpid()} on {platform.node()} since {started}\n", encoding="utf-8")
             yield
         finally:
-            with contextlib.suppress(OSError):  # the folder may be gone, or closed: the run says so itself
+            with contextlib.suppress(OSError):  # the folder may be gone or read-only: the run reports that itself
                 holder.unlink(missing_ok=True)
             lock.release()
 
     def check_there(self) -> None:
-        """Check that the folder of a run at work is still there, and open.
+        """Check that the folder still exists during a run, and is writable.
 
-        What the run has written there since it was removed is marked as its own: the next one must not take it for
-        foreign.
+        If it was removed and holds only what the run has written since, it is marked as made by a run: otherwise the
+        next run would refuse it.
 
         Raises:
-            InputError: it is gone, or nothing can be written there.
+            InputError: it was removed, or is not writable.
         """
         if not (self.root / LOCK).exists():
             left = {path.name for path in self.root.iterdir()} if self.root.is_dir() else set()
@@ -223,17 +225,17 @@ class Workspace:
         self._check_writable()
 
     def discard_unfinished(self) -> None:
-        """Let no run go on with what a stage has left half done."""
+        """Remove the markers of unfinished work, so that no run resumes it."""
         markers = (self.root.glob(f"{folder}/{UNFINISHED}") for folder in ("*", "*/*"))
         for path in (self.database_marker, self.frames_marker, *chain(*markers)):
             path.unlink(missing_ok=True)
 
 
 class Aside(Workspace):
-    """A folder within the output folder, for another hypothesis about the same photos.
+    """A folder inside the output folder, for another hypothesis about the same photos.
 
     Args:
-        of: whose photos and masks they are.
+        of: the run's workspace, which has the photos and masks.
         name: of the folder.
     """
 
@@ -243,19 +245,19 @@ class Aside(Workspace):
 
     @property
     def photos(self) -> Path:
-        """Those of the run itself."""
+        """Photos of the run itself."""
         return self.of.photos
 
     @property
     def masks(self) -> Path:
-        """Those of the run itself."""
+        """Masks of the run itself."""
         return self.of.masks
 
 
 def _cannot_write(folder: Path, err: OSError) -> InputError:
     return InputError(
         f"cannot write to {folder}: {err.strerror}",
-        hint="make it writable, and the same command goes on; or name another output folder with -o",
+        hint="make it writable and run the same command again, or name another output folder with -o",
     )
 
 

@@ -1,1 +1,1 @@
-"""The stages of a run, one file each: take products, call the part that does the work, count, give a product."""
+"""The stages of a run, one file each: take products, call the code that does the work, count, return a product."""

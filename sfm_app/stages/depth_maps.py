@@ -36,7 +36,7 @@ CONFIRMING = 2
 
 
 def make(scene: Scene, run: RunContext) -> Path:
-    """Give every photo that has neighbors a depth and a normal map; a run that was killed goes on where it stopped.
+    """Make a depth and a normal map of every photo that has neighbors; a killed run can resume.
 
     Args:
         scene: cameras, poses and points.
@@ -73,12 +73,12 @@ def load(run: RunContext) -> Path:
 
 
 def digest(place: Workspace) -> str:
-    """Return hash of the undistorted photos and their maps."""
+    """Return a hash of the undistorted photos and their maps."""
     return digest_maps(place.dense)
 
 
 def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None:
-    """Undistort photos and masks, unless a killed run has left a workspace with the same model and other inputs.
+    """Undistort photos and masks, unless a killed run has left a workspace made from the same inputs.
 
     Args:
         scene: cameras, poses and points.
@@ -98,16 +98,16 @@ def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None
 
 
 def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | None], run: RunContext) -> None:
-    """Note what share of each photo has a depth, and why photos have none.
+    """Note the share of each photo that has a depth, and why photos have no depth map.
 
     Args:
         dense_dir: folder with undistorted photos and their maps.
         views: all undistorted photos.
-        found: per view why it has no depth; None where it has.
+        found: per view why it has no depth map; None where it has one.
         run: the run.
 
     Raises:
-        ReconstructionError: none has.
+        ReconstructionError: no view has a depth map.
     """
     rejected = Counter(reason.reason for reason in found if reason is not None)
     coverage = {
@@ -123,7 +123,7 @@ def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | No
 
 @contextmanager
 def single_threaded_opencv() -> Iterator[None]:
-    """Provide one OpenCV thread per worker: the photos are what runs in parallel."""
+    """Let OpenCV use one thread per worker, since the photos are processed in parallel."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

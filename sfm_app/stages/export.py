@@ -26,10 +26,10 @@ def make(model: Model, run: RunContext) -> tuple[Path, ...]:
 
 
 def load(run: RunContext) -> tuple[Path, ...]:
-    """Return paths of the files that are there."""
+    """Return the paths of the model's files."""
     return run.model_paths(NAME)
 
 
 def digest(place: Workspace) -> str:
-    """Return hash of the files of the model."""
+    """Return a hash of the model's files."""
     return digest_files(place.root, *(f"{NAME}.{suffix}" for suffix in STANDARD_FORMATS))

@@ -12,7 +12,7 @@ from sfm_app.types import Calibration, Intrinsics, MatchGraph, ViewGraph
 
 
 def make(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
-    """Find the cameras, write them down and count them.
+    """Find the cameras, write them to calibration.json and record their figures.
 
     Args:
         matches: keypoints and raw matches.
@@ -36,7 +36,7 @@ def load(run: RunContext) -> Intrinsics:
 
 
 def digest(place: Workspace) -> str:
-    """Return hash of calibration.json."""
+    """Return a hash of calibration.json."""
     return digest_files(place.root, place.calibration.name)
 
 

@@ -13,7 +13,7 @@ from sfm_app.types import MatchGraph, PhotoSet
 def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
     """Find features and match every photo with every other, without geometric verification.
 
-    What a killed run has found of the same photos stays.
+    Features and matches that a killed run has found in the same photos are reused.
 
     Args:
         photos: usable photos, laid out in the workspace.
@@ -48,11 +48,11 @@ def load(photos: PhotoSet, run: RunContext) -> MatchGraph:
     """Read the match graph back from the database.
 
     Args:
-        photos: those the database was made from.
+        photos: those that the database was made from.
         run: the run.
 
     Raises:
-        ValueError: the database is torn; COLMAP would end the program.
+        ValueError: the database is damaged; COLMAP would end the program on it.
     """
     if not is_sound(run.workspace.database):
         raise ValueError(f"{run.workspace.database} is damaged")
@@ -61,5 +61,5 @@ def load(photos: PhotoSet, run: RunContext) -> MatchGraph:
 
 
 def digest(place: Workspace) -> str:
-    """Return hash of the photos, keypoints and matches in the database."""
+    """Return a hash of the photos, keypoints and matches in the database."""
     return digest_matches(place.database)

@@ -33,14 +33,14 @@ from sfm_app.types import Surface
 
 SURFACE = "surface.npz"
 WHOLE = "fused.txt"
-"""Hash of the fused points: a run that goes on does not read damaged ones."""
+"""File with the hash of the fused points, so that a resumed run does not read damaged ones."""
 HINT = "take more photos, a step apart, with more overlap; OUT/points.ply and OUT/points.glb have the sparse points"
 
 MIN_POINTS = 100
 """Fewer fused points carry no surface."""
 
 SURE = 2 / 3
-"""A part stays when this share of the photos that a fused point needs confirm its average vertex."""
+"""A part stays when this share of the photos that a fused point needs confirms its average vertex."""
 
 
 def make(dense_dir: Path, run: RunContext) -> Surface:
@@ -51,7 +51,7 @@ def make(dense_dir: Path, run: RunContext) -> Surface:
         run: the run.
 
     Raises:
-        ReconstructionError: the depth maps do not give a surface; says why.
+        ReconstructionError: the depth maps do not give a surface; the message says why.
         BackendError: COLMAP failed.
     """
     place, options = run.workspace.surface, run.settings.mesh
@@ -75,7 +75,7 @@ def make(dense_dir: Path, run: RunContext) -> Surface:
 
 
 def _nonempty(surface: Surface, otherwise: str) -> Surface:
-    """Return the surface, which has triangles.
+    """Return the surface after checking that it has triangles.
 
     Raises:
         ReconstructionError: it has none.
@@ -92,12 +92,12 @@ def load(run: RunContext) -> Surface:
 
 
 def digest(place: Workspace) -> str:
-    """Return hash of the surface."""
+    """Return a hash of the surface."""
     return digest_files(place.surface, SURFACE)
 
 
 def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArray[np.float64]:
-    """Give (N, 3) points of all depth maps together, fused anew only where a depth map, or their folder, is younger."""
+    """Return the (N, 3) points fused from all depth maps; fuse again only where a map or their folder is newer."""
     if not views:
         raise ReconstructionError("no photo has a depth map", hint=HINT)
     place = run.workspace.surface
@@ -125,10 +125,10 @@ def _photos_needed(views: list[View], run: RunContext) -> int:
 
 
 def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> tuple[Surface, Support]:
-    """Return the surface in the colors of the photos, and what they say about each of its vertices.
+    """Return the surface with colors from the photos, and their support for each of its vertices.
 
     Args:
-        surface: as Poisson reconstruction leaves it.
+        surface: from Poisson reconstruction.
         dense_dir: folder with undistorted photos and their maps.
         views: photos with a depth map.
         run: the run.

@@ -40,14 +40,14 @@ from sfm_app.types import GpsPosition, Photo, PhotoSet, UnusablePhoto
 
 
 def make(source: Source, run: RunContext) -> PhotoSet:
-    """Look at every file of a folder, or at the frames of a video, and lay the usable photos out for COLMAP.
+    """Read every file of a folder, or the frames of a video, and lay the usable photos out for COLMAP.
 
     Args:
         source: folder or video.
         run: the run.
 
     Raises:
-        InputError: the source is missing, fewer than two photos are usable, or a mask is not.
+        InputError: the source is missing, fewer than two photos are usable, or a mask is unusable.
     """
     if not source.video:
         return _read_photos(source, source.path, list(source.files), run)
@@ -56,7 +56,7 @@ def make(source: Source, run: RunContext) -> PhotoSet:
 
 
 def load(source: Source, run: RunContext) -> PhotoSet:
-    """Read photos.json back; what is gone of what was laid out, or was damaged, is laid out again.
+    """Read photos.json back; laid-out photos that are missing or damaged are laid out again.
 
     Args:
         source: what the photos were read from.
@@ -66,12 +66,12 @@ def load(source: Source, run: RunContext) -> PhotoSet:
 
 
 def digest(place: Workspace) -> str:
-    """Return hash of photos.json, which holds hashes of the copies."""
+    """Return a hash of photos.json, which holds hashes of the copies."""
     return digest_files(place.root, place.photo_set.name)
 
 
 def _read_photos(source: Source, folder: Path, names: Sequence[str], run: RunContext) -> PhotoSet:
-    """Look at these files of a folder and lay the usable photos out for COLMAP; errors as `make`."""
+    """Read these files of a folder and lay the usable photos out for COLMAP; errors as in `make`."""
     options = within_memory(run)
     found = run.map(partial(read_photo, folder, options=options), names, "photos")
     glances = [photo for photo in found if isinstance(photo, Glance)]
@@ -81,7 +81,8 @@ def _read_photos(source: Source, folder: Path, names: Sequence[str], run: RunCon
     unusable = sorted(unusable + blackened + needless, key=lambda photo: photo.name)
     if len(photos) < 2:
         raise InputError(
-            _too_few(folder, len(photos), unusable), hint="two photos of one place are the least; 10 to 50 work best"
+            _too_few(folder, len(photos), unusable),
+            hint="at least two photos of a place are needed; 10 to 50 work best",
         )
     named = tuple(stored_names(grouped(photos, options.cameras)))
     photo_set = PhotoSet(folder, named, tuple(unusable), source.mask_dir)
@@ -98,7 +99,7 @@ def _read_photos(source: Source, folder: Path, names: Sequence[str], run: RunCon
 
 
 def within_memory(run: RunContext) -> PhotoSettings:
-    """Return the settings for photos; where the user allows only so much memory, larger ones are scaled down."""
+    """Return the photo settings; where the user limits the memory, `max_megapixels` is reduced to fit."""
     options = run.settings.photos
     if not run.settings.max_memory_gb:
         return options
@@ -107,10 +108,10 @@ def within_memory(run: RunContext) -> PhotoSettings:
 
 
 def chosen(glances: list[Glance], *, keep_low_quality: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
-    """Return the photos that are worth their time, and the others.
+    """Return the photos that are worth using, and the others.
 
     Args:
-        glances: photos, with what a look at each has shown.
+        glances: photos with their measured quality.
         keep_low_quality: whether blurred and repeated ones stay.
     """
     if keep_low_quality:
@@ -123,11 +124,11 @@ def chosen(glances: list[Glance], *, keep_low_quality: bool) -> tuple[list[Photo
 def masked(
     glances: list[Glance], folder: Path, source: Source, run: RunContext
 ) -> tuple[list[Glance], list[UnusablePhoto]]:
-    """Return the photos with their masks, and those of which nothing is left.
+    """Return the photos with their masks, and those that their masks cover completely.
 
     Args:
-        glances: photos that are worth their time.
-        folder, source: where the photos are read from, and their masks.
+        glances: photos with their measured quality.
+        folder, source: folder of the photos; source with the folder of masks.
         run: the run.
 
     Raises:
@@ -162,7 +163,7 @@ def laid_out(photo: Photo, *, folder: Path, target: Path) -> None:
         target: folder of laid-out photos.
 
     Raises:
-        InputError: it has changed since it was looked at.
+        InputError: it has changed since it was first read.
     """
     try:
         lay_out(photo, folder, target)
@@ -181,7 +182,7 @@ def _save_photo_set(photos: PhotoSet, run: RunContext) -> None:
 
 
 def _copy_digest(photo: Photo, run: RunContext) -> str | None:
-    """Return hash of the bytes of a copy; None where a link leads to the photo, or where nothing is."""
+    """Return a hash of the bytes of a copy; None where there is a link to the photo, or nothing."""
     place = run.workspace.photos / photo.name
     return digest_files(run.workspace.photos, photo.name) if place.is_file() and not place.is_symlink() else None
 
@@ -210,7 +211,7 @@ def _photo(entry: Mapping[str, Any]) -> Photo:
 
 
 def _too_few(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:
-    """Return why there is nothing to reconstruct, in one line."""
+    """Return why there are not enough photos, in one line."""
     reasons = Counter("copies of another" if "same picture" in photo.reason else photo.reason for photo in unusable)
     seen = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
     number = "no usable photo" if usable == 0 else "only one usable photo"

@@ -29,7 +29,7 @@ POINTS = "points"
 
 
 def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Scene:
-    """Map the photos and adjust everything; the largest model goes on, the others are kept beside it.
+    """Map the photos and adjust everything; later stages use the largest model, the others are kept beside it.
 
     Args:
         matches: keypoints and raw matches.
@@ -38,13 +38,13 @@ def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Run
         run: the run.
 
     Raises:
-        ReconstructionError: no pair of photos grows into a model; says what was seen.
+        ReconstructionError: no pair of photos grows into a model; the message says why.
     """
     aside = mapping_run(run)
     first = Found(reconstruct(matches, views, intrinsics, aside), matches, views, intrinsics, aside)
     try:
         scene = _adjusted_scene(look_again(first), run)
-    except ReconstructionError:  # any other end, such as Ctrl-C or a full disk: the same command goes on with it
+    except ReconstructionError:  # after any other end, such as Ctrl-C or a full disk, the same command resumes there
         shutil.rmtree(aside.workspace.root, ignore_errors=True)
         raise
     shutil.rmtree(aside.workspace.root, ignore_errors=True)
@@ -60,12 +60,12 @@ def load(run: RunContext) -> Scene:
 
 
 def digest(place: Workspace) -> str:
-    """Return hash of the model and scene.json."""
+    """Return a hash of the model and scene.json."""
     return digest_files(place.root, place.sparse.name, place.scene.name)
 
 
 def mapping_run(run: RunContext) -> RunContext:
-    """Return the run in a folder of its own, where mapping has its database and what a killed run left is kept."""
+    """Return the run in an inner folder, where mapping has its own database and a killed run can resume."""
     place = Aside(run.workspace, MAPPING)
     if not can_go_on(place.root, run.fingerprint):
         mark_unfinished(place.root, run.fingerprint)
@@ -73,10 +73,10 @@ def mapping_run(run: RunContext) -> RunContext:
 
 
 def _adjusted_scene(found: Found, run: RunContext) -> Scene:
-    """Adjust the models, put them upright, write them down and count them.
+    """Adjust the models, orient them upright, write them and record their figures.
 
     Raises:
-        ReconstructionError: no model holds depth.
+        ReconstructionError: no model has depth.
     """
     matches, views, intrinsics = found.matches, found.views, found.intrinsics
     outcome = _with_depth(found.outcome, matches, views, intrinsics, run)
@@ -117,10 +117,10 @@ def _adjusted_scene(found: Found, run: RunContext) -> Scene:
 def _with_depth(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
-    """Drop the models of photos that hold no depth: these could be anything.
+    """Drop the models of photos without parallax: their shape is arbitrary.
 
     Raises:
-        ReconstructionError: no model is left; says what was seen.
+        ReconstructionError: no model is left; the message says why.
     """
     kept, doubts = [], []
     for attempt in outcome.models:
@@ -139,7 +139,7 @@ def _with_depth(
 
 
 def how_it_was_made(outcome: Outcome) -> dict[str, Json]:
-    """Return what the manifest says about relative poses and mapping."""
+    """Return the manifest's figures about relative poses and mapping."""
     poses, main = outcome.graph.poses.values(), outcome.models[0]
     dropped = list(outcome.graph.dropped.values())
     kinds = [pose.kind for pose in poses]
@@ -160,7 +160,7 @@ def how_it_was_made(outcome: Outcome) -> dict[str, Json]:
 
 
 def _how_it_was_adjusted(adjusted: Sequence[Adjusted], names: Mapping[str, str]) -> dict[str, Json]:
-    """Return what the manifest says about what the last adjustment could not do; empty where that is nothing."""
+    """Return the manifest's entries about problems of the last adjustment; empty for none."""
     main, others = adjusted[0], adjusted[1:]
     cameras = {image.camera_id: names[image.name] for image in posed_images(main.model)}
     found: dict[str, Json] = {
@@ -173,7 +173,7 @@ def _how_it_was_adjusted(adjusted: Sequence[Adjusted], names: Mapping[str, str])
 
 
 def write_models(models: list[Reconstruction], run: RunContext) -> None:
-    """Put the main model into OUT/sparse and the others into OUT/other_models/1, 2, ..., each as a whole.
+    """Write the main model to OUT/sparse and the others to OUT/other_models/1, 2, ..., each as a whole.
 
     Args:
         models: the main one first; at least one.
@@ -187,11 +187,11 @@ def write_models(models: list[Reconstruction], run: RunContext) -> None:
 
 
 def write_model(model: Reconstruction, target: Path) -> None:
-    """Put a model into a folder as a whole.
+    """Write a model into a folder beside the target, then replace the target with it.
 
     Args:
         model: COLMAP's reconstruction.
-        target: folder, replaced if it is there.
+        target: folder, replaced if it exists.
     """
     beside = target.with_name(f".{target.name}")
     shutil.rmtree(beside, ignore_errors=True)
@@ -204,7 +204,7 @@ def write_model(model: Reconstruction, target: Path) -> None:
 
 
 def refined_by_name(adjusted: Adjusted, names: Mapping[str, str]) -> dict[str, Refined]:
-    """Return what is known about the refined cameras besides COLMAP's model, by name of the camera.
+    """Return deviations and determined parameters of the refined cameras, by name of the camera.
 
     Args:
         adjusted: the model with the deviations of its cameras.
@@ -221,7 +221,7 @@ def write_scene(scene: Scene, run: RunContext) -> None:
     """Write scene.json: what COLMAP's model does not hold.
 
     Args:
-        scene: what was found.
+        scene: the scene.
         run: the run.
     """
     known = {

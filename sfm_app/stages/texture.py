@@ -21,13 +21,13 @@ from sfm_app.types import Model, Scene, Surface, Texture
 
 TEXTURE = "texture.npz"
 PARTS = "parts"
-"""Beside it while the texture is made: what is done with each photo."""
+"""Folder beside it while the texture is made: the finished work on each photo."""
 
 
 def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
     """Paint the surface with the photos at full size.
 
-    A run that was killed goes on where it stopped.
+    A killed run can resume.
 
     Args:
         scene: cameras and poses.
@@ -49,31 +49,31 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
 
 
 class Files:
-    """Photos and masks of two folders, and arrays in files, as `sfm_app.texture.Store` has them."""
+    """The `sfm_app.texture.Store` of a run: photos and masks of two folders, and arrays in files."""
 
     def __init__(self, photo_dir: Path, folder: Path, mask_dir: Path | None = None) -> None:
         self.photo_dir, self.folder, self.mask_dir = photo_dir, folder, mask_dir
 
     def photo(self, view: PhotoView) -> NDArray[np.uint8]:
-        """Return (height, width, 3) RGB of a view, with nothing seen where it is masked."""
+        """Return (height, width, 3) RGB of a view, without what is masked."""
         return read_photo(self.photo_dir, view, self.used(view))
 
     def used(self, view: PhotoView) -> NDArray[np.bool_] | None:
-        """Return (height, width) which pixels of a photo may be used; None where no masks are given."""
+        """Return a (height, width) mask of the pixels that may be used; None where no masks are given."""
         return None if self.mask_dir is None else read_used(self.mask_dir, view.name)
 
     def recall(self, name: str) -> dict[str, NDArray[np.generic]] | None:
         """Return the arrays that were kept under a name, if they are there and sound."""
         try:
             return load_arrays(self._path(name))
-        except Exception:  # not there, or damaged, of which decoders make whatever they like
+        except Exception:  # missing, or damaged: decoders raise all kinds of errors
             return None
 
     def keep(self, name: str, arrays: Mapping[str, NDArray[np.generic]]) -> None:
-        """Keep arrays in a file that appears complete or not at all.
+        """Keep arrays in a file, written atomically.
 
         Args:
-            name: what they are kept under.
+            name: of the file, without suffix.
             arrays: by their own names.
         """
         with replacing(self._path(name)) as path:
@@ -84,7 +84,7 @@ class Files:
 
 
 def surface_digest(surface: Surface) -> str:
-    """Return hash of vertices, triangles and colors."""
+    """Return a hash of vertices, triangles and colors."""
     found = blake2b()
     for part in (surface.vertices, surface.faces, surface.colors):
         found.update(part.tobytes())
@@ -92,12 +92,12 @@ def surface_digest(surface: Surface) -> str:
 
 
 def photo_views(scene: Scene) -> list[PhotoView]:
-    """Return the registered photos as the texture sees them."""
+    """Return the views of the registered photos for texturing."""
     return [photo_view(name, scene.cameras[scene.camera_of[name]], pose) for name, pose in scene.cam_from_world.items()]
 
 
 def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
-    """Return (height, width, 3) RGB of a photo at the size of the view; smaller ones are averaged, not picked.
+    """Return (height, width, 3) RGB of a photo at the size of the view; it is scaled down by averaging.
 
     Args:
         photo_dir: folder with the photos.
@@ -135,7 +135,7 @@ def load(run: RunContext) -> Model:
 
 
 def digest(place: Workspace) -> str:
-    """Return hash of the surface with its texture."""
+    """Return a hash of the surface with its texture."""
     return digest_files(place.texture, TEXTURE)
 
 

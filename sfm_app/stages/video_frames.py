@@ -1,4 +1,4 @@
-"""A video becomes a folder of photos: OUT/frames."""
+"""The chosen frames of a video, written to OUT/frames as a folder of photos."""
 
 import json
 import shutil
@@ -14,7 +14,7 @@ from sfm_app.photos import Follower, UnreadableError, choose, opened
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
 
-HINT = "walk around while you film, slowly, and keep the thing in view"
+HINT = "walk around while you film, slowly, and keep the object in view"
 DAMAGED = "play it to see whether it is whole; save it as MP4 with H.264"
 INTERLACED = "save it deinterlaced (progressive), as MP4 with H.264"
 BLACK = "black"
@@ -23,21 +23,21 @@ LONGEST_STEM = 40
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """What is known once the frames of a video are chosen."""
+    """The choice of frames of a video."""
 
     made_from: str
     """Fingerprint of the inputs."""
     frames: tuple[int, ...]
-    """Their numbers."""
+    """Numbers of the chosen frames."""
     counts: Mapping[str, Any]
-    """For the manifest."""
+    """Figures for the manifest."""
 
 
 @contextmanager
 def video_frames(source: Path, run: RunContext) -> Iterator[Path]:
     """Provide a folder with the chosen frames of a video.
 
-    A run that is killed before the block ends without an error does not choose again.
+    If the run is killed before the block ends, the next one keeps the choice.
 
     Args:
         source: video file.
@@ -59,7 +59,7 @@ def video_frames(source: Path, run: RunContext) -> Iterator[Path]:
 
 
 def kept(run: RunContext) -> Chosen | None:
-    """Return what a killed run had chosen from the same inputs."""
+    """Return the choice of a killed run from the same inputs; None where there is none."""
     try:
         found = json.loads(run.workspace.frames_marker.read_text(encoding="utf-8"))
         chosen = Chosen(found["made_from"], tuple(map(int, found["frames"])), dict(found["counts"]))
@@ -69,7 +69,7 @@ def kept(run: RunContext) -> Chosen | None:
 
 
 def chosen_from(source: Path, run: RunContext) -> Chosen:
-    """Look at the whole video and choose.
+    """Choose frames from the whole video.
 
     Args:
         source: video file.
@@ -108,7 +108,7 @@ def chosen_from(source: Path, run: RunContext) -> Chosen:
 
 def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None:
     """Write the frames that are not there yet."""
-    for half in run.workspace.frames.glob(".*"):  # of a run that was killed while it wrote
+    for half in run.workspace.frames.glob(".*"):  # incomplete files of a killed run
         half.unlink()
     places = {frame: run.workspace.frames / f"{stem_of(source)}_{frame:06d}.jpg" for frame in frames}
     missing = [frame for frame, place in places.items() if not place.exists()]
@@ -128,6 +128,6 @@ def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> Non
 
 
 def stem_of(source: Path) -> str:
-    """Return what the frames of a video are named by: short, visible, and printable."""
+    """Return the stem of the names of a video's frames: short, printable and not hidden."""
     printable = "".join(c if c.isprintable() else "_" for c in source.stem)
     return printable.lstrip(".")[:LONGEST_STEM] or "frame"

@@ -14,7 +14,7 @@ from sfm_app.types import MatchGraph, ViewGraph
 
 
 def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
-    """Fit every pair on its own, and count why pairs fell.
+    """Fit every pair on its own, and count why pairs were rejected.
 
     Args:
         matches: keypoints and raw matches.
@@ -46,5 +46,5 @@ def load(run: RunContext) -> ViewGraph:
 
 
 def digest(place: Workspace) -> str:
-    """Return hash of view_graph.npz."""
+    """Return a hash of view_graph.npz."""
     return digest_files(place.root, place.view_graph.name)

@@ -1,11 +1,11 @@
-"""The products that stages hand on: frozen, picklable, numpy only.
+"""The products that stages pass on: frozen, picklable, numpy only.
 
-Conventions, said once:
+Conventions:
 
 - Pixels: the center of the top-left pixel is (0.5, 0.5), as in COLMAP. x runs right, y down.
 - ``x2' F x1 = 0``: a fundamental matrix maps points of view 1 to epipolar lines of view 2.
 - ``cam_from_world`` maps world points into the camera frame: x right, y down, z forward.
-- Units stand in names: ``_px``, ``_deg``.
+- Units are part of names: ``_px``, ``_deg``.
 """
 
 from sfm_app.types.calibration import Calibration, Intrinsics

@@ -1,4 +1,4 @@
-"""Camera matrices and what supports them."""
+"""Camera matrices with their evidence."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -21,25 +21,25 @@ class Calibration:
     width: int
     height: int
     method: str
-    """Calibrator, "estimate" where the photos determine K roughly, or where a guess came from ("exif", "guess")."""
+    """Name of the calibrator; "estimate" where the photos determine K roughly; "exif" or "guess" for a guess."""
     identifiable: bool
     """False when the fundamental matrices do not determine K; K is then a guess."""
     reason: str = ""
     """Why K is not identifiable; empty when it is."""
     radial: float = 0.0
-    """k1 of COLMAP's SIMPLE_RADIAL: x_d = x_u (1 + k1 r^2) with r in focal lengths; 0 where no lens was sought."""
+    """k1 of COLMAP's SIMPLE_RADIAL: x_d = x_u (1 + k1 r^2) with r in focal lengths; 0 where it was not estimated."""
     spread: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations where the calibrator estimates them: "fx", "fy", "cx", "cy" in pixels, "k1"."""
     held: tuple[str, ...] = ()
-    """What the photos do not determine and so stays at its usual value: "center", "aspect", "k1"."""
+    """Parameters at their usual values because the photos do not determine them: "center", "aspect", "k1"."""
     key_pairs: tuple[PairId, ...] = ()
-    """Pairs of photos that a reconstruction starts from best, by what they say about K; best first."""
+    """Pairs of photos best suited to start a reconstruction from, by their evidence on K; best first."""
     evidence: Mapping[str, float] = field(default_factory=dict)
     """Named figures that support K: pairs used, support at the peak, ..."""
 
     @property
     def estimated(self) -> bool:
-        """Whether mapping may build on K: the photos determine it, or tell it roughly."""
+        """Whether mapping may build on K: the photos determine it, at least roughly."""
         return self.identifiable or self.method == "estimate"
 
     @property
@@ -69,7 +69,7 @@ class Intrinsics:
     cameras: Mapping[str, Calibration]
     """By name of the camera; the first entry has the most photos."""
     camera_of: Mapping[str, str] = field(default_factory=dict)
-    """Name of the camera by photo: its camera group, unless a group turned out to hold photos of several cameras."""
+    """Name of the camera by photo: its camera group, unless that was split because it held several cameras."""
     photos: Mapping[int, str] = field(default_factory=dict)
     """Name of the photo by the id that pairs use."""
 

@@ -1,4 +1,4 @@
-"""Pairs of photos with what is known about each: what calibrators work from."""
+"""Pairs of photos with their data: the input of calibrators."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
@@ -11,7 +11,7 @@ from sfm_app.types.matches import PairId
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPairs:
-    """Fundamental matrices of pairs with the same camera, and what is known about each.
+    """Fundamental matrices of pairs with the same camera, and data of each pair.
 
     Nothing is checked here: a calibrator refuses malformed values with a ValueError, see `selfcal.inputs.prepare`.
     """
@@ -19,15 +19,15 @@ class CameraPairs:
     Fs: NDArray[np.float64]
     """(P, 3, 3) in pixels, x2' F x1 = 0, any scale."""
     weights: NDArray[np.float64]
-    """(P,) >= 0, how far each F is trusted."""
+    """(P,) >= 0, weight of each F."""
     size: tuple[int, int]
     """(width, height) of the photos in pixels."""
     photos: tuple[PairId, ...] = ()
-    """Per pair the ids of its two photos; empty where nobody knows."""
+    """Per pair the ids of its two photos; empty where they are unknown."""
     inliers: tuple[NDArray[np.float64], ...] = ()
-    """Per pair (N, 4) x1, y1, x2, y2 in pixels: the matches that F rests on; empty where only the F's are known."""
+    """Per pair (N, 4) x1, y1, x2, y2 in pixels: the matches behind F; empty where only the Fs are known."""
     focal_hints_px: tuple[float, ...] = field(default=())
-    """Focals that somebody claims (EXIF), in pixels, one per photo that has one. Never trusted."""
+    """Focal lengths claimed by EXIF, in pixels, one per photo that has one; hints, never trusted."""
 
     @classmethod
     def of(cls, Fs: ArrayLike, size: tuple[int, int], weights: ArrayLike | None = None) -> "CameraPairs":
@@ -36,7 +36,7 @@ class CameraPairs:
         Args:
             Fs: (P, 3, 3) in pixels, x2' F x1 = 0, any scale.
             size: width and height of the photos in pixels.
-            weights: (P,) >= 0; all trusted alike where None.
+            weights: (P,) >= 0; None for equal weights.
         """
         matrices = np.asarray(Fs, np.float64)
         return cls(matrices, np.ones(len(matrices)) if weights is None else np.asarray(weights, np.float64), size)
@@ -49,7 +49,7 @@ class PhotoPairs:
     Fs: NDArray[np.float64]
     """(P, 3, 3) in pixels, x2' F x1 = 0, any scale."""
     weights: NDArray[np.float64]
-    """(P,) >= 0, how far each F is trusted."""
+    """(P,) >= 0, weight of each F."""
     photos: tuple[PairId, ...]
     """Per pair the ids of its two photos."""
     inliers: tuple[NDArray[np.float64], ...]
@@ -57,17 +57,17 @@ class PhotoPairs:
     sizes: Mapping[int, tuple[int, int]]
     """(width, height) in pixels by photo."""
     groups: Mapping[int, str]
-    """By photo the group that is thought to be one camera."""
+    """By photo the group that is assumed to share one camera."""
     focal_hints_px: Mapping[int, float] = field(default_factory=dict)
     """Claimed focal (EXIF) by photo, where there is one."""
     brought_to: Mapping[int, tuple[int, int]] = field(default_factory=dict)
-    """By photo the size that bars have brought it to, where there are any: `sizes` is then that of the picture within.
-    Groups that were brought to one size may be of as many cameras as photos."""
+    """By photo with bars the size including the bars; `sizes` then has that of the picture inside them. Photos that
+    bars bring to one size may each be of another camera."""
 
     def moved(self, corners: Mapping[int, tuple[int, int]]) -> "PhotoPairs":
-        """Return the same in pixels counted from these corners (left, top), by photo.
+        """Return the pairs with pixels counted from new origins (left, top), given by photo.
 
-        The sizes are taken as they are.
+        The sizes stay the same.
         """
         if not corners:
             return self
@@ -79,7 +79,7 @@ class PhotoPairs:
         return replace(self, Fs=Fs, inliers=inliers)
 
     def among(self, members: Collection[int]) -> CameraPairs:
-        """Return the pairs within photos of one size."""
+        """Return the pairs whose photos are both members; all members have one size."""
         wanted = set(members)
         kept = [k for k, pair in enumerate(self.photos) if wanted.issuperset(pair)]
         return CameraPairs(

@@ -1,4 +1,4 @@
-"""What is known about pairs of photos."""
+"""Fundamental matrices of pairs of photos."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -20,9 +20,9 @@ class EpipolarFit:
     inliers: NDArray[np.bool_]
     """(N,) per match: within the threshold of the returned F."""
     priors: NDArray[np.float64]
-    """(N,) in [0, 1] per match: how valid the estimator holds it; p(v_i) of the thesis, largest value 1."""
+    """(N,) in [0, 1] per match: its validity according to the estimator; p(v_i) of the thesis, largest value 1."""
     trials: int
-    """Minimal samples that were drawn."""
+    """Number of minimal samples drawn."""
     rms_px: float
     """Root mean square Sampson distance of the inliers."""
     degeneracy: str = ""
@@ -30,7 +30,7 @@ class EpipolarFit:
 
     @property
     def inlier_count(self) -> int:
-        """How many matches agree with F."""
+        """Number of matches that agree with F."""
         return int(np.count_nonzero(self.inliers))
 
 
@@ -57,7 +57,7 @@ class ViewGraph:
         return dict(Counter(r.reason for r in self.rejected.values()).most_common())
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """Return plain arrays for an .npz file; rows of matches are laid end to end."""
+        """Return plain arrays for an .npz file; the matches of all pairs are concatenated."""
         fits = list(self.fits.values())
         return {
             "pairs": np.array(list(self.fits), np.uint32).reshape(-1, 2),

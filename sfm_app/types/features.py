@@ -1,4 +1,4 @@
-"""What a way to find features says about one photo."""
+"""Features of one photo, as feature methods return them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Features:
-    """Keypoints of one picture, the best first, and whatever their finder wants to know when they are matched."""
+    """Keypoints of one picture, the best first, with the data that their method needs to match them."""
 
     size: tuple[int, int]
     """Width and height of the picture in pixels."""
@@ -23,5 +23,5 @@ class Features:
         return len(self.keypoints)
 
     def only(self, rows: NDArray[Any]) -> "Features":
-        """Return those of these rows."""
+        """Return the features in these rows."""
         return Features(self.size, self.keypoints[rows], {name: value[rows] for name, value in self.values.items()})

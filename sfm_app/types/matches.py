@@ -24,9 +24,9 @@ class MatchedImage:
     exif_focal_px: float | None = None
     gps: GpsPosition | None = None
     turn_deg: int = 0
-    """By how much it has to be turned clockwise to be upright, as far as EXIF and its shape say so."""
+    """Clockwise rotation that makes it upright, according to EXIF and its shape."""
     shown: Frame | None = None
-    """The picture within bars; None where all of it is picture."""
+    """The picture inside the bars; None where there are no bars."""
 
 
 @dataclass(frozen=True, slots=True)

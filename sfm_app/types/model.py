@@ -1,4 +1,4 @@
-"""What goes into a model file."""
+"""Contents of a model file."""
 
 from dataclasses import dataclass
 
@@ -22,11 +22,11 @@ class Texture:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frustum:
-    """A photo as it stands in the scene."""
+    """Intrinsics and pose of a photo in the scene."""
 
     name: str
     K: NDArray[np.float64]
-    """(3, 3) in pixels, without the lens."""
+    """(3, 3) in pixels, without lens distortion."""
     cam_from_world: NDArray[np.float64]
     """(3, 4) [R | t]."""
     width: int

@@ -1,4 +1,4 @@
-"""What a folder of photos holds."""
+"""Photos of a folder, usable or not."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ Frame = tuple[int, int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class GpsPosition:
-    """Where a photo claims to be taken (WGS84)."""
+    """Where a photo was taken according to EXIF (WGS84)."""
 
     latitude_deg: float
     """North of the equator, [-90, 90]."""
@@ -24,9 +24,9 @@ class Photo:
     """One usable photo."""
 
     name: str
-    """What it goes by everywhere: its path inside the folder, with forward slashes, unless COLMAP cannot have that."""
+    """Its name everywhere: its path inside the folder, with forward slashes, unless COLMAP cannot use that."""
     width: int
-    """Width in pixels as it is laid out: as the sensor lies, so that photos of one camera have one size."""
+    """Width in pixels as it is laid out: in the sensor's orientation, so that photos of one camera have one size."""
     height: int
     """Height in pixels."""
     group: str
@@ -38,17 +38,17 @@ class Photo:
     gps: GpsPosition | None = None
     """Where EXIF claims it was taken; a hint, never trusted."""
     original: str = ""
-    """Path inside the folder; the name where empty."""
+    """Path inside the folder; empty where it is the name."""
     lossy: bool = True
-    """Whether the file's format has lost something already."""
+    """Whether the file's format is lossy."""
     turn_deg: int = 0
-    """By how much it has to be turned clockwise to be upright: 0, 90, 180 or 270."""
+    """Clockwise rotation that makes it upright: 0, 90, 180 or 270."""
     notes: tuple[str, ...] = ()
-    """What people should know about how it is read."""
+    """Remarks for the user about how it was read."""
     shown: Frame | None = None
-    """The picture within bars of one color, as it is laid out; None where all of it is picture."""
+    """The picture inside bars of one color, as it is laid out; None where there are no bars."""
     mask: str = ""
-    """Path of its mask inside the folder of masks; empty where all of it may be used."""
+    """Path of its mask inside the folder of masks; empty where it has none."""
 
     @property
     def path(self) -> str:
@@ -66,7 +66,7 @@ class UnusablePhoto:
 
 @dataclass(frozen=True, slots=True)
 class PhotoSet:
-    """All usable photos of a folder, and every file that is not."""
+    """All usable photos of a folder, and every unusable file."""
 
     folder: Path
     photos: tuple[Photo, ...]

@@ -1,4 +1,4 @@
-"""Relative poses of pairs of photos, and how they hang together."""
+"""Relative poses of pairs of photos, and the graph that they form."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,21 +29,21 @@ class RelativePose:
     """"calibrated", "uncalibrated" (a camera is a guess: the inliers are those of F), "planar" (all inliers on one
     plane), "rotation" (they show no parallax, so that t means nothing)."""
     guided: bool = False
-    """Found only with the help of other pairs."""
+    """Whether it was found only with the help of other pairs."""
 
     @property
     def inlier_count(self) -> int:
-        """How many matches agree with the pose."""
+        """Number of matches that agree with the pose."""
         return int(np.count_nonzero(self.inliers))
 
 
 @dataclass(frozen=True, slots=True)
 class LookAlikes:
-    """Pairs of photos that take equal things in two places for one thing."""
+    """Pairs of photos that match equal things in two places as if they were one."""
 
     pairs: tuple[PairId, ...]
     missing: float
-    """Share, 0 to 1, of what these pairs would have to show if the places were one, and do not."""
+    """Share, 0 to 1, of what these pairs would have in common if the places were one, but do not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,12 +54,12 @@ class PoseGraph:
     dropped: Mapping[PairId, str]
     """Pairs with an epipolar geometry that were left out, with the reason."""
     groups: tuple[tuple[int, ...], ...]
-    """Photos that hang together, the largest group first."""
+    """Connected photos, the largest group first."""
     look_alikes: tuple[LookAlikes, ...] = ()
-    """What was told apart; these pairs are among the dropped ones."""
+    """Look-alikes that were separated; their pairs are among the dropped ones."""
     doubtful: tuple[LookAlikes, ...] = ()
-    """Loops, or look-alikes: pairs that stayed, but which the photos between theirs do not bear out."""
+    """Loops, or look-alikes: pairs that stayed although the photos between theirs do not confirm them."""
 
     def group_of(self, photo: int) -> tuple[int, ...]:
-        """Return all photos that hang together with this one; empty where none does."""
+        """Return all photos connected with this one; empty where there are none."""
         return next((group for group in self.groups if photo in group), ())

@@ -23,7 +23,7 @@ class CameraModel:
     deviations: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations: "fx", "fy", "cx", "cy" in pixels, "k1", "k2", "p1", "p2"."""
     determined: tuple[str, ...] = ()
-    """What the photos determine besides the focal: "center", "aspect", "k1", ...; the rest stayed as it was."""
+    """What the photos determine besides the focal: "center", "aspect", "k1", ...; the others kept their values."""
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -33,7 +33,7 @@ class CameraModel:
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """A COLMAP model on disk and what the summary says about it."""
+    """A COLMAP model on disk, with the figures of its summary."""
 
     model_dir: Path
     cam_from_world: Mapping[str, NDArray[np.float64]]

@@ -290,7 +290,7 @@ COMMANDS = {
     "a list with a video": (["{videos}/clip.avi", "-o", "{here}/out", "--images", "{here}/list.txt"], 2, "--images"),
     "a video where the run writes": (["{here}/old/photos/x.avi", "-o", "{here}/old"], 3, "keeps its own files"),
     "one frame of a video": (["{videos}/clip.avi", "-o", "{here}/out", "--max-frames", "1"], 2, "photos.max_frames"),
-    "photos are the output": (["{photos}", "-o", "{photos}"], 3, "cannot be the photos and the output"),
+    "photos are the output": (["{photos}", "-o", "{photos}"], 3, "cannot be both the photos and the output"),
     "photos where the run writes": (["{photos}", "-o", "{here}"], 3, "keeps its own files"),
     "the run's own photos": (["{here}/old/photos", "-o", "{here}/old"], 3, "keeps its own files"),
     "links to photos": (["{here}/old/photos", "-o", "{here}/new"], 3, "1 a link out of the folder"),

@@ -69,8 +69,8 @@ def test_the_target_is_named_as_people_name_files(finished, tmp_path, file_forma
     [
         (("--format", "stl"), 2, "no file format is named 'stl'"),
         (("-o", "model.stl"), 2, "no file format is named 'stl'"),
-        (("-o", "model.ply", "--format", "glb"), 2, "model.ply is no name for glb"),
-        ((), 2, "no format is named"),
+        (("-o", "model.ply", "--format", "glb"), 2, "model.ply does not end in .glb"),
+        ((), 2, "no format is given"),
     ],
 )
 def test_formats_that_are_not_there_end_with_exit_code_2(finished, arguments, code, says):
@@ -125,7 +125,7 @@ def test_a_surface_that_was_cut_off_is_no_crash(finished, left):
     result = call(finished, "--format", "ply")
 
     assert (result.exit_code, "is damaged" in result.stderr) == (3, True)
-    assert "goes on where it stopped" in result.stderr
+    assert "resumes where it stopped" in result.stderr
 
 
 def test_a_model_without_a_texture_has_the_colors_of_its_vertices(ball, finished):

@@ -124,7 +124,7 @@ def test_a_fold_counts_unless_it_is_said_or_cut_into_honest_parts():
     silent = of_walk([model(two_ways)], ["scene  20 of 20 photos placed"])
     said = of_walk([model(two_ways)], ["photos 003 and 013 may be folded onto one place"])
     parts = of_walk([model(range(10)), model(range(8))], [])
-    sure = of_walk([model(two_ways)], ["look-alikes told apart, 20 pairs of photos"])
+    sure = of_walk([model(two_ways)], ["look-alikes separated, 20 pairs of photos"])
 
     assert [folded("oats23", row) for row in (silent, said, parts, sure)] == [1, 0, 0, 1]
     assert folded("oats23", {}) is None and folded("castle-P19", silent) is None

@@ -23,7 +23,7 @@ def test_every_parameter_stands_beside_its_deviation():
     assert [line.strip() for line in others] == [
         "sees 90 degrees from left to right, 76 from top to bottom",
         "The lens bends lines outwards (barrel), k1 -0.050 +- 0.010.",
-        "Taken to be as usual, as far as the photos allow: square pixels.",
+        "Assumed, since the photos do not determine it: square pixels.",
         "best pairs of photos to start from: a.jpg + b.jpg, b.jpg + c.jpg, c.jpg + 4",
     ]
 

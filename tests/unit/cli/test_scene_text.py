@@ -29,7 +29,7 @@ def test_people_read_how_many_photos_are_placed_how_and_how_sure_the_camera_is()
     assert "5 of 6 photos placed, 1234 points, mean reprojection error 0.321 px" in text
     assert "mapped all at once: it explains more\n" in text
     assert "pairs of photos left out because they do not fit the others: 4" in text
-    assert "no place for x.jpg: shares no scene" in text
+    assert "not placed: x.jpg: shares no scene" in text
     assert "fx 900.0 +- 1.2" in text and "fy 901.0  cx" in text
     assert "upright by vanishing lines, to about 0.3 degrees; in a unit of its own" in text
     assert "beware" not in text and "another model" not in text
@@ -43,10 +43,10 @@ def test_other_models_and_cuts_are_named():
 
     assert "another model of 6 photos in other_models/1: b0.jpg, b1.jpg, b2.jpg, b3.jpg and 2 more" in text
     assert "another model of 3 photos in other_models/2: c.jpg, d.jpg, e.jpg\n" in text
-    assert "cut apart, because more matches contradict the join than bear it out: a, b" in text
+    assert "split, because more matches contradict the connection than support it: a, b" in text
     assert len(summary["other_models"][0]) == 6
-    assert "no place for x.jpg" in text
-    assert "no place for x.jpg" not in told(other_models=[["x.jpg"]])[0], "said once is enough"
+    assert "not placed: x.jpg" in text
+    assert "not placed: x.jpg" not in told(other_models=[["x.jpg"]])[0], "said once is enough"
 
 
 def test_a_model_that_many_matches_contradict_comes_with_a_warning():
@@ -59,10 +59,10 @@ def test_what_finer_features_brought_is_said():
     found = {"photos": ["x.jpg", "y.jpg"], "pairs": 9, "placed": [3, 5], "taken": True}
 
     text, summary = told(second_look=found)
-    assert "finer features were sought for 2 photos without a place: 5 photos placed instead of 3\n" in text
+    assert "finer features were sought in 2 unplaced photos: 5 photos placed instead of 3\n" in text
     assert summary["second_look"]["pairs"] == 9
     failed = told(second_look={"photos": ["x.jpg"], "pairs": 9, "placed": [5], "taken": False, "failed": "no room"})[0]
-    assert "without a place: no more photos placed (it failed: no room)\n" in failed
+    assert "in 1 unplaced photos: no more photos placed (it failed: no room)\n" in failed
     assert "finer" not in told()[0]
 
 
@@ -97,9 +97,9 @@ def test_what_the_last_adjustment_could_not_do_is_said():
 def test_a_model_that_could_not_be_turned_upright_says_so():
     text, _ = told(orientation={"failed": "it has no points", "unit": "that of mapping", "gps": "not used"})
 
-    assert "stands as mapping left it, neither upright nor in meters: it has no points" in text
+    assert "frame as left by mapping, neither upright nor in meters: it has no points" in text
     unsure, _ = told(orientation=COUNTS["orientation"] | {"up_deviation_deg": None})
-    assert "upright by vanishing lines, nobody knows how exactly" in unsure
+    assert "upright by vanishing lines, with unknown accuracy" in unsure
 
 
 def test_look_alikes_are_named_and_so_is_what_may_be():
@@ -108,7 +108,7 @@ def test_look_alikes_are_named_and_so_is_what_may_be():
 
     text, summary = told(look_alikes=[join])
     assert (
-        "look-alikes told apart, 12 pairs of photos: a.jpg, b.jpg | z0.jpg, z1.jpg, z2.jpg, z3.jpg and 1 more (37 %"
+        "look-alikes separated, 12 pairs of photos: a.jpg, b.jpg | z0.jpg, z1.jpg, z2.jpg, z3.jpg and 1 more (37 %"
         in text
     )
     assert "beware" not in text and summary["look_alikes"] == [join]
@@ -120,11 +120,12 @@ def test_look_alikes_are_named_and_so_is_what_may_be():
     )
 
     text, summary = told(weakly_joined=[["a.jpg"], ["b.jpg", "c.jpg"]])
-    assert "beware: hardly a point says how far a.jpg is from the rest" in text and "b.jpg, c.jpg are from" in text
+    assert "beware: hardly any point determines how far a.jpg is from the rest" in text
+    assert "b.jpg, c.jpg are from" in text
     assert summary["weakly_joined"] == [["a.jpg"], ["b.jpg", "c.jpg"]]
 
     text, _ = told(jumps=[["a.jpg", "b.jpg"]])
-    assert "beware: a jump from a.jpg to b.jpg, which follow each other" in text
+    assert "beware: a jump from a.jpg to b.jpg, which are consecutive" in text
 
 
 def test_a_camera_for_each_photo_is_named_where_it_was_tried():

@@ -21,7 +21,7 @@ def test_photos_are_never_where_the_run_writes(tmp_path, inside):
 def test_photos_beside_what_the_run_writes_are_fine(tmp_path):
     Workspace(tmp_path).keep_apart(tmp_path / "my photos")
     Workspace(tmp_path / "photos" / "out").keep_apart(tmp_path / "photos")
-    with pytest.raises(InputError, match="cannot be the photos and the output"):
+    with pytest.raises(InputError, match="cannot be both the photos and the output"):
         Workspace(tmp_path).keep_apart(tmp_path)
 
 
