@@ -144,8 +144,8 @@ def scatter_by_photos(fit: Fit) -> FloatArray:
     """Return (5C,) standard deviations of the cameras by a jackknife over the photos; 0 where the photos are too few.
 
     Consecutive photos form a group, because neighbors often share an error (blur, a rolling shutter, a repeated wall).
-        With each group left out, the cameras take the step of the remaining pairs. The weights of the pairs stay fixed:
-        otherwise wrong pairs would gain weight where right ones are left out.
+    With each group left out, the cameras take the step of the remaining pairs. The weights of the pairs stay fixed:
+    otherwise wrong pairs would gain weight where right ones are left out.
     """
     photos, nothing = np.unique(fit.matches.photos), np.zeros(fit.state.thetas.size)
     if len(photos) < LEAST_PHOTOS:

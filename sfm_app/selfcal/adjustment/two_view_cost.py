@@ -24,7 +24,7 @@ CAMERA = 5
 PAIR = 2 * CAMERA + POSE
 """Parameters of a pair: two cameras and a pose, by definition."""
 REACH = 3.0
-"""c of the robust cost, in sigma. docs /algorithms.md, Self-calibration, 2. Chosen by hand; not measured on its own."""
+"""c of the robust cost, in sigma. docs/algorithms.md, Self-calibration, 2. Chosen by hand; not measured on its own."""
 HOPELESS = 1e60
 """Squared distances in sigma^2, or derivatives, above this count as not finite. Its square is finite in double
 precision."""
