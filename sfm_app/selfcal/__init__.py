@@ -36,7 +36,7 @@ CALIBRATORS: dict[str, tuple[CalibrateFunction, str]] = {
     ),
     perturbation.METHOD: (
         perturbation.calibrate,
-        "thesis Algorithm 3: least squares that mistrusts pairs no error of the camera explains",
+        "thesis Algorithm 3: least squares that downweights pairs whose error no error of the camera explains",
     ),
     geometric.METHOD: (
         geometric.calibrate,
@@ -44,7 +44,7 @@ CALIBRATORS: dict[str, tuple[CalibrateFunction, str]] = {
     ),
     huang_faugeras.METHOD: (
         huang_faugeras.calibrate,
-        "least squares over all pairs alike, the thesis's non-robust benchmark",
+        "least squares with equal weights for all pairs, the thesis's non-robust benchmark",
     ),
     kruppa.METHOD: (
         kruppa.calibrate,

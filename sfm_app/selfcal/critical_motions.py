@@ -1,6 +1,6 @@
-"""Why a set of pairs leaves the focal open: motions for which E = K'FK has equal singular values at any focal.
+"""Critical motions leave the focal open: E = K'FK has equal singular values at any focal.
 
-Sturm (1999); the degenerate motions of thesis 5.4. To tell them by the poses that were found is ours.
+Sturm (1999); the degenerate motions of thesis 5.4. Recognizing them by the estimated poses is ours.
 """
 
 import numpy as np
@@ -18,10 +18,10 @@ measured on its own."""
 
 
 def open_focal(fit: Fit) -> str:
-    """Return what the relative poses of the pairs have in common, for people; nothing where that is no known motion.
+    """Return the critical motion of most pairs in words for the user; empty where there is none.
 
     Parallel axes, and axes that meet at one distance from both cameras (an isosceles triangle, as on an orbit), are the
-    two for which one pair says nothing about the focal (Sturm 1999).
+    two for which one pair does not constrain the focal (Sturm 1999).
     """
     R = fit.state.poses[:, :9].reshape(-1, 3, 3)
     if len(R) == 0:

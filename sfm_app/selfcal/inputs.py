@@ -1,4 +1,4 @@
-"""Fundamental matrices as every calibrator wants them: checked, of rank 2, in image units.
+"""Fundamental matrices as every calibrator expects them: checked, of rank 2, in image units.
 
 Thesis 5.6.4 brings every F to norm 1; rank 2 and the epipoles are ours.
 """
@@ -31,7 +31,7 @@ class Pairs:
     weights: FloatArray
     """(P,) how far each F is trusted, > 0."""
     kept: NDArray[np.int64]
-    """(P,) which of the given matrices these are."""
+    """(P,) their indices among the given matrices."""
 
     def __len__(self) -> int:
         return len(self.F)
@@ -43,13 +43,13 @@ class Pairs:
 
 
 def pair_weights(inlier_counts: ArrayLike) -> FloatArray:
-    """Return how far fundamental matrices with that many inliers are trusted: min(1, n / 300)."""
+    """Return the weights of fundamental matrices from their numbers n of inliers: min(1, n / 300)."""
     counts = np.asarray(inlier_counts, dtype=np.float64)
     return np.minimum(1.0, counts / FULL_WEIGHT_INLIERS)
 
 
 def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float]) -> Pairs:
-    """Check what a calibrator was given and express it in units of `unit_px` from `origin_px`.
+    """Check the input of a calibrator and express it in units of `unit_px` from `origin_px`.
 
     Pairs of weight 0 are left out, and so is an F that repeats another, in either direction: it is no further evidence.
 
@@ -64,7 +64,7 @@ def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float
     """
     raw, trust, used = checked(pairs)
     to_pixels = np.array([[unit_px, 0.0, origin_px[0]], [0.0, unit_px, origin_px[1]], [0.0, 0.0, 1.0]])
-    # scaled first, so that neither 1e-200 nor 1e200 over- or underflows in the products
+    # scaled first, so that the products of entries such as 1e200 or 1e-200 neither overflow nor underflow
     scaled = raw / np.max(np.abs(raw), axis=(1, 2), keepdims=True)
     distinct = _distinct(scaled)
     scaled, trust = scaled[distinct], trust[distinct]
@@ -81,7 +81,7 @@ def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float
 
 
 def checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
-    """Return matrices (Q, 3, 3) and weights (Q,) of the pairs with a weight, and which of the given these are.
+    """Return matrices (Q, 3, 3) and weights (Q,) of the pairs with a weight, and their indices.
 
     Raises:
         ValueError: as `prepare`.
@@ -116,7 +116,7 @@ def checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.int6
 
 
 def _distinct(scaled: FloatArray) -> NDArray[np.int64]:
-    """Return indices of the first of all matrices that agree to 9 digits up to sign and transposition."""
+    """Return the indices of the first of all matrices that agree to 9 digits up to sign and transposition."""
     seen: dict[bytes, int] = {}
     for index, F in enumerate(scaled):
         keys = [(np.round(sign * G, 9) + 0.0).tobytes() for sign in (1, -1) for G in (F, F.T)]

@@ -3,8 +3,8 @@
 Ours; the thesis has no lens.
 
 The lens is COLMAP's SIMPLE_RADIAL: x_d = x_u (1 + k1 r_u^2) about the optical center, r_u in focal lengths. While the
-focal is sought, the lens is held as kappa = k1 / f^2, with f and lengths in longer sides: how far it moves a point of
-the photo must not depend on the focal that is tried.
+focal is sought, the parameter of the lens is kappa = k1 / f^2, with f and lengths in longer sides: the displacement of
+a point of the photo must not depend on the focal that is tried.
 """
 
 import numpy as np
@@ -17,10 +17,11 @@ FloatArray = NDArray[np.float64]
 LOG_FOCAL, CENTER_U, CENTER_V, LOG_ASPECT, KAPPA = range(5)
 """Places in the parameters of a camera: log f with f = sqrt(fx fy), center from the middle, log fy/fx, kappa."""
 LEAST_SLOPE = 0.2
-"""Once the lens squeezes radii by this much it goes on evenly: it must not fold. Chosen by hand; not measured on its
-own."""
+"""Least slope of the distorted over the undistorted radius; beyond it the lens continues linearly, so that it does not
+fold. Chosen by hand; not measured on its own."""
 NEWTON_STEPS = 20
-"""Most; three or four are enough but for the strongest pincushions. Chosen by hand; not measured on its own."""
+"""Most steps; three or four are enough except for the strongest pincushions. Chosen by hand; not measured on its
+own."""
 
 
 @kernel
@@ -38,7 +39,7 @@ def camera_of(theta: FloatArray, camera: FloatArray) -> None:
 
 @kernel
 def undone(radius: float, k1: float, guess: float) -> float:
-    """Return r_u of a distorted radius, in focal lengths, by Newton.
+    """Return the undistorted radius r_u of a distorted one, in focal lengths, by Newton's method.
 
     Args:
         radius: r_d in focal lengths, >= 0.
@@ -67,10 +68,10 @@ def ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -
     """Write the point (a, b) of the plane z = 1 that a pixel sees, its derivatives, and r_u.
 
     Args:
-        x: of the pixel, in the units of the camera.
-        y: likewise.
+        x: column of the pixel, in the units of the camera.
+        y: row of the pixel, in the units of the camera.
         camera: (5,) fx, fy, u, v, k1.
-        guess: r_u of a camera nearby, or negative.
+        guess: r_u of a similar camera, to start from; negative for none.
         out: (7,), written to: a, b, da/dx, da/dy, db/dx, db/dy, r_u.
     """
     a, b = (x - camera[2]) / camera[0], (y - camera[3]) / camera[1]
@@ -90,10 +91,10 @@ def ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -
 
 @kernel
 def straightened(points: FloatArray, theta: FloatArray) -> FloatArray:
-    """Return (N, 2) where points would lie without the lens.
+    """Return (N, 2) undistorted points.
 
     Args:
-        points: (N, 2) about the middle of the photo.
+        points: (N, 2) from the middle of the photo.
         theta: (5,) parameters of the camera, in the same units.
     """
     camera, out, straight = np.empty(5), np.empty(7), np.empty_like(points)

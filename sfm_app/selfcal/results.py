@@ -1,4 +1,4 @@
-"""What a calibrator hands back.
+"""Results of a calibrator.
 
 Ours; the thesis gives a K in any case.
 """
@@ -33,7 +33,7 @@ def guessed(size: tuple[int, int], reason: str, evidence: Mapping[str, float]) -
 def calibration_of(
     theta: NDArray[np.float64], size: tuple[int, int], method: str, unit_px: float | None = None
 ) -> Calibration:
-    """Return answer from the parameters of `lens`, about the middle of the photo.
+    """Return the calibration with the parameters of `lens`, which count from the middle of the photo.
 
     Args:
         theta: (5,) log f, u, v, log a, kappa.
@@ -49,7 +49,7 @@ def calibration_of(
 
 
 def roughly(found: Calibration, reason: str) -> Calibration:
-    """Return the answer as an estimate that is not relied on, where there is a reason for that; else as it is.
+    """Return the calibration, as an estimate that is not relied on if there is a reason for that.
 
     Args:
         found: the answer.

@@ -1,4 +1,4 @@
-"""Pairs as a camera without its lens would have given them: only there do zero curves meet.
+"""Pairs without lens distortion: only of these do the zero curves meet.
 
 Ours; the thesis has no lens.
 """
@@ -18,7 +18,7 @@ REACH_PX = 3.0
 
 
 def without_lens(pairs: CameraPairs, camera: Calibration) -> CameraPairs:
-    """Return the inliers straightened and every F fitted to them anew; the pairs themselves where no lens is known.
+    """Undistort the inliers and refit every F to them; return the pairs themselves where no lens is known.
 
     Args:
         pairs: P fundamental matrices in pixels, with or without their inliers.
@@ -40,10 +40,10 @@ def without_lens(pairs: CameraPairs, camera: Calibration) -> CameraPairs:
 
 
 def straight_points(points: FloatArray, theta: FloatArray) -> FloatArray:
-    """Return (N, 2) points without the lens of a camera.
+    """Return (N, 2) undistorted points of a camera.
 
     Args:
-        points: (N, 2) about the middle of the photo.
+        points: (N, 2) from the middle of the photo.
         theta: (5,) parameters of the camera, see `lens`, in the same units.
     """
     return np.asarray(straightened(np.ascontiguousarray(points, np.float64), theta), np.float64)

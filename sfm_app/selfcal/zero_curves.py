@@ -1,8 +1,8 @@
-"""Zero Curves as the product uses it: thesis (5.33) over all of K at once, then the matches themselves, then a verdict.
+"""Zero Curves as the program uses it: thesis (5.33) over all of K at once, then the matches themselves, then a verdict.
 
 Beyond the thesis: the center is sought together with the focal (cropped photos), fy/fx and a lens are freed where the
-photos ask for it, every parameter comes with a standard deviation, and an answer that the pairs do not determine is not
-given. The consensus of the pairs finds the camera from nothing; the adjustment of `calibrate_pairs` makes it exact.
+evidence supports it, every parameter has a standard deviation, and K is refused where the pairs do not determine it.
+The consensus of the pairs finds the camera without a start; the adjustment of `calibrate_pairs` makes it exact.
 """
 
 from dataclasses import dataclass, replace
@@ -29,29 +29,29 @@ MIN_PAIRS = 3
 """Each F gives two constraints; below three pairs nothing is left to contradict a wrong K. Counted, by definition of
 the constraint (thesis 5.2.4)."""
 FEW_PAIRS = 3
-"""So many pairs fit almost any center: without their matches it is held where uncropped photos have it. Chosen by hand;
-not measured on its own."""
+"""Pairs up to which almost any center fits: without their matches it is held where uncropped photos have it. Chosen by
+hand; not measured on its own."""
 UNCROPPED_SIGMA = 0.02
-"""Standard deviation of the center of such photos about the middle, in widths. Chosen by hand; not measured on its
+"""Standard deviation of the center of uncropped photos from the middle, in widths. Chosen by hand; not measured on its
 own."""
 VOTES_SIGMA, KEPT = 0.01, 0.8
-"""A camera that keeps less than this share of the votes (of this width) that the peak of the consensus has follows
-matches that most pairs contradict. On fourteen sets and variants right adjustments keep 0.97 to 1, the one that many
-wrong F's pulled away (fox50) 0.35; without that set the bound would be the same. Which sets:
+"""Width of votes, and share of the votes for the peak of the consensus that the adjusted camera must keep: with less,
+it follows matches that most pairs contradict. On fourteen sets and variants right adjustments keep 0.97 to 1, the one
+that many wrong F's pulled away (fox50) 0.35; without that set the bound would be the same. Which sets:
 benchmarks/corpus/tuning_sets.py."""
 ENOUGH_PAIRS = 6.0
-"""Effective pairs that must agree on the peak to contradict: twelve constraints on five parameters of a camera. With
-three pairs (merton1) the peak's center is anywhere. docs/algorithms.md, Self-calibration, 2. Chosen by hand; not
-measured on its own."""
+"""Effective pairs that must agree on the peak to contradict the camera: twelve constraints on five parameters of a
+camera. With three pairs (merton1) the peak's center is anywhere. docs/algorithms.md, Self-calibration, 2. Chosen by
+hand; not measured on its own."""
 AGREES = 0.1
-"""Pairs with r below this at the peak are then listened to, and no others; on the same sets 0.03 and 0.05 move no focal
-by more than 0.1 %. Chosen on those sets, benchmarks/corpus/tuning_sets.py."""
+"""A contradicted camera is adjusted again, only to pairs with r below this at the peak; on the same sets 0.03 and 0.05
+move no focal by more than 0.1 %. Chosen on those sets, benchmarks/corpus/tuning_sets.py."""
 ANOTHER_FOCAL = 1.25
-"""Times by which focals of the consensus and of the matches may differ. docs/algorithms.md, Self-calibration, 5. Chosen
-by hand; not measured on its own."""
+"""Factor by which focals of the consensus and of the matches may differ. docs/algorithms.md, Self-calibration, 5.
+Chosen by hand; not measured on its own."""
 ELSEWHERE = float(np.log(1.1))
-"""A consensus on straightened photos that lies this far in log f from the adjusted camera is tried as a start. Chosen
-by hand; not measured on its own."""
+"""A consensus of undistorted pairs that lies this far in log f from the adjusted camera is tried as a start. Chosen by
+hand; not measured on its own."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
@@ -79,7 +79,7 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 
 
 def _from_fundamentals(pairs: CameraPairs, usable: Pairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Return the peak of the consensus, when the matrices are all that is known."""
+    """Find the camera from the matrices alone: the peak of the consensus."""
     side = float(max(pairs.size))
     center_sigma = options.center_sigma if len(usable) > FEW_PAIRS else min(options.center_sigma, UNCROPPED_SIGMA)
     consensus = Consensus(usable, center_sigma * pairs.size[0] / side)
@@ -102,9 +102,9 @@ def _from_fundamentals(pairs: CameraPairs, usable: Pairs, options: CalibrationSe
 def _from_matches(
     pairs: CameraPairs, usable: Pairs, options: CalibrationSettings, evidence: dict[str, float]
 ) -> Calibration:
-    """Return the consensus finds where to begin; the matches say the rest.
+    """Adjust the camera to the matches, starting from the consensus.
 
-    A consensus without the lens has the last word.
+    A consensus of undistorted pairs then confirms or contradicts it.
     """
     side = float(max(pairs.size))
     sigma = options.center_sigma * pairs.size[0] / side
@@ -143,13 +143,13 @@ def _from_matches(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Adjusted:
-    """A camera adjusted to matches, and what the consensus of all pairs says to it."""
+    """A camera adjusted to matches, and the consensus of all pairs to check it."""
 
     fit: Fit
     listened: NDArray[np.int64]
     """Which of the usable pairs it was adjusted to."""
     consensus: Consensus
-    """Of all usable pairs, as the camera without its lens would have given them."""
+    """Of all usable pairs, undistorted."""
     answer: consensus_peak.Answer
     """Its peak."""
 
@@ -162,7 +162,7 @@ class _Adjusted:
 
     @property
     def contradicted(self) -> bool:
-        """Whether enough pairs agree on another camera to say that this one is wrong: few fit almost any center."""
+        """Whether enough pairs agree on another camera to reject this one: few pairs fit almost any center."""
         enough = min(effective_count(self.answer.votes), float(len(self.agreeing)))
         return self.votes_kept < KEPT and enough >= ENOUGH_PAIRS
 
@@ -173,7 +173,7 @@ class _Adjusted:
 
 
 def _adjusted(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _Adjusted | None = None) -> _Adjusted:
-    """Adjust the camera to the matches of all pairs, or only of those that agree on the peak that `before` left."""
+    """Adjust the camera to the matches of all pairs, or only of those that agree on the peak of `before`."""
     matches, Fs = _in_sides(pairs, usable)
     if before is None:
         first, listened = consensus_peak.found(Consensus(usable, priors.center_sigma)), np.arange(len(usable))
@@ -201,7 +201,7 @@ def _prepared(pairs: CameraPairs) -> Pairs:
 
 
 def _in_sides(pairs: CameraPairs, usable: Pairs) -> tuple[Matches, FloatArray]:
-    """Return inliers and F's of the usable pairs in longer sides about the middle."""
+    """Return the inliers and F's of the usable pairs in longer sides from the middle."""
     side = float(max(pairs.size))
     middle = np.tile(np.array(pairs.size) / 2, 2)
     inliers = [(np.asarray(pairs.inliers[k], np.float64) - middle) / side for k in usable.kept]
@@ -226,13 +226,13 @@ def _figures(fit: Fit, side: float, log_focal_spread: float) -> dict[str, float]
 
 
 def _split(adjusted: _Adjusted) -> str:
-    """Say why the matches and the consensus of their F's do not name one camera, or nothing."""
+    """Return why the matches and the consensus of their F's disagree on the camera; empty where they agree."""
     ratio = float(np.exp(abs(adjusted.fit.state.thetas[0, LOG_FOCAL] - adjusted.answer.theta[LOG_FOCAL])))
     if ratio >= ANOTHER_FOCAL:
         return f"the pairs agree on one focal and their matches on another, {ratio:.1f} times away"
     if adjusted.contradicted:
         kept = 100 * adjusted.votes_kept
-        return f"the pairs agree on one camera, of whose votes the one that their matches name keeps {kept:.0f} %"
+        return f"the pairs agree on one camera, their matches on another, which keeps {kept:.0f} % of its votes"
     return ""
 
 

@@ -1,4 +1,4 @@
-"""From first ideas of the cameras to what their matches say: adjust, ask what the evidence frees, adjust again.
+"""Fit initial cameras to their matches: adjust, free the parameters that the evidence supports, adjust again.
 
 Ours; the thesis calibrates from fundamental matrices alone.
 """
@@ -31,19 +31,20 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 FEW_MATCHES = 100
-"""Of one pair, until the cameras have nearly arrived. Chosen by hand; not measured on its own."""
+"""Matches per pair until the cameras have nearly converged. Chosen by hand; not measured on its own."""
 FIRST_ROUNDS, LAST_ROUNDS = 8, 12
-"""Before starts are compared, and with all matches. Chosen by hand; not measured on their own."""
+"""Rounds before starts are compared, and rounds with all matches. Chosen by hand; not measured on their own."""
 POSE_MATCHES = 30
-"""Enough to tell which of the four poses of an E is the right one. Chosen by hand; not measured on its own."""
+"""Matches that decide which of the four poses of an E is right. Chosen by hand; not measured on its own."""
 CHOICES = 3
-"""Times the evidence is asked again after an adjustment. Chosen by hand; not measured on its own."""
+"""Most rounds of choosing the free parameters by the evidence and adjusting again. Chosen by hand; not measured on its
+own."""
 JACKKNIFE_GROUPS = 8
 """Groups of neighboring photos that are left out in turn (docs/algorithms.md, Self-calibration, 4). Chosen by hand; not
 measured on its own."""
 LEAST_PHOTOS, LEAST_LEFT = 6, 4.0
-"""Photos, and weight of the remaining pairs, below which leaving photos out says more about what is missing than about
-errors. docs/algorithms.md, Self-calibration, 4. Chosen by hand; not measured on their own."""
+"""Photos, and weight of the remaining pairs, below which a jackknife reflects the missing pairs rather than errors.
+docs/algorithms.md, Self-calibration, 4. Chosen by hand; not measured on their own."""
 REFIT_REACH = 3.0
 """Scale of the robust refit of an F, in sigma. As `two_view_cost.REACH`. Chosen by hand; not measured on its own."""
 
@@ -59,36 +60,36 @@ class Fit:
     prior: Prior
     priors: CameraPriors
     held: BoolArray | None = None
-    """(C, 4) what stays at its usual value, because the pairs do not determine it."""
+    """(C, 4) parameters that stay at their usual values because the pairs do not determine them."""
 
     def names_held(self, camera: int) -> tuple[str, ...]:
-        """Return what one camera holds, by name."""
+        """Return the names of the parameters that one camera holds at their usual values."""
         return tuple(name for place, name in enumerate(NAMES) if self.held is not None and self.held[camera, place])
 
     @property
     def information(self) -> Information:
-        """What each pair says."""
+        """Information of each pair about the cameras."""
         return informed(self.matches, self.state)
 
     @property
     def trust(self) -> FloatArray:
-        """(P,) what the say of each pair counts, as if the matches of one keypoint were worth what they are."""
+        """(P,) factor of each pair's information, reduced because matches that share keypoints are not independent."""
         return np.asarray(
             self.matches.trust * self.state.weights / (self.state.scale * self.matches.redundancy), np.float64
         )
 
     @property
     def evidence(self) -> Evidence:
-        """What all pairs say."""
+        """Joint likelihood of all pairs about the cameras."""
         H, g = self.matches.scattered(self.information, self.trust)
         return Evidence(self.state.thetas, H, g, float(np.sum(self.state.weights)), self.priors)
 
     def cost(self, sigma: float, scale: float) -> float:
-        """Return negative log-probability by which fits from different starts compete, the pairs' say bounded.
+        """Return the negative log-probability that ranks fits from different starts, each pair's part bounded.
 
         Args:
-            sigma: of a distance; with its own, larger one a wrong fit would be lenient with itself.
-            scale: of the disagreement; likewise.
+            sigma: standard deviation of a distance, the same for all fits: its own larger one would favor a wrong fit.
+            scale: scale of the disagreement, the same for all fits for that reason.
         """
         state = reweighted(self.matches, replace(self.state, sigma=sigma))
         gains = informed(self.matches, state).gains / (scale * self.matches.redundancy)
@@ -99,13 +100,13 @@ class Fit:
 
 
 def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], priors: CameraPriors) -> Fit:
-    """Return the best of the fits that begin at `starts`, the most likely first, with the pixels square and not.
+    """Fit the cameras from all starts, then with non-square pixels, and return the best fit.
 
     Args:
-        matches: inliers about the middle of the photos.
-        Fs: (P, 3, 3) in the same frame and units; begin the poses.
-        starts: (C, 5) each, first ideas of the cameras.
-        priors: what is known before.
+        matches: inliers, with the origin at the middle of each photo.
+        Fs: (P, 3, 3) in the same frame and units; initialize the poses.
+        starts: (C, 5) each, initial cameras, the most likely first.
+        priors: prior knowledge about the cameras.
     """
     few = matches.thinned(FEW_MATCHES)
     best = _best([_begun(few, Fs, thetas, priors, square=True) for thetas in starts])
@@ -126,12 +127,12 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], prio
 
 
 def of_all_pairs(fit: Fit, matches: Matches, Fs: FloatArray) -> Fit:
-    """Return the same cameras with a pose for every pair, also for those that they were not adjusted to.
+    """Return the fit with a pose for every pair, including pairs that it was not adjusted to.
 
     Args:
         fit: cameras adjusted to some of the pairs.
         matches: inliers of all P pairs.
-        Fs: (P, 3, 3) in the frame and units of the matches; begin the poses.
+        Fs: (P, 3, 3) in the frame and units of the matches; initialize the poses.
     """
     if len(matches.cameras) == len(fit.matches.cameras):
         return fit
@@ -140,13 +141,11 @@ def of_all_pairs(fit: Fit, matches: Matches, Fs: FloatArray) -> Fit:
 
 
 def scatter_by_photos(fit: Fit) -> FloatArray:
-    """Return (5C,) standard deviations of the cameras by a jackknife over the photos.
+    """Return (5C,) standard deviations of the cameras by a jackknife over the photos; 0 where the photos are too few.
 
-    0 where photos are too few to ask.
-
-    Neighbors in the list go together: what is wrong with one photo (blur, a moving shutter, a repeated wall) is often
-    wrong with the next. With each group left out the cameras take the step that the other pairs ask for; every pair
-    weighs what it weighs, or where right pairs are left out wrong ones would take their place.
+    Consecutive photos form a group, because neighbors often share an error (blur, a rolling shutter, a repeated wall).
+    With each group left out, the cameras take the step of the remaining pairs. The weights of the pairs stay fixed:
+    otherwise wrong pairs would gain weight where right ones are left out.
     """
     photos, nothing = np.unique(fit.matches.photos), np.zeros(fit.state.thetas.size)
     if len(photos) < LEAST_PHOTOS:
@@ -165,7 +164,7 @@ def scatter_by_photos(fit: Fit) -> FloatArray:
 
 
 def straight_fundamentals(fit: Fit) -> FloatArray:
-    """Return (P, 3, 3) F's of the photos as they were without a lens: refitted to the matches, free of any K."""
+    """Return (P, 3, 3) F's of the undistorted photos, refitted to the matches without assuming a K."""
     thetas, cameras = fit.state.thetas, fit.matches.cameras
     found = np.empty((len(cameras), 3, 3))
     for pair, (first, second) in enumerate(cameras):
@@ -180,7 +179,7 @@ def straight_fundamentals(fit: Fit) -> FloatArray:
 
 
 def camera_matrix_of(theta: FloatArray) -> FloatArray:
-    """Return (3, 3) camera matrix of the parameters (5,), in their units about the middle."""
+    """Return the (3, 3) camera matrix of the parameters (5,), in their units from the middle of the photo."""
     f, half = np.exp(theta[LOG_FOCAL]), np.exp(0.5 * theta[LOG_ASPECT])
     return np.array([[f / half, 0.0, theta[CENTER_U]], [0.0, f * half, theta[CENTER_V]], [0.0, 0.0, 1.0]])
 

@@ -1,12 +1,11 @@
-"""Cameras and relative poses of all pairs adjusted to their matches at once: bundle adjustment without points.
+"""Bundle adjustment without points: cameras and relative poses of all pairs, adjusted jointly to the matches.
 
-Ours. Bundle adjustment and Schur's complement: Triggs and others (2000). What the weights do for pairs, Eq. 5.23 and
-5.24 of the thesis do in its Algorithm 3.
+Ours. Bundle adjustment and the Schur complement: Triggs and others (2000). The weights do what Eq. 5.23 and 5.24 do in
+Algorithm 3 of the thesis.
 
-Every pair has its own relative pose, which is eliminated (Schur complement): what is left of a pair is what it says
-about the cameras, one Hessian and one gradient. A pair whose matches are right but whose geometry is not (repeated
-facades, another camera, a zoom) pulls at the cameras far harder than its noise allows; it is recognized by that and
-weighs less.
+Every pair has its own relative pose, which is eliminated (Schur complement). What remains of a pair is its information
+about the cameras: one Hessian and one gradient. A pair whose matches are right but whose geometry is wrong (repeated
+facades, another camera, a zoom) pulls at the cameras far harder than its noise explains; such a pair is downweighted.
 """
 
 from collections.abc import Sequence
@@ -27,27 +26,27 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 MOST_MATCHES = 1000
-"""Of one pair; more of them are not independent, and would let one pair outvote all others. With 300 errors and
+"""Most matches of one pair; more are not independent, and would let one pair outvote all others. With 300, errors and
 deviations are half as large again (docs/algorithms.md, Self-calibration, Tried and left out)."""
 CONFLICT = 3.0
-"""A pair that would gain this much log-likelihood from cameras of its own is worth a quarter. By definition of chi^2
-with two degrees of freedom noise alone gains as much once in twenty times: exp(-3)."""
+"""Log-likelihood gain from cameras of its own at which a pair's weight is a quarter. By definition of chi^2 with two
+degrees of freedom, noise alone gains as much once in twenty times: exp(-3)."""
 ALONE = np.array([0.3, 0.15, 0.15, 0.2, 0.2])
-"""How far such cameras of its own may lie away: standard deviations of log f, u, v, log a, kappa. Chosen by hand; not
+"""How far a pair's own cameras may deviate: standard deviations of log f, u, v, log a, kappa. Chosen by hand; not
 measured on their own."""
 LOWER_QUARTILE = 0.288
-"""Of that gain, where two degrees of freedom are noise: by definition of chi^2, -ln(3/4)."""
+"""Lower quartile of that gain for noise in two degrees of freedom: by definition of chi^2, -ln(3/4)."""
 LEAST_SIGMA_PX = 0.1
-"""Least standard deviation of a distance: synthetic matches without noise would weigh without bound. Chosen by hand;
-not measured on its own."""
+"""Least standard deviation of a distance: noise-free synthetic matches would otherwise have unbounded weight. Chosen by
+hand; not measured on its own."""
 FEW_PHOTOS, CAUTION = 5, 0.25
-"""A camera of fewer photos answers to what no model holds (a lens, a wall that is not quite still) with a focal and a
-center of its own: what its pairs say counts as if their noise were twice as large. Chosen by hand; not measured on
-their own."""
+"""A camera of fewer photos absorbs unmodeled effects (a lens, a wall that is not quite still) into its focal and
+center; the information of its pairs counts as if their noise were twice as large. Chosen by hand; not measured on their
+own."""
 ROUNDS = 25
-"""Most rounds of weights and step. Chosen by hand; not measured on its own."""
+"""Most rounds of reweighting and stepping. Chosen by hand; not measured on its own."""
 DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e8)
-"""Of Levenberg and Marquardt's steps, relative to the diagonal. Chosen by hand; not measured on their own."""
+"""Damping of Levenberg-Marquardt steps, relative to the diagonal. Chosen by hand; not measured on their own."""
 ARRIVED = 2e-5
 """Largest change of a camera's parameter that ends the rounds. Chosen by hand; not measured on its own."""
 
@@ -68,7 +67,7 @@ class Prior:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """Where the adjustment stands."""
+    """State of the adjustment."""
 
     thetas: FloatArray
     """(C, 5) parameters of the cameras, see `lens`."""
@@ -84,10 +83,10 @@ class State:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Information:
-    """What each pair says about the cameras once its pose is eliminated."""
+    """Information of each pair about the cameras, with its pose eliminated."""
 
     hessians: FloatArray
-    """(P, 10, 10) of camera 1 and camera 2; in the first five rows and columns where both are the same camera."""
+    """(P, 10, 10) of camera 1 and camera 2; where both are the same camera, all in the first five rows and columns."""
     gradients: FloatArray
     """(P, 10) negative gradients."""
     gains: FloatArray
@@ -95,14 +94,14 @@ class Information:
 
 
 class Matches:
-    """Inliers of pairs, laid end to end.
+    """Inliers of all pairs, concatenated.
 
     Args:
-        inliers: per pair (N, 4), about the middle of the photos, in longer sides of the largest.
+        inliers: per pair (N, 4), from the middle of each photo, in longer sides of the largest photo.
         cameras: (P, 2) numbers of the cameras, counted from 0.
         photos: (P, 2) numbers of the photos.
         unit_px: length of that unit, in pixels.
-        most: of one pair; evenly chosen where there are more.
+        most: most matches of one pair; evenly chosen where there are more.
         count: number of cameras.
     """
 
@@ -110,7 +109,7 @@ class Matches:
         self, inliers: Sequence[FloatArray], cameras: IndexArray, photos: IndexArray, unit_px: float,
         most: int = MOST_MATCHES, count: int = 1,
     ) -> None:  # fmt: skip
-        # what lies outside of the photos is no match, and would overflow
+        # points outside of the photos are no matches, and would overflow
         kept = [evenly(x[np.all(np.abs(x) <= 1.0, axis=1)], most) for x in inliers]
         self.unit_px = unit_px
         self.points = np.ascontiguousarray(np.concatenate([*kept, np.empty((0, 4))]))
@@ -125,10 +124,10 @@ class Matches:
 
     @cached_property
     def redundancy(self) -> float:
-        """Matches over independent errors, >= 1.
+        """Number of matches per independent error, >= 1.
 
-        One keypoint in m photos gives m (m - 1) / 2 matches, but 2 m - 3 independent errors. How many matches there are
-        per keypoint says what m is.
+        One keypoint in m photos gives m (m - 1) / 2 matches, but 2 m - 3 independent errors. The number of matches per
+        keypoint determines m.
         """
         if len(self.points) == 0:
             return 1.0
@@ -138,31 +137,31 @@ class Matches:
         return max(1.0, 0.5 * each * (each + 1.0) / (2.0 * each - 1.0))
 
     def of_pair(self, pair: int) -> FloatArray:
-        """Return (N, 4) of one pair."""
+        """Return the matches (N, 4) of one pair."""
         return self.points[self.ends[pair] : self.ends[pair + 1]]
 
     def chosen(self, which: IndexArray) -> "Matches":
-        """Keep these pairs only."""
+        """Return the matches of the given pairs only."""
         if len(which) == len(self.cameras):
             return self
         inliers = [self.of_pair(pair) for pair in which]
         return Matches(inliers, self.cameras[which], self.photos[which], self.unit_px, count=self.count)
 
     def thinned(self, most: int) -> "Matches":
-        """Return the same with at most so many matches per pair."""
+        """Return at most `most` matches of each pair, evenly chosen."""
         inliers = [self.of_pair(pair) for pair in range(len(self.cameras))]
         return Matches(inliers, self.cameras, self.photos, self.unit_px, most, self.count)
 
     def costs(self, state: State) -> FloatArray:
-        """Return (P,) robust costs."""
+        """Return (P,) robust costs of the pairs."""
         return np.asarray(
             pair_costs(self.points, self.ends, state.thetas, self.cameras, state.poses, state.sigma), np.float64
         )
 
     def noise(self, state: State) -> float:
-        """Return standard deviation of the distances of the pairs that agree, from their median.
+        """Return the standard deviation of the distances in agreeing pairs, from their median.
 
-        A pose takes five of a pair's degrees of freedom: the distances of few matches are smaller than their errors.
+        A pose absorbs five of a pair's degrees of freedom: the distances of few matches are smaller than their errors.
         """
         counts = np.diff(self.ends)
         found = np.abs(distances(self.points, self.ends, state.thetas, self.cameras, state.poses))
@@ -171,11 +170,11 @@ class Matches:
         return max(MAD_TO_SIGMA * float(np.median(found[agreeing])) if agreeing.any() else 0.0, self.least_sigma)
 
     def scattered(self, information: Information, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Sum over the pairs: (5C, 5C) and (5C,) in the parameters of all cameras.
+        """Sum the information of the pairs into (5C, 5C) and (5C,) over the parameters of all cameras.
 
         Args:
             information: of P pairs.
-            factors: (P,) what each pair is multiplied by.
+            factors: (P,) factor of each pair.
         """
         rows = (CAMERA * self.cameras[:, :, None] + np.arange(CAMERA)).reshape(-1, 2 * CAMERA)
         H, b = np.zeros((CAMERA * self.count,) * 2), np.zeros(CAMERA * self.count)
@@ -185,21 +184,21 @@ class Matches:
 
 
 def evenly(rows: FloatArray, most: int) -> FloatArray:
-    """Return at most so many rows, evenly chosen.
+    """Return at most `most` rows, evenly chosen.
 
     Args:
         rows: (N, ...) array.
-        most: rows to keep, > 0.
+        most: largest number of rows to keep, > 0.
     """
     return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
 
 
 def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) -> State:
-    """Weigh the pairs anew and take a step of Levenberg and Marquardt, until the cameras stand still.
+    """Adjust cameras and poses: reweight the pairs and take a Levenberg-Marquardt step until the cameras converge.
 
     Args:
         matches: inliers of P pairs.
-        state: where to begin.
+        state: where to start.
         prior: on the parameters of the cameras.
         rounds: most steps, > 0.
     """
@@ -216,17 +215,17 @@ def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) 
 
 
 def reweighted(matches: Matches, state: State) -> State:
-    """Weigh every pair by what it would gain from cameras of its own.
+    """Weigh every pair by the log-likelihood that it would gain from cameras of its own.
 
     Args:
         matches: inliers of P pairs.
-        state: where it stands; only the weights and their scale change.
+        state: current state; only the weights and their scale change.
     """
     return _weighed(state, _system(matches, state))
 
 
 def informed(matches: Matches, state: State) -> Information:
-    """Eliminate the poses: return what each pair says about the cameras.
+    """Eliminate the poses and return the information of each pair about the cameras.
 
     Args:
         matches: inliers of P pairs.
@@ -240,7 +239,7 @@ def _system(matches: Matches, state: State) -> tuple[FloatArray, FloatArray]:
 
 
 def _information(system: tuple[FloatArray, FloatArray]) -> Information:
-    """Return what the pairs say about their cameras, and the gains g = b' H^-1 b / 2 (see `_weighed`)."""
+    """Return the information of the pairs about their cameras, with the gains g = b' H^-1 b / 2 (see `_weighed`)."""
     H, b, _, _ = _eliminate_poses(*system, 0.0)
     gains = 0.5 * np.einsum("pi,pi->p", b, solve_each(H + np.diag(np.tile(ALONE**-2.0, 2)), b[..., None])[..., 0])
     return Information(H, b, gains)
@@ -252,8 +251,8 @@ def _weighed(state: State, system: tuple[FloatArray, FloatArray]) -> State:
         g = b' H^-1 b / 2,      w = (1 + g / (3 s))^-2,      s = max(1, lower quartile of all g / 0.288)
 
     H and b are the pair's Hessian and negative gradient in its cameras, the poses eliminated, with the prior `ALONE`.
-    Where only noise speaks, g is half of a chi^2 of two degrees of freedom, whose lower quartile is 0.288. w is the
-    derivative of Geman and McClure's cost (1987) g / (1 + g / (3 s)): least squares, reweighted, of a bounded say.
+    With noise alone, g is half of a chi^2 variable of two degrees of freedom, whose lower quartile is 0.288. w is the
+    derivative of Geman and McClure's cost (1987) g / (1 + g / (3 s)): iteratively reweighted least squares.
     """
     gains = _information(system).gains
     scale = max(1.0, float(np.quantile(gains, 0.25)) / LOWER_QUARTILE) if len(gains) else 1.0
@@ -261,24 +260,24 @@ def _weighed(state: State, system: tuple[FloatArray, FloatArray]) -> State:
 
 
 class Eliminated(NamedTuple):
-    """Normal equations of P pairs in their cameras alone, and what gives the poses once the cameras have moved."""
+    """Normal equations of P pairs reduced to their cameras, and the terms for back substitution of the poses."""
 
     hessians: FloatArray
     """(P, 10, 10) U - W V^-1 W'."""
     gradients: FloatArray
     """(P, 10) b_cameras - W V^-1 b_pose."""
     pose_by_cameras: FloatArray
-    """(P, 5, 10) V^-1 W': the pose's step less this much of the cameras' step."""
+    """(P, 5, 10) V^-1 W': its product with the cameras' step is subtracted from the pose's step."""
     pose_alone: FloatArray
-    """(P, 5) V^-1 b_pose: the pose's step if the cameras stay."""
+    """(P, 5) V^-1 b_pose: the pose's step if the cameras do not move."""
 
     def pose_steps(self, camera_steps: FloatArray) -> FloatArray:
-        """Return (P, 5) steps of the poses after those of the cameras (P, 10): back substitution."""
+        """Return (P, 5) steps of the poses by back substitution of the steps (P, 10) of the cameras."""
         return np.asarray(self.pose_alone - (self.pose_by_cameras @ camera_steps[..., None])[..., 0], np.float64)
 
 
 def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> Eliminated:
-    """Take the poses out of the systems of all pairs by Schur's complement::
+    """Eliminate the poses from the systems of all pairs by the Schur complement::
 
         A = | U   W |     (U - W V^-1 W') d_cameras = b_cameras - W V^-1 b_pose
             | W'  V |
@@ -291,7 +290,7 @@ def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> Eliminated
     n = 2 * CAMERA
     V = A[:, n:, n:].copy()
     diagonal = np.arange(V.shape[-1])
-    # few or degenerate matches leave a pose open: what is added must count beside the largest entry
+    # few or degenerate matches leave a pose undetermined: the damping must not vanish beside the largest entry
     least = 1e-9 + 1e-12 * np.max(V[:, diagonal, diagonal], axis=1, keepdims=True)
     V[:, diagonal, diagonal] += damping * V[:, diagonal, diagonal] + least
     solved = np.linalg.solve(V, np.concatenate([A[:, n:, :n], b[:, n:, None]], axis=2))
@@ -308,7 +307,7 @@ def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> Eliminated
 def _stepped(
     matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
 ) -> tuple[State, float]:
-    """Return one step that lowers the cost, damped as far as that needs, and the damping for the next."""
+    """Take one step that lowers the cost, damped as far as needed; return the state and the next damping."""
     factors = matches.trust * state.weights / state.scale
     cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
 
@@ -323,7 +322,7 @@ def _stepped(
 def _step_of(
     matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
 ) -> State:
-    """Return the state after one damped step: the cameras by all pairs and the prior, then each pose by its pair."""
+    """Return the state after one damped step: cameras from all pairs and the prior, then each pose from its pair."""
     reduced = _eliminate_poses(*system, damping)
     said = Information(reduced.hessians, reduced.gradients, np.empty(0))
     H, g = matches.scattered(said, matches.trust * state.weights / state.scale)

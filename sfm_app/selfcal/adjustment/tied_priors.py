@@ -1,4 +1,4 @@
-"""Cameras of one folder are alike: what is believed about each follows what is found of the others.
+"""Hierarchical priors on focals: cameras of one folder are alike, so that each is tied to the others.
 
 Ours.
 """
@@ -20,27 +20,26 @@ from sfm_app.selfcal.adjustment.structureless_ba import Prior
 from sfm_app.selfcal.lens import LOG_FOCAL
 
 TIE = 0.3
-"""Standard deviation of log f among the photos of one folder. Of reichstag10's ten cameras it is 0.31; photos about
-which no pair says anything follow the others. The set that it was compared with is named in
-benchmarks/corpus/tuning_sets.py."""
+"""Standard deviation of log f among the photos of one folder. Of reichstag10's ten cameras it is 0.31; photos without
+informative pairs follow the others. The set that it was compared with is named in benchmarks/corpus/tuning_sets.py."""
 LEAST = 2
-"""Photos that are tied; one alone has nobody to follow. By definition."""
+"""Least number of photos that are tied: a single photo has no others to follow. By definition."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tied(CameraPriors):
-    """Priors whose focals scatter about a mean of their own: hierarchical, with the mean where it is best."""
+    """Hierarchical priors: the focals of a family scatter about their own mean, which is set to its optimum."""
 
     families: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
-    """(C,) number of the family of a camera; -1: it is of none."""
+    """(C,) number of each camera's family; -1 for none."""
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
-        """Give the prior; the mean of a family is that of its cameras, drawn towards the usual focal.
+        """Return the prior; the mean of a family is that of its cameras, shrunk towards the usual focal.
 
         Args:
-            free: (C, 4) what is freed.
+            free: (C, 4) parameters that are freed.
             thetas: (C, 5) parameters of the cameras.
-            held: (C, 4) what stays at its usual value; nothing where None.
+            held: (C, 4) parameters that stay at their usual values; None for no parameters.
         """
         plain = CameraPriors.prior(self, free, thetas, held)
         mean, precision = plain.mean.copy(), plain.precision.copy()

@@ -1,12 +1,12 @@
-"""What the matches of pairs of photos say about their cameras: Sampson distances of E = [t]x R, and derivatives.
+"""Cost of the matches of photo pairs over cameras and poses: Sampson distances of E = [t]x R, and derivatives.
 
 A pair has fifteen parameters: five of each camera (`lens`), and the five of its relative pose. The distance of a match
-is Sampson's in pixels of the photo as it is, so that a lens which is undone does not change what a pixel is worth::
+is Sampson's, in pixels of the photo as it is, so that undistorting does not change the weight of a pixel::
 
     r = C / |dC/d(x1, y1, x2, y2)|,      C = q2' E q1,      q = ray of a pixel
 
-That is Eq. 4.2 of the thesis for rays, with E of Eq. 5.7; to adjust cameras by it is ours. Matches that fit badly are
-worth less: r^2 / (1 + r^2 / c^2) with c = 3 sigma (Geman and McClure 1987).
+That is Eq. 4.2 of the thesis for rays, with E of Eq. 5.7; adjusting cameras by it is ours. Matches that fit badly are
+downweighted by the cost r^2 / (1 + r^2 / c^2) with c = 3 sigma (Geman and McClure 1987).
 """
 
 import numpy as np
@@ -24,18 +24,18 @@ CAMERA = 5
 PAIR = 2 * CAMERA + POSE
 """Parameters of a pair: two cameras and a pose, by definition."""
 REACH = 3.0
-"""c, in sigma. docs/algorithms.md, Self-calibration, 2. Chosen by hand; not measured on its own."""
+"""c of the robust cost, in sigma. docs/algorithms.md, Self-calibration, 2. Chosen by hand; not measured on its own."""
 HOPELESS = 1e60
-"""Squared distances in sigma^2, or derivatives, above this are no numbers any more. Squares of it are finite in double
+"""Squared distances in sigma^2, or derivatives, above this count as not finite. Its square is finite in double
 precision."""
 _STEP = 1e-6
-"""By which parameters move for a difference: curvature leaves an error of about 1e-6 of it, rounding in double
+"""Step of the parameters for finite differences: curvature causes a relative error of about 1e-6, rounding in double
 precision 1e-10. Chosen by hand; not measured on its own."""
 
 
 @kernel
 def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
-    """Return r of the rays p of view 1 and q of view 2, each (7,) as `lens.ray` writes it."""
+    """Return the distance r of the rays p of view 1 and q of view 2, each (7,) as `lens.ray` writes it."""
     l0 = E[0, 0] * p[0] + E[0, 1] * p[1] + E[0, 2]
     l1 = E[1, 0] * p[0] + E[1, 1] * p[1] + E[1, 2]
     l2 = E[2, 0] * p[0] + E[2, 1] * p[1] + E[2, 2]
@@ -50,7 +50,7 @@ def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
 def distances(
     matches: FloatArray, ends: IndexArray, thetas: FloatArray, cameras: IndexArray, poses: FloatArray
 ) -> FloatArray:
-    """Return (M,) Sampson distances with sign, in the units of the matches.
+    """Return (M,) signed Sampson distances, in the units of the matches.
 
     Args:
         matches: (M, 4) of all pairs, one after the other.
@@ -111,10 +111,10 @@ def pair_systems(
 
     Returns:
         (P, 15, 15) approximate Hessians of the costs and (P, 15) their negative gradients; where both views are of one
-        camera, all that concerns it stands in the first five rows and columns.
+        camera, all of its entries are in the first five rows and columns.
     """
     A, b = np.zeros((len(poses), PAIR, PAIR)), np.zeros((len(poses), PAIR))
-    # derivatives are differences: index 0 is the thing itself, 1 to 5 what it is with one parameter moved
+    # derivatives are finite differences: index 0 is unchanged, 1 to 5 have one parameter moved
     lenses, Es = np.empty((2, 1 + CAMERA, 5)), np.empty((1 + POSE, 3, 3))
     rays, J = np.empty((2, 1 + CAMERA, 7)), np.empty(PAIR)
     for k in range(len(poses)):
@@ -158,7 +158,7 @@ def _write_cameras(theta: FloatArray, lenses: FloatArray) -> None:
 
 @kernel
 def _write_rays(x: float, y: float, lenses: FloatArray, rays: FloatArray) -> None:
-    """Write the ray of a pixel through each of `lenses` (6, 5) into `rays` (6, 7); the first begins the others."""
+    """Write the ray of a pixel through each of `lenses` (6, 5) into `rays` (6, 7); the first initializes the others."""
     guess = -1.0
     for j in range(1 + CAMERA):
         ray(x, y, lenses[j], guess, rays[j])
@@ -190,7 +190,7 @@ def _write_derivatives(rays: FloatArray, Es: FloatArray, sigma: float, shared: b
 
 @kernel
 def _are_numbers(r: float, J: FloatArray) -> bool:
-    """Return whether a distance and its derivatives are numbers: at an epipole there is no gradient to divide by."""
+    """Return whether a distance and its derivatives are finite; at an epipole the gradient vanishes."""
     total = r * r
     for j in range(PAIR):
         total += abs(J[j])
@@ -207,7 +207,7 @@ def _mirror(A: FloatArray) -> None:
 
 @kernel
 def _add(A: FloatArray, b: FloatArray, J: FloatArray, r: float, weight: float) -> None:
-    """Add what one match says: weight J'J to the lower triangle of A, -weight J'r to b."""
+    """Add one match: weight J'J to the lower triangle of A, -weight J'r to b."""
     for i in range(PAIR):
         scaled = weight * J[i]
         b[i] -= scaled * r

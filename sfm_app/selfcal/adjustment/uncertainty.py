@@ -1,6 +1,6 @@
-"""How far a fit may be trusted: covariances, standard deviations in pixels, and which pairs say most.
+"""Uncertainty of a fit: covariances, standard deviations in pixels, and the most informative pairs.
 
-Ours; to leave out photos is the jackknife (Efron 1982). Key pairs are what chapter 6 of the thesis asks for.
+Ours; leaving out photos is the jackknife (Efron 1982). Key pairs are what chapter 6 of the thesis asks for.
 """
 
 import numpy as np
@@ -16,20 +16,20 @@ from sfm_app.types import PairId
 FloatArray = NDArray[np.float64]
 
 MODEL_ERROR = np.array([1e-3, 1e-3, 1e-3, 1e-3, 3e-3])
-"""Standard deviations of what no lens model holds: of log f, u, v in longer sides, log a, and k1. docs/algorithms.md,
-Self-calibration, 4. Chosen by hand; not measured on their own."""
+"""Standard deviations of errors that no lens model covers: of log f, u and v in longer sides, log a, and k1.
+docs/algorithms.md, Self-calibration, 4. Chosen by hand; not measured on their own."""
 AGREES = 0.5
 """A pair with a smaller weight in the fit is no key pair. docs/algorithms.md, Self-calibration, 7. Chosen by hand; not
 measured on its own."""
 
 
 def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> FloatArray:
-    """Return (5C, 5C) covariance of all parameters, over all choices of what is free, with what no model holds added.
+    """Return the (5C, 5C) covariance of all parameters over all choices of free ones, plus the model error.
 
     Args:
         fit: cameras adjusted to matches.
         sides: (C,) longer sides of the photos.
-        resampled: widen it where leaving photos out moves the cameras further than it says.
+        resampled: widen it where leaving photos out moves the cameras further than it predicts.
     """
     found = fit.evidence.covariance(fit.free)
     if resampled:
@@ -43,7 +43,7 @@ def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> Float
 
 
 def spread_of(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, float]:
-    """Return standard deviations of fx, fy, cx, cy in pixels and of k1.
+    """Return the standard deviations of fx, fy, cx, cy in pixels and of k1.
 
     Args:
         theta: (5,) parameters of the camera.
@@ -63,9 +63,9 @@ def spread_of(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, f
 
 
 def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:
-    """Return pairs that agree with the cameras, those that say most about them first.
+    """Return the pairs that agree with the cameras, the most informative first.
 
-    Views that differ in more than place.
+    Their views differ in more than position.
 
     Args:
         fit: cameras adjusted to P pairs.

@@ -1,11 +1,11 @@
-"""Whether photos of one size are of one camera: asked of pairs that nobody was fitted to.
+"""Decide by cross-validation over pairs whether photos of one size are of one camera.
 
 Ours, on the constraint of thesis 5.2.4.
 
-Photos from the web are brought to one size, and cropped; equal sizes are no proof. "Each photo its own camera" fits any
-pairs better than "one camera", wrong ones too, because it has a focal more per photo. So both are fitted to four fifths
-of the pairs, and the rest say which predicts them: wrong pairs are predicted by neither, and what a photo's other pairs
-say about its focal holds for the pair left out only where it is a focal of its own.
+Photos from the web are brought to one size and cropped; equal sizes are no proof. A camera per photo fits any pairs,
+wrong ones too, better than one camera, because it has one more focal per photo. So both are fitted to four fifths of
+the pairs and compared on the rest. Neither predicts wrong pairs. The focal that a photo's other pairs give it predicts
+the held-out pair only where the photo has its own focal.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,53 +19,55 @@ from sfm_app.selfcal.inputs import FloatArray
 from sfm_app.types import PairId
 
 LEAST_PHOTOS = 5
-"""Of fewer, a pair less leaves too little to say what focal a photo has. Chosen by hand; not measured on its own."""
+"""With fewer photos, the pairs that are not held out do not determine the focal of a photo. Chosen by hand; not
+measured on its own."""
 FOLDS = 5
-"""Parts of the pairs that are held back in turn (docs/algorithms.md, Self-calibration, 6). Chosen by hand; not measured
+"""Parts of the pairs that are held out in turn (docs/algorithms.md, Self-calibration, 6). Chosen by hand; not measured
 on its own."""
 FITS = 0.88
-"""A camera that wins this share of all votes leaves nothing to be explained: of fountain-P11 and Herz-Jesus-P8 it wins
-0.94, of ten cameras brought to one size 0.68, of one camera with four pairs in ten wrong 0.5 to 0.7. What it was chosen
-on: benchmarks/corpus/tuning_sets.py."""
+"""A camera that wins this share of all votes explains the photos: of fountain-P11 and Herz-Jesus-P8 it wins 0.94, of
+ten cameras brought to one size 0.68, of one camera with four pairs in ten wrong 0.5 to 0.7. What it was chosen on:
+benchmarks/corpus/tuning_sets.py."""
 LEAST_GAIN, LEAST_GAIN_OF_SEVERAL = 0.05, 0.02
-"""Share of all votes that cameras of their own must win on held pairs: against one camera, and against several, where
-it is certain already that the photos are not of one. Chosen on 120 random scenes of one camera (lens, crop, up to two
+"""Share of all votes that a camera per photo must win on held-out pairs: against one camera, and against several, where
+it is already certain that the photos are not of one. Chosen on 120 random scenes of one camera (lens, crop, up to two
 pixels of noise, up to 40 % wrong pairs, orbits; at most 0.08 with six photos, 0.00 with ten and sixteen) and on
-reichstag10 brought to one size (0.12 to 0.15); without it, ten random cameras say the same (0.17). Of the other photo
-sets, none of which was looked at before, 0.01 at most. All sets: benchmarks/corpus/tuning_sets.py."""
+reichstag10 brought to one size (0.12 to 0.15); without that set, ten random cameras give the same (0.17). Of the other
+photo sets, none of which was looked at before, 0.01 at most. All sets: benchmarks/corpus/tuning_sets.py."""
 CLEARLY, FEW_PAIRS = 2.5, 10.0
-"""In standard deviations of that gain, pairs taken as independent, how much it must be; and what few pairs need more,
-divided by their number. The same scenes: at most 3.0 with six photos; reichstag10 3.6 to 3.7. Chosen with them. All
+"""Least gain in its standard deviations, with pairs taken as independent; few pairs need the second number, divided by
+their number, in addition. The same scenes: at most 3.0 with six photos; reichstag10 3.6 to 3.7. Chosen with them. All
 sets: benchmarks/corpus/tuning_sets.py."""
 LEAST_EACH = 3.0
-"""Photos that each of several cameras must have on average: more cameras than that are a sign of each its own. Chosen
-by hand; not measured on its own."""
+"""Photos that each of several cameras must have on average: more cameras suggest a camera per photo. Chosen by hand;
+not measured on its own."""
 
 
 class Prediction(NamedTuple):
-    """What held pairs say about two hypotheses."""
+    """Votes of the held-out pairs for two hypotheses."""
 
     shared: float
-    """Share of their votes for the cameras that were asked against: one for all, or few."""
+    """Share of the votes for one camera, or for few."""
     own: float
-    """The same for a camera of each photo's own."""
+    """Share of the votes for a camera per photo."""
     deviations: float
-    """How many standard deviations lie between."""
+    """Difference of the votes in its standard deviations."""
     each_its_own: bool
-    """Whether every photo is taken for one of its own camera."""
+    """Whether every photo counts as one of its own camera."""
 
 
 def predicted(
     tables: Tables, photos: Sequence[PairId], starts: Sequence[FloatArray], labels: Mapping[int, int], seed: int
 ) -> Prediction:
-    """Return few cameras and a camera for each photo, fitted to most pairs and compared on the others.
+    """Judge few cameras against a camera per photo on pairs held out from the fit.
 
     Args:
-        tables: the pairs, without lens, in longer sides about the middle; its members are not used.
-        photos: per pair its two photos.
-        starts: (5,) each, cameras whose center and pixels may be those of the photos; the middle is tried besides.
-        labels: number of the camera by photo when there are few; all 0 when there is one.
-        seed: of the choice of the pairs held.
+        tables: undistorted pairs, in longer sides from the middle of the photos; its members are not used.
+        photos: the two photos of each pair.
+        starts: (5,) each, candidates for the center and aspect of the photos; square pixels and the middle are also
+            tried.
+        labels: number of the camera by photo; all 0 for one camera.
+        seed: of the division of the pairs into folds.
     """
     rows = chosen_pairs(len(photos))
     everyone = sorted({photo for pair in photos for photo in pair})
@@ -80,7 +82,7 @@ def predicted(
     best = max(grids, key=lambda grid: grid.fitted(few))
     shared = best.fitted(few) / weight
     tried = [best] if best is grids[-1] else [best, grids[-1]]
-    # what even the pairs that it was fitted to do not say, those held will not
+    # a gain that is missing on the fitted pairs will not appear on those held out
     if shared > FITS or max(grid.fitted(each) for grid in tried) / weight - shared <= least:
         return Prediction(shared, shared, 0.0, each_its_own=False)
     fold = np.random.default_rng(seed).permutation(len(rows)) % FOLDS
@@ -93,6 +95,6 @@ def predicted(
 
 
 def _numbered(labels: Sequence[int]) -> IndexArray:
-    """Return (N,) cameras counted from 0; one for all where so many leave each with few photos."""
+    """Return (N,) cameras counted from 0; one for all where each would have too few photos."""
     cameras = np.unique(labels, return_inverse=True)[1].astype(np.int64)
     return cameras if (np.max(cameras) + 1) * LEAST_EACH <= len(cameras) else np.zeros_like(cameras)

@@ -1,8 +1,8 @@
-"""Photos that were thought to be of one camera but are of several: a zoom, or mixed devices without EXIF.
+"""Divide photos of supposedly one camera by focal: a zoom, or mixed devices without EXIF.
 
 Several cameras are several peaks of the consensus (thesis Figure 5.15, left undone there). The photos whose pairs agree
-on a peak are one camera; each other photo is asked, by its pairs with those, which focal it has. Where photos clearly
-name another one, every photo takes the camera with which its pairs agree best.
+on a peak are the core. For each other photo, its pairs with the core vote on its focal. Where photos clearly have
+another focal, every photo is assigned the camera with which its pairs agree best.
 """
 
 from collections.abc import Sequence
@@ -18,39 +18,40 @@ from sfm_app.selfcal.lens import LOG_FOCAL
 from sfm_app.types import PairId
 
 SIGMA = 0.03
-"""Width of the votes, in units of r: 3 % of focal still agree, 10 % do not. Chosen by hand; not measured on its own."""
+"""Width of the votes, in units of r: focals 3 % apart still agree, those 10 % apart do not. Chosen by hand; not
+measured on its own."""
 FAIR_SHARE = 0.5
-"""Share of its votes that a photo must get to belong to a peak, or to name a focal. Chosen by hand; not measured on its
-own."""
+"""Share of its possible votes that a photo needs to belong to a peak, or to have another focal. Chosen by hand; not
+measured on its own."""
 OTHER_FOCAL = 0.05
-"""A difference in log f from which on it is another camera. Chosen by hand; not measured on its own."""
+"""Difference in log f from which on it is another camera. Chosen by hand; not measured on its own."""
 CLEARLY = 0.25
 """Share of a photo's votes by which another focal must beat that of the peak. docs/algorithms.md, Self-calibration, 6.
 Chosen by hand; not measured on its own."""
 LEAST_GAIN = 0.25
-"""The same of the photos of all other cameras together, for a split to be worth it. Chosen by hand; not measured on its
-own."""
+"""Share of the votes of the photos of all other cameras together that a split must win. Chosen by hand; not measured on
+its own."""
 REACH, TRIALS = 1.1, 111
-"""Focals that a photo is asked about: up to three times longer or shorter. Chosen by hand; not measured on their
-own."""
+"""Range in log f and number of the focals that are tried for a photo: up to three times longer or shorter. Chosen by
+hand; not measured on their own."""
 MOST_PEAKS = 4
-"""Peaks of the consensus that cameras are begun from. Chosen by hand; not measured on its own."""
+"""Peaks of the consensus that serve as starts. Chosen by hand; not measured on its own."""
 ROUNDS = 10
-"""Most times all photos are asked for their camera. Chosen by hand; not measured on its own."""
+"""Most rounds of assigning photos to cameras. Chosen by hand; not measured on its own."""
 
 
 def separated(
     tables: Tables, photos: Sequence[PairId], starts: Sequence[FloatArray]
 ) -> tuple[FloatArray, dict[int, int]]:
-    """Return cameras among photos that share all but the focal, and which photo is of which.
+    """Find cameras that share all but the focal, and which photo is of which.
 
     Args:
-        tables: the pairs, without lens, in longer sides about the middle; its members are not used.
-        photos: per pair its two photos.
-        starts: (5,) each, cameras that may be those of many pairs.
+        tables: undistorted pairs, in longer sides from the middle of the photos; its members are not used.
+        photos: the two photos of each pair.
+        starts: (5,) each, candidate cameras.
 
     Returns:
-        (C, 5) cameras, and the number of the camera by photo; one camera where the photos do not disagree.
+        (C, 5) cameras, and the number of the camera by photo; one camera where the photos agree.
     """
     everyone = sorted({photo for pair in photos for photo in pair})
     pairs = _Pairs(tables, photos)
@@ -73,7 +74,7 @@ def separated(
 
 
 def peaks_of(consensus: Consensus) -> list[FloatArray]:
-    """Return (5,) each: the peaks of the consensus as cameras without lens, highest first."""
+    """Return the peaks of the consensus as cameras (5,) without distortion, highest first."""
     answer = consensus_peak.found(consensus)
     return [np.append(theta, 0.0) for theta in (answer.theta, *answer.others)][:MOST_PEAKS]
 
@@ -85,7 +86,7 @@ class _Pairs:
         self.tables, self.photos = tables, photos
 
     def core(self, theta: FloatArray, everyone: Sequence[int]) -> tuple[float, FloatArray, set[int]]:
-        """Return votes beyond the fair share of the photos that agree on a camera, the camera, and those photos."""
+        """Find the photos that agree on a camera; return their votes beyond the fair share, the camera, and them."""
         beyond = [
             float(self.tables.votes(k, theta[None], theta[None], SIGMA)[0, 0] - FAIR_SHARE * self.tables.weights[k])
             for k in range(len(self.photos))
@@ -105,7 +106,7 @@ class _Pairs:
         return float(sum(inside)), theta, core
 
     def named(self, photo: int, theta: FloatArray, core: set[int]) -> list[float]:
-        """Return the focal that a photo's pairs with the core clearly name instead, as a step in log f; or nothing."""
+        """Return the step in log f to the focal that a photo's pairs with the core clearly prefer; empty for none."""
         steps = np.linspace(-REACH, REACH, TRIALS)
         trials = np.repeat(theta[None], TRIALS, axis=0)
         trials[:, LOG_FOCAL] += steps
@@ -123,7 +124,7 @@ class _Pairs:
         return [float(steps[best])] if clear and abs(steps[best]) > OTHER_FOCAL else []
 
     def labeled(self, cameras: FloatArray, everyone: Sequence[int], core: set[int]) -> dict[int, int]:
-        """Give every photo with camera for which its pairs vote most, the others as they are, until none changes."""
+        """Give every photo in turn the camera for which its pairs vote most, until none changes."""
         labels = {photo: 0 if photo in core else -1 for photo in everyone}
         for _ in range(ROUNDS):
             before = dict(labels)
@@ -140,12 +141,12 @@ class _Pairs:
         return labels
 
     def at_stake(self, asked: set[int]) -> float:
-        """Return the most votes that the pairs of some photos can give."""
+        """Return the most votes that the pairs of the given photos can give."""
         touched = [bool(asked.intersection(pair)) for pair in self.photos]
         return float(np.sum(self.tables.weights[touched]))
 
     def total(self, cameras: FloatArray, labels: dict[int, int]) -> float:
-        """Return votes of all pairs."""
+        """Return the sum of the votes of all pairs."""
         return float(
             sum(
                 self.tables.votes(k, cameras[labels[first]][None], cameras[labels[second]][None], SIGMA)[0, 0]
@@ -155,7 +156,7 @@ class _Pairs:
 
 
 def _clustered(steps: Sequence[float]) -> list[float]:
-    """Return medians of the runs of values that lie within `OTHER_FOCAL` of the one before."""
+    """Return the medians of clusters of values; gaps above `OTHER_FOCAL` separate clusters."""
     ordered: NDArray[np.float64] = np.sort(np.array(steps))
     cuts = np.flatnonzero(np.diff(ordered) > OTHER_FOCAL) + 1
     return [float(np.median(run)) for run in np.split(ordered, cuts) if len(run)]

@@ -1,4 +1,4 @@
-"""Votes of pairs for the focals of their two photos, on one grid for all of them.
+"""Votes of pairs for the focals of their two photos, on a common grid.
 
 Ours: the consensus of thesis 5.8.4 on the focals alone.
 """
@@ -16,12 +16,12 @@ SIGMA = 0.05
 """Width of the votes, in units of r: neighbors on the grid of focals, 7 % apart, still vote for each other. Chosen by
 hand; not measured on its own."""
 MOST_PAIRS = 1500
-"""Evenly chosen where there are more: tables of all focals of both photos take 13 kB a pair. Chosen by hand; not
+"""Most pairs that vote, evenly chosen: tables of all focals of both photos take 13 kB a pair. Chosen by hand; not
 measured on its own."""
 
 
 def chosen_pairs(count: int) -> IndexArray:
-    """Return which of so many pairs are asked."""
+    """Return the indices of the pairs that vote, evenly chosen out of `count`."""
     return np.linspace(0, count - 1, min(count, MOST_PAIRS)).astype(np.int64)
 
 
@@ -29,9 +29,9 @@ class FocalGrid:
     """Votes of pairs for the focals of their two photos.
 
     Args:
-        tables: the pairs, without lens.
-        rows: (P,) which of them.
-        theta: (5,) the camera whose center and pixels are those of all photos.
+        tables: undistorted pairs.
+        rows: (P,) indices of the pairs that vote.
+        theta: (5,) camera with the center and aspect of all photos.
         members: (P, 2) photos, counted from 0.
     """
 
@@ -40,11 +40,11 @@ class FocalGrid:
         self.grid = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
 
     def places(self, cameras: IndexArray, rows: IndexArray) -> IndexArray:
-        """Return (C,) places on the grid on which these pairs agree.
+        """Return (C,) grid indices of the focals on which the given pairs agree.
 
         Args:
             cameras: camera of each photo, counted from 0.
-            rows: the pairs that are asked.
+            rows: the pairs that vote.
         """
         one = np.einsum("pgg->g", self.votes[rows]) - 0.5 * ((self.grid - USUAL_FOCAL) / FOCAL_SPREAD) ** 2
         priors = -0.5 * ((self.grid - self.grid[np.argmax(one)]) / TIE) ** 2
@@ -63,16 +63,16 @@ class FocalGrid:
         return best_places(own, between)
 
     def given(self, places: IndexArray) -> FloatArray:
-        """Return (P,) votes when photo k has the focal at `places[k]`."""
+        """Return (P,) votes of the pairs if photo k has the focal at `places[k]`."""
         first, second = places[self.members].T
         return np.asarray(self.votes[np.arange(len(self.votes)), first, second], np.float64)
 
     def fitted(self, cameras: IndexArray) -> float:
-        """Return the sum of them for cameras that all pairs agree on."""
+        """Return the sum of the votes for the focals on which all pairs agree."""
         return float(np.sum(self.given(self.places(cameras, np.arange(len(self.votes)))[cameras])))
 
     def held(self, cameras: IndexArray, fold: IndexArray) -> FloatArray:
-        """Return (P,) votes of every pair for cameras that the pairs of the other folds agree on.
+        """Return (P,) votes of every pair for the focals on which the pairs of the other folds agree.
 
         Args:
             cameras: camera of each photo, counted from 0.

@@ -37,12 +37,12 @@ FOCALS = 41
 """Focals on the grid of a camera, each 7 % above the one before. docs/algorithms.md, Self-calibration, 6. Chosen by
 hand; not measured on its own."""
 MESSAGE_ROUNDS, DAMPING = 30, 0.5
-"""Most rounds of max-sum message passing, and the share of the message before that a new one keeps. Chosen by hand; not
-measured on their own."""
-FAIR_SHARE, BORNE_OUT, NOT_ALL = 0.5, 0.8, "not all of its photos bear it out"
-"""Shares of their votes that every photo, and all together, must give to a camera that photos of one size were divided
-into. Chosen on folders 0 to 179 and 1000 to 1020 of `python -m benchmarks.trouble`: two cameras get 0.86 to 0.93
-(0.57 and 0.69 with a moving object), those of a zoom and those over 5 % off 0.44 to 0.76."""
+"""Most rounds of max-sum message passing, and the share of the previous message that a new one keeps. Chosen by hand;
+not measured on their own."""
+FAIR_SHARE, BORNE_OUT, NOT_ALL = 0.5, 0.8, "not all of its photos support it"
+"""Shares of their votes that every photo, and all together, must give to a camera split from photos of one size, and
+the reason where they do not. Chosen on folders 0 to 179 and 1000 to 1020 of `python -m benchmarks.trouble`: two cameras
+get 0.86 to 0.93 (0.57 and 0.69 with a moving object), those of a zoom and those over 5 % off 0.44 to 0.76."""
 LEAST_PAIRS = 2
 """Pairs that a camera needs: two constraints find its focal, two more contradict a wrong one. Counted: by definition of
 the constraint (thesis 5.2.4)."""
@@ -55,19 +55,19 @@ class CameraGroup:
     size: tuple[int, int]
     """(width, height) of its photos in pixels."""
     start: Calibration | None = None
-    """What its own pairs say, or a photo of it."""
+    """Calibration from its own pairs or from splitting its group; None where there is none."""
     known: bool = False
-    """Whether its own pairs determine that."""
+    """Whether its own pairs determine `start`."""
     hint_px: float = np.nan
-    """Claimed focal."""
+    """Claimed focal; NaN for none."""
     family: int = -1
-    """Number of the folder whose cameras are alike, though each photo has its own; -1: it stands alone."""
+    """Number of the folder whose photos have similar cameras, one each; -1 for none."""
     divided: bool = False
-    """Whether it is one of several that photos of one size were divided into: then each of its photos is asked."""
+    """Whether it was split from photos of one size: then each of its photos must support it."""
 
     @property
     def whole(self) -> bool:
-        """Whether its own pairs were asked about it, all of them and no others."""
+        """Whether it was calibrated from all of its own pairs and no others."""
         return self.family < 0 and not self.divided
 
 
@@ -77,10 +77,10 @@ def calibrate_several(
     """Return one calibration per camera, in their order; each is identifiable or a guess with the reason.
 
     Args:
-        cameras: sizes, and what is known.
+        cameras: sizes and prior knowledge.
         pairs: all pairs, within and between cameras, with inliers; the size is not used.
         members: (P, 2) number of the camera that took view 1, view 2.
-        options: whether to look for a lens.
+        options: prior on the center, and whether to look for a lens.
         method: name that goes into the answers.
     """
     unit = float(max(max(camera.size) for camera in cameras))
@@ -116,16 +116,16 @@ def calibrate_several(
 
 
 def _borne_out(found: Calibration, least: float) -> Calibration:
-    """Return the answer, as an estimate where its photos, one of them at `least`, give it too few of their votes."""
+    """Return the calibration, as an estimate where all photos or the worst (`least`) give it too few votes."""
     doubtful = least < FAIR_SHARE or found.evidence["support"] < BORNE_OUT
     return roughly(found, NOT_ALL if doubtful else "")
 
 
 class Tables:
-    """How well pairs agree, focal by focal of their two cameras.
+    """Votes of pairs for any two cameras of their photos.
 
     Args:
-        Fs: (P, 3, 3) in one unit about the middle of each photo.
+        Fs: (P, 3, 3) in one unit from the middle of each photo.
         members: (P, 2) cameras.
         weights: (P,).
     """
@@ -149,7 +149,7 @@ class Tables:
 
 
 def _least_shares(thetas: FloatArray, tables: Tables, photos: Sequence[PairId]) -> dict[int, float]:
-    """Return, by camera, the smallest share of its votes that one of its photos gets, by all pairs of that photo."""
+    """Return by camera the smallest share of possible votes that the pairs of one of its photos give."""
     got: dict[tuple[int, int], float] = {}
     most: dict[tuple[int, int], float] = {}
     for k, (i, j) in enumerate(tables.members):
@@ -167,7 +167,7 @@ def _least_shares(thetas: FloatArray, tables: Tables, photos: Sequence[PairId]) 
 def _in_units(
     cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, unit: float
 ) -> tuple[IndexArray, FloatArray, Matches]:
-    """Return usable pairs, their F's and inliers in units about the middle of each photo."""
+    """Return the usable pairs, and their F's and inliers in units from the middle of each photo."""
     ready = prepare(pairs, unit_px=unit, origin_px=(0.0, 0.0))
     middles = np.array([camera.size for camera in cameras]) / (2.0 * unit)
     used = members[ready.kept]
@@ -189,7 +189,7 @@ def _first(camera: CameraGroup, side: float, unit: float) -> FloatArray:
 
 
 def _with_focals(thetas: FloatArray, unknown: NDArray[np.bool_], tables: Tables, priors: CameraPriors) -> FloatArray:
-    """Return the unknown focals on which most pairs agree."""
+    """Return the cameras with the unknown focals on which most pairs agree."""
     grid = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
     trials = np.repeat(thetas[:, None], FOCALS, axis=1)
     trials[unknown, :, LOG_FOCAL] = grid + np.log(priors.sides[unknown])[:, None]
@@ -212,13 +212,13 @@ def _with_focals(thetas: FloatArray, unknown: NDArray[np.bool_], tables: Tables,
 
 
 def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> IndexArray:
-    """Give which place on its grid every camera takes, so that the sum over cameras and over pairs of cameras is large.
+    """Choose a grid index for every camera so that the sum over cameras and over pairs of cameras is large.
 
-    Damped max-sum message passing (Pearl 1988; exact on trees), then one camera after the other while that helps; the
-    same from what each camera wants by itself, which loops of messages do not always outdo.
+    Damped max-sum message passing (Pearl 1988; exact on trees), then coordinate ascent. Ascent also starts from the
+    best index of each camera by itself, which messages on loops do not always outdo.
 
     Args:
-        own, between: (C, G) what each camera gains by itself; (G, G) what two, i < j, gain together, by (i, j).
+        own, between: (C, G) value of each camera by itself; (G, G) value of two cameras i < j together, by (i, j).
     """
     tables = {(i, j): table for (i, j), table in between.items()} | {(j, i): t.T for (i, j), t in between.items()}
     messages = {edge: np.zeros(own.shape[1]) for edge in tables}
@@ -237,7 +237,7 @@ def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> 
 
 
 def _one_by_one(places: IndexArray, own: FloatArray, tables: dict[tuple[int, int], FloatArray]) -> IndexArray:
-    """Return every camera in turn takes its best place, the others as they are, until none changes."""
+    """Give every camera in turn its best index, with the others fixed, until none changes."""
     places = places.astype(np.int64)
     for _ in range(MESSAGE_ROUNDS):
         before = places.copy()
@@ -260,7 +260,7 @@ def _gain(places: IndexArray, own: FloatArray, between: dict[tuple[int, int], Fl
 def _judged(
     index: int, camera: CameraGroup, fit: Fit, cov: FloatArray, straight: Tables, unit: float, method: str, motion: str
 ) -> Calibration:
-    """Return the answer for one camera, or why its pairs do not give one; `motion` says what leaves all focals open."""
+    """Return the calibration of one camera, or a guess and why; `motion` names a motion that leaves all focals open."""
     theta = fit.state.thetas[index]
     block = cov[CAMERA * index : CAMERA * (index + 1), CAMERA * index : CAMERA * (index + 1)]
     mine = np.flatnonzero((fit.matches.cameras == index).any(axis=1))
@@ -284,10 +284,10 @@ def _judged(
     elif not camera.known and lead < MIN_LEAD:
         reason = "the pairs fit other focals as well or better"
     vague = consensus_peak.vagueness(spread, one_of_many=camera.family >= 0)
-    # a motion that leaves the focal open belies a small deviation, not a large one
+    # a motion that leaves the focal open is the reason only where the deviation is small
     reason = reason or (not (camera.divided and vague) and motion) or consensus_peak.objection(in_sides, spread, half)
     if reason and camera.family >= 0:
-        # what the others are like is in it: better to start mapping from than the usual focal
+        # it contains the mean of the family: a better start for mapping than the usual focal
         return replace(guessed(camera.size, reason, evidence), K=_of_its_family(theta, camera.size, unit))
     if reason:
         return guessed(camera.size, reason, evidence)
@@ -297,17 +297,14 @@ def _judged(
 
 
 def _of_its_family(theta: FloatArray, size: tuple[int, int], unit: float) -> FloatArray:
-    """Return the usual camera matrix with the focal that is most likely, though uncertain."""
+    """Return the usual camera matrix with the most likely focal, though uncertain."""
     side = max(size)
     low, high = np.array(FOCAL_RANGE) * side
     return guessed_camera_matrix(size, float(np.clip(np.exp(theta[LOG_FOCAL]) * unit, low, high)))
 
 
 def _lead(index: int, thetas: FloatArray, tables: Tables) -> tuple[float, float]:
-    """Return votes by which a camera's focal leads all others, the other cameras as they are.
-
-    And its share of the votes.
-    """
+    """Return votes by which a camera's focal leads all others, the other cameras fixed, and its share of its votes."""
     offsets = np.concatenate([[0.0], np.linspace(-1.5, 1.5, 61)])
     trials = np.repeat(thetas[None, index], len(offsets), axis=0)
     trials[:, LOG_FOCAL] += offsets
@@ -328,7 +325,7 @@ def _lead(index: int, thetas: FloatArray, tables: Tables) -> tuple[float, float]
 
 @kernel
 def _ratios(pair: FloatArray, first: FloatArray, second: FloatArray) -> FloatArray:
-    """Return (A, B) r = (s1 - s2) / (s1 + s2) of E = K2'F K1, for cameras (A, 5) and (B, 5), lenses aside.
+    """Return (A, B) r = (s1 - s2) / (s1 + s2) of E = K2'F K1, for cameras (A, 5) and (B, 5), without distortion.
 
     As `constraints.singular_value_ratio`, with two cameras.
     """

@@ -1,4 +1,4 @@
-"""A set of photos: which of them are of one camera, and the K of every camera.
+"""Cameras of a photo set: which photos share one, and the K of each.
 
 Ours; the thesis takes one camera for all photos (5.5.2).
 """
@@ -30,18 +30,19 @@ logger = logging.getLogger("sfm_app")
 CalibrateFunction = Callable[[CameraPairs, CalibrationSettings, int], Calibration]
 
 LEAST_TO_SPLIT = 4
-"""Photos of a group below which nobody can say who disagrees with whom. Chosen by hand; not measured on its own."""
+"""Photos below which a group is not split: too few to tell which of them disagree. Chosen by hand; not measured on its
+own."""
 ALIKE = 0.03
 """Parts of a group whose log f differ by less are one camera. docs/algorithms.md, Self-calibration, 6. Chosen by hand;
 not measured on its own."""
 MANY, PERHAPS_ZOOM = 3, "photos of one size fall into {count} cameras, as those of a zoom do"
-"""From so many on, the border between two of them may be anywhere: none of them is relied on. Chosen by hand; not
-measured on its own."""
+"""Parts of a group from which on the borders between them may be anywhere, so that none is relied on; and the reason.
+Chosen by hand; not measured on its own."""
 PERHAPS_TWO = "its photos may be of two cameras"
-NOBODYS = "no usable pair says which camera took its photos"
+NOBODYS = "no usable pair shows which camera took its photos"
 BENT = 0.01
-"""From this |k1| on, photos are straightened before they are asked whether they are of one camera. Chosen by hand; not
-measured on its own."""
+"""|k1| from which on photos are undistorted before they are tested for one camera. Chosen by hand; not measured on its
+own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +53,9 @@ class CalibratedCamera:
     photos: tuple[int, ...]
     found: Calibration
     family: int = -1
-    """Number of the group, where each of its photos was found to have a camera of its own."""
+    """Number of the group, where each of its photos has its own camera; else -1."""
     of_parts: int = 1
-    """So many cameras was its group divided into."""
+    """Number of cameras that its group was split into."""
 
 
 def calibrate_photo_set(
@@ -66,10 +67,10 @@ def calibrate_photo_set(
     Args:
         pairs: all pairs that are not degenerate.
         calibrate: finds one camera from its own pairs.
-        options: handed to it.
-        seed: likewise.
+        options: passed to `calibrate`.
+        seed: passed to `calibrate`.
         together: also use the pairs between cameras.
-        split: then also split groups whose photos disagree.
+        split: with `together`, also split groups whose photos disagree.
     """
     groups: dict[str, list[int]] = {}
     for photo, group in pairs.groups.items():
@@ -85,7 +86,7 @@ def calibrate_photo_set(
 
 
 def _alone(calibrate: CalibrateFunction, own: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Return what a calibrator makes of the pairs of one camera; a guess where its numbers fail."""
+    """Return the calibration from the pairs of one camera; a guess where the computation fails."""
     try:
         return calibrate(own, options, seed)
     except FAILURES as err:
@@ -96,7 +97,7 @@ def _alone(calibrate: CalibrateFunction, own: CameraPairs, options: CalibrationS
 def _jointly(
     cameras: list[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings, seed: int, *, split: bool
 ) -> list[CalibratedCamera]:
-    """Return the cameras as all pairs have them; as each has them alone where the numbers fail."""
+    """Return the cameras calibrated from all pairs; unchanged where the computation fails."""
     try:
         return _of_all_pairs(cameras, pairs, options, seed) if split else _together(cameras, pairs, options)
     except FAILURES as err:
@@ -107,9 +108,9 @@ def _jointly(
 def _of_all_pairs(
     whole: Sequence[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings, seed: int
 ) -> list[CalibratedCamera]:
-    """Return groups split where their photos disagree, and all cameras from all pairs.
+    """Divide groups whose photos disagree, and calibrate all cameras from all pairs.
 
-    Parts of a group that turn out to have the same focal were one camera after all.
+    A group of which two parts turn out to have the same focal stays whole.
     """
     unlike = _unlike_within_bars(whole, pairs, seed)
     parts = [
@@ -130,14 +131,14 @@ def _of_all_pairs(
 
 
 def _alike(focals: Sequence[float]) -> bool:
-    """Return whether two of them are the same."""
+    """Return whether two of the focals are the same."""
     return bool(np.any(np.diff(np.sort(np.log(focals))) < ALIKE))
 
 
 def _split(
     camera: CalibratedCamera, number: int, pairs: PhotoPairs, options: CalibrationSettings, seed: int
 ) -> list[CalibratedCamera]:
-    """Return the camera, the several that its photos are of, or one for each photo."""
+    """Return the camera itself, the cameras that its photos are divided among, or one for each photo."""
     if len(camera.photos) < LEAST_TO_SPLIT:
         return [camera]
     own, found = pairs.among(camera.photos), camera.found
@@ -166,9 +167,9 @@ def _split(
 
 
 def _borne_out(labels: Mapping[int, int], photos: Sequence[PairId]) -> dict[int, int]:
-    """Return labels of the photos that share a pair with another of their camera, and of those that are alone in it.
+    """Return the labels of photos that share a pair with another of their camera, or are its only photo.
 
-    Of a pair between two cameras nobody knows which of the two photos is of which.
+    A pair between two cameras does not tell which of its photos is of which.
     """
     count = Counter(labels.values())
     inside = {photo for pair in photos if labels[pair[0]] == labels[pair[1]] for photo in pair}
@@ -180,7 +181,7 @@ def _parts(
 ) -> list[CalibratedCamera]:
     """Return the cameras that a group was divided into.
 
-    Photos that no pair gives to one of them are another, not known.
+    Photos without a label form another camera, which is not known.
     """
     names, size = _names(camera, pairs), pairs.sizes[camera.photos[0]]
     parts = []
@@ -201,23 +202,23 @@ def _parts(
 
 
 def _names(camera: CalibratedCamera, pairs: PhotoPairs) -> Iterator[str]:
-    """Return names for what becomes of a group; the first keeps its own."""
+    """Return names for the parts of a group; the first keeps the name of the group."""
     taken = set(pairs.groups.values())
     return chain([camera.name], (name for k in count(2) if (name := f"{camera.name} #{k}") not in taken))
 
 
 def _each_its_own(camera: CalibratedCamera, family: int, pairs: PhotoPairs) -> list[CalibratedCamera]:
-    """Return a camera, not known yet, for each photo of a group."""
+    """Return a camera, not calibrated yet, for each photo of a group."""
     nothing, names = guessed(pairs.sizes[camera.photos[0]], "", {}), _names(camera, pairs)
     return [CalibratedCamera(next(names), (photo,), nothing, family) for photo in sorted(camera.photos)]
 
 
 def _unlike_within_bars(whole: Sequence[CalibratedCamera], pairs: PhotoPairs, seed: int) -> dict[str, int]:
-    """Return groups that bars have brought to one size with others, and whose photos are each of a camera of its own.
+    """Find groups that bars have brought to one size with others and whose photos each have their own camera.
 
-    By name; the number says which have one size.
+    The result maps the name of the group to a number of that size.
 
-    Pictures of one shape are not of one camera either, when the others are not: all of one size are asked together.
+    All groups of one size are tested together: if the photos of the others are not of one camera, neither are its own.
     """
     found: dict[str, int] = {}
     for number, size in enumerate(sorted(set(pairs.brought_to.values()))):
@@ -237,7 +238,7 @@ def _unlike_within_bars(whole: Sequence[CalibratedCamera], pairs: PhotoPairs, se
 
 
 def _in_sides(size: tuple[int, int]) -> FloatArray:
-    """Return (3, 3) from longer sides about the middle to pixels."""
+    """Return the (3, 3) transform from longer sides, from the middle, to pixels."""
     side = float(max(size))
     return np.array([[side, 0.0, size[0] / 2], [0.0, side, size[1] / 2], [0.0, 0.0, 1.0]])
 
@@ -245,7 +246,7 @@ def _in_sides(size: tuple[int, int]) -> FloatArray:
 def _together(
     cameras: Sequence[CalibratedCamera], pairs: PhotoPairs, options: CalibrationSettings
 ) -> list[CalibratedCamera]:
-    """Return all cameras from all pairs at once; one camera is what its own pairs say."""
+    """Return all cameras calibrated jointly from all pairs; a single camera stays as it is."""
     if len(cameras) <= 1:
         return list(cameras)
     number = {photo: k for k, camera in enumerate(cameras) for photo in camera.photos}
@@ -267,13 +268,13 @@ def _together(
 
 
 def _less_sure(camera: CalibratedCamera, found: Calibration) -> Calibration:
-    """Return the answer, as an estimate where the camera is one of many that photos of one size were divided into."""
+    """Return the calibration, as an estimate where the group was split into many cameras, as photos of a zoom are."""
     many = found.identifiable and camera.of_parts >= MANY
     return roughly(found, PERHAPS_ZOOM.format(count=camera.of_parts)) if many else found
 
 
 def _or_guess(camera: CalibratedCamera, pairs: PhotoPairs) -> Calibration:
-    """Return what was found; else the K that mapping starts from: EXIF's claim, or 1.2 x the longer side."""
+    """Return the calibration; where nothing was found, a K to start from: EXIF's claim, or 1.2 x the longer side."""
     found = camera.found
     if found.identifiable or found.method == ESTIMATE:
         return found

@@ -1,10 +1,11 @@
-"""Whether photos of one size are of two cameras: asked of all pairs at once.
+"""Decide from all pairs jointly whether photos of one size are of two cameras.
 
 Ours, on the constraint of thesis 5.2.4.
 
-Photos that agree with each other on another focal hide behind a majority: their pairs have a vote or two for any focal,
-and one of them alone, taken for another camera, disagrees with its own. So for each second focal on a grid every photo
-takes the camera that its pairs want, beginning with what they want when both photos change, until none changes.
+A minority that agrees on another focal cannot be found one photo at a time: its pairs give some votes to any focal, and
+a single photo moved to another camera disagrees with the rest of its group. So for each second focal on a grid every
+photo in turn takes the camera for which its pairs vote, until none changes. At the start, a photo takes the camera that
+its pairs prefer if both of their photos change.
 """
 
 from collections.abc import Sequence
@@ -19,19 +20,19 @@ from sfm_app.selfcal.lens import LOG_FOCAL
 from sfm_app.types import PairId
 
 APART = 2
-"""Steps on the grid of focals, 7 % each, that two cameras are apart. Chosen by hand; not measured on its own."""
+"""Least distance of two cameras, in steps of 7 % on the grid of focals. Chosen by hand; not measured on its own."""
 NEAR = 4
-"""Steps that both focals may move in the end. Chosen by hand; not measured on its own."""
+"""Steps that both focals may move in each round of the final refinement. Chosen by hand; not measured on its own."""
 ROUNDS = 20
-"""Most times all photos are asked for their camera. Chosen by hand; not measured on its own."""
+"""Most rounds of assigning photos to cameras. Chosen by hand; not measured on its own."""
 LEAST_GAIN = 0.15
-"""Share of the smaller camera's votes that two must win against one. Chosen on 120 random scenes of one camera (as for
-`camera_per_photo`; at most 0.02), and on rendered folders of `python -m benchmarks.trouble`, seeds 0 to 64: two
+"""Share of the smaller camera's votes that two cameras must win against one. Chosen on 120 random scenes of one camera
+(as for `camera_per_photo`; at most 0.02), and on rendered folders of `python -m benchmarks.trouble`, seeds 0 to 64: two
 cameras and zooms have 0.22 to 0.70. Of the photo sets of one camera, none of which was looked at before, 0.05 at most,
 but for a single photo of kitchen25."""
 CLEARLY, LEAST_PHOTOS = 2.5, 2
-"""The gain in its standard deviations from which on the photos are of two cameras; below, they may be. The folders have
-2.8 to 7.9. One photo alone is left to `camera_split`. Chosen on them, `python -m benchmarks.trouble`, seeds 0 to
+"""Least gain in its standard deviations for two cameras to be certain, and least photos of the smaller one. The folders
+have 2.8 to 7.9. One photo alone is left to `camera_split`. Chosen on them, `python -m benchmarks.trouble`, seeds 0 to
 64."""
 
 
@@ -39,11 +40,11 @@ class TwoCameras(NamedTuple):
     """The best division of photos among two cameras."""
 
     cameras: FloatArray
-    """(2, 5), the one of most photos first."""
+    """(2, 5), the one with more photos first."""
     labels: dict[int, int]
-    """Number of the camera, of the photos that have pairs."""
+    """Number of the camera by photo, for photos that have pairs."""
     gain: float
-    """Votes that it wins against one camera."""
+    """Votes that the division wins against one camera."""
     stake: float
     """Most votes that the pairs of the smaller camera's photos can give."""
     deviations: float
@@ -53,22 +54,22 @@ class TwoCameras(NamedTuple):
 
     @property
     def perhaps(self) -> bool:
-        """Whether it is worth a doubt that there is one camera."""
+        """Whether there may be two cameras."""
         return self.fewest >= LEAST_PHOTOS and self.gain >= LEAST_GAIN * self.stake
 
     @property
     def clearly(self) -> bool:
-        """Whether there are two."""
+        """Whether there are certainly two cameras."""
         return self.perhaps and self.deviations >= CLEARLY
 
 
 def two_cameras(tables: Tables, photos: Sequence[PairId], starts: Sequence[FloatArray]) -> TwoCameras | None:
-    """Divide photos among two cameras that share all but the focal, as most pairs want; None where nothing is gained.
+    """Divide photos among two cameras that share all but the focal, by the votes of their pairs; None for no gain.
 
     Args:
-        tables: the pairs, without lens, in longer sides about the middle; its members are not used.
-        photos: per pair its two photos.
-        starts: (5,) each, cameras whose center and pixels may be those of the photos.
+        tables: undistorted pairs, in longer sides from the middle of the photos; its members are not used.
+        photos: the two photos of each pair.
+        starts: (5,) each, candidates for the center and aspect of the photos.
     """
     rows = chosen_pairs(len(photos))
     everyone = sorted({photo for pair in photos for photo in pair})
@@ -107,11 +108,11 @@ def two_cameras(tables: Tables, photos: Sequence[PairId], starts: Sequence[Float
 
 
 class _Division:
-    """Photos, each with one of two cameras.
+    """Assignment of photos to two cameras.
 
     Args:
         grid: votes of the pairs.
-        photos: how many.
+        photos: number of photos.
     """
 
     def __init__(self, grid: FocalGrid, photos: int) -> None:
@@ -120,16 +121,16 @@ class _Division:
         self.of = [np.flatnonzero((grid.members == photo).any(axis=1)) for photo in range(photos)]
 
     def starts(self, priors: int, other: int) -> tuple[IndexArray, IndexArray]:
-        """Return (N,) all with the usual focal.
+        """Return two initial labelings (N,): all photos 0, and each photo as its pairs prefer.
 
-        And each with what its pairs want, when both photos of a pair take it.
+        The preference of a pair assumes that both of its photos change.
         """
         wants = self.votes[:, other, other] - self.votes[:, priors, priors]
         wanted = np.array([np.sum(wants[rows]) for rows in self.of])
         return np.zeros(self.photos, np.int64), (wanted > 0).astype(np.int64)
 
     def settled(self, places: IndexArray, labels: IndexArray) -> tuple[IndexArray, IndexArray]:
-        """Return every photo in turn takes the camera for which its pairs vote most, until none changes."""
+        """Give every photo in turn the camera for which its pairs vote most, until none changes."""
         labels = labels.copy()
         for _ in range(ROUNDS):
             changed = False
@@ -148,16 +149,16 @@ class _Division:
         return float(np.sum(self.votes[rows, places[mine[:, 0]], places[mine[:, 1]]]))
 
     def each(self, places: IndexArray, labels: IndexArray) -> FloatArray:
-        """Return (P,) votes of the pairs."""
+        """Return (P,) votes of the pairs for a division."""
         first, second = places[labels][self.members].T
         return np.asarray(self.votes[self.rows, first, second], np.float64)
 
     def total(self, places: IndexArray, labels: IndexArray) -> float:
-        """Return the sum of the votes."""
+        """Return the sum of the votes for a division."""
         return float(np.sum(self.each(places, labels)))
 
     def refined(self, places: IndexArray, labels: IndexArray) -> tuple[IndexArray, IndexArray]:
-        """Move both focals where the pairs want them, and every photo to its camera, until none changes."""
+        """Move both focals to where they win most votes, and every photo to its camera, until nothing changes."""
         for _ in range(ROUNDS):
             near = [np.arange(max(0, place - NEAR), min(FOCALS, place + NEAR + 1)) for place in places]
             tried = [np.array([first, second]) for first in near[0] for second in near[1]]

@@ -1,13 +1,13 @@
 """The consensus of all pairs over all of K at once.
 
-Thesis (5.33) seeks the point where most zero curves meet, in one plane of K at a time. Here the same is asked of the
-whole of K: at the parameters ``theta = (log f, u, v, log a)``, with f = sqrt(fx fy) and a = fy / fx, how many pairs
-satisfy the constraint? Each pair speaks with at most its weight, so outliers do not pull::
+Thesis (5.33) seeks the point where most zero curves meet, in one plane of K at a time. Here all of K is searched at
+once: at the parameters ``theta = (log f, u, v, log a)``, with f = sqrt(fx fy) and a = fy / fx, how many pairs satisfy
+the constraint? Each pair votes with at most its weight, so that outliers have little influence::
 
     support(theta) = sum_i w_i exp(-r_i(theta) / sigma),      r = (s1 - s2) / (s1 + s2) of E_i = K'F_iK
 
-A pair's say is read as a log-likelihood, so that a prior on the center adds to it: it decides where pairs are few and
-fades where they are many.
+A vote is taken as a log-likelihood, to which a log-prior on the center is added: the prior decides where pairs are few
+and fades where they are many.
 """
 
 from collections.abc import Sequence
@@ -23,16 +23,16 @@ LOG_FOCAL, CENTER_U, CENTER_V, LOG_ASPECT = range(4)
 FIRST_STEPS = np.array([0.05, 0.03, 0.03, 0.05])
 """First steps of the local search along theta. Chosen by hand; not measured on their own."""
 FINISHED_STEP, FINISHED_VALUE = 1e-5, 1e-6
-"""A simplex of this extent in theta and in value has arrived. Chosen by hand; not measured on their own."""
+"""A simplex of this extent in theta and in value has converged. Chosen by hand; not measured on their own."""
 MOST_STEPS = 300
-"""Of a simplex. Chosen by hand; not measured on its own."""
+"""Most steps of a simplex. Chosen by hand; not measured on its own."""
 
 
 class Consensus:
     """The function that the right K maximizes.
 
     Args:
-        pairs: what votes.
+        pairs: the pairs that vote.
         center_sigma: standard deviation of the prior on (u, v) about (0, 0), in units of the pairs; may be inf.
         weights: (P,) to use instead of those of the pairs.
     """
@@ -44,11 +44,11 @@ class Consensus:
         self._packed = pairs.packed
 
     def weighted(self, weights: FloatArray) -> "Consensus":
-        """Return the same pairs with other weights (P,)."""
+        """Return the consensus of the same pairs with other weights (P,)."""
         return Consensus(self.pairs, self.center_sigma, weights)
 
     def at(self, thetas: FloatArray, sigma: float) -> FloatArray:
-        """Return (N,) supports plus log-priors.
+        """Return (N,) supports plus log-priors at `thetas`.
 
         Args:
             thetas: (N, 4) parameters of K.
@@ -117,7 +117,7 @@ def _values(
 def _climbed(
     packed: FloatArray, weights: FloatArray, center_sigma: float, simplex: FloatArray, sigma: float
 ) -> tuple[FloatArray, float]:
-    """Return Nelder and Mead (1965) upwards from a simplex (n + 1, 4), with their coefficients 1, 2, 1/2, 1/2."""
+    """Find a maximum by Nelder and Mead (1965) from a simplex (n + 1, 4), with their coefficients 1, 2, 1/2, 1/2."""
     count = len(simplex)
     values = _values(packed, weights, center_sigma, simplex, sigma)
     for _ in range(MOST_STEPS):
@@ -163,7 +163,7 @@ def _sort(simplex: FloatArray, values: FloatArray) -> None:
 
 @kernel
 def _moved(simplex: FloatArray, factor: float) -> FloatArray:
-    """Return last corner mirrored at the middle of the others, `factor` times as far behind it as it was before it."""
+    """Return the last corner reflected at the centroid of the others, its distance scaled by `factor`."""
     trial = np.empty(4)
     for column in range(4):
         middle = 0.0

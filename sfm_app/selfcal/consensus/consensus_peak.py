@@ -1,6 +1,6 @@
-"""The K that most pairs agree on: the highest peak of the joint consensus, and what speaks for and against it.
+"""The K that most pairs agree on: the highest peak of the joint consensus, and the evidence for and against it.
 
-Thesis 5.8.4 carried from a plane to all of K; what speaks for and against the answer is ours.
+Thesis 5.8.4 extended from a plane to all of K; the evidence is ours.
 """
 
 from dataclasses import dataclass
@@ -38,20 +38,21 @@ MAX_LOG_FOCAL_SPREAD = 0.1
 """Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess.
 docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured on its own."""
 IDENTIFIED_LOG_FOCAL_SPREAD = 0.02
-"""Largest standard deviation of log f that counts as known: with 0.025 one focal of twenty is off by 5 %, and what is
-called identifiable should not be. Between this and the limit above the answer is an estimate: a better start than a
-guess, and no more. Of 109 cameras of seeds 0 to 180, 1000 to 1035 and 2000 to 2139 of
-`python -m benchmarks.trouble` four lie between 0.02 and 0.03: off by 10, 7, 2 and 1 %."""
+"""Largest standard deviation of log f that counts as known: with 0.025 one focal of twenty is off by 5 %, which is too
+much to be called identifiable. Between this and the limit above the answer is an estimate: a better start than a guess,
+and no more. Of 109 cameras of seeds 0 to 180, 1000 to 1035 and 2000 to 2139 of `python -m benchmarks.trouble` four lie
+between 0.02 and 0.03: off by 10, 7, 2 and 1 %."""
 CLEAR_LEAD_SHARE, FEW_ASTRAY = 0.2, 0.8
-"""A focal a quarter away that loses less than this share of the votes is hardly told from the right one, by walks to
-the side or on one plane; then few votes may be missing, or what turned these pairs astray has pulled at the others. Of
-the same 109 cameras eight are short of both: off by 43, 10, 6, 4, 4, 1, 0.3 and 0.2 %; no other of them whose deviation
-is below 0.02 is off by more than 2.5 %. docs/algorithms.md, Self-calibration, 5."""
+"""Where a focal a quarter away loses less than the first share of the votes (walks to the side or on one plane), the
+focal is poorly determined. Then pairs must win the second share of all votes: what misled the missing ones may have
+biased the others. Of the same 109 cameras eight are short of both: off by 43, 10, 6, 4, 4, 1, 0.3 and 0.2 %; no other
+of them whose deviation is below 0.02 is off by more than 2.5 %. docs/algorithms.md, Self-calibration, 5."""
 IDENTIFIED_OF_MANY = 0.015
-"""The same where every photo has a focal of its own: the worst of them is further off than one. docs/algorithms.md,
-Self-calibration, 6. Chosen by hand; not measured on its own."""
+"""Largest such deviation where every photo has its own focal: the worst of many is further off than a single one.
+docs/algorithms.md, Self-calibration, 6. Chosen by hand; not measured on its own."""
 EDGE = 1.02
-"""A focal within this factor of an end of the range has run there. Chosen by hand; not measured on its own."""
+"""A focal within this factor of an end of the range counts as having run to that end. Chosen by hand; not measured on
+its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,11 +64,11 @@ class Answer:
     free: tuple[int, ...]
     """Places in theta that were sought."""
     sigma: float
-    """Width of the consensus that suits its own pairs."""
+    """Width of the consensus that fits the agreeing pairs."""
     lead: float
     """Votes by which it leads every other focal."""
     votes: FloatArray
-    """(P,) what each pair gives."""
+    """(P,) votes of the pairs for it."""
     gain: float
     """Votes that freeing fy/fx wins."""
     others: tuple[FloatArray, ...]
@@ -75,18 +76,18 @@ class Answer:
 
     @property
     def doubt_of_pixels(self) -> str:
-        """Why an answer with square pixels is an estimate, or nothing."""
+        """Why an answer with square pixels is only an estimate; empty where it is not."""
         doubtful = LOG_ASPECT not in self.free and self.gain >= PERHAPS_ASPECT_GAIN
         return "its pixels may not be square" if doubtful else ""
 
     def doubt_of_focal(self, weights: FloatArray) -> str:
-        """Return why an answer to pairs of these weights (P,) is an estimate despite a small deviation, or nothing."""
+        """Return why an answer to pairs of weights (P,) is an estimate despite a small deviation; empty for none."""
         mass = float(np.sum(self.votes))
         doubtful = self.lead < CLEAR_LEAD_SHARE * mass and mass < FEW_ASTRAY * float(np.sum(weights))
         return "many pairs fit other focals nearly as well, and some fit none" if doubtful else ""
 
     def evidence(self, weights: FloatArray) -> dict[str, float]:
-        """Return figures for people."""
+        """Return figures for the report, by name."""
         mass = float(np.sum(self.votes))
         return {
             "support": mass / float(np.sum(weights)),
@@ -98,7 +99,7 @@ class Answer:
         }
 
     def contradicted(self, weights: FloatArray) -> str:
-        """Return why the pairs, of these weights (P,), do not make a camera, or nothing."""
+        """Return why pairs of the given weights (P,) do not determine a camera; empty where they do."""
         return disagreement(self.votes, weights) or indecision(self.lead, self.votes)
 
     def scatter(self, consensus: Consensus, seed: int) -> FloatArray:
@@ -111,17 +112,17 @@ class Answer:
         return resampled(consensus, self.theta, self.free, self.sigma, seed)
 
     def deviation(self, values: FloatArray) -> float:
-        """Return standard deviation of an entry of theta from its resampled `values` (B,)."""
+        """Return the standard deviation of an entry of theta from its resampled `values` (B,)."""
         return deviation(values, effective_count(self.votes), len(self.free))
 
 
 def found(consensus: Consensus) -> Answer:
-    """Return the answer with square pixels, or, where the pairs clearly ask for it, with any."""
+    """Find the highest peak with square pixels or, where the pairs clearly support it, with any aspect."""
     profile = scan(consensus, (0.0,))
     square = peaks(consensus, profile, SQUARE_PIXELS)
     free_profile = scan(consensus, LOG_ASPECTS)
     free = peaks(consensus, free_profile, ANY_PIXELS)
-    # both are measured with the width that suits the freer one, or a wrong square answer would choose a lenient width
+    # both use the width that fits the freer one: a wrong square answer would choose a lenient width
     sigmas = (own_sigma(consensus, free[0].theta),)
     theta, value = consensus.climb(square[0].theta, SQUARE_PIXELS, sigmas)
     gain = max(consensus.climb(start, ANY_PIXELS, sigmas)[1] for start in (theta, free[0].theta)) - value
@@ -131,7 +132,7 @@ def found(consensus: Consensus) -> Answer:
 
 
 def _examined(consensus: Consensus, ends: list[Peak], profile: Profile, free: tuple[int, ...], gain: float) -> Answer:
-    """Refine the highest peak to the width that its own pairs ask for, and collect what speaks for it."""
+    """Refine the highest peak with the width that fits its pairs, and collect the evidence for it."""
     best = ends[0]
     sigma = own_sigma(consensus, best.theta)
     theta, _ = consensus.climb(best.theta, free, (sigma,))
@@ -143,18 +144,18 @@ def _examined(consensus: Consensus, ends: list[Peak], profile: Profile, free: tu
 
 
 def vagueness(log_focal_spread: float, *, one_of_many: bool = False) -> str:
-    """Return why an answer to which there is no objection is an estimate and not knowledge, or nothing.
+    """Return why an answer without objections is only an estimate; empty where it is identifiable.
 
     Args:
         log_focal_spread: standard deviation of log f.
-        one_of_many: whether every photo has a focal of its own; a smaller spread is asked for then.
+        one_of_many: whether every photo has a focal of its own; a smaller spread is required then.
     """
     vague = log_focal_spread > (IDENTIFIED_OF_MANY if one_of_many else IDENTIFIED_LOG_FOCAL_SPREAD)
     return f"the focal is uncertain by {100 * log_focal_spread:.0f} %" if vague else ""
 
 
 def objection(theta: FloatArray, log_focal_spread: float, half_size: tuple[float, float]) -> str:
-    """Return why an answer that the pairs agree on is not to be trusted, or nothing.
+    """Return why an answer that the pairs agree on is not trusted; empty where it is.
 
     Args:
         theta: log f, u, v, ... in longer sides from the middle.

@@ -1,4 +1,4 @@
-"""What speaks for a peak of the joint consensus: how many pairs, against which rivals, how stable.
+"""Evidence for a peak of the joint consensus: how many pairs support it, its best rival, its stability.
 
 Ours; the bootstrap is Rubin's (1981), the effective sample size Kish's (1965).
 """
@@ -15,10 +15,10 @@ OWN_SIGMA_RANGE = (0.005, 0.02)
 """The last width of the consensus follows the data within these bounds, in units of r. Chosen by hand; not measured on
 their own."""
 OWN_SIGMA_FACTOR = 1.5
-"""In medians of r: half of the agreeing pairs then speak with more than half their weight. docs/algorithms.md,
-Self-calibration, 1. Chosen by hand; not measured on its own."""
+"""That width in medians of r: half of the agreeing pairs then vote with more than half their weight.
+docs/algorithms.md, Self-calibration, 1. Chosen by hand; not measured on its own."""
 MIN_AGREEING = 2.25
-"""Effective number of pairs that must agree; three parameters satisfy one and a half pairs whatever these say.
+"""Effective number of pairs that must agree; three parameters satisfy one and a half pairs in any case.
 docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured on its own."""
 MIN_SUPPORT = 0.12
 """Share of the votes that K must win; many pairs without any common K give up to 0.06. docs/algorithms.md,
@@ -30,11 +30,11 @@ MIN_LEAD = 0.5
 """Votes by which K must lead every other focal. docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured
 on its own."""
 MIN_LEAD_SHARE = 0.03
-"""The same as a share of the votes for K: many pairs that hardly tell focals apart do not add up to knowledge.
+"""That lead as a share of the votes for K: many pairs that barely distinguish focals do not determine one.
 docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured on its own."""
 RESAMPLES = 25
-"""Of the Bayesian bootstrap (docs/algorithms.md, Self-calibration, without matches). Chosen by hand; not measured on
-its own."""
+"""Number of resamples of the Bayesian bootstrap (docs/algorithms.md, Self-calibration, without matches). Chosen by
+hand; not measured on its own."""
 STABLE_SIGMA = 0.01
 """Resampled fits use at least this width: below it they snap to single pairs. Chosen by hand; not measured on its
 own."""
@@ -58,7 +58,7 @@ def own_sigma(consensus: Consensus, theta: FloatArray) -> float:
 
 
 def votes(consensus: Consensus, theta: FloatArray, sigma: float) -> FloatArray:
-    """Return (P,) what each pair gives to K: w_i exp(-r_i / sigma).
+    """Return (P,) votes of the pairs for K: w_i exp(-r_i / sigma).
 
     Args:
         consensus: of P pairs.
@@ -69,13 +69,13 @@ def votes(consensus: Consensus, theta: FloatArray, sigma: float) -> FloatArray:
 
 
 def effective_count(votes: FloatArray) -> float:
-    """Return how many equal votes weigh the same (Kish's effective sample size); 0 where nobody votes."""
+    """Return the effective number of votes (Kish's effective sample size); 0 for no votes."""
     total, squares = float(np.sum(votes)), float(np.sum(votes**2))
     return total * total / squares if squares > 0 else 0.0
 
 
 def disagreement(given: FloatArray, weights: FloatArray) -> str:
-    """Return why votes do not make a camera, or nothing.
+    """Return why the votes do not suffice for a camera; empty where they do.
 
     Args:
         given: (P,) votes for K.
@@ -88,7 +88,7 @@ def disagreement(given: FloatArray, weights: FloatArray) -> str:
 
 
 def indecision(lead: float, given: FloatArray) -> str:
-    """Return why a lead over the best rival is not enough, or nothing.
+    """Return why a lead over the best rival is not enough; empty where it is.
 
     Args:
         lead: votes by which K leads.
@@ -131,7 +131,7 @@ def best_rival(
 
 
 def resampled(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigma: float, seed: int) -> FloatArray:
-    """Return (RESAMPLES, 4) the peak under randomly reweighted pairs: the Bayesian bootstrap (Rubin 1981).
+    """Return the peak (RESAMPLES, 4) under randomly reweighted pairs: the Bayesian bootstrap (Rubin 1981).
 
     Weights instead of draws, because three pairs drawn with replacement are often one pair three times.
 
@@ -153,7 +153,7 @@ def resampled(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigm
 
 
 def deviation(values: FloatArray, count: float, parameters: int) -> float:
-    """Return the deviation of an unknown over resampled peaks, as large as the pairs justify.
+    """Return the standard deviation of an unknown over resampled peaks, corrected for degrees of freedom.
 
     A pair gives two constraints. With three pairs and three unknowns half of the scatter has gone into the fit, and the
     resampled peaks scatter too little by the same share: the usual correction for degrees of freedom.
@@ -168,7 +168,7 @@ def deviation(values: FloatArray, count: float, parameters: int) -> float:
 
 
 def spread_px(thetas: FloatArray, unit_px: float, count: float, parameters: int) -> dict[str, float]:
-    """Return standard deviations of fx, fy, cx, cy, in pixels; see `deviation`.
+    """Return the standard deviations of fx, fy, cx, cy, in pixels; see `deviation`.
 
     Args:
         thetas: (B, 4) resampled peaks, B >= 2.

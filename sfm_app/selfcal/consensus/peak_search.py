@@ -47,7 +47,7 @@ class Profile(NamedTuple):
 
 
 def scan(consensus: Consensus, log_aspects: Sequence[float]) -> Profile:
-    """Look at every cell of the grid over K.
+    """Find the best cell of the grid over K for every focal.
 
     Args:
         consensus: of all pairs.
@@ -64,7 +64,7 @@ def scan(consensus: Consensus, log_aspects: Sequence[float]) -> Profile:
 
 
 def peaks(consensus: Consensus, profile: Profile, free: Sequence[int]) -> list[Peak]:
-    """Return where the best local maxima of the profile lead to, highest first.
+    """Return the peaks reached by climbing from the best local maxima of the profile, highest first.
 
     Args:
         consensus: of all pairs.

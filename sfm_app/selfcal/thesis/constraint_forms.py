@@ -23,7 +23,7 @@ from sfm_app.selfcal.inputs import FloatArray
 from sfm_app.settings import ConstraintForm
 
 _TINY = float(np.finfo(np.float64).tiny)
-"""The smallest normal number in double precision, in place of a zero that would divide."""
+"""The smallest normal number in double precision; added to divisors, so that none is zero."""
 LEAST_COMPLEMENT = 1e-6
 """(5.8) divides by s2; 1 - r is held above this, so that a matrix of rank 1 gets a large number, not infinity. Chosen
 by hand; not measured on its own."""
@@ -75,9 +75,9 @@ def trivedi(E: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Halves:
-    """F = U S V' by its two non-zero singular values: what E is made of once the epipoles are left out.
+    """F = U S V' of rank 2, kept as its two non-zero singular values and their vectors; the epipoles are left out.
 
-    K'U and K'V span what E maps to and from. With their Gram matrices A = U'KK'U = L L' and B = V'KK'V = N N', the
+    K'U and K'V span the column and row space of E. With the Gram matrices A = U'KK'U = L L' and B = V'KK'V = N N', the
     singular values of E are those of the 2 x 2 matrix M = L'S N, and the Kruppa equations are relations of A, S and B.
     """
 
@@ -90,17 +90,17 @@ class Halves:
 
     @classmethod
     def of(cls, F: FloatArray) -> "Halves":
-        """Return (P, ...) of matrices (P, 3, 3) of rank 2, brought to Frobenius norm 1."""
+        """Return the factors (P, ...) of matrices (P, 3, 3) of rank 2, scaled to Frobenius norm 1."""
         U, s, Vt = np.linalg.svd(F)
         s = s[:, :2] / np.linalg.norm(s[:, :2], axis=1, keepdims=True)
         return cls(np.swapaxes(U, 1, 2)[:, :2], Vt[:, :2], s)
 
     def __getitem__(self, rows: NDArray[np.int64]) -> "Halves":
-        """Return those of the given indices, which may have any shape."""
+        """Return the factors at the given indices, which may have any shape."""
         return Halves(self.U[rows], self.V[rows], self.s[rows])
 
     def grams(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return (..., 3), (..., 3) entries 11, 12, 22 of A and B for cameras (..., 4) of fx, fy, u, v."""
+        """Return the entries 11, 12, 22 of A and B, each (..., 3), for cameras (..., 4) of fx, fy, u, v."""
         return _gram(self.U, cameras), _gram(self.V, cameras)
 
     def essential(self, cameras: FloatArray) -> FloatArray:
@@ -133,7 +133,7 @@ def equations(halves: Halves, cameras: FloatArray) -> FloatArray:
 
 
 def huang_faugeras_equations(halves: Halves, cameras: FloatArray) -> FloatArray:
-    """Give (..., 2) as `equations`, lengthened so that norm is (s1 - s2) / s2 = 2 r / (1 - r), the term of (5.8).
+    """Return `equations` (..., 2), scaled so that their norm is (s1 - s2) / s2 = 2 r / (1 - r), the term of (5.8).
 
     Args:
         halves: (...,) fundamental matrices.
@@ -170,7 +170,7 @@ EQUATIONS: Mapping[ConstraintForm, Equations] = MappingProxyType(
         "polynomial": _polynomial_equations,
     }
 )
-"""What least squares makes small, by the setting `calibration.constraint_form`."""
+"""Equations whose squares are minimized, by the setting `calibration.constraint_form`."""
 
 
 def _through(basis: FloatArray, cameras: FloatArray) -> FloatArray:

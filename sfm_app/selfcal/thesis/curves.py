@@ -22,10 +22,11 @@ def focal_curves(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> F
         center: u, v in the same units.
 
     Returns:
-        (P, S) fy; 0 where no root has a non-zero real part. Not clipped to a range: `degeneracy` wants to see it.
+        (P, S) fy; 0 where no root has a non-zero real part. Not clipped to a range: `degeneracy` counts values out of
+        range.
     """
     coefficients = focal_polynomials(pairs, fx, center)
-    # the quartic is in fy^2: a negative fy^2 becomes an fy without real part, which the choice of the root passes over
+    # the quartic is in fy^2: a negative fy^2 becomes an fy without real part, which the choice of the root skips
     roots = np.sqrt(swept_roots(coefficients))
     # the imaginary part is to be "approximately zero": roots in which it prevails form tails near fy = 0 on which all
     # curves agree, whatever the camera
@@ -44,7 +45,7 @@ def center_curves(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> Fl
 
 
 def degeneracy(curves: FloatArray, upper: float) -> FloatArray:
-    """Return thesis (5.35): per curve, the share of its samples that lie out of range.
+    """Return the share of the samples of each curve that lie out of range (thesis 5.35).
 
     Args:
         curves: (P, S) values.

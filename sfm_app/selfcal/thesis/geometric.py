@@ -15,7 +15,7 @@ from sfm_app.types import Calibration, CameraPairs
 
 METHOD = "geometric"
 LEAST_RESIDUAL_PX = 1e-3
-"""Exact matches are trusted this far, not infinitely. docs/algorithms.md, The thesis's methods. Chosen by hand; not
+"""Least residual: it bounds the weight of exact matches. docs/algorithms.md, The thesis's methods. Chosen by hand; not
 measured on its own."""
 
 
@@ -38,7 +38,7 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 def residual_weights(pairs: CameraPairs) -> FloatArray:
     """Return (P,) 1 / mean Sampson distance of a pair's inliers, with mean 1 over the pairs that take part.
 
-    Pairs of weight 0 keep it; a pair without inliers, or with infinite distances, gets it.
+    Pairs of weight 0 keep it; a pair without inliers, or with infinite distances, gets weight 0.
 
     Raises:
         ValueError: malformed input, see `selfcal.inputs.prepare`.

@@ -1,4 +1,4 @@
-"""The Huang-Faugeras constraint minimized over all pairs alike: the thesis's "non-robust" method (5.5.3)."""
+"""The Huang-Faugeras constraint minimized with equal weights: the thesis's "non-robust" method (5.5.3)."""
 
 from functools import partial
 

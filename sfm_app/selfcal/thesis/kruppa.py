@@ -1,12 +1,12 @@
 """The Kruppa equations (thesis 5.2.3), their focal-only form (Sturm 2001), and a calibrator that minimizes them.
 
-(5.5) says  F C F' ~ [e2] C [e2]'  with C = KK' and the epipole e2. In the basis of F's own singular vectors,
+(5.5) states  F C F' ~ [e2] C [e2]'  with C = KK' and the epipole e2. In the basis of F's own singular vectors,
 F = U diag(a, b) V', it shrinks to 2 x 2 matrices (Lourakis and Deriche 1999)::
 
     S B S ~ adj(A),    A = U'CU,    B = V'CV,    S = diag(a, b)
 
 Six ratios (5.6), of which two are independent and any may be 0 / 0, become three:
-a^2 B11 / A22 = -ab B12 / A12 = b^2 B22 / A11. No epipole is left in them.
+a^2 B11 / A22 = -ab B12 / A12 = b^2 B22 / A11. They contain no epipole.
 """
 
 import numpy as np
@@ -25,7 +25,7 @@ margin was chosen by hand."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Return least squares over the Kruppa equations of all pairs, from the median of their focal-only solutions.
+    """Minimize the squared Kruppa equations of all pairs, from the median of their focal-only solutions.
 
     Args:
         pairs: F's and weights.
@@ -85,11 +85,11 @@ def _sides(halves: Halves, cameras: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def focals_of(pairs: Pairs, center: tuple[float, float]) -> FloatArray:
-    """Return the focal that each pair asks for if the pixels are square and the center is known (Sturm 2001).
+    """Return the focal of each pair, if the pixels are square and the center is known (Sturm 2001).
 
-    The equations that hold with the off-diagonal entries are linear in f^2 once the trivial root f = 1 is divided out;
-    they fail where the optical axes lie in one plane. The third is quadratic. Of the solutions of both that one is
-    taken which satisfies all three best.
+    The two equations with the off-diagonal entries are linear in f^2 once the trivial root f = 1 is divided out; they
+    fail where the optical axes lie in one plane. The third is quadratic. Of the solutions of all, the one that
+    satisfies all three best is returned.
 
     Args:
         pairs: P fundamental matrices.
@@ -123,7 +123,7 @@ def _roots(quadratic: FloatArray) -> FloatArray:
     for row, coefficients in zip(found, quadratic, strict=True):
         size = np.max(np.abs(coefficients))
         if size > VANISHED:
-            # what is lost in rounding would only add a root far out
+            # coefficients of the size of rounding would only add a root far out
             kept = np.where(np.abs(coefficients) > VANISHED * size, coefficients, 0.0)
             roots = np.polynomial.polynomial.polyroots(np.trim_zeros(kept, "b"))
             row[: len(roots)] = np.where(np.isreal(roots), roots.real, np.nan)

@@ -1,4 +1,4 @@
-"""Least squares over (fx, fy, u, v): what all methods of the thesis but Zero Curves rest on (5.6, 5.7)."""
+"""Least squares over (fx, fy, u, v): the basis of all methods of the thesis but Zero Curves (5.6, 5.7)."""
 
 from collections.abc import Callable
 from functools import partial
@@ -14,18 +14,18 @@ from sfm_app.selfcal.thesis.verdict import CameraParameters
 DEFAULT = EQUATIONS["huang-faugeras"]
 """The form that the thesis chooses (5.5.1)."""
 FIRST_DAMPING = 1e-2
-"""Of Levenberg and Marquardt's steps, relative to the diagonal. Chosen by hand; not measured on its own."""
+"""First damping of Levenberg-Marquardt steps, relative to the diagonal. Chosen by hand; not measured on its own."""
 DAMPING_RANGE = (1e-9, 1e9)
-"""Within which damping stays. Chosen by hand; not measured on their own."""
+"""Least and largest damping. Chosen by hand; not measured on their own."""
 MOST_STEPS = 60
-"""Of one search. Chosen by hand; not measured on its own."""
+"""Most steps of one search. Chosen by hand; not measured on its own."""
 LONGEST_STEP = 0.5
-"""In any parameter, of which the focals are taken as logarithms. Chosen by hand; not measured on its own."""
+"""Longest step in any parameter; the focals are logarithms. Chosen by hand; not measured on its own."""
 DIFFERENCE = 1e-7
-"""By which parameters move for a derivative: near the root of what double precision leaves. Chosen by hand; not
-measured on its own."""
+"""Step of the parameters for finite differences: near the square root of double precision. Chosen by hand; not measured
+on its own."""
 FINISHED = 1e-9
-"""A step that lowers the sum by a smaller share has arrived. Chosen by hand; not measured on its own."""
+"""A search whose step lowers the sum by a smaller share has converged. Chosen by hand; not measured on its own."""
 
 
 class Minima(NamedTuple):
@@ -40,7 +40,7 @@ class Minima(NamedTuple):
 def fitted(
     pairs: Pairs, start: CameraParameters, weights: FloatArray, equations: Equations = DEFAULT
 ) -> CameraParameters:
-    """Return local minimum of sum_i w_i |equations_i|^2 / sum_i w_i that is reached from `start`, over all pairs.
+    """Return the local minimum of sum_i w_i |equations_i|^2 / sum_i w_i that is reached from `start`, over all pairs.
 
     Args:
         pairs: P fundamental matrices.
@@ -53,7 +53,7 @@ def fitted(
 
 
 def minima(halves: Halves, weights: FloatArray, starts: FloatArray, equations: Equations = DEFAULT) -> Minima:
-    """Return Levenberg-Marquardt from many starts at once, each on pairs of its own.
+    """Run Levenberg-Marquardt from many starts at once, each on its own pairs.
 
     Thesis (5.8) sums the terms; Levenberg-Marquardt, which the thesis minimizes it with, sums their squares.
 
@@ -93,7 +93,7 @@ def _step(residuals: Callable[[FloatArray], FloatArray], thetas: FloatArray, dam
     normal = np.swapaxes(J, 1, 2) @ J
     gradient = np.einsum("bmk,bm->bk", J, here)
     diagonal = np.einsum("bkk->bk", normal)
-    # lifted a little even where no equation depends on a parameter, which then stays
+    # invertible even where no equation depends on a parameter, which then stays
     least = np.finfo(np.float64).eps * (1.0 + np.max(diagonal, axis=1, keepdims=True))
     lifted = normal + (damping[:, None] * diagonal + least)[:, :, None] * np.eye(4)
     steps = np.linalg.solve(lifted, -gradient[..., None])[..., 0]

@@ -11,7 +11,7 @@ SEPARATION = 1.25
 """Peaks whose focals sqrt(fx fy) differ by a smaller factor are one. docs/algorithms.md, The thesis's methods. Chosen
 by hand; not measured on its own."""
 LEAST_SHARE = 0.5
-"""A peak has at least this share of the highest one's support; what curves meet in by chance mostly has less.
+"""A peak has at least this share of the highest one's support; accidental meeting points mostly have less.
 docs/algorithms.md, The thesis's methods. Chosen by hand; not measured on its own."""
 
 
@@ -27,11 +27,10 @@ class Meeting(NamedTuple):
 
 
 def meeting_point(curves: FloatArray, upper: float, sigma: float) -> Meeting | None:
-    """Return thesis (5.33), with its argmin corrected to argmax.
+    """Return the meeting point of thesis (5.33), with its argmin corrected to argmax.
 
-    The sample with the most consensus among the other curves.
-
-    Distance as in (5.34), the difference at the same sample of the sweep; rho(d) = exp(-d / sigma).
+    It is the sample with the highest support by the other curves. The distance d is that of (5.34), the difference at
+    the same sample of the sweep; rho(d) = exp(-d / sigma).
 
     Args:
         curves: (C, S) curves that are not degenerate.

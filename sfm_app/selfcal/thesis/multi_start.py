@@ -19,12 +19,12 @@ SAMPLE = 3
 CONFIDENCE = 0.95
 """Probability that any one triple is drawn (thesis 5.6.3)."""
 MOST_STARTS = 4000
-"""MaxIter grows with the cube of the number of pairs; from 22 pairs on it is cut here (docs/algorithms.md, The thesis's
-methods). Chosen by hand; not measured on its own."""
+"""MaxIter grows with the cube of the number of pairs; from 22 pairs on this is the limit (docs/algorithms.md, The
+thesis's methods). Chosen by hand; not measured on its own."""
 FOCAL_RANGE = (0.1, 3.0)
 """Focals that count, in image widths: thesis (5.29) ends at 3. The lower end was chosen by hand."""
 USUAL_FOCAL = (1.0, 0.5)
-"""Mean and standard deviation in image widths where no pair has a focal of its own. The mean is that of K_init (thesis
+"""Mean and standard deviation in image widths of the focal where no pair gives one. The mean is that of K_init (thesis
 5.7.2); the deviation was chosen by hand."""
 
 
@@ -46,14 +46,14 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 def algorithm_2(
     pairs: Pairs, tall: float, evidence: dict[str, float], seed: int, equations: Equations = DEFAULT
 ) -> CameraParameters:
-    """Estimate the camera as the thesis writes.
+    """Estimate the camera by Algorithm 2 as the thesis writes it.
 
     Residual(s) is that of the triple: the thesis writes that other pairs play no part, and that this costs accuracy.
 
     Args:
         pairs: P fundamental matrices in image widths.
         tall: height of the photos in widths.
-        evidence: filled with the distribution and MaxIter.
+        evidence: filled with the distribution of the focal and MaxIter.
         seed: same seed, same result.
         equations: form of the constraint.
     """
@@ -64,7 +64,7 @@ def algorithm_2(
     focal = np.clip(rng.normal(mean, deviation, count), *FOCAL_RANGE)
     center = rng.normal([0.5, 0.5 * tall], [1 / 6, tall / 6], (count, 2))
     starts = np.column_stack([focal, focal, center])
-    # sorted by a property that neither scale nor direction nor place changes: the order of the pairs has no effect
+    # sorted by a value that depends on neither scale nor direction: the order of the pairs has no effect
     halves = Halves.of(pairs.F)[np.argsort(pairs.product, kind="stable")]
     triples = np.argsort(rng.random((count, len(pairs))), axis=1)[:, :SAMPLE]
     found = minima(halves[triples], np.ones(triples.shape), starts, equations)

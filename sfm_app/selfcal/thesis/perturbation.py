@@ -21,7 +21,7 @@ own."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
-    """Minimize (5.8) again and again, with weights from the error discrepancy (thesis Algorithm 3).
+    """Minimize (5.8) repeatedly, with weights from the error discrepancy (thesis Algorithm 3).
 
     Args:
         pairs: F's; weights tell which pairs take part (> 0), and count in the verdict only.
@@ -38,7 +38,7 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 def algorithm_3(
     pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations = DEFAULT
 ) -> CameraParameters:
-    """Estimate the camera as the thesis writes, from K_init.
+    """Estimate the camera from K_init by Algorithm 3 as the thesis writes it.
 
     Args:
         pairs: P fundamental matrices in image widths.
@@ -57,7 +57,7 @@ def algorithm_3(
 
 
 def error_discrepancies(F: FloatArray, K: FloatArray, change: FloatArray) -> FloatArray:
-    """Give thesis (5.23): ((s1 - s2) / (2 |D|))^2, how far E = K'FK is off beyond what an error `change` of K explains.
+    """Return thesis (5.23): ((s1 - s2) / (2 |D|))^2, the error of E = K'FK over what an error `change` of K explains.
 
     |D| is the spectral norm of the part of E's error that K alone causes. (5.22) prints two transposes in the wrong
     place; the expansion of (K + dK)' F (K + dK) gives D = dK'FK + K'F dK + dK'F dK.
@@ -78,5 +78,5 @@ def discrepancy_weights(discrepancies: FloatArray) -> FloatArray:
     scale = MAD_TO_SIGMA * float(np.median(np.abs(discrepancies - np.median(discrepancies))))
     if scale == 0:
         return np.ones(len(discrepancies))
-    # the smallest discrepancy is common to all and says nothing about any: without it all weights may underflow
+    # subtracting the smallest discrepancy only scales the weights: without it all of them may underflow
     return np.asarray(np.exp(-(discrepancies - np.min(discrepancies)) / scale))

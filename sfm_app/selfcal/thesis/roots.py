@@ -1,4 +1,4 @@
-"""All roots of many real polynomials (thesis 5.8.3): eigenvalues of companion matrices, and their way along a sweep."""
+"""All roots of many real polynomials (thesis 5.8.3): eigenvalues of companion matrices, followed along a sweep."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,12 +9,12 @@ from sfm_app.selfcal.inputs import FloatArray
 ComplexArray = NDArray[np.complex128]
 
 _MOST_ROUNDS = 30
-"""Of Aberth's iteration for one sample. Chosen by hand; not measured on its own."""
+"""Most rounds of Aberth's iteration for one sample. Chosen by hand; not measured on its own."""
 _NUDGE = 1e-3
-"""Roots start this share of their size off where they were, each in another direction. Chosen by hand; not measured on
-its own."""
+"""Roots start off those of the sample before by this share of their size, each in another direction. Chosen by hand;
+not measured on its own."""
 _ROUNDING = 1e-16
-"""Of a polynomial's value, as a share of the sizes of its terms: double precision."""
+"""Rounding error of a polynomial's value, as a share of the sizes of its terms: double precision."""
 _BLUR = 1e-10
 """A root that rounding may shift by a larger share of its size counts as a multiple one. Chosen by hand; not measured
 on its own."""
@@ -44,10 +44,8 @@ def companion_roots(coefficients: FloatArray) -> ComplexArray:
 def swept_roots(coefficients: FloatArray) -> ComplexArray:
     """Return `companion_roots` of polynomials that change little from one to the next along the second axis.
 
-    Far quicker.
-
-    Aberth's iteration (Math. Comp. 27, 1973) carries all roots of one polynomial to those of the next. Where it does
-    not settle, and for multiple roots, which it blurs more, the eigenvalues have the word.
+    It is far faster: Aberth's iteration (Math. Comp. 27, 1973) carries all roots of one polynomial to those of the
+    next. Eigenvalues are used where it does not converge, and for multiple roots, which it finds less accurately.
 
     Args:
         coefficients: (P, S, n + 1), lowest power first.
@@ -67,7 +65,7 @@ def swept_roots(coefficients: FloatArray) -> ComplexArray:
 
 
 def _monic(coefficients: FloatArray) -> FloatArray:
-    """Divide by the leading coefficient; one that is missing gets the smallest that counts."""
+    """Divide by the leading coefficient; one that vanishes is replaced by the smallest that counts."""
     size = np.max(np.abs(coefficients), axis=-1, keepdims=True)
     scaled = coefficients / np.where(size == 0, 1.0, size)
     smallest = np.finfo(np.float64).eps
@@ -78,7 +76,7 @@ def _monic(coefficients: FloatArray) -> FloatArray:
 
 @kernel
 def _follow(monic: FloatArray, start: ComplexArray, first: NDArray[np.int64], roots: ComplexArray) -> NDArray[np.bool_]:
-    """Fill `roots` from the `first` sample of each pair on, whose roots are `start`; returns where they settled."""
+    """Fill `roots` from the `first` sample of each pair on, whose roots are `start`; return where they converged."""
     count, samples, degree = roots.shape
     settled = np.zeros((count, samples), dtype=np.bool_)
     for i in range(count):
@@ -96,7 +94,7 @@ def _follow(monic: FloatArray, start: ComplexArray, first: NDArray[np.int64], ro
 
 @kernel
 def _settle(monic: FloatArray, roots: ComplexArray) -> bool:
-    """Move estimates of all roots to the roots; False where they do not stand still or are multiple."""
+    """Move estimates of all roots to the roots; return False where they do not converge or are multiple."""
     degree = len(roots)
     for _ in range(_MOST_ROUNDS):
         moved = False
@@ -131,6 +129,6 @@ def _settle(monic: FloatArray, roots: ComplexArray) -> bool:
 
 @kernel
 def _inverse(z: complex) -> complex:
-    """Return 1 / z; infinite or no number, but no exception, at 0."""
+    """Return 1 / z; infinite or NaN at 0, without an exception."""
     square = z.real * z.real + z.imag * z.imag
     return complex(z.real / square, -z.imag / square)

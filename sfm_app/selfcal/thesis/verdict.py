@@ -1,4 +1,4 @@
-"""What every literal method of the thesis shares: its frame, and the verdict on its answer.
+"""What all literal methods of the thesis share: the frame, and the verdict on the answer.
 
 The verdict is not the thesis's: an answer counts as known where the pairs satisfy the constraint there, and do not
 satisfy it as well at other focals.
@@ -34,7 +34,7 @@ class CameraParameters(NamedTuple):
     def initial(cls, tall: float) -> "CameraParameters":
         """Return K_init of thesis 5.7.2 for an image of width 1 and height `tall`.
 
-        53 degrees (not 90, as it says) across.
+        Its horizontal field of view is 53 degrees, not 90 as the thesis says.
         """
         return cls(1.0, 1.0, 0.5, 0.5 * tall)
 
@@ -45,18 +45,19 @@ class CameraParameters(NamedTuple):
 
 
 Find = Callable[[Pairs, float, dict[str, float]], CameraParameters | str]
-"""A method: pairs in image widths, height over width, and a table for its figures; K, or why there is none."""
+"""A method takes pairs in image widths, height over width, and a dict for its figures; it returns K, or why there is
+none."""
 
 
 def calibrate_with(method: str, pairs: CameraPairs, find: Find, sample: int = 0) -> Calibration:
-    """Run a method and judge what it finds.
+    """Run a method and judge its answer.
 
     Args:
         method: its name.
         pairs: what it works from.
-        find: what it does.
-        sample: pairs that it picks out and fits alone. They agree with the answer whatever that is worth, so that the
-            others must.
+        find: the method.
+        sample: number of pairs that it picks and fits alone. These agree even with a wrong answer, so that the others
+            must confirm it.
 
     Returns:
         K with ``identifiable=True``, or a guess and the reason. `evidence` has what the method answered in both cases,
@@ -82,9 +83,9 @@ def calibrate_with(method: str, pairs: CameraPairs, find: Find, sample: int = 0)
 
 
 def _objection(found: CameraParameters, pairs: Pairs, sample: int, evidence: dict[str, float]) -> str:
-    """Return why the answer is not to be trusted, or nothing; adds support and lead to the evidence."""
+    """Return why the answer is not trusted, or an empty string; add support and lead to the evidence."""
     theta = np.array([0.5 * np.log(found.fx * found.fy), found.u, found.v, np.log(found.fy / found.fx)])
-    # the wider sigma: these answers are no maxima of the consensus, and must not be held against the last per cent
+    # the wider sigma: these answers are no maxima of the consensus, and may be off by a per cent
     consensus, sigmas = Consensus(pairs, np.inf), SIGMAS[:1]
     given = votes(consensus, theta, sigmas[-1])
     lead = float(np.sum(given)) - best_rival(consensus, theta, range(4), sigmas)

@@ -24,7 +24,8 @@ by hand; not measured on its own."""
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:
     """Find K where the zero curves of all pairs meet (thesis Algorithm 4).
 
-    The thesis gives every pair the same say: weights tell which pairs take part (> 0), and count in the verdict only.
+    The thesis gives every pair the same weight: the given weights tell which pairs take part (> 0), and count in the
+    verdict only.
 
     Args:
         pairs: F's and weights.
@@ -39,14 +40,14 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
 
 
 def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: int) -> CameraParameters | str:
-    """Estimate the camera as the thesis writes, or give the reason where too few curves are usable.
+    """Estimate the camera by Algorithm 4 as the thesis writes it; return why not where too few curves are usable.
 
     Several `focal_peaks` are several cameras (Figure 5.15), of which the answer is one.
 
     Args:
         pairs: P fundamental matrices in image widths.
         tall: height of the photos in widths.
-        evidence: filled with the number of curves, their support where they meet, and the peaks of that.
+        evidence: filled with the number of curves, their support where they meet, and the number of its peaks.
         samples: of a sweep, > 0.
     """
     sweep = np.arange(1, samples + 1) / samples
