@@ -99,5 +99,5 @@ def _bar(lines: NDArray[np.uint8]) -> int:
 
 
 def _share(line: NDArray[np.uint8], color: NDArray[np.int16], levels: int) -> float:
-    """Return the share of a line (M, 3) that differs from a color by more than so many gray levels."""
+    """Return the share of a line (M, 3) that differs from a color by more than `levels`."""
     return float(np.mean(np.max(np.abs(line.astype(np.int16) - color), axis=1) > levels))

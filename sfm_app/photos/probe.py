@@ -24,7 +24,7 @@ from sfm_app.types import Frame, Photo, UnusablePhoto
 
 MEGA = 1_000_000
 LINKED = ("JPEG", "MPO", "PNG")
-"""Formats that COLMAP reads and writes as they are."""
+"""Formats that COLMAP reads and writes without conversion."""
 
 
 def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | UnusablePhoto:
