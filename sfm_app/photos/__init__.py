@@ -1,4 +1,4 @@
-"""Folders of photos, and videos, as people have them: which files and frames are photos, and what is known."""
+"""Read folders of photos and videos: which files and frames are usable photos, and their metadata."""
 
 from sfm_app.photos.camera_groups import grouped
 from sfm_app.photos.decode import UnreadableError, read_picture, upright

@@ -9,20 +9,20 @@ from sfm_app.photos.letterbox import with_one_frame
 from sfm_app.types import Photo
 
 ON_END_DEG = 90
-"""What a photo on end is taken to be turned by where nobody knows. The other way round only mirrors the place of the
+"""Rotation assumed for a portrait photo whose EXIF does not give one. The opposite rotation would only mirror the
 optical center, which lies near the middle."""
 
 
 def grouped(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
-    """Yield photos with their groups, in their order; those of one group share one camera.
+    """Yield photos with their groups, in their order; photos of one group share one camera.
 
-    COLMAP's cameras have one size. Photos taken on end are turned to lie as the others of their camera do; otherwise
-    photos of different sizes are never of one group, nor are pictures of different sizes within bars, where nobody has
-    said whose photos they are.
+    A camera in COLMAP has one image size. Photos without an EXIF rotation are therefore turned to the more common
+    orientation of their camera; photos that still differ in size get different groups. With "auto", so do letterboxed
+    photos whose pictures within the bars differ in size.
 
     Args:
-        photos: with the camera that EXIF names as their group.
-        cameras: "auto": by EXIF; "single": one camera took all; "folder": one per folder; "each": one per photo.
+        photos: their group is the camera named in EXIF.
+        cameras: "auto": by EXIF; "single": one camera for all; "folder": one per folder; "each": one per photo.
     """
     sizes = Counter((_maker(photo, cameras), photo.width, photo.height) for photo in photos)
     found = []
@@ -36,7 +36,7 @@ def grouped(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
 
 
 def _within_bars(photos: Sequence[Photo]) -> list[Photo]:
-    """Give pictures of other sizes within bars groups of their own."""
+    """Give letterboxed photos with different picture sizes groups of their own."""
     groups: dict[str, list[int]] = {}
     for place, photo in enumerate(photos):
         groups.setdefault(photo.group, []).append(place)

@@ -1,4 +1,4 @@
-"""From the bytes of a file to an upright picture of 8 bits, or the reason why there is none."""
+"""Decode a file to an upright 8-bit picture, or give the reason why it cannot be decoded."""
 
 import importlib
 from collections.abc import Iterator
@@ -18,13 +18,13 @@ from sfm_app.photos.tiff import complaints
 from sfm_app.photos.video.video_formats import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
-"""What is always read."""
+"""Formats that every Pillow can read."""
 LOSSY = ("JPEG", "MPO", "WEBP", "HEIF", "AVIF")
-"""A copy as JPEG loses next to nothing more."""
+"""Lossy formats: a copy as JPEG loses almost nothing more."""
 
 LARGE_PX = 50_000_000
 LEAST_BYTES_PER_PX = 0.02
-"""Large photos have more, however hard they are compressed; an area of one color has less."""
+"""Real photos have more, even at high compression; decompression bombs of one color have less."""
 MOST_FRAMES = 100
 DAMAGED = "truncated or damaged"
 ONE_AT_A_TIME = Lock()
@@ -36,7 +36,7 @@ class UnreadableError(Exception):
 
 @cache
 def formats() -> tuple[str, ...]:
-    """Return what can be read here: HEIC needs the extra, AVIF a Pillow that was built with it."""
+    """Return the formats that this installation reads: HEIC needs the extra, AVIF a Pillow built with it."""
     found = FORMATS + (("AVIF",) if features.check("avif") else ())
     try:
         importlib.import_module("pillow_heif").register_heif_opener()
@@ -50,18 +50,18 @@ class DecodedPhoto:
     """The first picture of a file."""
 
     image: Image.Image
-    """With its pixels, as the file has them."""
+    """Decoded, in the orientation stored in the file."""
     exif: Image.Exif
-    """Empty where it is damaged: the picture may be fine all the same."""
+    """Empty if the EXIF is damaged; the picture may still be intact."""
     frames: int
-    """Pictures in the file; they are not counted beyond MOST_FRAMES."""
+    """Number of pictures in the file; for a TIFF, counted up to MOST_FRAMES + 1."""
 
 
 def read_picture(path: Path) -> DecodedPhoto:
-    """Decode a file as a whole.
+    """Decode a whole file.
 
     Raises:
-        UnreadableError: it is no photo, or a damaged one.
+        UnreadableError: the file is not a photo, or it is damaged.
     """
     try:
         with Image.open(path, formats=formats()) as image:
@@ -83,36 +83,36 @@ def read_picture(path: Path) -> DecodedPhoto:
         raise UnreadableError("too large for the memory of this machine") from None
     except PermissionError:
         raise UnreadableError("not readable: permission denied") from None
-    except Exception:  # whatever a decoder makes of damaged bytes
+    except Exception:  # decoders raise anything on damaged bytes
         raise UnreadableError(DAMAGED) from None
 
 
 @contextmanager
 def room_for(path: Path) -> Iterator[None]:
-    """Provide large photos are dealt with one at a time: each takes ten bytes per pixel and more."""
+    """Hold a lock while a large photo is decoded, because each takes ten bytes per pixel or more."""
     try:
         with Image.open(path, formats=formats()) as image:
             pixels = image.width * image.height
-    except Exception:  # who reads it says so
+    except Exception:  # the reader reports it
         pixels = 0
     with ONE_AT_A_TIME if pixels > LARGE_PX / 2 else nullcontext():
         yield
 
 
 def _refuse_bombs(image: Image.Image, path: Path) -> None:
-    """Let Pillow refuse what is larger still."""
+    """Refuse decompression bombs that are below Pillow's own limit."""
     pixels = image.width * image.height
     if pixels > LARGE_PX and path.stat().st_size < LEAST_BYTES_PER_PX * pixels:
         raise UnreadableError("too many pixels for a file of its size")
 
 
 def _frames_of(image: Image.Image) -> int:
-    """Return how many pictures a file holds, or MOST_FRAMES + 1; the others of an MPO are previews."""
+    """Return the number of pictures, for a TIFF at most MOST_FRAMES + 1; 1 for an MPO, whose others are previews."""
     if image.format == "MPO":
         return 1
     if image.format != "TIFF":
         return getattr(image, "n_frames", 1)
-    for frame in range(1, MOST_FRAMES + 1):  # a list, of which nobody knows how long it is
+    for frame in range(1, MOST_FRAMES + 1):  # TIFF stores a linked list without its length
         try:
             image.seek(frame)
         except EOFError:
@@ -125,38 +125,38 @@ def _exif_of(image: Image.Image) -> Image.Exif:
         exif = image.getexif()
         exif.get_ifd(EXIF_IFD)
         exif.get_ifd(GPS_IFD)
-    except Exception:  # as above
+    except Exception:  # damaged EXIF raises anything
         return Image.Exif()
     return exif
 
 
 def upright(picture: DecodedPhoto) -> Image.Image:
-    """Return the picture upright by EXIF, in RGB or gray of 8 bits, what is transparent on white."""
+    """Return the picture upright by EXIF, in 8-bit RGB or gray, with transparent pixels on white."""
     return turned_upright(_eight_bit(picture.image), orientation(picture.exif))
 
 
 def turned_upright(image: Image.Image, turned: int) -> Image.Image:
-    """Return the image after its EXIF orientation is undone.
+    """Turn an image upright by its EXIF orientation.
 
     Args:
-        image: as the file has it.
-        turned: EXIF orientation, 1 to 8; another number turns nothing.
+        image: as stored in the file.
+        turned: EXIF orientation, 1 to 8; other values leave the image unchanged.
     """
     return image.transpose(ORIENTATIONS[turned]) if turned in ORIENTATIONS else image
 
 
 def turned_back(upright: Image.Image, turn_deg: int) -> Image.Image:
-    """Return what has to be turned clockwise to be upright.
+    """Turn an upright image back to the orientation of the sensor.
 
     Args:
-        upright: image as people see it.
-        turn_deg: degrees clockwise: 0, 90, 180 or 270.
+        upright: image as displayed.
+        turn_deg: clockwise rotation from sensor to upright, in degrees: 0, 90, 180 or 270.
     """
     return upright.transpose(TURNS[turn_deg]) if turn_deg else upright
 
 
 TURNS = {90: Image.Transpose.ROTATE_90, 180: Image.Transpose.ROTATE_180, 270: Image.Transpose.ROTATE_270}
-"""What turns counterclockwise."""
+"""Pillow's transposition for each counterclockwise rotation, in degrees."""
 
 ORIENTATIONS = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -167,7 +167,7 @@ ORIENTATIONS = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-"""What undoes an EXIF orientation."""
+"""Pillow's transposition that undoes each EXIF orientation."""
 
 
 def _eight_bit(image: Image.Image) -> Image.Image:
@@ -180,7 +180,7 @@ def _eight_bit(image: Image.Image) -> Image.Image:
 
 
 def _levels(deep: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return gray of 16 bits, or of what range ever, in 256 levels."""
+    """Map 16-bit gray, or gray of any other range, to 256 levels."""
     values = np.nan_to_num(deep.astype(np.float64))
     low, high = values.min(), values.max()
     if deep.dtype.kind in "iu" and low >= 0 and high <= 65535:

@@ -1,4 +1,4 @@
-"""Copies: the same picture saved twice, smaller, or as another format. They add nothing, and no pair has a parallax."""
+"""Find copies: one picture saved twice, smaller, or in another format. They add nothing and have no parallax."""
 
 from collections.abc import Sequence
 
@@ -8,16 +8,16 @@ from sfm_app.photos.thumbnail_stats import SIDE_PX, Glance
 from sfm_app.types import Photo, UnusablePhoto
 
 ALIKE = 0.015
-"""Root mean square difference, as a share of the contrast, of pictures that are one. A step of a thousandth of the
-width to the side makes more of it; saving a picture anew, smaller or as JPEG, less."""
+"""Largest root mean square difference between copies, as a share of the contrast. Moving the camera sideways by a
+thousandth of the width gives a larger difference; saving a picture again, smaller or as JPEG, a smaller one."""
 LEAST_CONTRAST = 4.0
-"""Gray levels; of pictures with less nothing can be said."""
+"""Gray levels; pictures with less contrast are not compared."""
 
 
 def without_copies(glances: Sequence[Glance]) -> tuple[list[Photo], list[UnusablePhoto]]:
-    """Return the photos, of every picture the largest, of those with a mask where there are any; and the copies.
+    """Return one photo per picture, and the copies of them; both in the order given.
 
-    Both in the order given.
+    Of several copies, one with a mask is preferred, then the largest.
     """
     order = sorted(range(len(glances)), key=lambda k: (not glances[k].photo.mask, -_pixels(glances[k].photo), k))
     small = np.array([glance.small for glance in glances], np.float32).reshape(len(glances), SIDE_PX**2)

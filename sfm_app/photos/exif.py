@@ -1,4 +1,4 @@
-"""What EXIF says about a photo: hints that are never trusted."""
+"""Read EXIF: hints about a photo that are never trusted."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,32 +13,29 @@ GPS_LATITUDE_REF, GPS_LATITUDE, GPS_LONGITUDE_REF, GPS_LONGITUDE, GPS_ALTITUDE_R
 
 FULL_FRAME_WIDTH_MM = 36.0
 LOWEST_M, HIGHEST_M = -1000.0, 20_000.0
-"""Altitudes that a photo may be taken at."""
+"""Range of plausible altitudes."""
 
 
 def orientation(exif: Image.Exif) -> int:
-    """Return 1 to 8: how the pixels have to be turned and mirrored to stand upright.
-
-    1 where they are, or where unknown.
-    """
+    """Return the EXIF orientation, 1 to 8; 1 (upright) if it is missing or invalid."""
     value = exif.get(ORIENTATION, 1)
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 
 
 def turn_deg(exif: Image.Exif) -> int:
-    """Return by how much a camera that was held so has to be turned clockwise: 0 where the picture is mirrored, too."""
+    """Return the clockwise rotation from sensor to upright, in degrees; 0 also for mirrored pictures."""
     return {3: 180, 6: 90, 8: 270}.get(orientation(exif), 0)
 
 
 def camera_name(exif: Image.Exif) -> str:
-    """Make, model, focal length and digital zoom in one text; empty where nothing is said."""
+    """Return make, model, focal length and digital zoom in one text; empty if EXIF has none of them."""
     details = exif.get_ifd(EXIF_IFD)
     said = [exif.get(MAKE), exif.get(MODEL), details.get(FOCAL_MM), _zoom(details.get(ZOOM))]
     return " ".join(text for text in (printable(value) for value in said) if text)
 
 
 def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
-    """Return focal length in pixels by the one for 35 mm film; None where it is missing or cannot be true.
+    """Return the focal length in pixels from the 35 mm equivalent; None if it is missing or implausible.
 
     Args:
         exif: of the photo.
@@ -52,9 +49,9 @@ def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
 
 
 def gps_position(exif: Image.Exif) -> GpsPosition | None:
-    """Return the position; None where it is missing or cannot be true.
+    """Return the GPS position; None if it is missing or implausible.
 
-    Cameras without a fix write zeros: latitude and longitude 0 is open sea, and counts as missing.
+    Cameras without a fix write zeros: latitude and longitude 0 is open sea and counts as missing.
     """
     entries: Mapping[int, Any] = exif.get_ifd(GPS_IFD)
     latitude = _degrees(entries.get(GPS_LATITUDE), entries.get(GPS_LATITUDE_REF), "NS", 90.0)
@@ -65,13 +62,13 @@ def gps_position(exif: Image.Exif) -> GpsPosition | None:
 
 
 def printable(value: object) -> str:
-    """Return a value as a text without control characters; empty for None."""
+    """Return a value as text without control characters; empty for None."""
     text = "" if value is None else str(value)
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())
 
 
 def _zoom(value: Any) -> str | None:
-    """Return digital zoom crops the picture: another camera. 0 and 1 say that it was not used."""
+    """Return the digital zoom, which crops like another camera; None for 0 and 1, which mean no zoom."""
     try:
         return None if float(value) in (0.0, 1.0) else f"x{float(value):g}"
     except (TypeError, ValueError, ZeroDivisionError):
@@ -79,7 +76,7 @@ def _zoom(value: Any) -> str | None:
 
 
 def _degrees(parts: Any, reference: Any, sides: str, largest: float) -> float | None:
-    """Return signed degrees from EXIF's degrees, minutes and seconds and the letter of the side."""
+    """Return signed degrees from EXIF's degrees, minutes, seconds and hemisphere letter."""
     try:
         degrees, minutes, seconds = (float(part) for part in parts)
         side = sides.index(str(reference).strip("\0 ").upper()[:1] or "?")

@@ -1,4 +1,4 @@
-"""Which files of a folder are looked at, and where they lie. Nothing outside the folder is read."""
+"""List the files of a folder and resolve their paths. Nothing outside the folder is read."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -12,14 +12,14 @@ VIDEOS = "MP4, MOV, MKV, WebM, AVI and MPEG are read: copy the file again, or sa
 
 
 def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: Sequence[Path] = ()) -> list[str]:
-    """Return names of all files below the folder, with forward slashes, sorted.
+    """Return the names of all files below the folder, with forward slashes, sorted.
 
-    Hidden folders and links to folders are not entered and count as one file. The output folder is left out.
+    Hidden folders and links to folders are not entered; each counts as one file. The output folder is left out.
 
     Args:
-        folder, out: of photos; output folder, which may lie in it.
-        listed_in: text file that names those to look at, one per line, as seen from the folder; all where None.
-        closed: other folders that are left out, like that for the output.
+        folder, out: of the photos; output folder, which may lie in it.
+        listed_in: text file of the names to return, one per line, relative to the folder; None for all files.
+        closed: other folders that are left out, like the output folder.
 
     Raises:
         InputError: there is no such folder, or it cannot be read.
@@ -37,7 +37,7 @@ def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: S
 
 
 def _no_folder(path: Path) -> InputError:
-    """Return what is said of a path that is neither a folder nor a video."""
+    """Return the error for a path that is neither a folder nor a video."""
     if not path.exists():
         what = "file" if path.suffix.lower() in ENDINGS else "folder"
         return InputError(f"no such {what}: {path}", hint=f"{HINT}, or a video")
@@ -49,10 +49,10 @@ def _no_folder(path: Path) -> InputError:
 
 
 def place_of(folder: Path, name: str) -> Path | str:
-    """Return where a file really is, links followed, or why it is not opened.
+    """Return the path of a file with links resolved, or the reason why it is not opened.
 
     Args:
-        folder, name: of the photos, nothing outside it is opened; path inside the folder.
+        folder, name: of the photos (nothing outside it is opened); path inside the folder.
     """
     root, place = folder.resolve(), folder / name
     if Path(name).name.startswith("."):
@@ -62,7 +62,7 @@ def place_of(folder: Path, name: str) -> Path | str:
         there = real.exists()
     except RuntimeError:  # links in a ring
         return "a link that leads nowhere"
-    except (OSError, ValueError) as err:  # lists may hold what is no name; folders may be closed
+    except (OSError, ValueError) as err:  # lists may hold invalid names; folders may be inaccessible
         return f"not readable: {getattr(err, 'strerror', 'no name').lower()}"
     if not real.is_relative_to(root):
         return "a link out of the folder" if place.is_symlink() else "outside the folder"
@@ -70,7 +70,7 @@ def place_of(folder: Path, name: str) -> Path | str:
         return "a link that leads nowhere" if place.is_symlink() else "not there"
     if real.is_dir():
         return "a link to a folder" if place.is_symlink() else "a folder"
-    return real if real.is_file() else "not a file"  # pipes would never end
+    return real if real.is_file() else "not a file"  # reading a pipe would never end
 
 
 def _listed(file: Path) -> list[str]:

@@ -1,8 +1,8 @@
-"""Bars of one color around a picture: what services add to bring photos of any size to one.
+"""Find bars of one color around a picture, which services add to bring photos of any size to one size.
 
-The picture within is the photo: its size tells cameras apart, and its middle, not that of the whole, is where the
-optical center usually lies. A bar is of one color, and ends at a straight edge, all along which the picture differs
-from it; a black background or a blown-out sky does not end like that.
+The picture within the bars is the photo: its size distinguishes cameras, and the optical center usually lies near its
+middle, not near the middle of the whole. A bar has one color and ends at a straight edge, along which the whole picture
+differs from it; a black background or an overexposed sky does not end like that.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,26 +15,26 @@ from PIL import Image
 from sfm_app.types import Frame, Photo
 
 ALIKE = 8
-"""Gray levels by which a bar may differ from its color: JPEG leaves fewer, but for what rings beside the edge."""
+"""Gray levels by which a bar may differ from its color: JPEG changes it by less, except for ringing beside the edge."""
 STRAY = 0.01
-"""Share of a line that may differ by more."""
+"""Share of the pixels of a line that may differ by more."""
 UNLIKE, LEAST_EDGE = 16, 0.7
-"""Gray levels by which so large a share of the line behind the edge must differ from the bar."""
+"""Gray levels by which the line behind the edge must differ from the bar, and the share of its pixels that must."""
 BLUR_PX, RINGING_PX = 3, 18
-"""Lines from the first that is not of one color to the picture: resizing blurs the edge, and JPEG rings as far as its
-blocks of color reach, 16 pixels; then the bar ends where the picture begins."""
+"""Largest distance, in lines, from the end of the uniform bar to the picture: resizing blurs the edge, and JPEG rings
+as far as its chroma blocks reach, 16 pixels. With ringing, the bar ends where the picture begins."""
 LEAST_PX, LEAST_SHARE = 4, 0.008
-"""A thinner bar, in pixels and in shares of the side, moves nothing."""
+"""Thinner bars, in pixels and in shares of the side, are ignored: they hardly move the middle."""
 MOST_SHARE = 0.7
-"""Bars that leave less than the rest of a side are no bars, but a thing before a plain ground."""
+"""Largest share of a side that a bar may cover; beyond, it is an object in front of a plain background."""
 SAME_PX, SAME_SHARE = 4.0, 0.01
-"""Pictures whose edges lie that close to each other, in pixels or in shares of the longer side, have one size."""
+"""Pictures whose edges differ by at most this, in pixels or in shares of the longer side, count as one size."""
 
 
 def shown_part(picture: Image.Image) -> Frame | None:
-    """Return the picture within bars; None where there are none.
+    """Return the frame of the picture within bars; None without bars.
 
-    A bar above without one below is not believed: it may be a sky of one color above a level horizon.
+    A bar above without one below is ignored: it may be a sky of one color above a level horizon.
     """
     pixels = np.asarray(picture.convert("RGB"))
     height, width = pixels.shape[:2]
@@ -49,10 +49,11 @@ def shown_part(picture: Image.Image) -> Frame | None:
 
 
 def with_one_frame(photos: Sequence[Photo]) -> Iterator[Photo]:
-    """Yield photos of one size with the pictures within them made equal where they nearly are.
+    """Yield photos of one size, with nearly equal picture frames replaced by their median.
 
-    Where all bars that are seen are alike, photos whose bars are not seen (a sky of their color) have them, too. Bars
-    around fewer than half of the photos are not believed: a wall before an empty ground ends at straight edges, too.
+    If all detected bars agree, photos without detected bars (for example, with a sky of the same color) get them too.
+    Bars around fewer than half of the photos are ignored: a wall in front of an empty background also ends at straight
+    edges.
     """
     if 2 * sum(photo.shown is not None for photo in photos) < len(photos):
         photos = [replace(photo, shown=None) for photo in photos]
@@ -83,7 +84,7 @@ def _edges(frame: Frame) -> NDArray[np.int64]:
 
 
 def _bar(lines: NDArray[np.uint8]) -> int:
-    """Return how many of the first lines (N, M, 3) are a bar."""
+    """Return how many of the first lines of (N, M, 3) form a bar."""
     color = np.median(lines[0], axis=0).astype(np.int16)
     most = int(MOST_SHARE * len(lines))
     first = next((k for k in range(most) if _share(lines[k], color, ALIKE) > STRAY), 0)
@@ -93,10 +94,10 @@ def _bar(lines: NDArray[np.uint8]) -> int:
     unlike = [_share(lines[k], color, UNLIKE) for k in behind]
     edge = next((k for k, share in zip(behind, unlike, strict=True) if share >= LEAST_EDGE), 0)
     if sum(share >= LEAST_EDGE / 2 for share in unlike[: max(edge - first, 0)]) > BLUR_PX:
-        return 0  # the edge slopes: a thing ends there, not the picture
+        return 0  # a sloping edge belongs to an object, not to a bar
     return first if 0 < edge <= first + BLUR_PX else edge
 
 
 def _share(line: NDArray[np.uint8], color: NDArray[np.int16], levels: int) -> float:
-    """Return share of a line (M, 3) that differs from a color by more."""
+    """Return the share of a line (M, 3) that differs from a color by more than `levels`."""
     return float(np.mean(np.max(np.abs(line.astype(np.int16) - color), axis=1) > levels))

@@ -1,7 +1,7 @@
-"""Masks: pictures that say which pixels of a photo may be used, named and painted as COLMAP wants them.
+"""Read and write masks, which mark the usable pixels of a photo, in COLMAP's naming and format.
 
-The mask of `sub/a.jpg` is `sub/a.jpg.png` or `sub/a.png` in a folder of its own; what is black or transparent there is
-not used. A mask is for the photo as people see it.
+The mask of `sub/a.jpg` is `sub/a.jpg.png` or `sub/a.png` in a separate folder; black or transparent pixels are not
+used. A mask belongs to the upright photo, as displayed.
 """
 
 import os
@@ -24,22 +24,22 @@ ENDING = ".png"
 MASK_HINT = "the mask of sub/a.jpg is sub/a.jpg.png or sub/a.png in the folder of masks, of the size of the photo"
 USED = 255
 SIDEWAYS = 5
-"""EXIF orientations from here on change width and height."""
+"""EXIF orientations from this value on swap width and height."""
 
 BoolImage = NDArray[np.bool_]
 """(H, W)."""
 
 
 def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
-    """Return names of all files below the folder of masks, as `list_files` has them, without photos and output.
+    """Return the names of all files below the folder of masks, as `list_files` does, without photos and output.
 
     Args:
         masks: folder of the masks.
         photos: folder of the photos.
-        out: output folder; may lie in that of the masks.
+        out: output folder; may lie inside the folder of masks.
 
     Raises:
-        InputError: there is no such folder, or it is that of the photos.
+        InputError: there is no such folder, or it is also the folder of the photos.
     """
     if not masks.is_dir():
         what = "not a folder" if masks.exists() else "no such folder"
@@ -50,7 +50,7 @@ def list_masks(masks: Path, photos: Path, out: Path) -> list[str]:
 
 
 def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
-    """Return the photo with its mask, if it has one; unusable where all of it is masked.
+    """Return the photo with its mask, if it has one; an unusable photo if everything is masked.
 
     Args:
         photo: as it was read.
@@ -58,7 +58,7 @@ def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
         masks: folder of the masks.
 
     Raises:
-        InputError: the mask cannot be used; says why.
+        InputError: the mask cannot be used.
     """
     names = f"{photo.path}{ENDING}", str(PurePosixPath(photo.path).with_suffix(ENDING))
     name = next((name for name in names if os.path.lexists(masks / name)), "")
@@ -71,7 +71,7 @@ def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
 
 
 def unused_masks(names: Sequence[str], photos: Sequence[Photo]) -> list[str]:
-    """Return which files of the folder of masks are the mask of no photo; hidden ones are nobody's.
+    """Return the files in the folder of masks that belong to no photo; hidden files are ignored.
 
     Args:
         names: from `list_masks`.
@@ -82,15 +82,15 @@ def unused_masks(names: Sequence[str], photos: Sequence[Photo]) -> list[str]:
 
 
 def lay_out_mask(photo: Photo, folder: Path, masks: Path, target: Path) -> None:
-    """Put the mask of a photo into a folder, as the photo is laid out; all white where it has none.
+    """Write the mask of a photo, in the orientation of the laid-out photo; all white if it has none.
 
-    COLMAP passes over photos without a mask when it is given any.
+    COLMAP skips photos without a mask as soon as it is given any masks.
 
     Args:
         photo: with its mask, if it has one.
         folder: of the photos.
         masks: folder of the masks.
-        target: folder that gets it.
+        target: folder to write to.
 
     Raises:
         InputError: as `find_mask`.
@@ -101,7 +101,7 @@ def lay_out_mask(photo: Photo, folder: Path, masks: Path, target: Path) -> None:
 
 
 def mask_place(target: Path, name: str) -> Path:
-    """Return where the mask of a photo is staged.
+    """Return the path of the staged mask of a photo.
 
     Args:
         target: folder of the staged masks.
@@ -111,12 +111,12 @@ def mask_place(target: Path, name: str) -> Path:
 
 
 def save_used(target: Path, name: str, used: BoolImage) -> None:
-    """Write which pixels of a photo may be used as a mask of black and white.
+    """Write the usable pixels of a photo as a black and white mask.
 
     Args:
         target: folder of the staged masks.
         name: of the photo.
-        used: (H, W) as the photo is laid out.
+        used: (H, W), in the orientation of the laid-out photo.
     """
     place = mask_place(target, name)
     place.parent.mkdir(parents=True, exist_ok=True)
@@ -124,7 +124,7 @@ def save_used(target: Path, name: str, used: BoolImage) -> None:
 
 
 def read_used(target: Path, name: str) -> BoolImage:
-    """Return (H, W) what `save_used` wrote.
+    """Read the (H, W) mask that `save_used` wrote.
 
     Args:
         target: folder of the staged masks.
@@ -138,13 +138,13 @@ def read_used(target: Path, name: str) -> BoolImage:
 
 
 def without_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uint8]:
-    """Return a photo whose masked pixels take the color of the nearest one that may be used.
+    """Return a photo whose masked pixels take the color of the nearest usable pixel.
 
-    Then neither interpolation nor a smaller size brings back what is masked.
+    This keeps masked colors out of interpolation and downscaling.
 
     Args:
         pixels: (H, W, 3) RGB.
-        used: (H, W) which of them may be used.
+        used: (H, W), whether each pixel may be used.
     """
     if used.all() or not used.any():
         return pixels
@@ -157,7 +157,7 @@ def without_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uin
 
 
 def _fitted(photo: Photo, folder: Path, masks: Path) -> BoolImage:
-    """Return (H, W) which pixels of the photo, as it is laid out, its mask leaves."""
+    """Return (H, W) usable pixels of the photo by its mask, in the orientation of the laid-out photo."""
     try:
         place = place_of(masks, photo.mask)
         if isinstance(place, str):
@@ -174,7 +174,7 @@ def _fitted(photo: Photo, folder: Path, masks: Path) -> BoolImage:
 
 
 def _turned_like(photo: Photo, size: tuple[int, int], mask: Image.Image, folder: Path) -> Image.Image:
-    """Return a mask that fits the photo as its file has it, before EXIF turns it."""
+    """Apply the photo's EXIF orientation to a mask that was painted on the pixels as stored in the file."""
     if _alike(mask.size[::-1], size):
         source = place_of(folder, photo.path)
         turned = orientation(read_picture(source).exif) if isinstance(source, Path) else 1
@@ -185,12 +185,12 @@ def _turned_like(photo: Photo, size: tuple[int, int], mask: Image.Image, folder:
 
 
 def _alike(one: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Return whether two sizes have the same shape, to within a pixel of the smaller one."""
+    """Return whether two sizes have the same aspect ratio, to within a pixel of the smaller one."""
     return abs(one[0] * other[1] - one[1] * other[0]) <= max(*one, *other)
 
 
 def _black_and_white(image: Image.Image) -> Image.Image:
-    """Return white where any channel is not black and the picture not transparent."""
+    """Return white where any channel is nonzero and the pixel is not transparent."""
     if image.mode.startswith("I") or image.mode == "F":
         used = np.asarray(image) != 0
     elif image.mode in ("1", "L") and "transparency" not in image.info:

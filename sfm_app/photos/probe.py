@@ -1,4 +1,4 @@
-"""What one file of the folder is: a usable photo, or why not."""
+"""Examine one file of the folder: a usable photo, or the reason why it is not one."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,16 +24,16 @@ from sfm_app.types import Frame, Photo, UnusablePhoto
 
 MEGA = 1_000_000
 LINKED = ("JPEG", "MPO", "PNG")
-"""Formats that COLMAP reads and writes as they are."""
+"""Formats that COLMAP reads and writes without conversion."""
 
 
 def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | UnusablePhoto:
-    """Decode one file to know that it is a whole photo, what camera took it, and what it looks like.
+    """Decode one file to check that it is intact, and measure what is needed to compare it with other photos.
 
     Args:
         folder: of the photos.
         name: path inside the folder.
-        options: least and largest size.
+        options: smallest and largest size.
     """
     place = place_of(folder, name)
     if isinstance(place, str):
@@ -46,12 +46,12 @@ def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | U
 
 
 def described(name: str, picture: DecodedPhoto, options: PhotoSettings) -> Glance | UnusablePhoto:
-    """Return what is known about a photo, and what it looks like.
+    """Return a photo's metadata and image statistics.
 
     Args:
         name: path inside the folder.
         picture: what the file holds.
-        options: least and largest size.
+        options: smallest and largest size.
     """
     image, exif = picture.image, picture.exif
     turn = turn_deg(exif)
@@ -81,7 +81,7 @@ def described(name: str, picture: DecodedPhoto, options: PhotoSettings) -> Glanc
 
 
 def _shown(seen: Image.Image, photo: Photo) -> Frame | None:
-    """Return the picture within bars, in pixels of the photo as it is laid out."""
+    """Return the frame of the picture within bars, in pixels of the laid-out photo."""
     laid = turned_back(seen, photo.turn_deg)
     found = shown_part(laid)
     if found is None or laid.size == (photo.width, photo.height):
@@ -91,7 +91,7 @@ def _shown(seen: Image.Image, photo: Photo) -> Frame | None:
 
 
 def scaled(size: tuple[int, int], most_px: float) -> tuple[int, int]:
-    """Return width and height of a picture shrunk to at most so many pixels.
+    """Return width and height after shrinking a picture to at most `most_px` pixels.
 
     Args:
         size: width and height in pixels.

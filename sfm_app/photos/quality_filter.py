@@ -1,4 +1,4 @@
-"""Photos that nothing can be learned from: blurred beyond use, and screenshots among photos. Never all of a set."""
+"""Drop photos that cannot help: blurred beyond use, or screenshots among photos. Some photos always remain."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -9,16 +9,17 @@ from sfm_app.photos.thumbnail_stats import Glance
 from sfm_app.types import Photo, UnusablePhoto
 
 BLURRED, BLURRED_MORE = 0.85, 0.15
-"""Share of the slope that edges keep when they are blurred once more: at least that, and more than most others by that.
+"""A photo is blurred if, after one more blur, its edges keep more than the first share of their slope, and more than
+the median photo's share plus the second.
 Sharp photos: 0.33 to 0.70. At 0.85, a blur of 0.8 % of the width or a smear of 2.5 %, 1 to 5 % of inliers are left."""
 FLAT = 0.5
-"""Share of a picture without any change from pixel to pixel: windows, menus, drawings."""
+"""Share of a picture with no change from pixel to pixel; screenshots and drawings have more."""
 ODD = 0.2
-"""A size that fewer of the photos have is an odd one."""
+"""A size is odd if a smaller share of the photos has it."""
 
 
 def screened(glances: Sequence[Glance]) -> tuple[list[Glance], list[UnusablePhoto]]:
-    """Return what is of use, and what is not; both in the order given."""
+    """Return the usable and the unusable photos, both in the order given."""
     most = float(np.median([glance.blur for glance in glances])) if glances else 0.0
     sizes = Counter(_size(glance.photo) for glance in glances)
     photographic = np.mean([glance.flat < FLAT for glance in glances]) > 0.5 if glances else False
@@ -34,5 +35,5 @@ def screened(glances: Sequence[Glance]) -> tuple[list[Glance], list[UnusablePhot
 
 
 def _size(photo: Photo) -> tuple[int, int]:
-    """Return whichever way the camera was held."""
+    """Return the size independent of portrait or landscape orientation."""
     return min(photo.width, photo.height), max(photo.width, photo.height)

@@ -1,4 +1,4 @@
-"""What the user has given: a folder of photos or a video, perhaps masks, and hashes of every file."""
+"""Read the user's input: a folder of photos or a video, optional masks, and the hashes of all files."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -16,7 +16,7 @@ from sfm_app.types import PhotoSet
 Stamp = tuple[int, int]
 """Size in bytes, and time of the last change in nanoseconds."""
 Spread = Callable[[Callable[[str], str], Sequence[str]], Iterable[str]]
-"""Calls a function for every item, perhaps in parallel, and gives the results in their order."""
+"""Calls a function for every item, possibly in parallel, and returns the results in order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,24 +26,24 @@ class Source:
     path: Path
     video: bool
     files: Mapping[str, str]
-    """Hashes of all files of the folder by name; of a video the hash of it, by an empty name."""
+    """Hashes of all files of the folder by name; for a video, its hash under an empty name."""
     mask_dir: Path | None
-    """Folder of masks; None where none is given."""
+    """Folder of masks, if given."""
     masks: Mapping[str, str]
-    """Hashes by name."""
+    """Hashes of the masks by name."""
     stamps: Mapping[Path, Stamp]
-    """Sizes and times of the files, by which it is seen later that one has changed."""
+    """Sizes and times of the files, to detect later changes."""
 
     @property
     def fingerprint(self) -> str:
-        """Hash of all of it."""
+        """Hash of the path, the files and the masks."""
         return fingerprint(str(self.path.resolve()), self.files, self.masks)
 
     def adapt(self, settings: Settings) -> Settings:
-        """Return the settings that go with it: frames of one video share a camera, unless the user says otherwise.
+        """Adjust the settings to the source: frames of one video share a camera unless the user sets otherwise.
 
         Raises:
-            ConfigError: they do not go with a video.
+            ConfigError: a setting cannot be used with a video.
         """
         if not self.video:
             return settings
@@ -53,9 +53,9 @@ class Source:
         return settings.model_copy(update={"photos": settings.photos.model_copy(update={"cameras": cameras})})
 
     def content(self, photos: PhotoSet) -> str:
-        """Return hash of what stages take from the photos that are used; other files of the folder do not matter.
+        """Return a hash of the used photos and their masks; other files of the folder do not enter.
 
-        Camera groups do not, either: features and matches are the same whoever took the photos.
+        Nor do camera groups: features and matches do not depend on which camera took a photo.
         """
         used = [
             {**asdict(photo), "group": "", "notes": (), "bytes": self.files.get(photo.path, self.files.get(""))}
@@ -65,10 +65,10 @@ class Source:
         return fingerprint(used, photos.masks is not None)
 
     def check(self, photos: PhotoSet) -> None:
-        """Check that none of these photos, nor a mask of theirs, nor the video, has changed since.
+        """Check that the video, these photos and their masks have not changed since the run began.
 
         Raises:
-            InputError: something has.
+            InputError: a file has changed.
         """
         used = {self.path} | {self.path / photo.path for photo in photos.photos}
         used |= {photos.masks / photo.mask for photo in photos.photos if photos.masks and photo.mask}
@@ -80,13 +80,13 @@ class Source:
 
 
 def read_source(path: Path, out: Path, options: PhotoSettings, spread: Spread) -> Source:
-    """Read every file once.
+    """List the input files and compute their hashes.
 
     Args:
         path: a folder of photos, or a video.
-        out: the output folder; nothing in it is a photo.
-        options: may name masks, or list the photos to use.
-        spread: how files are read side by side.
+        out: the output folder; its files are not listed.
+        options: may name a folder of masks or a list of the photos to use.
+        spread: maps a function over files, possibly in parallel.
 
     Raises:
         InputError: the photos or the masks cannot be used.
@@ -103,7 +103,7 @@ def read_source(path: Path, out: Path, options: PhotoSettings, spread: Spread) -
 
 
 def digest(file: Path) -> str:
-    """Return hash of the bytes of a file."""
+    """Return the hash of the bytes of a file; "unreadable" if it cannot be read."""
     try:
         return digest_file(file)
     except OSError:
@@ -111,7 +111,7 @@ def digest(file: Path) -> str:
 
 
 def _stamp(path: Path) -> Stamp | None:
-    """Return size and time of a file; None where there is none."""
+    """Return size and time of a regular file; None if there is none."""
     try:
         found = path.stat()
     except (OSError, ValueError):
@@ -120,7 +120,7 @@ def _stamp(path: Path) -> Stamp | None:
 
 
 def _contents(folder: Path, names: Sequence[str], spread: Spread) -> dict[str, str]:
-    """Return hashes of files in a folder by name; instead of a hash, why a file is not read."""
+    """Return the hashes of files in a folder by name; the reason instead of a hash if a file is not read."""
 
     def digest_of(name: str) -> str:
         place = place_of(folder, name)

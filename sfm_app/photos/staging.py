@@ -1,4 +1,4 @@
-"""The photos as COLMAP gets them: links to files that it can read, 8-bit copies of the others, as the sensor lies."""
+"""Lay photos out for COLMAP: links to files that it can read, 8-bit copies of the others, in sensor orientation."""
 
 import os
 import shutil
@@ -14,14 +14,14 @@ from sfm_app.photos.files import place_of
 from sfm_app.types import Photo
 
 READ_BY_COLMAP = (".jpg", ".jpeg", ".png")
-"""COLMAP chooses by these endings how it writes a photo."""
+"""File extensions by which COLMAP chooses the format it writes."""
 JPEG_QUALITY = 95
 
 
 def stored_names(photos: Iterable[Photo]) -> Iterator[Photo]:
-    """Yield photos with the names that they go by: COLMAP writes them into databases and lists, a line each.
+    """Yield photos with unique names that COLMAP can write into databases and line-based lists.
 
-    A name keeps what can be printed and an ending that COLMAP knows; it stays as it is where it can.
+    A name is printable and has an extension that COLMAP knows; a name that already fits is kept.
     """
     photos = list(photos)
     taken = {photo.path for photo in photos}
@@ -36,20 +36,20 @@ def stored_names(photos: Iterable[Photo]) -> Iterator[Photo]:
 
 
 def lay_out(photo: Photo, folder: Path, target: Path) -> None:
-    """Put one photo where COLMAP reads it.
+    """Link or copy one photo to where COLMAP reads it.
 
     Args:
-        photo, folder, target: as it was read; of the photos; folder that gets the link or copy.
+        photo, folder, target: as read; folder of the photos; folder to put the link or copy in.
 
     Raises:
         OSError: the target cannot be written.
-        UnreadableError: the file has changed since it was looked at.
+        UnreadableError: the file has changed since it was read.
     """
     place = target / photo.name
     if not (is_below(photo.name) and place.parent.resolve().is_relative_to(target.resolve())):
         raise UnreadableError("its name leads out of the folder")
     place.parent.mkdir(parents=True, exist_ok=True)
-    place.unlink(missing_ok=True)  # what is written to a link goes where the link leads
+    place.unlink(missing_ok=True)  # writing to an existing link would change its target
     source = place_of(folder, photo.path)
     if isinstance(source, str):
         raise UnreadableError(source)
@@ -71,7 +71,7 @@ def _copy(photo: Photo, source: Path, place: Path) -> None:
 
 
 def _link(source: Path, place: Path, *, relative: bool) -> None:
-    """Link a photo: frames are in the output folder and move with it, the user's photos stay where they are."""
+    """Link a photo; a relative link is for video frames, which move together with the output folder."""
     try:
         place.symlink_to(os.path.relpath(source, place.parent.resolve()) if relative else source)
     except OSError:  # Windows without the right to link, some network drives

@@ -1,4 +1,4 @@
-"""What is kept of a photo once it has been looked at: enough to compare it with the others."""
+"""Measure a thumbnail, blur and flat areas of a photo: enough to compare it with the others."""
 
 from dataclasses import dataclass
 
@@ -12,50 +12,50 @@ from sfm_app.types import Photo
 SIDE_PX = 32
 """Side of the small pictures that are compared."""
 LOOKED_AT_PX = 1024
-"""Longer side at which photos are looked at; smaller ones as they are."""
+"""Longer side to which photos are downsampled for measuring; smaller ones are not resized."""
 EDGES = 99
-"""Percentile of the slopes that counts as that of edges: noise is less steep."""
+"""Percentile of the gradients that counts as edge slope; noise has smaller gradients."""
 NOISE_PX, WIDE_PX = 1.5, 17
-"""Blur that takes the noise away, and how wide what is compared with is blurred once more."""
+"""Standard deviation of the blur that removes noise, and width of the further blur that edges are compared with."""
 BLOCK_PX = 8
-"""Side of the squares that have one color or not."""
+"""Side of the squares that are tested for having one color."""
 DIM, LEAST_PX = 4.0, 200
-"""Gray levels of contrast, and pixels, below which nothing can be said about sharpness."""
+"""Contrast in gray levels and shorter side in pixels, below which sharpness is not measured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Glance:
-    """A usable photo, and what it looks like."""
+    """A usable photo and its image statistics."""
 
     photo: Photo
     small: NDArray[np.float32]
     """(SIDE_PX, SIDE_PX) upright and gray."""
     blur: float = 0.0
-    """Share of their slope that edges keep when they are blurred once more; near 1 where they are blurred already."""
+    """Share of their slope that edges keep when they are blurred once more; near 1 if the photo is already blurred."""
     flat: float = 0.0
-    """Share of the picture in which neighbors are alike to the last bit."""
+    """Share of the picture in which neighboring pixels are exactly equal."""
 
 
 def glance(photo: Photo, upright: Image.Image) -> Glance:
-    """Measure blur and flat areas of a photo, and make it small.
+    """Measure the blur and flat areas of a photo, and make its thumbnail.
 
     Args:
-        photo: what is known of it.
-        upright: its picture as people see it.
+        photo: metadata.
+        upright: its picture, upright.
     """
     gray = upright.convert("L")
     return Glance(photo, small_picture(gray), blur_of(gray), flat_share(gray))
 
 
 def small_picture(gray: Image.Image) -> NDArray[np.float32]:
-    """Return what is compared to find copies."""
+    """Return the thumbnail that is compared to find copies."""
     return np.asarray(gray.resize((SIDE_PX, SIDE_PX), Image.Resampling.LANCZOS, reducing_gap=6.0), np.float32)
 
 
 def blur_of(gray: Image.Image) -> float:
-    """Return how much of their slope edges keep when they are blurred once more, in [0, 1].
+    """Return the share of their slope that edges keep when they are blurred once more, in [0, 1].
 
-    The worse of both directions.
+    The larger value of the horizontal and vertical directions.
     """
     gray = gray.copy()
     gray.thumbnail((LOOKED_AT_PX, LOOKED_AT_PX), Image.Resampling.BOX)
@@ -68,7 +68,7 @@ def blur_of(gray: Image.Image) -> float:
 
 
 def flat_share(picture: Image.Image) -> float:
-    """Return share of the picture, in small squares, that has one color."""
+    """Return the share of small squares of the picture that have one color."""
     gray = np.asarray(picture)
     height, width = (side // BLOCK_PX * BLOCK_PX for side in gray.shape)
     squares = gray[:height, :width].reshape(height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX)

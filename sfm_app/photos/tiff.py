@@ -1,4 +1,4 @@
-"""What libtiff finds wrong with a file: it would print it and leave the picture as it is, and Pillow does not ask."""
+"""Collect libtiff's errors, which it would print while returning a damaged picture; Pillow does not check them."""
 
 import ctypes
 import threading
@@ -11,18 +11,18 @@ from typing import Any
 import PIL
 
 PLACES = (Path(PIL.__file__).parents[1] / "pillow.libs", Path(PIL.__file__).parent / ".dylibs")
-"""Where Pillow's wheels have their own libtiff, on Linux and on macOS."""
+"""Where Pillow's wheels keep their own libtiff on Linux and macOS."""
 HANDLER = ctypes.CFUNCTYPE(None, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_void_p)
-"""Module, format and arguments of a message."""
+"""Type of libtiff's error callback: module, format and arguments of a message."""
 
 _heard = threading.local()
 
 
 @contextmanager
 def complaints() -> Iterator[list[str]]:
-    """Provide a list that takes what libtiff calls an error while this thread decodes.
+    """Provide a list that collects libtiff's errors while this thread decodes.
 
-    Nothing where Pillow has no own copy.
+    It stays empty if Pillow has no libtiff of its own.
     """
     _listen()
     _heard.errors = []

@@ -1,4 +1,4 @@
-"""Cameras and the paths that a photographer walks with them."""
+"""Build synthetic cameras and their poses along typical photographers' paths."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -16,7 +16,7 @@ NEWTON_STEPS = 100
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """What stays the same from photo to photo."""
+    """Intrinsics and image size, shared by photos of one camera."""
 
     K: FloatArray
     """(3, 3) camera matrix in pixels, zero skew."""
@@ -24,21 +24,21 @@ class Camera:
     height: int
     radial: float = 0.0
     """k1 of COLMAP's SIMPLE_RADIAL and OPENCV: x_d = x_u (1 + k1 r^2) about the optical center, with
-    x = (X/Z, Y/Z) and r = |x_u|, so that r counts in focal lengths; < 0: barrel."""
+    x = (X/Z, Y/Z) and r = |x_u|, so r is in focal lengths; < 0: barrel."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Views:
-    """Photos that are to be taken: with which camera and from where."""
+    """Photos to render: the camera and pose of each."""
 
     cameras: Mapping[str, Camera]
-    """By photo name; the same names as below."""
+    """By photo name; same names as in `cam_from_world`."""
     cam_from_world: Mapping[str, FloatArray]
     """By photo name: (3, 4) [R | t]."""
 
     @classmethod
     def of(cls, camera: Camera, poses: Sequence[FloatArray]) -> "Views":
-        """Return one camera at several poses, the photos named view_00.jpg and so on.
+        """Return photos of one camera at several poses, named view_00.jpg and so on.
 
         Args:
             camera: of all photos.
@@ -48,10 +48,10 @@ class Views:
         return cls(dict.fromkeys(named, camera), named)
 
     def taken_with(self, camera: Camera, photos: Collection[str]) -> "Views":
-        """Return the same views, these photos taken with another camera.
+        """Return the views with another camera for some photos.
 
         Args:
-            camera: the other one.
+            camera: the other camera.
             photos: names of photos among the views.
 
         Raises:
@@ -65,10 +65,9 @@ class Views:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArcOptions:
-    """A walk around the front of a scene, hand-held: no two photos share distance, height, aim or roll.
+    """A hand-held walk around the front of a scene: distance, height, aim and roll vary from photo to photo.
 
-    A circle around the point that all photos look at leaves the focal length undetermined (an orbit), so each of
-    them varies.
+    They vary because a circle around a point that all photos look at (an orbit) leaves the focal length undetermined.
 
     Raises:
         ConfigError: a value is out of range.
@@ -83,7 +82,7 @@ class ArcOptions:
     height: tuple[float, float] = (0.7, 2.6)
     """Range of the height above the ground, in scene units."""
     aim: tuple[float, float, float] = (0.0, 1.3, -0.2)
-    """What the photos look at, before it is varied."""
+    """Point that the photos look at, before random offsets."""
     aim_spread: float = 0.4
     """Largest offset of the aim in each direction, in scene units, >= 0."""
     roll_deg: float = 14.0
@@ -111,7 +110,7 @@ def make_camera(
     aspect: float = 1.0,
     radial: float = 0.0,
 ) -> Camera:
-    """Return a camera about which a guess goes wrong: its optical center is not the middle of the photo.
+    """Return a camera whose optical center is not the image center, so that a default guess is wrong.
 
     Args:
         width, height: pixels, >= 16.
@@ -133,8 +132,8 @@ def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Vie
 
     Args:
         camera: of all photos.
-        options: the walk; the usual one where None.
-        seed: same seed, same steps.
+        options: the walk; the default one if None.
+        seed: same seed, same poses.
     """
     options = options or ArcOptions()
     rng = np.random.default_rng([seed, 11])
@@ -152,7 +151,7 @@ def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Vie
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PastOptions:
-    """A walk along a wall that faces +z, hand-held, each photo turned towards the middle as far as it likes.
+    """A hand-held walk along a wall that faces +z, each photo turned towards the middle by a random amount.
 
     Raises:
         ConfigError: a value is out of range.
@@ -161,7 +160,7 @@ class PastOptions:
     photos: int = 12
     """>= 2."""
     length: float = 8.0
-    """Of the walk along x, in scene units, > 0."""
+    """Length of the walk along x, in scene units, > 0."""
     distance: tuple[float, float] = (5.0, 7.0)
     """Range of z, in scene units."""
     height: tuple[float, float] = (1.2, 2.2)
@@ -181,8 +180,8 @@ def past(camera: Camera, options: PastOptions | None = None, seed: int = 0) -> V
 
     Args:
         camera: of all photos.
-        options: the walk; the usual one where None.
-        seed: same seed, same steps.
+        options: the walk; the default one if None.
+        seed: same seed, same poses.
     """
     options = options or PastOptions()
     rng = np.random.default_rng([seed, 13])
@@ -202,15 +201,15 @@ def orbit(
     distance: float = 5.6,
     aim: tuple[float, float, float] = (0.0, 1.3, -0.2),
 ) -> Views:
-    """Place upright photos evenly on a level circle, all looking at its center: they leave the focal undetermined.
+    """Place upright photos evenly on a level circle, all looking at its center; the focal length is undetermined.
 
-    Any two of the optical axes meet at the same distance from both cameras (isosceles), and then one F says nothing
-    about the focal length (Sturm 2001); K is the same for all photos.
+    Any two of the optical axes meet at the same distance from both cameras (isosceles), and then F does not
+    constrain the focal length (Sturm 2001); K is the same for all photos.
 
     Args:
         camera: takes all photos.
         photos: >= 2.
-        sweep_deg: angle of the arc that the photos share out, in degrees, (0, 360].
+        sweep_deg: angle of the arc that the photos divide evenly, in degrees, (0, 360].
         distance: radius of the circle, in scene units, > 0.
         aim: the circle's center.
 
@@ -219,7 +218,7 @@ def orbit(
     """
     if photos < 2 or not (0 < sweep_deg <= 360 and 0 < distance < math.inf):
         raise ConfigError("synthetic orbit: photos, sweep_deg or distance is out of range")
-    # steps of sweep / photos: with 360 degrees the last photo is not the first again
+    # steps of sweep / photos, so that at 360 degrees the last photo does not repeat the first
     azimuth = np.radians(sweep_deg) * ((np.arange(photos) + 0.5) / photos - 0.5)
     around = np.column_stack([np.sin(azimuth), np.zeros(photos), np.cos(azimuth)])
     middle = np.array(aim)
@@ -229,13 +228,13 @@ def orbit(
 def panorama(
     camera: Camera, photos: int = 6, step_deg: float = 12.0, center: tuple[float, float, float] = (0.0, 1.5, 4.5)
 ) -> Views:
-    """Return photos from one spot, turned from left to right, each a little up or down and rolled: they hold no depth.
+    """Return photos from one spot, panning left to right with slight tilt and roll: they have no parallax.
 
     Args:
         camera: takes all photos.
         photos: >= 2.
         step_deg: angle from photo to photo, in degrees.
-        center: the spot, in scene units; the middle of the photos looks towards -z.
+        center: the spot, in scene units; the middle photo looks towards -z.
     """
     azimuth = np.radians(step_deg) * (np.arange(photos) - (photos - 1) / 2)
     tilt, roll_deg = 0.05 * np.cos(np.pi * np.arange(photos)), 3.0 * np.sin(2.0 * np.arange(photos))
@@ -282,17 +281,17 @@ def axis_rotation(axis: FloatArray, angle_deg: float) -> FloatArray:
 
 
 def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> FloatArray:
-    """Return directions of view in the camera frame, row by row.
+    """Return viewing directions in the camera frame, row by row.
 
     Args:
         camera: its lens distortion is undone exactly.
-        offset_px: where in each pixel the ray goes through; (0.5, 0.5) is the center.
+        offset_px: position of the ray in each pixel; (0.5, 0.5) is the center.
 
     Returns:
         (height * width, 3), z = 1.
 
     Raises:
-        ConfigError: the radial distortion folds within the photo, so that a pixel has no one ray.
+        ConfigError: the radial distortion folds within the photo, so that a pixel has no unique ray.
     """
     x, y = np.meshgrid(np.arange(camera.width) + offset_px[0], np.arange(camera.height) + offset_px[1])
     x = (x.ravel() - camera.K[0, 2]) / camera.K[0, 0]
@@ -307,7 +306,7 @@ def _undistorted_over_distorted(distorted: FloatArray, k1: float) -> FloatArray:
     if k1 < 0 and distorted.max(initial=0.0) >= 2.0 / 3.0 / math.sqrt(-3.0 * k1):
         raise ConfigError(f"synthetic camera: a radial distortion of {k1:g} folds within the photo")
     r = distorted.copy()
-    # the cubic bends one way all along, so Newton from d nears the root from one side and cannot overshoot
+    # the cubic is convex or concave throughout, so Newton from d converges from one side and cannot overshoot
     for _ in range(NEWTON_STEPS if k1 != 0 else 0):
         step = (r * (1.0 + k1 * r * r) - distorted) / (1.0 + 3.0 * k1 * r * r)
         r -= step

@@ -1,4 +1,4 @@
-"""How close a reconstruction came to the truth of a rendered photo folder."""
+"""Compare a reconstruction with the ground truth of a rendered photo folder."""
 
 from collections.abc import Mapping
 
@@ -14,9 +14,9 @@ from sfm_app.synthetic.render import cast, ray_caster
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
-# Rays per photo, along its longer side, that find out which part of the true surface was seen.
+# Rays along the longer side of each photo that determine which part of the true surface is visible.
 SEEN_RAYS = 96
-# Points that stand for a surface.
+# Points sampled on a surface.
 SAMPLES = 20_000
 
 
@@ -24,9 +24,9 @@ def focal_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
     """Return e_focal of thesis section 5.5.3: mean error of fx and fy in percent of the truth.
 
     Args:
-        K: (3, 3) that was found.
+        K: (3, 3) estimate.
         truth: of the photo folder.
-        photo: whose camera K belongs to; needed where there are several cameras.
+        photo: name of the photo to which K belongs; needed if there are several cameras.
 
     Raises:
         ValueError: the photos have several cameras and none is named.
@@ -39,9 +39,9 @@ def center_error_percent(K: FloatArray, truth: Truth, photo: str = "") -> float:
     """Return e_OC of thesis section 5.5.3: mean error of the optical center's x and y in percent of the truth.
 
     Args:
-        K: (3, 3) that was found.
+        K: (3, 3) estimate.
         truth: of the photo folder.
-        photo: whose camera K belongs to; needed where there are several cameras.
+        photo: name of the photo to which K belongs; needed if there are several cameras.
 
     Raises:
         ValueError: the photos have several cameras and none is named.
@@ -57,11 +57,11 @@ def surface_error(
     truth: Truth,
     samples: int = SAMPLES,
 ) -> float:
-    """Return median distance of a reconstructed surface to the true one, as a share of the scene's size.
+    """Return the median distance of a reconstructed surface to the true one, as a share of the scene's size.
 
-    The reconstruction is moved onto the truth by the similarity between the camera centers. The scene's size is the
-    diagonal of the bounding box of the true surface that the photos see. The median says nothing about what is
-    missing: see `surface_coverage`.
+    The reconstruction is aligned with the truth by the similarity between the camera centers. The scene's size is the
+    diagonal of the bounding box of the true surface that the photos see. The median ignores missing parts: see
+    `surface_coverage`.
 
     Args:
         vertices, faces: (V, 3) in the reconstruction's frame, and (T, 3) vertex indices.
@@ -82,7 +82,7 @@ def surface_accuracy(
     truth: Truth,
     tolerance: float = 0.005,
 ) -> float:
-    """Return share of a reconstructed surface, by area, that lies within `tolerance` scene sizes of the true one.
+    """Return the share of a reconstructed surface, by area, that lies within `tolerance` scene sizes of the true one.
 
     Args:
         vertices: (V, 3) in the reconstruction's frame.
@@ -104,9 +104,9 @@ def surface_coverage(
     truth: Truth,
     tolerance: float = 0.01,
 ) -> float:
-    """Give share of what photos see of the true surface that has reconstructed surface within `tolerance` scene sizes.
+    """Return the share of the visible true surface within `tolerance` scene sizes of the reconstructed surface.
 
-    Weighted as the photos see it: evenly over their pixels.
+    Every pixel of the photos that sees the surface has the same weight.
 
     Args:
         vertices: (V, 3) in the reconstruction's frame.
@@ -125,12 +125,12 @@ def surface_coverage(
 
 
 def scene_size(truth: Truth) -> float:
-    """Return diagonal of the bounding box of the true surface that the photos see, in scene units."""
+    """Return the diagonal of the bounding box of the visible true surface, in scene units."""
     return float(np.linalg.norm(np.ptp(seen_points(truth), axis=0)))
 
 
 def seen_points(truth: Truth) -> FloatArray:
-    """Return (N, 3) points where an even grid of rays through all photos meets the true surface."""
+    """Return (N, 3) points where a regular grid of rays through all photos meets the true surface."""
     caster = ray_caster(truth.vertices, truth.faces)
     found = []
     for name, pose in truth.cam_from_world.items():
@@ -142,7 +142,7 @@ def seen_points(truth: Truth) -> FloatArray:
 
 
 def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity:
-    """Return the similarity that takes found camera centers to the true ones, not led astray by wrong photos.
+    """Return the similarity from estimated to true camera centers, robust to wrongly placed photos.
 
     Args:
         centers: camera center (3,) by photo name, in the reconstruction's frame.
@@ -154,14 +154,14 @@ def align_centers(centers: Mapping[str, FloatArray], truth: Truth) -> Similarity
     true_centers = truth.centers
     names = sorted(set(centers) & set(true_centers))
     if len(names) < 3:
-        raise ValueError(f"{len(names)} of the found camera centers are known; 3 are needed")
+        raise ValueError(f"{len(names)} of the estimated camera centers are in the truth; 3 are needed")
     a = np.array([centers[name] for name in names], dtype=np.float64)
     b = np.array([true_centers[name] for name in names])
     return robust_similarity(a, b)
 
 
 def sample_surface(vertices: FloatArray, faces: IndexArray, count: int, seed: int = 0) -> FloatArray:
-    """Return (count, 3) points spread evenly over the triangles.
+    """Return (count, 3) points drawn uniformly by area from the triangles.
 
     Args:
         vertices: (V, 3).
@@ -193,14 +193,14 @@ def sample_triangles(
     chosen = rng.choice(len(faces), count, p=area / area.sum())
     corners = vertices[faces[chosen]]
     u, v = rng.uniform(size=(2, count, 1))
-    # folding the unit square onto the triangle keeps the points even
+    # folding the unit square onto the triangle keeps the points uniform
     outside = u + v > 1.0
     u, v = np.where(outside, 1.0 - u, u), np.where(outside, 1.0 - v, v)
     return np.asarray(corners[:, 0] * (1.0 - u - v) + corners[:, 1] * u + corners[:, 2] * v), chosen
 
 
 def surface_distances(points: FloatArray, vertices: FloatArray, faces: IndexArray) -> FloatArray:
-    """Return (N,) distance of points to the nearest place on the triangles; in single precision.
+    """Return (N,) distances from points to the triangles, in single precision.
 
     Args:
         points: (N, 3).
@@ -218,7 +218,7 @@ def _distances_to_truth(
     truth: Truth,
     samples: int = SAMPLES,
 ) -> FloatArray:
-    """Give (samples,) distances of places spread evenly over a reconstructed surface to true one, in scene sizes."""
+    """Return (samples,) distances from uniform samples of a reconstructed surface to the true one, in scene sizes."""
     points = sample_surface(align_centers(centers, truth)(vertices), faces, samples)
     return surface_distances(points, truth.vertices, truth.faces) / scene_size(truth)
 

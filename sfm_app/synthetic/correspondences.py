@@ -16,9 +16,9 @@ from sfm_app.synthetic.cameras import axis_rotation
 FloatArray = NDArray[np.float64]
 Poses = tuple[FloatArray, FloatArray]
 
-# The scene lies in front of the first camera, in units of the distance at which the optical axes ought to meet.
+# Depth range from the first camera, in units of the distance to the middle of the scene.
 NEAR, FAR = 0.6, 1.6
-# Below this share of the first camera's points a setup counts as non-convergent: the cameras look at different things.
+# If the cameras share fewer of the first camera's points, the setup counts as non-convergent and is drawn again.
 MIN_OVERLAP = 0.3
 MAX_SETUPS = 10_000
 
@@ -28,7 +28,7 @@ class PairOptions:
     """A random image pair; the defaults are those of thesis section 4.8.
 
     Raises:
-        ConfigError: a value is out of range; names all of them.
+        ConfigError: values are out of range; the message names all of them.
     """
 
     points: int = 1200
@@ -43,7 +43,7 @@ class PairOptions:
     height: int = 512
     focal_px: float = 700.0
     max_rotation_deg: float = 60.0
-    """Largest rotation between the cameras about an arbitrary axis, in degrees, (0, 180]."""
+    """Largest rotation between the cameras, about a random axis, in degrees, (0, 180]."""
     max_baseline: float = 1.0
     """Largest distance between the cameras, as a share of the distance to the middle of the scene, (0, 3]."""
 
@@ -65,7 +65,7 @@ class TrackOptions:
     """Tracks through several cameras of one K; the defaults are those of thesis section 5.5.3.
 
     Raises:
-        ConfigError: a value is out of range; names all of them.
+        ConfigError: values are out of range; the message names all of them.
     """
 
     cameras: int = 5
@@ -75,7 +75,7 @@ class TrackOptions:
     sigma_px: float = 1.0
     """Standard deviation of the Gaussian noise on every coordinate, in pixels, >= 0."""
     corrupted_pairs: int = 0
-    """Pairs whose matches get outliers; the thesis corrupts 2 of 10."""
+    """Number of pairs whose matches get outliers; the thesis corrupts 2 of 10."""
     outliers: float = 0.3
     """Share of wrong matches in the corrupted pairs, in [0, 1)."""
     outlier_range_px: float = 256.0
@@ -115,14 +115,14 @@ class TrackOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TwoViews:
-    """Matches of two views and everything that is true about them."""
+    """Matches of two views and their ground truth."""
 
     x1: FloatArray
     """(N, 2) pixels."""
     x2: FloatArray
-    """(N, 2) pixels, row by row the partners of x1."""
+    """(N, 2) pixels; row k matches row k of x1."""
     is_inlier: NDArray[np.bool_]
-    """(N,): False where x2 was moved away. By construction: an outlier may fall on its epipolar line by chance."""
+    """(N,): False where x2 was displaced. An outlier may still lie near its epipolar line by chance."""
     F: FloatArray
     """(3, 3) from the cameras; x2' F x1 = 0 without noise, rank 2, Frobenius norm 1."""
     K1: FloatArray
@@ -138,18 +138,18 @@ class TwoViews:
 
     @property
     def K(self) -> FloatArray:
-        """(3, 3) camera matrix of view 1; that of both unless the focal length was changed between them."""
+        """(3, 3) camera matrix of view 1, and of view 2 unless their focal lengths differ."""
         return self.K1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """Tracks of points that every camera sees, and everything that is true about them."""
+    """Tracks of points that every camera sees, and their ground truth."""
 
     pairs: Mapping[tuple[int, int], TwoViews]
     """Matches per pair of cameras (i, j), i < j; the noise of a point is the same in all pairs."""
     corrupted: tuple[tuple[int, int], ...]
-    """Pairs that hold outliers."""
+    """Pairs with outliers."""
     K: FloatArray
     """(C, 3, 3) camera matrix per camera; all equal unless the last one has another focal length."""
     R: FloatArray
@@ -186,7 +186,7 @@ def make_pair(options: PairOptions, seed: int) -> TwoViews:
     size = (options.width, options.height)
     for _ in range(MAX_SETUPS):
         R = random_rotation(rng, options.max_rotation_deg)
-        # the least baseline keeps the epipolar geometry away from a pure rotation
+        # the minimum baseline keeps the motion away from a pure rotation
         center = _direction(rng) * options.max_baseline * rng.uniform(0.1, 1.0)
         poses = (np.stack([np.eye(3), R]), np.stack([np.zeros(3), -R @ center]))
         Ks = np.stack([K, K])
@@ -230,13 +230,13 @@ def pair_matches(
 ) -> Iterator[tuple[tuple[int, int], FloatArray]]:
     """Yield the matches of every pair of cameras, with outliers in chosen pairs.
 
-    One set of tracks under several corruptions.
+    The same tracks can be corrupted in several ways.
 
     Args:
-        tracks: their noise is kept; outliers that they hold already are not.
+        tracks: their noise is kept, their outliers are not.
         outliers: share of wrong matches, in [0, 1), per pair; no pair by default.
         outlier_range_px: outliers are off by a uniform value in [-range, range] in x and in y in the second view.
-        seed: a pair's outliers depend on the seed and the pair alone.
+        seed: a pair's outliers depend only on the seed and the pair.
 
     Yields:
         Pair (i, j) in the order of `tracks.pairs`, and (N, 4) x1, y1, x2, y2 in pixels.
@@ -256,7 +256,7 @@ def random_rotation(rng: np.random.Generator, max_angle_deg: float) -> FloatArra
     """Return (3, 3) rotation about a uniformly random axis by a uniformly random angle.
 
     Args:
-        rng: where the draws come from.
+        rng: random generator.
         max_angle_deg: degrees, >= 0.
     """
     return axis_rotation(_direction(rng), rng.uniform(0.0, max_angle_deg))
@@ -331,7 +331,7 @@ def _visible_points(
 
 
 def _candidates(Ks: FloatArray, poses: Poses, size: tuple[int, int], rng: np.random.Generator) -> Iterator[FloatArray]:
-    # uniform in image 1 and in depth; only what falls into the other images is kept
+    # uniform in image 1 and in depth; callers keep the points that are visible in the other images
     while True:
         x = rng.uniform(size=(256, 2)) * size
         depth = rng.uniform(NEAR, FAR, (256, 1))

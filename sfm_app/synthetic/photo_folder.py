@@ -1,4 +1,4 @@
-"""Rendered photo folders with known truth."""
+"""Render photo folders with ground truth."""
 
 import json
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ TRUTH_FILE, SURFACE_FILE = "truth.json", "surface.ply"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PhotoOptions:
-    """From a perfect image to a photo.
+    """Image quality of rendered photos.
 
     Raises:
         ConfigError: a value is out of range.
@@ -55,14 +55,14 @@ class PhotoOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """Everything that is true about a rendered photo folder."""
+    """Ground truth of a rendered photo folder."""
 
     cameras: Mapping[str, Camera]
     """By photo name."""
     cam_from_world: Mapping[str, FloatArray]
     """By photo name: (3, 4) [R | t]."""
     vertices: FloatArray
-    """(V, 3) of the surface, y up."""
+    """(V, 3) vertices of the surface, y up."""
     faces: NDArray[np.int64]
     """(T, 3) vertex indices."""
 
@@ -98,14 +98,14 @@ def write_photo_folder(
 ) -> Truth:
     """Render one JPEG without EXIF per view into a folder.
 
-    The truth is not written: it belongs outside the photo folder, see `save_truth`.
+    The truth is not written; `save_truth` writes it outside the photo folder.
 
     Args:
-        folder: made where it is missing.
+        folder: created if missing.
         scene: what is photographed.
-        views: with which cameras and from where.
-        options: quality and noise of the photos; the usual ones where None.
-        progress: told about every photo.
+        views: camera and pose of each photo.
+        options: quality and noise of the photos; defaults if None.
+        progress: advances with every photo.
 
     Raises:
         InputError: the folder cannot be written.
@@ -125,12 +125,12 @@ def write_photo_folder(
 
 
 def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Blur the image, then apply gamma and sensor noise: linear RGB to 8 bits.
+    """Blur the image, then apply gamma and sensor noise, from linear RGB to 8 bits.
 
     Args:
         image: (H, W, 3) linear RGB, about 0..1.
         options: blur and noise.
-        rng: where the noise comes from.
+        rng: random generator of the noise.
     """
     if options.blur_px > 0:
         image = np.asarray(cv2.GaussianBlur(image, (0, 0), options.blur_px), dtype=np.float64)
@@ -140,11 +140,11 @@ def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) 
 
 
 def save_truth(truth: Truth, folder: Path) -> None:
-    """Write truth.json (x ~ K d(R X + t), d the lens) and surface.ply.
+    """Write truth.json (x ~ K d(R X + t) with lens distortion d) and surface.ply.
 
     Args:
         truth: of the photo folder.
-        folder: made where it is missing; not that of the photos.
+        folder: created if missing; not the folder of the photos.
     """
     images = []
     for name, pose in truth.cam_from_world.items():
@@ -174,10 +174,10 @@ def save_truth(truth: Truth, folder: Path) -> None:
 
 
 def load_truth(folder: Path) -> Truth:
-    """Read what `save_truth` wrote.
+    """Read the files that `save_truth` wrote.
 
     Raises:
-        InputError: the files are missing or not as `save_truth` writes them.
+        InputError: the files are missing or malformed.
     """
     try:
         text: dict[str, Any] = json.loads((folder / TRUTH_FILE).read_text(encoding="utf-8"))

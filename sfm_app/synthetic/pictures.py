@@ -1,4 +1,4 @@
-"""Pictures of a finished model: in its own colors as a camera would see it, its bare shape in gray, beside a photo."""
+"""Render pictures of a finished model: in its own colors, untextured in gray, or next to a photo."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -16,37 +16,37 @@ FloatArray = NDArray[np.float64]
 Colors = NDArray[np.uint8]
 BoolArray = NDArray[np.bool_]
 GRAY, INSIDE = np.array([205.0, 205.0, 205.0]), np.array([196.0, 120.0, 110.0])
-"""Of the bare shape in full light, seen from outside and from inside."""
+"""Colors of the untextured shape in full light, seen from outside and from inside."""
 AMBIENT = 0.25
-"""Light that reaches every face of the bare shape, 0..1."""
+"""Ambient light on the untextured shape, 0..1."""
 LAMP = np.array([-0.45, -0.65, -1.0]) / np.linalg.norm([-0.45, -0.65, -1.0])
 """Direction from a face to the lamp, in the camera's frame: over the photographer's left shoulder."""
 ASIDE_DEG = 25.0
-"""How far the view from beside is turned away from the photo's."""
+"""Angle between the view of the photo and the side view."""
 OVER = 2
-"""The pictures beside a photo are rendered this many times as large and averaged."""
+"""Supersampling factor, in x and in y, of the pictures next to a photo."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedModel:
-    """A model ready for many pictures."""
+    """A model prepared for rendering many pictures."""
 
     model: Model
     rays: Any
-    """Open3D RaycastingScene; None where there are no triangles."""
+    """Open3D RaycastingScene; None if there are no triangles."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """What a camera sees of a model."""
+    """A rendered picture of a model."""
 
     colors: Colors
-    """(H, W, 3) RGB; 0 where nothing is seen."""
+    """(H, W, 3) RGB; 0 where the model is not visible."""
     covered: BoolArray
-    """(H, W) where the model is seen."""
+    """(H, W), whether the model is visible."""
 
     def on(self, background: tuple[int, int, int] = (255, 255, 255)) -> Colors:
-        """Return (H, W, 3) with a color where nothing is seen."""
+        """Return (H, W, 3) with a background color where the model is not visible."""
         return np.where(self.covered[..., None], self.colors, np.array(background, np.uint8))
 
 
@@ -57,12 +57,10 @@ def prepare_model(model: Model) -> PreparedModel:
 
 
 def render_model(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
-    """Return the model with its own colors, without light.
+    """Render the model unlit in its own colors: its texture, or its vertex colors if it has no texture.
 
-    The texture, or the colors of the vertices where there is none.
-
-    Both sides of a triangle are seen. A pixel shows the model at its center, so that a texture much finer than the
-    pixels flickers.
+    Triangles are visible from both sides. Each pixel is sampled once at its center, so a texture much finer than the
+    pixels causes aliasing.
 
     Args:
         model: in the frame of `cam_from_world`.
@@ -74,7 +72,7 @@ def render_model(model: Model | PreparedModel, camera: Camera, cam_from_world: F
 
 
 def view_along(model: Model | PreparedModel, origin: FloatArray, directions: FloatArray) -> Picture:
-    """Render as `render_model` does, for any lens: one ray per pixel.
+    """Render as `render_model` does, for any lens, with one given ray per pixel.
 
     Args:
         model: in the frame of the rays.
@@ -96,7 +94,7 @@ def view_along(model: Model | PreparedModel, origin: FloatArray, directions: Flo
 
 
 def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Picture:
-    """Return the bare shape in gray, each triangle lit by itself, so that every bump shows; reddish from inside.
+    """Render the untextured shape in gray with flat shading, so that every bump shows; reddish from inside.
 
     Args:
         model: in the frame of `cam_from_world`.
@@ -120,10 +118,10 @@ def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: F
 
 
 def beside_photo(photo: Colors, model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Colors:
-    """Return a photo and the model from its camera; below, the model from beside and there its bare shape.
+    """Return a photo and the model from its camera; below, the model and its untextured shape from the side.
 
     Args:
-        photo: (h, w, 3) RGB; brought to the camera's size.
+        photo: (h, w, 3) RGB; resized to the camera's size.
         model: in the frame of `cam_from_world`, with y up.
         camera: intrinsics and distortion, and the size of each of the four pictures.
         cam_from_world: (3, 4) pose.
@@ -146,11 +144,11 @@ def beside_photo(photo: Colors, model: Model | PreparedModel, camera: Camera, ca
 
 
 def walked_around(pose: FloatArray, surface: Surface, angle_deg: float) -> FloatArray:
-    """Return the pose of somebody who walked around what a camera looks at, in a frame with y up.
+    """Return a camera pose rotated about the vertical axis through the surface it looks at, in a frame with y up.
 
     Args:
         pose: (3, 4) cam_from_world of that camera.
-        surface: what it looks at; its median depth is the middle of the walk.
+        surface: its median depth gives the center of rotation on the optical axis.
         angle_deg: degrees about y.
     """
     R, t = pose[:, :3], pose[:, 3]
@@ -167,7 +165,7 @@ def _from_vertices(surface: Surface, face: NDArray[np.int64], weights: FloatArra
 
 
 def _from_pages(texture: Texture, face: NDArray[np.int64], weights: FloatArray) -> Colors:
-    """Return bilinear look-up; texel centers at +0.5, the border repeated."""
+    """Sample the texture bilinearly; texel centers at +0.5, the border repeated."""
     place = np.einsum("hwk,hwkc->hwc", weights, texture.uv[face].astype(np.float64))
     page_of = texture.page[face]
     found = np.zeros((*face.shape, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""Rendering by ray casting: a synthetic scene to a photo."""
+"""Render photos of a synthetic scene by ray casting."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -25,13 +25,13 @@ AMBIENT_RAYS = 24
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PreparedScene:
-    """A scene ready for many photos: ray-casting structure and the tables that the shading reads."""
+    """A scene prepared for rendering many photos: ray-casting structure and shading tables."""
 
     rays: Any
     """Open3D RaycastingScene."""
     faces: NDArray[np.int64]
     vertex_table: FloatArray
-    """(V, 7): normal, texture coordinates, and the share of the sky that is not hidden (ambient occlusion)."""
+    """(V, 7): normal, texture coordinates, and the visible share of the sky (ambient occlusion)."""
     face_material: NDArray[np.int64]
     materials: FloatArray
     lights: FloatArray
@@ -39,7 +39,7 @@ class PreparedScene:
 
 
 def prepare(scene: SyntheticScene) -> PreparedScene:
-    """Build the tables of a scene once for all its photos."""
+    """Build the ray-casting structure and tables of a scene once for all photos."""
     vertices, faces = scene.vertices, scene.faces
     shapes = [body.shape for body in scene.bodies]
     normals = np.concatenate([shape.normals for shape in shapes])
@@ -60,13 +60,13 @@ def prepare(scene: SyntheticScene) -> PreparedScene:
 def render_scene(
     scene: PreparedScene, camera: Camera, cam_from_world: FloatArray, supersampling: int = 2
 ) -> FloatArray:
-    """Return what the camera sees before blur, noise and gamma.
+    """Render the image of a camera, before blur, noise and gamma.
 
     Args:
         scene: from `prepare`.
         camera: intrinsics, size and distortion.
         cam_from_world: (3, 4) pose.
-        supersampling: rays per pixel in x and in y, >= 1; each has its shadow.
+        supersampling: rays per pixel in x and in y, >= 1; each has its own shadow ray.
 
     Returns:
         (height, width, 3) linear RGB, about 0..1.
@@ -80,7 +80,7 @@ def render_scene(
             directions = pixel_rays(camera, (float(dx), float(dy))) @ R
             hits = cast(scene.rays, center, directions)
             lit = _lit(scene, center, directions, hits)
-            # t_hit counts in z depth, since the rays have z = 1: the size of a pixel is depth / f
+            # t_hit is the z depth, since the rays have z = 1; a pixel covers depth / f on the surface
             pixel = np.where(np.isfinite(hits["t_hit"]), hits["t_hit"], 1.0) / camera.K[0, 0]
             shade(
                 (directions, hits["primitive_ids"], hits["primitive_uvs"], pixel, lit),
@@ -91,7 +91,7 @@ def render_scene(
 
 
 def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
-    """Return open3D's RaycastingScene of one mesh; it works in single precision.
+    """Return Open3D's RaycastingScene of one mesh, in single precision.
 
     Args:
         vertices: (V, 3).
@@ -105,12 +105,12 @@ def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
 
 
 def cast(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, NDArray[Any]]:
-    """Return first hits of rays, by Open3D's names; t_hit is inf where there is none.
+    """Return the first hits of rays, by Open3D's names; t_hit is inf for rays that hit nothing.
 
     Args:
         caster: from `ray_caster`.
         origin: (3,), or (N, 3) one per ray.
-        directions: (N, 3) of any length; t_hit counts in it.
+        directions: (N, 3) of any length, which is the unit of t_hit.
     """
     rays = np.empty((len(directions), 6), dtype=np.float32)
     rays[:, :3] = origin
@@ -122,7 +122,7 @@ def cast(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, N
 def _lit(
     scene: PreparedScene, center: FloatArray, directions: FloatArray, hits: dict[str, NDArray[Any]]
 ) -> NDArray[np.bool_]:
-    """Return whether the sun reaches each hit; only asked where the surface faces the sun."""
+    """Return whether the sun reaches each hit; shadow rays are cast only where the surface faces the sun."""
     sun = scene.lights[0]
     lit = hits["primitive_normals"] @ sun.astype(np.float32) > 0
     asked = np.flatnonzero(lit)
@@ -135,7 +135,7 @@ def _lit(
 
 
 def _openness(caster: Any, vertices: FloatArray, normals: FloatArray) -> FloatArray:
-    """Return share of cosine-distributed rays (Fibonacci spiral) that leave a vertex without hitting anything near."""
+    """Return the share of cosine-distributed rays (Fibonacci spiral) from each vertex that hit nothing nearby."""
     k = np.arange(AMBIENT_RAYS) + 0.5
     radius = np.sqrt(k / AMBIENT_RAYS)
     angle = k * np.pi * (3.0 - np.sqrt(5.0))
@@ -147,7 +147,7 @@ def _openness(caster: Any, vertices: FloatArray, normals: FloatArray) -> FloatAr
     for r, a in zip(radius, angle, strict=True):
         direction = r * np.cos(a) * u + r * np.sin(a) * v + np.sqrt(1.0 - r * r) * normals
         distance = cast(caster, vertices + 1e-2 * normals, direction)["t_hit"].astype(np.float64)
-        free += np.clip(distance / 1.5, 0.0, 1.0)  # what is 1.5 units away no longer darkens
+        free += np.clip(distance / 1.5, 0.0, 1.0)  # surfaces beyond 1.5 units do not darken
     return free / AMBIENT_RAYS
 
 

@@ -1,6 +1,6 @@
-"""Photo folders with random trouble: how people really take photos, with known truth.
+"""Generate photo folders with random problems of real photography, with ground truth.
 
-A seed decides everything: the scene, the walk, the cameras, and a few troubles at a time.
+The seed determines everything: the scene, the walk, the cameras, and a few problems at a time.
 """
 
 import math
@@ -39,36 +39,36 @@ PLACES = ("things", "plane", "repeats", "look-alikes")
 OF_CAMERAS = ("two cameras", "zoom", "crop", "squeeze", "lens")
 OF_PHOTOS = ("motion blur", "defocus", "moving object", "few features")
 ORDINARY = ("walk", "things")
-"""No trouble."""
+"""Choices that do not count as trouble."""
 KINDS = tuple(kind for kind in (*WALKS, *PLACES, *OF_CAMERAS, *OF_PHOTOS) if kind not in ORDINARY)
 """All troubles by name."""
 SIZES = ((480, 320), (512, 384), (384, 512), (576, 384), (640, 480), (640, 400))
 PHOTOS = (6, 20)
 AIM = (0.0, 0.7, 0.0)
-"""What the walks look at: the middle of the things."""
+"""Point that the photos look at: the middle of the objects."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spoiling:
-    """What happens to single photos."""
+    """Defects of single photos."""
 
     blur_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """By photo name: length and direction (radians) of its motion blur."""
     defocus_px: Mapping[str, float] = field(default_factory=dict)
-    """By photo name: standard deviation of its blur."""
+    """By photo name: standard deviation of its defocus blur, in pixels."""
     thing: SyntheticScene | None = None
-    """Moves while the photos are taken."""
+    """Object that moves from photo to photo."""
     thing_at: Mapping[str, FloatArray] = field(default_factory=dict)
     """By photo name: (3, 4) world_from_thing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TroubledFolder:
-    """A folder of photos that is to be rendered."""
+    """Plan of a folder of photos to render."""
 
     seed: int
     troubles: tuple[str, ...]
-    """Of `KINDS`, in their order; empty where nothing is wrong."""
+    """Entries of `KINDS`, in their order; empty without trouble."""
     scene: SyntheticScene
     views: Views
     options: PhotoOptions
@@ -76,7 +76,7 @@ class TroubledFolder:
 
 
 def troubled_folder(seed: int) -> TroubledFolder:
-    """Draw a folder: same seed, same folder."""
+    """Draw the plan of a folder: same seed, same plan."""
     rng = np.random.default_rng([seed, 29])
     walk = str(rng.choice(WALKS, p=(0.4, 0.15, 0.15, 0.15, 0.15)))
     place = str(rng.choice(PLACES, p=(0.55, 0.15, 0.15, 0.15)))
@@ -109,7 +109,7 @@ def write_troubled_folder(folder: Path, plan: TroubledFolder) -> Truth:
     """Render one JPEG per view into a folder; the truth is not written.
 
     Args:
-        folder: made where it is missing.
+        folder: created if missing.
         plan: from `troubled_folder`.
 
     Raises:
@@ -135,12 +135,12 @@ def write_troubled_folder(folder: Path, plan: TroubledFolder) -> Truth:
 
 
 def smeared(image: FloatArray, length_px: float, direction: float) -> FloatArray:
-    """Return the image of a camera that turned during the exposure: averaged along a line.
+    """Apply the motion blur of a camera that turned during the exposure: average along a line.
 
     Args:
         image: (H, W, 3) linear RGB.
-        length_px: of the line; below 1 nothing is done.
-        direction: of the line, radians from x to y.
+        length_px: of the line; below 1, the image is returned unchanged.
+        direction: of the line, in radians from x towards y.
     """
     if length_px < 1:
         return image
@@ -162,12 +162,12 @@ Seen = tuple[PreparedScene, FloatArray]
 
 
 def in_front(image: FloatArray, still: Seen, moving: Seen, camera: Camera, supersampling: int) -> FloatArray:
-    """Return the image of the still scene with what moves where that is nearer; it casts no shadow.
+    """Return the image of the still scene with the moving object where it is nearer; the object casts no shadow.
 
     Args:
         image: (H, W, 3) linear RGB of the still scene.
         still: scene and pose of the camera in it.
-        moving: the same for what moves.
+        moving: scene of the moving object and pose of the camera in it.
         camera: of the image.
         supersampling: rays per pixel in x and in y, >= 1.
     """
@@ -182,18 +182,18 @@ def in_front(image: FloatArray, still: Seen, moving: Seen, camera: Camera, super
 
 
 def pose_after(cam_from_world: FloatArray, world_from_thing: FloatArray) -> FloatArray:
-    """Return (3, 4) pose of the camera in the frame of a thing.
+    """Return the (3, 4) pose of the camera in the frame of an object.
 
     Args:
         cam_from_world: (3, 4) pose of the camera.
-        world_from_thing: (3, 4) place of the thing.
+        world_from_thing: (3, 4) pose of the object.
     """
     R, t = cam_from_world[:, :3], cam_from_world[:, 3]
     return np.column_stack([R @ world_from_thing[:, :3], R @ world_from_thing[:, 3] + t])
 
 
 def _some(kinds: tuple[str, ...], shares: tuple[float, ...], rng: Random) -> list[str]:
-    """Draw none, one, two, ... of the kinds, as probable as the shares say."""
+    """Draw k of the kinds, where k = 0, 1, ... has the probability shares[k]."""
     return [str(kind) for kind in rng.choice(kinds, int(rng.choice(len(shares), p=shares)), replace=False)]
 
 
@@ -210,7 +210,7 @@ def _scene(place: str, rng: Random) -> SyntheticScene:
 
 
 def _camera(drawn: set[str], rng: Random) -> Camera:
-    """Draw the camera of a folder; its center, pixels and lens may be part of the trouble."""
+    """Draw the camera of a folder; its optical center, pixel aspect and lens may be among the troubles."""
     width, height = (int(side) for side in rng.choice(SIZES))
     longer = math.exp(rng.uniform(math.log(0.75), math.log(1.6)))
     center = 0.5 + rng.normal(0.0, 0.008, 2)
@@ -218,17 +218,17 @@ def _camera(drawn: set[str], rng: Random) -> Camera:
         center = center + rng.choice((-1.0, 1.0), 2) * rng.uniform(0.04, 0.16, 2)
     aspect = float(rng.choice((0.75, 0.85, 1.2, 1.33))) if "squeeze" in drawn else 1.0
     camera = make_camera(width, height, longer * max(width, height) / width, (center[0], center[1]), aspect)
-    # how far a corner of the photo is pushed; a phone's lens is corrected to about half a percent
+    # relative displacement of a corner; phones correct their lenses to about half a percent
     bend = rng.choice((-1.0, 1.0)) * rng.uniform(0.03, 0.1) if "lens" in drawn else rng.normal(0.0, 0.003)
     return bent(camera, float(bend))
 
 
 def bent(camera: Camera, bend: float) -> Camera:
-    """Return the camera with a lens that pushes the farthest corner outwards.
+    """Return the camera with the radial distortion that moves the farthest corner outwards by a share.
 
     Args:
-        camera: of any lens; it is replaced.
-        bend: share of the corner's distance; < 0: inwards.
+        camera: its own distortion is replaced.
+        bend: k1 r^2 at the corner; < 0: inwards.
     """
     corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
     seen = (corners - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
@@ -236,11 +236,11 @@ def bent(camera: Camera, bend: float) -> Camera:
 
 
 def zoomed(camera: Camera, factor: float) -> Camera:
-    """Return the camera with a longer or shorter lens, which bends lines as before.
+    """Return the camera with another focal length and the same distortion in pixels.
 
     Args:
-        camera: before.
-        factor: of the focal length, > 0.
+        camera: before the zoom.
+        factor: new over old focal length, > 0.
     """
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= factor
@@ -267,7 +267,7 @@ def _walk(walk: str, place: str, camera: Camera, rng: Random) -> Views:
 
 
 def _straight_on(walk: str, camera: Camera, count: int, distance: float, rng: Random) -> Views:
-    """Return a straight way with a straight look: ahead, as from a car, or to the side, as from a train."""
+    """Return a straight path with a fixed viewing direction: ahead, as from a car, or sideways, as from a train."""
     along = np.linspace(0.5, -0.5, count) + rng.normal(0.0, 0.1 / count, count)
     way = np.zeros((count, 3))
     if walk == "forward":
@@ -287,7 +287,7 @@ def _with_cameras(views: Views, drawn: set[str], rng: Random) -> Views:
         other = zoomed(views.cameras[names[0]], factor)
         K = other.K.copy()
         K[:2, 2] += center * (other.width, other.height)
-        # in turn or one after the other: as two people, or as one with two cameras
+        # alternating or one after the other, as with two photographers or one with two cameras
         turn = names[1::2] if rng.uniform() < 0.5 else names[: len(names) // 2]
         views = views.taken_with(replace(other, K=K), turn)
     if "zoom" in drawn:
@@ -312,7 +312,7 @@ def _spoiling(drawn: set[str], views: Views, rng: Random) -> Spoiling:
 
 
 def _wandering(names: list[str], rng: Random) -> dict[str, FloatArray]:
-    """Let somebody walk about before the things, turning as they like: (3, 4) world_from_thing."""
+    """Draw a random walk with random turns in front of the objects: (3, 4) world_from_thing by photo."""
     place, angle = np.array([rng.uniform(-1.0, 1.0), 0.0, rng.uniform(1.0, 1.8)]), rng.uniform(0.0, 360.0)
     found = {}
     for name in names:

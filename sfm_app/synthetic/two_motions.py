@@ -13,9 +13,9 @@ from sfm_app.synthetic.correspondences import FAR, MAX_SETUPS, NEAR, PairOptions
 FloatArray = NDArray[np.float64]
 
 RADIUS = (0.1, 0.2)
-"""Of the moving object, in units of the distance to the middle of the scene."""
+"""Range of the radius of the moving object, in units of the distance to the middle of the scene."""
 MAX_TURN_DEG, MAX_SHIFT = 30.0, 0.3
-"""How far the object turns about its center and shifts between the two images."""
+"""Largest turn of the object about its center and shift per axis between the two images."""
 LEAST_DEPARTURE_PX = 5.0
 """Median Sampson distance of the object's exact matches to the geometry of the scene: an object that slides along its
 epipolar lines does not count as moving."""
@@ -26,11 +26,11 @@ class TwoMotions:
     """Matches of a still scene, of an object that moves, and outliers, in random order."""
 
     pair: TwoViews
-    """Everything about the still scene; the object's matches are outliers in `is_inlier`."""
+    """Ground truth of the still scene; the object's matches are outliers in `is_inlier`."""
     is_moving: NDArray[np.bool_]
-    """(N,) the matches on the object."""
+    """(N,), whether a match lies on the object."""
     moving_F: FloatArray
-    """(3, 3) of the object: x2' F x1 = 0 for its exact points, Frobenius norm 1."""
+    """(3, 3) fundamental matrix of the object: x2' F x1 = 0 for its exact points, Frobenius norm 1."""
 
 
 def make_two_motions(options: PairOptions, moving: float, seed: int) -> TwoMotions:
@@ -73,7 +73,7 @@ def make_two_motions(options: PairOptions, moving: float, seed: int) -> TwoMotio
 def _moving_object(
     still: TwoViews, options: PairOptions, count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return exact points of a ball with its own motion in both images, and its fundamental matrix."""
+    """Return noise-free image points of a moving ball in both images, and its fundamental matrix."""
     size = np.array([options.width, options.height])
     for _ in range(MAX_SETUPS):
         pixel = np.append(rng.uniform(size=2) * size, 1.0)

@@ -1,1 +1,1 @@
-"""Frames of a video that become photos."""
+"""Select the frames of a video that become photos."""

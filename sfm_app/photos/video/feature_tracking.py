@@ -1,4 +1,4 @@
-"""How far the picture of a video has moved on, and how sharp it is, frame by frame."""
+"""Measure image motion and sharpness of a video, frame by frame."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -12,48 +12,48 @@ BoolArray = NDArray[np.bool_]
 Picture = NDArray[np.uint8]
 
 STEP = 0.05
-"""One step: the median corner has moved by this share of the longer side."""
+"""One step of motion: the median displacement of the corners, as a share of the longer side."""
 LONGEST = 1.5
-"""A blurred frame is no reference before so many steps."""
+"""A blurred frame becomes a reference only after this many steps."""
 LEAST_FOLLOWED = 0.6
-"""It is a step, too, when a smaller share of the corners is found again: the overlap goes."""
+"""Tracking a smaller share of the corners also counts as a step, since the overlap is shrinking."""
 BLURRED = 0.5
 """A frame with less than this share of its neighbors' sharpness is blurred."""
 RECENT = 30
-"""Frames that sharpness is compared with; a longer blur than most of them is taken for what there is."""
+"""Number of frames that sharpness is compared with; a blur longer than most of them counts as normal."""
 SHARP_PERCENTILE = 80
-"""Of the recent frames: what a sharp one has, even where most are blurred."""
+"""Percentile of the recent sharpness that stands for a sharp frame, even if most are blurred."""
 CORNERS = 200
 FEWEST = 20
-"""With fewer corners nothing is said about motion."""
+"""Motion is not estimated from fewer corners."""
 THERE_AND_BACK_PX = 1.0
-"""A corner that is followed and followed back lands so near to where it was, or it is lost."""
+"""Largest forward-backward error of a tracked corner; beyond, it is lost."""
 WINDOW_PX, LEVELS = 15, 3
-"""Of the Lucas-Kanade method."""
+"""Window and pyramid levels of the Lucas-Kanade method."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackedFrame:
-    """What is kept of one frame."""
+    """Measurements of one frame."""
 
     frame: int
-    """Its number."""
+    """Frame number."""
     sharpness: float
-    """Variance of the Laplacian; to be compared with that of neighbors only."""
+    """Variance of the Laplacian; comparable only between neighboring frames."""
     way: float
-    """Steps from the first frame to here."""
+    """Accumulated motion from the first frame to this one, in steps."""
 
 
 class Follower:
-    """Follows corners from a reference to each frame; after a step, a frame that is not blurred is the next reference.
+    """Tracks corners from a reference to each frame; after one step, the next sharp frame becomes the reference.
 
-    Frames are compared with the reference, not with the one before: otherwise noise and a shaking hand would add up to
-    a way where the camera stands still.
+    Frames are compared with the reference, not with the previous frame: otherwise noise and camera shake would add up
+    to motion of a camera that stands still.
     """
 
     def __init__(self) -> None:
         self.seen = False
-        """Whether there was ever something to follow."""
+        """Whether any frame had enough corners to track."""
         self._passed = 0.0
         self._reference: Picture | None = None
         self._corners = np.zeros((0, 1, 2), np.float32)
@@ -62,11 +62,11 @@ class Follower:
         self._recent: deque[float] = deque(maxlen=RECENT)
 
     def look(self, frame: int, gray: Picture) -> TrackedFrame:
-        """Measure the next frame: how sharp it is, and how far the picture has moved on.
+        """Measure sharpness and accumulated motion of the next frame.
 
         Args:
             frame: its number.
-            gray: (H, W); all frames are of one size.
+            gray: (H, W); all frames have one size.
         """
         sharpness = float(cv2.Laplacian(gray, cv2.CV_32F).var())
         self._recent.append(sharpness)
@@ -74,7 +74,7 @@ class Follower:
             self._refer(gray)
             return TrackedFrame(frame, sharpness, self._passed)
         self._moved, followed = self._follow(self._reference, gray)
-        # blur loses corners that come back: no reason to take such a frame
+        # corners lost to blur reappear later, so they do not count as lost overlap
         blurred = sharpness < BLURRED * float(np.percentile(self._recent, SHARP_PERCENTILE))
         lost = 0.0 if blurred else min(1.0, (1 - followed) / (1 - LEAST_FOLLOWED))
         part = max(self._moved / STEP, lost)
@@ -92,7 +92,7 @@ class Follower:
         self.seen = self.seen or len(self._corners) >= FEWEST
 
     def _follow(self, reference: Picture, gray: Picture) -> tuple[float, float]:
-        """Return by how many longer sides the median corner moved, and the share of the corners that is found again."""
+        """Return the median displacement of the corners, in longer sides, and the share of corners that are tracked."""
         there, found = _tracked(reference, gray, self._corners, self._last)
         back, found_back = _tracked(gray, reference, there, self._corners)
         off = np.linalg.norm(back - self._corners, axis=2)[:, 0]
@@ -101,13 +101,13 @@ class Follower:
         if np.count_nonzero(alive) < FEWEST:
             return self._moved, float(np.mean(alive))
         flow = (there - self._corners)[alive, 0]
-        # corners that are lost now are looked for beside the others the next time
+        # the next search for lost corners starts from the median flow
         self._last = np.where(alive[:, None, None], there, self._corners + np.median(flow, axis=0)).astype(np.float32)
         return float(np.median(np.linalg.norm(flow, axis=1))) / max(gray.shape), float(np.mean(alive))
 
 
 def _tracked(before: Picture, after: Picture, points: FloatArray, guess: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Find where points (N, 1, 2) of one picture are in another, and which of them were found."""
+    """Find points (N, 1, 2) of one picture in another; return their positions and whether each was found."""
     there, found, _ = cv2.calcOpticalFlowPyrLK(
         before, after, points, guess.copy(),
         winSize=(WINDOW_PX, WINDOW_PX), maxLevel=LEVELS, flags=cv2.OPTFLOW_USE_INITIAL_FLOW,

@@ -1,4 +1,4 @@
-"""Which frames of a video become photos: one for every step of the picture, the sharpest one thereabouts."""
+"""Select the frames of a video that become photos: the sharpest frame around each step of motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,26 +11,26 @@ from sfm_app.photos.video.feature_tracking import BLURRED, TrackedFrame
 FloatArray = NDArray[np.float64]
 
 NEAR, FAR = 0.25, 0.5
-"""The sharpest frame is looked for within so many steps to either side; further away where all of these are blurred."""
+"""The sharpest frame is searched within NEAR steps on either side; within FAR steps if those are all blurred."""
 GAP = 1.5
-"""Steps between frames that may pass without one where there are blurred ones only."""
+"""Longest gap between chosen frames, in steps, while all frames are blurred; then a blurred one is chosen."""
 HARDLY_MOVED, LESS_SHARP, TOO_MANY = "hardly moved on", "less sharp than a neighbor", "more than max_frames"
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The frames that were chosen, in rising order, and why the others were not."""
+    """Chosen frames in ascending order, and why the others were not chosen."""
 
     frames: tuple[int, ...]
     left_out: dict[str, int]
-    """Reason and number of frames; each frame that was looked at is chosen or counted once."""
+    """Number of frames by reason; each measured frame is either chosen or counted once."""
 
 
 def choose(looks: Sequence[TrackedFrame], most: int) -> Choice:
-    """Return one frame per step of the way; steps are longer where that would be more than `most` frames.
+    """Choose one frame per step of motion; the spacing grows if that would be more than `most` frames.
 
     Args:
-        looks, most: of all frames that were looked at, in their order; frames, >= 2.
+        looks, most: measurements of the frames, in order; largest number of chosen frames, >= 2.
     """
     way = np.array([look.way for look in looks], np.float64)
     sharpness = np.array([look.sharpness for look in looks], np.float64)
@@ -52,10 +52,10 @@ def choose(looks: Sequence[TrackedFrame], most: int) -> Choice:
 
 
 def sharpest(way: FloatArray, sharpness: FloatArray, spacing: float) -> tuple[list[int], set[int]]:
-    """Return the sharpest frame around every multiple of a spacing, and all those that it was chosen from.
+    """Return the sharpest frame around every multiple of a spacing, and all candidates.
 
     Args:
-        way, sharpness: (N,) steps, and (N,).
+        way, sharpness: (N,) accumulated motion in steps, (N,) sharpness.
         spacing: steps, >= 1.
     """
     chosen: list[int] = []
@@ -81,7 +81,7 @@ def _best(sharpness: FloatArray, frames: NDArray[np.int64]) -> int:
 
 
 def _around(way: FloatArray, moment: int, target: float, reach: float, first: int) -> NDArray[np.int64]:
-    """Return frames about a moment, one after the other, whose way lies within reach of the target."""
+    """Return the consecutive frames around a moment whose accumulated motion lies within reach of the target."""
     outside = np.abs(way - target) > reach
     outside[:first] = True
     before = np.flatnonzero(outside[:moment])

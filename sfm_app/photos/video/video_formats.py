@@ -1,9 +1,9 @@
-"""Which files are videos, by their first bytes: names say nothing, and lists of other files are none."""
+"""Recognize videos by their first bytes, not by their names; playlists are not videos."""
 
 from pathlib import Path
 
 ENDINGS = (".mp4", ".m4v", ".mov", ".mkv", ".webm", ".avi", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".3gp")
-"""What people expect to be a video; only what is said to them depends on it."""
+"""Extensions of videos; used only to word error messages."""
 HEAD_BYTES = 400
 """Enough for three packets of an MPEG transport stream."""
 HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"mif1", b"msf1")
@@ -11,13 +11,13 @@ AVIF_BRANDS = (b"avif", b"avis")
 OTHER_BRANDS = (*HEIC_BRANDS, *AVIF_BRANDS, b"crx ", b"M4A ", b"M4B ", b"M4P ")
 """Photos and sound in the container of MP4."""
 ATOMS = (b"moov", b"mdat", b"wide", b"free", b"skip")
-"""What QuickTime files without a brand begin with."""
+"""First atoms of QuickTime files without a brand."""
 
 
 def head_of(path: Path) -> bytes:
-    """Return the first bytes of a regular file; none where it cannot be read."""
+    """Return the first bytes of a regular file; empty if it cannot be read."""
     try:
-        if not path.is_file():  # pipes would never end
+        if not path.is_file():  # reading a pipe would never end
             return b""
         with path.open("rb") as file:
             return file.read(HEAD_BYTES)
@@ -40,5 +40,5 @@ def is_video(head: bytes) -> bool:
 
 
 def _packets(head: bytes, first: int, length: int) -> bool:
-    """Return whether the packets of an MPEG transport stream begin where they should."""
+    """Return whether the sync bytes of an MPEG transport stream are in place."""
     return len(head) == HEAD_BYTES and all(head[k] == 0x47 for k in range(first, HEAD_BYTES, length))

@@ -1,4 +1,4 @@
-"""Reading a video frame by frame. One regular file is opened by FFmpeg, and nothing that it may name: no network."""
+"""Read a video frame by frame. FFmpeg opens one regular file, but no file or network address named in it."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,37 +15,37 @@ from sfm_app.photos.video.video_formats import head_of, is_video
 Picture = NDArray[np.uint8]
 
 SMALL_PX = 480
-"""Longer side of the pictures that frames are chosen by."""
+"""Longer side of the pictures that frames are selected from."""
 LOOKS_PER_S = 30
-"""More frames in a second are not looked at one by one."""
+"""Faster videos are subsampled to about this rate."""
 FASTEST = 240
-"""Frames per second; files that claim more do not know."""
+"""Frames per second; a higher rate in the file is taken as wrong."""
 CUT_SHORT = 0.95
-"""A file that ends before this share of its length is cut off or damaged."""
+"""A file that ends before this share of its stated length is cut off or damaged."""
 JPEG_QUALITY = 95
 
 FFMPEG = {
     "OPENCV_FFMPEG_CAPTURE_OPTIONS": "protocol_whitelist;file|format_whitelist;mov,matroska,webm,avi,mpeg,mpegts",
     "OPENCV_FFMPEG_LOGLEVEL": "-8",
 }
-"""OpenCV reads these when it opens a file. Without the first, FFmpeg follows lists and patterns of other files."""
+"""Variables that OpenCV reads when it opens a file. Without the first, FFmpeg follows playlists and file patterns."""
 
 
 @contextmanager
 def opened(path: Path) -> Iterator["Video"]:
-    """Provide a video, open for one reading; what FFmpeg has to say about it is not shown.
+    """Provide a video that is open for one pass, with FFmpeg's messages silenced.
 
     Raises:
-        UnreadableError: it is none, or nothing in it can be read.
+        UnreadableError: the file is not a video, or nothing in it can be read.
     """
-    place = path.resolve()  # FFmpeg takes a name with a colon for a protocol, unless it is absolute
+    place = path.resolve()  # FFmpeg takes a relative name with a colon for a protocol
     if not is_video(head_of(place)):
         raise UnreadableError("not a video")
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         with _environment(FFMPEG):
-            software = (cv2.CAP_PROP_HW_ACCELERATION, cv2.VIDEO_ACCELERATION_NONE)  # the same bytes everywhere
+            software = (cv2.CAP_PROP_HW_ACCELERATION, cv2.VIDEO_ACCELERATION_NONE)  # same pixels on every machine
             capture = cv2.VideoCapture(str(place), cv2.CAP_FFMPEG, software)
         if not capture.isOpened():
             raise UnreadableError("damaged, cut off, or of an unknown kind")
@@ -56,41 +56,41 @@ def opened(path: Path) -> Iterator["Video"]:
 
 
 class Video:
-    """An open video, upright as its rotation says; frames are numbered from 0."""
+    """An open video, with its rotation applied; frames are numbered from 0."""
 
     def __init__(self, capture: cv2.VideoCapture) -> None:
         self._capture = capture
         self.rate = max(0.0, capture.get(cv2.CAP_PROP_FPS))
-        """Frames per second as the file says; 0 where it does not."""
+        """Frames per second as stated in the file; 0 if it is not."""
         self.claimed = max(0, int(capture.get(cv2.CAP_PROP_FRAME_COUNT)))
-        """Frames as the file says, which need not be true."""
+        """Number of frames as stated in the file, which may be wrong."""
         self.frames = 0
-        """Frames that were read so far."""
+        """Number of frames read so far."""
         self.seconds = 0.0
-        """When the last of them is shown."""
+        """Timestamp of the last of them."""
         self.black = 0
-        """Frames that were looked at and are black all over: so OpenCV gives those that are interlaced."""
+        """Number of sampled frames that are entirely black, which is how OpenCV returns interlaced frames."""
 
     @property
     def stride(self) -> int:
-        """Every which frame is looked at."""
+        """Sampling interval in frames."""
         return max(1, round(self.rate / LOOKS_PER_S)) if self.rate <= FASTEST else 1
 
     @property
     def looks(self) -> int:
-        """About how many frames will be looked at."""
+        """Approximate number of frames that will be sampled."""
         return max(1, self.claimed // self.stride)
 
     @property
     def cut_short(self) -> bool:
-        """Whether the file ended before its time; known once all frames were read."""
+        """Whether the file ended before its stated length; known once all frames were read."""
         if not (self.rate and self.claimed):
             return False
-        # by time, for counts are made from a rate that may be wrong, and then both are
+        # by time: a frame count that was derived from a wrong rate is wrong, too
         return self.seconds + 2 / self.rate < CUT_SHORT * self.claimed / self.rate
 
     def small_frames(self) -> Iterator[tuple[int, Picture]]:
-        """Yield small gray pictures of the frames that are looked at, with their numbers."""
+        """Yield small gray pictures of the sampled frames, with their numbers."""
         size: tuple[int, int] | None = None
         for number in self._grabbed():
             if number % self.stride:
@@ -107,7 +107,7 @@ class Video:
             yield number, _gray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
     def jpegs(self, numbers: Sequence[int]) -> Iterator[tuple[int, bytes]]:
-        """Yield frames at full size as JPEG, with their numbers, in rising order; fewer where the file has changed."""
+        """Yield frames at full size as JPEG, with their numbers, in ascending order; fewer if the file has changed."""
         wanted = set(numbers)
         for number in self._grabbed():
             if number in wanted:
@@ -119,7 +119,7 @@ class Video:
                 return
 
     def _grabbed(self) -> Iterator[int]:
-        """Yield numbers of the frames, one after the other; each may be retrieved while it is the last one."""
+        """Yield frame numbers in order; a frame can be retrieved only until the next one is grabbed."""
         while self._capture.grab():
             self.frames += 1
             self.seconds = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
@@ -132,7 +132,7 @@ def _gray(picture: NDArray[np.uint8]) -> Picture:
 
 @contextmanager
 def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Set these variables, and restore them afterwards."""
+    """Set environment variables, and restore them afterwards."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:

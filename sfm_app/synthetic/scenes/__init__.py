@@ -1,1 +1,1 @@
-"""What is rendered: scenes of known shape."""
+"""Define the synthetic scenes."""

@@ -1,4 +1,4 @@
-"""What a synthetic scene is made of."""
+"""Define the bodies that a synthetic scene consists of."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """One thing in a scene. Bodies of one material still differ in every stain: their place in the scene seeds them."""
+    """One object in a scene. Bodies of one material differ in texture: their index in the scene seeds it."""
 
     shape: Shape
     material: Material
@@ -34,7 +34,7 @@ class SyntheticScene:
 
     @property
     def vertices(self) -> FloatArray:
-        """(V, 3) of all bodies."""
+        """(V, 3) vertices of all bodies."""
         return np.concatenate([body.shape.vertices for body in self.bodies])
 
     @property

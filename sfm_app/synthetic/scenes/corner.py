@@ -13,7 +13,7 @@ from sfm_app.synthetic.scenes.textures import Material
 PLASTER = Material(
     pattern="stone", base=(214, 208, 192), second=(205, 198, 182), joint=(208, 202, 186), scale=0.5, contrast=0.03
 )
-"""Paint on plaster: gray levels differ by about as much as the noise of a photo."""
+"""Painted plaster: its gray levels vary by about as much as the noise of a photo."""
 PAPER = Material(
     pattern="leaves", base=(150, 164, 158), second=(186, 190, 172), joint=(122, 138, 136), scale=0.11, contrast=0.25
 )
@@ -34,13 +34,13 @@ CANVAS = (
     Material(pattern="stone", base=(176, 84, 62), second=(232, 206, 150), joint=(40, 52, 84), scale=0.2),
 )
 SIDE, HEIGHT = 3.2, 2.5
-"""Of the room, in scene units; its corner is where x = z = 0."""
+"""Size of the room, in scene units; its corner is at x = z = 0."""
 TURN_DEG, MIDDLE = -45.0, (0.0, 0.0, -1.9)
-"""The corner is turned to face +z and put behind the origin, where the photos look."""
+"""Rotation and translation that turn the corner towards +z and put it behind the origin, at which the photos aim."""
 
 
 def corner() -> SyntheticScene:
-    """Return the scene; light falls in over the photographer's shoulder."""
+    """Return the scene; the light comes over the photographer's shoulder."""
     bodies = [*_walls(), *_shelf(), *_pictures(), *_table(), *_armchair(), *_things()]
     placed = tuple(replace(body, shape=body.shape.moved(MIDDLE, turn_deg=TURN_DEG)) for body in bodies)
     return SyntheticScene("corner", placed, to_light=(-0.25, 0.8, 0.75), sun=0.55, sky=0.75)
@@ -51,7 +51,7 @@ def corner_views(camera: Camera, seed: int = 0) -> Views:
 
     Args:
         camera: of all photos.
-        seed: same seed, same steps.
+        seed: same seed, same poses.
     """
     walk = ArcOptions(
         photos=14, sweep_deg=70.0, distance=(1.9, 2.9), height=(1.0, 1.9), aim=(0.0, 0.95, -0.9), aim_spread=0.3,
@@ -61,7 +61,7 @@ def corner_views(camera: Camera, seed: int = 0) -> Views:
 
 
 def _walls() -> list[Body]:
-    # an uneven floor stood up: plaster is never quite flat
+    # uneven ground turned upright, since plaster is not quite flat
     plain = ground((0.0, SIDE), (-HEIGHT, 0.0), unevenness=0.003, spacing=0.06).moved(tilt_deg=90.0)
     papered = box(0.1, HEIGHT, SIDE, spacing=0.08).moved((-0.05, 0.0, SIDE / 2))
     floor = box(SIDE, SIDE, 0.05, spacing=0.08).moved((SIDE / 2, 0.0, 0.0), tilt_deg=90.0).moved((0.0, -0.025, 0.0))
@@ -72,7 +72,7 @@ def _walls() -> list[Body]:
 
 
 def _shelf() -> list[Body]:
-    """Return books against the papered wall."""
+    """Return a shelf of books against the papered wall."""
     rng = np.random.default_rng(17)
     boards = [box(0.28, 0.03, 1.0).moved((0.15, y, 2.2)) for y in (0.02, 0.42, 0.82, 1.22)]
     boards += [box(0.28, 1.25, 0.03).moved((0.15, 0.0, z)) for z in (1.7, 2.7)]
@@ -109,7 +109,7 @@ def _pictures() -> list[Body]:
 
 
 def _table() -> list[Body]:
-    """Make a table before the plain wall, which shows above and beside it."""
+    """Return a table in front of the plain wall, which is visible above and beside it."""
     legs = [box(0.05, 0.6, 0.05).moved((1.35 + x, 0.0, 0.45 + z)) for x in (-0.4, 0.4) for z in (-0.22, 0.22)]
     top = box(0.95, 0.04, 0.56, spacing=0.06).moved((1.35, 0.6, 0.45))
     lamp = revolved(np.array([[0.1, 0.0], [0.1, 0.02], [0.02, 0.04], [0.02, 0.3], [0.0, 0.3]]), segments=40, sharp=True)

@@ -1,6 +1,6 @@
-"""The demo scene: an amphora on a stepped pedestal in a paved court, an arcade behind it, odd things around it.
+"""The demo scene: an amphora on a stepped pedestal in a paved court, an arcade behind it, various objects around it.
 
-Nothing in it is flat as a whole: a plane would leave the fundamental matrices undetermined.
+The scene is not planar, since a plane would leave the fundamental matrices undetermined.
 """
 
 from dataclasses import replace
@@ -39,7 +39,7 @@ PEDESTAL_TOP_Y = 1.36
 
 
 def courtyard() -> SyntheticScene:
-    """Return the scene; photos from about 5 units away on the side of +z show it best."""
+    """Return the scene; it is best photographed from about 5 units away on the side of +z."""
     floor = Body(ground((-5.2, 5.2), (-3.0, 7.0), unevenness=0.02), PAVING)
     bodies = [floor, *_back_wall(), *_arcade(), *_side_walls(), *_pedestal(), *_amphora(), *_leaning_things()]
     return SyntheticScene("courtyard", (*bodies, *_round_things()))
@@ -58,7 +58,7 @@ def _arcade() -> list[Body]:
     z = BACK_WALL_Z
     column = revolved(_profile((0.17, 0.13), (0.0, 1.35)), segments=80, flutes=(20, 0.06))
     ring = revolved(_profile((0.0, 0.2, 0.2, 0.16, 0.0), (0.0, 0.0, 0.07, 0.12, 0.12)), segments=48, sharp=True)
-    # rings in between, so that the light under the arch is not smeared across the disc
+    # intermediate rings, so that shading under the arch is not interpolated across the disc
     rims = _profile((0.65, 0.65, 0.5, 0.35, 0.2, 0.0), (0.0, 0.06, 0.06, 0.06, 0.06, 0.06))
     half_disc = revolved(rims, segments=40, span_deg=180.0, sharp=True)
     bodies = []
@@ -101,7 +101,7 @@ def _amphora() -> list[Body]:
     radius = (0.0, 0.15, 0.15, 0.08, 0.13, 0.25, 0.31, 0.29, 0.19, 0.105, 0.1, 0.13, 0.18, 0.16, 0.09, 0.07)
     height = (0.0, 0.0, 0.03, 0.07, 0.16, 0.36, 0.56, 0.72, 0.86, 0.95, 1.06, 1.13, 1.16, 1.19, 1.15, 0.9)
     body = revolved(_smoothed(_profile(radius, height), 6), segments=128)
-    # an open ring, turned so that its gap faces -x, then stood up
+    # an open ring, turned so that its gap faces -x, then set upright
     handle = torus(0.19, 0.026, span_deg=220.0).moved(turn_deg=-110.0).moved(tilt_deg=90.0)
     y = PEDESTAL_TOP_Y
     return [

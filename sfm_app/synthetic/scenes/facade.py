@@ -29,15 +29,15 @@ FLOWERS = Material(
 
 WIDTH, THICKNESS, RECESS = 9.0, 0.5, 0.26
 AXES = (-3.5, -1.75, 0.0, 1.75, 3.5)
-"""Middles of the openings, in x."""
+"""Centers of the openings, in x."""
 OPENING = 1.0
 """Width of an opening."""
 FLOORS = ((0.0, 0.75, 2.45, 2.9), (2.9, 3.6, 5.2, 5.9))
-"""Per floor: foot of the wall, sill, lintel, top of the wall, in y. Its front is z = 0."""
+"""Per floor: foot of the wall, sill, lintel, top of the wall, in y. The front of the wall is at z = 0."""
 
 
 def facade() -> SyntheticScene:
-    """Return the scene; photos from 5 to 7 units in front of it show it best."""
+    """Return the scene; it is best photographed from 5 to 7 units in front of it."""
     bodies = [
         Body(ground((-4.8, 4.8), (-0.6, 2.2), unevenness=0.012), replace(PAVING, scale=0.4)),
         Body(_wall(0), ASHLAR),
@@ -53,7 +53,7 @@ def facade_views(camera: Camera, seed: int = 0) -> Views:
 
     Args:
         camera: of all photos.
-        seed: same seed, same steps.
+        seed: same seed, same poses.
     """
     return past(camera, PastOptions(length=8.5, distance=(6.6, 8.4), height=(1.3, 2.6), aim=(2.5, 3.5)), seed)
 
@@ -73,7 +73,7 @@ def _wall(floor: int) -> Shape:
 
 
 def _windows() -> list[Body]:
-    """Return panes, bars and sills; what hangs in and beside each differs, as people do."""
+    """Return panes, bars and sills; curtains, shutters and flowers differ between the windows."""
     bodies = []
     for floor, (foot, sill, lintel, _) in enumerate(FLOORS):
         for k, x in enumerate(AXES):
@@ -122,7 +122,7 @@ def _pane(x: float, bottom: float, top: float, curtain: int) -> list[Body]:
 
 
 def _courses() -> list[Body]:
-    """Return bands along the whole front."""
+    """Return plinth, courses, quoins and cornice of the whole front."""
     top = FLOORS[1][3]
     plinth = assembled([box(3.85, 0.4, 0.14).moved((side * 2.575, -0.02, 0.05)) for side in (-1.0, 1.0)])
     brackets = [box(0.14, 0.2, 0.3).moved((x, top - 0.14, 0.12)) for x in np.linspace(-4.3, 4.3, 22)]
@@ -163,7 +163,7 @@ def _portal() -> list[Body]:
 
 
 def _balcony() -> list[Body]:
-    """Make the balcony on the portal."""
+    """Return the balcony on the portal."""
     y = 2.6
     baluster = revolved(
         np.array(

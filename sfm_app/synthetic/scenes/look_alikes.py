@@ -1,8 +1,8 @@
-"""Matches of photos of a place in which equal things stand in several places; nothing is rendered.
+"""Simulate matches of photos of a place with identical objects in several positions; nothing is rendered.
 
-Every point has a look, and points of equal things share theirs. Photos match what looks the same from about the same
-side, wherever it stands, as SIFT does. The relative pose of a pair is that of the place, or of the thing, which most
-of its matches agree with.
+Every point has an appearance; corresponding points of identical objects share theirs. As with SIFT, points match if
+they look the same from about the same side, wherever they stand. The relative pose of a pair is the one that most of
+its matches agree with: that of the place, or that of a pair of identical objects.
 """
 
 from collections.abc import Sequence
@@ -18,57 +18,57 @@ from sfm_app.types import Calibration, MatchedImage, MatchGraph, PairId, Relativ
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 Placement = tuple[FloatArray, FloatArray]
-"""R and t that bring a thing from its own frame to where it stands, or the world before a camera."""
+"""R and t from an object's own frame to the world, or from the world to a camera."""
 Things = tuple[FloatArray, FloatArray]
 """(N, 3) points and (N, 3) normals."""
 
 FOCAL, SIZE = 900.0, (1000, 750)
 SEEN, MATCHED = 0.8, 0.75
-"""Share of the points in view that become keypoints, and of the common ones, from one side, that are matched."""
+"""Share of the points in view that become keypoints, and of common keypoints from one direction that are matched."""
 WIDE_DEG, SCALE = 25.0, 0.5
-"""Angle, and logarithm of the ratio of distances, at which e times fewer are matched."""
+"""Angle, and logarithm of the ratio of distances, at which the share of matches drops by a factor e."""
 NOISE_PX = 0.3
 LEAST = 16
-"""Matches that agree on a pose: a pair with fewer has none."""
+"""Matches that must agree on a pose; a pair with fewer has no pose."""
 NEAR, FAR, STEEP = 0.3, 30.0, 0.2
-"""Distances from which points are seen, and the least cosine between a point's normal and the way to the camera."""
+"""Range of depths of visible points, and least cosine between a point's normal and the direction to the camera."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """Points of a place, and how the things got there."""
+    """Points of a place, and the poses of its objects."""
 
     X: FloatArray
     """(N, 3)"""
     normals: FloatArray
     """(N, 3) of length 1; zeros where a point is seen from all sides."""
     looks: IndexArray
-    """(N,) equal for points that look the same."""
+    """(N,) appearance numbers; equal for points that look the same."""
     stands: IndexArray
-    """(N,) number of the placement that brought the point here; -1 for points that are unique."""
+    """(N,) index of each point's placement; -1 for unique points."""
     placements: tuple[Placement, ...]
-    """Of the things; the last one stands for the place itself."""
+    """Placements of the objects; the last one, the identity, is that of the unique points."""
     pillar: float = 0.0
     """Radius of an upright cylinder about the origin that hides what is behind it; 0 for none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LookAlikeScene:
-    """What photos of the place have in common, and the truth about it."""
+    """Matches of photos of the place, and their ground truth."""
 
     matches: MatchGraph
     cameras: dict[int, Calibration]
     poses: dict[PairId, RelativePose]
     true: frozenset[PairId]
-    """Pairs whose pose is that of the place."""
+    """Pairs with a correct relative pose."""
 
 
 def gathered(unique: Things, repeated: Sequence[tuple[Things, Sequence[Placement]]], pillar: float = 0.0) -> Place:
-    """Return a place.
+    """Build a place from unique points and repeated objects.
 
     Args:
-        unique: points and their normals, (N, 3) each, that are there once.
-        repeated: points and normals of things, in their own frames, each with everywhere that it stands.
+        unique: points and their normals, (N, 3) each, that occur once.
+        repeated: points and normals of objects, in their own frames, each with all its placements.
         pillar: radius of an upright cylinder about the origin that hides what is behind it; 0 for none.
     """
     X, normals = [unique[0]], [unique[1]]
@@ -95,12 +95,12 @@ def gathered(unique: Things, repeated: Sequence[tuple[Things, Sequence[Placement
 
 
 def matched(place: Place, views: Sequence[Placement], seed: int = 0) -> LookAlikeScene:
-    """Photograph and match.
+    """Make simulated photos of a place and their matches.
 
     Args:
-        place: what is there.
-        views: R and t of the photos, from the world.
-        seed: of what is seen and what is matched.
+        place: its points.
+        views: R and t of each photo, from the world to the camera.
+        seed: determines visibility, noise and matching.
     """
     rng = np.random.default_rng([seed, 71])
     K = camera_matrix(FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2)
@@ -112,7 +112,7 @@ def matched(place: Place, views: Sequence[Placement], seed: int = 0) -> LookAlik
         chosen, shown = (seen[a], seen[b]), (views[a - 1], views[b - 1])
         rows = _rows(place, chosen, shown, rng)
         kinds = np.stack([place.stands[one[column]] for one, column in zip(chosen, rows.T, strict=True)], axis=1)
-        kinds[kinds[:, 0] == kinds[:, 1]] = -1  # at its own place a thing agrees with all else
+        kinds[kinds[:, 0] == kinds[:, 1]] = -1  # an object that is matched to itself agrees with the unique points
         names, which, counts = np.unique(kinds, axis=0, return_inverse=True, return_counts=True)
         if not len(rows) or counts.max() < LEAST:
             continue
@@ -128,7 +128,7 @@ def matched(place: Place, views: Sequence[Placement], seed: int = 0) -> LookAlik
 
 
 def _photographed(place: Place, view: Placement, rng: np.random.Generator) -> tuple[IndexArray, FloatArray]:
-    """Return numbers of the points that a photo shows, and where."""
+    """Return the indices of the points visible in a photo, and their pixels."""
     R, t = view
     Y = place.X @ R.T + t
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -146,9 +146,9 @@ def _photographed(place: Place, view: Placement, rng: np.random.Generator) -> tu
 
 
 def _hidden(X: FloatArray, center: FloatArray, radius: float) -> NDArray[np.bool_]:
-    """Return (N,) whether the way from the camera to a point runs through the cylinder.
+    """Return (N,) whether the line of sight to a point passes through the cylinder.
 
-    Its own surface is not hidden.
+    Points on the cylinder itself count as visible.
     """
     ground, start = X[:, [0, 2]], center[[0, 2]]
     way = ground - start
@@ -158,7 +158,7 @@ def _hidden(X: FloatArray, center: FloatArray, radius: float) -> NDArray[np.bool
 
 
 def _rows(place: Place, seen: Sequence[IndexArray], views: Sequence[Placement], rng: np.random.Generator) -> IndexArray:
-    """Return (M, 2) keypoints that look the same, once in either photo, and are seen from about the same side."""
+    """Return (M, 2) pairs of keypoints that look the same, are unique in both photos, and seen from similar sides."""
     looks = [place.looks[one] for one in seen]
     common, *ends = np.intersect1d(looks[0], looks[1], return_indices=True)
     once = [np.bincount(one, minlength=int(place.looks.max()) + 1)[common] == 1 for one in looks]
@@ -167,7 +167,7 @@ def _rows(place: Place, seen: Sequence[IndexArray], views: Sequence[Placement], 
     ways = []
     for (R, t), one, column in zip(views, seen, rows.T, strict=True):
         way = -R.T @ t - place.X[one[column]]
-        # as the thing has it that the point belongs to
+        # in the frame of the point's object
         ways.append(np.einsum("nji,nj->ni", turns[place.stands[one[column]]], way))
     lengths = [np.linalg.norm(way, axis=1) for way in ways]
     cosines = (ways[0] * ways[1]).sum(1) / (lengths[0] * lengths[1])
@@ -177,7 +177,7 @@ def _rows(place: Place, seen: Sequence[IndexArray], views: Sequence[Placement], 
 
 
 def _relative(views: Sequence[Placement], stands: Sequence[Placement], inliers: NDArray[np.bool_]) -> RelativePose:
-    """Return the pose of view 2 from view 1, with what stands here taken for what stands there."""
+    """Return the pose of view 2 from view 1 if the objects of two placements are taken for the same object."""
     (R1, t1), (R2, t2) = ((R @ S, R @ s + t) for (R, t), (S, s) in zip(views, stands, strict=True))
     R = R2 @ R1.T
     t = t2 - R @ t1

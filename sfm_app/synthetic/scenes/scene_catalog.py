@@ -1,4 +1,4 @@
-"""Synthetic scenes by name, and the photos that people would take of them."""
+"""List the synthetic scenes by name, with typical views of each."""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -22,7 +22,7 @@ WALKS: Mapping[str, Callable[[int], Views]] = MappingProxyType({
     "facade": lambda seed: facade_views(make_camera(1152, 768), seed),
     "corner": lambda seed: corner_views(make_camera(1152, 768, focal_widths=0.9), seed),
 })  # fmt: skip
-"""By scene: a walk with a camera that suits it; the seed changes the steps."""
+"""By scene: a walk with a suitable camera; the seed varies the poses."""
 
 Item = TypeVar("Item")
 
@@ -31,7 +31,7 @@ def build_scene(name: str = "courtyard") -> SyntheticScene:
     """Return the scene of that name.
 
     Raises:
-        ConfigError: there is none; names the known ones.
+        ConfigError: there is no such scene; the message names the known ones.
     """
     return _named(name, SCENES)()
 
@@ -41,10 +41,10 @@ def scene_views(name: str = "courtyard", seed: int = 0) -> Views:
 
     Args:
         name: of a scene in `WALKS`.
-        seed: same seed, same steps.
+        seed: same seed, same poses.
 
     Raises:
-        ConfigError: there is none; names the known ones.
+        ConfigError: there is no such scene; the message names the known ones.
     """
     return _named(name, WALKS)(seed)
 

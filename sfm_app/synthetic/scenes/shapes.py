@@ -1,4 +1,4 @@
-"""Triangle meshes of simple bodies, y up, counter-clockwise seen from outside."""
+"""Build triangle meshes of simple bodies, y up, counterclockwise seen from outside."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -15,7 +15,7 @@ IndexArray = NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shape:
-    """Triangles with normals for shading and the coordinates at which their texture is read."""
+    """Triangles with shading normals and texture coordinates."""
 
     vertices: FloatArray
     """(V, 3)."""
@@ -24,7 +24,7 @@ class Shape:
     normals: FloatArray
     """(V, 3) unit normals; vertices are doubled along sharp edges."""
     texture: FloatArray
-    """(V, 3): where the body was before it was put into the scene, so that its texture moves with it."""
+    """(V, 3): vertices before the shape was moved into the scene, so that its texture moves with it."""
 
     def moved(
         self, to: tuple[float, float, float] = (0.0, 0.0, 0.0), turn_deg: float = 0.0, tilt_deg: float = 0.0
@@ -41,18 +41,18 @@ class Shape:
 
 
 def box(width: float, height: float, depth: float, spacing: float = 0.15) -> Shape:
-    """Return a box centered in x and z that stands on y = 0, its sides cut into squares.
+    """Return a box centered in x and z that stands on y = 0, its sides divided into squares.
 
     Args:
         width: along x.
         height: along y.
         depth: along z.
-        spacing: side of a square, about.
+        spacing: approximate side of a square.
     """
     size = np.array([width, height, depth])
     parts = []
     for axis in range(3):
-        # u x v = axis keeps the triangles counter-clockwise
+        # u x v = axis keeps the triangles counterclockwise
         u, v = (axis + 1) % 3, (axis + 2) % 3
         grid = [np.linspace(-0.5, 0.5, 1 + max(1, round(size[k] / spacing))) * size[k] for k in (u, v)]
         side, faces = _grid(*grid)
@@ -71,14 +71,14 @@ def revolved(
     sharp: bool = False,
     flutes: tuple[int, float] = (0, 0.0),
 ) -> Shape:
-    """Return a profile turned about the y axis.
+    """Return the surface of revolution of a profile about the y axis.
 
     Args:
-        profile: (P, 2) radius and height; outside lies to the right of the way from the first to the last point
-            seen with the height up, so a vase runs from its foot to its lip and on down the inside.
+        profile: (P, 2) radius and height; with height up, the outside lies to the right of the path from the first to
+            the last point, so a vase runs from its foot to its lip and on down the inside.
         segments: steps around the axis.
         span_deg: how far around, in degrees; less than 360 leaves the ends open.
-        sharp: whether the points of the profile are edges.
+        sharp: whether the points of the profile are sharp edges.
         flutes: number of grooves around the axis, and their depth as a share of the radius.
     """
     strips = [profile[k : k + 2] for k in range(len(profile) - 1)] if sharp else [profile]
@@ -99,7 +99,7 @@ def torus(radius: float, tube: float, span_deg: float = 360.0) -> Shape:
 
 
 def arch(radius: float, thickness: float, depth: float) -> Shape:
-    """Make half a ring of square section standing on y = 0 across x, its back at z = 0.
+    """Return half a ring of square section standing on y = 0 across x, its back at z = 0.
 
     Args:
         radius: of the opening.
@@ -131,7 +131,7 @@ def ball(radius: float, segments: int = 96, bumps: float = 0.0, seed: int = 0) -
 
 
 def waves(points: FloatArray, seed: int) -> FloatArray:
-    """Return (N,) smooth noise of unit variance: cosines of 24 directions, 0.7 to 3 units long.
+    """Return (N,) smooth noise of unit variance: cosines in 24 directions with wavelengths of 0.7 to 3 units.
 
     Args:
         points: (N, 3).
@@ -150,13 +150,13 @@ def carved(
     rows: int = 220,
     segments: int = 240,
 ) -> Shape:
-    """Return the outside of a body around the y axis, closed at the top and the bottom.
+    """Return the outer surface of a body around the y axis, closed at the top and the bottom.
 
-    What a sculptor can carve all round.
+    It keeps only the outermost radius in each direction, so undercuts are lost.
 
     Args:
         field: positive inside the body at points (N, 3).
-        height: lowest and highest level that is looked at.
+        height: lowest and highest level that is sampled.
         reach: the body lies within this distance of the axis.
         rows: levels.
         segments: steps around the axis.
@@ -172,7 +172,7 @@ def carved(
 
 
 def assembled(parts: Sequence[Shape]) -> Shape:
-    """Return one body made of several; its texture runs on from part to part."""
+    """Join several shapes into one; the texture continues across the parts."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
@@ -185,8 +185,8 @@ def ground(x: tuple[float, float], z: tuple[float, float], unevenness: float, sp
     Args:
         x: from and to.
         z: from and to.
-        unevenness: largest height, about.
-        spacing: side of a square, about.
+        unevenness: approximate largest height.
+        spacing: approximate side of a square.
     """
     xs, zs = (np.linspace(a, b, 1 + max(1, round((b - a) / spacing))) for a, b in (x, z))
     grid, faces = _grid(zs, xs)
@@ -208,8 +208,10 @@ def _turned(
 
 
 def _strips(segments: int, rows: int, count: int) -> IndexArray:
-    """Give triangles between `segments` pairs of neighbors among `count` columns of `rows` vertices; last meets the
-    first where there are as many."""
+    """Return triangles between `segments` pairs of adjacent columns, of `count` columns with `rows` vertices each.
+
+    The last column joins the first if `segments` equals `count`.
+    """
     ring = np.arange(segments)[:, None] * rows + np.arange(rows - 1)
     step = (ring + rows) % (count * rows)
     faces = np.concatenate([np.stack([ring, step, step + 1], -1), np.stack([ring, step + 1, ring + 1], -1)])
@@ -219,9 +221,9 @@ def _strips(segments: int, rows: int, count: int) -> IndexArray:
 def _outermost(
     field: Callable[[FloatArray], FloatArray], ways: FloatArray, level: float, reach: float, steps: int = 32
 ) -> FloatArray:
-    """Return distance (N,) at which rays from outside along -`ways` (N, 3) enter the body at a level.
+    """Return the radius (N,) at which rays from outside along -`ways` (N, 3) enter the body at a level.
 
-    0 where they miss.
+    0 for rays that miss it.
     """
 
     def inside(radius: FloatArray) -> NDArray[np.bool_]:
@@ -253,7 +255,7 @@ def _joined(parts: list[tuple[FloatArray, IndexArray]]) -> Shape:
     faces = np.concatenate([faces + start for (_, faces), start in zip(parts, starts[:-1], strict=True)])
     corners = vertices[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    kept = np.linalg.norm(cross, axis=1) > 1e-12  # the poles of a turned profile
+    kept = np.linalg.norm(cross, axis=1) > 1e-12  # drops degenerate triangles at the poles of a revolved profile
     normals = np.zeros_like(vertices)
     for k in range(3):
         np.add.at(normals, faces[kept, k], cross[kept])

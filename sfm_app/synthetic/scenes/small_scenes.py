@@ -1,4 +1,4 @@
-"""Scenes for what goes wrong: a plane, and a second place that shares nothing with the courtyard."""
+"""Build scenes for failure cases: a plane, and a place that shares nothing with the courtyard."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""A colossal bust on a plinth, seen all round: a closed body, smooth in the face, fine in hair and folds."""
+"""Build a colossal bust on a plinth, seen all round: a closed body, smooth in the face, fine in hair and folds."""
 
 from dataclasses import replace
 from functools import cache
@@ -19,7 +19,7 @@ BRONZE = Material(
     pattern="leaves", base=(74, 96, 66), second=(132, 118, 66), joint=(40, 44, 30), scale=0.035, contrast=0.4
 )
 SHARPNESS = 2.6
-"""How little neighboring blobs run together."""
+"""Falloff of the blobs; larger values blend neighbors less."""
 PLINTH_TOP_Y = 1.02
 BLOBS = np.array([
     # middle x, y, z; half axes x, y, z; weight
@@ -50,7 +50,7 @@ HAIR = slice(-2, None)
 
 
 def statue() -> SyntheticScene:
-    """Return the scene: the bust looks towards +z; its terrace is small, so that the scene is about as large as it."""
+    """Return the scene; the bust looks towards +z, and the terrace is small, so that the bust fills the scene."""
     return SyntheticScene("statue", (*_terrace(), *_plinth(), *_bust()), to_light=(0.5, 0.75, 0.42), sky=0.6)
 
 
@@ -59,7 +59,7 @@ def statue_views(camera: Camera, seed: int = 0, photos: int = 22) -> Views:
 
     Args:
         camera: of all photos.
-        seed: same seed, same steps.
+        seed: same seed, same poses.
         photos: how many, >= 2.
     """
     walk = ArcOptions(
@@ -71,17 +71,17 @@ def statue_views(camera: Camera, seed: int = 0, photos: int = 22) -> Views:
 
 @cache
 def bust() -> Shape:
-    """Return the stone itself, standing on y = 0."""
+    """Return the shape of the bust, standing on y = 0."""
     return carved(bust_field, (0.02, 1.24), reach=0.62)
 
 
 def bust_field(points: FloatArray) -> FloatArray:
-    """Return positive inside.
+    """Return the implicit function of the bust at (N, 3) points, positive inside.
 
-    Blobs that run together (Blinn, ACM TOG 1982), with curls in the hair and folds in the cloth.
+    Blended blobs (Blinn, ACM TOG 1982), with curls in the hair and folds in the cloth.
     """
     middles, axes, weights = BLOBS[:, :3], BLOBS[:, 3:6], BLOBS[:, 6]
-    # the squared distances to all middles, in half axes, as products of matrices
+    # squared distances to all blob centers, in half axes, as matrix products
     squares = points**2 @ axes.T**-2.0 - 2.0 * points @ (middles / axes**2).T + ((middles / axes) ** 2).sum(axis=1)
     parts = weights * np.exp(SHARPNESS * (1.0 - squares))
     hair = np.clip(parts[:, HAIR].sum(axis=1), 0.0, 1.0)
@@ -111,7 +111,7 @@ def _bust() -> list[Body]:
 def _plinth() -> list[Body]:
     blocks = [(1.5, 0.14, 0.0), (1.2, 0.14, 0.14), (0.84, 0.6, 0.28), (1.0, 0.08, 0.86), (0.9, 0.08, 0.94)]
     bodies = [Body(box(width, high, width, spacing=0.08).moved((0.0, y, 0.0)), SANDSTONE) for width, high, y in blocks]
-    # each side has its own relief: a plinth that looks alike from four sides could be joined wrongly
+    # each side has its own relief: with four equal sides, photos could be matched to the wrong side
     shield = revolved(np.array([[0.21, 0.0], [0.19, 0.03], [0.1, 0.07], [0.0, 0.09]]), segments=48)
     plaque = box(0.5, 0.3, 0.06, spacing=0.06)
     rosette = ball(0.17, bumps=0.08, seed=5)

@@ -1,4 +1,4 @@
-"""Random scenes: things strewn on the ground, equal things in two places, panels that repeat, a wall."""
+"""Draw random scenes: objects strewn on the ground, identical objects in two places, repeating panels, a wall."""
 
 from dataclasses import replace
 
@@ -26,11 +26,11 @@ OF_THINGS = (WOOD, MARBLE, PAINT, TERRACOTTA, GREEN_MARBLE, LEAVES, LIMESTONE, B
 OF_GROUNDS = (PAVING, LEAVES, SANDSTONE)
 OF_WALLS = (MARBLE, GREEN_MARBLE, PLASTER, SANDSTONE, BRICK)
 TWIN_X = 1.7
-"""Equal things stand so far to the left and to the right."""
+"""Identical objects stand at this distance to the left and right."""
 
 
 def heap_of_things(rng: Random) -> tuple[Body, ...]:
-    """Return boxes, balls, rings and drums about the origin, on a ground; every second time before a wall."""
+    """Return boxes, balls, rings and drums about the origin, on a ground; half of the scenes have a wall behind."""
     floor = Body(ground((-4.5, 4.5), (-3.5, 5.5), float(rng.uniform(0.0, 0.08)), spacing=0.15), _of(OF_GROUNDS, rng))
     bodies = [floor]
     for _ in range(int(rng.integers(7, 19))):
@@ -42,7 +42,7 @@ def heap_of_things(rng: Random) -> tuple[Body, ...]:
 
 
 def twins(rng: Random) -> tuple[Body, ...]:
-    """Return two or three things, and the very same, stain by stain, in another place."""
+    """Return two or three objects, each in two places with identical texture."""
     bodies = []
     for k in range(int(rng.integers(2, 4))):
         thing = _thing(rng, size=(0.6, 1.0)).moved((0.5 * (k - 1), 0.0, 0.5 * (k % 2)), turn_deg=rng.uniform(0.0, 90.0))
@@ -52,7 +52,7 @@ def twins(rng: Random) -> tuple[Body, ...]:
 
 
 def panelled(rng: Random) -> tuple[Body, ...]:
-    """Return a wall of equal panels, stain by stain: features find a partner in every one of them."""
+    """Return a wall of panels with identical texture, so that features match in every panel."""
     side, gap = float(rng.uniform(0.5, 0.9)), 0.08
     panel = box(side, side, 0.08, spacing=0.1)
     columns = [(k - 3.5) * (side + gap) for k in range(8)]
@@ -61,12 +61,12 @@ def panelled(rng: Random) -> tuple[Body, ...]:
 
 
 def wall(rng: Random) -> SyntheticScene:
-    """Make nothing but a flat wall that faces +z."""
+    """Return a scene with only a flat wall that faces +z."""
     return SyntheticScene("wall", (Body(box(11.0, 7.0, 0.1).moved((0.0, -2.2, -0.1)), _of(OF_WALLS, rng)),))
 
 
 def moving_thing(rng: Random) -> tuple[Body, ...]:
-    """Make something of the size of a child, around its own foot."""
+    """Return an object about the size of a child, with its origin at its foot."""
     size = float(rng.uniform(0.7, 1.3))
     body = box(0.5 * size, 0.75 * size, 0.4 * size, spacing=0.08)
     head = ball(0.2 * size, bumps=0.1, seed=int(rng.integers(100))).moved((0.0, 0.9 * size, 0.0))
@@ -74,7 +74,7 @@ def moving_thing(rng: Random) -> tuple[Body, ...]:
 
 
 def alike(copies: list[Shape]) -> Shape:
-    """Return one body made of several that keep their own places in the texture, so that equal ones look equal."""
+    """Join shapes into one that keeps their texture coordinates, so that equal shapes look equal."""
     starts = np.cumsum([0, *(len(copy.vertices) for copy in copies)])
     faces = [copy.faces + start for copy, start in zip(copies, starts[:-1], strict=True)]
     return Shape(
@@ -86,17 +86,17 @@ def alike(copies: list[Shape]) -> Shape:
 
 
 def faded(scene: SyntheticScene, strength: float) -> SyntheticScene:
-    """Return the scene with colors that differ less: plain things, few features.
+    """Return the scene with less color contrast, and thus few features.
 
     Args:
-        scene: before.
-        strength: share in [0, 1] of the differences that stays.
+        scene: the original.
+        strength: share in [0, 1] of the contrast that is kept.
     """
     return replace(scene, bodies=tuple(Body(body.shape, _pale(body.material, strength)) for body in scene.bodies))
 
 
 def _thing(rng: Random, size: tuple[float, float] = (0.3, 0.9)) -> Shape:
-    """Make a thing that stands around the y axis."""
+    """Return a random object that stands on y = 0 around the y axis."""
     width, height, depth = rng.uniform(*size, 3)
     kind = int(rng.integers(4))
     if kind == 0:

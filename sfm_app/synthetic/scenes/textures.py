@@ -1,7 +1,7 @@
-"""Procedural surface colors as machine code: rich at every scale, so that feature detectors find something everywhere.
+"""Compute procedural surface colors in compiled kernels, with detail at every scale for feature detectors.
 
-A color is a function of the place on the body alone, so it is the same from every side. Detail finer than a pixel is
-faded out, since it would flicker between photos.
+A color depends only on the position on the body, so it is the same from every side. Detail finer than a pixel is faded
+out, since it would alias.
 """
 
 import math
@@ -22,28 +22,28 @@ PATTERNS: tuple[str, ...] = get_args(Pattern)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Material:
-    """How a body is colored. Colors are sRGB, 0..255."""
+    """Procedural color of a body. Colors are sRGB, 0..255."""
 
     pattern: Pattern
     base: Color
     second: Color
-    """Veins, bands, grain, dirt."""
+    """Color of veins, bands, grain and dirt."""
     joint: Color = (70, 66, 60)
-    """Between bricks and slabs; thin lines."""
+    """Color between bricks and slabs, and of thin lines."""
     scale: float = 0.3
     """Size of a brick, slab, leaf or band, in scene units."""
     contrast: float = 0.5
     """Strength of the fine grain, 0..1."""
 
     def row(self, seed: int) -> FloatArray:
-        """Return (13,) numbers for the kernels: pattern, scale, contrast, seed, then three linear RGB colors."""
+        """Return the (13,) parameters for the kernels: pattern, scale, contrast, seed, then three linear RGB colors."""
         colors = [(np.array(c) / 255.0) ** 2.2 for c in (self.base, self.second, self.joint)]
         return np.concatenate([[PATTERNS.index(self.pattern), self.scale, self.contrast, seed], *colors])
 
 
 @kernel
 def lattice(ix: int, iy: int, iz: int, seed: int) -> float:
-    """Return a number in [0, 1) that belongs to a lattice point; wraps after 2^32.
+    """Return a pseudo-random number in [0, 1) for a lattice point; wraps after 2^32.
 
     Args:
         ix: step along x.
@@ -86,7 +86,7 @@ def octaves(p: tuple[float, float, float], size: float, gain: float, footprint: 
     """Return noise summed over halving sizes, from `size` down to the size of a pixel; about -1..1.
 
     Args:
-        p: place (x, y, z).
+        p: position (x, y, z).
         size: of the broadest noise, > 0.
         gain: amplitude of each octave over the one before, in (0, 1).
         footprint: size of a pixel on the surface; octaves fade out between twice that size and that size.
@@ -106,9 +106,9 @@ def octaves(p: tuple[float, float, float], size: float, gain: float, footprint: 
 
 @kernel
 def cells(a: float, b: float, seed: int) -> tuple[float, float]:
-    """Return random cells in the plane.
+    """Return border distance and number of the cell at a point, for random cells in the plane.
 
-    Distance to the border of the cell, in cells, and a number in [0, 1) that names it.
+    The distance is in cells; the number, in [0, 1), identifies the cell.
 
     Args:
         a: across, in cells.
@@ -131,7 +131,7 @@ def cells(a: float, b: float, seed: int) -> tuple[float, float]:
 
 @kernel
 def bricks(a: float, b: float, seed: int) -> tuple[float, float]:
-    """Return bricks twice as long as high, in running bond: as `cells`, in brick heights.
+    """Return border distance and number as `cells` does, for bricks twice as long as high in running bond.
 
     Args:
         a: along the row, in brick heights.
@@ -147,7 +147,7 @@ def bricks(a: float, b: float, seed: int) -> tuple[float, float]:
 
 @kernel
 def _ramp(x: float, low: float, high: float) -> float:
-    """Return 0 below `low`, 1 above `high`, straight between."""
+    """Return 0 below `low`, 1 above `high`, linear in between."""
     return min(1.0, max(0.0, (x - low) / (high - low)))
 
 
@@ -155,13 +155,13 @@ def _ramp(x: float, low: float, high: float) -> float:
 def tiles(
     kind: int, p: tuple[float, float, float], n: tuple[float, float, float], scale: float, seed: int
 ) -> tuple[float, float]:
-    """Return bricks on upright walls (1), slabs on the ground (2), leaves along the axis they face most (6).
+    """Return border distance and number as `cells` does, for the tile pattern of a kind.
 
-    As `cells`.
+    Bricks on upright walls (1), slabs on the ground (2), leaves along the axis they face most (6).
 
     Args:
         kind: 1, 2 or 6, as above.
-        p: place on the body before it was moved.
+        p: position on the body before it was moved.
         n: unit normal there.
         scale: size of a tile, > 0.
         seed: another seed, other tiles.
@@ -179,12 +179,12 @@ def tiles(
 
 @kernel
 def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
-    """Return Greek pottery: share of the second color (glaze), share of the thin lines.
+    """Return the shares of the second color (glaze) and of the thin lines on Greek pottery.
 
-    Bands by height, figures by angle.
+    Bands follow the height, figures the angle about the y axis.
 
     Args:
-        p: place on the body before it was moved.
+        p: position on the body before it was moved.
         scale: height of a band, > 0.
     """
     band = p[1] / scale
@@ -210,11 +210,11 @@ def ceramic(p: tuple[float, float, float], scale: float) -> tuple[float, float]:
 def mixture(
     row: NDArray[np.float64], p: tuple[float, float, float], n: tuple[float, float, float], footprint: float
 ) -> tuple[float, float, float]:
-    """Return share of the second color, share of the joint color, and brightness (about 1) at a place of a body.
+    """Return share of the second color, share of the joint color, and brightness (about 1) at a point of a body.
 
     Args:
         row: from `Material.row()`.
-        p: place on the body before it was moved.
+        p: position on the body before it was moved.
         n: unit normal there.
         footprint: size of a pixel on the surface.
     """

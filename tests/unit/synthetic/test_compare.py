@@ -84,7 +84,7 @@ def test_wrong_photos_do_not_spoil_the_alignment(wrong):
 def test_alignment_needs_three_known_photos_off_a_line(photos):
     truth = photos[1]
     two = dict(list(truth.centers.items())[:2]) | {"stranger.jpg": np.zeros(3)}
-    with pytest.raises(ValueError, match="2 of the found camera centers"):
+    with pytest.raises(ValueError, match="2 of the estimated camera centers"):
         align_centers(two, truth)
     on_a_line = {name: np.array([float(k), 0.0, 0.0]) for k, name in enumerate(truth.centers)}
     with pytest.raises(ValueError, match="on a line"):
