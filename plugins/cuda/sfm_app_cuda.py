@@ -1,11 +1,10 @@
 """COLMAP's PatchMatch stereo (Schoenberger et al., ECCV 2016) on the GPU, as a plug-in of sfm-app.
 
-Photos are done one after the other, first on their own, then with the depths of their neighbors, so that progress is
-seen per photo and a run that was killed goes on with the photo at which it stopped: COLMAP leaves maps alone that are
-there already.
+Photos are processed one by one, first alone, then with the depths of their neighbors. So progress is shown per photo,
+and a run that was killed continues at the photo where it stopped: COLMAP does not compute existing maps again.
 """
 
-import zlib  # noqa: F401 - before pycolmap, which brings a deflate of its own that breaks Python's when it comes first
+import zlib  # noqa: F401 - before pycolmap, whose bundled deflate breaks Python's if it is loaded first
 from collections.abc import Iterable
 from functools import partial
 from threading import Lock
@@ -22,7 +21,7 @@ CONFIG = "patch-match-one.cfg"
 
 
 def unavailable() -> str:
-    """Why the GPU cannot be used; empty where it can."""
+    """Return why the GPU cannot be used; empty if it can."""
     if not pycolmap.has_cuda:
         return "this pycolmap was built without CUDA (pip install pycolmap-cuda12)"
     devices = getattr(pycolmap, "get_num_cuda_devices", None)
@@ -30,7 +29,7 @@ def unavailable() -> str:
 
 
 def make(task: DepthTask) -> list[Rejected | None]:
-    """Depth and normal maps of all photos that have neighbors."""
+    """Make depth and normal maps of all photos that have neighbors."""
     gpu = Lock()
     everything = range(len(task.views))
     task.map(partial(_match, task=task, geometric=False, gpu=gpu), everything, "matching depths")

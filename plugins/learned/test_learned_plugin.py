@@ -1,4 +1,4 @@
-"""What is the learned features' own; what all ways to find features promise is in tests/contract."""
+"""Tests for the learned features alone; those that all feature methods pass are in tests/contract."""
 
 import pytest
 
@@ -21,7 +21,7 @@ OPTIONS = MatchSettings()
 
 @pytest.fixture(scope="module")
 def picture():
-    """Blots of all sizes."""
+    """A picture of blobs of several sizes."""
     rng = np.random.default_rng(3)
     layers = [
         cv2.resize(rng.uniform(0, 255, (side, side, 3)), (320, 240), interpolation=cv2.INTER_CUBIC)

@@ -1,13 +1,13 @@
 """OpenCV's estimators of the fundamental matrix, as a plug-in of sfm-app.
 
-What OpenCV makes of the settings, tried with OpenCV 5.0:
+How OpenCV interprets the settings, checked with OpenCV 5.0:
 
 - USAC compares the Sampson distance with the threshold, as sfm-app does. `opencv-ransac` compares the larger of the two
-  distances from a point to its epipolar line, at least sqrt(2) times as large; its threshold is raised by as much.
-- MAGSAC marginalises over noise up to a limit of its own: the threshold matters little to the search.
-- Random states are fixed inside OpenCV; the seed acts through the order of the matches.
-- OpenCV does not say how many samples it drew: `EpipolarFit.trials` is the most it may have drawn.
-- `opencv-ransac` returns its best seven-point model as it is, without a fit to the inliers.
+  distances from a point to its epipolar line, at least sqrt(2) times as large; its threshold is multiplied by sqrt(2).
+- MAGSAC marginalizes over noise up to its own limit: the threshold has little effect on the search.
+- Random states are fixed inside OpenCV; the seed only changes the order of the matches.
+- OpenCV does not report how many samples it drew: `EpipolarFit.trials` is the largest possible number.
+- `opencv-ransac` returns its best seven-point model without a fit to the inliers.
 """
 
 from collections.abc import Iterable
@@ -26,22 +26,22 @@ FloatArray = NDArray[np.float64]
 
 
 def fit_magsac(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-    """MAGSAC++ (Barath, Noskova, Ivashechkin and Matas 2020)."""
+    """Run MAGSAC++ (Barath, Noskova, Ivashechkin and Matas 2020)."""
     return estimate_with(partial(_find, cv2.USAC_MAGSAC), x1, x2, options, seed)
 
 
 def fit_usac(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-    """USAC (Raguram, Chum, Pollefeys, Matas and Frahm 2013) with OpenCV's default parts."""
+    """Run USAC (Raguram, Chum, Pollefeys, Matas and Frahm 2013) with OpenCV's default parts."""
     return estimate_with(partial(_find, cv2.USAC_DEFAULT), x1, x2, options, seed)
 
 
 def fit_usac_accurate(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-    """USAC with graph-cut local optimization (Barath and Matas 2018)."""
+    """Run USAC with graph-cut local optimization (Barath and Matas 2018)."""
     return estimate_with(partial(_find, cv2.USAC_ACCURATE), x1, x2, options, seed)
 
 
 def fit_ransac(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-    """RANSAC (Fischler and Bolles 1981)."""
+    """Run RANSAC (Fischler and Bolles 1981)."""
     return estimate_with(partial(_find, cv2.FM_RANSAC), x1, x2, options, seed)
 
 
@@ -62,5 +62,5 @@ def sfm_estimators() -> Iterable[Estimator]:
         Estimator("opencv-magsac", fit_magsac, "OpenCV's MAGSAC++"),
         Estimator("opencv-usac", fit_usac, "OpenCV's USAC with its default parts"),
         Estimator("opencv-usac-accurate", fit_usac_accurate, "OpenCV's USAC with graph-cut local optimization"),
-        Estimator("opencv-ransac", fit_ransac, "OpenCV's RANSAC, its best sample as it is"),
+        Estimator("opencv-ransac", fit_ransac, "OpenCV's RANSAC, its best sample without a refit"),
     ]

@@ -1,4 +1,4 @@
-"""What is OpenCV's own; what all estimators promise is in tests/contract."""
+"""Tests for OpenCV's estimators alone; those that all estimators pass are in tests/contract."""
 
 import pytest
 
@@ -42,7 +42,7 @@ def test_the_threshold_means_in_opencv_what_the_plug_in_says(flag, scale):
     distance = sampson_distance(F, PAIR.x1, PAIR.x2)
     assert inside.sum() > 300
     assert 1.4 < distance[inside].max() < 1.51
-    # usac takes every match within the threshold, ransac also asks for both distances
+    # USAC accepts every match within the threshold; RANSAC also requires both distances to be small
     assert np.mean(distance[~inside] < 1.5) <= (0.0 if scale == 1 else 0.2)
 
 

@@ -1,8 +1,8 @@
 """PoseLib's LO-RANSAC for fundamental matrices, as a plug-in of sfm-app.
 
-PoseLib compares the Sampson distance with `max_epipolar_error`, as sfm-app does, and ends with a fit of all inliers by
-their Sampson distances, Cauchy-weighted at 1 px. Its least number of samples stays what PoseLib sets, unless
-`max_trials` is less.
+PoseLib compares the Sampson distance with `max_epipolar_error`, as sfm-app does, and ends with a fit to all inliers by
+their Sampson distances, Cauchy-weighted at 1 px. It draws at least the number of samples that PoseLib sets by default,
+unless `max_trials` is less.
 """
 
 from collections.abc import Iterable
@@ -22,7 +22,7 @@ LEAST_TRIALS = 1000
 
 
 def fit_poselib(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-    """LO-RANSAC (Larsson and contributors, PoseLib)."""
+    """Run LO-RANSAC (Larsson and contributors, PoseLib)."""
     return estimate_with(_find, x1, x2, options, seed)
 
 

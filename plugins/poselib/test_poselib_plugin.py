@@ -1,4 +1,4 @@
-"""What is PoseLib's own; what all estimators promise is in tests/contract."""
+"""Tests for PoseLib's estimators alone; those that all estimators pass are in tests/contract."""
 
 import pytest
 

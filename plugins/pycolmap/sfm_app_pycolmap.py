@@ -1,11 +1,11 @@
 """COLMAP's LO-RANSAC for fundamental matrices, as a plug-in of sfm-app.
 
-COLMAP compares the Sampson distance with `max_error`, as sfm-app does. Its least number of samples stays what COLMAP
-sets, unless `max_trials` is less. It does not say how many samples it drew: `EpipolarFit.trials` is the most it may
-have drawn.
+COLMAP compares the Sampson distance with `max_error`, as sfm-app does. It draws at least the number of samples that
+COLMAP sets by default, unless `max_trials` is less. It does not report how many it drew: `EpipolarFit.trials` is the
+largest possible number.
 """
 
-import zlib  # noqa: F401 - before pycolmap, which brings a deflate of its own that breaks Python's when it comes first
+import zlib  # noqa: F401 - before pycolmap, whose bundled deflate breaks Python's if it is loaded first
 from collections.abc import Iterable
 
 import numpy as np
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 
 
 def fit_loransac(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-    """LO-RANSAC (Chum, Matas and Kittler 2003) as COLMAP has it."""
+    """Run LO-RANSAC (Chum, Matas and Kittler 2003) as implemented in COLMAP."""
     return estimate_with(_find, x1, x2, options, seed)
 
 

@@ -1,4 +1,4 @@
-"""What is COLMAP's own; what all estimators promise is in tests/contract."""
+"""Tests for COLMAP's estimators alone; those that all estimators pass are in tests/contract."""
 
 import subprocess
 import sys

@@ -1,16 +1,16 @@
 """Robust estimation of fundamental matrices (thesis, chapter 4).
 
-An estimator is an `estimator_config.Recipe`: what it samples, solves, scores and verifies with, when it stops, how it
-refits. `loop.search` runs it, `estimate.estimate` judges what it found, and `estimate.estimate_with` what other
-libraries find. `lev_ransac` is the estimator that the program uses, `estimator_configs` has the others.
+An estimator is an `estimator_config.Recipe`: sampler, solver, score, verifier, stopping rule and final fit.
+`loop.search` runs it, `estimate.estimate` judges its model, and `estimate.estimate_with` judges the models of other
+libraries. `lev_ransac` is the estimator that the program uses; `estimator_configs` has the others.
 
 From matches to the answer, in the order of a run:
 
-1. `points`, checked and scaled.
+1. `points`: check and scale the matches.
 2. `loop` and `inner_loop`: draw (`sampling`), solve (`solvers`), test and score (`verification`, `scoring`), until
-   `sampling.stopping` or `sampling.termination` says enough; `best_model` is what has won so far.
-3. `refine`: the last fit.
-4. `estimate`: is it chance (`verification.a_contrario`), and does it determine F (`degeneracy`)?
+   `sampling.stopping` or `sampling.termination` ends the search; `best_model` holds the best model so far.
+3. `refine`: the final fit.
+4. `estimate`: could the support be chance (`verification.a_contrario`), and do the matches determine F (`degeneracy`)?
 
 docs/symbols.md has the symbols of the thesis and their names here.
 """
@@ -34,6 +34,6 @@ ESTIMATORS: dict[str, tuple[FitFundamentalLike, str]] = {
     "lev-ransac": (fit_lev_ransac, "samples guided by Cook's distances, local optimization, robust refit; the default"),
     **{name: (classical(name), about) for name, (_, about) in RECIPES.items()},
 }
-"""Name, way to fit, and one line about it."""
+"""By name: the function that fits, and one line about it."""
 
 __all__ = ["ESTIMATORS", "FitFundamentalLike", "check_points", "estimate_with", "judge"]

@@ -1,6 +1,7 @@
-"""The best model of a search, and what the next one has to beat.
+"""The best model of a search, and the penalties that the next one has to beat.
 
-Thesis 4.7.5, lines 6 and 7 of Algorithm 1 (F*, Q*). Two scores at once, and bars by the kind of the sample, are ours.
+Thesis 4.7.5, lines 6 and 7 of Algorithm 1 (F*, Q*). Two scores at once, and separate bars for the two kinds of samples,
+are ours.
 """
 
 import math
@@ -19,15 +20,15 @@ FloatArray = NDArray[np.float64]
 class Best:
     """The best model so far.
 
-    Algorithm 1 starts with Q* = 0 in print; as a penalty that is to fall it has to start at infinity.
+    Algorithm 1 starts with Q* = 0 in print; a penalty to be minimized has to start at infinity.
     """
 
     f: FloatArray
     """(9,) entries of F, norm 1; F* of the thesis."""
     to_beat: FloatArray
-    """(2,) bars, by kind of sample: penalties that models have to stay below (see `inner_loop.next_better`)."""
+    """(2,) bars, one per kind of sample: penalties that models have to stay below (see `inner_loop.next_better`)."""
     samples: FloatArray
-    """(2, 9) the models of samples that were last below their bars."""
+    """(2, 9) for each kind, the last model of a sample that was below the bar."""
 
     def __init__(self, points: FloatArray, threshold: float, recipe: Recipe) -> None:
         self._points, self._threshold, self._recipe = points, threshold, recipe
@@ -37,7 +38,7 @@ class Best:
         self.to_beat, self.samples = np.full(2, math.inf), np.zeros((2, 9))
 
     def __bool__(self) -> bool:
-        """Return whether there is one yet."""
+        """Return whether a model was found yet."""
         return self._lowest < math.inf
 
     def inlier_share(self) -> float:
@@ -45,10 +46,10 @@ class Best:
         return float(np.mean(squared_distances(self._points, self.f) <= self._threshold**2))
 
     def update(self, kind: int) -> bool:
-        """Update the best model and the bars by the sample that was below the bar of its kind.
+        """Update the best model and the bars with the sample that was below the bar of its kind.
 
-        With one score the sample is the new best model, and its penalty the bar of both kinds. With two scores it has
-        to win once it is optimized; the kinds then have bars of their own.
+        With one score the sample is the new best model, and its penalty the bar of both kinds. With two scores its
+        model is locally optimized and has to win by the finer score; each kind then has a bar of its own.
 
         Returns:
             Whether the best model changed.
@@ -67,15 +68,15 @@ class Best:
         self.to_beat[:] = self._lowest
 
     def _set_bar_of_unguided(self) -> None:
-        """Set the bar of unguided samples to `LENIENCE` of the support that the best guided sample has.
+        """Set the bar of unguided samples to `LENIENCE` of the support of the best guided sample.
 
-        Support is what the penalty lies below that of a model which nothing agrees with.
+        Support is the penalty of a model without any inliers minus the penalty of the model.
         """
         nothing = len(self._points) * self.loss.worst
         self.to_beat[UNGUIDED] = nothing - LENIENCE * (nothing - self.to_beat[GUIDED])
 
     def _replace(self, model: FloatArray, found: float) -> None:
-        """Replace the best model by that of a sample, or by what local optimization makes of it."""
+        """Replace the best model by that of a sample, locally optimized where this lowers the penalty."""
         self.f, self._lowest = model, found
         if self._recipe.improve is not None:
             improved = self._improved(model.reshape(3, 3))
@@ -85,7 +86,7 @@ class Best:
         self._measure_anew()
 
     def challenged_by(self, F: FloatArray) -> bool:
-        """Return whether F (3, 3), locally optimized, is the best model by the finer penalty."""
+        """Replace the best model by the optimized F (3, 3) if its finer penalty is lower; return whether it is."""
         improved = self._improved(F)
         score = penalty(self._points, 0, improved, self._fine or self.loss, self._lowest, OPEN)
         if score < self._lowest:
@@ -99,9 +100,9 @@ class Best:
         return np.asarray(np.ascontiguousarray(F).reshape(9) / np.linalg.norm(F))
 
     def _measure_anew(self) -> None:
-        """Score anew: MLESAC's function changes with the best model.
+        """Score the best model again if the penalty changed: that of MLESAC depends on the best model.
 
-        The thesis names the flaw of comparing across the change.
+        The thesis notes that comparing penalties across such a change is not always sensible.
         """
         renewed = self._recipe.score(self._points, self._threshold, self.f)
         if renewed != self.loss:

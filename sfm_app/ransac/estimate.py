@@ -1,7 +1,7 @@
 """From the best model of a search to the answer: a fit with its evidence, or a rejection with its reason.
 
-Ours: the thesis ends with F*. What is judged comes from thesis 4.2 (distances), 4.3 (the last fit) and Moisan and
-Stival (2004).
+Ours: the thesis ends with F*. The criteria come from thesis 4.2 (distances), 4.3 (the final fit) and Moisan and Stival
+(2004).
 """
 
 import math
@@ -25,7 +25,7 @@ from sfm_app.types import EpipolarFit, Rejected
 
 FloatArray = NDArray[np.float64]
 Find = Callable[[FloatArray, FloatArray, EpipolarSettings, int], tuple[ArrayLike, int] | None]
-"""(x1, x2, options, seed) -> F and how many samples were drawn, or None: a search from outside, for `estimate_with`."""
+"""(x1, x2, options, seed) -> F and the number of samples drawn, or None: an external search for `estimate_with`."""
 
 # why a pair is rejected, in the order of the checks
 TOO_FEW_MATCHES = "too few matches"
@@ -37,12 +37,12 @@ CHANCE = "inliers no better than chance"
 def estimate(
     x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int, recipe: Recipe
 ) -> EpipolarFit | Rejected:
-    """Return one fundamental matrix from matches of which many may be wrong.
+    """Estimate one fundamental matrix from matches, many of which may be wrong.
 
     Args:
         x1: (N, 2) pixels.
         x2: (N, 2) pixels, row by row the partners of x1.
-        options: threshold, confidence, most samples, fewest inliers.
+        options: threshold, confidence, largest number of samples, smallest number of inliers.
         seed: same seed, same bytes.
         recipe: the estimator.
 
@@ -66,16 +66,16 @@ def estimate(
 def estimate_with(
     find: Find, x1: ArrayLike, x2: ArrayLike, options: EpipolarSettings, seed: int
 ) -> EpipolarFit | Rejected:
-    """Hold an estimator from outside to what the built-in ones promise: the way to write a plug-in.
+    """Run an external search and judge its F as for the built-in estimators; for plug-ins.
 
     Args:
         find: gets the distinct matches, at least `options.min_inliers`, as contiguous (M, 2) pixels about the middle of
-            each view, in an order that depends on the seed. Its F may have any scale; it is brought to rank 2, and its
-            inliers, priors, degeneracy and chance are worked out as for any other. It should not raise on data.
+            each view, in an order that depends on the seed. Its F may have any scale; it is brought to rank 2. Inliers,
+            priors, degeneracy and the test against chance are computed from this F. `find` should not raise on data.
         x1: (N, 2) pixels.
         x2: (N, 2) pixels, row by row the partners of x1.
         options: as in `estimate`.
-        seed: same seed, same bytes, as far as `find` keeps to it.
+        seed: same seed, same bytes, if `find` is deterministic.
 
     Raises:
         ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
@@ -93,16 +93,16 @@ def estimate_with(
 
 
 def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> EpipolarFit | Rejected:
-    """Return what matches say about a fundamental matrix, wherever it comes from.
+    """Judge a fundamental matrix from any source by the matches.
 
     Args:
         x1: (N, 2) pixels.
         x2: (N, 2) pixels, row by row the partners of x1.
         F: (3, 3) of any scale, x2' F x1 = 0 in pixels.
-        options: threshold and fewest inliers.
+        options: threshold and smallest number of inliers.
 
     Returns:
-        The fit, its `trials` 1, or why F is not to be trusted.
+        The fit, with `trials` 1, or the reason why F is rejected.
 
     Raises:
         ValueError: the points are not as above (see `check_points`), or F is not (3, 3).
@@ -115,7 +115,7 @@ def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings)
 
 
 def matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> int:
-    """Return how many distinct inliers of F show parallax: those off the plane that holds most of them.
+    """Count the distinct inliers of F with parallax: those off the plane that holds most of them.
 
     Args:
         x1: (N, 2) pixels.
@@ -136,19 +136,19 @@ def matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: Epipo
 
 
 def _in_frame(F: ArrayLike, unit_px: float, center: FloatArray) -> FloatArray:
-    """Return F of pixels as F of points that are centered and in units; the inverse of `Matches.to_pixels`."""
+    """Return F of pixels as F of `Matches.points`: the inverse of `Matches.to_pixels`."""
     pixels = np.asarray(F, dtype=np.float64)
     if pixels.shape != (3, 3):
         raise ValueError(f"F must have shape (3, 3), got {pixels.shape}")
     to1, to2 = (np.array([[unit_px, 0, x], [0, unit_px, y], [0, 0, 1]]) for x, y in (center[:2], center[2:]))
-    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is rejected
+    with np.errstate(over="ignore", invalid="ignore"):  # an F that is not finite is rejected
         return np.asarray(to2.T @ pixels @ to1)
 
 
 def _judge_any(
     x1: FloatArray, x2: FloatArray, matches: Matches, F: FloatArray, trials: int, options: EpipolarSettings
 ) -> EpipolarFit | Rejected:
-    """Return `_judge` for an F that need not be finite, of rank 2 or of a sensible scale."""
+    """Judge an F of any scale and rank; reject it if it is not finite or its rank is below 2."""
     largest = np.abs(F).max()
     if not (np.isfinite(largest) and largest > 0) or np.linalg.matrix_rank(F / largest) < 2:
         return Rejected(NO_MODEL)

@@ -1,6 +1,6 @@
-"""What an estimator is made of: sampler, solver, score, verifier, stopping rule, final fit.
+"""The parts of an estimator: sampler, solver, score, verifier, stopping rule, final fit.
 
-The stages of thesis Figure 3.7 and section 4.4, each a part that can be exchanged.
+They are the stages of thesis Figure 3.7 and section 4.4; each can be exchanged.
 """
 
 from collections.abc import Callable
@@ -18,37 +18,37 @@ FloatArray = NDArray[np.float64]
 Refine = Callable[[FloatArray, FloatArray, float], FloatArray]
 """(points, F, threshold) -> a better F."""
 Recover = Callable[[FloatArray, FloatArray, float, Loss, PreTest, RandomState], FloatArray | None]
-"""(points, F, threshold, loss, pre-test, random generator) -> another F that the samples may have missed, or None."""
+"""(points, F, threshold, loss, pre-test, random generator) -> an F that the samples may have missed, or None."""
 Validity = Callable[[FloatArray, FloatArray, float], FloatArray]
 """(points, f, threshold) -> p(v_i), (N,) >= 0, at least one of them > 0."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recipe:
-    """What sets one estimator apart from the next: sampler, solver, score, verifier, stopping rule, final fit."""
+    """One estimator: sampler, solver, score, verifier, stopping rule, final fit."""
 
     score: Score
-    """The penalty that the best model has least of (see `scoring.robust_costs` and `scoring.mlesac`)."""
+    """The penalty to minimize (see `scoring.robust_costs` and `scoring.mlesac`)."""
     finish: Refine
     """The final fit, from the best model of the loop."""
     sample_size: int = SAMPLE_SIZE
-    """7: all models through seven matches; 8: the linear one through eight."""
+    """7: all models through seven matches; 8: the linear model through eight matches."""
     validity: Validity | None = None
-    """Priors from a new best model; None samples uniformly throughout."""
+    """Priors from a new best model; None: all samples are uniform."""
     guided_share: float = 1.0
     """Share of the samples that are drawn by the priors."""
     rest_share: float = 0.0
-    """Share of the samples that are drawn from what the best model leaves unexplained, once there are priors."""
+    """Share of the samples that are drawn from matches that the best model does not explain, once there are priors."""
     batch: int = 1
-    """Samples between two looks at whether one of them was better."""
+    """Samples between two checks for a better model."""
     guided_after: float = 0.0
     """Share of the trials before the first priors."""
     verifier: Callable[[int, int], Verifier] = FullVerification
-    """(number of matches, sample size) -> the test of hypotheses before they are scored in full."""
+    """(number of matches, sample size) -> the test that hypotheses take before they are scored in full."""
     assumed_share: float | None = None
-    """Inliers that the number of trials is made for (3.19); None: those of the best model."""
+    """Share of inliers for the number of trials (thesis 3.19); None: that of the best model."""
     least_trials: int = 0
-    """Samples that are drawn even if fewer would do by 3.19, and before `patience` is asked."""
+    """Samples that are drawn in any case, even if (3.19) needs fewer, and before the first call of `patience`."""
     stop_on_convergence: bool = False
     """End when the priors have converged (thesis 4.18)."""
     patience: Callable[[FloatArray, FloatArray, float], float] | None = None
@@ -56,7 +56,7 @@ class Recipe:
     improve: Refine | None = None
     """Local optimization of every new best model of a sample."""
     fine_score: Score | None = None
-    """The penalty by which improved models compete, apart from those of samples; None: all compete by `score`."""
+    """The penalty that ranks locally optimized models; None: `score` ranks them, too."""
     recover: Recover | None = None
     """A last attempt from the best model, by means other than samples of matches."""
     oriented: bool = False

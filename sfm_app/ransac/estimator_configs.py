@@ -1,8 +1,8 @@
-"""The estimators of thesis chapter 4, each as the parts it is made of.
+"""The estimators of thesis chapter 4, each described by its parts.
 
-All of them are the same loop with another sampler, solver, score, verifier or stopping rule; where a part is not
-named it is the plain one (see `estimator_config.Recipe`). The threshold T is `max_error_px`; the thesis takes 1.96 px
-for a noise of 1 px.
+All of them run the same loop with different samplers, solvers, scores, verifiers or stopping rules. Parts that are not
+named are the defaults of `estimator_config.Recipe`. The threshold T is `max_error_px`; the thesis takes 1.96 px for a
+noise of 1 px.
 """
 
 import math
@@ -39,9 +39,9 @@ def _refit_to_median(points: FloatArray, F: FloatArray, _threshold: float) -> Fl
 
 
 def median_sigma(squared: FloatArray) -> float:
-    """Return standard deviation of the inliers from the median of the squared distances (Rousseeuw and Leroy 1987).
+    """Return the standard deviation of the inliers from the median of the squared distances (Rousseeuw and Leroy 1987).
 
-    The factor 1 + 5 / (n - p) makes up for the p = 7 matches that a minimal model meets exactly.
+    The factor 1 + 5 / (n - p) compensates for the p = 7 matches that a minimal model meets exactly.
     """
     return MAD_TO_SIGMA * (1 + 5 / max(len(squared) - 7, 1)) * math.sqrt(float(np.median(squared)))
 
@@ -78,12 +78,12 @@ RECIPES: Mapping[str, tuple[Recipe, str]] = {
         "least median of squares, for up to half outliers",
     ),
 }
-"""Name, recipe, and one line about it. RES-RANSAC draws a tenth of its trials before it has priors (thesis 4.6.2);
-LMedS is for half outliers (4.4.1)."""
+"""By name: recipe, and one line about it. RES-RANSAC draws a tenth of its trials before it has priors (thesis 4.6.2);
+LMedS assumes half outliers (4.4.1)."""
 
 
 class Classical:
-    """The estimator of that name, as a function. See `estimate`."""
+    """A callable that runs the recipe of a name in `RECIPES`; see `estimate`."""
 
     def __init__(self, name: str) -> None:
         self.__name__ = name
@@ -92,11 +92,11 @@ class Classical:
         return estimate(x1, x2, options, seed, RECIPES[self.__name__][0])
 
     def __reduce__(self) -> tuple[Callable[[str], "Classical"], tuple[str]]:
-        """Pickle by name, as functions do: workers get the one that they have themselves."""
+        """Pickle by name, as functions are: a worker process looks up its own instance."""
         return classical, (self.__name__,)
 
 
 @cache
 def classical(name: str) -> Classical:
-    """Return the one estimator of that name in `RECIPES`."""
+    """Return the estimator of a name in `RECIPES`, always the same object."""
     return Classical(name)

@@ -1,4 +1,4 @@
-"""The inner loop: draw, solve and score until something better than the best turns up.
+"""The inner loop: draw, solve and score until a better model is found.
 
 Thesis 4.7.5, lines 3 to 6 of Algorithm 1.
 """
@@ -18,24 +18,25 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 GUIDED, UNGUIDED = range(2)
-"""Kinds of samples: those that the priors draw (all of them where there are no priors), and those drawn besides."""
+"""Kinds of samples: drawn by the priors (or any sample while there are no priors), and drawn without them."""
 
 
 class Draws(NamedTuple):
-    """How hypotheses are made."""
+    """How samples are drawn and models computed from them."""
 
     sample_size: int
     """7 or 8, see `solvers.minimal`."""
     oriented: bool
     """Whether models that put a sampled point behind a camera are dropped."""
     batch: int
-    """Samples between two looks at whether one of them was better."""
+    """Samples between two checks for a better model."""
     guided_share: float
     """Share of the samples that are drawn by the priors."""
     priors: FloatArray
     """(N,) running sum of the priors p(v_i)."""
     rest_share: float
-    """Share of those that are drawn from the rest: what the best model leaves unexplained. The others are uniform."""
+    """Share of the samples drawn from the rest, matches that the best model does not explain; the others are
+    uniform."""
     rest: FloatArray
     """(N,) running count of the matches in the rest."""
 
@@ -51,20 +52,20 @@ def next_better(
     state: RandomState,
     best: FloatArray,
 ) -> int:
-    """Draw samples until a model of one has a smaller penalty than the best of its kind.
+    """Draw samples until a model has a smaller penalty than the best of its kind.
 
-    Lines 4 to 6 of Algorithm 1. Samples that owe nothing to the priors are a kind of their own: a second motion, or
-    what a wrong model took for outliers, would never be found in competition with samples that the priors have made
-    nearly perfect.
+    Lines 4 to 6 of Algorithm 1. Samples drawn without the priors compete only among themselves: a second motion, or
+    inliers that a wrong model took for outliers, would never win against samples that the priors have made nearly
+    perfect.
 
     Args:
-        points: (N, 4) matches in random order, N >= the sample size; twice over, (2 N, 4), for a pre-test with a random
-            start, so that any N rows on end are all of them.
-        draws: how samples are drawn and models made.
+        points: (N, 4) matches in random order, N >= the sample size; repeated to (2 N, 4) for a pre-test with a random
+            start, so that any N consecutive rows hold all matches.
+        draws: how samples are drawn and models computed.
         loss: the penalty.
         pretests: the tests that a model has to pass, by the kind of its sample: `GUIDED`, `UNGUIDED`.
         to_beat: (2,) smallest penalty so far of each kind; lowered.
-        limit: most samples.
+        limit: largest number of samples.
         state: random generator.
         best: (2, 9) set to the better models.
 
@@ -96,8 +97,8 @@ def next_better(
 def draw_sample(draws: Draws, state: RandomState, sample: IntArray) -> int:
     """Draw one sample by the priors, from the rest, or uniformly, and return its kind.
 
-    A lot decides between the three. What cannot be drawn by weights, because too few matches hold them all, is drawn
-    uniformly, and so is everything as long as there are no priors.
+    A random number chooses among the three. Samples are uniform, too, while there are no priors, and where too few
+    matches hold nearly all the weight.
 
     Args:
         draws: the shares of the three, and the weights.

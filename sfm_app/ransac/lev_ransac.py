@@ -1,11 +1,11 @@
-"""LEV-RANSAC as the program uses it: Algorithm 1 with what today's estimators have learnt since.
+"""LEV-RANSAC as the program uses it: Algorithm 1 with improvements from later estimators.
 
 Thesis 4.7, with Chum, Matas and Kittler (2003), Chum, Werner and Matas (2004, 2005) and Capel (2005); the two scales,
 the kinds of samples and the patience by evidence are ours.
 
-One kind of cost goes through all of it, r^2 / (r^2 + c^2), which has no threshold to fall off: at a coarse scale c for
-the models of samples, which are noisy, and at a fine one for models that were optimized on all matches nearby. Fine
-scales tell the true geometry from one that lies on repeated structure or on a single plane.
+One kind of cost is used throughout, r^2 / (r^2 + c^2), which has no threshold: with a coarse scale c for the models of
+samples, which are noisy, and with a fine scale for models that were optimized on all matches nearby. Fine scales tell
+the true geometry from one that lies on repeated structure or on a single plane.
 """
 
 from functools import partial
@@ -37,15 +37,15 @@ _LOCAL_MATCHES, _LOCAL_STEPS, _ENOUGH = 1000, (5, 3), 1e-3
 """Most matches, steps at either scale, and relative decrease of the cost that ends them, in local optimization. The
 1000 were chosen on the Strecha sets with six seeds; the others by hand, not measured on their own."""
 _REACH, _FINAL_STEPS = 3.0, 12
-"""Thresholds within which matches take part in the last fit, and its most steps (docs/algorithms.md, Fundamental
-matrices). What the fit is worth: `python -m benchmarks.fundamental --real DATA --ablation`, least squares
+"""Thresholds within which matches take part in the final fit, and its largest number of steps (docs/algorithms.md,
+Fundamental matrices). What the fit is worth: `python -m benchmarks.fundamental --real DATA --ablation`, least squares
 instead; the numbers were chosen by hand."""
 
 
 def _optimize_locally(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Fit by 8 points to the matches within twice the threshold, then Sampson steps, coarse and fine, on all around.
+    """Fit by 8 points to the matches within twice the threshold, then step on the Sampson distance at both scales.
 
-    A model through seven noisy matches misses many true ones by more than the threshold; from the wider set it reaches
+    A model through seven noisy matches misses many true ones by more than the threshold; a fit to the wider set reaches
     them (Chum, Matas and Kittler 2003).
     """
     squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
@@ -58,7 +58,7 @@ def _optimize_locally(points: FloatArray, F: FloatArray, threshold: float) -> Fl
 
 
 def _refit_to_all(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Return maximum likelihood on all matches within three thresholds, whose noise it measures."""
+    """Return the maximum likelihood F of all matches within three thresholds; their noise is estimated, too."""
     return refine_mixture(points, F, threshold=threshold, reach=_REACH, most_steps=_FINAL_STEPS)
 
 
@@ -83,12 +83,12 @@ seeds and other sets stand in benchmarks/README.md."""
 
 
 def fit_lev_ransac(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
-    """Run the production estimator. See `estimate`.
+    """Run the production estimator; see `estimate`.
 
     Args:
         x1: (N, 2) pixels in photo 1.
         x2: (N, 2) pixels in photo 2, row by row the partners of x1.
-        options: threshold, confidence, most samples, fewest inliers.
+        options: threshold, confidence, largest number of samples, smallest number of inliers.
         seed: same seed, same result.
     """
     return estimate(x1, x2, options, seed, PRODUCTION)

@@ -1,4 +1,4 @@
-"""Algorithm 1 of the thesis as a frame: the loop that all estimators share."""
+"""Algorithm 1 of the thesis: the loop that all estimators share."""
 
 import math
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ _EXPLAINED = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hypothesis:
-    """The best model of a search."""
+    """The best model of a search, and the number of samples drawn."""
 
     F: FloatArray
     """(3, 3) in the frame of `Matches`."""
@@ -32,11 +32,11 @@ class Hypothesis:
 
 
 def search(matches: Matches, options: EpipolarSettings, seed: int, recipe: Recipe) -> Hypothesis | None:
-    """Draw samples, by the priors, until one of the stopping rules holds (thesis, Algorithm 1).
+    """Draw samples by the priors until a stopping rule holds (thesis, Algorithm 1).
 
     Args:
         matches: the distinct matches of a pair.
-        options: threshold, confidence, most samples.
+        options: threshold, confidence, largest number of samples.
         seed: same seed, same result.
         recipe: the estimator.
     """
@@ -46,16 +46,16 @@ def search(matches: Matches, options: EpipolarSettings, seed: int, recipe: Recip
 
 
 class _Search:
-    """Algorithm 1 at work: the best model so far, and what follows from it for the samples to come."""
+    """The state of Algorithm 1: the best model so far, and from it the priors and limits for the next samples."""
 
     share: float
-    """Of inliers, in the best model that was ever seen or as assumed."""
+    """Largest share of inliers of any best model so far, or the assumed one."""
     limit: int
-    """Samples, by 3.19 and the settings."""
+    """Largest number of samples, by (3.19) and the settings."""
     first_priors: int
     """Samples before the priors are first estimated."""
     patience: float
-    """Idle samples after which the best model is asked for more."""
+    """Samples without a better model after which the evidence for the best one is evaluated."""
 
     def __init__(self, matches: Matches, options: EpipolarSettings, seed: int, recipe: Recipe) -> None:
         self.points, self.threshold = matches.points, options.max_error_px / matches.unit_px
@@ -73,7 +73,7 @@ class _Search:
         self._look_ahead()
 
     def run(self) -> Hypothesis | None:
-        """Go on until the samples are used up, the priors have converged, or patience has run out."""
+        """Continue until the samples are used up, the priors have converged, or patience has run out."""
         while self.trials < self.limit:
             better = self._draw()
             if self._guide(better) or self._has_waited_enough():
@@ -84,7 +84,7 @@ class _Search:
         return Hypothesis(self.best.f.reshape(3, 3), self.trials)
 
     def _draw(self) -> bool:
-        """Draw samples until one is better or something else has to be decided; return whether the best changed."""
+        """Draw samples until a better model or the next decision; return whether the best model changed."""
         left = min(self.limit - self.trials, self.test.review, self.patience - self.idle)
         if self.trials < self.first_priors:
             left = min(left, self.first_priors - self.trials)
@@ -95,7 +95,7 @@ class _Search:
         self.idle += drawn
         self.test.learn(drawn)
         improved = np.flatnonzero(best.to_beat < before).tolist()
-        better = any([best.update(kind) for kind in improved])  # noqa: C419  both kinds are to be asked
+        better = any([best.update(kind) for kind in improved])  # noqa: C419  update both kinds
         if better:
             seen = best.inlier_share()
             self.idle, self.share = 0, self.recipe.assumed_share or max(self.share, seen)
@@ -111,7 +111,7 @@ class _Search:
         self.first_priors = math.ceil(self.recipe.guided_after * self.limit)
 
     def _guide(self, better: bool) -> bool:
-        """Set the priors after a new best model; return whether they say that the search is over."""
+        """Set the priors after a new best model; return whether they have converged and end the search."""
         recipe = self.recipe
         if recipe.validity is None or not self.best or self.trials < self.first_priors:
             return False
@@ -126,14 +126,14 @@ class _Search:
         return recipe.stop_on_convergence and have_converged(before, self.priors)
 
     def _has_waited_enough(self) -> bool:
-        """Return whether the best model has stood for as many samples as its evidence calls for."""
+        """Return whether the best model has survived as many samples as its evidence requires."""
         if self.recipe.patience is None or self.idle < self.patience:
             return False
         if not self.best:
             self.patience += self.recipe.least_trials
             return False
         wanted = self.recipe.patience(self.points, self.best.f.reshape(3, 3), self.threshold)
-        if math.isinf(wanted):  # what may be luck is no guide
+        if math.isinf(wanted):  # support that may be chance must not guide the sampling
             self.draws = self.draws._replace(guided_share=0.0, rest_share=0.0)
         self.patience = math.ceil(min(wanted, self.options.max_trials))
         return self.patience <= self.idle

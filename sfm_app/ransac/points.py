@@ -1,6 +1,7 @@
-"""Matched points on their way in: checked, freed of duplicates, shuffled, and scaled to numbers near 1.
+"""Preparation of matched points: check them, drop duplicates, shuffle, and scale to numbers near 1.
 
-Thesis 4.3.2 asks for normalized points, as Hartley (1997) does; a frame that absurd matches do not move is ours.
+Thesis 4.3.2 asks for normalized points, as Hartley (1997) does; the robust frame, which gross outliers do not move, is
+ours.
 """
 
 from dataclasses import dataclass
@@ -13,10 +14,10 @@ from sfm_app.geometry.epipolar import unit_norm
 FloatArray = NDArray[np.float64]
 
 _LARGEST_PX = 1e15
-"""Coordinates beyond this are no pixels: in double precision they lie an eighth of a pixel apart there."""
+"""Largest coordinate of a pixel: beyond it double precision resolves only an eighth of a pixel."""
 _MOST, _MOST_TO_RMS = 0.9, 1.56
-"""Share of the coordinates that tell the spread, and the largest of them over the root mean square, if uniform. The
-second follows from the first: 0.9 sqrt(3). Chosen by hand; not measured on its own."""
+"""Quantile of the deviations that measures the spread, and its ratio to their root mean square, if uniform. The second
+follows from the first: 0.9 sqrt(3). Chosen by hand; not measured on its own."""
 
 
 def check_points(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -56,17 +57,17 @@ def _check(x: ArrayLike, name: str) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """The distinct matches of a pair as the estimators see them."""
+    """The distinct matches of a pair, as input of the estimators."""
 
     points: FloatArray
     """(M, 4) x1, y1, x2, y2 in random order; each view centered, both divided by `unit_px`.
 
-    In Fortran order: kernels run along the matches, and a column on end in memory lets them take several at once.
+    In Fortran order: kernels run along the matches, and contiguous columns let the compiler vectorize them.
     """
     rows: NDArray[np.intp]
     """(N,) for each match as given, its row in `points`."""
     unit_px: float
-    """Pixels per unit of `points`; one scale for both views, so that a Sampson distance stays one."""
+    """Pixels per unit of `points`; one scale for both views, which only scales Sampson distances."""
     center: FloatArray
     """(4,) pixels x1, y1, x2, y2 of the origin of `points`."""
 
@@ -79,18 +80,18 @@ class Matches:
 
 
 def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
-    """Drop repeated matches, shuffle and scale.
+    """Drop repeated matches, shuffle and scale the rest.
 
-    SIFT gives a keypoint once per orientation, so that one match may come several times. Repeats would count as support
-    and make samples degenerate. The random order lets a scorer stop early: its first points are a fair sample.
+    SIFT returns a keypoint once per orientation, so that one match may occur several times. Repeats would count as
+    support and make samples degenerate. The random order lets a scorer stop early: its first points are a fair sample.
 
     Args:
         x1: (N, 2) pixels in photo 1.
         x2: (N, 2) pixels in photo 2, row by row the partners of x1.
-        seed: of the random order.
+        seed: seed of the random order.
     """
     stacked = np.hstack([x1, x2])
-    # One key per match: a projection on incommensurable numbers is equal for equal rows and sorts faster than rows do.
+    # one key per match: a projection with incommensurable weights is equal for equal rows, and sorts faster than rows
     keys = stacked[:, 0] + stacked[:, 1] * np.sqrt(2) + stacked[:, 2] * np.sqrt(3) + stacked[:, 3] * np.sqrt(5)
     ranked = np.argsort(keys, kind="stable")
     is_new = np.diff(keys[ranked], prepend=-np.inf) > 0
@@ -106,9 +107,9 @@ def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
 
 
 def _frame(points: FloatArray) -> tuple[FloatArray, float]:
-    """Return origin (4,) and unit in which most coordinates are of magnitude 1.
+    """Return the origin (4,) and the unit in which most coordinates are of magnitude 1.
 
-    A few absurd matches do not move them.
+    A few gross outliers do not change them.
     """
     if not len(points):
         return np.zeros(4), 1.0

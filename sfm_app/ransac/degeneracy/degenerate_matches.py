@@ -1,11 +1,11 @@
-"""Matches that do not determine F: all on one line of a photo, on one plane, or taken without moving the camera.
+"""Matches that do not determine F: all on one line of a photo, on one plane, or from a camera that did not move.
 
-Ours, with Hartley and Zisserman (2004), 11.9, on what a line or a plane leaves free, and Moisan and Stival (2004) on
-chance.
+Ours, with Hartley and Zisserman (2004), 11.9, on the parameters that a line or a plane leaves free, and Moisan and
+Stival (2004) on chance.
 
-Matches on a line of one view leave two parameters of F free, on a line of both views four. Any so many other matches
-fix them, mismatches too: what counts is matches off the line, more of them than accident gives. In the same way what
-tells a real epipole is matches off the dominant plane (see `dominant_plane`).
+Matches on a line of one view leave two parameters of F free, on a line of both views four. As many other matches fix
+them, even mismatches: the evidence is more matches off the line than expected by chance. In the same way the evidence
+for an epipole is matches off the dominant plane (see `dominant_plane`).
 """
 
 import numpy as np
@@ -20,45 +20,46 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 _LINE_SAMPLE, _PARALLAX_SAMPLE = 4, 2
-"""Matches that fix what a line, or a plane, leaves free of F. Counted: parameters of F (docs/algorithms.md, All
-estimators)."""
+"""Matches that fix the parameters of F that a line, or a plane, leaves free. Counted: parameters of F
+(docs/algorithms.md, All estimators)."""
 _OFF_LINE = 2.0
-"""A match is off the line when that misses it by more than this many thresholds. As for planes,
-`dominant_plane.OFF_PLANE`. Chosen by hand; not measured on its own."""
+"""Distance in thresholds beyond which a match is off the line, as for planes `dominant_plane.OFF_PLANE`. Chosen by
+hand; not measured on its own."""
 _LINES, _MOST_SCORED = 16, 300
-"""A line that matters holds most of the inliers: few samples will find it. Of 16 pairs of matches one lies on a line
-that holds half of them 99 times in 100. Chosen by hand; not measured on their own."""
+"""Sampled lines, and the inliers that each is scored on. A relevant line holds most inliers, so few samples find it:
+one of 16 pairs lies on a line that holds half of them 99 times in 100. Chosen by hand; not measured on their own."""
 _EXTENT = (0.01, 0.99)
-"""Where the points of a view begin and end, a few absurd ones aside. Chosen by hand; not measured on their own."""
+"""Quantiles that bound the points of a view, without a few gross outliers. Chosen by hand; not measured on their
+own."""
 _FOCALS = np.geomspace(0.4, 6.0, 60)
 """Focal lengths that are tried for a rotation, in sides of the box around the points. Chosen by hand; not measured on
 their own."""
 _PARALLAX_OF_A_MOTION = 0.05
-"""Share of the inliers off the plane below which a rotation stays one. Mismatches on rows of bricks have a vanishing
-point in common: they agree with an epipole there far more often than accident has it. On the real photo sets no pair
-has such a homography and less than 40 % off it (docs/algorithms.md, All estimators)."""
+"""Share of the inliers off the plane below which a rotation counts as one. Mismatches on rows of bricks share a
+vanishing point: they agree with an epipole there far more often than by chance. On the real photo sets no pair has such
+a homography and less than 40 % off it (docs/algorithms.md, All estimators)."""
 _ROTATION_TOLERANCE = 0.05
-"""A rotation stretches nothing; a homography that stretches less than this, for some focal length, counts as one.
+"""Largest relative stretch of a homography that counts as a rotation, for some focal length; a rotation has none.
 Chosen by hand; not measured on its own."""
 
 
 def find_degeneracy(
     points: FloatArray, F: FloatArray, inliers: BoolArray, wrong: FloatArray, threshold: float, centers: FloatArray
 ) -> str:
-    """Return what leaves F undetermined.
+    """Return the kind of degeneracy that leaves F undetermined.
 
     Args:
         points: (N, 4) matches in random order.
         F: (3, 3) the model.
-        inliers: (N,) at least 3 of them.
+        inliers: (N,) mask, at least 3 of them True.
         wrong: (M,) squared distances of mismatches to F, from `a_contrario.squared_mismatches`.
         threshold: largest distance of an inlier.
         centers: (4,) the origin of `points` in a frame that both views share, in the same units.
 
     Returns:
-        "collinear" where all matches lie on one line of a photo, or in one place (but for a few that may be accident),
-        "rotation" where the camera only turned, "planar" where all matches lie on one plane (or too close to one to
-        tell), "" where F is determined.
+        "collinear" where all matches lie on one line of a photo or at one point (except for a few that may be chance),
+        "rotation" where the camera only rotated, "planar" where all matches lie on one plane or too close to one, ""
+        where F is determined.
     """
     chance = accidental_share(wrong, threshold)
     for view in range(2):
@@ -75,7 +76,7 @@ def find_degeneracy(
 
 
 def _may_be_accident(off: BoolArray, inliers: BoolArray, sample_size: int, chance: float) -> bool:
-    """Give whether so many of the matches `off` a line or plane would agree with some F if all of these were wrong."""
+    """Return whether the inliers among the matches `off` a line or plane could all be mismatches."""
     agreeing = int(np.count_nonzero(off & inliers))
     return false_alarms(int(np.count_nonzero(off)), agreeing, sample_size, chance) > MOST_FALSE_ALARMS
 
@@ -85,12 +86,12 @@ def off_dominant_line(points: FloatArray, inliers: BoolArray, view: int, width: 
 
     Args:
         points: (N, 4) matches in random order.
-        inliers: (N,) at least one of them.
+        inliers: (N,) mask, at least one of them True.
         view: 0 or 1.
         width: in the units of `points`.
 
     Returns:
-        (N,)
+        (N,) mask.
     """
     x, y = points[:, 2 * view], points[:, 2 * view + 1]
     a, b, c = _dominant_line(x[inliers], y[inliers], width)
@@ -99,14 +100,14 @@ def off_dominant_line(points: FloatArray, inliers: BoolArray, view: int, width: 
 
 @kernel
 def _dominant_line(x: FloatArray, y: FloatArray, width: float) -> tuple[float, float, float]:
-    """Return the line a x + b y + c = 0, a^2 + b^2 = 1, that passes most of the first points, through two of all."""
+    """Return the line a x + b y + c = 0, a^2 + b^2 = 1, through two sampled points, near most of the first points."""
     count, most, best, state = x.shape[0], -1, (1.0, 0.0, 0.0), np.empty(1, dtype=np.uint64)
     state[0] = count
     for _ in range(_LINES):
         i, j = int(uniform(state) * count), int(uniform(state) * count)
         a, b = y[i] - y[j], x[j] - x[i]
         norm = np.sqrt(a * a + b * b)
-        a, b = (a / norm, b / norm) if norm > 0.0 else (1.0, 0.0)  # of two points in one place any line will do
+        a, b = (a / norm, b / norm) if norm > 0.0 else (1.0, 0.0)  # for two equal points any line will do
         c, on_line = -(a * x[i] + b * y[i]), 0
         for n in range(min(count, _MOST_SCORED)):
             on_line += abs(a * x[n] + b * y[n] + c) <= width
@@ -116,7 +117,7 @@ def _dominant_line(x: FloatArray, y: FloatArray, width: float) -> tuple[float, f
 
 
 def is_rotation(H: FloatArray, points: FloatArray, centers: FloatArray) -> bool:
-    """Return whether H = K R K^-1 for one focal length, and a center in the middle of where both views have points.
+    """Return whether H = K R K^-1 for one focal length, with the center in the middle of the points of both views.
 
     Args:
         H: (3, 3) homography, view 2 from view 1, in the frame of the points.

@@ -3,7 +3,7 @@
 Hartley and Zisserman (2004), Result 13.6, as a regression whose weights are ours.
 
 Where one homography H explains the matches, every F = [e]x H does, for any epipole e: the estimator then picks the e
-that catches the most accidental inliers. What tells a real epipole is matches off the plane.
+that gets the most inliers by chance. The evidence for an epipole is matches off the plane.
 """
 
 import numpy as np
@@ -17,14 +17,13 @@ from sfm_app.ransac.solvers.eigenvalues import symmetric_eigen
 FloatArray = NDArray[np.float64]
 
 OFF_PLANE = 2.0
-"""A match is off the plane when H misses it by more than this many thresholds. Chosen by hand; not measured on its
-own."""
+"""Transfer distance in thresholds beyond which a match is off the plane. Chosen by hand; not measured on its own."""
 _SAMPLES, _SAMPLE_SIZE = 64, 3
 """Samples of three matches: a plane that holds half of them is missed twice in ten thousand times, (7/8)^64. Chosen by
 hand; not measured on its own."""
 _LEAST_AREA = 1e-3
-"""Twice the area of the triangle of a sample, in squares of the points' spread: thinner ones fix no plane. Chosen by
-hand; not measured on its own."""
+"""Twice the area of the triangle of a sample, in squares of the points' spread: thinner ones determine no plane. Chosen
+by hand; not measured on its own."""
 _MOST_SCORED = 300
 """Matches that a sampled plane is scored on. Chosen by hand; not measured on its own."""
 _LEAST_SUPPORT = 1e-12
@@ -36,9 +35,9 @@ by hand; not measured on its own."""
 def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
     """Return the homography of the plane that holds the most matches, among those compatible with F.
 
-    They are H = A - e2 v' with A = [e2]x F and v' x1 = b for every match on the plane, where
-    b = (x2 x A x1)'(x2 x e2) / |x2 x e2|^2 (Hartley and Zisserman, Result 13.6): a linear regression, three parameters.
-    Its noise goes as 1 / |x2 x e2|, so each match weighs by its distance from the epipole.
+    Such homographies are H = A - e2 v' with A = [e2]x F and v' x1 = b for every match on the plane, where
+    b = (x2 x A x1)'(x2 x e2) / |x2 x e2|^2 (Hartley and Zisserman, Result 13.6): a linear regression with three
+    parameters. Its noise is proportional to 1 / |x2 x e2|, so each match has the weight |x2 x e2|^2.
 
     Args:
         points: (N, 4) inliers of F in random order, N >= 3.
@@ -72,7 +71,7 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
 
 @kernel
 def _homography(A: FloatArray, e2: FloatArray, v: FloatArray) -> FloatArray:
-    """Return a - e2 v'."""
+    """Return A - e2 v'."""
     H = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -97,9 +96,9 @@ def _plane_equations(points: FloatArray, A: FloatArray, e2: FloatArray) -> tuple
 
 @kernel
 def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray, plane: FloatArray) -> bool:
-    """Return weighted least squares of v' x1 = b into `plane` (3,).
+    """Fit v' x1 = b by weighted least squares and write v to `plane` (3,).
 
-    False, and nothing changed, for points on one line.
+    Returns False and writes nothing for points on one line.
     """
     gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
     right, row = np.zeros(3), np.ones(3)
@@ -125,7 +124,7 @@ def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray, plane: Fl
 
 @kernel
 def _sampled_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatArray, limit: float) -> FloatArray:
-    """Return the v through three matches, v' x1 = b, whose H maps most of the first ones to within sqrt(limit)."""
+    """Return the v through three sampled matches whose H maps most of the first matches to within sqrt(limit)."""
     count, most, state = min(points.shape[0], _MOST_SCORED), -1, np.empty(1, dtype=np.uint64)
     best, corner, v = np.zeros(3), np.empty(3, dtype=np.int64), np.empty(3)
     state[0] = count
@@ -160,7 +159,7 @@ def _sampled_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatAr
 
 
 def transfer_distance(H: FloatArray, points: FloatArray) -> FloatArray:
-    """Return (N,) |x2 - H x1| / sqrt(2): about the distance of the match (x1, x2) in 4D to those that fit H exactly.
+    """Return (N,) |x2 - H x1| / sqrt(2): about the distance in 4D of (x1, x2) to the nearest match that fits H exactly.
 
     Args:
         H: (3, 3) homography, view 2 from view 1.

@@ -1,7 +1,7 @@
 """Plane and parallax: the right epipole for a model found on a dominant plane (after Chum, Werner and Matas 2005).
 
-Samples from a scene with one large plane mostly lie on it, and their F has the plane's homography H right and the
-epipole wrong. With H given, two matches off the plane are a sample: the lines from H x1 to x2 meet in the epipole.
+Samples from a scene with one large plane mostly lie on it; their F has the right homography H of the plane, but a wrong
+epipole. With H given, two matches off the plane are a minimal sample: the lines from H x1 to x2 meet in the epipole.
 """
 
 import numpy as np
@@ -18,21 +18,21 @@ FloatArray = NDArray[np.float64]
 _SAMPLES = 100
 """Samples of two matches off the plane. Chosen by hand; not measured on its own."""
 _LEAST_INLIERS = 8
-"""Fewer do not tell which plane they lie on. Chosen by hand; not measured on its own."""
+"""Fewer do not determine the dominant plane. Chosen by hand; not measured on its own."""
 _MOST_INLIERS = 300
-"""Inliers that the plane is sought among. Chosen by hand; not measured on its own."""
+"""Largest number of inliers that the plane is fitted to. Chosen by hand; not measured on its own."""
 
 
 def with_another_epipole(
     points: FloatArray, F: FloatArray, threshold: float, loss: Loss, pretest: PreTest, state: RandomState
 ) -> FloatArray | None:
-    """Return the best model that shares the dominant plane of F's inliers; None without a plane and two matches off it.
+    """Estimate the best model with the dominant plane of F's inliers; None without a plane and two matches off it.
 
     Args:
         points, F: (N, 4) in random order, and (3, 3).
         threshold: largest distance of an inlier.
         loss: the penalty.
-        pretest: the test that a model has to pass; not one with a random start.
+        pretest: the test that a model has to pass, without a random start.
         state: random generator.
     """
     inliers = squared_distances(points, np.ascontiguousarray(F).reshape(9)) <= threshold * threshold

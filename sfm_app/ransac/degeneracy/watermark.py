@@ -1,10 +1,10 @@
-"""Matches that stay in place while the scene moves: logos, time stamps, dust, or one photo twice.
+"""Matches that stay in place while the scene moves: logos, time stamps, dust, or the same photo twice.
 
 Ours; the name is COLMAP's.
 
-A logo agrees with F = [t]x for any t, so that enough of its matches make the camera stand still. What tells it from a
-scene whose image happens to stay in place, such as a thing that the photographer kept in the middle, is its peak:
-displacements of a scene vary smoothly with depth and place, and reach 0 no more often than anything near 0.
+A logo agrees with F = [t]x for any t, so that enough of its matches make the camera appear not to rotate. A scene may
+also stay in place in the image, such as an object that the photographer kept in the middle. A logo differs by its peak:
+displacements of a scene vary smoothly with depth and position, and are 0 no more often than any value near 0.
 """
 
 from collections.abc import Callable
@@ -24,46 +24,46 @@ SAME_PHOTO = "the same photo twice, or nearly"
 ONLY_A_LOGO = "nothing in common but a logo or time stamp"
 
 PEAK, STATIONARY, AROUND = 1.0, 2.0, 4.0
-"""Displacements at the peak, those taken for stationary, and those compared with, in steps of the keypoints' noise.
-Looked at on the real photo sets, of which they touch one pair of 456 (docs/algorithms.md, All estimators)."""
+"""Largest displacements at the peak, of stationary matches, and of the ring around the peak, in units of keypoint
+noise. Checked on the real photo sets, where they affect one pair of 456 (docs/algorithms.md, All estimators)."""
 LEAST = 8
-"""Fewer matches at the peak are left to the estimator. Chosen by hand; not measured on its own."""
+"""Least number of matches at the peak; fewer are left to the estimator. Chosen by hand; not measured on its own."""
 MOST_LOST = 0.2
-"""Share of the matches, the stationary or the others, that may be taken from the scene together with a logo.
+"""Share of the stationary matches, or of the others, that may be removed from the scene with a logo.
 docs/algorithms.md, All estimators. Chosen by hand; not measured on its own."""
 CELLS, WIDE = 8, 0.25
-"""Cells of the photo along each side, and the share of those with keypoints that a logo does not reach. Chosen by hand;
-not measured on their own."""
+"""Cells of the photo along each side, and the share of the cells with keypoints that a logo does not exceed. Chosen by
+hand; not measured on their own."""
 EXPLAINED = 0.9
 """Share of the stationary matches that a motion without rotation explains. Chosen by hand; not measured on its own."""
 
 
 def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> BoolArray:
-    """Return which matches stay where they are, although the others move or nothing moves at all.
+    """Find the matches that stay in place although the others move, or because nothing moves at all.
 
-    The displacements of a scene are spread along a curve or over an area around 0: within four steps there are at least
-    three times as many more as within one. Matches count as stationary where the peak holds more than that, and where
-    hardly any of the scene is lost with them: frames of a video in which all move by a few pixels keep theirs.
+    The displacements of a scene are spread along a curve or over an area around 0: between one and four units there are
+    at least three times as many as below one. Matches count as stationary where the peak holds no fewer than that
+    ring, and where few matches of the scene are lost: video frames in which all move by a few pixels keep theirs.
 
     Args:
         x1: (N, 2) pixels.
         x2: (N, 2) pixels in a photo of the same size.
-        unit_px: what keypoints are exact to, generously; more than 1 where they were found in a smaller image.
+        unit_px: generous noise of the keypoints; more than 1 where they were found in a smaller image.
 
     Returns:
-        (N,); all False where there is no such peak.
+        (N,) mask; all False where there is no such peak.
     """
     squared = np.square(x2 - x1).sum(axis=1) / unit_px**2
     peak, held, reached = (int(np.count_nonzero(squared <= steps**2)) for steps in (PEAK, STATIONARY, AROUND))
     ring = reached - peak
-    # a scene on a line through 0 has a third of the ring in every step
+    # of a scene on a line through 0, each unit of displacement holds a third of the ring
     lost = ring * STATIONARY / (AROUND - PEAK)
     is_peak = peak >= max(LEAST, ring) and lost <= MOST_LOST * max(held, len(x1) - held)
     return squared <= STATIONARY**2 if is_peak else np.zeros(len(x1), bool)
 
 
 def covers(points: FloatArray, keypoints: FloatArray, size: tuple[int, int]) -> bool:
-    """Return whether points lie all over what a photo shows.
+    """Return whether points are spread over a large part of a photo.
 
     Args:
         points: (N, 2) pixels.
@@ -77,21 +77,21 @@ def fit_moving(
     fit: Fit, points: tuple[FloatArray, FloatArray], stationary: BoolArray, wide: bool, options: EpipolarSettings,
     seed: int,
 ) -> EpipolarFit | Rejected:  # fmt: skip
-    """Return epipolar geometry of the matches that move; the stationary ones are no inliers and have no prior.
+    """Estimate the epipolar geometry of the moving matches; the stationary ones are no inliers and have prior 0.
 
-    Where the camera moved without turning, far things stay in place, too: stationary matches all over the photo that
-    the geometry of the others explains are of the scene, and all matches are fitted together.
+    Where the camera moved without rotation, distant objects stay in place, too: stationary matches all over the photo
+    that agree with the geometry of the others belong to the scene, and all matches are fitted together.
 
     Args:
         fit: the estimator.
         points: x1, x2, each (N, 2) pixels.
-        stationary: (N,) from `find_stationary`.
-        wide: whether these lie all over the photo, see `covers`.
-        options: of the estimator.
-        seed: likewise.
+        stationary: (N,) mask from `find_stationary`.
+        wide: whether these lie all over the photo, see `watermark.covers`.
+        options: settings of the estimator.
+        seed: seed of the estimator.
 
     Returns:
-        A fit whose inliers and priors are (N,), or why there is none: of matches that do not move alone, what they are.
+        A fit whose inliers and priors are (N,); or, where the moving matches have no fit, the kind of stationary ones.
     """
     x1, x2 = points
     found = fit(x1[~stationary], x2[~stationary], options, seed)

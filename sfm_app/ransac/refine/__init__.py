@@ -1,1 +1,1 @@
-"""The last fit of F, on each of the distances of thesis 4.2."""
+"""The final fit of F, on each of the distances of thesis 4.2."""

@@ -1,7 +1,8 @@
-"""The last fit: the estimator's own, or after it one that the settings name (thesis 4.3).
+"""The final fit: the estimator's own, optionally followed by one that the settings name (thesis 4.3).
 
-The three are least squares on the inliers of the given model: of the algebraic distance, and from there of the Sampson
-or the reprojection distance. With fewer than eight inliers the model stays as it is.
+The three named fits are least squares on the inliers of the given model. One minimizes the algebraic distance; the
+other two start from its result and minimize the Sampson or the reprojection distance. With fewer than eight inliers the
+model does not change.
 """
 
 from collections.abc import Callable
@@ -37,7 +38,7 @@ def refit_sampson(points: FloatArray, F: FloatArray, threshold: float) -> FloatA
 
 
 def _refit_reprojection(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
-    """Minimize the reprojection distance (thesis 4.3), from the least squares on its first order."""
+    """Minimize the reprojection distance (thesis 4.3), starting from the minimum of the Sampson distance."""
     inliers = _inliers(points, F, threshold)
     return F if len(inliers) < 8 else refine_reprojection(inliers, refit_sampson(points, F, threshold))
 
@@ -47,13 +48,13 @@ REFITS: dict[str, Refit] = {
     "sampson": refit_sampson,
     "reprojection": _refit_reprojection,
 }
-"""What `EpipolarSettings.refit` may name besides "auto"."""
+"""Values of `EpipolarSettings.refit` besides "auto"."""
 
 
 def last_fit(name: str, own: Refit) -> Refit:
-    """Return the estimator's own fit, and unless the name is "auto" the fit of that name to its inliers.
+    """Return the estimator's own fit, followed by the named fit to its inliers unless the name is "auto".
 
-    The own fit comes first in any case: its inliers are better than those of the best sample.
+    The own fit always comes first: its inliers are better than those of the best sample.
 
     Args:
         name: "auto", or a name in `REFITS`.

@@ -2,12 +2,12 @@
 
     cost = sum_i c^2 log(1 + r_i^2 / c^2)          (c = inf: least squares)
 
-with r_i the reprojection distance of match i, hence already the least over its point X_i. Bundle adjustment of two
+with r_i the reprojection distance of match i, which is already minimized over its point X_i. Bundle adjustment of two
 views has twelve camera parameters and three per point, but of the twelve only the seven of F count (2.34: v and lambda
-are free), and the Schur complement of a point at its best place leaves one equation of its match: r_i, with the
-derivative x2 x1' / |gradient of x2' F x1| over F, both taken at the nearest exact match. So this is Levenberg-Marquardt
-over F alone, and the points follow exactly. It needs no depth: points at infinity are points like all others, and those
-near an epipole, where depth is undetermined, do not hold back the rest. Time and memory grow with the matches.
+are free), and the Schur complement of a point at its optimum leaves one equation per match: r_i, with the derivative
+x2 x1' / |gradient of x2' F x1| over F, both evaluated at the nearest exact match. So this is Levenberg-Marquardt over
+F alone, with the points eliminated exactly. It needs no depth: points at infinity are no special case, and points near
+an epipole, whose depth is undetermined, do not hold back the others. Time and memory grow with the number of matches.
 """
 
 import numpy as np
@@ -20,9 +20,9 @@ from sfm_app.geometry.epipolar import homogeneous, nearest_rank_two, unit_norm
 FloatArray = NDArray[np.float64]
 
 DAMPING = DampingRange(first=1e-4, least=1e-12, most=1e12)
-"""Of Levenberg and Marquardt's steps. Chosen by hand; not measured on its own."""
+"""Damping of Levenberg-Marquardt steps. Chosen by hand; not measured on its own."""
 _ENOUGH = 1e-9
-"""Relative decrease of the cost under which the search ends. Chosen by hand; not measured on its own."""
+"""Relative decrease of the cost below which the iteration ends. Chosen by hand; not measured on its own."""
 _FLOOR = 1e-12
 """Least curvature, relative to the largest: some matches leave a direction of F free. Chosen by hand; not measured on
 its own."""
@@ -37,7 +37,7 @@ def refine_reprojection(
         points: (N, 4) inliers, of magnitude about 1.
         F: (3, 3) start.
         scale: Cauchy scale c, in the units of `points`; inf for plain least squares.
-        most_steps: most Levenberg-Marquardt steps.
+        most_steps: largest number of Levenberg-Marquardt steps.
 
     Returns:
         (3, 3), rank 2, Frobenius norm 1.
@@ -73,7 +73,7 @@ def refine_reprojection(
 
 
 def _moves(points: FloatArray, F: FloatArray) -> FloatArray:
-    """Return (N, 4) from every match to the nearest exact one, where its best point reprojects."""
+    """Return (N, 4) displacements from every match to the nearest exact match, where its best point projects."""
     return np.hstack(nearest_exact_matches(F, points[:, :2], points[:, 2:])) - points
 
 
@@ -83,7 +83,7 @@ def _cost(moves: FloatArray, softness: float) -> float:
 
 
 def _tangent(F: FloatArray) -> FloatArray:
-    """Return (7, 9) orthonormal directions in which F, of norm 1, stays of rank 2 and of norm 1 to first order."""
+    """Return (7, 9) orthonormal directions that to first order keep the rank 2 and the norm 1 of F."""
     U, _, Vt = np.linalg.svd(F)
     basis: FloatArray = np.linalg.svd(np.stack([np.outer(U[:, 2], Vt[2]).ravel(), F.ravel()]))[2][2:]
     return basis
@@ -96,9 +96,9 @@ def _normal_equations(
     exact1, exact2 = homogeneous(points[:, :2] + moves[:, :2]), homogeneous(points[:, 2:] + moves[:, 2:])
     gradient = np.hstack([(exact2 @ F)[:, :2], (exact1 @ F.T)[:, :2]])
     length = np.linalg.norm(gradient, axis=1)
-    inverse = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)  # both on the epipoles: no direction
+    inverse = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)  # 0 at both epipoles
     residuals = -(moves * gradient).sum(axis=1) * inverse
     rows = (exact2[:, :, None] * exact1[:, None, :]).reshape(-1, 9) * inverse[:, None]
-    jacobian = np.einsum("nk,jk->nj", rows, basis)  # einsum sums in one thread, in one order
+    jacobian = np.einsum("nk,jk->nj", rows, basis)  # einsum, because it sums in one thread and a fixed order
     weighted = jacobian / (1.0 + softness * (moves**2).sum(axis=1))[:, None]
     return np.einsum("nj,nk->jk", weighted, jacobian), -np.einsum("nj,n->j", weighted, residuals)

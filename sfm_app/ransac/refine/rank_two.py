@@ -1,7 +1,7 @@
-"""Matrices of rank 2 by rotations: F = U diag(1, s, 0) V' (Bartoli and Sturm 2004).
+"""Matrices of rank 2 as rotations and a singular value: F = U diag(1, s, 0) V' (Bartoli and Sturm 2004).
 
-Three parameters of each rotation and s: seven in all, rank 2 at every step and no spare scale. U turns to U exp([a]x),
-V to V exp([b]x).
+Three parameters of each rotation and s are seven in all: every step keeps rank 2, and scale is not a parameter. A step
+replaces U by U exp([a]x) and V by V exp([b]x).
 """
 
 import numpy as np
@@ -14,13 +14,13 @@ from sfm_app.ransac.solvers.eigenvalues import symmetric_eigen
 FloatArray = NDArray[np.float64]
 
 LEAST_RATIO = 1e-12
-"""Of the singular values: below it a matrix counts as one of rank 1. Rounding in double precision leaves 1e-16; the
-margin was chosen by hand."""
+"""Least ratio of the first two singular values: below it a matrix counts as rank 1. Rounding in double precision leaves
+1e-16; the margin was chosen by hand."""
 
 
 @kernel
 def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
-    """Return rotations U and V and the number s of the nearest rank 2 matrix U diag(1, s, 0) V', up to its scale."""
+    """Decompose the nearest matrix of rank 2, up to scale, into U diag(1, s, 0) V'; return U, s, V."""
     gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -34,9 +34,9 @@ def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
         for i in range(3):
             U[i, k] = F[i, 0] * V[0, k] + F[i, 1] * V[1, k] + F[i, 2] * V[2, k]
     first = _normalize(U, FIRST)
-    _turn_away(U)  # what rounding left where s is small
+    _turn_away(U)  # removes rounding errors, which matter where s is small
     second = _normalize(U, 1)
-    if not second > LEAST_RATIO * first:  # rank 1: any direction will do
+    if not second > LEAST_RATIO * first:  # rank 1: any second column will do
         least = 0
         for i in range(1, 3):
             least = i if abs(U[i, 0]) < abs(U[least, 0]) else least
@@ -44,7 +44,7 @@ def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
             U[i, 1] = 1.0 if i == least else 0.0
         _turn_away(U)
         _normalize(U, 1)
-    for i in range(3):  # the third columns meet the singular value 0: they make rotations of both
+    for i in range(3):  # the third columns, of singular value 0, make both matrices rotations
         j, k = (i + 1) % 3, (i + 2) % 3
         U[i, 2] = U[j, 0] * U[k, 1] - U[k, 0] * U[j, 1]
         V[i, 2] = V[j, 0] * V[k, 1] - V[k, 0] * V[j, 1]
@@ -53,7 +53,7 @@ def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
 
 @kernel
 def _normalize(U: FloatArray, k: int) -> float:
-    """Return column k over its length; the length."""
+    """Divide column k by its length; return the length."""
     length = np.sqrt(U[0, k] * U[0, k] + U[1, k] * U[1, k] + U[2, k] * U[2, k])
     for i in range(3):
         U[i, k] /= length
@@ -70,7 +70,7 @@ def _turn_away(U: FloatArray) -> None:
 
 @kernel
 def compose(U: FloatArray, s: float, V: FloatArray) -> FloatArray:
-    """Return (9,) the entries of U diag(1, s, 0) V' by rows.
+    """Return the (9,) entries of U diag(1, s, 0) V' by rows.
 
     Args:
         U: (3, 3) rotation.
@@ -86,7 +86,7 @@ def compose(U: FloatArray, s: float, V: FloatArray) -> FloatArray:
 
 @kernel
 def tangent(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
-    """Write dF over the seven parameters, one row each: U [e_k]x S V', -U S [e_k]x V', u2 v2'.
+    """Write the derivatives of F by the seven parameters, one row each: U [e_k]x S V', -U S [e_k]x V', u2 v2'.
 
     Args:
         U: (3, 3) rotation.
@@ -108,7 +108,7 @@ def tangent(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
 
 @kernel
 def turned(R: FloatArray, w: FloatArray) -> FloatArray:
-    """Return R exp([w]x), by Rodrigues.
+    """Return R exp([w]x) by Rodrigues' formula.
 
     Args:
         R: (3, 3) rotation.

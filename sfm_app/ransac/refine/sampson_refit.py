@@ -1,8 +1,8 @@
 """Non-linear refinement of F on the Sampson distance (thesis 4.3, Eq. 4.2), over its seven degrees of freedom.
 
-The parameters are those of `rank_two`. All fits are reweighted least squares: weigh the matches by their distances,
-take one Levenberg-Marquardt step that lowers sum_i w_i r_i^2, weigh again. For a cost that is a concave function of
-r^2, as all robust ones are, such a step lowers the cost itself as well.
+The parameters are those of `rank_two`. All fits are iteratively reweighted least squares: weigh the matches by their
+distances, take one Levenberg-Marquardt step that lowers sum_i w_i r_i^2, weigh again. For a cost that is a concave
+function of r^2, as robust costs are, such a step lowers the cost itself as well.
 """
 
 from typing import NamedTuple
@@ -19,39 +19,39 @@ from sfm_app.ransac.solvers.design_matrix import LANES, add_products, gather, mi
 FloatArray = NDArray[np.float64]
 
 _FIRST_DAMPING, _SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-12, 1e12
-"""Of Levenberg and Marquardt's steps, relative to the curvature. Chosen by hand; not measured on their own."""
+"""Damping of Levenberg-Marquardt steps, relative to the curvature. Chosen by hand; not measured on their own."""
 _ENOUGH = 1e-9
-"""Relative decrease of the cost under which the search ends. Chosen by hand; not measured on its own."""
+"""Relative decrease of the cost below which the iteration ends. Chosen by hand; not measured on its own."""
 _ENOUGH_LIKELIHOOD = 1e-4
-"""The same where the weights follow the noise. Chosen by hand; not measured on its own."""
+"""Relative decrease of the cost below which the mixture fit ends. Chosen by hand; not measured on its own."""
 _NEGLIGIBLE = 1e-3
 """Weight below which a match is left out of a step. Chosen by hand; not measured on its own."""
 _LEAST_SIGMA = 0.02
-"""In thresholds: matches that are nearly perfect must not shut out all others. Chosen by hand; not measured on its own.
-"""
+"""Least sigma in thresholds: without it nearly perfect matches would exclude all others. Chosen by hand; not measured
+on its own."""
 _FIRST_SHARE, _MOST_SHARE = 0.9, 0.999
-"""Inliers among the matches within reach: where expectation maximization begins, and what it stays below. Chosen by
+"""Share of inliers among the matches within reach: initial value and upper bound in expectation maximization. Chosen by
 hand; not measured on their own."""
 _FIRST_ROUNDS = 6
 """Rounds of expectation maximization before the first step; one before each later step. Chosen by hand; not measured
 on its own."""
 _LEAST_CURVATURE = 1e-9
-"""Over the largest: what damping multiplies at least, where some matches leave a direction of F free. Chosen by hand;
-not measured on its own."""
+"""Least curvature that damping multiplies, relative to the largest: matches may leave a direction of F free. Chosen by
+hand; not measured on its own."""
 
 
 class Weighing(NamedTuple):
-    """How matches are weighed by their squared distances: by a robust cost, or by a mixture of two densities."""
+    """How squared distances become weights: by a robust cost, or by a mixture of two densities."""
 
     is_mixture: bool = False
     softness: float = 0.0
     """1 / c^2 of the robust cost r^2 / (1 + r^2 / c^2); 0 for least squares. Not used by the mixture."""
     squared_reach: float = 0.0
-    """Mixture: squared distance within which matches count, and over which the outliers are spread evenly."""
+    """Mixture: squared distance within which matches count; outliers are uniform up to this distance."""
     largest_variance: float = 0.0
-    """Mixture: bound of the inliers' variance."""
+    """Mixture: upper bound of the inliers' variance."""
     first_variance: float = 0.0
-    """Mixture: where expectation maximization begins."""
+    """Mixture: initial variance in expectation maximization."""
 
 
 def refine_sampson(
@@ -63,8 +63,8 @@ def refine_sampson(
         points: (N, 4) matches.
         F: (3, 3) start.
         scale: c, in the units of `points`; inf for least squares.
-        most_steps: most Levenberg-Marquardt steps.
-        enough: relative decrease of the cost under which to stop.
+        most_steps: largest number of Levenberg-Marquardt steps.
+        enough: relative decrease of the cost below which to stop.
 
     Returns:
         (3, 3), rank 2, its largest singular value 1.
@@ -74,17 +74,17 @@ def refine_sampson(
 
 
 def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach: float, most_steps: int) -> FloatArray:
-    """Give maximum likelihood of F, inliers' sigma and their share, by expectation maximization (thesis 3.5 and 4.6).
+    """Estimate F with the sigma and share of inliers by maximum likelihood: EM (thesis 3.5 and 4.6).
 
-    Among the matches within `reach` thresholds, distances of inliers are those of a Gaussian about 0, all others are
-    spread evenly. The weight of a match is the probability that it is an inlier. sigma is at most one threshold.
+    Among the matches within `reach` thresholds, signed distances of inliers are Gaussian about 0, those of outliers
+    uniform. The weight of a match is the probability that it is an inlier. sigma is at most one threshold.
 
     Args:
         points: (N, 4) matches.
-        F: (3, 3) start, near enough for its inliers to tell sigma.
+        F: (3, 3) start, near enough for its inliers to determine sigma.
         threshold: largest distance of an inlier.
         reach: thresholds within which matches count, > 1.
-        most_steps: most steps.
+        most_steps: largest number of steps.
 
     Returns:
         (3, 3), rank 2, its largest singular value 1.
@@ -95,7 +95,7 @@ def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach
     sigma = mad_sigma(np.sqrt(inside)) if len(inside) else threshold
     squared_reach = float((reach * threshold) ** 2)
     weighing = Weighing(
-        is_mixture=squared_reach > 0.0,  # of a threshold too small to square nothing but least squares is left
+        is_mixture=squared_reach > 0.0,  # where the squared threshold underflows, fall back to least squares
         squared_reach=squared_reach,
         largest_variance=float(threshold**2),
         first_variance=float(min(sigma, threshold) ** 2),
@@ -118,7 +118,7 @@ def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return the first half of `fit_eight_point`: (3, 3) of norm 1 with the least algebraic error, of any rank.
+    """Return the (3, 3) matrix of norm 1 and any rank with the least algebraic error: `fit_eight_point` without rank 2.
 
     Args:
         points: (N, 4), of magnitude about 1.
@@ -133,9 +133,9 @@ def _reweighted(
     points: FloatArray, U: FloatArray, s: float, V: FloatArray, weighing: Weighing, most_steps: int, enough: float,
     gram: FloatArray,
 ) -> FloatArray:  # fmt: skip
-    """Weigh and step in turn until a step lowers the cost by less than its share `enough`.
+    """Weigh and step in turn until a step lowers the cost by less than the relative decrease `enough`.
 
-    `gram` (10, 10) is for work: the compiler would spell out all sums of a matrix whose size it knows.
+    `gram` (10, 10) is a work array: if its size were known at compile time, the compiler would unroll all sums.
     """
     count = points.shape[0]
     weights, squared, trial = np.empty(count), np.empty(count), np.empty(count)
@@ -181,7 +181,7 @@ def _weigh_robustly(squared: FloatArray, softness: float, weights: FloatArray) -
 def _weigh_by_mixture(
     squared: FloatArray, weighing: Weighing, variance: float, share: float, rounds: int, weights: FloatArray
 ) -> tuple[float, float]:
-    """Weigh matches by their probability to be inliers; return the inliers' variance and share that follow."""
+    """Weigh matches by their probability to be inliers; return the new variance and share of inliers."""
     reach, largest = weighing.squared_reach, weighing.largest_variance
     for _ in range(rounds):
         inlier, outlier = share * np.sqrt(2.0 / (np.pi * variance)), (1.0 - share) / np.sqrt(reach)
@@ -214,7 +214,7 @@ def _normal_equations(
     points: FloatArray, f: FloatArray, weights: FloatArray, U: FloatArray, s: float, V: FloatArray,
     gram: FloatArray, normal: FloatArray, right: FloatArray,
 ) -> None:  # fmt: skip
-    """Sum up weighted J'J and -J'r over the seven parameters."""
+    """Write the weighted J'J and -J'r of the seven parameters to `normal` and `right`."""
     size = gram.shape[0]
     for j in range(size):
         for k in range(size):
@@ -259,7 +259,7 @@ def _derivatives(block: FloatArray, count: int, f: FloatArray, rows: FloatArray)
 
 @kernel
 def _project(gram: FloatArray, basis: FloatArray, normal: FloatArray, right: FloatArray) -> None:
-    """Project normal equations over the nine entries, whose gradient is the last row, to the seven parameters."""
+    """Project the normal equations of the nine entries (last row: the gradient) to the seven parameters."""
     part = np.empty(9)
     for p in range(7):
         right[p] = 0.0
@@ -276,9 +276,9 @@ def _project(gram: FloatArray, basis: FloatArray, normal: FloatArray, right: Flo
 
 @kernel
 def _solve(normal: FloatArray, right: FloatArray, damping: float, step: FloatArray) -> bool:
-    """Return Cholesky solution of (normal + damping diag(normal)) step = right.
+    """Write the Cholesky solution of (normal + damping diag(normal)) step = right.
 
-    False if that is not positive definite.
+    Returns False if the matrix is not positive definite.
     """
     lower = normal.copy()
     largest = 0.0

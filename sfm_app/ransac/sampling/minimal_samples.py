@@ -1,7 +1,7 @@
-"""Random minimal samples, uniform or by weight, from a generator whose state is passed around.
+"""Random minimal samples, uniform or by weight, from a generator whose state is an argument.
 
 The generator is splitmix64 (Steele, Lea and Flood 2014): 64 bits of state, one multiplication chain per number. Its
-state is an argument, so that pairs run in parallel threads and still repeat to the last bit.
+state is an argument, so that pairs can run in parallel threads and still give the same bits.
 """
 
 import numpy as np
@@ -27,12 +27,12 @@ _S30, _S27, _S31, _S11 = np.uint64(30), np.uint64(27), np.uint64(31), np.uint64(
 _TO_UNIT = 2.0**-53
 """From 53 random bits to [0, 1) in double precision."""
 _MOST_REDRAWS = 100
-"""Draws of a match that the sample holds already, before weights are given up. Chosen by hand; not measured on its
-own."""
+"""Repeated draws of matches that the sample already holds, before the weights are given up. Chosen by hand; not
+measured on its own."""
 
 
 def random_state(seed: int) -> RandomState:
-    """Return (1,) state of the generator for any integer seed."""
+    """Return the (1,) state of the generator for any integer seed."""
     return np.array([seed % 2**64], dtype=np.uint64)
 
 
@@ -51,7 +51,7 @@ def draw_uniform(state: RandomState, count: int, sample: IntArray) -> None:
     """Fill a sample with distinct indices.
 
     Args:
-        state: of the generator; it moves on.
+        state: of the generator; it is advanced.
         count: indices lie below it; at least the sample's length.
         sample: (m,), written to.
     """
@@ -66,8 +66,8 @@ def draw_uniform(state: RandomState, count: int, sample: IntArray) -> None:
 def draw_weighted(state: RandomState, cumulative: FloatArray, sample: IntArray) -> bool:
     """Fill `sample` with distinct indices, each draw proportional to the weights of those that are left.
 
-    Drawing again when an index is already in the sample is the same as drawing from the others. False when that does
-    not end, because fewer points than the sample needs hold nearly all the weight.
+    Drawing again when an index is already in the sample is the same as drawing from the others. Returns False when this
+    does not end, because fewer points than the sample needs hold nearly all the weight.
 
     Args:
         state: generator.

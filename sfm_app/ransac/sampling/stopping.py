@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 CONVERGED = 0.05
-"""G of the thesis (4.7.4, Eq. 4.18): priors that changed less than this, in sum, have converged."""
+"""G of the thesis (4.7.4, Eq. 4.18): priors have converged when the sum of their changes is below this."""
 
 
 def trials_needed(success: float, confidence: float, log_missed: float = 0.0) -> float:
-    """Return samples of which at least one succeeds with the wanted probability (thesis 3.19); inf if none can.
+    """Return how many samples make one success as probable as wanted (thesis 3.19); inf if none can succeed.
 
     Args:
-        success: probability of one sample to be clean, share^m, and to pass the test of its models.
+        success: probability that one sample is clean, share^m, and that its model passes the test.
         confidence: wanted probability, in (0, 1).
         log_missed: logarithm of the probability that all samples drawn before failed; they are not counted again.
     """
@@ -26,13 +26,13 @@ def trials_needed(success: float, confidence: float, log_missed: float = 0.0) ->
 
 
 def have_converged(before: NDArray[np.float64], after: NDArray[np.float64], limit: float = CONVERGED) -> bool:
-    """Return whether the priors, each normalized to sum 1, moved less than a limit in sum (thesis 4.18).
+    """Return whether the priors, normalized to sum 1, changed less than a limit in sum (thesis 4.18).
 
-    The printed sum grows with the number of matches; as probabilities that sum to 1 it lies in [0, 2] for any number.
+    The printed sum grows with the number of matches; for probabilities that sum to 1 it lies in [0, 2].
 
     Args:
         before: (N,) priors >= 0, of any sum but zero.
-        after: (N,) the new ones.
+        after: (N,) the new priors.
         limit: of the sum of the changes, in [0, 2].
     """
     return bool(np.abs(after / after.sum() - before / before.sum()).sum() < limit)

@@ -1,4 +1,4 @@
-"""How well the matches off the dominant plane bear a model out, and how long to wait for a better one.
+"""How strongly the matches off the dominant plane support a model, and how long to wait for a better one.
 
 Ours, in place of thesis 4.7.4 (Eq. 4.18), which stops too early where the first models are poor.
 """
@@ -21,25 +21,25 @@ FloatArray = NDArray[np.float64]
 
 _SURE = 1400.0
 """Samples to wait are the square of this over z (docs/algorithms.md, Fundamental matrices). Chosen on the Strecha sets;
-`python -m benchmarks.fundamental --real DATA --ablation` has the search without it beside it."""
+`python -m benchmarks.fundamental --real DATA --ablation` compares with a search without it."""
 _MOST = 3000.0
-"""Samples to wait where the evidence is poor, z below 26. Chosen with `_SURE` (docs/algorithms.md, Fundamental
-matrices)."""
+"""Samples to wait where the evidence is poor, z below 26. Chosen with the constant above (docs/algorithms.md,
+Fundamental matrices)."""
 _LEAST_IN_DOUBT = 250.0
-"""A quarter of them are samples of the rest; a motion that holds two thirds of it is in one of 17 of these. Chosen on
-pairs with two motions: `python -m benchmarks.fundamental --two-motions 100`."""
+"""A quarter of these samples are drawn from the rest; a motion that holds two thirds of it fills one in 17 of them.
+Chosen on pairs with two motions: `python -m benchmarks.fundamental --two-motions 100`."""
 _LEAST_INLIERS = 8
-"""Fewer are no evidence: one more than seven, through which a model always goes. Chosen by hand; not measured on its
-own."""
+"""Fewer are no evidence: a model always goes through seven, and one more is asked for. Chosen by hand; not measured on
+its own."""
 
 
 def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> float:
-    """Return samples without a better model after which to believe this one.
+    """Return how many samples without a better model are enough to accept this one.
 
-    Wrong models live on one plane, or on repeated structure, and have little else for them. The inliers off the
-    dominant plane are counted in standard deviations z over what accident gives: right models of real photos have z of
-    40 to 300, wrong ones mostly less than 40. The patience is 3000 samples up to z = 26 and falls as 1 / z^2. Where
-    most matches are not explained, another motion may hold them, and has to be given a chance to be sampled.
+    Wrong models are supported by one plane, or by repeated structure, and by little else. Let z be the number of
+    inliers off the dominant plane, in standard deviations above the number expected by chance: right models of real
+    photos have z of 40 to 300, wrong ones mostly less than 40. The patience is 3000 samples up to z = 26 and falls as
+    1 / z^2. Where most matches are not explained, they may belong to another motion, which needs time to be sampled.
 
     Args:
         points: (N, 4) distinct matches in random order, N >= 7.
@@ -47,7 +47,7 @@ def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> floa
         threshold: largest distance of an inlier.
 
     Returns:
-        The number; inf where even the support as a whole may be luck.
+        The number; inf where even the whole support may be chance.
     """
     squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
     inliers, wrong = squared <= threshold * threshold, squared_mismatches(points, np.ascontiguousarray(F).reshape(9))

@@ -2,11 +2,11 @@
 
 F is the unit vector f with A f = 0, where row i of the design matrix A is x2 (x) x1. Near a given f the unit vector
 moves in the eight directions perpendicular to it, so that this is a regression with p = 8 parameters, and the hat
-matrix is that of A restricted to them. With all nine directions the ninth would divide by what is zero but for the
-noise.
+matrix is that of A restricted to them. The ninth direction, f itself, would divide by a number that only noise keeps
+from zero.
 
 Leverage and Cook's distance do not change when each view is shifted and scaled, because this maps the rows of A
-linearly (and A f is small): one well-scaled frame (`points.Matches`) gives what Hartley's normalization gives.
+linearly (and A f is small): one well-scaled frame (`points.Matches`) gives the same as Hartley's normalization.
 """
 
 import numpy as np
@@ -24,26 +24,27 @@ PARAMETERS = 8
 """p of Eq. 3.16 and 4.17: the directions perpendicular to the unit vector f (docs/algorithms.md, Fundamental
 matrices)."""
 _LEAST_VARIANCE = 1e-24
-"""Of residuals in units of the points' spread: perfect matches are left with the rounding of their coordinates. Double
+"""Least variance of residuals, in units of the points' spread: perfect matches still have rounded coordinates. Double
 precision leaves 1e-16 of them, squared 1e-32; the margin was chosen by hand."""
 _LEAST_FREEDOM = 2.0**-52
-"""Of 1 - h: the distance of 1 to the next number in double precision."""
+"""Least 1 - h: the distance of 1 to the next number in double precision."""
 _LEAST_SUPPORT = 1e-14
-"""Of a direction, over that of the best supported one. Double precision leaves 1e-16; the margin was chosen by hand."""
+"""Least eigenvalue of a direction, over the largest one. Double precision leaves 1e-16; the margin was chosen by
+hand."""
 _FAR = 700.0
-"""Exponent from which the exponential is 0 for all purposes: in double precision exp(-746) is 0."""
+"""Largest exponent x for which exp(-x) is computed and not taken as 0: in double precision exp(-746) is 0."""
 
 
 def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArray:
-    """Return leverage h_ii of every match in a regression on the fitted ones plus itself (thesis 3.11).
+    """Return the leverage h_ii of every match in a regression on the fitted matches and itself (thesis 3.11).
 
-    For a fitted match that is the diagonal of the hat matrix. For any other the textbook formula would exceed 1; what
-    counts is how much it would pull if it were fitted as well, which is g / (1 + g) with g = a_i' (A_in' A_in)^-1 a_i.
+    For a fitted match this is the diagonal of the hat matrix. For any other match the textbook formula would exceed 1.
+    Its leverage if it were fitted as well is g / (1 + g) with g = a_i' (A_in' A_in)^-1 a_i.
 
     Args:
         points: (N, 4) matches, of magnitude about 1.
         f: (9,) the model, of norm 1.
-        fitted: (N,) the matches that the model rests on.
+        fitted: (N,) the matches that the model was fitted to.
 
     Returns:
         (N,) in [0, 1].
@@ -51,7 +52,7 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
     tangent = _perpendicular(f)
     within = tangent.T @ weighted_gram(points, fitted.astype(np.float64)) @ tangent
     values, vectors = np.linalg.eigh(within)
-    # a direction without support: whatever lies in it has leverage 1
+    # no fitted match constrains such a direction: matches along it have leverage 1
     floor = max(values[-1], 2.0**-1000) * _LEAST_SUPPORT
     forms = quadratic_forms(points, tangent @ (vectors / np.sqrt(np.maximum(values, floor))))
     return _of_forms(forms, fitted)
@@ -59,7 +60,7 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
 
 @kernel
 def _of_forms(forms: FloatArray, fitted: BoolArray) -> FloatArray:
-    """Return h for those fitted, g / (1 + g) for the others; without support g may be inf."""
+    """Return h of the fitted matches, g / (1 + g) of the others; g may be inf in unconstrained directions."""
     leverage = np.empty(forms.shape[0])
     for i in range(forms.shape[0]):
         leverage[i] = min(forms[i], 1.0) if fitted[i] else 1.0 / (1.0 + 1.0 / forms[i])
@@ -70,7 +71,7 @@ def _of_forms(forms: FloatArray, fitted: BoolArray) -> FloatArray:
 def _perpendicular(f: FloatArray) -> FloatArray:
     """Return (9, 8) orthonormal directions perpendicular to a unit vector.
 
-    A reflection takes it and them to the axes.
+    They are the columns of a Householder reflection that maps f to an axis.
     """
     last = f[8] + 1.0 if f[8] >= 0.0 else f[8] - 1.0
     basis = np.zeros((9, PARAMETERS))
@@ -83,12 +84,12 @@ def _perpendicular(f: FloatArray) -> FloatArray:
 
 @kernel
 def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: BoolArray) -> FloatArray:
-    """Give residuals over their standard deviation (thesis 3.14 and 3.15, the variance taken from the fitted matches).
+    """Divide residuals by their standard deviation (thesis 3.14, 3.15), with the variance of the fitted matches.
 
     Args:
         residuals: (N,) distances to the model.
         leverage: (N,) from `leverages`.
-        fitted: (N,) the matches that the model rests on.
+        fitted: (N,) the matches that the model was fitted to.
     """
     count, total, moment = 0, 0.0, 0.0
     for i in range(residuals.shape[0]):
@@ -110,10 +111,10 @@ def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: B
 def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
     """Return how far the fit would move without each match (thesis 3.16 and 4.17).
 
-    The square of d_i is missing in print.
+    The square of d_i is missing in the thesis.
 
     Args:
-        studentised: (N,) from `studentised_residuals`.
+        studentised: (N,) from `leverage.studentised_residuals`.
         leverage: (N,) from `leverages`, in [0, 1].
     """
     distances = np.empty(studentised.shape[0])
@@ -129,14 +130,14 @@ def priors(distances: FloatArray, sigma: float) -> FloatArray:
 
     Args:
         distances: (N,) Cook's distances, >= 0.
-        sigma: of the Gaussian, in their units; 0 leaves only the smallest.
+        sigma: of the Gaussian, in the same units; with 0, p is 1 for the smallest distance and 0 for all others.
     """
     least, probable = np.inf, np.empty(distances.shape[0])
     for i in range(distances.shape[0]):
         least = min(least, distances[i])
     for i in range(distances.shape[0]):
         if sigma > 0.0:
-            # less the smallest exponent, which makes the largest value 1
+            # minus the smallest exponent, so that the largest value is 1
             exponent = (distances[i] - least) / sigma * ((distances[i] + least) / sigma) / 2.0
             probable[i] = np.exp(-exponent) if exponent < _FAR else 0.0
         else:
@@ -146,7 +147,7 @@ def priors(distances: FloatArray, sigma: float) -> FloatArray:
 
 @kernel
 def mad_sigma(distances: FloatArray) -> float:
-    """Return standard deviation about zero from the median absolute deviation (thesis 4.7.3)."""
+    """Return the standard deviation about zero from the median absolute deviation (thesis 4.7.3)."""
     count = distances.shape[0]
     deviations = np.empty(count)
     for i in range(count):
@@ -161,7 +162,8 @@ def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma
         points: (N, 4) matches.
         f: (9,) the best model so far, of norm 1.
         threshold: largest distance of an inlier; the inliers are the fitted matches.
-        sigma_from_inliers: take sigma from the inliers' Cook's distances; otherwise from all, as in the thesis.
+        sigma_from_inliers: estimate sigma from the Cook's distances of the inliers; otherwise of all matches, as in the
+            thesis.
     """
     squared = squared_distances(points, f)
     fitted = squared <= threshold * threshold

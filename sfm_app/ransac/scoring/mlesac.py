@@ -5,7 +5,7 @@ window w. Each match costs::
 
     q = log((1 + odds) / (exp(-r^2 / (2 sigma^2)) + odds)),    odds = (1 - gamma) / gamma * sigma sqrt(2 pi) / w
 
-which is -log p(r) of 3.5 less its value at r = 0, so that no penalty is negative and hopeless models can be left early.
+which is -log p(r) of 3.5 minus its value at r = 0: no penalty is negative, so that scoring can stop early.
 """
 
 import math
@@ -20,16 +20,16 @@ FloatArray = NDArray[np.float64]
 SIGMAS = 1.96
 """Standard deviations of the inliers in a threshold (thesis 3.3.6)."""
 _NEGLIGIBLE = 1e-12
-"""Density of an inlier, over that of the outliers at most, from which on a match costs what an outlier does. Chosen by
+"""Density of an inlier, relative to that of the outliers, below which a match costs as much as an outlier. Chosen by
 hand; not measured on its own."""
 _MOST_STEPS = 100
-"""Of expectation maximization. Chosen by hand; not measured on its own."""
+"""Largest number of steps of expectation maximization. Chosen by hand; not measured on its own."""
 _SETTLED = 1e-5
-"""A change of gamma that ends expectation maximization. Chosen by hand; not measured on its own."""
+"""Change of gamma that ends expectation maximization. Chosen by hand; not measured on its own."""
 
 
 def mlesac(points: FloatArray, threshold: float, best: FloatArray | None) -> Loss:
-    """Return penalty above, with the share gamma of inliers that the best model shows, one half before there is one.
+    """Return the penalty above; gamma is the share of inliers of the best model, one half before there is one.
 
     Args:
         points: (N, 4) matches.
@@ -44,13 +44,13 @@ def mlesac(points: FloatArray, threshold: float, best: FloatArray | None) -> Los
 
 
 def window(points: FloatArray) -> float:
-    """Return range w of an outlier's signed distance: the diagonal of a view's matches, the mean of both."""
+    """Return the range w of an outlier's signed distance: the diagonal of the matches in a view, averaged over both."""
     extent = np.ptp(points, axis=0)
     return max(float(np.hypot(extent[[0, 2]], extent[[1, 3]]).mean()), np.finfo(float).tiny)
 
 
 def inlier_share(squared: FloatArray, sigma: float, width: float) -> float:
-    """Return gamma = p(v) of the mixture by expectation maximization, for given sigma and w.
+    """Estimate gamma = p(v) of the mixture by expectation maximization, for given sigma and w.
 
     Args:
         squared: (N,) squared distances to the model.

@@ -1,7 +1,7 @@
 """How well F explains all matches: penalties on the Sampson distance, with early exits (thesis 4.4.1).
 
-A penalty is to be made small. A score is a function (points, threshold, best model or None) -> `Loss`, asked
-again at every new best model; only that of MLESAC changes during the search.
+Penalties are minimized. A score is a function (points, threshold, best model or None) -> `Loss`, called again at every
+new best model; only that of MLESAC changes during the search.
 """
 
 from collections.abc import Callable
@@ -16,20 +16,19 @@ from sfm_app.ransac.verification.pretests import BLOCK, PreTest
 FloatArray = NDArray[np.float64]
 
 FIRST = cast("int", np.int64(0))
-"""Where blocks begin: 0, by definition. A plain 0 is a type of its own to numba, and kernels are compiled for it once
-more."""
+"""Start of the first block: 0, by definition. Numba types a literal 0 separately, and would compile kernels twice."""
 
 RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS, GEMAN_MCCLURE = range(6)
-"""Kinds of `Loss`: one for each penalty below."""
+"""Kinds of `Loss`, one for each penalty below."""
 
 
 _FEW = 16
-"""Matches whose distances are taken at once where the pre-test looks often. Chosen by hand for speed: no result depends
-on it."""
+"""Matches whose distances are computed at once where the pre-test checks often. Chosen by hand for speed: no result
+depends on it."""
 
 
 class Loss(NamedTuple):
-    """A penalty as the inner loop counts it."""
+    """A penalty and its parameters, as passed to kernels."""
 
     kind: int
     limit: float
@@ -47,56 +46,56 @@ Score = Callable[[FloatArray, float, FloatArray | None], Loss]
 
 
 def ransac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return 1 for every match beyond the threshold, else 0 (thesis 3.20, 4.4).
+    """Return the number of outliers as a `Loss`: 1 for each match beyond the threshold (thesis 3.20, 4.4).
 
     Args:
-        _points: not looked at, as every score gets them.
+        _points: not used; all scores take them.
         threshold: largest distance of an inlier, in the units of the points.
-        _best: not looked at.
+        _best: not used.
     """
     return Loss(RANSAC, threshold * threshold, threshold * threshold, 1.0)
 
 
 def msac(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the squared distance, at most the squared threshold (Torr and Zisserman 2000).
+    """Return the squared distance, at most the squared threshold, as a `Loss` (Torr and Zisserman 2000).
 
     Args:
-        _points: not looked at, as every score gets them.
+        _points: not used; all scores take them.
         threshold: largest distance of an inlier, in the units of the points.
-        _best: not looked at.
+        _best: not used.
     """
     return Loss(MSAC, threshold * threshold, threshold * threshold, threshold * threshold)
 
 
 def msac_linear(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the distance, at most the threshold (thesis 4.5 as printed).
+    """Return the distance, at most the threshold, as a `Loss` (thesis 4.5 as printed).
 
     Args:
-        _points: not looked at, as every score gets them.
+        _points: not used; all scores take them.
         threshold: largest distance of an inlier, in the units of the points.
-        _best: not looked at.
+        _best: not used.
     """
     return Loss(MSAC_LINEAR, threshold * threshold, threshold * threshold, threshold)
 
 
 def lmeds(_points: FloatArray, threshold: float, _best: FloatArray | None) -> Loss:
-    """Return the median of the squared distances (Rousseeuw 1984; thesis 4.4.1).
+    """Return the median of the squared distances as a `Loss` (Rousseeuw 1984; thesis 4.4.1).
 
     Args:
-        _points: not looked at, as every score gets them.
-        threshold: largest distance of an inlier; only counts these.
-        _best: not looked at.
+        _points: not used; all scores take them.
+        threshold: largest distance of an inlier; used only to count inliers.
+        _best: not used.
     """
     return Loss(LMEDS, threshold * threshold, np.inf, np.inf)
 
 
 def geman_mcclure(_points: FloatArray, threshold: float, _best: FloatArray | None, *, scale: float) -> Loss:
-    """Return r^2 / (r^2 + c^2): no edge, and close matches count most (Geman and McClure 1987).
+    """Return r^2 / (r^2 + c^2) as a `Loss`: smooth, and close matches count most (Geman and McClure 1987).
 
     Args:
-        _points: not looked at, as every score gets them.
+        _points: not used; all scores take them.
         threshold: largest distance of an inlier, in the units of the points.
-        _best: not looked at.
+        _best: not used.
         scale: c in thresholds, > 0.
     """
     return Loss(GEMAN_MCCLURE, threshold * threshold, np.inf, 1.0, (scale * threshold) ** -2)
@@ -104,14 +103,14 @@ def geman_mcclure(_points: FloatArray, threshold: float, _best: FloatArray | Non
 
 @kernel
 def squared_sampson(f: FloatArray, x1: float, y1: float, x2: float, y2: float) -> float:
-    """Return squared Sampson distance (thesis 4.2) of one match.
+    """Return the squared Sampson distance (thesis 4.2) of one match.
 
     Args:
         f: (9,) entries of F by rows.
-        x1: of the point in view 1.
-        y1: likewise.
-        x2: of its partner in view 2.
-        y2: likewise.
+        x1: x of the point in view 1.
+        y1: y of the point in view 1.
+        x2: x of its partner in view 2.
+        y2: y of its partner in view 2.
     """
     ax, ay, az = f[0] * x1 + f[1] * y1 + f[2], f[3] * x1 + f[4] * y1 + f[5], f[6] * x1 + f[7] * y1 + f[8]
     bx, by = f[0] * x2 + f[3] * y2 + f[6], f[1] * x2 + f[4] * y2 + f[7]
@@ -135,7 +134,7 @@ def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
 
 @kernel
 def distances_of_block(points: FloatArray, f: FloatArray, start: int, squared: FloatArray) -> None:
-    """Write the squared Sampson distances of as many matches as there is room for.
+    """Write the squared Sampson distances of consecutive matches.
 
     Args:
         points: (N, 4) matches.
@@ -144,7 +143,7 @@ def distances_of_block(points: FloatArray, f: FloatArray, start: int, squared: F
         squared: (n,), written to; n <= N - start.
     """
     f0, f1, f2, f3, f4, f5, f6, f7, f8 = f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8]
-    for i in range(squared.shape[0]):  # spelt out: several matches at once in the lanes of the processor
+    for i in range(squared.shape[0]):  # scalars, so that the compiler vectorizes over matches
         x1, y1, x2, y2 = points[start + i, 0], points[start + i, 1], points[start + i, 2], points[start + i, 3]
         ax, ay, az = f0 * x1 + f1 * y1 + f2, f3 * x1 + f4 * y1 + f5, f6 * x1 + f7 * y1 + f8
         bx, by = f0 * x2 + f3 * y2 + f6, f1 * x2 + f4 * y2 + f7
@@ -155,7 +154,7 @@ def distances_of_block(points: FloatArray, f: FloatArray, start: int, squared: F
 
 @kernel
 def _cost(loss: Loss, squared: float) -> float:
-    """Return penalty of one match."""
+    """Return the penalty of one match."""
     if loss.kind == GEMAN_MCCLURE:
         return 1.0 - 1.0 / (1.0 + loss.precision * squared)
     if not squared <= loss.reach:
@@ -171,15 +170,15 @@ def _cost(loss: Loss, squared: float) -> float:
 
 @kernel
 def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: float, pretest: PreTest) -> float:
-    """Return penalty of all matches, or inf as soon as f cannot stay below `to_beat` or fails the pre-test.
+    """Return the penalty of all matches, or inf as soon as f cannot stay below `to_beat` or fails the pre-test.
 
     Args:
-        points: (N, 4), in random order; (2 N, 4), the matches twice over, for a pre-test with a random start.
+        points: (N, 4) matches in random order; repeated to (2 N, 4) for a pre-test with a random start.
         start: the match to begin with.
         f: (9,) entries of F.
-        loss: which penalty. The pre-test passes all for the median: it is counted another way.
+        loss: which penalty. The pre-test is not applied to the median.
         to_beat: best penalty so far; inf for a full count.
-        pretest: how many inliers f must show on the way.
+        pretest: how many inliers f must have after each part of the matches.
     """
     if loss.kind == LMEDS:
         return _median_of_squares(points, f, to_beat)
@@ -190,7 +189,7 @@ def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: 
         often = pretest.stride < BLOCK and done < pretest.stride * pretest.least_inliers.shape[0]
         size = min(_FEW if often else BLOCK, count - done)
         distances_of_block(points, f, start + done, squared[:size])
-        if often:  # the pre-test looks after every few matches, and most models end at the first looks
+        if often:  # the pre-test checks after every few matches, and rejects most models at the first checks
             for i in range(size):
                 inliers += squared[i] <= loss.limit
                 total += _cost(loss, squared[i])
@@ -210,7 +209,7 @@ def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: 
 
 @kernel
 def _passes(pretest: PreTest, done: int, inliers: int) -> bool:
-    """Say whether a model with so many inliers among the first matches goes on, and count it."""
+    """Return whether a model with this many inliers passes the pre-test; count it if it is rejected."""
     looks = done // pretest.stride
     if (
         done % pretest.stride != 0
@@ -225,11 +224,11 @@ def _passes(pretest: PreTest, done: int, inliers: int) -> bool:
 
 @kernel
 def _add_up(squared: FloatArray, loss: Loss) -> tuple[int, float]:
-    """Return inliers among the given matches, and the sum of their penalties."""
+    """Return the number of inliers, and the sum of the penalties of the matches."""
     total, inliers = 0.0, 0
     for i in range(squared.shape[0]):
         inliers += squared[i] <= loss.limit
-    if loss.kind == GEMAN_MCCLURE:  # without a branch inside: several at once
+    if loss.kind == GEMAN_MCCLURE:  # branch-free, so that the compiler vectorizes
         for i in range(squared.shape[0]):
             total += 1.0 - 1.0 / (1.0 + loss.precision * squared[i])
     else:
@@ -240,9 +239,7 @@ def _add_up(squared: FloatArray, loss: Loss) -> tuple[int, float]:
 
 @kernel
 def _median_of_squares(points: FloatArray, f: FloatArray, to_beat: float) -> float:
-    """Return the (N // 2 + 1)th smallest squared distance, or inf once too many matches lie too far for it to be
-    smaller.
-    """
+    """Return the (N // 2 + 1)th smallest squared distance, or inf once it cannot be below `to_beat`."""
     count = points.shape[0]
     squared = np.empty(count)
     may_miss = count - count // 2 - 1

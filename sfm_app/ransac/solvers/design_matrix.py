@@ -1,7 +1,7 @@
 """The design matrix A of the matches, row by row x2 (x) x1, and its products (thesis 2.27): x2' F x1 = 0 is A f = 0.
 
-Matches are taken in blocks that lie in the processor's nearest memory, each quantity on end, so that sums over matches
-run in several lanes.
+Matches are processed in blocks that fit in the first-level cache, each quantity contiguous, so that sums over matches
+are vectorized.
 """
 
 import numpy as np
@@ -18,7 +18,7 @@ LANES = 64
 
 @kernel
 def design_row(point: FloatArray, row: FloatArray) -> None:
-    """Write x2 (x) x1: the coefficients of the entries of F, by rows, in x2' F x1 = 0.
+    """Write x2 (x) x1, the coefficients of the entries of F (by rows) in x2' F x1 = 0.
 
     Args:
         point: (4,) match x1, y1, x2, y2.
@@ -33,7 +33,7 @@ def design_row(point: FloatArray, row: FloatArray) -> None:
 
 @kernel
 def gather(points: FloatArray, weights: FloatArray, start: int, block: FloatArray) -> tuple[int, int]:
-    """Return next matches of positive weight, as columns x1, y1, x2, y2, sqrt(weight) of `block`.
+    """Copy the next matches of positive weight, as columns x1, y1, x2, y2, sqrt(weight), to `block`.
 
     Args:
         points: (N, 4) matches.
@@ -42,7 +42,7 @@ def gather(points: FloatArray, weights: FloatArray, start: int, block: FloatArra
         block: (5, LANES), written to.
 
     Returns:
-        Number of columns filled, and the row to go on from.
+        Number of columns filled, and the row to continue at.
     """
     filled, i = 0, start
     while i < points.shape[0] and filled < LANES:
@@ -70,8 +70,8 @@ def add_products(rows: FloatArray, count: int, gram: FloatArray) -> None:
     """Add the sums over n of rows[j, n] rows[k, n] to gram[j, k] for all k <= j.
 
     Args:
-        rows: (9, LANES) columns of the design matrix, each on end.
-        count: how many n count, from 0 on.
+        rows: (9, LANES) columns of the design matrix, each contiguous.
+        count: number of n, from 0 on.
         gram: (9, 9), added to.
     """
     for j in range(rows.shape[0]):
@@ -91,7 +91,7 @@ def mirror(gram: FloatArray) -> None:
 
 
 def weighted_gram(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return (9, 9) matrix A' W A of the matches.
+    """Return the (9, 9) matrix A' W A of the matches.
 
     Args:
         points: (N, 4) matches.
@@ -104,7 +104,7 @@ def weighted_gram(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 @kernel
 def _add_gram(points: FloatArray, weights: FloatArray, gram: FloatArray) -> None:
-    # a size that the compiler does not know: it would spell out all 45 sums
+    # gram.shape[0] instead of 9: if the size were known at compile time, the compiler would unroll all 45 sums
     block, rows = np.empty((5, LANES)), np.empty((gram.shape[0], LANES))
     start = FIRST
     while start < points.shape[0]:
@@ -120,7 +120,7 @@ def quadratic_forms(points: FloatArray, whitening: FloatArray) -> FloatArray:
 
     Args:
         points: (N, 4) matches.
-        whitening: (9, p) factor that rows of A are multiplied by.
+        whitening: (9, p) matrix that the rows of A are multiplied by.
     """
     count = points.shape[0]
     forms, ones = np.zeros(count), np.ones(count)

@@ -11,18 +11,19 @@ from sfm_app.jit import kernel
 FloatArray = NDArray[np.float64]
 
 _MOST_SWEEPS = 30
-"""Sweeps over all rotations; convergence is quadratic (Golub and Van Loan 2013). Chosen by hand; not measured on its
-own."""
+"""Largest number of sweeps over all rotations; convergence is quadratic (Golub and Van Loan 2013). Chosen by hand; not
+measured on its own."""
 _SETTLED = 1e-32
-"""Squares of the off-diagonal entries over those of the diagonal ones: 1e-16, what double precision leaves, squared."""
+"""Sum of the squared off-diagonal entries over that of the diagonal ones, at convergence: 1e-16, what double precision
+leaves, squared."""
 
 
 @kernel
 def symmetric_eigen(matrix: FloatArray, values: FloatArray, vectors: FloatArray) -> None:
-    """Write eigenvalues in rising order and their unit vectors, by Jacobi's rotations.
+    """Write the eigenvalues in ascending order and the unit eigenvectors, by Jacobi's rotations.
 
     Args:
-        matrix: (n, n) symmetric; destroyed.
+        matrix: (n, n) symmetric; overwritten.
         values: (n,) filled.
         vectors: (n, n) filled, one eigenvector per column.
     """

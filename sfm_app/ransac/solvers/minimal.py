@@ -13,18 +13,20 @@ IntArray = NDArray[np.int64]
 MOST_MODELS = 3
 """Real roots of the cubic det F = 0 (thesis 4.3.1)."""
 _RANK_TOLERANCE = 1e-9
-"""Pivot over the largest one below which the constraints depend on each other. Chosen by hand; not measured on its
-own."""
+"""Pivot, relative to the largest, below which the constraints are linearly dependent. Chosen by hand; not measured on
+its own."""
 _SQUARINGS = 6
-"""Of C'C: each doubles the exponent of the ratio of its eigenvalues, to 64. Chosen by hand; not measured on its own."""
+"""Squarings of C'C: each doubles the exponent of the ratio of its eigenvalues, to 64. Chosen by hand; not measured on
+its own."""
 
 
 @kernel
 def models_through(points: FloatArray, sample: IntArray, models: FloatArray) -> int:
-    """Return F from a minimal sample: all those through seven matches, or the linear one through eight.
+    """Compute F from a minimal sample: all solutions through seven matches, or the linear one through eight.
 
-    Seven constraints leave F = a + z b; one more settles z: det F = 0, a cubic with one or three real roots, or an
-    eighth match. The linear model is then moved to the nearest one of rank 2, and with noise misses its own sample.
+    Seven constraints leave F = a + z b; one more determines z: det F = 0, a cubic with one or three real roots, or an
+    eighth match. The linear solution is then replaced by the nearest matrix of rank 2, which with noise no longer fits
+    its sample exactly.
 
     Args:
         points: (N, 4) x1, y1, x2, y2, of magnitude about 1.
@@ -32,7 +34,7 @@ def models_through(points: FloatArray, sample: IntArray, models: FloatArray) -> 
         models: (3, 9) filled with the solutions, row by row, each of norm 1.
 
     Returns:
-        Number of solutions, 0 to 3; 0 where the constraints depend on each other (points repeated or coplanar).
+        Number of solutions, 0 to 3; 0 where the constraints are linearly dependent (repeated or coplanar points).
     """
     basis = np.empty((2, 9))
     if not _null_space(points, sample, basis):
@@ -44,10 +46,10 @@ def models_through(points: FloatArray, sample: IntArray, models: FloatArray) -> 
 
 @kernel
 def _of_rank_two(basis: FloatArray, models: FloatArray) -> int:
-    """Return those of the pencil a + z b whose determinant vanishes."""
+    """Write the matrices of the pencil a + z b with determinant 0; return their number."""
     a, b = basis[0], basis[1]
     c0, c1, c2, c3 = _det(a), _mixed_det(a, b), _mixed_det(b, a), _det(b)
-    if abs(c3) < abs(c0):  # the larger end leads, so that no root runs off to infinity
+    if abs(c3) < abs(c0):  # the larger coefficient leads, so that no root goes to infinity
         a, b = b, a
         c0, c1, c2, c3 = c3, c2, c1, c0
     roots = np.empty(3)
@@ -62,7 +64,7 @@ def _of_rank_two(basis: FloatArray, models: FloatArray) -> int:
 
 @kernel
 def _through_eighth(point: FloatArray, basis: FloatArray, model: FloatArray) -> int:
-    """Return the one of the pencil that meets `point` (4,), less what stands in the way of rank 2: F - F v v'."""
+    """Write the F of the pencil that fits `point` (4,), reduced to rank 2 as F - F v v'; return 0 or 1 models."""
     row, v = np.empty(9), np.empty(3)
     design_row(point, row)
     a, b = 0.0, 0.0
@@ -86,10 +88,10 @@ def _through_eighth(point: FloatArray, basis: FloatArray, model: FloatArray) -> 
 
 @kernel
 def _weakest_direction(f: FloatArray, v: FloatArray) -> bool:
-    """Return the right singular vector of F's smallest singular value into v (3,); False for a rank below 2.
+    """Write the right singular vector of F's smallest singular value to v (3,); return False for a rank below 2.
 
-    The cofactors C of F have the same singular vectors with the values s2 s3, s1 s3, s1 s2, so that the vector wanted
-    leads in C'C, and the more so each time that is squared.
+    The cofactors C of F have the same singular vectors with the values s2 s3, s1 s3, s1 s2, so that this vector
+    dominates C'C, and more strongly after each squaring.
     """
     cofactors, gram, square = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
@@ -127,8 +129,8 @@ def _dot3(a: FloatArray, b: FloatArray) -> float:
 def is_oriented(points: FloatArray, sample: IntArray, f: FloatArray) -> bool:
     """Return whether the sampled matches can all lie in front of both cameras of f (Chum, Werner and Matas 2004).
 
-    For such points e2 x x2 and F x1, the same line up to scale, point the same way for all matches or opposite for all.
-    Wrong models rarely pass, and need not be scored.
+    For such points e2 x x2 and F x1 are the same line up to a factor whose sign is the same for all matches.
+    Wrong models rarely pass; those that fail need not be scored.
 
     Args:
         points: (N, 4) matches.
@@ -183,22 +185,22 @@ def real_cubic_roots(c0: float, c1: float, c2: float, c3: float, roots: FloatArr
         # of the two equivalent cube roots, the one without cancellation
         u = np.cbrt(-q / 2.0 - np.sqrt(discriminant)) if q > 0.0 else np.cbrt(-q / 2.0 + np.sqrt(discriminant))
         roots[0] = u - p / (3.0 * u) - a / 3.0 if u != 0.0 else -a / 3.0
-    for k in range(count):  # Newton takes off the rounding of the closed form
+    for k in range(count):  # Newton steps remove the rounding errors of the closed form
         for _ in range(2):
             z = roots[k]
             value, slope = ((z + a) * z + b) * z + c, (3.0 * z + 2.0 * a) * z + b
             better = z - value / slope if slope != 0.0 else z
-            if abs(((better + a) * better + b) * better + c) < abs(value):  # not so beside a multiple root
+            if abs(((better + a) * better + b) * better + c) < abs(value):  # fails near a multiple root
                 roots[k] = better
     return count
 
 
 @kernel
 def _null_space(points: FloatArray, sample: IntArray, basis: FloatArray) -> bool:
-    """Return two orthonormal vectors perpendicular to the first seven design rows of the sample, by elimination.
+    """Write two orthonormal vectors perpendicular to the first seven design rows of the sample, by elimination.
 
-    Complete pivoting makes it as exact as reflections would be, in half the time. False where the rows depend on each
-    other.
+    With complete pivoting it is as exact as Householder reflections, in half the time. Returns False where the rows are
+    linearly dependent.
     """
     rows, place = np.empty((SAMPLE_SIZE, 9)), np.empty(9, dtype=np.int64)
     for j in range(9):
@@ -230,7 +232,7 @@ def _null_space(points: FloatArray, sample: IntArray, basis: FloatArray) -> bool
 
 @kernel
 def _bring_pivot(rows: FloatArray, place: IntArray, k: int) -> float:
-    """Swap the largest entry from (k, k) on to that place, and return its magnitude; `place` keeps track of columns."""
+    """Swap the largest entry from (k, k) on to (k, k); return its magnitude; `place` records the column order."""
     largest, row, column = -1.0, k, k
     for i in range(k, SAMPLE_SIZE):
         for j in range(k, 9):

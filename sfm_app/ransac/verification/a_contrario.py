@@ -1,4 +1,4 @@
-"""Whether a model's support could be luck (a-contrario reasoning: Moisan and Stival 2004)."""
+"""Whether a model's support could be chance (a-contrario reasoning: Moisan and Stival 2004)."""
 
 import math
 
@@ -13,24 +13,24 @@ from sfm_app.ransac.solvers.minimal import MOST_MODELS
 FloatArray = NDArray[np.float64]
 
 MOST_FALSE_ALARMS = 1e-2
-"""Support counts as real when less than this many models with as much of it are expected in random matches.
+"""Support counts as real when fewer than this number of models with as much are expected in random matches.
 docs/algorithms.md, All estimators. Chosen by hand; not measured on its own."""
 
 _FRACTIONS = (1.0, 0.5, 0.25)
 """Support is judged at these fractions of the threshold: precise inliers are stronger evidence. docs/algorithms.md, All
 estimators. Chosen by hand; not measured on their own."""
 _MISMATCHES = 8000
-"""Mismatches that accident is measured on, about. Chosen by hand; not measured on its own."""
+"""Approximate number of mismatches that measure chance agreement. Chosen by hand; not measured on its own."""
 _MOST = 1e300
-"""Most false alarms that are told apart: near the largest number in double precision."""
+"""Largest number of false alarms that is returned: near the largest number in double precision."""
 
 
 def false_alarms_of(squared: FloatArray, wrong: FloatArray, threshold: float) -> float:
-    """Return how many models with as much support are expected among random matches of the same points.
+    """Return the expected number of models with as much support among random matches of the same points.
 
     Args:
         squared: (N,) squared distances of the matches to the model.
-        wrong: (M,) those of mismatches, from `squared_mismatches`.
+        wrong: (M,) those of mismatches, from `a_contrario.squared_mismatches`.
         threshold: largest distance of an inlier.
     """
     tried = []
@@ -42,14 +42,14 @@ def false_alarms_of(squared: FloatArray, wrong: FloatArray, threshold: float) ->
 
 
 def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> float:
-    """Return the expected number of minimal samples whose model has so many inliers, if every match is wrong.
+    """Return the expected number of minimal samples whose model has this many inliers, if every match is wrong.
 
-    Each of the C(count, s) samples agrees with itself, and with each of the other matches by accident, so that the
+    Each of the C(count, s) samples agrees with itself, and with each of the other matches by chance, so that the
     expectation is C(count, s) P(Binomial(count - s, chance) >= inliers - s).
 
     Args:
-        count: all matches.
-        inliers: those that agree with the model.
+        count: number of matches.
+        inliers: number of matches that agree with the model.
         sample_size: s, the matches that determine a model.
         chance: probability that a wrong match agrees with a model, in (0, 1).
 
@@ -65,7 +65,7 @@ def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> f
 def squared_mismatches(points: FloatArray, f: FloatArray) -> FloatArray:
     """Return (M,) squared Sampson distances of deliberate mismatches.
 
-    Points of view 1 with the partners of some others.
+    Each pairs a point of view 1 with the partner of another point.
 
     Args:
         points: (N, 4) distinct matches in random order, N >= 2.
@@ -88,9 +88,9 @@ def _shifted(points: FloatArray, f: FloatArray, shifts: int) -> FloatArray:
 
 
 def accidental_share(wrong: FloatArray, threshold: float) -> float:
-    """Return probability that a wrong match agrees with a model, in (0, 1).
+    """Return the probability that a wrong match agrees with a model, in (0, 1).
 
-    Measured, not modeled: it knows the extent of the photos, where their points cluster, and where the epipoles are.
+    It is measured, not modeled, and so includes the extent of the photos, clusters of points and the epipoles.
 
     Args:
         wrong: (M,) squared distances of mismatches to the model.
@@ -100,11 +100,11 @@ def accidental_share(wrong: FloatArray, threshold: float) -> float:
 
 
 def log_binomial_tail(count: int, least: int, chance: float) -> float:
-    """Return upper bound of log P(Binomial(count, chance) >= least) (Chernoff 1952).
+    """Return an upper bound of log P(Binomial(count, chance) >= least) (Chernoff 1952).
 
     Args:
         count: number of trials, > 0.
-        least: successes asked for.
+        least: least number of successes.
         chance: probability of one success, in (0, 1).
     """
     share = least / count

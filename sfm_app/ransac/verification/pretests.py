@@ -1,13 +1,13 @@
-"""Which hypotheses are worth scoring on all matches (thesis 4.4.4).
+"""Tests that decide which hypotheses are scored on all matches (thesis 4.4.4).
 
-A hypothesis is checked match by match, and every test here comes down to one list: how many of the first m matches
-must be inliers for it to go on. For the bail-out test and T(d,d) that is their definition. Wald's likelihood ratio
-after m matches depends only on how many of them were inliers, so that its threshold is such a list too: the line of
-rejection numbers of sequential sampling inspection.
+A hypothesis is checked match by match, and every test here is one list: how many of the first m matches must be inliers
+for the check to continue. The bail-out test and T(d,d) are defined this way. Wald's likelihood ratio after m matches
+depends only on how many of them were inliers, so that its threshold is such a list, too: the line of rejection numbers
+of sequential sampling inspection.
 
-Randomized tests begin at a random match, afresh for every hypothesis. In a fixed order all hypotheses would be judged
-on the same first matches: if these are outliers every good model falls, however long the search goes on, while the
-stopping rules count on errors that are independent from one hypothesis to the next.
+Randomized tests begin at a new random match for every hypothesis. In a fixed order all hypotheses would be tested on
+the same first matches: if these are outliers, every good model is rejected, however long the search is. The stopping
+rules assume errors that are independent between hypotheses.
 """
 
 from typing import NamedTuple, Protocol
@@ -20,21 +20,21 @@ from sfm_app.ransac.sampling.stopping import trials_needed
 IntArray = NDArray[np.int64]
 
 BLOCK = 64
-"""Matches between two looks at whether to go on, where no test asks for more. Chosen by hand for speed."""
+"""Matches between two checks for an early exit, where no test needs more. Chosen by hand for speed."""
 
 LENIENCE = 0.5
-"""Support that a model besides the priors must have, over that of the best sample, to be looked at. Chosen with the
-other constants of lev-ransac (benchmarks/corpus/tuning_sets.py); not measured on its own."""
+"""Least support of a model drawn without the priors, relative to that of the best sample. Chosen with the other
+constants of lev-ransac (benchmarks/corpus/tuning_sets.py); not measured on its own."""
 _BAIL_OUT_SIGMAS = 3.0
-"""Standard deviations of the hypergeometric count that a hypothesis may fall short by (Capel 2005): one good one of a
-thousand falls."""
+"""Standard deviations that the hypergeometric count of a hypothesis may fall short by (Capel 2005): one of a thousand
+good hypotheses is rejected."""
 
 
 class PreTest(NamedTuple):
-    """A test as the inner loop runs it."""
+    """A test and its statistics, as passed to kernels."""
 
     least_inliers: IntArray
-    """Inliers that a hypothesis must show after each `stride` matches; empty for no test."""
+    """Inliers that a hypothesis must have after each `stride` matches; empty for no test."""
     stride: int
     random_start: bool
     rejected: IntArray
@@ -42,11 +42,11 @@ class PreTest(NamedTuple):
 
 
 def pretest(least_inliers: IntArray, stride: int, *, random_start: bool) -> PreTest:
-    """Make a pre-test that has counted nothing.
+    """Make a pre-test with counts of 0.
 
     Args:
-        least_inliers: (T,) inliers that must be seen by each look; empty for no test.
-        stride: matches between two looks, > 0.
+        least_inliers: (T,) inliers that a hypothesis must have at each check; empty for no test.
+        stride: matches between two checks, > 0.
         random_start: begin at a random match for every hypothesis, not at the first.
     """
     return PreTest(least_inliers, stride, random_start, np.zeros(2, dtype=np.int64))
@@ -57,13 +57,13 @@ OPEN = pretest(np.zeros(0, dtype=np.int64), BLOCK, random_start=False)
 
 
 class Verifier(Protocol):
-    """A test, what it learns during a search, and the trials that its mistakes cost."""
+    """A test that adapts during a search, and the number of trials that allows for its errors."""
 
     pretest: PreTest
     lenient: PreTest
-    """For models of samples that owe nothing to the priors."""
+    """Test of models from samples drawn without the priors."""
     review: int
-    """Most trials between two calls of `learn`."""
+    """Largest number of trials between two calls of `learn`."""
 
     def learn(self, trials: int) -> None:
         """Count samples that were drawn and tested."""
@@ -72,7 +72,7 @@ class Verifier(Protocol):
         """Expect this share of inliers, that of the best model."""
 
     def trials_needed(self, share: float, confidence: float) -> float:
-        """Return samples, those already drawn included, that hold with this probability a clean one which passes.
+        """Return how many samples, those already drawn included, give a clean one that passes with this probability.
 
         Args:
             share: share of inliers, in [0, 1].
@@ -90,13 +90,13 @@ class FullVerification:
         self.pretest = self.lenient = OPEN
 
     def learn(self, trials: int) -> None:
-        """Take no notice of samples that were drawn and tested."""
+        """Do nothing: the test does not depend on the samples."""
 
     def expect(self, share: float) -> None:
-        """Take no notice of the best model's share of inliers."""
+        """Do nothing: the test does not depend on the share of inliers."""
 
     def trials_needed(self, share: float, confidence: float) -> float:
-        """Return samples that hold with this probability a clean one.
+        """Return how many samples give a clean one with this probability.
 
         Args:
             share: share of inliers, in [0, 1].
@@ -106,7 +106,7 @@ class FullVerification:
 
 
 class BailOut(FullVerification):
-    """Leave a hypothesis that falls behind the best one (Capel 2005), seen on the matches in their random order."""
+    """Reject a hypothesis once it has too few inliers to be the best one (Capel 2005); matches are in random order."""
 
     def expect(self, share: float) -> None:
         """Make both tests for this share of inliers, that of the best model."""
@@ -116,9 +116,9 @@ class BailOut(FullVerification):
 
 
 class RandomisedTdd(FullVerification):
-    """T(d,d): the first d matches must all be inliers (Matas and Chum 2004); d = 1 is the best choice there.
+    """T(d,d): the first d matches must all be inliers (Matas and Chum 2004, who find d = 1 best).
 
-    A clean model passes with probability share^d, and the samples needed are that much more.
+    A clean model passes with probability share^d, so that more samples are needed.
     """
 
     d = 1
@@ -128,7 +128,7 @@ class RandomisedTdd(FullVerification):
         self.pretest = self.lenient = pretest(np.arange(1, self.d + 1), 1, random_start=True)
 
     def trials_needed(self, share: float, confidence: float) -> float:
-        """Return samples that hold with this probability a clean one which passes.
+        """Return how many samples give a clean one that passes with this probability.
 
         Args:
             share: share of inliers, in [0, 1].
@@ -138,14 +138,14 @@ class RandomisedTdd(FullVerification):
 
 
 def bail_out_table(count: int, inlier_share: float) -> IntArray:
-    """Return how many inliers a hypothesis must show after each block to be worth finishing.
+    """Return how many inliers a hypothesis must have after each block to be scored further.
 
-    A hypothesis as good as the best one has a share `inlier_share` of inliers; in the first m of N matches their
-    number is hypergeometric, and falls short of the figures given here about once in a thousand times.
+    A hypothesis as good as the best one has a share `inlier_share` of inliers; in the first m of N matches their number
+    is hypergeometric, and is below the returned counts about once in a thousand times.
 
     Args:
         count: number of matches.
-        inlier_share: that of the best model, in [0, 1].
+        inlier_share: share of inliers of the best model, in [0, 1].
 
     Returns:
         (blocks,) counts.
