@@ -17,12 +17,12 @@ class Bar(NamedTuple):
 
 
 def least(column: str, bound: float | str) -> Bar:
-    """The figure is not smaller."""
+    """Make a bar that is a lower bound."""
     return Bar(column, bound, at_most=False)
 
 
 def most(column: str, bound: float | str) -> Bar:
-    """The figure is not larger."""
+    """Make a bar that is an upper bound."""
     return Bar(column, bound, at_most=True)
 
 
@@ -50,7 +50,7 @@ BARS: Mapping[str, tuple[Bar, ...]] = {
 
 
 def verdict(row: Row, of_methods: Mapping[str, Row], bars: Sequence[Bar]) -> str:
-    """ "yes", or which bars are missed and by what; empty where there are none.
+    """Return "yes", or which bars are missed and by how much; empty where the set has no bars.
 
     Args:
         row: one method on one set.

@@ -39,14 +39,14 @@ ABOUT = (
 
 
 def chosen_sets(args: argparse.Namespace, cache: Path) -> Iterator[tuple[PhotoSet, str]]:
-    """Each set with the name of its data; the change stands behind a blank."""
+    """Yield each set with the name of its data; the change follows the name after a space."""
     for title in args.sets:
         name, _, change = title.partition(" ")
         yield photo_set(args.data, name, change, cache, "each" if name in args.each else "auto"), name
 
 
 def all_runs(args: argparse.Namespace, these: Sequence[Method], cache: Path) -> Iterator[Row]:
-    """Every set, every repetition, every method."""
+    """Run every method on every set in every repetition."""
     sets = list(chosen_sets(args, cache))
     warm_up([photos for photos, _ in sets], these, cache / "cameras" / "warm-up")
     for photos, name in sets:
@@ -61,7 +61,7 @@ def all_runs(args: argparse.Namespace, these: Sequence[Method], cache: Path) -> 
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("cameras", __doc__)
     parser.add_argument("data", type=Path, help="folder with NAME/images and NAME/cameras.json")
     parser.add_argument("--cache", type=Path, help="keeps copies of photos and the last run of every method")
@@ -79,7 +79,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Measure all, and publish."""
+    """Run all methods on all sets, and write the results."""
     args = parser().parse_args()
     these = [
         method for method in methods(overrides(args.also), ours_only=args.ours_only) if method.name not in args.without

@@ -22,7 +22,7 @@ MODES = {"each": "AUTO", "folder": "PER_FOLDER"}
 
 
 def ours(photos: Path, out: Path, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The program until the cameras stand; its seconds are those of the manifest."""
+    """Run the program up to its scene; the seconds are those of its manifest."""
     import sfm_app
 
     failed, code, run, manifest = "", 0, None, out / "manifest.json"
@@ -42,7 +42,7 @@ def ours(photos: Path, out: Path, options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) -> dict[str, Any]:
-    """pycolmap's defaults but for a seed, a cap on the image size, and one camera for all photos where that is so."""
+    """Run pycolmap with its defaults but for a seed, a cap on the image size, and cameras shared as the options say."""
     import pycolmap
 
     zlib.crc32(b"")  # the import above is there for its side effect

@@ -29,7 +29,7 @@ Step = tuple[str, tuple[float, ...]]
 
 
 def put(photo: Path, folder: Path) -> None:
-    """A photo in another folder, without a second copy of its bytes where the disk allows; links out are not read."""
+    """Hard-link a photo into another folder, or copy it; the program skips symbolic links out of a folder."""
     place = folder / photo.name
     if not place.exists():
         try:
@@ -43,7 +43,7 @@ EVERY = "every:"
 
 
 def stride(text: str) -> int:
-    """Which of the photos a change takes: every so many, all (1) where it does not say.
+    """Return the stride at which a change takes photos, 1 where it names none.
 
     Raises:
         ValueError: that is no positive number.
@@ -78,7 +78,7 @@ class PhotoSet:
 
 
 def steps(text: str) -> list[Step]:
-    """The steps of a change.
+    """Parse the steps of a change.
 
     Raises:
         ValueError: a kind is not known, or has another number of figures.
@@ -106,7 +106,7 @@ class Frame(NamedTuple):
 
 
 def framed(kind: str, size: tuple[int, int], wanted: Sequence[float]) -> Frame:
-    """The place of a photo of `size` in a frame of the `wanted` one; `kind` is one of `ONE_SIZE`."""
+    """Return where a photo of `size` lies in a frame of the `wanted` size; `kind` is one of `ONE_SIZE`."""
     ratios = [side / own for side, own in zip(wanted, size, strict=True)]
     factor = max(ratios) if kind == "fill" else min(ratios)
     width, height = (round(factor * own) for own in size)
@@ -115,7 +115,7 @@ def framed(kind: str, size: tuple[int, int], wanted: Sequence[float]) -> Frame:
 
 
 def changed_size(size: tuple[int, int], step: Step) -> tuple[int, int]:
-    """Width and height of a photo after a step."""
+    """Return the width and height of a photo after a step."""
     kind, values = step
     if kind == "scale":
         return round(size[0] * values[0]), round(size[1] * values[1])
@@ -125,7 +125,7 @@ def changed_size(size: tuple[int, int], step: Step) -> tuple[int, int]:
 
 
 def changed_photo(image: Image.Image, change: Sequence[Step]) -> Image.Image:
-    """The photo after the steps."""
+    """Apply the steps to a photo."""
     for kind, values in change:
         after = changed_size(image.size, (kind, values))
         if kind == "scale":
@@ -142,7 +142,7 @@ def changed_photo(image: Image.Image, change: Sequence[Step]) -> Image.Image:
 
 
 def changed_camera(K: NDArray[np.float64], change: Sequence[Step], size: tuple[int, int]) -> NDArray[np.float64]:
-    """The camera matrix of a photo of `size` after these steps; pixel centers at +0.5, so that resizing multiplies."""
+    """Return the camera matrix of a photo of `size` after these steps; pixel centers at +0.5, so scaling multiplies."""
     K = K.copy()
     for kind, values in change:
         if kind == "scale":
@@ -158,7 +158,7 @@ def changed_camera(K: NDArray[np.float64], change: Sequence[Step], size: tuple[i
 
 
 def photo_set(data: Path, name: str, change: str, cache: Path, cameras: str = "auto") -> PhotoSet:
-    """A set of DATA after a change; the copies are kept in the cache, and nothing there is written twice.
+    """Make a set of DATA after a change; the copies stay in the cache, and existing ones are not written again.
 
     Where all photos come from one camera (`cameras` is not "each"), the truth is its median over the photos.
     """
@@ -178,7 +178,7 @@ def photo_set(data: Path, name: str, change: str, cache: Path, cameras: str = "a
 
 
 def save_plain(source: Path, target: Path, change: Sequence[Step]) -> None:
-    """Upright, changed, and of the rest the pixels alone: PNG loses none of them, and nobody hands EXIF on."""
+    """Save a photo upright, changed, and without metadata: PNG keeps all pixels, and no EXIF is passed on."""
     with Image.open(source) as image:
         upright = ImageOps.exif_transpose(image).convert("RGB")
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -40,7 +40,7 @@ class Attempt:
 def take_turns(
     methods: Mapping[str, Method], pairs: Sequence[Pair], seed: int = 0, label: str = ""
 ) -> dict[str, list[Attempt]]:
-    """All methods on all pairs; every method has one call before that, unmeasured, to compile and load what it needs.
+    """Run all methods on all pairs; every method is first called once, unmeasured, to compile and load what it needs.
 
     Returns:
         Per method, one attempt for each pair. Pair n is estimated with `seed` + n.
@@ -60,12 +60,12 @@ def take_turns(
 
 
 def is_usable(F: FloatArray | None) -> bool:
-    """Whether this is one matrix with numbers in it."""
+    """Return whether this is one finite, nonzero (3, 3) matrix."""
     return F is not None and F.shape == (3, 3) and bool(np.isfinite(F).all()) and bool(np.any(F))
 
 
 def timing(attempts: Sequence[Attempt]) -> dict[str, float | None]:
-    """Milliseconds, and the mean number of samples where the method tells."""
+    """Return milliseconds, and the mean number of samples where the method reports it."""
     ms = np.array([attempt.ms for attempt in attempts])
     trials = [attempt.trials for attempt in attempts if attempt.trials is not None]
     return {

@@ -39,20 +39,20 @@ SLACK = 0.01
 
 
 def bars_of(title: str) -> tuple[Bar, ...]:
-    """All bars of a set with its change."""
+    """Return all bars of a set with its change."""
     own = PADDED_BARS if title.startswith("reichstag10 ") and PADDED in title else ()
     return (*BARS.get(title, ()), *SEEN_LATER.get(title, ()), *own)
 
 
 def folded(name: str, row: Row) -> int | None:
-    """1 where a walk is folded and nothing is said of it; None where nobody knows."""
+    """Return 1 where a walk is folded and no warning is given, else 0; None where it is unknown."""
     column, bound = UNFOLDED_AT.get(name, ("", 0.0))
     value = row.get(column)
     return None if value is None else int(value < bound and row.get("warned of folds") != "yes")
 
 
 def behind(row: Row, stock: Row, slack: float = 0.0) -> str:
-    """In what a run is worse than stock on the same pixels by more than the slack; empty where in nothing."""
+    """List the figures in which a run is worse than stock on the same pixels by more than the slack; empty if none."""
     figures = [(name, row.get(name) or 0, stock.get(name) or 0) for name in ("registered", "AUC@1", "AUC@5")]
     return "; ".join(f"{name} {ours:g}, stock {theirs:g}" for name, ours, theirs in figures if ours < theirs - slack)
 
@@ -66,7 +66,7 @@ class Demand(NamedTuple):
 
 
 def demands(rows: Sequence[Row], stated: Sequence[Row]) -> list[Demand]:
-    """What is asked of the whole corpus, of our runs and the parameters that they state.
+    """Check what is required of the whole corpus: of our runs, and of the parameters that they state.
 
     Args:
         rows: our runs.

@@ -47,7 +47,7 @@ LIMIT_MIN = 40.0
 
 
 def default_titles(data: Path) -> list[str]:
-    """Every set in DATA, smallest first, then the changed ones."""
+    """List every set in DATA, smallest first, then the changed ones."""
     counts = {path.name: _photos(path) for path in data.iterdir() if (path / "images").is_dir()}
     plain = [f"{name} {EVERY.get(name, '')}".strip() for name in sorted(counts, key=lambda name: (counts[name], name))]
     changed = [title for title in BARS if title.partition(" ")[0] in counts]
@@ -60,7 +60,7 @@ def _photos(folder: Path) -> int:
 
 
 def score(method: Method, photos: PhotoSet, out: Path, data: Path, done: Done) -> tuple[Row, list[Row]]:
-    """The figures of a run, and the parameters that it states, one by one."""
+    """Score a run, and list the parameters that it states."""
     name, _, change = photos.name.partition(" ")
     truth = true_photos(data / name / "cameras.json", steps(change))
     row = scored(done.said, photos, truth if name not in OFFSETS else {}, method, out)
@@ -79,7 +79,7 @@ def score(method: Method, photos: PhotoSet, out: Path, data: Path, done: Done) -
 
 
 def line(row: Row) -> str:
-    """A run in one line."""
+    """Describe a run in one line."""
     figures = [row["placed"] + " placed"] + [f"{key} {row[key]}" for key in SHOWN if row.get(key) not in (None, "")]
     return f"{row['photos']}: {row['method']}: {', '.join(figures)}"
 
@@ -89,27 +89,27 @@ SHOWN = ("models", "AUC@1", "AUC@5", "axis", "distance", "median center cm", "K 
 
 
 def set_of(title: str, args: argparse.Namespace) -> PhotoSet:
-    """A set by its name and change; its photos are copied on first use."""
+    """Make a set from its name and change; its photos are copied on first use."""
     name, _, change = title.partition(" ")
     return photo_set(args.data, name, change, args.cache, "each" if name in EACH else "auto")
 
 
 def compile_kernels(args: argparse.Namespace, these: Sequence[Method]) -> bool:
-    """One unmeasured run on the first set with photos enough to need all kernels."""
+    """Run once, unmeasured, on the first set that has enough photos to need all kernels."""
     enough = [title for title in args.sets if _photos(args.data / title.partition(" ")[0]) >= FEW]
     warm_up([set_of((enough or args.sets)[0], args)], these, args.cache / "corpus" / "warm-up")
     return True
 
 
 def failed_row(title: str, method: Method, error: Exception) -> Row:
-    """What stands in the table where a run could not be begun or scored: that is a fault of the benchmark."""
+    """Return the row of a run that could not be started or scored, which is a fault of the benchmark."""
     empty: Row = dict.fromkeys(("models", "total", "registered", "of", "peak MB"))
     text = f"benchmark: {type(error).__name__}: {error}"
     return {"photos": title, "method": method.name, "failed": text, "exit code": None, "placed": ""} | empty
 
 
 def all_runs(args: argparse.Namespace, these: Sequence[Method]) -> Iterator[tuple[Row, list[Row]]]:
-    """Every set by every method; a failure of one is no end of the others."""
+    """Run every method on every set; a failure of one does not stop the others."""
     compiled = False
     for number, title in enumerate(args.sets, start=1):
         for method in these:
@@ -131,7 +131,7 @@ def all_runs(args: argparse.Namespace, these: Sequence[Method]) -> Iterator[tupl
 
 
 def judged(rows: Sequence[Row]) -> None:
-    """Fill in what takes other rows: ratios, what is worse than stock, and whether the bars are met."""
+    """Fill in the columns that need other rows: ratios, figures worse than stock, and whether the bars are met."""
     compared(rows)
     for row in rows:
         beside = {other["method"]: other for other in rows if other["photos"] == row["photos"]}
@@ -139,7 +139,7 @@ def judged(rows: Sequence[Row]) -> None:
 
 
 def publish(args: argparse.Namespace, these: Sequence[Method], rows: Sequence[Row], stated: Sequence[Row]) -> str:
-    """Write what there is so far."""
+    """Write the results so far."""
     judged(rows)
     options = {"methods": [method.name for method in these], "each": list(EACH), "limit min": args.limit_min}
     found = document("corpus", ABOUT, options, {"sets": list(args.sets), "parameters": list(stated)}, rows)
@@ -149,7 +149,7 @@ def publish(args: argparse.Namespace, these: Sequence[Method], rows: Sequence[Ro
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("corpus", __doc__)
     parser.add_argument("data", type=Path, help="folder with NAME/images and, where known, NAME/cameras.json")
     parser.add_argument("--cache", type=Path, required=True, help="keeps copies of photos and the last run of each")
@@ -167,7 +167,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def parsed() -> argparse.Namespace:
-    """Read the command line, with the sets that are meant."""
+    """Read the command line, and resolve which sets to run."""
     args = parser().parse_args()
     wanted = args.sets or default_titles(args.data)
     args.sets = [title for title in wanted if title not in args.without and title.partition(" ")[0] not in args.without]

@@ -29,7 +29,7 @@ MISSES = (
 
 
 def compared(rows: Sequence[Row]) -> None:
-    """Fill in what takes the runs of a set together: ours beside stock incremental."""
+    """Fill in the columns that compare a run with stock incremental on the same set."""
     for row in rows:
         stock = next((r for r in rows if r["photos"] == row["photos"] and r["method"] == INCREMENTAL), None)
         both = stock is not None and stock["total"] and row["total"]
@@ -40,7 +40,7 @@ def compared(rows: Sequence[Row]) -> None:
 
 
 def corpus_page(about: str, rows: Sequence[Row], stated: Sequence[Row]) -> str:
-    """The page.
+    """Return the page.
 
     Args:
         about: what is measured, and how.
@@ -62,7 +62,7 @@ def corpus_page(about: str, rows: Sequence[Row], stated: Sequence[Row]) -> str:
 
 
 def columns_with(rows: Sequence[Row], columns: Sequence[str]) -> str:
-    """The table without columns that are empty throughout."""
+    """Format the table without columns that are empty throughout."""
     return table(rows, [name for name in columns if any(row.get(name) not in (None, "") for row in rows)])
 
 

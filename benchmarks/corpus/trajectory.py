@@ -30,7 +30,7 @@ class Order(NamedTuple):
 
 
 def order_scores(poses: Mapping[str, Pose]) -> Order | None:
-    """The order of a model's photos; None with fewer than three, or where all stand in one place."""
+    """Score the order of a model's photos; None with fewer than three, or where all centers coincide."""
     if len(poses) < 3:
         return None
     centers = _centers([poses[name] for name in sorted(poses)])
@@ -59,7 +59,7 @@ class Offset(NamedTuple):
 
 
 def offset_errors(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> Offset | None:
-    """Fit the similarity of the worlds and the offset of the cameras together, robustly; what remains is the error.
+    """Fit the similarity of the worlds and the offset of the cameras jointly and robustly; return the residuals.
 
     None with fewer than four photos: three fit any offset.
     """

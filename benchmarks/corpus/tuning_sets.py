@@ -102,17 +102,17 @@ GROUPS: Mapping[str, Group] = {
 
 
 def seen_sets() -> tuple[str, ...]:
-    """Every set that some constant was chosen on."""
+    """List every set that some constant was chosen on."""
     return tuple(dict.fromkeys(name for group in GROUPS.values() for name in group.sets))
 
 
 def unseen(rows: Sequence[Row], sets: Sequence[str]) -> list[Row]:
-    """Rows without those of these sets, changed or not."""
+    """Return the rows whose set, changed or not, is none of these."""
     return [row for row in rows if row["photos"].partition(" ")[0] not in sets]
 
 
 def groups_table(rows: Sequence[Row]) -> list[Row]:
-    """For each group: what it has seen, and how many bars our runs meet on the sets that it has not seen."""
+    """Return, per group, the sets it has seen, and how many bars our runs meet on the sets it has not seen."""
     found = []
     for name, group in GROUPS.items():
         judged = [row for row in unseen(rows, group.sets) if row.get("bar met")]

@@ -43,7 +43,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 
 
 def ablated(options: EpipolarSettings) -> dict[str, Method]:
-    """The whole estimator, and one for every row of `ABLATIONS`, all called in the same way."""
+    """Return the whole estimator and one for every row of `ABLATIONS`, all called in the same way."""
     recipes = {WHOLE: PRODUCTION} | {name: replace(PRODUCTION, **fields) for name, fields in ABLATIONS.items()}
     return {name: _fit_with(recipe, options) for name, recipe in recipes.items()}
 

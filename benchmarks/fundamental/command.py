@@ -56,7 +56,7 @@ RATIO_SETS = ("fountain-P11", "castle-P19", "Herz-Jesus-P8", "merton1", "temple1
 
 
 def score_real(pairs: Sequence[RealPair], methods: Mapping[str, Method], seed: int) -> tuple[list[Row], dict[str, Any]]:
-    """Pose errors, distances of the true inliers and times; also the pose errors themselves, by method."""
+    """Score pose errors, distances of the true inliers and times; also return the pose errors by method."""
     attempts = take_turns(methods, pairs, seed, "pairs")
     errors: dict[str, NDArray[np.float64]] = {}
     rows = []
@@ -76,7 +76,7 @@ def score_real(pairs: Sequence[RealPair], methods: Mapping[str, Method], seed: i
 
 
 def run_real(task: str, files: list[Path], methods: Mapping[str, Method], args: argparse.Namespace) -> None:
-    """Pairs of photos."""
+    """Compare the methods on pairs of photos."""
     pairs = load_pairs(files, args.pairs_per_set)
     if not pairs:
         raise SystemExit(f"no usable pairs in {', '.join(map(str, files)) or 'no file'}")
@@ -107,7 +107,7 @@ def run_real(task: str, files: list[Path], methods: Mapping[str, Method], args: 
 
 
 def draw_recall(errors: Mapping[str, NDArray[np.float64]], title: str, folder: Path, name: str) -> None:
-    """Draw the share of the pairs over their pose error, a line per method."""
+    """Draw the recall over the pose error, one line per method."""
     figure, axes = pyplot().subplots(figsize=(7.5, 3.6))
     for name, values in errors.items():
         recall = np.arange(1, len(values) + 1) / len(values)
@@ -119,7 +119,7 @@ def draw_recall(errors: Mapping[str, NDArray[np.float64]], title: str, folder: P
 
 
 def run_synthetic(tests: int, methods: Mapping[str, Method], args: argparse.Namespace) -> None:
-    """The pairs of thesis section 4.8."""
+    """Compare the methods on the pairs of thesis section 4.8."""
     rows: list[Row] = []
     for outliers in OUTLIERS:
         pairs = [make_pair(PairOptions(outliers=outliers), args.seed + n) for n in range(tests)]
@@ -146,7 +146,7 @@ def run_synthetic(tests: int, methods: Mapping[str, Method], args: argparse.Name
 
 
 def draw_levels(rows: Sequence[Row], folder: Path, name: str) -> None:
-    """Draw error and time over the share of outliers, a line per method."""
+    """Draw error and time over the share of outliers, one line per method."""
     figure, (left, right) = pyplot().subplots(1, 2, figsize=(10, 3.8))
     for axes, value in ((left, "capped mean px"), (right, "ms mean")):
         lines = {row.pop("method"): list(row.values()) for row in pivot(rows, "outliers", value)}
@@ -158,7 +158,7 @@ def draw_levels(rows: Sequence[Row], folder: Path, name: str) -> None:
 
 
 def run_two_motions(tests: int, methods: Mapping[str, Method], args: argparse.Namespace) -> None:
-    """Pairs with an object that moves by itself."""
+    """Compare the methods on pairs with an independently moving object."""
     rows: list[Row] = []
     for moving, outliers in MOTIONS:
         options = PairOptions(outliers=outliers)
@@ -215,7 +215,7 @@ def _name(task: str, args: argparse.Namespace) -> str:
 
 
 def _set_in_relation(rows: list[Row], column: str) -> None:
-    """Every time over that of the baseline, where that was measured."""
+    """Divide every time by that of the baseline, where the baseline was measured."""
     times = {row["method"]: row[column] for row in rows}
     for row in rows if BASELINE in times else []:
         row["time : MAGSAC++"] = round(row[column] / times[BASELINE], 3)
@@ -226,7 +226,7 @@ def _finite(value: float) -> float | None:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("fundamental", __doc__)
     parser.add_argument("--real", type=Path, metavar="DATA", help="folder with pairs/*.npz (see real_pairs.py)")
     parser.add_argument("--ratio", type=Path, metavar="DATA", help="folder with NAME/images and NAME/cameras.json")
@@ -245,7 +245,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def parsed() -> argparse.Namespace:
-    """Read the command line, and refuse what does not fit together."""
+    """Read the command line, and refuse options that do not fit together."""
     line = parser()
     args = line.parse_args()
     if not any((args.real, args.ratio, args.synthetic, args.two_motions)):
@@ -256,7 +256,7 @@ def parsed() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Measure what was asked for."""
+    """Run the comparisons that were asked for."""
     args = parsed()
     on_one_thread()
     options = EpipolarSettings(max_error_px=THRESHOLD_PX, confidence=CONFIDENCE, max_trials=MAX_TRIALS)

@@ -57,7 +57,7 @@ class RealPair:
 
 
 def load_pairs(files: list[Path], limit: int | None = None) -> list[RealPair]:
-    """The usable pairs of all files, at most `limit` evenly spaced ones of each."""
+    """Read the usable pairs of all files, at most `limit` evenly spaced ones of each."""
     found: list[RealPair] = []
     for path in files:
         with np.load(path) as data:
@@ -72,14 +72,14 @@ def load_pairs(files: list[Path], limit: int | None = None) -> list[RealPair]:
 
 
 def evenly(pairs: list[RealPair], limit: int) -> list[RealPair]:
-    """At most `limit` of them, spread over the list."""
+    """Take at most `limit` of the pairs, spread evenly over the list."""
     if len(pairs) <= limit:
         return pairs
     return [pairs[i] for i in np.linspace(0, len(pairs) - 1, limit).round().astype(int)]
 
 
 def cached_ratio_matches(data: Path, name: str, cache: Path) -> Path:
-    """The matches of a photo set after COLMAP's ratio test, as the program itself makes them; kept in `cache`.
+    """Match a photo set with the program's own matching, COLMAP's ratio test included; the file is kept in `cache`.
 
     Args:
         data: folder with NAME/images and NAME/cameras.json.

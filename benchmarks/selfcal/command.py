@@ -45,7 +45,7 @@ ABOUT_SPEED = "Medians of up to five calls in one process on one thread, compile
 
 
 def run_photos(args: argparse.Namespace) -> None:
-    """Every photo set by every method."""
+    """Run every method on every photo set."""
     rows: list[Row] = []
     for photos in chosen_sets(args):
         rows += calibrated(photos, args)
@@ -55,7 +55,7 @@ def run_photos(args: argparse.Namespace) -> None:
 
 
 def chosen_sets(args: argparse.Namespace) -> Iterator[PhotoSet]:
-    """The varied sets with their variants, the others, and what is rendered."""
+    """Yield the varied sets with their variants, the plain sets, and the rendered sets."""
     plain = [(name, "", "auto") for name in args.sets] + [(name, "", "each") for name in args.each]
     varied = [(name, change, "auto") for name in args.varied for change in ("", *args.variants)]
     for name, change, cameras in [*varied, *plain] if args.photos else []:
@@ -64,7 +64,7 @@ def chosen_sets(args: argparse.Namespace) -> Iterator[PhotoSet]:
 
 
 def calibrated(photos: PhotoSet, args: argparse.Namespace) -> list[Row]:
-    """All methods on one set."""
+    """Run all methods on one set."""
     subject = measured(photos, args.cache)
     found = list(every_method(subject, args.methods, overrides(args.also)))
     truth = photos.truth or adjusted_cameras(subject)
@@ -76,7 +76,7 @@ def calibrated(photos: PhotoSet, args: argparse.Namespace) -> list[Row]:
 
 
 def tables(rows: list[Row]) -> str:
-    """The methods beside each other, then everything about each."""
+    """Format the methods side by side, then all columns of each method."""
     parts = []
     for column in ("known", "e_focal %", "center % of width", "fy/fx %"):
         beside: dict[str, Row] = {}
@@ -91,7 +91,7 @@ def tables(rows: list[Row]) -> str:
 
 
 def run_coverage(args: argparse.Namespace) -> None:
-    """Honesty of the standard deviations; once more for every other setting."""
+    """Check the stated standard deviations; once more for every `--also` setting."""
     for label, others in {"": {}, **overrides(args.also)}.items():
         trials = coverage(args.coverage, Settings.from_mapping(others), args.seed)
         name = f"{args.name}-coverage{'-' if label else ''}{label}"
@@ -102,7 +102,7 @@ def run_coverage(args: argparse.Namespace) -> None:
 
 
 def run_speed(args: argparse.Namespace) -> None:
-    """Seconds."""
+    """Measure the speed."""
     subject = None
     if args.photos:
         subject = measured(photo_set(args.photos, args.speed, "", args.cache), args.cache)
@@ -112,18 +112,18 @@ def run_speed(args: argparse.Namespace) -> None:
 
 
 def options(args: argparse.Namespace) -> dict[str, Any]:
-    """What was asked for."""
+    """Return the options of the command that belong to the results."""
     return {"methods": list(args.methods), "also": list(args.also)}
 
 
 def publish(args: argparse.Namespace, name: str, found: Row, page: str) -> None:
-    """Into the results, and onto the screen."""
+    """Write the results, and print the page."""
     write(args.results, name, found, page)
     print(page)
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("selfcal", __doc__)
     parser.add_argument("--photos", type=Path, metavar="DATA", help="folder with NAME/images and NAME/cameras.json")
     parser.add_argument("--cache", type=Path, help="where copies of photos, matches and fundamental matrices are kept")
@@ -147,7 +147,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def parsed() -> argparse.Namespace:
-    """Read the command line, and refuse what does not fit together."""
+    """Read the command line, and refuse options that do not fit together."""
     line = parser()
     args = line.parse_args()
     if not (args.photos or args.rendered or args.coverage or args.speed):
@@ -160,7 +160,7 @@ def parsed() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Measure what was asked for."""
+    """Run the measurements that were asked for."""
     args = parsed()
     on_one_thread()
     warm_up()

@@ -28,7 +28,7 @@ CAMERAS = (7, 10, 14, 20)
 
 
 def speed(subject: Measured | None, overrides: Mapping[str, Mapping[str, object]]) -> list[Row]:
-    """One row per measurement: CPU seconds of one call, the least of a few after one that is not counted."""
+    """Return one row per measurement: CPU seconds of one call, the minimum of a few after an unmeasured one."""
     rows = [_curves(synthetic_pairs(THESIS_CAMERAS))]
     for label, others in {"": {}, **overrides}.items():
         settings = Settings.from_mapping(merged({"seed": 0}, others))
@@ -49,7 +49,7 @@ def _known(pairs: CameraPairs, method: str) -> CameraPairs:
 
 @cache
 def synthetic_pairs(cameras: int, seed: int = 0) -> CameraPairs:
-    """All pairs of so many synthetic photos, estimated from matches with noise."""
+    """Make all pairs of `cameras` synthetic photos, estimated from noisy matches."""
     # many cameras have to see the same points, so they stand closer together than in the thesis
     options = TrackOptions(cameras=cameras, sigma_px=0.5, max_rotation_deg=20.0, max_shift=0.4)
     return estimated(make_tracks(options, seed), Settings(), seed)

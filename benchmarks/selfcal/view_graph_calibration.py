@@ -18,7 +18,7 @@ METHOD = "view-graph calibration"
 def view_graph_calibration(
     database: Path, scratch: Path, matches: MatchGraph, views: ViewGraph, seed: int = 0
 ) -> tuple[dict[int, Calibration], float]:
-    """Calibrate a copy of the database that starts from 1.2 times the longer side, of which nobody is sure.
+    """Calibrate a copy of the database whose focals start at 1.2 times the longer side, without a prior.
 
     Degenerate pairs stay in it, marked as such, as they do for mapping. Relative poses are not estimated anew: that
     is no part of the calibration, and would only cost it time.

@@ -28,7 +28,7 @@ BARS: Mapping[str, tuple[Bar, ...]] = {
 
 
 def asked(rows: Sequence[Row]) -> list[Row]:
-    """One row per bar: what was asked, what was measured, whether it is met."""
+    """Return one row per bar: the bar, the measured value, and whether it is met."""
     found = []
     for row in rows:
         for bar in BARS.get(row["photos"], ()):

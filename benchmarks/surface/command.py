@@ -41,7 +41,7 @@ ABOUT = (
 
 
 def measure(photos: SurfaceSet, out: Path, args: argparse.Namespace) -> Row:
-    """Everything about one set."""
+    """Measure everything about one set."""
     again = () if args.keep else dense_stages()
     said = run_stages(photos.photos, out, ("scene", *dense_stages()), args.settings, again)
     row: Row = {"photos": photos.name, "method": "sfm-app", **cost(said), "of": photos.count}
@@ -65,7 +65,7 @@ def measure(photos: SurfaceSet, out: Path, args: argparse.Namespace) -> Row:
 
 
 def measure_parts(whole: SurfaceSet, counts: Sequence[int], cache: Path, settings: Mapping[str, Any]) -> list[Row]:
-    """What more and more photos of a set cost."""
+    """Measure the cost of growing numbers of photos of a set."""
     rows = []
     for count in counts:
         part = part_of(whole, count, cache)
@@ -81,7 +81,7 @@ def measure_parts(whole: SurfaceSet, counts: Sequence[int], cache: Path, setting
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("surface", __doc__)
     parser.add_argument("data", type=Path, nargs="?", help="folder with NAME/images; rendered scenes need none")
     parser.add_argument("--cache", type=Path, help="keeps rendered photos and the last run of every set")
@@ -100,7 +100,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def arguments() -> argparse.Namespace:
-    """Read the command line, with the sets that are meant and the settings."""
+    """Read the command line, and resolve the sets and settings."""
     args = parser().parse_args()
     if args.sets is None:
         args.sets = [*RENDERED, *(REAL if args.data else ())]
@@ -111,7 +111,7 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Measure all sets, and publish."""
+    """Measure all sets, and write the results."""
     args = arguments()
     with tempfile.TemporaryDirectory(prefix="surface-") as scratch:
         cache = (args.cache or Path(scratch)).resolve()

@@ -32,7 +32,7 @@ class SurfaceSet:
 
 
 def surface_set(name: str, data: Path | None, cache: Path) -> SurfaceSet:
-    """A scene of the program's own, rendered once into the cache, or DATA/NAME/images.
+    """Return one of the program's own scenes, rendered once into the cache, or DATA/NAME/images.
 
     Args:
         name: of a scene, SCENE@SEED for another walk and other noise, or of a folder.
@@ -52,7 +52,7 @@ def surface_set(name: str, data: Path | None, cache: Path) -> SurfaceSet:
 
 
 def part_of(whole: SurfaceSet, count: int, cache: Path) -> SurfaceSet:
-    """The first photos of a set."""
+    """Make a set of the first photos of another."""
     folder = cache / "parts" / f"{whole.name}-{count}"
     folder.mkdir(parents=True, exist_ok=True)
     photos = sorted(path for path in whole.photos.iterdir() if path.suffix.lower() in FORMATS)
@@ -62,13 +62,13 @@ def part_of(whole: SurfaceSet, count: int, cache: Path) -> SurfaceSet:
 
 
 def finished_model(photos: Path, out: Path, settings: Settings) -> Model:
-    """The textured surface that a finished run holds; with colors of the vertices where there is no texture."""
+    """Read the textured surface of a finished run, or the one with vertex colors where there is no texture."""
     with opened_run(out, settings, None) as run:
         return run_stages(photos, run, last=TEXTURE.name)[TEXTURE]
 
 
 def dense_stages() -> Sequence[str]:
-    """The stages behind the cameras, in order."""
+    """List the stages after the cameras, in order."""
     return NAMES[NAMES.index(SCENE.name) + 1 :]
 
 

@@ -25,7 +25,7 @@ _VERTEX = np.dtype(
 
 
 def sparse_surfaces(model_dir: Path) -> Iterator[tuple[float, Surface]]:
-    """Surfaces under several trimmings: the more is trimmed, the less lies where there are no points."""
+    """Yield surfaces under several trimmings: more trimming leaves less surface where there are no points."""
     points, normals, colors = oriented_points(pycolmap.Reconstruction(model_dir))
     with tempfile.TemporaryDirectory(prefix="rival-") as scratch:
         source, target = Path(scratch) / "points.ply", Path(scratch) / "mesh.ply"
@@ -41,7 +41,7 @@ def sparse_surfaces(model_dir: Path) -> Iterator[tuple[float, Surface]]:
 
 
 def oriented_points(model: "pycolmap.Reconstruction") -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
-    """Points (N, 3), unit normals (N, 3) of their surroundings, turned to the photos that see them, colors (N, 3)."""
+    """Return points (N, 3), unit normals (N, 3) that face the photos that see them, and colors (N, 3)."""
     centers = {key: image.projection_center() for key, image in model.images.items() if image.has_pose}
     known = [model.points3D[key] for key in sorted(model.points3D)]
     points = np.array([point.xyz for point in known]).reshape(-1, 3)
@@ -55,7 +55,7 @@ def oriented_points(model: "pycolmap.Reconstruction") -> tuple[FloatArray, Float
 
 
 def points_ply(points: FloatArray, normals: FloatArray, colors: NDArray[np.uint8]) -> bytes:
-    """As COLMAP writes fused.ply."""
+    """Encode the points as COLMAP writes fused.ply."""
     rows = np.empty(len(points), _VERTEX)
     for names, values in (("xyz", points), (("nx", "ny", "nz"), normals), ("rgb", colors)):
         for k, name in enumerate(names):

@@ -26,7 +26,7 @@ HIDDEN = 2e-3
 
 
 def truth_scores(surface: Surface, centers: Mapping[str, FloatArray], truth: Truth, seen: FloatArray) -> Row:
-    """Accuracy, completeness, their harmonic mean, the median distance, the share that is right in detail; in percent.
+    """Return accuracy, completeness, F, median distance and the share that is right in detail, all in percent.
 
     Args:
         surface: in the frame of the reconstruction; moved onto the truth by the camera centers.
@@ -47,7 +47,7 @@ def truth_scores(surface: Surface, centers: Mapping[str, FloatArray], truth: Tru
 
 
 def seen_places(truth: Truth, photos: int = SEEN_BY, samples: int = 3 * SAMPLES) -> FloatArray:
-    """Places of the true surface, evenly over its area, that so many photos see: in the photo, in front, not hidden.
+    """Sample places of the true surface, evenly over its area, that enough photos see: in frame, in front, not hidden.
 
     Args:
         truth: of the rendered photos.
@@ -76,7 +76,7 @@ def seen_places(truth: Truth, photos: int = SEEN_BY, samples: int = 3 * SAMPLES)
 
 
 def _with_normals(truth: Truth, samples: int) -> tuple[FloatArray, FloatArray]:
-    """Points on the surface and the normals of their triangles."""
+    """Sample points on the surface, with the normals of their triangles."""
     places, face = sample_triangles(truth.vertices, truth.faces, samples)
     corners = truth.vertices[truth.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -36,7 +36,7 @@ class Said:
 def run_stages(
     photos: Path, out: Path, stages: Sequence[str], settings: Mapping[str, Any], again: Sequence[str] = ()
 ) -> dict[str, Said]:
-    """Run the program stage by stage; stops where one fails.
+    """Run the program stage by stage, and stop where one fails.
 
     Args:
         photos: folder with photos.

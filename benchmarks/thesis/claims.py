@@ -15,7 +15,7 @@ class Claim:
 
 
 def verdict(holds: Sequence[bool]) -> str:
-    """In words."""
+    """Return the verdict in words."""
     if all(holds):
         return "holds"
     return "holds in part" if any(holds) else "does not hold"

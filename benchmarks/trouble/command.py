@@ -49,7 +49,7 @@ OPEN = Lock()
 
 
 def folder_of(seed: int, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
-    """The photos of a seed, their truth, and its troubles; rendered on first use."""
+    """Return the photos of a seed, their truth and its troubles; rendered on first use."""
     plan = troubled_folder(seed)
     photos, truth = cache / "trouble" / "photos" / f"{seed:05d}", cache / "trouble" / "truth" / f"{seed:05d}"
     with OPEN:
@@ -60,7 +60,7 @@ def folder_of(seed: int, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
 
 
 def run_folder(seed: int, args: argparse.Namespace) -> Row:
-    """One folder through the program, and what came out."""
+    """Run the program on one folder, and score the result."""
     photos, truth, troubles = folder_of(seed, args.cache)
     out = args.cache / "trouble" / "runs" / f"{seed:05d}"
     key = key_of(Method(OURS), PhotoSet(photos.name, photos, {}))
@@ -80,7 +80,7 @@ def run_folder(seed: int, args: argparse.Namespace) -> Row:
 
 
 def text(row: Row) -> str:
-    """A folder in one line."""
+    """Describe a folder in one line."""
     shown = ("placed", "AUC@5", "known", "focal %", "known after", "focal % after", "worst in sd")
     figures = ", ".join(f"{name} {row[name]}" for name in shown if row.get(name) is not None)
     return (
@@ -89,7 +89,7 @@ def text(row: Row) -> str:
 
 
 def scored(out: Path, truth: Truth) -> Row:
-    """What came out, beside the truth."""
+    """Score the result against the truth."""
     photos = {
         Path(name).stem: TruePhoto(camera.K, truth.cam_from_world[name], camera.width)
         for name, camera in truth.cameras.items()
@@ -112,7 +112,7 @@ def scored(out: Path, truth: Truth) -> Row:
 
 
 def known_cameras(out: Path, photos: dict[str, TruePhoto], when: str, stated: Sequence[Row] = ()) -> Row:
-    """How many photos have a camera that is called known, and how far the worst of them is off, photo by photo."""
+    """Count the photos with a camera that is called known, and return the error of the worst of them."""
     suffix, (found, camera_of) = ("", cameras_before(out)) if when == "before" else (" after", cameras_after(out))
     sure = {row["camera"] for row in stated if row["identifiable"] == "yes"}
     known = {name for name, camera in found.items() if (camera["identifiable"] if when == "before" else name in sure)}
@@ -130,7 +130,7 @@ def known_cameras(out: Path, photos: dict[str, TruePhoto], when: str, stated: Se
 
 
 def summary(rows: Sequence[Row]) -> Row:
-    """Some folders in figures."""
+    """Summarize some folders."""
     known = [row for row in rows if row["focal %"] is not None]
     stated = sum(row["stated"] for row in rows)
     return {
@@ -147,7 +147,7 @@ def summary(rows: Sequence[Row]) -> Row:
 
 
 def by_trouble(rows: Sequence[Row]) -> Iterator[Row]:
-    """The summary of all folders, and of those with each trouble."""
+    """Yield the summary of all folders, and of those with each trouble."""
     yield {"trouble": "all"} | summary(rows)
     for kind in ("none", *KINDS):
         if having := [row for row in rows if kind in row["troubles"].split(", ")]:
@@ -155,7 +155,7 @@ def by_trouble(rows: Sequence[Row]) -> Iterator[Row]:
 
 
 def demands(rows: Sequence[Row]) -> list[Row]:
-    """What is asked of all folders together."""
+    """Check what is required of all folders together."""
     all_of = summary(rows)
     before, after, allowed = all_of["K wrong"], all_of["K wrong after"], int(WRONG_SHARE * len(rows))
     stated, off = sum(row["stated"] for row in rows), sum(row["beyond 3 sd"] for row in rows)
@@ -174,7 +174,7 @@ def demands(rows: Sequence[Row]) -> list[Row]:
 
 
 def page(rows: Sequence[Row]) -> str:
-    """The tables: what is asked, trouble by trouble, and the folders that are far off."""
+    """Return the tables: requirements, results by trouble, and the folders that are far off."""
     far = [row for row in rows if row["exit code"] not in EXPECTED or row["wrong"] or row["wrong after"]]
     shown = (
         "seed", "troubles", "exit code", "last", "placed", "AUC@5", "known", "focal %", "known after", "focal % after",
@@ -195,7 +195,7 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("trouble", __doc__)
     parser.add_argument("--cache", type=Path, required=True, help="keeps rendered photos and runs")
     parser.add_argument("--folders", type=int, default=200)
@@ -211,7 +211,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Run all folders, and publish after each."""
+    """Run all folders, and write the results after each."""
     args = parser().parse_args()
     seeds = args.only or [args.seed + k for k in range(args.folders)]
     rows: list[Row] = []

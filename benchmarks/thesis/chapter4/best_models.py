@@ -33,7 +33,7 @@ class BestModel:
 
 
 def trace(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int, *, guided: bool) -> Iterator[BestModel]:
-    """Every new best model of a search, with samples drawn by the priors (LEV-RANSAC) or uniformly (RANSAC).
+    """Yield every new best model of a search, with samples drawn by the priors (LEV-RANSAC) or uniformly (RANSAC).
 
     The search ends by Eq. 3.19 alone, so that there is more to see than until the priors have converged.
     """
@@ -61,7 +61,7 @@ def trace(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int, 
 def refits(
     x1: FloatArray, x2: FloatArray, options: EpipolarSettings, repeats: int, seed: int
 ) -> Iterator[dict[str, float]]:
-    """Mean residual in px of a 7-point model of a random sample, and of its refits to its own inliers (Figure 4.4)."""
+    """Yield the mean residual in px of a 7-point model of a random sample and of refits to its inliers (Figure 4.4)."""
     matches, state = prepare(x1, x2, seed), random_state(seed)
     points, threshold = matches.points, options.max_error_px / matches.unit_px
     done = 0
@@ -84,7 +84,7 @@ def refits(
 
 
 def _candidates(points: FloatArray, state: RandomState, cumulative: FloatArray) -> list[FloatArray]:
-    """The one to three models through one sample."""
+    """Return the one to three models through one sample."""
     sample, models = np.empty(SAMPLE_SIZE, np.int64), np.empty((MOST_MODELS, 9))
     if not (len(cumulative) and draw_weighted(state, cumulative, sample)):
         draw_uniform(state, len(points), sample)
@@ -92,5 +92,5 @@ def _candidates(points: FloatArray, state: RandomState, cumulative: FloatArray) 
 
 
 def _as_given(matches: Matches, *values: FloatArray) -> Iterator[FloatArray]:
-    """From the shuffled order of `Matches` back to that of the caller."""
+    """Reorder values from the shuffled order of `Matches` back to the caller's."""
     return (value[matches.rows] for value in values)

@@ -72,13 +72,13 @@ TRACED = (
 
 
 def claims_of_sweep(rows: Sequence[Row]) -> list[Claim]:
-    """Figures 4.11 to 4.13: one row per estimator and level."""
+    """Judge the claims of Figures 4.11 to 4.13; `rows` has one row per estimator and level."""
     claims = [_compared(rows, comparison) for comparison in COMPARISONS]
     return sorted(claims + [_steady(rows, *names) for names in STEADY_ONES], key=lambda claim: claim.figure)
 
 
 def claims_of_traces(traces: Mapping[str, Sequence[Row]], figures: Sequence[str]) -> list[Claim]:
-    """Figures 4.7 to 4.9: `traces` holds, per sequence, one row for every best model."""
+    """Judge the claims of Figures 4.7 to 4.9; `traces` holds, per sequence, one row for every best model."""
     found = []
     for figure, says, column, sign in (entry for entry in TRACED if entry[0] in figures):
         holds, numbers = [], []
@@ -93,7 +93,7 @@ def claims_of_traces(traces: Mapping[str, Sequence[Row]], figures: Sequence[str]
 
 
 def claim_of_refits(rows: Sequence[Row]) -> Claim:
-    """Figure 4.4: one row per sample."""
+    """Judge the claim of Figure 4.4; `rows` has one row per sample."""
     minimal, linear = (np.array([row[name] for row in rows]) for name in ("7-point", "8-point refit"))
     medians = f"median {np.median(linear):.3g} against {np.median(minimal):.3g} px"
     numbers = f"lower in {np.mean(linear < minimal):.0%} of {len(rows)} samples, {medians}"
@@ -101,7 +101,7 @@ def claim_of_refits(rows: Sequence[Row]) -> Claim:
 
 
 def curve(rows: Sequence[Row], method: str, column: str) -> dict[float, float]:
-    """A column of one estimator by outlier ratio; empty where it was not measured."""
+    """Return a column of one estimator by outlier ratio; empty where it was not measured."""
     return {row["outliers"]: row[column] for row in rows if row["method"] == method}
 
 

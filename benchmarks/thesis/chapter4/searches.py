@@ -29,7 +29,7 @@ class Search:
         return (None, None) if found is None else (matches.to_pixels(found.F), found.trials)
 
     def errors_after_refit_px(self, pairs: list[TwoViews]) -> FloatArray:
-        """(N,) capped errors of the last calls, which were on these pairs, after the estimator's own final fit."""
+        """Return (N,) capped errors of the last calls, one per pair, after the estimator's own final fit."""
         errors = []
         for pair, (matches, found) in zip(pairs, self._found[-len(pairs) :], strict=True):
             F = None
@@ -42,6 +42,6 @@ class Search:
 
 
 def searches(names: list[str], options: EpipolarSettings) -> dict[str, Search]:
-    """By the name of the estimator."""
+    """Return searches by the name of the estimator."""
     recipes = {"lev-ransac": PRODUCTION} | {name: recipe for name, (recipe, _) in RECIPES.items()}
     return {name: Search(recipes[name], options) for name in names}

@@ -57,7 +57,7 @@ CACHE = Path.home() / ".cache" / "sfm-app-benchmarks"
 
 
 def setting_of(lab: Lab) -> str:
-    """What a reader must know of all figures."""
+    """Describe the setting that all figures share."""
     return (
         f"{lab.tests} tests a level, {lab.runs} runs a sequence ({lab.fewer}), "
         f"seed {lab.seed}. Synthetic sequences are those of section 5.5.3: five cameras, 512 x 512, 200 points, fx 500 "
@@ -71,7 +71,7 @@ def setting_of(lab: Lab) -> str:
 
 
 def page(lab: Lab, drawn: Mapping[str, Drawn]) -> str:
-    """The Markdown page."""
+    """Return the Markdown page."""
     claimed = [
         {"figure": claim.figure, "the thesis": claim.says, "here": claim.verdict, "numbers": claim.numbers}
         for part in drawn.values()
@@ -91,7 +91,7 @@ def page(lab: Lab, drawn: Mapping[str, Drawn]) -> str:
 
 
 def answers(drawn: Mapping[str, Drawn]) -> list[dict[str, object]]:
-    """Per experiment and level, how often the production method answers."""
+    """Return, per experiment and level, the share of tests that the production method answers."""
     rows = [row for part in drawn.values() for row in part.rows if row["method"] == PRODUCTION and "part" in row]
     found: dict[str, dict[str, object]] = {}
     for row in rows:
@@ -101,13 +101,13 @@ def answers(drawn: Mapping[str, Drawn]) -> list[dict[str, object]]:
 
 
 def most_of(text: str) -> tuple[str, int]:
-    """METHOD=N of the command line."""
+    """Parse METHOD=N of the command line."""
     method, _, count = text.partition("=")
     return method, int(count)
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("thesis.chapter5", __doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("--tests", type=int, default=20, help="seeds per level; 100 in the thesis")
@@ -134,7 +134,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Draw every figure, judge the claims, and publish."""
+    """Draw every figure, judge the claims, and write the results."""
     args = parser().parse_args()
     on_one_thread()
     pyplot()  # said before an hour of work

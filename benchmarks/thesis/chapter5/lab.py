@@ -50,7 +50,7 @@ class Lab:
     _contests: dict[str, list[Row]] = field(default_factory=dict)
 
     def sequence(self, name: str) -> ImageSequence:
-        """A real sequence by the thesis's name."""
+        """Return a real sequence by the thesis's name."""
         if name not in self._sequences:
             found = corner_sequence(self.data, name) if name in CORNERS else photo_sequence(self.data, name, self.cache)
             self._sequences[name] = found
@@ -63,7 +63,7 @@ class Lab:
         tests: int | None = None,
         also: Mapping[str, str] | None = None,
     ) -> list[Row]:
-        """The rows of an experiment of `setups`; each is run once. `also`: more methods, tested as often as others."""
+        """Return the rows of an experiment of `setups`, run once; `also`: more methods, each with another's test count."""
         title = f"{experiment.__name__} {sequence}".strip()
         if title not in self._contests:
             count = self.tests if tests is None else tests
@@ -75,14 +75,14 @@ class Lab:
 
     @property
     def fewer(self) -> str:
-        """The methods that have fewer tests or runs, for people."""
+        """Methods that have fewer tests or runs, as text."""
         most = max(self.tests, self.runs)
         return (
             ", ".join(f"at most {count} of `{name}`" for name, count in self.most.items() if count < most) or "of all"
         )
 
     def keep(self, number: str, figure: Any, rows: Sequence[Row]) -> None:
-        """Write the PNG and the CSV of a figure, where it is asked for."""
+        """Write the PNG and the CSV of a figure, if it was asked for."""
         if not is_wanted(self.pictures, number):
             pyplot().close(figure)
             return

@@ -50,14 +50,14 @@ class ImageSequence:
         return first
 
     def first(self, count: int) -> "ImageSequence":
-        """The same, of the first views alone."""
+        """Return the sequence of the first views alone."""
         ids = sorted({view for pair in self.matches for view in pair})[:count]
         kept = {pair: rows for pair, rows in self.matches.items() if set(pair) <= set(ids)}
         return replace(self, matches=kept)
 
 
 def corner_sequence(data: Path, name: str) -> ImageSequence:
-    """Corners and cameras of a VGG sequence under DATA/vgg-corners, all of whose pairs are used."""
+    """Read corners and cameras of a VGG sequence under DATA/vgg-corners; all of its pairs are used."""
     folder, size = data / "vgg-corners" / CORNERS[name][0], CORNERS[name][1]
     Ps = np.array([np.loadtxt(path) for path in sorted(folder.glob("*.P"))])
     found = {
@@ -69,7 +69,7 @@ def corner_sequence(data: Path, name: str) -> ImageSequence:
 
 
 def photo_sequence(data: Path, name: str, cache: Path) -> ImageSequence:
-    """Raw matches of the pairs that the program keeps, found under CACHE/NAME or made there from DATA/NAME/images."""
+    """Read the raw matches of the pairs that the program keeps, from CACHE/NAME, or make them from DATA/NAME/images."""
     place = data / PHOTOS[name]
     with opened_run(cache / PHOTOS[name], Settings(), None) as run:
         products = run_stages(place / "images", run, last=VIEW_GRAPH.name)
@@ -82,14 +82,14 @@ def photo_sequence(data: Path, name: str, cache: Path) -> ImageSequence:
 
 
 def camera_matrix_of(P: FloatArray) -> FloatArray:
-    """(3, 3) K of a projection matrix P ~ K [R | t] (3, 4), positive diagonal, K[2, 2] = 1."""
+    """Decompose a projection matrix P ~ K [R | t] (3, 4), and return K (3, 3), positive diagonal, K[2, 2] = 1."""
     K, _ = rq(P[:, :3])
     K = K * np.sign(np.diag(K))
     return np.asarray(K / K[2, 2])
 
 
 def fundamental_of(P1: FloatArray, P2: FloatArray) -> FloatArray:
-    """(3, 3) F of unit norm with x2' F x1 = 0 (Hartley & Zisserman, eq. 9.1)."""
+    """Compute F (3, 3) of unit norm with x2' F x1 = 0 (Hartley & Zisserman, eq. 9.1)."""
     center = np.linalg.svd(P1)[2][-1]
     e2 = P2 @ center
     cross = np.array([[0, -e2[2], e2[1]], [e2[2], 0, -e2[0]], [-e2[1], e2[0], 0]])

@@ -41,7 +41,7 @@ class Trial(NamedTuple):
 
 
 def matching_outliers(seed: int) -> Iterator[Trial]:
-    """Two of ten F's are outlying; the share of their outliers varies (Figures 5.6a, 5.10a, 5.17a, 5.18a and c)."""
+    """Vary the share of outliers in two of ten F's (Figures 5.6a, 5.10a, 5.17a, 5.18a and c)."""
     tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX), seed)
     clean = robust_fits(dict(pair_matches(tracks)), seed)
     chosen = _shuffled(tracks.pairs, seed)[:2]
@@ -51,14 +51,14 @@ def matching_outliers(seed: int) -> Iterator[Trial]:
 
 
 def focal_deviation(seed: int) -> Iterator[Trial]:
-    """One of five frames has a longer focal length (Figures 5.6b, 5.10b, 5.17b, 5.18b and d)."""
+    """Vary the focal length of one of five frames (Figures 5.6b, 5.10b, 5.17b, 5.18b and d)."""
     for deviation in DEVIATIONS:
         tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX, other_focal=1.0 + deviation), seed)
         yield Trial(100 * deviation, robust_fits(dict(pair_matches(tracks)), seed), tracks.size, tracks.K[0])
 
 
 def outlying_matrices(seed: int) -> Iterator[Trial]:
-    """The number of outlying F's varies, each from 50 % outliers (Figure 5.19a)."""
+    """Vary the number of outlying F's, each from 50 % outliers (Figure 5.19a)."""
     tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX), seed)
     clean = robust_fits(dict(pair_matches(tracks)), seed)
     order = _shuffled(tracks.pairs, seed)
@@ -68,7 +68,7 @@ def outlying_matrices(seed: int) -> Iterator[Trial]:
 
 
 def outlying_corners(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
-    """The same with the corners of a real sequence (Figure 5.19b)."""
+    """Vary the number of outlying F's, with the corners of a real sequence (Figure 5.19b)."""
     clean = robust_fits(sequence.matches, seed)
     order = _shuffled(clean, seed)
     spoilt = {}
@@ -81,7 +81,7 @@ def outlying_corners(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
 
 
 def raw_pairs(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
-    """Seven photos; the number of F's that are fitted to all raw matches varies (Figure 5.20)."""
+    """Vary the number of F's that are fitted to all raw matches, with seven photos (Figure 5.20)."""
     seven = sequence.first(7)
     clean = robust_fits(seven.matches, seed)
     order = _shuffled(clean, seed)
@@ -90,14 +90,14 @@ def raw_pairs(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
 
 
 def gaussian_noise(seed: int) -> Iterator[Trial]:
-    """The noise of all matches varies, without outliers (Figure 5.21)."""
+    """Vary the noise of all matches, without outliers (Figure 5.21)."""
     for sigma_px in NOISES_PX:
         tracks = make_tracks(TrackOptions(sigma_px=sigma_px), seed)
         yield Trial(sigma_px, robust_fits(dict(pair_matches(tracks)), seed), tracks.size, tracks.K[0])
 
 
 def noisy_frame(seed: int) -> Iterator[Trial]:
-    """The number of frames varies; all F's with the last one are outlying, from 50 % outliers (Figure 5.22a)."""
+    """Vary the number of frames; all F's with the last one are outlying, from 50 % outliers (Figure 5.22a)."""
     for count in FRAMES:
         tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX, cameras=count), seed)
         clean = robust_fits(dict(pair_matches(tracks)), seed)
@@ -107,14 +107,14 @@ def noisy_frame(seed: int) -> Iterator[Trial]:
 
 
 def clean_frames(seed: int) -> Iterator[Trial]:
-    """The number of frames varies, without outliers: for the computation times (Figure 5.22b)."""
+    """Vary the number of frames, without outliers: for the computation times (Figure 5.22b)."""
     for count in FRAMES:
         tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX, cameras=count), seed)
         yield Trial(count, robust_fits(dict(pair_matches(tracks)), seed), tracks.size, tracks.K[0])
 
 
 def whole_sequence(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
-    """All pairs of a real sequence (Tables 5.2 and 5.3)."""
+    """Yield all pairs of a real sequence (Tables 5.2 and 5.3)."""
     yield Trial(0, robust_fits(sequence.matches, seed), sequence.size, sequence.K)
 
 

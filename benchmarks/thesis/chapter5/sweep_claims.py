@@ -81,12 +81,12 @@ CLAIMS = (
 
 
 def claims_of(found: Mapping[str, Sequence[Row]]) -> list[Claim]:
-    """The claims about these plots, given the rows of each."""
+    """Judge the claims about these plots, given the rows of each."""
     return [_judged(found[said.part], said) for said in CLAIMS if said.part in found]
 
 
 def value(rows: Sequence[Row], method: str, x: float, column: str) -> float:
-    """A figure of one method at one level; NaN where there is none."""
+    """Return a figure of one method at one level; NaN where there is none."""
     held = next((row[column] for row in rows if row["method"] == method and row["x"] == x), None)
     return float("nan") if held is None else float(held)
 
@@ -106,7 +106,7 @@ def _judged(rows: Sequence[Row], said: Said) -> Claim:
 
 
 def holds(said: Said, own: Sequence[float], others: Sequence[Sequence[float]] = ()) -> list[bool]:
-    """Whether the sentence holds, level by level or once; NaN never does."""
+    """Check the claim at each level, or once for the whole curve; NaN never holds."""
     match said.kind:
         case "below":
             factor = said.limit or 1.0
