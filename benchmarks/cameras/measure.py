@@ -1,4 +1,4 @@
-"""One method on one photo set: run, and scored against the truth."""
+"""Run one method on one photo set, and score it against the truth."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ from benchmarks.common.results import Row
 EACH = ("reichstag10",)
 """Sets in which every photo has its own camera."""
 FEW = 6
-"""Sets with fewer photos do not need all kernels."""
+"""Sets with fewer photos do not use all kernels."""
 
 
 def warm_up(sets: Sequence[PhotoSet], these: Sequence[Method], out: Path) -> None:

@@ -1,4 +1,4 @@
-"""The ways from photos to cameras, and how one of them is run: in a process of its own, see worker.py."""
+"""The methods that turn photos into cameras; each runs in a process of its own, see worker.py."""
 
 import json
 import shutil
@@ -22,13 +22,13 @@ WORKER = "benchmarks.cameras.worker"
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """One way from photos to cameras."""
+    """A method that turns photos into cameras."""
 
     name: str
     kind: str = OURS
     """`OURS`, or one of `STOCK`."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Of the program, beside its defaults."""
+    """Settings of the program that differ from its defaults."""
 
 
 def methods(also: Mapping[str, Mapping[str, Any]], *, ours_only: bool = False) -> list[Method]:
@@ -46,7 +46,7 @@ def taking_turns(these: Sequence[Method], repetition: int) -> list[Method]:
 def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = None) -> Row:
     """Run a method from scratch into OUT, and return its times, its peak memory and the reason if it failed.
 
-    What has not ended after `limit_s` is ended, with all that it has started.
+    After `limit_s` the process is killed, together with its children.
     """
     shutil.rmtree(out, ignore_errors=True)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -63,7 +63,7 @@ def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = Non
     if (out / RESULT).exists():
         found: Row = json.loads((out / RESULT).read_text(encoding="utf-8"))
         return said | found
-    failed = f"not done after {limit_s:g} s" if code is None else f"exit code {code}: {last}"
+    failed = f"not finished after {limit_s:g} s" if code is None else f"exit code {code}: {last}"
     return said | {"failed": failed, "exit code": code, "seconds": {}, "peak MB": None}
 
 

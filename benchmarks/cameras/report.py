@@ -1,4 +1,4 @@
-"""Camera poses of several methods as a page: medians over the repetitions, tables, and one figure."""
+"""The result page of camera poses: medians over the repetitions, tables, and one figure."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What a method left behind on one photo set, as plain figures: poses, cameras, stated deviations, times."""
+"""Scores of one method's output on one photo set: poses, cameras, stated deviations, times."""
 
 import hashlib
 import json
@@ -30,16 +30,16 @@ STEPS = {
     "match_and_verify": "features + matches", "view_graph": "view graph", "intrinsics": "K", "calibrate": "K",
     "scene": "map + BA", "map": "map + BA",
 }  # fmt: skip
-"""Columns that the steps of the methods are counted in. COLMAP verifies pairs as part of matching, we do it after."""
+"""The column that each step is counted in. COLMAP verifies pairs as part of matching, we do it afterwards."""
 
 
 class TruePhoto(NamedTuple):
-    """What is true of one photo."""
+    """Ground truth of one photo."""
 
     K: NDArray[np.float64]
     pose: Pose
     width: float
-    """Of the photo before any change."""
+    """Width of the photo before any change."""
 
 
 class Model(NamedTuple):
@@ -156,7 +156,7 @@ def stated_deviations(out: Path, model: Model, truth: Mapping[str, TruePhoto]) -
 
 
 PLACES = {"f": ((0, 0), (1, 1)), "fx": ((0, 0),), "fy": ((1, 1),), "cx": ((0, 2),), "cy": ((1, 2),)}
-"""Entries of K that a parameter stands for; their mean counts."""
+"""Entries of K for each parameter; their mean counts."""
 
 
 def _place(K: NDArray[np.float64], name: str) -> float:

@@ -1,4 +1,4 @@
-"""What the command lines of all benchmarks share."""
+"""Options and helpers that the command lines of all benchmarks share."""
 
 import argparse
 import os
@@ -17,7 +17,7 @@ def new_parser(subject: str, text: str | None) -> argparse.ArgumentParser:
 
     Args:
         subject: name of the package, such as "cameras".
-        text: its help, printed as it stands.
+        text: its help, printed verbatim.
     """
     return argparse.ArgumentParser(
         prog=f"python -m benchmarks.{subject}",

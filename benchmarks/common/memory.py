@@ -1,4 +1,4 @@
-"""Memory of this process, by what Python itself brings: nothing else may count."""
+"""Memory of this process, measured with the standard library alone: other imports would count."""
 
 import re
 import resource

@@ -1,4 +1,4 @@
-"""Camera poses and fundamental matrices against the truth."""
+"""Errors of camera poses and fundamental matrices against the truth."""
 
 import json
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ Pose = NDArray[np.float64]
 LOST_DEG = 180.0
 """Error of a pair with a photo that has no pose, and of a pair without F."""
 CAP_PX = 5.0
-"""A fundamental matrix that is farther off than this has failed; as a capped error it counts as this much."""
+"""A fundamental matrix with a larger error has failed; capped errors count it at this value."""
 
 
 def load_truth(path: Path) -> dict[str, tuple[NDArray[np.float64], Pose]]:
@@ -45,7 +45,7 @@ def fundamental_pose_error_deg(
 ) -> float:
     """Return the larger of the errors of rotation and translation direction in F, decomposed with the true K1 and K2.
 
-    Of the four poses in F the best one counts; `LOST_DEG` without F.
+    Of the four poses in F, the best one counts. `LOST_DEG` without F.
     """
     if F is None:
         return LOST_DEG

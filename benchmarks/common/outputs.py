@@ -1,4 +1,4 @@
-"""What a run says about cameras in its output folder."""
+"""The cameras in the output folder of a run."""
 
 import json
 from pathlib import Path

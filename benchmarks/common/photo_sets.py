@@ -1,9 +1,9 @@
-"""Photo sets for calibration: copies that tell nothing about the camera, changed as asked, and what is true of them.
+"""Photo sets for calibration: copies without metadata, changed as requested, and their ground truth.
 
 A change is written as steps joined by "+": ``crop:LEFT,TOP`` cuts columns and rows, ``scale:SX,SY`` resizes, and
-``window:LEFT,TOP,WIDTH,HEIGHT`` keeps a part. Three bring photos of any size to one, as services on the web do:
-``pad:W,H`` makes the photo fit and leaves black bars on both sides, ``corner:W,H`` puts it to the top left, and
-``fill:W,H`` makes it cover all and cuts off what is left over.
+``window:LEFT,TOP,WIDTH,HEIGHT`` keeps a part. Three steps bring photos of any size to one size, as web services do:
+``pad:W,H`` fits the photo in with black bars on both sides, ``corner:W,H`` puts it at the top left, and
+``fill:W,H`` covers the frame and cuts off the rest.
 """
 
 import json
@@ -21,9 +21,9 @@ from PIL import Image, ImageOps
 
 FORMATS = (".jpg", ".jpeg", ".png")
 STEPS = {"crop": 2, "scale": 2, "window": 4, "pad": 2, "corner": 2, "fill": 2}
-"""Kinds of change, and how many figures each takes."""
+"""Kinds of change, and how many numbers each takes."""
 ONE_SIZE = ("pad", "corner", "fill")
-"""Those after which all photos have one size."""
+"""Kinds after which all photos have one size."""
 
 Step = tuple[str, tuple[float, ...]]
 
@@ -39,27 +39,27 @@ def put(photo: Path, folder: Path) -> None:
 
 
 EVERY = "every:"
-"""No change of pixels: ``every:N`` takes every Nth photo, by name."""
+"""Prefix of ``every:N``, which takes every Nth photo by name and changes no pixels."""
 
 
 def stride(text: str) -> int:
     """Return the stride at which a change takes photos, 1 where it names none.
 
     Raises:
-        ValueError: that is no positive number.
+        ValueError: the stride is not positive.
     """
     found = [int(part.removeprefix(EVERY)) for part in text.split("+") if part.startswith(EVERY)]
     if any(number < 1 for number in found):
-        raise ValueError(f"'{text}' takes every 0th photo")
+        raise ValueError(f"'{text}': N of every:N must be at least 1")
     return math.prod(found)
 
 
 class TrueCamera(NamedTuple):
-    """What took a photo."""
+    """The true camera of a photo."""
 
     K: NDArray[np.float64]
     k1: float | None = None
-    """Of COLMAP's SIMPLE_RADIAL; None where nobody knows."""
+    """k1 of COLMAP's SIMPLE_RADIAL; None where it is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,21 +67,21 @@ class PhotoSet:
     """Photos without EXIF."""
 
     name: str
-    """Of the set, with the change behind a blank."""
+    """Name of the set, a space, and the change."""
     folder: Path
     truth: Mapping[str, TrueCamera]
-    """By photo name without suffix; empty where nobody knows."""
+    """By photo name without suffix; empty where it is unknown."""
     cameras: str = "auto"
     """Which photos share a camera, as in the setting `photos.cameras`."""
     told: bool = True
-    """Whether the program gets to know that."""
+    """Whether the program is given `cameras`."""
 
 
 def steps(text: str) -> list[Step]:
     """Parse the steps of a change.
 
     Raises:
-        ValueError: a kind is not known, or has another number of figures.
+        ValueError: a kind is unknown, or has the wrong number of values.
     """
     found = []
     for part in (part for part in text.split("+") if part and not part.startswith(EVERY)):
@@ -89,20 +89,20 @@ def steps(text: str) -> list[Step]:
         values = tuple(float(value) for value in figures.split(","))
         if STEPS.get(kind) != len(values):
             raise ValueError(
-                f"'{part}' is none of crop:LEFT,TOP scale:SX,SY window:LEFT,TOP,WIDTH,HEIGHT pad:W,H corner fill"
+                f"'{part}' is not one of crop:LEFT,TOP scale:SX,SY window:LEFT,TOP,WIDTH,HEIGHT pad:W,H corner fill"
             )
         found.append((kind, values))
     return found
 
 
 class Frame(NamedTuple):
-    """Where a photo that is brought to a size comes to lie."""
+    """Where a resized photo lies in its frame."""
 
     size: tuple[int, int]
-    """Of the photo, resized."""
+    """Size of the resized photo."""
     left: int
     top: int
-    """Of its first pixel; negative where it is cut off."""
+    """Left and top of its first pixel; negative where it is cut off."""
 
 
 def framed(kind: str, size: tuple[int, int], wanted: Sequence[float]) -> Frame:

@@ -1,4 +1,4 @@
-"""Processes of their own for what is measured: how they are started and ended."""
+"""Start and stop the processes that are measured."""
 
 import os
 import signal
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-"""Of the project."""
+"""Root folder of the project."""
 
 
 def module_command(module: str, *arguments: str) -> list[str]:
@@ -35,8 +35,8 @@ def end_of(command: Sequence[str], limit_s: float | None = None) -> tuple[int | 
             code = None
         finally:
             if process.poll() is None:  # too slow, or we are interrupted
-                os.killpg(process.pid, signal.SIGKILL)  # its mappers have processes of their own
+                os.killpg(process.pid, signal.SIGKILL)  # mappers run in processes of their own
                 process.wait()
         errors.seek(0)
-        lines = errors.read().strip().splitlines() or ["no word"]
+        lines = errors.read().strip().splitlines() or ["no output on stderr"]
         return code, next((line for line in reversed(lines) if line.startswith("error: ")), lines[-1])

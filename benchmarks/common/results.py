@@ -1,4 +1,4 @@
-"""What every benchmark writes: one JSON document with all that is needed to repeat it, and Markdown tables.
+"""Results of every benchmark: one JSON document with all that is needed to repeat it, and Markdown tables.
 
 The document:
 

@@ -1,4 +1,4 @@
-"""What every set of the corpus has to reach, and the corpus as a whole."""
+"""Bars for every set of the corpus, and for the corpus as a whole."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -25,17 +25,17 @@ SEEN_LATER: Mapping[str, tuple[Bar, ...]] = {
     "temple16": (WHOLE,),
     "fountain-P11": (WHOLE,),
 }  # fmt: skip
-"""Beside the bars of the cameras' table."""
+"""In addition to the bars of the cameras' table."""
 PADDED_BARS = (least("AUC@5", 0.60), least("cameras", 2))
-"""Of reichstag10 with all photos brought to one size: not taken for one camera."""
+"""For reichstag10 with all photos brought to one size: they must not be taken for one camera."""
 UNFOLDED_AT: Mapping[str, tuple[str, float]] = {
     "oats23": ("axis of the worst part", 0.95),
     "books21": ("distance of the worst part", 0.8),
 }
-"""Figure that a walk, or each of its parts, has to reach so as not to count as folded."""
+"""The score below which a walk, or its worst part, counts as folded."""
 PADDED = "pad:"
 SLACK = 0.01
-"""AUC moves by so much from seed to seed (CONTRIBUTING.md)."""
+"""AUC varies by this much from seed to seed (CONTRIBUTING.md)."""
 
 
 def bars_of(title: str) -> tuple[Bar, ...]:
@@ -58,7 +58,7 @@ def behind(row: Row, stock: Row, slack: float = 0.0) -> str:
 
 
 class Demand(NamedTuple):
-    """Something asked of all runs together."""
+    """A requirement on all runs together."""
 
     asked: str
     found: str
@@ -70,7 +70,7 @@ def demands(rows: Sequence[Row], stated: Sequence[Row]) -> list[Demand]:
 
     Args:
         rows: our runs.
-        stated: parameters of all of them.
+        stated: the parameters of all our runs.
     """
     seen = counted(stated)
     codes = [row["exit code"] for row in rows]

@@ -1,11 +1,11 @@
-"""Every photo set of DATA as it is, and changed, through `sfm-app` and stock pycolmap: one table.
+"""Run `sfm-app` and stock pycolmap on every photo set of DATA, as it is and changed: one table.
 
     python -m benchmarks.corpus DATA --cache CACHE --keep
     python -m benchmarks.corpus DATA --cache CACHE --sets merton1 "kitchen1000 every:5" --ours-only
     python -m benchmarks.corpus DATA --cache CACHE --score-only
 
-A command that was interrupted goes on with --keep: what has been run with the same program, settings and photos is not
-run again. --score-only runs nothing and makes the table of all that lies in CACHE.
+--keep continues an interrupted command: what has been run with the same program, settings and photos is not
+run again. --score-only runs nothing and makes the table from the runs in CACHE.
 """
 
 import argparse
@@ -40,7 +40,7 @@ ABOUT = (
     "Exit codes are those of the command: 0, 4 where the photos do not support a scene, none where it ran out of time."
 )
 EVERY = {"kitchen1000": "every:5"}
-"""Sets of which a part is taken unless --sets says otherwise."""
+"""Changes of sets that are not run in full unless --sets names them."""
 PADDED = "reichstag10 pad:1024,1024"
 """Photos of ten cameras brought to one size."""
 LIMIT_MIN = 40.0
@@ -124,7 +124,7 @@ def all_runs(args: argparse.Namespace, these: Sequence[Method]) -> Iterator[tupl
                     compiled = compiled or compile_kernels(args, these)
                     done = run_anew(method, photos, out, 60 * args.limit_min)
                 row, stated = score(method, photos, out, args.data, done)
-            except Exception as error:  # unattended: the next set may still be measured
+            except Exception as error:  # runs unattended: measure the next set anyway
                 row = failed_row(title, method, error)
             print(f"[{number}/{len(args.sets)}] {line(row)}", file=sys.stderr, flush=True)
             yield row, stated
@@ -153,14 +153,16 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser("corpus", __doc__)
     parser.add_argument("data", type=Path, help="folder with NAME/images and, where known, NAME/cameras.json")
     parser.add_argument("--cache", type=Path, required=True, help="keeps copies of photos and the last run of each")
-    parser.add_argument("--sets", nargs="+", metavar="SET", help='"NAME" or "NAME CHANGE"; all where not given')
-    parser.add_argument("--without", nargs="*", default=[], metavar="SET", help="sets to leave out")
-    parser.add_argument("--stock", nargs="*", default=[INCREMENTAL], choices=STOCK, help="ways of stock pycolmap")
-    parser.add_argument("--ours-only", action="store_true", help="without stock pycolmap")
-    parser.add_argument("--also", nargs="*", default=(), metavar="TABLE.KEY=VALUE", help="ours under this, too")
-    parser.add_argument("--keep", action="store_true", help="do not run again what was run by the same program")
-    parser.add_argument("--score-only", action="store_true", help="run nothing: the table of what lies in CACHE")
-    parser.add_argument("--limit-min", type=float, default=LIMIT_MIN, metavar="M", help="minutes that a run may take")
+    parser.add_argument("--sets", nargs="+", metavar="SET", help='"NAME" or "NAME CHANGE"; all by default')
+    parser.add_argument("--without", nargs="*", default=[], metavar="SET", help="sets to skip")
+    parser.add_argument("--stock", nargs="*", default=[INCREMENTAL], choices=STOCK, help="stock mappers")
+    parser.add_argument("--ours-only", action="store_true", help="skip stock pycolmap")
+    parser.add_argument("--also", nargs="*", default=(), metavar="TABLE.KEY=VALUE", help="run ours with it, too")
+    parser.add_argument("--keep", action="store_true", help="reuse runs of the same program")
+    parser.add_argument("--score-only", action="store_true", help="run nothing: make the table from CACHE")
+    parser.add_argument(
+        "--limit-min", type=float, default=LIMIT_MIN, metavar="M", help="time limit of a run in minutes"
+    )
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--name", default="corpus", help="name of the result files")
     return parser

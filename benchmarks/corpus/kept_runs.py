@@ -1,4 +1,4 @@
-"""Finished runs in the cache, and whether they would come out the same again."""
+"""Finished runs in the cache, and whether they can be reused."""
 
 import argparse
 import hashlib
@@ -15,14 +15,14 @@ from benchmarks.common.results import Row
 from sfm_app.engine.staleness import versions
 
 RECORD = "corpus.json"
-"""In OUT: what was run, and what it said."""
+"""File in OUT with the key of a run and its result."""
 
 
 class Done(NamedTuple):
     """A finished run."""
 
     key: str
-    """Of the program, settings and photos that it was made with."""
+    """Hash of the program, settings and photos of the run."""
     said: Row
 
 

@@ -1,4 +1,4 @@
-"""The corpus as a page: what is asked of all runs, every run, and the same without sets that constants have seen."""
+"""The corpus page: requirements on all runs, every run, and the same without sets that constants were chosen on."""
 
 from collections.abc import Sequence
 
@@ -43,9 +43,9 @@ def corpus_page(about: str, rows: Sequence[Row], stated: Sequence[Row]) -> str:
     """Return the page.
 
     Args:
-        about: what is measured, and how.
+        about: the description of the measurement.
         rows: all runs.
-        stated: parameters of our cameras, one by one, with `photos` and `method`.
+        stated: one row per parameter of our cameras, with `photos` and `method`.
     """
     fresh, fresh_stated = unseen(rows, seen_sets()), unseen(stated, seen_sets())
     parts = [f"# The whole corpus\n\n{about}\n", "## What is asked of all runs\n", _demands(rows, stated)]

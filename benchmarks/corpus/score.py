@@ -1,4 +1,4 @@
-"""What a run over a set of the corpus is worth: cameras in stated deviations, walks, and what was said of folds."""
+"""Scores of a run on a set of the corpus: camera errors in stated deviations, walks, and warnings of folds."""
 
 import math
 import re
@@ -20,21 +20,21 @@ OFFSETS = ("kitchen1000",)
 """Sets whose truth is the poses of another camera on the same rig, and no K."""
 PARAMETERS = ("fx", "fy", "cx", "cy")
 FAR_SD = 3.0
-"""A parameter that is so many stated deviations off is a miss."""
+"""A parameter that is off by more stated deviations is a miss."""
 FAR_PERCENT = 3.0
-"""A focal that is called identifiable and is so far off is confidently wrong."""
+"""A focal that is called identifiable and is off by more is confidently wrong."""
 FOLD_WORDS = re.compile(r"fold|alike|beware|jump", re.IGNORECASE)
-"""What a sentence about equal things in several places has in it."""
+"""Words of a sentence about look-alike places."""
 WARNING_WORDS = re.compile(r"fold|beware", re.IGNORECASE)
-"""What it has in it where it says that the model may be wrong; "look-alikes told apart" says that it is not."""
+"""Words of a sentence that warns of a wrong model; "look-alikes told apart" is no such warning."""
 
 
 class Doubt(NamedTuple):
-    """How far the truth itself may be off, as its source says: one standard deviation, in percent."""
+    """Uncertainty of the truth itself, from its source: one standard deviation, in percent."""
 
     focal: float
     center: float
-    """Of the width."""
+    """In percent of the width."""
 
 
 DOUBTS: Mapping[str, Doubt] = {
@@ -43,13 +43,13 @@ DOUBTS: Mapping[str, Doubt] = {
     "merton1": Doubt(1.7, 0.9),
     "reichstag10": Doubt(1.5, 2.0),
 }
-"""COLMAP models (their center held, or known to a percent), and three views whose K differ by a few percent."""
+"""COLMAP models (center held fixed, or known to a percent), and three views whose K differ by a few percent."""
 
 
 def parameters(out: Path, truth: Mapping[str, TruePhoto], doubt: Doubt) -> list[Row]:
     """List every parameter of every camera that the program states: estimate, truth, and error in deviations.
 
-    Before adjustment only cameras that are called identifiable count: the others are guesses, and called so. A camera's
+    Before adjustment only cameras that are called identifiable count; the others are declared guesses. A camera's
     truth is the median over its photos.
     """
     rows = []
@@ -64,7 +64,7 @@ def parameters(out: Path, truth: Mapping[str, TruePhoto], doubt: Doubt) -> list[
 
 
 class Stage(NamedTuple):
-    """What is stated of a camera before or after bundle adjustment."""
+    """The stated parameters of a camera before or after bundle adjustment."""
 
     camera: str
     photos: tuple[str, ...]
@@ -148,7 +148,7 @@ def counted(rows: Sequence[Row]) -> Row:
 
 
 def claims(rows: Sequence[Row]) -> Row:
-    """Return the errors of what is called identifiable before adjustment, 0 if nothing is; f in the bounds of kitti51."""
+    """Return the errors of what is called identifiable before adjustment (else 0), and f in the bounds of kitti51."""
     before = [row for row in rows if row["when"] == "before"]
     after = [row for row in rows if row["when"] == "after" and row["parameter"] in ("fx", "fy")]
     row: Row = {

@@ -1,11 +1,11 @@
-"""Fundamental matrices: estimators of sfm_app beside OpenCV, PoseLib and pycolmap, all in one run on one thread.
+"""Fundamental matrices: estimators of sfm_app, OpenCV, PoseLib and pycolmap, compared in one run on one thread.
 
     python -m benchmarks.fundamental --real DATA --ratio DATA --cache CACHE
     python -m benchmarks.fundamental --synthetic 200 --two-motions 100
     python -m benchmarks.fundamental --real DATA --ablation
 
-Methods take turns pair by pair after a warm-up call, with the same threshold, confidence and limit. Ours are called
-through the public API and may reject a pair, which counts as failure; rivals are called as they are.
+Methods alternate pair by pair after a warm-up call, with the same threshold, confidence and limit. Ours are called
+through the public API and may reject a pair, which counts as a failure; rivals are called directly.
 """
 
 import argparse
@@ -47,9 +47,9 @@ OURS = ("lev-ransac", "lev-ransac-thesis", "msac")
 POSE_LIMITS_DEG = (5, 10, 20)
 OUTLIERS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 MOTIONS = ((0.1, 0.1), (0.1, 0.2), (0.2, 0.1), (0.2, 0.2), (0.3, 0.1), (0.3, 0.2), (0.4, 0.1))
-"""Share of the matches on the moving object, share of outliers; the still scene always has more."""
+"""Share of the matches on the moving object, share of outliers; the still scene always has the most matches."""
 FOUND_PX = 1.0
-"""The dominant geometry counts as found when its exact matches are nearer than this, on average."""
+"""The dominant geometry counts as found when its exact matches are closer than this on average."""
 DRAWN = ("real", "ratio", "synthetic")
 """Comparisons that can be drawn."""
 RATIO_SETS = ("fountain-P11", "castle-P19", "Herz-Jesus-P8", "merton1", "temple16")
@@ -232,12 +232,12 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--ratio", type=Path, metavar="DATA", help="folder with NAME/images and NAME/cameras.json")
     parser.add_argument("--cache", type=Path, help="where the matches of --ratio are kept")
     parser.add_argument("--sets", nargs="+", default=RATIO_SETS, help="photo sets of --ratio")
-    parser.add_argument("--pairs-per-set", type=int, help="at most so many pairs of each set, evenly spaced")
+    parser.add_argument("--pairs-per-set", type=int, help="limit of pairs per set, evenly spaced")
     parser.add_argument("--synthetic", type=int, metavar="N", help="pairs per level of outliers; 200 in the thesis")
     parser.add_argument("--two-motions", type=int, metavar="N", help="pairs per level")
     parser.add_argument("--methods", nargs="+", default=OURS, help="estimators of sfm_app (see `sfm-app plugins`)")
-    parser.add_argument("--rivals", nargs="*", default=RIVALS, choices=RIVALS, help="which of the others; all of them")
-    parser.add_argument("--ablation", action="store_true", help="instead of --methods: lev-ransac with a part missing")
+    parser.add_argument("--rivals", nargs="*", default=RIVALS, choices=RIVALS, help="other estimators; all by default")
+    parser.add_argument("--ablation", action="store_true", help="not --methods, but lev-ransac with a part missing")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--results", type=Path, default=RESULTS)
     add_pictures(parser, 'comparisons, such as "real"')

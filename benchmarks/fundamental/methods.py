@@ -1,4 +1,4 @@
-"""The estimators that are compared: ours by name through the public API, and the rivals as they come."""
+"""The estimators that are compared: ours by name through the public API, and the rivals called directly."""
 
 import sys
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from sfm_app.types import EpipolarFit
 FloatArray = NDArray[np.float64]
 
 BASELINE = "OpenCV MAGSAC++"
-"""The rival that times are set in relation to."""
+"""The rival that times are divided by."""
 RIVALS = ("OpenCV RANSAC", BASELINE, "PoseLib", "pycolmap LO-RANSAC")
 
 

@@ -31,7 +31,7 @@ _FIELDS = ("x1", "x2", "F", "K1", "K2", "R", "t")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RealPair:
-    """Matches of two photos, and the truth."""
+    """Matches of two photos, with the true geometry."""
 
     photos: str
     """Name of the photo set."""
@@ -46,12 +46,12 @@ class RealPair:
 
     @property
     def is_true(self) -> NDArray[np.bool_]:
-        """(N,) the matches near the true geometry."""
+        """(N,) whether a match is near the true geometry."""
         return np.asarray(sampson_distance(self.F, self.x1, self.x2) < TRUE_PX)
 
     @property
     def is_usable(self) -> bool:
-        """Whether the two photos show enough of the same."""
+        """Whether the two photos overlap enough."""
         true = self.is_true
         return int(np.count_nonzero(true)) >= LEAST_TRUE and float(true.mean()) >= LEAST_SHARE
 
@@ -84,7 +84,7 @@ def cached_ratio_matches(data: Path, name: str, cache: Path) -> Path:
     Args:
         data: folder with NAME/images and NAME/cameras.json.
         name: the photo set.
-        cache: where NAME.npz lies, or comes to lie.
+        cache: folder of NAME.npz, which is written if missing.
     """
     path = cache / f"{name}.npz"
     if not path.exists():

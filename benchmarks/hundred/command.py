@@ -1,4 +1,4 @@
-"""What hundreds of photos of 12 megapixels cost: seconds and memory of every stage, beside those of half as many.
+"""Cost of hundreds of 12-megapixel photos: seconds and memory of every stage, beside those of half as many photos.
 
 python -m benchmarks.hundred --cache CACHE
 python -m benchmarks.hundred --cache CACHE --counts 50 100 --set quality=draft
@@ -35,7 +35,7 @@ ABOUT = (
 )
 PHOTOS, SMALL, LARGE, QUALITY = 200, (750, 1000), (3000, 4000), 90
 EVERY_S = 0.1
-"""Between looks at the memory."""
+"""Interval between readings of the memory."""
 
 
 def photo_folder(count: int, cache: Path) -> Path:
@@ -64,7 +64,7 @@ def cost_of_stages(command: Sequence[str]) -> tuple[dict[str, int], dict[str, fl
         for line in lines:
             print(line, end="", file=sys.stderr, flush=True)
             if found := re.match(r"(\d+)/\d+ ", line):
-                Path(f"/proc/{process.pid}/clear_refs").write_text("5")  # its peak is counted anew
+                Path(f"/proc/{process.pid}/clear_refs").write_text("5")  # resets its peak memory
                 stage[0] = NAMES[int(found[1]) - 1]
 
     reader = threading.Thread(target=read, args=(process.stderr,))

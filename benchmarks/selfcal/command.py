@@ -1,11 +1,11 @@
-"""Self-calibration before bundle adjustment: ours beside COLMAP's view-graph calibration and the thesis's methods.
+"""Self-calibration before bundle adjustment: ours, COLMAP's view-graph calibration and the thesis's methods.
 
     python -m benchmarks.selfcal --photos DATA --cache CACHE --rendered 2
     python -m benchmarks.selfcal --photos DATA --cache CACHE --varied castle-P19 --sets --each \\
         --variants crop:460,200+scale:0.75,1
     python -m benchmarks.selfcal --speed --coverage 500
 
-All methods work from the same fundamental matrices, those of our own estimator, and nobody sees EXIF.
+All methods use the same fundamental matrices, those of our own estimator, and none sees EXIF.
 """
 
 import argparse
@@ -127,18 +127,18 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser("selfcal", __doc__)
     parser.add_argument("--photos", type=Path, metavar="DATA", help="folder with NAME/images and NAME/cameras.json")
     parser.add_argument("--cache", type=Path, help="where copies of photos, matches and fundamental matrices are kept")
-    parser.add_argument("--varied", nargs="*", default=VARIED, help="sets that are taken plain and in every variant")
+    parser.add_argument("--varied", nargs="*", default=VARIED, help="sets to run unchanged and in every variant")
     parser.add_argument("--variants", nargs="*", default=VARIANTS, help="changes of the photos, see photo_sets.py")
-    parser.add_argument("--sets", nargs="*", default=SETS, help="sets that are taken plain")
+    parser.add_argument("--sets", nargs="*", default=SETS, help="sets to run unchanged")
     parser.add_argument("--each", nargs="*", default=EACH, help="sets in which every photo has its own camera")
-    parser.add_argument("--rendered", type=int, default=0, metavar="N", help="rendered sets, each under so many seeds")
-    parser.add_argument("--coverage", type=int, metavar="N", help="so many synthetic calibrations")
+    parser.add_argument("--rendered", type=int, default=0, metavar="N", help="seeds of each rendered set")
+    parser.add_argument("--coverage", type=int, metavar="N", help="number of synthetic calibrations")
     parser.add_argument(
-        "--speed", nargs="?", const="castle-P19", metavar="SET", help="times, with --photos also of a set"
+        "--speed", nargs="?", const="castle-P19", metavar="SET", help="measure times, with --photos also on a set"
     )
     parser.add_argument("--methods", nargs="*", default=list(load_plugins().calibrators), help="calibrators")
     parser.add_argument(
-        "--also", nargs="*", default=[], metavar="TABLE.KEY=VALUE", help=f"{PRODUCTION} once more under this setting"
+        "--also", nargs="*", default=[], metavar="TABLE.KEY=VALUE", help=f"run {PRODUCTION} once more with this setting"
     )
     parser.add_argument("--seed", type=int, default=0, help="first seed of --coverage")
     parser.add_argument("--results", type=Path, default=RESULTS)

@@ -1,4 +1,4 @@
-"""Is the stated standard deviation honest: where does the truth lie in many synthetic calibrations?"""
+"""Coverage of the stated standard deviations: how often the truth lies within them in synthetic calibrations."""
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +24,7 @@ OUTLIERS = 0.2
 
 
 class Trial(NamedTuple):
-    """One synthetic set of photos, and what it was calibrated to."""
+    """One synthetic set of photos, and its calibration."""
 
     options: TrackOptions
     found: Calibration

@@ -22,21 +22,21 @@ from sfm_app.types.scene import CameraModel
 
 PRODUCTION = "zero-curves"
 WITHOUT_MATCHES = f"{PRODUCTION} without matches"
-"""From the fundamental matrices alone: what the consensus says by itself, which knows no lens."""
+"""The consensus on the fundamental matrices alone, which has no lens model."""
 ANSWER = ("fx_px", "fy_px", "cx_px", "cy_px")
-"""Evidence in which a literal method leaves its own answer, whatever our verdict on it."""
+"""Evidence in which a method of the thesis leaves its own answer, whatever our verdict on it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """What one method said about one photo set."""
+    """The result of one method on one photo set."""
 
     method: str
     cameras: Mapping[str, Calibration]
     """By photo name without suffix."""
     seconds: float
     pairs: int
-    """Fundamental matrices it could use."""
+    """Number of fundamental matrices that it could use."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +50,7 @@ class Measured:
     matches: MatchGraph
     views: ViewGraph
     matching_seconds: float
-    """Of features and matches, when they were made."""
+    """Seconds of features and matching in the run that made them."""
 
     @property
     def groups(self) -> list[list[MatchedImage]]:

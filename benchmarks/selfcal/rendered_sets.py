@@ -1,4 +1,4 @@
-"""Rendered photo sets whose lens, path or mixture of cameras is what a calibrator has to find out."""
+"""Rendered photo sets that test a calibrator by their lens, path or mixture of cameras."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -11,9 +11,9 @@ from sfm_app.synthetic.scenes.scene_catalog import build_scene
 
 SIZE = (960, 640)
 LENSES = (-0.25, -0.1, 0.1)
-"""k1 of COLMAP's SIMPLE_RADIAL."""
+"""Values of k1 of COLMAP's SIMPLE_RADIAL."""
 TWO_FOCALS = (1.05, 1.5)
-"""In widths, of two cameras with photos of one size."""
+"""Focal lengths in widths, of two cameras with photos of one size."""
 
 
 def walk(radial: float, seed: int) -> Views:

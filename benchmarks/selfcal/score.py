@@ -42,7 +42,7 @@ COLUMNS = (
     "e_focal %", "worst e_focal %", "center % of width", "fy/fx %", "k1 error", "sd of f %",
     "fx sd", "fy sd", "cx sd", "cy sd", "in 3 sd",
 )  # fmt: skip
-"""What needs the truth. "fx sd" is the error of fx in its own standard deviations, and so on."""
+"""Columns that need the truth. "fx sd" is the error of fx in its own standard deviations, and so on."""
 
 
 def deviations(camera: Calibration, K: NDArray[np.float64]) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Surfaces of `sfm-app`: rendered scenes against their truth, real ones against their photos, and what they cost.
+"""Surfaces of `sfm-app`: rendered scenes against their truth, real ones against their photos, and the cost.
 
 python -m benchmarks.surface DATA --cache CACHE --left-out 3 --parts castle-P19 5 10 19
 python -m benchmarks.surface --sets statue corner --cache CACHE
@@ -86,12 +86,12 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("data", type=Path, nargs="?", help="folder with NAME/images; rendered scenes need none")
     parser.add_argument("--cache", type=Path, help="keeps rendered photos and the last run of every set")
     parser.add_argument("--sets", nargs="*", metavar="SET", help="rendered scenes and names in DATA; all by default")
-    parser.add_argument("--left-out", type=int, default=0, metavar="N", help="photos of each set left out in turn")
-    parser.add_argument("--geometry-too", action="store_true", help="left out of depth maps and mesh, too")
+    parser.add_argument("--left-out", type=int, default=0, metavar="N", help="leave out N photos of each set in turn")
+    parser.add_argument("--geometry-too", action="store_true", help="leave them out of depth maps and mesh, too")
     parser.add_argument(
         "--parts", nargs="+", default=[], metavar=("SET", "COUNT"), help="cost of the first COUNT photos"
     )
-    parser.add_argument("--keep", action="store_true", help="do not do stages again that are up to date")
+    parser.add_argument("--keep", action="store_true", help="reuse stages that are up to date")
     parser.add_argument("--set", dest="assignments", nargs="*", default=[], metavar="TABLE.KEY=VALUE")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--name", default="surface", help="name of the result files")

@@ -1,4 +1,4 @@
-"""The figures of one photo set: cost, files, distance to the truth, likeness to the photos."""
+"""Scores of one photo set: cost, file sizes, distance to the truth, similarity to the photos."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -95,7 +95,7 @@ def left_out(
         if any(one.failed for one in said.values()):
             return {"left out": next(one.failed for one in said.values() if one.failed)}
         without = prepare_model(finished_model(photos.photos, target, Settings.from_mapping(settings)))
-        # the camera is that of the finished run, in whose frame the copy stands
+        # the camera is that of the finished run, whose frame the copy shares
         psnr = likenesses(without, out, [name])[name].psnr_db
         if math.isfinite(psnr) and math.isfinite(with_it[name].psnr_db):
             values.append(psnr)

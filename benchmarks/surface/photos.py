@@ -1,4 +1,4 @@
-"""A finished model beside the photos it was made of: how much of them it covers, and how alike it is there."""
+"""Compare a finished model with its photos: how much of them it covers, and how similar it is there."""
 
 import shutil
 from collections.abc import Mapping
@@ -18,20 +18,20 @@ from sfm_app.synthetic.pictures import Picture, PreparedModel, view_along
 Pixels = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
 BLACK = 32
-"""Gray level below which a pixel of a photo on black shows nothing."""
+"""Value of the brightest channel below which a pixel counts as black background."""
 LEAST_PIXELS = 1000
-"""Covered pixels that a photo's likeness is judged by."""
+"""Least number of covered pixels for a PSNR."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedPhoto:
-    """A photo with its camera as it was found, lens and all."""
+    """A photo with its estimated camera, lens distortion included."""
 
     name: str
     pixels: Pixels
     """(H, W, 3) RGB."""
     center: FloatArray
-    """(3,) of the camera."""
+    """(3,) center of the camera."""
     rays: FloatArray
     """(H, W, 3) directions in the world that the pixels see."""
 
@@ -43,11 +43,11 @@ class Likeness:
     coverage: float
     """Share of the pixels that show the model, 0..1."""
     not_black: float
-    """Share of the photo's pixels that are not black: on a black background nothing can be seen."""
+    """Share of the photo's pixels that are not black background."""
     coverage_not_black: float
     """Share of those that show the model."""
     psnr_db: float
-    """On the covered pixels after the rendering's exposure is adjusted; nan where next to nothing is covered."""
+    """PSNR on the covered pixels after adjusting the rendering's exposure; nan where too few are covered."""
 
 
 def placed_photos(out: Path) -> dict[str, "pycolmap.Image"]:
@@ -119,9 +119,9 @@ def leave_out(out: Path, target: Path, name: str, *, geometry_too: bool) -> str:
 
     Args:
         out: the finished run.
-        target: the copy; what lies there is removed.
-        name: of the photo.
-        geometry_too: whether depth maps and mesh have to do without it as well, or the texture only.
+        target: folder of the copy; its contents are removed.
+        name: name of the photo.
+        geometry_too: whether depth maps and mesh leave it out as well, or the texture only.
 
     Returns:
         The stage from which on the program has to run again.

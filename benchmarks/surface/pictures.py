@@ -1,4 +1,4 @@
-"""A page of pictures per model: a photo, the model from there and from beside it, and its bare shape."""
+"""A page of pictures per model: a photo, the model from its camera and from beside it, and its bare shape."""
 
 from pathlib import Path
 
@@ -15,9 +15,9 @@ Pixels = NDArray[np.uint8]
 TALL_PX, WIDE_PX = 800, 1000
 """Largest height and width of one picture; a page has two by two of them."""
 COLORS, PALETTE_PIXELS = 256, 20_000
-"""Of a page, which keeps PNGs small, and the pixels that its colors are chosen by."""
+"""Colors of a page, few to keep PNGs small, and the number of pixels that they are chosen from."""
 WIDTHS_PX, BYTES = (1600, 1400, 1200, 1000, 800), 600_000
-"""Of a page."""
+"""Widths of a page to try, and the largest file."""
 
 
 def model_page(out: Path, name: str, model: PreparedModel) -> Pixels:

@@ -1,4 +1,4 @@
-"""Surfaces as a page."""
+"""The result page of surfaces."""
 
 from collections.abc import Mapping, Sequence
 

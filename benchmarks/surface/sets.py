@@ -1,4 +1,4 @@
-"""Photo sets to make surfaces of: rendered ones with their truth, real ones, parts of them; and the finished model."""
+"""Photo sets for surfaces: rendered ones with their truth, real ones, and parts of them; also the finished model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ REAL = ("fountain-P11", "Herz-Jesus-P8", "castle-P19", "temple16", "kermit11")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceSet:
-    """Photos of one place."""
+    """Photos of one scene."""
 
     name: str
     photos: Path
     truth: Truth | None
-    """Of rendered photos."""
+    """Truth of rendered photos; None for real ones."""
 
     @property
     def count(self) -> int:
@@ -35,12 +35,12 @@ def surface_set(name: str, data: Path | None, cache: Path) -> SurfaceSet:
     """Return one of the program's own scenes, rendered once into the cache, or DATA/NAME/images.
 
     Args:
-        name: of a scene, SCENE@SEED for another walk and other noise, or of a folder.
-        data: folder of folders.
-        cache: for what is rendered.
+        name: a scene, SCENE@SEED for another walk and other noise, or a folder of DATA.
+        data: folder of the photo sets.
+        cache: folder for rendered photos.
 
     Raises:
-        ValueError: neither is there.
+        ValueError: neither exists.
     """
     scene, _, seed = name.partition("@")
     if scene in WALKS:

@@ -1,4 +1,4 @@
-"""What COLMAP gives without CUDA: Poisson's surface through the sparse points of the same run."""
+"""COLMAP's surface without CUDA: Poisson reconstruction from the sparse points of the same run."""
 
 import tempfile
 from collections.abc import Iterator
@@ -14,11 +14,11 @@ from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
 NEIGHBORS = 16
-"""Points that a normal is fitted to."""
+"""Number of points that a normal is fitted to."""
 DEPTH = 10
-"""Of the octree; the points are too few for COLMAP's 13, which gives the same surface later."""
+"""Depth of the octree; with so few points, COLMAP's 13 gives the same surface but takes longer."""
 TRIMS = (7.0, 6.0, 5.0, 4.0)
-"""Under COLMAP's own trimming, 10, nothing is left of points as few as these."""
+"""Trimmings to try; COLMAP's default, 10, removes the whole surface of points as few as these."""
 _VERTEX = np.dtype(
     [*((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((c, "u1") for c in ("r", "g", "b"))]
 )

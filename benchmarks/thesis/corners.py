@@ -1,4 +1,4 @@
-"""Matched corners of the VGG sequences that the thesis uses, and what is done to them."""
+"""Matched corners of the VGG sequences that the thesis uses, and artificial outliers for them."""
 
 from pathlib import Path
 

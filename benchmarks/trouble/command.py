@@ -1,9 +1,9 @@
-"""Rendered folders with random trouble through `sfm-app run --until scene`: does it ever fail, or know a wrong camera?
+"""Run `sfm-app run --until scene` on rendered folders with random trouble, and count failures and wrong cameras.
 
     python -m benchmarks.trouble --cache CACHE --folders 200 --keep
     python -m benchmarks.trouble --cache CACHE --only 17 42
 
-A seed decides a folder. With --keep, what was run with the same program is not run again.
+A seed determines a folder. With --keep, runs of the same program are reused.
 """
 
 import argparse
@@ -40,12 +40,12 @@ ABOUT = (
     "and cy after bundle adjustment in stated deviations, against the median of the cameras of the photos."
 )
 WRONG_PERCENT = 5.0
-"""A focal that is called identifiable and is further off is wrong."""
+"""A focal that is called identifiable and has a larger error is wrong."""
 WRONG_SHARE = 0.01
-"""So many folders may have one."""
+"""Largest share of folders that may have a wrong focal."""
 EXPECTED = (0, 4)
 OPEN = Lock()
-"""Rendering takes all cores anyway."""
+"""Held while rendering, which uses all cores anyway."""
 
 
 def folder_of(seed: int, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
@@ -199,12 +199,12 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser("trouble", __doc__)
     parser.add_argument("--cache", type=Path, required=True, help="keeps rendered photos and runs")
     parser.add_argument("--folders", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0, help="of the first folder; the others count on from it")
-    parser.add_argument("--only", nargs="+", type=int, metavar="SEED", help="these seeds instead")
-    parser.add_argument("--keep", action="store_true", help="do not run again what was run by the same program")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first folder; the others count up from it")
+    parser.add_argument("--only", nargs="+", type=int, metavar="SEED", help="run only these seeds")
+    parser.add_argument("--keep", action="store_true", help="reuse runs of the same program")
     parser.add_argument("--jobs", type=int, default=1, help="folders at a time")
-    parser.add_argument("--workers", type=int, default=0, help="of each run; 0: one per core")
-    parser.add_argument("--limit-min", type=float, default=15.0, metavar="M", help="minutes that a run may take")
+    parser.add_argument("--workers", type=int, default=0, help="workers of each run; 0: one per core")
+    parser.add_argument("--limit-min", type=float, default=15.0, metavar="M", help="time limit of a run in minutes")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--name", default="trouble", help="name of the result files")
     return parser

@@ -1,11 +1,11 @@
-"""Do our model files open everywhere, and do they look right? One row per GLB.
+"""Check that our model files open in several viewers and look right. One row per GLB.
 
     python -m benchmarks.viewers OUT OUT
     python -m benchmarks.viewers OUT OUT --pictures
 
 Runs the Khronos validator and three.js in headless Chromium (benchmarks/viewers, needs Node and `npm install` there),
-Open3D and trimesh on what finished runs left behind and on a small model with two pages of texture whose colors are
-known. With --pictures, a screenshot of each model goes to benchmarks/results/viewers-NAME.png: look at them.
+Open3D and trimesh on the output of finished runs and on a small model with two pages of texture whose colors are
+known. With --pictures, a screenshot of each model goes to benchmarks/results/viewers-NAME.png, to be looked at.
 """
 
 import argparse
@@ -35,7 +35,7 @@ Row = dict[str, Any]
 BROWSER = Path(__file__).parent
 SAMPLE = "sample"
 PAGES = ((200, 90, 60), (40, 90, 200))
-"""sRGB of the pages of the sample."""
+"""sRGB colors of the sample's pages."""
 ABOUT = """\
 Every GLB through the Khronos validator, three.js in headless Chromium, Open3D and trimesh; the surface as its PLY has
 it. on screen: share of the picture that the model covers. outward: share of the vertices whose normal looks at a
@@ -55,12 +55,12 @@ SURFACES = (
 
 LIMITS = {"outward": 0.95, "off center": 0.2, "up +- deg": 3.0, "up odds": 20.0, "on screen": 0.002}
 TURNED_DEG = {"temple16": 270}
-"""By run: how far its photos have to be turned clockwise to be upright, as people see it; the others are upright."""
+"""By run: the clockwise turn that makes its photos upright, judged by eye; photos of other runs are upright."""
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """One GLB and what belongs to it."""
+    """One GLB, with its PLY, cameras and orientation."""
 
     name: str
     glb: Path

@@ -1,4 +1,4 @@
-"""Algorithm 1 in slow motion: what residuals, Cook's distances and priors look like at every new best model."""
+"""Algorithm 1 step by step: residuals, Cook's distances and priors at every new best model."""
 
 import math
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BestModel:
-    """What is known about every match when a new best model has been found."""
+    """Quantities per match when a new best model has been found."""
 
     trial: int
     residuals_px: FloatArray
@@ -35,7 +35,7 @@ class BestModel:
 def trace(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int, *, guided: bool) -> Iterator[BestModel]:
     """Yield every new best model of a search, with samples drawn by the priors (LEV-RANSAC) or uniformly (RANSAC).
 
-    The search ends by Eq. 3.19 alone, so that there is more to see than until the priors have converged.
+    The search ends by Eq. 3.19 alone, so it also shows what happens after the priors have converged.
     """
     matches, state = prepare(x1, x2, seed), random_state(seed)
     points, threshold = matches.points, options.max_error_px / matches.unit_px

@@ -1,9 +1,9 @@
-"""The figures of thesis chapter 4 from our own estimators, beside what the thesis claims of them.
+"""The figures of thesis chapter 4 from our own estimators, compared with the claims of the thesis.
 
     python -m benchmarks.thesis.chapter4 DATA --tests 200
     python -m benchmarks.thesis.chapter4 DATA --quick
 
-DATA holds vgg-corners/Merton-College-I and vgg-corners/Wadham-College. Written are chapter4.md and chapter4.json, and
+DATA holds vgg-corners/Merton-College-I and vgg-corners/Wadham-College. Output: chapter4.md and chapter4.json, and
 with --pictures a PNG for every figure.
 """
 
@@ -181,7 +181,7 @@ def parser() -> argparse.ArgumentParser:
     parser = new_parser("thesis.chapter4", __doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("--tests", type=int, default=20, help="pairs per level; 200 in the thesis")
-    parser.add_argument("--max-trials", type=int, default=50_000, help="most samples; see Eq. 3.19")
+    parser.add_argument("--max-trials", type=int, default=50_000, help="limit of samples; see Eq. 3.19")
     parser.add_argument("--quick", action="store_true", help="3 pairs at four levels, at most 10 000 trials")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--results", type=Path, default=RESULTS)

@@ -1,4 +1,4 @@
-"""The search of an estimator alone, as Algorithm 1 has it: no final refit, and nobody who judges the result."""
+"""The search of an estimator alone, as in Algorithm 1: no final refit and no check of the result."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Search:
-    """A method to take turns with (see `turns`) that keeps what it found, for the refit that is not timed."""
+    """A method for `timing.take_turns` that keeps its results for the refit, which is not timed."""
 
     def __init__(self, recipe: Recipe, options: EpipolarSettings) -> None:
         self._recipe, self._options = recipe, options

@@ -1,4 +1,4 @@
-"""What perturbation theory says of one fundamental matrix (Figures 5.7 to 5.9)."""
+"""Bounds from perturbation theory for one fundamental matrix (Figures 5.7 to 5.9)."""
 
 import numpy as np
 
@@ -14,9 +14,9 @@ from sfm_app.selfcal.thesis.constraint_forms import essential
 from sfm_app.selfcal.thesis.perturbation import error_discrepancies
 
 OFF = np.linspace(-0.3, 0.3, 120)
-"""Errors of the focal, as shares; 0, where all but the bound of a noisy F vanish, is not among them."""
+"""Relative errors of the focal, without 0, where all curves but the bound of a noisy F vanish."""
 SHARE = 0.1
-"""Of outliers in a noisy F."""
+"""Share of outliers in a noisy F."""
 OUTLYING = 3
 FOCAL_OFF = 0.1
 

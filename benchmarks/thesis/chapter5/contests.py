@@ -1,4 +1,4 @@
-"""All calibrators on the same trials of an experiment: errors, answers and times per level."""
+"""Run all calibrators on the same trials of an experiment: errors, answers and times per level."""
 
 import sys
 import time
@@ -19,18 +19,18 @@ from sfm_app.types import Calibration
 
 PRODUCTION = "zero-curves"
 WITHOUT_LENS = "zero-curves without a lens"
-"""The same with `calibration.lens = false`: the camera model of the truth that comes with the VGG sequences."""
+"""`zero-curves` with `calibration.lens = false`: the camera model of the VGG sequences' truth."""
 ZERO_CURVES, MULTI_START, PERTURBATION = "zero-curves-thesis", "multi-start", "perturbation"
 GEOMETRIC, NON_ROBUST, KRUPPA = "geometric", "huang-faugeras", "kruppa"
 METHODS = (PRODUCTION, ZERO_CURVES, MULTI_START, PERTURBATION, GEOMETRIC, NON_ROBUST, KRUPPA)
 CAP_PERCENT = 200.0
-"""An answer counts as this far off at most, so that one that ran away does not decide a mean."""
+"""Errors are capped at this value, so that one diverged answer does not dominate a mean."""
 
 Experiment = Callable[[int], Iterator[Trial]]
 
 
 class Attempt(NamedTuple):
-    """One answer of one calibrator."""
+    """The result of one calibrator on one trial."""
 
     method: str
     x: float
@@ -94,9 +94,9 @@ def contest(experiment: Experiment, tests: dict[str, int], seed: int, pool: Exec
     Args:
         experiment: yields the trials of a seed; it must survive pickling.
         tests: number of seeds per method.
-        seed: the first of them.
-        pool: where seeds are tried side by side; the result does not depend on it, but for the times.
-        title: shown while it runs.
+        seed: the first seed.
+        pool: runs the seeds in parallel; apart from the times, the result does not depend on it.
+        title: printed when it is done.
     """
     seeds = range(max(tests.values(), default=0))
     lists = [[name for name, count in tests.items() if n < count] for n in seeds]

@@ -1,4 +1,4 @@
-"""Fundamental matrices as in thesis section 5.5.3: robust ones, and outlying ones that are fitted to everything."""
+"""Fundamental matrices as in thesis section 5.5.3: robust ones, and outlying ones that are fitted to all matches."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Fit(NamedTuple):
-    """One fundamental matrix and the matches it rests on."""
+    """One fundamental matrix and the matches that support it."""
 
     F: FloatArray
     """(3, 3) in pixels."""

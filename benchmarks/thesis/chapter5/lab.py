@@ -1,4 +1,4 @@
-"""What the figures of chapter 5 draw from: data, experiments that several of them share, a folder for the results."""
+"""Data, shared experiments and the result folder for the figures of chapter 5."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -17,20 +17,20 @@ from benchmarks.thesis.claims import Claim
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A figure or table that is finished."""
+    """A finished figure or table."""
 
     claims: Sequence[Claim] = ()
     rows: Sequence[Row] = ()
     """For the JSON document."""
     note: str = ""
-    """What a reader must know to read it."""
+    """Note for the reader."""
     tables: str = ""
     """Markdown below the note."""
 
 
 @dataclass(eq=False)
 class Lab:
-    """The run as a whole."""
+    """Options and shared results of one run of the benchmark."""
 
     data: Path
     cache: Path
@@ -41,11 +41,11 @@ class Lab:
     runs: int
     """Seeds per sequence of the tables."""
     most: Mapping[str, int]
-    """At most so many of both for methods that take far longer than the others."""
+    """Limits of both for methods that take far longer than the others."""
     seed: int
     pool: Executor
     pictures: Sequence[str] | None = None
-    """Figures that are asked for; none, or where empty all."""
+    """Figures to write: none if None, all if empty."""
     _sequences: dict[str, ImageSequence] = field(default_factory=dict)
     _contests: dict[str, list[Row]] = field(default_factory=dict)
 
@@ -63,7 +63,7 @@ class Lab:
         tests: int | None = None,
         also: Mapping[str, str] | None = None,
     ) -> list[Row]:
-        """Return the rows of an experiment of `setups`, run once; `also`: more methods, each with another's test count."""
+        """Return the rows of an experiment of `setups`, run once; `also` maps more methods to one tested as often."""
         title = f"{experiment.__name__} {sequence}".strip()
         if title not in self._contests:
             count = self.tests if tests is None else tests

@@ -1,4 +1,4 @@
-"""The image sequences of thesis section 5.9 that we have: matches, size and true camera matrices."""
+"""The available image sequences of thesis section 5.9: matches, size and true camera matrices."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from sfm_app.types.matches import PairId
 
 FloatArray = NDArray[np.float64]
 LEAST_CORNERS = 20
-"""Views that share fewer corners make no pair."""
+"""Least number of shared corners of a pair of views."""
 CORNERS = {
     "Corridor": ("Corridor", (512, 512)),
     "Wadham": ("Wadham-College", (1024, 768)),
@@ -39,13 +39,13 @@ class ImageSequence:
     Ks: FloatArray
     """(V, 3, 3) true camera matrix per view."""
     matches: Mapping[PairId, FloatArray]
-    """Per pair of views (N, 4) x1, y1, x2, y2 in pixels, as an estimator is given them."""
+    """Per pair of views (N, 4) x1, y1, x2, y2 in pixels, unfiltered."""
     Fs: Mapping[PairId, FloatArray]
     """True (3, 3) fundamental matrices, unit norm; empty where the cameras of the photos are not needed."""
 
     @property
     def K(self) -> FloatArray:
-        """(3, 3) of the first view, which is what Table 5.2 calls the truth."""
+        """(3, 3) camera matrix of the first view, which Table 5.2 takes as the truth."""
         first: FloatArray = self.Ks[0]
         return first
 

@@ -1,8 +1,8 @@
-"""The experiments of thesis sections 5.5.3 and 5.9: each yields, for one seed, a set of F's per level.
+"""The experiments of thesis sections 5.5.3 and 5.9: each yields one set of F's per level for a seed.
 
-An outlying F is fitted to all matches of its pair by the 8-point algorithm, as the thesis says of Figure 5.20; fitted
-robustly it would be no outlier. All other F's are LEV-RANSAC's. One seed keeps its cameras, points, noise and clean F's
-over all levels, so that a curve compares like with like.
+An outlying F is fitted to all matches of its pair by the 8-point algorithm, as in the thesis's Figure 5.20; fitted
+robustly it would be no outlier. All other F's are LEV-RANSAC's. A seed keeps its cameras, points, noise and clean F's
+over all levels, so that the levels of a curve are comparable.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,10 +17,10 @@ from sfm_app.synthetic.correspondences import TrackOptions, make_tracks, pair_ma
 from sfm_app.types.matches import PairId
 
 NOISE_PX = 0.5
-"""Of all matches; the thesis names a noise for Figure 5.21 alone."""
+"""Noise of all matches; the thesis states the noise for Figure 5.21 only."""
 REACH_PX = 256.0
 HEAVY = 0.5
-"""Share of outliers where the number of outlying F's or frames varies."""
+"""Share of outliers in an outlying F where the number of outlying F's or frames varies."""
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 DEVIATIONS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 COUNTS = (0, 2, 4, 6, 8)
@@ -30,10 +30,10 @@ FRAMES = (4, 5, 6, 8, 10)
 
 
 class Trial(NamedTuple):
-    """What a calibrator is given, and what it ought to find."""
+    """The input of a calibrator, and the true camera."""
 
     x: float
-    """Level: where the trial stands on the axis of the figure."""
+    """Level of the trial on the axis of the figure."""
     fits: Fits
     size: tuple[int, int]
     K: FloatArray

@@ -1,4 +1,4 @@
-"""Slices through the objective function: what moves its minimum (Figures 5.1 to 5.5)."""
+"""Slices through the objective function, which show what shifts its minimum (Figures 5.1 to 5.5)."""
 
 import numpy as np
 
@@ -18,10 +18,10 @@ from sfm_app.types import CameraPairs
 
 SHOWN = ("Wadham", "Merton1")
 SCALES = np.linspace(0.4, 2.0, 161)
-"""Focal lengths of a slice, over the true one."""
+"""Focal lengths of a slice, relative to the true one."""
 CENTER_OFF_PX = 100.0
 MUCH = 0.05
-"""A minimum that moves by this share of the focal has moved."""
+"""Share of the focal by which a minimum must move to count as moved."""
 HUANG_FAUGERAS, KRUPPA, SINES = FORMS = ("Huang-Faugeras", "Kruppa (5.6)", "Kruppa, sines")
 F_NOISE = 1e-3
 """Standard deviation of the noise on F of unit norm, in image widths: the thesis's variance is 1e-6 |F|."""

@@ -1,4 +1,4 @@
-"""What the thesis says of the curves of Figures 5.6, 5.10 and 5.17 to 5.22, and how it is judged."""
+"""Claims of the thesis about the curves of Figures 5.6, 5.10 and 5.17 to 5.22, and how they are judged."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,19 +12,20 @@ from benchmarks.thesis.chapter5.contests import ZERO_CURVES as ZC
 from benchmarks.thesis.claims import Claim, verdict
 
 STEADY = 2.0
-"""The largest error of a curve over its smallest, up to which we call it steady."""
+"""Ratio of a curve's largest error to its smallest, up to which we call it steady."""
 ANY, TAINTED = (-1.0, 1e9), (1e-9, 1e9)
-"""All levels, and those at which something is wrong with some of the F's."""
+"""All levels, and those at which some of the F's are corrupted."""
 BUT_ZC, BUT_RMS, BUT_PBW = (RMS, PBW, GEO, NON), (PBW, GEO, NON), (ZC, RMS, GEO, NON)
 
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """A sentence of the thesis about the curves of a plot.
+    """A claim of the thesis about the curves of a plot.
 
-    `kind` is how it is judged: "below": `method` errs less than each of `others`, level by level, by the factor `limit`
+    `kind` is how it is judged: "below": `method` has less error than each of `others` at each level, by factor `limit`
     if there is one; "steady": its largest error over the levels is at most twice its smallest; "rising": its last error
-    is more than twice its first; "falling": it is less; "under", "over": its errors lie below `limit`, or not.
+    is more than twice its first; "falling": its last error is less than its first; "under", "over": its errors lie
+    below `limit`, or not.
     """
 
     part: str

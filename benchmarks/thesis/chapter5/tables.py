@@ -1,4 +1,4 @@
-"""Tables 5.2 and 5.3: real sequences, with the thesis's own figures beside ours."""
+"""Tables 5.2 and 5.3: real sequences, with the thesis's results beside ours."""
 
 from collections.abc import Mapping, Sequence
 

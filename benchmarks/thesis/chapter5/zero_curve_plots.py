@@ -1,4 +1,4 @@
-"""Zero curves drawn, searched, and where they fail (Figures 5.11, 5.12, 5.14 to 5.16)."""
+"""Zero curves: plots, search times, and failures (Figures 5.11, 5.12, 5.14 to 5.16)."""
 
 import time
 from collections.abc import Callable
@@ -24,9 +24,9 @@ from sfm_app.types import CameraPairs
 RANGE, SAMPLES = 3.0, 100
 """Focals are swept up to this many widths, with this many samples (thesis 5.29, 5.8.3)."""
 SIGMA = 0.1 * RANGE
-"""Of rho, in image widths (thesis 5.8.4)."""
+"""Scale of rho, in image widths (thesis 5.8.4)."""
 NEAR = 0.06
-"""A peak or curve this close to a focal, as a share, is at it; two steps of the sweep for a focal of one width."""
+"""Relative distance within which a peak or curve is at a focal; two steps of the sweep for a focal of one width."""
 
 
 def prepared(Fs: FloatArray, size: tuple[int, int]) -> Pairs:
