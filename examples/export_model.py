@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Other files of a finished run, nothing computed anew: python examples/export_model.py OUT FOLDER"""
+"""Export other files from a finished run without recomputing: python examples/export_model.py OUT FOLDER"""
 
 import sys
 from pathlib import Path

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The two estimators alone, on synthetic matches: python examples/one_estimator.py"""
+"""Run the two estimators alone, on synthetic matches: python examples/one_estimator.py"""
 
 import sfm_app
 from sfm_app.synthetic.correspondences import PairOptions, TrackOptions, make_pair, make_tracks

@@ -15,14 +15,14 @@ from sfm_app.synthetic.photo_folder import load_truth, save_truth, write_photo_f
 from sfm_app.synthetic.scenes.scene_catalog import build_scene
 from sfm_app.types import Frustum, Model, Surface, Texture
 
-# how long an example takes says how busy the machine is
+# the time of an example depends on how busy the machine is
 settings.register_profile("untimed", deadline=None)
 settings.load_profile("untimed")
 
 
 @pytest.fixture(scope="session")
 def rendered(tmp_path_factory):
-    """A small rendered photo folder and its truth."""
+    """Render a small photo folder, and return it with its truth."""
     place = tmp_path_factory.mktemp("rendered")
     views = arc(make_camera(480, 320), ArcOptions(photos=7, sweep_deg=50.0))
     save_truth(write_photo_folder(place / "photos", build_scene(), views), place)
@@ -31,7 +31,7 @@ def rendered(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def unrelated(tmp_path_factory) -> Path:
-    """Two photos of different places: textured, with nothing in common."""
+    """Make two textured photos of different places, with nothing in common."""
     place = tmp_path_factory.mktemp("unrelated")
     for seed in (1, 2):
         rng = np.random.default_rng(seed)
@@ -45,7 +45,7 @@ def unrelated(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def ball() -> Model:
-    """A unit ball with a color per vertex that says where the vertex is."""
+    """Make a unit ball whose vertex colors encode their positions."""
     mesh = trimesh.creation.icosphere(subdivisions=2)
     vertices = np.array(mesh.vertices, np.float64)
     colors = np.clip(128 + 120 * vertices, 0, 255).astype(np.uint8)
@@ -54,7 +54,7 @@ def ball() -> Model:
 
 @pytest.fixture(scope="session")
 def textured_ball(ball) -> Model:
-    """The ball seen from above on a red page, and its lower half on a wide blue one."""
+    """Texture the ball: its upper half from a red page, its lower half from a wide blue one."""
     corners = ball.surface.vertices[ball.surface.faces]
     page = (corners[:, :, 1].mean(axis=1) < 0).astype(np.int32)
     uv = (0.5 + 0.45 * corners[:, :, [0, 2]]).astype(np.float32)
@@ -64,7 +64,7 @@ def textured_ball(ball) -> Model:
 
 @pytest.fixture(scope="session")
 def cloud(ball) -> Model:
-    """The ball's vertices as points, and three cameras around them that look at the middle."""
+    """Make a point cloud of the ball's vertices, with three cameras around it that look at the middle."""
     K = np.array([[800.0, 0, 310], [0, 820, 250], [0, 0, 1]])
     poses = orbit(make_camera(640, 480), 3, 120.0, 4.0, (0.0, 0.0, 0.0)).cam_from_world
     cameras = tuple(Frustum(name, K, pose, 640, 480) for name, pose in poses.items())
@@ -73,7 +73,7 @@ def cloud(ball) -> Model:
 
 @pytest.fixture(scope="session")
 def as_ordinary_user(tmp_path_factory):
-    """Runs Python with arguments as somebody whom the modes of files keep out, also where root runs the tests."""
+    """Return a function that runs Python as a user bound by file modes, even where root runs the tests."""
     script = Path(__file__).with_name("ordinary.py")
     closed = tmp_path_factory.mktemp("closed") / "file"
     closed.touch(0)
@@ -83,5 +83,5 @@ def as_ordinary_user(tmp_path_factory):
         return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
 
     if run("-c", f"open({str(closed)!r})").returncode == 0:
-        pytest.skip("here, modes keep nobody out")
+        pytest.skip("file modes restrict nobody here")
     return run

@@ -1,4 +1,4 @@
-"""Run Python as a user would who is not root: ordinary.py ARGUMENTS. Root reads and writes whatever the modes say."""
+"""Run Python as if by a user who is not root: ordinary.py ARGUMENTS. Root ignores file modes."""
 
 import ctypes
 import os
@@ -6,7 +6,7 @@ import sys
 
 DROP_FROM_BOUNDING_SET = 24
 READS_AND_WRITES_ALL, READS_ALL = 1, 2
-"""Linux's numbers of the capabilities that make modes meaningless."""
+"""Linux's numbers of the capabilities that bypass file modes (CAP_DAC_OVERRIDE, CAP_DAC_READ_SEARCH)."""
 
 if __name__ == "__main__":
     if sys.platform == "linux" and os.geteuid() == 0:

@@ -1,4 +1,4 @@
-"""What cameras have to reach on each photo set, and whether they do."""
+"""Bars that the cameras must meet on each photo set, and whether they do."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -12,17 +12,17 @@ class Bar(NamedTuple):
 
     column: str
     bound: float | str
-    """A figure, or the method whose figure in that column is the bound."""
+    """A number, or the method whose value in that column is the bound."""
     at_most: bool
 
 
 def least(column: str, bound: float | str) -> Bar:
-    """The figure is not smaller."""
+    """Make a bar that is a lower bound."""
     return Bar(column, bound, at_most=False)
 
 
 def most(column: str, bound: float | str) -> Bar:
-    """The figure is not larger."""
+    """Make a bar that is an upper bound."""
     return Bar(column, bound, at_most=True)
 
 
@@ -46,16 +46,16 @@ BARS: Mapping[str, tuple[Bar, ...]] = {
     "lund-door12": (NOBODY_LEFT_OUT, most("reprojection px", INCREMENTAL)),
     "kermit11": (NOBODY_LEFT_OUT, most("reprojection px", INCREMENTAL)),
 }
-"""By photo set, with its change. Where the truth is itself uncertain, nothing is asked of the standard deviations."""
+"""By photo set, with its change. Where the truth is itself uncertain, the standard deviations have no bar."""
 
 
 def verdict(row: Row, of_methods: Mapping[str, Row], bars: Sequence[Bar]) -> str:
-    """ "yes", or which bars are missed and by what; empty where there are none.
+    """Return "yes", or which bars are missed and by how much; empty where the set has no bars.
 
     Args:
         row: one method on one set.
         of_methods: all methods on that set, by name.
-        bars: of that set.
+        bars: the bars of that set.
     """
     missed = [text for text in (_missed(row, of_methods, bar) for bar in bars) if text]
     return f"no: {'; '.join(missed)}" if missed else "yes" if bars else ""

@@ -1,10 +1,10 @@
-"""Cameras of `sfm-app` beside those of stock pycolmap: the same pixels, the same run, nobody sees EXIF.
+"""Cameras of `sfm-app` compared with those of stock pycolmap: same pixels, same run, no EXIF for either.
 
     python -m benchmarks.cameras DATA --cache CACHE --repeat 3 --twice
     python -m benchmarks.cameras DATA --cache CACHE --sets merton1 "castle-P19 crop:300,100" --ours-only
     python -m benchmarks.cameras DATA --cache CACHE --also scene.min_seed_angle_deg=4
 
-Stock is pycolmap's default, incremental and global, but for one shared camera, a seed, and our cap on the image size.
+Stock is pycolmap's default, incremental and global, except for one shared camera, a seed, and our cap on image size.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from benchmarks.common.photo_sets import PhotoSet, photo_set
 from benchmarks.common.results import RESULTS, Row, document, write
 
 ALSO: tuple[str, ...] = ()
-"""Settings under which the program runs once more unless --also names others."""
+"""Settings for one more run of the program each, unless --also names others."""
 ABOUT = (
     "The same pixels for all: photos saved anew as PNG, upright, without EXIF. Every run in a process of its own, "
     "methods taking turns, kernels compiled before; medians over the repetitions. e_focal, e_OC: mean errors of fx and "
@@ -39,14 +39,14 @@ ABOUT = (
 
 
 def chosen_sets(args: argparse.Namespace, cache: Path) -> Iterator[tuple[PhotoSet, str]]:
-    """Each set with the name of its data; the change stands behind a blank."""
+    """Yield each set with the name of its data; the change follows the name after a space."""
     for title in args.sets:
         name, _, change = title.partition(" ")
         yield photo_set(args.data, name, change, cache, "each" if name in args.each else "auto"), name
 
 
 def all_runs(args: argparse.Namespace, these: Sequence[Method], cache: Path) -> Iterator[Row]:
-    """Every set, every repetition, every method."""
+    """Run every method on every set in every repetition."""
     sets = list(chosen_sets(args, cache))
     warm_up([photos for photos, _ in sets], these, cache / "cameras" / "warm-up")
     for photos, name in sets:
@@ -61,17 +61,17 @@ def all_runs(args: argparse.Namespace, these: Sequence[Method], cache: Path) -> 
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("cameras", __doc__)
     parser.add_argument("data", type=Path, help="folder with NAME/images and NAME/cameras.json")
     parser.add_argument("--cache", type=Path, help="keeps copies of photos and the last run of every method")
     parser.add_argument("--sets", nargs="+", default=list(BARS), metavar="SET", help='"NAME" or "NAME CHANGE"')
     parser.add_argument("--each", nargs="*", default=EACH, help="sets in which every photo has its own camera")
-    parser.add_argument("--ours-only", action="store_true", help="without stock pycolmap")
-    parser.add_argument("--without", nargs="*", default=[], choices=STOCK, help="ways of stock pycolmap to leave out")
-    parser.add_argument("--also", nargs="*", default=ALSO, metavar="TABLE.KEY=VALUE", help="ours under this, too")
+    parser.add_argument("--ours-only", action="store_true", help="skip stock pycolmap")
+    parser.add_argument("--without", nargs="*", default=[], choices=STOCK, help="stock mappers to skip")
+    parser.add_argument("--also", nargs="*", default=ALSO, metavar="TABLE.KEY=VALUE", help="run ours with it, too")
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="runs of every method")
-    parser.add_argument("--twice", action="store_true", help="ours at least twice: are the bytes the same?")
+    parser.add_argument("--twice", action="store_true", help="run ours at least twice and compare the bytes")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--name", default="cameras", help="name of the result files")
     add_pictures(parser, "result files")
@@ -79,7 +79,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Measure all, and publish."""
+    """Run all methods on all sets, and write the results."""
     args = parser().parse_args()
     these = [
         method for method in methods(overrides(args.also), ours_only=args.ours_only) if method.name not in args.without

@@ -1,4 +1,4 @@
-"""One method on one photo set: run, and scored against the truth."""
+"""Run one method on one photo set, and score it against the truth."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,11 +21,11 @@ from benchmarks.common.results import Row
 EACH = ("reichstag10",)
 """Sets in which every photo has its own camera."""
 FEW = 6
-"""Sets with fewer photos do not need all kernels."""
+"""Sets with fewer photos do not use all kernels."""
 
 
 def warm_up(sets: Sequence[PhotoSet], these: Sequence[Method], out: Path) -> None:
-    """Compile the kernels: one unmeasured run on the smallest set of every kind that is no special case."""
+    """Compile the kernels: one unmeasured run for each kind of set, on its smallest set with enough photos."""
     by_size = sorted(sets, key=lambda photos: (_count(photos) < FEW, _bytes(photos)), reverse=True)
     smallest = {photos.cameras: photos for photos in by_size}
     for photos in smallest.values():
@@ -35,13 +35,13 @@ def warm_up(sets: Sequence[PhotoSet], these: Sequence[Method], out: Path) -> Non
 
 
 def measure(photos: PhotoSet, truth_file: Path, method: Method, out: Path) -> Row:
-    """One method, once, on one set."""
+    """Run one method once on one set, and score it."""
     said = run(method, photos, out)
     return scored(said, photos, true_photos(truth_file, steps(photos.name.partition(" ")[2])), method, out)
 
 
 def scored(said: Row, photos: PhotoSet, truth: Mapping[str, TruePhoto], method: Method, out: Path) -> Row:
-    """The figures of a finished run; a truth of more photos than the set has is cut to those."""
+    """Score a finished run; true photos that the set does not have are left out."""
     truth = {name: true for name, true in truth.items() if (photos.folder / f"{name}.png").exists()}
     models = read_models(out)
     row = {"photos": photos.name, "method": method.name, "failed": said["failed"], "exit code": said["exit code"]}

@@ -1,4 +1,4 @@
-"""The ways from photos to cameras, and how one of them is run: in a process of its own, see worker.py."""
+"""The methods that turn photos into cameras; each runs in a process of its own, see worker.py."""
 
 import json
 import shutil
@@ -22,31 +22,31 @@ WORKER = "benchmarks.cameras.worker"
 
 @dataclass(frozen=True, slots=True)
 class Method:
-    """One way from photos to cameras."""
+    """A method that turns photos into cameras."""
 
     name: str
     kind: str = OURS
     """`OURS`, or one of `STOCK`."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Of the program, beside its defaults."""
+    """Settings of the program that differ from its defaults."""
 
 
 def methods(also: Mapping[str, Mapping[str, Any]], *, ours_only: bool = False) -> list[Method]:
-    """The program as it comes and under other settings, and pycolmap's two ways of mapping."""
+    """List the program with its defaults, the program with other settings, and pycolmap's two mappers."""
     ours = [Method(OURS), *(Method(f"{OURS}, {label}", OURS, settings) for label, settings in also.items())]
     return ours if ours_only else ours + [Method(kind, kind) for kind in STOCK]
 
 
 def taking_turns(these: Sequence[Method], repetition: int) -> list[Method]:
-    """Every repetition starts with another method, so that none always meets a cold or a busy machine."""
+    """Start every repetition with another method, so that none always meets a cold or a busy machine."""
     first = repetition % len(these)
     return [*these[first:], *these[:first]]
 
 
 def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = None) -> Row:
-    """Run a method from nothing into OUT; seconds of its steps, peak memory, and why it failed where it did.
+    """Run a method from scratch into OUT, and return its times, its peak memory and the reason if it failed.
 
-    What has not ended after `limit_s` is ended, with all that it has started.
+    After `limit_s` the process is killed, together with its children.
     """
     shutil.rmtree(out, ignore_errors=True)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -63,12 +63,12 @@ def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = Non
     if (out / RESULT).exists():
         found: Row = json.loads((out / RESULT).read_text(encoding="utf-8"))
         return said | found
-    failed = f"not done after {limit_s:g} s" if code is None else f"exit code {code}: {last}"
+    failed = f"not finished after {limit_s:g} s" if code is None else f"exit code {code}: {last}"
     return said | {"failed": failed, "exit code": code, "seconds": {}, "peak MB": None}
 
 
 def by_size(folder: Path) -> dict[tuple[int, int], list[Path]]:
-    """The photos of a folder by width and height."""
+    """Group the photos of a folder by width and height."""
     found: dict[tuple[int, int], list[Path]] = {}
     for path in sorted(folder.glob("*.png")):
         with Image.open(path) as image:
@@ -77,7 +77,7 @@ def by_size(folder: Path) -> dict[tuple[int, int], list[Path]]:
 
 
 def in_folders(sizes: Mapping[tuple[int, int], Sequence[Path]], into: Path) -> Path:
-    """A folder for each size: told of one camera for all, COLMAP leaves out photos that lie on their side."""
+    """Make a folder for each size: told of one camera for all, COLMAP leaves out photos that lie on their side."""
     for (width, height), photos in sizes.items():
         folder = into / f"{width}x{height}"
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Camera poses of several methods as a page: medians over the repetitions, tables, and one figure."""
+"""The result page of camera poses: medians over the repetitions, tables, and one figure."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -29,7 +29,7 @@ DEVIATIONS = (
 
 
 def medians(runs: Sequence[Row]) -> list[Row]:
-    """One row per set and method: medians of figures, words that differ from run to run side by side, and the bars."""
+    """Return one row per set and method: medians of figures, differing texts side by side, and the bars."""
     add_ratios(runs)
     together: dict[tuple[str, str], list[Row]] = {}
     for run in runs:
@@ -43,7 +43,7 @@ def medians(runs: Sequence[Row]) -> list[Row]:
 
 
 def add_ratios(runs: Sequence[Row]) -> None:
-    """Total time over that of stock incremental in the same repetition."""
+    """Add the total time divided by that of stock incremental in the same repetition."""
     base = {(run["photos"], run["repetition"]): run["total"] for run in runs if run["method"] == INCREMENTAL}
     for run in runs:
         of = base.get((run["photos"], run["repetition"]))
@@ -73,7 +73,7 @@ def _median(repeated: Sequence[Row]) -> Row:
 
 
 def same_bytes(repeated: Sequence[Row]) -> str | None:
-    """Whether all repetitions wrote the same model, and if not, which files differ."""
+    """Return whether all repetitions wrote the same model, and if not, which files differ."""
     known = [name for name in FILES if all(run.get(name) for run in repeated)]
     if len(repeated) < 2 or not known:
         return None
@@ -82,7 +82,7 @@ def same_bytes(repeated: Sequence[Row]) -> str | None:
 
 
 def page(about: str, rows: Sequence[Row], picture: str = "") -> str:
-    """The tables, without columns that are empty throughout, and a picture by its name."""
+    """Return the page with its tables, without columns that are empty throughout, and a picture by its name."""
     ours = [row for row in rows if row["method"] not in STOCK]
     repeated = [row for row in ours if row["same bytes"]]
     parts = [
@@ -103,7 +103,7 @@ def _table(rows: Sequence[Row], columns: Sequence[str]) -> str:
 
 
 def draw(rows: Sequence[Row], folder: Path, name: str) -> bool:
-    """AUC@1 and AUC@5 of every method on every set that has a truth; a stroke marks the bar where there is one.
+    """Draw AUC@1 and AUC@5 of every method on every set that has a truth; a stroke marks the bar where there is one.
 
     Returns:
         Whether there is such a set.

@@ -1,4 +1,4 @@
-"""What a method left behind on one photo set, as plain figures: poses, cameras, stated deviations, times."""
+"""Scores of one method's output on one photo set: poses, cameras, stated deviations, times."""
 
 import hashlib
 import json
@@ -30,16 +30,16 @@ STEPS = {
     "match_and_verify": "features + matches", "view_graph": "view graph", "intrinsics": "K", "calibrate": "K",
     "scene": "map + BA", "map": "map + BA",
 }  # fmt: skip
-"""Columns that the steps of the methods are counted in. COLMAP verifies pairs as part of matching, we do it after."""
+"""The column that each step is counted in. COLMAP verifies pairs as part of matching, we do it afterwards."""
 
 
 class TruePhoto(NamedTuple):
-    """What is true of one photo."""
+    """Ground truth of one photo."""
 
     K: NDArray[np.float64]
     pose: Pose
     width: float
-    """Of the photo before any change."""
+    """Width of the photo before any change."""
 
 
 class Model(NamedTuple):
@@ -54,7 +54,7 @@ class Model(NamedTuple):
 
 
 def true_photos(path: Path, change: Sequence[Step]) -> dict[str, TruePhoto]:
-    """By photo name without suffix; empty where there is no such file."""
+    """Read the truth by photo name without suffix; empty where the file does not exist."""
     images = json.loads(path.read_text(encoding="utf-8"))["images"] if path.exists() else []
     return {
         Path(entry["file"]).stem: TruePhoto(
@@ -67,7 +67,7 @@ def true_photos(path: Path, change: Sequence[Step]) -> dict[str, TruePhoto]:
 
 
 def read_models(out: Path) -> list[Model]:
-    """All models in OUT: first the one that the program calls its result, then by the number of photos."""
+    """Read all models in OUT: first the one that the program calls its result, then by the number of photos."""
     found = sorted(path.parent for path in out.rglob("images.bin"))
     folders = [folder for folder in found if not any(part.startswith(".") for part in folder.relative_to(out).parts)]
     models = {folder: read_model(folder) for folder in folders}
@@ -75,7 +75,7 @@ def read_models(out: Path) -> list[Model]:
 
 
 def read_model(folder: Path) -> Model:
-    """Poses and cameras of the photos that have a place."""
+    """Read the poses and cameras of the registered photos."""
     model = pycolmap.Reconstruction(folder)
     posed = {Path(image.name).stem: image for image in model.images.values() if image.has_pose}
     return Model(
@@ -88,7 +88,7 @@ def read_model(folder: Path) -> Model:
 
 
 def accuracy(models: Sequence[Model], truth: Mapping[str, TruePhoto], photos: int) -> Row:
-    """The first model against the truth, and each model for itself; only its size where there is no truth."""
+    """Score the first model against the truth, and each model by itself; without a truth, only count."""
     best = models[0] if models else Model({}, {}, 0, 0, float("nan"))
     registered = len(set(best.poses) & set(truth)) if truth else len(best.poses)
     row: Row = {
@@ -112,13 +112,13 @@ def accuracy(models: Sequence[Model], truth: Mapping[str, TruePhoto], photos: in
 
 
 def within(model: Model, truth: Mapping[str, Pose]) -> float:
-    """AUC@5 over the pairs of the photos that a model holds: whether it is right as far as it goes."""
+    """Return AUC@5 over the pairs of the photos in one model: whether the model is right as far as it goes."""
     errors = pose_errors_deg(model.poses, {name: truth[name] for name in model.poses if name in truth})
     return area_under_recall(errors, 5)
 
 
 def camera_errors(K: Mapping[str, NDArray[np.float64]], truth: Mapping[str, TruePhoto]) -> Row:
-    """Mean errors of the cameras over the photos that have one, each against its own truth."""
+    """Average the errors of the cameras over the photos that have one, each against its own truth."""
     common = sorted(set(K) & set(truth))
     if not common:
         return dict.fromkeys(("e_focal %", "e_OC %", "e_OC_w %"))
@@ -130,7 +130,7 @@ def camera_errors(K: Mapping[str, NDArray[np.float64]], truth: Mapping[str, True
 
 
 def before_adjustment(out: Path, truth: Mapping[str, TruePhoto]) -> Row:
-    """What the program knew of the cameras before mapping; empty where it knew nothing."""
+    """Score the cameras that the program knew before mapping."""
     cameras, camera_of = _calibration(out)
     known = {photo: cameras[name] for photo, name in camera_of.items() if cameras[name]["identifiable"]}
     row: Row = {"K known": f"{len(known)}/{len(camera_of)}"}
@@ -141,7 +141,7 @@ def before_adjustment(out: Path, truth: Mapping[str, TruePhoto]) -> Row:
 
 
 def stated_deviations(out: Path, model: Model, truth: Mapping[str, TruePhoto]) -> Row:
-    """Standard deviations after bundle adjustment, and the errors counted in them; of several cameras the worst."""
+    """Return the standard deviations after bundle adjustment, and the errors in units of them; the worst camera's."""
     by_camera, camera_of = _stated(out)
     row: Row = {}
     for photo in sorted(set(model.K) & set(truth)):
@@ -156,7 +156,7 @@ def stated_deviations(out: Path, model: Model, truth: Mapping[str, TruePhoto]) -
 
 
 PLACES = {"f": ((0, 0), (1, 1)), "fx": ((0, 0),), "fy": ((1, 1),), "cx": ((0, 2),), "cy": ((1, 2),)}
-"""Entries of K that a parameter stands for; their mean counts."""
+"""Entries of K for each parameter; their mean counts."""
 
 
 def _place(K: NDArray[np.float64], name: str) -> float:
@@ -164,20 +164,20 @@ def _place(K: NDArray[np.float64], name: str) -> float:
 
 
 def _stated(out: Path) -> tuple[dict[str, Mapping[str, float]], dict[str, str]]:
-    """Deviations of the refined cameras by name, and names of cameras by photo without suffix."""
+    """Read the deviations of the refined cameras by name, and the camera names by photo without suffix."""
     cameras, camera_of = cameras_after(out)
     deviations = {name: camera["deviations"] for name, camera in cameras.items()}
     return deviations, {Path(photo).stem: name for photo, name in camera_of.items()}
 
 
 def _calibration(out: Path) -> tuple[dict[str, Any], dict[str, str]]:
-    """Cameras by name, and names of cameras by photo without suffix."""
+    """Read the cameras by name, and the camera names by photo without suffix."""
     cameras, camera_of = cameras_before(out)
     return cameras, {Path(photo).stem: name for photo, name in camera_of.items()}
 
 
 def times(seconds: Mapping[str, float], *, complete: bool) -> Row:
-    """Seconds per column, what the steps took one by one, and, if all were done, all of them together."""
+    """Sum the seconds per column; also the seconds of each step and, if all steps were done, the total."""
     row: Row = {}
     for step, value in seconds.items():
         row[STEPS[step]] = round(row.get(STEPS[step], 0.0) + value, 2)
@@ -186,7 +186,7 @@ def times(seconds: Mapping[str, float], *, complete: bool) -> Row:
 
 
 def hashes(out: Path) -> Row:
-    """Of the files of the program's model."""
+    """Hash the files of the program's model."""
     found = {name: out / "sparse" / name for name in FILES}
     return {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in found.items() if path.exists()}
 

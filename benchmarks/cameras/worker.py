@@ -1,6 +1,6 @@
-"""Photos to cameras by one method: ``python -m benchmarks.cameras.worker METHOD PHOTOS OUT JSON``, a process for each.
+"""Turn photos into cameras by one method: ``python -m benchmarks.cameras.worker METHOD PHOTOS OUT JSON``.
 
-Nothing is imported but what the method itself needs, so that memory and times are its own.
+Each run is a process of its own and imports only what the method needs, so that memory and times are the method's.
 """
 
 import json
@@ -16,13 +16,13 @@ from benchmarks.common.memory import peak_mb
 OURS = "sfm-app"
 INCREMENTAL, GLOBAL = "incremental", "global"
 RESULT = "benchmark.json"
-"""In OUT: what the process says about itself."""
+"""File in OUT with the process's own report."""
 MODES = {"each": "AUTO", "folder": "PER_FOLDER"}
-"""pycolmap's name for which photos share a camera, by ours; one camera for all where nothing is said."""
+"""pycolmap's camera mode by our name for it; anything else means one camera for all photos."""
 
 
 def ours(photos: Path, out: Path, options: Mapping[str, Any]) -> dict[str, Any]:
-    """The program until the cameras stand; its seconds are those of the manifest."""
+    """Run the program up to its scene; the seconds are those of its manifest."""
     import sfm_app
 
     failed, code, run, manifest = "", 0, None, out / "manifest.json"
@@ -35,17 +35,17 @@ def ours(photos: Path, out: Path, options: Mapping[str, Any]) -> dict[str, Any]:
     stages = json.loads(manifest.read_text(encoding="utf-8"))["stages"] if manifest.exists() else {}
     said = {"failed": failed, "exit code": code, "peak MB": peak_mb()}
     if run is not None:
-        from sfm_app.cli.display import run_lines  # what it costs is no part of the method
+        from sfm_app.cli.display import run_lines  # imported late: its cost is not the method's
 
         said["summary"] = list(run_lines(run))
     return said | {"seconds": {name: stage["seconds"] for name, stage in stages.items()}}
 
 
 def stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) -> dict[str, Any]:
-    """pycolmap's defaults but for a seed, a cap on the image size, and one camera for all photos where that is so."""
+    """Run pycolmap with its defaults but for a seed, a cap on the image size, and cameras shared as the options say."""
     import pycolmap
 
-    zlib.crc32(b"")  # the import above is there for its side effect
+    zlib.crc32(b"")  # keeps the import above, which is there for its side effect
     out.mkdir()
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     pycolmap.set_random_seed(0)

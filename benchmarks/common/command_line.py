@@ -1,4 +1,4 @@
-"""What the command lines of all benchmarks share."""
+"""Options and helpers that the command lines of all benchmarks share."""
 
 import argparse
 import os
@@ -17,7 +17,7 @@ def new_parser(subject: str, text: str | None) -> argparse.ArgumentParser:
 
     Args:
         subject: name of the package, such as "cameras".
-        text: its help, printed as it stands.
+        text: its help, printed verbatim.
     """
     return argparse.ArgumentParser(
         prog=f"python -m benchmarks.{subject}",
@@ -33,12 +33,12 @@ def add_pictures(parser: argparse.ArgumentParser, named_by: str) -> None:
 
 
 def is_wanted(pictures: Sequence[str] | None, name: str) -> bool:
-    """Say whether `--pictures` asks for the picture of this name."""
+    """Return whether `--pictures` asks for the picture of this name."""
     return pictures is not None and (not pictures or name in pictures)
 
 
 def overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Read the settings of `--also` by what was typed; several at once are joined by blanks."""
+    """Read the settings of `--also`, keyed by the text that was typed; a text may hold several, separated by spaces."""
     found = {}
     for text in texts:
         settings: dict[str, Any] = {}
@@ -49,7 +49,7 @@ def overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
 
 
 def on_one_thread() -> None:
-    """Start the command anew with one thread in every library, unless that is so already: they look only once."""
+    """Restart the command with one thread in every library, unless it has one: libraries read the setting once."""
     if any(os.environ.get(name) != "1" for name in _THREADS):
         environment = {**os.environ, **dict.fromkeys(_THREADS, "1")}
         os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], environment)  # noqa: S606

@@ -21,7 +21,7 @@ MARKERS = "osD^vP*Xhd<>"
 
 
 def pyplot() -> Any:
-    """matplotlib without a display, in our style; it is imported only where a figure is drawn."""
+    """Return matplotlib's pyplot without a display, in our style; it is imported only where a figure is drawn."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -38,7 +38,7 @@ def curves(
     heavy: Sequence[str] = (),
     order: Sequence[str] = (),
 ) -> None:
-    """One line per name, bolder for those in `heavy`; markers shrink from line to line, so that none hides another.
+    """Draw one line per name, bolder for those in `heavy`; markers shrink from line to line, so none hides another.
 
     Names in `order` keep their color and marker from figure to figure, whichever of them are drawn.
     """
@@ -50,7 +50,7 @@ def curves(
 
 
 def label(axes: Any, x: str, y: str, title: str = "", *, log: bool = False) -> None:
-    """Names of the axes; on a logarithmic axis figures near 1 are written out, not as powers."""
+    """Label the axes; on a logarithmic axis numbers near 1 are written out, not as powers."""
     axes.set(xlabel=x, ylabel=y, title=title)
     if log:
         axes.set_yscale("log")
@@ -62,12 +62,12 @@ def label(axes: Any, x: str, y: str, title: str = "", *, log: bool = False) -> N
 
 
 def legend_beside(figure: Any, axes: Any) -> None:
-    """One legend to the right of all plots of a figure."""
+    """Add one legend to the right of all plots of a figure."""
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right center")
 
 
 def save(figure: Any, folder: Path, name: str) -> None:
-    """NAME.png."""
+    """Write NAME.png."""
     folder.mkdir(parents=True, exist_ok=True)
     figure.savefig(folder / f"{name}.png", metadata={"Software": None})
     pyplot().close(figure)

@@ -1,4 +1,4 @@
-"""Memory of this process, by what Python itself brings: nothing else may count."""
+"""Memory of this process, measured with the standard library alone: other imports would count."""
 
 import re
 import resource
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def peak_mb() -> int:
-    """Give the most memory, in MB, this process held; the kernel's other count starts with what the parent held."""
+    """Return the peak memory of this process in MB; the kernel's other count starts with what the parent held."""
     status = Path("/proc/self/status")
     found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text()) if status.exists() else None
     return (int(found[1]) if found else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss) // 1024

@@ -1,4 +1,4 @@
-"""Camera poses and fundamental matrices against the truth."""
+"""Errors of camera poses and fundamental matrices against the truth."""
 
 import json
 from collections.abc import Mapping
@@ -17,11 +17,11 @@ Pose = NDArray[np.float64]
 LOST_DEG = 180.0
 """Error of a pair with a photo that has no pose, and of a pair without F."""
 CAP_PX = 5.0
-"""A fundamental matrix that is farther off than this has failed; as a capped error it counts as this much."""
+"""A fundamental matrix with a larger error has failed; capped errors count it at this value."""
 
 
 def load_truth(path: Path) -> dict[str, tuple[NDArray[np.float64], Pose]]:
-    """K and (3, 4) cam_from_world by photo name without suffix."""
+    """Read K and (3, 4) cam_from_world by photo name without suffix."""
     images = json.loads(path.read_text(encoding="utf-8"))["images"]
     return {
         Path(entry["file"]).stem: (np.array(entry["K"]), np.column_stack([np.array(entry["R"]), np.ravel(entry["t"])]))
@@ -30,7 +30,7 @@ def load_truth(path: Path) -> dict[str, tuple[NDArray[np.float64], Pose]]:
 
 
 def pose_errors_deg(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> NDArray[np.float64]:
-    """Per pair of true photos: the larger of the errors of relative rotation and of translation direction."""
+    """Return, per pair of true photos, the larger of the errors of relative rotation and translation direction."""
     errors = []
     for a, b in combinations(sorted(truth), 2):
         if a in found and b in found:
@@ -43,9 +43,9 @@ def pose_errors_deg(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> NDA
 def fundamental_pose_error_deg(
     F: NDArray[np.float64] | None, cameras: tuple[NDArray[np.float64], NDArray[np.float64]], R: Pose, t: Pose
 ) -> float:
-    """The larger of the errors of rotation and of translation direction in F, decomposed with the true K1 and K2.
+    """Return the larger of the errors of rotation and translation direction in F, decomposed with the true K1 and K2.
 
-    Of the four poses in F the best one counts; `LOST_DEG` without F.
+    Of the four poses in F, the best one counts. `LOST_DEG` without F.
     """
     if F is None:
         return LOST_DEG
@@ -54,17 +54,17 @@ def fundamental_pose_error_deg(
 
 
 def rms_sampson_px(F: NDArray[np.float64] | None, x1: NDArray[np.float64], x2: NDArray[np.float64]) -> float:
-    """Root mean square Sampson distance of matches to F; inf without F."""
+    """Return the root mean square Sampson distance of matches to F; inf without F."""
     return float("inf") if F is None else float(np.sqrt(np.mean(sampson_distance(F, x1, x2) ** 2)))
 
 
 def mean_sampson_px(F: NDArray[np.float64] | None, x1: NDArray[np.float64], x2: NDArray[np.float64]) -> float:
-    """Mean Sampson distance of matches to F; inf without F."""
+    """Return the mean Sampson distance of matches to F; inf without F."""
     return float("inf") if F is None else float(np.mean(sampson_distance(F, x1, x2)))
 
 
 def summary_px(errors_px: NDArray[np.float64]) -> dict[str, float | int]:
-    """Mean of the answers that did not fail, mean of all with failures at `CAP_PX`, and how many failed."""
+    """Return the mean of the answers that did not fail, the mean of all with failures at `CAP_PX`, and the failures."""
     good = errors_px <= CAP_PX
     return {
         "mean px": round(float(errors_px[good].mean()), 4) if good.any() else CAP_PX,
@@ -74,7 +74,7 @@ def summary_px(errors_px: NDArray[np.float64]) -> dict[str, float | int]:
 
 
 def area_under_recall(errors_deg: NDArray[np.float64], limit_deg: float) -> float:
-    """Area under the curve of recall over error, up to a limit, 0 to 1."""
+    """Compute the area under the curve of recall over error, up to a limit, 0 to 1."""
     errors = np.concatenate([[0.0], np.sort(errors_deg)])
     recall = np.linspace(0.0, 1.0, len(errors))
     count = int(np.searchsorted(errors, limit_deg))
@@ -83,22 +83,22 @@ def area_under_recall(errors_deg: NDArray[np.float64], limit_deg: float) -> floa
 
 
 def focal_error_percent(found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
-    """e_focal of the thesis: mean error of fx and fy."""
+    """Compute e_focal of the thesis: the mean error of fx and fy."""
     return float(50 * (abs(found[0, 0] / truth[0, 0] - 1) + abs(found[1, 1] / truth[1, 1] - 1)))
 
 
 def center_error_percent(found: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
-    """e_OC of the thesis: mean error of cx and cy, in percent of the true ones."""
+    """Compute e_OC of the thesis: the mean error of cx and cy, in percent of the true ones."""
     return float(50 * (abs(found[0, 2] / truth[0, 2] - 1) + abs(found[1, 2] / truth[1, 2] - 1)))
 
 
 def center_shift_percent(found: NDArray[np.float64], truth: NDArray[np.float64], width: float) -> float:
-    """Distance of the optical centers as a share of a width, which does not depend on where the center lies."""
+    """Compute the distance of the optical centers in percent of a width, which is independent of where they lie."""
     return float(100 * np.linalg.norm(found[:2, 2] - truth[:2, 2]) / width)
 
 
 def position_rms_percent(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> float | None:
-    """How far the cameras stand from their true places after a similarity; None with fewer than three.
+    """Compute the RMS error of the camera centers after a similarity; None with fewer than three.
 
     In percent of the mean distance of the true places from their mean. Photos without a pose are left out.
     """

@@ -1,4 +1,4 @@
-"""What a run says about cameras in its output folder."""
+"""The cameras in the output folder of a run."""
 
 import json
 from pathlib import Path
@@ -13,12 +13,12 @@ class Cameras(NamedTuple):
 
 
 def cameras_before(out: Path) -> Cameras:
-    """Read what pairs of photos say; empty where the run did not come so far."""
+    """Read the cameras before mapping; empty where the run did not get that far."""
     return _read(out / "calibration.json")
 
 
 def cameras_after(out: Path) -> Cameras:
-    """Read what bundle adjustment makes of them; empty where the run did not come so far."""
+    """Read the cameras after bundle adjustment; empty where the run did not get that far."""
     return _read(out / "scene.json")
 
 

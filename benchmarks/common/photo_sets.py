@@ -1,9 +1,9 @@
-"""Photo sets for calibration: copies that tell nothing about the camera, changed as asked, and what is true of them.
+"""Photo sets for calibration: copies without metadata, changed as requested, and their ground truth.
 
 A change is written as steps joined by "+": ``crop:LEFT,TOP`` cuts columns and rows, ``scale:SX,SY`` resizes, and
-``window:LEFT,TOP,WIDTH,HEIGHT`` keeps a part. Three bring photos of any size to one, as services on the web do:
-``pad:W,H`` makes the photo fit and leaves black bars on both sides, ``corner:W,H`` puts it to the top left, and
-``fill:W,H`` makes it cover all and cuts off what is left over.
+``window:LEFT,TOP,WIDTH,HEIGHT`` keeps a part. Three steps bring photos of any size to one size, as web services do:
+``pad:W,H`` fits the photo in with black bars on both sides, ``corner:W,H`` puts it at the top left, and
+``fill:W,H`` covers the frame and cuts off the rest.
 """
 
 import json
@@ -21,15 +21,15 @@ from PIL import Image, ImageOps
 
 FORMATS = (".jpg", ".jpeg", ".png")
 STEPS = {"crop": 2, "scale": 2, "window": 4, "pad": 2, "corner": 2, "fill": 2}
-"""Kinds of change, and how many figures each takes."""
+"""Kinds of change, and how many numbers each takes."""
 ONE_SIZE = ("pad", "corner", "fill")
-"""Those after which all photos have one size."""
+"""Kinds after which all photos have one size."""
 
 Step = tuple[str, tuple[float, ...]]
 
 
 def put(photo: Path, folder: Path) -> None:
-    """A photo in another folder, without a second copy of its bytes where the disk allows; links out are not read."""
+    """Hard-link a photo into another folder, or copy it; the program skips symbolic links out of a folder."""
     place = folder / photo.name
     if not place.exists():
         try:
@@ -39,27 +39,27 @@ def put(photo: Path, folder: Path) -> None:
 
 
 EVERY = "every:"
-"""No change of pixels: ``every:N`` takes every Nth photo, by name."""
+"""Prefix of ``every:N``, which takes every Nth photo by name and changes no pixels."""
 
 
 def stride(text: str) -> int:
-    """Which of the photos a change takes: every so many, all (1) where it does not say.
+    """Return the stride at which a change takes photos, 1 where it names none.
 
     Raises:
-        ValueError: that is no positive number.
+        ValueError: the stride is not positive.
     """
     found = [int(part.removeprefix(EVERY)) for part in text.split("+") if part.startswith(EVERY)]
     if any(number < 1 for number in found):
-        raise ValueError(f"'{text}' takes every 0th photo")
+        raise ValueError(f"'{text}': N of every:N must be at least 1")
     return math.prod(found)
 
 
 class TrueCamera(NamedTuple):
-    """What took a photo."""
+    """The true camera of a photo."""
 
     K: NDArray[np.float64]
     k1: float | None = None
-    """Of COLMAP's SIMPLE_RADIAL; None where nobody knows."""
+    """k1 of COLMAP's SIMPLE_RADIAL; None where it is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,21 +67,21 @@ class PhotoSet:
     """Photos without EXIF."""
 
     name: str
-    """Of the set, with the change behind a blank."""
+    """Name of the set, a space, and the change."""
     folder: Path
     truth: Mapping[str, TrueCamera]
-    """By photo name without suffix; empty where nobody knows."""
+    """By photo name without suffix; empty where it is unknown."""
     cameras: str = "auto"
     """Which photos share a camera, as in the setting `photos.cameras`."""
     told: bool = True
-    """Whether the program gets to know that."""
+    """Whether the program is given `cameras`."""
 
 
 def steps(text: str) -> list[Step]:
-    """The steps of a change.
+    """Parse the steps of a change.
 
     Raises:
-        ValueError: a kind is not known, or has another number of figures.
+        ValueError: a kind is unknown, or has the wrong number of values.
     """
     found = []
     for part in (part for part in text.split("+") if part and not part.startswith(EVERY)):
@@ -89,24 +89,24 @@ def steps(text: str) -> list[Step]:
         values = tuple(float(value) for value in figures.split(","))
         if STEPS.get(kind) != len(values):
             raise ValueError(
-                f"'{part}' is none of crop:LEFT,TOP scale:SX,SY window:LEFT,TOP,WIDTH,HEIGHT pad:W,H corner fill"
+                f"'{part}' is not one of crop:LEFT,TOP scale:SX,SY window:LEFT,TOP,WIDTH,HEIGHT pad:W,H corner fill"
             )
         found.append((kind, values))
     return found
 
 
 class Frame(NamedTuple):
-    """Where a photo that is brought to a size comes to lie."""
+    """Where a resized photo lies in its frame."""
 
     size: tuple[int, int]
-    """Of the photo, resized."""
+    """Size of the resized photo."""
     left: int
     top: int
-    """Of its first pixel; negative where it is cut off."""
+    """Left and top of its first pixel; negative where it is cut off."""
 
 
 def framed(kind: str, size: tuple[int, int], wanted: Sequence[float]) -> Frame:
-    """The place of a photo of `size` in a frame of the `wanted` one; `kind` is one of `ONE_SIZE`."""
+    """Return where a photo of `size` lies in a frame of the `wanted` size; `kind` is one of `ONE_SIZE`."""
     ratios = [side / own for side, own in zip(wanted, size, strict=True)]
     factor = max(ratios) if kind == "fill" else min(ratios)
     width, height = (round(factor * own) for own in size)
@@ -115,7 +115,7 @@ def framed(kind: str, size: tuple[int, int], wanted: Sequence[float]) -> Frame:
 
 
 def changed_size(size: tuple[int, int], step: Step) -> tuple[int, int]:
-    """Width and height of a photo after a step."""
+    """Return the width and height of a photo after a step."""
     kind, values = step
     if kind == "scale":
         return round(size[0] * values[0]), round(size[1] * values[1])
@@ -125,7 +125,7 @@ def changed_size(size: tuple[int, int], step: Step) -> tuple[int, int]:
 
 
 def changed_photo(image: Image.Image, change: Sequence[Step]) -> Image.Image:
-    """The photo after the steps."""
+    """Apply the steps to a photo."""
     for kind, values in change:
         after = changed_size(image.size, (kind, values))
         if kind == "scale":
@@ -142,7 +142,7 @@ def changed_photo(image: Image.Image, change: Sequence[Step]) -> Image.Image:
 
 
 def changed_camera(K: NDArray[np.float64], change: Sequence[Step], size: tuple[int, int]) -> NDArray[np.float64]:
-    """The camera matrix of a photo of `size` after these steps; pixel centers at +0.5, so that resizing multiplies."""
+    """Return the camera matrix of a photo of `size` after these steps; pixel centers at +0.5, so scaling multiplies."""
     K = K.copy()
     for kind, values in change:
         if kind == "scale":
@@ -158,7 +158,7 @@ def changed_camera(K: NDArray[np.float64], change: Sequence[Step], size: tuple[i
 
 
 def photo_set(data: Path, name: str, change: str, cache: Path, cameras: str = "auto") -> PhotoSet:
-    """A set of DATA after a change; the copies are kept in the cache, and nothing there is written twice.
+    """Make a set of DATA after a change; the copies stay in the cache, and existing ones are not written again.
 
     Where all photos come from one camera (`cameras` is not "each"), the truth is its median over the photos.
     """
@@ -178,7 +178,7 @@ def photo_set(data: Path, name: str, change: str, cache: Path, cameras: str = "a
 
 
 def save_plain(source: Path, target: Path, change: Sequence[Step]) -> None:
-    """Upright, changed, and of the rest the pixels alone: PNG loses none of them, and nobody hands EXIF on."""
+    """Save a photo upright, changed, and without metadata: PNG keeps all pixels, and no EXIF is passed on."""
     with Image.open(source) as image:
         upright = ImageOps.exif_transpose(image).convert("RGB")
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What every benchmark writes: one JSON document with all that is needed to repeat it, and Markdown tables.
+"""Results of every benchmark: one JSON document with all that is needed to repeat it, and Markdown tables.
 
 The document:
 
@@ -30,7 +30,7 @@ Row = dict[str, Any]
 
 
 def document(task: str, about: str, options: Mapping[str, Any], data: Mapping[str, Any], rows: Sequence[Row]) -> Row:
-    """The JSON document, with machine and versions."""
+    """Build the JSON document, with machine and versions."""
     machine = {
         "machine": platform.machine(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
@@ -49,12 +49,12 @@ def document(task: str, about: str, options: Mapping[str, Any], data: Mapping[st
 
 
 def finite(value: object) -> object:
-    """Give the value, or None where it is a number that JSON does not know."""
+    """Return the value, or None where it is a number that JSON does not allow."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def problems(found: Mapping[str, Any]) -> list[str]:
-    """Where a document is not as described above; empty when it is."""
+    """List where a document is not as described above; empty when it is valid."""
     wrong = [f"{key} is not {kind.__name__}" for key, kind in _KEYS.items() if not isinstance(found.get(key), kind)]
     wrong += [f"unknown key {key}" for key in found if key not in _KEYS]
     if wrong:
@@ -68,14 +68,14 @@ def problems(found: Mapping[str, Any]) -> list[str]:
 
 
 def write(folder: Path, name: str, found: Row, page: str) -> None:
-    """NAME.json and NAME.md."""
+    """Write NAME.json and NAME.md."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / f"{name}.json").write_text(json.dumps(found, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     (folder / f"{name}.md").write_text(page, encoding="utf-8")
 
 
 def write_csv(folder: Path, name: str, rows: Sequence[Row]) -> None:
-    """NAME.csv."""
+    """Write NAME.csv."""
     with (folder / f"{name}.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
@@ -83,7 +83,7 @@ def write_csv(folder: Path, name: str, rows: Sequence[Row]) -> None:
 
 
 def table(rows: Sequence[Row], columns: Sequence[str] | None = None) -> str:
-    """Rows as a Markdown table."""
+    """Format rows as a Markdown table."""
     names = list(columns or dict.fromkeys(key for row in rows for key in row))
     lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
     lines += ["| " + " | ".join(_text(row.get(name)) for name in names) + " |" for row in rows]
@@ -91,7 +91,7 @@ def table(rows: Sequence[Row], columns: Sequence[str] | None = None) -> str:
 
 
 def pivot(rows: Sequence[Row], across: str, value: str) -> list[Row]:
-    """One row per method, one column per value of `across`."""
+    """Return one row per method with one column per value of `across`."""
     found: dict[str, Row] = {}
     for row in rows:
         found.setdefault(row["method"], {"method": row["method"]})[str(row[across])] = row[value]

@@ -1,4 +1,4 @@
-"""Several estimators on the same pairs in one run, taking turns pair by pair, timed one call at a time."""
+"""Run several estimators on the same pairs, alternating pair by pair, and time each call."""
 
 import sys
 import time
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 Method = Callable[[FloatArray, FloatArray, int], tuple[FloatArray | None, int | None]]
-"""(x1, x2, seed) -> F or None, and the samples drawn where the method tells."""
+"""(x1, x2, seed) -> F or None, and the number of samples where the method reports it."""
 
 
 class Pair(Protocol):
-    """What an estimator sees."""
+    """The input of an estimator."""
 
     @property
     def x1(self) -> FloatArray:
@@ -24,15 +24,15 @@ class Pair(Protocol):
 
     @property
     def x2(self) -> FloatArray:
-        """(N, 2) pixels, row by row the partners of x1."""
+        """(N, 2) pixels, matched to x1 row by row."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Attempt:
-    """One method on one pair."""
+    """The result of one method on one pair."""
 
     F: FloatArray | None
-    """(3, 3), finite; None where the method gave no such matrix."""
+    """(3, 3), finite; None where the method returned no usable matrix."""
     ms: float
     trials: int | None
 
@@ -40,7 +40,7 @@ class Attempt:
 def take_turns(
     methods: Mapping[str, Method], pairs: Sequence[Pair], seed: int = 0, label: str = ""
 ) -> dict[str, list[Attempt]]:
-    """All methods on all pairs; every method has one call before that, unmeasured, to compile and load what it needs.
+    """Run all methods on all pairs; every method is first called once, unmeasured, to compile and load what it needs.
 
     Returns:
         Per method, one attempt for each pair. Pair n is estimated with `seed` + n.
@@ -60,12 +60,12 @@ def take_turns(
 
 
 def is_usable(F: FloatArray | None) -> bool:
-    """Whether this is one matrix with numbers in it."""
+    """Return whether this is one finite, nonzero (3, 3) matrix."""
     return F is not None and F.shape == (3, 3) and bool(np.isfinite(F).all()) and bool(np.any(F))
 
 
 def timing(attempts: Sequence[Attempt]) -> dict[str, float | None]:
-    """Milliseconds, and the mean number of samples where the method tells."""
+    """Return milliseconds, and the mean number of samples where the method reports it."""
     ms = np.array([attempt.ms for attempt in attempts])
     trials = [attempt.trials for attempt in attempts if attempt.trials is not None]
     return {

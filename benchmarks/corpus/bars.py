@@ -1,4 +1,4 @@
-"""What every set of the corpus has to reach, and the corpus as a whole."""
+"""Bars for every set of the corpus, and for the corpus as a whole."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -25,40 +25,40 @@ SEEN_LATER: Mapping[str, tuple[Bar, ...]] = {
     "temple16": (WHOLE,),
     "fountain-P11": (WHOLE,),
 }  # fmt: skip
-"""Beside the bars of the cameras' table."""
+"""In addition to the bars of the cameras' table."""
 PADDED_BARS = (least("AUC@5", 0.60), least("cameras", 2))
-"""Of reichstag10 with all photos brought to one size: not taken for one camera."""
+"""For reichstag10 with all photos brought to one size: they must not be taken for one camera."""
 UNFOLDED_AT: Mapping[str, tuple[str, float]] = {
     "oats23": ("axis of the worst part", 0.95),
     "books21": ("distance of the worst part", 0.8),
 }
-"""Figure that a walk, or each of its parts, has to reach so as not to count as folded."""
+"""The score below which a walk, or its worst part, counts as folded."""
 PADDED = "pad:"
 SLACK = 0.01
-"""AUC moves by so much from seed to seed (CONTRIBUTING.md)."""
+"""AUC varies by this much from seed to seed (CONTRIBUTING.md)."""
 
 
 def bars_of(title: str) -> tuple[Bar, ...]:
-    """All bars of a set with its change."""
+    """Return all bars of a set with its change."""
     own = PADDED_BARS if title.startswith("reichstag10 ") and PADDED in title else ()
     return (*BARS.get(title, ()), *SEEN_LATER.get(title, ()), *own)
 
 
 def folded(name: str, row: Row) -> int | None:
-    """1 where a walk is folded and nothing is said of it; None where nobody knows."""
+    """Return 1 where a walk is folded and no warning is given, else 0; None where it is unknown."""
     column, bound = UNFOLDED_AT.get(name, ("", 0.0))
     value = row.get(column)
     return None if value is None else int(value < bound and row.get("warned of folds") != "yes")
 
 
 def behind(row: Row, stock: Row, slack: float = 0.0) -> str:
-    """In what a run is worse than stock on the same pixels by more than the slack; empty where in nothing."""
+    """List the figures in which a run is worse than stock on the same pixels by more than the slack; empty if none."""
     figures = [(name, row.get(name) or 0, stock.get(name) or 0) for name in ("registered", "AUC@1", "AUC@5")]
     return "; ".join(f"{name} {ours:g}, stock {theirs:g}" for name, ours, theirs in figures if ours < theirs - slack)
 
 
 class Demand(NamedTuple):
-    """Something asked of all runs together."""
+    """A requirement on all runs together."""
 
     asked: str
     found: str
@@ -66,11 +66,11 @@ class Demand(NamedTuple):
 
 
 def demands(rows: Sequence[Row], stated: Sequence[Row]) -> list[Demand]:
-    """What is asked of the whole corpus, of our runs and the parameters that they state.
+    """Check what is required of the whole corpus: of our runs, and of the parameters that they state.
 
     Args:
         rows: our runs.
-        stated: parameters of all of them.
+        stated: the parameters of all our runs.
     """
     seen = counted(stated)
     codes = [row["exit code"] for row in rows]

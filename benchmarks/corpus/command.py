@@ -1,11 +1,11 @@
-"""Every photo set of DATA as it is, and changed, through `sfm-app` and stock pycolmap: one table.
+"""Run `sfm-app` and stock pycolmap on every photo set of DATA, as it is and changed: one table.
 
     python -m benchmarks.corpus DATA --cache CACHE --keep
     python -m benchmarks.corpus DATA --cache CACHE --sets merton1 "kitchen1000 every:5" --ours-only
     python -m benchmarks.corpus DATA --cache CACHE --score-only
 
-A command that was interrupted goes on with --keep: what has been run with the same program, settings and photos is not
-run again. --score-only runs nothing and makes the table of all that lies in CACHE.
+--keep continues an interrupted command: what has been run with the same program, settings and photos is not
+run again. --score-only runs nothing and makes the table from the runs in CACHE.
 """
 
 import argparse
@@ -40,14 +40,14 @@ ABOUT = (
     "Exit codes are those of the command: 0, 4 where the photos do not support a scene, none where it ran out of time."
 )
 EVERY = {"kitchen1000": "every:5"}
-"""Sets of which a part is taken unless --sets says otherwise."""
+"""Changes of sets that are not run in full unless --sets names them."""
 PADDED = "reichstag10 pad:1024,1024"
 """Photos of ten cameras brought to one size."""
 LIMIT_MIN = 40.0
 
 
 def default_titles(data: Path) -> list[str]:
-    """Every set in DATA, smallest first, then the changed ones."""
+    """List every set in DATA, smallest first, then the changed ones."""
     counts = {path.name: _photos(path) for path in data.iterdir() if (path / "images").is_dir()}
     plain = [f"{name} {EVERY.get(name, '')}".strip() for name in sorted(counts, key=lambda name: (counts[name], name))]
     changed = [title for title in BARS if title.partition(" ")[0] in counts]
@@ -60,7 +60,7 @@ def _photos(folder: Path) -> int:
 
 
 def score(method: Method, photos: PhotoSet, out: Path, data: Path, done: Done) -> tuple[Row, list[Row]]:
-    """The figures of a run, and the parameters that it states, one by one."""
+    """Score a run, and list the parameters that it states."""
     name, _, change = photos.name.partition(" ")
     truth = true_photos(data / name / "cameras.json", steps(change))
     row = scored(done.said, photos, truth if name not in OFFSETS else {}, method, out)
@@ -79,7 +79,7 @@ def score(method: Method, photos: PhotoSet, out: Path, data: Path, done: Done) -
 
 
 def line(row: Row) -> str:
-    """A run in one line."""
+    """Describe a run in one line."""
     figures = [row["placed"] + " placed"] + [f"{key} {row[key]}" for key in SHOWN if row.get(key) not in (None, "")]
     return f"{row['photos']}: {row['method']}: {', '.join(figures)}"
 
@@ -89,27 +89,27 @@ SHOWN = ("models", "AUC@1", "AUC@5", "axis", "distance", "median center cm", "K 
 
 
 def set_of(title: str, args: argparse.Namespace) -> PhotoSet:
-    """A set by its name and change; its photos are copied on first use."""
+    """Make a set from its name and change; its photos are copied on first use."""
     name, _, change = title.partition(" ")
     return photo_set(args.data, name, change, args.cache, "each" if name in EACH else "auto")
 
 
 def compile_kernels(args: argparse.Namespace, these: Sequence[Method]) -> bool:
-    """One unmeasured run on the first set with photos enough to need all kernels."""
+    """Run once, unmeasured, on the first set that has enough photos to need all kernels."""
     enough = [title for title in args.sets if _photos(args.data / title.partition(" ")[0]) >= FEW]
     warm_up([set_of((enough or args.sets)[0], args)], these, args.cache / "corpus" / "warm-up")
     return True
 
 
 def failed_row(title: str, method: Method, error: Exception) -> Row:
-    """What stands in the table where a run could not be begun or scored: that is a fault of the benchmark."""
+    """Return the row of a run that could not be started or scored, which is a fault of the benchmark."""
     empty: Row = dict.fromkeys(("models", "total", "registered", "of", "peak MB"))
     text = f"benchmark: {type(error).__name__}: {error}"
     return {"photos": title, "method": method.name, "failed": text, "exit code": None, "placed": ""} | empty
 
 
 def all_runs(args: argparse.Namespace, these: Sequence[Method]) -> Iterator[tuple[Row, list[Row]]]:
-    """Every set by every method; a failure of one is no end of the others."""
+    """Run every method on every set; a failure of one does not stop the others."""
     compiled = False
     for number, title in enumerate(args.sets, start=1):
         for method in these:
@@ -124,14 +124,14 @@ def all_runs(args: argparse.Namespace, these: Sequence[Method]) -> Iterator[tupl
                     compiled = compiled or compile_kernels(args, these)
                     done = run_anew(method, photos, out, 60 * args.limit_min)
                 row, stated = score(method, photos, out, args.data, done)
-            except Exception as error:  # unattended: the next set may still be measured
+            except Exception as error:  # runs unattended: measure the next set anyway
                 row = failed_row(title, method, error)
             print(f"[{number}/{len(args.sets)}] {line(row)}", file=sys.stderr, flush=True)
             yield row, stated
 
 
 def judged(rows: Sequence[Row]) -> None:
-    """Fill in what takes other rows: ratios, what is worse than stock, and whether the bars are met."""
+    """Fill in the columns that need other rows: ratios, figures worse than stock, and whether the bars are met."""
     compared(rows)
     for row in rows:
         beside = {other["method"]: other for other in rows if other["photos"] == row["photos"]}
@@ -139,7 +139,7 @@ def judged(rows: Sequence[Row]) -> None:
 
 
 def publish(args: argparse.Namespace, these: Sequence[Method], rows: Sequence[Row], stated: Sequence[Row]) -> str:
-    """Write what there is so far."""
+    """Write the results so far."""
     judged(rows)
     options = {"methods": [method.name for method in these], "each": list(EACH), "limit min": args.limit_min}
     found = document("corpus", ABOUT, options, {"sets": list(args.sets), "parameters": list(stated)}, rows)
@@ -149,25 +149,27 @@ def publish(args: argparse.Namespace, these: Sequence[Method], rows: Sequence[Ro
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("corpus", __doc__)
     parser.add_argument("data", type=Path, help="folder with NAME/images and, where known, NAME/cameras.json")
     parser.add_argument("--cache", type=Path, required=True, help="keeps copies of photos and the last run of each")
-    parser.add_argument("--sets", nargs="+", metavar="SET", help='"NAME" or "NAME CHANGE"; all where not given')
-    parser.add_argument("--without", nargs="*", default=[], metavar="SET", help="sets to leave out")
-    parser.add_argument("--stock", nargs="*", default=[INCREMENTAL], choices=STOCK, help="ways of stock pycolmap")
-    parser.add_argument("--ours-only", action="store_true", help="without stock pycolmap")
-    parser.add_argument("--also", nargs="*", default=(), metavar="TABLE.KEY=VALUE", help="ours under this, too")
-    parser.add_argument("--keep", action="store_true", help="do not run again what was run by the same program")
-    parser.add_argument("--score-only", action="store_true", help="run nothing: the table of what lies in CACHE")
-    parser.add_argument("--limit-min", type=float, default=LIMIT_MIN, metavar="M", help="minutes that a run may take")
+    parser.add_argument("--sets", nargs="+", metavar="SET", help='"NAME" or "NAME CHANGE"; all by default')
+    parser.add_argument("--without", nargs="*", default=[], metavar="SET", help="sets to skip")
+    parser.add_argument("--stock", nargs="*", default=[INCREMENTAL], choices=STOCK, help="stock mappers")
+    parser.add_argument("--ours-only", action="store_true", help="skip stock pycolmap")
+    parser.add_argument("--also", nargs="*", default=(), metavar="TABLE.KEY=VALUE", help="run ours with it, too")
+    parser.add_argument("--keep", action="store_true", help="reuse runs of the same program")
+    parser.add_argument("--score-only", action="store_true", help="run nothing: make the table from CACHE")
+    parser.add_argument(
+        "--limit-min", type=float, default=LIMIT_MIN, metavar="M", help="time limit of a run in minutes"
+    )
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--name", default="corpus", help="name of the result files")
     return parser
 
 
 def parsed() -> argparse.Namespace:
-    """Read the command line, with the sets that are meant."""
+    """Read the command line, and resolve which sets to run."""
     args = parser().parse_args()
     wanted = args.sets or default_titles(args.data)
     args.sets = [title for title in wanted if title not in args.without and title.partition(" ")[0] not in args.without]

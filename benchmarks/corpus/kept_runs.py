@@ -1,4 +1,4 @@
-"""Finished runs in the cache, and whether they would come out the same again."""
+"""Finished runs in the cache, and whether they can be reused."""
 
 import argparse
 import hashlib
@@ -15,19 +15,19 @@ from benchmarks.common.results import Row
 from sfm_app.engine.staleness import versions
 
 RECORD = "corpus.json"
-"""In OUT: what was run, and what it said."""
+"""File in OUT with the key of a run and its result."""
 
 
 class Done(NamedTuple):
     """A finished run."""
 
     key: str
-    """Of the program, settings and photos that it was made with."""
+    """Hash of the program, settings and photos of the run."""
     said: Row
 
 
 def key_of(method: Method, photos: PhotoSet) -> str:
-    """Hash of what a run depends on; stock does not depend on our program."""
+    """Hash everything that a run depends on; a stock run does not depend on our program."""
     package = Path(sfm_app.__file__).parent
     sources = sorted(package.rglob("*.py")) if method.kind == OURS else [Path(worker.__file__)]
     found = hashlib.sha256(json.dumps([method.kind, method.settings, photos.cameras, versions()]).encode())
@@ -38,7 +38,7 @@ def key_of(method: Method, photos: PhotoSet) -> str:
 
 
 def finished(out: Path) -> Done | None:
-    """The run that lies in OUT, if it came to an end."""
+    """Read the run in OUT, if it finished."""
     try:
         return Done(**json.loads((out / RECORD).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
@@ -46,7 +46,7 @@ def finished(out: Path) -> Done | None:
 
 
 def kept(method: Method, photos: PhotoSet, out: Path, args: argparse.Namespace) -> Done | None:
-    """What lies in OUT and need not be run again. What ran out of time is tried again when it gets more of it."""
+    """Return the run in OUT if it can be reused. A run that timed out is repeated when it gets more time."""
     before = finished(out)
     if before is None or args.score_only:
         return before
@@ -55,13 +55,13 @@ def kept(method: Method, photos: PhotoSet, out: Path, args: argparse.Namespace) 
 
 
 def run_anew(method: Method, photos: PhotoSet, out: Path, limit_s: float) -> Done:
-    """Run a method and write down what it said."""
+    """Run a method, and record its result."""
     done = Done(key_of(method, photos), run(method, photos, out, limit_s))
     remember(out, done)
     return done
 
 
 def remember(out: Path, done: Done) -> None:
-    """Write down in OUT that a run came to an end, and how."""
+    """Record in OUT that a run finished, and its result."""
     out.mkdir(parents=True, exist_ok=True)
     (out / RECORD).write_text(json.dumps(done._asdict()), encoding="utf-8")

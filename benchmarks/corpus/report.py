@@ -1,4 +1,4 @@
-"""The corpus as a page: what is asked of all runs, every run, and the same without sets that constants have seen."""
+"""The corpus page: requirements on all runs, every run, and the same without sets that constants were chosen on."""
 
 from collections.abc import Sequence
 
@@ -29,7 +29,7 @@ MISSES = (
 
 
 def compared(rows: Sequence[Row]) -> None:
-    """Fill in what takes the runs of a set together: ours beside stock incremental."""
+    """Fill in the columns that compare a run with stock incremental on the same set."""
     for row in rows:
         stock = next((r for r in rows if r["photos"] == row["photos"] and r["method"] == INCREMENTAL), None)
         both = stock is not None and stock["total"] and row["total"]
@@ -40,12 +40,12 @@ def compared(rows: Sequence[Row]) -> None:
 
 
 def corpus_page(about: str, rows: Sequence[Row], stated: Sequence[Row]) -> str:
-    """The page.
+    """Return the page.
 
     Args:
-        about: what is measured, and how.
+        about: the description of the measurement.
         rows: all runs.
-        stated: parameters of our cameras, one by one, with `photos` and `method`.
+        stated: one row per parameter of our cameras, with `photos` and `method`.
     """
     fresh, fresh_stated = unseen(rows, seen_sets()), unseen(stated, seen_sets())
     parts = [f"# The whole corpus\n\n{about}\n", "## What is asked of all runs\n", _demands(rows, stated)]
@@ -62,7 +62,7 @@ def corpus_page(about: str, rows: Sequence[Row], stated: Sequence[Row]) -> str:
 
 
 def columns_with(rows: Sequence[Row], columns: Sequence[str]) -> str:
-    """The table without columns that are empty throughout."""
+    """Format the table without columns that are empty throughout."""
     return table(rows, [name for name in columns if any(row.get(name) not in (None, "") for row in rows)])
 
 

@@ -1,4 +1,4 @@
-"""What a run over a set of the corpus is worth: cameras in stated deviations, walks, and what was said of folds."""
+"""Scores of a run on a set of the corpus: camera errors in stated deviations, walks, and warnings of folds."""
 
 import math
 import re
@@ -20,21 +20,21 @@ OFFSETS = ("kitchen1000",)
 """Sets whose truth is the poses of another camera on the same rig, and no K."""
 PARAMETERS = ("fx", "fy", "cx", "cy")
 FAR_SD = 3.0
-"""A parameter that is so many stated deviations off is a miss."""
+"""A parameter that is off by more stated deviations is a miss."""
 FAR_PERCENT = 3.0
-"""A focal that is called identifiable and is so far off is confidently wrong."""
+"""A focal that is called identifiable and is off by more is confidently wrong."""
 FOLD_WORDS = re.compile(r"fold|alike|beware|jump", re.IGNORECASE)
-"""What a sentence about equal things in several places has in it."""
+"""Words of a sentence about look-alike places."""
 WARNING_WORDS = re.compile(r"fold|beware", re.IGNORECASE)
-"""What it has in it where it says that the model may be wrong; "look-alikes told apart" says that it is not."""
+"""Words of a sentence that warns of a wrong model; "look-alikes told apart" is no such warning."""
 
 
 class Doubt(NamedTuple):
-    """How far the truth itself may be off, as its source says: one standard deviation, in percent."""
+    """Uncertainty of the truth itself, from its source: one standard deviation, in percent."""
 
     focal: float
     center: float
-    """Of the width."""
+    """In percent of the width."""
 
 
 DOUBTS: Mapping[str, Doubt] = {
@@ -43,13 +43,13 @@ DOUBTS: Mapping[str, Doubt] = {
     "merton1": Doubt(1.7, 0.9),
     "reichstag10": Doubt(1.5, 2.0),
 }
-"""COLMAP models (their center held, or known to a percent), and three views whose K differ by a few percent."""
+"""COLMAP models (center held fixed, or known to a percent), and three views whose K differ by a few percent."""
 
 
 def parameters(out: Path, truth: Mapping[str, TruePhoto], doubt: Doubt) -> list[Row]:
-    """Every parameter of every camera that the program states: what it found, the truth, the error in deviations.
+    """List every parameter of every camera that the program states: estimate, truth, and error in deviations.
 
-    Before adjustment only cameras that are called identifiable count: the others are guesses, and called so. A camera's
+    Before adjustment only cameras that are called identifiable count; the others are declared guesses. A camera's
     truth is the median over its photos.
     """
     rows = []
@@ -64,7 +64,7 @@ def parameters(out: Path, truth: Mapping[str, TruePhoto], doubt: Doubt) -> list[
 
 
 class Stage(NamedTuple):
-    """What is stated of a camera before or after bundle adjustment."""
+    """The stated parameters of a camera before or after bundle adjustment."""
 
     camera: str
     photos: tuple[str, ...]
@@ -75,7 +75,7 @@ class Stage(NamedTuple):
 
 
 def _stages(out: Path) -> Iterator[Stage]:
-    """Every camera before adjustment, and after it, where mapping may have divided it."""
+    """Yield every camera before adjustment, and after it, where mapping may have split it."""
     cameras, camera_of = cameras_before(out)
     for name, photos in _members(camera_of).items():
         before = cameras[name]
@@ -88,12 +88,12 @@ def _stages(out: Path) -> Iterator[Stage]:
 
 
 def _members(camera_of: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
-    """Photos by camera."""
+    """Group the photos by camera."""
     return {name: tuple(photo for photo in camera_of if camera_of[photo] == name) for name in camera_of.values()}
 
 
 def _claimed(K: NDArray[np.float64], deviations: Mapping[str, float]) -> bool:
-    """Whether bundle adjustment calls its focals good to `FAR_PERCENT`: three deviations of each are no more."""
+    """Return whether bundle adjustment claims focals within `FAR_PERCENT`: three deviations of each are no more."""
     stated = [(K[PLACES[name][0]], deviations.get(name, deviations.get("f"))) for name in ("fx", "fy")]
     return all(sd is not None and 0 < FAR_SD * sd <= FAR_PERCENT / 100 * focal for focal, sd in stated)
 
@@ -120,7 +120,7 @@ def _errors(stage: Stage, true: NDArray[np.float64], width: float, doubt: Doubt)
 
 
 def of_parameters(rows: Sequence[Row]) -> Row:
-    """The parameters of a run in a few figures."""
+    """Summarize the parameters of a run."""
     row: Row = {}
     for when in ("before", "after"):
         stated = [one for one in rows if one["when"] == when and one["in sd"] is not None]
@@ -134,7 +134,7 @@ def of_parameters(rows: Sequence[Row]) -> Row:
 
 
 def counted(rows: Sequence[Row]) -> Row:
-    """Of parameters: how many are stated, how many are far off, how many focals are confidently wrong."""
+    """Count the stated parameters, those that are far off, and the focals that are confidently wrong."""
     stated = [row for row in rows if row["in sd"] is not None]
     focals = [row for row in rows if row["parameter"] in ("fx", "fy") and row["identifiable"] == "yes"]
     granted = "in sd, truth's doubt granted"
@@ -148,7 +148,7 @@ def counted(rows: Sequence[Row]) -> Row:
 
 
 def claims(rows: Sequence[Row]) -> Row:
-    """Errors of what is called identifiable before adjustment, 0 where nothing is; f in the bounds of kitti51."""
+    """Return the errors of what is called identifiable before adjustment (else 0), and f in the bounds of kitti51."""
     before = [row for row in rows if row["when"] == "before"]
     after = [row for row in rows if row["when"] == "after" and row["parameter"] in ("fx", "fy")]
     row: Row = {
@@ -162,7 +162,7 @@ def claims(rows: Sequence[Row]) -> Row:
 
 
 def of_walk(models: Sequence[Model], said: Sequence[str]) -> Row:
-    """The order of the photos in each model, and whether a fold goes without a word."""
+    """Score the order of the photos in each model, and check whether a fold is reported."""
     orders = [order for order in (order_scores(model.poses) for model in models) if order is not None]
     if not orders:
         return {}
@@ -177,7 +177,7 @@ def of_walk(models: Sequence[Model], said: Sequence[str]) -> Row:
 
 
 def of_offset(models: Sequence[Model], truth: Mapping[str, TruePhoto]) -> Row:
-    """Errors against a camera beside ours."""
+    """Return the errors against a camera fixed beside ours."""
     poses = {name: photo.pose for name, photo in truth.items()}
     found = offset_errors(models[0].poses, poses) if models else None
     if found is None:
@@ -190,12 +190,12 @@ def of_offset(models: Sequence[Model], truth: Mapping[str, TruePhoto]) -> Row:
 
 
 def fold_lines(said: Sequence[str]) -> list[str]:
-    """What a run has said about equal things in several places."""
+    """List the lines in which a run mentions look-alike places."""
     return [line.strip() for line in said if FOLD_WORDS.search(line)]
 
 
 def corpus_figures(name: str, out: Path, truth: Mapping[str, TruePhoto], said: Sequence[str]) -> tuple[Row, list[Row]]:
-    """What the corpus asks of a run beside what the cameras' table does: figures, and the parameters one by one."""
+    """Return the corpus figures that the cameras' table lacks, and the parameters one by one."""
     models = read_models(out)
     row: Row = {"of photos in models": sum(len(model.poses) for model in models)}
     stated: list[Row] = []

@@ -1,4 +1,4 @@
-"""What is known of a walk without a model of it: the order of the photos, or the poses of another camera beside it."""
+"""Scores of a walk without a true model: by the order of the photos, or by the poses of another camera beside it."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -13,24 +13,24 @@ from benchmarks.common.metrics import Pose
 from sfm_app.geometry.similarity import umeyama
 
 LONG_STEPS = 5.0
-"""A step that is so many usual ones long is a jump."""
+"""A step of more than this many median steps is a jump."""
 SOFT = 0.02
-"""From here on a miss of the offset camera counts less than squared: 2 cm, or a degree; the truth of a Kinect."""
+"""Scale of the robust loss on the offset camera's residuals: 2 cm, or a degree; the truth of a Kinect."""
 
 
 class Order(NamedTuple):
-    """Does a model lead onwards, photo by photo? 1 is perfect."""
+    """How well the centers of a model follow the order of the photos; 1 is perfect."""
 
     axis: float
     """Rank correlation of the photos' order by name with their place along the main axis; for straight walks."""
     distance: float
     """Rank correlation of |i - j| with the distance between the centers i and j; for walks that bend, too."""
     jumps: int
-    """Steps between photos that follow each other that are much longer than usual."""
+    """Number of steps between consecutive photos that are much longer than the median."""
 
 
 def order_scores(poses: Mapping[str, Pose]) -> Order | None:
-    """The order of a model's photos; None with fewer than three, or where all stand in one place."""
+    """Score the order of a model's photos; None with fewer than three, or where all centers coincide."""
     if len(poses) < 3:
         return None
     centers = _centers([poses[name] for name in sorted(poses)])
@@ -47,21 +47,21 @@ def order_scores(poses: Mapping[str, Pose]) -> Order | None:
 
 
 class Offset(NamedTuple):
-    """What remains between a model and the poses of a camera that was fixed beside ours."""
+    """Residuals between a model and the poses of a camera that was fixed beside ours."""
 
     center: NDArray[np.float64]
     """By photo, in units of the truth."""
     rotation_deg: NDArray[np.float64]
     shift: float
-    """Distance of the two cameras, in units of the truth."""
+    """Distance between the two cameras, in units of the truth."""
     turn_deg: float
-    """Angle between them."""
+    """Angle between the two cameras."""
 
 
 def offset_errors(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> Offset | None:
-    """Fit the similarity of the worlds and the offset of the cameras together, robustly; what remains is the error.
+    """Fit the similarity of the worlds and the offset of the cameras jointly and robustly; return the residuals.
 
-    None with fewer than four photos: three fit any offset.
+    None with fewer than four photos, since three fit any offset.
     """
     names = sorted(set(found) & set(truth))
     if len(names) < 4:

@@ -1,7 +1,7 @@
-"""On which photo sets the program's constants were chosen, group by group: figures on these sets flatter it.
+"""Photo sets on which the program's constants were chosen, by group: results on these sets are biased in its favor.
 
-A group that names a set has seen it, whether a constant was fitted to it or only looked at and left. Where nothing is
-written down, all sets that lay there at the time are named. Whoever chooses a constant on a set adds the set here.
+A group names every set it has seen, whether a constant was fitted to it or only checked on it. Where nothing is
+written down, all sets available at the time are named. Whoever chooses a constant on a set adds the set here.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,20 +12,20 @@ from benchmarks.common.results import Row
 STRECHA = ("fountain-P11", "castle-P19", "Herz-Jesus-P8")
 WITH_TRUTH = (*STRECHA, "temple16", "merton1", "reichstag10", "lund-door12")
 FIRST_EIGHT = (*WITH_TRUTH, "kermit11")
-"""All sets that there were up to the issue that asks for this table."""
+"""All sets that existed when this table was requested."""
 
 
 class Group(NamedTuple):
     """Constants that were chosen together."""
 
     modules: tuple[str, ...]
-    """Of sfm_app, where they stand."""
+    """Modules of sfm_app that define them."""
     sets: tuple[str, ...]
-    """Photo sets that they have seen."""
+    """Photo sets that they were chosen or checked on."""
     also: str
-    """What else they were chosen on."""
+    """Other data that they were chosen on."""
     said_in: str
-    """Where that is written, or that it is not."""
+    """Where this is documented, or that it is not."""
 
 
 GROUPS: Mapping[str, Group] = {
@@ -102,17 +102,17 @@ GROUPS: Mapping[str, Group] = {
 
 
 def seen_sets() -> tuple[str, ...]:
-    """Every set that some constant was chosen on."""
+    """List every set that some constant was chosen on."""
     return tuple(dict.fromkeys(name for group in GROUPS.values() for name in group.sets))
 
 
 def unseen(rows: Sequence[Row], sets: Sequence[str]) -> list[Row]:
-    """Rows without those of these sets, changed or not."""
+    """Return the rows whose set, changed or not, is none of these."""
     return [row for row in rows if row["photos"].partition(" ")[0] not in sets]
 
 
 def groups_table(rows: Sequence[Row]) -> list[Row]:
-    """For each group: what it has seen, and how many bars our runs meet on the sets that it has not seen."""
+    """Return, per group, the sets it has seen, and how many bars our runs meet on the sets it has not seen."""
     found = []
     for name, group in GROUPS.items():
         judged = [row for row in unseen(rows, group.sets) if row.get("bar met")]

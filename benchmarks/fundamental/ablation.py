@@ -1,4 +1,4 @@
-"""`lev-ransac` with one part switched off at a time: what each part is worth."""
+"""`lev-ransac` with one part switched off at a time: the contribution of each part."""
 
 from dataclasses import replace
 from functools import partial
@@ -39,11 +39,11 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "SPRT instead of bail-out": {"verifier": Sprt},
     "least squares on the inliers last": {"finish": refit_sampson},
 }
-"""Name of what is missing, and the fields of the recipe that say so."""
+"""Name of the missing part, and the fields of the recipe that switch it off."""
 
 
 def ablated(options: EpipolarSettings) -> dict[str, Method]:
-    """The whole estimator, and one for every row of `ABLATIONS`, all called in the same way."""
+    """Return the whole estimator and one for every row of `ABLATIONS`, all called in the same way."""
     recipes = {WHOLE: PRODUCTION} | {name: replace(PRODUCTION, **fields) for name, fields in ABLATIONS.items()}
     return {name: _fit_with(recipe, options) for name, recipe in recipes.items()}
 

@@ -1,11 +1,11 @@
-"""Fundamental matrices: estimators of sfm_app beside OpenCV, PoseLib and pycolmap, all in one run on one thread.
+"""Fundamental matrices: estimators of sfm_app, OpenCV, PoseLib and pycolmap, compared in one run on one thread.
 
     python -m benchmarks.fundamental --real DATA --ratio DATA --cache CACHE
     python -m benchmarks.fundamental --synthetic 200 --two-motions 100
     python -m benchmarks.fundamental --real DATA --ablation
 
-Methods take turns pair by pair after a warm-up call, with the same threshold, confidence and limit. Ours are called
-through the public API and may reject a pair, which counts as failure; rivals are called as they are.
+Methods alternate pair by pair after a warm-up call, with the same threshold, confidence and limit. Ours are called
+through the public API and may reject a pair, which counts as a failure; rivals are called directly.
 """
 
 import argparse
@@ -47,16 +47,16 @@ OURS = ("lev-ransac", "lev-ransac-thesis", "msac")
 POSE_LIMITS_DEG = (5, 10, 20)
 OUTLIERS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 MOTIONS = ((0.1, 0.1), (0.1, 0.2), (0.2, 0.1), (0.2, 0.2), (0.3, 0.1), (0.3, 0.2), (0.4, 0.1))
-"""Share of the matches on the moving object, share of outliers; the still scene always has more."""
+"""Share of the matches on the moving object, share of outliers; the still scene always has the most matches."""
 FOUND_PX = 1.0
-"""The dominant geometry counts as found when its exact matches are nearer than this, on average."""
+"""The dominant geometry counts as found when its exact matches are closer than this on average."""
 DRAWN = ("real", "ratio", "synthetic")
 """Comparisons that can be drawn."""
 RATIO_SETS = ("fountain-P11", "castle-P19", "Herz-Jesus-P8", "merton1", "temple16")
 
 
 def score_real(pairs: Sequence[RealPair], methods: Mapping[str, Method], seed: int) -> tuple[list[Row], dict[str, Any]]:
-    """Pose errors, distances of the true inliers and times; also the pose errors themselves, by method."""
+    """Score pose errors, distances of the true inliers and times; also return the pose errors by method."""
     attempts = take_turns(methods, pairs, seed, "pairs")
     errors: dict[str, NDArray[np.float64]] = {}
     rows = []
@@ -76,7 +76,7 @@ def score_real(pairs: Sequence[RealPair], methods: Mapping[str, Method], seed: i
 
 
 def run_real(task: str, files: list[Path], methods: Mapping[str, Method], args: argparse.Namespace) -> None:
-    """Pairs of photos."""
+    """Compare the methods on pairs of photos."""
     pairs = load_pairs(files, args.pairs_per_set)
     if not pairs:
         raise SystemExit(f"no usable pairs in {', '.join(map(str, files)) or 'no file'}")
@@ -107,7 +107,7 @@ def run_real(task: str, files: list[Path], methods: Mapping[str, Method], args: 
 
 
 def draw_recall(errors: Mapping[str, NDArray[np.float64]], title: str, folder: Path, name: str) -> None:
-    """Draw the share of the pairs over their pose error, a line per method."""
+    """Draw the recall over the pose error, one line per method."""
     figure, axes = pyplot().subplots(figsize=(7.5, 3.6))
     for name, values in errors.items():
         recall = np.arange(1, len(values) + 1) / len(values)
@@ -119,7 +119,7 @@ def draw_recall(errors: Mapping[str, NDArray[np.float64]], title: str, folder: P
 
 
 def run_synthetic(tests: int, methods: Mapping[str, Method], args: argparse.Namespace) -> None:
-    """The pairs of thesis section 4.8."""
+    """Compare the methods on the pairs of thesis section 4.8."""
     rows: list[Row] = []
     for outliers in OUTLIERS:
         pairs = [make_pair(PairOptions(outliers=outliers), args.seed + n) for n in range(tests)]
@@ -146,7 +146,7 @@ def run_synthetic(tests: int, methods: Mapping[str, Method], args: argparse.Name
 
 
 def draw_levels(rows: Sequence[Row], folder: Path, name: str) -> None:
-    """Draw error and time over the share of outliers, a line per method."""
+    """Draw error and time over the share of outliers, one line per method."""
     figure, (left, right) = pyplot().subplots(1, 2, figsize=(10, 3.8))
     for axes, value in ((left, "capped mean px"), (right, "ms mean")):
         lines = {row.pop("method"): list(row.values()) for row in pivot(rows, "outliers", value)}
@@ -158,7 +158,7 @@ def draw_levels(rows: Sequence[Row], folder: Path, name: str) -> None:
 
 
 def run_two_motions(tests: int, methods: Mapping[str, Method], args: argparse.Namespace) -> None:
-    """Pairs with an object that moves by itself."""
+    """Compare the methods on pairs with an independently moving object."""
     rows: list[Row] = []
     for moving, outliers in MOTIONS:
         options = PairOptions(outliers=outliers)
@@ -215,7 +215,7 @@ def _name(task: str, args: argparse.Namespace) -> str:
 
 
 def _set_in_relation(rows: list[Row], column: str) -> None:
-    """Every time over that of the baseline, where that was measured."""
+    """Divide every time by that of the baseline, where the baseline was measured."""
     times = {row["method"]: row[column] for row in rows}
     for row in rows if BASELINE in times else []:
         row["time : MAGSAC++"] = round(row[column] / times[BASELINE], 3)
@@ -226,18 +226,18 @@ def _finite(value: float) -> float | None:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("fundamental", __doc__)
     parser.add_argument("--real", type=Path, metavar="DATA", help="folder with pairs/*.npz (see real_pairs.py)")
     parser.add_argument("--ratio", type=Path, metavar="DATA", help="folder with NAME/images and NAME/cameras.json")
     parser.add_argument("--cache", type=Path, help="where the matches of --ratio are kept")
     parser.add_argument("--sets", nargs="+", default=RATIO_SETS, help="photo sets of --ratio")
-    parser.add_argument("--pairs-per-set", type=int, help="at most so many pairs of each set, evenly spaced")
+    parser.add_argument("--pairs-per-set", type=int, help="limit of pairs per set, evenly spaced")
     parser.add_argument("--synthetic", type=int, metavar="N", help="pairs per level of outliers; 200 in the thesis")
     parser.add_argument("--two-motions", type=int, metavar="N", help="pairs per level")
     parser.add_argument("--methods", nargs="+", default=OURS, help="estimators of sfm_app (see `sfm-app plugins`)")
-    parser.add_argument("--rivals", nargs="*", default=RIVALS, choices=RIVALS, help="which of the others; all of them")
-    parser.add_argument("--ablation", action="store_true", help="instead of --methods: lev-ransac with a part missing")
+    parser.add_argument("--rivals", nargs="*", default=RIVALS, choices=RIVALS, help="other estimators; all by default")
+    parser.add_argument("--ablation", action="store_true", help="not --methods, but lev-ransac with a part missing")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--results", type=Path, default=RESULTS)
     add_pictures(parser, 'comparisons, such as "real"')
@@ -245,7 +245,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def parsed() -> argparse.Namespace:
-    """Read the command line, and refuse what does not fit together."""
+    """Read the command line, and refuse options that do not fit together."""
     line = parser()
     args = line.parse_args()
     if not any((args.real, args.ratio, args.synthetic, args.two_motions)):
@@ -256,7 +256,7 @@ def parsed() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Measure what was asked for."""
+    """Run the comparisons that were asked for."""
     args = parsed()
     on_one_thread()
     options = EpipolarSettings(max_error_px=THRESHOLD_PX, confidence=CONFIDENCE, max_trials=MAX_TRIALS)

@@ -1,4 +1,4 @@
-"""The estimators that are compared: ours by name through the public API, and the rivals as they come."""
+"""The estimators that are compared: ours by name through the public API, and the rivals called directly."""
 
 import sys
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ from sfm_app.types import EpipolarFit
 FloatArray = NDArray[np.float64]
 
 BASELINE = "OpenCV MAGSAC++"
-"""The rival that times are set in relation to."""
+"""The rival that times are divided by."""
 RIVALS = ("OpenCV RANSAC", BASELINE, "PoseLib", "pycolmap LO-RANSAC")
 
 
 def our_estimators(names: Sequence[str], options: EpipolarSettings) -> dict[str, Method]:
-    """Estimators of sfm_app by name; unknown names are left out with a note, so that older states can be measured."""
+    """Return estimators of sfm_app by name; unknown ones are skipped with a note, so older versions can be measured."""
     known = load_plugins().estimators
     if missing := [name for name in names if name not in known]:
         print(f"left out, no such estimator: {', '.join(missing)}", file=sys.stderr)
@@ -41,7 +41,7 @@ def _ours(name: str, options: EpipolarSettings) -> Method:
 
 
 def rivals(names: Sequence[str], options: EpipolarSettings) -> dict[str, Method]:
-    """Rivals by name, with our threshold, confidence and limit; what they return is not judged any further."""
+    """Return rivals by name, with our threshold, confidence and limit; what they return is not judged any further."""
     cv2.setNumThreads(1)
     makers = (_opencv(cv2.FM_RANSAC), _opencv(cv2.USAC_MAGSAC), _poselib, _pycolmap)
     return {name: make(options) for name, make in zip(RIVALS, makers, strict=True) if name in names}

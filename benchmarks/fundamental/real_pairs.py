@@ -31,7 +31,7 @@ _FIELDS = ("x1", "x2", "F", "K1", "K2", "R", "t")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RealPair:
-    """Matches of two photos, and the truth."""
+    """Matches of two photos, with the true geometry."""
 
     photos: str
     """Name of the photo set."""
@@ -46,18 +46,18 @@ class RealPair:
 
     @property
     def is_true(self) -> NDArray[np.bool_]:
-        """(N,) the matches near the true geometry."""
+        """(N,) whether a match is near the true geometry."""
         return np.asarray(sampson_distance(self.F, self.x1, self.x2) < TRUE_PX)
 
     @property
     def is_usable(self) -> bool:
-        """Whether the two photos show enough of the same."""
+        """Whether the two photos overlap enough."""
         true = self.is_true
         return int(np.count_nonzero(true)) >= LEAST_TRUE and float(true.mean()) >= LEAST_SHARE
 
 
 def load_pairs(files: list[Path], limit: int | None = None) -> list[RealPair]:
-    """The usable pairs of all files, at most `limit` evenly spaced ones of each."""
+    """Read the usable pairs of all files, at most `limit` evenly spaced ones of each."""
     found: list[RealPair] = []
     for path in files:
         with np.load(path) as data:
@@ -72,19 +72,19 @@ def load_pairs(files: list[Path], limit: int | None = None) -> list[RealPair]:
 
 
 def evenly(pairs: list[RealPair], limit: int) -> list[RealPair]:
-    """At most `limit` of them, spread over the list."""
+    """Take at most `limit` of the pairs, spread evenly over the list."""
     if len(pairs) <= limit:
         return pairs
     return [pairs[i] for i in np.linspace(0, len(pairs) - 1, limit).round().astype(int)]
 
 
 def cached_ratio_matches(data: Path, name: str, cache: Path) -> Path:
-    """The matches of a photo set after COLMAP's ratio test, as the program itself makes them; kept in `cache`.
+    """Match a photo set with the program's own matching, COLMAP's ratio test included; the file is kept in `cache`.
 
     Args:
         data: folder with NAME/images and NAME/cameras.json.
         name: the photo set.
-        cache: where NAME.npz lies, or comes to lie.
+        cache: folder of NAME.npz, which is written if missing.
     """
     path = cache / f"{name}.npz"
     if not path.exists():

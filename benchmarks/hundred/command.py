@@ -1,4 +1,4 @@
-"""What hundreds of photos of 12 megapixels cost: seconds and memory of every stage, beside those of half as many.
+"""Cost of hundreds of 12-megapixel photos: seconds and memory of every stage, beside those of half as many photos.
 
 python -m benchmarks.hundred --cache CACHE
 python -m benchmarks.hundred --cache CACHE --counts 50 100 --set quality=draft
@@ -35,11 +35,11 @@ ABOUT = (
 )
 PHOTOS, SMALL, LARGE, QUALITY = 200, (750, 1000), (3000, 4000), 90
 EVERY_S = 0.1
-"""Between looks at the memory."""
+"""Interval between readings of the memory."""
 
 
 def photo_folder(count: int, cache: Path) -> Path:
-    """Every so many of the photos all round; all are rendered once into the cache."""
+    """Return a folder with `count` evenly spaced photos from all round; all are rendered once into the cache."""
     whole = cache / "hundred" / "photos"
     if not whole.exists():
         beside = whole.with_name("rendering")
@@ -56,7 +56,7 @@ def photo_folder(count: int, cache: Path) -> Path:
 
 
 def cost_of_stages(command: Sequence[str]) -> tuple[dict[str, int], dict[str, float]]:
-    """Run `sfm-app run` and give the most memory of each stage, in MB, and its CPU seconds. Linux only."""
+    """Run `sfm-app run`, and return the peak memory of each stage, in MB, and its CPU seconds. Linux only."""
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     stage, peaks, spent = [NAMES[0]], dict.fromkeys(NAMES, 0), dict.fromkeys(NAMES, 0.0)
 
@@ -64,7 +64,7 @@ def cost_of_stages(command: Sequence[str]) -> tuple[dict[str, int], dict[str, fl
         for line in lines:
             print(line, end="", file=sys.stderr, flush=True)
             if found := re.match(r"(\d+)/\d+ ", line):
-                Path(f"/proc/{process.pid}/clear_refs").write_text("5")  # its peak is counted anew
+                Path(f"/proc/{process.pid}/clear_refs").write_text("5")  # resets its peak memory
                 stage[0] = NAMES[int(found[1]) - 1]
 
     reader = threading.Thread(target=read, args=(process.stderr,))
@@ -84,30 +84,30 @@ def cost_of_stages(command: Sequence[str]) -> tuple[dict[str, int], dict[str, fl
 
 
 def cpu_s(process: int) -> float:
-    """CPU seconds of a process and of all that it has started; 0 where it has ended."""
+    """Return the CPU seconds of a process and its children; 0 where it has ended."""
     return (_ticks(process) + sum(_ticks(child) for child in children(process))) / os.sysconf("SC_CLK_TCK")
 
 
 def held_mb(process: int) -> int:
-    """Most memory that a process held since it was last counted anew, with what its children hold now."""
+    """Return the larger of a process's peak memory since its last reset and what it and its children hold now."""
     own = memory_kb(process)
     return max(own["VmHWM"], own["VmRSS"] + sum(memory_kb(child)["VmRSS"] for child in children(process))) // 1024
 
 
 def children(process: int) -> list[int]:
-    """Processes that it has started and that still run."""
+    """List the running children of a process."""
     lists = Path(f"/proc/{process}/task").glob("*/children")
     return [int(child) for path in lists for child in text_of(path).split()]
 
 
 def memory_kb(process: int) -> dict[str, int]:
-    """What the kernel says about a process; zeros where it has ended."""
+    """Read a process's memory counts from the kernel; zeros where it has ended."""
     said = re.findall(r"(VmHWM|VmRSS):\s+(\d+) kB", text_of(Path(f"/proc/{process}/status")))
     return {"VmHWM": 0, "VmRSS": 0} | {name: int(size) for name, size in said}
 
 
 def text_of(path: Path) -> str:
-    """What a file of the kernel holds; nothing where it is gone."""
+    """Read a file of the kernel; empty where it is gone."""
     try:
         return path.read_text(encoding="utf-8")
     except OSError:
@@ -120,7 +120,7 @@ def _ticks(process: int) -> int:
 
 
 def measure(count: int, cache: Path, settings: Sequence[str]) -> Row:
-    """One run from nothing."""
+    """Run the program once from scratch."""
     photos = photo_folder(count, cache)
     out = Path(tempfile.mkdtemp(prefix=f"run-{count}-", dir=cache / "hundred"))
     flags = [part for assignment in settings for part in ("--set", assignment)]
@@ -133,7 +133,7 @@ def measure(count: int, cache: Path, settings: Sequence[str]) -> Row:
 
 
 def page(rows: Sequence[Row]) -> str:
-    """One row per stage, and by number of photos its seconds and its memory."""
+    """Return the page: one row per stage, and per number of photos its seconds and its memory."""
     lines: list[Row] = [
         {"stage": name}
         | {f"CPU, {row['photos']} photos": row[f"CPU {name}"] for row in rows}
@@ -151,7 +151,7 @@ def page(rows: Sequence[Row]) -> str:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("hundred", __doc__)
     parser.add_argument("--cache", type=Path, help="keeps the rendered photos and the runs")
     parser.add_argument("--counts", type=int, nargs="+", default=[100, 200], help="photos, each a divisor of 200")
@@ -162,7 +162,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Measure runs of so many photos, and publish."""
+    """Measure a run for each number of photos, and write the results."""
     args = parser().parse_args()
     with tempfile.TemporaryDirectory(prefix="hundred-") as scratch:
         cache = (args.cache or Path(scratch)).resolve()

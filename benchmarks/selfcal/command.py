@@ -1,11 +1,11 @@
-"""Self-calibration before bundle adjustment: ours beside COLMAP's view-graph calibration and the thesis's methods.
+"""Self-calibration before bundle adjustment: ours, COLMAP's view-graph calibration and the thesis's methods.
 
     python -m benchmarks.selfcal --photos DATA --cache CACHE --rendered 2
     python -m benchmarks.selfcal --photos DATA --cache CACHE --varied castle-P19 --sets --each \\
         --variants crop:460,200+scale:0.75,1
     python -m benchmarks.selfcal --speed --coverage 500
 
-All methods work from the same fundamental matrices, those of our own estimator, and nobody sees EXIF.
+All methods use the same fundamental matrices, those of our own estimator, and none sees EXIF.
 """
 
 import argparse
@@ -45,7 +45,7 @@ ABOUT_SPEED = "Medians of up to five calls in one process on one thread, compile
 
 
 def run_photos(args: argparse.Namespace) -> None:
-    """Every photo set by every method."""
+    """Run every method on every photo set."""
     rows: list[Row] = []
     for photos in chosen_sets(args):
         rows += calibrated(photos, args)
@@ -55,7 +55,7 @@ def run_photos(args: argparse.Namespace) -> None:
 
 
 def chosen_sets(args: argparse.Namespace) -> Iterator[PhotoSet]:
-    """The varied sets with their variants, the others, and what is rendered."""
+    """Yield the varied sets with their variants, the plain sets, and the rendered sets."""
     plain = [(name, "", "auto") for name in args.sets] + [(name, "", "each") for name in args.each]
     varied = [(name, change, "auto") for name in args.varied for change in ("", *args.variants)]
     for name, change, cameras in [*varied, *plain] if args.photos else []:
@@ -64,7 +64,7 @@ def chosen_sets(args: argparse.Namespace) -> Iterator[PhotoSet]:
 
 
 def calibrated(photos: PhotoSet, args: argparse.Namespace) -> list[Row]:
-    """All methods on one set."""
+    """Run all methods on one set."""
     subject = measured(photos, args.cache)
     found = list(every_method(subject, args.methods, overrides(args.also)))
     truth = photos.truth or adjusted_cameras(subject)
@@ -76,7 +76,7 @@ def calibrated(photos: PhotoSet, args: argparse.Namespace) -> list[Row]:
 
 
 def tables(rows: list[Row]) -> str:
-    """The methods beside each other, then everything about each."""
+    """Format the methods side by side, then all columns of each method."""
     parts = []
     for column in ("known", "e_focal %", "center % of width", "fy/fx %"):
         beside: dict[str, Row] = {}
@@ -91,7 +91,7 @@ def tables(rows: list[Row]) -> str:
 
 
 def run_coverage(args: argparse.Namespace) -> None:
-    """Honesty of the standard deviations; once more for every other setting."""
+    """Check the stated standard deviations; once more for every `--also` setting."""
     for label, others in {"": {}, **overrides(args.also)}.items():
         trials = coverage(args.coverage, Settings.from_mapping(others), args.seed)
         name = f"{args.name}-coverage{'-' if label else ''}{label}"
@@ -102,7 +102,7 @@ def run_coverage(args: argparse.Namespace) -> None:
 
 
 def run_speed(args: argparse.Namespace) -> None:
-    """Seconds."""
+    """Measure the speed."""
     subject = None
     if args.photos:
         subject = measured(photo_set(args.photos, args.speed, "", args.cache), args.cache)
@@ -112,33 +112,33 @@ def run_speed(args: argparse.Namespace) -> None:
 
 
 def options(args: argparse.Namespace) -> dict[str, Any]:
-    """What was asked for."""
+    """Return the options of the command that belong to the results."""
     return {"methods": list(args.methods), "also": list(args.also)}
 
 
 def publish(args: argparse.Namespace, name: str, found: Row, page: str) -> None:
-    """Into the results, and onto the screen."""
+    """Write the results, and print the page."""
     write(args.results, name, found, page)
     print(page)
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("selfcal", __doc__)
     parser.add_argument("--photos", type=Path, metavar="DATA", help="folder with NAME/images and NAME/cameras.json")
     parser.add_argument("--cache", type=Path, help="where copies of photos, matches and fundamental matrices are kept")
-    parser.add_argument("--varied", nargs="*", default=VARIED, help="sets that are taken plain and in every variant")
+    parser.add_argument("--varied", nargs="*", default=VARIED, help="sets to run unchanged and in every variant")
     parser.add_argument("--variants", nargs="*", default=VARIANTS, help="changes of the photos, see photo_sets.py")
-    parser.add_argument("--sets", nargs="*", default=SETS, help="sets that are taken plain")
+    parser.add_argument("--sets", nargs="*", default=SETS, help="sets to run unchanged")
     parser.add_argument("--each", nargs="*", default=EACH, help="sets in which every photo has its own camera")
-    parser.add_argument("--rendered", type=int, default=0, metavar="N", help="rendered sets, each under so many seeds")
-    parser.add_argument("--coverage", type=int, metavar="N", help="so many synthetic calibrations")
+    parser.add_argument("--rendered", type=int, default=0, metavar="N", help="seeds of each rendered set")
+    parser.add_argument("--coverage", type=int, metavar="N", help="number of synthetic calibrations")
     parser.add_argument(
-        "--speed", nargs="?", const="castle-P19", metavar="SET", help="times, with --photos also of a set"
+        "--speed", nargs="?", const="castle-P19", metavar="SET", help="measure times, with --photos also on a set"
     )
     parser.add_argument("--methods", nargs="*", default=list(load_plugins().calibrators), help="calibrators")
     parser.add_argument(
-        "--also", nargs="*", default=[], metavar="TABLE.KEY=VALUE", help=f"{PRODUCTION} once more under this setting"
+        "--also", nargs="*", default=[], metavar="TABLE.KEY=VALUE", help=f"run {PRODUCTION} once more with this setting"
     )
     parser.add_argument("--seed", type=int, default=0, help="first seed of --coverage")
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -147,7 +147,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def parsed() -> argparse.Namespace:
-    """Read the command line, and refuse what does not fit together."""
+    """Read the command line, and refuse options that do not fit together."""
     line = parser()
     args = line.parse_args()
     if not (args.photos or args.rendered or args.coverage or args.speed):
@@ -160,7 +160,7 @@ def parsed() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Measure what was asked for."""
+    """Run the measurements that were asked for."""
     args = parsed()
     on_one_thread()
     warm_up()

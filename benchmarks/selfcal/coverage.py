@@ -1,4 +1,4 @@
-"""Is the stated standard deviation honest: where does the truth lie in many synthetic calibrations?"""
+"""Coverage of the stated standard deviations: how often the truth lies within them in synthetic calibrations."""
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -24,7 +24,7 @@ OUTLIERS = 0.2
 
 
 class Trial(NamedTuple):
-    """One synthetic set of photos, and what it was calibrated to."""
+    """One synthetic set of photos, and its calibration."""
 
     options: TrackOptions
     found: Calibration
@@ -32,7 +32,7 @@ class Trial(NamedTuple):
 
 
 def drawn(seed: int) -> TrackOptions:
-    """Five to twelve photos of a camera that nobody knows, wrong matches in every pair."""
+    """Sample a setup: five to twelve photos of a random camera, with wrong matches in every pair."""
     rng = np.random.default_rng([seed, 55])
     cameras = int(rng.integers(CAMERAS[0], CAMERAS[1] + 1))
     return TrackOptions(
@@ -50,7 +50,7 @@ def drawn(seed: int) -> TrackOptions:
 
 
 def estimated(tracks: Tracks, settings: Settings, seed: int) -> CameraPairs:
-    """The pairs of the tracks, with fundamental matrices from the program's own estimator."""
+    """Estimate the fundamental matrices of the tracks' pairs with the program's own estimator."""
     fit = load_plugins().estimator(settings.epipolar.estimator).fit
     fits = {
         pair: (view, fit(view.x1, view.x2, settings.epipolar, seed + n))
@@ -67,7 +67,7 @@ def estimated(tracks: Tracks, settings: Settings, seed: int) -> CameraPairs:
 
 
 def trial(seed: int, settings: Settings) -> Trial:
-    """Draw, estimate, calibrate, compare."""
+    """Sample a setup, estimate, calibrate, and compare."""
     options = drawn(seed)
     tracks = make_tracks(options, seed)
     pairs = estimated(tracks, settings, seed)
@@ -88,7 +88,7 @@ def trial(seed: int, settings: Settings) -> Trial:
 
 
 def coverage(count: int, settings: Settings, first_seed: int = 0) -> list[Trial]:
-    """So many trials; seeds count up from the first."""
+    """Run `count` trials; seeds count up from the first."""
     trials = []
     for seed in range(first_seed, first_seed + count):
         trials.append(trial(seed, settings))
@@ -110,7 +110,7 @@ KINDS: Mapping[str, Callable[[Trial], bool]] = {
 
 
 def summary(trials: Sequence[Trial]) -> list[Row]:
-    """One row per kind of trial: how many are answered, how well, and how often the truth is where it should be."""
+    """Return one row per kind of trial: share of answers, errors, and how often the truth is within its bounds."""
     kinds = {name: [t for t in trials if belongs(t)] for name, belongs in KINDS.items()}
     return [{"method": name, **_figures(chosen)} for name, chosen in kinds.items() if chosen]
 

@@ -22,21 +22,21 @@ from sfm_app.types.scene import CameraModel
 
 PRODUCTION = "zero-curves"
 WITHOUT_MATCHES = f"{PRODUCTION} without matches"
-"""From the fundamental matrices alone: what the consensus says by itself, which knows no lens."""
+"""The consensus on the fundamental matrices alone, which has no lens model."""
 ANSWER = ("fx_px", "fy_px", "cx_px", "cy_px")
-"""Evidence in which a literal method leaves its own answer, whatever our verdict on it."""
+"""Evidence in which a method of the thesis leaves its own answer, whatever our verdict on it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """What one method said about one photo set."""
+    """The result of one method on one photo set."""
 
     method: str
     cameras: Mapping[str, Calibration]
     """By photo name without suffix."""
     seconds: float
     pairs: int
-    """Fundamental matrices it could use."""
+    """Number of fundamental matrices that it could use."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,11 +50,11 @@ class Measured:
     matches: MatchGraph
     views: ViewGraph
     matching_seconds: float
-    """Of features and matches, when they were made."""
+    """Seconds of features and matching in the run that made them."""
 
     @property
     def groups(self) -> list[list[MatchedImage]]:
-        """The photos by the camera that they are thought to share."""
+        """Photos grouped by the camera that they are assumed to share."""
         images = list(self.matches.images.values())
         return [[image for image in images if image.group == name] for name in dict.fromkeys(i.group for i in images)]
 
@@ -71,7 +71,7 @@ def measured(photos: PhotoSet, cache: Path, seed: int = 0) -> Measured:
 
 
 def production(subject: Measured, overrides: Mapping[str, object] | None = None, label: str = PRODUCTION) -> Found:
-    """The stage `intrinsics`, with everything that the program does there, under other settings where given."""
+    """Run the stage `intrinsics` in full, with other settings where given."""
     settings = Settings.from_mapping(merged(subject.settings.model_dump(), overrides or {}))
     with opened_run(subject.out, settings, None) as run:
         found = run_stages(subject.photos.folder, run, first=INTRINSICS.name, last=INTRINSICS.name)[INTRINSICS]
@@ -81,12 +81,12 @@ def production(subject: Measured, overrides: Mapping[str, object] | None = None,
 
 
 def camera_of(image: MatchedImage, found: Intrinsics) -> Calibration:
-    """The camera that the program takes to have made a photo."""
+    """Return the camera that the program assigns to a photo."""
     return found.camera(image)
 
 
 def literal(subject: Measured, method: str) -> Found:
-    """A calibrator alone on the pairs within each camera; its own answer counts even where our verdict on it is no."""
+    """Run a calibrator alone on the pairs within each camera; its own answer counts even if our verdict rejects it."""
     calibrator = load_plugins().calibrator(PRODUCTION if method == WITHOUT_MATCHES else method)
     cameras: dict[str, Calibration] = {}
     seconds, pairs = 0.0, 0
@@ -105,7 +105,7 @@ def literal(subject: Measured, method: str) -> Found:
 
 
 def colmap(subject: Measured) -> Found:
-    """View-graph calibration."""
+    """Run COLMAP's view-graph calibration."""
     database = subject.out / "database.db"
     found, seconds = rival.view_graph_calibration(database, subject.out, subject.matches, subject.views)
     cameras = {Path(subject.matches.images[key].name).stem: camera for key, camera in found.items()}
@@ -115,7 +115,7 @@ def colmap(subject: Measured) -> Found:
 def every_method(
     subject: Measured, methods: Sequence[str], others: Mapping[str, Mapping[str, object]]
 ) -> Iterator[Found]:
-    """All of them, the production under its own settings and under the others named."""
+    """Run all methods; the production one under its own settings and under each of the others."""
     yield production(subject)
     for label, overrides in others.items():
         yield production(subject, overrides, f"{PRODUCTION}, {label}")
@@ -125,7 +125,7 @@ def every_method(
 
 
 def adjusted_cameras(subject: Measured) -> dict[str, TrueCamera]:
-    """What our own bundle adjustment ends at: a reference where there is no truth."""
+    """Return the cameras of our own bundle adjustment: a reference where there is no truth."""
     run = sfm_app.reconstruct(subject.photos.folder, subject.out, subject.settings, last="scene")
     refined = run.scene.cameras if run.scene else {}
     return {
@@ -140,7 +140,7 @@ def _first_radial_term(camera: CameraModel) -> float:
 
 
 def warm_up() -> None:
-    """Compile the kernels: one call of every calibrator, unmeasured."""
+    """Compile the kernels by one unmeasured call of every calibrator."""
     tracks = make_tracks(TrackOptions(cameras=4), seed=0)
     inliers = tuple(np.hstack([view.x1, view.x2]) for view in tracks.pairs.values())
     pairs = CameraPairs(tracks.F, np.ones(len(tracks.F)), tracks.size, tuple(tracks.pairs), inliers)

@@ -1,4 +1,4 @@
-"""Rendered photo sets whose lens, path or mixture of cameras is what a calibrator has to find out."""
+"""Rendered photo sets that test a calibrator by their lens, path or mixture of cameras."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -11,23 +11,23 @@ from sfm_app.synthetic.scenes.scene_catalog import build_scene
 
 SIZE = (960, 640)
 LENSES = (-0.25, -0.1, 0.1)
-"""k1 of COLMAP's SIMPLE_RADIAL."""
+"""Values of k1 of COLMAP's SIMPLE_RADIAL."""
 TWO_FOCALS = (1.05, 1.5)
-"""In widths, of two cameras with photos of one size."""
+"""Focal lengths in widths, of two cameras with photos of one size."""
 
 
 def walk(radial: float, seed: int) -> Views:
-    """A hand-held walk; every seed has its own path, and its own camera."""
+    """Make a hand-held walk; every seed has its own path and its own camera."""
     return arc(make_camera(*SIZE, focal_widths=1.05 + 0.1 * seed, radial=radial), seed=seed)
 
 
 def turntable(seed: int) -> Views:
-    """An orbit, which leaves the focal undetermined."""
+    """Make an orbit, which leaves the focal undetermined."""
     return orbit(make_camera(*SIZE), sweep_deg=80.0 + 20.0 * seed)
 
 
 def two_cameras(seed: int) -> Views:
-    """Every other photo with a longer lens, and nothing in the files says so."""
+    """Make views with a longer lens in every other photo; nothing in the files tells them apart."""
     first, second = (make_camera(*SIZE, focal_widths=focal) for focal in TWO_FOCALS)
     views = arc(first, ArcOptions(photos=14), seed=seed)
     return views.taken_with(second, sorted(views.cameras)[1::2])
@@ -42,7 +42,7 @@ KINDS: Mapping[str, Callable[[int], Views]] = {
 
 
 def rendered_sets(seeds: int, cache: Path) -> Iterator[PhotoSet]:
-    """Every kind under so many seeds; folders in the cache that are complete are taken as they are."""
+    """Yield every kind for each of the seeds; complete folders in the cache are reused."""
     for kind, views in KINDS.items():
         for seed in range(seeds):
             name = f"{kind} seed {seed}"

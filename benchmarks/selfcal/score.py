@@ -17,7 +17,7 @@ INSIDE = 3.0
 
 
 def row(photos: str, found: Found, truth: Mapping[str, TrueCamera]) -> Row:
-    """Medians over the photos whose camera is known; with one camera for all, simply its figures."""
+    """Return medians over the photos that have a truth; with one camera for all, these are its errors."""
     cameras = list(dict.fromkeys(found.cameras.values()))
     known = sum(camera.identifiable for camera in found.cameras.values())
     reasons = [camera.reason for camera in cameras if camera.reason]
@@ -42,22 +42,22 @@ COLUMNS = (
     "e_focal %", "worst e_focal %", "center % of width", "fy/fx %", "k1 error", "sd of f %",
     "fx sd", "fy sd", "cx sd", "cy sd", "in 3 sd",
 )  # fmt: skip
-"""What needs the truth. "fx sd" is the error of fx in its own standard deviations, and so on."""
+"""Columns that need the truth. "fx sd" is the error of fx in its own standard deviations, and so on."""
 
 
 def deviations(camera: Calibration, K: NDArray[np.float64]) -> dict[str, float]:
-    """|error| over the stated standard deviation, for what has one."""
+    """Return |error| over the stated standard deviation, for the parameters that have one."""
     stated = {name: camera.spread[name] for name in PLACES if camera.spread.get(name, 0.0) > 0}
     return {name: float(abs(camera.K[PLACES[name]] - K[PLACES[name]]) / sd) for name, sd in stated.items()}
 
 
 def center_error_percent(camera: Calibration, K: NDArray[np.float64]) -> float:
-    """Distance of the optical centers as a share of the width."""
+    """Compute the distance of the optical centers in percent of the width."""
     return float(100 * np.linalg.norm(camera.K[:2, 2] - K[:2, 2]) / camera.width)
 
 
 def aspect_error_percent(camera: Calibration, K: NDArray[np.float64]) -> float:
-    """Error of fy / fx."""
+    """Compute the error of fy / fx in percent."""
     return float(100 * abs((camera.K[1, 1] / camera.K[0, 0]) / (K[1, 1] / K[0, 0]) - 1))
 
 

@@ -19,16 +19,16 @@ from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import CameraPairs
 
 REPEATS, ENOUGH_SECONDS = 5, 5.0
-"""Calls are repeated until there are so many or so much time is spent, but at least once after the first."""
+"""Limits on the number and total time of the measured calls; at least one follows the unmeasured first."""
 SAMPLES = 100
 THESIS_CAMERAS = 10
 """45 pairs."""
 CAMERAS = (7, 10, 14, 20)
-"""21 to 190 pairs: each step doubles them."""
+"""21 to 190 pairs: each step about doubles them."""
 
 
 def speed(subject: Measured | None, overrides: Mapping[str, Mapping[str, object]]) -> list[Row]:
-    """One row per measurement: CPU seconds of one call, the least of a few after one that is not counted."""
+    """Return one row per measurement: CPU seconds of one call, the minimum of a few after an unmeasured one."""
     rows = [_curves(synthetic_pairs(THESIS_CAMERAS))]
     for label, others in {"": {}, **overrides}.items():
         settings = Settings.from_mapping(merged({"seed": 0}, others))
@@ -49,8 +49,8 @@ def _known(pairs: CameraPairs, method: str) -> CameraPairs:
 
 @cache
 def synthetic_pairs(cameras: int, seed: int = 0) -> CameraPairs:
-    """All pairs of so many synthetic photos, estimated from matches with noise."""
-    # many cameras have to see the same points, so they stand closer together than in the thesis
+    """Make all pairs of `cameras` synthetic photos, estimated from noisy matches."""
+    # all cameras must see the same points, so they stand closer together than in the thesis
     options = TrackOptions(cameras=cameras, sigma_px=0.5, max_rotation_deg=20.0, max_shift=0.4)
     return estimated(make_tracks(options, seed), Settings(), seed)
 
@@ -85,7 +85,7 @@ def _seconds(work: Callable[[], object]) -> float:
     work()
     found: list[float] = []
     while len(found) < REPEATS and sum(found) < ENOUGH_SECONDS:
-        # not the clock on the wall: other processes on the machine would count
+        # not wall-clock time, which would include other processes on the machine
         start = time.process_time()
         work()
         found.append(time.process_time() - start)

@@ -1,4 +1,4 @@
-"""COLMAP's view-graph calibration on our fundamental matrices: what zero curves compete with."""
+"""COLMAP's view-graph calibration on our fundamental matrices: the rival of zero curves."""
 
 import shutil
 import time
@@ -18,14 +18,14 @@ METHOD = "view-graph calibration"
 def view_graph_calibration(
     database: Path, scratch: Path, matches: MatchGraph, views: ViewGraph, seed: int = 0
 ) -> tuple[dict[int, Calibration], float]:
-    """Calibrate a copy of the database that starts from 1.2 times the longer side, of which nobody is sure.
+    """Calibrate a copy of the database whose focals start at 1.2 times the longer side, without a prior.
 
-    Degenerate pairs stay in it, marked as such, as they do for mapping. Relative poses are not estimated anew: that
-    is no part of the calibration, and would only cost it time.
+    Degenerate pairs stay in it, marked as such, as they do for mapping. Relative poses are not re-estimated: that
+    is not part of the calibration and would only add to its time.
 
     Returns:
-        By image id, and the seconds of COLMAP's part alone. A camera that stays at its guess counts as not
-        identifiable: COLMAP itself does not say so.
+        Calibrations by image id, and the seconds of COLMAP's part alone. A camera that stays at its guess counts as not
+        identifiable, although COLMAP itself does not report this.
     """
     copy = scratch / "view_graph_calibration.db"
     shutil.copyfile(database, copy)
@@ -68,6 +68,6 @@ def _forget_cameras(path: Path) -> None:
 
 def _answer(camera: Any, done: bool) -> Calibration:
     K = np.asarray(camera.calibration_matrix(), np.float64)
-    known = done and camera.has_prior_focal_length  # COLMAP sets it where it accepts what it found
+    known = done and camera.has_prior_focal_length  # COLMAP sets it where it accepts its estimate
     reason = "" if known else "kept the guess" if done else "gave up"
     return Calibration(K, camera.width, camera.height, METHOD, identifiable=known, reason=reason)

@@ -1,4 +1,4 @@
-"""What surfaces have to reach, and whether they do."""
+"""Bars that the surfaces must meet, and whether they do."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,11 +7,11 @@ from benchmarks.common.results import Row
 from benchmarks.surface.sets import REAL, RENDERED
 
 WIDELY_SEEN = ("fountain-P11", "Herz-Jesus-P8")
-"""Sets whose photos show little but the object."""
+"""Sets whose photos show mainly the object."""
 TIMED = "fountain-P11"
-"""Of this set, depth maps, mesh and texture together have to be done in time on two cores."""
+"""The set whose depth maps, mesh and texture together have a time limit, on two cores."""
 ON_BLACK = ("temple16",)
-"""Sets on a black background, of whose photos less than the bar may show anything."""
+"""Sets on a black background, whose photos may show less of the object than the bar."""
 BARS: Mapping[str, tuple[Bar, ...]] = {
     name: (least("accuracy %", 90.0), least("completeness %", 85.0)) for name in RENDERED
 } | {
@@ -24,11 +24,11 @@ BARS: Mapping[str, tuple[Bar, ...]] = {
     )
     for name in REAL
 }
-"""By photo set: shares of a rendered scene's surface; what a photo's camera sees of the model of a real one."""
+"""By photo set: shares of the surface for rendered scenes, coverage and PSNR of the photos for real ones."""
 
 
 def asked(rows: Sequence[Row]) -> list[Row]:
-    """One row per bar: what was asked, what was measured, whether it is met."""
+    """Return one row per bar: the bar, the measured value, and whether it is met."""
     found = []
     for row in rows:
         for bar in BARS.get(row["photos"], ()):

@@ -1,4 +1,4 @@
-"""Surfaces of `sfm-app`: rendered scenes against their truth, real ones against their photos, and what they cost.
+"""Surfaces of `sfm-app`: rendered scenes against their truth, real ones against their photos, and the cost.
 
 python -m benchmarks.surface DATA --cache CACHE --left-out 3 --parts castle-P19 5 10 19
 python -m benchmarks.surface --sets statue corner --cache CACHE
@@ -41,7 +41,7 @@ ABOUT = (
 
 
 def measure(photos: SurfaceSet, out: Path, args: argparse.Namespace) -> Row:
-    """Everything about one set."""
+    """Measure everything about one set."""
     again = () if args.keep else dense_stages()
     said = run_stages(photos.photos, out, ("scene", *dense_stages()), args.settings, again)
     row: Row = {"photos": photos.name, "method": "sfm-app", **cost(said), "of": photos.count}
@@ -65,7 +65,7 @@ def measure(photos: SurfaceSet, out: Path, args: argparse.Namespace) -> Row:
 
 
 def measure_parts(whole: SurfaceSet, counts: Sequence[int], cache: Path, settings: Mapping[str, Any]) -> list[Row]:
-    """What more and more photos of a set cost."""
+    """Measure the cost of growing numbers of photos of a set."""
     rows = []
     for count in counts:
         part = part_of(whole, count, cache)
@@ -81,17 +81,17 @@ def measure_parts(whole: SurfaceSet, counts: Sequence[int], cache: Path, setting
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("surface", __doc__)
     parser.add_argument("data", type=Path, nargs="?", help="folder with NAME/images; rendered scenes need none")
     parser.add_argument("--cache", type=Path, help="keeps rendered photos and the last run of every set")
     parser.add_argument("--sets", nargs="*", metavar="SET", help="rendered scenes and names in DATA; all by default")
-    parser.add_argument("--left-out", type=int, default=0, metavar="N", help="photos of each set left out in turn")
-    parser.add_argument("--geometry-too", action="store_true", help="left out of depth maps and mesh, too")
+    parser.add_argument("--left-out", type=int, default=0, metavar="N", help="leave out N photos of each set in turn")
+    parser.add_argument("--geometry-too", action="store_true", help="leave them out of depth maps and mesh, too")
     parser.add_argument(
         "--parts", nargs="+", default=[], metavar=("SET", "COUNT"), help="cost of the first COUNT photos"
     )
-    parser.add_argument("--keep", action="store_true", help="do not do stages again that are up to date")
+    parser.add_argument("--keep", action="store_true", help="reuse stages that are up to date")
     parser.add_argument("--set", dest="assignments", nargs="*", default=[], metavar="TABLE.KEY=VALUE")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--name", default="surface", help="name of the result files")
@@ -100,7 +100,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def arguments() -> argparse.Namespace:
-    """Read the command line, with the sets that are meant and the settings."""
+    """Read the command line, and resolve the sets and settings."""
     args = parser().parse_args()
     if args.sets is None:
         args.sets = [*RENDERED, *(REAL if args.data else ())]
@@ -111,7 +111,7 @@ def arguments() -> argparse.Namespace:
 
 
 def main() -> None:
-    """Measure all sets, and publish."""
+    """Measure all sets, and write the results."""
     args = arguments()
     with tempfile.TemporaryDirectory(prefix="surface-") as scratch:
         cache = (args.cache or Path(scratch)).resolve()

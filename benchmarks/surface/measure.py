@@ -1,4 +1,4 @@
-"""The figures of one photo set: cost, files, distance to the truth, likeness to the photos."""
+"""Scores of one photo set: cost, file sizes, distance to the truth, similarity to the photos."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ FILES = ("glb", "ply", "obj")
 
 
 def cost(said: Mapping[str, Said]) -> Row:
-    """Seconds and memory of the stages behind the cameras, and why they stopped where they did."""
+    """Return seconds and memory of the stages after the cameras, and the reason if one failed."""
     failed = next((one.failed for one in said.values() if one.failed), "")
     row: Row = {"failed": failed, "seconds together": None}
     for stage in dense_stages():
@@ -43,13 +43,13 @@ def cost(said: Mapping[str, Said]) -> Row:
 
 
 def files(out: Path) -> Row:
-    """Sizes of the model files in kB."""
+    """Return the sizes of the model files in kB."""
     found = {suffix: out / f"model.{suffix}" for suffix in FILES}
     return {f"kB {suffix}": path.stat().st_size // 1000 for suffix, path in found.items() if path.exists()}
 
 
 def against_truth(surface: Surface, out: Path, truth: Truth) -> Row:
-    """Ours, and the best of what the sparse points give."""
+    """Score our surface, and the best one from the sparse points, against the truth."""
     centers = {name: image.projection_center() for name, image in placed_photos(out).items()}
     seen = seen_places(truth)
     row = truth_scores(surface, centers, truth, seen)
@@ -64,12 +64,12 @@ def against_truth(surface: Surface, out: Path, truth: Truth) -> Row:
 
 
 def against_photos(model: PreparedModel, out: Path, names: Sequence[str]) -> Row:
-    """Means over all photos that have a place."""
+    """Average the scores over all registered photos."""
     return photo_scores(likenesses(model, out, names))
 
 
 def likenesses(model: PreparedModel, out: Path, names: Sequence[str]) -> dict[str, Likeness]:
-    """By photo."""
+    """Compare the rendered model with each photo, by photo name."""
     found = {}
     for name in names:
         photo = placed_photo(out, name)
@@ -80,7 +80,7 @@ def likenesses(model: PreparedModel, out: Path, names: Sequence[str]) -> dict[st
 def left_out(
     photos: SurfaceSet, out: Path, model: PreparedModel, settings: Mapping[str, Any], *, count: int, geometry_too: bool
 ) -> Row:
-    """PSNR in photos that the texture was made without, and by how much it is lower than with them."""
+    """Return PSNR in photos that the texture was made without, and by how much it is lower than with them."""
     names = spread_out(list(placed_photos(out)), count)
     with_it = likenesses(model, out, names)
     values, lower = [], []
@@ -95,7 +95,7 @@ def left_out(
         if any(one.failed for one in said.values()):
             return {"left out": next(one.failed for one in said.values() if one.failed)}
         without = prepare_model(finished_model(photos.photos, target, Settings.from_mapping(settings)))
-        # the camera is that of the finished run, in whose frame the copy stands
+        # the camera is that of the finished run, whose frame the copy shares
         psnr = likenesses(without, out, [name])[name].psnr_db
         if math.isfinite(psnr) and math.isfinite(with_it[name].psnr_db):
             values.append(psnr)

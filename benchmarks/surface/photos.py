@@ -1,4 +1,4 @@
-"""A finished model beside the photos it was made of: how much of them it covers, and how alike it is there."""
+"""Compare a finished model with its photos: how much of them it covers, and how similar it is there."""
 
 import shutil
 from collections.abc import Mapping
@@ -18,20 +18,20 @@ from sfm_app.synthetic.pictures import Picture, PreparedModel, view_along
 Pixels = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
 BLACK = 32
-"""Gray level below which a pixel of a photo on black shows nothing."""
+"""Value of the brightest channel below which a pixel counts as black background."""
 LEAST_PIXELS = 1000
-"""Covered pixels that a photo's likeness is judged by."""
+"""Least number of covered pixels for a PSNR."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedPhoto:
-    """A photo with its camera as it was found, lens and all."""
+    """A photo with its estimated camera, lens distortion included."""
 
     name: str
     pixels: Pixels
     """(H, W, 3) RGB."""
     center: FloatArray
-    """(3,) of the camera."""
+    """(3,) center of the camera."""
     rays: FloatArray
     """(H, W, 3) directions in the world that the pixels see."""
 
@@ -43,21 +43,21 @@ class Likeness:
     coverage: float
     """Share of the pixels that show the model, 0..1."""
     not_black: float
-    """Share of the photo's pixels that are not black: on a black background nothing can be seen."""
+    """Share of the photo's pixels that are not black background."""
     coverage_not_black: float
     """Share of those that show the model."""
     psnr_db: float
-    """On the covered pixels after the rendering's exposure is adjusted; nan where next to nothing is covered."""
+    """PSNR on the covered pixels after adjusting the rendering's exposure; nan where too few are covered."""
 
 
 def placed_photos(out: Path) -> dict[str, "pycolmap.Image"]:
-    """Photos of the finished run that have a place, by name."""
+    """Read the registered photos of the finished run, by name."""
     model = pycolmap.Reconstruction(out / "sparse")
     return {image.name: image for image in sorted(model.images.values(), key=lambda i: i.name) if image.has_pose}
 
 
 def placed_photo(out: Path, name: str) -> PlacedPhoto:
-    """One of them with its pixels and its rays."""
+    """Read one registered photo with its pixels and rays."""
     model = pycolmap.Reconstruction(out / "sparse")
     image = next(image for image in model.images.values() if image.name == name)
     camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
@@ -69,12 +69,12 @@ def placed_photo(out: Path, name: str) -> PlacedPhoto:
 
 
 def rendered(model: PreparedModel, photo: PlacedPhoto) -> Picture:
-    """The model as that photo's camera sees it."""
+    """Render the model into the photo's camera."""
     return view_along(model, photo.center, photo.rays)
 
 
 def likeness(picture: Picture, photo: Pixels) -> Likeness:
-    """How much of a photo a rendering (of the same size) covers, and how alike they are there."""
+    """Compare a rendering with a photo of the same size: coverage, and PSNR where it covers the photo."""
     covered, lit = picture.covered, photo.max(axis=2) >= BLACK
     psnr = float("nan")
     if covered.sum() >= LEAST_PIXELS:
@@ -84,7 +84,7 @@ def likeness(picture: Picture, photo: Pixels) -> Likeness:
 
 
 def psnr_db(rendering: Pixels, photo: Pixels) -> float:
-    """Peak signal-to-noise ratio of colors (N, 3) after a gain and an offset per channel took out the exposure."""
+    """Compute the PSNR of colors (N, 3) after a gain and an offset per channel compensate the exposure."""
     squares = []
     for a, b in zip(rendering.T.astype(np.float64), photo.T.astype(np.float64), strict=True):
         spread = a.var()
@@ -94,7 +94,7 @@ def psnr_db(rendering: Pixels, photo: Pixels) -> float:
 
 
 def photo_scores(found: Mapping[str, Likeness]) -> Row:
-    """Means over the photos, and the worst of them."""
+    """Average the scores over the photos, and give the worst of them."""
     coverage = [100.0 * one.coverage for one in found.values()]
     psnr = [one.psnr_db for one in found.values() if np.isfinite(one.psnr_db)]
     return {
@@ -108,20 +108,20 @@ def photo_scores(found: Mapping[str, Likeness]) -> Row:
 
 
 def spread_out(names: list[str], count: int) -> list[str]:
-    """So many of the names, evenly from first to last, without the ends where others are there."""
+    """Take `count` evenly spaced names, away from both ends where possible."""
     if count >= len(names):
         return names
     return [names[round(place)] for place in (np.arange(count) + 0.5) / count * (len(names) - 1)]
 
 
 def leave_out(out: Path, target: Path, name: str, *, geometry_too: bool) -> str:
-    """Copy a finished run and take a photo's place away, as if it had never been found.
+    """Copy a finished run without a photo's pose, as if the photo had never been registered.
 
     Args:
         out: the finished run.
-        target: the copy; what lies there is removed.
-        name: of the photo.
-        geometry_too: whether depth maps and mesh have to do without it as well, or the texture only.
+        target: folder of the copy; its contents are removed.
+        name: name of the photo.
+        geometry_too: whether depth maps and mesh leave it out as well, or the texture only.
 
     Returns:
         The stage from which on the program has to run again.

@@ -1,4 +1,4 @@
-"""A page of pictures per model: a photo, the model from there and from beside it, and its bare shape."""
+"""A page of pictures per model: a photo, the model from its camera and from beside it, and its bare shape."""
 
 from pathlib import Path
 
@@ -15,13 +15,13 @@ Pixels = NDArray[np.uint8]
 TALL_PX, WIDE_PX = 800, 1000
 """Largest height and width of one picture; a page has two by two of them."""
 COLORS, PALETTE_PIXELS = 256, 20_000
-"""Of a page, which keeps PNGs small, and the pixels that its colors are chosen by."""
+"""Colors of a page, few to keep PNGs small, and the number of pixels that they are chosen from."""
 WIDTHS_PX, BYTES = (1600, 1400, 1200, 1000, 800), 600_000
-"""Of a page."""
+"""Widths of a page to try, and the largest file."""
 
 
 def model_page(out: Path, name: str, model: PreparedModel) -> Pixels:
-    """Photo, model from its camera; model from beside, bare shape: (H, W, 3)."""
+    """Draw photo and model from its camera, below them the model from beside and its bare shape: (H, W, 3)."""
     sparse = pycolmap.Reconstruction(out / "sparse")
     image = next(image for image in sparse.images.values() if image.name == name)
     camera, pose = sparse.cameras[image.camera_id], np.asarray(image.cam_from_world().matrix())
@@ -33,7 +33,7 @@ def model_page(out: Path, name: str, model: PreparedModel) -> Pixels:
 
 
 def save_page(page: Pixels, path: Path) -> None:
-    """A PNG of at most `WIDTHS_PX[0]` and `BYTES`, in few colors; narrower where it would be larger."""
+    """Write a PNG of at most `WIDTHS_PX[0]` pixels width and `BYTES`, in few colors; narrower if it would be larger."""
     path.parent.mkdir(parents=True, exist_ok=True)
     palette = Image.new("P", (1, 1))
     palette.putpalette(palette_of(page).tobytes())
@@ -48,7 +48,7 @@ def save_page(page: Pixels, path: Path) -> None:
 
 
 def palette_of(page: Pixels) -> Pixels:
-    """(COLORS, 3) that stand for the colors of a page: white, and k-means of some of its pixels that are not."""
+    """Choose a palette (COLORS, 3) for a page: white, and k-means of a sample of its other pixels."""
     pixels = page[page.min(axis=2) < 255]
     if not len(pixels):
         return np.full((COLORS, 3), 255, np.uint8)

@@ -1,4 +1,4 @@
-"""Surfaces as a page."""
+"""The result page of surfaces."""
 
 from collections.abc import Mapping, Sequence
 
@@ -19,7 +19,7 @@ COST = ("photos", "placed", "seconds together", "seconds per photo")
 
 
 def page(about: str, rows: Sequence[Row], parts: Sequence[Row], files_of: Mapping[str, str]) -> str:
-    """Bars first, then all figures; at last the pictures that were drawn, by set."""
+    """Return the page: bars first, then all figures, then the pictures that were drawn, by set."""
     columns = list(dict.fromkeys(key for row in (*rows, *parts) for key in row))
     stages = [key for key in columns if key.startswith(("s of ", "MB "))]
     files = [key for key in columns if key.startswith("kB ")]

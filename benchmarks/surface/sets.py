@@ -1,4 +1,4 @@
-"""Photo sets to make surfaces of: rendered ones with their truth, real ones, parts of them; and the finished model."""
+"""Photo sets for surfaces: rendered ones with their truth, real ones, and parts of them; also the finished model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ REAL = ("fountain-P11", "Herz-Jesus-P8", "castle-P19", "temple16", "kermit11")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SurfaceSet:
-    """Photos of one place."""
+    """Photos of one scene."""
 
     name: str
     photos: Path
     truth: Truth | None
-    """Of rendered photos."""
+    """Truth of rendered photos; None for real ones."""
 
     @property
     def count(self) -> int:
@@ -32,15 +32,15 @@ class SurfaceSet:
 
 
 def surface_set(name: str, data: Path | None, cache: Path) -> SurfaceSet:
-    """A scene of the program's own, rendered once into the cache, or DATA/NAME/images.
+    """Return one of the program's own scenes, rendered once into the cache, or DATA/NAME/images.
 
     Args:
-        name: of a scene, SCENE@SEED for another walk and other noise, or of a folder.
-        data: folder of folders.
-        cache: for what is rendered.
+        name: a scene, SCENE@SEED for another walk and other noise, or a folder of DATA.
+        data: folder of the photo sets.
+        cache: folder for rendered photos.
 
     Raises:
-        ValueError: neither is there.
+        ValueError: neither exists.
     """
     scene, _, seed = name.partition("@")
     if scene in WALKS:
@@ -52,7 +52,7 @@ def surface_set(name: str, data: Path | None, cache: Path) -> SurfaceSet:
 
 
 def part_of(whole: SurfaceSet, count: int, cache: Path) -> SurfaceSet:
-    """The first photos of a set."""
+    """Make a set of the first photos of another."""
     folder = cache / "parts" / f"{whole.name}-{count}"
     folder.mkdir(parents=True, exist_ok=True)
     photos = sorted(path for path in whole.photos.iterdir() if path.suffix.lower() in FORMATS)
@@ -62,13 +62,13 @@ def part_of(whole: SurfaceSet, count: int, cache: Path) -> SurfaceSet:
 
 
 def finished_model(photos: Path, out: Path, settings: Settings) -> Model:
-    """The textured surface that a finished run holds; with colors of the vertices where there is no texture."""
+    """Read the textured surface of a finished run, or the one with vertex colors where there is no texture."""
     with opened_run(out, settings, None) as run:
         return run_stages(photos, run, last=TEXTURE.name)[TEXTURE]
 
 
 def dense_stages() -> Sequence[str]:
-    """The stages behind the cameras, in order."""
+    """List the stages after the cameras, in order."""
     return NAMES[NAMES.index(SCENE.name) + 1 :]
 
 

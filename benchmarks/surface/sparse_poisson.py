@@ -1,4 +1,4 @@
-"""What COLMAP gives without CUDA: Poisson's surface through the sparse points of the same run."""
+"""COLMAP's surface without CUDA: Poisson reconstruction from the sparse points of the same run."""
 
 import tempfile
 from collections.abc import Iterator
@@ -14,18 +14,18 @@ from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
 NEIGHBORS = 16
-"""Points that a normal is fitted to."""
+"""Number of points that a normal is fitted to."""
 DEPTH = 10
-"""Of the octree; the points are too few for COLMAP's 13, which gives the same surface later."""
+"""Depth of the octree; with so few points, COLMAP's 13 gives the same surface but takes longer."""
 TRIMS = (7.0, 6.0, 5.0, 4.0)
-"""Under COLMAP's own trimming, 10, nothing is left of points as few as these."""
+"""Trimmings to try; COLMAP's default, 10, removes the whole surface of points as few as these."""
 _VERTEX = np.dtype(
     [*((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")), *((c, "u1") for c in ("r", "g", "b"))]
 )
 
 
 def sparse_surfaces(model_dir: Path) -> Iterator[tuple[float, Surface]]:
-    """Surfaces under several trimmings: the more is trimmed, the less lies where there are no points."""
+    """Yield surfaces under several trimmings: more trimming leaves less surface where there are no points."""
     points, normals, colors = oriented_points(pycolmap.Reconstruction(model_dir))
     with tempfile.TemporaryDirectory(prefix="rival-") as scratch:
         source, target = Path(scratch) / "points.ply", Path(scratch) / "mesh.ply"
@@ -41,7 +41,7 @@ def sparse_surfaces(model_dir: Path) -> Iterator[tuple[float, Surface]]:
 
 
 def oriented_points(model: "pycolmap.Reconstruction") -> tuple[FloatArray, FloatArray, NDArray[np.uint8]]:
-    """Points (N, 3), unit normals (N, 3) of their surroundings, turned to the photos that see them, colors (N, 3)."""
+    """Return points (N, 3), unit normals (N, 3) that face the photos that see them, and colors (N, 3)."""
     centers = {key: image.projection_center() for key, image in model.images.items() if image.has_pose}
     known = [model.points3D[key] for key in sorted(model.points3D)]
     points = np.array([point.xyz for point in known]).reshape(-1, 3)
@@ -55,7 +55,7 @@ def oriented_points(model: "pycolmap.Reconstruction") -> tuple[FloatArray, Float
 
 
 def points_ply(points: FloatArray, normals: FloatArray, colors: NDArray[np.uint8]) -> bytes:
-    """As COLMAP writes fused.ply."""
+    """Encode the points as COLMAP writes fused.ply."""
     rows = np.empty(len(points), _VERTEX)
     for names, values in (("xyz", points), (("nx", "ny", "nz"), normals), ("rgb", colors)):
         for k, name in enumerate(names):

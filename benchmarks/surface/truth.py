@@ -1,4 +1,4 @@
-"""A surface against the true one: how much of it is right, and how much of what was seen is there."""
+"""Compare a surface with the true one: accuracy, and completeness over the places that the photos see."""
 
 from collections.abc import Mapping
 
@@ -14,24 +14,24 @@ from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
 ACCURATE, COMPLETE, FINE = 0.005, 0.01, 0.001
-"""Distances that count as right, as there, and as right in detail, in sizes of the scene."""
+"""Distance limits of accuracy, of completeness and of "right in detail", in sizes of the scene."""
 SAMPLES = 40_000
-"""Points that a surface is judged by, evenly over its area."""
+"""Number of points that a surface is sampled at, evenly over its area."""
 SEEN_BY = 2
-"""Photos that have to see a place before a surface can be asked for: depth takes two."""
+"""Least number of photos that see a place whose surface is required: depth takes two."""
 GRAZING_DEG = 80.0
-"""A place seen at more than this angle to its normal is not seen."""
+"""A place viewed at more than this angle to its normal does not count as seen."""
 HIDDEN = 2e-3
-"""How far behind what a photo sees first a place counts as seen by it, in sizes of the scene."""
+"""Largest distance behind the first surface on a ray at which a place counts as seen, in sizes of the scene."""
 
 
 def truth_scores(surface: Surface, centers: Mapping[str, FloatArray], truth: Truth, seen: FloatArray) -> Row:
-    """Accuracy, completeness, their harmonic mean, the median distance, the share that is right in detail; in percent.
+    """Return accuracy, completeness, F, median distance and the share that is right in detail, all in percent.
 
     Args:
         surface: in the frame of the reconstruction; moved onto the truth by the camera centers.
         centers: (3,) by photo name in that frame.
-        truth: of the rendered photos.
+        truth: truth of the rendered photos.
         seen: (N, 3) places of the true surface from `seen_places`.
     """
     names = ("accuracy %", "completeness %", "F %", "median %", "within 0.1 %")
@@ -47,12 +47,12 @@ def truth_scores(surface: Surface, centers: Mapping[str, FloatArray], truth: Tru
 
 
 def seen_places(truth: Truth, photos: int = SEEN_BY, samples: int = 3 * SAMPLES) -> FloatArray:
-    """Places of the true surface, evenly over its area, that so many photos see: in the photo, in front, not hidden.
+    """Sample places of the true surface, evenly over its area, that enough photos see: in frame, in front, not hidden.
 
     Args:
-        truth: of the rendered photos.
+        truth: truth of the rendered photos.
         photos: least number of photos.
-        samples: over the whole surface, with what nobody sees.
+        samples: number of samples over the whole surface, unseen parts included.
     """
     caster = ray_caster(truth.vertices, truth.faces)
     places, normals = _with_normals(truth, samples)
@@ -69,14 +69,14 @@ def seen_places(truth: Truth, photos: int = SEEN_BY, samples: int = 3 * SAMPLES)
         distance = np.linalg.norm(ways, axis=1)
         facing = -(ways * normals).sum(axis=1) > np.cos(np.radians(GRAZING_DEG)) * distance
         asked = np.flatnonzero(within & facing)
-        # the ways are as long as the distance, so that t_hit counts in them
+        # the ray directions have the length of the distance, so t_hit is in units of it
         first = cast(caster, center, ways[asked])["t_hit"].astype(np.float64) * distance[asked]
         counted[asked[first >= distance[asked] - slack]] += 1
     return places[counted >= photos]
 
 
 def _with_normals(truth: Truth, samples: int) -> tuple[FloatArray, FloatArray]:
-    """Points on the surface and the normals of their triangles."""
+    """Sample points on the surface, with the normals of their triangles."""
     places, face = sample_triangles(truth.vertices, truth.faces, samples)
     corners = truth.vertices[truth.faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,8 +1,8 @@
-"""One stage of the program in a process of its own.
+"""Run one stage of the program in a process of its own.
 
     python -m benchmarks.surface.worker PHOTOS OUT FIRST LAST SETTINGS
 
-Its memory is then that of the stage. Without FIRST, what is up to date is not done again.
+The memory of the process is then that of the stage. Without FIRST, up-to-date stages are not run again.
 """
 
 import json
@@ -19,31 +19,31 @@ from benchmarks.common.processes import environment, module_command
 
 WORKER = "benchmarks.surface.worker"
 RESULT = "surface-{stage}.json"
-"""In OUT: what the process says about a stage."""
+"""File in OUT with the process's report on a stage."""
 
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """What a stage cost."""
+    """The cost of a stage, or why it failed."""
 
     failed: str
     """Why there is no result; empty where there is one."""
     seconds: float | None
-    """Of the stage, as in the manifest."""
+    """Seconds of the stage, as in the manifest."""
     peak_mb: int | None
 
 
 def run_stages(
     photos: Path, out: Path, stages: Sequence[str], settings: Mapping[str, Any], again: Sequence[str] = ()
 ) -> dict[str, Said]:
-    """Run the program stage by stage; stops where one fails.
+    """Run the program stage by stage, and stop where one fails.
 
     Args:
         photos: folder with photos.
         out: output folder.
-        stages: each runs up to its name, and so includes what comes before it and is missing.
-        settings: beside the defaults.
-        again: stages to do again though they are up to date; what the others said before is read.
+        stages: each run goes up to this stage, and so includes missing stages before it.
+        settings: settings that differ from the defaults.
+        again: stages to run again even if they are up to date; of the others, the last report is read.
     """
     found: dict[str, Said] = {}
     for stage in stages:
@@ -52,7 +52,7 @@ def run_stages(
         command = module_command(WORKER, str(photos), str(out), first, stage, json.dumps(settings))
         done = run_process(command, capture_output=True, text=True, check=False, env=environment())
         if not path.exists() or (done.returncode and path.stat().st_mtime == before):
-            last = done.stderr.strip().splitlines()[-1:] or ["no word"]
+            last = done.stderr.strip().splitlines()[-1:] or ["no output on stderr"]
             found[stage] = Said(f"{stage}: exit code {done.returncode}: {last[0]}", None, None)
         else:
             found[stage] = Said(**json.loads(path.read_text(encoding="utf-8")))
@@ -70,7 +70,7 @@ def main() -> None:
         sfm_app.reconstruct(photos, out, sfm_app.Settings.from_mapping(json.loads(text)), first=first, last=last)
     except sfm_app.SfmError as error:
         failed = f"{last}: {error}"
-    # a stage that was up to date has said before what it cost
+    # a stage that was up to date keeps the report of its last run
     redone = failed or manifest.stat().st_mtime >= start - 1.0
     path = Path(out) / RESULT.format(stage=last)
     if redone or not path.exists():

@@ -1,4 +1,4 @@
-"""A claim of the thesis beside our own figures."""
+"""Claims of the thesis compared with our own measurements."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """One sentence of the thesis beside our figures."""
+    """One claim of the thesis, and our numbers for it."""
 
     figure: str
     says: str
@@ -15,7 +15,7 @@ class Claim:
 
 
 def verdict(holds: Sequence[bool]) -> str:
-    """In words."""
+    """Return the verdict in words."""
     if all(holds):
         return "holds"
     return "holds in part" if any(holds) else "does not hold"

@@ -1,4 +1,4 @@
-"""Matched corners of the VGG sequences that the thesis uses, and what is done to them."""
+"""Matched corners of the VGG sequences that the thesis uses, and artificial outliers for them."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ BoolArray = NDArray[np.bool_]
 
 
 def load_corners(folder: Path, first: int, second: int) -> tuple[FloatArray, FloatArray]:
-    """The matches of two views of a sequence.
+    """Read the matches of two views of a sequence.
 
     Args:
         folder: holds one *.corners file per view and *nview-corners: per 3D point and view the number of the corner,
@@ -30,7 +30,7 @@ def load_corners(folder: Path, first: int, second: int) -> tuple[FloatArray, Flo
 
 
 def with_outliers(x2: FloatArray, share: float, reach_px: float, seed: int) -> tuple[FloatArray, BoolArray]:
-    """Add a uniform value in [-reach, reach] to a random share of the points; also which ones were left alone."""
+    """Add a uniform value in [-reach, reach] to a random share of the points; also return the mask of the others."""
     rng = np.random.default_rng([seed, 47])
     is_inlier = np.ones(len(x2), np.bool_)
     is_inlier[rng.permutation(len(x2))[: round(share * len(x2))]] = False

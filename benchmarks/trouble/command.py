@@ -1,9 +1,9 @@
-"""Rendered folders with random trouble through `sfm-app run --until scene`: does it ever fail, or know a wrong camera?
+"""Run `sfm-app run --until scene` on rendered folders with random trouble, and count failures and wrong cameras.
 
     python -m benchmarks.trouble --cache CACHE --folders 200 --keep
     python -m benchmarks.trouble --cache CACHE --only 17 42
 
-A seed decides a folder. With --keep, what was run with the same program is not run again.
+A seed determines a folder. With --keep, runs of the same program are reused.
 """
 
 import argparse
@@ -40,16 +40,16 @@ ABOUT = (
     "and cy after bundle adjustment in stated deviations, against the median of the cameras of the photos."
 )
 WRONG_PERCENT = 5.0
-"""A focal that is called identifiable and is further off is wrong."""
+"""A focal that is called identifiable and has a larger error is wrong."""
 WRONG_SHARE = 0.01
-"""So many folders may have one."""
+"""Largest share of folders that may have a wrong focal."""
 EXPECTED = (0, 4)
 OPEN = Lock()
-"""Rendering takes all cores anyway."""
+"""Held while rendering, which uses all cores anyway."""
 
 
 def folder_of(seed: int, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
-    """The photos of a seed, their truth, and its troubles; rendered on first use."""
+    """Return the photos of a seed, their truth and its troubles; rendered on first use."""
     plan = troubled_folder(seed)
     photos, truth = cache / "trouble" / "photos" / f"{seed:05d}", cache / "trouble" / "truth" / f"{seed:05d}"
     with OPEN:
@@ -60,7 +60,7 @@ def folder_of(seed: int, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
 
 
 def run_folder(seed: int, args: argparse.Namespace) -> Row:
-    """One folder through the program, and what came out."""
+    """Run the program on one folder, and score the result."""
     photos, truth, troubles = folder_of(seed, args.cache)
     out = args.cache / "trouble" / "runs" / f"{seed:05d}"
     key = key_of(Method(OURS), PhotoSet(photos.name, photos, {}))
@@ -80,7 +80,7 @@ def run_folder(seed: int, args: argparse.Namespace) -> Row:
 
 
 def text(row: Row) -> str:
-    """A folder in one line."""
+    """Describe a folder in one line."""
     shown = ("placed", "AUC@5", "known", "focal %", "known after", "focal % after", "worst in sd")
     figures = ", ".join(f"{name} {row[name]}" for name in shown if row.get(name) is not None)
     return (
@@ -89,7 +89,7 @@ def text(row: Row) -> str:
 
 
 def scored(out: Path, truth: Truth) -> Row:
-    """What came out, beside the truth."""
+    """Score the result against the truth."""
     photos = {
         Path(name).stem: TruePhoto(camera.K, truth.cam_from_world[name], camera.width)
         for name, camera in truth.cameras.items()
@@ -112,7 +112,7 @@ def scored(out: Path, truth: Truth) -> Row:
 
 
 def known_cameras(out: Path, photos: dict[str, TruePhoto], when: str, stated: Sequence[Row] = ()) -> Row:
-    """How many photos have a camera that is called known, and how far the worst of them is off, photo by photo."""
+    """Count the photos with a camera that is called known, and return the error of the worst of them."""
     suffix, (found, camera_of) = ("", cameras_before(out)) if when == "before" else (" after", cameras_after(out))
     sure = {row["camera"] for row in stated if row["identifiable"] == "yes"}
     known = {name for name, camera in found.items() if (camera["identifiable"] if when == "before" else name in sure)}
@@ -130,7 +130,7 @@ def known_cameras(out: Path, photos: dict[str, TruePhoto], when: str, stated: Se
 
 
 def summary(rows: Sequence[Row]) -> Row:
-    """Some folders in figures."""
+    """Summarize some folders."""
     known = [row for row in rows if row["focal %"] is not None]
     stated = sum(row["stated"] for row in rows)
     return {
@@ -147,7 +147,7 @@ def summary(rows: Sequence[Row]) -> Row:
 
 
 def by_trouble(rows: Sequence[Row]) -> Iterator[Row]:
-    """The summary of all folders, and of those with each trouble."""
+    """Yield the summary of all folders, and of those with each trouble."""
     yield {"trouble": "all"} | summary(rows)
     for kind in ("none", *KINDS):
         if having := [row for row in rows if kind in row["troubles"].split(", ")]:
@@ -155,7 +155,7 @@ def by_trouble(rows: Sequence[Row]) -> Iterator[Row]:
 
 
 def demands(rows: Sequence[Row]) -> list[Row]:
-    """What is asked of all folders together."""
+    """Check what is required of all folders together."""
     all_of = summary(rows)
     before, after, allowed = all_of["K wrong"], all_of["K wrong after"], int(WRONG_SHARE * len(rows))
     stated, off = sum(row["stated"] for row in rows), sum(row["beyond 3 sd"] for row in rows)
@@ -174,7 +174,7 @@ def demands(rows: Sequence[Row]) -> list[Row]:
 
 
 def page(rows: Sequence[Row]) -> str:
-    """The tables: what is asked, trouble by trouble, and the folders that are far off."""
+    """Return the tables: requirements, results by trouble, and the folders that are far off."""
     far = [row for row in rows if row["exit code"] not in EXPECTED or row["wrong"] or row["wrong after"]]
     shown = (
         "seed", "troubles", "exit code", "last", "placed", "AUC@5", "known", "focal %", "known after", "focal % after",
@@ -195,23 +195,23 @@ def _mean(values: Sequence[float]) -> float | None:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("trouble", __doc__)
     parser.add_argument("--cache", type=Path, required=True, help="keeps rendered photos and runs")
     parser.add_argument("--folders", type=int, default=200)
-    parser.add_argument("--seed", type=int, default=0, help="of the first folder; the others count on from it")
-    parser.add_argument("--only", nargs="+", type=int, metavar="SEED", help="these seeds instead")
-    parser.add_argument("--keep", action="store_true", help="do not run again what was run by the same program")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first folder; the others count up from it")
+    parser.add_argument("--only", nargs="+", type=int, metavar="SEED", help="run only these seeds")
+    parser.add_argument("--keep", action="store_true", help="reuse runs of the same program")
     parser.add_argument("--jobs", type=int, default=1, help="folders at a time")
-    parser.add_argument("--workers", type=int, default=0, help="of each run; 0: one per core")
-    parser.add_argument("--limit-min", type=float, default=15.0, metavar="M", help="minutes that a run may take")
+    parser.add_argument("--workers", type=int, default=0, help="workers of each run; 0: one per core")
+    parser.add_argument("--limit-min", type=float, default=15.0, metavar="M", help="time limit of a run in minutes")
     parser.add_argument("--results", type=Path, default=RESULTS)
     parser.add_argument("--name", default="trouble", help="name of the result files")
     return parser
 
 
 def main() -> None:
-    """Run all folders, and publish after each."""
+    """Run all folders, and write the results after each."""
     args = parser().parse_args()
     seeds = args.only or [args.seed + k for k in range(args.folders)]
     rows: list[Row] = []

@@ -1,6 +1,6 @@
-// node check.mjs FOLDER: the Khronos validator and three.js on every GLB in FOLDER.
-// CHROME names another browser than the bundled one, which is for Linux.
-// Prints JSON {name: {validator, three}} and leaves NAME.png, a view of the model, beside each file.
+// node check.mjs FOLDER: run the Khronos validator and three.js on every GLB in FOLDER.
+// CHROME: path of another browser than the bundled one, which is for Linux.
+// Prints JSON {name: {validator, three}} and writes NAME.png, a view of the model, beside each file.
 import chromium from '@sparticuz/chromium';
 import validator from 'gltf-validator';
 import fs from 'node:fs';

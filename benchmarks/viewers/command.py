@@ -1,11 +1,11 @@
-"""Do our model files open everywhere, and do they look right? One row per GLB.
+"""Check that our model files open in several viewers and look right. One row per GLB.
 
     python -m benchmarks.viewers OUT OUT
     python -m benchmarks.viewers OUT OUT --pictures
 
 Runs the Khronos validator and three.js in headless Chromium (benchmarks/viewers, needs Node and `npm install` there),
-Open3D and trimesh on what finished runs left behind and on a small model with two pages of texture whose colors are
-known. With --pictures, a screenshot of each model goes to benchmarks/results/viewers-NAME.png: look at them.
+Open3D and trimesh on the output of finished runs and on a small model with two pages of texture whose colors are
+known. With --pictures, a screenshot of each model goes to benchmarks/results/viewers-NAME.png, to be looked at.
 """
 
 import argparse
@@ -35,7 +35,7 @@ Row = dict[str, Any]
 BROWSER = Path(__file__).parent
 SAMPLE = "sample"
 PAGES = ((200, 90, 60), (40, 90, 200))
-"""sRGB of the pages of the sample."""
+"""sRGB colors of the sample's pages."""
 ABOUT = """\
 Every GLB through the Khronos validator, three.js in headless Chromium, Open3D and trimesh; the surface as its PLY has
 it. on screen: share of the picture that the model covers. outward: share of the vertices whose normal looks at a
@@ -55,12 +55,12 @@ SURFACES = (
 
 LIMITS = {"outward": 0.95, "off center": 0.2, "up +- deg": 3.0, "up odds": 20.0, "on screen": 0.002}
 TURNED_DEG = {"temple16": 270}
-"""By run: how far its photos have to be turned clockwise to be upright, as people see it; the others are upright."""
+"""By run: the clockwise turn that makes its photos upright, judged by eye; photos of other runs are upright."""
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """One GLB and what belongs to it."""
+    """One GLB, with its PLY, cameras and orientation."""
 
     name: str
     glb: Path
@@ -71,7 +71,7 @@ class Subject:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("viewers", __doc__)
     parser.add_argument("runs", nargs="*", type=Path, metavar="OUT", help="output folders of finished runs")
     parser.add_argument("--results", type=Path, default=RESULTS, help="where tables and screenshots go")
@@ -80,7 +80,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main() -> int:
-    """Check, publish, and say by the exit code whether all is well."""
+    """Check all models, write the results, and return exit code 0 if all are fine, else 1."""
     options = parser().parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         subjects = gather(options.runs, Path(scratch))
@@ -99,7 +99,7 @@ def main() -> int:
 
 
 def gather(runs: Sequence[Path], place: Path) -> list[Subject]:
-    """The GLBs of all runs and the sample, side by side under names of their own."""
+    """Copy the GLBs of all runs and the sample into one folder under distinct names."""
     files = {**EXPORTERS["glb"][0](sample(), SAMPLE), **EXPORTERS["ply"][0](sample(), SAMPLE)}
     for name, data in files.items():
         (place / name).write_bytes(data)
@@ -115,7 +115,7 @@ def gather(runs: Sequence[Path], place: Path) -> list[Subject]:
 
 
 def sample() -> Model:
-    """A ball, its upper half on one page of texture and the lower on another, each of one color."""
+    """Make a ball with its upper half on one page of texture and its lower half on another, each of one color."""
     mesh = trimesh.creation.icosphere(subdivisions=4)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces, np.int64)
     corners = vertices[faces]
@@ -126,14 +126,14 @@ def sample() -> Model:
 
 
 def in_browser(place: Path) -> dict[str, Any]:
-    """What validator and three.js say of every GLB in a folder; screenshots come to lie beside them."""
+    """Return what validator and three.js report on every GLB in a folder; screenshots are written beside them."""
     command = ["node", str(BROWSER / "check.mjs"), str(place)]
     found: dict[str, Any] = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
     return found
 
 
 def checked(subject: Subject, seen: Mapping[str, Any]) -> Row:
-    """One row: how a GLB fares, and whether all is as it should be."""
+    """Return the row of one GLB: what the readers find, and its faults."""
     three, validator = seen["three"], seen["validator"]
     readers = {"Open3D": in_open3d(subject.glb), "trimesh": in_trimesh(subject.glb)}
     surface = looked_at(subject)
@@ -156,7 +156,7 @@ def checked(subject: Subject, seen: Mapping[str, Any]) -> Row:
 
 
 def faults(subject: Subject, seen: Mapping[str, Any], readers: Mapping[str, Mapping[str, int]], row: Row) -> list[str]:
-    """What is not as it should be."""
+    """List the faults of a model."""
     three, validator = seen["three"], seen["validator"]
     triangles = {three["triangles"], validator["triangles"], row.get("surface triangles", 0)}
     triangles |= {got.get("triangles", 0) for got in readers.values()}
@@ -180,20 +180,20 @@ def faults(subject: Subject, seen: Mapping[str, Any], readers: Mapping[str, Mapp
 
 
 def shows_pages(most: Sequence[int]) -> bool:
-    """Whether the two colors that cover most are those of the sample's pages: neither lit nor too dark."""
+    """Return whether the two colors that cover most are those of the sample's pages, neither lit nor too dark."""
     colors = sorted((value >> 16, value >> 8 & 255, value & 255) for value in most)
     return bool(np.abs(np.array(colors) - np.array(sorted(PAGES))).max() <= 3)
 
 
 def in_open3d(path: Path) -> dict[str, int]:
-    """What Open3D finds in a GLB; it does not read points from one."""
+    """Count what Open3D finds in a GLB; it does not read points from one."""
     model = load_open3d().io.read_triangle_model(str(path))
     triangles = sum(len(part.mesh.triangles) for part in model.meshes)
     return {"triangles": triangles, "pages": sum(part.albedo_img is not None for part in model.materials)}
 
 
 def in_trimesh(path: Path) -> dict[str, int]:
-    """What trimesh finds in a GLB."""
+    """Count what trimesh finds in a GLB."""
     found: dict[str, int] = {}
     for part in trimesh.load_scene(path, process=False).geometry.values():
         what = {"Trimesh": "triangles", "PointCloud": "points"}.get(type(part).__name__, "lines")
@@ -205,7 +205,7 @@ def in_trimesh(path: Path) -> dict[str, int]:
 
 
 def looked_at(subject: Subject) -> Row:
-    """The shape itself, as Open3D reads it from the PLY."""
+    """Measure the surface, as Open3D reads it from the PLY."""
     mesh = load_open3d().io.read_triangle_mesh(str(subject.ply))
     vertices, faces, normals = (np.asarray(part) for part in (mesh.vertices, mesh.triangles, mesh.vertex_normals))
     row: Row = {"not finite": int((~np.isfinite(np.concatenate([vertices, normals]))).any(axis=1).sum())}
@@ -234,7 +234,7 @@ def looked_at(subject: Subject) -> Row:
 
 
 def off_center(corners: np.ndarray, area: np.ndarray) -> float:
-    """How far the middle of the surface, the median of its area along each axis, lies from 0."""
+    """Return the distance from 0 to the middle of the surface, the median of its area along each axis."""
     middle = []
     for values in corners.mean(axis=1).T:
         order = np.argsort(values)
@@ -244,7 +244,7 @@ def off_center(corners: np.ndarray, area: np.ndarray) -> float:
 
 
 def facing(vertices: np.ndarray, normals: np.ndarray, cameras: Sequence[Frustum]) -> float:
-    """Share of the vertices whose normal looks at one of the cameras."""
+    """Return the share of the vertices whose normal faces one of the cameras."""
     looks = np.zeros(len(vertices), bool)
     for camera in cameras:
         looks |= np.sum((center(camera) - vertices) * normals, axis=1) > 0
@@ -252,7 +252,7 @@ def facing(vertices: np.ndarray, normals: np.ndarray, cameras: Sequence[Frustum]
 
 
 def markdown(rows: Sequence[Row], drawn: Sequence[str] = ()) -> str:
-    """What is published for people, with the pictures that were drawn."""
+    """Return the page, with the pictures that were drawn."""
     files = table(rows, FILES)
     surfaces = table([row for row in rows if row.get("surface triangles")], SURFACES)
     parts = [f"# Model files in viewers\n\n{ABOUT}\n\n## Files\n\n{files}", f"## Surfaces\n\n{surfaces}"]

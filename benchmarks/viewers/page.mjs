@@ -1,15 +1,15 @@
-// A viewer as plain as they come: three.js and its loader, the model in view, a plain background, a lamp and daylight.
+// A minimal viewer: three.js and its loader, the model in view, a plain background, a directional and a sky light.
 import * as THREE from 'three';
 import { GLTFLoader } from 'three/addons/loaders/GLTFLoader.js';
 
 const GRAY = 0x9a9a9a;
-const DARK = 0x202020; // behind points, of which most are as light as the gray
+const DARK = 0x202020; // background of points, most of which are as light as the gray
 const FROM = new THREE.Vector3(0.35, 0.25, 1).normalize(); // +z is the front of a glTF model
 const FOV = 35;
 const MARGIN = 1.08;
 const FAR_OUT = 0.01;
 
-// What is to be in view: everything, but of points not the farthest on each side, which would make the rest small.
+// Return what must be in view: everything but the farthest points on each side, which would make the rest small.
 function middling(scene, farOut) {
   const places = [];
   const lines = [];
@@ -32,7 +32,7 @@ function middling(scene, farOut) {
   return { box: new THREE.Box3().setFromPoints(kept), places: kept };
 }
 
-// As near as it goes with all these places in view.
+// Place the camera as near as possible with all places in view.
 function framed({ box, places }, aspect) {
   const camera = new THREE.PerspectiveCamera(FOV, aspect, 0.01, 1000);
   const middle = box.getCenter(new THREE.Vector3());

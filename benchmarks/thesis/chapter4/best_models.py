@@ -1,4 +1,4 @@
-"""Algorithm 1 in slow motion: what residuals, Cook's distances and priors look like at every new best model."""
+"""Algorithm 1 step by step: residuals, Cook's distances and priors at every new best model."""
 
 import math
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BestModel:
-    """What is known about every match when a new best model has been found."""
+    """Quantities per match when a new best model has been found."""
 
     trial: int
     residuals_px: FloatArray
@@ -33,9 +33,9 @@ class BestModel:
 
 
 def trace(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int, *, guided: bool) -> Iterator[BestModel]:
-    """Every new best model of a search, with samples drawn by the priors (LEV-RANSAC) or uniformly (RANSAC).
+    """Yield every new best model of a search, with samples drawn by the priors (LEV-RANSAC) or uniformly (RANSAC).
 
-    The search ends by Eq. 3.19 alone, so that there is more to see than until the priors have converged.
+    The search ends by Eq. 3.19 alone, so it also shows what happens after the priors have converged.
     """
     matches, state = prepare(x1, x2, seed), random_state(seed)
     points, threshold = matches.points, options.max_error_px / matches.unit_px
@@ -61,7 +61,7 @@ def trace(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int, 
 def refits(
     x1: FloatArray, x2: FloatArray, options: EpipolarSettings, repeats: int, seed: int
 ) -> Iterator[dict[str, float]]:
-    """Mean residual in px of a 7-point model of a random sample, and of its refits to its own inliers (Figure 4.4)."""
+    """Yield the mean residual in px of a 7-point model of a random sample and of refits to its inliers (Figure 4.4)."""
     matches, state = prepare(x1, x2, seed), random_state(seed)
     points, threshold = matches.points, options.max_error_px / matches.unit_px
     done = 0
@@ -84,7 +84,7 @@ def refits(
 
 
 def _candidates(points: FloatArray, state: RandomState, cumulative: FloatArray) -> list[FloatArray]:
-    """The one to three models through one sample."""
+    """Return the one to three models through one sample."""
     sample, models = np.empty(SAMPLE_SIZE, np.int64), np.empty((MOST_MODELS, 9))
     if not (len(cumulative) and draw_weighted(state, cumulative, sample)):
         draw_uniform(state, len(points), sample)
@@ -92,5 +92,5 @@ def _candidates(points: FloatArray, state: RandomState, cumulative: FloatArray) 
 
 
 def _as_given(matches: Matches, *values: FloatArray) -> Iterator[FloatArray]:
-    """From the shuffled order of `Matches` back to that of the caller."""
+    """Reorder values from the shuffled order of `Matches` back to the caller's."""
     return (value[matches.rows] for value in values)

@@ -1,4 +1,4 @@
-"""What chapter 4 claims of its figures, and whether our own measurements bear it out."""
+"""Claims of chapter 4 about its figures, and whether our own measurements confirm them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,14 +11,14 @@ from benchmarks.thesis.claims import Claim, verdict
 ERROR, TIME, TRIALS = "capped mean px", "ms mean", "trials mean"
 LEV, RES, CLASSICS = "lev-ransac-thesis", "res-ransac", ("ransac", "msac", "mlesac")
 ALL, LOW, HIGH = (0.0, 1.0), (0.0, 0.3), (0.6, 1.0)
-"""Outlier ratios that a claim speaks of."""
+"""Ranges of the outlier ratio that a claim covers."""
 STEADY = 8.0
-"""Time at 70 % outliers over that at 10 %, up to which we call it steady."""
+"""Time at 70 % outliers divided by that at 10 %, up to which we call it steady."""
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """The claim that one estimator has less of something than every other."""
+    """The claim that one estimator has less error, time or trials than every other."""
 
     figure: str
     says: str
@@ -27,7 +27,7 @@ class Comparison:
     column: str
     ratios: tuple[float, float] = ALL
     factor: float = 1.0
-    """How many times less."""
+    """Least ratio of the others' value to the winner's."""
 
 
 def _with_verification(figure: str, title: str, suffix: str) -> tuple[Comparison, ...]:
@@ -68,17 +68,17 @@ TRACED = (
     ("4.8", "the mean Cook's distance of inliers is below that of outliers", "cook mean", 1),
     ("4.9", "the mean prior of inliers is above that of outliers", "prior mean", -1),
 )
-"""Figure, claim, column, and 1 where inliers are to have the smaller value."""
+"""Figure, claim, column, and 1 where inliers must have the smaller value, else -1."""
 
 
 def claims_of_sweep(rows: Sequence[Row]) -> list[Claim]:
-    """Figures 4.11 to 4.13: one row per estimator and level."""
+    """Judge the claims of Figures 4.11 to 4.13; `rows` has one row per estimator and level."""
     claims = [_compared(rows, comparison) for comparison in COMPARISONS]
     return sorted(claims + [_steady(rows, *names) for names in STEADY_ONES], key=lambda claim: claim.figure)
 
 
 def claims_of_traces(traces: Mapping[str, Sequence[Row]], figures: Sequence[str]) -> list[Claim]:
-    """Figures 4.7 to 4.9: `traces` holds, per sequence, one row for every best model."""
+    """Judge the claims of Figures 4.7 to 4.9; `traces` holds, per sequence, one row for every best model."""
     found = []
     for figure, says, column, sign in (entry for entry in TRACED if entry[0] in figures):
         holds, numbers = [], []
@@ -93,7 +93,7 @@ def claims_of_traces(traces: Mapping[str, Sequence[Row]], figures: Sequence[str]
 
 
 def claim_of_refits(rows: Sequence[Row]) -> Claim:
-    """Figure 4.4: one row per sample."""
+    """Judge the claim of Figure 4.4; `rows` has one row per sample."""
     minimal, linear = (np.array([row[name] for row in rows]) for name in ("7-point", "8-point refit"))
     medians = f"median {np.median(linear):.3g} against {np.median(minimal):.3g} px"
     numbers = f"lower in {np.mean(linear < minimal):.0%} of {len(rows)} samples, {medians}"
@@ -101,7 +101,7 @@ def claim_of_refits(rows: Sequence[Row]) -> Claim:
 
 
 def curve(rows: Sequence[Row], method: str, column: str) -> dict[float, float]:
-    """A column of one estimator by outlier ratio; empty where it was not measured."""
+    """Return a column of one estimator by outlier ratio; empty where it was not measured."""
     return {row["outliers"]: row[column] for row in rows if row["method"] == method}
 
 

@@ -1,9 +1,9 @@
-"""The figures of thesis chapter 4 from our own estimators, beside what the thesis claims of them.
+"""The figures of thesis chapter 4 from our own estimators, compared with the claims of the thesis.
 
     python -m benchmarks.thesis.chapter4 DATA --tests 200
     python -m benchmarks.thesis.chapter4 DATA --quick
 
-DATA holds vgg-corners/Merton-College-I and vgg-corners/Wadham-College. Written are chapter4.md and chapter4.json, and
+DATA holds vgg-corners/Merton-College-I and vgg-corners/Wadham-College. Output: chapter4.md and chapter4.json, and
 with --pictures a PNG for every figure.
 """
 
@@ -51,7 +51,7 @@ TRACED = {
 
 
 def sweep(tests: int, levels: Sequence[float], options: EpipolarSettings, seed: int) -> list[Row]:
-    """Section 4.8: every estimator on the same pairs at every level; one row each."""
+    """Run every estimator on the same pairs at every level (section 4.8); one row each."""
     methods = searches(list(dict.fromkeys(name for names in SWEEPS.values() for name in names)), options)
     rows = []
     for outliers in levels:
@@ -66,7 +66,7 @@ def sweep(tests: int, levels: Sequence[float], options: EpipolarSettings, seed: 
 
 
 def traced(data: Path, options: EpipolarSettings, seed: int, *, guided: bool) -> dict[str, list[Row]]:
-    """Mean and standard deviation over true inliers and outliers, per sequence and best model."""
+    """Return mean and standard deviation over true inliers and outliers, per sequence and best model."""
     found: dict[str, list[Row]] = {}
     for name, (folder, share) in SEQUENCES.items():
         x1, x2 = load_corners(data / "vgg-corners" / folder, 1, 2)
@@ -84,7 +84,7 @@ def traced(data: Path, options: EpipolarSettings, seed: int, *, guided: bool) ->
 
 
 def draw_sweep(figure_name: str, rows: Sequence[Row], folder: Path) -> bool:
-    """Error and time over the outlier ratio; False where none of the figure's own estimators was measured."""
+    """Draw error and time over the outlier ratio; False where none of the figure's own estimators was measured."""
     names = [name for name in SWEEPS[figure_name] if any(row["method"] == name for row in rows)]
     chosen = [row for name in names for row in rows if row["method"] == name]
     heavy = [LITERAL] if figure_name == "4.11" else [name for name in names if name not in SWEEPS["4.11"]]
@@ -105,7 +105,7 @@ def draw_sweep(figure_name: str, rows: Sequence[Row], folder: Path) -> bool:
 
 
 def draw_traces(figure_name: str, traces: dict[str, list[Row]], folder: Path) -> None:
-    """Inliers against outliers over the best models, one plot per sequence and quantity."""
+    """Draw inliers against outliers over the best models, one plot per sequence and quantity."""
     columns, title = TRACED[figure_name]
     figure, axes = pyplot().subplots(len(columns), len(traces), figsize=(9, 2.9 * len(columns)), squeeze=False)
     for j, (name, found) in enumerate(traces.items()):
@@ -126,7 +126,7 @@ def draw_traces(figure_name: str, traces: dict[str, list[Row]], folder: Path) ->
 
 
 def rows_of_traces(figure_name: str, traces: dict[str, list[Row]]) -> list[Row]:
-    """Give what a figure of `TRACED` shows, and no other quantity."""
+    """Return the rows of a figure of `TRACED`, with its own quantity only."""
     quantity = TRACED[figure_name][0][0].split()[0]
     rows = [{"sequence": name, **row} for name, found in traces.items() for row in found]
     return [
@@ -135,7 +135,7 @@ def rows_of_traces(figure_name: str, traces: dict[str, list[Row]]) -> list[Row]:
 
 
 def draw_refits(rows: Sequence[Row], folder: Path) -> None:
-    """Figure 4.4: the mean residual of every sample's model before and after its refits, sorted by the first."""
+    """Draw Figure 4.4: the mean residual of every sample's model before and after its refits, sorted by the first."""
     ordered = sorted(rows, key=lambda row: row["7-point"])
     figure, axes = pyplot().subplots(figsize=(7, 3.4))
     for n, name in enumerate(ordered[0]):
@@ -150,7 +150,7 @@ def draw_refits(rows: Sequence[Row], folder: Path) -> None:
 def draw_all(
     args: argparse.Namespace, refitted: Sequence[Row], traces: Mapping[str, dict[str, list[Row]]], rows: Sequence[Row]
 ) -> list[str]:
-    """Draw the figures that are asked for; gives their numbers."""
+    """Draw the figures that were asked for, and return their numbers."""
     drawn = [name for name in ("4.4", *TRACED, *SWEEPS) if is_wanted(args.pictures, name)]
     if "4.4" in drawn:
         draw_refits(refitted, args.results)
@@ -160,7 +160,7 @@ def draw_all(
 
 
 def page(claims: Sequence[Claim], rows: Sequence[Row], drawn: Sequence[str], setting: str) -> str:
-    """The Markdown page."""
+    """Return the Markdown page."""
     claimed = [{"figure": c.figure, "the thesis": c.says, "here": c.verdict, "numbers": c.numbers} for c in claims]
     parts = ["# Chapter 4: the thesis's figures and ours", setting, "## Claims", table(claimed)]
     for title, column in (
@@ -177,11 +177,11 @@ def page(claims: Sequence[Claim], rows: Sequence[Row], drawn: Sequence[str], set
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("thesis.chapter4", __doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("--tests", type=int, default=20, help="pairs per level; 200 in the thesis")
-    parser.add_argument("--max-trials", type=int, default=50_000, help="most samples; see Eq. 3.19")
+    parser.add_argument("--max-trials", type=int, default=50_000, help="limit of samples; see Eq. 3.19")
     parser.add_argument("--quick", action="store_true", help="3 pairs at four levels, at most 10 000 trials")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -190,7 +190,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Measure, judge the claims, and publish."""
+    """Measure, judge the claims, and write the results."""
     args = parser().parse_args()
     on_one_thread()
     tests, most, levels = (3, 10_000, QUICK_LEVELS) if args.quick else (args.tests, args.max_trials, LEVELS)

@@ -1,4 +1,4 @@
-"""The search of an estimator alone, as Algorithm 1 has it: no final refit, and nobody who judges the result."""
+"""The search of an estimator alone, as in Algorithm 1: no final refit and no check of the result."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Search:
-    """A method to take turns with (see `turns`) that keeps what it found, for the refit that is not timed."""
+    """A method for `timing.take_turns` that keeps its results for the refit, which is not timed."""
 
     def __init__(self, recipe: Recipe, options: EpipolarSettings) -> None:
         self._recipe, self._options = recipe, options
@@ -29,7 +29,7 @@ class Search:
         return (None, None) if found is None else (matches.to_pixels(found.F), found.trials)
 
     def errors_after_refit_px(self, pairs: list[TwoViews]) -> FloatArray:
-        """(N,) capped errors of the last calls, which were on these pairs, after the estimator's own final fit."""
+        """Return (N,) capped errors of the last calls, one per pair, after the estimator's own final fit."""
         errors = []
         for pair, (matches, found) in zip(pairs, self._found[-len(pairs) :], strict=True):
             F = None
@@ -42,6 +42,6 @@ class Search:
 
 
 def searches(names: list[str], options: EpipolarSettings) -> dict[str, Search]:
-    """By the name of the estimator."""
+    """Return searches by the name of the estimator."""
     recipes = {"lev-ransac": PRODUCTION} | {name: recipe for name, (recipe, _) in RECIPES.items()}
     return {name: Search(recipes[name], options) for name in names}

@@ -1,4 +1,4 @@
-"""What perturbation theory says of one fundamental matrix (Figures 5.7 to 5.9)."""
+"""Bounds from perturbation theory for one fundamental matrix (Figures 5.7 to 5.9)."""
 
 import numpy as np
 
@@ -14,32 +14,32 @@ from sfm_app.selfcal.thesis.constraint_forms import essential
 from sfm_app.selfcal.thesis.perturbation import error_discrepancies
 
 OFF = np.linspace(-0.3, 0.3, 120)
-"""Errors of the focal, as shares; 0, where all but the bound of a noisy F vanish, is not among them."""
+"""Relative errors of the focal, without 0, where all curves but the bound of a noisy F vanish."""
 SHARE = 0.1
-"""Of outliers in a noisy F."""
+"""Share of outliers in a noisy F."""
 OUTLYING = 3
 FOCAL_OFF = 0.1
 
 
 def gap(E: FloatArray) -> FloatArray:
-    """(...,) s1 - s2 of E (..., 3, 3)."""
+    """Compute s1 - s2 (...,) of E (..., 3, 3)."""
     s = np.linalg.svd(E, compute_uv=False)
     return np.asarray(s[..., 0] - s[..., 1])
 
 
 def full_bound(F: FloatArray, noisy: FloatArray, K: FloatArray, change: FloatArray) -> float:
-    """2 |error of E| of thesis (5.19), (5.21), which takes the true F to be known; F's and K's (3, 3)."""
+    """Compute 2 |error of E| of thesis (5.19), (5.21), which assumes that the true F is known; F's and K's (3, 3)."""
     error = essential(noisy, K + change) - essential(F, K)
     return 2.0 * float(np.linalg.norm(error, ord=2))
 
 
 def reduced_bound(noisy: FloatArray, K: FloatArray, change: FloatArray) -> float:
-    """2 |part of E's error that K alone causes| of thesis (5.22), with its transposes set right."""
+    """Compute 2 |part of E's error that K alone causes| of thesis (5.22), with its transposes corrected."""
     return 2.0 * float(np.linalg.norm(essential(noisy, K + change) - essential(noisy, K), ord=2))
 
 
 def bounds(lab: Lab) -> Drawn:
-    """Figures 5.7 and 5.8: objective, bound and reduced bound over the error of the focal."""
+    """Draw Figures 5.7 and 5.8: objective, bound and reduced bound over the error of the focal."""
     panels = []
     for name in ("Merton1", "Wadham"):
         sequence = lab.sequence(name)
@@ -53,7 +53,7 @@ def bounds(lab: Lab) -> Drawn:
 
 
 def discrepancies(lab: Lab) -> Drawn:
-    """Figure 5.9: Error Discrepancy of ten F's of which the first three are outlying, at a focal that is 10 % off."""
+    """Draw Figure 5.9: Error Discrepancy of ten F's, the first three outlying, at a focal that is 10 % off."""
     figure, axes = pyplot().subplots(1, 2, figsize=(8.6, 3.2))
     rows, holds, numbers = [], [], []
     for axis, name in zip(axes, ("Corridor", "Wadham"), strict=True):
@@ -113,7 +113,7 @@ def _claim_of_reduced(panels: list[Panel]) -> Claim:
 
 
 def _of_one_camera(F: FloatArray, K1: FloatArray, K2: FloatArray, K: FloatArray) -> FloatArray:
-    """F as it would be, had both views the camera matrix K; largest singular value 1."""
+    """Return F as if both views had the camera matrix K; largest singular value 1."""
     back = np.linalg.inv(K)
     same = back.T @ K2.T @ F @ K1 @ back
     return np.asarray(same / np.linalg.norm(same, ord=2))

@@ -1,10 +1,10 @@
-"""The figures and tables of thesis chapter 5 from our own calibrators, beside what the thesis claims of them.
+"""The figures and tables of thesis chapter 5 from our own calibrators, compared with the claims of the thesis.
 
     python -m benchmarks.thesis.chapter5 DATA --tests 100 --runs 50
     python -m benchmarks.thesis.chapter5 DATA --only 5.1 5.18 --results /tmp/part
     python -m benchmarks.thesis.chapter5 DATA --quick --results /tmp/quick
 
-DATA holds vgg-corners, castle-P19 and fountain-P11. Written are chapter5.md and chapter5.json, and with --pictures a
+DATA holds vgg-corners, castle-P19 and fountain-P11. Output: chapter5.md and chapter5.json, and with --pictures a
 PNG and a CSV of its points for every figure.
 """
 
@@ -49,15 +49,15 @@ PARTS: Mapping[str, Callable[[Lab], Drawn]] = {
     **{number: partial(sweep, number=number) for number in SWEEPS},
     TABLES: real_sequences,
 }
-"""What draws each figure."""
+"""The function that draws each figure."""
 IN_ORDER = sorted(PARTS, key=lambda name: 99 if name == TABLES else int(name.removeprefix("5.").split("-")[0]))
 MOST = ((MULTI_START, 20), (PRODUCTION, 20))
-"""Tests that slow methods are given at most; all else is done in some ten minutes."""
+"""Limits on the tests of slow methods; all else is done in about ten minutes."""
 CACHE = Path.home() / ".cache" / "sfm-app-benchmarks"
 
 
 def setting_of(lab: Lab) -> str:
-    """What a reader must know of all figures."""
+    """Describe the setting that all figures share."""
     return (
         f"{lab.tests} tests a level, {lab.runs} runs a sequence ({lab.fewer}), "
         f"seed {lab.seed}. Synthetic sequences are those of section 5.5.3: five cameras, 512 x 512, 200 points, fx 500 "
@@ -71,7 +71,7 @@ def setting_of(lab: Lab) -> str:
 
 
 def page(lab: Lab, drawn: Mapping[str, Drawn]) -> str:
-    """The Markdown page."""
+    """Return the Markdown page."""
     claimed = [
         {"figure": claim.figure, "the thesis": claim.says, "here": claim.verdict, "numbers": claim.numbers}
         for part in drawn.values()
@@ -91,7 +91,7 @@ def page(lab: Lab, drawn: Mapping[str, Drawn]) -> str:
 
 
 def answers(drawn: Mapping[str, Drawn]) -> list[dict[str, object]]:
-    """Per experiment and level, how often the production method answers."""
+    """Return, per experiment and level, the share of tests that the production method answers."""
     rows = [row for part in drawn.values() for row in part.rows if row["method"] == PRODUCTION and "part" in row]
     found: dict[str, dict[str, object]] = {}
     for row in rows:
@@ -101,13 +101,13 @@ def answers(drawn: Mapping[str, Drawn]) -> list[dict[str, object]]:
 
 
 def most_of(text: str) -> tuple[str, int]:
-    """METHOD=N of the command line."""
+    """Parse METHOD=N of the command line."""
     method, _, count = text.partition("=")
     return method, int(count)
 
 
 def parser() -> argparse.ArgumentParser:
-    """Give the command line."""
+    """Return the parser of the command line."""
     parser = new_parser("thesis.chapter5", __doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("--tests", type=int, default=20, help="seeds per level; 100 in the thesis")
@@ -118,7 +118,7 @@ def parser() -> argparse.ArgumentParser:
         default=MOST,
         type=most_of,
         metavar="METHOD=N",
-        help="at most so many of both for slow methods",
+        help="limit both for slow methods",
     )
     parser.add_argument(
         "--only", nargs="+", choices=IN_ORDER, default=IN_ORDER, metavar="FIGURE", help=", ".join(IN_ORDER)
@@ -134,10 +134,10 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Draw every figure, judge the claims, and publish."""
+    """Draw every figure, judge the claims, and write the results."""
     args = parser().parse_args()
     on_one_thread()
-    pyplot()  # said before an hour of work
+    pyplot()  # fails here if matplotlib is missing, not after an hour of work
     tests, runs = (2, 2) if args.quick else (args.tests, args.runs)
     most = dict(args.most)
     args.results.mkdir(parents=True, exist_ok=True)

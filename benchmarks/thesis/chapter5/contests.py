@@ -1,4 +1,4 @@
-"""All calibrators on the same trials of an experiment: errors, answers and times per level."""
+"""Run all calibrators on the same trials of an experiment: errors, answers and times per level."""
 
 import sys
 import time
@@ -19,18 +19,18 @@ from sfm_app.types import Calibration
 
 PRODUCTION = "zero-curves"
 WITHOUT_LENS = "zero-curves without a lens"
-"""The same with `calibration.lens = false`: the camera model of the truth that comes with the VGG sequences."""
+"""`zero-curves` with `calibration.lens = false`: the camera model of the VGG sequences' truth."""
 ZERO_CURVES, MULTI_START, PERTURBATION = "zero-curves-thesis", "multi-start", "perturbation"
 GEOMETRIC, NON_ROBUST, KRUPPA = "geometric", "huang-faugeras", "kruppa"
 METHODS = (PRODUCTION, ZERO_CURVES, MULTI_START, PERTURBATION, GEOMETRIC, NON_ROBUST, KRUPPA)
 CAP_PERCENT = 200.0
-"""An answer counts as this far off at most, so that one that ran away does not decide a mean."""
+"""Errors are capped at this value, so that one diverged answer does not dominate a mean."""
 
 Experiment = Callable[[int], Iterator[Trial]]
 
 
 class Attempt(NamedTuple):
-    """One answer of one calibrator."""
+    """The result of one calibrator on one trial."""
 
     method: str
     x: float
@@ -41,7 +41,7 @@ class Attempt(NamedTuple):
 
 
 def ask(method: str, fits: Fits, size: tuple[int, int], seed: int) -> Calibration:
-    """A calibrator by its name, with all that is known about the pairs."""
+    """Run a calibrator by its name, with all that is known about the pairs."""
     lens = method != WITHOUT_LENS
     return sfm_app.calibrate_fundamentals(
         np.array([fit.F for fit in fits.values()]).reshape(-1, 3, 3),
@@ -56,7 +56,7 @@ def ask(method: str, fits: Fits, size: tuple[int, int], seed: int) -> Calibratio
 
 
 def answer_of(method: str, found: Calibration) -> FloatArray | None:
-    """K; for a method of the thesis, which knows no doubt, also the K that its verdict here holds back."""
+    """Return K; for a method of the thesis, which always answers, also the K that our verdict rejects."""
     if found.identifiable:
         return found.K
     told = [found.evidence.get(name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")]
@@ -67,17 +67,17 @@ def answer_of(method: str, found: Calibration) -> FloatArray | None:
 
 
 def e_focal(K: FloatArray, true_K: FloatArray) -> float:
-    """Thesis 5.5.3: mean error of fx and fy in percent of the truth."""
+    """Compute the mean error of fx and fy in percent of the truth (thesis 5.5.3)."""
     return float(50.0 * sum(abs(K[k, k] / true_K[k, k] - 1.0) for k in (0, 1)))
 
 
 def e_center(K: FloatArray, true_K: FloatArray) -> float:
-    """Thesis 5.5.3, e_OC: mean error of the optical center's x and y in percent of the truth."""
+    """Compute e_OC, the mean error of the optical center's x and y in percent of the truth (thesis 5.5.3)."""
     return float(50.0 * sum(abs(K[k, 2] / true_K[k, 2] - 1.0) for k in (0, 1)))
 
 
 def attempts(experiment: Experiment, methods: Sequence[str], seed: int) -> list[Attempt]:
-    """All levels of one seed."""
+    """Run the methods on all levels of one seed."""
     found = []
     for trial in experiment(seed):
         for method in methods:
@@ -89,14 +89,14 @@ def attempts(experiment: Experiment, methods: Sequence[str], seed: int) -> list[
 
 
 def contest(experiment: Experiment, tests: dict[str, int], seed: int, pool: Executor, title: str) -> list[Row]:
-    """One row per method and level.
+    """Return one row per method and level.
 
     Args:
         experiment: yields the trials of a seed; it must survive pickling.
         tests: number of seeds per method.
-        seed: the first of them.
-        pool: where seeds are tried side by side; the result does not depend on it, but for the times.
-        title: shown while it runs.
+        seed: the first seed.
+        pool: runs the seeds in parallel; apart from the times, the result does not depend on it.
+        title: printed when it is done.
     """
     seeds = range(max(tests.values(), default=0))
     lists = [[name for name, count in tests.items() if n < count] for n in seeds]
@@ -113,7 +113,7 @@ def contest(experiment: Experiment, tests: dict[str, int], seed: int, pool: Exec
 
 
 def summary(method: str, x: float, tries: Sequence[Attempt]) -> Row:
-    """Mean and median errors over the answers, and how many there are."""
+    """Return mean and median errors over the answers, and the share of answers."""
     answers = [(attempt.K, attempt.true_K) for attempt in tries if attempt.K is not None]
     row: Row = {"method": method, "x": rounded(x), "tests": len(tries), "answered": len(answers) / max(len(tries), 1)}
     for title, error in (("e_focal", e_focal), ("e_OC", e_center)):

@@ -1,4 +1,4 @@
-"""Fundamental matrices as in thesis section 5.5.3: robust ones, and outlying ones that are fitted to everything."""
+"""Fundamental matrices as in thesis section 5.5.3: robust ones, and outlying ones that are fitted to all matches."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 
 
 class Fit(NamedTuple):
-    """One fundamental matrix and the matches it rests on."""
+    """One fundamental matrix and the matches that support it."""
 
     F: FloatArray
     """(3, 3) in pixels."""
@@ -28,7 +28,7 @@ Fits = Mapping[PairId, Fit]
 
 
 def robust_fits(matches: Mapping[PairId, FloatArray], seed: int) -> dict[PairId, Fit]:
-    """Every pair by LEV-RANSAC, without those that it rejects or calls degenerate."""
+    """Fit every pair by LEV-RANSAC, without those that it rejects or calls degenerate."""
     found = {}
     for pair, rows in matches.items():
         own_seed = int(np.random.SeedSequence([seed, *pair]).generate_state(1)[0])
@@ -39,11 +39,11 @@ def robust_fits(matches: Mapping[PairId, FloatArray], seed: int) -> dict[PairId,
 
 
 def fit_to_all(rows: FloatArray) -> Fit:
-    """The 8-point algorithm on all matches (N, 4), outliers and all: an outlying fundamental matrix."""
+    """Run the 8-point algorithm on all matches (N, 4), outliers included: an outlying fundamental matrix."""
     matches = prepare(rows[:, :2], rows[:, 2:], seed=0)
     return Fit(matches.to_pixels(fit_eight_point(matches.points, np.ones(len(matches.points)))), rows)
 
 
 def with_outlying(clean: Fits, spoilt: Mapping[PairId, FloatArray]) -> dict[PairId, Fit]:
-    """The clean matrices, those of some pairs replaced by what all of these matches give."""
+    """Replace the clean matrices of some pairs by fits to all of the given matches."""
     return {**clean, **{pair: fit_to_all(rows) for pair, rows in spoilt.items()}}

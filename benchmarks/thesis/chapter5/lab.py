@@ -1,4 +1,4 @@
-"""What the figures of chapter 5 draw from: data, experiments that several of them share, a folder for the results."""
+"""Data, shared experiments and the result folder for the figures of chapter 5."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -17,20 +17,20 @@ from benchmarks.thesis.claims import Claim
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A figure or table that is finished."""
+    """A finished figure or table."""
 
     claims: Sequence[Claim] = ()
     rows: Sequence[Row] = ()
     """For the JSON document."""
     note: str = ""
-    """What a reader must know to read it."""
+    """Note for the reader."""
     tables: str = ""
     """Markdown below the note."""
 
 
 @dataclass(eq=False)
 class Lab:
-    """The run as a whole."""
+    """Options and shared results of one run of the benchmark."""
 
     data: Path
     cache: Path
@@ -41,16 +41,16 @@ class Lab:
     runs: int
     """Seeds per sequence of the tables."""
     most: Mapping[str, int]
-    """At most so many of both for methods that take far longer than the others."""
+    """Limits of both for methods that take far longer than the others."""
     seed: int
     pool: Executor
     pictures: Sequence[str] | None = None
-    """Figures that are asked for; none, or where empty all."""
+    """Figures to write: none if None, all if empty."""
     _sequences: dict[str, ImageSequence] = field(default_factory=dict)
     _contests: dict[str, list[Row]] = field(default_factory=dict)
 
     def sequence(self, name: str) -> ImageSequence:
-        """A real sequence by the thesis's name."""
+        """Return a real sequence by the thesis's name."""
         if name not in self._sequences:
             found = corner_sequence(self.data, name) if name in CORNERS else photo_sequence(self.data, name, self.cache)
             self._sequences[name] = found
@@ -63,7 +63,7 @@ class Lab:
         tests: int | None = None,
         also: Mapping[str, str] | None = None,
     ) -> list[Row]:
-        """The rows of an experiment of `setups`; each is run once. `also`: more methods, tested as often as others."""
+        """Return the rows of an experiment of `setups`, run once; `also` maps more methods to one tested as often."""
         title = f"{experiment.__name__} {sequence}".strip()
         if title not in self._contests:
             count = self.tests if tests is None else tests
@@ -75,14 +75,14 @@ class Lab:
 
     @property
     def fewer(self) -> str:
-        """The methods that have fewer tests or runs, for people."""
+        """Methods that have fewer tests or runs, as text."""
         most = max(self.tests, self.runs)
         return (
             ", ".join(f"at most {count} of `{name}`" for name, count in self.most.items() if count < most) or "of all"
         )
 
     def keep(self, number: str, figure: Any, rows: Sequence[Row]) -> None:
-        """Write the PNG and the CSV of a figure, where it is asked for."""
+        """Write the PNG and the CSV of a figure, if it was asked for."""
         if not is_wanted(self.pictures, number):
             pyplot().close(figure)
             return

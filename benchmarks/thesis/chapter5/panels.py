@@ -1,4 +1,4 @@
-"""Plots side by side, and what they show as rows for a CSV file."""
+"""Plots side by side, and their points as rows for a CSV file."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -19,13 +19,13 @@ class Panel(NamedTuple):
     x: Values
     lines: Mapping[str, Values]
     truth: Sequence[float] = ()
-    """Where the right answers lie on the x axis."""
+    """Positions of the true values on the x axis."""
 
 
 def draw(panels: Sequence[Panel], x: str, y: str, *, log: bool = False, columns: int = 0) -> Any:
-    """A figure with the panels in rows of `columns`, or in one row.
+    """Draw a figure with the panels in rows of `columns`, or in one row.
 
-    There is a legend in the first panel, and in each whose lines have other names.
+    The first panel has a legend, and so has each whose lines have other names.
     """
     across = columns or len(panels)
     down = -(-len(panels) // across)
@@ -47,7 +47,7 @@ def draw(panels: Sequence[Panel], x: str, y: str, *, log: bool = False, columns:
 
 
 def rows_of(panels: Sequence[Panel]) -> list[Row]:
-    """One row per point of every line, to six digits."""
+    """Return one row per point of every line, to six digits."""
     return [
         {"panel": panel.title, "line": name, "x": rounded(x), "y": rounded(y)}
         for panel in panels
@@ -57,10 +57,10 @@ def rows_of(panels: Sequence[Panel]) -> list[Row]:
 
 
 def lowest(panel: Panel, line: str) -> float:
-    """The x of the lowest point of a line."""
+    """Return the x of the lowest point of a line."""
     return float(panel.x[int(np.nanargmin(panel.lines[line]))])
 
 
 def rounded(value: float, digits: int = 6) -> float:
-    """As many significant digits as anyone will read."""
+    """Round to a number of significant digits."""
     return float(f"{value:.{digits}g}")

@@ -1,4 +1,4 @@
-"""The image sequences of thesis section 5.9 that we have: matches, size and true camera matrices."""
+"""The available image sequences of thesis section 5.9: matches, size and true camera matrices."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from sfm_app.types.matches import PairId
 
 FloatArray = NDArray[np.float64]
 LEAST_CORNERS = 20
-"""Views that share fewer corners make no pair."""
+"""Least number of shared corners of a pair of views."""
 CORNERS = {
     "Corridor": ("Corridor", (512, 512)),
     "Wadham": ("Wadham-College", (1024, 768)),
@@ -39,25 +39,25 @@ class ImageSequence:
     Ks: FloatArray
     """(V, 3, 3) true camera matrix per view."""
     matches: Mapping[PairId, FloatArray]
-    """Per pair of views (N, 4) x1, y1, x2, y2 in pixels, as an estimator is given them."""
+    """Per pair of views (N, 4) x1, y1, x2, y2 in pixels, unfiltered."""
     Fs: Mapping[PairId, FloatArray]
     """True (3, 3) fundamental matrices, unit norm; empty where the cameras of the photos are not needed."""
 
     @property
     def K(self) -> FloatArray:
-        """(3, 3) of the first view, which is what Table 5.2 calls the truth."""
+        """(3, 3) camera matrix of the first view, which Table 5.2 takes as the truth."""
         first: FloatArray = self.Ks[0]
         return first
 
     def first(self, count: int) -> "ImageSequence":
-        """The same, of the first views alone."""
+        """Return the sequence of the first views alone."""
         ids = sorted({view for pair in self.matches for view in pair})[:count]
         kept = {pair: rows for pair, rows in self.matches.items() if set(pair) <= set(ids)}
         return replace(self, matches=kept)
 
 
 def corner_sequence(data: Path, name: str) -> ImageSequence:
-    """Corners and cameras of a VGG sequence under DATA/vgg-corners, all of whose pairs are used."""
+    """Read corners and cameras of a VGG sequence under DATA/vgg-corners; all of its pairs are used."""
     folder, size = data / "vgg-corners" / CORNERS[name][0], CORNERS[name][1]
     Ps = np.array([np.loadtxt(path) for path in sorted(folder.glob("*.P"))])
     found = {
@@ -69,7 +69,7 @@ def corner_sequence(data: Path, name: str) -> ImageSequence:
 
 
 def photo_sequence(data: Path, name: str, cache: Path) -> ImageSequence:
-    """Raw matches of the pairs that the program keeps, found under CACHE/NAME or made there from DATA/NAME/images."""
+    """Read the raw matches of the pairs that the program keeps, from CACHE/NAME, or make them from DATA/NAME/images."""
     place = data / PHOTOS[name]
     with opened_run(cache / PHOTOS[name], Settings(), None) as run:
         products = run_stages(place / "images", run, last=VIEW_GRAPH.name)
@@ -82,14 +82,14 @@ def photo_sequence(data: Path, name: str, cache: Path) -> ImageSequence:
 
 
 def camera_matrix_of(P: FloatArray) -> FloatArray:
-    """(3, 3) K of a projection matrix P ~ K [R | t] (3, 4), positive diagonal, K[2, 2] = 1."""
+    """Decompose a projection matrix P ~ K [R | t] (3, 4), and return K (3, 3), positive diagonal, K[2, 2] = 1."""
     K, _ = rq(P[:, :3])
     K = K * np.sign(np.diag(K))
     return np.asarray(K / K[2, 2])
 
 
 def fundamental_of(P1: FloatArray, P2: FloatArray) -> FloatArray:
-    """(3, 3) F of unit norm with x2' F x1 = 0 (Hartley & Zisserman, eq. 9.1)."""
+    """Compute F (3, 3) of unit norm with x2' F x1 = 0 (Hartley & Zisserman, eq. 9.1)."""
     center = np.linalg.svd(P1)[2][-1]
     e2 = P2 @ center
     cross = np.array([[0, -e2[2], e2[1]], [e2[2], 0, -e2[0]], [-e2[1], e2[0], 0]])

@@ -1,8 +1,8 @@
-"""The experiments of thesis sections 5.5.3 and 5.9: each yields, for one seed, a set of F's per level.
+"""The experiments of thesis sections 5.5.3 and 5.9: each yields one set of F's per level for a seed.
 
-An outlying F is fitted to all matches of its pair by the 8-point algorithm, as the thesis says of Figure 5.20; fitted
-robustly it would be no outlier. All other F's are LEV-RANSAC's. One seed keeps its cameras, points, noise and clean F's
-over all levels, so that a curve compares like with like.
+An outlying F is fitted to all matches of its pair by the 8-point algorithm, as in the thesis's Figure 5.20; fitted
+robustly it would be no outlier. All other F's are LEV-RANSAC's. A seed keeps its cameras, points, noise and clean F's
+over all levels, so that the levels of a curve are comparable.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,10 +17,10 @@ from sfm_app.synthetic.correspondences import TrackOptions, make_tracks, pair_ma
 from sfm_app.types.matches import PairId
 
 NOISE_PX = 0.5
-"""Of all matches; the thesis names a noise for Figure 5.21 alone."""
+"""Noise of all matches; the thesis states the noise for Figure 5.21 only."""
 REACH_PX = 256.0
 HEAVY = 0.5
-"""Share of outliers where the number of outlying F's or frames varies."""
+"""Share of outliers in an outlying F where the number of outlying F's or frames varies."""
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 DEVIATIONS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 COUNTS = (0, 2, 4, 6, 8)
@@ -30,10 +30,10 @@ FRAMES = (4, 5, 6, 8, 10)
 
 
 class Trial(NamedTuple):
-    """What a calibrator is given, and what it ought to find."""
+    """The input of a calibrator, and the true camera."""
 
     x: float
-    """Level: where the trial stands on the axis of the figure."""
+    """Level of the trial on the axis of the figure."""
     fits: Fits
     size: tuple[int, int]
     K: FloatArray
@@ -41,7 +41,7 @@ class Trial(NamedTuple):
 
 
 def matching_outliers(seed: int) -> Iterator[Trial]:
-    """Two of ten F's are outlying; the share of their outliers varies (Figures 5.6a, 5.10a, 5.17a, 5.18a and c)."""
+    """Vary the share of outliers in two of ten F's (Figures 5.6a, 5.10a, 5.17a, 5.18a and c)."""
     tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX), seed)
     clean = robust_fits(dict(pair_matches(tracks)), seed)
     chosen = _shuffled(tracks.pairs, seed)[:2]
@@ -51,14 +51,14 @@ def matching_outliers(seed: int) -> Iterator[Trial]:
 
 
 def focal_deviation(seed: int) -> Iterator[Trial]:
-    """One of five frames has a longer focal length (Figures 5.6b, 5.10b, 5.17b, 5.18b and d)."""
+    """Vary the focal length of one of five frames (Figures 5.6b, 5.10b, 5.17b, 5.18b and d)."""
     for deviation in DEVIATIONS:
         tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX, other_focal=1.0 + deviation), seed)
         yield Trial(100 * deviation, robust_fits(dict(pair_matches(tracks)), seed), tracks.size, tracks.K[0])
 
 
 def outlying_matrices(seed: int) -> Iterator[Trial]:
-    """The number of outlying F's varies, each from 50 % outliers (Figure 5.19a)."""
+    """Vary the number of outlying F's, each from 50 % outliers (Figure 5.19a)."""
     tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX), seed)
     clean = robust_fits(dict(pair_matches(tracks)), seed)
     order = _shuffled(tracks.pairs, seed)
@@ -68,7 +68,7 @@ def outlying_matrices(seed: int) -> Iterator[Trial]:
 
 
 def outlying_corners(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
-    """The same with the corners of a real sequence (Figure 5.19b)."""
+    """Vary the number of outlying F's, with the corners of a real sequence (Figure 5.19b)."""
     clean = robust_fits(sequence.matches, seed)
     order = _shuffled(clean, seed)
     spoilt = {}
@@ -81,7 +81,7 @@ def outlying_corners(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
 
 
 def raw_pairs(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
-    """Seven photos; the number of F's that are fitted to all raw matches varies (Figure 5.20)."""
+    """Vary the number of F's that are fitted to all raw matches, with seven photos (Figure 5.20)."""
     seven = sequence.first(7)
     clean = robust_fits(seven.matches, seed)
     order = _shuffled(clean, seed)
@@ -90,14 +90,14 @@ def raw_pairs(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
 
 
 def gaussian_noise(seed: int) -> Iterator[Trial]:
-    """The noise of all matches varies, without outliers (Figure 5.21)."""
+    """Vary the noise of all matches, without outliers (Figure 5.21)."""
     for sigma_px in NOISES_PX:
         tracks = make_tracks(TrackOptions(sigma_px=sigma_px), seed)
         yield Trial(sigma_px, robust_fits(dict(pair_matches(tracks)), seed), tracks.size, tracks.K[0])
 
 
 def noisy_frame(seed: int) -> Iterator[Trial]:
-    """The number of frames varies; all F's with the last one are outlying, from 50 % outliers (Figure 5.22a)."""
+    """Vary the number of frames; all F's with the last one are outlying, from 50 % outliers (Figure 5.22a)."""
     for count in FRAMES:
         tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX, cameras=count), seed)
         clean = robust_fits(dict(pair_matches(tracks)), seed)
@@ -107,14 +107,14 @@ def noisy_frame(seed: int) -> Iterator[Trial]:
 
 
 def clean_frames(seed: int) -> Iterator[Trial]:
-    """The number of frames varies, without outliers: for the computation times (Figure 5.22b)."""
+    """Vary the number of frames, without outliers: for the computation times (Figure 5.22b)."""
     for count in FRAMES:
         tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX, cameras=count), seed)
         yield Trial(count, robust_fits(dict(pair_matches(tracks)), seed), tracks.size, tracks.K[0])
 
 
 def whole_sequence(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
-    """All pairs of a real sequence (Tables 5.2 and 5.3)."""
+    """Yield all pairs of a real sequence (Tables 5.2 and 5.3)."""
     yield Trial(0, robust_fits(sequence.matches, seed), sequence.size, sequence.K)
 
 

@@ -1,4 +1,4 @@
-"""Slices through the objective function: what moves its minimum (Figures 5.1 to 5.5)."""
+"""Slices through the objective function, which show what shifts its minimum (Figures 5.1 to 5.5)."""
 
 import numpy as np
 
@@ -18,27 +18,27 @@ from sfm_app.types import CameraPairs
 
 SHOWN = ("Wadham", "Merton1")
 SCALES = np.linspace(0.4, 2.0, 161)
-"""Focal lengths of a slice, over the true one."""
+"""Focal lengths of a slice, relative to the true one."""
 CENTER_OFF_PX = 100.0
 MUCH = 0.05
-"""A minimum that moves by this share of the focal has moved."""
+"""Share of the focal by which a minimum must move to count as moved."""
 HUANG_FAUGERAS, KRUPPA, SINES = FORMS = ("Huang-Faugeras", "Kruppa (5.6)", "Kruppa, sines")
 F_NOISE = 1e-3
 """Standard deviation of the noise on F of unit norm, in image widths: the thesis's variance is 1e-6 |F|."""
 
 
 def objective(Fs: FloatArray, K: FloatArray) -> float:
-    """Thesis (5.8) with equal weights."""
+    """Compute thesis (5.8) with equal weights."""
     return float(np.mean(huang_faugeras(essential(Fs, K))))
 
 
 def focal_slice(Fs: FloatArray, K: FloatArray, scales: FloatArray = SCALES) -> FloatArray:
-    """(S,) the objective where both focals are multiplied by each of `scales`."""
+    """Compute the objective (S,) where both focals are multiplied by each of `scales`."""
     return np.array([objective(Fs, K @ np.diag([scale, scale, 1.0])) for scale in scales])
 
 
 def one_outlier(lab: Lab) -> Drawn:
-    """Figure 5.1: one wrong match in every pair."""
+    """Draw Figure 5.1: one wrong match in every pair."""
     panels, shifts, robust = [], {}, {}
     for name in SHOWN:
         sequence = lab.sequence(name)
@@ -62,7 +62,7 @@ def one_outlier(lab: Lab) -> Drawn:
 
 
 def parallel_axes(lab: Lab) -> Drawn:
-    """Figure 5.2: of three synthetic cameras two have parallel axes."""
+    """Draw Figure 5.2: two of three synthetic cameras have parallel axes."""
     panels, flat, sharp = [], [], []
     for seed in range(lab.seed, lab.seed + 2):
         K, size, matches = _three_views(seed)
@@ -80,7 +80,7 @@ def parallel_axes(lab: Lab) -> Drawn:
 
 
 def wrong_center(lab: Lab) -> Drawn:
-    """Figure 5.3: the optical center is taken to be 100 px beside the true one."""
+    """Draw Figure 5.3: the optical center is assumed 100 px beside the true one."""
     panels, moved, numbers = [], [], []
     for name in SHOWN:
         sequence = lab.sequence(name)
@@ -98,7 +98,7 @@ def wrong_center(lab: Lab) -> Drawn:
 
 
 def surfaces(lab: Lab) -> Drawn:
-    """Figure 5.4: the objective over fx and the center's x, for the Corridor and, in place of Valbonne, for Wadham."""
+    """Draw Figure 5.4: the objective over fx and cx, for the Corridor and, in place of Valbonne, for Wadham."""
     figure, axes = pyplot().subplots(1, 2, figsize=(9.6, 3.6))
     rows = []
     for axis, name in zip(axes, ("Corridor", "Wadham"), strict=True):
@@ -122,7 +122,7 @@ def surfaces(lab: Lab) -> Drawn:
 
 
 def kruppa_under_noise(lab: Lab) -> Drawn:
-    """Figure 5.5: the Kruppa equations and the Huang-Faugeras constraint before and after noise on F."""
+    """Draw Figure 5.5: the Kruppa equations and the Huang-Faugeras constraint before and after noise on F."""
     panels, worse, numbers = [], [], []
     for name in SHOWN:
         sequence = lab.sequence(name)
@@ -160,7 +160,7 @@ def _fitted_slice(sequence: ImageSequence, seed: int | None = None, *, robust: b
 
 
 def _three_views(seed: int) -> tuple[FloatArray, tuple[int, int], dict[tuple[int, int], FloatArray]]:
-    """K, size and matches of three cameras, the first two with parallel axes."""
+    """Return K, size and matches of three cameras, the first two with parallel axes."""
     tracks = make_tracks(TrackOptions(cameras=2, sigma_px=0.0), seed)
     rng = np.random.default_rng([seed, 52])
     turn = axis_rotation(np.array([0.6, 0.8, 0.0]), 15.0)
@@ -174,7 +174,7 @@ def _three_views(seed: int) -> tuple[FloatArray, tuple[int, int], dict[tuple[int
 
 
 def parallel_pair(seed: int) -> Fit:
-    """F of two synthetic cameras with parallel axes, fitted to their noisy matches."""
+    """Fit F of two synthetic cameras with parallel axes to their noisy matches."""
     _, _, matches = _three_views(seed)
     return fit_to_all(matches[0, 1])
 
@@ -186,7 +186,7 @@ def _at(Fs: FloatArray, K: FloatArray, fx: float, cx: float) -> float:
 
 
 def _forms(sequence: ImageSequence, seed: int | None = None) -> FloatArray:
-    """(3, S) the objectives named by FORMS over the focal; `seed` of the noise on F, or None for none."""
+    """Compute (3, S) the objectives named by FORMS over the focal; `seed` of the noise on F, or None for none."""
     width, height = sequence.size
     Fs = np.array(list(sequence.Fs.values()))
     pairs = prepare(CameraPairs.of(Fs, sequence.size), unit_px=width, origin_px=(width / 2, height / 2))
@@ -203,5 +203,5 @@ def _forms(sequence: ImageSequence, seed: int | None = None) -> FloatArray:
 
 
 def _lowest_scales(forms: FloatArray) -> FloatArray:
-    """(..., 3) the scale of the focal at which each form (..., 3, S) is lowest."""
+    """Return (..., 3) the scale of the focal at which each form (..., 3, S) is lowest."""
     return np.asarray(SCALES[np.argmin(forms, axis=-1)])

@@ -1,4 +1,4 @@
-"""What the thesis says of the curves of Figures 5.6, 5.10 and 5.17 to 5.22, and how it is judged."""
+"""Claims of the thesis about the curves of Figures 5.6, 5.10 and 5.17 to 5.22, and how they are judged."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,19 +12,20 @@ from benchmarks.thesis.chapter5.contests import ZERO_CURVES as ZC
 from benchmarks.thesis.claims import Claim, verdict
 
 STEADY = 2.0
-"""The largest error of a curve over its smallest, up to which we call it steady."""
+"""Ratio of a curve's largest error to its smallest, up to which we call it steady."""
 ANY, TAINTED = (-1.0, 1e9), (1e-9, 1e9)
-"""All levels, and those at which something is wrong with some of the F's."""
+"""All levels, and those at which some of the F's are corrupted."""
 BUT_ZC, BUT_RMS, BUT_PBW = (RMS, PBW, GEO, NON), (PBW, GEO, NON), (ZC, RMS, GEO, NON)
 
 
 @dataclass(frozen=True, slots=True)
 class Said:
-    """A sentence of the thesis about the curves of a plot.
+    """A claim of the thesis about the curves of a plot.
 
-    `kind` is how it is judged: "below": `method` errs less than each of `others`, level by level, by the factor `limit`
+    `kind` is how it is judged: "below": `method` has less error than each of `others` at each level, by factor `limit`
     if there is one; "steady": its largest error over the levels is at most twice its smallest; "rising": its last error
-    is more than twice its first; "falling": it is less; "under", "over": its errors lie below `limit`, or not.
+    is more than twice its first; "falling": its last error is less than its first; "under", "over": its errors lie
+    below `limit`, or not.
     """
 
     part: str
@@ -81,12 +82,12 @@ CLAIMS = (
 
 
 def claims_of(found: Mapping[str, Sequence[Row]]) -> list[Claim]:
-    """The claims about these plots, given the rows of each."""
+    """Judge the claims about these plots, given the rows of each."""
     return [_judged(found[said.part], said) for said in CLAIMS if said.part in found]
 
 
 def value(rows: Sequence[Row], method: str, x: float, column: str) -> float:
-    """A figure of one method at one level; NaN where there is none."""
+    """Return a figure of one method at one level; NaN where there is none."""
     held = next((row[column] for row in rows if row["method"] == method and row["x"] == x), None)
     return float("nan") if held is None else float(held)
 
@@ -106,7 +107,7 @@ def _judged(rows: Sequence[Row], said: Said) -> Claim:
 
 
 def holds(said: Said, own: Sequence[float], others: Sequence[Sequence[float]] = ()) -> list[bool]:
-    """Whether the sentence holds, level by level or once; NaN never does."""
+    """Check the claim at each level, or once for the whole curve; NaN never holds."""
     match said.kind:
         case "below":
             factor = said.limit or 1.0

@@ -40,7 +40,7 @@ class Plot:
 
     @property
     def title(self) -> str:
-        """Of the plot."""
+        """Title of the plot."""
         return self.part if self.sequence in self.part else f"{self.part} {self.sequence}"
 
 

@@ -1,4 +1,4 @@
-"""Tables 5.2 and 5.3: real sequences, with the thesis's own figures beside ours."""
+"""Tables 5.2 and 5.3: real sequences, with the thesis's results beside ours."""
 
 from collections.abc import Mapping, Sequence
 
@@ -54,7 +54,7 @@ K_ENTRIES = ("fx", "fy", "cx", "cy")
 
 
 def real_sequences(lab: Lab) -> Drawn:
-    """Every sequence, `runs` times."""
+    """Run every sequence `runs` times."""
     rows: list[Row] = []
     for name in PRINTED_E_FOCAL:
         found = lab.contest(setups.whole_sequence, name, lab.runs, also={WITHOUT_LENS: PRODUCTION})
@@ -83,7 +83,7 @@ _NOTE = (
 
 
 def with_printed(name: str, row: Row) -> Row:
-    """A row with the thesis's errors beside it; None for methods that Table 5.3 lacks."""
+    """Add the thesis's errors to a row; None for methods that Table 5.3 lacks."""
     known = row["method"] in PRINTED_ORDER
     column = PRINTED_ORDER.index(row["method"]) if known else 0
     return row | {
@@ -93,7 +93,7 @@ def with_printed(name: str, row: Row) -> Row:
 
 
 def errors(rows: Sequence[Row]) -> list[Row]:
-    """Table 5.3 of all methods."""
+    """Return Table 5.3 of all methods."""
     columns = (
         "sequence",
         "method",
@@ -109,7 +109,7 @@ def errors(rows: Sequence[Row]) -> list[Row]:
 
 
 def cameras(rows: Sequence[Row], truths: Mapping[str, np.ndarray]) -> list[Row]:
-    """Table 5.2: the truth as printed and as in the data, and what each method finds."""
+    """Return Table 5.2: the truth as printed and as in the data, and what each method finds."""
     found: list[Row] = []
     for name, K in truths.items():
         found.append({"sequence": name, "K": "truth, thesis"} | dict(zip(K_ENTRIES, PRINTED_K[name], strict=True)))
@@ -120,12 +120,12 @@ def cameras(rows: Sequence[Row], truths: Mapping[str, np.ndarray]) -> list[Row]:
 
 
 def entries(K: np.ndarray) -> tuple[float, ...]:
-    """fx, fy, cx, cy of K (3, 3)."""
+    """Return fx, fy, cx, cy of K (3, 3)."""
     return tuple(float(K[entry]) for entry in ((0, 0), (1, 1), (0, 2), (1, 2)))
 
 
 def means(rows: Sequence[Row]) -> list[Row]:
-    """The mean of the sequences' means, per method, over those with an answer; how many they are stands beside it."""
+    """Return, per method, the mean of the sequences' means over those with an answer, and how many those are."""
     found: list[Row] = []
     for method in dict.fromkeys(row["method"] for row in rows):
         own = [row for row in rows if row["method"] == method and row["sequence"] in TARGET]
@@ -144,7 +144,7 @@ def means(rows: Sequence[Row]) -> list[Row]:
 
 
 def _best(rows: Sequence[Row]) -> list[float | None]:
-    """Per sequence the least mean error of the methods that Table 5.3 has."""
+    """Return, per sequence, the smallest mean error of the methods that Table 5.3 has."""
     printed = [row for row in rows if row["method"] in PRINTED_ORDER and row["e_focal"] is not None]
     return [min((row["e_focal"] for row in printed if row["sequence"] == name), default=None) for name in TARGET]
 
@@ -155,7 +155,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def claims(rows: Sequence[Row]) -> list[Claim]:
-    """What section 5.9 says of Table 5.3, and our own target."""
+    """Judge the claims of section 5.9 about Table 5.3, and our own target."""
     average = {row["method"]: row for row in means(rows)}
     corridor = {row["method"]: row for row in rows if row["sequence"] == "Corridor"}
     focal = {name: row["here"] for name, row in average.items()}

@@ -1,4 +1,4 @@
-"""Zero curves drawn, searched, and where they fail (Figures 5.11, 5.12, 5.14 to 5.16)."""
+"""Zero curves: plots, search times, and failures (Figures 5.11, 5.12, 5.14 to 5.16)."""
 
 import time
 from collections.abc import Callable
@@ -24,34 +24,34 @@ from sfm_app.types import CameraPairs
 RANGE, SAMPLES = 3.0, 100
 """Focals are swept up to this many widths, with this many samples (thesis 5.29, 5.8.3)."""
 SIGMA = 0.1 * RANGE
-"""Of rho, in image widths (thesis 5.8.4)."""
+"""Scale of rho, in image widths (thesis 5.8.4)."""
 NEAR = 0.06
-"""A peak or curve this close to a focal, as a share, is at it; two steps of the sweep for a focal of one width."""
+"""Relative distance within which a peak or curve is at a focal; two steps of the sweep for a focal of one width."""
 
 
 def prepared(Fs: FloatArray, size: tuple[int, int]) -> Pairs:
-    """F's (P, 3, 3) in units of the image width from the top left corner."""
+    """Convert F's (P, 3, 3) to units of the image width from the top left corner."""
     return prepare(CameraPairs.of(Fs, size), unit_px=size[0], origin_px=(0.0, 0.0))
 
 
 def swept(samples: int = SAMPLES) -> FloatArray:
-    """(S,) fx in image widths."""
+    """Return (S,) fx in image widths."""
     return RANGE * np.arange(1, samples + 1) / samples
 
 
 def curves_of(Fs: FloatArray, size: tuple[int, int], samples: int = SAMPLES) -> FloatArray:
-    """(P, S) focal curves in image widths, the optical center in the middle."""
+    """Compute (P, S) focal curves in image widths, with the optical center in the middle."""
     return focal_curves(prepared(Fs, size), swept(samples), (0.5, 0.5 * size[1] / size[0]))
 
 
 def support(curves: FloatArray) -> FloatArray:
-    """(P, S) the sum that thesis (5.33) maximizes, for every sample of every curve."""
+    """Compute (P, S) the sum that thesis (5.33) maximizes, for every sample of every curve."""
     distances = np.abs(curves[:, None] - curves[None])
     return np.asarray(np.exp(-distances / SIGMA).sum(axis=1) - 1.0)
 
 
 def examples(lab: Lab) -> Drawn:
-    """Figure 5.11: curves of exact F's of synthetic cameras, and of real ones."""
+    """Draw Figure 5.11: curves of exact F's of synthetic cameras, and of real ones."""
     tracks = make_tracks(TrackOptions(center_offset=0.0, width=1024, height=768), lab.seed)
     castle = lab.sequence("Castle-P19").first(5)
     real = robust_fits(castle.matches, lab.seed)
@@ -84,7 +84,7 @@ def examples(lab: Lab) -> Drawn:
 
 
 def outlying(lab: Lab) -> Drawn:
-    """Figure 5.12: ten curves of which two are outlying, and the function that their meeting point maximizes."""
+    """Draw Figure 5.12: ten curves, two of them outlying, and the function that their meeting point maximizes."""
     errors = [_meeting_error(*_two_outlying(seed)) for seed in range(lab.seed, lab.seed + lab.tests)]
     fits, size, K = _two_outlying(lab.seed)
     curves = usable(curves_of(np.array([fit.F for fit in fits.values()]), size), RANGE)
@@ -109,7 +109,7 @@ def outlying(lab: Lab) -> Drawn:
 
 
 def timing(lab: Lab) -> Drawn:
-    """Figure 5.14: the search over all samples beside Nelder-Mead on (5.32), over the F's and over the samples."""
+    """Draw Figure 5.14: times of the search over all samples and of Nelder-Mead on (5.32), over F's and samples."""
     counts, samples = (3, 6, 10, 15, 21, 28, 36, 45), (50, 100, 200, 300, 400, 600, 800)
     tracks = make_tracks(TrackOptions(cameras=10, sigma_px=NOISE_PX), lab.seed)
     Fs = tracks.F
@@ -136,7 +136,7 @@ def timing(lab: Lab) -> Drawn:
 
 
 def two_cameras(lab: Lab) -> Drawn:
-    """Figure 5.15: F's of two cameras, five each: two places where curves meet."""
+    """Draw Figure 5.15: five F's of each of two cameras; the curves meet in two places."""
     focals = (500.0, 900.0)
     both, tops, best = [], [], []
     for seed in range(lab.seed, lab.seed + lab.tests):
@@ -169,7 +169,7 @@ def two_cameras(lab: Lab) -> Drawn:
 
 
 def degenerate(lab: Lab) -> Drawn:
-    """Figure 5.16: curves of pairs with parallel axes."""
+    """Draw Figure 5.16: curves of pairs with parallel axes."""
     Fs = np.array([parallel_pair(seed).F for seed in range(lab.seed, lab.seed + lab.tests)])
     exact = np.array([[0.0, -1.0, 0.2], [1.0, 0.0, -0.5], [-0.2, 0.5, 0.0]])
     corridor = lab.sequence("Corridor")
@@ -234,7 +234,7 @@ def _of_two(focals: tuple[float, float], seed: int) -> tuple[FloatArray, tuple[i
 
 
 def _times(curves: FloatArray) -> tuple[float, float]:
-    """Milliseconds of the search over all samples, and of Nelder-Mead on the sum of rho from (one width, one width)."""
+    """Return the milliseconds of the search over all samples and of Nelder-Mead on the sum of rho from (1, 1) width."""
     x = swept(curves.shape[1])
 
     def badness(f: FloatArray) -> float:
