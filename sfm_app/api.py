@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from sfm_app.atomic_io import save_files
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.plugins import load_plugins
-from sfm_app.progress import Progress, Silent
+from sfm_app.progress import Progress, SilentProgress
 from sfm_app.ransac import check_points
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor, worker_count
@@ -63,12 +63,12 @@ def reconstruct(
     """
     from sfm_app import pipeline  # loads COLMAP, which an estimator alone does not need
 
-    with opened_run(Path(out), settings or Settings(), progress) as run:
+    with open_run(Path(out), settings or Settings(), progress) as run:
         run.plugins.depth_method(run.settings.depth.method)  # fail now, not halfway through the work
         wanted = (pipeline.INTRINSICS, pipeline.SCENE, pipeline.FILES)
         products = pipeline.run_stages(Path(photos), run, first, last, wanted)
         manifest = run.workspace.manifest.read()
-        done = pipeline.PIPELINE.until(last)
+        done = pipeline.PIPELINE.stages_until(last)
         scene = products[pipeline.SCENE] if pipeline.SCENE in done else None
         return Run(
             out=run.workspace.root,
@@ -108,7 +108,7 @@ def export_model(
         raise ConfigError(f"{place.name} does not end in .{file_format}", hint=f"name it {place.stem}.{file_format}")
     if place.is_dir():
         place /= "points" if points else "model"
-    with opened_run(Path(out), Settings(), None) as run:
+    with open_run(Path(out), Settings(), None) as run:
         model = stored_model(run, points=points)
     place = place if place.suffix.lower() == f".{exporter.name}" else Path(f"{place}.{exporter.name}")
     files = exporter.write(model, place.stem)
@@ -142,7 +142,7 @@ def calibrate_photos(
         check_figure(Path(figure))  # fail before minutes of work
     with (
         tempfile.TemporaryDirectory(prefix="sfm-app-") as scratch,
-        opened_run(Path(out or scratch), settings or Settings(), progress) as run,
+        open_run(Path(out or scratch), settings or Settings(), progress) as run,
     ):
         wanted = (pipeline.MATCH_GRAPH, pipeline.VIEW_GRAPH, pipeline.INTRINSICS)
         products = pipeline.run_stages(Path(photos), run, last=pipeline.INTRINSICS.name, wanted=wanted)
@@ -198,12 +198,12 @@ def calibrate_fundamentals(
         ConfigError: no calibrator has that name.
     """
     found = [np.asarray(pair, np.float64) for pair in matches]
-    pairs = replace(CameraPairs.of(Fs, size, weights), photos=tuple(photos), inliers=tuple(found))
+    pairs = replace(CameraPairs.from_Fs(Fs, size, weights), photos=tuple(photos), inliers=tuple(found))
     return load_plugins().calibrator(method).calibrate(pairs, (settings or Settings()).calibration, seed)
 
 
 @contextmanager
-def opened_run(out: Path, settings: Settings, progress: Progress | None) -> Iterator[RunContext]:
+def open_run(out: Path, settings: Settings, progress: Progress | None) -> Iterator[RunContext]:
     """Provide a run with its workers, which stop when the block ends.
 
     Args:
@@ -217,4 +217,4 @@ def opened_run(out: Path, settings: Settings, progress: Progress | None) -> Iter
     plugins.feature_method(settings.matching.features)
     workers = worker_count(settings.workers)
     with make_executor(workers) as executor:
-        yield RunContext(settings, Workspace(out), plugins, executor, workers, progress or Silent())
+        yield RunContext(settings, Workspace(out), plugins, executor, workers, progress or SilentProgress())

@@ -11,7 +11,7 @@ UNFINISHED = "unfinished.txt"
 
 
 @contextlib.contextmanager
-def replacing(target: Path) -> Iterator[Path]:
+def replace_atomically(target: Path) -> Iterator[Path]:
     """Provide a path beside `target`, which replaces it when the block ends without an error."""
     target.parent.mkdir(parents=True, exist_ok=True)
     beside = target.with_name(f".{target.stem}.{os.getpid()}{target.suffix}")
@@ -22,7 +22,7 @@ def replacing(target: Path) -> Iterator[Path]:
         beside.unlink(missing_ok=True)
 
 
-def can_go_on(folder: Path, made_from: str) -> bool:
+def resume_or_clear(folder: Path, made_from: str) -> bool:
     """Return whether a killed run was filling this folder from the same inputs; remove the folder if not.
 
     Args:
@@ -55,7 +55,7 @@ def mark_unfinished(folder: Path, made_from: str) -> None:
         folder: created if it is missing.
         made_from: fingerprint of the inputs.
     """
-    with replacing(folder / UNFINISHED) as path:
+    with replace_atomically(folder / UNFINISHED) as path:
         path.write_text(made_from, encoding="utf-8")
 
 
@@ -73,6 +73,6 @@ def save_files(files: Mapping[str, bytes], folder: Path) -> tuple[Path, ...]:
     """
     paths = tuple(folder / name for name in files)
     for path, data in reversed(list(zip(paths, files.values(), strict=True))):
-        with replacing(path) as beside:
+        with replace_atomically(path) as beside:
             beside.write_bytes(data)
     return paths

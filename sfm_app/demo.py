@@ -23,7 +23,7 @@ from sfm_app.synthetic.compare import (
     surface_error,
 )
 from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth, write_photo_folder
-from sfm_app.synthetic.pictures import beside_photo
+from sfm_app.synthetic.pictures import comparison_image
 from sfm_app.synthetic.scenes.scene_catalog import build_scene
 from sfm_app.types import Model, Scene
 
@@ -84,7 +84,7 @@ def run_demo(out: Path, settings: Settings, progress: Progress) -> DemoResult:
         raise InputError("the demo's reconstruction is incomplete", hint=f"remove {out} and try again")
     model = read_texture(Workspace(run.out))
     draw(model, run.scene, out)
-    return compared(run, run.scene, model, truth, (rendered - start, done - rendered), out)
+    return evaluate(run, run.scene, model, truth, (rendered - start, done - rendered), out)
 
 
 def _render_photos(out: Path, progress: Progress) -> Truth:
@@ -98,7 +98,7 @@ def _render_photos(out: Path, progress: Progress) -> Truth:
     return truth
 
 
-def compared(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[float, float], out: Path) -> DemoResult:
+def evaluate(run: Run, scene: Scene, model: Model, truth: Truth, seconds: tuple[float, float], out: Path) -> DemoResult:
     """Measure how close the reconstruction came to the ground truth.
 
     Args:
@@ -148,7 +148,7 @@ def draw(model: Model, scene: Scene, out: Path) -> None:
     found = scene.cameras[scene.camera_of[name]]
     camera = Camera(found.K, found.width, found.height)
     photo = np.asarray(Image.open(out / "photos" / name).convert("RGB"))
-    Image.fromarray(beside_photo(photo, model, camera, scene.cam_from_world[name])).save(out / "model.png")
+    Image.fromarray(comparison_image(photo, model, camera, scene.cam_from_world[name])).save(out / "model.png")
 
 
 def demo_lines(result: DemoResult) -> list[str]:

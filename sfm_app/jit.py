@@ -14,7 +14,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 def kernel(function: Function) -> Function:
     """Compile a function with numba: nogil, cached on disk, IEEE arithmetic (same seed, same bytes)."""
-    return _compiled(function, fastmath=False)
+    return _compile(function, fastmath=False)
 
 
 def summing_kernel(function: Function) -> Function:
@@ -22,20 +22,20 @@ def summing_kernel(function: Function) -> Function:
 
     Nothing else is relaxed: there are no assumptions about infinities or NaN, and no approximate division.
     """
-    return _compiled(function, fastmath={"reassoc", "nsz"})
+    return _compile(function, fastmath={"reassoc", "nsz"})
 
 
-def _compiled(function: Function, *, fastmath: bool | set[str]) -> Function:
+def _compile(function: Function, *, fastmath: bool | set[str]) -> Function:
     options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": fastmath, "no_cfunc_wrapper": True}
     try:
         compiled: Function = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder for the cache is writable: compile in every process
         return cast(Function, numba.njit(**options)(function))
-    _forget_unreadable(compiled)
+    _forget_unreadable_cache(compiled)
     return compiled
 
 
-def _forget_unreadable(compiled: Any) -> None:
+def _forget_unreadable_cache(compiled: Any) -> None:
     """Let a kernel be recompiled where its cache refers to classes that no longer exist, as after an upgrade."""
     cache_file = compiled._cache._cache_file
     load = cache_file._load_index

@@ -20,25 +20,25 @@ MAD_TO_SIGMA = 1.4826
 1987), with the digits that the thesis prints (5.7.2)."""
 
 
-def reason_of(err: Exception) -> str:
+def error_reason(err: Exception) -> str:
     """Return the last line of an error's message; the name of its class where there is none."""
     lines = str(err).strip().splitlines()
     return lines[-1] if lines else type(err).__name__
 
 
-def finite_only(values: Mapping[str, float | None]) -> dict[str, float]:
+def finite_entries(values: Mapping[str, float | None]) -> dict[str, float]:
     """Return the entries that are finite."""
     return {name: value for name, value in values.items() if value is not None and np.isfinite(value)}
 
 
 def json_text(value: Any) -> str:
     """Return plain values as JSON; infinities and NaN become null, which every reader understands."""
-    return json.dumps(_plain(value), indent=1, allow_nan=False) + "\n"
+    return json.dumps(_replace_nonfinite(value), indent=1, allow_nan=False) + "\n"
 
 
-def _plain(value: Any) -> Any:
+def _replace_nonfinite(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _replace_nonfinite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [_replace_nonfinite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sfm_app.colmap.model import sparse_model
 from sfm_app.engine.execution import Pipeline
-from sfm_app.engine.stage import Products, Stage, go_on_hint, undamaged
+from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
 from sfm_app.errors import InputError
 from sfm_app.photos import read_source
 from sfm_app.runtime.context import RunContext
@@ -114,9 +114,9 @@ def run_stages(
         wanted: stages whose products are loaded before returning.
     """
     options, place = run.settings.photos, run.workspace
-    place.keep_apart(photo_dir)
+    place.check_no_overlap(photo_dir)
     if options.masks:
-        place.keep_apart(Path(options.masks), "masks")
+        place.check_no_overlap(Path(options.masks), "masks")
     source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
     return PIPELINE.run(source, replace(run, settings=source.adapt(run.settings)), first, last, wanted)
 
@@ -136,11 +136,11 @@ def stored_model(run: RunContext, *, points: bool = False) -> Model:
     place.manifest.check_format()
     needed, what = (SCENE, "points") if points else (TEXTURE, "model")
     if place.manifest.record(needed.name) is None:
-        hint = go_on_hint(run)
+        hint = resume_hint(run)
         if place.manifest.record(SCENE.name):
             hint += "; `--points` exports the points and cameras"
         raise InputError(f"{place.root} holds no {what} yet: stage `{needed.name}` is missing", hint=hint)
     if not points:
         return Products(run)[TEXTURE]
-    with undamaged(SCENE, run):
+    with check_undamaged(SCENE, run):
         return sparse_model(place.sparse)

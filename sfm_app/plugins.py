@@ -118,14 +118,14 @@ class MakeDepthMaps(Protocol):
     def __call__(self, task: "DepthTask", /) -> list[Rejected | None]: ...
 
 
-def _always() -> str:
+def _no_reason() -> str:
     return ""
 
 
-def _make_on_cpu(task: "DepthTask") -> list[Rejected | None]:
-    from sfm_app.stereo import make_on_cpu
+def _make_depth_maps_on_cpu(task: "DepthTask") -> list[Rejected | None]:
+    from sfm_app.stereo import make_depth_maps_on_cpu
 
-    return make_on_cpu(task)
+    return make_depth_maps_on_cpu(task)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +135,7 @@ class DepthMethod:
     name: str
     make: MakeDepthMaps
     summary: str = ""
-    unavailable: Callable[[], str] = _always
+    unavailable: Callable[[], str] = _no_reason
     """Why it cannot run on this machine; empty where it can."""
 
 
@@ -147,7 +147,7 @@ class FeatureMethod:
     find: FindFeatures | None = None
     match: MatchFeatures | None = None
     summary: str = ""
-    unavailable: Callable[[], str] = _always
+    unavailable: Callable[[], str] = _no_reason
     """Why it cannot run on this machine; empty where it can."""
     sift: Mapping[str, bool | int | float] | None = None
     """In place of functions: options of COLMAP's SIFT extraction that differ from its defaults."""
@@ -217,7 +217,7 @@ class BuiltIns:
     @hookimpl
     def sfm_depth_methods(self) -> Iterable[DepthMethod]:
         """Return the depth maps made on the CPU."""
-        return [DepthMethod(CPU, _make_on_cpu, "semi-global matching and PatchMatch, on every machine")]
+        return [DepthMethod(CPU, _make_depth_maps_on_cpu, "semi-global matching and PatchMatch, on every machine")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,19 +232,19 @@ class Plugins:
 
     def estimator(self, name: str) -> Estimator:
         """Return the estimator of that name; ConfigError names the known ones."""
-        return _named(self.estimators, name, "estimator")
+        return _look_up(self.estimators, name, "estimator")
 
     def calibrator(self, name: str) -> Calibrator:
         """Return the calibrator of that name; ConfigError names the known ones."""
-        return _named(self.calibrators, name, "calibrator")
+        return _look_up(self.calibrators, name, "calibrator")
 
     def exporter(self, name: str) -> Exporter:
         """Return the file format of that name; ConfigError names the known ones."""
-        return _named(self.exporters, name, "file format")
+        return _look_up(self.exporters, name, "file format")
 
     def feature_method(self, name: str) -> FeatureMethod:
         """Return the way to find features of that name; ConfigError where there is none, or it cannot run here."""
-        method = _named(self.features, name, "way to find features")
+        method = _look_up(self.features, name, "way to find features")
         if reason := method.unavailable():
             hint = f"'{SIFT}' runs everywhere"
             raise ConfigError(f"the features '{name}' cannot be used here: {reason}", hint=hint)
@@ -257,7 +257,7 @@ class Plugins:
             ConfigError: no method has that name, or it cannot run on this machine.
         """
         if name != AUTO:
-            method = _named(self.depth_methods, name, "depth method")
+            method = _look_up(self.depth_methods, name, "depth method")
             if reason := method.unavailable():
                 raise ConfigError(
                     f"the depth method '{name}' cannot run here: {reason}",
@@ -310,23 +310,23 @@ def _load(modules: Sequence[ModuleType | object], installed: bool) -> Plugins:
             f"a plug-in does not load: {err}", hint="update or uninstall it; hooks: sfm_app.plugins.Hooks"
         ) from err
     return Plugins(
-        estimators=_by_name(manager.hook.sfm_estimators()),
-        calibrators=_by_name(manager.hook.sfm_calibrators()),
-        exporters=_by_name(manager.hook.sfm_exporters()),
-        depth_methods=_by_name(manager.hook.sfm_depth_methods()),
-        features=_by_name(manager.hook.sfm_features()),
+        estimators=_index_by_name(manager.hook.sfm_estimators()),
+        calibrators=_index_by_name(manager.hook.sfm_calibrators()),
+        exporters=_index_by_name(manager.hook.sfm_exporters()),
+        depth_methods=_index_by_name(manager.hook.sfm_depth_methods()),
+        features=_index_by_name(manager.hook.sfm_features()),
     )
 
 
-class _Named(Protocol):
+class _NamedPart(Protocol):
     @property
     def name(self) -> str: ...
 
 
-Part = TypeVar("Part", bound=_Named)
+Part = TypeVar("Part", bound=_NamedPart)
 
 
-def _by_name(results: Iterable[Iterable[Part]]) -> Mapping[str, Part]:
+def _index_by_name(results: Iterable[Iterable[Part]]) -> Mapping[str, Part]:
     # pluggy calls the last registered first; reversed, the built-ins lead every listing
     found: dict[str, Part] = {}
     for part in (part for parts in reversed(list(results)) for part in parts):
@@ -336,7 +336,7 @@ def _by_name(results: Iterable[Iterable[Part]]) -> Mapping[str, Part]:
     return MappingProxyType(found)
 
 
-def _named(parts: Mapping[str, Part], name: str, kind: str) -> Part:
+def _look_up(parts: Mapping[str, Part], name: str, kind: str) -> Part:
     if name not in parts:
         raise ConfigError(f"no {kind} is named '{name}'", hint=f"known: {', '.join(parts)}")
     return parts[name]

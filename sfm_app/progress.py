@@ -38,7 +38,7 @@ class Progress(Protocol):
         """Finish the work that was started last."""
 
 
-class Silent:
+class SilentProgress:
     """A display that shows nothing."""
 
     def stage(self, name: str, note: str = "") -> None:

@@ -16,7 +16,7 @@ from sfm_app.errors import ConfigError
 
 MOST_TOML_BYTES = 20_000
 """Most bytes of a settings file. One with every setting has a fifth; a megabyte of dots takes minutes to parse."""
-TOLD, SHOWN = 20, 100
+MAX_PROBLEMS, MAX_VALUE_CHARS = 20, 100
 """Most problems that an error lists, and most characters of a wrong value that it shows."""
 
 Quality = Literal["draft", "normal", "high"]
@@ -189,11 +189,11 @@ class Settings(Section):
         """
         preset = QUALITY_PRESETS.get(str(values.get("quality", "normal")), {})
         try:
-            return cls.model_validate(merged(preset, values))
+            return cls.model_validate(merge_nested(preset, values))
         except ValidationError as err:
             errors = err.errors(include_url=False)
-            problems = [_problem(dict(e)) for e in errors[:TOLD]]
-            more = f"; and {len(errors) - TOLD} more" if len(errors) > TOLD else ""
+            problems = [_problem(dict(e)) for e in errors[:MAX_PROBLEMS]]
+            more = f"; and {len(errors) - MAX_PROBLEMS} more" if len(errors) > MAX_PROBLEMS else ""
             raise ConfigError(
                 f"{where}: " + "; ".join(text for text, _ in problems) + more,
                 hint=next((hint for _, hint in problems if hint), "`sfm-app config` prints every setting"),
@@ -207,7 +207,7 @@ class Settings(Section):
             path: TOML file.
             overrides: nested values from flags; they win.
         """
-        return cls.from_mapping(merged(read_toml(path), overrides or {}), where=str(path))
+        return cls.from_mapping(merge_nested(read_toml(path), overrides or {}), where=str(path))
 
     def to_toml(self) -> str:
         """Return every setting with its help as a comment; `from_toml` reads it back."""
@@ -248,7 +248,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path} is not a TOML file: {err}", hint=hint) from err
 
 
-def merged(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
+def merge_nested(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
     """Return two nested mappings merged into one.
 
     Args:
@@ -258,7 +258,7 @@ def merged(low: Mapping[str, Any], high: Mapping[str, Any]) -> dict[str, Any]:
     result = dict(low)
     for key, value in high.items():
         below = result.get(key)
-        result[key] = merged(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
+        result[key] = merge_nested(below, value) if isinstance(below, Mapping) and isinstance(value, Mapping) else value
     return result
 
 
@@ -266,20 +266,20 @@ def _problem(error: dict[str, Any]) -> tuple[str, str]:
     *table, key = [str(part) for part in error["loc"]] or ["settings"]
     name = ".".join((*table, key))
     if error["type"] != "extra_forbidden":
-        return f"'{name}': {error['msg'].lower()}, got {_shown(error['input'])}", ""
+        return f"'{name}': {error['msg'].lower()}, got {_abbreviate(error['input'])}", ""
     section: Any = Settings
     for part in table:
         section = section.model_fields[part].annotation
     close = difflib.get_close_matches(key, section.model_fields, n=1)
-    return f"unknown setting {_shown(name)}", f"did you mean '{'.'.join((*table, close[0]))}'?" if close else ""
+    return f"unknown setting {_abbreviate(name)}", f"did you mean '{'.'.join((*table, close[0]))}'?" if close else ""
 
 
-def _shown(value: object) -> str:
+def _abbreviate(value: object) -> str:
     try:
         text = repr(value)
     except (RecursionError, ValueError):  # deeply nested values, numbers of thousands of digits
         text = f"a {type(value).__name__}"
-    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+    return text if len(text) <= MAX_VALUE_CHARS else f"{text[:MAX_VALUE_CHARS]}..."
 
 
 def _toml_lines(section: BaseModel, table: str = "") -> Iterator[str]:

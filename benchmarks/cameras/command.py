@@ -15,14 +15,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from benchmarks.cameras.bars import BARS
-from benchmarks.cameras.measure import EACH, measure, warm_up
-from benchmarks.cameras.methods import STOCK, Method, methods, taking_turns
+from benchmarks.cameras.measure import OWN_CAMERA_SETS, measure, warm_up
+from benchmarks.cameras.methods import STOCK, Method, methods, rotate_methods
 from benchmarks.cameras.report import draw, medians, page
 from benchmarks.common.command_line import add_pictures, is_wanted, new_parser, overrides
 from benchmarks.common.photo_sets import PhotoSet, photo_set
 from benchmarks.common.results import RESULTS, Row, document, write
 
-ALSO: tuple[str, ...] = ()
+EXTRA_SETTINGS: tuple[str, ...] = ()
 """Settings for one more run of the program each, unless --also names others."""
 ABOUT = (
     "The same pixels for all: photos saved anew as PNG, upright, without EXIF. Every run in a process of its own, "
@@ -45,13 +45,13 @@ def chosen_sets(args: argparse.Namespace, cache: Path) -> Iterator[tuple[PhotoSe
         yield photo_set(args.data, name, change, cache, "each" if name in args.each else "auto"), name
 
 
-def all_runs(args: argparse.Namespace, these: Sequence[Method], cache: Path) -> Iterator[Row]:
+def run_all(args: argparse.Namespace, these: Sequence[Method], cache: Path) -> Iterator[Row]:
     """Run every method on every set in every repetition."""
     sets = list(chosen_sets(args, cache))
     warm_up([photos for photos, _ in sets], these, cache / "cameras" / "warm-up")
     for photos, name in sets:
         for repetition in range(max(args.repeat, 1 + args.twice)):
-            for method in taking_turns(these, repetition):
+            for method in rotate_methods(these, repetition):
                 if method.kind in STOCK and repetition >= args.repeat:
                     continue
                 out = cache / "cameras" / photos.folder.name / method.name.replace(" ", "_")
@@ -66,10 +66,14 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("data", type=Path, help="folder with NAME/images and NAME/cameras.json")
     parser.add_argument("--cache", type=Path, help="keeps copies of photos and the last run of every method")
     parser.add_argument("--sets", nargs="+", default=list(BARS), metavar="SET", help='"NAME" or "NAME CHANGE"')
-    parser.add_argument("--each", nargs="*", default=EACH, help="sets in which every photo has its own camera")
+    parser.add_argument(
+        "--each", nargs="*", default=OWN_CAMERA_SETS, help="sets in which every photo has its own camera"
+    )
     parser.add_argument("--ours-only", action="store_true", help="skip stock pycolmap")
     parser.add_argument("--without", nargs="*", default=[], choices=STOCK, help="stock mappers to skip")
-    parser.add_argument("--also", nargs="*", default=ALSO, metavar="TABLE.KEY=VALUE", help="run ours with it, too")
+    parser.add_argument(
+        "--also", nargs="*", default=EXTRA_SETTINGS, metavar="TABLE.KEY=VALUE", help="run ours with it, too"
+    )
     parser.add_argument("--repeat", type=int, default=1, metavar="N", help="runs of every method")
     parser.add_argument("--twice", action="store_true", help="run ours at least twice and compare the bytes")
     parser.add_argument("--results", type=Path, default=RESULTS)
@@ -85,7 +89,7 @@ def main() -> None:
         method for method in methods(overrides(args.also), ours_only=args.ours_only) if method.name not in args.without
     ]
     with tempfile.TemporaryDirectory(prefix="cameras-") as scratch:
-        runs = list(all_runs(args, these, args.cache or Path(scratch)))
+        runs = list(run_all(args, these, args.cache or Path(scratch)))
     rows = medians(runs)
     options = {"methods": [method.name for method in these], "repeat": args.repeat, "each": list(args.each)}
     found = document("cameras", ABOUT, options, {"sets": list(args.sets), "medians": rows}, runs)

@@ -11,10 +11,10 @@ from typing import Any
 from PIL import Image
 
 from benchmarks.cameras.worker import GLOBAL, INCREMENTAL, OURS, RESULT
-from benchmarks.common.photo_sets import PhotoSet, put
-from benchmarks.common.processes import end_of, module_command
+from benchmarks.common.photo_sets import PhotoSet, link_or_copy
+from benchmarks.common.processes import module_command, run_command
 from benchmarks.common.results import Row
-from sfm_app.settings import MatchSettings, merged
+from sfm_app.settings import MatchSettings, merge_nested
 
 STOCK = (INCREMENTAL, GLOBAL)
 WORKER = "benchmarks.cameras.worker"
@@ -37,7 +37,7 @@ def methods(also: Mapping[str, Mapping[str, Any]], *, ours_only: bool = False) -
     return ours if ours_only else ours + [Method(kind, kind) for kind in STOCK]
 
 
-def taking_turns(these: Sequence[Method], repetition: int) -> list[Method]:
+def rotate_methods(these: Sequence[Method], repetition: int) -> list[Method]:
     """Start every repetition with another method, so that none always meets a cold or a busy machine."""
     first = repetition % len(these)
     return [*these[first:], *these[:first]]
@@ -50,15 +50,17 @@ def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = Non
     """
     shutil.rmtree(out, ignore_errors=True)
     out.parent.mkdir(parents=True, exist_ok=True)
-    settings = merged({"photos": {"cameras": photos.cameras if photos.told else "auto"}}, method.settings)
+    settings = merge_nested(
+        {"photos": {"cameras": photos.cameras if photos.cameras_given else "auto"}}, method.settings
+    )
     cap = MatchSettings(**settings.get("matching", {})).max_image_size_px
     options = {"settings": settings, "cameras": photos.cameras, "max_image_size_px": cap}
     folder = photos.folder
-    if method.kind in STOCK and photos.cameras != "each" and len(sizes := by_size(folder)) > 1:
-        folder, options["cameras"] = in_folders(sizes, folder.with_name(f"{folder.name}-by-size")), "folder"
+    if method.kind in STOCK and photos.cameras != "each" and len(sizes := group_by_size(folder)) > 1:
+        folder, options["cameras"] = split_into_folders(sizes, folder.with_name(f"{folder.name}-by-size")), "folder"
     command = module_command(WORKER, method.kind, str(folder), str(out), json.dumps(options))
     start = time.perf_counter()
-    code, last = end_of(command, limit_s)
+    code, last = run_command(command, limit_s)
     said: Row = {"wall seconds": round(time.perf_counter() - start, 2)}
     if (out / RESULT).exists():
         found: Row = json.loads((out / RESULT).read_text(encoding="utf-8"))
@@ -67,7 +69,7 @@ def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = Non
     return said | {"failed": failed, "exit code": code, "seconds": {}, "peak MB": None}
 
 
-def by_size(folder: Path) -> dict[tuple[int, int], list[Path]]:
+def group_by_size(folder: Path) -> dict[tuple[int, int], list[Path]]:
     """Group the photos of a folder by width and height."""
     found: dict[tuple[int, int], list[Path]] = {}
     for path in sorted(folder.glob("*.png")):
@@ -76,11 +78,11 @@ def by_size(folder: Path) -> dict[tuple[int, int], list[Path]]:
     return found
 
 
-def in_folders(sizes: Mapping[tuple[int, int], Sequence[Path]], into: Path) -> Path:
+def split_into_folders(sizes: Mapping[tuple[int, int], Sequence[Path]], into: Path) -> Path:
     """Make a folder for each size: told of one camera for all, COLMAP leaves out photos that lie on their side."""
     for (width, height), photos in sizes.items():
         folder = into / f"{width}x{height}"
         folder.mkdir(parents=True, exist_ok=True)
         for photo in photos:
-            put(photo, folder)
+            link_or_copy(photo, folder)
     return into

@@ -34,7 +34,7 @@ def medians(runs: Sequence[Row]) -> list[Row]:
     together: dict[tuple[str, str], list[Row]] = {}
     for run in runs:
         together.setdefault((run["photos"], run["method"]), []).append(run)
-    rows = [_median(repeated) for repeated in together.values()]
+    rows = [_median_row(repeated) for repeated in together.values()]
     for row in rows:
         of_methods = {other["method"]: other for other in rows if other["photos"] == row["photos"]}
         bars = () if row["method"] in STOCK else BARS.get(row["photos"], ())
@@ -50,7 +50,7 @@ def add_ratios(runs: Sequence[Row]) -> None:
         run["/ incremental"] = round(run["total"] / of, 3) if of and run["total"] else None
 
 
-def _median(repeated: Sequence[Row]) -> Row:
+def _median_row(repeated: Sequence[Row]) -> Row:
     row: Row = {}
     for name in dict.fromkeys(key for run in repeated for key in run if key not in ("repetition", *FILES)):
         values = [run[name] for run in repeated if run.get(name) not in (None, "")]
@@ -68,11 +68,11 @@ def _median(repeated: Sequence[Row]) -> Row:
         "fastest": min(totals, default=None),
         "slowest": max(totals, default=None),
         "in 3 sd": None if worst is None else "yes" if worst <= 3 else "no",
-        "same bytes": same_bytes(repeated),
+        "same bytes": compare_bytes(repeated),
     }
 
 
-def same_bytes(repeated: Sequence[Row]) -> str | None:
+def compare_bytes(repeated: Sequence[Row]) -> str | None:
     """Return whether all repetitions wrote the same model, and if not, which files differ."""
     known = [name for name in FILES if all(run.get(name) for run in repeated)]
     if len(repeated) < 2 or not known:

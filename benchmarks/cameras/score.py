@@ -18,7 +18,7 @@ from benchmarks.common.metrics import (
     pose_errors_deg,
     position_rms_percent,
 )
-from benchmarks.common.outputs import cameras_after, cameras_before
+from benchmarks.common.outputs import read_initial_cameras, read_refined_cameras
 from benchmarks.common.photo_sets import Step, changed_camera
 from benchmarks.common.results import Row
 from sfm_app.colmap.backend import pycolmap
@@ -104,14 +104,14 @@ def accuracy(models: Sequence[Model], truth: Mapping[str, TruePhoto], photos: in
         return row
     poses = {name: photo.pose for name, photo in truth.items()}
     row |= camera_errors(best.K, truth)
-    row["center rms %"] = _rounded(position_rms_percent(best.poses, poses))
+    row["center rms %"] = _round_or_none(position_rms_percent(best.poses, poses))
     errors = pose_errors_deg(best.poses, poses)
     row |= {f"AUC@{limit}": round(area_under_recall(errors, limit), 4) for limit in LIMITS_DEG}
-    alone = [within(model, poses) for model in models]
+    alone = [model_auc(model, poses) for model in models]
     return row | {"AUC@5 of each model": ", ".join(f"{value:.2f}" for value in alone) if len(models) > 1 else None}
 
 
-def within(model: Model, truth: Mapping[str, Pose]) -> float:
+def model_auc(model: Model, truth: Mapping[str, Pose]) -> float:
     """Return AUC@5 over the pairs of the photos in one model: whether the model is right as far as it goes."""
     errors = pose_errors_deg(model.poses, {name: truth[name] for name in model.poses if name in truth})
     return area_under_recall(errors, 5)
@@ -129,7 +129,7 @@ def camera_errors(K: Mapping[str, NDArray[np.float64]], truth: Mapping[str, True
     }
 
 
-def before_adjustment(out: Path, truth: Mapping[str, TruePhoto]) -> Row:
+def errors_before_adjustment(out: Path, truth: Mapping[str, TruePhoto]) -> Row:
     """Score the cameras that the program knew before mapping."""
     cameras, camera_of = _calibration(out)
     known = {photo: cameras[name] for photo, name in camera_of.items() if cameras[name]["identifiable"]}
@@ -142,37 +142,37 @@ def before_adjustment(out: Path, truth: Mapping[str, TruePhoto]) -> Row:
 
 def stated_deviations(out: Path, model: Model, truth: Mapping[str, TruePhoto]) -> Row:
     """Return the standard deviations after bundle adjustment, and the errors in units of them; the worst camera's."""
-    by_camera, camera_of = _stated(out)
+    by_camera, camera_of = _refined_deviations(out)
     row: Row = {}
     for photo in sorted(set(model.K) & set(truth)):
         K, true = model.K[photo], truth[photo].K
         for name, deviation in by_camera.get(camera_of.get(photo, ""), {}).items():
-            if name in PLACES and deviation > 0:
-                error = abs(_place(K, name) - _place(true, name))
+            if name in PARAMETER_ENTRIES and deviation > 0:
+                error = abs(_mean_entry(K, name) - _mean_entry(true, name))
                 row[f"sd {name} px"] = max(row.get(f"sd {name} px", 0.0), round(deviation, 3))
                 row[f"{name} in sd"] = max(row.get(f"{name} in sd", 0.0), round(float(error / deviation), 2))
     counted = [value for name, value in row.items() if name.endswith(" in sd")]
     return row | {"worst in sd": max(counted, default=None)}
 
 
-PLACES = {"f": ((0, 0), (1, 1)), "fx": ((0, 0),), "fy": ((1, 1),), "cx": ((0, 2),), "cy": ((1, 2),)}
+PARAMETER_ENTRIES = {"f": ((0, 0), (1, 1)), "fx": ((0, 0),), "fy": ((1, 1),), "cx": ((0, 2),), "cy": ((1, 2),)}
 """Entries of K for each parameter; their mean counts."""
 
 
-def _place(K: NDArray[np.float64], name: str) -> float:
-    return float(np.mean([K[place] for place in PLACES[name]]))
+def _mean_entry(K: NDArray[np.float64], name: str) -> float:
+    return float(np.mean([K[place] for place in PARAMETER_ENTRIES[name]]))
 
 
-def _stated(out: Path) -> tuple[dict[str, Mapping[str, float]], dict[str, str]]:
+def _refined_deviations(out: Path) -> tuple[dict[str, Mapping[str, float]], dict[str, str]]:
     """Read the deviations of the refined cameras by name, and the camera names by photo without suffix."""
-    cameras, camera_of = cameras_after(out)
+    cameras, camera_of = read_refined_cameras(out)
     deviations = {name: camera["deviations"] for name, camera in cameras.items()}
     return deviations, {Path(photo).stem: name for photo, name in camera_of.items()}
 
 
 def _calibration(out: Path) -> tuple[dict[str, Any], dict[str, str]]:
     """Read the cameras by name, and the camera names by photo without suffix."""
-    cameras, camera_of = cameras_before(out)
+    cameras, camera_of = read_initial_cameras(out)
     return cameras, {Path(photo).stem: name for photo, name in camera_of.items()}
 
 
@@ -191,5 +191,5 @@ def hashes(out: Path) -> Row:
     return {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in found.items() if path.exists()}
 
 
-def _rounded(value: float | None) -> float | None:
+def _round_or_none(value: float | None) -> float | None:
     return None if value is None else round(value, 4)

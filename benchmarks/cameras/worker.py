@@ -21,7 +21,7 @@ MODES = {"each": "AUTO", "folder": "PER_FOLDER"}
 """pycolmap's camera mode by our name for it; anything else means one camera for all photos."""
 
 
-def ours(photos: Path, out: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+def run_ours(photos: Path, out: Path, options: Mapping[str, Any]) -> dict[str, Any]:
     """Run the program up to its scene; the seconds are those of its manifest."""
     import sfm_app
 
@@ -41,7 +41,7 @@ def ours(photos: Path, out: Path, options: Mapping[str, Any]) -> dict[str, Any]:
     return said | {"seconds": {name: stage["seconds"] for name, stage in stages.items()}}
 
 
-def stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) -> dict[str, Any]:
+def run_stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) -> dict[str, Any]:
     """Run pycolmap with its defaults but for a seed, a cap on the image size, and cameras shared as the options say."""
     import pycolmap
 
@@ -76,7 +76,11 @@ def stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) -> d
 def main() -> None:
     kind, photos, out, text = sys.argv[1:]
     options = json.loads(text)
-    found = ours(Path(photos), Path(out), options) if kind == OURS else stock(Path(photos), Path(out), options, kind)
+    found = (
+        run_ours(Path(photos), Path(out), options)
+        if kind == OURS
+        else run_stock(Path(photos), Path(out), options, kind)
+    )
     (Path(out) / RESULT).write_text(json.dumps(found), encoding="utf-8")
 
 

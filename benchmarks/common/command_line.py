@@ -6,8 +6,8 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from sfm_app.cli.options import assigned
-from sfm_app.settings import merged
+from sfm_app.cli.options import parse_assignment
+from sfm_app.settings import merge_nested
 
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -43,12 +43,12 @@ def overrides(texts: Sequence[str]) -> dict[str, dict[str, Any]]:
     for text in texts:
         settings: dict[str, Any] = {}
         for assignment in text.split():
-            settings = merged(settings, assigned(assignment))
+            settings = merge_nested(settings, parse_assignment(assignment))
         found[text] = settings
     return found
 
 
-def on_one_thread() -> None:
+def ensure_single_thread() -> None:
     """Restart the command with one thread in every library, unless it has one: libraries read the setting once."""
     if any(os.environ.get(name) != "1" for name in _THREADS):
         environment = {**os.environ, **dict.fromkeys(_THREADS, "1")}

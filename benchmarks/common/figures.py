@@ -31,7 +31,7 @@ def pyplot() -> Any:
     return plt
 
 
-def curves(
+def draw_curves(
     axes: Any,
     x: Sequence[float],
     lines: Mapping[str, Sequence[float]],
@@ -61,7 +61,7 @@ def label(axes: Any, x: str, y: str, title: str = "", *, log: bool = False) -> N
             axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in labeled else "")
 
 
-def legend_beside(figure: Any, axes: Any) -> None:
+def add_legend(figure: Any, axes: Any) -> None:
     """Add one legend to the right of all plots of a figure."""
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right center")
 

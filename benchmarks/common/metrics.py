@@ -34,7 +34,7 @@ def pose_errors_deg(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> NDA
     errors = []
     for a, b in combinations(sorted(truth), 2):
         if a in found and b in found:
-            errors.append(_angle_deg(_relative(found[a], found[b]), _relative(truth[a], truth[b])))
+            errors.append(_angle_deg(_relative_pose(found[a], found[b]), _relative_pose(truth[a], truth[b])))
         else:
             errors.append(LOST_DEG)
     return np.array(errors)
@@ -120,6 +120,6 @@ def _angle_deg(a: tuple[Pose, Pose], b: tuple[Pose, Pose]) -> float:
     return float(max(np.degrees(np.arccos(np.clip(cosines, -1, 1)))))
 
 
-def _relative(a: Pose, b: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _relative_pose(a: Pose, b: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     R = b[:, :3] @ a[:, :3].T
     return R, b[:, 3] - R @ a[:, 3]

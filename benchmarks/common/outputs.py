@@ -12,12 +12,12 @@ class Cameras(NamedTuple):
     camera_of: dict[str, str]
 
 
-def cameras_before(out: Path) -> Cameras:
+def read_initial_cameras(out: Path) -> Cameras:
     """Read the cameras before mapping; empty where the run did not get that far."""
     return _read(out / "calibration.json")
 
 
-def cameras_after(out: Path) -> Cameras:
+def read_refined_cameras(out: Path) -> Cameras:
     """Read the cameras after bundle adjustment; empty where the run did not get that far."""
     return _read(out / "scene.json")
 

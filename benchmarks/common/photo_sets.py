@@ -28,7 +28,7 @@ ONE_SIZE = ("pad", "corner", "fill")
 Step = tuple[str, tuple[float, ...]]
 
 
-def put(photo: Path, folder: Path) -> None:
+def link_or_copy(photo: Path, folder: Path) -> None:
     """Hard-link a photo into another folder, or copy it; the program skips symbolic links out of a folder."""
     place = folder / photo.name
     if not place.exists():
@@ -73,7 +73,7 @@ class PhotoSet:
     """By photo name without suffix; empty where it is unknown."""
     cameras: str = "auto"
     """Which photos share a camera, as in the setting `photos.cameras`."""
-    told: bool = True
+    cameras_given: bool = True
     """Whether the program is given `cameras`."""
 
 
@@ -105,7 +105,7 @@ class Frame(NamedTuple):
     """Left and top of its first pixel; negative where it is cut off."""
 
 
-def framed(kind: str, size: tuple[int, int], wanted: Sequence[float]) -> Frame:
+def place_in_frame(kind: str, size: tuple[int, int], wanted: Sequence[float]) -> Frame:
     """Return where a photo of `size` lies in a frame of the `wanted` size; `kind` is one of `ONE_SIZE`."""
     ratios = [side / own for side, own in zip(wanted, size, strict=True)]
     factor = max(ratios) if kind == "fill" else min(ratios)
@@ -131,7 +131,7 @@ def changed_photo(image: Image.Image, change: Sequence[Step]) -> Image.Image:
         if kind == "scale":
             image = image.resize(after, Image.Resampling.LANCZOS)
         elif kind in ONE_SIZE:
-            place = framed(kind, image.size, values)
+            place = place_in_frame(kind, image.size, values)
             frame = Image.new(image.mode, after)
             frame.paste(image.resize(place.size, Image.Resampling.LANCZOS), (place.left, place.top))
             image = frame
@@ -148,7 +148,7 @@ def changed_camera(K: NDArray[np.float64], change: Sequence[Step], size: tuple[i
         if kind == "scale":
             K[:2] *= np.array(values)[:, None]
         elif kind in ONE_SIZE:
-            place = framed(kind, size, values)
+            place = place_in_frame(kind, size, values)
             K[:2] *= np.array([[own / before] for own, before in zip(place.size, size, strict=True)])
             K[:2, 2] += place.left, place.top
         else:
@@ -169,15 +169,15 @@ def photo_set(data: Path, name: str, change: str, cache: Path, cameras: str = "a
     for source in sources[:: stride(change)]:
         target = folder / f"{source.stem}.png"
         if not target.exists():
-            save_plain(source, target, todo)
+            save_without_exif(source, target, todo)
     truth = dict(_true_cameras(data / name / "cameras.json", todo))
     if truth and cameras != "each":
         K = np.median([camera.K for camera in truth.values()], axis=0)
         truth = {photo: TrueCamera(K, camera.k1) for photo, camera in truth.items()}
-    return PhotoSet(title, folder, truth, cameras, told=not any(kind in ONE_SIZE for kind, _ in todo))
+    return PhotoSet(title, folder, truth, cameras, cameras_given=not any(kind in ONE_SIZE for kind, _ in todo))
 
 
-def save_plain(source: Path, target: Path, change: Sequence[Step]) -> None:
+def save_without_exif(source: Path, target: Path, change: Sequence[Step]) -> None:
     """Save a photo upright, changed, and without metadata: PNG keeps all pixels, and no EXIF is passed on."""
     with Image.open(source) as image:
         upright = ImageOps.exif_transpose(image).convert("RGB")

@@ -23,7 +23,7 @@ def environment() -> dict[str, str]:
     return {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *([before] if before else [])])}
 
 
-def end_of(command: Sequence[str], limit_s: float | None = None) -> tuple[int | None, str]:
+def run_command(command: Sequence[str], limit_s: float | None = None) -> tuple[int | None, str]:
     """Return a command's exit code (None if stopped after `limit_s`), and its error or last line on stderr."""
     with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as errors:
         process = subprocess.Popen(

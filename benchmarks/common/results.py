@@ -43,12 +43,12 @@ def document(task: str, about: str, options: Mapping[str, Any], data: Mapping[st
         "options": dict(options),
         "data": dict(data),
         "machine": machine,
-        "versions": program_versions() | _version_of("poselib"),
+        "versions": program_versions() | _installed_version("poselib"),
         "rows": list(rows),
     }
 
 
-def finite(value: object) -> object:
+def finite_or_none(value: object) -> object:
     """Return the value, or None where it is a number that JSON does not allow."""
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
@@ -86,7 +86,7 @@ def table(rows: Sequence[Row], columns: Sequence[str] | None = None) -> str:
     """Format rows as a Markdown table."""
     names = list(columns or dict.fromkeys(key for row in rows for key in row))
     lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
-    lines += ["| " + " | ".join(_text(row.get(name)) for name in names) + " |" for row in rows]
+    lines += ["| " + " | ".join(_format_cell(row.get(name)) for name in names) + " |" for row in rows]
     return "\n".join(lines) + "\n"
 
 
@@ -98,7 +98,7 @@ def pivot(rows: Sequence[Row], across: str, value: str) -> list[Row]:
     return list(found.values())
 
 
-def _text(value: object) -> str:
+def _format_cell(value: object) -> str:
     if value is None:
         return ""
     return (
@@ -110,7 +110,7 @@ def _text(value: object) -> str:
     )
 
 
-def _version_of(name: str) -> dict[str, str]:
+def _installed_version(name: str) -> dict[str, str]:
     try:
         return {name: version(name)}
     except PackageNotFoundError:

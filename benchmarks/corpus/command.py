@@ -15,17 +15,17 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from benchmarks.cameras.bars import BARS, verdict
-from benchmarks.cameras.measure import EACH, FEW, scored, warm_up
+from benchmarks.cameras.measure import FEW_PHOTOS, OWN_CAMERA_SETS, score_run, warm_up
 from benchmarks.cameras.methods import STOCK, Method, methods
 from benchmarks.cameras.score import true_photos
 from benchmarks.cameras.worker import INCREMENTAL, OURS
 from benchmarks.common import photo_sets
 from benchmarks.common.command_line import new_parser, overrides
 from benchmarks.common.photo_sets import FORMATS, PhotoSet, photo_set, steps
-from benchmarks.common.results import RESULTS, Row, document, finite, write
-from benchmarks.corpus.bars import bars_of, folded
-from benchmarks.corpus.kept_runs import Done, kept, key_of, run_anew
-from benchmarks.corpus.report import compared, corpus_page
+from benchmarks.common.results import RESULTS, Row, document, finite_or_none, write
+from benchmarks.corpus.bars import required_bars, unreported_fold
+from benchmarks.corpus.kept_runs import FinishedRun, reusable_run, run_and_record, run_key
+from benchmarks.corpus.report import add_comparisons, corpus_page
 from benchmarks.corpus.score import OFFSETS, corpus_figures, fold_lines
 
 ABOUT = (
@@ -39,7 +39,7 @@ ABOUT = (
     "that are called guesses are not counted before. The truth's own doubt: see DOUBTS in benchmarks/corpus/score.py. "
     "Exit codes are those of the command: 0, 4 where the photos do not support a scene, none where it ran out of time."
 )
-EVERY = {"kitchen1000": "every:5"}
+DEFAULT_CHANGES = {"kitchen1000": "every:5"}
 """Changes of sets that are not run in full unless --sets names them."""
 PADDED = "reichstag10 pad:1024,1024"
 """Photos of ten cameras brought to one size."""
@@ -48,37 +48,40 @@ LIMIT_MIN = 40.0
 
 def default_titles(data: Path) -> list[str]:
     """List every set in DATA, smallest first, then the changed ones."""
-    counts = {path.name: _photos(path) for path in data.iterdir() if (path / "images").is_dir()}
-    plain = [f"{name} {EVERY.get(name, '')}".strip() for name in sorted(counts, key=lambda name: (counts[name], name))]
+    counts = {path.name: _photo_count(path) for path in data.iterdir() if (path / "images").is_dir()}
+    plain = [
+        f"{name} {DEFAULT_CHANGES.get(name, '')}".strip()
+        for name in sorted(counts, key=lambda name: (counts[name], name))
+    ]
     changed = [title for title in BARS if title.partition(" ")[0] in counts]
     padded = [PADDED] if "pad" in photo_sets.STEPS and PADDED.partition(" ")[0] in counts else []
     return list(dict.fromkeys([*plain, *changed, *padded]))
 
 
-def _photos(folder: Path) -> int:
+def _photo_count(folder: Path) -> int:
     return sum(path.suffix.lower() in FORMATS for path in (folder / "images").iterdir())
 
 
-def score(method: Method, photos: PhotoSet, out: Path, data: Path, done: Done) -> tuple[Row, list[Row]]:
+def score(method: Method, photos: PhotoSet, out: Path, data: Path, done: FinishedRun) -> tuple[Row, list[Row]]:
     """Score a run, and list the parameters that it states."""
     name, _, change = photos.name.partition(" ")
     truth = true_photos(data / name / "cameras.json", steps(change))
-    row = scored(done.said, photos, truth if name not in OFFSETS else {}, method, out)
+    row = score_run(done.said, photos, truth if name not in OFFSETS else {}, method, out)
     row["placed"] = f"{row['registered']}/{row['of']}"
     said = done.said.get("summary", [])
     figures, stated = corpus_figures(name, out, truth, said)
     row |= figures
     if method.kind == OURS:
-        row |= {"folded without a word": folded(name, row), "said of folds": " / ".join(fold_lines(said))}
+        row |= {"folded without a word": unreported_fold(name, row), "said of folds": " / ".join(fold_lines(said))}
         calibration = out / "calibration.json"
         if calibration.exists():
             row["cameras"] = len(json.loads(calibration.read_text(encoding="utf-8"))["cameras"])
-        row["made by"] = None if done.key == key_of(method, photos) else "another program, or settings"
+        row["made by"] = None if done.key == run_key(method, photos) else "another program, or settings"
     stated = [{"photos": photos.name, "method": method.name} | one for one in stated]
-    return {name: finite(value) for name, value in row.items()}, stated
+    return {name: finite_or_none(value) for name, value in row.items()}, stated
 
 
-def line(row: Row) -> str:
+def summary_line(row: Row) -> str:
     """Describe a run in one line."""
     figures = [row["placed"] + " placed"] + [f"{key} {row[key]}" for key in SHOWN if row.get(key) not in (None, "")]
     return f"{row['photos']}: {row['method']}: {', '.join(figures)}"
@@ -88,16 +91,16 @@ SHOWN = ("models", "AUC@1", "AUC@5", "axis", "distance", "median center cm", "K 
          "failed")  # fmt: skip
 
 
-def set_of(title: str, args: argparse.Namespace) -> PhotoSet:
+def load_set(title: str, args: argparse.Namespace) -> PhotoSet:
     """Make a set from its name and change; its photos are copied on first use."""
     name, _, change = title.partition(" ")
-    return photo_set(args.data, name, change, args.cache, "each" if name in EACH else "auto")
+    return photo_set(args.data, name, change, args.cache, "each" if name in OWN_CAMERA_SETS else "auto")
 
 
 def compile_kernels(args: argparse.Namespace, these: Sequence[Method]) -> bool:
     """Run once, unmeasured, on the first set that has enough photos to need all kernels."""
-    enough = [title for title in args.sets if _photos(args.data / title.partition(" ")[0]) >= FEW]
-    warm_up([set_of((enough or args.sets)[0], args)], these, args.cache / "corpus" / "warm-up")
+    enough = [title for title in args.sets if _photo_count(args.data / title.partition(" ")[0]) >= FEW_PHOTOS]
+    warm_up([load_set((enough or args.sets)[0], args)], these, args.cache / "corpus" / "warm-up")
     return True
 
 
@@ -108,40 +111,40 @@ def failed_row(title: str, method: Method, error: Exception) -> Row:
     return {"photos": title, "method": method.name, "failed": text, "exit code": None, "placed": ""} | empty
 
 
-def all_runs(args: argparse.Namespace, these: Sequence[Method]) -> Iterator[tuple[Row, list[Row]]]:
+def run_all(args: argparse.Namespace, these: Sequence[Method]) -> Iterator[tuple[Row, list[Row]]]:
     """Run every method on every set; a failure of one does not stop the others."""
     compiled = False
     for number, title in enumerate(args.sets, start=1):
         for method in these:
             stated: list[Row] = []
             try:
-                photos = set_of(title, args)
+                photos = load_set(title, args)
                 out = args.cache / "corpus" / photos.folder.name / method.name.replace(" ", "_")
-                done = kept(method, photos, out, args)
+                done = reusable_run(method, photos, out, args)
                 if done is None and args.score_only:
                     continue
                 if done is None:
                     compiled = compiled or compile_kernels(args, these)
-                    done = run_anew(method, photos, out, 60 * args.limit_min)
+                    done = run_and_record(method, photos, out, 60 * args.limit_min)
                 row, stated = score(method, photos, out, args.data, done)
             except Exception as error:  # runs unattended: measure the next set anyway
                 row = failed_row(title, method, error)
-            print(f"[{number}/{len(args.sets)}] {line(row)}", file=sys.stderr, flush=True)
+            print(f"[{number}/{len(args.sets)}] {summary_line(row)}", file=sys.stderr, flush=True)
             yield row, stated
 
 
-def judged(rows: Sequence[Row]) -> None:
+def add_verdicts(rows: Sequence[Row]) -> None:
     """Fill in the columns that need other rows: ratios, figures worse than stock, and whether the bars are met."""
-    compared(rows)
+    add_comparisons(rows)
     for row in rows:
         beside = {other["method"]: other for other in rows if other["photos"] == row["photos"]}
-        row["bar met"] = "" if row["method"] in STOCK else verdict(row, beside, bars_of(row["photos"]))
+        row["bar met"] = "" if row["method"] in STOCK else verdict(row, beside, required_bars(row["photos"]))
 
 
 def publish(args: argparse.Namespace, these: Sequence[Method], rows: Sequence[Row], stated: Sequence[Row]) -> str:
     """Write the results so far."""
-    judged(rows)
-    options = {"methods": [method.name for method in these], "each": list(EACH), "limit min": args.limit_min}
+    add_verdicts(rows)
+    options = {"methods": [method.name for method in these], "each": list(OWN_CAMERA_SETS), "limit min": args.limit_min}
     found = document("corpus", ABOUT, options, {"sets": list(args.sets), "parameters": list(stated)}, rows)
     text = corpus_page(ABOUT, rows, stated)
     write(args.results, args.name, found, text)
@@ -168,7 +171,7 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def parsed() -> argparse.Namespace:
+def parse_arguments() -> argparse.Namespace:
     """Read the command line, and resolve which sets to run."""
     args = parser().parse_args()
     wanted = args.sets or default_titles(args.data)
@@ -178,13 +181,13 @@ def parsed() -> argparse.Namespace:
 
 def main() -> None:
     """Run, score and publish set by set."""
-    args = parsed()
+    args = parse_arguments()
     stock = () if args.ours_only else args.stock
     these = [method for method in methods(overrides(args.also)) if method.kind == OURS or method.name in stock]
     rows: list[Row] = []
     stated: list[Row] = []
     page = ""
-    for row, parameters in all_runs(args, these):
+    for row, parameters in run_all(args, these):
         rows.append(row)
         stated += parameters
         page = publish(args, these, rows, stated)

@@ -18,7 +18,7 @@ RECORD = "corpus.json"
 """File in OUT with the key of a run and its result."""
 
 
-class Done(NamedTuple):
+class FinishedRun(NamedTuple):
     """A finished run."""
 
     key: str
@@ -26,7 +26,7 @@ class Done(NamedTuple):
     said: Row
 
 
-def key_of(method: Method, photos: PhotoSet) -> str:
+def run_key(method: Method, photos: PhotoSet) -> str:
     """Hash everything that a run depends on; a stock run does not depend on our program."""
     package = Path(sfm_app.__file__).parent
     sources = sorted(package.rglob("*.py")) if method.kind == OURS else [Path(worker.__file__)]
@@ -37,31 +37,31 @@ def key_of(method: Method, photos: PhotoSet) -> str:
     return found.hexdigest()[:16]
 
 
-def finished(out: Path) -> Done | None:
+def load_finished_run(out: Path) -> FinishedRun | None:
     """Read the run in OUT, if it finished."""
     try:
-        return Done(**json.loads((out / RECORD).read_text(encoding="utf-8")))
+        return FinishedRun(**json.loads((out / RECORD).read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
         return None
 
 
-def kept(method: Method, photos: PhotoSet, out: Path, args: argparse.Namespace) -> Done | None:
+def reusable_run(method: Method, photos: PhotoSet, out: Path, args: argparse.Namespace) -> FinishedRun | None:
     """Return the run in OUT if it can be reused. A run that timed out is repeated when it gets more time."""
-    before = finished(out)
+    before = load_finished_run(out)
     if before is None or args.score_only:
         return before
     cut_short = before.said["exit code"] is None and before.said["wall seconds"] < 60 * args.limit_min
-    return before if args.keep and before.key == key_of(method, photos) and not cut_short else None
+    return before if args.keep and before.key == run_key(method, photos) and not cut_short else None
 
 
-def run_anew(method: Method, photos: PhotoSet, out: Path, limit_s: float) -> Done:
+def run_and_record(method: Method, photos: PhotoSet, out: Path, limit_s: float) -> FinishedRun:
     """Run a method, and record its result."""
-    done = Done(key_of(method, photos), run(method, photos, out, limit_s))
-    remember(out, done)
+    done = FinishedRun(run_key(method, photos), run(method, photos, out, limit_s))
+    record_run(out, done)
     return done
 
 
-def remember(out: Path, done: Done) -> None:
+def record_run(out: Path, done: FinishedRun) -> None:
     """Record in OUT that a run finished, and its result."""
     out.mkdir(parents=True, exist_ok=True)
     (out / RECORD).write_text(json.dumps(done._asdict()), encoding="utf-8")

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.cameras.score import PLACES, Model, TruePhoto, read_models
-from benchmarks.common.outputs import cameras_after, cameras_before
+from benchmarks.cameras.score import PARAMETER_ENTRIES, Model, TruePhoto, read_models
+from benchmarks.common.outputs import read_initial_cameras, read_refined_cameras
 from benchmarks.common.results import Row
 from benchmarks.corpus.trajectory import offset_errors, order_scores
 
@@ -46,7 +46,7 @@ DOUBTS: Mapping[str, Doubt] = {
 """COLMAP models (center held fixed, or known to a percent), and three views whose K differ by a few percent."""
 
 
-def parameters(out: Path, truth: Mapping[str, TruePhoto], doubt: Doubt) -> list[Row]:
+def parameter_errors(out: Path, truth: Mapping[str, TruePhoto], doubt: Doubt) -> list[Row]:
     """List every parameter of every camera that the program states: estimate, truth, and error in deviations.
 
     Before adjustment only cameras that are called identifiable count; the others are declared guesses. A camera's
@@ -59,7 +59,7 @@ def parameters(out: Path, truth: Mapping[str, TruePhoto], doubt: Doubt) -> list[
             true = np.median([truth[photo].K for photo in photos], axis=0)
             width = float(np.median([truth[photo].width for photo in photos]))
             about = {"camera": stage.camera, "its photos": len(photos)}
-            rows += [about | row for row in _errors(stage, true, width, doubt)]
+            rows += [about | row for row in _stage_errors(stage, true, width, doubt)]
     return rows
 
 
@@ -76,31 +76,31 @@ class Stage(NamedTuple):
 
 def _stages(out: Path) -> Iterator[Stage]:
     """Yield every camera before adjustment, and after it, where mapping may have split it."""
-    cameras, camera_of = cameras_before(out)
-    for name, photos in _members(camera_of).items():
+    cameras, camera_of = read_initial_cameras(out)
+    for name, photos in _photos_by_camera(camera_of).items():
         before = cameras[name]
         if before["identifiable"]:
             yield Stage(name, photos, "before", np.array(before["K"]), before.get("spread", {}), identifiable=True)
-    cameras, camera_of = cameras_after(out)
-    for name, photos in _members(camera_of).items():
+    cameras, camera_of = read_refined_cameras(out)
+    for name, photos in _photos_by_camera(camera_of).items():
         K, deviations = np.array(cameras[name]["K"]), cameras[name].get("deviations", {})
-        yield Stage(name, photos, "after", K, deviations, identifiable=_claimed(K, deviations))
+        yield Stage(name, photos, "after", K, deviations, identifiable=_is_focal_claimed(K, deviations))
 
 
-def _members(camera_of: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+def _photos_by_camera(camera_of: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
     """Group the photos by camera."""
     return {name: tuple(photo for photo in camera_of if camera_of[photo] == name) for name in camera_of.values()}
 
 
-def _claimed(K: NDArray[np.float64], deviations: Mapping[str, float]) -> bool:
+def _is_focal_claimed(K: NDArray[np.float64], deviations: Mapping[str, float]) -> bool:
     """Return whether bundle adjustment claims focals within `FAR_PERCENT`: three deviations of each are no more."""
-    stated = [(K[PLACES[name][0]], deviations.get(name, deviations.get("f"))) for name in ("fx", "fy")]
+    stated = [(K[PARAMETER_ENTRIES[name][0]], deviations.get(name, deviations.get("f"))) for name in ("fx", "fy")]
     return all(sd is not None and 0 < FAR_SD * sd <= FAR_PERCENT / 100 * focal for focal, sd in stated)
 
 
-def _errors(stage: Stage, true: NDArray[np.float64], width: float, doubt: Doubt) -> Iterator[Row]:
+def _stage_errors(stage: Stage, true: NDArray[np.float64], width: float, doubt: Doubt) -> Iterator[Row]:
     for name in PARAMETERS:
-        (place,) = PLACES[name]
+        (place,) = PARAMETER_ENTRIES[name]
         focal = name in ("fx", "fy")
         whole = float(true[place]) if focal else width
         error, sd = abs(float(stage.K[place] - true[place])), stage.deviations.get(name, stage.deviations.get("f"))
@@ -119,7 +119,7 @@ def _errors(stage: Stage, true: NDArray[np.float64], width: float, doubt: Doubt)
         }
 
 
-def of_parameters(rows: Sequence[Row]) -> Row:
+def parameter_summary(rows: Sequence[Row]) -> Row:
     """Summarize the parameters of a run."""
     row: Row = {}
     for when in ("before", "after"):
@@ -133,7 +133,7 @@ def of_parameters(rows: Sequence[Row]) -> Row:
     return row
 
 
-def counted(rows: Sequence[Row]) -> Row:
+def parameter_counts(rows: Sequence[Row]) -> Row:
     """Count the stated parameters, those that are far off, and the focals that are confidently wrong."""
     stated = [row for row in rows if row["in sd"] is not None]
     focals = [row for row in rows if row["parameter"] in ("fx", "fy") and row["identifiable"] == "yes"]
@@ -147,7 +147,7 @@ def counted(rows: Sequence[Row]) -> Row:
     }
 
 
-def claims(rows: Sequence[Row]) -> Row:
+def claimed_errors(rows: Sequence[Row]) -> Row:
     """Return the errors of what is called identifiable before adjustment (else 0), and f in the bounds of kitti51."""
     before = [row for row in rows if row["when"] == "before"]
     after = [row for row in rows if row["when"] == "after" and row["parameter"] in ("fx", "fy")]
@@ -161,7 +161,7 @@ def claims(rows: Sequence[Row]) -> Row:
     return row
 
 
-def of_walk(models: Sequence[Model], said: Sequence[str]) -> Row:
+def walk_figures(models: Sequence[Model], said: Sequence[str]) -> Row:
     """Score the order of the photos in each model, and check whether a fold is reported."""
     orders = [order for order in (order_scores(model.poses) for model in models) if order is not None]
     if not orders:
@@ -176,7 +176,7 @@ def of_walk(models: Sequence[Model], said: Sequence[str]) -> Row:
     return row | {"warned of folds": "yes" if any(map(WARNING_WORDS.search, said)) else "no"}
 
 
-def of_offset(models: Sequence[Model], truth: Mapping[str, TruePhoto]) -> Row:
+def offset_figures(models: Sequence[Model], truth: Mapping[str, TruePhoto]) -> Row:
     """Return the errors against a camera fixed beside ours."""
     poses = {name: photo.pose for name, photo in truth.items()}
     found = offset_errors(models[0].poses, poses) if models else None
@@ -200,10 +200,10 @@ def corpus_figures(name: str, out: Path, truth: Mapping[str, TruePhoto], said: S
     row: Row = {"of photos in models": sum(len(model.poses) for model in models)}
     stated: list[Row] = []
     if name in WALKS:
-        row |= of_walk(models, said)
+        row |= walk_figures(models, said)
     elif name in OFFSETS:
-        row |= of_offset(models, truth)
+        row |= offset_figures(models, truth)
     elif truth:
-        stated = parameters(out, truth, DOUBTS.get(name, Doubt(0.0, 0.0)))
-        row |= of_parameters(stated) | claims(stated)
+        stated = parameter_errors(out, truth, DOUBTS.get(name, Doubt(0.0, 0.0)))
+        row |= parameter_summary(stated) | claimed_errors(stated)
     return row, stated

@@ -14,7 +14,7 @@ from sfm_app.geometry.similarity import umeyama
 
 LONG_STEPS = 5.0
 """A step of more than this many median steps is a jump."""
-SOFT = 0.02
+ROBUST_SCALE = 0.02
 """Scale of the robust loss on the offset camera's residuals: 2 cm, or a degree; the truth of a Kinect."""
 
 
@@ -71,7 +71,7 @@ def offset_errors(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> Offse
     Ca, Cb = _centers(ours), _centers(true)
     start = umeyama(Ca, Cb)
 
-    def rest(p: NDArray[np.float64]) -> NDArray[np.float64]:
+    def residuals(p: NDArray[np.float64]) -> NDArray[np.float64]:
         turn, world = Rotation.from_rotvec(p[:3]).as_matrix(), Rotation.from_rotvec(p[3:6]).as_matrix()
         turned = np.einsum("ij,njk,lk->nil", turn, Ra, world)
         rotation = Rotation.from_matrix(np.einsum("nij,nkj->nik", turned, Rb)).as_rotvec()
@@ -81,8 +81,8 @@ def offset_errors(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> Offse
 
     world = Rotation.from_matrix(start.R).as_rotvec()
     first = np.concatenate([np.zeros(3), world, [np.log(start.scale)], start.t, np.zeros(3)])
-    fit = least_squares(rest, first, loss="soft_l1", f_scale=SOFT)
-    rotation, center = np.linalg.norm(rest(fit.x).reshape(2, -1, 3), axis=2)
+    fit = least_squares(residuals, first, loss="soft_l1", f_scale=ROBUST_SCALE)
+    rotation, center = np.linalg.norm(residuals(fit.x).reshape(2, -1, 3), axis=2)
     return Offset(
         center,
         np.degrees(rotation),

@@ -24,7 +24,7 @@ class Group(NamedTuple):
     """Photo sets that they were chosen or checked on."""
     also: str
     """Other data that they were chosen on."""
-    said_in: str
+    source: str
     """Where this is documented, or that it is not."""
 
 
@@ -106,7 +106,7 @@ def seen_sets() -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for group in GROUPS.values() for name in group.sets))
 
 
-def unseen(rows: Sequence[Row], sets: Sequence[str]) -> list[Row]:
+def unseen_rows(rows: Sequence[Row], sets: Sequence[str]) -> list[Row]:
     """Return the rows whose set, changed or not, is none of these."""
     return [row for row in rows if row["photos"].partition(" ")[0] not in sets]
 
@@ -115,14 +115,14 @@ def groups_table(rows: Sequence[Row]) -> list[Row]:
     """Return, per group, the sets it has seen, and how many bars our runs meet on the sets it has not seen."""
     found = []
     for name, group in GROUPS.items():
-        judged = [row for row in unseen(rows, group.sets) if row.get("bar met")]
+        judged = [row for row in unseen_rows(rows, group.sets) if row.get("bar met")]
         found.append(
             {
                 "constants": name,
                 "stand in": ", ".join(group.modules),
                 "chosen on": ", ".join(group.sets) or "no photo set",
                 "also on": group.also,
-                "as said in": group.said_in,
+                "as said in": group.source,
                 "bars met on sets not seen": f"{sum(row['bar met'] == 'yes' for row in judged)} of {len(judged)}",
             }
         )

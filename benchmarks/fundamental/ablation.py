@@ -42,13 +42,13 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 """Name of the missing part, and the fields of the recipe that switch it off."""
 
 
-def ablated(options: EpipolarSettings) -> dict[str, Method]:
+def ablated_estimators(options: EpipolarSettings) -> dict[str, Method]:
     """Return the whole estimator and one for every row of `ABLATIONS`, all called in the same way."""
     recipes = {WHOLE: PRODUCTION} | {name: replace(PRODUCTION, **fields) for name, fields in ABLATIONS.items()}
-    return {name: _fit_with(recipe, options) for name, recipe in recipes.items()}
+    return {name: _make_method(recipe, options) for name, recipe in recipes.items()}
 
 
-def _fit_with(recipe: Recipe, options: EpipolarSettings) -> Method:
+def _make_method(recipe: Recipe, options: EpipolarSettings) -> Method:
     def fit(x1: FloatArray, x2: FloatArray, seed: int) -> tuple[FloatArray | None, int | None]:
         found = estimate(x1, x2, options, seed, recipe)
         return (found.F, found.trials) if isinstance(found, EpipolarFit) else (None, None)

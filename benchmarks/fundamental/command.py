@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.common.command_line import add_pictures, is_wanted, new_parser, on_one_thread
-from benchmarks.common.figures import curves, label, legend_beside, pyplot, save
+from benchmarks.common.command_line import add_pictures, ensure_single_thread, is_wanted, new_parser
+from benchmarks.common.figures import add_legend, draw_curves, label, pyplot, save
 from benchmarks.common.metrics import (
     CAP_PX,
     area_under_recall,
@@ -28,7 +28,7 @@ from benchmarks.common.metrics import (
 )
 from benchmarks.common.results import RESULTS, Row, document, pivot, table, write
 from benchmarks.common.timing import Method, take_turns, timing
-from benchmarks.fundamental.ablation import ablated
+from benchmarks.fundamental.ablation import ablated_estimators
 from benchmarks.fundamental.methods import BASELINE, RIVALS, our_estimators, rivals
 from benchmarks.fundamental.real_pairs import (
     LEAST_SHARE,
@@ -66,12 +66,12 @@ def score_real(pairs: Sequence[RealPair], methods: Mapping[str, Method], seed: i
         rms = [rms_sampson_px(a.F, p.x1[p.is_true], p.x2[p.is_true]) for p, a in answers]
         row: Row = {"method": name}
         row |= {f"AUC@{limit}": round(area_under_recall(errors[name], limit), 4) for limit in POSE_LIMITS_DEG}
-        row |= {"rms px": _finite(np.median(rms)), "no F": sum(a.F is None for a in tries), **timing(tries)}
+        row |= {"rms px": _round_finite(np.median(rms)), "no F": sum(a.F is None for a in tries), **timing(tries)}
         for photos in dict.fromkeys(pair.photos for pair in pairs):
             of_set = errors[name][[pair.photos == photos for pair in pairs]]
             row[f"{photos} AUC@10"] = round(area_under_recall(of_set, 10), 4)
         rows.append(row)
-    _set_in_relation(rows, "ms total")
+    _add_time_ratios(rows, "ms total")
     return rows, errors
 
 
@@ -114,7 +114,7 @@ def draw_recall(errors: Mapping[str, NDArray[np.float64]], title: str, folder: P
         axes.step(np.sort(values), recall, where="post", label=name, linewidth=2.4 if name == OURS[0] else 1.2)
     axes.set(xlim=(0, POSE_LIMITS_DEG[-1]), ylim=(0, 1))
     label(axes, "pose error, degrees", "share of the pairs", title)
-    legend_beside(figure, axes)
+    add_legend(figure, axes)
     save(figure, folder, name)
 
 
@@ -150,10 +150,10 @@ def draw_levels(rows: Sequence[Row], folder: Path, name: str) -> None:
     figure, (left, right) = pyplot().subplots(1, 2, figsize=(10, 3.8))
     for axes, value in ((left, "capped mean px"), (right, "ms mean")):
         lines = {row.pop("method"): list(row.values()) for row in pivot(rows, "outliers", value)}
-        curves(axes, [100 * level for level in OUTLIERS], lines, OURS[:1])
+        draw_curves(axes, [100 * level for level in OUTLIERS], lines, OURS[:1])
     label(left, "outliers, %", "mean error, px (failures as 5)", log=True)
     label(right, "outliers, %", "mean time, ms", log=True)
-    legend_beside(figure, left)
+    add_legend(figure, left)
     save(figure, folder, name)
 
 
@@ -214,14 +214,14 @@ def _name(task: str, args: argparse.Namespace) -> str:
     return f"fundamental-{task}" + ("-ablation" if args.ablation else "")
 
 
-def _set_in_relation(rows: list[Row], column: str) -> None:
+def _add_time_ratios(rows: list[Row], column: str) -> None:
     """Divide every time by that of the baseline, where the baseline was measured."""
     times = {row["method"]: row[column] for row in rows}
     for row in rows if BASELINE in times else []:
         row["time : MAGSAC++"] = round(row[column] / times[BASELINE], 3)
 
 
-def _finite(value: float) -> float | None:
+def _round_finite(value: float) -> float | None:
     return round(float(value), 4) if np.isfinite(value) else None
 
 
@@ -244,7 +244,7 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def parsed() -> argparse.Namespace:
+def parse_arguments() -> argparse.Namespace:
     """Read the command line, and refuse options that do not fit together."""
     line = parser()
     args = line.parse_args()
@@ -257,10 +257,10 @@ def parsed() -> argparse.Namespace:
 
 def main() -> None:
     """Run the comparisons that were asked for."""
-    args = parsed()
-    on_one_thread()
+    args = parse_arguments()
+    ensure_single_thread()
     options = EpipolarSettings(max_error_px=THRESHOLD_PX, confidence=CONFIDENCE, max_trials=MAX_TRIALS)
-    methods = (ablated(options) if args.ablation else our_estimators(args.methods, options)) | rivals(
+    methods = (ablated_estimators(options) if args.ablation else our_estimators(args.methods, options)) | rivals(
         args.rivals, options
     )
     if args.real:

@@ -27,10 +27,10 @@ def our_estimators(names: Sequence[str], options: EpipolarSettings) -> dict[str,
     known = load_plugins().estimators
     if missing := [name for name in names if name not in known]:
         print(f"left out, no such estimator: {', '.join(missing)}", file=sys.stderr)
-    return {name: _ours(name, options) for name in names if name in known}
+    return {name: _our_estimator(name, options) for name in names if name in known}
 
 
-def _ours(name: str, options: EpipolarSettings) -> Method:
+def _our_estimator(name: str, options: EpipolarSettings) -> Method:
     settings = Settings(epipolar=options)
 
     def fit(x1: FloatArray, x2: FloatArray, seed: int) -> tuple[FloatArray | None, int | None]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.metrics import load_truth
-from sfm_app.api import opened_run
+from sfm_app.api import open_run
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.pipeline import MATCH_GRAPH, run_stages
@@ -67,11 +67,11 @@ def load_pairs(files: list[Path], limit: int | None = None) -> list[RealPair]:
                 for name in names
             )
             usable = [pair for pair in read if pair.is_usable]
-        found += usable if limit is None else evenly(usable, limit)
+        found += usable if limit is None else subsample(usable, limit)
     return found
 
 
-def evenly(pairs: list[RealPair], limit: int) -> list[RealPair]:
+def subsample(pairs: list[RealPair], limit: int) -> list[RealPair]:
     """Take at most `limit` of the pairs, spread evenly over the list."""
     if len(pairs) <= limit:
         return pairs
@@ -90,7 +90,7 @@ def cached_ratio_matches(data: Path, name: str, cache: Path) -> Path:
     if not path.exists():
         print(f"matching {name}", file=sys.stderr)
         cache.mkdir(parents=True, exist_ok=True)
-        with opened_run(cache / name, Settings(), None) as run:
+        with open_run(cache / name, Settings(), None) as run:
             graph = run_stages(data / name / "images", run, last=MATCH_GRAPH.name)[MATCH_GRAPH]
         truth = load_truth(data / name / "cameras.json")
         arrays: dict[str, Any] = {}

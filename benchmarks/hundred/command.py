@@ -20,7 +20,7 @@ from typing import Any
 from PIL import Image
 
 from benchmarks.common.command_line import new_parser
-from benchmarks.common.photo_sets import put
+from benchmarks.common.photo_sets import link_or_copy
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from sfm_app.pipeline import NAMES
 from sfm_app.synthetic.cameras import make_camera
@@ -34,7 +34,7 @@ ABOUT = (
     "all stages, with the processes that it starts."
 )
 PHOTOS, SMALL, LARGE, QUALITY = 200, (750, 1000), (3000, 4000), 90
-EVERY_S = 0.1
+SAMPLING_INTERVAL_S = 0.1
 """Interval between readings of the memory."""
 
 
@@ -51,11 +51,11 @@ def photo_folder(count: int, cache: Path) -> Path:
     part = cache / "hundred" / f"photos-{count}"
     part.mkdir(exist_ok=True)
     for path in sorted(whole.iterdir())[:: PHOTOS // count][:count]:
-        put(path, part)
+        link_or_copy(path, part)
     return part
 
 
-def cost_of_stages(command: Sequence[str]) -> tuple[dict[str, int], dict[str, float]]:
+def measure_stages(command: Sequence[str]) -> tuple[dict[str, int], dict[str, float]]:
     """Run `sfm-app run`, and return the peak memory of each stage, in MB, and its CPU seconds. Linux only."""
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     stage, peaks, spent = [NAMES[0]], dict.fromkeys(NAMES, 0), dict.fromkeys(NAMES, 0.0)
@@ -75,7 +75,7 @@ def cost_of_stages(command: Sequence[str]) -> tuple[dict[str, int], dict[str, fl
         if now == stage[0]:
             peaks[now] = max(peaks[now], held)
             spent[now] = max(spent[now], cpu_s(process.pid))
-        time.sleep(EVERY_S)
+        time.sleep(SAMPLING_INTERVAL_S)
     reader.join()
     if process.returncode:
         raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}")
@@ -97,16 +97,16 @@ def held_mb(process: int) -> int:
 def children(process: int) -> list[int]:
     """List the running children of a process."""
     lists = Path(f"/proc/{process}/task").glob("*/children")
-    return [int(child) for path in lists for child in text_of(path).split()]
+    return [int(child) for path in lists for child in read_if_present(path).split()]
 
 
 def memory_kb(process: int) -> dict[str, int]:
     """Read a process's memory counts from the kernel; zeros where it has ended."""
-    said = re.findall(r"(VmHWM|VmRSS):\s+(\d+) kB", text_of(Path(f"/proc/{process}/status")))
+    said = re.findall(r"(VmHWM|VmRSS):\s+(\d+) kB", read_if_present(Path(f"/proc/{process}/status")))
     return {"VmHWM": 0, "VmRSS": 0} | {name: int(size) for name, size in said}
 
 
-def text_of(path: Path) -> str:
+def read_if_present(path: Path) -> str:
     """Read a file of the kernel; empty where it is gone."""
     try:
         return path.read_text(encoding="utf-8")
@@ -115,7 +115,7 @@ def text_of(path: Path) -> str:
 
 
 def _ticks(process: int) -> int:
-    after_name = text_of(Path(f"/proc/{process}/stat")).rpartition(")")[2].split()
+    after_name = read_if_present(Path(f"/proc/{process}/stat")).rpartition(")")[2].split()
     return sum(map(int, after_name[11:15]))
 
 
@@ -124,7 +124,7 @@ def measure(count: int, cache: Path, settings: Sequence[str]) -> Row:
     photos = photo_folder(count, cache)
     out = Path(tempfile.mkdtemp(prefix=f"run-{count}-", dir=cache / "hundred"))
     flags = [part for assignment in settings for part in ("--set", assignment)]
-    peaks, spent = cost_of_stages([sys.executable, "-m", "sfm_app", "run", str(photos), "-o", str(out), *flags])
+    peaks, spent = measure_stages([sys.executable, "-m", "sfm_app", "run", str(photos), "-o", str(out), *flags])
     stages: dict[str, Any] = json.loads((out / "manifest.json").read_text(encoding="utf-8"))["stages"]
     row: Row = {"method": "sfm-app", "photos": count, "placed": stages["scene"]["counts"]["registered"]}
     for name in NAMES:

@@ -15,21 +15,21 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common.command_line import new_parser, on_one_thread, overrides
+from benchmarks.common.command_line import ensure_single_thread, new_parser, overrides
 from benchmarks.common.photo_sets import PhotoSet, photo_set, steps
 from benchmarks.common.results import RESULTS, Row, document, table, write
-from benchmarks.selfcal.coverage import coverage, summary
-from benchmarks.selfcal.methods import PRODUCTION, adjusted_cameras, every_method, measured, warm_up
+from benchmarks.selfcal.coverage import run_trials, summary
+from benchmarks.selfcal.methods import PRODUCTION, adjusted_cameras, match_set, run_every_method, warm_up
 from benchmarks.selfcal.rendered_sets import rendered_sets
 from benchmarks.selfcal.score import row
-from benchmarks.selfcal.speed import speed
+from benchmarks.selfcal.speed import measure_speed
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings
 
 VARIED = ("fountain-P11", "castle-P19", "Herz-Jesus-P8")
 VARIANTS = ("crop:460,200", "scale:0.75,1", "window:512,256,512,512")
 SETS = ("merton1", "lund-door12", "temple16", "kermit11")
-EACH = ("reichstag10",)
+OWN_CAMERA_SETS = ("reichstag10",)
 ABOUT = (
     "Before bundle adjustment; fundamental matrices from our own estimator, photos without EXIF. e_focal: mean error "
     "of fx and fy (thesis 5.5.3). known: whether the method says that it knows the camera; where not, the errors are "
@@ -48,7 +48,7 @@ def run_photos(args: argparse.Namespace) -> None:
     """Run every method on every photo set."""
     rows: list[Row] = []
     for photos in chosen_sets(args):
-        rows += calibrated(photos, args)
+        rows += calibrate_set(photos, args)
     data = {"sets": list(dict.fromkeys(line["photos"] for line in rows))}
     found = document("selfcal", ABOUT, options(args), data, rows)
     publish(args, args.name, found, f"# Self-calibration\n\n{ABOUT}\n\n{tables(rows)}")
@@ -63,10 +63,10 @@ def chosen_sets(args: argparse.Namespace) -> Iterator[PhotoSet]:
     yield from rendered_sets(args.rendered, args.cache)
 
 
-def calibrated(photos: PhotoSet, args: argparse.Namespace) -> list[Row]:
+def calibrate_set(photos: PhotoSet, args: argparse.Namespace) -> list[Row]:
     """Run all methods on one set."""
-    subject = measured(photos, args.cache)
-    found = list(every_method(subject, args.methods, overrides(args.also)))
+    subject = match_set(photos, args.cache)
+    found = list(run_every_method(subject, args.methods, overrides(args.also)))
     truth = photos.truth or adjusted_cameras(subject)
     name = photos.name if photos.truth else f"{photos.name} (against our bundle adjustment)"
     rows = [row(name, answer, truth) | {"matching seconds": subject.matching_seconds} for answer in found]
@@ -93,7 +93,7 @@ def tables(rows: list[Row]) -> str:
 def run_coverage(args: argparse.Namespace) -> None:
     """Check the stated standard deviations; once more for every `--also` setting."""
     for label, others in {"": {}, **overrides(args.also)}.items():
-        trials = coverage(args.coverage, Settings.from_mapping(others), args.seed)
+        trials = run_trials(args.coverage, Settings.from_mapping(others), args.seed)
         name = f"{args.name}-coverage{'-' if label else ''}{label}"
         data = {"trials": args.coverage, "first seed": args.seed, "each": [trial.row for trial in trials]}
         found = document("selfcal-coverage", ABOUT_COVERAGE, options(args), data, summary(trials))
@@ -105,8 +105,8 @@ def run_speed(args: argparse.Namespace) -> None:
     """Measure the speed."""
     subject = None
     if args.photos:
-        subject = measured(photo_set(args.photos, args.speed, "", args.cache), args.cache)
-    rows = speed(subject, overrides(args.also))
+        subject = match_set(photo_set(args.photos, args.speed, "", args.cache), args.cache)
+    rows = measure_speed(subject, overrides(args.also))
     found = document("selfcal-speed", ABOUT_SPEED, options(args), {"photos": args.speed if subject else None}, rows)
     publish(args, f"{args.name}-speed", found, f"# Speed of self-calibration\n\n{ABOUT_SPEED}\n\n{table(rows)}")
 
@@ -130,7 +130,9 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--varied", nargs="*", default=VARIED, help="sets to run unchanged and in every variant")
     parser.add_argument("--variants", nargs="*", default=VARIANTS, help="changes of the photos, see photo_sets.py")
     parser.add_argument("--sets", nargs="*", default=SETS, help="sets to run unchanged")
-    parser.add_argument("--each", nargs="*", default=EACH, help="sets in which every photo has its own camera")
+    parser.add_argument(
+        "--each", nargs="*", default=OWN_CAMERA_SETS, help="sets in which every photo has its own camera"
+    )
     parser.add_argument("--rendered", type=int, default=0, metavar="N", help="seeds of each rendered set")
     parser.add_argument("--coverage", type=int, metavar="N", help="number of synthetic calibrations")
     parser.add_argument(
@@ -146,7 +148,7 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def parsed() -> argparse.Namespace:
+def parse_arguments() -> argparse.Namespace:
     """Read the command line, and refuse options that do not fit together."""
     line = parser()
     args = line.parse_args()
@@ -161,8 +163,8 @@ def parsed() -> argparse.Namespace:
 
 def main() -> None:
     """Run the measurements that were asked for."""
-    args = parsed()
-    on_one_thread()
+    args = parse_arguments()
+    ensure_single_thread()
     warm_up()
     if args.photos or args.rendered:
         run_photos(args)

@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.common.metrics import focal_error_percent
 from benchmarks.common.results import Row
-from benchmarks.selfcal.score import INSIDE, PLACES, center_error_percent, deviations
+from benchmarks.selfcal.score import INSIDE, PARAMETER_ENTRIES, center_error_percent, deviations
 from sfm_app.plugins import load_plugins
 from sfm_app.selfcal import pair_weights
 from sfm_app.settings import Settings
@@ -31,7 +31,7 @@ class Trial(NamedTuple):
     row: Row
 
 
-def drawn(seed: int) -> TrackOptions:
+def sample_options(seed: int) -> TrackOptions:
     """Sample a setup: five to twelve photos of a random camera, with wrong matches in every pair."""
     rng = np.random.default_rng([seed, 55])
     cameras = int(rng.integers(CAMERAS[0], CAMERAS[1] + 1))
@@ -49,7 +49,7 @@ def drawn(seed: int) -> TrackOptions:
     )
 
 
-def estimated(tracks: Tracks, settings: Settings, seed: int) -> CameraPairs:
+def estimate_pairs(tracks: Tracks, settings: Settings, seed: int) -> CameraPairs:
     """Estimate the fundamental matrices of the tracks' pairs with the program's own estimator."""
     fit = load_plugins().estimator(settings.epipolar.estimator).fit
     fits = {
@@ -66,11 +66,11 @@ def estimated(tracks: Tracks, settings: Settings, seed: int) -> CameraPairs:
     )
 
 
-def trial(seed: int, settings: Settings) -> Trial:
+def run_trial(seed: int, settings: Settings) -> Trial:
     """Sample a setup, estimate, calibrate, and compare."""
-    options = drawn(seed)
+    options = sample_options(seed)
     tracks = make_tracks(options, seed)
-    pairs = estimated(tracks, settings, seed)
+    pairs = estimate_pairs(tracks, settings, seed)
     found = load_plugins().calibrator(settings.calibration.calibrator).calibrate(pairs, settings.calibration, seed)
     K = tracks.K[0]
     row: Row = {
@@ -83,15 +83,17 @@ def trial(seed: int, settings: Settings) -> Trial:
     }  # fmt: skip
     away = deviations(found, K) if found.identifiable else {}
     return Trial(
-        options, found, row | {f"{name} sd": round(away[name], 3) if name in away else None for name in PLACES}
+        options,
+        found,
+        row | {f"{name} sd": round(away[name], 3) if name in away else None for name in PARAMETER_ENTRIES},
     )
 
 
-def coverage(count: int, settings: Settings, first_seed: int = 0) -> list[Trial]:
+def run_trials(count: int, settings: Settings, first_seed: int = 0) -> list[Trial]:
     """Run `count` trials; seeds count up from the first."""
     trials = []
     for seed in range(first_seed, first_seed + count):
-        trials.append(trial(seed, settings))
+        trials.append(run_trial(seed, settings))
         print(f"\rcoverage {len(trials)}/{count}", end="", file=sys.stderr, flush=True)
     print(file=sys.stderr)
     return trials
@@ -122,10 +124,10 @@ def _figures(trials: Sequence[Trial]) -> Row:
         for label, share in (("median", 0.5), ("p95", 0.95)):
             line[f"{label} {name}"] = round(float(np.quantile([row[name] for row in rows], share)), 3) if rows else None
     for limit in (1.0, INSIDE):
-        for name in PLACES:
+        for name in PARAMETER_ENTRIES:
             away = [row[f"{name} sd"] for row in rows if row[f"{name} sd"] is not None]
             line[f"{name} in {limit:.0f} sd %"] = _percent([value <= limit for value in away])
-    farthest = [max([row[f"{name} sd"] or 0.0 for name in PLACES]) for row in rows]
+    farthest = [max([row[f"{name} sd"] or 0.0 for name in PARAMETER_ENTRIES]) for row in rows]
     return line | {"all in 3 sd %": _percent([value <= INSIDE for value in farthest])}
 
 

@@ -10,12 +10,12 @@ import numpy as np
 import sfm_app
 from benchmarks.common.photo_sets import PhotoSet, TrueCamera
 from benchmarks.selfcal import view_graph_calibration as rival
-from sfm_app.api import opened_run
+from sfm_app.api import open_run
 from sfm_app.estimation.calibrating import camera_pairs
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.pipeline import INTRINSICS, MATCH_GRAPH, VIEW_GRAPH, run_stages
 from sfm_app.plugins import load_plugins
-from sfm_app.settings import Settings, merged
+from sfm_app.settings import Settings, merge_nested
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, ViewGraph
 from sfm_app.types.scene import CameraModel
@@ -28,7 +28,7 @@ ANSWER = ("fx_px", "fy_px", "cx_px", "cy_px")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class MethodResult:
     """The result of one method on one photo set."""
 
     method: str
@@ -40,7 +40,7 @@ class Found:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class MatchedSet:
     """A photo set up to its fundamental matrices, which all methods share."""
 
     photos: PhotoSet
@@ -59,33 +59,35 @@ class Measured:
         return [[image for image in images if image.group == name] for name in dict.fromkeys(i.group for i in images)]
 
 
-def measured(photos: PhotoSet, cache: Path, seed: int = 0) -> Measured:
+def match_set(photos: PhotoSet, cache: Path, seed: int = 0) -> MatchedSet:
     """Run the program up to the fundamental matrices, or take them from the cache."""
     settings = Settings.from_mapping({"seed": seed, "workers": 1, "photos": {"cameras": photos.cameras}})
     out = cache / "out" / photos.folder.name
-    with opened_run(out, settings, None) as run:
+    with open_run(out, settings, None) as run:
         products = run_stages(photos.folder, run, last=VIEW_GRAPH.name)
         matches, views = products[MATCH_GRAPH], products[VIEW_GRAPH]
         seconds = run.workspace.manifest.read()["stages"]["match_graph"]["seconds"]
-    return Measured(photos, out, settings, matches, views, seconds)
+    return MatchedSet(photos, out, settings, matches, views, seconds)
 
 
-def production(subject: Measured, overrides: Mapping[str, object] | None = None, label: str = PRODUCTION) -> Found:
+def run_production(
+    subject: MatchedSet, overrides: Mapping[str, object] | None = None, label: str = PRODUCTION
+) -> MethodResult:
     """Run the stage `intrinsics` in full, with other settings where given."""
-    settings = Settings.from_mapping(merged(subject.settings.model_dump(), overrides or {}))
-    with opened_run(subject.out, settings, None) as run:
+    settings = Settings.from_mapping(merge_nested(subject.settings.model_dump(), overrides or {}))
+    with open_run(subject.out, settings, None) as run:
         found = run_stages(subject.photos.folder, run, first=INTRINSICS.name, last=INTRINSICS.name)[INTRINSICS]
         seconds = run.workspace.manifest.read()["stages"]["intrinsics"]["seconds"]
-    cameras = {Path(image.name).stem: camera_of(image, found) for image in subject.matches.images.values()}
-    return Found(label, cameras, seconds, len(subject.views.fits))
+    cameras = {Path(image.name).stem: image_camera(image, found) for image in subject.matches.images.values()}
+    return MethodResult(label, cameras, seconds, len(subject.views.fits))
 
 
-def camera_of(image: MatchedImage, found: Intrinsics) -> Calibration:
+def image_camera(image: MatchedImage, found: Intrinsics) -> Calibration:
     """Return the camera that the program assigns to a photo."""
     return found.camera(image)
 
 
-def literal(subject: Measured, method: str) -> Found:
+def run_calibrator(subject: MatchedSet, method: str) -> MethodResult:
     """Run a calibrator alone on the pairs within each camera; its own answer counts even if our verdict rejects it."""
     calibrator = load_plugins().calibrator(PRODUCTION if method == WITHOUT_MATCHES else method)
     cameras: dict[str, Calibration] = {}
@@ -101,30 +103,30 @@ def literal(subject: Measured, method: str) -> Found:
         if method != WITHOUT_MATCHES and all(name in found.evidence for name in ANSWER):
             found = replace(found, K=camera_matrix(*(found.evidence[name] for name in ANSWER)))
         cameras |= {Path(image.name).stem: found for image in images}
-    return Found(method, cameras, seconds, pairs)
+    return MethodResult(method, cameras, seconds, pairs)
 
 
-def colmap(subject: Measured) -> Found:
+def run_colmap(subject: MatchedSet) -> MethodResult:
     """Run COLMAP's view-graph calibration."""
     database = subject.out / "database.db"
     found, seconds = rival.view_graph_calibration(database, subject.out, subject.matches, subject.views)
     cameras = {Path(subject.matches.images[key].name).stem: camera for key, camera in found.items()}
-    return Found(rival.METHOD, cameras, seconds, len(subject.views.fits))
+    return MethodResult(rival.METHOD, cameras, seconds, len(subject.views.fits))
 
 
-def every_method(
-    subject: Measured, methods: Sequence[str], others: Mapping[str, Mapping[str, object]]
-) -> Iterator[Found]:
+def run_every_method(
+    subject: MatchedSet, methods: Sequence[str], others: Mapping[str, Mapping[str, object]]
+) -> Iterator[MethodResult]:
     """Run all methods; the production one under its own settings and under each of the others."""
-    yield production(subject)
+    yield run_production(subject)
     for label, overrides in others.items():
-        yield production(subject, overrides, f"{PRODUCTION}, {label}")
-    yield colmap(subject)
+        yield run_production(subject, overrides, f"{PRODUCTION}, {label}")
+    yield run_colmap(subject)
     for method in (WITHOUT_MATCHES, *(name for name in methods if name != PRODUCTION)):
-        yield literal(subject, method)
+        yield run_calibrator(subject, method)
 
 
-def adjusted_cameras(subject: Measured) -> dict[str, TrueCamera]:
+def adjusted_cameras(subject: MatchedSet) -> dict[str, TrueCamera]:
     """Return the cameras of our own bundle adjustment: a reference where there is no truth."""
     run = sfm_app.reconstruct(subject.photos.folder, subject.out, subject.settings, last="scene")
     refined = run.scene.cameras if run.scene else {}

@@ -30,7 +30,7 @@ def two_cameras(seed: int) -> Views:
     """Make views with a longer lens in every other photo; nothing in the files tells them apart."""
     first, second = (make_camera(*SIZE, focal_widths=focal) for focal in TWO_FOCALS)
     views = arc(first, ArcOptions(photos=14), seed=seed)
-    return views.taken_with(second, sorted(views.cameras)[1::2])
+    return views.with_camera(second, sorted(views.cameras)[1::2])
 
 
 KINDS: Mapping[str, Callable[[int], Views]] = {

@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 from benchmarks.common.metrics import focal_error_percent
 from benchmarks.common.photo_sets import TrueCamera
 from benchmarks.common.results import Row
-from benchmarks.selfcal.methods import Found
+from benchmarks.selfcal.methods import MethodResult
 from sfm_app.types import Calibration
 
-PLACES = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
+PARAMETER_ENTRIES = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
 INSIDE = 3.0
 """Standard deviations within which the truth should lie."""
 
 
-def row(photos: str, found: Found, truth: Mapping[str, TrueCamera]) -> Row:
+def row(photos: str, found: MethodResult, truth: Mapping[str, TrueCamera]) -> Row:
     """Return medians over the photos that have a truth; with one camera for all, these are its errors."""
     cameras = list(dict.fromkeys(found.cameras.values()))
     known = sum(camera.identifiable for camera in found.cameras.values())
@@ -27,7 +27,7 @@ def row(photos: str, found: Found, truth: Mapping[str, TrueCamera]) -> Row:
         "known": _share(known, len(found.cameras)),
         **dict.fromkeys(COLUMNS),
         "held": ", ".join(cameras[0].held),
-        "k1": _rounded([camera.radial for camera in cameras], 4),
+        "k1": _rounded_median([camera.radial for camera in cameras], 4),
         "pairs": found.pairs,
         "seconds": round(found.seconds, 3),
         "reason": reasons[0] if reasons else "",
@@ -47,8 +47,11 @@ COLUMNS = (
 
 def deviations(camera: Calibration, K: NDArray[np.float64]) -> dict[str, float]:
     """Return |error| over the stated standard deviation, for the parameters that have one."""
-    stated = {name: camera.spread[name] for name in PLACES if camera.spread.get(name, 0.0) > 0}
-    return {name: float(abs(camera.K[PLACES[name]] - K[PLACES[name]]) / sd) for name, sd in stated.items()}
+    stated = {name: camera.spread[name] for name in PARAMETER_ENTRIES if camera.spread.get(name, 0.0) > 0}
+    return {
+        name: float(abs(camera.K[PARAMETER_ENTRIES[name]] - K[PARAMETER_ENTRIES[name]]) / sd)
+        for name, sd in stated.items()
+    }
 
 
 def center_error_percent(camera: Calibration, K: NDArray[np.float64]) -> float:
@@ -67,19 +70,22 @@ def _errors(cameras: Sequence[Calibration], truth: Sequence[TrueCamera]) -> Row:
     stated = [values for values in stated if values]
     focal = [focal_error_percent(camera.K, true.K) for camera, true in both]
     line: Row = {
-        "e_focal %": _rounded(focal),
-        "worst e_focal %": _rounded([max(focal)]) if len({true.K.tobytes() for true in truth}) > 1 else None,
-        "center % of width": _rounded([center_error_percent(camera, true.K) for camera, true in both]),
-        "fy/fx %": _rounded([aspect_error_percent(camera, true.K) for camera, true in both]),
-        "k1 error": _rounded([abs(camera.radial - true.k1) for camera, true in both if true.k1 is not None], 4),
-        "sd of f %": _rounded([100 * c.spread["fx"] / c.K[0, 0] for c in cameras if c.spread.get("fx")]),
+        "e_focal %": _rounded_median(focal),
+        "worst e_focal %": _rounded_median([max(focal)]) if len({true.K.tobytes() for true in truth}) > 1 else None,
+        "center % of width": _rounded_median([center_error_percent(camera, true.K) for camera, true in both]),
+        "fy/fx %": _rounded_median([aspect_error_percent(camera, true.K) for camera, true in both]),
+        "k1 error": _rounded_median([abs(camera.radial - true.k1) for camera, true in both if true.k1 is not None], 4),
+        "sd of f %": _rounded_median([100 * c.spread["fx"] / c.K[0, 0] for c in cameras if c.spread.get("fx")]),
     }
-    line |= {f"{name} sd": _rounded([values[name] for values in stated if name in values]) for name in PLACES}
+    line |= {
+        f"{name} sd": _rounded_median([values[name] for values in stated if name in values])
+        for name in PARAMETER_ENTRIES
+    }
     inside = sum(max(values.values()) <= INSIDE for values in stated)
     return line | {"in 3 sd": _share(inside, len(stated)) if stated else None}
 
 
-def _rounded(values: Sequence[float], digits: int = 2) -> float | None:
+def _rounded_median(values: Sequence[float], digits: int = 2) -> float | None:
     return round(float(np.median(values)), digits) if len(values) else None
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.database import SQUARE_PIXELS, camera_params, opened
+from sfm_app.colmap.database import SQUARE_PIXELS, camera_params, open_database
 from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.types import Calibration, MatchGraph, ViewGraph
 
@@ -30,15 +30,15 @@ def view_graph_calibration(
     copy = scratch / "view_graph_calibration.db"
     shutil.copyfile(database, copy)
     _write_fits(copy, matches, views)
-    _forget_cameras(copy)
+    _reset_cameras(copy)
     options = pycolmap.ViewGraphCalibrationOptions()
     options.random_seed, options.reestimate_relative_pose = seed, False
     start = time.perf_counter()
     done = pycolmap.calibrate_view_graph(copy, options)
     seconds = time.perf_counter() - start
-    with opened(copy) as opened_copy:
+    with open_database(copy) as opened_copy:
         found = {
-            entry.image_id: _answer(opened_copy.read_camera(entry.camera_id), done)
+            entry.image_id: _to_calibration(opened_copy.read_camera(entry.camera_id), done)
             for entry in opened_copy.read_all_images()
         }
     copy.unlink()
@@ -47,7 +47,7 @@ def view_graph_calibration(
 
 def _write_fits(path: Path, matches: MatchGraph, views: ViewGraph) -> None:
     kinds = pycolmap.TwoViewGeometryConfiguration
-    with opened(path) as database:
+    with open_database(path) as database:
         database.clear_two_view_geometries()
         for pair, fit in views.fits.items():
             geometry = pycolmap.TwoViewGeometry()
@@ -57,8 +57,8 @@ def _write_fits(path: Path, matches: MatchGraph, views: ViewGraph) -> None:
             database.write_two_view_geometry(*pair, geometry)
 
 
-def _forget_cameras(path: Path) -> None:
-    with opened(path) as database, pycolmap.DatabaseTransaction(database):
+def _reset_cameras(path: Path) -> None:
+    with open_database(path) as database, pycolmap.DatabaseTransaction(database):
         for camera in database.read_all_cameras():
             camera.model = getattr(pycolmap.CameraModelId, SQUARE_PIXELS)
             camera.params = camera_params(guessed_camera_matrix((camera.width, camera.height)), SQUARE_PIXELS)
@@ -66,7 +66,7 @@ def _forget_cameras(path: Path) -> None:
             database.update_camera(camera)
 
 
-def _answer(camera: Any, done: bool) -> Calibration:
+def _to_calibration(camera: Any, done: bool) -> Calibration:
     K = np.asarray(camera.calibration_matrix(), np.float64)
     known = done and camera.has_prior_focal_length  # COLMAP sets it where it accepts its estimate
     reason = "" if known else "kept the guess" if done else "gave up"

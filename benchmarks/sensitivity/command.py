@@ -23,8 +23,8 @@ from benchmarks.common.processes import environment, module_command
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.sensitivity.constants import ROOMS, Constant, constants
 from benchmarks.sensitivity.problem import Problem
-from benchmarks.trouble.command import folder_of
-from sfm_app.api import opened_run
+from benchmarks.trouble.command import load_folder
+from sfm_app.api import open_run
 from sfm_app.pipeline import MATCH_GRAPH, run_stages
 from sfm_app.settings import Settings
 from sfm_app.types import MatchGraph
@@ -59,7 +59,7 @@ def prepare(data: Path, cache: Path) -> None:
             keep(cache / "problems" / name, Problem(matches, *({k: v[i] for k, v in truth.items()} for i in (0, 1))))
     for seed in SEEDS:
         if not (cache / "problems" / f"trouble {seed}" / "problem.pickle").exists():
-            photos, true, _ = folder_of(seed, cache)
+            photos, true, _ = load_folder(seed, cache)
             matches = matches_of(photos, cache / "runs" / str(seed))
             Ks = {Path(name).stem: camera.K for name, camera in true.cameras.items()}
             poses = {Path(name).stem: pose for name, pose in true.cam_from_world.items()}
@@ -69,7 +69,7 @@ def prepare(data: Path, cache: Path) -> None:
 def matches_of(photos: Path, out: Path) -> MatchGraph:
     """Return keypoints and raw matches, as the program finds them."""
     print(f"matching {photos}", file=sys.stderr)
-    with opened_run(out, Settings(), None) as run:
+    with open_run(out, Settings(), None) as run:
         return run_stages(photos, run, last=MATCH_GRAPH.name)[MATCH_GRAPH]
 
 

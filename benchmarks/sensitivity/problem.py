@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.metrics import LOST_DEG, area_under_recall, focal_error_percent
-from sfm_app.api import opened_run
+from sfm_app.api import open_run
 from sfm_app.errors import ReconstructionError
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.settings import Settings
@@ -41,12 +41,12 @@ def figures(problem: Problem, seed: int) -> dict[str, float]:
         seed: of the run.
     """
     settings, matches = Settings(seed=seed, workers=1), problem.matches
-    with tempfile.TemporaryDirectory() as folder, opened_run(Path(folder), settings, None) as run:
+    with tempfile.TemporaryDirectory() as folder, open_run(Path(folder), settings, None) as run:
         try:
-            views = view_graph_stage.make(matches, run.for_stage("F"))
+            views = view_graph_stage.make(matches, run.with_fingerprint("F"))
         except ReconstructionError:
             return {"AUC@5": 0.0, "focal %": WORST_PERCENT}
-        intrinsics = intrinsics_stage.make(matches, views, run.for_stage("K"))
+        intrinsics = intrinsics_stage.make(matches, views, run.with_fingerprint("K"))
         options = PoseGraphOptions(settings.epipolar.max_error_px, settings.epipolar.min_inliers, seed)
         graph = build_pose_graph(matches, views, intrinsics, options, run.map)
     return {

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from benchmarks.cameras.bars import Bar, least, most
+from benchmarks.cameras.bars import Bar, lower_bound, upper_bound
 from benchmarks.common.results import Row
 from benchmarks.surface.sets import REAL, RENDERED
 
@@ -13,21 +13,21 @@ TIMED = "fountain-P11"
 ON_BLACK = ("temple16",)
 """Sets on a black background, whose photos may show less of the object than the bar."""
 BARS: Mapping[str, tuple[Bar, ...]] = {
-    name: (least("accuracy %", 90.0), least("completeness %", 85.0)) for name in RENDERED
+    name: (lower_bound("accuracy %", 90.0), lower_bound("completeness %", 85.0)) for name in RENDERED
 } | {
     name: (
-        least("worst coverage %", 75.0 if name in WIDELY_SEEN else 50.0),
-        least("worst PSNR dB", 20.0),
-        most("left out: PSNR lower by dB", 2.0),
-        *((most("seconds together", 90.0),) if name == TIMED else ()),
-        *((least("coverage of not black %", 50.0),) if name in ON_BLACK else ()),
+        lower_bound("worst coverage %", 75.0 if name in WIDELY_SEEN else 50.0),
+        lower_bound("worst PSNR dB", 20.0),
+        upper_bound("left out: PSNR lower by dB", 2.0),
+        *((upper_bound("seconds together", 90.0),) if name == TIMED else ()),
+        *((lower_bound("coverage of not black %", 50.0),) if name in ON_BLACK else ()),
     )
     for name in REAL
 }
 """By photo set: shares of the surface for rendered scenes, coverage and PSNR of the photos for real ones."""
 
 
-def asked(rows: Sequence[Row]) -> list[Row]:
+def bar_rows(rows: Sequence[Row]) -> list[Row]:
     """Return one row per bar: the bar, the measured value, and whether it is met."""
     found = []
     for row in rows:

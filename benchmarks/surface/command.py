@@ -16,14 +16,14 @@ from typing import Any
 
 from benchmarks.common.command_line import add_pictures, is_wanted, new_parser
 from benchmarks.common.results import RESULTS, Row, document, write
-from benchmarks.surface.measure import against_photos, against_truth, cost, files, left_out
+from benchmarks.surface.measure import compare_with_photos, compare_with_truth, cost, file_sizes, score_left_out
 from benchmarks.surface.photos import placed_photos
 from benchmarks.surface.pictures import model_page, save_page
 from benchmarks.surface.report import page
-from benchmarks.surface.sets import REAL, RENDERED, SurfaceSet, dense_stages, finished_model, part_of, surface_set
+from benchmarks.surface.sets import REAL, RENDERED, SurfaceSet, dense_stages, finished_model, first_photos, surface_set
 from benchmarks.surface.worker import run_stages
-from sfm_app.cli.options import assigned
-from sfm_app.settings import Settings, merged
+from sfm_app.cli.options import parse_assignment
+from sfm_app.settings import Settings, merge_nested
 from sfm_app.synthetic.pictures import prepare_model
 
 ABOUT = (
@@ -50,17 +50,17 @@ def measure(photos: SurfaceSet, out: Path, args: argparse.Namespace) -> Row:
     settings = Settings.from_mapping(args.settings)
     model = finished_model(photos.photos, out, settings)
     names = list(placed_photos(out))
-    row |= {"placed": len(names), "triangles": len(model.surface.faces), **files(out)}
+    row |= {"placed": len(names), "triangles": len(model.surface.faces), **file_sizes(out)}
     row["texture pages"] = len(model.texture.pages) if model.texture else 0
     row["seconds per photo"] = round(row["seconds together"] / len(names), 2)
     prepared = prepare_model(model)
     if is_wanted(args.pictures, photos.name):
         save_page(model_page(out, names[len(names) // 2], prepared), args.results / f"{args.name}-{photos.name}.png")
     if photos.truth is not None:
-        return row | against_truth(model.surface, out, photos.truth)
-    row |= against_photos(prepared, out, names)
+        return row | compare_with_truth(model.surface, out, photos.truth)
+    row |= compare_with_photos(prepared, out, names)
     if args.left_out:
-        row |= left_out(photos, out, prepared, args.settings, count=args.left_out, geometry_too=args.geometry_too)
+        row |= score_left_out(photos, out, prepared, args.settings, count=args.left_out, geometry_too=args.geometry_too)
     return row
 
 
@@ -68,7 +68,7 @@ def measure_parts(whole: SurfaceSet, counts: Sequence[int], cache: Path, setting
     """Measure the cost of growing numbers of photos of a set."""
     rows = []
     for count in counts:
-        part = part_of(whole, count, cache)
+        part = first_photos(whole, count, cache)
         out = cache / "surface" / f"{whole.name}-{count}"
         said = run_stages(part.photos, out, ("scene", *dense_stages()), settings, dense_stages())
         row: Row = {"photos": part.name, "method": "sfm-app", **cost(said), "of": count}
@@ -99,20 +99,20 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def arguments() -> argparse.Namespace:
+def parse_arguments() -> argparse.Namespace:
     """Read the command line, and resolve the sets and settings."""
     args = parser().parse_args()
     if args.sets is None:
         args.sets = [*RENDERED, *(REAL if args.data else ())]
     args.settings = {}
     for assignment in args.assignments:
-        args.settings = merged(args.settings, assigned(assignment))
+        args.settings = merge_nested(args.settings, parse_assignment(assignment))
     return args
 
 
 def main() -> None:
     """Measure all sets, and write the results."""
-    args = arguments()
+    args = parse_arguments()
     with tempfile.TemporaryDirectory(prefix="surface-") as scratch:
         cache = (args.cache or Path(scratch)).resolve()
         rows = []

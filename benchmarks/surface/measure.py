@@ -14,13 +14,13 @@ from benchmarks.surface.photos import (
     photo_scores,
     placed_photo,
     placed_photos,
-    rendered,
-    spread_out,
+    render_view,
+    subsample,
 )  # fmt: skip
 from benchmarks.surface.sets import SurfaceSet, dense_stages, finished_model
 from benchmarks.surface.sparse_poisson import sparse_surfaces
 from benchmarks.surface.truth import seen_places, truth_scores
-from benchmarks.surface.worker import Said, run_stages
+from benchmarks.surface.worker import StageCost, run_stages
 from sfm_app.settings import Settings
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.synthetic.pictures import PreparedModel, prepare_model
@@ -29,7 +29,7 @@ from sfm_app.types import Surface
 FILES = ("glb", "ply", "obj")
 
 
-def cost(said: Mapping[str, Said]) -> Row:
+def cost(said: Mapping[str, StageCost]) -> Row:
     """Return seconds and memory of the stages after the cameras, and the reason if one failed."""
     failed = next((one.failed for one in said.values() if one.failed), "")
     row: Row = {"failed": failed, "seconds together": None}
@@ -42,13 +42,13 @@ def cost(said: Mapping[str, Said]) -> Row:
     return row
 
 
-def files(out: Path) -> Row:
+def file_sizes(out: Path) -> Row:
     """Return the sizes of the model files in kB."""
     found = {suffix: out / f"model.{suffix}" for suffix in FILES}
     return {f"kB {suffix}": path.stat().st_size // 1000 for suffix, path in found.items() if path.exists()}
 
 
-def against_truth(surface: Surface, out: Path, truth: Truth) -> Row:
+def compare_with_truth(surface: Surface, out: Path, truth: Truth) -> Row:
     """Score our surface, and the best one from the sparse points, against the truth."""
     centers = {name: image.projection_center() for name, image in placed_photos(out).items()}
     seen = seen_places(truth)
@@ -63,7 +63,7 @@ def against_truth(surface: Surface, out: Path, truth: Truth) -> Row:
     return row | {f"sparse: {name}": value for name, value in best.items()}
 
 
-def against_photos(model: PreparedModel, out: Path, names: Sequence[str]) -> Row:
+def compare_with_photos(model: PreparedModel, out: Path, names: Sequence[str]) -> Row:
     """Average the scores over all registered photos."""
     return photo_scores(likenesses(model, out, names))
 
@@ -73,15 +73,15 @@ def likenesses(model: PreparedModel, out: Path, names: Sequence[str]) -> dict[st
     found = {}
     for name in names:
         photo = placed_photo(out, name)
-        found[name] = likeness(rendered(model, photo), photo.pixels)
+        found[name] = likeness(render_view(model, photo), photo.pixels)
     return found
 
 
-def left_out(
+def score_left_out(
     photos: SurfaceSet, out: Path, model: PreparedModel, settings: Mapping[str, Any], *, count: int, geometry_too: bool
 ) -> Row:
     """Return PSNR in photos that the texture was made without, and by how much it is lower than with them."""
-    names = spread_out(list(placed_photos(out)), count)
+    names = subsample(list(placed_photos(out)), count)
     with_it = likenesses(model, out, names)
     values, lower = [], []
     for name in names:

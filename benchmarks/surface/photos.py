@@ -12,8 +12,8 @@ from PIL import Image
 
 from benchmarks.common.results import Row
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.model import part_of
-from sfm_app.synthetic.pictures import Picture, PreparedModel, view_along
+from sfm_app.colmap.model import submodel
+from sfm_app.synthetic.pictures import Picture, PreparedModel, render_rays
 
 Pixels = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
@@ -68,9 +68,9 @@ def placed_photo(out: Path, name: str) -> PlacedPhoto:
     return PlacedPhoto(name, pixels, -pose[:, :3].T @ pose[:, 3], rays.reshape(camera.height, camera.width, 3))
 
 
-def rendered(model: PreparedModel, photo: PlacedPhoto) -> Picture:
+def render_view(model: PreparedModel, photo: PlacedPhoto) -> Picture:
     """Render the model into the photo's camera."""
-    return view_along(model, photo.center, photo.rays)
+    return render_rays(model, photo.center, photo.rays)
 
 
 def likeness(picture: Picture, photo: Pixels) -> Likeness:
@@ -107,7 +107,7 @@ def photo_scores(found: Mapping[str, Likeness]) -> Row:
     }
 
 
-def spread_out(names: list[str], count: int) -> list[str]:
+def subsample(names: list[str], count: int) -> list[str]:
     """Take `count` evenly spaced names, away from both ends where possible."""
     if count >= len(names):
         return names
@@ -133,5 +133,5 @@ def leave_out(out: Path, target: Path, name: str, *, geometry_too: bool) -> str:
     for folder in places:
         model = pycolmap.Reconstruction(folder)
         others = [image.image_id for image in model.images.values() if image.has_pose and image.name != name]
-        part_of(model, others).write(folder)
+        submodel(model, others).write(folder)
     return "depth_maps" if geometry_too else "texture"

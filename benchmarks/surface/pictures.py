@@ -9,7 +9,7 @@ from PIL import Image
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.synthetic.cameras import Camera
-from sfm_app.synthetic.pictures import PreparedModel, beside_photo
+from sfm_app.synthetic.pictures import PreparedModel, comparison_image
 
 Pixels = NDArray[np.uint8]
 TALL_PX, WIDE_PX = 800, 1000
@@ -29,14 +29,14 @@ def model_page(out: Path, name: str, model: PreparedModel) -> Pixels:
     shrink = min(TALL_PX / camera.height, WIDE_PX / camera.width)
     size = round(camera.width * shrink), round(camera.height * shrink)
     K = np.diag([size[0] / camera.width, size[1] / camera.height, 1.0]) @ camera.calibration_matrix()
-    return beside_photo(photo, model, Camera(K, *size), pose)
+    return comparison_image(photo, model, Camera(K, *size), pose)
 
 
 def save_page(page: Pixels, path: Path) -> None:
     """Write a PNG of at most `WIDTHS_PX[0]` pixels width and `BYTES`, in few colors; narrower if it would be larger."""
     path.parent.mkdir(parents=True, exist_ok=True)
     palette = Image.new("P", (1, 1))
-    palette.putpalette(palette_of(page).tobytes())
+    palette.putpalette(page_palette(page).tobytes())
     for width in WIDTHS_PX:
         shrink = min(1.0, width / page.shape[1])
         size = round(page.shape[1] * shrink), round(page.shape[0] * shrink)
@@ -47,7 +47,7 @@ def save_page(page: Pixels, path: Path) -> None:
             return
 
 
-def palette_of(page: Pixels) -> Pixels:
+def page_palette(page: Pixels) -> Pixels:
     """Choose a palette (COLORS, 3) for a page: white, and k-means of a sample of its other pixels."""
     pixels = page[page.min(axis=2) < 255]
     if not len(pixels):

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from benchmarks.common.results import Row, table
-from benchmarks.surface.bars import asked
+from benchmarks.surface.bars import bar_rows
 
 TRUTH = (
     "photos", "placed", "triangles", "accuracy %", "completeness %", "F %", "median %", "within 0.1 %",
@@ -25,12 +25,12 @@ def page(about: str, rows: Sequence[Row], parts: Sequence[Row], files_of: Mappin
     files = [key for key in columns if key.startswith("kB ")]
     found = [
         f"# Surfaces\n\n{about}\n",
-        f"## Asked and measured\n\n{table(asked(rows))}" if asked(rows) else "",
-        _part("Rendered scenes, against the true surface", [row for row in rows if "accuracy %" in row], TRUTH),
-        _part("Real photos, against the model rendered into their cameras", _seen(rows), PHOTOS),
-        _part("Seconds, memory, files", rows, (*COST, *stages, *files)),
-        _part("The same set with fewer and more photos", parts, (*COST, *stages)),
-        _part("Failed", [row for row in rows if row["failed"]], ("photos", "failed")),
+        f"## Asked and measured\n\n{table(bar_rows(rows))}" if bar_rows(rows) else "",
+        _section("Rendered scenes, against the true surface", [row for row in rows if "accuracy %" in row], TRUTH),
+        _section("Real photos, against the model rendered into their cameras", _photo_rows(rows), PHOTOS),
+        _section("Seconds, memory, files", rows, (*COST, *stages, *files)),
+        _section("The same set with fewer and more photos", parts, (*COST, *stages)),
+        _section("Failed", [row for row in rows if row["failed"]], ("photos", "failed")),
     ]
     pictures = [f"![{name}]({file})" for name, file in files_of.items()]
     if pictures:
@@ -38,10 +38,10 @@ def page(about: str, rows: Sequence[Row], parts: Sequence[Row], files_of: Mappin
     return "\n".join([*(part for part in found if part), *pictures, ""])
 
 
-def _seen(rows: Sequence[Row]) -> list[Row]:
+def _photo_rows(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if "coverage %" in row]
 
 
-def _part(title: str, rows: Sequence[Row], columns: Sequence[str]) -> str:
+def _section(title: str, rows: Sequence[Row], columns: Sequence[str]) -> str:
     known = [name for name in columns if any(row.get(name) not in (None, "") for row in rows)]
     return f"## {title}\n\n{table(rows, known)}" if rows else ""

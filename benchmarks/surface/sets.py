@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.common.photo_sets import FORMATS, put
-from sfm_app.api import opened_run
+from benchmarks.common.photo_sets import FORMATS, link_or_copy
+from sfm_app.api import open_run
 from sfm_app.pipeline import NAMES, SCENE, TEXTURE, run_stages
 from sfm_app.settings import Settings
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, load_truth, save_truth, write_photo_folder
@@ -45,25 +45,25 @@ def surface_set(name: str, data: Path | None, cache: Path) -> SurfaceSet:
     scene, _, seed = name.partition("@")
     if scene in WALKS:
         folder = cache / "rendered" / name
-        return SurfaceSet(name, folder / "photos", _rendered(scene, int(seed or 0), folder))
+        return SurfaceSet(name, folder / "photos", _load_or_render(scene, int(seed or 0), folder))
     if data is None or not (data / name / "images").is_dir():
         raise ValueError(f"'{name}' is neither a rendered scene ({', '.join(WALKS)}) nor a folder of DATA")
     return SurfaceSet(name, data / name / "images", None)
 
 
-def part_of(whole: SurfaceSet, count: int, cache: Path) -> SurfaceSet:
+def first_photos(whole: SurfaceSet, count: int, cache: Path) -> SurfaceSet:
     """Make a set of the first photos of another."""
     folder = cache / "parts" / f"{whole.name}-{count}"
     folder.mkdir(parents=True, exist_ok=True)
     photos = sorted(path for path in whole.photos.iterdir() if path.suffix.lower() in FORMATS)
     for photo in photos[:count]:
-        put(photo, folder)
+        link_or_copy(photo, folder)
     return SurfaceSet(f"{whole.name} first {count}", folder, None)
 
 
 def finished_model(photos: Path, out: Path, settings: Settings) -> Model:
     """Read the textured surface of a finished run, or the one with vertex colors where there is no texture."""
-    with opened_run(out, settings, None) as run:
+    with open_run(out, settings, None) as run:
         return run_stages(photos, run, last=TEXTURE.name)[TEXTURE]
 
 
@@ -72,7 +72,7 @@ def dense_stages() -> Sequence[str]:
     return NAMES[NAMES.index(SCENE.name) + 1 :]
 
 
-def _rendered(name: str, seed: int, folder: Path) -> Truth:
+def _load_or_render(name: str, seed: int, folder: Path) -> Truth:
     if not (folder / "truth.json").exists():  # written last
         options = PhotoOptions(seed=seed)
         save_truth(write_photo_folder(folder / "photos", build_scene(name), scene_views(name, seed), options), folder)

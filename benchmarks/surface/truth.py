@@ -9,7 +9,7 @@ from benchmarks.common.results import Row
 from sfm_app.synthetic.cameras import camera_center
 from sfm_app.synthetic.compare import align_centers, sample_surface, sample_triangles, scene_size, surface_distances
 from sfm_app.synthetic.photo_folder import Truth
-from sfm_app.synthetic.render import cast, ray_caster
+from sfm_app.synthetic.render import cast_rays, ray_caster
 from sfm_app.types import Surface
 
 FloatArray = NDArray[np.float64]
@@ -55,7 +55,7 @@ def seen_places(truth: Truth, photos: int = SEEN_BY, samples: int = 3 * SAMPLES)
         samples: number of samples over the whole surface, unseen parts included.
     """
     caster = ray_caster(truth.vertices, truth.faces)
-    places, normals = _with_normals(truth, samples)
+    places, normals = _sample_with_normals(truth, samples)
     slack = HIDDEN * scene_size(truth)
     counted = np.zeros(len(places), np.int64)
     for name, pose in truth.cam_from_world.items():
@@ -70,12 +70,12 @@ def seen_places(truth: Truth, photos: int = SEEN_BY, samples: int = 3 * SAMPLES)
         facing = -(ways * normals).sum(axis=1) > np.cos(np.radians(GRAZING_DEG)) * distance
         asked = np.flatnonzero(within & facing)
         # the ray directions have the length of the distance, so t_hit is in units of it
-        first = cast(caster, center, ways[asked])["t_hit"].astype(np.float64) * distance[asked]
+        first = cast_rays(caster, center, ways[asked])["t_hit"].astype(np.float64) * distance[asked]
         counted[asked[first >= distance[asked] - slack]] += 1
     return places[counted >= photos]
 
 
-def _with_normals(truth: Truth, samples: int) -> tuple[FloatArray, FloatArray]:
+def _sample_with_normals(truth: Truth, samples: int) -> tuple[FloatArray, FloatArray]:
     """Sample points on the surface, with the normals of their triangles."""
     places, face = sample_triangles(truth.vertices, truth.faces, samples)
     corners = truth.vertices[truth.faces]

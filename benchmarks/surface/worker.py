@@ -23,7 +23,7 @@ RESULT = "surface-{stage}.json"
 
 
 @dataclass(frozen=True, slots=True)
-class Said:
+class StageCost:
     """The cost of a stage, or why it failed."""
 
     failed: str
@@ -35,7 +35,7 @@ class Said:
 
 def run_stages(
     photos: Path, out: Path, stages: Sequence[str], settings: Mapping[str, Any], again: Sequence[str] = ()
-) -> dict[str, Said]:
+) -> dict[str, StageCost]:
     """Run the program stage by stage, and stop where one fails.
 
     Args:
@@ -45,7 +45,7 @@ def run_stages(
         settings: settings that differ from the defaults.
         again: stages to run again even if they are up to date; of the others, the last report is read.
     """
-    found: dict[str, Said] = {}
+    found: dict[str, StageCost] = {}
     for stage in stages:
         first, path = stage if stage in again else "", out / RESULT.format(stage=stage)
         before = path.stat().st_mtime if path.exists() else 0.0
@@ -53,9 +53,9 @@ def run_stages(
         done = run_process(command, capture_output=True, text=True, check=False, env=environment())
         if not path.exists() or (done.returncode and path.stat().st_mtime == before):
             last = done.stderr.strip().splitlines()[-1:] or ["no output on stderr"]
-            found[stage] = Said(f"{stage}: exit code {done.returncode}: {last[0]}", None, None)
+            found[stage] = StageCost(f"{stage}: exit code {done.returncode}: {last[0]}", None, None)
         else:
-            found[stage] = Said(**json.loads(path.read_text(encoding="utf-8")))
+            found[stage] = StageCost(**json.loads(path.read_text(encoding="utf-8")))
         if found[stage].failed:
             break
     return found

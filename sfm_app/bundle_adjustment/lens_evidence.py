@@ -3,7 +3,8 @@
 Ours; the choice by marginal likelihood is that of `geometry.model_selection`.
 
 As for pairs (`camera_priors`): each part of a camera has a narrow prior about its usual value and a wide one, and is
-freed where the evidence for the wide one outweighs how rare such cameras are. Freed or not, the prior stays in the estimate: what the photos do not determine stays where it usually is.
+freed where the evidence for the wide one outweighs how rare such cameras are. Freed or not, the prior stays in the
+estimate: what the photos do not determine stays where it usually is.
 """
 
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.bundle_adjustment.normal_equations import CAMERA, CX, CY, FX, FY, K1, K2, P1, P2, Reduced
+from sfm_app.bundle_adjustment.normal_equations import CAMERA, CX, CY, FX, FY, K1, K2, P1, P2, ReducedSystem
 from sfm_app.geometry.model_selection import NormalPriors, binary_choices, cavity, posteriors
 from sfm_app.geometry.spd_solve import inverse_of_positive
 from sfm_app.selfcal.adjustment.camera_priors import ASPECT, CENTER, FREE_SHARE, LENS, NARROW, WIDE
@@ -135,7 +136,7 @@ class LensEstimate:
     """(C,) cameras that would have run away: they stay, and nothing about them counts as determined."""
 
 
-def estimate(params: FloatArray, reduced: Reduced, priors: LensPriors) -> LensEstimate:
+def estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors) -> LensEstimate:
     """Return the most probable cameras, with the most probable choice of freed parts; undetermined parts stay.
 
     The deviations are those of all parts, about the value that was chosen, even where that is the present one, and over

@@ -7,18 +7,18 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.spd_solve import solve_positive, without_negative
+from sfm_app.geometry.spd_solve import project_to_psd, solve_positive
 
 FloatArray = NDArray[np.float64]
 
 FX, FY, CX, CY, K1, K2, P1, P2 = range(8)
 """Indices of the parameters of a camera, as in COLMAP's OPENCV model."""
-LEAST = 1e-6
+DAMPING = 1e-6
 """Added to the diagonal, so that a photo with no observation left does not make the system singular. Chosen by hand;
 not measured on its own."""
 CAMERA, POSE = 8, 6
 """Numbers of parameters of a camera and of a pose. By definition."""
-FLAT = 1e-11
+MIN_INFORMATION = 1e-11
 """Share of a point's information below which a direction counts as undetermined: rounding leaves this much of the depth
 of rays that nearly coincide. Two rays 1.5 degrees apart leave 2e-4. Chosen on no set. docs/algorithms.md, Bundle
 adjustment."""
@@ -26,7 +26,7 @@ USUAL_NOISE_PX, USUAL_COUNT = 0.25, 4.0
 """Prior noise of a keypoint coordinate (the usual noise of SIFT), and its weight as a number of measurements. It
 matters where there are hardly more observations than unknowns; beside thousands of observations it does not count.
 docs/algorithms.md, Bundle adjustment."""
-LOST_PX, ENDLESS = 1e4, 1e60
+LOST_PX, MAX_DERIVATIVE = 1e4, 1e60
 """Residual and derivative above which an observation is lost, i.e. not used; the residual is also what a lost
 observation costs. docs/algorithms.md, Bundle adjustment. Chosen by hand; not measured on their own."""
 
@@ -54,7 +54,7 @@ class Bundle:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reduced:
+class ReducedSystem:
     """Cost as a function of a change d of the cameras, minimized over poses and points: cost - g'd + d'Hd / 2."""
 
     H: FloatArray
@@ -65,11 +65,11 @@ class Reduced:
     """Standard deviation of a coordinate, from the residuals after the best linear step."""
     pose_step: FloatArray
     """(6I,) best change of the poses with fixed cameras."""
-    pose_give: FloatArray
+    pose_response: FloatArray
     """(6I, 8C) decrease of that change per change of the cameras."""
     point_step: FloatArray
     """(3P,) best change of the points with fixed poses and cameras."""
-    point_give: sparse.csr_array
+    point_response: sparse.csr_array
     """(3P, 6I + 8C) decrease of that change per change of poses and cameras."""
     lost: int
     """Number of observations that are not used: behind their camera, or not finite."""
@@ -79,10 +79,10 @@ class Reduced:
     """Number of points that their rays do not determine: at infinity, or seen from one position only. They do not move
     along undetermined directions."""
 
-    def follow(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def back_substitute(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the best changes of poses (I, 6) and points (P, 3) for a given change of the cameras (C, 8)."""
-        poses = self.pose_step - np.einsum("ij,j->i", self.pose_give, cameras.ravel())
-        points = self.point_step - self.point_give @ np.concatenate([poses, cameras.ravel()])
+        poses = self.pose_step - np.einsum("ij,j->i", self.pose_response, cameras.ravel())
+        points = self.point_step - self.point_response @ np.concatenate([poses, cameras.ravel()])
         return poses.reshape(-1, POSE), points.reshape(-1, 3)
 
 
@@ -119,7 +119,7 @@ def project(bundle: Bundle) -> tuple[FloatArray, FloatArray, FloatArray, FloatAr
     return predicted, by_camera, by_pose, np.einsum("nij,njk->nik", by_x, R)
 
 
-def reduce(bundle: Bundle, scale_px: float) -> Reduced:
+def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     """Eliminate points, then poses (Schur complement), in the Gauss-Newton approximation.
 
     The covariance of the cameras is noise^2 H^-1.
@@ -128,7 +128,7 @@ def reduce(bundle: Bundle, scale_px: float) -> Reduced:
         bundle: the model; the result is accurate where poses and points minimize the cost.
         scale_px: s of the loss s^2 (sqrt(1 + |r|^2 / s^2) - 1), which is COLMAP's SOFT_L1.
     """
-    r, by_view, by_point, seen = _linearized(bundle, scale_px)
+    r, by_view, by_point, seen = _linearize(bundle, scale_px)
     whiten, rank = _whiten(by_point, bundle.point, len(bundle.X))
     by_point = np.einsum("nki,nji->nkj", by_point, whiten[bundle.point])
     poses, cameras = POSE * len(bundle.R), CAMERA * len(bundle.params)
@@ -138,18 +138,18 @@ def reduce(bundle: Bundle, scale_px: float) -> Reduced:
             poses + CAMERA * bundle.camera[bundle.photo][:, None] + np.arange(CAMERA),
         ]
     )
-    J = _sparse(by_view, columns, poses + cameras)
-    Jp = _sparse(by_point, 3 * bundle.point[:, None] + np.arange(3), 3 * len(bundle.X))
+    J = _to_sparse(by_view, columns, poses + cameras)
+    Jp = _to_sparse(by_point, 3 * bundle.point[:, None] + np.arange(3), 3 * len(bundle.X))
     A = (Jp.T @ J).tocsr()
-    S = (J.T @ J - A.T @ A).toarray() + LEAST * np.eye(poses + cameras)
+    S = (J.T @ J - A.T @ A).toarray() + DAMPING * np.eye(poses + cameras)
     flat = r.ravel()
     along = Jp.T @ flat
     gradient = J.T @ flat - A.T @ along
-    free = _gauge(bundle)
+    free = _free_pose_columns(bundle)
     give = solve_positive(S[np.ix_(free, free)], np.column_stack([S[free][:, poses:], gradient[free]]))
     across = np.einsum("ij,jk->ik", S[poses:][:, free], give)
     H, g = S[poses:, poses:] - across[:, :-1], gradient[poses:] - across[:, -1]
-    H = without_negative(0.5 * (H + H.T), np.asarray(J[:, poses:].power(2).sum(axis=0), np.float64))
+    H = project_to_psd(0.5 * (H + H.T), np.asarray(J[:, poses:].power(2).sum(axis=0), np.float64))
     step = solve_positive(H, g[:, None])[:, 0]
     explained = np.sum(along**2) + np.sum(gradient[free] * give[:, -1]) + np.sum(g * step)
     left = max(float(np.sum(flat**2) - explained), 0.0) + USUAL_COUNT * USUAL_NOISE_PX**2
@@ -158,14 +158,14 @@ def reduce(bundle: Bundle, scale_px: float) -> Reduced:
     pose_step[free], pose_give[free] = give[:, -1], give[:, :-1]
     left_over = flat - J[:, :poses] @ pose_step - Jp @ (along - A[:, :poses] @ pose_step)
     unwhiten = _block_diagonal(whiten.transpose(0, 2, 1))
-    return Reduced(
+    return ReducedSystem(
         H=H,
         g=g,
         noise_px=float(np.sqrt(left / spare)),
         pose_step=pose_step,
-        pose_give=pose_give,
+        pose_response=pose_give,
         point_step=unwhiten @ along,
-        point_give=unwhiten @ A,
+        point_response=unwhiten @ A,
         lost=len(seen) - int(np.count_nonzero(seen)),
         scores=_scores((J, Jp, A), pose_give, left_over, np.repeat(bundle.photo, 2), len(bundle.R)),
         open_points=int(np.count_nonzero(rank < 3)),
@@ -192,7 +192,7 @@ def _scores(
     return found
 
 
-def moved(bundle: Bundle, params: FloatArray, poses: FloatArray, points: FloatArray) -> Bundle:
+def apply_step(bundle: Bundle, params: FloatArray, poses: FloatArray, points: FloatArray) -> Bundle:
     """Return the bundle with new cameras, and with changed poses and points.
 
     Args:
@@ -215,11 +215,11 @@ def cost(bundle: Bundle, scale_px: float) -> float:
     with np.errstate(all="ignore"):
         r = bundle.x - project(bundle)[0]
         squares = np.einsum("ni,ni->n", r, r)
-    squares = np.where(in_sight(bundle, r), squares, LOST_PX**2)
+    squares = np.where(usable_mask(bundle, r), squares, LOST_PX**2)
     return float(scale_px**2 * np.sum(np.sqrt(1.0 + squares / scale_px**2) - 1.0))
 
 
-def in_sight(bundle: Bundle, r: FloatArray) -> NDArray[np.bool_]:
+def usable_mask(bundle: Bundle, r: FloatArray) -> NDArray[np.bool_]:
     """Return (N,) which observations are of points in front of their camera, with residuals below LOST_PX.
 
     Args:
@@ -235,10 +235,10 @@ def lost_points(bundle: Bundle) -> NDArray[np.bool_]:
     """Return (P,) which points have a lost observation."""
     with np.errstate(all="ignore"):
         r = bundle.x - project(bundle)[0]
-    return np.bincount(bundle.point[~in_sight(bundle, r)], minlength=len(bundle.X)) > 0
+    return np.bincount(bundle.point[~usable_mask(bundle, r)], minlength=len(bundle.X)) > 0
 
 
-def _linearized(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+def _linearize(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
     """Return weighted residuals (N, 2), derivatives by view (N, 2, 14) and point (N, 2, 3), and which are used (N,).
 
     The others are 0: points behind their camera, or in its principal plane, would distort all that is near.
@@ -247,7 +247,7 @@ def _linearized(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray
         predicted, by_camera, by_pose, by_point = project(bundle)
         r, by_view = bundle.x - predicted, np.concatenate([by_pose, by_camera], 2)
         largest = np.maximum(np.abs(by_view).max(axis=(1, 2), initial=0.0), np.abs(by_point).max(axis=(1, 2)))
-        seen = in_sight(bundle, r) & (largest < ENDLESS)
+        seen = usable_mask(bundle, r) & (largest < MAX_DERIVATIVE)
     r, by_view, by_point = (np.where(seen.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in (r, by_view, by_point))
     root = (1.0 + np.einsum("ni,ni->n", r, r) / scale_px**2) ** -0.25
     return r * root[:, None], by_view * root[:, None, None], by_point * root[:, None, None], seen
@@ -269,12 +269,12 @@ def _whiten(by_point: FloatArray, point: NDArray[np.int64], points: int) -> tupl
     # the pivots of the Cholesky decomposition
     second = unit[:, 1, 1] - unit[:, 1, 0] ** 2
     across = unit[:, 2, 1] - unit[:, 2, 0] * unit[:, 1, 0]
-    third = unit[:, 2, 2] - unit[:, 2, 0] ** 2 - across**2 / np.maximum(second, FLAT)
-    fixed = (unit[:, 0, 0] > 0.0) & (second > FLAT) & (third > FLAT)
+    third = unit[:, 2, 2] - unit[:, 2, 0] ** 2 - across**2 / np.maximum(second, MIN_INFORMATION)
+    fixed = (unit[:, 0, 0] > 0.0) & (second > MIN_INFORMATION) & (third > MIN_INFORMATION)
     W, rank = np.zeros((points, 3, 3)), np.full(points, 3)
     W[fixed] = np.linalg.inv(np.linalg.cholesky(H[fixed]))
     values, vectors = np.linalg.eigh(unit[~fixed])
-    kept = values > FLAT
+    kept = values > MIN_INFORMATION
     gains = np.where(kept, np.where(kept, values, 1.0) ** -0.5, 0.0)
     W[~fixed] = gains[:, :, None] * vectors.transpose(0, 2, 1) / scale[~fixed, None, :]
     rank[~fixed] = np.count_nonzero(kept, axis=1)
@@ -288,7 +288,7 @@ def _block_diagonal(blocks: FloatArray) -> sparse.csr_array:
     return sparse.csr_array((blocks.ravel(), columns.ravel(), 3 * np.arange(3 * P + 1)), shape=(3 * P, 3 * P))
 
 
-def _gauge(bundle: Bundle) -> NDArray[np.int64]:
+def _free_pose_columns(bundle: Bundle) -> NDArray[np.int64]:
     """Return the free pose columns when the gauge is fixed: the first photo, and one coordinate of the farthest one."""
     centers = -np.einsum("nji,nj->ni", bundle.R, bundle.t)
     far = int(np.argmax(np.linalg.norm(centers - centers[0], axis=1)))
@@ -297,7 +297,7 @@ def _gauge(bundle: Bundle) -> NDArray[np.int64]:
     return np.array([k for k in range(POSE * len(bundle.R)) if k not in held], np.int64)
 
 
-def _sparse(blocks: FloatArray, columns: NDArray[np.int64], width: int) -> sparse.csr_array:
+def _to_sparse(blocks: FloatArray, columns: NDArray[np.int64], width: int) -> sparse.csr_array:
     """Return the sparse matrix (2N, width) of blocks (N, 2, k), each in two rows and the k columns (N, k) given."""
     N, _, k = blocks.shape
     places = np.repeat(columns, 2, axis=0).ravel()

@@ -7,8 +7,8 @@ from typing import Any
 from sfm_app.report import field_of_view_deg, held_text, lens_text
 from sfm_app.types import Intrinsics
 
-KEY_PAIRS = 3
-PHOTOS = 4
+BEST_PAIRS = 3
+PHOTOS_SHOWN = 4
 """Most key pairs and photos that the text names; --json has all."""
 
 
@@ -36,8 +36,8 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
         lines.append(f"camera      {f'{name}: ' if many else ''}{k_text(camera.K, camera.spread)}")
         mine = [photo for photo, of in intrinsics.camera_of.items() if of == name]
         if many and mine:
-            more = f" and {len(mine) - PHOTOS} more" if len(mine) > PHOTOS else ""
-            lines.append(f"            took {', '.join(mine[:PHOTOS])}{more}")
+            more = f" and {len(mine) - PHOTOS_SHOWN} more" if len(mine) > PHOTOS_SHOWN else ""
+            lines.append(f"            took {', '.join(mine[:PHOTOS_SHOWN])}{more}")
         if not camera.identifiable:
             source = {"exif": "EXIF's claim", "guess": "a guess", "estimate": "an estimate"}.get(
                 camera.method, camera.method
@@ -47,7 +47,7 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
         lines.append(f"            sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom")
         lines += [f"            {text}" for text in (lens_text(camera), held_text(camera)) if text]
         if camera.key_pairs:
-            named = [[intrinsics.photos.get(key, str(key)) for key in pair] for pair in camera.key_pairs[:KEY_PAIRS]]
+            named = [[intrinsics.photos.get(key, str(key)) for key in pair] for pair in camera.key_pairs[:BEST_PAIRS]]
             best = ", ".join(f"{first} + {second}" for first, second in named)
             lines.append(f"            best pairs of photos to start from: {best}")
     return lines

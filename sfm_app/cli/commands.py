@@ -19,12 +19,12 @@ from sfm_app.cli.display import (
     print_lines,
     run_lines,
     run_summary,
-    shown,
     table,
+    to_printable,
 )
 from sfm_app.cli.doctor import examine
-from sfm_app.cli.options import output_options, settings_from, settings_options
-from sfm_app.colmap.backend import left_running
+from sfm_app.cli.options import output_options, settings_from_flags, settings_options
+from sfm_app.colmap.backend import has_running_call
 from sfm_app.demo import demo_lines, run_demo
 from sfm_app.errors import ConfigError, SfmError
 from sfm_app.pipeline import NAMES
@@ -43,7 +43,7 @@ class Commands(click.Group):
         try:
             return super().main(*args, **kwargs)
         finally:
-            if left_running():  # a normal exit frees what the call works on, and crashes
+            if has_running_call():  # a normal exit frees what the call works on, and crashes
                 sys.stdout.flush()
                 sys.stderr.flush()
                 os._exit(INTERRUPTED)
@@ -59,12 +59,12 @@ class Commands(click.Group):
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise
         except OSError as err:  # a full disk, a folder that went away
-            fail(*told(err), 3)
+            fail(*describe_os_error(err), 3)
         except Exception as err:  # a bug: the user gets one line, log.txt has the traceback
             fail(f"unexpected {type(err).__name__}: {err}", "this is a bug; please report it with OUT/log.txt", 1)
 
 
-def told(err: OSError) -> tuple[str, str]:
+def describe_os_error(err: OSError) -> tuple[str, str]:
     """Return the message and the hint for an error of the operating system."""
     if err.errno in FULL:
         return f"the disk is full ({err.strerror})", "free some space; the same command resumes where this one stopped"
@@ -80,7 +80,7 @@ def fail(message: str, hint: str, code: int) -> None:
         hint: what to do about it; may be empty.
         code: exit code, > 0.
     """
-    click.echo(f"error: {shown(message)}" + (f"\nhint: {shown(hint)}" if hint else ""), err=True)
+    click.echo(f"error: {to_printable(message)}" + (f"\nhint: {to_printable(hint)}" if hint else ""), err=True)
     sys.exit(code)
 
 
@@ -105,7 +105,7 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
 
     Stages whose results in OUT are up to date are skipped, so an interrupted run resumes where it stopped.
     """
-    settings = settings_from(flags)
+    settings = settings_from_flags(flags)
     out = out or photos.resolve().with_name(f"{photos.resolve().name}-model")
     done = reconstruct(photos, out, settings, first=first or "", last=last, progress=Terminal(quiet=flags["quiet"]))
     print_json(run_summary(done)) if flags["as_json"] else print_lines(run_lines(done))
@@ -124,7 +124,7 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
 def calibrate(photos: Path, out: Path | None, figure: Path | None, **flags: Any) -> None:
     """Find the camera matrix of PHOTOS, a folder or a video, without reconstructing the scene."""
     progress = Terminal(quiet=flags["quiet"])
-    found = calibrate_photos(photos, settings_from(flags), out=out, figure=figure, progress=progress)
+    found = calibrate_photos(photos, settings_from_flags(flags), out=out, figure=figure, progress=progress)
     print_json(intrinsics_summary(found)) if flags["as_json"] else print_lines(intrinsics_lines(found))
 
 
@@ -152,7 +152,7 @@ def export(out: Path, file_format: str, target: Path | None, points: bool, as_js
 @output_options
 def demo(out: Path, **flags: Any) -> None:
     """Render photos of a known scene, reconstruct them and print the errors."""
-    result = run_demo(out, settings_from(flags), Terminal(quiet=flags["quiet"]))
+    result = run_demo(out, settings_from_flags(flags), Terminal(quiet=flags["quiet"]))
     print_json(result.to_dict()) if flags["as_json"] else print_lines(demo_lines(result))
 
 
@@ -168,7 +168,7 @@ def doctor(as_json: bool) -> None:
 @settings_options
 def config(**flags: Any) -> None:
     """Print all settings as TOML, including the changes by other options."""
-    print_lines(settings_from(flags).to_toml().splitlines())
+    print_lines(settings_from_flags(flags).to_toml().splitlines())
 
 
 @main.command()

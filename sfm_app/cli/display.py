@@ -28,7 +28,7 @@ STAGE_TITLES = {
 }
 
 MEGABYTE, KILOBYTE = 1e6, 1e3
-NAMED = 5
+NAMES_SHOWN = 5
 """Most files of one kind that are named; the manifest has all."""
 
 
@@ -92,10 +92,10 @@ def print_json(value: Any) -> None:
 
 def print_lines(lines: list[str]) -> None:
     """Print lines on stdout."""
-    sys.stdout.write("\n".join(map(shown, lines)) + "\n")
+    sys.stdout.write("\n".join(map(to_printable, lines)) + "\n")
 
 
-def shown(text: str) -> str:
+def to_printable(text: str) -> str:
     """Return a text with unprintable characters escaped: a file's name could move the cursor or break the line."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
@@ -115,10 +115,10 @@ def run_summary(run: Run) -> dict[str, Any]:
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
     }
     if run.scene:
-        points = [str(path) for path in written(run, "scene")]
+        points = [str(path) for path in written_files(run, "scene")]
         summary["scene"] = {**scene_summary(run.scene, counts.get("scene", {})), "files": points}
     if run.mesh_path:
-        files = [str(path) for path in written(run, "files")]
+        files = [str(path) for path in written_files(run, "files")]
         about = {key: counts["files"][key] for key in ("pages_px", "jpeg_quality") if key in counts["files"]}
         summary["mesh"] = {"triangles": counts["mesh"].get("triangles"), **about, "files": files}
     return summary
@@ -142,10 +142,10 @@ def run_lines(run: Run) -> list[str]:
         lines += intrinsics_lines(run.calibration)
     if run.scene:
         lines += scene_lines(run.scene, run.manifest.get("stages", {}).get("scene", {}).get("counts", {}))
-        lines += [f"            points and cameras: {line}" for line in file_lines(written(run, "scene"))]
+        lines += [f"            points and cameras: {line}" for line in file_lines(written_files(run, "scene"))]
     if run.mesh_path:
         lines.append(f"mesh        {summary['mesh']['triangles']} triangles{texture_text(summary['mesh'])}")
-        lines += [f"            {line}" for line in file_lines(written(run, "files"))]
+        lines += [f"            {line}" for line in file_lines(written_files(run, "files"))]
     seconds = summary["seconds"]
     lines.append(
         "seconds     "
@@ -171,20 +171,20 @@ def photo_lines(photos: Mapping[str, Any]) -> Iterator[str]:
     for name, notes in photos["notes"].items():
         yield f"{name}: {', '.join(notes)}"
     for reason, names in by_reason.items():
-        yield f"left out: {some(names)}: {reason}"
+        yield f"left out: {abbreviate_names(names)}: {reason}"
 
 
 def _mask_lines(masks: Mapping[str, Any], photos: int) -> Iterator[str]:
     """Yield how many photos have a mask, and which mask files belong to no photo."""
     yield f"masks       {masks['photos']} of {photos} photos"
     if masks["unused"]:
-        yield f"            without a photo that is used: {some(masks['unused'])}"
+        yield f"            without a photo that is used: {abbreviate_names(masks['unused'])}"
 
 
-def some(names: Sequence[str]) -> str:
+def abbreviate_names(names: Sequence[str]) -> str:
     """Return the first few names, and how many more there are."""
-    more = f" and {len(names) - NAMED} more (all of them in manifest.json)" if len(names) > NAMED else ""
-    return f"{', '.join(names[:NAMED])}{more}"
+    more = f" and {len(names) - NAMES_SHOWN} more (all of them in manifest.json)" if len(names) > NAMES_SHOWN else ""
+    return f"{', '.join(names[:NAMES_SHOWN])}{more}"
 
 
 def texture_text(mesh: Mapping[str, Any]) -> str:
@@ -193,7 +193,7 @@ def texture_text(mesh: Mapping[str, Any]) -> str:
     return f", texture {pages} px, JPEG of quality {mesh['jpeg_quality']}" if pages else ""
 
 
-def written(run: Run, stage: str) -> list[Path]:
+def written_files(run: Run, stage: str) -> list[Path]:
     """Return the existing model files that a stage wrote, the one to open first.
 
     Args:

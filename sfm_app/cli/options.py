@@ -8,15 +8,15 @@ from typing import Any
 
 import click
 
-from sfm_app.cli.setting_flags import SETTING_FLAGS, Command, field_of, setting_option
+from sfm_app.cli.setting_flags import SETTING_FLAGS, Command, setting_field, setting_option
 from sfm_app.colmap.backend import show_log
 from sfm_app.errors import ConfigError
-from sfm_app.settings import Settings, merged
+from sfm_app.settings import Settings, merge_nested
 
 
 def settings_options(command: Command) -> Command:
     """Add the options that change settings, from --config to -v."""
-    without = (field_of("plugins").description or "").partition(";")[0]
+    without = (setting_field("plugins").description or "").partition(";")[0]
     options = (
         click.option(
             "--config", type=click.Path(path_type=Path), help="Settings file (TOML); `sfm-app config` prints one."
@@ -35,21 +35,21 @@ def output_options(command: Command) -> Command:
     return click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")(command)
 
 
-def settings_from(flags: Mapping[str, Any]) -> Settings:
+def settings_from_flags(flags: Mapping[str, Any]) -> Settings:
     """Return settings from the shared options; flags override the file."""
     show_log(flags["verbose"])
     overrides: dict[str, Any] = {"plugins": False} if flags["no_plugins"] else {}
     for flag in SETTING_FLAGS:
         if (value := flags[flag.parameter]) is not None:
-            overrides = merged(overrides, flag.nested(value))
+            overrides = merge_nested(overrides, flag.to_mapping(value))
     for assignment in flags["assignments"]:
-        overrides = merged(overrides, assigned(assignment))
+        overrides = merge_nested(overrides, parse_assignment(assignment))
     if flags["config"] is not None:
         return Settings.from_toml(flags["config"], overrides)
     return Settings.from_mapping(overrides, where="command line")
 
 
-def assigned(text: str) -> dict[str, Any]:
+def parse_assignment(text: str) -> dict[str, Any]:
     """Return TABLE.KEY=VALUE as nested settings; ConfigError where it is malformed."""
     name, equals, value = text.partition("=")
     if not equals:

@@ -6,12 +6,12 @@ from typing import Any
 from sfm_app.cli.camera_text import k_text
 from sfm_app.types import Scene
 
-NAMES = 4
+NAMES_SHOWN = 4
 """Most photos of a group that are named."""
 MAPPERS = {"incremental": "photo after photo", "global": "all at once", "colmap": "as COLMAP does by itself"}
-CONTRADICTED = 0.1
+CONTRADICTED_WARNING_SHARE = 0.1
 """Share of contradicted matches above which the text warns."""
-ONE_EACH = {
+CAMERA_PER_PHOTO_TEXTS = {
     "taken": "one camera for all photos of a size does not explain them: each has its own (a zoom, or several devices)",
     "two": "one camera for all photos of a size does not explain them, two do",
     "left": "a camera for each photo was tried, too, and explains no more",
@@ -55,7 +55,7 @@ def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
         f"scene       {summary['registered']} of {summary['of']} photos placed, {scene.points} points, "
         f"mean reprojection error {summary['mean_reprojection_px']} px"
     )
-    yield from (f"            {text}" for text in _how(summary, counts))
+    yield from (f"            {text}" for text in _remark_lines(summary, counts))
     named = {name for names in summary.get("other_models", ()) for name in names}
     for name, reason in scene.unregistered.items():
         if name not in named:
@@ -65,41 +65,41 @@ def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
         yield f"            camera {f'{name} ' if many else ''}refined: {k_text(camera.K, camera.deviations)}"
 
 
-def _how(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]:
+def _remark_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]:
     if summary.get("mapper") in MAPPERS:
         dropped = sum(summary.get("pairs_dropped", {}).values())
         because = f": {counts['mapper_reason']}" if counts.get("mapper_reason") else ""
         yield f"mapped {MAPPERS[summary['mapper']]}{because}"
         if counts.get("rival_tried_because"):
             yield f"COLMAP's own mapper was tried, too: {counts['rival_tried_because']}"
-        if counts.get("one_camera_each") in ONE_EACH:
-            yield ONE_EACH[counts["one_camera_each"]]
-        yield from _second_look(counts.get("second_look", {}))
+        if counts.get("one_camera_each") in CAMERA_PER_PHOTO_TEXTS:
+            yield CAMERA_PER_PHOTO_TEXTS[counts["one_camera_each"]]
+        yield from _second_look_lines(counts.get("second_look", {}))
         if dropped:
             yield f"pairs of photos left out because they do not fit the others: {dropped}"
     for photos in summary.get("cut_apart", ()):
         yield f"split, because more matches contradict the connection than support it: {photos}"
-    yield from _doubts(summary)
+    yield from _doubt_lines(summary)
     for number, names in enumerate(summary.get("other_models", ()), start=1):
-        yield f"another model of {len(names)} photos in other_models/{number}: {_some(names)}"
+        yield f"another model of {len(names)} photos in other_models/{number}: {_name_list(names)}"
     explained, against = counts.get("explained_matches", 0), counts.get("contradicted_matches", 0)
-    if against > CONTRADICTED * (explained + against):
+    if against > CONTRADICTED_WARNING_SHARE * (explained + against):
         yield (
             f"beware: {100 * against / (explained + against):.0f} % of the matches between these photos contradict it; "
             "look for places that look alike"
         )
-    yield from _badly_adjusted(summary.get("adjustment", {}))
+    yield from _adjustment_warnings(summary.get("adjustment", {}))
     orientation = summary.get("orientation", {})
     if orientation.get("failed"):
         yield f"frame as left by mapping, neither upright nor in meters: {orientation['failed']}"
     elif orientation:
         deviation = orientation["up_deviation_deg"]
         sure = f"to about {max(deviation, 0.1):.1f} degrees" if deviation is not None else "with unknown accuracy"
-        yield f"upright by {orientation['up']}, {sure}; in {_unit(orientation)}"
-        yield from _perhaps_not_upright(orientation)
+        yield f"upright by {orientation['up']}, {sure}; in {_unit_text(orientation)}"
+        yield from _orientation_warnings(orientation)
 
 
-def _second_look(found: Mapping[str, Any]) -> Iterator[str]:
+def _second_look_lines(found: Mapping[str, Any]) -> Iterator[str]:
     """Yield the result of mapping again with finer features."""
     if found:
         before, after = found["placed"][0], found["placed"][-1]
@@ -108,7 +108,7 @@ def _second_look(found: Mapping[str, Any]) -> Iterator[str]:
         yield f"finer features were sought in {len(found['photos'])} unplaced photos: {brought}{failed}"
 
 
-def _badly_adjusted(adjustment: Mapping[str, Any]) -> Iterator[str]:
+def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:
     """Yield warnings about the last bundle adjustment."""
     if adjustment.get("failed"):
         yield (
@@ -121,35 +121,35 @@ def _badly_adjusted(adjustment: Mapping[str, Any]) -> Iterator[str]:
         yield f"beware: these photos do not determine camera {name}; it stayed as mapping left it"
 
 
-def _doubts(summary: Mapping[str, Any]) -> Iterator[str]:
+def _doubt_lines(summary: Mapping[str, Any]) -> Iterator[str]:
     """Yield warnings about look-alikes, possible folds, and parts whose scale is weakly determined."""
     for join in summary.get("look_alikes", ()):
-        here, there = (_some(names) for names in join["between"])
+        here, there = (_name_list(names) for names in join["between"])
         yield (
             f"look-alikes separated, {join['pairs']} pairs of photos: {here} | {there} "
             f"({100 * join['missing']:.0f} % of what they would share in one place is missing)"
         )
     for join in summary.get("perhaps_look_alikes", ()):
-        here, there = (_some(names) for names in join["between"])
+        here, there = (_name_list(names) for names in join["between"])
         yield (
             f"beware: a loop, or look-alikes: {join['pairs']} pairs take {here} and {there} for one place, "
             "but the photos between them do not confirm it"
         )
     for names in summary.get("weakly_joined", ()):
         yield (
-            f"beware: hardly any point determines how far {_some(names)} {'are' if len(names) > 1 else 'is'} from "
+            f"beware: hardly any point determines how far {_name_list(names)} {'are' if len(names) > 1 else 'is'} from "
             "the rest; photos between them help"
         )
     for before, after in summary.get("jumps", ()):
         yield f"beware: a jump from {before} to {after}, which are consecutive: in a video, a sign of look-alikes"
 
 
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - NAMES} more" if len(names) > NAMES else ""
-    return f"{', '.join(names[:NAMES])}{more}"
+def _name_list(names: Sequence[str]) -> str:
+    more = f" and {len(names) - NAMES_SHOWN} more" if len(names) > NAMES_SHOWN else ""
+    return f"{', '.join(names[:NAMES_SHOWN])}{more}"
 
 
-def _perhaps_not_upright(orientation: Mapping[str, Any]) -> Iterator[str]:
+def _orientation_warnings(orientation: Mapping[str, Any]) -> Iterator[str]:
     """Yield a warning where the model may not be upright, with the setting that corrects it."""
     mistakes = {"up_sign_odds": ("stand upside down", (180,)), "up_axis_odds": ("lie on its side", (90, 270))}
     for key, (what, turns) in mistakes.items():
@@ -162,5 +162,5 @@ def _perhaps_not_upright(orientation: Mapping[str, Any]) -> Iterator[str]:
             )
 
 
-def _unit(orientation: Mapping[str, Any]) -> str:
+def _unit_text(orientation: Mapping[str, Any]) -> str:
     return "meters by GPS" if orientation["unit"] == "meter" else "a unit of its own"

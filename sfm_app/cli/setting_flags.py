@@ -7,10 +7,10 @@ from typing import Any, TypeVar, get_args
 import click
 from pydantic.fields import FieldInfo
 
-from sfm_app.settings import QUALITY_PRESETS, Section, Settings, merged
+from sfm_app.settings import QUALITY_PRESETS, Section, Settings, merge_nested
 
 Command = TypeVar("Command", bound=Callable[..., Any])
-BELOW, ABOVE = {"ge": "{}<=", "gt": "{}<"}, {"le": "<={}", "lt": "<{}"}
+LOWER_BOUND_FORMATS, UPPER_BOUND_FORMATS = {"ge": "{}<=", "gt": "{}<"}, {"le": "<={}", "lt": "<{}"}
 """Formats of bounds, by pydantic's name for them."""
 
 
@@ -30,7 +30,7 @@ class SettingFlag:
         """Name of the command's parameter."""
         return self.flag.removeprefix("--").replace("-", "_")
 
-    def nested(self, value: object) -> dict[str, Any]:
+    def to_mapping(self, value: object) -> dict[str, Any]:
         """Return the setting as a mapping of settings."""
         table, _, key = self.setting.rpartition(".")
         return {table: {key: value}} if table else {key: value}
@@ -57,7 +57,7 @@ SETTING_FLAGS = (
 
 def setting_option(flag: SettingFlag) -> Callable[[Command], Command]:
     """Return the click option of a setting; its value is None where it is not given."""
-    kind, text = field_of(flag.setting).annotation, help_text(flag.setting)
+    kind, text = setting_field(flag.setting).annotation, help_text(flag.setting)
     if kind is bool:
         return click.option(flag.flag, is_flag=True, default=None, help=text)
     if flag.choice:
@@ -67,7 +67,7 @@ def setting_option(flag: SettingFlag) -> Callable[[Command], Command]:
 
 def help_text(setting: str) -> str:
     """Return the description of a setting as a sentence, with its default and its range."""
-    description = field_of(setting).description or ""
+    description = setting_field(setting).description or ""
     facts = "; ".join(fact for fact in (default_text(setting), range_text(setting)) if fact)
     return f"{description[:1].upper()}{description[1:]}." + (f"  [{facts}]" if facts else "")
 
@@ -75,28 +75,28 @@ def help_text(setting: str) -> str:
 def default_text(setting: str) -> str:
     """Return the default, one for each quality where the presets differ; empty for empty values and switches."""
     values = {
-        quality: value_of(Settings.from_mapping(merged(preset, {"quality": quality})), setting)
+        quality: setting_value(Settings.from_mapping(merge_nested(preset, {"quality": quality})), setting)
         for quality, preset in QUALITY_PRESETS.items()
     }
     if setting != "quality" and len(set(values.values())) > 1:
         return "default: " + ", ".join(f"{value} for {quality}" for quality, value in values.items())
-    value = value_of(Settings(), setting)
+    value = setting_value(Settings(), setting)
     return "" if value == "" or isinstance(value, bool) else f"default: {value}"
 
 
 def range_text(setting: str) -> str:
     """Return the range of a number, such as "1<=x<=9"; empty where there is none."""
 
-    def written(side: Mapping[str, str]) -> str:
-        bounds = field_of(setting).metadata
+    def bound_text(side: Mapping[str, str]) -> str:
+        bounds = setting_field(setting).metadata
         pairs = ((bound, name) for bound in bounds for name in side if hasattr(bound, name))
         return "".join(side[name].format(getattr(bound, name)) for bound, name in pairs)
 
-    below, above = written(BELOW), written(ABOVE)
+    below, above = bound_text(LOWER_BOUND_FORMATS), bound_text(UPPER_BOUND_FORMATS)
     return f"{below}x{above}" if below or above else ""
 
 
-def field_of(setting: str) -> FieldInfo:
+def setting_field(setting: str) -> FieldInfo:
     """Return the field of a setting such as "mesh.faces"."""
     section: type[Section] = Settings
     *tables, key = setting.split(".")
@@ -105,7 +105,7 @@ def field_of(setting: str) -> FieldInfo:
     return section.model_fields[key]
 
 
-def value_of(settings: Section, setting: str) -> Any:
+def setting_value(settings: Section, setting: str) -> Any:
     """Return the value of a setting.
 
     Args:

@@ -15,19 +15,29 @@ import numpy as np
 import pycolmap
 
 from sfm_app.errors import BackendError, NumericalError, SfmError
-from sfm_app.numerical import FAILURES, Json, reason_of
+from sfm_app.numerical import FAILURES, Json, error_reason
 from sfm_app.progress import Progress
 
 __all__ = [
-    "backend", "check_written", "counted", "has_cuda", "interruptible", "left_running", "log_level", "patiently",
-    "plain", "pycolmap", "show_log", "versions",
+    "check_written",
+    "has_cuda",
+    "has_running_call",
+    "json_options",
+    "log_level",
+    "pycolmap",
+    "run_in_daemon_thread",
+    "run_interruptible",
+    "run_with_progress",
+    "show_log",
+    "translate_errors",
+    "versions",
 ]  # fmt: skip
 
 Result = TypeVar("Result")
 
-LEFT, POLL_S = "colmap-alone", 0.2
+THREAD_NAME, POLL_S = "colmap-alone", 0.2
 """Name of the threads that nothing waits for, and the interval at which they are polled."""
-ROOM = 1_000_000
+MIN_FREE_BYTES = 1_000_000
 """Free bytes that the disk must have: more than any program buffers before it writes."""
 
 zlib.crc32(b"")  # zlib is imported for its side effect
@@ -59,7 +69,7 @@ def versions() -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def backend(doing: str) -> Iterator[None]:
+def translate_errors(doing: str) -> Iterator[None]:
     """Turn COLMAP's exceptions into a BackendError that names the operation; our own errors pass through.
 
     Raises:
@@ -73,10 +83,10 @@ def backend(doing: str) -> Iterator[None]:
     except Exception as err:
         if not _is_ours(err):
             hint = "run again with -v to see what COLMAP says"
-            raise BackendError(f"COLMAP failed while {doing}: {reason_of(err)}", hint) from err
+            raise BackendError(f"COLMAP failed while {doing}: {error_reason(err)}", hint) from err
         if isinstance(err, FAILURES):
             hint = "this is a bug; please report it with OUT/log.txt"
-            raise NumericalError(f"the computation failed while {doing}: {reason_of(err)}", hint) from err
+            raise NumericalError(f"the computation failed while {doing}: {error_reason(err)}", hint) from err
         raise
 
 
@@ -91,7 +101,7 @@ def _is_ours(err: Exception) -> bool:
     where = str(frames[-1].f_globals.get("__name__", ""))
     if where.startswith(("sfm_app.colmap.", "pycolmap")):
         return False
-    called = len(frames) > 2  # the first frame is that of `backend`, the second that of the `with` block
+    called = len(frames) > 2  # the first frame is that of `translate_errors`, the second that of the `with` block
     return called and where.startswith(("sfm_app.", "numpy.", "scipy.", "cv2"))
 
 
@@ -104,13 +114,13 @@ def check_written(*files: Path) -> None:
     longest = max((file.stat().st_size for file in files), default=0)
     with tempfile.TemporaryFile(dir=files[0].parent) as probe:
         probe.seek(longest)
-        probe.write(bytes(ROOM))
+        probe.write(bytes(MIN_FREE_BYTES))
 
 
-def patiently(call: Callable[[], Result]) -> Result:
+def run_in_daemon_thread(call: Callable[[], Result]) -> Result:
     """Run a COLMAP call that cannot be stopped, so that Ctrl-C takes effect at once.
 
-    After Ctrl-C the call goes on in its daemon thread; see `left_running`.
+    After Ctrl-C the call goes on in its daemon thread; see `has_running_call`.
     """
     found: Future[Result] = Future()
 
@@ -120,7 +130,7 @@ def patiently(call: Callable[[], Result]) -> Result:
         except BaseException as err:
             found.set_exception(err)
 
-    threading.Thread(target=run, name=LEFT, daemon=True).start()
+    threading.Thread(target=run, name=THREAD_NAME, daemon=True).start()
     while True:
         with contextlib.suppress(NotYet):
             return found.result(timeout=POLL_S)
@@ -128,12 +138,12 @@ def patiently(call: Callable[[], Result]) -> Result:
             return found.result()
 
 
-def left_running() -> bool:
+def has_running_call() -> bool:
     """Return whether an abandoned COLMAP call is still running; the program must then exit without waiting for it."""
-    return any(thread.name == LEFT for thread in threading.enumerate())
+    return any(thread.name == THREAD_NAME for thread in threading.enumerate())
 
 
-def interruptible(call: Callable[[pycolmap.CancellationToken], None], poll: Callable[[], None]) -> None:
+def run_interruptible(call: Callable[[pycolmap.CancellationToken], None], poll: Callable[[], None]) -> None:
     """Run a long COLMAP call in a thread, so that Ctrl-C stops it.
 
     Args:
@@ -156,14 +166,14 @@ def interruptible(call: Callable[[pycolmap.CancellationToken], None], poll: Call
             raise
 
 
-def counted(
+def run_with_progress(
     call: Callable[[pycolmap.CancellationToken], None],
     done: Callable[[], int],
     label: str,
     total: int,
     progress: Progress,
 ) -> None:
-    """Run a long COLMAP call as `interruptible` does, with a progress bar.
+    """Run a long COLMAP call as `run_interruptible` does, with a progress bar.
 
     Args:
         call: ends early once its token is cancelled.
@@ -181,17 +191,17 @@ def counted(
 
     progress.start(label, total)
     try:
-        interruptible(call, poll)
+        run_interruptible(call, poll)
     finally:
         progress.finish()
 
 
-def plain(options: Mapping[object, object]) -> dict[str, Json]:
+def json_options(options: Mapping[object, object]) -> dict[str, Json]:
     """Return COLMAP's options as JSON values; the manifest records all of them."""
-    return {str(key): _plain(value) for key, value in options.items()}
+    return {str(key): _json_value(value) for key, value in options.items()}
 
 
-def _plain(value: object) -> Json:
+def _json_value(value: object) -> Json:
     if isinstance(value, dict):
-        return plain(value)
+        return json_options(value)
     return value if isinstance(value, bool | int | float | str) else str(value)

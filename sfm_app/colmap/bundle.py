@@ -8,17 +8,27 @@ from pathlib import Path
 import numpy as np
 
 from sfm_app.bundle_adjustment.lens_evidence import PARTS, LensEstimate, LensPriors, estimate
-from sfm_app.bundle_adjustment.normal_equations import FX, FY, POSE, Bundle, Reduced, cost, lost_points, moved, reduce
-from sfm_app.colmap.backend import backend, patiently, pycolmap
-from sfm_app.colmap.database import TWO_FOCALS, camera_params, opened
-from sfm_app.colmap.model import somewhere
+from sfm_app.bundle_adjustment.normal_equations import (
+    FX,
+    FY,
+    POSE,
+    Bundle,
+    ReducedSystem,
+    apply_step,
+    cost,
+    lost_points,
+    reduce,
+)
+from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread, translate_errors
+from sfm_app.colmap.database import TWO_FOCALS, camera_params, open_database
+from sfm_app.colmap.model import finite_mask
 from sfm_app.colmap.types import all_cameras, all_points
 from sfm_app.errors import NumericalError
-from sfm_app.numerical import FAILURES, finite_only, reason_of
+from sfm_app.numerical import FAILURES, error_reason, finite_entries
 
 logger = logging.getLogger("sfm_app")
 
-PHOTOS_TO_ASK = 5
+MIN_PHOTOS = 5
 """Photos of a camera below which only its focal and k1 are refined: with fewer, effects that the camera model leaves
 out (a lens, a zoom) change its parameters more than the noise does."""
 
@@ -28,21 +38,21 @@ LOSS_SCALE_PX = 0.5
 MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
 """COLMAP's own limits for a point: largest reprojection error, least angle between its rays."""
 
-ROUNDS, CHANGED, STEP = 6, 0.0005, 0.2
+ROUNDS, CHANGED_SHARE, STEP = 6, 0.0005, 0.2
 """Largest number of rounds. They end early when less than this share of the observations changes, and no camera
 parameter by more than this share of its standard deviation."""
 
-LEAST_LEFT = 0.1
+MIN_KEPT_SHARE = 0.1
 """Smallest share of the points that an adjustment must keep; one that drops more has diverged and is rejected. Chosen
 on no set; none of six that were run fell below it."""
 
-FAR = 1.0
+LONG_STEP = 1.0
 """Step of the cameras, in standard deviations, above which the linear step of poses and points is too inaccurate and
 COLMAP's solver refines them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Adjusted:
+class Adjustment:
     """The refined model, and the uncertainty of its cameras."""
 
     model: pycolmap.Reconstruction
@@ -50,7 +60,7 @@ class Adjusted:
     """Standard deviations by camera id, as in `CameraModel`."""
     determined: dict[int, tuple[str, ...]]
     """Parameters that the photos determine, by camera id, as in `CameraModel`."""
-    trouble: str = ""
+    failure: str = ""
     """Why the adjustment failed, empty where it did not; the model is then the given one, without deviations."""
     held: tuple[int, ...] = ()
     """Ids of cameras whose estimate diverged; they keep their parameters."""
@@ -58,7 +68,7 @@ class Adjusted:
     """Points that their rays did not determine when the adjustment began."""
 
 
-def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
+def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjustment:
     """Refine cameras, poses, points and tracks in turn; only camera parameters that the photos determine are freed.
 
     In each round, poses and points are eliminated, and the likelihood of the cameras is weighed against their priors.
@@ -75,7 +85,7 @@ def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
     model, points = pycolmap.Reconstruction(model), model.num_points3D()
     for camera in all_cameras(model):
         _generalize(camera)
-    drop_endless(model)
+    drop_infinite_points(model)
     graph = _correspondences(model, database)
     open_points = []
     for _ in range(ROUNDS):
@@ -84,21 +94,21 @@ def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
             raise NumericalError("a camera has no focal length")
         reduced = reduce(bundle, LOSS_SCALE_PX)
         open_points.append(reduced.open_points)
-        found = estimate(bundle.params, reduced, _usual_cameras(model, ids))
+        found = estimate(bundle.params, reduced, _lens_priors(model, ids))
         _write_bundle(model, ids, _best_step(bundle, reduced, found))
-        if found.step > FAR:
+        if found.step > LONG_STEP:
             solve(model)
         changed = _improve_tracks(model, graph)
-        if model.num_points3D() <= LEAST_LEFT * points:
+        if model.num_points3D() <= MIN_KEPT_SHARE * points:
             raise NumericalError(f"it left {model.num_points3D()} of {points} points")
-        if found.step < STEP and changed < CHANGED * len(bundle.x):
+        if found.step < STEP and changed < CHANGED_SHARE * len(bundle.x):
             break
     model.update_point_3d_errors()
     held = tuple(camera_id for camera_id, away in zip(ids, found.held, strict=True) if away)
-    return Adjusted(model, *_summary(ids, found), held=held, open_points=open_points[0])
+    return Adjustment(model, *_summary(ids, found), held=held, open_points=open_points[0])
 
 
-def adjusted_or_as_it_was(model: pycolmap.Reconstruction, database: Path) -> Adjusted:
+def adjust_or_keep(model: pycolmap.Reconstruction, database: Path) -> Adjustment:
     """Adjust a model; where that fails numerically, return the given model with the reason.
 
     Args:
@@ -108,17 +118,17 @@ def adjusted_or_as_it_was(model: pycolmap.Reconstruction, database: Path) -> Adj
         BackendError: COLMAP failed.
     """
     try:
-        with backend("adjusting the bundle"):
+        with translate_errors("adjusting the bundle"):
             return adjust(model, database)
     except FAILURES as err:
         logger.info("the last adjustment failed", exc_info=err)
-        nothing: dict[int, dict[str, float]] = {camera_id: {} for camera_id in used_cameras(model)}
-        return Adjusted(model, nothing, dict.fromkeys(nothing, ()), trouble=reason_of(err))
+        nothing: dict[int, dict[str, float]] = {camera_id: {} for camera_id in photos_per_camera(model)}
+        return Adjustment(model, nothing, dict.fromkeys(nothing, ()), failure=error_reason(err))
 
 
-def drop_endless(model: pycolmap.Reconstruction) -> None:
+def drop_infinite_points(model: pycolmap.Reconstruction) -> None:
     """Remove points at infinity, in place."""
-    for point_id in [key for key, point in all_points(model) if not somewhere(point.xyz)]:
+    for point_id in [key for key, point in all_points(model) if not finite_mask(point.xyz)]:
         model.delete_point3D(point_id)
 
 
@@ -134,10 +144,10 @@ def solve(model: pycolmap.Reconstruction) -> None:
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
-    for camera_id in used_cameras(model):
+    for camera_id in photos_per_camera(model):
         config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    patiently(pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve)
+    run_in_daemon_thread(pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve)
 
 
 def _improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
@@ -159,7 +169,7 @@ def _improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.Corresponden
 def read_bundle(model: pycolmap.Reconstruction) -> tuple[list[int], Bundle]:
     """Return the ids of the cameras in use, and the model as arrays."""
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
-    ids, points = sorted(used_cameras(model)), sorted(model.points3D)
+    ids, points = sorted(photos_per_camera(model)), sorted(model.points3D)
     rows = {point: row for row, point in enumerate(points)}
     seen = [image.get_observation_points2D() for image in images]
     poses = np.array([image.cam_from_world().matrix() for image in images])
@@ -175,18 +185,18 @@ def read_bundle(model: pycolmap.Reconstruction) -> tuple[list[int], Bundle]:
     )
 
 
-def _best_step(bundle: Bundle, reduced: Reduced, found: LensEstimate) -> Bundle:
+def _best_step(bundle: Bundle, reduced: ReducedSystem, found: LensEstimate) -> Bundle:
     """Return the bundle with the estimated cameras, and with poses and points moved if that does not raise the cost.
 
     A point that would move behind a camera stays: along an undetermined direction a linear step has no bound.
     """
     nowhere = np.zeros((len(bundle.R), POSE)), np.zeros_like(bundle.X)
-    poses, points = reduced.follow(found.params - bundle.params)
-    tried = [moved(bundle, found.params, *nowhere)]
+    poses, points = reduced.back_substitute(found.params - bundle.params)
+    tried = [apply_step(bundle, found.params, *nowhere)]
     if np.isfinite(poses).all():
         points[~np.isfinite(points).all(axis=1)] = 0.0
-        points[lost_points(moved(bundle, found.params, poses, points)) & ~lost_points(bundle)] = 0.0
-        tried.insert(0, moved(bundle, found.params, poses, points))
+        points[lost_points(apply_step(bundle, found.params, poses, points)) & ~lost_points(bundle)] = 0.0
+        tried.insert(0, apply_step(bundle, found.params, poses, points))
     return min(tried, key=lambda one: cost(one, LOSS_SCALE_PX))
 
 
@@ -201,16 +211,16 @@ def _write_bundle(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle
         model.points3D[point].xyz = xyz
 
 
-def _usual_cameras(model: pycolmap.Reconstruction, ids: list[int]) -> LensPriors:
+def _lens_priors(model: pycolmap.Reconstruction, ids: list[int]) -> LensPriors:
     """Return the priors of the cameras, before any evidence from the bundle."""
-    used = used_cameras(model)
+    used = photos_per_camera(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
-    many = np.array([used[camera_id] >= PHOTOS_TO_ASK for camera_id in ids])
+    many = np.array([used[camera_id] >= MIN_PHOTOS for camera_id in ids])
     asked = many[:, None] | np.array([part.name == "k1" for part in PARTS])
     return LensPriors(sizes / 2, sizes.max(axis=1), asked)
 
 
-def used_cameras(model: pycolmap.Reconstruction) -> Counter[int]:
+def photos_per_camera(model: pycolmap.Reconstruction) -> Counter[int]:
     """Return the number of posed photos of each camera, by its id."""
     return Counter(model.images[image_id].camera_id for image_id in sorted(model.reg_image_ids()))
 
@@ -227,14 +237,14 @@ def _correspondences(model: pycolmap.Reconstruction, database: Path) -> pycolmap
     options = pycolmap.DatabaseCacheOptions()
     options.load_all_images = True  # else photos that no pair in the database connects would be missing
     options.image_names = {model.images[image_id].name for image_id in model.reg_image_ids()}
-    with opened(database) as db:
+    with open_database(database) as db:
         return pycolmap.DatabaseCache.create(db, options).correspondence_graph
 
 
 def _summary(ids: list[int], found: LensEstimate) -> tuple[dict[int, dict[str, float]], dict[int, tuple[str, ...]]]:
     names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
     deviations = {
-        camera_id: finite_only(dict(zip(names, map(float, values), strict=True)))
+        camera_id: finite_entries(dict(zip(names, map(float, values), strict=True)))
         for camera_id, values in zip(ids, found.deviations, strict=True)
     }
     determined = {

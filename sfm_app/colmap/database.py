@@ -38,12 +38,12 @@ KINDS = {
 }
 """COLMAP's names for the kinds of relative poses."""
 
-SQUARE_WITHIN = 0.005
+SQUARE_TOLERANCE = 0.005
 """Largest |fy/fx - 1| of square pixels: calibrators give no more where the photos show no other aspect."""
 
 
 @contextlib.contextmanager
-def opened(path: Path) -> Iterator[pycolmap.Database]:
+def open_database(path: Path) -> Iterator[pycolmap.Database]:
     """Provide the database, and close it in any case."""
     database = pycolmap.Database.open(path)
     try:
@@ -67,7 +67,7 @@ def is_sound(path: Path) -> bool:
         return False
 
 
-MATCHES = (
+MATCH_QUERIES = (
     "SELECT sql FROM sqlite_master ORDER BY name",
     "SELECT image_id, name FROM images ORDER BY image_id",
     "SELECT image_id, rows, cols, data FROM keypoints ORDER BY image_id",
@@ -80,7 +80,7 @@ def digest_matches(path: Path) -> str:
     """Return the hash of photos, keypoints and matches."""
     found = hashlib.blake2b(digest_size=16)
     with contextlib.closing(sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True)) as connection:
-        for query in MATCHES:
+        for query in MATCH_QUERIES:
             for row in connection.execute(query):
                 for value in row:
                     found.update(value if isinstance(value, bytes) else repr(value).encode())
@@ -103,7 +103,7 @@ def create_database(path: Path, photos: PhotoSet) -> None:
         path: database file, created if it is missing.
         photos: usable photos, grouped by camera.
     """
-    with opened(path) as database:
+    with open_database(path) as database:
         for camera_id, members in enumerate(photos.groups.values(), start=1):
             size = members[0].width, members[0].height
             _write_camera(database, camera_id, Calibration(guessed_camera_matrix(size), *size, "guess", False))
@@ -121,7 +121,7 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
         photos: the photos that the database was made from.
     """
     by_name = {photo.name: photo for photo in photos.photos}
-    with opened(path) as database:
+    with open_database(path) as database:
         images, keypoints = {}, {}
         for entry in sorted(database.read_all_images(), key=lambda entry: entry.image_id):
             photo = by_name[entry.name]
@@ -138,18 +138,18 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
 
 def photo_names(path: Path) -> dict[int, str]:
     """Return the names of all photos by id."""
-    with opened(path) as database:
+    with open_database(path) as database:
         return {entry.image_id: entry.name for entry in sorted(database.read_all_images(), key=lambda e: e.image_id)}
 
 
-def unmatched(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
+def unmatched_pairs(path: Path, pairs: Sequence[PairId]) -> list[PairId]:
     """Return the pairs that have no entry of matches in the database, not even an empty one.
 
     Args:
         path: database file.
         pairs: ids, the smaller one first.
     """
-    with opened(path) as database:
+    with open_database(path) as database:
         return [pair for pair in pairs if not database.exists_matches(*pair)]
 
 
@@ -161,7 +161,7 @@ def write_keypoints(path: Path, photo: int, keypoints: NDArray[np.float32]) -> N
         photo: id.
         keypoints: (N, 2) pixels.
     """
-    with opened(path) as database:
+    with open_database(path) as database:
         _put_keypoints(database, photo, keypoints)
 
 
@@ -178,7 +178,7 @@ def write_matches(path: Path, pair: PairId, rows: NDArray[np.uint32]) -> None:
         pair: ids, the smaller one first.
         rows: (M, 2) keypoint indices.
     """
-    with opened(path) as database:
+    with open_database(path) as database:
         database.write_matches(*pair, np.ascontiguousarray(rows, np.uint32))
 
 
@@ -194,7 +194,7 @@ def write_match_graph(path: Path, matches: MatchGraph) -> None:
     remove_database(path)
     groups = dict.fromkeys(image.group for _, image in sorted(matches.images.items()))
     numbers = {group: number for number, group in enumerate(groups, start=1)}
-    with opened(path) as database:
+    with open_database(path) as database:
         for photo, known in sorted(matches.images.items()):
             camera_id, size = numbers[known.group], (known.width, known.height)
             if not database.exists_camera(camera_id):
@@ -210,7 +210,7 @@ def write_match_graph(path: Path, matches: MatchGraph) -> None:
 
 def read_features(path: Path) -> tuple[dict[int, NDArray[np.float64]], dict[PairId, NDArray[np.uint32]]]:
     """Return keypoints (N, 2) of every photo that has any, and the raw matches of pairs."""
-    with opened(path) as database:
+    with open_database(path) as database:
         found = {image.image_id: database.read_keypoints(image.image_id) for image in database.read_all_images()}
         pair_ids, rows = database.read_all_matches()
     keypoints = {photo: np.asarray(x, np.float64)[:, :2].copy() for photo, x in sorted(found.items()) if len(x)}
@@ -225,10 +225,10 @@ def write_pose_graph(path: Path, matches: MatchGraph, graph: PoseGraph) -> None:
         matches: raw matches, whose rows the inliers select.
         graph: relative poses.
     """
-    with opened(path) as database:
+    with open_database(path) as database:
         database.clear_two_view_geometries()
         for pair, pose in graph.poses.items():
-            database.write_two_view_geometry(*pair, _posed_geometry(pose, matches.matches[pair]))
+            database.write_two_view_geometry(*pair, _two_view_geometry(pose, matches.matches[pair]))
 
 
 def keep_raw_matches(path: Path, pairs: Collection[PairId]) -> None:
@@ -238,7 +238,7 @@ def keep_raw_matches(path: Path, pairs: Collection[PairId]) -> None:
         path: database file.
         pairs: pairs whose matches are kept.
     """
-    with opened(path) as database:
+    with open_database(path) as database:
         database.clear_two_view_geometries()
         for pair in {_pair(pair_id) for pair_id in database.read_all_matches()[0]}.difference(pairs):
             database.delete_matches(*pair)
@@ -253,9 +253,9 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
     Args:
         path, matches, intrinsics: database file; all photos; cameras, and the camera of each photo.
     """
-    used = {image.id: intrinsics.name_of(image) for image in matches.images.values()}
+    used = {image.id: intrinsics.camera_name(image) for image in matches.images.values()}
     ids = {name: number for number, name in enumerate(dict.fromkeys(used[key] for key in sorted(used)), start=1)}
-    with opened(path) as database:
+    with open_database(path) as database:
         database.clear_frames()
         database.clear_rigs()
         for name, camera_id in ids.items():
@@ -278,7 +278,7 @@ def _write_camera(database: pycolmap.Database, camera_id: int, calibration: Cali
         width=calibration.width,
         height=calibration.height,
         params=camera_params(calibration.K, name, calibration.radial),
-        has_prior_focal_length=calibration.estimated,
+        has_prior_focal_length=calibration.is_estimated,
     )
     if database.exists_camera(camera_id):
         database.update_camera(camera)
@@ -299,7 +299,7 @@ def _write_frame(database: pycolmap.Database, image: pycolmap.Image) -> None:
 def camera_model(calibration: Calibration) -> str:
     """Return COLMAP's name of the smallest camera model for a calibration."""
     K = calibration.K
-    square = "aspect" in calibration.held or abs(K[1, 1] / K[0, 0] - 1.0) < SQUARE_WITHIN
+    square = "aspect" in calibration.held or abs(K[1, 1] / K[0, 0] - 1.0) < SQUARE_TOLERANCE
     return SQUARE_PIXELS if square else TWO_FOCALS
 
 
@@ -322,7 +322,7 @@ def _pair(pair_id: int) -> PairId:
     return int(first), int(second)
 
 
-def _posed_geometry(pose: RelativePose, matches: NDArray[np.uint32]) -> pycolmap.TwoViewGeometry:
+def _two_view_geometry(pose: RelativePose, matches: NDArray[np.uint32]) -> pycolmap.TwoViewGeometry:
     geometry = pycolmap.TwoViewGeometry()
     geometry.config = pycolmap.TwoViewGeometryConfiguration.__members__[KINDS[pose.kind]]
     geometry.E = cross_matrix(pose.t) @ pose.R

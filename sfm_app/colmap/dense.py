@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import backend, check_written, pycolmap
+from sfm_app.colmap.backend import check_written, pycolmap, translate_errors
 from sfm_app.colmap.masks import used_pixels
-from sfm_app.colmap.processes.worker_process import UndistortTask, finished
+from sfm_app.colmap.processes.worker_process import UndistortTask, run_worker
 from sfm_app.colmap.types import all_images
 from sfm_app.hashing import digest_files, is_below
 from sfm_app.progress import Progress
@@ -45,12 +45,12 @@ def undistort(
         "max_side_px": max_side_px,
         "workers": workers,
     }
-    finished("sfm_app.colmap.processes.undistort_process", task, "undistorting photos", progress)
+    run_worker("sfm_app.colmap.processes.undistort_process", task, "undistorting photos", progress)
 
 
 def read_views(dense_dir: Path) -> list[View]:
     """Return the undistorted views with the sparse points that they observe, by name."""
-    with backend("reading the undistorted model"):
+    with translate_errors("reading the undistorted model"):
         model = pycolmap.Reconstruction(dense_dir / "sparse")
         images = sorted(all_images(model), key=lambda image: image.name)
         if not all(is_below(image.name) for image in images):
@@ -179,12 +179,15 @@ def write_maps(dense_dir: Path, view: View, maps: DepthMap) -> None:
     """
     # pycolmap takes (H, W, 3) but stores the bytes unchanged, while COLMAP keeps x, y and z in planes.
     planes = np.ascontiguousarray(maps.normals.transpose(2, 0, 1)).reshape(maps.normals.shape)
-    with backend(f"writing the normal map of {view.name}"), _whole(_map_path(dense_dir, NORMALS, view)) as path:
+    with (
+        translate_errors(f"writing the normal map of {view.name}"),
+        _atomic_path(_map_path(dense_dir, NORMALS, view)) as path,
+    ):
         pycolmap.NormalMap.from_array(planes).write(path)
     _write_depth_format(dense_dir, DEPTHS, view, maps.depth, "geometric")
 
 
-def hide_masked(dense_dir: Path, view: View) -> None:
+def mask_depths(dense_dir: Path, view: View) -> None:
     """Write MASKED into the confirmed depths of a view where the photo is masked, whichever method made them.
 
     Args:
@@ -226,7 +229,7 @@ def digest_maps(dense_dir: Path) -> str:
 
 
 def _read_depth_format(dense_dir: Path, folder: str, view: View, kind: Kind) -> NDArray[np.float32]:
-    with backend(f"reading the depth map of {view.name}"):
+    with translate_errors(f"reading the depth map of {view.name}"):
         stored = pycolmap.DepthMap()
         stored.read(_map_path(dense_dir, folder, view, kind))
     return np.array(stored.to_array(), np.float32)
@@ -235,7 +238,10 @@ def _read_depth_format(dense_dir: Path, folder: str, view: View, kind: Kind) -> 
 def _write_depth_format(dense_dir: Path, folder: str, view: View, values: NDArray[np.float32], kind: Kind) -> None:
     known = values[values > 0]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
-    with backend(f"writing the depth map of {view.name}"), _whole(_map_path(dense_dir, folder, view, kind)) as path:
+    with (
+        translate_errors(f"writing the depth map of {view.name}"),
+        _atomic_path(_map_path(dense_dir, folder, view, kind)) as path,
+    ):
         pycolmap.DepthMap.from_array(np.ascontiguousarray(values), low, high).write(path)
 
 
@@ -244,7 +250,7 @@ def _map_path(dense_dir: Path, folder: str, view: View, kind: Kind = "geometric"
 
 
 @contextmanager
-def _whole(target: Path) -> Iterator[Path]:
+def _atomic_path(target: Path) -> Iterator[Path]:
     """Provide a temporary path beside `target`, and rename it to `target` once everything is written."""
     target.parent.mkdir(parents=True, exist_ok=True)
     beside = target.with_name(f".{target.name}")

@@ -4,19 +4,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-from sfm_app.colmap.processes.worker_process import FeatureTask, SiftOption, relay, started
+from sfm_app.colmap.processes.worker_process import FeatureTask, SiftOption, relay, start_worker
 from sfm_app.numerical import Json
 from sfm_app.progress import Progress
 from sfm_app.settings import MatchSettings
 from sfm_app.types import PairId
 
-USUAL: Mapping[str, SiftOption] = MappingProxyType({})
+DEFAULT_SIFT: Mapping[str, SiftOption] = MappingProxyType({})
 """No options: COLMAP's defaults."""
 
 
 def find_and_match(
     database: Path, photo_dir: Path, names: Sequence[str], options: MatchSettings, workers: int, progress: Progress,
-    mask_dir: Path | None = None, sift: Mapping[str, SiftOption] = USUAL, pairs: Sequence[PairId] | None = None,
+    mask_dir: Path | None = None, sift: Mapping[str, SiftOption] = DEFAULT_SIFT, pairs: Sequence[PairId] | None = None,
 ) -> dict[str, Json]:  # fmt: skip
     """Find features of all photos and match every photo with every other; existing features and matches stay.
 
@@ -47,7 +47,7 @@ def find_and_match(
         "sift": dict(sift),
         "pairs": None if pairs is None else [list(pair) for pair in pairs],
     }
-    with started("sfm_app.colmap.processes.feature_process", task) as process:
+    with start_worker("sfm_app.colmap.processes.feature_process", task) as process:
         found = relay(process, progress)
         process.check("matching photos" if found else "finding features")
     return found

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sfm_app.colmap.backend import check_written, pycolmap
 from sfm_app.colmap.database import SQUARE_PIXELS
-from sfm_app.colmap.processes.worker_process import GlobalMappingTask, MappingTask, started
+from sfm_app.colmap.processes.worker_process import GlobalMappingTask, MappingTask, start_worker
 from sfm_app.colmap.types import Cancellation, all_cameras
 
 LOCAL_GAIN, GLOBAL_GAIN, GLOBAL_REFINEMENT = 1e-3, 1e-4, 1.3
@@ -43,14 +43,14 @@ def map_incrementally(
     start.write(scratch / "start")
     check_written(*(scratch / "start").iterdir())
     options = incremental_options(seed, known=known)
-    seek_lens = not known and all(_lens_to_be_found(camera) for camera in all_cameras(start))
+    seek_lens = not known and all(_has_unknown_lens(camera) for camera in all_cameras(start))
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = seek_lens
     models = pycolmap.incremental_mapping(
         database, photo_dir, scratch / "found", options,
         input_path=scratch / "start", next_image_callback=tick, cancellation_token=token,
     )  # fmt: skip
     shutil.rmtree(scratch, ignore_errors=True)
-    return largest(models)
+    return largest_model(models)
 
 
 def copy_database(database: Path, scratch: Path) -> None:
@@ -91,10 +91,10 @@ def map_globally(
         "seed": seed,
         "names": list(names),
     }
-    return _map_apart("sfm_app.colmap.processes.global_mapping", task, "mapping all photos at once", token)
+    return _map_in_process("sfm_app.colmap.processes.global_mapping", task, "mapping all photos at once", token)
 
 
-def map_as_colmap_does(
+def map_with_colmap_defaults(
     photo_dir: Path, scratch: Path, seed: int, token: Cancellation
 ) -> pycolmap.Reconstruction | None:
     """Verify the raw matches and map the photos by COLMAP's defaults, with the cameras of the database as first guess.
@@ -106,14 +106,14 @@ def map_as_colmap_does(
         scratch, seed, token: as in `map_globally`.
     """
     task: MappingTask = {"scratch": str(scratch), "photos": str(photo_dir), "seed": seed}
-    return _map_apart("sfm_app.colmap.processes.baseline_mapping", task, "mapping photos by its defaults", token)
+    return _map_in_process("sfm_app.colmap.processes.baseline_mapping", task, "mapping photos by its defaults", token)
 
 
-def _map_apart(module: str, task: MappingTask, doing: str, token: Cancellation) -> pycolmap.Reconstruction | None:
+def _map_in_process(module: str, task: MappingTask, doing: str, token: Cancellation) -> pycolmap.Reconstruction | None:
     scratch = Path(task["scratch"])
     try:
-        with started(module, task) as process:
-            while not process.ended(POLL_S):
+        with start_worker(module, task) as process:
+            while not process.has_ended(POLL_S):
                 if token.is_cancelled:
                     return None
             process.check(doing)
@@ -147,7 +147,7 @@ def incremental_options(seed: int, *, known: bool = False) -> pycolmap.Increment
     return options
 
 
-def _lens_to_be_found(camera: pycolmap.Camera) -> bool:
+def _has_unknown_lens(camera: pycolmap.Camera) -> bool:
     """Return whether mapping has to estimate the lens: a known one is held fixed until the last adjustment.
 
     On the first few photos even one distortion term varies more than the noise explains, and four diverge.
@@ -155,6 +155,6 @@ def _lens_to_be_found(camera: pycolmap.Camera) -> bool:
     return bool(camera.model.name == SQUARE_PIXELS and camera.params[camera.extra_params_idxs()[0]] == 0.0)
 
 
-def largest(models: Mapping[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
+def largest_model(models: Mapping[int, pycolmap.Reconstruction]) -> pycolmap.Reconstruction | None:
     """Return the model with most photos; None if there is no model."""
     return max(models.values(), key=lambda model: model.num_reg_images(), default=None)

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import backend, pycolmap
+from sfm_app.colmap.backend import pycolmap, translate_errors
 from sfm_app.colmap.types import all_images
-from sfm_app.photos import mask_place, read_used, save_used
+from sfm_app.photos import mask_path, read_mask, save_mask
 from sfm_app.stereo import View
 
 MASKS = "masks"
@@ -30,13 +30,13 @@ def mask_undistorter(model_dir: Path, mask_dir: Path, dense_dir: Path) -> Callab
         mask_dir: masks of the original photos.
         dense_dir: workspace with the undistorted photos.
     """
-    with backend("reading the model"):
+    with translate_errors("reading the model"):
         model = pycolmap.Reconstruction(model_dir)
         cameras = {image.name: model.cameras[image.camera_id] for image in all_images(model)}
 
     def undistort(view: View) -> None:
-        used = _undistorted(read_used(mask_dir, view.name), cameras[view.name], view)
-        save_used(dense_dir / MASKS, view.name, used)
+        used = _undistort_mask(read_mask(mask_dir, view.name), cameras[view.name], view)
+        save_mask(dense_dir / MASKS, view.name, used)
 
     return undistort
 
@@ -49,23 +49,23 @@ def used_pixels(dense_dir: Path, view: View) -> BoolImage | None:
         view: an undistorted photo.
     """
     place = dense_dir / MASKS
-    return read_used(place, view.name) if mask_place(place, view.name).exists() else None
+    return read_mask(place, view.name) if mask_path(place, view.name).exists() else None
 
 
-def _undistorted(used: BoolImage, camera: pycolmap.Camera, view: View) -> BoolImage:
+def _undistort_mask(used: BoolImage, camera: pycolmap.Camera, view: View) -> BoolImage:
     """Return (H, W) the mask of an undistorted photo: a pixel is used if all original pixels under it are."""
     x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
     rays = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ np.linalg.inv(view.K).T
-    with backend(f"undistorting the mask of {view.name}"):
+    with translate_errors(f"undistorting the mask of {view.name}"):
         at = np.floor(camera.img_from_cam(rays)).astype(np.int64).reshape(view.height, view.width, 2)
     col, row = at[..., 0], at[..., 1]
     height, width = used.shape
     inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
-    whole = _shrunk(used, ceil(max(camera.focal_length_x / view.K[0, 0], camera.focal_length_y / view.K[1, 1])))
-    return _shrunk(inside & whole[row.clip(0, height - 1), col.clip(0, width - 1)], REACH_PX)
+    whole = _erode(used, ceil(max(camera.focal_length_x / view.K[0, 0], camera.focal_length_y / view.K[1, 1])))
+    return _erode(inside & whole[row.clip(0, height - 1), col.clip(0, width - 1)], REACH_PX)
 
 
-def _shrunk(used: BoolImage, reach: int) -> BoolImage:
+def _erode(used: BoolImage, reach: int) -> BoolImage:
     """Return the mask without pixels that have an unused one within `reach` pixels."""
     square = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
     return np.asarray(cv2.erode(used.view(np.uint8), square)) > 0

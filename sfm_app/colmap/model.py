@@ -8,25 +8,25 @@ from typing import TypedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import backend, patiently, pycolmap
-from sfm_app.colmap.database import opened
+from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread, translate_errors
+from sfm_app.colmap.database import open_database
 from sfm_app.colmap.types import all_images, all_points
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.geometry.two_view_init import TwoViewSeed
-from sfm_app.numerical import finite_only
+from sfm_app.numerical import finite_entries
 from sfm_app.types import CameraModel, Frustum, Model, PairId, Scene, Surface
 
-CONFIRMED = 100
+MIN_CONFIRMED_POINTS = 100
 """Points seen by three or more photos from which on their bounding box limits the scene."""
 
 
-ENDLESS = 1e100
+MAX_COORDINATE = 1e100
 """Largest coordinate of a finite point: squares of much larger ones overflow."""
 
 
-def somewhere(xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
+def finite_mask(xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return (...) which points (..., 3) are finite, and near enough that their distances do not overflow."""
-    return np.asarray((np.abs(xyz) < ENDLESS).all(axis=-1))
+    return np.asarray((np.abs(xyz) < MAX_COORDINATE).all(axis=-1))
 
 
 def model_from_seed(
@@ -40,7 +40,7 @@ def model_from_seed(
         matches: (N, 2) keypoint indices, one row per point of the seed.
         seed: pose and points; only its usable points are added.
     """
-    with opened(database) as db:
+    with open_database(database) as db:
         cache = pycolmap.DatabaseCache.create(db, pycolmap.DatabaseCacheOptions())
     model = pycolmap.Reconstruction()
     model.load(cache)
@@ -87,12 +87,12 @@ def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray
     return found
 
 
-def photos_of(model: pycolmap.Reconstruction) -> list[int]:
+def posed_photo_ids(model: pycolmap.Reconstruction) -> list[int]:
     """Return the ids of the posed photos of a model, in order."""
     return [image.image_id for image in posed_images(model)]
 
 
-def cameras_of(model: pycolmap.Reconstruction) -> dict[int, tuple[NDArray[np.float64], float]]:
+def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, tuple[NDArray[np.float64], float]]:
     """Return K (3, 3) and the first radial term of the camera of every posed photo, by photo id."""
     found = {}
     for image in posed_images(model):
@@ -102,7 +102,7 @@ def cameras_of(model: pycolmap.Reconstruction) -> dict[int, tuple[NDArray[np.flo
     return found
 
 
-def color(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None:
+def color_points(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None:
     """Give every point the mean color of its pixels.
 
     Args:
@@ -110,10 +110,10 @@ def color(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None
         photo_dir: folder with the photos.
         workers: threads.
     """
-    patiently(lambda: model.extract_colors_for_all_images(photo_dir, num_threads=workers))
+    run_in_daemon_thread(lambda: model.extract_colors_for_all_images(photo_dir, num_threads=workers))
 
 
-def part_of(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.Reconstruction:
+def submodel(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.Reconstruction:
     """Return a copy of a model with only the given photos, and the points that at least two of them see.
 
     Args:
@@ -128,7 +128,7 @@ def part_of(model: pycolmap.Reconstruction, photos: Sequence[int]) -> pycolmap.R
     return part
 
 
-def both(
+def merge_models(
     database: Path, first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, similarity: Similarity
 ) -> pycolmap.Reconstruction:
     """Return one model with the photos and points of two models that share no photo.
@@ -143,7 +143,7 @@ def both(
     move(other, similarity)
     options = pycolmap.DatabaseCacheOptions()
     options.load_all_images = True  # also those that no pair in the database connects
-    with opened(database) as db:
+    with open_database(database) as db:
         cache = pycolmap.DatabaseCache.create(db, options)
     model = pycolmap.Reconstruction()
     model.load(cache)
@@ -161,7 +161,7 @@ def both(
     return model
 
 
-def places_of_keypoints(model: pycolmap.Reconstruction) -> dict[tuple[int, int], tuple[int, NDArray[np.float64]]]:
+def points_by_keypoint(model: pycolmap.Reconstruction) -> dict[tuple[int, int], tuple[int, NDArray[np.float64]]]:
     """Return the id and position (3,) of the 3D point of each keypoint in a track, by photo and keypoint index."""
     return {
         (element.image_id, element.point2D_idx): (key, np.asarray(point.xyz, np.float64))
@@ -175,7 +175,7 @@ def posed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     return sorted((image for image in all_images(model) if image.has_pose), key=lambda image: image.image_id)
 
 
-def posed_photos(model: pycolmap.Reconstruction) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.float64]]:
+def poses_and_points(model: pycolmap.Reconstruction) -> tuple[dict[int, NDArray[np.float64]], NDArray[np.float64]]:
     """Return (3, 4) cam_from_world of the posed photos by id, in order of ids, and the points (P, 3)."""
     poses = {image.image_id: np.asarray(image.cam_from_world().matrix(), np.float64) for image in posed_images(model)}
     points = np.array([model.points3D[key].xyz for key in sorted(model.points3D)]).reshape(-1, 3)
@@ -201,10 +201,10 @@ def seen_points(model: pycolmap.Reconstruction, most: int) -> SeenPoints:
         model: COLMAP's reconstruction, colored.
         most: largest number of points.
     """
-    keys = [key for key in sorted(model.points3D) if somewhere(model.points3D[key].xyz)]
+    keys = [key for key in sorted(model.points3D) if finite_mask(model.points3D[key].xyz)]
     chosen = np.sort(np.random.default_rng(0).permutation(len(keys))[:most])
     found = [model.points3D[keys[k]] for k in chosen]
-    seen: dict[int, list[int]] = {image_id: [] for image_id in photos_of(model)}
+    seen: dict[int, list[int]] = {image_id: [] for image_id in posed_photo_ids(model)}
     for number, point in enumerate(found):
         for image_id in {element.image_id for element in point.track.elements} & seen.keys():
             seen[image_id].append(number)
@@ -221,13 +221,13 @@ def sparse_model(model_dir: Path) -> Model:
     No third photo confirms points that only two photos see. Wrong ones among them lie far away and would shrink the
     scene to a dot in a viewer, so points outside the bounding box of the confirmed points are left out.
     """
-    with backend("reading the sparse model"):
+    with translate_errors("reading the sparse model"):
         model = pycolmap.Reconstruction(model_dir)
-    found = [model.points3D[key] for key in sorted(model.points3D) if somewhere(model.points3D[key].xyz)]
+    found = [model.points3D[key] for key in sorted(model.points3D) if finite_mask(model.points3D[key].xyz)]
     places = np.array([point.xyz for point in found], np.float64).reshape(-1, 3)
     colors = np.array([point.color for point in found], np.uint8).reshape(-1, 3)
     confirmed = np.array([point.track.length() > 2 for point in found], bool)
-    if np.count_nonzero(confirmed) >= CONFIRMED:
+    if np.count_nonzero(confirmed) >= MIN_CONFIRMED_POINTS:
         low, high = places[confirmed].min(axis=0), places[confirmed].max(axis=0)
         inside = ((places >= low) & (places <= high)).all(axis=1)
         places, colors = places[inside], colors[inside]
@@ -275,7 +275,7 @@ def move(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
     model.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.t))
 
 
-class Refined(TypedDict, total=False):
+class RefinedCamera(TypedDict, total=False):
     """Facts about a refined camera that COLMAP's model does not hold; as in `CameraModel`."""
 
     deviations: Mapping[str, float | None]
@@ -283,7 +283,7 @@ class Refined(TypedDict, total=False):
 
 
 def read_scene(
-    model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str], refined: Mapping[str, Refined]
+    model_dir: Path, names: Mapping[str, str], unregistered: Mapping[str, str], refined: Mapping[str, RefinedCamera]
 ) -> Scene:
     """Read a model on disk as the scene that later stages use.
 
@@ -307,8 +307,8 @@ def read_scene(
     )
 
 
-def _camera(camera: pycolmap.Camera, refined: Refined) -> CameraModel:
+def _camera(camera: pycolmap.Camera, refined: RefinedCamera) -> CameraModel:
     K = np.asarray(camera.calibration_matrix(), np.float64)
     params = tuple(float(value) for value in camera.params)
-    deviations, determined = finite_only(refined.get("deviations", {})), tuple(refined.get("determined", ()))
+    deviations, determined = finite_entries(refined.get("deviations", {})), tuple(refined.get("determined", ()))
     return CameraModel(camera.model.name, params, K, camera.width, camera.height, deviations, determined)

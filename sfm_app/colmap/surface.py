@@ -6,12 +6,12 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import backend
-from sfm_app.colmap.processes.worker_process import FuseTask, PoissonTask, SimplifyTask, finished
+from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.processes.worker_process import FuseTask, PoissonTask, SimplifyTask, run_worker
 from sfm_app.types import Surface
 
 FUSED = "fused.ply"
-FULL_DEPTH = 5
+MIN_DEPTH = 5
 """Smallest depth of Poisson's octree: with less, small surfaces become too coarse."""
 
 
@@ -39,19 +39,19 @@ def fuse(
         "box": box.tolist(),
         "cache_gb": cache_gb,
     }
-    finished("sfm_app.colmap.processes.surface_process", task, "fusing depth maps")
+    run_worker("sfm_app.colmap.processes.surface_process", task, "fusing depth maps")
     target.with_name(f"{target.name}.vis").unlink(missing_ok=True)  # which photos see which point; not used
 
 
 def read_fused(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Read fused points (N, 3) and their unit normals (N, 3), which point to the photos that see them."""
-    with backend("reading the fused points"):
+    with translate_errors("reading the fused points"):
         vertex = trimesh.load(folder / FUSED).metadata["_ply_raw"]["vertex"]["data"]
         points, normals = (np.stack([vertex[c] for c in names], axis=1) for names in ("xyz", ("nx", "ny", "nz")))
     return points.astype(np.float64), normals.astype(np.float64)
 
 
-def poisson(folder: Path, depth: int) -> Surface:
+def poisson_surface(folder: Path, depth: int) -> Surface:
     """Return Poisson's closed surface (Kazhdan and Hoppe, ACM TOG 2013) through the fused points, with their colors.
 
     Args:
@@ -64,9 +64,9 @@ def poisson(folder: Path, depth: int) -> Surface:
         "do": "poisson",
         "points": str(folder / FUSED),
         "target": str(path),
-        "depth": max(depth, FULL_DEPTH),
+        "depth": max(depth, MIN_DEPTH),
     }
-    finished("sfm_app.colmap.processes.surface_process", task, "finding the surface")
+    run_worker("sfm_app.colmap.processes.surface_process", task, "finding the surface")
     surface = _read(path)
     path.unlink()
     return surface
@@ -92,7 +92,7 @@ def simplify(surface: Surface, share: float, max_error: float, scratch: Path) ->
         "share": share,
         "max_error": max_error,
     }
-    finished("sfm_app.colmap.processes.surface_process", task, "simplifying the surface")
+    run_worker("sfm_app.colmap.processes.surface_process", task, "simplifying the surface")
     simple = _read(found)
     given.unlink()
     found.unlink()

@@ -8,13 +8,19 @@ from dataclasses import dataclass, field
 from itertools import dropwhile
 
 from sfm_app.colmap.backend import check_written
-from sfm_app.engine.run_log import logged, peak_memory_mb
+from sfm_app.engine.run_log import log_to_file, peak_memory_mb
 from sfm_app.engine.stage import Product, Products, Stage
-from sfm_app.engine.staleness import OTHER_PHOTOS, fingerprint_of, made_with, manifest_head, why_again
+from sfm_app.engine.staleness import (
+    PHOTOS_CHANGED,
+    manifest_head,
+    rerun_reason,
+    settings_and_versions,
+    stage_fingerprint,
+)
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
 from sfm_app.photos import Source
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.cost_estimate import plan_within
+from sfm_app.runtime.cost_estimate import choose_plan
 from sfm_app.runtime.manifest import StageRecord
 from sfm_app.types import PhotoSet
 
@@ -27,19 +33,19 @@ class Pipeline:
 
     photos: Stage[PhotoSet]
     """The first stage, which reads the user's photos or video."""
-    later: tuple[Stage[object], ...]
+    later_stages: tuple[Stage[object], ...]
 
     @property
     def stages(self) -> tuple[Stage[object], ...]:
         """All stages, in order."""
-        return (self.photos, *self.later)
+        return (self.photos, *self.later_stages)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of all stages."""
         return tuple(stage.name for stage in self.stages)
 
-    def until(self, last: str) -> tuple[Stage[object], ...]:
+    def stages_until(self, last: str) -> tuple[Stage[object], ...]:
         """Return the stages up to and including the one of this name."""
         return self.stages[: self.names.index(last) + 1]
 
@@ -61,19 +67,19 @@ class Pipeline:
         for name in filter(None, (first, last)):
             if name not in self.names:
                 raise ConfigError(f"no stage is named '{name}'", hint=f"stages: {', '.join(self.names)}")
-        stages = self.until(last or self.names[-1])
+        stages = self.stages_until(last or self.names[-1])
         run.workspace.create()
-        with run.workspace.held(), logged(run):
+        with run.workspace.hold_lock(), log_to_file(run):
             run.workspace.manifest.check_format()
             for _ in self.stages:
                 try:
-                    return _Execution(self, source, run, first).through(stages, wanted)
+                    return _Execution(self, source, run, first).execute(stages, wanted)
                 except DamagedProductError as err:
                     logger.info("%s", err, exc_info=err)
                     run.progress.stage(err.stage, "damaged: done again")
                     self.forget(err.stage, run)
                     first = ""
-            return _Execution(self, source, run, first).through(stages, wanted)
+            return _Execution(self, source, run, first).execute(stages, wanted)
 
     def forget(self, name: str, run: RunContext) -> None:
         """Remove a stage and all later ones from the manifest; the photos stage alone, as no other needs its files.
@@ -102,36 +108,36 @@ class _Execution:
     def __post_init__(self) -> None:
         self.products = Products(self.run, self.source)
 
-    def through(self, stages: Sequence[Stage[object]], wanted: Sequence[Stage[object]]) -> Products:
+    def execute(self, stages: Sequence[Stage[object]], wanted: Sequence[Stage[object]]) -> Products:
         """Run these stages where they are not up to date, and load the wanted products."""
         photos, later = self.pipeline.photos, stages[1:]
-        again = self.why(photos, (self.source.fingerprint,))
-        self.do(photos, again, self.run)
+        again = self.stage_rerun_reason(photos, (self.source.fingerprint,))
+        self.run_stage(photos, again, self.run)
         # later stages do not depend on changes to other files in the folder
-        inputs = {photos.name: self.source.content(self.products[photos])}
+        inputs = {photos.name: self.source.content_hash(self.products[photos])}
         reasons: dict[str, str | None] = {}
         for stage in later:
-            reasons[stage.name] = self.why(stage, [inputs[taken.name] for taken in stage.takes])
+            reasons[stage.name] = self.stage_rerun_reason(stage, [inputs[taken.name] for taken in stage.takes])
             inputs[stage.name] = self.fingerprints[stage.name]
         redone = photos.name if self.first == photos.name else ""
         ahead = list(dropwhile(lambda name: not redone and reasons[name] is None, reasons))
-        with _planned(self.products[photos], ahead, self.run) as run:
+        with _limit_workers(self.products[photos], ahead, self.run) as run:
             for stage in later:
                 again = reasons[stage.name]
-                self.do(stage, f"after {redone}" if redone and again in (None, OTHER_PHOTOS) else again, run)
+                self.run_stage(stage, f"after {redone}" if redone and again in (None, PHOTOS_CHANGED) else again, run)
                 redone = redone if again is None else stage.name
         for stage in wanted:
             if stage in stages:
                 self.products[stage]
         return self.products
 
-    def why(self, stage: Stage[object], inputs: Sequence[str]) -> str | None:
+    def stage_rerun_reason(self, stage: Stage[object], inputs: Sequence[str]) -> str | None:
         """Return why a stage has to run, None if it is up to date; keep the fingerprint of what it depends on."""
-        self.fingerprints[stage.name] = fingerprint_of(stage, inputs, self.run)
-        again = why_again(stage, self.fingerprints[stage.name], self.run)
+        self.fingerprints[stage.name] = stage_fingerprint(stage, inputs, self.run)
+        again = rerun_reason(stage, self.fingerprints[stage.name], self.run)
         return "as asked" if again is None and stage.name == self.first else again
 
-    def do(self, stage: Stage[Product], again: str | None, run: RunContext) -> None:
+    def run_stage(self, stage: Stage[Product], again: str | None, run: RunContext) -> None:
         """Run a stage and enter it in the manifest, unless it is up to date (`again` is None)."""
         if again is None:
             run.progress.stage(stage.name, "up to date")
@@ -139,36 +145,36 @@ class _Execution:
         self.pipeline.forget(stage.name, run)
         run.progress.stage(stage.name, f"again: {again}" if again else "")
         logger.info("%s begins%s", stage.name, f" again: {again}" if again else "")
-        run = run.for_stage(self.fingerprints[stage.name])
+        run = run.with_fingerprint(self.fingerprints[stage.name])
         start = time.perf_counter()
-        product = self.made(stage, run)
+        product = self.make_product(stage, run)
         seconds = round(time.perf_counter() - start, 2)
         place = run.workspace
         record = StageRecord(
             run.fingerprint, seconds, run.statistics, place.manifest.sizes(stage.files), peak_memory_mb(),
-            made_with(stage, run), stage.digest(place),
+            settings_and_versions(stage, run), stage.digest(place),
         )  # fmt: skip
         place.manifest.finish(stage.name, record, manifest_head(run))
         logger.info("%s took %.2f s", stage.name, seconds)
         run.progress.stage_done(seconds)
         self.products.keep(stage, product)
 
-    def made(self, stage: Stage[Product], run: RunContext) -> Product:
+    def make_product(self, stage: Stage[Product], run: RunContext) -> Product:
         """Return the product of a stage, if its photos and the output folder stayed the same meanwhile."""
         photos = self.pipeline.photos
         try:
             product = stage.make(self.products, run)
             used = product if isinstance(product, PhotoSet) else self.products[photos]
-            disturbed(self.source, used, run)
+            check_undisturbed(self.source, used, run)
         except Exception as err:
             logger.info("%s stopped: %s; counted so far: %s", stage.name, err, run.statistics)
-            disturbed(self.source, None if stage is photos else self.products[photos], run, by=err)
+            check_undisturbed(self.source, None if stage is photos else self.products[photos], run, by=err)
             raise
         return product
 
 
 @contextmanager
-def _planned(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> Iterator[RunContext]:
+def _limit_workers(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> Iterator[RunContext]:
     """Say what these stages will cost, and provide a run with as many workers as the memory allows.
 
     Raises:
@@ -177,7 +183,7 @@ def _planned(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> Iterato
     if not ahead:
         yield run
         return
-    plan = plan_within(photos.photos, run.settings, run.workers, run.memory_mb, ahead)
+    plan = choose_plan(photos.photos, run.settings, run.workers, run.memory_mb, ahead)
     if run.settings.max_memory_gb and plan.peak_mb(ahead) > run.memory_mb:
         raise ConfigError(
             f"{plan.photos} photos need about {plan.peak_mb(ahead) / 1000:.1f} GB, more than --max-memory",
@@ -189,7 +195,7 @@ def _planned(photos: PhotoSet, ahead: Sequence[str], run: RunContext) -> Iterato
         yield narrower
 
 
-def disturbed(source: Source, photos: PhotoSet | None, run: RunContext, by: Exception | None = None) -> None:
+def check_undisturbed(source: Source, photos: PhotoSet | None, run: RunContext, by: Exception | None = None) -> None:
     """Check that nothing outside the program has interfered with a stage.
 
     Args:
@@ -202,7 +208,7 @@ def disturbed(source: Source, photos: PhotoSet | None, run: RunContext, by: Exce
         InputError: the output folder or a photo is missing or was replaced.
         OSError: the disk is full, which COLMAP does not always report.
     """
-    run.workspace.check_there()
+    run.workspace.check_exists()
     try:
         if photos is not None:
             source.check(photos)

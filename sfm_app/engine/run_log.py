@@ -19,7 +19,7 @@ class LogFile(logging.FileHandler):
 
 
 @contextmanager
-def logged(run: RunContext) -> Iterator[None]:
+def log_to_file(run: RunContext) -> Iterator[None]:
     """Keep a log in the output folder, with the traceback of whatever ends the run."""
     handler = LogFile(run.workspace.log, encoding="utf-8", errors="backslashreplace")
     handler.setFormatter(logging.Formatter("%(asctime)s %(message)s"))

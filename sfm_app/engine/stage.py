@@ -58,7 +58,7 @@ class Products:
             DamagedProductError: the files of the stage have changed, or cannot be read.
         """
         if stage.name not in self._known:
-            with undamaged(stage, self._run):
+            with check_undamaged(stage, self._run):
                 self._known[stage.name] = stage.load(self, self._run)
         return cast(Product, self._known[stage.name])
 
@@ -73,7 +73,7 @@ class Products:
 
 
 @contextmanager
-def undamaged(stage: Stage[object], run: RunContext) -> Iterator[None]:
+def check_undamaged(stage: Stage[object], run: RunContext) -> Iterator[None]:
     """Check the files of a stage, and turn errors of reading them in the block into one that names the stage.
 
     Args:
@@ -93,9 +93,9 @@ def undamaged(stage: Stage[object], run: RunContext) -> Iterator[None]:
     except Exception as err:  # decoders of damaged bytes raise all kinds of errors
         what = f"is not complete: {err.filename} is gone" if isinstance(err, FileNotFoundError) else "is damaged"
         left = f"what stage `{stage.name}` left in {run.workspace.root} {what}"
-        raise DamagedProductError(left, go_on_hint(run), stage.name) from err
+        raise DamagedProductError(left, resume_hint(run), stage.name) from err
 
 
-def go_on_hint(run: RunContext) -> str:
+def resume_hint(run: RunContext) -> str:
     """Say which command resumes a run."""
     return f"`sfm-app run PHOTOS -o {run.workspace.root}` resumes where it stopped"

@@ -12,12 +12,12 @@ from sfm_app.hashing import fingerprint
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.manifest import PROGRAM
 
-OTHER_PHOTOS = "the photos have changed"
-CHANGES = 3
+PHOTOS_CHANGED = "the photos have changed"
+CHANGES_SHOWN = 3
 """Most changes that are named."""
 
 
-def fingerprint_of(stage: Stage[object], inputs: Sequence[str], run: RunContext) -> str:
+def stage_fingerprint(stage: Stage[object], inputs: Sequence[str], run: RunContext) -> str:
     """Return a hash of everything that a stage's result depends on: its inputs, its settings, the versions.
 
     Args:
@@ -25,10 +25,10 @@ def fingerprint_of(stage: Stage[object], inputs: Sequence[str], run: RunContext)
         inputs: fingerprints of its inputs.
         run: has the settings.
     """
-    return fingerprint(stage.name, made_with(stage, run), inputs)
+    return fingerprint(stage.name, settings_and_versions(stage, run), inputs)
 
 
-def made_with(stage: Stage[object], run: RunContext) -> dict[str, Any]:
+def settings_and_versions(stage: Stage[object], run: RunContext) -> dict[str, Any]:
     """Return the values of a stage's settings, and the versions of the program and its libraries.
 
     Args:
@@ -36,10 +36,10 @@ def made_with(stage: Stage[object], run: RunContext) -> dict[str, Any]:
         run: has the settings.
     """
     values = run.settings.model_dump()
-    return {"settings": {key: value_of(values, key) for key in stage.settings}, "versions": versions()}
+    return {"settings": {key: nested_value(values, key) for key in stage.settings}, "versions": versions()}
 
 
-def why_again(stage: Stage[object], inputs: str, run: RunContext) -> str | None:
+def rerun_reason(stage: Stage[object], inputs: str, run: RunContext) -> str | None:
     """Return why a stage has to run; empty if it never ran, None if it is up to date.
 
     Args:
@@ -54,9 +54,9 @@ def why_again(stage: Stage[object], inputs: str, run: RunContext) -> str | None:
         return f"{changed[0]} is gone or was changed"
     if record.fingerprint == inputs:
         return None
-    found = list(_changes(record.made_with, json.loads(json.dumps(made_with(stage, run)))))
-    more = f" and {len(found) - CHANGES} more" if len(found) > CHANGES else ""
-    return f"{', '.join(found[:CHANGES])}{more}" if found else OTHER_PHOTOS
+    found = list(_changes(record.made_with, json.loads(json.dumps(settings_and_versions(stage, run)))))
+    more = f" and {len(found) - CHANGES_SHOWN} more" if len(found) > CHANGES_SHOWN else ""
+    return f"{', '.join(found[:CHANGES_SHOWN])}{more}" if found else PHOTOS_CHANGED
 
 
 def _changes(before: Any, now: Mapping[str, Any], name: str = "") -> Iterator[str]:
@@ -70,7 +70,7 @@ def _changes(before: Any, now: Mapping[str, Any], name: str = "") -> Iterator[st
             yield f"{inner} {json.dumps(old)} -> {json.dumps(new)}"
 
 
-def value_of(values: Any, key: str) -> Any:
+def nested_value(values: Any, key: str) -> Any:
     """Return a value of nested mappings by its dotted name; None where there is none.
 
     Args:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_app.estimation.diagnosis import of_fits, votes
+from sfm_app.estimation.diagnosis import diagnose_fits, inliers_by_degeneracy
 from sfm_app.runtime.context import RunContext
 from sfm_app.selfcal import CalibratedCamera, calibrate_photo_set, pair_weights
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
@@ -27,29 +27,29 @@ def find_intrinsics(
     cameras = calibrate_photo_set(
         pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split
     )
-    cameras = [of_whole_photo(camera, matches.images[camera.photos[0]]) for camera in cameras]
+    cameras = [to_whole_photo(camera, matches.images[camera.photos[0]]) for camera in cameras]
     intrinsics = Intrinsics(
-        cameras={camera.name: explained(camera, views) for camera in cameras},
+        cameras={camera.name: explain_failure(camera, views) for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
         photos={image.id: image.name for image in matches.images.values()},
     )
     return intrinsics, cameras
 
 
-def explained(camera: CalibratedCamera, views: ViewGraph) -> Calibration:
+def explain_failure(camera: CalibratedCamera, views: ViewGraph) -> Calibration:
     """Return the calibration; if it failed because most pairs are degenerate, its reason says how.
 
     Args:
         camera: the calibrated camera with its photos.
         views: fundamental matrices.
     """
-    kinds = votes(views, camera.photos)
+    kinds = inliers_by_degeneracy(views, camera.photos)
     if camera.found.identifiable or not kinds.total() > kinds[""]:
         return camera.found
-    return replace(camera.found, reason=f"{camera.found.reason}; {of_fits(views, camera.photos).message}")
+    return replace(camera.found, reason=f"{camera.found.reason}; {diagnose_fits(views, camera.photos).message}")
 
 
-def of_whole_photo(camera: CalibratedCamera, image: MatchedImage) -> CalibratedCamera:
+def to_whole_photo(camera: CalibratedCamera, image: MatchedImage) -> CalibratedCamera:
     """Return a camera in pixels of the whole photo, if it was found in those of the picture inside the bars.
 
     Args:
@@ -81,12 +81,12 @@ def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGrap
         inliers=tuple(np.hstack(matches.points(pair))[fit.inliers] for pair, fit in fits.items()),
         sizes={image.id: image.shown[2:] if image.shown else (image.width, image.height) for image in images},
         groups={image.id: image.group for image in images},
-        focal_hints_px={image.id: image.exif_focal_px * _share_shown(image) for image in images if image.exif_focal_px},
-        brought_to={image.id: (image.width, image.height) for image in images if image.shown},
-    ).moved({photo: frame[:2] for photo, frame in shown.items()})
+        focal_hints_px={image.id: image.exif_focal_px * _shown_share(image) for image in images if image.exif_focal_px},
+        padded_sizes={image.id: (image.width, image.height) for image in images if image.shown},
+    ).with_origins({photo: frame[:2] for photo, frame in shown.items()})
 
 
-def _share_shown(image: MatchedImage) -> float:
+def _shown_share(image: MatchedImage) -> float:
     """Return the longer side of the picture inside its bars over that of the photo, to which EXIF's focal refers."""
     return max(image.shown[2:]) / max(image.width, image.height) if image.shown else 1.0
 
@@ -99,4 +99,4 @@ def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGra
         matches: keypoints and raw matches.
         views: fundamental matrices.
     """
-    return photo_pairs(images, matches, views).among([image.id for image in images])
+    return photo_pairs(images, matches, views).to_camera_pairs([image.id for image in images])

@@ -13,7 +13,7 @@ from typing import Literal
 from sfm_app.errors import ReconstructionError
 from sfm_app.posegraph.groups import connected_groups
 from sfm_app.ransac.degeneracy.watermark import ONLY_A_LOGO, SAME_PHOTO
-from sfm_app.ransac.estimate import matches_off_plane
+from sfm_app.ransac.estimate import count_matches_off_plane
 from sfm_app.settings import EpipolarSettings, MatchSettings
 from sfm_app.types import MatchedImage, MatchGraph, PairId, ViewGraph
 
@@ -22,7 +22,7 @@ Cause = Literal["copies", "texture", "logo", "nothing", "rotation", "planar", "c
 NOTHING_MATCHED = ViewGraph({}, {})
 """The view graph where no two photos have matches."""
 
-BARE_PX = 800.0
+MAX_PX_PER_FEATURE = 800.0
 """Pixels per feature above which a photo shows hardly any texture: sensor noise on a white wall gives one per 1100 or
 more, the poorest real photos one per 630."""
 PLANE_PHOTOS = 3
@@ -71,7 +71,7 @@ class Diagnosis:
         return ReconstructionError(f"{self.message}; {details}" if details else self.message, hint=self.hint)
 
 
-def why_no_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) -> Diagnosis:
+def diagnose_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) -> Diagnosis:
     """Return the main reason why photos cannot be reconstructed.
 
     Args:
@@ -79,7 +79,7 @@ def why_no_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) 
         options: settings with which features were found.
     """
     if views.fits:
-        return of_fits(views, set(matches.images))
+        return diagnose_fits(views, set(matches.images))
     photos = len(matches.images)
     reasons = Counter(views.reasons)
     twins = {pair for pair, rejected in views.rejected.items() if rejected.reason == SAME_PHOTO}
@@ -88,7 +88,7 @@ def why_no_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) 
     counts = sorted(len(points) for points in matches.keypoints.values())
     features = f"{counts[0]} to {counts[-1]} features per photo" if counts[-1] else "no features"
     bare = [_pixels_per_feature(image, matches, options.max_image_size_px) for image in matches.images.values()]
-    if median(bare) > BARE_PX:
+    if median(bare) > MAX_PX_PER_FEATURE:
         return Diagnosis("texture", f"hardly any texture: {features}, and no two photos have enough in common")
     if reasons[ONLY_A_LOGO] > reasons.total() / 2:
         return Diagnosis("logo", f"the photos have {ONLY_A_LOGO}")
@@ -96,7 +96,7 @@ def why_no_scene(matches: MatchGraph, views: ViewGraph, options: MatchSettings) 
     return Diagnosis("nothing", f"the {photos} photos show nothing in common ({features}; {seen})")
 
 
-def why_no_depth(
+def diagnose_depth(
     matches: MatchGraph, views: ViewGraph, photos: Collection[int], options: EpipolarSettings, *, camera_known: bool
 ) -> Diagnosis | None:
     """Return why a model of these photos could be wrong with small residuals; None where they have parallax.
@@ -111,19 +111,19 @@ def why_no_depth(
         options: settings with which the pairs were fitted.
         camera_known: whether K rests on more than a guess.
     """
-    kinds = votes(views, photos)
+    kinds = inliers_by_degeneracy(views, photos)
     if kinds[""] >= kinds.total() / 2:
         return None
-    firm = [pair for pair in _among(views, photos) if not views.fits[pair].degeneracy]
-    parallax = sum(matches_off_plane(*matches.points(pair), views.fits[pair].F, options) for pair in firm)
+    firm = [pair for pair in _pairs_among(views, photos) if not views.fits[pair].degeneracy]
+    parallax = sum(count_matches_off_plane(*matches.points(pair), views.fits[pair].F, options) for pair in firm)
     if parallax >= LEAST_PARALLAX * kinds.total():
         return None
-    found = of_fits(views, photos)
+    found = diagnose_fits(views, photos)
     by_plane = found.cause == "planar" and (camera_known or len(photos) >= PLANE_PHOTOS)
     return None if by_plane else found
 
 
-def votes(views: ViewGraph, photos: Collection[int]) -> Counter[str]:
+def inliers_by_degeneracy(views: ViewGraph, photos: Collection[int]) -> Counter[str]:
     """Count the inliers of the pairs among some photos by degeneracy, "" where F is determined.
 
     Args:
@@ -131,19 +131,19 @@ def votes(views: ViewGraph, photos: Collection[int]) -> Counter[str]:
         photos: ids; both photos of a pair have to be among them.
     """
     found: Counter[str] = Counter()
-    for pair in _among(views, photos):
+    for pair in _pairs_among(views, photos):
         found[views.fits[pair].degeneracy] += views.fits[pair].inlier_count
     return found
 
 
-def of_fits(views: ViewGraph, photos: Collection[int]) -> Diagnosis:
+def diagnose_fits(views: ViewGraph, photos: Collection[int]) -> Diagnosis:
     """Return why the fitted pairs among some photos do not allow a reconstruction.
 
     Args:
         views: fundamental matrices.
         photos: ids; at least one pair among them has a fit.
     """
-    kinds, pairs = votes(views, photos), _among(views, photos)
+    kinds, pairs = inliers_by_degeneracy(views, photos), _pairs_among(views, photos)
     if kinds[""] < kinds.total() / 2:
         kind = max(DEGENERATE, key=lambda kind: kinds[kind])
         named = sum(views.fits[pair].degeneracy == kind for pair in pairs)
@@ -154,7 +154,7 @@ def of_fits(views: ViewGraph, photos: Collection[int]) -> Diagnosis:
     return Diagnosis("unclear", f"no pair of photos grows into a model ({seen})")
 
 
-def _among(views: ViewGraph, photos: Collection[int]) -> list[PairId]:
+def _pairs_among(views: ViewGraph, photos: Collection[int]) -> list[PairId]:
     members = set(photos)
     return [pair for pair in views.fits if members.issuperset(pair)]
 

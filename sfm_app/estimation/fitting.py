@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.atomic_io import can_go_on, mark_unfinished, replacing
+from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.hashing import load_arrays
 from sfm_app.numerical import FAILURES
 from sfm_app.progress import track
-from sfm_app.ransac.degeneracy.watermark import covers, find_stationary, fit_moving
+from sfm_app.ransac.degeneracy.watermark import find_stationary, fit_moving, is_widespread
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.settings import Settings
@@ -22,14 +22,14 @@ logger = logging.getLogger("sfm_app")
 BoolArray = NDArray[np.bool_]
 
 
-Fitted = tuple[EpipolarFit | Rejected, int]
+PairFit = tuple[EpipolarFit | Rejected, int]
 """Fit of a pair, or why there is none, and how many of its matches are stationary in the picture."""
 
 PART = 64
 """Pairs per file; after a killed run, finished pairs outside complete files are fitted again."""
 
 
-def fit_pairs(matches: MatchGraph, pairs: Sequence[PairId], run: RunContext) -> dict[PairId, Fitted]:
+def fit_pairs(matches: MatchGraph, pairs: Sequence[PairId], run: RunContext) -> dict[PairId, PairFit]:
     """Fit every pair on its own, seeded by the run's seed and its ids.
 
     Finished pairs stay in `view_graph_parts` until the caller removes it, so that a killed run can resume.
@@ -42,26 +42,26 @@ def fit_pairs(matches: MatchGraph, pairs: Sequence[PairId], run: RunContext) -> 
     options = run.settings.epipolar
     estimator = run.plugins.estimator(options.estimator)
 
-    def fit_pair(pair: PairId) -> Fitted:
+    def fit_pair(pair: PairId) -> PairFit:
         try:
-            return fit_numbers(pair)
+            return fit_or_raise(pair)
         except FAILURES as err:
             logger.info("pair %s could not be fitted", pair, exc_info=err)
             return Rejected("the computation failed"), 0
 
-    def fit_numbers(pair: PairId) -> Fitted:
+    def fit_or_raise(pair: PairId) -> PairFit:
         seed = int(np.random.SeedSequence([run.seed, *pair]).generate_state(1)[0])
         points, still = matches.points(pair), _stationary_matches(matches, pair, run.settings)
         if not still.any():
             return estimator.fit(*points, options, seed), 0
         image = matches.images[pair[0]]
-        wide = covers(points[0][still], matches.keypoints[image.id], (image.width, image.height))
+        wide = is_widespread(points[0][still], matches.keypoints[image.id], (image.width, image.height))
         return fit_moving(estimator.fit, points, still, wide, options, seed), int(np.count_nonzero(still))
 
-    return _in_parts(fit_pair, pairs, run)
+    return _fit_all(fit_pair, pairs, run)
 
 
-def graph_of(found: Mapping[PairId, Fitted]) -> ViewGraph:
+def to_view_graph(found: Mapping[PairId, PairFit]) -> ViewGraph:
     """Return the view graph of fitted and rejected pairs."""
     return ViewGraph(
         fits={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, EpipolarFit)},
@@ -69,17 +69,17 @@ def graph_of(found: Mapping[PairId, Fitted]) -> ViewGraph:
     )
 
 
-def _in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run: RunContext) -> dict[PairId, Fitted]:
+def _fit_all(fit_pair: Callable[[PairId], PairFit], pairs: Sequence[PairId], run: RunContext) -> dict[PairId, PairFit]:
     """Return the result of `fit_pair` for every pair, in order; each part is written to a file once it is complete."""
     folder = run.workspace.view_graph_parts
-    if not can_go_on(folder, run.fingerprint):
+    if not resume_or_clear(folder, run.fingerprint):
         mark_unfinished(folder, run.fingerprint)
     parts = {folder / f"{first:06d}.npz": pairs[first : first + PART] for first in range(0, len(pairs), PART)}
     known = {path: read_part(path, part) for path, part in parts.items()}
     left = [pair for path, part in parts.items() if known[path] is None for pair in part]
     fitted = ordered_map(run.executor, fit_pair, left, ahead=2 * run.workers)
     results = track(run.progress, fitted, "epipolar geometry", len(left))
-    found: dict[PairId, Fitted] = {}
+    found: dict[PairId, PairFit] = {}
     for path, part in parts.items():
         done = known[path]
         if done is None:
@@ -89,7 +89,7 @@ def _in_parts(fit_pair: Callable[[PairId], Fitted], pairs: Sequence[PairId], run
     return {pair: found[pair] for pair in pairs}
 
 
-def write_part(path: Path, found: Mapping[PairId, Fitted]) -> None:
+def write_part(path: Path, found: Mapping[PairId, PairFit]) -> None:
     """Write the results of some pairs.
 
     Args:
@@ -97,11 +97,11 @@ def write_part(path: Path, found: Mapping[PairId, Fitted]) -> None:
         found: fit, or why there is none, and number of stationary matches.
     """
     still = np.array([[*pair, count] for pair, (_, count) in found.items()], np.int64)
-    with replacing(path) as beside:
-        np.savez(beside, allow_pickle=False, still=still, **graph_of(found).to_arrays())
+    with replace_atomically(path) as beside:
+        np.savez(beside, allow_pickle=False, still=still, **to_view_graph(found).to_arrays())
 
 
-def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, Fitted] | None:
+def read_part(path: Path, pairs: Sequence[PairId]) -> dict[PairId, PairFit] | None:
     """Return what `write_part` has written; None where the file is missing or damaged.
 
     Args:

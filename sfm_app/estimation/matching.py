@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.atomic_io import can_go_on, mark_unfinished, replacing
-from sfm_app.colmap.backend import backend
-from sfm_app.colmap.database import photo_names, unmatched, write_keypoints, write_matches
+from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
+from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.database import photo_names, unmatched_pairs, write_keypoints, write_matches
 from sfm_app.colmap.features import find_and_match
 from sfm_app.errors import InputError, PluginError
 from sfm_app.hashing import load_arrays
 from sfm_app.numerical import Json
-from sfm_app.photos.masks import read_used
+from sfm_app.photos.masks import read_mask
 from sfm_app.plugins import FeatureMethod
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
@@ -28,7 +28,7 @@ from sfm_app.runtime.parallel import ordered_map
 from sfm_app.settings import MatchSettings
 from sfm_app.types import Features, PairId
 
-KEPT = 32
+PHOTOS_IN_MEMORY = 32
 """Photos whose features are held in memory while pairs are matched; the others are read again."""
 
 
@@ -59,15 +59,15 @@ def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId
             place.database, place.photos, list(names.values()), options, run.workers, run.progress, run.mask_dir,
             method.sift, pairs,
         )  # fmt: skip
-    if not can_go_on(place.feature_parts, run.fingerprint):
+    if not resume_or_clear(place.feature_parts, run.fingerprint):
         mark_unfinished(place.feature_parts, run.fingerprint)
     _find(method, names, run)
-    _match(method, pairs_of(names) if pairs is None else pairs, run)
+    _match(method, all_pairs(names) if pairs is None else pairs, run)
     shutil.rmtree(place.feature_parts)
     return {"method": method.name, "max_image_size": options.max_image_size_px, "max_features": options.max_features}
 
 
-def pairs_of(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
+def all_pairs(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
     """Return all pairs of photos, the smaller id first."""
     ids = sorted(photos)
     return [(first, second) for place, first in enumerate(ids) for second in ids[place + 1 :]]
@@ -77,25 +77,25 @@ def _find(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> N
     """Write the features of every photo to its part, and its keypoints to the database."""
 
     def find(photo: int) -> tuple[int, NDArray[np.float32]]:
-        features, to_photo, size = _found_in(method, names[photo], run)
+        features, to_photo, size = _find_in_photo(method, names[photo], run)
         keypoints = features.keypoints * to_photo
         if run.mask_dir is not None:
-            used = read_used(run.mask_dir, names[photo])
+            used = read_mask(run.mask_dir, names[photo])
             column, row = np.clip(keypoints.astype(np.int64), 0, np.array(size) - 1).T
             seen = used[row, column]
             features, keypoints = features.only(seen), keypoints[seen]
         rows = np.arange(min(len(keypoints), run.settings.matching.max_features))
-        _save(features.only(rows), part_of(photo, run))
+        _save(features.only(rows), part_path(photo, run))
         return photo, keypoints[rows].astype(np.float32)
 
-    left = [photo for photo in names if not part_of(photo, run).exists()]
+    left = [photo for photo in names if not part_path(photo, run).exists()]
     found = track(run.progress, ordered_map(run.executor, find, left, run.workers), "features", len(left))
     for photo, keypoints in found:
-        with backend("writing keypoints"):
+        with translate_errors("writing keypoints"):
             write_keypoints(run.workspace.database, photo, keypoints)
 
 
-def _found_in(
+def _find_in_photo(
     method: FeatureMethod, name: str, run: RunContext
 ) -> tuple[Features, NDArray[np.float64], tuple[int, int]]:
     """Return the features of one photo, the scale (x, y) that takes them to its pixels, and its size."""
@@ -108,7 +108,7 @@ def _found_in(
         size = max(1, round(width * scale)), max(1, round(height * scale))
         pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
     shown = pixels.shape[1], pixels.shape[0]
-    features = _checked(method, name, shown, _asked(method, name, pixels, options))
+    features = _check_features(method, name, shown, _call_find(method, name, pixels, options))
     return features, np.array([width / shown[0], height / shown[1]]), (width, height)
 
 
@@ -125,49 +125,47 @@ def read_pixels(path: Path) -> NDArray[np.uint8]:
     return np.asarray(read, np.uint8)
 
 
-def _asked(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
+def _call_find(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
     if method.find is None:
         raise PluginError(f"the features '{method.name}' have no `find`")
     try:
         return method.find(pixels, options)
     except Exception as err:  # a plug-in may raise anything
-        raise _broken(method, f"failed on {name}: {type(err).__name__}: {err}") from err
+        raise _method_error(method, f"failed on {name}: {type(err).__name__}: {err}") from err
 
 
-def _checked(method: FeatureMethod, name: str, size: tuple[int, int], features: Features) -> Features:
+def _check_features(method: FeatureMethod, name: str, size: tuple[int, int], features: Features) -> Features:
     """Return the features after checking that they are valid for a picture of this size."""
     points = np.asarray(features.keypoints, np.float64)
     if features.size != size:
-        raise _broken(method, f"report a size of {features.size} for {name} instead of {size}")
+        raise _method_error(method, f"report a size of {features.size} for {name} instead of {size}")
     if points.ndim != 2 or points.shape[1] != 2 or any(len(value) != len(points) for value in features.values.values()):
-        raise _broken(method, f"have arrays of other shapes than (N, 2) and (N, ...) for {name}")
+        raise _method_error(method, f"have arrays of other shapes than (N, 2) and (N, ...) for {name}")
     if not (np.isfinite(points).all() and (points >= 0).all() and (points <= size).all()):
-        raise _broken(method, f"put keypoints outside of {name}")
+        raise _method_error(method, f"put keypoints outside of {name}")
     return Features(size, points, features.values)
 
 
-def _broken(method: FeatureMethod, what: str) -> PluginError:
+def _method_error(method: FeatureMethod, what: str) -> PluginError:
     return PluginError(f"the features '{method.name}' {what}", hint="choose others with --features")
 
 
 def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> None:
     """Write the matches of every pair into the database, also where there are none."""
     options, database = run.settings.matching, run.workspace.database
-    read = lru_cache(max(KEPT, 2 * run.workers))(lambda photo: _load(part_of(photo, run)))
+    read = lru_cache(max(PHOTOS_IN_MEMORY, 2 * run.workers))(lambda photo: _load(part_path(photo, run)))
 
     def match(pair: PairId) -> tuple[PairId, NDArray[np.uint32]]:
-        return pair, _matches_between(method, (read(pair[0]), read(pair[1])), options)
+        return pair, _match_pair(method, (read(pair[0]), read(pair[1])), options)
 
-    left = unmatched(database, pairs)
+    left = unmatched_pairs(database, pairs)
     found = track(run.progress, ordered_map(run.executor, match, left, 2 * run.workers), "matching", len(left))
     for pair, rows in found:
-        with backend("writing matches"):
+        with translate_errors("writing matches"):
             write_matches(database, pair, rows)
 
 
-def _matches_between(
-    method: FeatureMethod, pair: tuple[Features, Features], options: MatchSettings
-) -> NDArray[np.uint32]:
+def _match_pair(method: FeatureMethod, pair: tuple[Features, Features], options: MatchSettings) -> NDArray[np.uint32]:
     """Return (M, 2) rows of the matching features of two photos; none where a photo has no features."""
     if method.match is None:
         raise PluginError(f"the features '{method.name}' have no `match`")
@@ -176,18 +174,18 @@ def _matches_between(
     try:
         rows = np.asarray(method.match(*pair, options))
     except Exception as err:  # a plug-in may raise anything
-        raise _broken(method, f"failed to match two photos: {type(err).__name__}: {err}") from err
+        raise _method_error(method, f"failed to match two photos: {type(err).__name__}: {err}") from err
     if rows.size == 0:
         return np.zeros((0, 2), np.uint32)
     if rows.ndim != 2 or rows.shape[1] != 2 or not np.issubdtype(rows.dtype, np.integer):
-        raise _broken(method, "have matches that are not (M, 2) integers")
+        raise _method_error(method, "have matches that are not (M, 2) integers")
     for column, features in zip(rows.T, pair, strict=True):
         if column.min() < 0 or column.max() >= len(features) or len(np.unique(column)) < len(column):
-            raise _broken(method, "match a keypoint twice, or one that does not exist")
+            raise _method_error(method, "match a keypoint twice, or one that does not exist")
     return rows.astype(np.uint32)
 
 
-def part_of(photo: int, run: RunContext) -> Path:
+def part_path(photo: int, run: RunContext) -> Path:
     """Return the file that keeps the features of a photo until all are matched.
 
     Args:
@@ -199,7 +197,7 @@ def part_of(photo: int, run: RunContext) -> Path:
 
 def _save(features: Features, path: Path) -> None:
     values = {f"value_{name}": value for name, value in features.values.items()}
-    with replacing(path) as beside:
+    with replace_atomically(path) as beside:
         np.savez(beside, allow_pickle=False, size=np.array(features.size), keypoints=features.keypoints, **values)
 
 

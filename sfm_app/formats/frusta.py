@@ -37,10 +37,10 @@ def camera_dots(model: Model) -> tuple[FloatArray, NDArray[np.uint8]]:
     corners, lines = camera_lines(model)
     along = np.linspace(0.0, 1.0, DOTS, endpoint=False)[:, None, None]
     dots = ((1 - along) * corners[lines[:, 0]] + along * corners[lines[:, 1]]).reshape(-1, 3)
-    return dots, painted(len(dots))
+    return dots, camera_colors(len(dots))
 
 
-def painted(count: int) -> NDArray[np.uint8]:
+def camera_colors(count: int) -> NDArray[np.uint8]:
     """Return the color of cameras for `count` vertices."""
     return np.tile(np.array(CAMERA_COLOR, np.uint8), (count, 1))
 
@@ -83,9 +83,9 @@ def scene_size(points: FloatArray) -> float:
     return float(np.linalg.norm(high - low))
 
 
-def with_cameras(model: Model) -> tuple[FloatArray, NDArray[np.uint8], IndexArray]:
+def append_cameras(model: Model) -> tuple[FloatArray, NDArray[np.uint8], IndexArray]:
     """Return the vertices of a model followed by the corners of its cameras, their colors, and the cameras' lines."""
     corners, lines = camera_lines(model)
     surface = model.surface
-    colors = np.concatenate([surface.colors, painted(len(corners))])
+    colors = np.concatenate([surface.colors, camera_colors(len(corners))])
     return np.concatenate([surface.vertices, corners]), colors, lines + len(surface.vertices)

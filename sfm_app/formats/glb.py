@@ -43,18 +43,18 @@ def write_glb(model: Model, name: str) -> Mapping[str, bytes]:
     check(model)
     glb = Glb(extensionsUsed=[UNLIT], scene=0)
     if model.texture is not None and len(model.surface.faces):
-        primitives = textured(glb, model, model.texture)
+        primitives = add_textured_primitives(glb, model, model.texture)
     else:
-        primitives = [colored(glb, model)]
+        primitives = [add_colored_primitive(glb, model)]
     mesh = glb.add("meshes", {"name": name, "primitives": primitives})
     nodes = [glb.add("nodes", {"name": name, "mesh": mesh})]
     if model.cameras:
-        nodes += cameras(glb, model)
+        nodes += add_cameras(glb, model)
     glb.add("scenes", {"name": name, "nodes": nodes})
     return {f"{name}.glb": glb.to_bytes()}
 
 
-def textured(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
+def add_textured_primitives(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
     """Add an image and a material per page, and return one primitive for each.
 
     Args:
@@ -73,13 +73,13 @@ def textured(glb: Glb, model: Model, texture: Texture) -> list[dict[str, Any]]:
             {"name": f"page {page}", "mimeType": "image/jpeg", "bufferView": glb.add_view(jpeg(texture.pages[page]))},
         )
         picture = glb.add("textures", {"sampler": sampler, "source": image})
-        material = photographed(glb, f"page {page}", baseColorTexture={"index": picture})
-        attributes = shape(glb, surface.vertices[old], normals[old]) | {"TEXCOORD_0": glb.add_vertices(uv)}
+        material = add_unlit_material(glb, f"page {page}", baseColorTexture={"index": picture})
+        attributes = add_geometry(glb, surface.vertices[old], normals[old]) | {"TEXCOORD_0": glb.add_vertices(uv)}
         primitives.append({"attributes": attributes, "indices": glb.add_indices(faces, len(old)), "material": material})
     return primitives
 
 
-def colored(glb: Glb, model: Model) -> dict[str, Any]:
+def add_colored_primitive(glb: Glb, model: Model) -> dict[str, Any]:
     """Add triangles, or points if there are none, with a color per vertex, and return the primitive.
 
     Args:
@@ -88,14 +88,16 @@ def colored(glb: Glb, model: Model) -> dict[str, Any]:
     """
     surface = model.surface
     normals = unit_normals(surface) if len(surface.faces) else None
-    attributes = shape(glb, surface.vertices, normals) | {"COLOR_0": glb.add_vertices(linear_colors(surface.colors))}
-    primitive = {"attributes": attributes, "material": photographed(glb, "colors")}
+    attributes = add_geometry(glb, surface.vertices, normals) | {
+        "COLOR_0": glb.add_vertices(linear_colors(surface.colors))
+    }
+    primitive = {"attributes": attributes, "material": add_unlit_material(glb, "colors")}
     if normals is None:
         return primitive | {"mode": POINTS}
     return primitive | {"indices": glb.add_indices(surface.faces, len(surface.vertices))}
 
 
-def shape(glb: Glb, vertices: NDArray[np.float64], normals: NDArray[np.float64] | None) -> dict[str, int]:
+def add_geometry(glb: Glb, vertices: NDArray[np.float64], normals: NDArray[np.float64] | None) -> dict[str, int]:
     """Add positions and normals of vertices; return the accessors' numbers by attribute.
 
     Args:
@@ -107,7 +109,7 @@ def shape(glb: Glb, vertices: NDArray[np.float64], normals: NDArray[np.float64] 
     return attributes if normals is None else attributes | {"NORMAL": glb.add_vertices(normals.astype(np.float32))}
 
 
-def photographed(glb: Glb, name: str, **base: Any) -> int:
+def add_unlit_material(glb: Glb, name: str, **base: Any) -> int:
     """Add an unlit material and return its number.
 
     It is double-sided, because both sides of an open surface can be seen.
@@ -139,7 +141,7 @@ def linear_colors(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
     return light.astype(np.float32)[colors]
 
 
-def cameras(glb: Glb, model: Model) -> list[int]:
+def add_cameras(glb: Glb, model: Model) -> list[int]:
     """Add the cameras twice: as lines that every viewer draws, and as glTF cameras to look through.
 
     Args:
@@ -151,9 +153,9 @@ def cameras(glb: Glb, model: Model) -> list[int]:
     """
     corners, lines = camera_lines(model)
     color = linear_colors(np.array(CAMERA_COLOR, np.uint8))
-    material = photographed(glb, "cameras", baseColorFactor=[*(round(float(part), 6) for part in color), 1.0])
+    material = add_unlit_material(glb, "cameras", baseColorFactor=[*(round(float(part), 6) for part in color), 1.0])
     primitive = {
-        "attributes": shape(glb, corners, None),
+        "attributes": add_geometry(glb, corners, None),
         "indices": glb.add_indices(lines, len(corners)),
         "mode": LINES,
         "material": material,

@@ -7,14 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.formats.checks import check, unit_normals
-from sfm_app.formats.frusta import scene_size, with_cameras
+from sfm_app.formats.frusta import append_cameras, scene_size
 from sfm_app.formats.pages import jpeg, pages_in_use
 from sfm_app.types import Model, Texture
 
 DIGITS = 6
 """Significant digits of coordinates relative to the model's size, and decimals of texture coordinates."""
 
-ACROSS = 10 ** (DIGITS + 1)
+KEY_BASE = 10 ** (DIGITS + 1)
 """Base that combines both texture coordinates, as integers, into one key."""
 
 CHUNK = 50_000
@@ -45,7 +45,7 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
     if texture is None:
         if len(model.surface.faces):
             corners = model.surface.faces + 1
-            text.append(rows("f %d//%d %d//%d %d//%d\n", np.repeat(corners, 2, axis=1)))
+            text.append(format_rows("f %d//%d %d//%d %d//%d\n", np.repeat(corners, 2, axis=1)))
     else:
         used = pages_in_use(texture.page)
         pages = {page: f"{beside}_{page}.jpg" for page in used}
@@ -58,34 +58,34 @@ def write_obj(model: Model, name: str) -> Mapping[str, bytes]:
 
 def _vertex_lines(model: Model, *, with_colors: bool) -> Iterator[str]:
     """Yield vertices, with colors after the coordinates as in MeshLab, normals, points and lines."""
-    vertices, colors, lines = with_cameras(model)
+    vertices, colors, lines = append_cameras(model)
     place = f"%.{decimals(model.surface.vertices)}f"
     values, form = [vertices], [place] * 3
     if with_colors:
         values, form = [vertices, colors / 255.0], [*form, *["%.4f"] * 3]
-    yield rows(f"v {' '.join(form)}\n", np.concatenate(values, axis=1))
+    yield format_rows(f"v {' '.join(form)}\n", np.concatenate(values, axis=1))
     if len(model.surface.faces):
-        yield rows("vn %.4f %.4f %.4f\n", unit_normals(model.surface))
+        yield format_rows("vn %.4f %.4f %.4f\n", unit_normals(model.surface))
     else:
-        yield rows("p %d\n", 1 + np.arange(len(model.surface.vertices))[:, None])
-    yield rows("l %d %d\n", lines + 1)
+        yield format_rows("p %d\n", 1 + np.arange(len(model.surface.vertices))[:, None])
+    yield format_rows("l %d %d\n", lines + 1)
 
 
 def _textured_lines(model: Model, texture: Texture, pages: list[int]) -> Iterator[str]:
     """Yield texture coordinates, each once, and the triangles page by page."""
     steps = np.round(10**DIGITS * texture.uv.reshape(-1, 2).astype(np.float64)).astype(np.int64)
     steps[:, 1] = 10**DIGITS - steps[:, 1]  # 0 is at the bottom in OBJ
-    keys, numbers = np.unique(steps @ np.array([ACROSS, 1]), return_inverse=True)
-    places = np.column_stack(np.divmod(keys, ACROSS)) / 10**DIGITS
-    yield rows(f"vt %.{DIGITS}f %.{DIGITS}f\n", places)
+    keys, numbers = np.unique(steps @ np.array([KEY_BASE, 1]), return_inverse=True)
+    places = np.column_stack(np.divmod(keys, KEY_BASE)) / 10**DIGITS
+    yield format_rows(f"vt %.{DIGITS}f %.{DIGITS}f\n", places)
     corners = np.repeat(model.surface.faces + 1, 3, axis=1)
     corners[:, 1::3] = numbers.reshape(-1, 3) + 1
     for page in pages:
         yield f"usemtl page_{page}\n"
-        yield rows("f %d/%d/%d %d/%d/%d %d/%d/%d\n", corners[texture.page == page])
+        yield format_rows("f %d/%d/%d %d/%d/%d %d/%d/%d\n", corners[texture.page == page])
 
 
-def rows(form: str, values: NDArray[np.generic]) -> str:
+def format_rows(form: str, values: NDArray[np.generic]) -> str:
     """Return the rows of an array (N, C) as text; formatting many at once is ten times faster than one by one.
 
     Args:

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 
 Trial = TypeVar("Trial")
 
-MORE, LESS = 10.0, 0.1
+INCREASE, DECREASE = 10.0, 0.1
 """Factors of the damping after a rejected and after an accepted step. The usual ones (Marquardt 1963)."""
 
 
@@ -38,6 +38,6 @@ def damped_step(
     while damping < limits.most:
         trial = attempt(damping)
         if trial is not None:
-            return trial, max(LESS * damping, limits.least)
-        damping *= MORE
+            return trial, max(DECREASE * damping, limits.least)
+        damping *= INCREASE
     return None, damping

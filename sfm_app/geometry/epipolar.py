@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 
 
-def homogeneous(x: ArrayLike) -> FloatArray:
+def to_homogeneous(x: ArrayLike) -> FloatArray:
     """Return (N, 2) points as (N, 3) with a last coordinate of 1; ValueError for any other shape."""
     points = np.asarray(x, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2:
@@ -27,7 +27,7 @@ def homogeneous_pair(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArr
     Raises:
         ValueError: other shapes, or rows that do not pair up.
     """
-    h1, h2 = homogeneous(x1), homogeneous(x2)
+    h1, h2 = to_homogeneous(x1), to_homogeneous(x2)
     if len(h1) != len(h2):
         raise ValueError(f"x1 and x2 must pair up, got {len(h1)} and {len(h2)} points")
     return h1, h2
@@ -39,7 +39,7 @@ def hartley_normalization(x: ArrayLike) -> FloatArray:
     Raises:
         ValueError: no points, or all of them coincide.
     """
-    points = homogeneous(x)[:, :2]
+    points = to_homogeneous(x)[:, :2]
     if not len(points):
         raise ValueError("no points to normalize")
     center = points.mean(axis=0)
@@ -74,7 +74,7 @@ def eight_point(x1: ArrayLike, x2: ArrayLike, weights: ArrayLike | None = None) 
         design *= np.sqrt(np.asarray(weights, dtype=np.float64))[:, None]
     # all of V is wanted, but not all of U, which is as large as the number of matches squared
     F = np.linalg.svd(design, full_matrices=len(design) < 9)[2][8].reshape(3, 3)
-    return unit_norm(T2.T @ nearest_rank_two(F) @ T1)
+    return to_unit_norm(T2.T @ nearest_rank_two(F) @ T1)
 
 
 def nearest_rank_two(F: ArrayLike) -> FloatArray:
@@ -84,7 +84,7 @@ def nearest_rank_two(F: ArrayLike) -> FloatArray:
     return rank_two
 
 
-def unit_norm(F: ArrayLike) -> FloatArray:
+def to_unit_norm(F: ArrayLike) -> FloatArray:
     """Return F with Frobenius norm 1 and its entry of largest magnitude positive.
 
     Raises:
@@ -120,7 +120,7 @@ def canonical_cameras(F: ArrayLike) -> tuple[FloatArray, FloatArray]:
     Raises:
         ValueError: F is zero or not finite.
     """
-    F = unit_norm(F)
+    F = to_unit_norm(F)
     e1, e2 = epipoles(F)
     s = np.linalg.svd(F, compute_uv=False)
     M = cross_matrix(e2) @ F + np.outer(e2, np.sqrt(s[0] * s[1]) * e1)
@@ -146,4 +146,4 @@ def fundamental_from_pose(K1: ArrayLike, K2: ArrayLike, R: ArrayLike, t: ArrayLi
         ValueError: t is zero: without a baseline there is no epipolar geometry.
     """
     K1, K2, R = (np.asarray(m, dtype=np.float64) for m in (K1, K2, R))
-    return unit_norm(np.linalg.inv(K2).T @ cross_matrix(t) @ R @ np.linalg.inv(K1))
+    return to_unit_norm(np.linalg.inv(K2).T @ cross_matrix(t) @ R @ np.linalg.inv(K1))

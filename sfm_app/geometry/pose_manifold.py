@@ -7,12 +7,12 @@ from sfm_app.jit import kernel
 
 FloatArray = NDArray[np.float64]
 
-POSE = 5
+POSE_DOF = 5
 """Parameters of a relative pose: three of rotation, two of direction. Counted."""
 
 
 @kernel
-def essential(pose: FloatArray, E: FloatArray) -> None:
+def write_essential(pose: FloatArray, E: FloatArray) -> None:
     """Write the essential matrix [t]x R of a pose.
 
     Args:
@@ -27,7 +27,7 @@ def essential(pose: FloatArray, E: FloatArray) -> None:
 
 
 @kernel
-def moved(pose: FloatArray, step: FloatArray) -> FloatArray:
+def retract(pose: FloatArray, step: FloatArray) -> FloatArray:
     """Return the pose (12,) after a step: R turned by exp([w]x), t moved in its tangent plane.
 
     Args:

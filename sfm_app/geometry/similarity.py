@@ -31,7 +31,7 @@ class Similarity:
         """Apply the similarity to points (N, 3)."""
         return np.asarray(self.scale * points @ self.R.T + self.t)
 
-    def after(self, first: "Similarity") -> "Similarity":
+    def compose(self, first: "Similarity") -> "Similarity":
         """Return the similarity that applies `first`, then this one."""
         return Similarity(self.scale * first.scale, self.R @ first.R, self.scale * self.R @ first.t + self.t)
 
@@ -72,7 +72,7 @@ def robust_similarity(a: FloatArray, b: FloatArray) -> Similarity:
     triples = _triples(count)
     best, residual = np.inf, np.zeros(count)
     for triple in triples:
-        if _on_a_line(a[triple]) or _on_a_line(b[triple]):
+        if _is_collinear(a[triple]) or _is_collinear(b[triple]):
             continue
         distance = np.linalg.norm(umeyama(a[triple], b[triple])(a) - b, axis=1)
         # 3 of the points fit by construction, so the score is the residual one rank above the median
@@ -94,6 +94,6 @@ def _triples(count: int) -> NDArray[np.intp]:
     return rng.permutation(triples)[:MAX_TRIPLES] if len(triples) > MAX_TRIPLES else triples
 
 
-def _on_a_line(points: FloatArray) -> bool:
+def _is_collinear(points: FloatArray) -> bool:
     s = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return bool(s[1] <= 1e-6 * s[0])

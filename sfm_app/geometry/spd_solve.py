@@ -9,18 +9,18 @@ FloatArray = NDArray[np.float64]
 
 BLOCK = 8
 """Rows that are eliminated at once, without BLAS. Chosen by hand for speed."""
-LEAST = 1e-13
+EIGENVALUE_FLOOR = 1e-13
 """Eigenvalues below this, of a matrix scaled to a unit diagonal, are zeros with rounding errors: some hundred sums of
 doubles. docs/algorithms.md, Where numbers end."""
-OPEN = 1e-10
+PIVOT_FLOOR = 1e-10
 """Share of a pivot that elimination must leave for a solution to move along it: a smaller pivot multiplies the rounding
 of all later steps by more than a million. Neither figure was chosen on a set: both follow from the precision of
 doubles. docs/algorithms.md, Where numbers end."""
 
-NO_NUMBER = "a matrix has infinite or NaN entries", "this is a bug; please report it with OUT/log.txt"
+NOT_FINITE = "a matrix has infinite or NaN entries", "this is a bug; please report it with OUT/log.txt"
 
 
-def lifted(S: FloatArray, least: float = LEAST, to: float = LEAST) -> FloatArray:
+def lift_eigenvalues(S: FloatArray, least: float = EIGENVALUE_FLOOR, to: float = EIGENVALUE_FLOOR) -> FloatArray:
     """Lift eigenvalues below `least` to `to`; matrices without any are returned unchanged.
 
     Eigenvalues are those of the matrix scaled to a unit diagonal, so that units do not matter. With `to` = LEAST the
@@ -35,7 +35,7 @@ def lifted(S: FloatArray, least: float = LEAST, to: float = LEAST) -> FloatArray
         NumericalError: S has infinite or NaN entries.
     """
     if not np.isfinite(S).all():
-        raise NumericalError(*NO_NUMBER)
+        raise NumericalError(*NOT_FINITE)
     diagonal = np.einsum("...ii->...i", S)
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     pairs = scale[..., :, None] * scale[..., None, :]
@@ -59,7 +59,7 @@ def solve_positive(S: FloatArray, B: FloatArray) -> FloatArray:
     Raises:
         NumericalError: S has infinite or NaN entries.
     """
-    return _eliminated(S, B, OPEN, 1.0)
+    return _eliminate(S, B, PIVOT_FLOOR, 1.0)
 
 
 def inverse_of_positive(S: FloatArray) -> FloatArray:
@@ -68,7 +68,7 @@ def inverse_of_positive(S: FloatArray) -> FloatArray:
     Raises:
         NumericalError: S has infinite or NaN entries.
     """
-    inverse = _eliminated(S, np.eye(len(S)), LEAST, LEAST)
+    inverse = _eliminate(S, np.eye(len(S)), EIGENVALUE_FLOOR, EIGENVALUE_FLOOR)
     return 0.5 * (inverse + inverse.T)
 
 
@@ -78,7 +78,7 @@ def inverses_of_positive(S: FloatArray) -> FloatArray:
     Raises:
         NumericalError: S has infinite or NaN entries.
     """
-    return np.asarray(np.linalg.inv(lifted(S)), np.float64)
+    return np.asarray(np.linalg.inv(lift_eigenvalues(S)), np.float64)
 
 
 def solve_each(S: FloatArray, B: FloatArray) -> FloatArray:
@@ -88,10 +88,10 @@ def solve_each(S: FloatArray, B: FloatArray) -> FloatArray:
         S: (..., n, n), symmetric and positive definite up to rounding.
         B: (..., n, k) right-hand sides.
     """
-    return np.asarray(np.linalg.solve(lifted(S, OPEN, 1.0), B), np.float64)
+    return np.asarray(np.linalg.solve(lift_eigenvalues(S, PIVOT_FLOOR, 1.0), B), np.float64)
 
 
-def without_negative(S: FloatArray, before: FloatArray) -> FloatArray:
+def project_to_psd(S: FloatArray, before: FloatArray) -> FloatArray:
     """Return the nearest positive semidefinite matrix (n, n): eigenvalues that rounding made negative become 0.
 
     Args:
@@ -106,7 +106,7 @@ def without_negative(S: FloatArray, before: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ik,k,jk->ij", vectors, np.maximum(values, 0.0), vectors) * pairs, np.float64)
 
 
-def _eliminated(S: FloatArray, B: FloatArray, least: float, to: float) -> FloatArray:
+def _eliminate(S: FloatArray, B: FloatArray, least: float, to: float) -> FloatArray:
     n = len(S)
     M = np.hstack([S, B])
     # a pivot is only rounding if it is tiny relative to its value before elimination
@@ -114,17 +114,17 @@ def _eliminated(S: FloatArray, B: FloatArray, least: float, to: float) -> FloatA
     for start in range(0, n, BLOCK):
         pivot = slice(start, min(start + BLOCK, n))
         rest = np.r_[0:start, pivot.stop : n]
-        block = _pivot(M[pivot, pivot], before[pivot], least, to)
+        block = _lift_pivot(M[pivot, pivot], before[pivot], least, to)
         row = np.einsum("ij,jk->ik", np.linalg.inv(block), M[pivot, pivot.stop :])
         M[pivot, pivot.stop :] = row
         M[rest, pivot.stop :] -= np.einsum("ij,jk->ik", M[rest, pivot], row)
     return np.asarray(M[:, n:], np.float64)
 
 
-def _pivot(block: FloatArray, before: FloatArray, least: float, to: float) -> FloatArray:
+def _lift_pivot(block: FloatArray, before: FloatArray, least: float, to: float) -> FloatArray:
     """Lift eigenvalues of which only rounding is left; `before` (n,) is the root of the diagonal before elimination."""
     if not np.isfinite(block).all():
-        raise NumericalError(*NO_NUMBER)
+        raise NumericalError(*NOT_FINITE)
     scale = before[:, None] * before
     values, vectors = np.linalg.eigh(block / scale)
     if values[0] >= least:

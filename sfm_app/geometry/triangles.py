@@ -24,7 +24,7 @@ def vertex_normals(vertices: FloatArray, faces: IndexArray) -> FloatArray:
     return np.asarray(np.divide(total, length, out=np.zeros_like(total), where=length > 0))
 
 
-def edges_of(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
+def unique_edges(faces: IndexArray) -> tuple[IndexArray, IndexArray]:
     """Return every edge once, (E, 2) with the lower vertex first, and (T, 3) their numbers per triangle: ab, bc, ca."""
     ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     size = int(faces.max(initial=0)) + 1
@@ -44,14 +44,14 @@ def areas(vertices: FloatArray, faces: IndexArray) -> FloatArray:
     return np.asarray(0.5 * np.linalg.norm(across, axis=1))
 
 
-def median_edge(vertices: FloatArray, faces: IndexArray) -> float:
+def median_edge_length(vertices: FloatArray, faces: IndexArray) -> float:
     """Return the median length of the edges.
 
     Args:
         vertices: (V, 3) points.
         faces: (T, 3) vertex indices.
     """
-    edges, _ = edges_of(faces)
+    edges, _ = unique_edges(faces)
     return float(np.median(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)))
 
 

@@ -6,7 +6,7 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 
 
-def unit(vectors: ArrayLike) -> FloatArray:
+def normalize(vectors: ArrayLike) -> FloatArray:
     """Return vectors (..., 3) with length 1; those of length 0 stay 0."""
     values = np.asarray(vectors, np.float64)
     length = np.linalg.norm(values, axis=-1, keepdims=True)
@@ -20,13 +20,13 @@ def axis_angle_deg(first: ArrayLike, second: ArrayLike) -> FloatArray:
         first: (..., 3) vectors of any length but zero.
         second: (..., 3) likewise; the two are broadcast.
     """
-    a, b = unit(first), unit(second)
+    a, b = normalize(first), normalize(second)
     # the cross product keeps its digits where the arc cosine loses them
     sine = np.linalg.norm(np.cross(a, b), axis=-1)
     return np.asarray(np.degrees(np.arctan2(sine, np.abs((a * b).sum(axis=-1)))))
 
 
-def along(vectors: FloatArray, axis: FloatArray) -> FloatArray:
+def component_along(vectors: FloatArray, axis: FloatArray) -> FloatArray:
     """Return the components (N,) of vectors along an axis, without BLAS, whose rounding depends on its threads.
 
     Args:
@@ -36,7 +36,7 @@ def along(vectors: FloatArray, axis: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("ni,i->n", vectors, axis))
 
 
-def across(vector: ArrayLike, axis: FloatArray) -> FloatArray:
+def perpendicular_component(vector: ArrayLike, axis: FloatArray) -> FloatArray:
     """Return the component of vectors perpendicular to an axis.
 
     Args:
@@ -47,14 +47,14 @@ def across(vector: ArrayLike, axis: FloatArray) -> FloatArray:
     return np.asarray(values - (values @ axis)[..., None] * axis)
 
 
-def basis_across(axis: FloatArray) -> FloatArray:
+def perpendicular_basis(axis: FloatArray) -> FloatArray:
     """Return orthonormal rows e1, e2 (2, 3) with e1 x e2 = axis, a unit vector (3,)."""
     least = np.eye(3)[int(np.argmin(np.abs(axis)))]
-    e1 = unit(across(least, axis))
+    e1 = normalize(perpendicular_component(least, axis))
     return np.stack([e1, np.cross(axis, e1)])
 
 
-def least_direction(matrix: FloatArray, like: FloatArray) -> FloatArray:
+def smallest_eigenvector(matrix: FloatArray, like: FloatArray) -> FloatArray:
     """Return the eigenvector (3,) of the smallest eigenvalue.
 
     Args:

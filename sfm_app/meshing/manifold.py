@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.triangles import areas, edges_of, select_faces
+from sfm_app.geometry.triangles import areas, select_faces, unique_edges
 from sfm_app.types import Surface
 
 MIN_HEIGHT = 1e-7
@@ -18,16 +18,16 @@ def make_manifold(surface: Surface) -> Surface:
     Degenerate, non-finite and duplicate triangles are removed. Where more than two triangles share an edge, or two run
     along it in the same direction, the smallest are removed. Vertices where fans only touch are split.
     """
-    surface = select_faces(surface, _proper(surface))
+    surface = select_faces(surface, _proper_faces(surface))
     while len(surface.faces):
-        bad = _crowded(surface)
+        bad = _excess_faces(surface)
         if not bad.any():
             break
         surface = select_faces(surface, ~bad)
     return split_fans(surface)
 
 
-def _proper(surface: Surface) -> NDArray[np.bool_]:
+def _proper_faces(surface: Surface) -> NDArray[np.bool_]:
     """Mark triangles that are finite and not degenerate, each set of corners once, (T,)."""
     corners = surface.vertices[surface.faces]
     sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -40,9 +40,9 @@ def _proper(surface: Surface) -> NDArray[np.bool_]:
     return np.asarray(proper & finite & (2.0 * area > MIN_HEIGHT * size * sides))
 
 
-def _crowded(surface: Surface) -> NDArray[np.bool_]:
+def _excess_faces(surface: Surface) -> NDArray[np.bool_]:
     """Mark the smallest triangle at every edge with too many triangles or two in the same direction, (T,)."""
-    edges, edge_of = edges_of(surface.faces)
+    edges, edge_of = unique_edges(surface.faces)
     forward = surface.faces < np.roll(surface.faces, -1, axis=1)
     uses = np.stack([np.bincount(edge_of[way], minlength=len(edges)) for way in (forward, ~forward)])
     wrong = np.asarray((uses > 1).any(axis=0))
@@ -62,7 +62,7 @@ def split_fans(surface: Surface) -> Surface:
     from scipy.sparse.csgraph import connected_components
 
     count = len(surface.faces)
-    _, edge_of = edges_of(surface.faces)
+    _, edge_of = unique_edges(surface.faces)
     # corners of two triangles belong together where the triangles share an edge that ends there
     order = np.argsort(edge_of, axis=None, kind="stable")
     same = np.flatnonzero(np.diff(edge_of.ravel()[order]) == 0)

@@ -20,7 +20,7 @@ class Occluders:
         self._scene = load_open3d().t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(self._tensor(vertices.astype(np.float32)), self._tensor(faces.astype(np.uint32)))
 
-    def hidden(self, center: NDArray[np.float64], slack: float, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def is_hidden(self, center: NDArray[np.float64], slack: float, points: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return (N,) whether a triangle lies between a point and the camera.
 
         Args:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.triangles import edges_of, select_faces
+from sfm_app.geometry.triangles import select_faces, unique_edges
 from sfm_app.meshing.visibility import CONFIRMED, EMPTY, SEEN_THROUGH
 from sfm_app.types import Surface
 
@@ -32,32 +32,32 @@ class Support:
 
     confirmed: NDArray[np.int32]
     """(V,)."""
-    through: NDArray[np.int32]
+    seen_through: NDArray[np.int32]
     """(V,)."""
     empty: NDArray[np.int32]
     """(V,)."""
 
     @classmethod
-    def none(cls, count: int) -> "Support":
+    def zeros(cls, count: int) -> "Support":
         """Make the zero counts of `count` vertices."""
         return cls(*(np.zeros(count, np.int32) for _ in range(3)))
 
     def add(self, verdict: NDArray[np.uint8]) -> None:
         """Add the verdict of one photo, from `judge`."""
         self.confirmed += verdict == CONFIRMED
-        self.through += verdict == SEEN_THROUGH
+        self.seen_through += verdict == SEEN_THROUGH
         self.empty += verdict == EMPTY
 
     @property
-    def free(self) -> NDArray[np.bool_]:
+    def is_free(self) -> NDArray[np.bool_]:
         """(V,) whether more photos see through a vertex than confirm it."""
-        return np.asarray(self.through > self.confirmed)
+        return np.asarray(self.seen_through > self.confirmed)
 
     @property
-    def believed(self) -> NDArray[np.bool_]:
+    def is_supported(self) -> NDArray[np.bool_]:
         """(V,) whether enough of the photos that should see a vertex confirm it."""
         enough = self.confirmed >= MIN_SHARE * (self.confirmed + self.empty)
-        return np.asarray((self.confirmed > 0) & ~self.free & enough)
+        return np.asarray((self.confirmed > 0) & ~self.is_free & enough)
 
 
 def trim(surface: Surface, support: Support, max_gap_triangles: float, least: float) -> Surface:
@@ -67,12 +67,12 @@ def trim(surface: Surface, support: Support, max_gap_triangles: float, least: fl
         surface: closed, from Poisson reconstruction.
         support: of its vertices.
         max_gap_triangles: as for `bridge_gaps`.
-        least: as for `drop_doubtful`.
+        least: as for `drop_doubtful_parts`.
     """
-    sign = np.where(support.believed, 1.0, -1.0)
-    smooth = smooth_support(surface, bridge_gaps(surface, sign, support.free, max_gap_triangles), SMOOTHING)
-    whole = bridge_gaps(surface, smooth, support.free, max_gap_triangles)
-    return cut(surface, drop_doubtful(surface, whole, support.confirmed, least))
+    sign = np.where(support.is_supported, 1.0, -1.0)
+    smooth = smooth_support(surface, bridge_gaps(surface, sign, support.is_free, max_gap_triangles), SMOOTHING)
+    whole = bridge_gaps(surface, smooth, support.is_free, max_gap_triangles)
+    return cut(surface, drop_doubtful_parts(surface, whole, support.confirmed, least))
 
 
 def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], max_width: float) -> FloatArray:
@@ -92,7 +92,7 @@ def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], 
     inside = support > 0
     if not inside.any() or inside.all():
         return support
-    edges, _ = edges_of(surface.faces)
+    edges, _ = unique_edges(surface.faces)
     length = np.linalg.norm(surface.vertices[edges[:, 0]] - surface.vertices[edges[:, 1]], axis=1)
     ends_inside = inside[edges].sum(axis=1)
     outer = edges[ends_inside == 0]
@@ -109,7 +109,9 @@ def bridge_gaps(surface: Surface, support: FloatArray, free: NDArray[np.bool_], 
     return np.where(~inside & bridged[patch], 1.0, support)
 
 
-def drop_doubtful(surface: Surface, support: FloatArray, confirmed: NDArray[np.int32], least: float) -> FloatArray:
+def drop_doubtful_parts(
+    surface: Surface, support: FloatArray, confirmed: NDArray[np.int32], least: float
+) -> FloatArray:
     """Remove the support of connected parts that too few photos confirm on average.
 
     Examples are fragments around outlines: two or three photos agree by chance, and the gaps between are bridged.
@@ -122,7 +124,7 @@ def drop_doubtful(surface: Surface, support: FloatArray, confirmed: NDArray[np.i
     """
     from scipy.sparse.csgraph import connected_components
 
-    edges, _ = edges_of(surface.faces)
+    edges, _ = unique_edges(surface.faces)
     inside = support > 0
     count, part = connected_components(_graph(edges[inside[edges].all(axis=1)], len(support)), directed=False)
     mean = np.bincount(part, confirmed, count) / np.bincount(part, minlength=count)
@@ -137,7 +139,7 @@ def smooth_support(surface: Surface, support: FloatArray, steps: int) -> FloatAr
         support: (V,) positive where photos confirm the surface.
         steps: iterations, >= 0.
     """
-    edges, _ = edges_of(surface.faces)
+    edges, _ = unique_edges(surface.faces)
     graph = _graph(edges, len(support))
     neighbors = np.maximum(np.bincount(edges.ravel(), minlength=len(support)), 1)
     for _ in range(steps):
@@ -162,7 +164,7 @@ def cut(surface: Surface, support: FloatArray) -> Surface:
         surface: any.
         support: (V,).
     """
-    edges, edge_of = edges_of(surface.faces)
+    edges, edge_of = unique_edges(surface.faces)
     support = np.where(support == 0, -1e-9, support)
     a, b = support[edges].T
     crossed = (a > 0) != (b > 0)

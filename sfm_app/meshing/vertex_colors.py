@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.meshing.visibility import CONFIRMED, Eye, FloatArray
+from sfm_app.meshing.visibility import CONFIRMED, DepthView, FloatArray
 
 ColorImage = NDArray[np.uint8]
 """(H, W, 3) RGB."""
@@ -22,7 +22,7 @@ class Paint:
     """(V,)."""
 
     @classmethod
-    def none(cls, count: int) -> "Paint":
+    def zeros(cls, count: int) -> "Paint":
         """Make the zero sums of `count` vertices."""
         return cls(np.zeros((count, 3), np.float32), np.zeros(count, np.float32))
 
@@ -31,14 +31,14 @@ class Paint:
         self.total += other.total
         self.weight += other.weight
 
-    def over(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def mean_colors(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return (V, 3) mean colors of the photos; vertices that no photo shows keep their color from `colors`."""
         mean = self.total / np.maximum(self.weight, np.finfo(np.float32).tiny)[:, None]
         return np.where(self.weight[:, None] > 0, np.rint(mean), colors).astype(np.uint8)
 
 
 def sample_colors(
-    points: FloatArray, normals: FloatArray, verdict: NDArray[np.uint8], eye: Eye, image: ColorImage
+    points: FloatArray, normals: FloatArray, verdict: NDArray[np.uint8], eye: DepthView, image: ColorImage
 ) -> Paint:
     """Sample colors of one photo at the points that it confirms.
 
@@ -51,7 +51,7 @@ def sample_colors(
         eye: the photo's camera.
         image: (H, W, 3) the same field of view as the depth map, at any size.
     """
-    paint = Paint.none(len(points))
+    paint = Paint.zeros(len(points))
     scale = np.array(image.shape[:2]) / eye.depth.shape
     projection = np.diag([scale[1], scale[0], 1.0]) @ eye.projection
     seen = verdict == CONFIRMED

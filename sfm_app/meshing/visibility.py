@@ -11,7 +11,7 @@ FloatArray = NDArray[np.float64]
 DepthArray = NDArray[np.float32]
 """(H, W) depth along the optical axis in scene units, 0 where unknown."""
 
-SILENT, CONFIRMED, SEEN_THROUGH, EMPTY = 0, 1, 2, 3
+NO_EVIDENCE, CONFIRMED, SEEN_THROUGH, EMPTY = 0, 1, 2, 3
 MIN_COSINE = 0.1
 """Least cosine between a surface's normal and the ray to the photo that confirms it."""
 THROUGH = 3.0
@@ -19,7 +19,7 @@ THROUGH = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Eye:
+class DepthView:
     """A posed photo without distortion, and its depth map."""
 
     K: FloatArray
@@ -49,7 +49,7 @@ class Eye:
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
 
 
-def judge(points: FloatArray, normals: FloatArray, eye: Eye, tolerance: float) -> NDArray[np.uint8]:
+def judge(points: FloatArray, normals: FloatArray, eye: DepthView, tolerance: float) -> NDArray[np.uint8]:
     """Judge points on a surface: CONFIRMED, SEEN_THROUGH, EMPTY or SILENT.
 
     A point is CONFIRMED if it faces the photo and the surrounding depths agree with its own within the relative

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.similarity import Similarity, robust_similarity
-from sfm_app.geometry.unit_vectors import basis_across
+from sfm_app.geometry.unit_vectors import perpendicular_basis
 from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.types import GpsPosition
 
@@ -20,16 +20,16 @@ EQUATOR_M, FLATTENING = 6378137.0, 1.0 / 298.257223563
 GPS_M, GPS_SHARE = 10.0, 0.15
 """Largest residual that consumer GPS explains: in meters, or as a share of the spread of the photos if that is more."""
 
-CHANCE = 1e-3
+SIGNIFICANCE = 1e-3
 """Largest probability that positions unrelated to the cameras fit as well."""
 
 SCALE_DEVIATION = 0.1
 """Largest relative standard deviation of the scale."""
 
-LEAST_PHOTOS, AGREEING = 3, 0.6
+LEAST_PHOTOS, LEAST_SHARE = 3, 0.6
 """Least number of distinct positions, and their least share, that must agree."""
 
-UP_DEG = 2.0
+MAX_UP_DEVIATION_DEG = 2.0
 """Largest standard deviation, in degrees, with which up from GPS replaces up from the cameras' roll."""
 
 MAX_PAIRS = 500
@@ -86,13 +86,13 @@ def georeference(
         return NoGeoreference("the photos have no positions")
     if len(set(given)) < LEAST_PHOTOS:
         return NoGeoreference(f"{len(set(given))} different positions, {LEAST_PHOTOS} are needed")
-    origin = _middle(given)
+    origin = _median_position(given)
     enu, cameras = enu_m(given, origin), centers[known]
-    level = _along_ground(cameras, enu, up, origin)
+    level = _fit_on_ground(cameras, enu, up, origin)
     if up_is_sure and level:
         return level
-    other = _up_of(cameras, enu, given)
-    tilted = _along_ground(cameras, enu, other[0], origin) if other else level
+    other = _up_from_positions(cameras, enu, given)
+    tilted = _fit_on_ground(cameras, enu, other[0], origin) if other else level
     return replace(tilted, up_deviation_deg=other[1]) if other and isinstance(tilted, Georeference) else level
 
 
@@ -116,7 +116,7 @@ def enu_m(positions: Sequence[GpsPosition], origin: GpsPosition) -> FloatArray:
     return np.column_stack([east, north, above])
 
 
-def position_at(enu: FloatArray, origin: GpsPosition) -> GpsPosition:
+def position_from_enu(enu: FloatArray, origin: GpsPosition) -> GpsPosition:
     """Return the position at an offset in meters from an origin; the inverse of `enu_m`.
 
     Args:
@@ -139,7 +139,7 @@ def _radii_m(origin: GpsPosition) -> tuple[float, float]:
     return float(meridian + height), float(max((across + height) * np.cos(latitude), 1.0))
 
 
-def _middle(positions: Sequence[GpsPosition]) -> GpsPosition:
+def _median_position(positions: Sequence[GpsPosition]) -> GpsPosition:
     """Return the median position; its altitude is the median of the known ones."""
     first = positions[0].longitude_deg
     turn = np.median([(position.longitude_deg - first + 180.0) % 360.0 - 180.0 for position in positions])
@@ -149,25 +149,25 @@ def _middle(positions: Sequence[GpsPosition]) -> GpsPosition:
     return GpsPosition(latitude, longitude, float(np.median(altitudes)) if altitudes else None)
 
 
-def _along_ground(
+def _fit_on_ground(
     cameras: FloatArray, enu: FloatArray, up: FloatArray, origin: GpsPosition
 ) -> Georeference | NoGeoreference:
-    axes = basis_across(up)
-    z, w = _complex(cameras @ axes.T), _complex(enu)
+    axes = perpendicular_basis(up)
+    z, w = _to_complex(cameras @ axes.T), _to_complex(enu)
     spread = float(MAD_TO_SIGMA * np.median(np.abs(w - (np.median(w.real) + 1j * np.median(w.imag)))))
     limit = max(GPS_M, GPS_SHARE * spread)
-    agreeing = _agreeing(z, w, limit)
-    a, b = _line(z[agreeing], w[agreeing])
+    agreeing = _inlier_mask(z, w, limit)
+    a, b = _fit_complex_line(z[agreeing], w[agreeing])
     places = np.unique(np.round(enu[:, :2], 2), axis=0)
     used = len(np.unique(np.round(enu[agreeing, :2], 2), axis=0))
-    if used < max(LEAST_PHOTOS, AGREEING * len(places)):
+    if used < max(LEAST_PHOTOS, LEAST_SHARE * len(places)):
         return NoGeoreference(f"only {used} of {len(places)} GPS positions agree with the cameras within {limit:.0f} m")
     rms = float(np.sqrt(np.mean(np.abs(a * z[agreeing] + b - w[agreeing]) ** 2)))
     extent = float(np.std(w[agreeing]))
     unexplained = min((rms / extent) ** 2, 1.0) if extent > 0 else 1.0
     deviation = np.sqrt(unexplained / max(1.0 - unexplained, 1e-12) / (2 * (used - 2)))
     # for positions unrelated to the cameras, `unexplained` has the distribution function u^(n-2): Beta(n - 2, 1)
-    if unexplained ** (used - 2) > CHANCE or deviation > SCALE_DEVIATION:
+    if unexplained ** (used - 2) > SIGNIFICANCE or deviation > SCALE_DEVIATION:
         return NoGeoreference(
             f"{used} GPS positions that spread over {extent:.0f} m and miss the cameras by {rms:.1f} m "
             "do not determine a scale"
@@ -180,12 +180,12 @@ def _along_ground(
     return Georeference(fit, origin, used, len(places), rms, float(deviation))
 
 
-def _complex(points: FloatArray) -> NDArray[np.complex128]:
+def _to_complex(points: FloatArray) -> NDArray[np.complex128]:
     """Return the horizontal components of points (N, 2 or 3) as x + iy."""
     return np.asarray(points[:, 0] + 1j * points[:, 1], np.complex128)
 
 
-def _agreeing(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float) -> NDArray[np.bool_]:
+def _inlier_mask(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float) -> NDArray[np.bool_]:
     """Find the inliers of the best pair by truncated squared residuals, then refit until they no longer change."""
     pairs = np.array(list(combinations(range(len(z)), 2)), np.intp)
     if len(pairs) > MAX_PAIRS:
@@ -194,13 +194,13 @@ def _agreeing(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float
     for pair in pairs:
         if abs(w[pair[0]] - w[pair[1]]) < 1e-6 or z[pair[0]] == z[pair[1]]:
             continue
-        a, b = _line(z[pair], w[pair])
+        a, b = _fit_complex_line(z[pair], w[pair])
         distance = np.abs(a * z + b - w)
         cost = float(np.minimum(distance, limit) @ np.minimum(distance, limit))
         if cost < least:
             best, least = distance < limit, cost
     for _ in range(5):
-        a, b = _line(z[best], w[best])
+        a, b = _fit_complex_line(z[best], w[best])
         after = np.abs(a * z + b - w) < limit
         if after.sum() < 2 or (after == best).all():
             break
@@ -208,15 +208,20 @@ def _agreeing(z: NDArray[np.complex128], w: NDArray[np.complex128], limit: float
     return best
 
 
-def _line(z: NDArray[np.complex128], w: NDArray[np.complex128]) -> tuple[complex, complex]:
+def _fit_complex_line(z: NDArray[np.complex128], w: NDArray[np.complex128]) -> tuple[complex, complex]:
     """Fit a and b of w = a z + b by least squares."""
     around = z - z.mean()
     a = complex(np.vdot(around, w - w.mean()) / max(float(np.vdot(around, around).real), 1e-300))
     return a, complex(w.mean() - a * z.mean())
 
 
-def _up_of(cameras: FloatArray, enu: FloatArray, positions: Sequence[GpsPosition]) -> tuple[FloatArray, float] | None:
-    """Estimate up (3,) in the world and its deviation from positions in space; None if it is not within `UP_DEG`."""
+def _up_from_positions(
+    cameras: FloatArray, enu: FloatArray, positions: Sequence[GpsPosition]
+) -> tuple[FloatArray, float] | None:
+    """Estimate up (3,) in the world and its deviation from positions in space.
+
+    None if it is not within `MAX_UP_DEVIATION_DEG`.
+    """
     if any(position.altitude_m is None for position in positions) or len(positions) < 5:
         return None
     try:
@@ -227,4 +232,4 @@ def _up_of(cameras: FloatArray, enu: FloatArray, positions: Sequence[GpsPosition
     narrow = np.sqrt(np.linalg.eigvalsh(np.cov(moved.T))[1])
     residual = MAD_TO_SIGMA * np.median(np.linalg.norm(moved - enu, axis=1))
     deviation_deg = float(np.degrees(residual / max(narrow * np.sqrt(len(moved)), 1e-12)))
-    return (np.asarray(fit.R[2]), deviation_deg) if deviation_deg < UP_DEG else None
+    return (np.asarray(fit.R[2]), deviation_deg) if deviation_deg < MAX_UP_DEVIATION_DEG else None

@@ -5,14 +5,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.unit_vectors import along, axis_angle_deg, least_direction, unit
+from sfm_app.geometry.unit_vectors import axis_angle_deg, component_along, normalize, smallest_eigenvector
 
 FloatArray = NDArray[np.float64]
 
 TRIPLES, MOST_POINTS = 1000, 4000
 """Number of samples of three points, and of the points that score them."""
 
-NEAR = 0.01
+INLIER_DISTANCE = 0.01
 """Points within this share of the scene's size lie on the plane."""
 
 LEAST_SHARE = 0.15
@@ -46,22 +46,22 @@ def dominant_plane(points: FloatArray, axis: FloatArray, between_deg: tuple[floa
     if len(cloud) < 10:
         return None
     center = np.median(cloud, axis=0)
-    reach = NEAR * float(np.percentile(np.linalg.norm(cloud - center, axis=1), 80))
+    reach = INLIER_DISTANCE * float(np.percentile(np.linalg.norm(cloud - center, axis=1), 80))
     best, most = None, LEAST_SHARE * len(cloud)
     for triple in rng.integers(0, len(cloud), (TRIPLES, 3)):
         a, b, c = cloud[triple]
-        normal = unit(np.cross(b - a, c - a))
+        normal = normalize(np.cross(b - a, c - a))
         if not normal.any() or not between_deg[0] <= axis_angle_deg(normal, axis) <= between_deg[1]:
             continue
-        near = np.abs(along(cloud - a, normal)) < reach
+        near = np.abs(component_along(cloud - a, normal)) < reach
         if np.count_nonzero(near) > most:
             best, most = near, float(np.count_nonzero(near))
-    return None if best is None else _fitted(cloud[best], axis, float(best.mean()))
+    return None if best is None else _fit_plane(cloud[best], axis, float(best.mean()))
 
 
-def _fitted(points: FloatArray, axis: FloatArray, share: float) -> Plane:
+def _fit_plane(points: FloatArray, axis: FloatArray, share: float) -> Plane:
     spread = points - points.mean(axis=0)
     scatter = np.einsum("ni,nj->ij", spread, spread)
     small, middle, _ = np.linalg.eigvalsh(scatter)
     deviation = np.degrees(np.arctan2(np.sqrt(small / len(points)), np.sqrt(max(middle, 1e-30))))
-    return Plane(least_direction(scatter, axis), share, float(deviation))
+    return Plane(smallest_eigenvector(scatter, axis), share, float(deviation))

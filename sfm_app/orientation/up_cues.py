@@ -10,20 +10,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.unit_vectors import along, unit
+from sfm_app.geometry.unit_vectors import component_along, normalize
 
 FloatArray = NDArray[np.float64]
 
 LEAST_POINTS = 10
 """Points that a photo must see for its depths to count."""
 
-LITTLE_DEPTH = 0.05
+DEPTH_SPREAD_FLOOR = 0.05
 """Spread of log depth below which it shows the shape of a distant thing rather than the ground in front of it."""
 
-NEIGHBORS, AROUND = 12, 60
+NEIGHBORS, WIDE_NEIGHBORS = 12, 60
 """Neighbors that a surface patch is fitted to, and those whose mean its normal and brightness are compared with."""
 
-FLAT = 0.2
+MAX_VARIANCE_RATIO = 0.2
 """Largest ratio of the two smaller variances of the points of a surface patch."""
 
 PICTURE_PX = 256
@@ -35,10 +35,10 @@ BLUR_PX = 2.0
 BLACK, BROAD_PX, BORDER_PX = 20, 15, 6
 """Gray level and width of an unlit background, whose border is not a ledge, and the width of that border."""
 
-NO_CHANGE = 1e-6
+MIN_RMS = 1e-6
 """Root mean square of differences of normals or log brightness below which they are only rounding."""
 
-EVEN, BLUR_SKY_PX, LEAST_SKY = 1.5, 1.0, 40
+MAX_SKY_SLOPE, BLUR_SKY_PX, LEAST_SKY = 1.5, 1.0, 40
 """Of sky: largest slope in gray levels per pixel, the blur before slopes are taken, and the least gray level."""
 
 
@@ -48,9 +48,9 @@ class Surfaces:
 
     normals: FloatArray
     """(N, 3) unit vectors on the side of the cameras."""
-    bends: FloatArray
+    normal_differences: FloatArray
     """(N, 3) normals minus the mean normal of their neighborhood."""
-    shades: FloatArray
+    brightness_differences: FloatArray
     """(N,) log brightness minus its mean over the neighborhood."""
 
 
@@ -61,7 +61,7 @@ def small_picture(gray: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def surfaces_of(
+def fit_surfaces(
     points: FloatArray, brightness: FloatArray, seen: Sequence[NDArray[np.int64]], centers: FloatArray
 ) -> Surfaces:
     """Fit a plane to the neighbors of each point, and keep those that are flat.
@@ -76,22 +76,22 @@ def surfaces_of(
 
     if len(points) < NEIGHBORS:
         return Surfaces(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-    around = np.asarray(cKDTree(points).query(points, k=min(AROUND, len(points)))[1])
+    around = np.asarray(cKDTree(points).query(points, k=min(WIDE_NEIGHBORS, len(points)))[1])
     near = points[around[:, :NEIGHBORS]]
     near = near - near.mean(axis=1, keepdims=True)
     variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
     towards = np.zeros_like(points)
     for chosen, center in zip(seen, centers, strict=True):
-        towards[chosen] += unit(center - points[chosen])
+        towards[chosen] += normalize(center - points[chosen])
     normals = axes[:, :, 0]
     normals = normals * np.where((normals * towards).sum(axis=1) < 0, -1.0, 1.0)[:, None]
     gray = np.log(10.0 + brightness)
     bends, shades = normals - normals[around].mean(axis=1), gray - gray[around].mean(axis=1)
-    flat = (variances[:, 0] < FLAT * variances[:, 1]) & towards.any(axis=1)
+    flat = (variances[:, 0] < MAX_VARIANCE_RATIO * variances[:, 1]) & towards.any(axis=1)
     return Surfaces(normals[flat], bends[flat], shades[flat])
 
 
-def low_is_near(
+def depth_height_correlation(
     up: FloatArray,
     rotations: FloatArray,
     centers: FloatArray,
@@ -117,14 +117,14 @@ def low_is_near(
             continue
         depth = np.log(local[:, 2])
         depth = np.clip(depth, *np.percentile(depth, (2, 98)))
-        height = along(local[:, :2] / local[:, 2:], (R @ up)[:2])
+        height = component_along(local[:, :2] / local[:, 2:], (R @ up)[:2])
         depth, height = depth - depth.mean(), height - height.mean()
-        spread = (depth.std() + LITTLE_DEPTH) * height.std()
+        spread = (depth.std() + DEPTH_SPREAD_FLOOR) * height.std()
         found.append(float((depth * height).mean() / spread) if spread > 0 else 0.0)
     return float(np.mean(found)) if found else 0.0
 
 
-def tops_are_seen(up: FloatArray, surfaces: Surfaces) -> float:
+def mean_upward_normal(up: FloatArray, surfaces: Surfaces) -> float:
     """Return the mean upward component of the normals, in [-1, 1].
 
     Floors, steps and sills are seen from above.
@@ -133,10 +133,10 @@ def tops_are_seen(up: FloatArray, surfaces: Surfaces) -> float:
         up: (3,) unit vector in the world.
         surfaces: patches around the points.
     """
-    return float(along(surfaces.normals, up).mean()) if len(surfaces.normals) else 0.0
+    return float(component_along(surfaces.normals, up).mean()) if len(surfaces.normals) else 0.0
 
 
-def tops_are_bright(up: FloatArray, surfaces: Surfaces) -> float:
+def brightness_normal_correlation(up: FloatArray, surfaces: Surfaces) -> float:
     """Return the correlation of brightness and upward component of the normal, both relative to their neighborhood.
 
     Light comes from above. In [-1, 1].
@@ -147,12 +147,12 @@ def tops_are_bright(up: FloatArray, surfaces: Surfaces) -> float:
     """
     if not len(surfaces.normals):
         return 0.0
-    rise, shade = along(surfaces.bends, up), surfaces.shades
+    rise, shade = component_along(surfaces.normal_differences, up), surfaces.brightness_differences
     spreads = [float(np.sqrt((values**2).mean())) for values in (rise, shade)]
-    return float((rise * shade).mean() / (spreads[0] * spreads[1])) if min(spreads) > NO_CHANGE else 0.0
+    return float((rise * shade).mean() / (spreads[0] * spreads[1])) if min(spreads) > MIN_RMS else 0.0
 
 
-def ledges_are_lit(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
+def slope_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
     """Return the share of rising minus that of falling brightness slopes along `up`, by power, in [-1, 1].
 
     The mean over the photos. Shadow under ledges, eaves and things on the ground has a sharp border to the lit top
@@ -175,7 +175,7 @@ def ledges_are_lit(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDA
     return float(np.mean(found)) if found else 0.0
 
 
-def sky_is_above(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
+def sky_asymmetry(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArray[np.uint8] | None]) -> float:
     """Return the share of even, bright pixels near the upper border minus that near the lower, in [-1, 1].
 
     The mean over the photos.
@@ -192,7 +192,7 @@ def sky_is_above(up: FloatArray, rotations: FloatArray, pictures: Sequence[NDArr
         gray = cv2.GaussianBlur(picture.astype(np.float32), (0, 0), BLUR_SKY_PX)
         steep = np.hypot(_slope(gray, np.array([1.0, 0.0])), _slope(gray, np.array([0.0, 1.0])))
         gray = gray[1:-1, 1:-1]
-        even = (steep < EVEN) & (gray > max(float(np.median(gray)), LEAST_SKY))
+        even = (steep < MAX_SKY_SLOPE) & (gray > max(float(np.median(gray)), LEAST_SKY))
         y, x = np.mgrid[: gray.shape[0], : gray.shape[1]] - 0.5 * (np.array(gray.shape)[:, None, None] - 1)
         axis = R @ up
         height = x * axis[0] + y * axis[1]

@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 
 from sfm_app.orientation.camera_roll import Roll
 from sfm_app.orientation.up_cues import (
-    ledges_are_lit,
-    low_is_near,
-    sky_is_above,
-    surfaces_of,
-    tops_are_bright,
-    tops_are_seen,
+    brightness_normal_correlation,
+    depth_height_correlation,
+    fit_surfaces,
+    mean_upward_normal,
+    sky_asymmetry,
+    slope_asymmetry,
 )
 
 FloatArray = NDArray[np.float64]
 
-MOST = 3.0
+MAX_NATS = 3.0
 """Largest evidence of one cue, in nats: each of them is wrong in one place of twenty (a vault, a stage, snow)."""
 
-LEDGES, LEDGES_MOST = 10.0, 4.0
-"""Nats for an axis per unit of `ledges_are_lit`, and their maximum. The other cues are as large sideways: along a wall,
-depth, normals and light change from side to side."""
+LEDGE_NATS, MAX_LEDGE_NATS = 10.0, 4.0
+"""Nats for an axis per unit of `slope_asymmetry`, and their maximum. The other cues are as large sideways: along a
+wall, depth, normals and light change from side to side."""
 
 HIGHEST_NATS = 14.0
 """Odds above a million to one are not distinguished."""
@@ -52,7 +52,7 @@ class Cue:
             points: number of surface patches that it comes from.
         """
         variance = self.deviation**2 + self.noise / max(points, 1)
-        return float(np.clip(2.0 * self.mean * value / variance, -MOST, MOST))
+        return float(np.clip(2.0 * self.mean * value / variance, -MAX_NATS, MAX_NATS))
 
 
 CUES: Mapping[str, Cue] = {
@@ -81,20 +81,20 @@ class Scenery:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Standing:
+class RollSelection:
     """Which way up a scene is, and the odds of that."""
 
     roll: Roll
     """The estimate from roll that was chosen."""
     evidence: Mapping[str, float]
     """By cue, log odds of up against down, in nats; negative if the cue contradicts."""
-    not_upside_down: float
+    sign_log_odds: float
     """Log odds of up against its opposite, including how cameras are held."""
-    not_on_its_side: float
+    axis_log_odds: float
     """Log odds of the vertical against the other one."""
 
 
-def stand(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery) -> Standing:
+def select_roll(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, scenery: Scenery) -> RollSelection:
     """Choose first the vertical, from how the cameras are held and the ledges; then which end of it is up.
 
     Args:
@@ -103,26 +103,30 @@ def stand(rolls: Sequence[Roll], rotations: FloatArray, centers: FloatArray, sce
         centers: (N, 3) camera centers.
         scenery: what the photos show.
     """
-    surfaces = surfaces_of(scenery.points, scenery.brightness, scenery.seen, centers)
-    ledges = [ledges_are_lit(roll.up, rotations, scenery.pictures) for roll in rolls[:2]]
+    surfaces = fit_surfaces(scenery.points, scenery.brightness, scenery.seen, centers)
+    ledges = [slope_asymmetry(roll.up, rotations, scenery.pictures) for roll in rolls[:2]]
     upright, lying = (
         float(np.logaddexp(-roll.cost, -opposite.cost)) for roll, opposite in zip(rolls[:2], rolls[2:], strict=True)
     )
-    gap = upright - lying + float(np.clip(LEDGES * (abs(ledges[0]) - abs(ledges[1])), -LEDGES_MOST, LEDGES_MOST))
+    gap = (
+        upright
+        - lying
+        + float(np.clip(LEDGE_NATS * (abs(ledges[0]) - abs(ledges[1])), -MAX_LEDGE_NATS, MAX_LEDGE_NATS))
+    )
     chosen = 0 if gap >= 0 else 1
     up, down = rolls[chosen], rolls[chosen + 2]
     values = {
-        "low is near": low_is_near(up.up, rotations, centers, scenery.points, scenery.seen),
-        "tops are seen": tops_are_seen(up.up, surfaces),
-        "tops are bright": tops_are_bright(up.up, surfaces),
+        "low is near": depth_height_correlation(up.up, rotations, centers, scenery.points, scenery.seen),
+        "tops are seen": mean_upward_normal(up.up, surfaces),
+        "tops are bright": brightness_normal_correlation(up.up, surfaces),
         "ledges are lit": ledges[chosen],
-        "sky is above": sky_is_above(up.up, rotations, scenery.pictures),
+        "sky is above": sky_asymmetry(up.up, rotations, scenery.pictures),
     }
     evidence = {name: CUES[name].nats(value, len(surfaces.normals)) for name, value in values.items()}
     for_up = down.cost - up.cost + sum(evidence.values())
     if for_up < 0:
         up, evidence = down, {name: -nats for name, nats in evidence.items()}
-    return Standing(up, evidence, abs(for_up), abs(gap))
+    return RollSelection(up, evidence, abs(for_up), abs(gap))
 
 
 def odds(nats: float) -> float:

@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.unit_vectors import along, axis_angle_deg, basis_across, least_direction, unit
+from sfm_app.geometry.unit_vectors import (
+    axis_angle_deg,
+    component_along,
+    normalize,
+    perpendicular_basis,
+    smallest_eigenvector,
+)
 
 FloatArray = NDArray[np.float64]
 
@@ -20,14 +26,14 @@ SEARCH_DEG, STEP_DEG, WIDTHS_DEG = 28.0, 2.0, (2.0, 1.0, 0.5)
 PRIOR_DEG = 25.0
 """Standard deviation of the true direction from where the search starts."""
 
-STANDS_OUT, LEVEL_STANDS_OUT = 2.0, 1.4
+MIN_CONTRAST, MIN_LEVEL_CONTRAST = 2.0, 1.4
 """Least ratio of the support of a direction to the 90th percentile of those far from it; the second is for a horizontal
 direction together with its perpendicular."""
 
 LEAST_SHARE, LEAST_SEGMENTS = 0.05, 12
 """Least share of the total length, and least number of segments, that a direction needs."""
 
-APART_DEG = 8.0
+SEPARATION_DEG = 8.0
 """Directions closer than this are the same."""
 
 LEAST_SINE = 0.05
@@ -56,7 +62,7 @@ class Segments:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Vanishing:
+class VanishingDirection:
     """A direction that many lines share."""
 
     direction: FloatArray
@@ -78,13 +84,13 @@ def segment_planes(first: FloatArray, second: FloatArray, photo: int, scale_px: 
         photo: the photo's number.
         scale_px: focal length in pixels, to turn angles into lengths.
     """
-    a, b = unit(first), unit(second)
+    a, b = normalize(first), normalize(second)
     cross = np.cross(a, b)
     lengths = scale_px * np.linalg.norm(cross, axis=1)
-    return Segments(unit(cross), unit(a + b), lengths, np.full(len(a), photo, np.int64))
+    return Segments(normalize(cross), normalize(a + b), lengths, np.full(len(a), photo, np.int64))
 
 
-def joined(parts: list[Segments]) -> Segments:
+def concatenate_segments(parts: list[Segments]) -> Segments:
     """Join the segments of several photos."""
     if not parts:
         return Segments(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
@@ -96,14 +102,14 @@ def joined(parts: list[Segments]) -> Segments:
     )
 
 
-def _misses_deg(direction: FloatArray, segments: Segments) -> FloatArray:
+def _residuals_deg(direction: FloatArray, segments: Segments) -> FloatArray:
     """Return (N,) angles in [0, 90] between each segment and the line from its middle to the vanishing point."""
-    sine = np.abs(along(segments.normals, direction))
+    sine = np.abs(component_along(segments.normals, direction))
     away = np.linalg.norm(np.cross(segments.middles, direction), axis=1)
     return np.asarray(np.degrees(np.arcsin(np.clip(sine / np.maximum(away, 1e-9), 0.0, 1.0))), np.float64)
 
 
-def vanishing_near(start: FloatArray, segments: Segments) -> Vanishing | None:
+def find_vanishing_direction(start: FloatArray, segments: Segments) -> VanishingDirection | None:
     """Find the direction within `SEARCH_DEG` of `start` that most segments run along; None if none stands out.
 
     The best direction of a grid is refined with Welsch weights of decreasing width.
@@ -114,11 +120,11 @@ def vanishing_near(start: FloatArray, segments: Segments) -> Vanishing | None:
     """
     if len(segments) < LEAST_SEGMENTS or not segments.lengths.sum() > 0.0:
         return None
-    grid = cap(start, SEARCH_DEG, STEP_DEG)
+    grid = spherical_cap(start, SEARCH_DEG, STEP_DEG)
     support = np.array([_support(direction, segments, WIDTHS_DEG[0]) for direction in grid])
     prior = np.exp(-0.5 * (axis_angle_deg(grid, start) / PRIOR_DEG) ** 2)
     best = grid[int(np.argmax(support * prior))]
-    return _judged(refined(best, segments), grid, support, segments)
+    return _verify_direction(refine_direction(best, segments), grid, support, segments)
 
 
 def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
@@ -130,11 +136,11 @@ def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
         up: (3,) unit vector in the world.
         segments: of all photos.
     """
-    on_horizon = np.abs(along(segments.normals, up)) > np.cos(np.radians(APART_DEG))
-    level = segments.take(~on_horizon & (_misses_deg(up, segments) > APART_DEG / 2))
+    on_horizon = np.abs(component_along(segments.normals, up)) > np.cos(np.radians(SEPARATION_DEG))
+    level = segments.take(~on_horizon & (_residuals_deg(up, segments) > SEPARATION_DEG / 2))
     if len(level) < LEAST_SEGMENTS:
         return None
-    e1, e2 = basis_across(up)
+    e1, e2 = perpendicular_basis(up)
     angles = np.radians(np.arange(0.0, 180.0))
     ring = np.cos(angles)[:, None] * e1 + np.sin(angles)[:, None] * e2
     single = np.array([_support(direction, level, WIDTHS_DEG[0]) for direction in ring])
@@ -142,12 +148,12 @@ def level_direction(up: FloatArray, segments: Segments) -> FloatArray | None:
     best = int(np.argmax(both))
     best -= 90 if single[best] < single[best - 90] else 0
     away = (np.arange(180) - best + 45) % 90 - 45
-    rival = float(np.percentile(both[np.abs(away) > APART_DEG], 90))
-    stands_out = both[best] > LEVEL_STANDS_OUT * rival and both[best] > LEAST_SHARE * segments.lengths.sum()
+    rival = float(np.percentile(both[np.abs(away) > SEPARATION_DEG], 90))
+    stands_out = both[best] > MIN_LEVEL_CONTRAST * rival and both[best] > LEAST_SHARE * segments.lengths.sum()
     return np.asarray(ring[best]) if stands_out else None
 
 
-def square_frame(up: FloatArray, level: FloatArray, segments: Segments) -> tuple[FloatArray, float]:
+def fit_orthogonal_frame(up: FloatArray, level: FloatArray, segments: Segments) -> tuple[FloatArray, float]:
     """Fit three perpendicular directions, near up, level and up x level, to the segments along them.
 
     Horizontal edges determine up as well as vertical ones, and columns taper where cornices do not. Gauss-Newton on
@@ -159,7 +165,8 @@ def square_frame(up: FloatArray, level: FloatArray, segments: Segments) -> tuple
         segments: of all photos.
 
     Returns:
-        (3, 3) with the directions as rows, and the standard deviation of the first in degrees, see `Vanishing`.
+        (3, 3) with the directions as rows, and the standard deviation of the first in degrees, see
+        `VanishingDirection`.
     """
     frame = np.stack([up, level, np.cross(up, level)])
     for width_deg in WIDTHS_DEG:
@@ -182,18 +189,18 @@ def square_frame(up: FloatArray, level: FloatArray, segments: Segments) -> tuple
 
 def _rotation_equations(frame: FloatArray, segments: Segments, width_deg: float) -> tuple[FloatArray, FloatArray]:
     """Return the normal equations of the rotation vector, per photo (P, 3, 3) and (P, 3)."""
-    misses = np.array([_misses_deg(axis, segments) for axis in frame])
+    misses = np.array([_residuals_deg(axis, segments) for axis in frame])
     axes = frame[np.argmin(misses, axis=0)]
     away = np.maximum(np.linalg.norm(np.cross(segments.middles, axes), axis=1), LEAST_SINE)
     weights = segments.lengths * np.exp(-0.5 * (misses.min(axis=0) / width_deg) ** 2) / away**2
     J, r = np.cross(axes, segments.normals), -(segments.normals * axes).sum(axis=1)
     return (
-        _per_photo(segments, weights[:, None, None] * J[:, :, None] * J[:, None]),
-        _per_photo(segments, (weights * r)[:, None] * J),
+        _sum_per_photo(segments, weights[:, None, None] * J[:, :, None] * J[:, None]),
+        _sum_per_photo(segments, (weights * r)[:, None] * J),
     )
 
 
-def refined(direction: FloatArray, segments: Segments) -> FloatArray:
+def refine_direction(direction: FloatArray, segments: Segments) -> FloatArray:
     """Refine a direction by least squares of its weighted residuals.
 
     Args:
@@ -203,13 +210,13 @@ def refined(direction: FloatArray, segments: Segments) -> FloatArray:
     for width_deg in WIDTHS_DEG:
         for _ in range(10):
             before = direction
-            direction = least_direction(_matrices(direction, segments, width_deg).sum(axis=0), direction)
+            direction = smallest_eigenvector(_scatter_matrices(direction, segments, width_deg).sum(axis=0), direction)
             if float(np.abs(direction - before).max()) < 1e-10:
                 break
     return direction
 
 
-def cap(axis: FloatArray, radius_deg: float, step_deg: float) -> FloatArray:
+def spherical_cap(axis: FloatArray, radius_deg: float, step_deg: float) -> FloatArray:
     """Return (N, 3) unit vectors spread evenly over a spherical cap around an axis.
 
     Args:
@@ -217,7 +224,7 @@ def cap(axis: FloatArray, radius_deg: float, step_deg: float) -> FloatArray:
         radius_deg: largest angle from it, degrees.
         step_deg: approximate angle between neighbors, degrees.
     """
-    e1, e2 = basis_across(axis)
+    e1, e2 = perpendicular_basis(axis)
     found = [axis[None]]
     for polar in np.radians(np.arange(step_deg, radius_deg + 1e-9, step_deg)):
         around = np.linspace(0.0, 2 * np.pi, max(6, round(2 * np.pi * np.sin(polar) / np.radians(step_deg))), False)
@@ -227,41 +234,43 @@ def cap(axis: FloatArray, radius_deg: float, step_deg: float) -> FloatArray:
 
 
 def _support(direction: FloatArray, segments: Segments, width_deg: float) -> float:
-    weights = np.exp(-0.5 * (_misses_deg(direction, segments) / width_deg) ** 2)
+    weights = np.exp(-0.5 * (_residuals_deg(direction, segments) / width_deg) ** 2)
     return float((segments.lengths * weights).sum())
 
 
-def _matrices(direction: FloatArray, segments: Segments, width_deg: float) -> FloatArray:
+def _scatter_matrices(direction: FloatArray, segments: Segments, width_deg: float) -> FloatArray:
     """Return (P, 3, 3), per photo the sum of n n' over its segments, weighted for least squares of the residuals."""
     away = np.maximum(np.linalg.norm(np.cross(segments.middles, direction), axis=1), LEAST_SINE)
-    weights = segments.lengths * np.exp(-0.5 * (_misses_deg(direction, segments) / width_deg) ** 2) / away**2
+    weights = segments.lengths * np.exp(-0.5 * (_residuals_deg(direction, segments) / width_deg) ** 2) / away**2
     n = segments.normals
-    return _per_photo(segments, weights[:, None, None] * n[:, :, None] * n[:, None])
+    return _sum_per_photo(segments, weights[:, None, None] * n[:, :, None] * n[:, None])
 
 
-def _per_photo(segments: Segments, values: FloatArray) -> FloatArray:
+def _sum_per_photo(segments: Segments, values: FloatArray) -> FloatArray:
     """Sum values (N, ...) over the segments of each photo."""
     sums = np.zeros((int(segments.photos.max(initial=-1)) + 1, *values.shape[1:]))
     np.add.at(sums, segments.photos, values)
     return sums
 
 
-def _judged(found: FloatArray, tried: FloatArray, support: FloatArray, segments: Segments) -> Vanishing | None:
+def _verify_direction(
+    found: FloatArray, tried: FloatArray, support: FloatArray, segments: Segments
+) -> VanishingDirection | None:
     """Return the direction with its evidence, if it stands out from the tried ones far from it."""
-    running = _misses_deg(found, segments) < WIDTHS_DEG[0]
+    running = _residuals_deg(found, segments) < WIDTHS_DEG[0]
     share = float(segments.lengths[running].sum() / segments.lengths.sum())
-    away = axis_angle_deg(tried, found) > APART_DEG
+    away = axis_angle_deg(tried, found) > SEPARATION_DEG
     if away.all():  # refined out of the region of the search
         return None
     contrast = float(support[~away].max()) / max(float(np.percentile(support[away], 90)), 1e-12)
-    enough = np.count_nonzero(running) >= LEAST_SEGMENTS and share >= LEAST_SHARE and contrast >= STANDS_OUT
-    return Vanishing(found, _direction_deviation_deg(found, segments), share, contrast) if enough else None
+    enough = np.count_nonzero(running) >= LEAST_SEGMENTS and share >= LEAST_SHARE and contrast >= MIN_CONTRAST
+    return VanishingDirection(found, _direction_deviation_deg(found, segments), share, contrast) if enough else None
 
 
 def _direction_deviation_deg(found: FloatArray, segments: Segments) -> float:
-    matrices = _matrices(found, segments, WIDTHS_DEG[-1])
+    matrices = _scatter_matrices(found, segments, WIDTHS_DEG[-1])
     total = matrices.sum(axis=0)
-    without = [least_direction(total - matrix, found) for matrix in matrices if matrix.any()]
+    without = [smallest_eigenvector(total - matrix, found) for matrix in matrices if matrix.any()]
     return _jackknife(axis_angle_deg(np.reshape(without, (-1, 3)), found))
 
 

@@ -5,15 +5,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import PurePosixPath
 
-from sfm_app.photos.letterbox import with_one_frame
+from sfm_app.photos.letterbox import unify_frames
 from sfm_app.types import Photo
 
-ON_END_DEG = 90
+PORTRAIT_TURN_DEG = 90
 """Rotation assumed for a portrait photo whose EXIF does not give one. The opposite rotation would only mirror the
 optical center, which lies near the middle."""
 
 
-def grouped(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
+def group_by_camera(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
     """Yield photos with their groups, in their order; photos of one group share one camera.
 
     A camera in COLMAP has one image size. Photos without an EXIF rotation are therefore turned to the more common
@@ -24,31 +24,31 @@ def grouped(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
         photos: their group is the camera named in EXIF.
         cameras: "auto": by EXIF; "single": one camera for all; "folder": one per folder; "each": one per photo.
     """
-    sizes = Counter((_maker(photo, cameras), photo.width, photo.height) for photo in photos)
+    sizes = Counter((_camera_key(photo, cameras), photo.width, photo.height) for photo in photos)
     found = []
     for photo in photos:
-        maker = _maker(photo, cameras)
+        maker = _camera_key(photo, cameras)
         here, across = (sizes[maker, *size] for size in ((photo.width, photo.height), (photo.height, photo.width)))
         on_end = across > here or (across == here and photo.height > photo.width)
-        laid = _turned(photo) if across and on_end and not photo.turn_deg else photo
+        laid = _rotate(photo) if across and on_end and not photo.turn_deg else photo
         found.append(replace(laid, group=" ".join(filter(None, (f"{laid.width}x{laid.height}", maker)))))
-    yield from _within_bars(found) if cameras == "auto" else (replace(photo, shown=None) for photo in found)
+    yield from _split_by_shown_size(found) if cameras == "auto" else (replace(photo, shown=None) for photo in found)
 
 
-def _within_bars(photos: Sequence[Photo]) -> list[Photo]:
+def _split_by_shown_size(photos: Sequence[Photo]) -> list[Photo]:
     """Give letterboxed photos with different picture sizes groups of their own."""
     groups: dict[str, list[int]] = {}
     for place, photo in enumerate(photos):
         groups.setdefault(photo.group, []).append(place)
     found = list(photos)
     for places in groups.values():
-        for place, photo in zip(places, with_one_frame([photos[place] for place in places]), strict=True):
+        for place, photo in zip(places, unify_frames([photos[place] for place in places]), strict=True):
             inside = f"{photo.shown[2]}x{photo.shown[3]} in " if photo.shown else ""
             found[place] = replace(photo, group=inside + photo.group)
     return found
 
 
-def _maker(photo: Photo, cameras: str) -> str:
+def _camera_key(photo: Photo, cameras: str) -> str:
     return {
         "auto": photo.group,
         "single": "",
@@ -57,9 +57,11 @@ def _maker(photo: Photo, cameras: str) -> str:
     }[cameras]
 
 
-def _turned(photo: Photo) -> Photo:
+def _rotate(photo: Photo) -> Photo:
     shown = photo.shown
     if shown is not None:
         left, top, width, height = shown
         shown = (top, photo.width - left - width, height, width)
-    return replace(photo, width=photo.height, height=photo.width, turn_deg=ON_END_DEG, needs_copy=True, shown=shown)
+    return replace(
+        photo, width=photo.height, height=photo.width, turn_deg=PORTRAIT_TURN_DEG, needs_copy=True, shown=shown
+    )

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError, features
 
-from sfm_app.photos.exif import EXIF_IFD, GPS_IFD, orientation, printable
-from sfm_app.photos.tiff import complaints
+from sfm_app.photos.exif import EXIF_IFD, GPS_IFD, orientation, printable_text
+from sfm_app.photos.tiff import libtiff_errors
 from sfm_app.photos.video.video_formats import AVIF_BRANDS, HEAD_BYTES, HEIC_BRANDS, is_video
 
 FORMATS = ("JPEG", "PNG", "TIFF", "WEBP", "BMP")
@@ -27,7 +27,7 @@ LEAST_BYTES_PER_PX = 0.02
 """Real photos have more, even at high compression; decompression bombs of one color have less."""
 MOST_FRAMES = 100
 DAMAGED = "truncated or damaged"
-ONE_AT_A_TIME = Lock()
+LARGE_PHOTO_LOCK = Lock()
 
 
 class UnreadableError(Exception):
@@ -66,15 +66,15 @@ def read_picture(path: Path) -> DecodedPhoto:
     try:
         with Image.open(path, formats=formats()) as image:
             _refuse_bombs(image, path)
-            frames = _frames_of(image)
+            frames = _frame_count(image)
             image.seek(0)
-            with complaints() as wrong:
+            with libtiff_errors() as wrong:
                 image.load()
             if wrong:
                 raise UnreadableError(DAMAGED)
-            return DecodedPhoto(image, _exif_of(image), frames)
+            return DecodedPhoto(image, _read_exif(image), frames)
     except UnidentifiedImageError:
-        raise UnreadableError(_no_photo(path)) from None
+        raise UnreadableError(_unreadable_reason(path)) from None
     except UnreadableError:
         raise
     except Image.DecompressionBombError:
@@ -88,14 +88,14 @@ def read_picture(path: Path) -> DecodedPhoto:
 
 
 @contextmanager
-def room_for(path: Path) -> Iterator[None]:
+def large_photo_lock(path: Path) -> Iterator[None]:
     """Hold a lock while a large photo is decoded, because each takes ten bytes per pixel or more."""
     try:
         with Image.open(path, formats=formats()) as image:
             pixels = image.width * image.height
     except Exception:  # the reader reports it
         pixels = 0
-    with ONE_AT_A_TIME if pixels > LARGE_PX / 2 else nullcontext():
+    with LARGE_PHOTO_LOCK if pixels > LARGE_PX / 2 else nullcontext():
         yield
 
 
@@ -106,7 +106,7 @@ def _refuse_bombs(image: Image.Image, path: Path) -> None:
         raise UnreadableError("too many pixels for a file of its size")
 
 
-def _frames_of(image: Image.Image) -> int:
+def _frame_count(image: Image.Image) -> int:
     """Return the number of pictures, for a TIFF at most MOST_FRAMES + 1; 1 for an MPO, whose others are previews."""
     if image.format == "MPO":
         return 1
@@ -120,7 +120,7 @@ def _frames_of(image: Image.Image) -> int:
     return MOST_FRAMES + 1
 
 
-def _exif_of(image: Image.Image) -> Image.Exif:
+def _read_exif(image: Image.Image) -> Image.Exif:
     try:
         exif = image.getexif()
         exif.get_ifd(EXIF_IFD)
@@ -130,12 +130,12 @@ def _exif_of(image: Image.Image) -> Image.Exif:
     return exif
 
 
-def upright(picture: DecodedPhoto) -> Image.Image:
+def upright_image(picture: DecodedPhoto) -> Image.Image:
     """Return the picture upright by EXIF, in 8-bit RGB or gray, with transparent pixels on white."""
-    return turned_upright(_eight_bit(picture.image), orientation(picture.exif))
+    return undo_exif_orientation(_to_eight_bit(picture.image), orientation(picture.exif))
 
 
-def turned_upright(image: Image.Image, turned: int) -> Image.Image:
+def undo_exif_orientation(image: Image.Image, turned: int) -> Image.Image:
     """Turn an image upright by its EXIF orientation.
 
     Args:
@@ -145,7 +145,7 @@ def turned_upright(image: Image.Image, turned: int) -> Image.Image:
     return image.transpose(ORIENTATIONS[turned]) if turned in ORIENTATIONS else image
 
 
-def turned_back(upright: Image.Image, turn_deg: int) -> Image.Image:
+def rotate_to_sensor(upright: Image.Image, turn_deg: int) -> Image.Image:
     """Turn an upright image back to the orientation of the sensor.
 
     Args:
@@ -170,16 +170,16 @@ ORIENTATIONS = {
 """Pillow's transposition that undoes each EXIF orientation."""
 
 
-def _eight_bit(image: Image.Image) -> Image.Image:
+def _to_eight_bit(image: Image.Image) -> Image.Image:
     if image.mode.startswith("I") or image.mode == "F":
-        return Image.fromarray(_levels(np.asarray(image)))
+        return Image.fromarray(_to_gray_levels(np.asarray(image)))
     if image.mode in ("RGBA", "RGBa", "LA", "La", "PA") or "transparency" in image.info:
         white = Image.new("RGBA", image.size, "white")
         return Image.alpha_composite(white, image.convert("RGBA")).convert("RGB")
     return image if image.mode in ("RGB", "L") else image.convert("RGB")
 
 
-def _levels(deep: NDArray[Any]) -> NDArray[np.uint8]:
+def _to_gray_levels(deep: NDArray[Any]) -> NDArray[np.uint8]:
     """Map 16-bit gray, or gray of any other range, to 256 levels."""
     values = np.nan_to_num(deep.astype(np.float64))
     low, high = values.min(), values.max()
@@ -188,7 +188,7 @@ def _levels(deep: NDArray[Any]) -> NDArray[np.uint8]:
     return np.asarray(np.clip((values - low) * (255.0 / max(high - low, 1e-12)), 0, 255), np.uint8)
 
 
-def _no_photo(path: Path) -> str:
+def _unreadable_reason(path: Path) -> str:
     try:
         with path.open("rb") as file:
             head = file.read(HEAD_BYTES)
@@ -201,4 +201,4 @@ def _no_photo(path: Path) -> str:
     if head[4:8] == b"ftyp" and head[8:12] in AVIF_BRANDS:
         needed = "AVIF photos need a newer Pillow: `pip install -U pillow`"
         return DAMAGED if "AVIF" in formats() else needed
-    return f"a video; run it alone: sfm-app run {printable(path.name)}" if is_video(head) else "not a photo"
+    return f"a video; run it alone: sfm-app run {printable_text(path.name)}" if is_video(head) else "not a photo"

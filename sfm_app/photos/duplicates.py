@@ -4,29 +4,29 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sfm_app.photos.thumbnail_stats import SIDE_PX, Glance
+from sfm_app.photos.thumbnail_stats import SIDE_PX, PhotoStats
 from sfm_app.types import Photo, UnusablePhoto
 
-ALIKE = 0.015
+MAX_DIFFERENCE = 0.015
 """Largest root mean square difference between copies, as a share of the contrast. Moving the camera sideways by a
 thousandth of the width gives a larger difference; saving a picture again, smaller or as JPEG, a smaller one."""
 LEAST_CONTRAST = 4.0
 """Gray levels; pictures with less contrast are not compared."""
 
 
-def without_copies(glances: Sequence[Glance]) -> tuple[list[Photo], list[UnusablePhoto]]:
+def drop_duplicates(glances: Sequence[PhotoStats]) -> tuple[list[Photo], list[UnusablePhoto]]:
     """Return one photo per picture, and the copies of them; both in the order given.
 
     Of several copies, one with a mask is preferred, then the largest.
     """
-    order = sorted(range(len(glances)), key=lambda k: (not glances[k].photo.mask, -_pixels(glances[k].photo), k))
-    small = np.array([glance.small for glance in glances], np.float32).reshape(len(glances), SIDE_PX**2)
+    order = sorted(range(len(glances)), key=lambda k: (not glances[k].photo.mask, -_pixel_count(glances[k].photo), k))
+    small = np.array([glance.thumbnail for glance in glances], np.float32).reshape(len(glances), SIDE_PX**2)
     contrast = small.std(axis=1)
     kept: list[int] = []
     same: dict[int, int] = {}
     for k in order:
         off = np.sqrt(np.mean((small[kept] - small[k]) ** 2, axis=1)) / max(contrast[k], LEAST_CONTRAST)
-        if contrast[k] >= LEAST_CONTRAST and off.min(initial=np.inf) < ALIKE:
+        if contrast[k] >= LEAST_CONTRAST and off.min(initial=np.inf) < MAX_DIFFERENCE:
             same[k] = kept[int(off.argmin())]
         else:
             kept.append(k)
@@ -37,5 +37,5 @@ def without_copies(glances: Sequence[Glance]) -> tuple[list[Photo], list[Unusabl
     return photos, copies
 
 
-def _pixels(photo: Photo) -> int:
+def _pixel_count(photo: Photo) -> int:
     return photo.width * photo.height

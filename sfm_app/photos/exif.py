@@ -31,7 +31,7 @@ def camera_name(exif: Image.Exif) -> str:
     """Return make, model, focal length and digital zoom in one text; empty if EXIF has none of them."""
     details = exif.get_ifd(EXIF_IFD)
     said = [exif.get(MAKE), exif.get(MODEL), details.get(FOCAL_MM), _zoom(details.get(ZOOM))]
-    return " ".join(text for text in (printable(value) for value in said) if text)
+    return " ".join(text for text in (printable_text(value) for value in said) if text)
 
 
 def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
@@ -61,7 +61,7 @@ def gps_position(exif: Image.Exif) -> GpsPosition | None:
     return GpsPosition(latitude, longitude, _altitude_m(entries.get(GPS_ALTITUDE), entries.get(GPS_ALTITUDE_REF)))
 
 
-def printable(value: object) -> str:
+def printable_text(value: object) -> str:
     """Return a value as text without control characters; empty for None."""
     text = "" if value is None else str(value)
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())

@@ -8,7 +8,7 @@ from sfm_app.errors import InputError
 from sfm_app.photos.video.video_formats import ENDINGS
 
 HINT = "name the folder that holds the photos"
-VIDEOS = "MP4, MOV, MKV, WebM, AVI and MPEG are read: copy the file again, or save it as MP4"
+VIDEO_HINT = "MP4, MOV, MKV, WebM, AVI and MPEG are read: copy the file again, or save it as MP4"
 
 
 def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: Sequence[Path] = ()) -> list[str]:
@@ -25,18 +25,18 @@ def list_files(folder: Path, out: Path, listed_in: Path | None = None, closed: S
         InputError: there is no such folder, or it cannot be read.
     """
     if not folder.is_dir():
-        raise _no_folder(folder)
+        raise _bad_path_error(folder)
     try:
         next(folder.iterdir(), None)
     except OSError as err:
         raise InputError(f"cannot read {folder}: {err.strerror}") from err
     if listed_in is not None:
-        return _listed(listed_in)
+        return _read_list(listed_in)
     left_out = {place.resolve() for place in (out, *closed)}
     return sorted(path.relative_to(folder).as_posix() for path in _walk(folder, left_out))
 
 
-def _no_folder(path: Path) -> InputError:
+def _bad_path_error(path: Path) -> InputError:
     """Return the error for a path that is neither a folder nor a video."""
     if not path.exists():
         what = "file" if path.suffix.lower() in ENDINGS else "folder"
@@ -45,10 +45,10 @@ def _no_folder(path: Path) -> InputError:
         return InputError(f"not a folder: {path}", hint=f"{HINT}, or a video, not a photo")
     if not os.access(path, os.R_OK):
         return InputError(f"cannot read {path}: permission denied")
-    return InputError(f"{path} is empty" if not path.stat().st_size else f"not a video: {path}", hint=VIDEOS)
+    return InputError(f"{path} is empty" if not path.stat().st_size else f"not a video: {path}", hint=VIDEO_HINT)
 
 
-def place_of(folder: Path, name: str) -> Path | str:
+def resolve_file(folder: Path, name: str) -> Path | str:
     """Return the path of a file with links resolved, or the reason why it is not opened.
 
     Args:
@@ -73,7 +73,7 @@ def place_of(folder: Path, name: str) -> Path | str:
     return real if real.is_file() else "not a file"  # reading a pipe would never end
 
 
-def _listed(file: Path) -> list[str]:
+def _read_list(file: Path) -> list[str]:
     try:
         lines = file.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, ValueError) as err:

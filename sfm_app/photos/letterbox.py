@@ -14,11 +14,11 @@ from PIL import Image
 
 from sfm_app.types import Frame, Photo
 
-ALIKE = 8
+BAR_TOLERANCE = 8
 """Gray levels by which a bar may differ from its color: JPEG changes it by less, except for ringing beside the edge."""
-STRAY = 0.01
+STRAY_SHARE = 0.01
 """Share of the pixels of a line that may differ by more."""
-UNLIKE, LEAST_EDGE = 16, 0.7
+EDGE_CONTRAST, LEAST_EDGE = 16, 0.7
 """Gray levels by which the line behind the edge must differ from the bar, and the share of its pixels that must."""
 BLUR_PX, RINGING_PX = 3, 18
 """Largest distance, in lines, from the end of the uniform bar to the picture: resizing blurs the edge, and JPEG rings
@@ -38,17 +38,17 @@ def shown_part(picture: Image.Image) -> Frame | None:
     """
     pixels = np.asarray(picture.convert("RGB"))
     height, width = pixels.shape[:2]
-    top, bottom = _bar(pixels), _bar(pixels[::-1])
+    top, bottom = _bar_thickness(pixels), _bar_thickness(pixels[::-1])
     if top and not bottom:
         top = 0
     columns = pixels[top : height - bottom].transpose(1, 0, 2)
-    left, right = _bar(columns), _bar(columns[::-1])
+    left, right = _bar_thickness(columns), _bar_thickness(columns[::-1])
     if not any((left, top, right, bottom)):
         return None
     return left, top, width - left - right, height - top - bottom
 
 
-def with_one_frame(photos: Sequence[Photo]) -> Iterator[Photo]:
+def unify_frames(photos: Sequence[Photo]) -> Iterator[Photo]:
     """Yield photos of one size, with nearly equal picture frames replaced by their median.
 
     If all detected bars agree, photos without detected bars (for example, with a sky of the same color) get them too.
@@ -83,21 +83,21 @@ def _edges(frame: Frame) -> NDArray[np.int64]:
     return np.array([left, top, left + width, top + height])
 
 
-def _bar(lines: NDArray[np.uint8]) -> int:
+def _bar_thickness(lines: NDArray[np.uint8]) -> int:
     """Return how many of the first lines of (N, M, 3) form a bar."""
     color = np.median(lines[0], axis=0).astype(np.int16)
     most = int(MOST_SHARE * len(lines))
-    first = next((k for k in range(most) if _share(lines[k], color, ALIKE) > STRAY), 0)
+    first = next((k for k in range(most) if _differing_share(lines[k], color, BAR_TOLERANCE) > STRAY_SHARE), 0)
     if first < max(LEAST_PX, LEAST_SHARE * len(lines)):
         return 0
     behind = range(first, min(first + RINGING_PX, most))
-    unlike = [_share(lines[k], color, UNLIKE) for k in behind]
+    unlike = [_differing_share(lines[k], color, EDGE_CONTRAST) for k in behind]
     edge = next((k for k, share in zip(behind, unlike, strict=True) if share >= LEAST_EDGE), 0)
     if sum(share >= LEAST_EDGE / 2 for share in unlike[: max(edge - first, 0)]) > BLUR_PX:
         return 0  # a sloping edge belongs to an object, not to a bar
     return first if 0 < edge <= first + BLUR_PX else edge
 
 
-def _share(line: NDArray[np.uint8], color: NDArray[np.int16], levels: int) -> float:
+def _differing_share(line: NDArray[np.uint8], color: NDArray[np.int16], levels: int) -> float:
     """Return the share of a line (M, 3) that differs from a color by more than `levels`."""
     return float(np.mean(np.max(np.abs(line.astype(np.int16) - color), axis=1) > levels))

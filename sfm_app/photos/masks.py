@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.errors import InputError
-from sfm_app.photos.decode import UnreadableError, read_picture, turned_back, turned_upright
+from sfm_app.photos.decode import UnreadableError, read_picture, rotate_to_sensor, undo_exif_orientation
 from sfm_app.photos.exif import orientation
-from sfm_app.photos.files import list_files, place_of
+from sfm_app.photos.files import list_files, resolve_file
 from sfm_app.types import Photo, UnusablePhoto
 
 ENDING = ".png"
 MASK_HINT = "the mask of sub/a.jpg is sub/a.jpg.png or sub/a.png in the folder of masks, of the size of the photo"
-USED = 255
-SIDEWAYS = 5
+WHITE = 255
+FIRST_SIDEWAYS = 5
 """EXIF orientations from this value on swap width and height."""
 
 BoolImage = NDArray[np.bool_]
@@ -65,7 +65,7 @@ def find_mask(photo: Photo, folder: Path, masks: Path) -> Photo | UnusablePhoto:
     if not name:
         return photo
     found = replace(photo, mask=name)
-    if not np.any(_fitted(found, folder, masks)):
+    if not np.any(_load_fitted_mask(found, folder, masks)):
         return UnusablePhoto(photo.path, f"its mask {name} is all black")
     return found
 
@@ -96,11 +96,11 @@ def lay_out_mask(photo: Photo, folder: Path, masks: Path, target: Path) -> None:
         InputError: as `find_mask`.
         OSError: the target cannot be written.
     """
-    used = _fitted(photo, folder, masks) if photo.mask else np.full((photo.height, photo.width), True)
-    save_used(target, photo.name, used)
+    used = _load_fitted_mask(photo, folder, masks) if photo.mask else np.full((photo.height, photo.width), True)
+    save_mask(target, photo.name, used)
 
 
-def mask_place(target: Path, name: str) -> Path:
+def mask_path(target: Path, name: str) -> Path:
     """Return the path of the staged mask of a photo.
 
     Args:
@@ -110,7 +110,7 @@ def mask_place(target: Path, name: str) -> Path:
     return target / f"{name}{ENDING}"
 
 
-def save_used(target: Path, name: str, used: BoolImage) -> None:
+def save_mask(target: Path, name: str, used: BoolImage) -> None:
     """Write the usable pixels of a photo as a black and white mask.
 
     Args:
@@ -118,13 +118,13 @@ def save_used(target: Path, name: str, used: BoolImage) -> None:
         name: of the photo.
         used: (H, W), in the orientation of the laid-out photo.
     """
-    place = mask_place(target, name)
+    place = mask_path(target, name)
     place.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(_painted(used)).save(place, "PNG", compress_level=1)
+    Image.fromarray(_to_uint8(used)).save(place, "PNG", compress_level=1)
 
 
-def read_used(target: Path, name: str) -> BoolImage:
-    """Read the (H, W) mask that `save_used` wrote.
+def read_mask(target: Path, name: str) -> BoolImage:
+    """Read the (H, W) mask that `save_mask` wrote.
 
     Args:
         target: folder of the staged masks.
@@ -133,11 +133,11 @@ def read_used(target: Path, name: str) -> BoolImage:
     Raises:
         OSError: it cannot be read.
     """
-    with Image.open(mask_place(target, name)) as image:
+    with Image.open(mask_path(target, name)) as image:
         return np.asarray(image) > 0
 
 
-def without_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uint8]:
+def fill_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uint8]:
     """Return a photo whose masked pixels take the color of the nearest usable pixel.
 
     This keeps masked colors out of interpolation and downscaling.
@@ -156,40 +156,40 @@ def without_masked(pixels: NDArray[np.uint8], used: BoolImage) -> NDArray[np.uin
     return np.asarray(pixels.reshape(-1, 3)[place[nearest]])
 
 
-def _fitted(photo: Photo, folder: Path, masks: Path) -> BoolImage:
+def _load_fitted_mask(photo: Photo, folder: Path, masks: Path) -> BoolImage:
     """Return (H, W) usable pixels of the photo by its mask, in the orientation of the laid-out photo."""
     try:
-        place = place_of(masks, photo.mask)
+        place = resolve_file(masks, photo.mask)
         if isinstance(place, str):
             raise UnreadableError(place)
         picture = read_picture(place)
-        mask = turned_upright(_black_and_white(picture.image), orientation(picture.exif))
+        mask = undo_exif_orientation(_binarize(picture.image), orientation(picture.exif))
         size = (photo.height, photo.width) if photo.turn_deg in (90, 270) else (photo.width, photo.height)
-        if not _alike(mask.size, size):
-            mask = _turned_like(photo, size, mask, folder)
+        if not _has_same_aspect(mask.size, size):
+            mask = _orient_mask(photo, size, mask, folder)
     except UnreadableError as err:
         raise InputError(f"the mask {photo.mask} cannot be used: {err}", hint=MASK_HINT) from err
     fitted = mask if mask.size == size else mask.resize(size, Image.Resampling.NEAREST)
-    return np.asarray(turned_back(fitted, photo.turn_deg)) > 0
+    return np.asarray(rotate_to_sensor(fitted, photo.turn_deg)) > 0
 
 
-def _turned_like(photo: Photo, size: tuple[int, int], mask: Image.Image, folder: Path) -> Image.Image:
+def _orient_mask(photo: Photo, size: tuple[int, int], mask: Image.Image, folder: Path) -> Image.Image:
     """Apply the photo's EXIF orientation to a mask that was painted on the pixels as stored in the file."""
-    if _alike(mask.size[::-1], size):
-        source = place_of(folder, photo.path)
+    if _has_same_aspect(mask.size[::-1], size):
+        source = resolve_file(folder, photo.path)
         turned = orientation(read_picture(source).exif) if isinstance(source, Path) else 1
-        if turned >= SIDEWAYS:
-            return turned_upright(mask, turned)
+        if turned >= FIRST_SIDEWAYS:
+            return undo_exif_orientation(mask, turned)
     width, height = mask.size
     raise UnreadableError(f"it has {width} x {height} pixels, its photo {size[0]} x {size[1]}")
 
 
-def _alike(one: tuple[int, int], other: tuple[int, int]) -> bool:
+def _has_same_aspect(one: tuple[int, int], other: tuple[int, int]) -> bool:
     """Return whether two sizes have the same aspect ratio, to within a pixel of the smaller one."""
     return abs(one[0] * other[1] - one[1] * other[0]) <= max(*one, *other)
 
 
-def _black_and_white(image: Image.Image) -> Image.Image:
+def _binarize(image: Image.Image) -> Image.Image:
     """Return white where any channel is nonzero and the pixel is not transparent."""
     if image.mode.startswith("I") or image.mode == "F":
         used = np.asarray(image) != 0
@@ -200,8 +200,8 @@ def _black_and_white(image: Image.Image) -> Image.Image:
     else:
         channels = np.asarray(image.convert("RGBA"))
         used = channels[..., :3].any(axis=2) & (channels[..., 3] > 0)
-    return Image.fromarray(_painted(used))
+    return Image.fromarray(_to_uint8(used))
 
 
-def _painted(used: BoolImage) -> NDArray[np.uint8]:
-    return np.where(used, np.uint8(USED), np.uint8(0))
+def _to_uint8(used: BoolImage) -> NDArray[np.uint8]:
+    return np.where(used, np.uint8(WHITE), np.uint8(0))

@@ -10,24 +10,24 @@ from sfm_app.photos.decode import (
     MOST_FRAMES,
     DecodedPhoto,
     UnreadableError,
+    large_photo_lock,
     read_picture,
-    room_for,
-    turned_back,
-    upright,
+    rotate_to_sensor,
+    upright_image,
 )
 from sfm_app.photos.exif import camera_name, focal_px, gps_position, orientation, turn_deg
-from sfm_app.photos.files import place_of
+from sfm_app.photos.files import resolve_file
 from sfm_app.photos.letterbox import shown_part
-from sfm_app.photos.thumbnail_stats import Glance, glance
+from sfm_app.photos.thumbnail_stats import PhotoStats, measure_photo
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import Frame, Photo, UnusablePhoto
 
 MEGA = 1_000_000
-LINKED = ("JPEG", "MPO", "PNG")
+LINKED_FORMATS = ("JPEG", "MPO", "PNG")
 """Formats that COLMAP reads and writes without conversion."""
 
 
-def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | UnusablePhoto:
+def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> PhotoStats | UnusablePhoto:
     """Decode one file to check that it is intact, and measure what is needed to compare it with other photos.
 
     Args:
@@ -35,17 +35,17 @@ def read_photo(folder: Path, name: str, *, options: PhotoSettings) -> Glance | U
         name: path inside the folder.
         options: smallest and largest size.
     """
-    place = place_of(folder, name)
+    place = resolve_file(folder, name)
     if isinstance(place, str):
         return UnusablePhoto(name, place)
     try:
-        with room_for(place):
-            return described(name, read_picture(place), options)
+        with large_photo_lock(place):
+            return describe(name, read_picture(place), options)
     except UnreadableError as err:
         return UnusablePhoto(name, str(err))
 
 
-def described(name: str, picture: DecodedPhoto, options: PhotoSettings) -> Glance | UnusablePhoto:
+def describe(name: str, picture: DecodedPhoto, options: PhotoSettings) -> PhotoStats | UnusablePhoto:
     """Return a photo's metadata and image statistics.
 
     Args:
@@ -58,7 +58,7 @@ def described(name: str, picture: DecodedPhoto, options: PhotoSettings) -> Glanc
     size = image.size[::-1] if orientation(exif) >= 5 and not turn else image.size
     if min(size) < options.min_side_px:
         return UnusablePhoto(name, f"smaller than {options.min_side_px} px")
-    width, height = scaled(size, options.max_megapixels * MEGA)
+    width, height = scaled_size(size, options.max_megapixels * MEGA)
     many = f"its {picture.frames}" if picture.frames <= MOST_FRAMES else f"more than {MOST_FRAMES}"
     notes = [f"the first of {many} pictures"] if picture.frames > 1 else []
     if (width, height) != size:
@@ -70,19 +70,21 @@ def described(name: str, picture: DecodedPhoto, options: PhotoSettings) -> Glanc
         height=height,
         group=camera_name(exif),
         exif_focal_px=focal_px(exif, max(width, height)),
-        needs_copy=not (image.format in LINKED and eight_bit and orientation(exif) == 1 and (width, height) == size),
+        needs_copy=not (
+            image.format in LINKED_FORMATS and eight_bit and orientation(exif) == 1 and (width, height) == size
+        ),
         gps=gps_position(exif),
         lossy=image.format in LOSSY,
         turn_deg=turn,
         notes=tuple(notes),
     )
-    seen = upright(picture)
-    return glance(replace(photo, shown=_shown(seen, photo)), seen)
+    seen = upright_image(picture)
+    return measure_photo(replace(photo, shown=_shown_frame(seen, photo)), seen)
 
 
-def _shown(seen: Image.Image, photo: Photo) -> Frame | None:
+def _shown_frame(seen: Image.Image, photo: Photo) -> Frame | None:
     """Return the frame of the picture within bars, in pixels of the laid-out photo."""
-    laid = turned_back(seen, photo.turn_deg)
+    laid = rotate_to_sensor(seen, photo.turn_deg)
     found = shown_part(laid)
     if found is None or laid.size == (photo.width, photo.height):
         return found
@@ -90,7 +92,7 @@ def _shown(seen: Image.Image, photo: Photo) -> Frame | None:
     return round(found[0] * x), round(found[1] * y), round(found[2] * x), round(found[3] * y)
 
 
-def scaled(size: tuple[int, int], most_px: float) -> tuple[int, int]:
+def scaled_size(size: tuple[int, int], most_px: float) -> tuple[int, int]:
     """Return width and height after shrinking a picture to at most `most_px` pixels.
 
     Args:

@@ -7,15 +7,15 @@ from stat import S_ISREG
 
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.hashing import digest_file, fingerprint
-from sfm_app.photos.files import list_files, place_of
+from sfm_app.photos.files import list_files, resolve_file
 from sfm_app.photos.masks import list_masks
-from sfm_app.photos.video.video_formats import head_of, is_video
+from sfm_app.photos.video.video_formats import is_video, read_head
 from sfm_app.settings import PhotoSettings, Settings
 from sfm_app.types import PhotoSet
 
 Stamp = tuple[int, int]
 """Size in bytes, and time of the last change in nanoseconds."""
-Spread = Callable[[Callable[[str], str], Sequence[str]], Iterable[str]]
+ParallelMap = Callable[[Callable[[str], str], Sequence[str]], Iterable[str]]
 """Calls a function for every item, possibly in parallel, and returns the results in order."""
 
 
@@ -52,7 +52,7 @@ class Source:
         cameras = "single" if settings.photos.cameras == "auto" else settings.photos.cameras
         return settings.model_copy(update={"photos": settings.photos.model_copy(update={"cameras": cameras})})
 
-    def content(self, photos: PhotoSet) -> str:
+    def content_hash(self, photos: PhotoSet) -> str:
         """Return a hash of the used photos and their masks; other files of the folder do not enter.
 
         Nor do camera groups: features and matches do not depend on which camera took a photo.
@@ -79,7 +79,7 @@ class Source:
                 raise InputError(f"{path} {what} since the run began", hint="run again once the files are restored")
 
 
-def read_source(path: Path, out: Path, options: PhotoSettings, spread: Spread) -> Source:
+def read_source(path: Path, out: Path, options: PhotoSettings, spread: ParallelMap) -> Source:
     """List the input files and compute their hashes.
 
     Args:
@@ -91,14 +91,14 @@ def read_source(path: Path, out: Path, options: PhotoSettings, spread: Spread) -
     Raises:
         InputError: the photos or the masks cannot be used.
     """
-    video, mask_dir = is_video(head_of(path)), Path(options.masks) if options.masks else None
+    video, mask_dir = is_video(read_head(path)), Path(options.masks) if options.masks else None
     listed = Path(options.images) if options.images else None
     names = [""] if video else list_files(path, out, listed, closed=() if mask_dir is None else (mask_dir,))
     mask_names = [] if mask_dir is None else list_masks(mask_dir, path, out)
     paths = [path / name for name in names] + [mask_dir / name for name in mask_names if mask_dir is not None]
     stamps = {file: stamp for file in paths if (stamp := _stamp(file)) is not None}
-    files = {"": digest(path)} if video else _contents(path, names, spread)
-    masks = {} if mask_dir is None else _contents(mask_dir, mask_names, spread)
+    files = {"": digest(path)} if video else _digests(path, names, spread)
+    masks = {} if mask_dir is None else _digests(mask_dir, mask_names, spread)
     return Source(path, video, files, mask_dir, masks, stamps)
 
 
@@ -119,11 +119,11 @@ def _stamp(path: Path) -> Stamp | None:
     return (found.st_size, found.st_mtime_ns) if S_ISREG(found.st_mode) else None
 
 
-def _contents(folder: Path, names: Sequence[str], spread: Spread) -> dict[str, str]:
+def _digests(folder: Path, names: Sequence[str], spread: ParallelMap) -> dict[str, str]:
     """Return the hashes of files in a folder by name; the reason instead of a hash if a file is not read."""
 
-    def digest_of(name: str) -> str:
-        place = place_of(folder, name)
+    def file_digest(name: str) -> str:
+        place = resolve_file(folder, name)
         return place if isinstance(place, str) else digest(place)
 
-    return dict(zip(names, spread(digest_of, names), strict=True))
+    return dict(zip(names, spread(file_digest, names), strict=True))

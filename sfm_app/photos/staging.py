@@ -9,8 +9,8 @@ from pathlib import Path, PurePosixPath
 from PIL import Image
 
 from sfm_app.hashing import is_below
-from sfm_app.photos.decode import UnreadableError, read_picture, room_for, turned_back, upright
-from sfm_app.photos.files import place_of
+from sfm_app.photos.decode import UnreadableError, large_photo_lock, read_picture, rotate_to_sensor, upright_image
+from sfm_app.photos.files import resolve_file
 from sfm_app.types import Photo
 
 READ_BY_COLMAP = (".jpg", ".jpeg", ".png")
@@ -18,7 +18,7 @@ READ_BY_COLMAP = (".jpg", ".jpeg", ".png")
 JPEG_QUALITY = 95
 
 
-def stored_names(photos: Iterable[Photo]) -> Iterator[Photo]:
+def assign_names(photos: Iterable[Photo]) -> Iterator[Photo]:
     """Yield photos with unique names that COLMAP can write into databases and line-based lists.
 
     A name is printable and has an extension that COLMAP knows; a name that already fits is kept.
@@ -50,18 +50,18 @@ def lay_out(photo: Photo, folder: Path, target: Path) -> None:
         raise UnreadableError("its name leads out of the folder")
     place.parent.mkdir(parents=True, exist_ok=True)
     place.unlink(missing_ok=True)  # writing to an existing link would change its target
-    source = place_of(folder, photo.path)
+    source = resolve_file(folder, photo.path)
     if isinstance(source, str):
         raise UnreadableError(source)
     if not photo.needs_copy:
         _link(source, place, relative=folder.parent.resolve() == target.parent.resolve())
         return
-    with room_for(source):
+    with large_photo_lock(source):
         _copy(photo, source, place)
 
 
 def _copy(photo: Photo, source: Path, place: Path) -> None:
-    copy = turned_back(upright(read_picture(source)), photo.turn_deg)
+    copy = rotate_to_sensor(upright_image(read_picture(source)), photo.turn_deg)
     if copy.size != (photo.width, photo.height):
         copy = copy.resize((photo.width, photo.height), Image.Resampling.LANCZOS)
     if photo.lossy:

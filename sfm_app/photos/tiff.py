@@ -10,39 +10,39 @@ from typing import Any
 
 import PIL
 
-PLACES = (Path(PIL.__file__).parents[1] / "pillow.libs", Path(PIL.__file__).parent / ".dylibs")
+LIBRARY_DIRS = (Path(PIL.__file__).parents[1] / "pillow.libs", Path(PIL.__file__).parent / ".dylibs")
 """Where Pillow's wheels keep their own libtiff on Linux and macOS."""
 HANDLER = ctypes.CFUNCTYPE(None, ctypes.c_char_p, ctypes.c_char_p, ctypes.c_void_p)
 """Type of libtiff's error callback: module, format and arguments of a message."""
 
-_heard = threading.local()
+_thread_errors = threading.local()
 
 
 @contextmanager
-def complaints() -> Iterator[list[str]]:
+def libtiff_errors() -> Iterator[list[str]]:
     """Provide a list that collects libtiff's errors while this thread decodes.
 
     It stays empty if Pillow has no libtiff of its own.
     """
-    _listen()
-    _heard.errors = []
+    _install_handler()
+    _thread_errors.errors = []
     try:
-        yield _heard.errors
+        yield _thread_errors.errors
     finally:
-        del _heard.errors
+        del _thread_errors.errors
 
 
-def _note(_module: Any, text: bytes | None, _arguments: Any) -> None:
-    getattr(_heard, "errors", []).append((text or b"").decode(errors="replace"))
+def _record_error(_module: Any, text: bytes | None, _arguments: Any) -> None:
+    getattr(_thread_errors, "errors", []).append((text or b"").decode(errors="replace"))
 
 
-NOTE = HANDLER(_note)
+ERROR_CALLBACK = HANDLER(_record_error)
 """Kept here, because libtiff keeps only its address."""
 
 
 @cache
-def _listen() -> None:
-    for library in (file for place in PLACES for file in place.glob("libtiff*")):
+def _install_handler() -> None:
+    for library in (file for place in LIBRARY_DIRS for file in place.glob("libtiff*")):
         set_handler = ctypes.CDLL(str(library)).TIFFSetErrorHandler
         set_handler.argtypes, set_handler.restype = [HANDLER], ctypes.c_void_p
-        set_handler(NOTE)
+        set_handler(ERROR_CALLBACK)

@@ -17,17 +17,17 @@ IndexArray = NDArray[np.int64]
 CELLS = 12
 """Cells along the longer side of a photo. 16 give the same on oats23 and books21; with 24 one wrong pair enters the
 backbone of oats23, and nothing is found there. docs/algorithms.md, Look-alikes."""
-CONFIRMED = 2
+MIN_OTHER_PHOTOS = 2
 """A keypoint is known to the set if it has partners in this many photos besides that of the pair. Chosen by hand; not
 measured on its own."""
-NEARLY_BEST = 0.9
+BACKBONE_SHARE = 0.9
 """A pair belongs to the backbone if its coverage is at least this share of that of the weakest pair on the best path
 between its photos. On oats23 and books21 equal things in different places reach 0.84 at most. docs/algorithms.md,
 Look-alikes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class Visibility:
     """Inliers of all pairs, and the keypoints and cells of the photos that they are in."""
 
     rows: Mapping[PairId, IndexArray]
@@ -38,7 +38,7 @@ class Sight:
     """By photo, (K,) number of the cell of each keypoint."""
 
 
-def sight_of(matches: MatchGraph, poses: Mapping[PairId, RelativePose]) -> Sight:
+def compute_visibility(matches: MatchGraph, poses: Mapping[PairId, RelativePose]) -> Visibility:
     """Collect the inliers of all pairs, their counts by keypoint, and the cells of all keypoints.
 
     Args:
@@ -51,17 +51,17 @@ def sight_of(matches: MatchGraph, poses: Mapping[PairId, RelativePose]) -> Sight
     for pair, found in rows.items():
         for photo, column in zip(pair, found.T, strict=True):
             seen[photo][np.unique(column)] += 1
-    return Sight(rows, seen, {photo: _cells_of(matches, photo) for photo in photos})
+    return Visibility(rows, seen, {photo: _keypoint_cells(matches, photo) for photo in photos})
 
 
-def _cells_of(matches: MatchGraph, photo: int) -> IndexArray:
+def _keypoint_cells(matches: MatchGraph, photo: int) -> IndexArray:
     """Return the numbers (K,) of the cells in which the keypoints of a photo lie."""
     image = matches.images[photo]
     columns, lines = (matches.keypoints[photo] // (max(image.width, image.height) / CELLS)).astype(np.int64).T
     return np.asarray(lines * (CELLS + 1) + columns, np.int64)
 
 
-def coverages(sight: Sight) -> dict[PairId, float]:
+def coverages(sight: Visibility) -> dict[PairId, float]:
     """Return by pair the share of the known cells that it covers, mean over its two photos, 0 to 1."""
     found = {}
     for pair, rows in sight.rows.items():
@@ -71,7 +71,7 @@ def coverages(sight: Sight) -> dict[PairId, float]:
             hit = np.zeros(len(seen), np.bool_)
             hit[column] = True
             covered = np.unique(cells[hit])
-            known = np.unique(cells[hit | (seen >= CONFIRMED)])
+            known = np.unique(cells[hit | (seen >= MIN_OTHER_PHOTOS)])
             shares.append(len(covered) / len(known))
         found[pair] = float(np.mean(shares))
     return found
@@ -92,12 +92,12 @@ def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
         partners.setdefault(a, []).append(b)
     chosen = set()
     for a, others in partners.items():
-        widest = _widest(a, near)
-        chosen |= {(a, b) for b in others if covered[a, b] >= NEARLY_BEST * widest[b]}
+        widest = _bottleneck_coverages(a, near)
+        chosen |= {(a, b) for b in others if covered[a, b] >= BACKBONE_SHARE * widest[b]}
     return chosen
 
 
-def _widest(root: int, near: Mapping[int, list[tuple[int, float]]]) -> dict[int, float]:
+def _bottleneck_coverages(root: int, near: Mapping[int, list[tuple[int, float]]]) -> dict[int, float]:
     """Return, by photo, the weakest coverage on the path from the root along the tree."""
     found, waiting = {root: np.inf}, [root]
     while waiting:

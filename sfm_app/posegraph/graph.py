@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from sfm_app.numerical import FAILURES
 from sfm_app.posegraph.groups import connected_groups
 from sfm_app.posegraph.guided import guided_pose
-from sfm_app.posegraph.look_alikes import tell_apart
-from sfm_app.posegraph.pair_pose import Pair, estimated
-from sfm_app.posegraph.rotations import agreeing_loops, average_rotations
+from sfm_app.posegraph.look_alikes import find_look_alikes
+from sfm_app.posegraph.pair_pose import Pair, estimate_pose
+from sfm_app.posegraph.rotations import average_rotations, check_loops
 from sfm_app.types import EpipolarFit, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose, ViewGraph
 
 logger = logging.getLogger("sfm_app")
 
 FloatArray = NDArray[np.float64]
-Map = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
+ParallelMap = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
 """Results of a function in the order of its arguments, computed in parallel; the text labels a progress bar."""
 
 LEAST_IN_FRONT = 0.75
@@ -29,18 +29,18 @@ AGREEMENT_DEG, GUESSED_DEG, SPREADS = 5.0, 15.0, 4.0
 """Largest angle between the rotation of a pair and those of its photos, the same if a camera is a guess, and the limit
 as a multiple of the median angle; the larger limit holds. docs/algorithms.md, From K to relative poses. Chosen by hand;
 not measured on their own."""
-ENOUGH = 100.0
+SATURATION_INLIERS = 100.0
 """Number of inliers above which the weight of a pair hardly grows. docs/algorithms.md, From K to relative poses. Chosen
 by hand; not measured on its own."""
-FLAT = 0.1
+FLAT_WEIGHT = 0.1
 """Weight factor of a pair whose matches lie on a plane: two poses explain it, and often the wrong one is chosen. Chosen
 on kitchen25, where such pairs outvoted those that join its two halves; nothing changes on castle-P19, fountain-P11 and
 temple16. All sets: benchmarks/corpus/tuning_sets.py."""
-WEAK = 2.0
+WEAK_FACTOR = 2.0
 """A pair with fewer inliers than this multiple of the minimum must be confirmed by a loop of other pairs.
 docs/algorithms.md, From K to relative poses. Chosen by hand; not measured on its own."""
 CONTRADICTS, BEHIND, TOO_FEW = "contradicts other pairs", "points behind a camera", "too few matches fit the cameras"
-NO_NUMBERS = "its pose cannot be computed"
+NOT_COMPUTABLE = "its pose cannot be computed"
 UNCONFIRMED = "few matches, and no other pair bears it out"
 LOOKS_ALIKE = "equal things in different places"
 
@@ -58,7 +58,7 @@ class PoseGraphOptions:
 
 
 def build_pose_graph(
-    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, options: PoseGraphOptions, run_map: Map
+    matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, options: PoseGraphOptions, run_map: ParallelMap
 ) -> PoseGraph:
     """Build the graph of relative poses: without pairs that contradict others, with rejected pairs that others recover.
 
@@ -70,45 +70,45 @@ def build_pose_graph(
         run_map: computes pairs in parallel.
     """
 
-    def pair_of(pair: PairId) -> Pair:
+    def make_pair(pair: PairId) -> Pair:
         cameras = [intrinsics.camera(matches.images[photo]) for photo in pair]
         return Pair(matches.points(pair), cameras, options.max_error_px)
 
-    def from_fit(item: tuple[PairId, EpipolarFit]) -> RelativePose | str | None:
+    def estimate_from_fit(item: tuple[PairId, EpipolarFit]) -> RelativePose | str | None:
         try:
-            return estimated(pair_of(item[0]), item[1])
+            return estimate_pose(make_pair(item[0]), item[1])
         except FAILURES as err:
             logger.info("pair %s has no pose", item[0], exc_info=err)
-            return NO_NUMBERS
+            return NOT_COMPUTABLE
 
-    found = dict(zip(views.fits, run_map(from_fit, list(views.fits.items()), "relative poses"), strict=True))
-    poses, dropped = _plausible(found, options.min_inliers)
+    found = dict(zip(views.fits, run_map(estimate_from_fit, list(views.fits.items()), "relative poses"), strict=True))
+    poses, dropped = _split_plausible(found, options.min_inliers)
     cameras = {photo: intrinsics.camera(image) for photo, image in matches.images.items()}
-    apart = tell_apart(matches, poses, cameras)
+    apart = find_look_alikes(matches, poses, cameras)
     for pair in [pair for join in apart.joins for pair in join.pairs]:
         dropped[pair] = LOOKS_ALIKE
         del poses[pair]
-    rotations, angles = averaged(poses, {pair for pair, fit in views.fits.items() if fit.degeneracy})
-    for pair in _contradicting(poses, angles):
+    rotations, angles = average_pair_rotations(poses, {pair for pair, fit in views.fits.items() if fit.degeneracy})
+    for pair in _contradicting_pairs(poses, angles):
         dropped[pair] = CONTRADICTS
         del poses[pair]
 
-    def again(pair: PairId) -> RelativePose | None:
+    def estimate_guided(pair: PairId) -> RelativePose | None:
         seed = int(np.random.SeedSequence([options.seed, *pair]).generate_state(1)[0])
-        known = pair_of(pair)
+        known = make_pair(pair)
         R = rotations[pair[1]] @ rotations[pair[0]].T
         try:
             return guided_pose(known, R, options.min_inliers, seed) if known.trusted else None
         except FAILURES:  # the reason that it has no pose is already recorded
             return None
 
-    left = [pair for pair in _without_pose(matches.matches, poses) if dropped.get(pair) != LOOKS_ALIKE]
-    for pair, pose in zip(left, run_map(again, left, "relative poses by known rotations"), strict=True):
-        if pose is not None and not apart.strange(pair, matches.matches[pair][pose.inliers]):
+    left = [pair for pair in _pairs_without_pose(matches.matches, poses) if dropped.get(pair) != LOOKS_ALIKE]
+    for pair, pose in zip(left, run_map(estimate_guided, left, "relative poses by known rotations"), strict=True):
+        if pose is not None and not apart.is_look_alike(pair, matches.matches[pair][pose.inliers]):
             poses[pair] = pose
             dropped.pop(pair, None)
     poses = dict(sorted(poses.items()))
-    for pair in _unconfirmed(poses, WEAK * options.min_inliers):
+    for pair in _unconfirmed_pairs(poses, WEAK_FACTOR * options.min_inliers):
         dropped[pair] = UNCONFIRMED
         del poses[pair]
     stayed = (replace(join, pairs=tuple(pair for pair in join.pairs if pair in poses)) for join in apart.doubtful)
@@ -132,13 +132,13 @@ def with_model(graph: PoseGraph, photos: Collection[int], poses: Mapping[PairId,
     return replace(graph, poses=entered, dropped=left, groups=_groups(entered))
 
 
-def _without_pose(pairs: Iterable[PairId], poses: Mapping[PairId, RelativePose]) -> list[PairId]:
+def _pairs_without_pose(pairs: Iterable[PairId], poses: Mapping[PairId, RelativePose]) -> list[PairId]:
     """Return the pairs without a pose whose photos are connected by pairs with one."""
     group = {photo: number for number, photos in enumerate(_groups(poses)) for photo in photos}
     return [pair for pair in pairs if pair not in poses and group.get(pair[0], -1) == group.get(pair[1], -2)]
 
 
-def _contradicting(poses: Mapping[PairId, RelativePose], angles: Mapping[PairId, float]) -> list[PairId]:
+def _contradicting_pairs(poses: Mapping[PairId, RelativePose], angles: Mapping[PairId, float]) -> list[PairId]:
     """Return the pairs whose angles to the rotations of their photos, in degrees, exceed the limit."""
     typical = SPREADS * float(np.median(list(angles.values()) or [0.0]))
     limits = {
@@ -147,7 +147,7 @@ def _contradicting(poses: Mapping[PairId, RelativePose], angles: Mapping[PairId,
     return [pair for pair, angle in angles.items() if angle > limits[pair]]
 
 
-def averaged(
+def average_pair_rotations(
     poses: Mapping[PairId, RelativePose], flat: Collection[PairId] = ()
 ) -> tuple[dict[int, FloatArray], dict[PairId, float]]:
     """Average the rotations of pairs, weighted by inliers, to those of photos; return these and how far pairs are off.
@@ -157,20 +157,22 @@ def averaged(
         flat: pairs whose matches lie on one plane, or otherwise do not determine F: they get little weight.
     """
     weights = {
-        pair: pose.inlier_count / (1.0 + pose.inlier_count / ENOUGH) * (FLAT if pair in flat else 1.0)
+        pair: pose.inlier_count
+        / (1.0 + pose.inlier_count / SATURATION_INLIERS)
+        * (FLAT_WEIGHT if pair in flat else 1.0)
         for pair, pose in poses.items()
     }
     return average_rotations({pair: pose.R for pair, pose in poses.items()}, weights)
 
 
-def _unconfirmed(poses: Mapping[PairId, RelativePose], firm: float) -> list[PairId]:
+def _unconfirmed_pairs(poses: Mapping[PairId, RelativePose], firm: float) -> list[PairId]:
     """Return the pairs with fewer than `firm` inliers that no loop of three photos confirms.
 
     Such pairs may join places that only look alike, with no other pair to contradict them.
     """
     photos = sorted({photo for pair in poses for photo in pair})
     edges = np.searchsorted(photos, np.array(list(poses), np.int64).reshape(-1, 2))
-    loops, agree = agreeing_loops(edges, np.array([pose.R for pose in poses.values()]).reshape(-1, 3, 3))
+    loops, agree = check_loops(edges, np.array([pose.R for pose in poses.values()]).reshape(-1, 3, 3))
     borne_out = set(loops[agree].ravel().tolist())
     return (
         [pair for k, (pair, pose) in enumerate(poses.items()) if pose.inlier_count < firm and k not in borne_out]
@@ -179,7 +181,7 @@ def _unconfirmed(poses: Mapping[PairId, RelativePose], firm: float) -> list[Pair
     )
 
 
-def _plausible(
+def _split_plausible(
     found: Mapping[PairId, RelativePose | str | None], min_inliers: int
 ) -> tuple[dict[PairId, RelativePose], dict[PairId, str]]:
     poses, dropped = {}, {}

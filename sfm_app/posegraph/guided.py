@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sfm_app.posegraph.pair_pose import Pair, in_front
-from sfm_app.posegraph.refine import pose_distances, refined
+from sfm_app.posegraph.pair_pose import Pair, is_in_front
+from sfm_app.posegraph.refine import pose_distances, refine_pose
 from sfm_app.types import RelativePose
 
 FloatArray = NDArray[np.float64]
@@ -17,14 +17,14 @@ FloatArray = NDArray[np.float64]
 SAMPLES = 200
 """Samples of two matches, each of which gives a direction (docs/algorithms.md, From K to relative poses). Chosen by
 hand; not measured on its own."""
-AS_MANY = 0.9
+MIN_KEPT_SHARE = 0.9
 """A pose whose rotation diverges is accepted with the rotation of the other pairs, if that keeps this share of its
 inliers: a long lens does not determine how far the camera has turned. docs/algorithms.md, From K to relative poses.
 Chosen by hand; not measured on its own."""
 HELD_ROUNDS, HELD_SIGMA = 8, 0.2
 """Rounds of reweighted least squares with fixed rotation, and the scale of the loss in thresholds. Chosen by hand; not
 measured on their own."""
-NEAR = 3.0
+NEAR_THRESHOLDS = 3.0
 """With the rotation of the other pairs, matches within this many thresholds are used. Chosen by hand; not measured on
 its own."""
 LEAST_IN_FRONT, MOST_TURN_DEG = 0.95, 2.0
@@ -44,21 +44,21 @@ def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> Relat
     """
     if len(pair.rays) < min_inliers:
         return None
-    t = sampled_direction(pair, R, np.random.default_rng(seed))
+    t = sample_direction(pair, R, np.random.default_rng(seed))
     if t is None:
         return None
-    near = pose_distances(pair.rays, pair.focals, R, t) <= NEAR * pair.max_error_px
+    near = pose_distances(pair.rays, pair.focals, R, t) <= NEAR_THRESHOLDS * pair.max_error_px
     if np.count_nonzero(near) < min_inliers:
         return None
-    turned, moved = refined(pair.rays[near], pair.focals, R, t)
+    turned, moved = refine_pose(pair.rays[near], pair.focals, R, t)
     inliers = pair.inliers(turned, moved)
     if np.count_nonzero(inliers) < min_inliers:
         return None
     if np.degrees(Rotation.from_matrix(R.T @ turned).magnitude()) > MOST_TURN_DEG:
         free = np.count_nonzero(inliers)
-        turned, moved = R, held_direction(pair, R, t)
+        turned, moved = R, refine_direction(pair, R, t)
         inliers = pair.inliers(turned, moved)
-        if np.count_nonzero(inliers) < max(min_inliers, AS_MANY * free):
+        if np.count_nonzero(inliers) < max(min_inliers, MIN_KEPT_SHARE * free):
             return None
     found = pair.pose(turned, moved, inliers, guided=True)
     return found if found.in_front >= LEAST_IN_FRONT and found.kind != "rotation" else None
@@ -71,7 +71,7 @@ def _epipolar_normals(pair: Pair, R: FloatArray) -> FloatArray:
     return np.asarray(np.cross(h1, h2), np.float64)
 
 
-def held_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
+def refine_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
     """Refine the direction of translation (3,) by robust least squares of the distances, with R fixed.
 
     Args:
@@ -92,7 +92,7 @@ def held_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
     return np.asarray(best, np.float64)
 
 
-def sampled_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> FloatArray | None:
+def sample_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> FloatArray | None:
     """Estimate the direction of translation (3,) that most matches agree with, given R.
 
     It is the best of `SAMPLES` directions from two matches each; None if no sample gives one.
@@ -115,5 +115,5 @@ def sampled_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> Fl
     if best is None:
         return None
     # t and -t have the same epipolar lines
-    front, behind = (np.count_nonzero(in_front(pair.rays, R, sign * best)) for sign in (1.0, -1.0))
+    front, behind = (np.count_nonzero(is_in_front(pair.rays, R, sign * best)) for sign in (1.0, -1.0))
     return best if front >= behind else -best

@@ -24,8 +24,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from sfm_app.posegraph.coverage import Sight, backbone, coverages, sight_of
-from sfm_app.posegraph.missing import Depths, missing_cells
+from sfm_app.posegraph.coverage import Visibility, backbone, compute_visibility, coverages
+from sfm_app.posegraph.missing import Depths, count_missing_cells
 from sfm_app.posegraph.rotations import average_rotations
 from sfm_app.types import Calibration, LookAlikes, MatchGraph, PairId, RelativePose
 
@@ -35,19 +35,19 @@ ALIKE, LOOP, EITHER = "alike", "loop", "either"
 LEAST_TRACKED, FEW_TRACKED = 30, 15
 """Least number of matches with both ends on tracks for a pair to be tested, and for one beside known look-alikes.
 docs/algorithms.md, Look-alikes. Chosen by hand; not measured on their own."""
-SAME_TRACK = 0.02
+SAME_TRACK_SHARE = 0.02
 """A pair with at most this share of its tracked matches on the same track contradicts the backbone. On oats23 and
 books21 look-alikes have 0; no pair of kitti51, castle-P19, temple16 and five more sets is below 0.07; where kitchen1000
 closes a loop, some have 0. docs/algorithms.md, Look-alikes."""
-FIRM = 0.1
+CONFIRMED_SHARE = 0.1
 """A pair with at least this share of its tracked matches on the same track is confirmed. Chosen by hand; not measured
 on its own."""
-LOW, MISSING, MISSING_ALL_THE_SAME = 25.0, 0.2, 0.3
+LOW_PERCENTILE, MAX_MISSING, MAX_MISSING_SAME_TURN = 25.0, 0.2, 0.3
 """Contradicting pairs join look-alikes if this percentile, over the photos, of the share of expected cells that are
 missing exceeds the limit; the second limit is for pairs whose rotation agrees with the path between them. It is 0.30 on
 oats23, 0.28 on books21; 0.12 where the video kitchen1000 (every 15th) closes a loop. Shares over all photos do not
 separate them: 0.37, 0.33, 0.25. docs/algorithms.md, Look-alikes."""
-TURNED_ALIKE_DEG = 3.0
+SAME_TURN_DEG = 3.0
 """Largest median angle between the rotations of such pairs and of the path at which they agree: 1 degree for that loop,
 9 on oats23 and 58 on books21. docs/algorithms.md, Look-alikes."""
 LEAST_CELLS, LEAST_PHOTOS = 15, 3
@@ -62,7 +62,7 @@ class FeatureTracks:
     names: Mapping[int, IndexArray]
     """By photo, (K,) number of the track of each keypoint; -1 if no pair of the backbone has it."""
 
-    def agreement(self, pair: PairId, rows: IndexArray) -> tuple[int, int]:
+    def count_agreement(self, pair: PairId, rows: IndexArray) -> tuple[int, int]:
         """Count the matches of a pair that have both ends on the same track, and those with both ends on any.
 
         Args:
@@ -73,7 +73,7 @@ class FeatureTracks:
         tracked = (first >= 0) & (second >= 0)
         return int(np.count_nonzero(tracked & (first == second))), int(np.count_nonzero(tracked))
 
-    def contradict(self, pair: PairId, rows: IndexArray, least: int = LEAST_TRACKED) -> bool:
+    def is_contradicted_by(self, pair: PairId, rows: IndexArray, least: int = LEAST_TRACKED) -> bool:
         """Return whether a pair joins points that the backbone keeps on different tracks.
 
         Args:
@@ -81,8 +81,8 @@ class FeatureTracks:
             rows: (N, 2) keypoints that match, one column for each photo.
             least: with fewer tracked matches the answer is no.
         """
-        same, tracked = self.agreement(pair, rows)
-        return tracked >= least and same <= SAME_TRACK * tracked
+        same, tracked = self.count_agreement(pair, rows)
+        return tracked >= least and same <= SAME_TRACK_SHARE * tracked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,17 +95,17 @@ class LookAlikeVerdict:
     """Joins that may be look-alikes or loops: their rotation disagrees with the path, but few matches are missing."""
     tracks: FeatureTracks
 
-    def strange(self, pair: PairId, rows: IndexArray) -> bool:
+    def is_look_alike(self, pair: PairId, rows: IndexArray) -> bool:
         """Return whether a pair that was estimated later joins look-alikes, too.
 
         Args:
             pair: two photos.
             rows: (N, 2) keypoints that match, one column for each photo.
         """
-        return bool(self.joins) and self.tracks.contradict(pair, rows, FEW_TRACKED)
+        return bool(self.joins) and self.tracks.is_contradicted_by(pair, rows, FEW_TRACKED)
 
 
-def tell_apart(
+def find_look_alikes(
     matches: MatchGraph, poses: Mapping[PairId, RelativePose], cameras: Mapping[int, Calibration]
 ) -> LookAlikeVerdict:
     """Find the pairs that match look-alikes as if they were one thing.
@@ -115,28 +115,28 @@ def tell_apart(
         poses: relative poses of all pairs that may be right.
         cameras: by photo.
     """
-    sight = sight_of(matches, poses)
+    sight = compute_visibility(matches, poses)
     best = backbone(coverages(sight))
-    tracks = _tracks_of(sight, best)
-    doubted = [pair for pair, rows in sight.rows.items() if pair not in best and tracks.contradict(pair, rows)]
+    tracks = _build_tracks(sight, best)
+    doubted = [pair for pair, rows in sight.rows.items() if pair not in best and tracks.is_contradicted_by(pair, rows)]
     if not doubted:
         return LookAlikeVerdict((), (), tracks)
-    trusted = best | {pair for pair, rows in sight.rows.items() if _firm(*tracks.agreement(pair, rows))}
+    trusted = best | {pair for pair, rows in sight.rows.items() if _is_confirmed(*tracks.count_agreement(pair, rows))}
     places = Depths(matches, cameras, poses, sight)
-    judged = [_judged(join, trusted, places) for join in joins_of(doubted, trusted)]
+    judged = [_judge_join(join, trusted, places) for join in group_doubted_pairs(doubted, trusted)]
     joins = [join for join, verdict in judged if verdict == ALIKE]
     doubtful = tuple(join for join, verdict in judged if verdict == EITHER)
     left = poses.keys() - best - {pair for join in joins for pair in join.pairs}
-    weak = sorted(pair for pair in left if tracks.contradict(pair, sight.rows[pair], FEW_TRACKED))
+    weak = sorted(pair for pair in left if tracks.is_contradicted_by(pair, sight.rows[pair], FEW_TRACKED))
     close = {frozenset(pair) for pair in trusted}
     for number, join in enumerate(joins):
-        also = [pair for pair in weak if any(_beside(pair, other, close) for other in join.pairs)]
+        also = [pair for pair in weak if any(_has_same_ends(pair, other, close) for other in join.pairs)]
         weak = [pair for pair in weak if pair not in also]
         joins[number] = replace(join, pairs=tuple(sorted((*join.pairs, *also))))
     return LookAlikeVerdict(tuple(joins), doubtful, tracks)
 
 
-def _tracks_of(sight: Sight, pairs: Iterable[PairId]) -> FeatureTracks:
+def _build_tracks(sight: Visibility, pairs: Iterable[PairId]) -> FeatureTracks:
     """Join the keypoints of pairs into tracks."""
     starts, count = {}, 0
     for photo, seen in sight.seen.items():
@@ -151,7 +151,7 @@ def _tracks_of(sight: Sight, pairs: Iterable[PairId]) -> FeatureTracks:
     return FeatureTracks({photo: names[start : start + len(sight.seen[photo])] for photo, start in starts.items()})
 
 
-def joins_of(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple[PairId, ...]]:
+def group_doubted_pairs(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple[PairId, ...]]:
     """Group doubted pairs that join the same two places.
 
     At both ends, their photos are the same or joined by a trusted pair.
@@ -165,42 +165,42 @@ def joins_of(doubted: Iterable[PairId], trusted: Iterable[PairId]) -> list[tuple
     while waiting:
         join = [waiting.pop(0)]
         for pair in join:
-            beside = [other for other in waiting if _beside(pair, other, close)]
+            beside = [other for other in waiting if _has_same_ends(pair, other, close)]
             waiting = [other for other in waiting if other not in beside]
             join += beside
         found.append(tuple(sorted(join)))
     return found
 
 
-def _beside(pair: PairId, other: PairId, close: set[frozenset[int]]) -> bool:
-    def near(a: int, b: int) -> bool:
+def _has_same_ends(pair: PairId, other: PairId, close: set[frozenset[int]]) -> bool:
+    def is_same_place(a: int, b: int) -> bool:
         return a == b or frozenset((a, b)) in close
 
     (a, b), (c, d) = pair, other
-    return (near(a, c) and near(b, d)) or (near(a, d) and near(b, c))
+    return (is_same_place(a, c) and is_same_place(b, d)) or (is_same_place(a, d) and is_same_place(b, c))
 
 
-def _firm(same: int, tracked: int) -> bool:
-    return tracked > 0 and same >= FIRM * tracked
+def _is_confirmed(same: int, tracked: int) -> bool:
+    return tracked > 0 and same >= CONFIRMED_SHARE * tracked
 
 
-def _judged(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> tuple[LookAlikes, str]:
+def _judge_join(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> tuple[LookAlikes, str]:
     """Judge whether a join is of look-alikes, a loop, or either; return it with its share of missing cells."""
     counts = []
     for photo in sorted({photo for pair in join for photo in pair}):
         friends, claimed = ({sum(pair) - photo for pair in pairs if photo in pair} for pairs in (trusted, join))
         if friends:
-            counts.append(missing_cells(photo, claimed, friends, places))
+            counts.append(count_missing_cells(photo, claimed, friends, places))
     expected, missing = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
     shares = [lacking / wanted for wanted, lacking in counts if wanted >= LEAST_CELLS]
-    same_turn = _turned_deg(join, trusted, places) <= TURNED_ALIKE_DEG
-    limit = MISSING_ALL_THE_SAME if same_turn else MISSING
-    alike = len(shares) >= LEAST_PHOTOS and float(np.percentile(shares, LOW)) > limit
+    same_turn = _rotation_gap_deg(join, trusted, places) <= SAME_TURN_DEG
+    limit = MAX_MISSING_SAME_TURN if same_turn else MAX_MISSING
+    alike = len(shares) >= LEAST_PHOTOS and float(np.percentile(shares, LOW_PERCENTILE)) > limit
     verdict = ALIKE if alike else LOOP if same_turn else EITHER
     return LookAlikes(join, missing / max(expected, 1)), verdict
 
 
-def _turned_deg(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> float:
+def _rotation_gap_deg(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> float:
     """Return the median angle between the rotations of pairs and those along the trusted ones."""
     poses = {pair: places.poses[pair] for pair in sorted(trusted)}
     weights = {pair: float(pose.inlier_count) for pair, pose in poses.items()}

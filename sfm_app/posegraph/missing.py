@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.camera import rays
-from sfm_app.posegraph.coverage import Sight
+from sfm_app.posegraph.coverage import Visibility
 from sfm_app.posegraph.pair_pose import depths
 from sfm_app.types import Calibration, MatchGraph, PairId, RelativePose
 
@@ -31,15 +31,15 @@ BORDER = 0.05
 its own."""
 WIDE_RAD = 0.2
 """Depths from wider angles get no more weight. Chosen by hand; not measured on its own."""
-TOGETHER = 8
+MIN_COMMON_POINTS = 8
 """Least number of points that two pairs of a photo must share to determine their relative scale. Chosen by hand; not
 measured on its own."""
-SOME = 2
+MIN_CELL_POINTS = 2
 """A cell of a photo with fewer expected points expects no match. Chosen by hand; not measured on its own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ends:
+class PairDepths:
     """Depths of the keypoints of a photo, from one of its pairs."""
 
     rows: IndexArray
@@ -60,19 +60,19 @@ class Depths:
         sight: their inliers.
     """
 
-    def __init__(self, matches: MatchGraph, cameras: Cameras, poses: Poses, sight: Sight) -> None:
+    def __init__(self, matches: MatchGraph, cameras: Cameras, poses: Poses, sight: Visibility) -> None:
         self.matches, self.cameras, self.poses, self.sight = matches, cameras, poses, sight
         self.rays: dict[int, FloatArray] = {}
-        self.known: dict[tuple[int, int], Ends] = {}
+        self.known: dict[tuple[int, int], PairDepths] = {}
 
-    def rays_of(self, photo: int) -> FloatArray:
+    def keypoint_rays(self, photo: int) -> FloatArray:
         """Return the keypoints of a photo as (K, 2) points of the plane z = 1."""
         if photo not in self.rays:
             camera = self.cameras[photo]
             self.rays[photo] = rays(self.matches.keypoints[photo], camera.K, camera.radial)
         return self.rays[photo]
 
-    def ends(self, photo: int, other: int) -> Ends:
+    def pair_depths(self, photo: int, other: int) -> PairDepths:
         """Return the depths of a photo's points from one pair.
 
         Args:
@@ -83,19 +83,19 @@ class Depths:
             return self.known[photo, other]
         pair = (min(photo, other), max(photo, other))
         pose, rows = self.poses[pair], self.sight.rows[pair]
-        used = np.hstack([self.rays_of(one)[column] for one, column in zip(pair, rows.T, strict=True)])
+        used = np.hstack([self.keypoint_rays(one)[column] for one, column in zip(pair, rows.T, strict=True)])
         found, front = depths(used, pose.R, pose.t), np.ones(len(rows), np.bool_)
         for one in found:
             front &= one > 0
-        h1, h2 = _homogeneous(used[:, :2]) @ pose.R.T, _homogeneous(used[:, 2:])
+        h1, h2 = _to_homogeneous(used[:, :2]) @ pose.R.T, _to_homogeneous(used[:, 2:])
         lengths = np.linalg.norm(h1, axis=1) * np.linalg.norm(h2, axis=1)
         sines = np.linalg.norm(np.cross(h1, h2), axis=1) / lengths
         weights = np.minimum(sines, WIDE_RAD) ** 2 + 1e-6
         for end, names in enumerate((pair, pair[::-1])):
-            self.known[names] = Ends(rows[front, end], np.log(found[end][front]), weights[front])
+            self.known[names] = PairDepths(rows[front, end], np.log(found[end][front]), weights[front])
         return self.known[photo, other]
 
-    def of_photo(self, photo: int, trusted: Iterable[int], doubted: Iterable[int]) -> tuple[FloatArray, Scales]:
+    def merge_depths(self, photo: int, trusted: Iterable[int], doubted: Iterable[int]) -> tuple[FloatArray, Scales]:
         """Return (K,) logarithms of depths from trusted pairs, NaN if there is none, and the log scale of each pair.
 
         Args:
@@ -105,25 +105,25 @@ class Depths:
         """
         total = np.zeros((2, len(self.matches.keypoints[photo])))
         scales: Scales = {}
-        known = {other: self.ends(photo, other) for other in trusted}
+        known = {other: self.pair_depths(photo, other) for other in trusted}
         waiting = sorted(known, key=lambda other: (-float(known[other].weights.sum()), other))
         while waiting:
-            other = next((one for one in waiting if _in_common(known[one], total) >= TOGETHER), waiting[0])
-            if scales and _in_common(known[other], total) < TOGETHER:
+            other = next((one for one in waiting if _count_common(known[one], total) >= MIN_COMMON_POINTS), waiting[0])
+            if scales and _count_common(known[other], total) < MIN_COMMON_POINTS:
                 break
             waiting.remove(other)
             end = known[other]
-            scales[other] = _scale(end, total) if scales else 0.0
+            scales[other] = _log_scale(end, total) if scales else 0.0
             np.add.at(total[0], end.rows, end.weights * (end.logs - scales[other]))
             np.add.at(total[1], end.rows, end.weights)
         for other in doubted:
-            end = self.ends(photo, other)
-            if _in_common(end, total) >= TOGETHER:
-                scales[other] = _scale(end, total)
+            end = self.pair_depths(photo, other)
+            if _count_common(end, total) >= MIN_COMMON_POINTS:
+                scales[other] = _log_scale(end, total)
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(total[1] > 0, total[0] / total[1], np.nan), scales
 
-    def expected(self, photo: int, other: int, points: IndexArray, logs: FloatArray) -> IndexArray:
+    def expected_points(self, photo: int, other: int, points: IndexArray, logs: FloatArray) -> IndexArray:
         """Return the points of a photo that the other one must show if their pair is right.
 
         Args:
@@ -132,8 +132,8 @@ class Depths:
             points: (N,) keypoints.
             logs: (N,) logarithms of their depths in the scale of the pair.
         """
-        R, t = _from_to(self.poses, photo, other)
-        rays_here = _homogeneous(self.rays_of(photo)[points])
+        R, t = _directed_pose(self.poses, photo, other)
+        rays_here = _to_homogeneous(self.keypoint_rays(photo)[points])
         z = np.exp(logs)
         turned = rays_here @ R.T
         there = turned * z[:, None] + t
@@ -148,7 +148,7 @@ class Depths:
         return np.asarray(points[inside & alike], np.int64)
 
 
-def missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int], places: Depths) -> tuple[int, int]:
+def count_missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int], places: Depths) -> tuple[int, int]:
     """Count the cells of a photo that other photos should show if pairs are right, and those of them without a match.
 
     Args:
@@ -158,35 +158,35 @@ def missing_cells(photo: int, joined: Iterable[int], trusted: Iterable[int], pla
         places: depths and poses.
     """
     sight, others = places.sight, sorted(joined)
-    logs, scales = places.of_photo(photo, sorted(trusted), others)
+    logs, scales = places.merge_depths(photo, sorted(trusted), others)
     points = np.flatnonzero(~np.isnan(logs))
     wanted, hit = np.zeros(len(logs), np.bool_), np.zeros(len(logs), np.bool_)
     for other in others:
         pair = (min(photo, other), max(photo, other))
         hit[sight.rows[pair][:, pair.index(photo)]] = True
         if other in scales:
-            wanted[places.expected(photo, other, points, logs[points] + scales[other])] = True
+            wanted[places.expected_points(photo, other, points, logs[points] + scales[other])] = True
     cells, counts = np.unique(sight.cells[photo][wanted], return_counts=True)
-    cells = cells[counts >= SOME]
+    cells = cells[counts >= MIN_CELL_POINTS]
     return len(cells), int(np.count_nonzero(~np.isin(cells, sight.cells[photo][hit])))
 
 
-def _from_to(poses: Mapping[PairId, RelativePose], photo: int, other: int) -> tuple[FloatArray, FloatArray]:
+def _directed_pose(poses: Mapping[PairId, RelativePose], photo: int, other: int) -> tuple[FloatArray, FloatArray]:
     if photo < other:
         return poses[photo, other].R, poses[photo, other].t
     pose = poses[other, photo]
     return pose.R.T, -pose.R.T @ pose.t
 
 
-def _in_common(end: Ends, total: FloatArray) -> int:
+def _count_common(end: PairDepths, total: FloatArray) -> int:
     return int(np.count_nonzero(total[1, end.rows] > 0))
 
 
-def _scale(end: Ends, total: FloatArray) -> float:
+def _log_scale(end: PairDepths, total: FloatArray) -> float:
     both = total[1, end.rows] > 0
     rows = end.rows[both]
     return float(np.median(end.logs[both] - total[0, rows] / total[1, rows]))
 
 
-def _homogeneous(x: FloatArray) -> FloatArray:
+def _to_homogeneous(x: FloatArray) -> FloatArray:
     return np.column_stack([x, np.ones(len(x))])

@@ -8,22 +8,24 @@ from numpy.typing import NDArray
 from sfm_app.geometry.camera import rays
 from sfm_app.geometry.epipolar import cross_matrix, eight_point
 from sfm_app.geometry.essential import decompose_essential, nearest_essential
-from sfm_app.posegraph.refine import SIGMAS_PX, pose_distances, refined
+from sfm_app.posegraph.refine import SIGMAS_PX, pose_distances, refine_pose
 from sfm_app.posegraph.starts import planar_starts, turned_starts
 from sfm_app.ransac.degeneracy.dominant_plane import OFF_PLANE, dominant_homography, transfer_distance
 from sfm_app.types import Calibration, EpipolarFit, RelativePose
 
 FloatArray = NDArray[np.float64]
+Pose = tuple[FloatArray, FloatArray]
+"""R (3, 3) and t (3,)."""
 
-MANY = 0.95
+CLEAR_SHARE = 0.95
 """A pair is planar, or a rotation, if this share of its inliers fits that. docs/algorithms.md, From K to relative
 poses. Chosen by hand; not measured on its own."""
-SAMPLE = 200
+SAMPLE_SIZE = 200
 """Number of points that decide between the four poses of an essential matrix. Chosen by hand; not measured on its
 own."""
-LEAST = 8
+MIN_INLIERS = 8
 """Least number of inliers that determine the pose of a pair. Chosen by hand; not measured on its own."""
-BEFORE_BOTH, BETTER = 0.9, 0.01
+MIN_IN_FRONT, MIN_IMPROVEMENT = 0.9, 0.01
 """A pose from a start other than that of F needs this share of its inliers in front of both cameras, and a cost lower
 by this share. Chosen by hand; not measured on their own."""
 ROTATION_ROUNDS, ROTATION_DEG = 10, 5.0
@@ -47,16 +49,16 @@ class Pair:
         self.rays = np.hstack([rays(x, c.K, c.radial) for x, c in zip(points, cameras, strict=True)])
         self.focals = np.concatenate([np.diag(camera.K)[:2] for camera in cameras])
         self.max_error_px = max_error_px
-        self.trusted = all(camera.estimated or camera.method == "exif" for camera in cameras)
+        self.trusted = all(camera.is_estimated or camera.method == "exif" for camera in cameras)
 
-    def start(self, fit: EpipolarFit) -> tuple[FloatArray, FloatArray]:
+    def initial_pose(self, fit: EpipolarFit) -> Pose:
         """Return R and t from F and the cameras, before refinement."""
-        inliers, E = self.rays[fit.inliers], self.essential(fit)
-        chosen = inliers[np.linspace(0, len(inliers) - 1, min(len(inliers), SAMPLE)).astype(np.int64)]
+        inliers, E = self.rays[fit.inliers], self.essential_matrix(fit)
+        chosen = inliers[np.linspace(0, len(inliers) - 1, min(len(inliers), SAMPLE_SIZE)).astype(np.int64)]
         poses = decompose_essential(nearest_essential(E))
-        return max(poses, key=lambda pose: int(np.count_nonzero(in_front(chosen, *pose))))
+        return max(poses, key=lambda pose: int(np.count_nonzero(is_in_front(chosen, *pose))))
 
-    def essential(self, fit: EpipolarFit) -> FloatArray:
+    def essential_matrix(self, fit: EpipolarFit) -> FloatArray:
         """Return E from F and the cameras, with singular values that are unequal because of noise."""
         first, second = self.cameras
         if first.radial or second.radial:  # F does not model distortion
@@ -74,7 +76,7 @@ class Pair:
             guided: whether the rotation came from other pairs.
         """
         used = self.rays[inliers]
-        front = in_front(used, R, t)
+        front = is_in_front(used, R, t)
         angle_deg = float(np.median(ray_angles_deg(used[front], R))) if front.any() else 0.0
         return RelativePose(
             R, t, inliers,
@@ -104,14 +106,14 @@ class Pair:
         """
         unit = float(self.focals.mean())
         within = OFF_PLANE * self.max_error_px
-        if angle_deg < ROTATION_DEG and np.mean(turn_distances(used, self.focals, R) <= within) >= MANY:
+        if angle_deg < ROTATION_DEG and np.mean(rotation_residuals(used, self.focals, R) <= within) >= CLEAR_SHARE:
             return "rotation"
         H = dominant_homography(np.asfortranarray(used), cross_matrix(t) @ R, self.max_error_px / unit)
         off_plane = transfer_distance(H, used) > within / unit
-        return "planar" if np.mean(off_plane) <= 1.0 - MANY else "calibrated"
+        return "planar" if np.mean(off_plane) <= 1.0 - CLEAR_SHARE else "calibrated"
 
 
-def estimated(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
+def estimate_pose(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
     """Estimate the relative pose of a fundamental matrix; None if too few matches agree with it.
 
     If a camera is a guess, E is wrong by as much as the guess, and the inliers of F are kept.
@@ -120,42 +122,40 @@ def estimated(pair: Pair, fit: EpipolarFit) -> RelativePose | None:
         pair: matches and cameras.
         fit: the fundamental matrix and its inliers.
     """
-    R, t = pair.start(fit)
+    R, t = pair.initial_pose(fit)
     if not pair.trusted:
         return pair.pose(R, t, fit.inliers)
-    R, t = _best_of_starts(pair, fit, (R, t))
+    R, t = _refine_best_start(pair, fit, (R, t))
     inliers = pair.inliers(R, t)
-    return pair.pose(R, t, inliers) if np.count_nonzero(inliers) >= LEAST else None
+    return pair.pose(R, t, inliers) if np.count_nonzero(inliers) >= MIN_INLIERS else None
 
 
-def _best_of_starts(
-    pair: Pair, fit: EpipolarFit, start: tuple[FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray]:
+def _refine_best_start(pair: Pair, fit: EpipolarFit, start: Pose) -> Pose:
     """Return the refined pose that the inliers of F fit best, of those with the points in front of both cameras.
 
     The pose from F itself is kept unless another one is clearly better and loses no inliers: of the two poses that a
     plane allows, the wrong one loses the matches off the plane.
     """
     used, focals = pair.rays[fit.inliers], pair.focals
-    best = refined(used, focals, *start)
+    best = refine_pose(used, focals, *start)
     if not len(used):
         return best
     lowest, most = _pose_cost(used, focals, *best), int(np.count_nonzero(pair.inliers(*best)))
-    if in_front(used, *best).mean() < BEFORE_BOTH:
+    if is_in_front(used, *best).mean() < MIN_IN_FRONT:
         lowest, most = np.inf, 0
     planar = planar_starts(used) if fit.degeneracy == "planar" else ()
-    for other in (*turned_starts(used, pair.essential(fit)), *planar):
-        R, t = refined(used, focals, *other)
+    for other in (*turned_starts(used, pair.essential_matrix(fit)), *planar):
+        R, t = refine_pose(used, focals, *other)
         cost, count = _pose_cost(used, focals, R, t), int(np.count_nonzero(pair.inliers(R, t)))
-        if cost < (1.0 - BETTER) * lowest and count >= most:
-            t = t if np.mean(in_front(used, R, t)) >= 0.5 else -t
-            if in_front(used, R, t).mean() >= BEFORE_BOTH:
+        if cost < (1.0 - MIN_IMPROVEMENT) * lowest and count >= most:
+            t = t if np.mean(is_in_front(used, R, t)) >= 0.5 else -t
+            if is_in_front(used, R, t).mean() >= MIN_IN_FRONT:
                 best, lowest, most = (R, t), cost, count
     return best
 
 
 def _pose_cost(used: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> float:
-    """Return the cost that `refined` minimizes at its last scale."""
+    """Return the cost that `refine_pose` minimizes at its last scale."""
     return float(np.sum(np.log1p((pose_distances(used, focals, R, t) / SIGMAS_PX[-1]) ** 2)))
 
 
@@ -167,7 +167,7 @@ def depths(used: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, 
         R: (3, 3) rotation of view 2 from view 1.
         t: (3,) translation.
     """
-    h1, h2 = _homogeneous(used[:, :2]) @ R.T, _homogeneous(used[:, 2:])
+    h1, h2 = _to_homogeneous(used[:, :2]) @ R.T, _to_homogeneous(used[:, 2:])
     # least squares of d1 h1 + t = d2 h2
     a, b, c = (h1 * h1).sum(1), (h1 * h2).sum(1), (h2 * h2).sum(1)
     p, q = h1 @ t, h2 @ t
@@ -175,7 +175,7 @@ def depths(used: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, 
     return (b * q - c * p) / determinant, (a * q - b * p) / determinant
 
 
-def in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
+def is_in_front(used: FloatArray, R: FloatArray, t: FloatArray) -> NDArray[np.bool_]:
     """Return (N,) whether each point is in front of both cameras.
 
     Args:
@@ -194,12 +194,12 @@ def ray_angles_deg(used: FloatArray, R: FloatArray) -> FloatArray:
         used: (N, 4) points of the plane z = 1, view 1 and view 2.
         R: (3, 3) rotation of view 2 from view 1.
     """
-    h1, h2 = _homogeneous(used[:, :2]) @ R.T, _homogeneous(used[:, 2:])
+    h1, h2 = _to_homogeneous(used[:, :2]) @ R.T, _to_homogeneous(used[:, 2:])
     sine = np.linalg.norm(np.cross(h1, h2), axis=1)
     return np.asarray(np.degrees(np.arctan2(sine, (h1 * h2).sum(axis=1))), np.float64)
 
 
-def turn_distances(used: FloatArray, focals: FloatArray, R: FloatArray) -> FloatArray:
+def rotation_residuals(used: FloatArray, focals: FloatArray, R: FloatArray) -> FloatArray:
     """Return residuals (N,), in pixels of view 2, of the rotation near R that explains most matches.
 
     Rays are rotated onto their partners (Kabsch), with robust weights.
@@ -209,7 +209,7 @@ def turn_distances(used: FloatArray, focals: FloatArray, R: FloatArray) -> Float
         focals: (4,) fx, fy of view 1 and of view 2, in pixels.
         R: (3, 3) rotation of view 2 from view 1, to start from.
     """
-    h1, h2 = (_unit(_homogeneous(used[:, view : view + 2])) for view in (0, 2))
+    h1, h2 = (_normalize(_to_homogeneous(used[:, view : view + 2])) for view in (0, 2))
     focal = float(focals.mean())
     for _ in range(ROTATION_ROUNDS):
         distances = focal * np.linalg.norm(h1 @ R.T - h2, axis=1)
@@ -219,9 +219,9 @@ def turn_distances(used: FloatArray, focals: FloatArray, R: FloatArray) -> Float
     return np.asarray(focal * np.linalg.norm(h1 @ R.T - h2, axis=1), np.float64)
 
 
-def _homogeneous(x: FloatArray) -> FloatArray:
+def _to_homogeneous(x: FloatArray) -> FloatArray:
     return np.column_stack([x, np.ones(len(x))])
 
 
-def _unit(h: FloatArray) -> FloatArray:
+def _normalize(h: FloatArray) -> FloatArray:
     return np.asarray(h / np.linalg.norm(h, axis=1, keepdims=True), np.float64)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.damping import DampingRange, damped_step
-from sfm_app.geometry.pose_manifold import POSE, essential, moved
+from sfm_app.geometry.pose_manifold import POSE_DOF, retract, write_essential
 from sfm_app.jit import kernel
 
 FloatArray = NDArray[np.float64]
@@ -23,11 +23,11 @@ DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e6)
 """Damping of the Levenberg-Marquardt steps. Chosen by hand; not measured on its own."""
 GAIN = 1e-6
 """Relative decrease of the cost below which they end. Chosen by hand; not measured on its own."""
-_STEP = 1e-6
+_DIFFERENCE_STEP = 1e-6
 """Step of the parameters for finite differences. Chosen by hand; not measured on its own."""
 
 
-def refined(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+def refine_pose(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Refine the pose (R, t) by robust least squares of Sampson distances (Levenberg-Marquardt).
 
     Args:
@@ -38,7 +38,7 @@ def refined(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) 
     """
     pose = np.concatenate([R.ravel(), t / np.linalg.norm(t)])
     for sigma in SIGMAS_PX:
-        pose = _descended(rays, focals, pose, sigma)
+        pose = _descend(rays, focals, pose, sigma)
     return pose[:9].reshape(3, 3).copy(), pose[9:].copy()
 
 
@@ -69,7 +69,7 @@ def _distance(ray: FloatArray, E: FloatArray, focals: FloatArray) -> float:
 @kernel
 def _distances(rays: FloatArray, focals: FloatArray, pose: FloatArray) -> FloatArray:
     E, found = np.empty((3, 3)), np.empty(rays.shape[0])
-    essential(pose, E)
+    write_essential(pose, E)
     for i in range(rays.shape[0]):
         found[i] = _distance(rays[i], E, focals)
     return found
@@ -78,7 +78,7 @@ def _distances(rays: FloatArray, focals: FloatArray, pose: FloatArray) -> FloatA
 @kernel
 def _cost(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) -> float:
     E, cost = np.empty((3, 3)), 0.0
-    essential(pose, E)
+    write_essential(pose, E)
     for i in range(rays.shape[0]):
         cost += np.log1p((_distance(rays[i], E, focals) / sigma) ** 2)
     return cost
@@ -87,31 +87,31 @@ def _cost(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) 
 @kernel
 def _system(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
     """Return the approximate Hessian (5, 5) and the negative gradient (5,) of half the cost."""
-    Es, J, step = np.empty((1 + POSE, 3, 3)), np.empty(POSE), np.zeros(POSE)
-    A, b = np.zeros((POSE, POSE)), np.zeros(POSE)
-    essential(pose, Es[0])
-    for j in range(POSE):
-        step[j] = _STEP
-        essential(moved(pose, step), Es[1 + j])
+    Es, J, step = np.empty((1 + POSE_DOF, 3, 3)), np.empty(POSE_DOF), np.zeros(POSE_DOF)
+    A, b = np.zeros((POSE_DOF, POSE_DOF)), np.zeros(POSE_DOF)
+    write_essential(pose, Es[0])
+    for j in range(POSE_DOF):
+        step[j] = _DIFFERENCE_STEP
+        write_essential(retract(pose, step), Es[1 + j])
         step[j] = 0.0
     for i in range(rays.shape[0]):
         r = _distance(rays[i], Es[0], focals) / sigma
         weight = 1.0 / (1.0 + r * r)
-        for j in range(POSE):
-            J[j] = (_distance(rays[i], Es[1 + j], focals) / sigma - r) / _STEP
-        for j in range(POSE):
+        for j in range(POSE_DOF):
+            J[j] = (_distance(rays[i], Es[1 + j], focals) / sigma - r) / _DIFFERENCE_STEP
+        for j in range(POSE_DOF):
             b[j] -= weight * r * J[j]
-            for k in range(POSE):
+            for k in range(POSE_DOF):
                 A[j, k] += weight * J[j] * J[k]
     return A, b
 
 
-def _descended(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
+def _descend(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
     cost, damping = _cost(rays, focals, pose, sigma), DAMPING.first
 
     def attempt(tried: float) -> tuple[FloatArray, float] | None:
         step = np.asarray(np.linalg.solve(A + np.diag(tried * np.diag(A) + 1e-9), b), np.float64)
-        trial = moved(pose, step)
+        trial = retract(pose, step)
         lower = _cost(rays, focals, trial, sigma)
         return (trial, lower) if lower < cost else None
 

@@ -25,7 +25,7 @@ SCALE_DEG = 3.0
 not measured on its own."""
 SUM_ROUNDS, SQUARE_ROUNDS = 15, 50
 """Rounds of the sum of angles, and of the robust sum of squares after it. Chosen by hand; not measured on their own."""
-LEAST_ANGLE, ARRIVED = 1e-3, 1e-7
+LEAST_ANGLE, LEAST_STEP = 1e-3, 1e-7
 """In radians: smaller angles get no more weight; smaller steps end the search. Chosen by hand; not measured on their
 own."""
 
@@ -49,19 +49,19 @@ def average_rotations(
     edges = np.array([[index[a], index[b]] for a, b in relative], np.int64)
     turns, strengths = np.array(list(relative.values())), np.array([weights[pair] for pair in relative])
     support = strengths * loop_support(edges, turns, strengths)
-    rotations = _along_tree(len(photos), edges, turns, support)
+    rotations = _propagate_along_tree(len(photos), edges, turns, support)
     for done in range(SUM_ROUNDS + SQUARE_ROUNDS):
-        left = _left_over(rotations, edges, turns)
+        left = _residuals(rotations, edges, turns)
         angles = np.linalg.norm(left, axis=1)
         if done < SUM_ROUNDS:
             factors = strengths / np.maximum(angles, LEAST_ANGLE)
         else:
             factors = strengths / (1.0 + (angles / np.radians(SCALE_DEG)) ** 2) ** 2
-        steps = _steps(len(photos), edges, left, factors)
+        steps = _solve_steps(len(photos), edges, left, factors)
         rotations = rotations @ Rotation.from_rotvec(steps).as_matrix()
-        if done > SUM_ROUNDS and np.abs(steps).max() < ARRIVED:
+        if done > SUM_ROUNDS and np.abs(steps).max() < LEAST_STEP:
             break
-    angles = np.degrees(np.linalg.norm(_left_over(rotations, edges, turns), axis=1))
+    angles = np.degrees(np.linalg.norm(_residuals(rotations, edges, turns), axis=1))
     return dict(zip(photos, rotations, strict=True)), dict(zip(relative, angles.tolist(), strict=True))
 
 
@@ -73,7 +73,7 @@ def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) ->
         turns: (E, 3, 3) rotation of photo 2 from photo 1.
         strengths: (E,) weights; a loop weighs as much as the weaker of the two other pairs in it.
     """
-    loops, agree = agreeing_loops(edges, turns)
+    loops, agree = check_loops(edges, turns)
     found = np.zeros((2, len(edges)))
     for one, others in ((0, (1, 2)), (1, (0, 2)), (2, (0, 1))):
         weight = np.minimum(*(strengths[loops[:, other]] for other in others))
@@ -83,7 +83,7 @@ def loop_support(edges: IndexArray, turns: FloatArray, strengths: FloatArray) ->
     return np.asarray((found[0] + least) / (found[1] + least), np.float64)
 
 
-def agreeing_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArray[np.bool_]]:
+def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArray[np.bool_]]:
     """Return (L, 3) numbers of the edges of every loop of three photos, and (L,) whether their rotations agree.
 
     Args:
@@ -108,7 +108,7 @@ def _loops(edges: Sequence[Sequence[int]]) -> Iterator[tuple[int, int, int]]:
         yield from ((k, number[b, c], number[a, c]) for c in after.get(b, ()) if (a, c) in number)
 
 
-def _along_tree(count: int, edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
+def _propagate_along_tree(count: int, edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
     """Return (count, 3, 3) rotations along the strongest edges, from the first photo of every group on."""
     group, near = list(range(count)), [[] for _ in range(count)]  # type: ignore[var-annotated]
     for k in np.argsort(-strengths, kind="stable"):
@@ -132,13 +132,13 @@ def _along_tree(count: int, edges: IndexArray, turns: FloatArray, strengths: Flo
     return rotations
 
 
-def _left_over(rotations: FloatArray, edges: IndexArray, turns: FloatArray) -> FloatArray:
+def _residuals(rotations: FloatArray, edges: IndexArray, turns: FloatArray) -> FloatArray:
     """Return the rotation vectors (E, 3) of R_j' R_ij R_i."""
     around = np.einsum("nji,njk,nkl->nil", rotations[edges[:, 1]], turns, rotations[edges[:, 0]])
     return np.asarray(Rotation.from_matrix(around).as_rotvec(), np.float64)
 
 
-def _steps(count: int, edges: IndexArray, left: FloatArray, factors: FloatArray) -> FloatArray:
+def _solve_steps(count: int, edges: IndexArray, left: FloatArray, factors: FloatArray) -> FloatArray:
     """Fit steps (count, 3) by weighted least squares of step_j - step_i = left; the free turn of each group stays 0."""
     i, j = edges.T
     L, b = 1e-9 * factors.max() * np.eye(count), np.zeros((count, 3))

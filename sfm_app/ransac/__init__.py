@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.ransac.estimate import estimate_with, judge
-from sfm_app.ransac.estimator_configs import RECIPES, classical
+from sfm_app.ransac.estimator_configs import RECIPES, classical_estimator
 from sfm_app.ransac.lev_ransac import fit_lev_ransac
 from sfm_app.ransac.points import check_points
 from sfm_app.settings import EpipolarSettings
@@ -32,7 +32,7 @@ FitFundamentalLike = Callable[[FloatArray, FloatArray, EpipolarSettings, int], E
 
 ESTIMATORS: dict[str, tuple[FitFundamentalLike, str]] = {
     "lev-ransac": (fit_lev_ransac, "samples guided by Cook's distances, local optimization, robust refit; the default"),
-    **{name: (classical(name), about) for name, (_, about) in RECIPES.items()},
+    **{name: (classical_estimator(name), about) for name, (_, about) in RECIPES.items()},
 }
 """By name: the function that fits, and one line about it."""
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from sfm_app.ransac.estimator_config import Recipe
 from sfm_app.ransac.inner_loop import GUIDED, UNGUIDED
 from sfm_app.ransac.scoring.robust_costs import penalty, squared_distances
-from sfm_app.ransac.verification.pretests import LENIENCE, OPEN
+from sfm_app.ransac.verification.pretests import LENIENCE, NO_PRETEST
 
 FloatArray = NDArray[np.float64]
 
 
-class Best:
+class BestModel:
     """The best model so far.
 
     Algorithm 1 starts with Q* = 0 in print; a penalty to be minimized has to start at infinity.
@@ -26,7 +26,7 @@ class Best:
     f: FloatArray
     """(9,) entries of F, norm 1; F* of the thesis."""
     to_beat: FloatArray
-    """(2,) bars, one per kind of sample: penalties that models have to stay below (see `inner_loop.next_better`)."""
+    """(2,) bars, one per kind of sample: penalties that models must stay below (see `inner_loop.draw_until_better`)."""
     samples: FloatArray
     """(2, 9) for each kind, the last model of a sample that was below the bar."""
 
@@ -56,18 +56,18 @@ class Best:
         """
         if self._fine is None:
             self._replace(self.samples[kind].copy(), float(self.to_beat[kind]))
-            self._set_one_bar()
+            self._set_common_bar()
             return True
-        if not self.challenged_by(self.samples[kind].reshape(3, 3)):
+        if not self.replace_if_better(self.samples[kind].reshape(3, 3)):
             return False
-        self._set_bar_of_unguided()
+        self._set_unguided_bar()
         return True
 
-    def _set_one_bar(self) -> None:
+    def _set_common_bar(self) -> None:
         """Set both bars to the penalty of the best model."""
         self.to_beat[:] = self._lowest
 
-    def _set_bar_of_unguided(self) -> None:
+    def _set_unguided_bar(self) -> None:
         """Set the bar of unguided samples to `LENIENCE` of the support of the best guided sample.
 
         Support is the penalty of a model without any inliers minus the penalty of the model.
@@ -79,31 +79,31 @@ class Best:
         """Replace the best model by that of a sample, locally optimized where this lowers the penalty."""
         self.f, self._lowest = model, found
         if self._recipe.improve is not None:
-            improved = self._improved(model.reshape(3, 3))
-            score = penalty(self._points, 0, improved, self.loss, math.inf, OPEN)
+            improved = self._improve(model.reshape(3, 3))
+            score = penalty(self._points, 0, improved, self.loss, math.inf, NO_PRETEST)
             if score < found:
                 self.f, self._lowest = improved, score
-        self._measure_anew()
+        self._rescore()
 
-    def challenged_by(self, F: FloatArray) -> bool:
+    def replace_if_better(self, F: FloatArray) -> bool:
         """Replace the best model by the optimized F (3, 3) if its finer penalty is lower; return whether it is."""
-        improved = self._improved(F)
-        score = penalty(self._points, 0, improved, self._fine or self.loss, self._lowest, OPEN)
+        improved = self._improve(F)
+        score = penalty(self._points, 0, improved, self._fine or self.loss, self._lowest, NO_PRETEST)
         if score < self._lowest:
             self.f, self._lowest = improved, score
             return True
         return False
 
-    def _improved(self, F: FloatArray) -> FloatArray:
+    def _improve(self, F: FloatArray) -> FloatArray:
         if self._recipe.improve is not None:
             F = self._recipe.improve(self._points, F, self._threshold)
         return np.asarray(np.ascontiguousarray(F).reshape(9) / np.linalg.norm(F))
 
-    def _measure_anew(self) -> None:
+    def _rescore(self) -> None:
         """Score the best model again if the penalty changed: that of MLESAC depends on the best model.
 
         The thesis notes that comparing penalties across such a change is not always sensible.
         """
         renewed = self._recipe.score(self._points, self._threshold, self.f)
         if renewed != self.loss:
-            self.loss, self._lowest = renewed, penalty(self._points, 0, self.f, renewed, math.inf, OPEN)
+            self.loss, self._lowest = renewed, penalty(self._points, 0, self.f, renewed, math.inf, NO_PRETEST)

@@ -16,10 +16,10 @@ from sfm_app.ransac.degeneracy.dominant_plane import OFF_PLANE, dominant_homogra
 from sfm_app.ransac.estimator_config import Recipe
 from sfm_app.ransac.loop import search
 from sfm_app.ransac.points import Matches, check_points, prepare
-from sfm_app.ransac.refine.final_refit import last_fit
+from sfm_app.ransac.refine.final_refit import choose_refit
 from sfm_app.ransac.scoring.leverage import prior_validity
 from sfm_app.ransac.scoring.robust_costs import squared_distances
-from sfm_app.ransac.verification.a_contrario import MOST_FALSE_ALARMS, false_alarms_of, squared_mismatches
+from sfm_app.ransac.verification.a_contrario import MOST_FALSE_ALARMS, model_false_alarms, squared_mismatch_distances
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
 
@@ -57,7 +57,7 @@ def estimate(
     if found is None:
         return Rejected(NO_MODEL)
     threshold = options.max_error_px / matches.unit_px
-    F = last_fit(options.refit, recipe.finish)(matches.points, found.F, threshold)
+    F = choose_refit(options.refit, recipe.finish)(matches.points, found.F, threshold)
     if not np.isfinite(F).all():
         return Rejected(NO_MODEL)
     return _judge(first, second, matches, F, found.trials, options)
@@ -89,7 +89,7 @@ def estimate_with(
     if found is None:
         return Rejected(NO_MODEL)
     F, trials = found
-    return _judge_any(first, second, matches, _in_frame(F, matches.unit_px, np.zeros(4)), trials, options)
+    return _check_and_judge(first, second, matches, _to_frame(F, matches.unit_px, np.zeros(4)), trials, options)
 
 
 def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> EpipolarFit | Rejected:
@@ -111,10 +111,10 @@ def judge(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings)
     matches = prepare(first, second, seed=0)
     if len(matches.points) < options.min_inliers:
         return Rejected(TOO_FEW_MATCHES)
-    return _judge_any(first, second, matches, _in_frame(F, matches.unit_px, matches.center), 1, options)
+    return _check_and_judge(first, second, matches, _to_frame(F, matches.unit_px, matches.center), 1, options)
 
 
-def matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> int:
+def count_matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: EpipolarSettings) -> int:
     """Count the distinct inliers of F with parallax: those off the plane that holds most of them.
 
     Args:
@@ -128,14 +128,14 @@ def matches_off_plane(x1: ArrayLike, x2: ArrayLike, F: ArrayLike, options: Epipo
     """
     matches = prepare(*check_points(x1, x2), seed=0)
     threshold = options.max_error_px / matches.unit_px
-    in_frame = _in_frame(F, matches.unit_px, matches.center)
+    in_frame = _to_frame(F, matches.unit_px, matches.center)
     f = np.ascontiguousarray(in_frame / np.linalg.norm(in_frame))
     agreeing = np.asfortranarray(matches.points[squared_distances(matches.points, f.reshape(9)) <= threshold**2])
     H = dominant_homography(agreeing, f, threshold)
     return int(np.count_nonzero(transfer_distance(H, agreeing) > OFF_PLANE * threshold))
 
 
-def _in_frame(F: ArrayLike, unit_px: float, center: FloatArray) -> FloatArray:
+def _to_frame(F: ArrayLike, unit_px: float, center: FloatArray) -> FloatArray:
     """Return F of pixels as F of `Matches.points`: the inverse of `Matches.to_pixels`."""
     pixels = np.asarray(F, dtype=np.float64)
     if pixels.shape != (3, 3):
@@ -145,7 +145,7 @@ def _in_frame(F: ArrayLike, unit_px: float, center: FloatArray) -> FloatArray:
         return np.asarray(to2.T @ pixels @ to1)
 
 
-def _judge_any(
+def _check_and_judge(
     x1: FloatArray, x2: FloatArray, matches: Matches, F: FloatArray, trials: int, options: EpipolarSettings
 ) -> EpipolarFit | Rejected:
     """Judge an F of any scale and rank; reject it if it is not finite or its rank is below 2."""
@@ -164,8 +164,8 @@ def _judge(
     inliers = squared <= threshold * threshold
     if np.count_nonzero(inliers) < options.min_inliers:
         return Rejected(TOO_FEW_INLIERS)
-    wrong = squared_mismatches(points, f)
-    if false_alarms_of(squared, wrong, threshold) > MOST_FALSE_ALARMS:
+    wrong = squared_mismatch_distances(points, f)
+    if model_false_alarms(squared, wrong, threshold) > MOST_FALSE_ALARMS:
         return Rejected(CHANCE)
     F_px = matches.to_pixels(F)
     squared_px = squared_distances(np.asfortranarray(np.hstack([x1, x2])), F_px.reshape(9))

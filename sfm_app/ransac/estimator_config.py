@@ -41,7 +41,7 @@ class Recipe:
     """Share of the samples that are drawn from matches that the best model does not explain, once there are priors."""
     batch: int = 1
     """Samples between two checks for a better model."""
-    guided_after: float = 0.0
+    warmup_share: float = 0.0
     """Share of the trials before the first priors."""
     verifier: Callable[[int, int], Verifier] = FullVerification
     """(number of matches, sample size) -> the test that hypotheses take before they are scored in full."""

@@ -21,7 +21,7 @@ from sfm_app.ransac.scoring.leverage import prior_validity
 from sfm_app.ransac.scoring.mlesac import mlesac
 from sfm_app.ransac.scoring.res_ransac import residual_validity
 from sfm_app.ransac.scoring.robust_costs import lmeds, msac, msac_linear, ransac, squared_distances
-from sfm_app.ransac.verification.pretests import RandomisedTdd
+from sfm_app.ransac.verification.pretests import RandomizedTdd
 from sfm_app.ransac.verification.sprt import Sprt
 from sfm_app.settings import EpipolarSettings
 from sfm_app.types import EpipolarFit, Rejected
@@ -61,18 +61,18 @@ RECIPES: Mapping[str, tuple[Recipe, str]] = {
         "lev-ransac-thesis with Wald's sequential test of hypotheses",
     ),
     "lev-ransac-tdd": (
-        replace(LEV_RANSAC, verifier=RandomisedTdd),
+        replace(LEV_RANSAC, verifier=RandomizedTdd),
         "lev-ransac-thesis with the T(1,1) test of hypotheses",
     ),
     "res-ransac": (
-        replace(RANSAC, score=mlesac, validity=residual_validity, guided_after=0.1),
+        replace(RANSAC, score=mlesac, validity=residual_validity, warmup_share=0.1),
         "MLESAC with samples guided by the residuals of the best model",
     ),
     "mlesac": (replace(RANSAC, score=mlesac), "likelihood of Gaussian inliers and uniform outliers"),
     "msac": (replace(RANSAC, score=msac), "uniform samples, truncated squared error"),
     "ransac": (RANSAC, "uniform samples, number of outliers"),
     "ransac-sprt": (replace(RANSAC, verifier=Sprt), "ransac with Wald's sequential test of hypotheses"),
-    "ransac-tdd": (replace(RANSAC, verifier=RandomisedTdd), "ransac with the T(1,1) test of hypotheses"),
+    "ransac-tdd": (replace(RANSAC, verifier=RandomizedTdd), "ransac with the T(1,1) test of hypotheses"),
     "lmeds": (
         replace(RANSAC, score=lmeds, assumed_share=0.5, finish=_refit_to_median),
         "least median of squares, for up to half outliers",
@@ -82,7 +82,7 @@ RECIPES: Mapping[str, tuple[Recipe, str]] = {
 LMedS assumes half outliers (4.4.1)."""
 
 
-class Classical:
+class ClassicalEstimator:
     """A callable that runs the recipe of a name in `RECIPES`; see `estimate`."""
 
     def __init__(self, name: str) -> None:
@@ -91,12 +91,12 @@ class Classical:
     def __call__(self, x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
         return estimate(x1, x2, options, seed, RECIPES[self.__name__][0])
 
-    def __reduce__(self) -> tuple[Callable[[str], "Classical"], tuple[str]]:
+    def __reduce__(self) -> tuple[Callable[[str], "ClassicalEstimator"], tuple[str]]:
         """Pickle by name, as functions are: a worker process looks up its own instance."""
-        return classical, (self.__name__,)
+        return classical_estimator, (self.__name__,)
 
 
 @cache
-def classical(name: str) -> Classical:
+def classical_estimator(name: str) -> ClassicalEstimator:
     """Return the estimator of a name in `RECIPES`, always the same object."""
-    return Classical(name)
+    return ClassicalEstimator(name)

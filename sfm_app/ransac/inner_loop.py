@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sfm_app.jit import kernel
 from sfm_app.ransac.sampling.minimal_samples import RandomState, draw_uniform, draw_weighted, uniform
 from sfm_app.ransac.scoring.robust_costs import Loss, penalty
-from sfm_app.ransac.solvers.minimal import MOST_MODELS, is_oriented, models_through
+from sfm_app.ransac.solvers.minimal import MOST_MODELS, is_oriented, solve_sample
 from sfm_app.ransac.verification.pretests import PreTest
 
 FloatArray = NDArray[np.float64]
@@ -21,7 +21,7 @@ GUIDED, UNGUIDED = range(2)
 """Kinds of samples: drawn by the priors (or any sample while there are no priors), and drawn without them."""
 
 
-class Draws(NamedTuple):
+class SamplingPlan(NamedTuple):
     """How samples are drawn and models computed from them."""
 
     sample_size: int
@@ -42,9 +42,9 @@ class Draws(NamedTuple):
 
 
 @kernel
-def next_better(
+def draw_until_better(
     points: FloatArray,
-    draws: Draws,
+    draws: SamplingPlan,
     loss: Loss,
     pretests: tuple[PreTest, PreTest],
     to_beat: FloatArray,
@@ -79,7 +79,7 @@ def next_better(
     for trial in range(1, limit + 1):
         kind = draw_sample(draws, state, sample)
         pretest = pretests[kind]
-        for k in range(models_through(points, sample, models)):
+        for k in range(solve_sample(points, sample, models)):
             if draws.oriented and not is_oriented(points, sample, models[k]):
                 continue
             start = int(uniform(state) * count) if pretest.random_start else 0
@@ -94,7 +94,7 @@ def next_better(
 
 
 @kernel
-def draw_sample(draws: Draws, state: RandomState, sample: IntArray) -> int:
+def draw_sample(draws: SamplingPlan, state: RandomState, sample: IntArray) -> int:
     """Draw one sample by the priors, from the rest, or uniformly, and return its kind.
 
     A random number chooses among the three. Samples are uniform, too, while there are no priors, and where too few

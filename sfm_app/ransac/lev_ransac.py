@@ -13,11 +13,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.ransac.degeneracy.plane_and_parallax import with_another_epipole
+from sfm_app.ransac.degeneracy.plane_and_parallax import recover_epipole
 from sfm_app.ransac.estimate import estimate
 from sfm_app.ransac.estimator_config import Recipe
 from sfm_app.ransac.refine.sampson_refit import fit_algebraic, refine_mixture, refine_sampson
-from sfm_app.ransac.sampling.termination import samples_to_wait
+from sfm_app.ransac.sampling.termination import search_patience
 from sfm_app.ransac.scoring.leverage import prior_validity
 from sfm_app.ransac.scoring.robust_costs import geman_mcclure, squared_distances
 from sfm_app.ransac.verification.pretests import BailOut
@@ -29,14 +29,14 @@ FloatArray = NDArray[np.float64]
 COARSE, FINE = 0.25, 0.1
 """Scales c in thresholds. Chosen on the 156 raw pairs of the Strecha sets (docs/algorithms.md, Fundamental matrices);
 `python -m benchmarks.fundamental --real DATA --ablation` has one score and other scores beside them."""
-_WIDE, _AROUND = 2.0, 4.0
+_ALGEBRAIC_REACH, _SAMPSON_REACH = 2.0, 4.0
 """Thresholds within which matches take part in the 8-point fit, and in the Sampson steps after it. docs/algorithms.md,
 Fundamental matrices. Chosen on the Strecha sets together with the other constants of lev-ransac; not measured on their
 own."""
-_LOCAL_MATCHES, _LOCAL_STEPS, _ENOUGH = 1000, (5, 3), 1e-3
+_LOCAL_MATCHES, _LOCAL_STEPS, _COST_TOLERANCE = 1000, (5, 3), 1e-3
 """Most matches, steps at either scale, and relative decrease of the cost that ends them, in local optimization. The
 1000 were chosen on the Strecha sets with six seeds; the others by hand, not measured on their own."""
-_REACH, _FINAL_STEPS = 3.0, 12
+_FINAL_REACH, _FINAL_STEPS = 3.0, 12
 """Thresholds within which matches take part in the final fit, and its largest number of steps (docs/algorithms.md,
 Fundamental matrices). What the fit is worth: `python -m benchmarks.fundamental --real DATA --ablation`, least squares
 instead; the numbers were chosen by hand."""
@@ -49,17 +49,17 @@ def _optimize_locally(points: FloatArray, F: FloatArray, threshold: float) -> Fl
     them (Chum, Matas and Kittler 2003).
     """
     squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
-    around = np.flatnonzero(squared <= (_AROUND * threshold) ** 2)[:_LOCAL_MATCHES]
-    some, wide = np.asfortranarray(points[around]), squared[around] <= (_WIDE * threshold) ** 2
+    around = np.flatnonzero(squared <= (_SAMPSON_REACH * threshold) ** 2)[:_LOCAL_MATCHES]
+    some, wide = np.asfortranarray(points[around]), squared[around] <= (_ALGEBRAIC_REACH * threshold) ** 2
     F = fit_algebraic(some, wide.astype(np.float64)) if np.count_nonzero(wide) >= 8 else F
     for scale, steps in zip((COARSE, FINE), _LOCAL_STEPS, strict=True):
-        F = refine_sampson(some, F, scale=scale * threshold, most_steps=steps, enough=_ENOUGH)
+        F = refine_sampson(some, F, scale=scale * threshold, most_steps=steps, enough=_COST_TOLERANCE)
     return F
 
 
-def _refit_to_all(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
+def _refit_by_likelihood(points: FloatArray, F: FloatArray, threshold: float) -> FloatArray:
     """Return the maximum likelihood F of all matches within three thresholds; their noise is estimated, too."""
-    return refine_mixture(points, F, threshold=threshold, reach=_REACH, most_steps=_FINAL_STEPS)
+    return refine_mixture(points, F, threshold=threshold, reach=_FINAL_REACH, most_steps=_FINAL_STEPS)
 
 
 PRODUCTION = Recipe(
@@ -71,11 +71,11 @@ PRODUCTION = Recipe(
     batch=32,
     verifier=BailOut,
     least_trials=100,
-    patience=samples_to_wait,
+    patience=search_patience,
     oriented=True,
     improve=_optimize_locally,
-    recover=with_another_epipole,
-    finish=_refit_to_all,
+    recover=recover_epipole,
+    finish=_refit_by_likelihood,
 )
 """The shares, the batch and the patience were chosen on the Strecha sets and on synthetic pairs of thesis 4.8 and with
 two motions. `python -m benchmarks.fundamental --real DATA --ablation` leaves out one part at a time; fresh

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.ransac.best_model import Best
+from sfm_app.ransac.best_model import BestModel
 from sfm_app.ransac.estimator_config import Recipe
-from sfm_app.ransac.inner_loop import Draws, next_better
+from sfm_app.ransac.inner_loop import SamplingPlan, draw_until_better
 from sfm_app.ransac.points import Matches
 from sfm_app.ransac.sampling.minimal_samples import random_state
-from sfm_app.ransac.sampling.stopping import have_converged
+from sfm_app.ransac.sampling.stopping import has_converged
 from sfm_app.ransac.scoring.robust_costs import squared_distances
-from sfm_app.ransac.verification.pretests import OPEN
+from sfm_app.ransac.verification.pretests import NO_PRETEST
 from sfm_app.settings import EpipolarSettings
 
 FloatArray = NDArray[np.float64]
@@ -52,7 +52,7 @@ class _Search:
     """Largest share of inliers of any best model so far, or the assumed one."""
     limit: int
     """Largest number of samples, by (3.19) and the settings."""
-    first_priors: int
+    warmup_trials: int
     """Samples before the priors are first estimated."""
     patience: float
     """Samples without a better model after which the evidence for the best one is evaluated."""
@@ -61,22 +61,22 @@ class _Search:
         self.points, self.threshold = matches.points, options.max_error_px / matches.unit_px
         self.options, self.recipe = options, recipe
         self.test = recipe.verifier(len(self.points), recipe.sample_size)
-        self.best, self.share = Best(self.points, self.threshold, recipe), recipe.assumed_share or 0.0
+        self.best, self.share = BestModel(self.points, self.threshold, recipe), recipe.assumed_share or 0.0
         self.priors, self.state = np.ones(len(self.points)), random_state(seed)
         no_rest = np.zeros(1)
         equal = np.cumsum(self.priors)
-        self.draws = Draws(recipe.sample_size, recipe.oriented, recipe.batch, 0.0, equal, 0.0, no_rest)
+        self.draws = SamplingPlan(recipe.sample_size, recipe.oriented, recipe.batch, 0.0, equal, 0.0, no_rest)
         twice = self.test.pretest.random_start
         self.circle = np.asfortranarray(np.vstack([self.points] * 2)) if twice else self.points
         self.trials, self.idle, self.has_priors = 0, 0, False
         self.patience = recipe.least_trials if recipe.patience is not None else math.inf
-        self._look_ahead()
+        self._update_limits()
 
     def run(self) -> Hypothesis | None:
         """Continue until the samples are used up, the priors have converged, or patience has run out."""
         while self.trials < self.limit:
             better = self._draw()
-            if self._guide(better) or self._has_waited_enough():
+            if self._update_priors(better) or self._has_waited_enough():
                 break
         if not self.best:
             return None
@@ -86,11 +86,11 @@ class _Search:
     def _draw(self) -> bool:
         """Draw samples until a better model or the next decision; return whether the best model changed."""
         left = min(self.limit - self.trials, self.test.review, self.patience - self.idle)
-        if self.trials < self.first_priors:
-            left = min(left, self.first_priors - self.trials)
+        if self.trials < self.warmup_trials:
+            left = min(left, self.warmup_trials - self.trials)
         best, before = self.best, self.best.to_beat.copy()
         parts = self.draws, best.loss, (self.test.pretest, self.test.lenient)  # guided, unguided
-        drawn = next_better(self.circle, *parts, best.to_beat, int(left), self.state, best.samples)
+        drawn = draw_until_better(self.circle, *parts, best.to_beat, int(left), self.state, best.samples)
         self.trials += drawn
         self.idle += drawn
         self.test.learn(drawn)
@@ -102,18 +102,18 @@ class _Search:
             self.test.expect(seen)
             if self.recipe.patience is not None:
                 self.patience = self.recipe.least_trials
-        self._look_ahead()
+        self._update_limits()
         return better
 
-    def _look_ahead(self) -> None:
-        needed = max(self.test.trials_needed(self.share, self.options.confidence), self.recipe.least_trials)
+    def _update_limits(self) -> None:
+        needed = max(self.test.required_trials(self.share, self.options.confidence), self.recipe.least_trials)
         self.limit = math.ceil(min(self.options.max_trials, needed))
-        self.first_priors = math.ceil(self.recipe.guided_after * self.limit)
+        self.warmup_trials = math.ceil(self.recipe.warmup_share * self.limit)
 
-    def _guide(self, better: bool) -> bool:
+    def _update_priors(self, better: bool) -> bool:
         """Set the priors after a new best model; return whether they have converged and end the search."""
         recipe = self.recipe
-        if recipe.validity is None or not self.best or self.trials < self.first_priors:
+        if recipe.validity is None or not self.best or self.trials < self.warmup_trials:
             return False
         if not better and self.has_priors:
             return False
@@ -123,7 +123,7 @@ class _Search:
         if recipe.rest_share > 0:
             rest = squared_distances(self.points, self.best.f) > (_EXPLAINED * self.threshold) ** 2
             self.draws = self.draws._replace(rest_share=recipe.rest_share, rest=np.cumsum(rest, dtype=np.float64))
-        return recipe.stop_on_convergence and have_converged(before, self.priors)
+        return recipe.stop_on_convergence and has_converged(before, self.priors)
 
     def _has_waited_enough(self) -> bool:
         """Return whether the best model has survived as many samples as its evidence requires."""
@@ -141,8 +141,8 @@ class _Search:
     def _recover(self) -> None:
         if self.recipe.recover is None:
             return
-        pretest = OPEN if self.test.pretest.random_start else self.test.pretest
+        pretest = NO_PRETEST if self.test.pretest.random_start else self.test.pretest
         F = self.best.f.reshape(3, 3)
         another = self.recipe.recover(self.points, F, self.threshold, self.best.loss, pretest, self.state)
         if another is not None:
-            self.best.challenged_by(another)
+            self.best.replace_if_better(another)

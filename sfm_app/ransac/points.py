@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sfm_app.geometry.epipolar import unit_norm
+from sfm_app.geometry.epipolar import to_unit_norm
 
 FloatArray = NDArray[np.float64]
 
 _LARGEST_PX = 1e15
 """Largest coordinate of a pixel: beyond it double precision resolves only an eighth of a pixel."""
-_MOST, _MOST_TO_RMS = 0.9, 1.56
+_FRAME_QUANTILE, _QUANTILE_TO_RMS = 0.9, 1.56
 """Quantile of the deviations that measures the spread, and its ratio to their root mean square, if uniform. The second
 follows from the first: 0.9 sqrt(3). Chosen by hand; not measured on its own."""
 
@@ -73,7 +73,7 @@ class Matches:
 
     def to_pixels(self, F: FloatArray) -> FloatArray:
         """Return F of `points` as F of pixels, Frobenius norm 1."""
-        return unit_norm(self._transform(self.center[2:]).T @ F @ self._transform(self.center[:2]))
+        return to_unit_norm(self._transform(self.center[2:]).T @ F @ self._transform(self.center[:2]))
 
     def _transform(self, center: FloatArray) -> FloatArray:
         return np.array([[1, 0, -center[0]], [0, 1, -center[1]], [0, 0, self.unit_px]]) / self.unit_px
@@ -102,11 +102,11 @@ def prepare(x1: FloatArray, x2: FloatArray, seed: int) -> Matches:
     rows = np.empty_like(ranked)
     rows[ranked] = place[np.cumsum(is_new) - 1]
     points = np.asfortranarray(stacked.take(first[order], axis=0))
-    center, unit_px = _frame(points)
+    center, unit_px = _robust_frame(points)
     return Matches((points - center) / unit_px, rows, unit_px, center)
 
 
-def _frame(points: FloatArray) -> tuple[FloatArray, float]:
+def _robust_frame(points: FloatArray) -> tuple[FloatArray, float]:
     """Return the origin (4,) and the unit in which most coordinates are of magnitude 1.
 
     A few gross outliers do not change them.
@@ -116,6 +116,6 @@ def _frame(points: FloatArray) -> tuple[FloatArray, float]:
     middle, deviations = len(points) // 2, np.empty_like(points)
     center = np.array([np.partition(column, middle)[middle] for column in points.T])
     np.abs(points - center, out=deviations)
-    ranked = int(_MOST * (deviations.size - 1))
-    unit_px = float(np.partition(deviations.ravel(order="K"), ranked)[ranked]) / _MOST_TO_RMS
+    ranked = int(_FRAME_QUANTILE * (deviations.size - 1))
+    unit_px = float(np.partition(deviations.ravel(order="K"), ranked)[ranked]) / _QUANTILE_TO_RMS
     return center, unit_px or float(np.sqrt((deviations**2).mean())) or 1.0

@@ -7,6 +7,6 @@ adds finer features (`added_matches`) for unregistered photos, and `unregistered
 """
 
 from sfm_app.reconstruction.mapping_passes import Outcome, reconstruct
-from sfm_app.reconstruction.second_look import Found, look_again
+from sfm_app.reconstruction.second_look import MappedScene, retry_lost_photos
 
-__all__ = ["Found", "Outcome", "look_again", "reconstruct"]
+__all__ = ["MappedScene", "Outcome", "reconstruct", "retry_lost_photos"]

@@ -16,7 +16,7 @@ SAME_PX = 0.5
 """Keypoints nearer than this count as one, so that tracks continue across kinds; about the noise of SIFT."""
 
 
-def with_added(
+def add_matches(
     matches: MatchGraph, keypoints: Mapping[int, FloatArray], added: Mapping[PairId, Rows]
 ) -> tuple[MatchGraph, tuple[PairId, ...]]:
     """Add keypoints and matches of another kind.
@@ -34,19 +34,19 @@ def with_added(
     """
     every, numbers = dict(matches.keypoints), {}
     for photo, found in keypoints.items():
-        every[photo], numbers[photo] = _merged(matches.keypoints[photo], found)
+        every[photo], numbers[photo] = _merge_keypoints(matches.keypoints[photo], found)
     rows, changed = dict(matches.matches), []
     for pair, new in added.items():
         known = rows.get(pair, np.zeros((0, 2), np.uint32))
         renamed = np.column_stack([numbers[photo][new[:, side]] for side, photo in enumerate(pair)])
-        together = _once(np.vstack([known, renamed.astype(np.uint32)]))
+        together = _drop_repeats(np.vstack([known, renamed.astype(np.uint32)]))
         if len(together) > len(known):
             rows[pair] = together
             changed.append(pair)
     return replace(matches, keypoints=every, matches=dict(sorted(rows.items()))), tuple(sorted(changed))
 
 
-def _merged(known: FloatArray, found: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
+def _merge_keypoints(known: FloatArray, found: FloatArray) -> tuple[FloatArray, NDArray[np.int64]]:
     """Return all keypoints of a photo, and the index of each added one among them."""
     numbers = len(known) + np.arange(len(found))
     if len(known) and len(found):
@@ -55,7 +55,7 @@ def _merged(known: FloatArray, found: FloatArray) -> tuple[FloatArray, NDArray[n
     return np.vstack([known.reshape(-1, 2), found]), numbers.astype(np.int64)
 
 
-def _once(rows: Rows) -> Rows:
+def _drop_repeats(rows: Rows) -> Rows:
     """Return the rows whose keypoints, in either photo, occur in no earlier row."""
     first = [np.isin(np.arange(len(rows)), np.unique(rows[:, side], return_index=True)[1]) for side in (0, 1)]
     return rows[first[0] & first[1]]

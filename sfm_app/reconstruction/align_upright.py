@@ -10,18 +10,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import backend
-from sfm_app.colmap.model import focal_px, move, photos_of, posed_photos, seen_points, somewhere, viewing_rays
+from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.model import (
+    finite_mask,
+    focal_px,
+    move,
+    posed_photo_ids,
+    poses_and_points,
+    seen_points,
+    viewing_rays,
+)
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import NumericalError
 from sfm_app.geometry.similarity import Similarity
-from sfm_app.numerical import FAILURES, Json, reason_of
-from sfm_app.orientation.georeference import Georeference, NoGeoreference, georeference, position_at
-from sfm_app.orientation.gravity import LINES, Upright, facing, up_direction, viewer_frame
+from sfm_app.numerical import FAILURES, Json, error_reason
+from sfm_app.orientation.georeference import Georeference, NoGeoreference, georeference, position_from_enu
+from sfm_app.orientation.gravity import LINES, UpEstimate, up_direction, viewer_direction, viewer_frame
 from sfm_app.orientation.line_segments import line_segments
 from sfm_app.orientation.up_cues import small_picture
 from sfm_app.orientation.up_direction import Scenery, odds
-from sfm_app.orientation.vanishing_points import Segments, joined, segment_planes
+from sfm_app.orientation.vanishing_points import Segments, concatenate_segments, segment_planes
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import GpsPosition, MatchGraph
 
@@ -29,7 +37,7 @@ logger = logging.getLogger("sfm_app")
 
 FloatArray = NDArray[np.float64]
 
-LOOKED_AT = 10
+SAMPLED_PHOTOS = 10
 """Number of photos per model that are searched for cues, spread over the set."""
 
 SCENERY_POINTS = 8000
@@ -37,7 +45,7 @@ SCENERY_POINTS = 8000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Look:
+class PhotoCues:
     """Cues to the up direction from one photo."""
 
     lines: FloatArray
@@ -46,11 +54,11 @@ class Look:
     """The photo itself, gray and small; None if it could not be read."""
 
 
-PhotoLooks = Mapping[int, "Future[Look]"]
+FutureCues = Mapping[int, "Future[PhotoCues]"]
 """Futures of the cues, by photo."""
 
 
-def look_at_photos(models: Sequence[Reconstruction], matches: MatchGraph, run: RunContext) -> PhotoLooks:
+def submit_cue_extraction(models: Sequence[Reconstruction], matches: MatchGraph, run: RunContext) -> FutureCues:
     """Start to extract cues from some photos of every model, in the background.
 
     Args:
@@ -60,15 +68,15 @@ def look_at_photos(models: Sequence[Reconstruction], matches: MatchGraph, run: R
     """
     looks = {}
     for model in models:
-        posed = photos_of(model)
-        for k in np.unique(np.linspace(0, len(posed) - 1, LOOKED_AT).astype(int)):
+        posed = posed_photo_ids(model)
+        for k in np.unique(np.linspace(0, len(posed) - 1, SAMPLED_PHOTOS).astype(int)):
             image = matches.images[posed[k]]
-            looks[posed[k]] = run.executor.submit(look_at, run.workspace.photos / image.name, image.turn_deg)
+            looks[posed[k]] = run.executor.submit(extract_cues, run.workspace.photos / image.name, image.turn_deg)
     return looks
 
 
-def orient_or_leave(
-    model: Reconstruction, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | None = None
+def orient_or_keep(
+    model: Reconstruction, matches: MatchGraph, looks: FutureCues, turn_deg: int | None = None
 ) -> dict[str, Json]:
     """Turn the model upright; where that fails numerically, leave it unchanged and return the reason.
 
@@ -79,11 +87,15 @@ def orient_or_leave(
         return orient(model, matches, looks, turn_deg)
     except FAILURES as err:
         logger.info("the model could not be turned upright", exc_info=err)
-        return {"failed": reason_of(err), "unit": "that of mapping", "gps": "not used: it is not known which way is up"}
+        return {
+            "failed": error_reason(err),
+            "unit": "that of mapping",
+            "gps": "not used: it is not known which way is up",
+        }
 
 
 def orient(
-    model: Reconstruction, matches: MatchGraph, looks: PhotoLooks, turn_deg: int | None = None
+    model: Reconstruction, matches: MatchGraph, looks: FutureCues, turn_deg: int | None = None
 ) -> dict[str, Json]:
     """Move the model into the frame of glTF viewers: y up, seen from +z, centered, of size about 1 or in meters.
 
@@ -99,43 +111,43 @@ def orient(
     Raises:
         NumericalError: the model has no finite points.
     """
-    with backend("reading the model"):
-        poses, points = posed_photos(model)
-    points = points[somewhere(points)]
+    with translate_errors("reading the model"):
+        poses, points = poses_and_points(model)
+    points = points[finite_mask(points)]
     if not len(points):
         raise NumericalError("it has no points")
     matrices = np.array(list(poses.values()))
     centers = -np.einsum("nij,ni->nj", matrices[:, :, :3], matrices[:, :, 3])
     turns = [matches.images[photo].turn_deg for photo in poses]
-    R = np.array([turned(rotation, turn) for rotation, turn in zip(matrices[:, :, :3], turns, strict=True)])
+    R = np.array([turn_camera(rotation, turn) for rotation, turn in zip(matrices[:, :, :3], turns, strict=True)])
     found = {photo: looks[photo].result() for photo in poses if photo in looks}
-    upright = up_direction(R, centers, _scenery_of(model, found), _lines_of(model, found), turn_deg)
+    upright = up_direction(R, centers, _scenery(model, found), _world_segments(model, found), turn_deg)
     positions = [matches.images[key].gps for key in poses]
     gps = _georeference(centers, positions, upright)
     meters = None
     if isinstance(gps, Georeference):
         meters = gps.enu_from_world.scale
         if gps.up_deviation_deg is not None:
-            upright = upright.turned_to(gps.enu_from_world.R[2], gps.up_deviation_deg)
-    towards, front = facing(upright, R, points)
+            upright = upright.with_up(gps.enu_from_world.R[2], gps.up_deviation_deg)
+    towards, front = viewer_direction(upright, R, points)
     viewer = viewer_frame(upright.up, towards, points, meters)
     if not is_sound(viewer):
         raise NumericalError("the frame of the viewer is not finite")
-    with backend("turning the model upright"):
+    with translate_errors("turning the model upright"):
         move(model, viewer)
-    entry = _how_it_stands(upright, front) | _where_it_stands(viewer, gps)
+    entry = _orientation_entry(upright, front) | _georeference_entry(viewer, gps)
     logger.info("orientation: %s", entry)
     return entry
 
 
 def _georeference(
-    centers: FloatArray, positions: Sequence[GpsPosition | None], upright: Upright
+    centers: FloatArray, positions: Sequence[GpsPosition | None], upright: UpEstimate
 ) -> Georeference | NoGeoreference:
     try:
-        found = georeference(centers, positions, upright.up, up_is_sure=upright.found_by == LINES)
+        found = georeference(centers, positions, upright.up, up_is_sure=upright.method == LINES)
     except FAILURES as err:
         logger.info("the GPS positions could not be used", exc_info=err)
-        return NoGeoreference(f"the computation failed: {reason_of(err)}")
+        return NoGeoreference(f"the computation failed: {error_reason(err)}")
     if not isinstance(found, Georeference) or is_sound(found.enu_from_world):
         return found
     return NoGeoreference("the positions give no scale")
@@ -146,7 +158,7 @@ def is_sound(similarity: Similarity) -> bool:
     return bool(np.isfinite(similarity.R).all() and np.isfinite(similarity.t).all() and 0.0 < similarity.scale < np.inf)
 
 
-def turned(R: FloatArray, turn_deg: int) -> FloatArray:
+def turn_camera(R: FloatArray, turn_deg: int) -> FloatArray:
     """Return the rotation (3, 3) cam_from_world of a photo that is turned clockwise.
 
     Args:
@@ -157,21 +169,21 @@ def turned(R: FloatArray, turn_deg: int) -> FloatArray:
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ R
 
 
-def _lines_of(model: Reconstruction, looks: Mapping[int, Look]) -> Segments:
+def _world_segments(model: Reconstruction, looks: Mapping[int, PhotoCues]) -> Segments:
     """Return the line segments of the photos of a model, in the world frame."""
-    with backend("computing viewing rays of line segments"):
-        return joined([_in_world(model, photo, look.lines) for photo, look in looks.items()])
+    with translate_errors("computing viewing rays of line segments"):
+        return concatenate_segments([_to_world(model, photo, look.lines) for photo, look in looks.items()])
 
 
-def _scenery_of(model: Reconstruction, looks: Mapping[int, Look]) -> Scenery:
+def _scenery(model: Reconstruction, looks: Mapping[int, PhotoCues]) -> Scenery:
     """Return points of a model and its small photos, as evidence for the up direction."""
-    with backend("reading the points"):
+    with translate_errors("reading the points"):
         shown = seen_points(model, SCENERY_POINTS)
-    pictures = tuple(looks[photo].picture if photo in looks else None for photo in photos_of(model))
+    pictures = tuple(looks[photo].picture if photo in looks else None for photo in posed_photo_ids(model))
     return Scenery(shown.points, shown.colors.mean(axis=1), shown.seen, pictures)
 
 
-def look_at(path: Path, turn_deg: int = 0) -> Look:
+def extract_cues(path: Path, turn_deg: int = 0) -> PhotoCues:
     """Return the line segments of a photo, and a small upright copy of it; empty if OpenCV cannot read the photo.
 
     Args:
@@ -184,38 +196,38 @@ def look_at(path: Path, turn_deg: int = 0) -> Look:
         data = np.zeros(0, np.uint8)
     read = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
     if read is None:
-        return Look(np.zeros((0, 4)), None)
+        return PhotoCues(np.zeros((0, 4)), None)
     gray = np.asarray(read, np.uint8)
-    return Look(line_segments(gray), np.rot90(small_picture(gray), -turn_deg // 90))
+    return PhotoCues(line_segments(gray), np.rot90(small_picture(gray), -turn_deg // 90))
 
 
-def _in_world(model: Reconstruction, image_id: int, lines: FloatArray) -> Segments:
+def _to_world(model: Reconstruction, image_id: int, lines: FloatArray) -> Segments:
     first, second = (viewing_rays(model, image_id, lines[:, ends]) for ends in (slice(0, 2), slice(2, 4)))
     return segment_planes(first, second, image_id, focal_px(model, image_id))
 
 
-def _how_it_stands(upright: Upright, front: str) -> dict[str, Json]:
+def _orientation_entry(upright: UpEstimate, front: str) -> dict[str, Json]:
     """Return the up and front directions and their evidence, for the manifest."""
-    standing = upright.standing
+    standing = upright.selection
     return {
-        "up": upright.found_by,
+        "up": upright.method,
         "up_deviation_deg": round(upright.deviation_deg, 3) if np.isfinite(upright.deviation_deg) else None,
-        "off_camera_roll_deg": round(upright.off_roll_deg, 2),
+        "off_camera_roll_deg": round(upright.angle_to_roll_deg, 2),
         "camera_roll_spread_deg": round(upright.roll.spread_deg, 2),
         "photos_turned_deg": upright.roll.turn_deg,
-        "up_sign_odds": odds(standing.not_upside_down),
-        "up_axis_odds": odds(standing.not_on_its_side),
+        "up_sign_odds": odds(standing.sign_log_odds),
+        "up_axis_odds": odds(standing.axis_log_odds),
         "up_evidence_nats": {name: round(nats, 1) for name, nats in standing.evidence.items()},
         "front": front,
     }
 
 
-def _where_it_stands(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Json]:
+def _georeference_entry(viewer: Similarity, gps: Georeference | NoGeoreference) -> dict[str, Json]:
     """Return the unit and georeference of the model that `viewer` has moved, for the manifest."""
     if isinstance(gps, NoGeoreference):
         return {"unit": "about the size of the scene", "gps": f"not used: {gps.reason}"}
-    enu_from_model = gps.enu_from_world.after(viewer.inverse())
-    origin = position_at(enu_from_model.t, gps.origin)
+    enu_from_model = gps.enu_from_world.compose(viewer.inverse())
+    origin = position_from_enu(enu_from_model.t, gps.origin)
     east, north, _ = -enu_from_model.R[:, 2]
     return {
         "unit": "meter",

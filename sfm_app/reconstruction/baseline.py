@@ -9,13 +9,13 @@ import logging
 from collections.abc import Mapping
 from dataclasses import replace
 
-from sfm_app.colmap.backend import backend, interruptible
+from sfm_app.colmap.backend import run_interruptible, translate_errors
 from sfm_app.colmap.database import keep_raw_matches, write_calibrations
-from sfm_app.colmap.mapping import copy_database, map_as_colmap_does
+from sfm_app.colmap.mapping import copy_database, map_with_colmap_defaults
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import BackendError
 from sfm_app.geometry.camera import GUESSED_FOCAL, guessed_camera_matrix
-from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, judged
+from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, judge_model
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, ViewGraph
 from sfm_app.types.epipolar import EpipolarFit
@@ -23,15 +23,15 @@ from sfm_app.types.epipolar import EpipolarFit
 logger = logging.getLogger("sfm_app")
 
 FOLDER = "rival"
-MAPPER, HOW = "colmap", "as COLMAP does by itself"
-LEFT_OUT, MANY = 0.25, 60
+MAPPER, NOTE = "colmap", "as COLMAP does by itself"
+MIN_UNPLACED_SHARE, MAX_PHOTOS = 0.25, 60
 """Share of unregistered photos above which other focals are tried, and number of photos above which they are not."""
-CONTRADICTED = 0.05
+MIN_CONTRADICTED_SHARE = 0.05
 """Share of the inliers of fundamental matrices that contradict a model, above which a rival is tried. Right models of
 the Strecha sets, cropped and squeezed, have 0.1 to 3 %."""
 
 
-def why_thin(model: Attempt | None, intrinsics: Intrinsics, matches: MatchGraph, views: ViewGraph) -> str:
+def rival_reason(model: Attempt | None, intrinsics: Intrinsics, matches: MatchGraph, views: ViewGraph) -> str:
     """Return why a rival is worth trying, in a few words; empty where the evidence is good.
 
     Args:
@@ -42,20 +42,24 @@ def why_thin(model: Attempt | None, intrinsics: Intrinsics, matches: MatchGraph,
     """
     if model is None:
         return "no photo was placed"
-    refused = {intrinsics.name_of(image) for image in matches.images.values()} - {
-        name for name, camera in intrinsics.cameras.items() if camera.estimated
+    refused = {intrinsics.camera_name(image) for image in matches.images.values()} - {
+        name for name, camera in intrinsics.cameras.items() if camera.is_estimated
     }
     if refused:
         return "the pairs do not determine a camera"
-    connected = photos_in(views.fits)
+    connected = connected_photos(views.fits)
     if model.photos < len(connected):
         return f"photos that match others have no place: {len(connected) - model.photos}"
     inliers = sum(pair.inliers for pair in model.explained.values())
     against = sum(pair.contradicted for pair in model.explained.values())
-    return f"{100 * against / inliers:.0f} % of the matches contradict it" if against > CONTRADICTED * inliers else ""
+    return (
+        f"{100 * against / inliers:.0f} % of the matches contradict it"
+        if against > MIN_CONTRADICTED_SHARE * inliers
+        else ""
+    )
 
 
-def photos_in(fits: Mapping[PairId, EpipolarFit]) -> set[int]:
+def connected_photos(fits: Mapping[PairId, EpipolarFit]) -> set[int]:
     """Collect the photos of pairs whose geometry is not degenerate."""
     return {photo for pair, fit in fits.items() if not fit.degeneracy for photo in pair}
 
@@ -75,21 +79,21 @@ def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, 
     found: list[Reconstruction | None] = []
     guess = guessed_intrinsics(intrinsics)
     try:
-        with backend("mapping photos by its defaults"):
+        with translate_errors("mapping photos by its defaults"):
             copy_database(run.workspace.database, scratch)
             write_calibrations(scratch / "database.db", matches, guess)
             keep_raw_matches(scratch / "database.db", matches.matches)
-            interruptible(
-                lambda token: found.append(map_as_colmap_does(run.workspace.photos, scratch, run.seed, token)),
+            run_interruptible(
+                lambda token: found.append(map_with_colmap_defaults(run.workspace.photos, scratch, run.seed, token)),
                 lambda: None,
             )
     except BackendError as err:  # our own model is not lost with it
         logger.info("the rival failed: %s", err)
-        return NoModel(MAPPER, f"{HOW}: failed, {err}")
-    return judged(matches, views, (MAPPER, HOW), found[0], run)
+        return NoModel(MAPPER, f"{NOTE}: failed, {err}")
+    return judge_model(matches, views, (MAPPER, NOTE), found[0], run)
 
 
-def leaves_many_out(model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph) -> bool:
+def has_many_unplaced(model: Attempt | None, intrinsics: Intrinsics, views: ViewGraph) -> bool:
     """Return whether a wrong guess of the focal may be why photos that match others are unregistered.
 
     This is not so where any camera is known. Where there are many photos, a pass costs more than it promises.
@@ -99,10 +103,10 @@ def leaves_many_out(model: Attempt | None, intrinsics: Intrinsics, views: ViewGr
         intrinsics: cameras from pairs.
         views: fundamental matrices.
     """
-    connected = photos_in(views.fits)
-    known = any(camera.estimated or camera.method == "exif" for camera in intrinsics.cameras.values())
+    connected = connected_photos(views.fits)
+    known = any(camera.is_estimated or camera.method == "exif" for camera in intrinsics.cameras.values())
     placed = model.photos if model is not None else 0
-    return not known and len(connected) <= MANY and len(connected) - placed > LEFT_OUT * len(connected)
+    return not known and len(connected) <= MAX_PHOTOS and len(connected) - placed > MIN_UNPLACED_SHARE * len(connected)
 
 
 def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> Intrinsics:

@@ -10,9 +10,9 @@ from sfm_app.geometry.epipolar import cross_matrix
 from sfm_app.geometry.two_view_init import GOOD_ANGLE_DEG, TwoViewSeed, two_view_seed
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose
 
-DISSENT = 0.1
+DISSENT_WEIGHT = 0.1
 """Weight of a seed whose pair contradicts the camera matrix that other pairs agree on."""
-FLAT = 0.5
+PLANAR_WEIGHT = 0.5
 """Weight of a seed whose points lie on a plane, or whose camera moved along its axis: its pose is less certain."""
 FORWARD = 0.95
 """Share of the translation along the camera's axis above which the motion counts as forward."""
@@ -46,13 +46,13 @@ def rank_seeds(
         if members.issuperset(pair) and pose.kind != "rotation" and pose.angle_deg >= min_angle_deg:
             cameras = [intrinsics.camera(matches.images[photo]) for photo in pair]
             worth = coverage(matches, pair, pose) * agreement(pair, cameras)
-            worth *= FLAT if pose.kind == "planar" or abs(pose.t[2]) > FORWARD else 1.0
+            worth *= PLANAR_WEIGHT if pose.kind == "planar" or abs(pose.t[2]) > FORWARD else 1.0
             score = pose.inlier_count * min(pose.angle_deg / GOOD_ANGLE_DEG, 1.0) * pose.in_front**4 * worth
             found.append(Candidate(pair, pose, score))
     return sorted(found, key=lambda candidate: (-candidate.score, candidate.pair))
 
 
-def seed_of(matches: MatchGraph, candidate: Candidate, intrinsics: Intrinsics) -> TwoViewSeed:
+def triangulate_seed(matches: MatchGraph, candidate: Candidate, intrinsics: Intrinsics) -> TwoViewSeed:
     """Return the pose and triangulated points of a candidate.
 
     Args:
@@ -75,7 +75,7 @@ def agreement(pair: PairId, cameras: Sequence[Calibration]) -> float:
     """
     first, second = cameras
     unknown = first is not second or not first.key_pairs
-    return 1.0 if unknown or pair in first.key_pairs else DISSENT
+    return 1.0 if unknown or pair in first.key_pairs else DISSENT_WEIGHT
 
 
 def coverage(matches: MatchGraph, pair: PairId, pose: RelativePose) -> float:

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_app.colmap.backend import backend
+from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.model import posed_images
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.numerical import Json
-from sfm_app.reconstruction.unregistered import names_of
+from sfm_app.reconstruction.unregistered import photo_names
 from sfm_app.types import LookAlikes, MatchGraph, PairId, PoseGraph, ViewGraph
 
 LEAST_IN_ORDER = 30
@@ -37,7 +37,7 @@ def without_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph)
     return replace(matches, matches=kept), replace(views, fits=fits)
 
 
-def with_earlier(graph: PoseGraph, earlier: PoseGraph) -> PoseGraph:
+def with_earlier_look_alikes(graph: PoseGraph, earlier: PoseGraph) -> PoseGraph:
     """Return a pose graph with the look-alikes of an earlier pass added to its own.
 
     Args:
@@ -48,7 +48,7 @@ def with_earlier(graph: PoseGraph, earlier: PoseGraph) -> PoseGraph:
     return replace(graph, dropped=dropped | dict(graph.dropped), look_alikes=earlier.look_alikes + graph.look_alikes)
 
 
-def in_words(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str, Json]]:
+def look_alike_entries(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str, Json]]:
     """Return the recognized look-alikes, for the manifest.
 
     Args:
@@ -58,7 +58,7 @@ def in_words(joins: Sequence[LookAlikes], matches: MatchGraph) -> list[dict[str,
     return [
         {
             "pairs": len(join.pairs),
-            "between": [names_of(photos, matches) for photos in sides(join.pairs, matches)],
+            "between": [photo_names(photos, matches) for photos in sides(join.pairs, matches)],
             "missing": round(join.missing, 3),
         }
         for join in joins
@@ -70,7 +70,7 @@ def jumps(model: Reconstruction) -> list[list[str]]:
 
     Empty where many steps are long, because the photos are then unordered. A jump is no proof: videos may be cut, too.
     """
-    with backend("reading poses"):
+    with translate_errors("reading poses"):
         placed = sorted((image.name, image.projection_center()) for image in posed_images(model))
     if len(placed) < LEAST_IN_ORDER:
         return []

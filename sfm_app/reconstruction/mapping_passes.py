@@ -5,35 +5,35 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_app.colmap.backend import backend
+from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import write_calibrations, write_match_graph, write_pose_graph
-from sfm_app.colmap.model import cameras_of, part_of, photos_of
+from sfm_app.colmap.model import cameras_by_photo, posed_photo_ids, submodel
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
-from sfm_app.reconstruction.baseline import guessed_intrinsics, leaves_many_out, map_baseline, why_thin
+from sfm_app.reconstruction.baseline import guessed_intrinsics, has_many_unplaced, map_baseline, rival_reason
 from sfm_app.reconstruction.camera_per_photo import (
-    explains_as_much,
-    explains_more,
-    may_have_one_each,
-    with_one_each,
-    with_two,
+    can_have_own_cameras,
+    is_as_good,
+    is_better,
+    with_camera_per_photo,
+    with_two_cameras,
 )
-from sfm_app.reconstruction.look_alikes import with_earlier, without_look_alikes
-from sfm_app.reconstruction.mapping_runs import Attempt, Group, NoModel, attempts, better, why
+from sfm_app.reconstruction.look_alikes import with_earlier_look_alikes, without_look_alikes
+from sfm_app.reconstruction.mapping_runs import Attempt, Group, NoModel, best_attempt, choice_reason, map_group
 from sfm_app.reconstruction.model_merge import join_models
 from sfm_app.reconstruction.model_split import sound_parts
 from sfm_app.reconstruction.support import model_poses
-from sfm_app.reconstruction.unregistered import names_of
+from sfm_app.reconstruction.unregistered import photo_names
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
 
-LEARNED_FROM = 3
+MIN_PHOTOS = 3
 """Smallest number of photos from which a camera is learned, and in a group that is mapped besides the main one."""
 MOST_PASSES = 4
 """Largest number of passes over all pairs. On dinoSparseRing with learned features the second finds a focal of 3272
 (true 3318), and the third places all photos with it."""
 OTHER_FOCALS = (0.6, 2.4, 4.8)
 """Guesses of the focal besides the usual one, in longer sides: steps of a factor of two over the range of cameras."""
-MOVED = 0.01
+FOCAL_TOLERANCE = 0.01
 """Relative change of a focal in mapping above which another pass over the pairs is worth it."""
 
 
@@ -83,30 +83,30 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
         intrinsics: cameras from pairs.
         run: the run.
     """
-    with backend("entering photos"):
+    with translate_errors("entering photos"):
         write_match_graph(run.workspace.database, matches)
-    best = _pass(matches, views, intrinsics, run)
+    best = _run_pass(matches, views, intrinsics, run)
     matches, views = without_look_alikes(matches, views, best.graph)
-    best = with_rival(best, matches, views, intrinsics, run)
-    best = _with_other_focals(best, matches, views, intrinsics, run)
-    best = _with_own_cameras(best, matches, views, intrinsics, run)
+    best = try_rival(best, matches, views, intrinsics, run)
+    best = _try_other_focals(best, matches, views, intrinsics, run)
+    best = _try_camera_per_photo(best, matches, views, intrinsics, run)
     for number in range(2, MOST_PASSES + 1):
-        if not best.models or not worth_another(best, best.intrinsics, matches):
+        if not best.models or not is_pass_worthwhile(best, best.intrinsics, matches):
             break
         learned = learned_intrinsics(best.models[0], best.intrinsics, matches)
-        again = _pass(matches, views, learned, run)
+        again = _run_pass(matches, views, learned, run)
         if again.support <= best.support:
-            _enter(best.graph, best.intrinsics, matches, run)
+            _write_graph(best.graph, best.intrinsics, matches, run)
             break
-        graph, tried = with_earlier(again.graph, best.graph), best.tried + again.tried
+        graph, tried = with_earlier_look_alikes(again.graph, best.graph), best.tried + again.tried
         best = replace(
             again, passes=number, thin=best.thin, graph=graph, tried=tried, one_camera_each=best.one_camera_each
         )
         matches, views = without_look_alikes(matches, views, best.graph)
-    return _with_joined(best, matches, views, run)
+    return _with_joined_models(best, matches, views, run)
 
 
-def with_rival(
+def try_rival(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
     """Map a rival where the evidence is weak, and return the outcome with the model that explains more.
@@ -116,79 +116,77 @@ def with_rival(
         matches, views, intrinsics, run: as in `reconstruct`.
     """
     main = outcome.main
-    thin = why_thin(main, intrinsics, matches, views)
+    thin = rival_reason(main, intrinsics, matches, views)
     if not thin:
         return outcome
     run.progress.say(f"COLMAP's own way is tried beside ours: {thin}")
     rival = map_baseline(matches, views, intrinsics, run)
     outcome = replace(outcome, thin=thin, tried=(*outcome.tried, rival.note))
     both = [attempt for attempt in (main, rival) if attempt is not None]
-    if isinstance(rival, NoModel) or better(both) is not rival:
+    if isinstance(rival, NoModel) or best_attempt(both) is not rival:
         return outcome
-    parts = taken_apart(rival)
-    taken = {photo for part in parts for photo in photos_of(part.model)}
-    others = [model for model in outcome.models if taken.isdisjoint(photos_of(model.model))]
+    parts = split_attempt(rival)
+    taken = {photo for part in parts for photo in posed_photo_ids(part.model)}
+    others = [model for model in outcome.models if taken.isdisjoint(posed_photo_ids(model.model))]
     models = sorted((*parts, *others), key=lambda attempt: (-attempt.photos, -attempt.support))
-    graph = _graph_of(models, outcome.graph, matches, run)
-    _enter(graph, intrinsics, matches, run)
-    return replace(outcome, models=tuple(models), graph=graph, reason=why(rival, both, len(matches.images)))
+    graph = _update_graph(models, outcome.graph, matches, run)
+    _write_graph(graph, intrinsics, matches, run)
+    return replace(outcome, models=tuple(models), graph=graph, reason=choice_reason(rival, both, len(matches.images)))
 
 
-def _with_other_focals(
+def _try_other_focals(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
     """Map with other guesses of the focal where many photos are unregistered, and return the best outcome."""
     main = outcome.main
-    if not leaves_many_out(main, intrinsics, views):
+    if not has_many_unplaced(main, intrinsics, views):
         return outcome
     run.progress.say("many photos have no place, and the focal length is a guess: other guesses are tried")
     for focal in OTHER_FOCALS:
-        other = _pass(matches, views, guessed_intrinsics(intrinsics, focal), run)
+        other = _run_pass(matches, views, guessed_intrinsics(intrinsics, focal), run)
         tried = (*outcome.tried, *(f"{note} (focal {focal:g} longer sides)" for note in other.tried))
         outcome = replace(other if other.support > outcome.support else outcome, thin=outcome.thin, tried=tried)
     if outcome.graph is not other.graph:
-        _enter(outcome.graph, outcome.intrinsics, matches, run)
+        _write_graph(outcome.graph, outcome.intrinsics, matches, run)
     return outcome
 
 
-def _with_own_cameras(
+def _try_camera_per_photo(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
     """Map with a camera for each photo where shared ones explain too little, and return the better outcome."""
     main = outcome.main
-    if main is None or not may_have_one_each(main, intrinsics, views, run.settings):
+    if main is None or not can_have_own_cameras(main, intrinsics, views, run.settings):
         return outcome
-    each = with_one_each(main, intrinsics, matches)
+    each = with_camera_per_photo(main, intrinsics, matches)
     if each is None:
         return outcome
     run.progress.say("one camera for all photos of a size does not explain them: one for each is tried")
-    own = _pass(matches, views, each, run)
-    own = with_rival(own, matches, views, each, run)
+    own = _run_pass(matches, views, each, run)
+    own = try_rival(own, matches, views, each, run)
     tried = (*outcome.tried, *(f"{note} (a camera for each photo)" for note in own.tried))
-    if not explains_more(own.main, main):
-        _enter(outcome.graph, outcome.intrinsics, matches, run)
+    if not is_better(own.main, main):
+        _write_graph(outcome.graph, outcome.intrinsics, matches, run)
         return replace(outcome, tried=tried, one_camera_each="left")
-    return _with_two_cameras(
+    return _try_two_cameras(
         replace(own, thin=outcome.thin, tried=tried, one_camera_each="taken"), matches, views, each, run
     )
 
 
-def _with_two_cameras(
-    own: Outcome, matches: MatchGraph, views: ViewGraph, each: Intrinsics, run: RunContext
-) -> Outcome:
+def _try_two_cameras(own: Outcome, matches: MatchGraph, views: ViewGraph, each: Intrinsics, run: RunContext) -> Outcome:
     """Map with two cameras instead of one for each photo, and return their outcome if they explain as much."""
-    between = with_two(own.models[0], each, matches)
+    between = with_two_cameras(own.models[0], each, matches)
     if between is None:
         return own
-    two = _pass(matches, views, between, run)
+    two = _run_pass(matches, views, between, run)
     tried = (*own.tried, *(f"{note} (two cameras)" for note in two.tried))
-    if explains_as_much(two.main, own.models[0]):
+    if is_as_good(two.main, own.models[0]):
         return replace(two, thin=own.thin, tried=tried, one_camera_each="two")
-    _enter(own.graph, own.intrinsics, matches, run)
+    _write_graph(own.graph, own.intrinsics, matches, run)
     return replace(own, tried=tried)
 
 
-def _with_joined(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
+def _with_joined_models(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: RunContext) -> Outcome:
     """Return the outcome with models joined where they share points."""
     if len(outcome.models) < 2:
         return outcome
@@ -196,13 +194,13 @@ def _with_joined(outcome: Outcome, matches: MatchGraph, views: ViewGraph, run: R
     if len(models) == len(outcome.models):
         return outcome
     run.progress.say(f"models were joined: {models[0].note}")
-    graph = _graph_of(models[:1], outcome.graph, matches, run)
-    _enter(graph, outcome.intrinsics, matches, run)
+    graph = _update_graph(models[:1], outcome.graph, matches, run)
+    _write_graph(graph, outcome.intrinsics, matches, run)
     tried = (*outcome.tried, models[0].note)
     return replace(outcome, models=models, graph=graph, tried=tried, reason=models[0].note)
 
 
-def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
+def is_pass_worthwhile(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph) -> bool:
     """Return whether another pass with the cameras that mapping found may improve the model.
 
     That is so if these cameras differ from those of the last pass, or if photos of the main group are missing.
@@ -213,14 +211,14 @@ def worth_another(outcome: Outcome, intrinsics: Intrinsics, matches: MatchGraph)
         matches: all photos.
     """
     main = outcome.models[0]
-    placed = photos_of(main.model)
-    if len(placed) < LEARNED_FROM:
+    placed = posed_photo_ids(main.model)
+    if len(placed) < MIN_PHOTOS:
         return False
     learned = learned_intrinsics(main, intrinsics, matches)
-    used = {intrinsics.name_of(matches.images[photo]) for photo in placed}
-    news = any(_far(intrinsics.cameras[name], learned.cameras[name]) for name in used)
-    anywhere = {photo for model in outcome.models for photo in photos_of(model.model)}
-    return news or not anywhere.issuperset(outcome.graph.group_of(placed[0]))
+    used = {intrinsics.camera_name(matches.images[photo]) for photo in placed}
+    news = any(_has_changed(intrinsics.cameras[name], learned.cameras[name]) for name in used)
+    anywhere = {photo for model in outcome.models for photo in posed_photo_ids(model.model)}
+    return news or not anywhere.issuperset(outcome.graph.connected_photos(placed[0]))
 
 
 def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGraph) -> Intrinsics:
@@ -231,67 +229,69 @@ def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGra
         intrinsics: cameras before mapping, of all photos.
         matches: all photos.
     """
-    with backend("reading cameras"):
-        found = cameras_of(model.model)
+    with translate_errors("reading cameras"):
+        found = cameras_by_photo(model.model)
     cameras = dict(intrinsics.cameras)
     for photo, (K, radial) in found.items():
-        name = intrinsics.name_of(matches.images[photo])
+        name = intrinsics.camera_name(matches.images[photo])
         cameras[name] = replace(
             intrinsics.cameras[name], K=K, radial=radial, identifiable=True, reason="", method="mapping"
         )
     return replace(intrinsics, cameras=cameras)
 
 
-def _far(before: Calibration, after: Calibration) -> bool:
-    return not before.estimated or abs(float(np.log(after.focal_px / before.focal_px))) > MOVED
+def _has_changed(before: Calibration, after: Calibration) -> bool:
+    return not before.is_estimated or abs(float(np.log(after.focal_px / before.focal_px))) > FOCAL_TOLERANCE
 
 
-def _pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:
+def _run_pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext) -> Outcome:
     epipolar = run.settings.epipolar
     options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
     graph = build_pose_graph(matches, views, intrinsics, options, run.map)
-    _enter(graph, intrinsics, matches, run)
+    _write_graph(graph, intrinsics, matches, run)
     matches, views = without_look_alikes(matches, views, graph)
     models: list[Attempt] = []
     reasons: dict[str, str] = {}
     tried: list[str] = []
     cuts: list[str] = []
     for number, photos in enumerate(graph.groups):
-        if number and len(photos) < LEARNED_FROM:
+        if number and len(photos) < MIN_PHOTOS:
             continue
-        found = attempts(Group(photos, matches, views, graph, intrinsics), run)
+        found = map_group(Group(photos, matches, views, graph, intrinsics), run)
         tried += [attempt.note for attempt in found]
-        best = better(found)
+        best = best_attempt(found)
         if best is not None:
-            reasons[best.note] = why(best, found, len(photos))
-            parts = taken_apart(best)
+            reasons[best.note] = choice_reason(best, found, len(photos))
+            parts = split_attempt(best)
             models += parts
-            cuts += [", ".join(names_of(sorted(photos_of(part.model)), matches)) for part in parts if len(parts) > 1]
+            cuts += [
+                ", ".join(photo_names(sorted(posed_photo_ids(part.model)), matches)) for part in parts if len(parts) > 1
+            ]
     models.sort(key=lambda attempt: (-attempt.photos, -attempt.support))
     reason = reasons[models[0].note] if models else ""
     return Outcome(tuple(models), graph, intrinsics, tuple(tried), reason, tuple(cuts))
 
 
-def taken_apart(attempt: Attempt) -> list[Attempt]:
+def split_attempt(attempt: Attempt) -> list[Attempt]:
     """Divide a model where more matches contradict than support its joins; return it unchanged if it has one part.
 
     Single photos are left out, and so are small parts beside the largest one.
     """
-    parts = sound_parts(attempt.explained, photos_of(attempt.model))
+    parts = sound_parts(attempt.explained, posed_photo_ids(attempt.model))
     if len(parts) == 1:
         return [attempt]
-    kept = [part for number, part in enumerate(parts) if len(part) >= (2 if number == 0 else LEARNED_FROM)]
-    with backend("dividing a model"):
+    kept = [part for number, part in enumerate(parts) if len(part) >= (2 if number == 0 else MIN_PHOTOS)]
+    with translate_errors("dividing a model"):
         return [_part(attempt, part) for part in kept]
 
 
 def _part(attempt: Attempt, photos: Sequence[int]) -> Attempt:
     members = set(photos)
     explained = {pair: found for pair, found in attempt.explained.items() if members.issuperset(pair)}
-    return replace(attempt, model=part_of(attempt.model, photos), explained=explained)
+    return replace(attempt, model=submodel(attempt.model, photos), explained=explained)
 
 
-def _graph_of(models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph, run: RunContext) -> PoseGraph:
+def _update_graph(models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph, run: RunContext) -> PoseGraph:
     """Return the pose graph with relative poses from models that were not mapped from it.
 
     Later steps complete the tracks of these models along its pairs.
@@ -299,11 +299,11 @@ def _graph_of(models: Sequence[Attempt], graph: PoseGraph, matches: MatchGraph, 
     epipolar = run.settings.epipolar
     for attempt in models:
         poses = model_poses(attempt.model, matches, epipolar.max_error_px, epipolar.min_inliers)
-        graph = with_model(graph, set(photos_of(attempt.model)), poses)
+        graph = with_model(graph, set(posed_photo_ids(attempt.model)), poses)
     return graph
 
 
-def _enter(graph: PoseGraph, intrinsics: Intrinsics, matches: MatchGraph, run: RunContext) -> None:
-    with backend("writing relative poses"):
+def _write_graph(graph: PoseGraph, intrinsics: Intrinsics, matches: MatchGraph, run: RunContext) -> None:
+    with translate_errors("writing relative poses"):
         write_calibrations(run.workspace.database, matches, intrinsics)
         write_pose_graph(run.workspace.database, matches, graph)

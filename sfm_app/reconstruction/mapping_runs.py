@@ -11,31 +11,31 @@ from typing import TypeAlias
 
 import numpy as np
 
-from sfm_app.colmap.backend import backend, interruptible
+from sfm_app.colmap.backend import run_interruptible, translate_errors
 from sfm_app.colmap.mapping import copy_database, map_globally, map_incrementally
 from sfm_app.colmap.model import model_from_seed
 from sfm_app.colmap.types import Cancellation, CancellationToken, Reconstruction
 from sfm_app.errors import BackendError
-from sfm_app.numerical import FAILURES, reason_of
-from sfm_app.reconstruction.initial_pairs import Candidate, rank_seeds, seed_of
-from sfm_app.reconstruction.support import Explained, explained_pairs, support
-from sfm_app.reconstruction.unregistered import names_of
+from sfm_app.numerical import FAILURES, error_reason
+from sfm_app.reconstruction.initial_pairs import Candidate, rank_seeds, triangulate_seed
+from sfm_app.reconstruction.support import PairSupport, explained_pairs, support
+from sfm_app.reconstruction.unregistered import photo_names
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph, ViewGraph
 
 logger = logging.getLogger("sfm_app")
 
-ENOUGH = 0.9
+ENOUGH_SHARE = 0.9
 """A model with this share of the photos of its group ends the search for a better seed."""
-CONFIRMED = 0.5
+CONFIRMED_SHARE = 0.5
 """This share is enough when two seeds agree on how many photos can be placed."""
-LEAST_GLOBAL = 3
+MIN_GLOBAL_PHOTOS = 3
 """Smallest number of photos for the global mapper: the positions of two photos do not determine a scale."""
-EQUAL = 0.01
+EQUAL_TOLERANCE = 0.01
 """Models whose supports differ by less than this share count as equal; the one with most photos and points is taken."""
-CONTRADICTED = 0.01
+MAX_CONTRADICTED_SHARE = 0.01
 """Share of the inliers of fundamental matrices that may contradict a complete model before others are tried."""
-WELL_KNOWN = 0.01
+MAX_FOCAL_DEVIATION = 0.01
 """Relative standard deviation of a focal up to which mapping holds it fixed."""
 INCREMENTAL_FOLDER, GLOBAL_FOLDER = "incremental", "global"
 
@@ -57,7 +57,7 @@ class Attempt:
 
     mapper: str
     model: Reconstruction
-    explained: dict[PairId, Explained]
+    explained: dict[PairId, PairSupport]
     note: str
     """How it was made, and how many photos it holds; for people."""
 
@@ -81,13 +81,13 @@ class NoModel:
     """As in `Attempt`."""
 
 
-Tried: TypeAlias = Attempt | NoModel
+MappingResult: TypeAlias = Attempt | NoModel
 """Result of a mapper."""
-Maker: TypeAlias = Callable[[CancellationToken], list[Tried]]
+Maker: TypeAlias = Callable[[CancellationToken], list[MappingResult]]
 """Function that makes models until a token stops it."""
 
 
-class Stop:
+class StopSignal:
     """Token that stops a mapper when the whole run is stopped, or when its model is no longer needed."""
 
     def __init__(self, token: Cancellation) -> None:
@@ -99,7 +99,7 @@ class Stop:
         return self.needless or self.token.is_cancelled
 
 
-def attempts(group: Group, run: RunContext) -> list[Tried]:
+def map_group(group: Group, run: RunContext) -> list[MappingResult]:
     """Return the results of the mappers on a group.
 
     The incremental mapper from the best seed and the global mapper run side by side. Where neither places most photos,
@@ -111,32 +111,32 @@ def attempts(group: Group, run: RunContext) -> list[Tried]:
         run: the run.
     """
     options = run.settings.scene
-    at_once = options.mapper != "incremental" and len(group.photos) >= LEAST_GLOBAL
+    at_once = options.mapper != "incremental" and len(group.photos) >= MIN_GLOBAL_PHOTOS
     seeds = rank_seeds(group.matches, group.graph, group.intrinsics, group.photos, options.min_seed_angle_deg)
     seeds = seeds[: options.max_init_pairs] if options.mapper != "global" or not at_once else []
     if at_once:
         copy_database(run.workspace.database, run.workspace.root / GLOBAL_FOLDER)
-    with _mapping(group, run) as made:
-        found = made(lambda token: _first_round(group, seeds[:1], at_once, run, token))
+    with _attempt_runner(group, run) as made:
+        found = made(lambda token: _run_first_round(group, seeds[:1], at_once, run, token))
         for seed in seeds[1:]:
-            if _settled(found, len(group.photos)):
+            if _can_stop(found, len(group.photos)):
                 break
-            found += made(partial(_from_seed, group, seed, run))
-        best = better(found)
+            found += made(partial(_attempt_from_seed, group, seed, run))
+        best = best_attempt(found)
         if best is not None and best.mapper == "global" and best.photos < len(group.photos):
-            found += made(partial(_completed, group, best, run))
+            found += made(partial(_attempt_completion, group, best, run))
     return found
 
 
-def better(found: Sequence[Tried]) -> Attempt | None:
+def best_attempt(found: Sequence[MappingResult]) -> Attempt | None:
     """Return the attempt with the largest support; among equal ones, the one with most photos and points."""
     models = [attempt for attempt in found if isinstance(attempt, Attempt)]
     most = max((attempt.support for attempt in models), default=0.0)
-    equal = [attempt for attempt in models if attempt.support >= (1.0 - EQUAL) * most]
+    equal = [attempt for attempt in models if attempt.support >= (1.0 - EQUAL_TOLERANCE) * most]
     return max(equal, key=lambda attempt: (attempt.photos, attempt.model.num_points3D()), default=None)
 
 
-def why(best: Attempt, found: Sequence[Tried], photos: int) -> str:
+def choice_reason(best: Attempt, found: Sequence[MappingResult], photos: int) -> str:
     """Return why an attempt was chosen among several, in a few words.
 
     Args:
@@ -144,7 +144,7 @@ def why(best: Attempt, found: Sequence[Tried], photos: int) -> str:
         found: all attempts.
         photos: number of photos in the group.
     """
-    if _flawless(best, photos):
+    if _is_flawless(best, photos):
         return f"it places all {photos} photos and next to nothing contradicts it"
     others = [attempt for attempt in found if isinstance(attempt, Attempt) and attempt is not best]
     if not others:
@@ -154,58 +154,58 @@ def why(best: Attempt, found: Sequence[Tried], photos: int) -> str:
     return f"it explains {counts[0]} matches with {best.photos} photos, the next best {counts[1]} with {rival.photos}"
 
 
-def _flawless(attempt: Attempt, photos: int) -> bool:
+def _is_flawless(attempt: Attempt, photos: int) -> bool:
     """Return whether a model holds all photos, and hardly any inliers contradict it."""
     inliers = sum(pair.inliers for pair in attempt.explained.values())
     against = sum(pair.contradicted for pair in attempt.explained.values())
-    return attempt.photos == photos and against <= CONTRADICTED * inliers
+    return attempt.photos == photos and against <= MAX_CONTRADICTED_SHARE * inliers
 
 
 @contextlib.contextmanager
-def _mapping(group: Group, run: RunContext) -> Iterator[Callable[[Maker], list[Tried]]]:
+def _attempt_runner(group: Group, run: RunContext) -> Iterator[Callable[[Maker], list[MappingResult]]]:
     """Provide a function that makes attempts in a thread that Ctrl-C can stop."""
 
-    def made(make: Maker) -> list[Tried]:
-        found: list[Tried] = []
+    def run_maker(make: Maker) -> list[MappingResult]:
+        found: list[MappingResult] = []
         run.progress.start("mapping", max(len(group.photos) - 2, 1))
         try:
-            interruptible(lambda token: found.extend(make(token)), lambda: None)
+            run_interruptible(lambda token: found.extend(make(token)), lambda: None)
         finally:
             run.progress.finish()
         return found
 
-    with backend("mapping photos"):
-        yield made
+    with translate_errors("mapping photos"):
+        yield run_maker
 
 
-def _first_round(
+def _run_first_round(
     group: Group, seeds: Sequence[Candidate], at_once: bool, run: RunContext, token: CancellationToken
-) -> list[Tried]:
-    stop = Stop(token)
+) -> list[MappingResult]:
+    stop = StopSignal(token)
 
-    def photo_by_photo(seed: Candidate) -> Tried:
-        (attempt,) = _from_seed(group, seed, run, token)
-        stop.needless = isinstance(attempt, Attempt) and _flawless(attempt, len(group.photos))
+    def map_from_seed(seed: Candidate) -> MappingResult:
+        (attempt,) = _attempt_from_seed(group, seed, run, token)
+        stop.needless = isinstance(attempt, Attempt) and _is_flawless(attempt, len(group.photos))
         return attempt
 
     with ThreadPoolExecutor(min(run.workers, 2), thread_name_prefix="mapper") as pool:
-        grown = [pool.submit(photo_by_photo, seed) for seed in seeds]
-        placed = [pool.submit(_all_at_once, group, run, stop)] if at_once else []
+        grown = [pool.submit(map_from_seed, seed) for seed in seeds]
+        placed = [pool.submit(_attempt_globally, group, run, stop)] if at_once else []
         found = [future.result() for future in (*grown, *placed)]
     if stop.needless:
         found[1:] = [NoModel("global", "all at once: not needed") for _ in placed]
     return found
 
 
-def _settled(found: Sequence[Tried], photos: int) -> bool:
+def _can_stop(found: Sequence[MappingResult], photos: int) -> bool:
     """Return whether another seed is unlikely to place more photos."""
     counts = [attempt.photos for attempt in found if isinstance(attempt, Attempt)]
     most = max(counts, default=0)
-    return most >= ENOUGH * photos or (counts.count(most) > 1 and most >= CONFIRMED * photos)
+    return most >= ENOUGH_SHARE * photos or (counts.count(most) > 1 and most >= CONFIRMED_SHARE * photos)
 
 
-def _all_at_once(group: Group, run: RunContext, stop: Stop) -> Tried:
-    names, scratch = names_of(group.photos, group.matches), run.workspace.root / GLOBAL_FOLDER
+def _attempt_globally(group: Group, run: RunContext, stop: StopSignal) -> MappingResult:
+    names, scratch = photo_names(group.photos, group.matches), run.workspace.root / GLOBAL_FOLDER
     try:
         model = None if stop.is_cancelled else map_globally(run.workspace.photos, names, scratch, run.seed, stop)
     except BackendError as err:  # another mapper may do better
@@ -213,43 +213,43 @@ def _all_at_once(group: Group, run: RunContext, stop: Stop) -> Tried:
         return NoModel("global", f"all at once: failed, {err}")
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-    return _judged(group, "global", "all at once", model, run)
+    return _judge_model(group, "global", "all at once", model, run)
 
 
-def _from_seed(group: Group, seed: Candidate, run: RunContext, token: CancellationToken) -> list[Tried]:
-    how = f"from {' + '.join(names_of(seed.pair, group.matches))}"
+def _attempt_from_seed(group: Group, seed: Candidate, run: RunContext, token: CancellationToken) -> list[MappingResult]:
+    how = f"from {' + '.join(photo_names(seed.pair, group.matches))}"
     rows = group.matches.matches[seed.pair][seed.pose.inliers]
     try:
-        points = seed_of(group.matches, seed, group.intrinsics)
+        points = triangulate_seed(group.matches, seed, group.intrinsics)
     except FAILURES as err:
-        return [NoModel("incremental", f"{how}: no points, {reason_of(err)}")]
+        return [NoModel("incremental", f"{how}: no points, {error_reason(err)}")]
     start = model_from_seed(run.workspace.database, seed.pair, rows, points)
-    return [_judged(group, "incremental", how, _grown(group, start, run, token), run)]
+    return [_judge_model(group, "incremental", how, _grow(group, start, run, token), run)]
 
 
-def _completed(group: Group, best: Attempt, run: RunContext, token: CancellationToken) -> list[Tried]:
+def _attempt_completion(group: Group, best: Attempt, run: RunContext, token: CancellationToken) -> list[MappingResult]:
     """Continue the global mapper's model photo by photo, with the photos that it left out."""
-    model = _grown(group, best.model, run, token)
-    return [_judged(group, "incremental", "what was left out, photo by photo", model, run)]
+    model = _grow(group, best.model, run, token)
+    return [_judge_model(group, "incremental", "what was left out, photo by photo", model, run)]
 
 
-def _grown(group: Group, start: Reconstruction, run: RunContext, token: CancellationToken) -> Reconstruction | None:
+def _grow(group: Group, start: Reconstruction, run: RunContext, token: CancellationToken) -> Reconstruction | None:
     place = run.workspace
     return map_incrementally(
         place.database, place.photos, start, place.root / INCREMENTAL_FOLDER, run.seed, run.progress.advance, token,
-        known=all(well_known(group.intrinsics.camera(group.matches.images[photo])) for photo in group.photos),
+        known=all(is_well_known(group.intrinsics.camera(group.matches.images[photo])) for photo in group.photos),
     )  # fmt: skip
 
 
-def well_known(camera: Calibration) -> bool:
+def is_well_known(camera: Calibration) -> bool:
     """Return whether a focal is known so well that the first few photos of a mapping cannot improve it."""
     spread = camera.spread.get("fx", np.inf)
-    return camera.identifiable and spread <= WELL_KNOWN * camera.K[0, 0]
+    return camera.identifiable and spread <= MAX_FOCAL_DEVIATION * camera.K[0, 0]
 
 
-def judged(
+def judge_model(
     matches: MatchGraph, views: ViewGraph, made: tuple[str, str], model: Reconstruction | None, run: RunContext
-) -> Tried:
+) -> MappingResult:
     """Count the matches that a model explains.
 
     Args:
@@ -268,9 +268,9 @@ def judged(
         explained = explained_pairs(model, matches, views, run.settings.epipolar.max_error_px)
     except FAILURES as err:
         logger.info("a model could not be judged", exc_info=err)
-        return NoModel(mapper, f"{note}, that could not be judged: {reason_of(err)}")
+        return NoModel(mapper, f"{note}, that could not be judged: {error_reason(err)}")
     return Attempt(mapper, model, explained, note)
 
 
-def _judged(group: Group, mapper: str, how: str, model: Reconstruction | None, run: RunContext) -> Tried:
-    return judged(group.matches, group.views, (mapper, how), model, run)
+def _judge_model(group: Group, mapper: str, how: str, model: Reconstruction | None, run: RunContext) -> MappingResult:
+    return judge_model(group.matches, group.views, (mapper, how), model, run)

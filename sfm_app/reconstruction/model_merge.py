@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import backend
-from sfm_app.colmap.bundle import adjusted_or_as_it_was
-from sfm_app.colmap.model import both, photos_of, places_of_keypoints
+from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.bundle import adjust_or_keep
+from sfm_app.colmap.model import merge_models, points_by_keypoint, posed_photo_ids
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.geometry.similarity import robust_similarity
-from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, judged
+from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, judge_model
 from sfm_app.reconstruction.model_split import sound_parts
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import MatchGraph, ViewGraph
@@ -43,7 +43,7 @@ def join_models(
     waiting = list(others)
     while waiting:
         other = waiting.pop(0)
-        together = _together(main, other, matches, views, run)
+        together = _join_pair(main, other, matches, views, run)
         if together is not None:
             main = together
             others.remove(other)
@@ -51,7 +51,7 @@ def join_models(
     return (main, *others)
 
 
-def _together(
+def _join_pair(
     first: Attempt, second: Attempt, matches: MatchGraph, views: ViewGraph, run: RunContext
 ) -> Attempt | None:
     """Join both models; return None where they share too few points, or matches contradict the join."""
@@ -63,18 +63,18 @@ def _together(
     except ValueError:  # on a line
         return None
     database: Path = run.workspace.database
-    with backend("joining two models"):
-        model = both(database, first.model, second.model, similarity)
-    model = adjusted_or_as_it_was(model, database).model
+    with translate_errors("joining two models"):
+        model = merge_models(database, first.model, second.model, similarity)
+    model = adjust_or_keep(model, database).model
     how = f"{first.photos} and {second.photos} photos joined by {len(shared)} points"
-    found = judged(matches, views, (first.mapper, how), model, run)
+    found = judge_model(matches, views, (first.mapper, how), model, run)
     if (
         isinstance(found, NoModel)
         or found.photos < first.photos + second.photos
         or found.support <= first.support + second.support
     ):
         return None
-    one = len(sound_parts(found.explained, photos_of(found.model))) == 1
+    one = len(sound_parts(found.explained, posed_photo_ids(found.model))) == 1
     return replace(found, note=how) if one else None
 
 
@@ -86,9 +86,9 @@ def shared_points(first: Reconstruction, second: Reconstruction, matches: MatchG
         matches: keypoints and raw matches.
         views: fundamental matrices; only their inliers are used.
     """
-    here, there = places_of_keypoints(first), places_of_keypoints(second)
+    here, there = points_by_keypoint(first), points_by_keypoint(second)
     found = {}
-    for a, b in _between(views, {photo for photo, _ in here}, {photo for photo, _ in there}):
+    for a, b in _pairs_between(views, {photo for photo, _ in here}, {photo for photo, _ in there}):
         pair = min(a, b), max(a, b)
         for row in matches.matches[pair][views.fits[pair].inliers]:
             row_of = dict(zip(pair, map(int, row), strict=True))
@@ -98,7 +98,7 @@ def shared_points(first: Reconstruction, second: Reconstruction, matches: MatchG
     return np.array([found[key] for key in sorted(found)]).reshape(-1, 6)
 
 
-def _between(views: ViewGraph, here: set[int], there: set[int]) -> Iterator[tuple[int, int]]:
+def _pairs_between(views: ViewGraph, here: set[int], there: set[int]) -> Iterator[tuple[int, int]]:
     """Yield pairs with geometry between two sets of photos, the photo of the first set first."""
     for a, b in views.fits:
         if a in here and b in there:

@@ -6,14 +6,14 @@ unexplained: those of pairs that see the true layout.
 
 from collections.abc import Iterable, Mapping
 
-from sfm_app.reconstruction.support import Explained
+from sfm_app.reconstruction.support import PairSupport
 from sfm_app.types import PairId
 
 LEAST_MATCHES = 16
 """Smallest number of matches with which a pair can join two parts."""
 
 
-def sound_parts(explained: Mapping[PairId, Explained], photos: Iterable[int]) -> list[tuple[int, ...]]:
+def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) -> list[tuple[int, ...]]:
     """Return photos in parts whose joins more matches support than contradict, largest part first.
 
     Pairs are taken strongest first; two parts become one when the matches between them that the model explains
@@ -29,17 +29,17 @@ def sound_parts(explained: Mapping[PairId, Explained], photos: Iterable[int]) ->
         first, second = part[pair[0]], part[pair[1]]
         if first == second or worth[pair] < LEAST_MATCHES:
             continue
-        between = sum(value for (a, b), value in worth.items() if _apart(a, b, first, second) and _counts(value))
-        if between > 0:
+        joins = (value for (a, b), value in worth.items() if _is_between(a, b, first, second))
+        if sum(value for value in joins if _is_significant(value)) > 0:
             for photo in first | second:
                 part[photo] = first | second
     parts = {tuple(sorted(members)) for members in part.values()}
     return sorted(parts, key=lambda members: (-len(members), members))
 
 
-def _apart(a: int, b: int, first: frozenset[int], second: frozenset[int]) -> bool:
+def _is_between(a: int, b: int, first: frozenset[int], second: frozenset[int]) -> bool:
     return (a in first and b in second) or (b in first and a in second)
 
 
-def _counts(worth: int) -> bool:
+def _is_significant(worth: int) -> bool:
     return abs(worth) >= LEAST_MATCHES

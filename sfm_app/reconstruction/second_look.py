@@ -9,21 +9,21 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
-from sfm_app.colmap.backend import backend
+from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import read_features, write_match_graph
-from sfm_app.colmap.model import photos_of
+from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import SfmError
 from sfm_app.estimation.calibrating import find_intrinsics
-from sfm_app.estimation.fitting import fit_pairs, graph_of
+from sfm_app.estimation.fitting import fit_pairs, to_view_graph
 from sfm_app.estimation.matching import fill_database
 from sfm_app.numerical import Json
 from sfm_app.plugins import SIFT_DSP
-from sfm_app.reconstruction.added_matches import with_added
+from sfm_app.reconstruction.added_matches import add_matches
 from sfm_app.reconstruction.mapping_passes import Outcome, reconstruct
-from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, better, judged
-from sfm_app.reconstruction.unregistered import names_of
+from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, best_attempt, judge_model
+from sfm_app.reconstruction.unregistered import photo_names
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.workspace import Aside
+from sfm_app.runtime.workspace import SubWorkspace
 from sfm_app.types import Intrinsics, MatchGraph, PairId, ViewGraph
 
 FOLDER, FEATURES = "second_look", "features"
@@ -41,7 +41,7 @@ MANY, FEW_LOST = 60, 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class MappedScene:
     """Models, and the matches, geometry and cameras they were made from."""
 
     outcome: Outcome
@@ -52,7 +52,7 @@ class Found:
     """Run whose workspace holds the database of these matches."""
 
 
-def look_again(first: Found) -> Found:
+def retry_lost_photos(first: MappedScene) -> MappedScene:
     """Look again at photos missing in the main model, and return the new result if it registers more of them.
 
     If the attempt fails, the first result is kept.
@@ -60,29 +60,29 @@ def look_again(first: Found) -> Found:
     run, lost = first.run, lost_photos(first)
     if not lost or run.settings.matching.features == SIFT_DSP or not run.settings.scene.second_look:
         return first
-    pairs = pairs_to_see(lost, first.matches)
+    pairs = candidate_pairs(lost, first.matches)
     seen = sorted({photo for pair in pairs for photo in pair})
     run.progress.say(f"{len(lost)} photos have no place: finer features are sought in {len(seen)}")
-    report: dict[str, Json] = {"photos": names_of(lost, first.matches), "pairs": len(pairs)}
+    report: dict[str, Json] = {"photos": photo_names(lost, first.matches), "pairs": len(pairs)}
     try:
-        second = _seen_again(first, pairs, report)
+        second = _retry_pairs(first, pairs, report)
     except SfmError as err:  # the first result is not lost with it
         report["failed"], second = str(err), None
-    placed = [_placed(one.outcome) for one in (first, second) if one is not None]
+    placed = [_placed_count(one.outcome) for one in (first, second) if one is not None]
     taken = second is not None and _is_better(second, first)
     run.record(second_look=report | {"placed": placed, "taken": taken})
     return second if second is not None and taken else first
 
 
-def lost_photos(found: Found) -> list[int]:
+def lost_photos(found: MappedScene) -> list[int]:
     """Return the photos missing in the main model; none where their share of a large set is too small."""
     models, images = found.outcome.models, found.matches.images
-    placed = set(photos_of(models[0].model)) if models else set()
+    placed = set(posed_photo_ids(models[0].model)) if models else set()
     lost = sorted(images.keys() - placed)
     return [] if len(images) >= MANY and len(lost) < FEW_LOST * len(images) else lost
 
 
-def pairs_to_see(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
+def candidate_pairs(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
     """Return pairs of lost photos with each other and with their likely neighbors.
 
     Args:
@@ -105,54 +105,54 @@ def pairs_to_see(lost: Collection[int], matches: MatchGraph) -> list[PairId]:
     return sorted(pairs)
 
 
-def _seen_again(first: Found, pairs: Sequence[PairId], report: dict[str, Json]) -> Found | None:
+def _retry_pairs(first: MappedScene, pairs: Sequence[PairId], report: dict[str, Json]) -> MappedScene | None:
     """Run all steps from features to models once more; return None if no pair has gained matches."""
-    run = _aside(first.run)
-    finer = replace(run, workspace=Aside(run.workspace, FEATURES))
-    with backend("looking for finer features"):
+    run = _side_run(first.run)
+    finer = replace(run, workspace=SubWorkspace(run.workspace, FEATURES))
+    with translate_errors("looking for finer features"):
         if not finer.workspace.database.exists():
             write_match_graph(finer.workspace.database, replace(first.matches, keypoints={}, matches={}))
     fill_database(run.plugins.feature_method(SIFT_DSP), finer, pairs)
-    with backend("adding matches"):
-        matches, changed = with_added(first.matches, *read_features(finer.workspace.database))
+    with translate_errors("adding matches"):
+        matches, changed = add_matches(first.matches, *read_features(finer.workspace.database))
         if not changed:
             return None
-    fitted = graph_of(fit_pairs(matches, changed, run))
+    fitted = to_view_graph(fit_pairs(matches, changed, run))
     asked = set(changed)
     kept = {pair: fit for pair, fit in first.views.fits.items() if pair not in asked}
     refused = {pair: why for pair, why in first.views.rejected.items() if pair not in asked}
     views = ViewGraph(dict(sorted((kept | dict(fitted.fits)).items())), refused | dict(fitted.rejected))
     report |= {"pairs_with_more_matches": len(changed), "pairs_with_geometry": [len(first.views.fits), len(views.fits)]}
-    intrinsics = first.intrinsics if _mostly_known(first) else find_intrinsics(matches, views, run)[0]
-    return Found(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
+    intrinsics = first.intrinsics if _is_mostly_calibrated(first) else find_intrinsics(matches, views, run)[0]
+    return MappedScene(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)
 
 
-def _mostly_known(found: Found) -> bool:
+def _is_mostly_calibrated(found: MappedScene) -> bool:
     """Return whether pairs determine the cameras of at least half of the photos; more pairs then change little."""
     images = found.matches.images.values()
-    return 2 * sum(found.intrinsics.camera(image).estimated for image in images) >= len(images)
+    return 2 * sum(found.intrinsics.camera(image).is_estimated for image in images) >= len(images)
 
 
-def _aside(run: RunContext) -> RunContext:
+def _side_run(run: RunContext) -> RunContext:
     """Return the run with a separate workspace folder, in which a killed run is resumed."""
-    place = Aside(run.workspace, FOLDER)
+    place = SubWorkspace(run.workspace, FOLDER)
     loose = run.settings.matching.model_copy(update={"max_ratio": max(LOOSE_RATIO, run.settings.matching.max_ratio)})
     settings = run.settings.model_copy(update={"matching": loose})
     return replace(run, workspace=place, settings=settings, statistics={})
 
 
-def _placed(outcome: Outcome) -> int:
+def _placed_count(outcome: Outcome) -> int:
     return outcome.models[0].photos if outcome.models else 0
 
 
-def _is_better(second: Found, first: Found) -> bool:
+def _is_better(second: MappedScene, first: MappedScene) -> bool:
     """Return whether the second main model places more photos, and explains more of all matches, old and new."""
-    if not second.outcome.models or _placed(second.outcome) <= _placed(first.outcome):
+    if not second.outcome.models or _placed_count(second.outcome) <= _placed_count(first.outcome):
         return False
-    models = [_judged_by(second, found.outcome) for found in (first, second) if found.outcome.models]
-    return better(models) is models[-1]
+    models = [_judge(second, found.outcome) for found in (first, second) if found.outcome.models]
+    return best_attempt(models) is models[-1]
 
 
-def _judged_by(found: Found, outcome: Outcome) -> Attempt | NoModel:
+def _judge(found: MappedScene, outcome: Outcome) -> Attempt | NoModel:
     main = outcome.models[0]
-    return judged(found.matches, found.views, (main.mapper, main.note), main.model, found.run)
+    return judge_model(found.matches, found.views, (main.mapper, main.note), main.model, found.run)

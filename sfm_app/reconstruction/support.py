@@ -12,20 +12,20 @@ from numpy.typing import NDArray
 
 from sfm_app.colmap.model import placed_views
 from sfm_app.colmap.types import Reconstruction
-from sfm_app.posegraph.pair_pose import in_front, ray_angles_deg
+from sfm_app.posegraph.pair_pose import is_in_front, ray_angles_deg
 from sfm_app.posegraph.refine import pose_distances
 from sfm_app.types import MatchGraph, PairId, RelativePose, ViewGraph
 
 FloatArray = NDArray[np.float64]
 
-GENEROUS = 2.0
+LOOSE_FACTOR = 2.0
 """Largest error of an explained match, in inlier thresholds: models are not adjusted to each pair."""
-ENOUGH = 100.0
+SATURATION = 100.0
 """Number of matches at which the support of a pair reaches half of its limit; beyond it, more matches add little."""
 
 
 @dataclass(frozen=True, slots=True)
-class Explained:
+class PairSupport:
     """Numbers of matches of a pair that a model explains or contradicts."""
 
     matches: int
@@ -38,7 +38,7 @@ class Explained:
 
 def explained_pairs(
     model: Reconstruction, matches: MatchGraph, views: ViewGraph, max_error_px: float
-) -> dict[PairId, Explained]:
+) -> dict[PairId, PairSupport]:
     """Return how well a model explains every pair of its photos.
 
     Args:
@@ -49,10 +49,10 @@ def explained_pairs(
     """
     found = {}
     for pair, seen in _placed_pairs(model, matches):
-        right = seen.right(GENEROUS * max_error_px)
+        right = seen.inlier_mask(LOOSE_FACTOR * max_error_px)
         fit = views.fits.get(pair)
         wrong = int(np.count_nonzero(fit.inliers & ~right)) if fit else 0
-        found[pair] = Explained(int(np.count_nonzero(right)), fit.inlier_count if fit else 0, wrong)
+        found[pair] = PairSupport(int(np.count_nonzero(right)), fit.inlier_count if fit else 0, wrong)
     return found
 
 
@@ -67,7 +67,7 @@ def model_poses(
     """
     found = {}
     for pair, seen in _placed_pairs(model, matches):
-        right = seen.right(max_error_px)
+        right = seen.inlier_mask(max_error_px)
         if np.count_nonzero(right) >= least:
             angle_deg = float(np.median(ray_angles_deg(seen.rays[right], seen.R)))
             found[pair] = RelativePose(seen.R, seen.t, right, angle_deg=angle_deg, in_front=1.0, kind="calibrated")
@@ -86,10 +86,10 @@ class _PlacedPair:
     t: FloatArray
     """Rotation and translation, view 2 from view 1; t has length 1, or is 0 for equal positions."""
 
-    def right(self, max_error_px: float) -> NDArray[np.bool_]:
+    def inlier_mask(self, max_error_px: float) -> NDArray[np.bool_]:
         """Return (M,) which matches lie on their epipolar lines, in front of both cameras."""
         distances = pose_distances(self.rays, self.focals, self.R, self.t)
-        return np.asarray((distances <= max_error_px) & in_front(self.rays, self.R, self.t), bool)
+        return np.asarray((distances <= max_error_px) & is_in_front(self.rays, self.R, self.t), bool)
 
 
 def _placed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[PairId, _PlacedPair]]:
@@ -105,7 +105,7 @@ def _placed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[
         yield pair, _PlacedPair(rays, focals, R, t / max(float(np.linalg.norm(t)), 1e-300))
 
 
-def support(explained: Mapping[PairId, Explained]) -> float:
+def support(explained: Mapping[PairId, PairSupport]) -> float:
     """Return the score of a model: its explained matches, of which each further one of a pair counts less."""
     counts = np.array([pair.matches for pair in explained.values()], np.float64)
-    return float(np.sum(counts / (1.0 + counts / ENOUGH)))
+    return float(np.sum(counts / (1.0 + counts / SATURATION)))

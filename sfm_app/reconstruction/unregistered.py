@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from sfm_app.types import MatchGraph, PoseGraph, ViewGraph
 
 
-def left_out(
+def unregistered_reasons(
     posed: set[int], others: Sequence[Sequence[int]], matches: MatchGraph, views: ViewGraph, graph: PoseGraph
 ) -> dict[str, str]:
     """Return why each photo is missing in the main model, by name.
@@ -49,7 +49,7 @@ def _edges(photo: int, views: ViewGraph) -> Iterator[tuple[int, int]]:
             yield pair[pair[0] == photo], fit.inlier_count
 
 
-def names_of(photos: Sequence[int], matches: MatchGraph) -> list[str]:
+def photo_names(photos: Sequence[int], matches: MatchGraph) -> list[str]:
     """Return the names of photos.
 
     Args:

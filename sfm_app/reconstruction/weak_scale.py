@@ -7,35 +7,35 @@ three see. Where a part shares hardly any of them with the rest, its points may 
 import numpy as np
 from scipy.sparse import csr_array
 
-from sfm_app.colmap.backend import backend
+from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.model import posed_images
 from sfm_app.colmap.types import Reconstruction, all_points
 
-LEAST = 5
+MIN_SHARED_POINTS = 5
 """Number of points seen by two placed photos and the next one, below which the scale between them is undetermined: a
 pose takes three, two more contradict a wrong one. Of the photo sets only temple16 with every second photo (0; its
 centers are a third off) and dinoSparseRing (2) have fewer; right models of castle-P19 and temple16 have 8."""
 
 
-def weakly_joined(model: Reconstruction) -> list[list[str]]:
+def weakly_joined_parts(model: Reconstruction) -> list[list[str]]:
     """Return the names of photos in parts whose scale against the first part depends on too few points.
 
     Photos join one by one: next is the one that sees most points which at least two joined photos see.
     """
-    with backend("reading points"):
+    with translate_errors("reading points"):
         names = {image.image_id: image.name for image in posed_images(model)}
         tracks = [{element.image_id for element in point.track.elements} for _, point in all_points(model)]
     photos = sorted(names)
-    seen = _seen(tracks, photos)
+    seen = _visibility_matrix(tracks, photos)
     parts: list[list[str]] = [[]]
-    for photo, known in _joining(seen):
-        if known < LEAST:
+    for photo, known in _joining_order(seen):
+        if known < MIN_SHARED_POINTS:
             parts.append([])
         parts[-1].append(names[photos[photo]])
     return [sorted(part) for part in parts[1:]]
 
 
-def _seen(tracks: list[set[int]], photos: list[int]) -> csr_array:
+def _visibility_matrix(tracks: list[set[int]], photos: list[int]) -> csr_array:
     """Return the matrix (N, P) with 1 where a point is seen by a photo."""
     place = {photo: k for k, photo in enumerate(photos)}
     columns = [place[photo] for track in tracks for photo in sorted(track)]
@@ -43,7 +43,7 @@ def _seen(tracks: list[set[int]], photos: list[int]) -> csr_array:
     return csr_array((np.ones(len(columns), np.int32), columns, ends), shape=(len(tracks), len(photos)))
 
 
-def _joining(seen: csr_array) -> list[tuple[int, int]]:
+def _joining_order(seen: csr_array) -> list[tuple[int, int]]:
     """Return the photos from the third on in joining order, each with its number of shared points."""
     points, photos = seen.shape
     if photos < 3 or points == 0:

@@ -17,7 +17,7 @@ from sfm_app.report.words import center_text, focal_text, held_text, lens_text, 
 from sfm_app.selfcal.consensus.consensus import Consensus
 from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
 from sfm_app.selfcal.thesis.curves import center_curves, focal_curves
-from sfm_app.selfcal.undistort_pairs import without_lens
+from sfm_app.selfcal.undistort_pairs import undistort_pairs
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchGraph, ViewGraph
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def draw_intrinsics(path: Path, matches: MatchGraph, views: ViewGraph, found: In
         found: the cameras.
     """
     images = list(matches.images.values())
-    groups = {name: [image for image in images if found.name_of(image) == name] for name in found.cameras}
+    groups = {name: [image for image in images if found.camera_name(image) == name] for name in found.cameras}
     panels = [Panel(n, c, camera_pairs(groups[n], matches, views)) for n, c in found.cameras.items() if groups[n]]
     draw_calibration(path, sorted(panels, key=lambda panel: -len(panel.pairs.Fs)))
 
@@ -105,13 +105,13 @@ def draw_calibration(path: Path, panels: Sequence[Panel]) -> None:
         figure = Figure(figsize=(12.5, 5.6 * len(shown)), layout="constrained")
         for part, panel in zip(figure.subfigures(len(shown), 1, squeeze=False)[:, 0], shown, strict=True):
             many = f"Camera {panel.name}, one of {len(panels)}.\n" if len(panels) > 1 else ""
-            part.suptitle(many + in_words(panel.camera), fontsize=10.5, x=0.02, ha="left")
+            part.suptitle(many + calibration_text(panel.camera), fontsize=10.5, x=0.02, ha="left")
             _draw_camera(part, panel)
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=130, metadata=SUFFIXES[path.suffix.lower()])
 
 
-def in_words(camera: Calibration) -> str:
+def calibration_text(camera: Calibration) -> str:
     """Return a calibration in words, one line per property."""
     texts = (verdict(camera), focal_text(camera), center_text(camera), lens_text(camera), held_text(camera))
     return "\n".join(fill(text, 150) for text in texts if text).replace("+-", "±")
@@ -120,7 +120,7 @@ def in_words(camera: Calibration) -> str:
 def _draw_camera(part: "Figure | SubFigure", panel: Panel) -> None:
     """Draw both planes of one camera."""
     camera = panel.camera
-    straight = without_lens(panel.pairs, camera)
+    straight = undistort_pairs(panel.pairs, camera)
     pairs = prepare(straight, unit_px=_unit(camera), origin_px=(camera.width / 2, camera.height / 2))
     left, right = part.subplots(1, 2)
     left.axline((0.0, 0.0), slope=1.0, color=GUIDE, linewidth=0.8, linestyle=":", label="square pixels")
@@ -175,7 +175,7 @@ def center_plane(camera: Calibration, pairs: Pairs) -> ParameterPlane:
 
 def _draw_plane(axes: "Axes", plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> None:
     """Draw votes, curves and K in one plane."""
-    shades = votes(plane, camera, pairs)
+    shades = vote_shares(plane, camera, pairs)
     axes.imshow(shades, extent=plane.extent, origin="lower", cmap="inferno", vmin=0, vmax=1, interpolation="bilinear")
     _draw_curves(axes, plane, plane.extent, SAMPLES)
     marker, label = ("o", "found") if camera.identifiable else ("X", "a guess")
@@ -189,8 +189,8 @@ def _draw_plane(axes: "Axes", plane: ParameterPlane, camera: Calibration, pairs:
 def _draw_curves(axes: "Axes", plane: ParameterPlane, extent: tuple[float, float, float, float], samples: int) -> None:
     """Draw the part of all curves that is in `extent`; the more there are, the fainter."""
     left, right, bottom, top = extent
-    x = _steps(left, right, samples)
-    y = _unbroken(plane.curves(x), min(bottom, top), max(bottom, top))
+    x = _midpoints(left, right, samples)
+    y = _mask_jumps(plane.curves(x), min(bottom, top), max(bottom, top))
     axes.plot(x, y.T, color=CURVE, linewidth=0.6, alpha=float(np.clip(12.0 / max(len(y), 1), 0.2, 0.8)))
     axes.set(xlim=(left, right), ylim=(bottom, top))
 
@@ -221,7 +221,7 @@ def _enlarge(axes: "Axes", plane: ParameterPlane, camera: Calibration) -> None:
         axes.plot([], [], color=MARK, linewidth=1.6, label=f"{label} (enlarged)")
 
 
-def votes(plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> FloatArray:
+def vote_shares(plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> FloatArray:
     """Return (CELLS, CELLS) share of the votes at every point of the plane; rows go from its bottom to its top.
 
     Args:
@@ -230,20 +230,15 @@ def votes(plane: ParameterPlane, camera: Calibration, pairs: Pairs) -> FloatArra
         pairs: of this camera, without lens distortion.
     """
     left, right, bottom, top = plane.extent
-    grid = [values.ravel() for values in np.meshgrid(_steps(left, right, CELLS), _steps(bottom, top, CELLS))]
+    grid = [values.ravel() for values in np.meshgrid(_midpoints(left, right, CELLS), _midpoints(bottom, top, CELLS))]
     fixed = {"fx": camera.K[0, 0], "fy": camera.K[1, 1], "cx": camera.K[0, 2], "cy": camera.K[1, 2]}
     at = {name: np.full(CELLS * CELLS, value) for name, value in fixed.items()}
     at |= dict(zip(plane.names, grid, strict=True))
     unit = _unit(camera)
-    thetas = np.column_stack(
-        [
-            0.5 * np.log(at["fx"] * at["fy"] / unit**2),
-            (at["cx"] - camera.width / 2) / unit,
-            (at["cy"] - camera.height / 2) / unit,
-            np.log(at["fy"] / at["fx"]),
-        ]
-    )
-    support = Consensus(pairs, np.inf).at(thetas, SIGMA)
+    focal, aspect = 0.5 * np.log(at["fx"] * at["fy"] / unit**2), np.log(at["fy"] / at["fx"])
+    center = (at["cx"] - camera.width / 2) / unit, (at["cy"] - camera.height / 2) / unit
+    thetas = np.column_stack([focal, *center, aspect])
+    support = Consensus(pairs, np.inf).evaluate(thetas, SIGMA)
     return support.reshape(CELLS, CELLS) / max(float(np.sum(pairs.weights)), 1.0)
 
 
@@ -251,11 +246,11 @@ def _unit(camera: Calibration) -> float:
     return float(max(camera.width, camera.height))
 
 
-def _steps(start: float, stop: float, count: int) -> FloatArray:
+def _midpoints(start: float, stop: float, count: int) -> FloatArray:
     return start + (stop - start) * (np.arange(count) + 0.5) / count
 
 
-def _unbroken(curves: FloatArray, low: float, high: float) -> FloatArray:
+def _mask_jumps(curves: FloatArray, low: float, high: float) -> FloatArray:
     """Return the curves with NaN outside of the range and at jumps from one root to another."""
     inside = np.where((curves > low) & (curves < high), curves, np.nan)
     jumps = np.abs(np.diff(inside, axis=1)) > JUMP * (high - low)

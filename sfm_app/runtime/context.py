@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from sfm_app.atomic_io import save_files
 from sfm_app.plugins import Plugins
-from sfm_app.progress import Progress, Silent, track
+from sfm_app.progress import Progress, SilentProgress, track
 from sfm_app.runtime.cost_estimate import SHARE_OF_MACHINE, machine_memory_mb
 from sfm_app.runtime.parallel import make_executor, ordered_map
 from sfm_app.runtime.workspace import Workspace
@@ -32,13 +32,13 @@ class RunContext:
     plugins: Plugins
     executor: Executor
     workers: int
-    progress: Progress = field(default_factory=Silent)
+    progress: Progress = field(default_factory=SilentProgress)
     fingerprint: str = ""
     """Hash of everything that the stage's result depends on."""
     statistics: dict[str, Any] = field(default_factory=dict)
     """What the stage has counted so far, for the manifest; no part of a product is read from here."""
 
-    def for_stage(self, fingerprint: str) -> "RunContext":
+    def with_fingerprint(self, fingerprint: str) -> "RunContext":
         """Return the same run for a stage that has counted nothing yet."""
         return replace(self, fingerprint=fingerprint, statistics={})
 

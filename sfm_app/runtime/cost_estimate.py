@@ -19,7 +19,7 @@ SHARE_OF_MACHINE = 0.8
 FEATURES_PER_MP = 4500
 """Photos with little texture have fewer."""
 
-ALONE = ("scene", "mesh")
+SERIAL_STAGES = ("scene", "mesh")
 """Stages in which more workers are of little use."""
 
 
@@ -37,7 +37,7 @@ class Plan:
 
     def minutes(self, stages: Iterable[str]) -> float:
         """Return how many minutes these stages take."""
-        return sum(self.core_seconds[name] / (1 if name in ALONE else self.workers) for name in stages) / 60
+        return sum(self.core_seconds[name] / (1 if name in SERIAL_STAGES else self.workers) for name in stages) / 60
 
     def peak_mb(self, stages: Iterable[str]) -> float:
         """Return the most memory in MB that these stages hold."""
@@ -47,12 +47,12 @@ class Plan:
         """Describe the plan for people."""
         names = list(stages)
         minutes, gigabytes = self.minutes(names), self.peak_mb(names) / 1000
-        how_long = f"{_rounded(minutes)} minutes" if minutes >= 1.5 else "a minute or two"
+        how_long = f"{_round_minutes(minutes)} minutes" if minutes >= 1.5 else "a minute or two"
         workers = f"{self.workers} worker{'s' if self.workers > 1 else ''}"
         return f"{self.photos} photos, {self.pairs} pairs: about {how_long} and up to {gigabytes:.1f} GB with {workers}"
 
 
-def megapixels_within(limit_mb: float) -> float:
+def largest_photo_megapixels(limit_mb: float) -> float:
     """Return the most megapixels of a photo with which one worker can texture the surface."""
     return max(2.0, (limit_mb - 1650) / 8)
 
@@ -66,7 +66,7 @@ def cache_gb(limit_mb: float) -> float:
     return min(64.0, max(0.25, (limit_mb - 1500) / 1000))
 
 
-def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float = math.inf) -> Plan:
+def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float = math.inf) -> Plan:
     """Estimate the costs of all stages after the photos stage.
 
     Args:
@@ -109,7 +109,7 @@ def plan_of(photos: Iterable[Photo], settings: Settings, workers: int, limit_mb:
     )
 
 
-def plan_within(
+def choose_plan(
     photos: Iterable[Photo], settings: Settings, workers: int, limit_mb: float, stages: Iterable[str]
 ) -> Plan:
     """Return the plan with the most workers that stays within the memory limit; with one worker if none does.
@@ -120,8 +120,8 @@ def plan_within(
         stages: names of those that will run.
     """
     chosen, names = list(photos), list(stages)
-    plans = (plan_of(chosen, settings, number, limit_mb) for number in range(workers, 0, -1))
-    return next((plan for plan in plans if plan.peak_mb(names) <= limit_mb), plan_of(chosen, settings, 1, limit_mb))
+    plans = (make_plan(chosen, settings, number, limit_mb) for number in range(workers, 0, -1))
+    return next((plan for plan in plans if plan.peak_mb(names) <= limit_mb), make_plan(chosen, settings, 1, limit_mb))
 
 
 def machine_memory_mb() -> float:
@@ -143,7 +143,7 @@ def _megapixels(size: tuple[int, int], longest: int) -> float:
     return size[0] * size[1] * scale**2 / MEGA
 
 
-def _rounded(minutes: float) -> int:
+def _round_minutes(minutes: float) -> int:
     """Round to a multiple of 1, 5 or 10, depending on the size."""
     step = 1 if minutes < 10 else 5 if minutes < 60 else 10
     return max(1, round(minutes / step) * step)

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sfm_app.atomic_io import replacing
+from sfm_app.atomic_io import replace_atomically
 from sfm_app.errors import InputError
 from sfm_app.hashing import fingerprint
 from sfm_app.numerical import json_text
@@ -14,7 +14,7 @@ from sfm_app.numerical import json_text
 MANIFEST, PROGRAM = "manifest.json", "sfm-app"
 FORMAT = 2
 """Version of the stages' files; raised when other versions of the program can no longer read them."""
-CHECK = "check"
+CHECKSUM = "check"
 """Key in a record: hash of the rest. A record that was edited or cut off is ignored."""
 MOST_BYTES = 64_000_000
 
@@ -71,7 +71,7 @@ class Manifest:
         """Return the record of a finished stage; None where there is none, or it was altered."""
         entry = self.read().get("stages", {}).get(stage)
         try:
-            return StageRecord(**entry) if entry.pop(CHECK) == fingerprint(entry) else None
+            return StageRecord(**entry) if entry.pop(CHECKSUM) == fingerprint(entry) else None
         except (AttributeError, KeyError, TypeError, RecursionError):
             return None
 
@@ -95,12 +95,12 @@ class Manifest:
             head: settings, versions, ...; replaces the rest of the manifest.
         """
         entry = json.loads(json_text(asdict(record)))
-        stages = self.read().get("stages", {}) | {stage: {**entry, CHECK: fingerprint(entry)}}
+        stages = self.read().get("stages", {}) | {stage: {**entry, CHECKSUM: fingerprint(entry)}}
         self.write({"format": FORMAT, **head, "stages": stages})
 
     def write(self, manifest: Mapping[str, Any]) -> None:
         """Replace the manifest as a whole."""
-        with replacing(self.path) as path:
+        with replace_atomically(self.path) as path:
             path.write_text(json_text(manifest), encoding="utf-8")
 
     def sizes(self, files: tuple[str, ...]) -> dict[str, int]:

@@ -18,11 +18,11 @@ from sfm_app.runtime.manifest import MANIFEST, Manifest
 
 DATABASE, CALIBRATION, SCENE = "database.db", "calibration.json", "scene.json"
 FOLDERS = ("photos", "frames", "masks", "sparse", "other_models", "dense", "surface", "texture")
-WRITTEN = (*FOLDERS, DATABASE, CALIBRATION, SCENE)
+OUTPUT_NAMES = (*FOLDERS, DATABASE, CALIBRATION, SCENE)
 """Names of files and folders that a run removes before it writes them."""
 LOCK, HOLDER = ".lock", ".held-by.txt"
 LOG, PARTS, FEATURES, MAPPING = "log.txt", "view_graph_parts", "feature_parts", ".mapping"
-FOLLOWED = (*WRITTEN, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING)
+LINK_CHECKED = (*OUTPUT_NAMES, LOCK, HOLDER, LOG, PARTS, FEATURES, MAPPING)
 """Names that a run writes to without replacing them: a link there would lead it out of the folder."""
 PHOTO_SET, VIEW_GRAPH = "photos.json", "view_graph.npz"
 
@@ -131,7 +131,7 @@ class Workspace:
             InputError: it is not, or it holds files that a run would overwrite, or links that it would write through.
         """
         known = any((self.root / name).exists() for name in (LOCK, MANIFEST))
-        foreign = [] if known else [name for name in WRITTEN if (self.root / name).exists()]
+        foreign = [] if known else [name for name in OUTPUT_NAMES if (self.root / name).exists()]
         if foreign:
             raise InputError(
                 f"{self.root / foreign[0]} exists, and no run has made it", hint="name another output folder with -o"
@@ -156,13 +156,13 @@ class Workspace:
 
     def _links(self) -> Iterator[Path]:
         """Yield links that no run has made; links to photos are left out, since laying out replaces them."""
-        for path in (self.root / name for name in FOLLOWED):
+        for path in (self.root / name for name in LINK_CHECKED):
             if path.is_symlink():
                 yield path
             elif path.name != self.photos.name:
                 yield from (below for below in path.rglob("*") if below.is_symlink())
 
-    def keep_apart(self, photos: Path, what: str = "photos") -> None:
+    def check_no_overlap(self, photos: Path, what: str = "photos") -> None:
         """Check that a run would not write over its photos, or its masks.
 
         Args:
@@ -177,14 +177,14 @@ class Workspace:
             raise InputError(
                 f"{photos} cannot be both the {what} and the output", hint="name another output folder with -o"
             )
-        if any(folder.is_relative_to(out / name) for name in WRITTEN):
+        if any(folder.is_relative_to(out / name) for name in OUTPUT_NAMES):
             raise InputError(
                 f"{photos} lies where the run in {self.root} keeps its own files",
                 hint="name another output folder with -o",
             )
 
     @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
+    def hold_lock(self) -> Iterator[None]:
         """Hold the lock that keeps other runs out; the system releases it when this process ends, however it ends.
 
         Raises:
@@ -196,7 +196,7 @@ class Workspace:
             lock.acquire()
         except Timeout:
             raise InputError(
-                f"another run is at work in {self.root}: {_said(holder)}",
+                f"another run is at work in {self.root}: {_read_holder(holder)}",
                 hint="wait for it, end it, or name another output folder with -o",
             ) from None
         try:
@@ -208,7 +208,7 @@ class Workspace:
                 holder.unlink(missing_ok=True)
             lock.release()
 
-    def check_there(self) -> None:
+    def check_exists(self) -> None:
         """Check that the folder still exists during a run, and is writable.
 
         If it was removed and holds only what the run has written since, it is marked as made by a run: otherwise the
@@ -219,7 +219,7 @@ class Workspace:
         """
         if not (self.root / LOCK).exists():
             left = {path.name for path in self.root.iterdir()} if self.root.is_dir() else set()
-            if left and left <= {*FOLLOWED, PHOTO_SET, VIEW_GRAPH}:
+            if left and left <= {*LINK_CHECKED, PHOTO_SET, VIEW_GRAPH}:
                 (self.root / LOCK).touch()
             raise InputError(f"{self.root} was removed while the run was at work", hint="run again")
         self._check_writable()
@@ -231,7 +231,7 @@ class Workspace:
             path.unlink(missing_ok=True)
 
 
-class Aside(Workspace):
+class SubWorkspace(Workspace):
     """A folder inside the output folder, for another hypothesis about the same photos.
 
     Args:
@@ -261,7 +261,7 @@ def _cannot_write(folder: Path, err: OSError) -> InputError:
     )
 
 
-def _said(file: Path) -> str:
+def _read_holder(file: Path) -> str:
     try:
         return file.read_text(encoding="utf-8").strip() or "it has just begun"
     except (OSError, UnicodeDecodeError):

@@ -32,7 +32,7 @@ def singular_value_ratio(pair: FloatArray, fx: float, fy: float, u: float, v: fl
     Unlike thesis (5.8) it is bounded, symmetric in the two views, and free of the scale of F.
 
     Args:
-        pair: (16,) a row of `Pairs.packed`.
+        pair: (16,) a row of `Pairs.packed_rows`.
     """
     f11, f12, f13 = pair[0], pair[1], pair[2]
     f21, f22, f23 = pair[3], pair[4], pair[5]
@@ -69,15 +69,18 @@ def focal_polynomials(pairs: Pairs, fx: FloatArray, center: tuple[float, float])
     x = (fx**2)[None, :]
     one = np.ones_like(x)
     a = _stack(
-        x**2 * _col(G[:, 0, 0]) + x * _col(G[:, 0, 2] + G[:, 2, 0]) + one * _col(G[:, 2, 2]),
-        x * _col(G[:, 0, 1] + G[:, 1, 0]) + one * _col(G[:, 1, 2] + G[:, 2, 1]),
-        one * _col(G[:, 1, 1]),
+        x**2 * _column(G[:, 0, 0]) + x * _column(G[:, 0, 2] + G[:, 2, 0]) + one * _column(G[:, 2, 2]),
+        x * _column(G[:, 0, 1] + G[:, 1, 0]) + one * _column(G[:, 1, 2] + G[:, 2, 1]),
+        one * _column(G[:, 1, 1]),
     )
     n1, n2 = (
-        _stack(x * _col(e[:, 1] - v * e[:, 2]) ** 2, one * _col(e[:, 0] - u * e[:, 2]) ** 2 + x * _col(e[:, 2]) ** 2)
+        _stack(
+            x * _column(e[:, 1] - v * e[:, 2]) ** 2,
+            one * _column(e[:, 0] - u * e[:, 2]) ** 2 + x * _column(e[:, 2]) ** 2,
+        )
         for e in (pairs.e1, pairs.e2)
     )
-    return _constraint(a, n1, n2, pairs.product)
+    return _constraint_polynomial(a, n1, n2, pairs.product)
 
 
 def center_polynomials(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
@@ -107,11 +110,11 @@ def center_polynomials(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) 
         (y, g32, F[..., 1, 1]),
     ):
         line = _stack(low, slope + zero)
-        a += factor * _pad(_times(line, line), 5)
+        a += factor * _pad(_multiply(line, line), 5)
     corner = _stack(g33, g23 + g32, F[..., 1, 1] + zero)
-    a += _times(corner, corner)
+    a += _multiply(corner, corner)
     n1, n2 = (_epipole_polynomial(e[:, None, :], t, x, y) for e in (pairs.e1, pairs.e2))
-    return _constraint(a, n1, n2, pairs.product)
+    return _constraint_polynomial(a, n1, n2, pairs.product)
 
 
 def _epipole_polynomial(e: FloatArray, t: FloatArray, x: float, y: float) -> FloatArray:
@@ -119,19 +122,19 @@ def _epipole_polynomial(e: FloatArray, t: FloatArray, x: float, y: float) -> Flo
     fixed = y * (e[..., 0] - t * e[..., 2]) ** 2 + x * y * e[..., 2] ** 2
     one = np.ones_like(fixed)
     line = _stack(e[..., 1] * one, -e[..., 2] * one)
-    return _pad(_stack(fixed), 3) + x * _times(line, line)
+    return _pad(_stack(fixed), 3) + x * _multiply(line, line)
 
 
-def _constraint(a: FloatArray, n1: FloatArray, n2: FloatArray, product: FloatArray) -> FloatArray:
-    square = _times(a, a)
-    minors = 4.0 * (product**2)[:, None, None] * _times(n1, n2)
+def _constraint_polynomial(a: FloatArray, n1: FloatArray, n2: FloatArray, product: FloatArray) -> FloatArray:
+    square = _multiply(a, a)
+    minors = 4.0 * (product**2)[:, None, None] * _multiply(n1, n2)
     difference = square - _pad(minors, square.shape[-1])
     size = np.max(np.abs(square), axis=-1, keepdims=True)
     vanished = np.max(np.abs(difference), axis=-1, keepdims=True) <= VANISHED * size
     return np.where(vanished, 0.0, difference)
 
 
-def _col(values: FloatArray) -> FloatArray:
+def _column(values: FloatArray) -> FloatArray:
     return values[:, None]
 
 
@@ -145,7 +148,7 @@ def _pad(polynomial: FloatArray, length: int) -> FloatArray:
     return padded
 
 
-def _times(p: FloatArray, q: FloatArray) -> FloatArray:
+def _multiply(p: FloatArray, q: FloatArray) -> FloatArray:
     product = np.zeros((*np.broadcast_shapes(p.shape[:-1], q.shape[:-1]), p.shape[-1] + q.shape[-1] - 1))
     for power in range(p.shape[-1]):
         product[..., power : power + q.shape[-1]] += p[..., power, None] * q

@@ -10,14 +10,14 @@ from sfm_app.selfcal.adjustment.calibrate_pairs import Fit
 
 FloatArray = NDArray[np.float64]
 
-HARDLY_TURNED_DEG = 3.0
+LEAST_ROTATION_DEG = 3.0
 """Median rotation of pairs below which the axes count as parallel. Chosen by hand; not measured on its own."""
 ISOSCELES = 0.1
 """Largest median deviation, in cosines, of pairs whose axes meet at one distance from both cameras. Chosen by hand; not
 measured on its own."""
 
 
-def open_focal(fit: Fit) -> str:
+def critical_motion(fit: Fit) -> str:
     """Return the critical motion of most pairs in words for the user; empty where there is none.
 
     Parallel axes, and axes that meet at one distance from both cameras (an isosceles triangle, as on an orbit), are the
@@ -27,7 +27,7 @@ def open_focal(fit: Fit) -> str:
     if len(R) == 0:
         return ""
     turned = np.degrees(np.arccos(np.clip((np.trace(R, axis1=1, axis2=2) - 1.0) / 2.0, -1.0, 1.0)))
-    if np.median(turned) < HARDLY_TURNED_DEG:
+    if np.median(turned) < LEAST_ROTATION_DEG:
         return "the camera hardly turned between the photos (parallel axes)"
     baseline = -np.einsum("pij,pi->pj", R, fit.state.poses[:, 9:])
     second = R[:, 2]

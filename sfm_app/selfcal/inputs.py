@@ -37,7 +37,7 @@ class Pairs:
         return len(self.F)
 
     @property
-    def packed(self) -> FloatArray:
+    def packed_rows(self) -> FloatArray:
         """(P, 16) F by rows, e1, e2 and product side by side, for kernels."""
         return np.column_stack([self.F.reshape(-1, 9), self.e1, self.e2, self.product])
 
@@ -62,11 +62,11 @@ def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float
         ValueError: a shape is wrong, a number is not finite, a weight is negative, an F is zero, or the size or a
             claimed focal is not positive.
     """
-    raw, trust, used = checked(pairs)
+    raw, trust, used = check_pairs(pairs)
     to_pixels = np.array([[unit_px, 0.0, origin_px[0]], [0.0, unit_px, origin_px[1]], [0.0, 0.0, 1.0]])
     # scaled first, so that the products of entries such as 1e200 or 1e-200 neither overflow nor underflow
     scaled = raw / np.max(np.abs(raw), axis=(1, 2), keepdims=True)
-    distinct = _distinct(scaled)
+    distinct = _distinct_indices(scaled)
     scaled, trust = scaled[distinct], trust[distinct]
     U, s, Vt = np.linalg.svd(to_pixels.T @ scaled @ to_pixels)
     s = s[:, :2] / np.linalg.norm(s[:, :2], axis=1, keepdims=True)
@@ -80,7 +80,7 @@ def prepare(pairs: CameraPairs, *, unit_px: float, origin_px: tuple[float, float
     )
 
 
-def checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+def check_pairs(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
     """Return matrices (Q, 3, 3) and weights (Q,) of the pairs with a weight, and their indices.
 
     Raises:
@@ -115,7 +115,7 @@ def checked(pairs: CameraPairs) -> tuple[FloatArray, FloatArray, NDArray[np.int6
     return raw[used], trust[used], used
 
 
-def _distinct(scaled: FloatArray) -> NDArray[np.int64]:
+def _distinct_indices(scaled: FloatArray) -> NDArray[np.int64]:
     """Return the indices of the first of all matrices that agree to 9 digits up to sign and transposition."""
     seen: dict[bytes, int] = {}
     for index, F in enumerate(scaled):

@@ -25,7 +25,7 @@ own."""
 
 
 @kernel
-def camera_of(theta: FloatArray, camera: FloatArray) -> None:
+def write_camera(theta: FloatArray, camera: FloatArray) -> None:
     """Write fx, fy, u, v, k1 of a camera.
 
     Args:
@@ -38,7 +38,7 @@ def camera_of(theta: FloatArray, camera: FloatArray) -> None:
 
 
 @kernel
-def undone(radius: float, k1: float, guess: float) -> float:
+def undistort_radius(radius: float, k1: float, guess: float) -> float:
     """Return the undistorted radius r_u of a distorted one, in focal lengths, by Newton's method.
 
     Args:
@@ -64,7 +64,7 @@ def undone(radius: float, k1: float, guess: float) -> float:
 
 
 @kernel
-def ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -> None:
+def write_ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -> None:
     """Write the point (a, b) of the plane z = 1 that a pixel sees, its derivatives, and r_u.
 
     Args:
@@ -79,7 +79,7 @@ def ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -
     radius, k1 = np.sqrt(r2), camera[4]
     if guess < 0.0:
         guess = radius / (1.0 + k1 * r2) if k1 > 0.0 else radius
-    r = undone(radius, k1, guess)
+    r = undistort_radius(radius, k1, guess)
     along = r / radius if radius > 1e-9 else 1.0
     radial = 1.0 / max(1.0 + 3.0 * k1 * r * r, LEAST_SLOPE)
     bend = (radial - along) / r2 if r2 > 1e-18 else 0.0
@@ -90,7 +90,7 @@ def ray(x: float, y: float, camera: FloatArray, guess: float, out: FloatArray) -
 
 
 @kernel
-def straightened(points: FloatArray, theta: FloatArray) -> FloatArray:
+def undistort_kernel(points: FloatArray, theta: FloatArray) -> FloatArray:
     """Return (N, 2) undistorted points.
 
     Args:
@@ -98,9 +98,9 @@ def straightened(points: FloatArray, theta: FloatArray) -> FloatArray:
         theta: (5,) parameters of the camera, in the same units.
     """
     camera, out, straight = np.empty(5), np.empty(7), np.empty_like(points)
-    camera_of(theta, camera)
+    write_camera(theta, camera)
     for i in range(len(points)):
-        ray(points[i, 0], points[i, 1], camera, -1.0, out)
+        write_ray(points[i, 0], points[i, 1], camera, -1.0, out)
         straight[i, 0] = out[0] * camera[0] + camera[2]
         straight[i, 1] = out[1] * camera[1] + camera[3]
     return straight

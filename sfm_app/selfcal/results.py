@@ -18,7 +18,7 @@ ESTIMATE = "estimate"
 """Method of a camera that the photos determine roughly."""
 
 
-def guessed(size: tuple[int, int], reason: str, evidence: Mapping[str, float]) -> Calibration:
+def guess_calibration(size: tuple[int, int], reason: str, evidence: Mapping[str, float]) -> Calibration:
     """Return the usual guess with the reason why nothing better is known.
 
     Args:
@@ -30,7 +30,7 @@ def guessed(size: tuple[int, int], reason: str, evidence: Mapping[str, float]) -
     return Calibration(K, *size, GUESS, identifiable=False, reason=reason, evidence=dict(evidence))
 
 
-def calibration_of(
+def calibration_from_parameters(
     theta: NDArray[np.float64], size: tuple[int, int], method: str, unit_px: float | None = None
 ) -> Calibration:
     """Return the calibration with the parameters of `lens`, which count from the middle of the photo.
@@ -48,7 +48,7 @@ def calibration_of(
     return Calibration(K, *size, method, identifiable=True, radial=float(theta[KAPPA]) * focal**2)
 
 
-def roughly(found: Calibration, reason: str) -> Calibration:
+def downgrade_to_estimate(found: Calibration, reason: str) -> Calibration:
     """Return the calibration, as an estimate that is not relied on if there is a reason for that.
 
     Args:
@@ -58,8 +58,8 @@ def roughly(found: Calibration, reason: str) -> Calibration:
     return replace(found, identifiable=False, method=ESTIMATE, reason=reason) if reason else found
 
 
-def parameters_of(found: Calibration, unit_px: float) -> NDArray[np.float64]:
-    """Return the parameters (5,) that `calibration_of` was made from.
+def parameters_from_calibration(found: Calibration, unit_px: float) -> NDArray[np.float64]:
+    """Return the parameters (5,) that `calibration_from_parameters` was made from.
 
     Args:
         found: the answer.

@@ -10,17 +10,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, of_all_pairs, refined, straight_fundamentals
+from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, extend_to_all_pairs, fit_cameras, undistorted_fundamentals
 from sfm_app.selfcal.adjustment.camera_priors import LENS, USUAL_FOCAL, CameraPriors
 from sfm_app.selfcal.adjustment.structureless_ba import Matches
-from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_of
+from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_from_covariance
 from sfm_app.selfcal.consensus import consensus_peak
 from sfm_app.selfcal.consensus.consensus import Consensus
 from sfm_app.selfcal.consensus.peak_evidence import effective_count, spread_px
-from sfm_app.selfcal.critical_motions import open_focal
+from sfm_app.selfcal.critical_motions import critical_motion
 from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
 from sfm_app.selfcal.lens import KAPPA, LOG_FOCAL
-from sfm_app.selfcal.results import calibration_of, guessed, roughly
+from sfm_app.selfcal.results import calibration_from_parameters, downgrade_to_estimate, guess_calibration
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
 
@@ -34,7 +34,7 @@ hand; not measured on its own."""
 UNCROPPED_SIGMA = 0.02
 """Standard deviation of the center of uncropped photos from the middle, in widths. Chosen by hand; not measured on its
 own."""
-VOTES_SIGMA, KEPT = 0.01, 0.8
+VOTES_SIGMA, LEAST_KEPT_SHARE = 0.01, 0.8
 """Width of votes, and share of the votes for the peak of the consensus that the adjusted camera must keep: with less,
 it follows matches that most pairs contradict. On fourteen sets and variants right adjustments keep 0.97 to 1, the one
 that many wrong F's pulled away (fox50) 0.35; without that set the bound would be the same. Which sets:
@@ -43,13 +43,13 @@ ENOUGH_PAIRS = 6.0
 """Effective pairs that must agree on the peak to contradict the camera: twelve constraints on five parameters of a
 camera. With three pairs (merton1) the peak's center is anywhere. docs/algorithms.md, Self-calibration, 2. Chosen by
 hand; not measured on its own."""
-AGREES = 0.1
+AGREEING_RATIO = 0.1
 """A contradicted camera is adjusted again, only to pairs with r below this at the peak; on the same sets 0.03 and 0.05
 move no focal by more than 0.1 %. Chosen on those sets, benchmarks/corpus/tuning_sets.py."""
 ANOTHER_FOCAL = 1.25
 """Factor by which focals of the consensus and of the matches may differ. docs/algorithms.md, Self-calibration, 5.
 Chosen by hand; not measured on its own."""
-ELSEWHERE = float(np.log(1.1))
+RESTART_DISTANCE = float(np.log(1.1))
 """A consensus of undistorted pairs that lies this far in log f from the adjusted camera is tried as a start. Chosen by
 hand; not measured on its own."""
 
@@ -69,37 +69,39 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
     Raises:
         ValueError: malformed input, see `selfcal.inputs.prepare`.
     """
-    usable = _prepared(pairs)
+    usable = _prepare(pairs)
     evidence = {"pairs": float(len(usable))}
     if len(usable) < MIN_PAIRS:
-        return guessed(pairs.size, f"{len(usable)} usable pairs, {MIN_PAIRS} are needed", evidence)
+        return guess_calibration(pairs.size, f"{len(usable)} usable pairs, {MIN_PAIRS} are needed", evidence)
     if pairs.inliers:
-        return _from_matches(pairs, usable, options, evidence)
-    return _from_fundamentals(pairs, usable, options, seed)
+        return _calibrate_from_matches(pairs, usable, options, evidence)
+    return _calibrate_from_fundamentals(pairs, usable, options, seed)
 
 
-def _from_fundamentals(pairs: CameraPairs, usable: Pairs, options: CalibrationSettings, seed: int) -> Calibration:
+def _calibrate_from_fundamentals(
+    pairs: CameraPairs, usable: Pairs, options: CalibrationSettings, seed: int
+) -> Calibration:
     """Find the camera from the matrices alone: the peak of the consensus."""
     side = float(max(pairs.size))
     center_sigma = options.center_sigma if len(usable) > FEW_PAIRS else min(options.center_sigma, UNCROPPED_SIGMA)
     consensus = Consensus(usable, center_sigma * pairs.size[0] / side)
-    answer = consensus_peak.found(consensus)
-    scatter = answer.scatter(consensus, seed)
+    answer = consensus_peak.find_peak(consensus)
+    scatter = answer.resample(consensus, seed)
     log_focal_spread = answer.deviation(scatter[:, LOG_FOCAL])
     evidence = {"pairs": float(len(usable)), **answer.evidence(usable.weights), "log_focal_spread": log_focal_spread}
-    reason = answer.contradicted(usable.weights) or consensus_peak.objection(
-        answer.theta, log_focal_spread, _half(pairs.size)
+    reason = answer.contradiction(usable.weights) or consensus_peak.objection(
+        answer.theta, log_focal_spread, _half_size(pairs.size)
     )
     if reason:
-        return guessed(pairs.size, reason, evidence)
+        return guess_calibration(pairs.size, reason, evidence)
     spread = spread_px(scatter, side, effective_count(answer.votes), len(answer.free))
-    found = calibration_of(np.append(answer.theta, 0.0), pairs.size, METHOD)
+    found = calibration_from_parameters(np.append(answer.theta, 0.0), pairs.size, METHOD)
     doubt = consensus_peak.vagueness(log_focal_spread) or answer.doubt_of_focal(usable.weights)
     doubt = doubt or answer.doubt_of_pixels
-    return roughly(replace(found, spread=spread, evidence=evidence), doubt)
+    return downgrade_to_estimate(replace(found, spread=spread, evidence=evidence), doubt)
 
 
-def _from_matches(
+def _calibrate_from_matches(
     pairs: CameraPairs, usable: Pairs, options: CalibrationSettings, evidence: dict[str, float]
 ) -> Calibration:
     """Adjust the camera to the matches, starting from the consensus.
@@ -110,43 +112,43 @@ def _from_matches(
     sigma = options.center_sigma * pairs.size[0] / side
     hint = float(np.median(pairs.focal_hints_px)) / side if pairs.focal_hints_px else np.nan
     priors = CameraPriors(np.ones(1), np.array([hint]), sigma, options.lens)
-    adjusted = _adjusted(pairs, usable, priors)
-    if adjusted.contradicted:
-        again = _adjusted(pairs, usable, priors, adjusted)
-        adjusted = max(adjusted, again, key=lambda one: one.votes_kept)
+    adjusted = _adjust(pairs, usable, priors)
+    if adjusted.is_contradicted:
+        again = _adjust(pairs, usable, priors, adjusted)
+        adjusted = max(adjusted, again, key=lambda one: one.kept_share)
     fit, answer, judged = adjusted.fit, adjusted.answer, adjusted.consensus.pairs
     theta, cov = fit.state.thetas[0], covariance(fit, np.ones(1), resampled=True)
     evidence |= {**answer.evidence(judged.weights), **_figures(fit, side, float(np.sqrt(cov[LOG_FOCAL, LOG_FOCAL])))}
-    evidence["votes_kept"] = adjusted.votes_kept
-    undecided, split = answer.contradicted(judged.weights), _split(adjusted)
+    evidence["votes_kept"] = adjusted.kept_share
+    undecided, split = answer.contradiction(judged.weights), _contradiction(adjusted)
     believed, spread = (answer.theta, 0.0) if split else (theta, evidence["log_focal_spread"])
-    reason = (undecided and (open_focal(fit) or undecided)) or consensus_peak.objection(
-        believed, spread, _half(pairs.size)
+    reason = (undecided and (critical_motion(fit) or undecided)) or consensus_peak.objection(
+        believed, spread, _half_size(pairs.size)
     )
     if reason:
-        return guessed(pairs.size, reason, evidence)
+        return guess_calibration(pairs.size, reason, evidence)
     if split:
-        agreed = calibration_of(np.append(answer.theta, theta[KAPPA]), pairs.size, METHOD)
-        return replace(roughly(agreed, split), evidence=evidence)
-    found = calibration_of(theta, pairs.size, METHOD)
-    photos = tuple(pairs.photos[k] for k in usable.kept[adjusted.listened]) if pairs.photos else ()
+        agreed = calibration_from_parameters(np.append(answer.theta, theta[KAPPA]), pairs.size, METHOD)
+        return replace(downgrade_to_estimate(agreed, split), evidence=evidence)
+    found = calibration_from_parameters(theta, pairs.size, METHOD)
+    photos = tuple(pairs.photos[k] for k in usable.kept[adjusted.used_pairs]) if pairs.photos else ()
     found = replace(
         found,
-        spread=spread_of(theta, cov, side),
+        spread=spread_from_covariance(theta, cov, side),
         evidence=evidence,
-        held=fit.names_held(0),
+        held=fit.held_names(0),
         key_pairs=key_pairs(fit, photos),
     )
     doubt = answer.doubt_of_focal(judged.weights) or (answer.doubt_of_pixels if "aspect" in found.held else "")
-    return roughly(found, consensus_peak.vagueness(evidence["log_focal_spread"]) or doubt)
+    return downgrade_to_estimate(found, consensus_peak.vagueness(evidence["log_focal_spread"]) or doubt)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Adjusted:
+class _Adjustment:
     """A camera adjusted to matches, and the consensus of all pairs to check it."""
 
     fit: Fit
-    listened: NDArray[np.int64]
+    used_pairs: NDArray[np.int64]
     """Which of the usable pairs it was adjusted to."""
     consensus: Consensus
     """Of all usable pairs, undistorted."""
@@ -154,53 +156,53 @@ class _Adjusted:
     """Its peak."""
 
     @property
-    def votes_kept(self) -> float:
+    def kept_share(self) -> float:
         """Votes for the camera over those for the peak."""
         thetas = np.array([self.fit.state.thetas[0, :KAPPA], self.answer.theta])
-        at_fit, at_peak = self.consensus.at(thetas, VOTES_SIGMA)
+        at_fit, at_peak = self.consensus.evaluate(thetas, VOTES_SIGMA)
         return float(at_fit / at_peak) if at_peak > 0 else 0.0
 
     @property
-    def contradicted(self) -> bool:
+    def is_contradicted(self) -> bool:
         """Whether enough pairs agree on another camera to reject this one: few pairs fit almost any center."""
-        enough = min(effective_count(self.answer.votes), float(len(self.agreeing)))
-        return self.votes_kept < KEPT and enough >= ENOUGH_PAIRS
+        enough = min(effective_count(self.answer.votes), float(len(self.agreeing_pairs)))
+        return self.kept_share < LEAST_KEPT_SHARE and enough >= ENOUGH_PAIRS
 
     @property
-    def agreeing(self) -> NDArray[np.int64]:
+    def agreeing_pairs(self) -> NDArray[np.int64]:
         """Usable pairs that come near the peak."""
-        return np.flatnonzero(self.consensus.ratios(self.answer.theta) < AGREES)
+        return np.flatnonzero(self.consensus.ratios(self.answer.theta) < AGREEING_RATIO)
 
 
-def _adjusted(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _Adjusted | None = None) -> _Adjusted:
+def _adjust(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _Adjustment | None = None) -> _Adjustment:
     """Adjust the camera to the matches of all pairs, or only of those that agree on the peak of `before`."""
-    matches, Fs = _in_sides(pairs, usable)
+    matches, Fs = _convert_to_sides(pairs, usable)
     if before is None:
-        first, listened = consensus_peak.found(Consensus(usable, priors.center_sigma)), np.arange(len(usable))
+        first, listened = consensus_peak.find_peak(Consensus(usable, priors.center_sigma)), np.arange(len(usable))
         plain = np.array([USUAL_FOCAL, 0.0, 0.0, 0.0])
         starts = [np.append(theta, 0.0)[None] for theta in (first.theta, *first.others[:1], plain)]
     else:
-        first, listened = before.answer, before.agreeing
+        first, listened = before.answer, before.agreeing_pairs
         starts = [np.append(first.theta, before.fit.state.thetas[0, KAPPA])[None]]
-    fit = refined(matches.chosen(listened), Fs[listened], starts, priors)
+    fit = fit_cameras(matches.select(listened), Fs[listened], starts, priors)
     consensus, answer = Consensus(usable, priors.center_sigma), first
     if fit.free[0, LENS]:
-        straight = _in_pixels(straight_fundamentals(of_all_pairs(fit, matches, Fs)), pairs)
-        consensus = Consensus(_prepared(CameraPairs(straight, usable.weights, pairs.size)), priors.center_sigma)
+        straight = _convert_to_pixels(undistorted_fundamentals(extend_to_all_pairs(fit, matches, Fs)), pairs)
+        consensus = Consensus(_prepare(CameraPairs(straight, usable.weights, pairs.size)), priors.center_sigma)
     if fit.free[0, LENS] or (before is not None and before.fit.free[0, LENS]):
-        answer = consensus_peak.found(consensus)
-    if abs(answer.theta[LOG_FOCAL] - fit.state.thetas[0, LOG_FOCAL]) > ELSEWHERE:
+        answer = consensus_peak.find_peak(consensus)
+    if abs(answer.theta[LOG_FOCAL] - fit.state.thetas[0, LOG_FOCAL]) > RESTART_DISTANCE:
         again = np.append(answer.theta, fit.state.thetas[0, KAPPA])
-        fit = refined(matches.chosen(listened), Fs[listened], [fit.state.thetas, again[None]], priors)
-    return _Adjusted(fit, listened, consensus, answer)
+        fit = fit_cameras(matches.select(listened), Fs[listened], [fit.state.thetas, again[None]], priors)
+    return _Adjustment(fit, listened, consensus, answer)
 
 
-def _prepared(pairs: CameraPairs) -> Pairs:
+def _prepare(pairs: CameraPairs) -> Pairs:
     width, height = pairs.size
     return prepare(pairs, unit_px=float(max(pairs.size)), origin_px=(width / 2, height / 2))
 
 
-def _in_sides(pairs: CameraPairs, usable: Pairs) -> tuple[Matches, FloatArray]:
+def _convert_to_sides(pairs: CameraPairs, usable: Pairs) -> tuple[Matches, FloatArray]:
     """Return the inliers and F's of the usable pairs in longer sides from the middle."""
     side = float(max(pairs.size))
     middle = np.tile(np.array(pairs.size) / 2, 2)
@@ -210,7 +212,7 @@ def _in_sides(pairs: CameraPairs, usable: Pairs) -> tuple[Matches, FloatArray]:
     return Matches(inliers, np.zeros((count, 2), np.int64), photos, side), usable.F
 
 
-def _in_pixels(Fs: FloatArray, pairs: CameraPairs) -> FloatArray:
+def _convert_to_pixels(Fs: FloatArray, pairs: CameraPairs) -> FloatArray:
     side = float(max(pairs.size))
     to_sides = np.array([[1 / side, 0, -pairs.size[0] / 2 / side], [0, 1 / side, -pairs.size[1] / 2 / side], [0, 0, 1]])
     return np.asarray(to_sides.T @ Fs @ to_sides, np.float64)
@@ -225,16 +227,16 @@ def _figures(fit: Fit, side: float, log_focal_spread: float) -> dict[str, float]
     }
 
 
-def _split(adjusted: _Adjusted) -> str:
+def _contradiction(adjusted: _Adjustment) -> str:
     """Return why the matches and the consensus of their F's disagree on the camera; empty where they agree."""
     ratio = float(np.exp(abs(adjusted.fit.state.thetas[0, LOG_FOCAL] - adjusted.answer.theta[LOG_FOCAL])))
     if ratio >= ANOTHER_FOCAL:
         return f"the pairs agree on one focal and their matches on another, {ratio:.1f} times away"
-    if adjusted.contradicted:
-        kept = 100 * adjusted.votes_kept
+    if adjusted.is_contradicted:
+        kept = 100 * adjusted.kept_share
         return f"the pairs agree on one camera, their matches on another, which keeps {kept:.0f} % of its votes"
     return ""
 
 
-def _half(size: tuple[int, int]) -> tuple[float, float]:
+def _half_size(size: tuple[int, int]) -> tuple[float, float]:
     return 0.5 * size[0] / max(size), 0.5 * size[1] / max(size)

@@ -10,12 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from sfm_app.atomic_io import can_go_on, mark_finished, mark_unfinished
+from sfm_app.atomic_io import mark_finished, mark_unfinished, resume_or_clear
 from sfm_app.colmap.dense import (
     DenseStore,
     digest_maps,
     drop_estimates,
-    hide_masked,
+    mask_depths,
     read_depth,
     read_views,
     undistort,
@@ -31,7 +31,7 @@ from sfm_app.types import Rejected, Scene
 
 HINT = "take photos a step apart, sideways rather than forward, with two thirds of the view in common"
 
-CONFIRMING = 2
+CONFIRMING_FACTOR = 2
 """A depth map is checked against this many times as many photos as it was made from."""
 
 
@@ -55,11 +55,11 @@ def make(scene: Scene, run: RunContext) -> Path:
     run.record(method=method.name, method_reason=why)
     prepare(scene, dense_dir, method.name, run)
     views = read_views(dense_dir)
-    ranked = rank_neighbors(views, CONFIRMING * options.neighbors)
+    ranked = rank_neighbors(views, CONFIRMING_FACTOR * options.neighbors)
     with single_threaded_opencv():
         found = method.make(DepthTask(dense_dir, views, ranked, options, DenseStore(dense_dir), run.map))
     if run.mask_dir is not None:
-        run.map(partial(hide_masked, dense_dir), views, "masking depth maps")
+        run.map(partial(mask_depths, dense_dir), views, "masking depth maps")
     record(dense_dir, views, found, run)
     drop_estimates(dense_dir, views)
     write_fusion_views(dense_dir, views)
@@ -88,7 +88,7 @@ def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None
     """
     model = [(file.name, blake2b(file.read_bytes()).hexdigest()) for file in sorted(scene.model_dir.glob("*.bin"))]
     made_from = fingerprint(run.fingerprint, method, model)
-    if not can_go_on(dense_dir, made_from):
+    if not resume_or_clear(dense_dir, made_from):
         largest = run.settings.depth.max_image_size_px
         undistort(scene.model_dir, run.workspace.photos, dense_dir, largest, run.workers, run.progress)
         if run.mask_dir is not None:

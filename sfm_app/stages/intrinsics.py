@@ -2,7 +2,7 @@
 
 import json
 
-from sfm_app.atomic_io import replacing
+from sfm_app.atomic_io import replace_atomically
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.hashing import digest_files
 from sfm_app.numerical import json_text
@@ -25,7 +25,7 @@ def make(matches: MatchGraph, views: ViewGraph, run: RunContext) -> Intrinsics:
         photos={camera.name: len(camera.photos) for camera in cameras},
         identifiable=sum(camera.found.identifiable for camera in cameras),
     )
-    with replacing(run.workspace.calibration) as path:
+    with replace_atomically(run.workspace.calibration) as path:
         path.write_text(json_text(intrinsics.to_dict()), encoding="utf-8")
     return intrinsics
 

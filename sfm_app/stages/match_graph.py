@@ -1,9 +1,9 @@
 """match_graph: PhotoSet -> MatchGraph."""
 
 from sfm_app.atomic_io import is_made_from
-from sfm_app.colmap.backend import backend
+from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import create_database, digest_matches, is_sound, read_match_graph, remove_database
-from sfm_app.estimation.diagnosis import NOTHING_MATCHED, why_no_scene
+from sfm_app.estimation.diagnosis import NOTHING_MATCHED, diagnose_scene
 from sfm_app.estimation.matching import fill_database
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
@@ -27,7 +27,7 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
     if not (is_made_from(marker, run.fingerprint) and is_sound(place.database)):
         marker.unlink(missing_ok=True)
         remove_database(place.database)
-        with backend("entering photos"):
+        with translate_errors("entering photos"):
             create_database(place.database, photos)
         marker.write_text(run.fingerprint, encoding="utf-8")
     in_force = fill_database(run.plugins.feature_method(options.features), run)
@@ -40,7 +40,7 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
     )
     marker.unlink()
     if not graph.matches:
-        raise why_no_scene(graph, NOTHING_MATCHED, options).error()
+        raise diagnose_scene(graph, NOTHING_MATCHED, options).error()
     return graph
 
 
@@ -56,7 +56,7 @@ def load(photos: PhotoSet, run: RunContext) -> MatchGraph:
     """
     if not is_sound(run.workspace.database):
         raise ValueError(f"{run.workspace.database} is damaged")
-    with backend("reading the database"):
+    with translate_errors("reading the database"):
         return read_match_graph(run.workspace.database, photos)
 
 

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.atomic_io import is_made_from, replacing
+from sfm_app.atomic_io import is_made_from, replace_atomically
 from sfm_app.colmap.dense import map_file, read_color, read_depth, read_views
-from sfm_app.colmap.surface import FUSED, fuse, poisson, read_fused, simplify
+from sfm_app.colmap.surface import FUSED, fuse, poisson_surface, read_fused, simplify
 from sfm_app.errors import ReconstructionError
-from sfm_app.geometry.triangles import median_edge, vertex_normals
+from sfm_app.geometry.triangles import median_edge_length, vertex_normals
 from sfm_app.hashing import digest_files, load_arrays
 from sfm_app.meshing import (
-    Eye,
+    DepthView,
     Paint,
     Support,
     drop_islands,
@@ -32,14 +32,14 @@ from sfm_app.stereo import View, region
 from sfm_app.types import Surface
 
 SURFACE = "surface.npz"
-WHOLE = "fused.txt"
+FUSED_DIGEST = "fused.txt"
 """File with the hash of the fused points, so that a resumed run does not read damaged ones."""
 HINT = "take more photos, a step apart, with more overlap; OUT/points.ply and OUT/points.glb have the sparse points"
 
 MIN_POINTS = 100
 """Fewer fused points carry no surface."""
 
-SURE = 2 / 3
+CONFIRMED_SHARE = 2 / 3
 """A part stays when this share of the photos that a fused point needs confirms its average vertex."""
 
 
@@ -60,21 +60,21 @@ def make(dense_dir: Path, run: RunContext) -> Surface:
     points = _fused_points(dense_dir, views, run)
     depth = octree_depth(points, options.poisson_depth)
     with run.step("finding the surface"):
-        raw = _nonempty(poisson(place, depth), "the fused points span no surface")
-    colored, support = looked_at(raw, dense_dir, views, run)
-    least = SURE * _photos_needed(views, run)
+        raw = _check_nonempty(poisson_surface(place, depth), "the fused points span no surface")
+    colored, support = color_and_confirm(raw, dense_dir, views, run)
+    least = CONFIRMED_SHARE * _min_views(views, run)
     trimmed = trim(colored, support, options.max_gap_triangles, least) if options.trim else colored
-    detailed = _nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
+    detailed = _check_nonempty(drop_islands(trimmed, options.min_island), "the photos confirm no part of the surface")
     run.record(poisson_depth=depth, raw_triangles=len(raw.faces), detailed_triangles=len(detailed.faces))
     with run.step("simplifying"):
-        surface = _nonempty(make_manifold(simplified(detailed, options, place)), "the surface has no extent")
+        surface = _check_nonempty(make_manifold(simplify_mesh(detailed, options, place)), "the surface has no extent")
     run.record(vertices=len(surface.vertices), triangles=len(surface.faces))
-    with replacing(place / SURFACE) as path:
+    with replace_atomically(place / SURFACE) as path:
         np.savez(path, vertices=surface.vertices, faces=surface.faces, colors=surface.colors)
     return surface
 
 
-def _nonempty(surface: Surface, otherwise: str) -> Surface:
+def _check_nonempty(surface: Surface, otherwise: str) -> Surface:
     """Return the surface after checking that it has triangles.
 
     Raises:
@@ -104,11 +104,11 @@ def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArra
     target = place / FUSED
     files = [map_file(dense_dir, view) for view in views]
     youngest = max(path.stat().st_mtime_ns for path in (*files, files[0].parent))
-    whole = place / WHOLE
+    whole = place / FUSED_DIGEST
     sound = target.exists() and is_made_from(whole, digest_files(place, FUSED))
     if not sound or target.stat().st_mtime_ns <= youngest:
-        with run.step("fusing depth maps"), replacing(target) as path:
-            fuse(dense_dir, _photos_needed(views, run), region(views), path, cache_gb(run.memory_mb))
+        with run.step("fusing depth maps"), replace_atomically(target) as path:
+            fuse(dense_dir, _min_views(views, run), region(views), path, cache_gb(run.memory_mb))
         whole.write_text(digest_files(place, FUSED), encoding="utf-8")
     points, _ = read_fused(place)
     run.record(fused_points=len(points))
@@ -119,12 +119,12 @@ def _fused_points(dense_dir: Path, views: list[View], run: RunContext) -> NDArra
     return points
 
 
-def _photos_needed(views: list[View], run: RunContext) -> int:
+def _min_views(views: list[View], run: RunContext) -> int:
     """Return how many photos have to see a fused point."""
     return min(1 + run.settings.depth.min_agreeing, len(views))
 
 
-def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> tuple[Surface, Support]:
+def color_and_confirm(surface: Surface, dense_dir: Path, views: list[View], run: RunContext) -> tuple[Surface, Support]:
     """Return the surface with colors from the photos, and their support for each of its vertices.
 
     Args:
@@ -136,20 +136,20 @@ def looked_at(surface: Surface, dense_dir: Path, views: list[View], run: RunCont
     normals = vertex_normals(surface.vertices, surface.faces)
     tolerance = run.settings.depth.consistency
 
-    def look(view: View) -> tuple[NDArray[np.uint8], Paint]:
-        eye = Eye(view.K, view.R, view.t, read_depth(dense_dir, view, "geometric"), view.sample_px)
+    def judge_view(view: View) -> tuple[NDArray[np.uint8], Paint]:
+        eye = DepthView(view.K, view.R, view.t, read_depth(dense_dir, view, "geometric"), view.sample_px)
         verdict = judge(surface.vertices, normals, eye, tolerance)
         return verdict, sample_colors(surface.vertices, normals, verdict, eye, read_color(dense_dir, view))
 
-    support, paint = Support.none(len(normals)), Paint.none(len(normals))
-    found = ordered_map(run.executor, look, views, ahead=run.workers)
+    support, paint = Support.zeros(len(normals)), Paint.zeros(len(normals))
+    found = ordered_map(run.executor, judge_view, views, ahead=run.workers)
     for verdict, colors in track(run.progress, found, "confirming the surface", len(views)):
         support.add(verdict)
         paint.add(colors)
-    return Surface(surface.vertices, surface.faces, paint.over(surface.colors)), support
+    return Surface(surface.vertices, surface.faces, paint.mean_colors(surface.colors)), support
 
 
-def simplified(surface: Surface, options: MeshSettings, scratch: Path) -> Surface:
+def simplify_mesh(surface: Surface, options: MeshSettings, scratch: Path) -> Surface:
     """Simplify to as few triangles as the error allows, and no more than asked for.
 
     Args:
@@ -159,7 +159,7 @@ def simplified(surface: Surface, options: MeshSettings, scratch: Path) -> Surfac
     """
     simple = surface
     if options.max_error_edges:
-        edge = median_edge(surface.vertices, surface.faces)
+        edge = median_edge_length(surface.vertices, surface.faces)
         simple = simplify(surface, 1.0 / len(surface.faces), options.max_error_edges * edge, scratch)
     if len(simple.faces) > options.faces:
         simple = simplify(simple, options.faces / len(simple.faces), 0.0, scratch)

@@ -10,29 +10,29 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sfm_app.atomic_io import replacing
+from sfm_app.atomic_io import replace_atomically
 from sfm_app.errors import InputError
 from sfm_app.hashing import digest_files, is_below
 from sfm_app.photos import (
     MASK_HINT,
-    Glance,
+    PhotoStats,
     Source,
     UnreadableError,
+    assign_names,
+    drop_duplicates,
+    drop_unusable,
     find_mask,
-    grouped,
+    group_by_camera,
     lay_out,
     lay_out_mask,
     list_files,
-    mask_place,
-    place_of,
+    mask_path,
     read_photo,
-    screened,
-    stored_names,
+    resolve_file,
     unused_masks,
-    without_copies,
 )
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.cost_estimate import megapixels_within
+from sfm_app.runtime.cost_estimate import largest_photo_megapixels
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import PhotoSettings
 from sfm_app.stages.video_frames import video_frames
@@ -72,23 +72,23 @@ def digest(place: Workspace) -> str:
 
 def _read_photos(source: Source, folder: Path, names: Sequence[str], run: RunContext) -> PhotoSet:
     """Read these files of a folder and lay the usable photos out for COLMAP; errors as in `make`."""
-    options = within_memory(run)
+    options = limit_to_memory(run)
     found = run.map(partial(read_photo, folder, options=options), names, "photos")
-    glances = [photo for photo in found if isinstance(photo, Glance)]
+    glances = [photo for photo in found if isinstance(photo, PhotoStats)]
     unusable = [photo for photo in found if isinstance(photo, UnusablePhoto)]
-    glances, blackened = masked(glances, folder, source, run)
-    photos, needless = chosen(glances, keep_low_quality=options.keep_low_quality)
+    glances, blackened = attach_masks(glances, folder, source, run)
+    photos, needless = select_photos(glances, keep_low_quality=options.keep_low_quality)
     unusable = sorted(unusable + blackened + needless, key=lambda photo: photo.name)
     if len(photos) < 2:
         raise InputError(
-            _too_few(folder, len(photos), unusable),
+            _too_few_message(folder, len(photos), unusable),
             hint="at least two photos of a place are needed; 10 to 50 work best",
         )
-    named = tuple(stored_names(grouped(photos, options.cameras)))
+    named = tuple(assign_names(group_by_camera(photos, options.cameras)))
     photo_set = PhotoSet(folder, named, tuple(unusable), source.mask_dir)
     for place in (run.workspace.photos, run.workspace.masks):
         shutil.rmtree(place, ignore_errors=True)
-    run.map(partial(laid_out, folder=folder, target=run.workspace.photos), photo_set.photos, "laying photos out")
+    run.map(partial(lay_out_photo, folder=folder, target=run.workspace.photos), photo_set.photos, "laying photos out")
     if photo_set.masks is not None:
         _lay_out_masks(photo_set, photo_set.masks, list(source.masks), run)
     _save_photo_set(photo_set, run)
@@ -98,16 +98,16 @@ def _read_photos(source: Source, folder: Path, names: Sequence[str], run: RunCon
     return photo_set
 
 
-def within_memory(run: RunContext) -> PhotoSettings:
+def limit_to_memory(run: RunContext) -> PhotoSettings:
     """Return the photo settings; where the user limits the memory, `max_megapixels` is reduced to fit."""
     options = run.settings.photos
     if not run.settings.max_memory_gb:
         return options
-    largest = min(options.max_megapixels, megapixels_within(run.memory_mb))
+    largest = min(options.max_megapixels, largest_photo_megapixels(run.memory_mb))
     return options.model_copy(update={"max_megapixels": largest})
 
 
-def chosen(glances: list[Glance], *, keep_low_quality: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
+def select_photos(glances: list[PhotoStats], *, keep_low_quality: bool) -> tuple[list[Photo], list[UnusablePhoto]]:
     """Return the photos that are worth using, and the others.
 
     Args:
@@ -116,14 +116,14 @@ def chosen(glances: list[Glance], *, keep_low_quality: bool) -> tuple[list[Photo
     """
     if keep_low_quality:
         return [glance.photo for glance in glances], []
-    useful, useless = screened(glances)
-    photos, copies = without_copies(useful)
+    useful, useless = drop_unusable(glances)
+    photos, copies = drop_duplicates(useful)
     return photos, useless + copies
 
 
-def masked(
-    glances: list[Glance], folder: Path, source: Source, run: RunContext
-) -> tuple[list[Glance], list[UnusablePhoto]]:
+def attach_masks(
+    glances: list[PhotoStats], folder: Path, source: Source, run: RunContext
+) -> tuple[list[PhotoStats], list[UnusablePhoto]]:
     """Return the photos with their masks, and those that their masks cover completely.
 
     Args:
@@ -154,7 +154,7 @@ def _lay_out_masks(photo_set: PhotoSet, masks: Path, names: Sequence[str], run: 
     run.record(masks={"photos": sum(bool(photo.mask) for photo in photo_set.photos), "unused": unused})
 
 
-def laid_out(photo: Photo, *, folder: Path, target: Path) -> None:
+def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
     """Put one photo into the workspace.
 
     Args:
@@ -177,7 +177,7 @@ def _save_photo_set(photos: PhotoSet, run: RunContext) -> None:
     """Write photos.json, with hashes of the copies."""
     known = {"photos": [asdict(photo) for photo in photos.photos], "unusable": [asdict(p) for p in photos.unusable]}
     copies = {photo.name: _copy_digest(photo, run) for photo in photos.photos}
-    with replacing(run.workspace.photo_set) as path:
+    with replace_atomically(run.workspace.photo_set) as path:
         path.write_text(json.dumps({**known, "copies": copies}, indent=1) + "\n", encoding="utf-8")
 
 
@@ -190,27 +190,27 @@ def _copy_digest(photo: Photo, run: RunContext) -> str | None:
 def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoSet:
     """Read photos.json back, and lay out what is missing."""
     values = json.loads(run.workspace.photo_set.read_text(encoding="utf-8"))
-    photos = tuple(_photo(entry) for entry in values["photos"])
+    photos = tuple(_photo_from_dict(entry) for entry in values["photos"])
     if not all(is_below(photo.name) for photo in photos):
         raise ValueError(f"{run.workspace.photo_set} names photos outside of their folder")
     for photo in photos:
         place, copy = run.workspace.photos / photo.name, values["copies"].get(photo.name)
-        if copy != _copy_digest(photo, run) or not (copy or place.resolve() == place_of(folder, photo.path)):
+        if copy != _copy_digest(photo, run) or not (copy or place.resolve() == resolve_file(folder, photo.path)):
             if folder == run.workspace.frames and not (folder / photo.path).exists():
                 raise FileNotFoundError(errno.ENOENT, "no such frame", str(folder / photo.path))
-            laid_out(photo, folder=folder, target=run.workspace.photos)
-        if masks is not None and not mask_place(run.workspace.masks, photo.name).exists():
+            lay_out_photo(photo, folder=folder, target=run.workspace.photos)
+        if masks is not None and not mask_path(run.workspace.masks, photo.name).exists():
             lay_out_mask(photo, folder, masks, run.workspace.masks)
     return PhotoSet(folder, photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]), masks)
 
 
-def _photo(entry: Mapping[str, Any]) -> Photo:
+def _photo_from_dict(entry: Mapping[str, Any]) -> Photo:
     gps, shown = entry.get("gps"), entry.get("shown")
     known = {"gps": GpsPosition(**gps) if gps else None, "shown": tuple(shown) if shown else None}
     return Photo(**{**entry, **known, "notes": tuple(entry.get("notes", ()))})
 
 
-def _too_few(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:
+def _too_few_message(folder: Path, usable: int, unusable: list[UnusablePhoto]) -> str:
     """Return why there are not enough photos, in one line."""
     reasons = Counter("copies of another" if "same picture" in photo.reason else photo.reason for photo in unusable)
     seen = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())

@@ -6,22 +6,22 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from sfm_app.atomic_io import can_go_on, mark_unfinished, replacing
-from sfm_app.colmap.backend import backend, check_written
-from sfm_app.colmap.bundle import Adjusted, adjusted_or_as_it_was
-from sfm_app.colmap.model import Refined, color, photos_of, posed_images, read_scene, sparse_model
+from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
+from sfm_app.colmap.backend import check_written, translate_errors
+from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
+from sfm_app.colmap.model import RefinedCamera, color_points, posed_images, posed_photo_ids, read_scene, sparse_model
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import ReconstructionError
-from sfm_app.estimation.diagnosis import why_no_depth, why_no_scene
+from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
 from sfm_app.hashing import digest_files
 from sfm_app.numerical import Json, json_text
-from sfm_app.reconstruction import Found, Outcome, look_again, reconstruct
-from sfm_app.reconstruction.align_upright import look_at_photos, orient_or_leave
-from sfm_app.reconstruction.look_alikes import in_words, jumps
-from sfm_app.reconstruction.unregistered import left_out, names_of
-from sfm_app.reconstruction.weak_scale import weakly_joined
+from sfm_app.reconstruction import MappedScene, Outcome, reconstruct, retry_lost_photos
+from sfm_app.reconstruction.align_upright import orient_or_keep, submit_cue_extraction
+from sfm_app.reconstruction.look_alikes import jumps, look_alike_entries
+from sfm_app.reconstruction.unregistered import photo_names, unregistered_reasons
+from sfm_app.reconstruction.weak_scale import weakly_joined_parts
 from sfm_app.runtime.context import RunContext
-from sfm_app.runtime.workspace import MAPPING, Aside, Workspace
+from sfm_app.runtime.workspace import MAPPING, SubWorkspace, Workspace
 from sfm_app.types import Intrinsics, MatchGraph, Scene, ViewGraph
 
 POINTS = "points"
@@ -41,9 +41,9 @@ def make(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: Run
         ReconstructionError: no pair of photos grows into a model; the message says why.
     """
     aside = mapping_run(run)
-    first = Found(reconstruct(matches, views, intrinsics, aside), matches, views, intrinsics, aside)
+    first = MappedScene(reconstruct(matches, views, intrinsics, aside), matches, views, intrinsics, aside)
     try:
-        scene = _adjusted_scene(look_again(first), run)
+        scene = _finish_scene(retry_lost_photos(first), run)
     except ReconstructionError:  # after any other end, such as Ctrl-C or a full disk, the same command resumes there
         shutil.rmtree(aside.workspace.root, ignore_errors=True)
         raise
@@ -55,7 +55,7 @@ def load(run: RunContext) -> Scene:
     """Read the model and scene.json back."""
     place = run.workspace
     known = json.loads(place.scene.read_text(encoding="utf-8"))
-    with backend("reading the sparse model"):
+    with translate_errors("reading the sparse model"):
         return read_scene(place.sparse, known["camera_of"], known["unregistered"], known["cameras"])
 
 
@@ -66,55 +66,55 @@ def digest(place: Workspace) -> str:
 
 def mapping_run(run: RunContext) -> RunContext:
     """Return the run in an inner folder, where mapping has its own database and a killed run can resume."""
-    place = Aside(run.workspace, MAPPING)
-    if not can_go_on(place.root, run.fingerprint):
+    place = SubWorkspace(run.workspace, MAPPING)
+    if not resume_or_clear(place.root, run.fingerprint):
         mark_unfinished(place.root, run.fingerprint)
     return replace(run, workspace=place)
 
 
-def _adjusted_scene(found: Found, run: RunContext) -> Scene:
+def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     """Adjust the models, orient them upright, write them and record their figures.
 
     Raises:
         ReconstructionError: no model has depth.
     """
     matches, views, intrinsics = found.matches, found.views, found.intrinsics
-    outcome = _with_depth(found.outcome, matches, views, intrinsics, run)
-    looks = look_at_photos([attempt.model for attempt in outcome.models], matches, run)
-    adjusted = [adjusted_or_as_it_was(attempt.model, found.run.workspace.database) for attempt in outcome.models]
+    outcome = _drop_models_without_depth(found.outcome, matches, views, intrinsics, run)
+    looks = submit_cue_extraction([attempt.model for attempt in outcome.models], matches, run)
+    adjusted = [adjust_or_keep(attempt.model, found.run.workspace.database) for attempt in outcome.models]
     models = [found.model for found in adjusted]
-    with backend("reading colors"):
+    with translate_errors("reading colors"):
         for model in models:
-            color(model, run.workspace.photos, run.workers)
+            color_points(model, run.workspace.photos, run.workers)
     turn_deg = None if run.settings.scene.photo_rotation_deg == "auto" else run.settings.scene.photo_rotation_deg
-    orientations = [orient_or_leave(model, matches, looks, turn_deg) for model in models]
+    orientations = [orient_or_keep(model, matches, looks, turn_deg) for model in models]
     write_models(models, run)
     run.write_model(sparse_model(run.workspace.sparse), POINTS)
-    members = [photos_of(model) for model in models]
-    reasons = left_out(set(members[0]), members[1:], matches, views, outcome.graph)
-    names = {image.name: outcome.intrinsics.name_of(image) for image in matches.images.values()}
-    scene = read_scene(run.workspace.sparse, names, reasons, refined_by_name(adjusted[0], names))
+    members = [posed_photo_ids(model) for model in models]
+    reasons = unregistered_reasons(set(members[0]), members[1:], matches, views, outcome.graph)
+    names = {image.name: outcome.intrinsics.camera_name(image) for image in matches.images.values()}
+    scene = read_scene(run.workspace.sparse, names, reasons, refined_cameras(adjusted[0], names))
     write_scene(scene, run)
     run.record(
         registered=len(scene.registered),
         of=len(matches.images),
         unregistered=dict(scene.unregistered),
-        other_models=[names_of(photos, matches) for photos in members[1:]],
+        other_models=[photo_names(photos, matches) for photos in members[1:]],
         points=scene.points,
         observations=scene.observations,
         mean_reprojection_px=round(scene.mean_reprojection_px, 4),
         orientation=orientations[0],
-        adjustment=_how_it_was_adjusted(adjusted, names),
-        **how_it_was_made(outcome),
-        look_alikes=in_words(outcome.graph.look_alikes, matches),
-        perhaps_look_alikes=in_words(outcome.graph.doubtful, matches),
+        adjustment=_adjustment_problems(adjusted, names),
+        **mapping_figures(outcome),
+        look_alikes=look_alike_entries(outcome.graph.look_alikes, matches),
+        perhaps_look_alikes=look_alike_entries(outcome.graph.doubtful, matches),
         jumps=jumps(models[0]),
-        weakly_joined=weakly_joined(models[0]),
+        weakly_joined=weakly_joined_parts(models[0]),
     )
     return scene
 
 
-def _with_depth(
+def _drop_models_without_depth(
     outcome: Outcome, matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run: RunContext
 ) -> Outcome:
     """Drop the models of photos without parallax: their shape is arbitrary.
@@ -124,9 +124,9 @@ def _with_depth(
     """
     kept, doubts = [], []
     for attempt in outcome.models:
-        placed = set(photos_of(attempt.model))
+        placed = set(posed_photo_ids(attempt.model))
         known = all(intrinsics.camera(matches.images[photo]).method != "guess" for photo in placed)
-        doubt = why_no_depth(matches, views, placed, run.settings.epipolar, camera_known=known)
+        doubt = diagnose_depth(matches, views, placed, run.settings.epipolar, camera_known=known)
         if doubt:
             doubts.append(doubt)
         else:
@@ -134,11 +134,11 @@ def _with_depth(
     if doubts and not kept:
         raise doubts[0].error()
     if not kept:
-        raise why_no_scene(matches, views, run.settings.matching).error("; ".join(outcome.tried))
+        raise diagnose_scene(matches, views, run.settings.matching).error("; ".join(outcome.tried))
     return replace(outcome, models=tuple(kept))
 
 
-def how_it_was_made(outcome: Outcome) -> dict[str, Json]:
+def mapping_figures(outcome: Outcome) -> dict[str, Json]:
     """Return the manifest's figures about relative poses and mapping."""
     poses, main = outcome.graph.poses.values(), outcome.models[0]
     dropped = list(outcome.graph.dropped.values())
@@ -159,13 +159,13 @@ def how_it_was_made(outcome: Outcome) -> dict[str, Json]:
     }
 
 
-def _how_it_was_adjusted(adjusted: Sequence[Adjusted], names: Mapping[str, str]) -> dict[str, Json]:
+def _adjustment_problems(adjusted: Sequence[Adjustment], names: Mapping[str, str]) -> dict[str, Json]:
     """Return the manifest's entries about problems of the last adjustment; empty for none."""
     main, others = adjusted[0], adjusted[1:]
     cameras = {image.camera_id: names[image.name] for image in posed_images(main.model)}
     found: dict[str, Json] = {
-        "failed": main.trouble,
-        "failed_in_other_models": {str(number): one.trouble for number, one in enumerate(others, 1) if one.trouble},
+        "failed": main.failure,
+        "failed_in_other_models": {str(number): one.failure for number, one in enumerate(others, 1) if one.failure},
         "cameras_held": [cameras[camera_id] for camera_id in main.held],
         "points_left_open": main.open_points,
     }
@@ -196,14 +196,14 @@ def write_model(model: Reconstruction, target: Path) -> None:
     beside = target.with_name(f".{target.name}")
     shutil.rmtree(beside, ignore_errors=True)
     beside.mkdir(parents=True)
-    with backend("writing the sparse model"):
+    with translate_errors("writing the sparse model"):
         model.write(beside)
         check_written(*beside.iterdir())
     shutil.rmtree(target, ignore_errors=True)
     beside.rename(target)
 
 
-def refined_by_name(adjusted: Adjusted, names: Mapping[str, str]) -> dict[str, Refined]:
+def refined_cameras(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, RefinedCamera]:
     """Return deviations and determined parameters of the refined cameras, by name of the camera.
 
     Args:
@@ -229,5 +229,5 @@ def write_scene(scene: Scene, run: RunContext) -> None:
         "camera_of": dict(scene.camera_of),
         "unregistered": dict(scene.unregistered),
     }
-    with replacing(run.workspace.scene) as path:
+    with replace_atomically(run.workspace.scene) as path:
         path.write_text(json_text(known), encoding="utf-8")

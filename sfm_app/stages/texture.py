@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from sfm_app.atomic_io import can_go_on, mark_unfinished, replacing
+from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.hashing import digest_files, fingerprint, load_arrays
 from sfm_app.meshing.occlusion import Occluders
-from sfm_app.photos import read_used, without_masked
+from sfm_app.photos import fill_masked, read_mask
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.texture import PhotoView, photo_view, texture_surface
@@ -37,10 +37,10 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
     views, parts = photo_views(scene), run.workspace.texture / PARTS
     cameras = [(view.name, view.row.tolist(), view.width, view.height) for view in views]
     made_from = fingerprint(run.fingerprint, cameras, surface_digest(surface))
-    if not can_go_on(parts, made_from):
+    if not resume_or_clear(parts, made_from):
         mark_unfinished(parts, made_from)
-    hidden = Occluders(surface.vertices, surface.faces).hidden
-    store = Files(run.workspace.photos, parts, run.mask_dir)
+    hidden = Occluders(surface.vertices, surface.faces).is_hidden
+    store = FileStore(run.workspace.photos, parts, run.mask_dir)
     model, figures = texture_surface(surface, views, store, hidden, run.settings.texture, run.map)
     run.record(**figures)
     save_texture(model, run)
@@ -48,7 +48,7 @@ def make(scene: Scene, surface: Surface, run: RunContext) -> Model:
     return model
 
 
-class Files:
+class FileStore:
     """The `sfm_app.texture.Store` of a run: photos and masks of two folders, and arrays in files."""
 
     def __init__(self, photo_dir: Path, folder: Path, mask_dir: Path | None = None) -> None:
@@ -56,11 +56,11 @@ class Files:
 
     def photo(self, view: PhotoView) -> NDArray[np.uint8]:
         """Return (height, width, 3) RGB of a view, without what is masked."""
-        return read_photo(self.photo_dir, view, self.used(view))
+        return read_photo(self.photo_dir, view, self.usable_pixels(view))
 
-    def used(self, view: PhotoView) -> NDArray[np.bool_] | None:
+    def usable_pixels(self, view: PhotoView) -> NDArray[np.bool_] | None:
         """Return a (height, width) mask of the pixels that may be used; None where no masks are given."""
-        return None if self.mask_dir is None else read_used(self.mask_dir, view.name)
+        return None if self.mask_dir is None else read_mask(self.mask_dir, view.name)
 
     def recall(self, name: str) -> dict[str, NDArray[np.generic]] | None:
         """Return the arrays that were kept under a name, if they are there and sound."""
@@ -76,7 +76,7 @@ class Files:
             name: of the file, without suffix.
             arrays: by their own names.
         """
-        with replacing(self._path(name)) as path:
+        with replace_atomically(self._path(name)) as path:
             np.savez(path, allow_pickle=False, **arrays)
 
     def _path(self, name: str) -> Path:
@@ -107,7 +107,7 @@ def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None 
     with Image.open(photo_dir / view.name) as image:
         photo = image.convert("RGB")
     if used is not None:
-        photo = Image.fromarray(without_masked(np.asarray(photo), used))
+        photo = Image.fromarray(fill_masked(np.asarray(photo), used))
     if photo.size != (view.width, view.height):
         photo = photo.resize((view.width, view.height), Image.Resampling.BOX)
     return np.asarray(photo)
@@ -125,7 +125,7 @@ def save_texture(model: Model, run: RunContext) -> None:
     if texture is not None:
         stored |= {"uv": texture.uv, "page": texture.page}
         stored |= {f"page{number}": page for number, page in enumerate(texture.pages)}
-    with replacing(run.workspace.texture / TEXTURE) as path:
+    with replace_atomically(run.workspace.texture / TEXTURE) as path:
         np.savez(path, **stored)
 
 

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sfm_app.atomic_io import replacing
+from sfm_app.atomic_io import replace_atomically
 from sfm_app.errors import InputError
-from sfm_app.photos import Follower, UnreadableError, choose, opened
+from sfm_app.photos import CornerTracker, UnreadableError, open_video, select_keyframes
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
 
@@ -22,7 +22,7 @@ LONGEST_STEM = 40
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class FrameChoice:
     """The choice of frames of a video."""
 
     made_from: str
@@ -46,11 +46,11 @@ def video_frames(source: Path, run: RunContext) -> Iterator[Path]:
     Raises:
         InputError: the video cannot be read, or shows too little.
     """
-    chosen = kept(run)
+    chosen = read_choice(run)
     if chosen is None:
-        chosen = chosen_from(source, run)
+        chosen = choose_frames(source, run)
         shutil.rmtree(run.workspace.frames, ignore_errors=True)
-        with replacing(run.workspace.frames_marker) as path:
+        with replace_atomically(run.workspace.frames_marker) as path:
             path.write_text(json.dumps(asdict(chosen)), encoding="utf-8")
     _write_frames(source, chosen.frames, run)
     run.record(video=chosen.counts)
@@ -58,17 +58,17 @@ def video_frames(source: Path, run: RunContext) -> Iterator[Path]:
     run.workspace.frames_marker.unlink()
 
 
-def kept(run: RunContext) -> Chosen | None:
+def read_choice(run: RunContext) -> FrameChoice | None:
     """Return the choice of a killed run from the same inputs; None where there is none."""
     try:
         found = json.loads(run.workspace.frames_marker.read_text(encoding="utf-8"))
-        chosen = Chosen(found["made_from"], tuple(map(int, found["frames"])), dict(found["counts"]))
+        chosen = FrameChoice(found["made_from"], tuple(map(int, found["frames"])), dict(found["counts"]))
     except (OSError, ValueError, TypeError, LookupError):
         return None
     return chosen if chosen.made_from == run.fingerprint else None
 
 
-def chosen_from(source: Path, run: RunContext) -> Chosen:
+def choose_frames(source: Path, run: RunContext) -> FrameChoice:
     """Choose frames from the whole video.
 
     Args:
@@ -77,21 +77,21 @@ def chosen_from(source: Path, run: RunContext) -> Chosen:
     """
     most = run.settings.photos.max_frames
     try:
-        with opened(source) as video:
-            follower = Follower()
-            pictures = track(run.progress, video.small_frames(), "looking at frames", video.looks)
-            looks = [follower.look(number, small) for number, small in pictures]
+        with open_video(source) as video:
+            follower = CornerTracker()
+            pictures = track(run.progress, video.small_frames(), "looking at frames", video.sample_count)
+            looks = [follower.track(number, small) for number, small in pictures]
     except UnreadableError as err:
         raise InputError(f"cannot read {source}: {err}", hint=DAMAGED) from err
     looked_at, notes = len(looks) + video.black, []
     if video.black and not looks:
         raise InputError(f"cannot read {source}: all frames come out black, as interlaced ones do", hint=INTERLACED)
-    if video.cut_short:
+    if video.is_cut_short:
         looks = looks[:-1]  # it may be half a picture
         notes = [f"the file is cut off or damaged after {video.seconds:.1f} s; what comes before is used"]
     if not looks:
         raise InputError(f"cannot read {source}: no frame can be decoded", hint=DAMAGED)
-    choice = choose(looks, most)
+    choice = select_keyframes(looks, most)
     if len(choice.frames) < 2:
         why = "the camera does not move" if follower.seen else "there is hardly any texture to follow"
         raise InputError(f"{why} in {source}: {video.frames} frames, and all show one view", hint=HINT)
@@ -103,22 +103,22 @@ def chosen_from(source: Path, run: RunContext) -> Chosen:
         "left_out": choice.left_out | ({BLACK: video.black} if video.black else {}),
         "notes": notes,
     }
-    return Chosen(run.fingerprint, choice.frames, counts)
+    return FrameChoice(run.fingerprint, choice.frames, counts)
 
 
 def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None:
     """Write the frames that are not there yet."""
     for half in run.workspace.frames.glob(".*"):  # incomplete files of a killed run
         half.unlink()
-    places = {frame: run.workspace.frames / f"{stem_of(source)}_{frame:06d}.jpg" for frame in frames}
+    places = {frame: run.workspace.frames / f"{frame_stem(source)}_{frame:06d}.jpg" for frame in frames}
     missing = [frame for frame, place in places.items() if not place.exists()]
     if not missing:
         return
     written = 0
     try:
-        with opened(source) as video:
+        with open_video(source) as video:
             for frame, data in track(run.progress, video.jpegs(missing), "writing frames", len(missing)):
-                with replacing(places[frame]) as path:
+                with replace_atomically(places[frame]) as path:
                     path.write_bytes(data)
                 written += 1
     except UnreadableError as err:
@@ -127,7 +127,7 @@ def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> Non
         raise InputError(f"{source} has changed while it was read", hint="run again once it is restored")
 
 
-def stem_of(source: Path) -> str:
+def frame_stem(source: Path) -> str:
     """Return the stem of the names of a video's frames: short, printable and not hidden."""
     printable = "".join(c if c.isprintable() else "_" for c in source.stem)
     return printable.lstrip(".")[:LONGEST_STEM] or "frame"

@@ -4,9 +4,9 @@ import shutil
 
 import numpy as np
 
-from sfm_app.atomic_io import replacing
-from sfm_app.estimation.diagnosis import why_no_scene
-from sfm_app.estimation.fitting import fit_pairs, graph_of
+from sfm_app.atomic_io import replace_atomically
+from sfm_app.estimation.diagnosis import diagnose_scene
+from sfm_app.estimation.fitting import fit_pairs, to_view_graph
 from sfm_app.hashing import digest_files, load_arrays
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
@@ -24,7 +24,7 @@ def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
         ReconstructionError: no pair has a usable epipolar geometry.
     """
     found = fit_pairs(matches, list(matches.matches), run)
-    graph = graph_of(found)
+    graph = to_view_graph(found)
     run.record(
         kept=len(graph.fits),
         rejected=graph.reasons,
@@ -33,8 +33,8 @@ def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
         stationary=sum(count for _, count in found.values()),
     )
     if not graph.fits:
-        raise why_no_scene(matches, graph, run.settings.matching).error()
-    with replacing(run.workspace.view_graph) as path:
+        raise diagnose_scene(matches, graph, run.settings.matching).error()
+    with replace_atomically(run.workspace.view_graph) as path:
         np.savez_compressed(path, allow_pickle=False, **graph.to_arrays())
     shutil.rmtree(run.workspace.view_graph_parts)
     return graph

@@ -67,7 +67,7 @@ def _merge(
                     support[row, col] = members
 
 
-def count_agreeing(
+def count_confirming_maps(
     view: View, depth: DepthArray, others: Sequence[tuple[View, DepthArray]], tolerance: float
 ) -> NDArray[np.uint8]:
     """Count the other depth maps that confirm each depth of a view, (H, W).
@@ -89,7 +89,7 @@ def count_agreeing(
     return agreeing
 
 
-def without_specks(depth: DepthArray, tolerance: float) -> DepthArray:
+def filter_speckles(depth: DepthArray, tolerance: float) -> DepthArray:
     """Remove small patches in which depths differ by less than the tolerance from pixel to pixel.
 
     Args:

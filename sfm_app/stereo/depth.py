@@ -7,25 +7,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.stereo.consistency import count_agreeing, merge_hypotheses, without_specks
-from sfm_app.stereo.edge_fattening import rims, without_spill
+from sfm_app.stereo.consistency import count_confirming_maps, filter_speckles, merge_hypotheses
+from sfm_app.stereo.edge_fattening import remove_spill, rim_mask
 from sfm_app.stereo.matching import depths_from_disparities, disparities
-from sfm_app.stereo.normals import fit_planes, normals_of
+from sfm_app.stereo.normals import fit_planes, plane_normals
 from sfm_app.stereo.patch_match import NO_MATCH, PlaneArray, improve_planes
-from sfm_app.stereo.planar_fill import bridge_even_areas
+from sfm_app.stereo.planar_fill import fill_planar_areas
 from sfm_app.stereo.rectify import rectify
-from sfm_app.stereo.textureless import without_surface
+from sfm_app.stereo.textureless import surfaceless_areas
 from sfm_app.stereo.view import DepthArray, GrayImage, View
 from sfm_app.types import Rejected
 
 SWEEPS = 1
 """The second improves a hundredth of the pixels and takes as long as the first."""
-WEAK = 0.3
+WEAK_CORRELATION = 0.3
 """Correlation below which there is hardly any texture: in skies depths agree only by chance, and on plain walls
 semi-global matching interpolates between the windows in the same way in every photo."""
-WEAK_NEED = 3
+WEAK_EXTRA_MAPS = 3
 """Additional depth maps that have to agree at such a correlation; with too few maps, the depth is dropped."""
-UNSURE = 0.5
+UNSURE_CORRELATION = 0.5
 """Correlation below which one more depth map has to agree."""
 
 CLIPPED_GRAY = 4
@@ -84,26 +84,26 @@ def match_depths(
     if not found:
         return Rejected(reason)
     depth, _ = merge_hypotheses(np.stack([d for d, _ in found]), np.stack([p for _, p in found]), tolerance)
-    planes = _started(depth)
+    planes = _initial_planes(depth)
     cost = improve_planes(planes, centered, image, used, SWEEPS)
-    cost[clipped(image)] = NO_MATCH
-    return _sampled(planes, cost, view.sample_px)
+    cost[clipped_mask(image)] = NO_MATCH
+    return _sample_planes(planes, cost, view.sample_px)
 
 
-def clipped(image: GrayImage) -> NDArray[np.bool_]:
+def clipped_mask(image: GrayImage) -> NDArray[np.bool_]:
     """Return (H, W) whether the 3x3 mean around a pixel is nearly black or white."""
     around = cv2.blur(image, (3, 3))
     return np.asarray((around <= CLIPPED_GRAY) | (around >= 255 - CLIPPED_GRAY))
 
 
-def _started(depth: DepthArray) -> PlaneArray:
+def _initial_planes(depth: DepthArray) -> PlaneArray:
     """Return planes with the exact depth of each pixel and the slopes fitted to its surroundings."""
     planes = fit_planes(depth)
     planes[..., 0] = np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
     return planes
 
 
-def _sampled(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) -> DepthEstimate:
+def _sample_planes(planes: PlaneArray, cost: NDArray[np.float32], sample_px: float) -> DepthEstimate:
     """Sample depths and confidences at the position inside the pixel that a view asks for."""
     shift = np.float32(sample_px - 0.5)
     inverse = planes[..., 0] + shift * (planes[..., 1] + planes[..., 2])
@@ -135,17 +135,17 @@ def confirm_depths(
     """
     if not others:
         return Rejected("no other depth map to compare with")
-    agreeing = count_agreeing(view, estimate.depth, others, tolerance)
+    agreeing = count_confirming_maps(view, estimate.depth, others, tolerance)
     confidence = estimate.confidence
     least, more = (min(need, len(others)) for need in (min_agreeing, min_agreeing + 1))
-    enough = np.where(confidence < UNSURE, more, least)
-    enough[confidence < WEAK] = min_agreeing + WEAK_NEED
+    enough = np.where(confidence < UNSURE_CORRELATION, more, least)
+    enough[confidence < WEAK_CORRELATION] = min_agreeing + WEAK_EXTRA_MAPS
     sound = (estimate.depth > 0) & (agreeing >= enough)
-    confirmed = np.where(sound & ~without_surface(confidence, sound), estimate.depth, np.float32(0))
-    doubtful = rims(confirmed > 0) & (agreeing < more)
-    confirmed = without_specks(without_spill(np.where(doubtful, np.float32(0), confirmed), image), tolerance)
-    planes = fit_planes(bridge_even_areas(confirmed, image, tolerance))
+    confirmed = np.where(sound & ~surfaceless_areas(confidence, sound), estimate.depth, np.float32(0))
+    doubtful = rim_mask(confirmed > 0) & (agreeing < more)
+    confirmed = filter_speckles(remove_spill(np.where(doubtful, np.float32(0), confirmed), image), tolerance)
+    planes = fit_planes(fill_planar_areas(confirmed, image, tolerance))
     if not planes.any():
         return Rejected("no depth is confirmed by other photos")
     depth = np.divide(1, planes[..., 0], out=np.zeros_like(confirmed), where=planes[..., 0] > 0)
-    return DepthMap(depth, normals_of(planes, view))
+    return DepthMap(depth, plane_normals(planes, view))

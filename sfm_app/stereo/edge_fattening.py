@@ -14,15 +14,15 @@ SURROUNDINGS_PX = 4 * REACH_PX + 1
 """Side of the square around a pixel that is compared with it: pixels with a depth, and pixels without one."""
 NOISE_GRAY = 3.0
 """Smallest standard deviation of gray levels: sensor noise and compression artifacts."""
-ODDS = 8.0
+MIN_ODDS = 8.0
 """Smallest likelihood ratio of a pixel's gray, pixels without a depth over pixels with one, that removes its depth."""
 LEAST_PX = 5
 """Fewest pixels that determine the gray distribution of the surroundings."""
-ANY_GRAY = 0.5 * np.log(2.0 * np.pi) - np.log(256.0)
+UNIFORM_LOG_LIKELIHOOD = 0.5 * np.log(2.0 * np.pi) - np.log(256.0)
 """Log likelihood of a gray under the uniform distribution, for objects so thin that they consist of rim only."""
 
 
-def without_spill(depth: DepthArray, image: GrayImage) -> DepthArray:
+def remove_spill(depth: DepthArray, image: GrayImage) -> DepthArray:
     """Remove rim depths whose gray resembles the empty side rather than the surface that they extend.
 
     Skies and plain backgrounds have no depth of their own, but a correlation window that reaches an object in front
@@ -36,20 +36,20 @@ def without_spill(depth: DepthArray, image: GrayImage) -> DepthArray:
         image: (H, W).
     """
     known = depth > 0
-    empty, rim = _broad(~known), rims(known)
+    empty, rim = _broad_areas(~known), rim_mask(known)
     gray = image.astype(np.float32)
     thing = _log_likelihood(gray, known & ~rim)
-    spilt = _log_likelihood(gray, empty) > np.where(np.isnan(thing), ANY_GRAY, thing) + np.log(ODDS)
+    spilt = _log_likelihood(gray, empty) > np.where(np.isnan(thing), UNIFORM_LOG_LIKELIHOOD, thing) + np.log(MIN_ODDS)
     return np.where(spilt & rim, np.float32(0), depth)
 
 
-def rims(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def rim_mask(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mark pixels with a depth within `REACH_PX` of a gap that is broader than two rims, (H, W)."""
-    away = cv2.distanceTransform(1 - _broad(~known).view(np.uint8), cv2.DIST_L2, 3)
+    away = cv2.distanceTransform(1 - _broad_areas(~known).view(np.uint8), cv2.DIST_L2, 3)
     return np.asarray(known & (away <= REACH_PX))
 
 
-def _broad(empty: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _broad_areas(empty: NDArray[np.bool_]) -> NDArray[np.bool_]:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * REACH_PX + 1, 2 * REACH_PX + 1))
     return np.asarray(cv2.morphologyEx(empty.view(np.uint8), cv2.MORPH_OPEN, disc)).view(np.bool_)
 

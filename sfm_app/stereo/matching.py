@@ -97,7 +97,7 @@ def _lift(
             theta = np.arctan2(across, a)
             u = (theta_max - theta) * columns_per_rad + margin - 0.5
             v = (np.arctan2(b, c) - phi_min) * rows_per_rad - 0.5
-            d = _interpolated(disparity, u, v)
+            d = _interpolate(disparity, u, v)
             if d < 0 or d + offset <= 0:
                 continue
             angle = (d + offset) / columns_per_rad
@@ -121,7 +121,7 @@ def _lift(
 
 
 @kernel
-def _interpolated(disparity: NDArray[np.float32], u: float, v: float) -> float:
+def _interpolate(disparity: NDArray[np.float32], u: float, v: float) -> float:
     """Return the bilinear value where the surface is continuous, else the nearest one; -1 where there is none."""
     height, width = disparity.shape
     i, j = int(np.floor(v)), int(np.floor(u))

@@ -9,7 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.numerical import FAILURES, reason_of
+from sfm_app.numerical import FAILURES, error_reason
 from sfm_app.settings import DepthSettings
 from sfm_app.stereo.depth import DepthEstimate, DepthMap, confirm_depths, match_depths
 from sfm_app.stereo.view import GrayImage, View
@@ -53,7 +53,7 @@ class DepthStore(Protocol):
         """
 
 
-class Map(Protocol):
+class ParallelMap(Protocol):
     """Applies a function to items in parallel and returns the results in order; a label names the progress."""
 
     def __call__(
@@ -72,10 +72,10 @@ class DepthTask:
     """For each view, the indices of its neighbors, best first."""
     options: DepthSettings
     store: DepthStore
-    map: Map
+    map: ParallelMap
 
 
-def make_on_cpu(task: DepthTask) -> list[Rejected | None]:
+def make_depth_maps_on_cpu(task: DepthTask) -> list[Rejected | None]:
     """Match every photo with its neighbors, then keep what the depth maps of other photos confirm.
 
     Returns:
@@ -97,7 +97,7 @@ def _match(index: int, task: DepthTask) -> Rejected | None:
     try:
         found = match_depths(view, candidates, task.store.photo, task.options.neighbors, task.options.consistency)
     except FAILURES as err:
-        return Rejected(f"the computation failed: {reason_of(err)}")
+        return Rejected(f"the computation failed: {error_reason(err)}")
     if isinstance(found, Rejected):
         return found
     task.store.write_estimate(view, found)
@@ -118,7 +118,7 @@ def _confirm(index: int, task: DepthTask, usable: NDArray[np.bool_]) -> Rejected
     try:
         found = confirm_depths(view, photo, estimate, others, options.min_agreeing, options.consistency)
     except FAILURES as err:
-        return Rejected(f"the computation failed: {reason_of(err)}")
+        return Rejected(f"the computation failed: {error_reason(err)}")
     if isinstance(found, Rejected):
         return found
     task.store.write_maps(view, found)

@@ -31,7 +31,7 @@ def fit_planes(depth: DepthArray) -> PlaneArray:
     return planes
 
 
-def normals_of(planes: PlaneArray, view: View) -> NDArray[np.float32]:
+def plane_normals(planes: PlaneArray, view: View) -> NDArray[np.float32]:
     """Return (H, W, 3) unit normals in the camera frame that point to the camera; 0 where the inverse depth is 0.
 
     Args:

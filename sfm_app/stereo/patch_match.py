@@ -112,14 +112,14 @@ def _sweep(
                 slopes = abs(trial[1] - best[1]) + abs(trial[2] - best[2])
                 if abs(trial[0] - best[0]) < SAME_PX * unit and slopes < SAME_SLOPE * unit:
                     continue
-                lowest = _better(row, col, trial, best, lowest, window, others, costs)
+                lowest = _try_plane(row, col, trial, best, lowest, window, others, costs)
             if lowest < NO_MATCH:
                 unit = _inverse_depth_per_px(row, col, best[0], others[3])
                 for c in range(3):
                     state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
                     number = 2.0 * (np.float64(state >> np.uint64(11)) / 9007199254740992.0) - 1.0  # in [-1, 1)
                     trial[c] = best[c] + number * STEP_PX * unit * (1.0 if c == 0 else SLOPE)
-                lowest = _better(row, col, trial, best, lowest, window, others, costs)
+                lowest = _try_plane(row, col, trial, best, lowest, window, others, costs)
             for c in range(3):
                 planes[row, col, c] = best[c]
             cost[row, col] = lowest
@@ -165,7 +165,7 @@ def _inverse_depth_per_px(row: int, col: int, q: float, projections: FloatArray)
 
 
 @kernel
-def _better(
+def _try_plane(
     row: int, col: int, trial: FloatArray, best: FloatArray, lowest: float, window: Any, others: Any, costs: FloatArray
 ) -> float:
     """Replace the best plane if the trial costs less by `MIN_GAIN`; return the lowest cost."""

@@ -28,7 +28,7 @@ MAX_BEND = 0.3
 """Largest root mean square of the cells' mean residuals, in tolerances."""
 
 
-def bridge_even_areas(depth: DepthArray, image: GrayImage, tolerance: float) -> DepthArray:
+def fill_planar_areas(depth: DepthArray, image: GrayImage, tolerance: float) -> DepthArray:
     """Replace depths in areas of uniform color by planes, within the convex hull of the known depths.
 
     Args:
@@ -40,23 +40,23 @@ def bridge_even_areas(depth: DepthArray, image: GrayImage, tolerance: float) -> 
         (H, W) depth, unchanged in other areas.
     """
     bridged = depth.copy()
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(_even(image).view(np.uint8), connectivity=4)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(_uniform_mask(image).view(np.uint8), connectivity=4)
     for label in range(1, len(stats)):
         left, top, width, height, area = stats[label]
         if area < MIN_AREA * image.size:
             continue
         box = np.s_[top : top + height, left : left + width]
-        _bridge(bridged[box], labels[box] == label, tolerance)
+        _fill_area(bridged[box], labels[box] == label, tolerance)
     return bridged
 
 
-def _even(image: GrayImage) -> NDArray[np.bool_]:
+def _uniform_mask(image: GrayImage) -> NDArray[np.bool_]:
     smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR_PX)
     slope = np.hypot(cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125))
     return np.asarray(slope < MAX_SLOPE)
 
 
-def _bridge(depth: DepthArray, area: NDArray[np.bool_], tolerance: float) -> None:
+def _fill_area(depth: DepthArray, area: NDArray[np.bool_], tolerance: float) -> None:
     """Replace the depths of an area, in its bounding box, if they lie on a plane."""
     known = area & (depth > 0)
     if np.count_nonzero(known) < max(MIN_KNOWN * np.count_nonzero(area), CELL_PIXELS):

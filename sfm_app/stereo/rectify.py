@@ -21,7 +21,7 @@ DISPARITY_STEP = 16
 MIN_POINTS = 5
 MARGIN_PX = 4.0
 """Disparities searched beyond those of the sparse points, at either end."""
-NEARER = 2.0
+NEAR_FACTOR = 2.0
 """Largest triangulation angle searched, relative to the nearest sparse points: near surfaces lack features."""
 BORDER_SAMPLES = 33
 
@@ -156,7 +156,7 @@ def _angle_range(angles: FloatArray, room: float) -> tuple[float, float]:
     low, high = np.percentile(angles, [1, 99])
     margin = 0.15 * (high - low) + 0.02 * high
     far = max(low - margin, 0.25 * low)
-    return float(max(high + margin, min(NEARER * high, far + room))), float(far)
+    return float(max(high + margin, min(NEAR_FACTOR * high, far + room))), float(far)
 
 
 def _bounds(rotation: FloatArray, view: View) -> FloatArray:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-BLANK = 0.1
+BLANK_CORRELATION = 0.1
 """Correlation below which photos are unrelated; noise alone reaches half of it."""
 SPECK_PX = 5
 """Side of the square for majority voting, because noise correlates by chance in places."""
@@ -16,14 +16,14 @@ MIN_SHARE = 0.03
 """Other photos confirm a twelfth or more of a wall, but at most a hundredth of a sky."""
 
 
-def without_surface(confidence: NDArray[np.float32], confirmed: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def surfaceless_areas(confidence: NDArray[np.float32], confirmed: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mark blank areas of which almost nothing is confirmed, (H, W).
 
     Args:
         confidence: (H, W) in [0, 1], 0 where there is no depth.
         confirmed: (H, W) whether enough other photos confirm the depth.
     """
-    blank = cv2.medianBlur((confidence < BLANK).view(np.uint8), SPECK_PX)
+    blank = cv2.medianBlur((confidence < BLANK_CORRELATION).view(np.uint8), SPECK_PX)
     count, areas = cv2.connectedComponents(blank, connectivity=4)
     size = np.maximum(np.bincount(areas.ravel(), minlength=count), 1)
     share = np.bincount(areas.ravel(), confirmed.ravel(), count) / size

@@ -37,7 +37,7 @@ class Views:
     """By photo name: (3, 4) [R | t]."""
 
     @classmethod
-    def of(cls, camera: Camera, poses: Sequence[FloatArray]) -> "Views":
+    def from_poses(cls, camera: Camera, poses: Sequence[FloatArray]) -> "Views":
         """Return photos of one camera at several poses, named view_00.jpg and so on.
 
         Args:
@@ -47,7 +47,7 @@ class Views:
         named = {f"view_{k:02d}.jpg": pose for k, pose in enumerate(poses)}
         return cls(dict.fromkeys(named, camera), named)
 
-    def taken_with(self, camera: Camera, photos: Collection[str]) -> "Views":
+    def with_camera(self, camera: Camera, photos: Collection[str]) -> "Views":
         """Return the views with another camera for some photos.
 
         Args:
@@ -140,17 +140,17 @@ def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Vie
     count = options.photos
     # stratified, so that few photos already spread over the whole range
     azimuth = np.radians(options.sweep_deg) * (np.arange(count) / (count - 1) - 0.5)
-    distance = _spread(options.distance, count, rng)
-    height = _spread(options.height, count, rng)
-    roll_deg = _spread((-options.roll_deg, options.roll_deg), count, rng)
+    distance = _stratified_samples(options.distance, count, rng)
+    height = _stratified_samples(options.height, count, rng)
+    roll_deg = _stratified_samples((-options.roll_deg, options.roll_deg), count, rng)
     aims = np.array(options.aim) + rng.uniform(-1.0, 1.0, (count, 3)) * options.aim_spread
     centers = np.column_stack([distance * np.sin(azimuth), height, distance * np.cos(azimuth)])
     poses = [look_at(center, aim, roll) for center, aim, roll in zip(centers, aims, roll_deg, strict=True)]
-    return Views.of(camera, poses)
+    return Views.from_poses(camera, poses)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PastOptions:
+class WallWalkOptions:
     """A hand-held walk along a wall that faces +z, each photo turned towards the middle by a random amount.
 
     Raises:
@@ -175,7 +175,7 @@ class PastOptions:
             raise ConfigError("synthetic cameras: photos, length or roll_deg is out of range")
 
 
-def past(camera: Camera, options: PastOptions | None = None, seed: int = 0) -> Views:
+def wall_walk(camera: Camera, options: WallWalkOptions | None = None, seed: int = 0) -> Views:
     """Return hand-held photos along a wall in the plane z = 0, from left to right, named view_00.jpg and so on.
 
     Args:
@@ -183,15 +183,19 @@ def past(camera: Camera, options: PastOptions | None = None, seed: int = 0) -> V
         options: the walk; the default one if None.
         seed: same seed, same poses.
     """
-    options = options or PastOptions()
+    options = options or WallWalkOptions()
     rng = np.random.default_rng([seed, 13])
     count = options.photos
     x = options.length * (np.arange(count) / (count - 1) - 0.5)
-    centers = np.column_stack([x, _spread(options.height, count, rng), _spread(options.distance, count, rng)])
+    centers = np.column_stack(
+        [x, _stratified_samples(options.height, count, rng), _stratified_samples(options.distance, count, rng)]
+    )
     # parallel axes would leave the focal length undetermined
-    aims = np.column_stack([x * _spread((0.2, 0.9), count, rng), _spread(options.aim, count, rng), np.zeros(count)])
-    roll_deg = _spread((-options.roll_deg, options.roll_deg), count, rng)
-    return Views.of(camera, [look_at(c, a, roll) for c, a, roll in zip(centers, aims, roll_deg, strict=True)])
+    aims = np.column_stack(
+        [x * _stratified_samples((0.2, 0.9), count, rng), _stratified_samples(options.aim, count, rng), np.zeros(count)]
+    )
+    roll_deg = _stratified_samples((-options.roll_deg, options.roll_deg), count, rng)
+    return Views.from_poses(camera, [look_at(c, a, roll) for c, a, roll in zip(centers, aims, roll_deg, strict=True)])
 
 
 def orbit(
@@ -222,7 +226,7 @@ def orbit(
     azimuth = np.radians(sweep_deg) * ((np.arange(photos) + 0.5) / photos - 0.5)
     around = np.column_stack([np.sin(azimuth), np.zeros(photos), np.cos(azimuth)])
     middle = np.array(aim)
-    return Views.of(camera, [look_at(middle + distance * way, middle) for way in around])
+    return Views.from_poses(camera, [look_at(middle + distance * way, middle) for way in around])
 
 
 def panorama(
@@ -239,7 +243,7 @@ def panorama(
     azimuth = np.radians(step_deg) * (np.arange(photos) - (photos - 1) / 2)
     tilt, roll_deg = 0.05 * np.cos(np.pi * np.arange(photos)), 3.0 * np.sin(2.0 * np.arange(photos))
     spot, ways = np.array(center), np.column_stack([np.sin(azimuth), tilt, -np.cos(azimuth)])
-    return Views.of(camera, [look_at(spot, spot + way, roll) for way, roll in zip(ways, roll_deg, strict=True)])
+    return Views.from_poses(camera, [look_at(spot, spot + way, roll) for way, roll in zip(ways, roll_deg, strict=True)])
 
 
 def look_at(center: FloatArray, aim: FloatArray, roll_deg: float = 0.0) -> FloatArray:
@@ -296,11 +300,11 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
     x, y = np.meshgrid(np.arange(camera.width) + offset_px[0], np.arange(camera.height) + offset_px[1])
     x = (x.ravel() - camera.K[0, 2]) / camera.K[0, 0]
     y = (y.ravel() - camera.K[1, 2]) / camera.K[1, 1]
-    stretch = _undistorted_over_distorted(np.hypot(x, y), camera.radial)
+    stretch = _undistortion_factor(np.hypot(x, y), camera.radial)
     return np.column_stack([x * stretch, y * stretch, np.ones(x.size)])
 
 
-def _undistorted_over_distorted(distorted: FloatArray, k1: float) -> FloatArray:
+def _undistortion_factor(distorted: FloatArray, k1: float) -> FloatArray:
     """Return r / d where r (1 + k1 r^2) = d, on the branch through the center."""
     # for k1 < 0 the left side rises up to r^2 = -1 / (3 k1), where it is 2 r / 3, and then falls
     if k1 < 0 and distorted.max(initial=0.0) >= 2.0 / 3.0 / math.sqrt(-3.0 * k1):
@@ -315,7 +319,7 @@ def _undistorted_over_distorted(distorted: FloatArray, k1: float) -> FloatArray:
     return np.divide(r, distorted, out=np.ones_like(r), where=distorted > 0)
 
 
-def _spread(limits: tuple[float, float], count: int, rng: np.random.Generator) -> FloatArray:
+def _stratified_samples(limits: tuple[float, float], count: int, rng: np.random.Generator) -> FloatArray:
     steps = (rng.permutation(count) + rng.uniform(0.2, 0.8, count)) / count
     return np.asarray(limits[0] + (limits[1] - limits[0]) * steps)
 

@@ -9,7 +9,7 @@ from sfm_app.geometry.similarity import Similarity, robust_similarity
 from sfm_app.meshing.open3d import load_open3d
 from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
 from sfm_app.synthetic.photo_folder import Truth
-from sfm_app.synthetic.render import cast, ray_caster
+from sfm_app.synthetic.render import cast_rays, ray_caster
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -119,7 +119,7 @@ def surface_coverage(
         ValueError: as for `surface_error`.
     """
     aligned = align_centers(centers, truth)(vertices)
-    if not _area(aligned, faces).sum() > 0:
+    if not _triangle_areas(aligned, faces).sum() > 0:
         raise ValueError("the surface has no area")
     return float(np.mean(surface_distances(seen_points(truth), aligned, faces) <= tolerance * scene_size(truth)))
 
@@ -134,8 +134,8 @@ def seen_points(truth: Truth) -> FloatArray:
     caster = ray_caster(truth.vertices, truth.faces)
     found = []
     for name, pose in truth.cam_from_world.items():
-        directions = pixel_rays(_coarse(truth.cameras[name])) @ pose[:, :3]
-        depth = cast(caster, camera_center(pose), directions)["t_hit"].astype(np.float64)
+        directions = pixel_rays(_coarse_camera(truth.cameras[name])) @ pose[:, :3]
+        depth = cast_rays(caster, camera_center(pose), directions)["t_hit"].astype(np.float64)
         hit = np.isfinite(depth)
         found.append(camera_center(pose) + directions[hit] * depth[hit, None])
     return np.concatenate(found)
@@ -186,7 +186,7 @@ def sample_triangles(
         count: points to draw.
         seed: same seed, same points.
     """
-    area = _area(vertices, faces)
+    area = _triangle_areas(vertices, faces)
     if not area.sum() > 0:
         raise ValueError("the surface has no area")
     rng = np.random.default_rng(seed)
@@ -223,13 +223,13 @@ def _distances_to_truth(
     return surface_distances(points, truth.vertices, truth.faces) / scene_size(truth)
 
 
-def _coarse(camera: Camera) -> Camera:
+def _coarse_camera(camera: Camera) -> Camera:
     shrink = SEEN_RAYS / max(camera.width, camera.height)
     K = np.diag([shrink, shrink, 1.0]) @ camera.K
     return Camera(K, round(camera.width * shrink), round(camera.height * shrink), camera.radial)
 
 
-def _area(vertices: FloatArray, faces: IndexArray) -> FloatArray:
+def _triangle_areas(vertices: FloatArray, faces: IndexArray) -> FloatArray:
     corners = vertices[faces]
     return np.asarray(
         0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)

@@ -187,10 +187,10 @@ def make_pair(options: PairOptions, seed: int) -> TwoViews:
     for _ in range(MAX_SETUPS):
         R = random_rotation(rng, options.max_rotation_deg)
         # the minimum baseline keeps the motion away from a pure rotation
-        center = _direction(rng) * options.max_baseline * rng.uniform(0.1, 1.0)
+        center = _random_direction(rng) * options.max_baseline * rng.uniform(0.1, 1.0)
         poses = (np.stack([np.eye(3), R]), np.stack([np.zeros(3), -R @ center]))
         Ks = np.stack([K, K])
-        if _converges(Ks, poses, size, rng):
+        if _is_convergent(Ks, poses, size, rng):
             exact = _project(Ks, poses, _visible_points(Ks, poses, size, options.points, rng))
             noisy = exact + rng.normal(scale=options.sigma_px, size=exact.shape)
             wrong = (options.outliers, options.outlier_range_px)
@@ -215,9 +215,9 @@ def make_tracks(options: TrackOptions, seed: int) -> Tracks:
     for _ in range(MAX_SETUPS):
         Ks = _random_intrinsics(options, rng)
         R = np.stack([random_rotation(rng, options.max_rotation_deg) for _ in range(options.cameras)])
-        centers = np.stack([_direction(rng) * options.max_shift * rng.uniform() for _ in range(options.cameras)])
+        centers = np.stack([_random_direction(rng) * options.max_shift * rng.uniform() for _ in range(options.cameras)])
         poses = (R, -np.einsum("cij,cj->ci", R, centers))
-        if _converges(Ks, poses, size, rng):
+        if _is_convergent(Ks, poses, size, rng):
             return _tracks(options, Ks, poses, rng)
     raise ConfigError("no random cameras see the same points", hint="lower max_rotation_deg or max_shift")
 
@@ -259,7 +259,7 @@ def random_rotation(rng: np.random.Generator, max_angle_deg: float) -> FloatArra
         rng: random generator.
         max_angle_deg: degrees, >= 0.
     """
-    return axis_rotation(_direction(rng), rng.uniform(0.0, max_angle_deg))
+    return axis_rotation(_random_direction(rng), rng.uniform(0.0, max_angle_deg))
 
 
 def _tracks(options: TrackOptions, Ks: FloatArray, poses: Poses, rng: np.random.Generator) -> Tracks:
@@ -314,9 +314,9 @@ def _with_outliers(
     return moved, is_inlier
 
 
-def _converges(Ks: FloatArray, poses: Poses, size: tuple[int, int], rng: np.random.Generator) -> bool:
+def _is_convergent(Ks: FloatArray, poses: Poses, size: tuple[int, int], rng: np.random.Generator) -> bool:
     drawn = next(_candidates(Ks, poses, size, rng))
-    return bool(np.mean(_in_all_views(Ks, poses, size, drawn)) >= MIN_OVERLAP)
+    return bool(np.mean(_is_in_all_views(Ks, poses, size, drawn)) >= MIN_OVERLAP)
 
 
 def _visible_points(
@@ -324,7 +324,7 @@ def _visible_points(
 ) -> FloatArray:
     found: list[FloatArray] = []
     for drawn in _candidates(Ks, poses, size, rng):
-        found.append(drawn[_in_all_views(Ks, poses, size, drawn)])
+        found.append(drawn[_is_in_all_views(Ks, poses, size, drawn)])
         if sum(map(len, found)) >= count:
             break
     return np.concatenate(found)[:count]
@@ -339,7 +339,7 @@ def _candidates(Ks: FloatArray, poses: Poses, size: tuple[int, int], rng: np.ran
         yield (rays * depth - poses[1][0]) @ poses[0][0]
 
 
-def _in_all_views(Ks: FloatArray, poses: Poses, size: tuple[int, int], X: FloatArray) -> NDArray[np.bool_]:
+def _is_in_all_views(Ks: FloatArray, poses: Poses, size: tuple[int, int], X: FloatArray) -> NDArray[np.bool_]:
     camera = np.einsum("cij,nj->cni", poses[0], X) + poses[1][:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         x = _project(Ks, poses, X)
@@ -354,7 +354,7 @@ def _project(Ks: FloatArray, poses: Poses, X: FloatArray) -> FloatArray:
     return np.asarray(h[..., :2] / h[..., 2:])
 
 
-def _direction(rng: np.random.Generator) -> FloatArray:
+def _random_direction(rng: np.random.Generator) -> FloatArray:
     v = rng.normal(size=3)
     return np.asarray(v / np.linalg.norm(v))
 

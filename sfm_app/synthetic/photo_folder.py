@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from sfm_app.errors import ConfigError, InputError
-from sfm_app.progress import Progress, Silent, track
+from sfm_app.progress import Progress, SilentProgress, track
 from sfm_app.synthetic.cameras import Camera, Views, camera_center
 from sfm_app.synthetic.render import GAMMA, prepare, render_scene
 from sfm_app.synthetic.scenes.bodies import SyntheticScene
@@ -74,7 +74,7 @@ class Truth:
             ValueError: there are several.
         """
         first, *others = self.cameras.values()
-        if any(_values(camera) != _values(first) for camera in others):
+        if any(_camera_values(camera) != _camera_values(first) for camera in others):
             raise ValueError("the photos were taken with several cameras")
         return first
 
@@ -115,7 +115,7 @@ def write_photo_folder(
     poses = list(enumerate(views.cam_from_world.items()))
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for k, (name, pose) in track(progress or Silent(), poses, "rendering photos", len(poses)):
+        for k, (name, pose) in track(progress or SilentProgress(), poses, "rendering photos", len(poses)):
             image = render_scene(prepared, views.cameras[name], pose, options.supersampling)
             photo = develop(image, options, np.random.default_rng([options.seed, k, 255]))
             Image.fromarray(photo).save(folder / name, format="JPEG", quality=options.quality)
@@ -148,7 +148,7 @@ def save_truth(truth: Truth, folder: Path) -> None:
     """
     images = []
     for name, pose in truth.cam_from_world.items():
-        width, height, K, radial = _values(truth.cameras[name])
+        width, height, K, radial = _camera_values(truth.cameras[name])
         images.append(
             {
                 "file": name,
@@ -168,7 +168,7 @@ def save_truth(truth: Truth, folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / TRUTH_FILE).write_text(json.dumps(text, indent=1), encoding="utf-8")
-        (folder / SURFACE_FILE).write_bytes(_ply(truth.vertices, truth.faces))
+        (folder / SURFACE_FILE).write_bytes(_to_ply(truth.vertices, truth.faces))
     except OSError as err:
         raise InputError(f"cannot write the truth to {folder}: {err}", hint="choose another folder") from err
 
@@ -184,7 +184,7 @@ def load_truth(folder: Path) -> Truth:
         images = text["images"]
         vertices, faces = _from_ply((folder / SURFACE_FILE).read_bytes())
         return Truth(
-            cameras={i["file"]: _camera(i) for i in images},
+            cameras={i["file"]: _camera_from_dict(i) for i in images},
             cam_from_world={i["file"]: np.column_stack([i["R"], i["t"]]) for i in images},
             vertices=vertices,
             faces=faces,
@@ -193,11 +193,11 @@ def load_truth(folder: Path) -> Truth:
         raise InputError(f"no truth in {folder}: {err}", hint="it holds truth.json and surface.ply") from err
 
 
-def _values(camera: Camera) -> tuple[int, int, list[list[float]], float]:
+def _camera_values(camera: Camera) -> tuple[int, int, list[list[float]], float]:
     return camera.width, camera.height, camera.K.tolist(), camera.radial
 
 
-def _camera(image: Mapping[str, Any]) -> Camera:
+def _camera_from_dict(image: Mapping[str, Any]) -> Camera:
     K = np.array(image["K"], dtype=np.float64)
     return Camera(K, int(image["width"]), int(image["height"]), float(image["radial"]))
 
@@ -205,7 +205,7 @@ def _camera(image: Mapping[str, Any]) -> Camera:
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
 
 
-def _ply(vertices: FloatArray, faces: NDArray[np.int64]) -> bytes:
+def _to_ply(vertices: FloatArray, faces: NDArray[np.int64]) -> bytes:
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(vertices)}\nproperty double x\nproperty double y\nproperty double z\n"

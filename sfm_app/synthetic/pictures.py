@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.synthetic.cameras import Camera, camera_center, pixel_rays
-from sfm_app.synthetic.render import cast, ray_caster
+from sfm_app.synthetic.render import cast_rays, ray_caster
 from sfm_app.types import Surface
 from sfm_app.types.model import Model, Texture
 
@@ -21,9 +21,9 @@ AMBIENT = 0.25
 """Ambient light on the untextured shape, 0..1."""
 LAMP = np.array([-0.45, -0.65, -1.0]) / np.linalg.norm([-0.45, -0.65, -1.0])
 """Direction from a face to the lamp, in the camera's frame: over the photographer's left shoulder."""
-ASIDE_DEG = 25.0
+SIDE_VIEW_DEG = 25.0
 """Angle between the view of the photo and the side view."""
-OVER = 2
+SUPERSAMPLING = 2
 """Supersampling factor, in x and in y, of the pictures next to a photo."""
 
 
@@ -45,7 +45,7 @@ class Picture:
     covered: BoolArray
     """(H, W), whether the model is visible."""
 
-    def on(self, background: tuple[int, int, int] = (255, 255, 255)) -> Colors:
+    def with_background(self, background: tuple[int, int, int] = (255, 255, 255)) -> Colors:
         """Return (H, W, 3) with a background color where the model is not visible."""
         return np.where(self.covered[..., None], self.colors, np.array(background, np.uint8))
 
@@ -68,10 +68,10 @@ def render_model(model: Model | PreparedModel, camera: Camera, cam_from_world: F
         cam_from_world: (3, 4) pose.
     """
     directions = pixel_rays(camera) @ cam_from_world[:, :3]
-    return view_along(model, camera_center(cam_from_world), directions.reshape(camera.height, camera.width, 3))
+    return render_rays(model, camera_center(cam_from_world), directions.reshape(camera.height, camera.width, 3))
 
 
-def view_along(model: Model | PreparedModel, origin: FloatArray, directions: FloatArray) -> Picture:
+def render_rays(model: Model | PreparedModel, origin: FloatArray, directions: FloatArray) -> Picture:
     """Render as `render_model` does, for any lens, with one given ray per pixel.
 
     Args:
@@ -83,13 +83,13 @@ def view_along(model: Model | PreparedModel, origin: FloatArray, directions: Flo
     shape = directions.shape[:2]
     if prepared.rays is None:
         return Picture(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.bool_))
-    hits = cast(prepared.rays, origin, directions.reshape(-1, 3))
+    hits = cast_rays(prepared.rays, origin, directions.reshape(-1, 3))
     covered = np.isfinite(hits["t_hit"]).reshape(shape)
     face = np.where(covered, hits["primitive_ids"].reshape(shape), 0).astype(np.int64)
     uv = hits["primitive_uvs"].reshape(*shape, 2).astype(np.float64)
     weights = np.concatenate([1.0 - uv.sum(axis=-1, keepdims=True), uv], axis=-1)
     surface, texture = prepared.model.surface, prepared.model.texture
-    colors = _from_vertices(surface, face, weights) if texture is None else _from_pages(texture, face, weights)
+    colors = _vertex_colors(surface, face, weights) if texture is None else _texture_colors(texture, face, weights)
     return Picture(np.where(covered[..., None], colors, 0).astype(np.uint8), covered)
 
 
@@ -107,7 +107,7 @@ def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: F
         return Picture(np.zeros((*shape, 3), np.uint8), np.zeros(shape, np.bool_))
     R = cam_from_world[:, :3]
     directions = pixel_rays(camera) @ R
-    hits = cast(prepared.rays, camera_center(cam_from_world), directions)
+    hits = cast_rays(prepared.rays, camera_center(cam_from_world), directions)
     normals = hits["primitive_normals"].astype(np.float64)
     inside = (normals * directions).sum(axis=1) > 0
     facing = np.abs(normals @ (LAMP @ R))
@@ -117,7 +117,7 @@ def render_shape(model: Model | PreparedModel, camera: Camera, cam_from_world: F
     return Picture(np.round(colors).astype(np.uint8).reshape(*shape, 3), covered.reshape(shape))
 
 
-def beside_photo(photo: Colors, model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Colors:
+def comparison_image(photo: Colors, model: Model | PreparedModel, camera: Camera, cam_from_world: FloatArray) -> Colors:
     """Return a photo and the model from its camera; below, the model and its untextured shape from the side.
 
     Args:
@@ -131,19 +131,24 @@ def beside_photo(photo: Colors, model: Model | PreparedModel, camera: Camera, ca
     """
     prepared = model if isinstance(model, PreparedModel) else prepare_model(model)
     size = camera.width, camera.height
-    fine = Camera(np.diag([OVER, OVER, 1.0]) @ camera.K, OVER * size[0], OVER * size[1], camera.radial)
-    aside = walked_around(cam_from_world, prepared.model.surface, ASIDE_DEG)
+    fine = Camera(
+        np.diag([SUPERSAMPLING, SUPERSAMPLING, 1.0]) @ camera.K,
+        SUPERSAMPLING * size[0],
+        SUPERSAMPLING * size[1],
+        camera.radial,
+    )
+    aside = orbited_pose(cam_from_world, prepared.model.surface, SIDE_VIEW_DEG)
     views = [
         photo,
-        render_model(prepared, fine, cam_from_world).on(),
-        render_model(prepared, fine, aside).on(),
-        render_shape(prepared, fine, aside).on(),
+        render_model(prepared, fine, cam_from_world).with_background(),
+        render_model(prepared, fine, aside).with_background(),
+        render_shape(prepared, fine, aside).with_background(),
     ]
     a, b, c, d = (np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_AREA), np.uint8) for view in views)
     return np.concatenate([np.concatenate([a, b], axis=1), np.concatenate([c, d], axis=1)])
 
 
-def walked_around(pose: FloatArray, surface: Surface, angle_deg: float) -> FloatArray:
+def orbited_pose(pose: FloatArray, surface: Surface, angle_deg: float) -> FloatArray:
     """Return a camera pose rotated about the vertical axis through the surface it looks at, in a frame with y up.
 
     Args:
@@ -159,12 +164,12 @@ def walked_around(pose: FloatArray, surface: Surface, angle_deg: float) -> Float
     return np.column_stack([turned, R @ middle + t - turned @ middle])
 
 
-def _from_vertices(surface: Surface, face: NDArray[np.int64], weights: FloatArray) -> FloatArray:
+def _vertex_colors(surface: Surface, face: NDArray[np.int64], weights: FloatArray) -> FloatArray:
     corners = surface.colors[surface.faces[face]].astype(np.float64)
     return np.asarray(np.round(np.einsum("hwk,hwkc->hwc", weights, corners)))
 
 
-def _from_pages(texture: Texture, face: NDArray[np.int64], weights: FloatArray) -> Colors:
+def _texture_colors(texture: Texture, face: NDArray[np.int64], weights: FloatArray) -> Colors:
     """Sample the texture bilinearly; texel centers at +0.5, the border repeated."""
     place = np.einsum("hwk,hwkc->hwc", weights, texture.uv[face].astype(np.float64))
     page_of = texture.page[face]

@@ -78,8 +78,8 @@ def render_scene(
     for dy in offsets:
         for dx in offsets:
             directions = pixel_rays(camera, (float(dx), float(dy))) @ R
-            hits = cast(scene.rays, center, directions)
-            lit = _lit(scene, center, directions, hits)
+            hits = cast_rays(scene.rays, center, directions)
+            lit = _is_sunlit(scene, center, directions, hits)
             # t_hit is the z depth, since the rays have z = 1; a pixel covers depth / f on the surface
             pixel = np.where(np.isfinite(hits["t_hit"]), hits["t_hit"], 1.0) / camera.K[0, 0]
             shade(
@@ -104,7 +104,7 @@ def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
     return caster
 
 
-def cast(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, NDArray[Any]]:
+def cast_rays(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, NDArray[Any]]:
     """Return the first hits of rays, by Open3D's names; t_hit is inf for rays that hit nothing.
 
     Args:
@@ -119,7 +119,7 @@ def cast(caster: Any, origin: FloatArray, directions: FloatArray) -> dict[str, N
     return {key: found[key].numpy() for key in ("t_hit", "primitive_ids", "primitive_uvs", "primitive_normals")}
 
 
-def _lit(
+def _is_sunlit(
     scene: PreparedScene, center: FloatArray, directions: FloatArray, hits: dict[str, NDArray[Any]]
 ) -> NDArray[np.bool_]:
     """Return whether the sun reaches each hit; shadow rays are cast only where the surface faces the sun."""
@@ -146,7 +146,7 @@ def _openness(caster: Any, vertices: FloatArray, normals: FloatArray) -> FloatAr
     free = np.zeros(len(vertices))
     for r, a in zip(radius, angle, strict=True):
         direction = r * np.cos(a) * u + r * np.sin(a) * v + np.sqrt(1.0 - r * r) * normals
-        distance = cast(caster, vertices + 1e-2 * normals, direction)["t_hit"].astype(np.float64)
+        distance = cast_rays(caster, vertices + 1e-2 * normals, direction)["t_hit"].astype(np.float64)
         free += np.clip(distance / 1.5, 0.0, 1.0)  # surfaces beyond 1.5 units do not darken
     return free / AMBIENT_RAYS
 

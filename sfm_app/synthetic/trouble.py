@@ -27,20 +27,20 @@ from sfm_app.synthetic.cameras import (
     pixel_rays,
 )
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, develop
-from sfm_app.synthetic.render import PreparedScene, cast, prepare, render_scene
+from sfm_app.synthetic.render import PreparedScene, cast_rays, prepare, render_scene
 from sfm_app.synthetic.scenes.bodies import SyntheticScene
-from sfm_app.synthetic.scenes.strewn import faded, heap_of_things, moving_thing, panelled, twins, wall
+from sfm_app.synthetic.scenes.strewn import fade_colors, heap_of_things, moving_thing, panel_wall, repeated_things, wall
 
 FloatArray = NDArray[np.float64]
 Random = np.random.Generator
 
 WALKS = ("walk", "forward", "sideways", "orbit", "wide steps")
 PLACES = ("things", "plane", "repeats", "look-alikes")
-OF_CAMERAS = ("two cameras", "zoom", "crop", "squeeze", "lens")
-OF_PHOTOS = ("motion blur", "defocus", "moving object", "few features")
+CAMERA_TROUBLES = ("two cameras", "zoom", "crop", "squeeze", "lens")
+PHOTO_TROUBLES = ("motion blur", "defocus", "moving object", "few features")
 ORDINARY = ("walk", "things")
 """Choices that do not count as trouble."""
-KINDS = tuple(kind for kind in (*WALKS, *PLACES, *OF_CAMERAS, *OF_PHOTOS) if kind not in ORDINARY)
+KINDS = tuple(kind for kind in (*WALKS, *PLACES, *CAMERA_TROUBLES, *PHOTO_TROUBLES) if kind not in ORDINARY)
 """All troubles by name."""
 SIZES = ((480, 320), (512, 384), (384, 512), (576, 384), (640, 480), (640, 400))
 PHOTOS = (6, 20)
@@ -49,7 +49,7 @@ AIM = (0.0, 0.7, 0.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Spoiling:
+class PhotoDefects:
     """Defects of single photos."""
 
     blur_px: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -72,7 +72,7 @@ class TroubledFolder:
     scene: SyntheticScene
     views: Views
     options: PhotoOptions
-    spoiling: Spoiling
+    spoiling: PhotoDefects
 
 
 def troubled_folder(seed: int) -> TroubledFolder:
@@ -80,14 +80,14 @@ def troubled_folder(seed: int) -> TroubledFolder:
     rng = np.random.default_rng([seed, 29])
     walk = str(rng.choice(WALKS, p=(0.4, 0.15, 0.15, 0.15, 0.15)))
     place = str(rng.choice(PLACES, p=(0.55, 0.15, 0.15, 0.15)))
-    of_cameras = _some(OF_CAMERAS, (0.35, 0.45, 0.2), rng)
-    of_photos = _some(OF_PHOTOS, (0.4, 0.4, 0.2), rng)
+    of_cameras = _draw_kinds(CAMERA_TROUBLES, (0.35, 0.45, 0.2), rng)
+    of_photos = _draw_kinds(PHOTO_TROUBLES, (0.4, 0.4, 0.2), rng)
     drawn = {walk, place, *of_cameras, *of_photos}
-    scene = _scene(place, rng)
+    scene = _draw_scene(place, rng)
     if "few features" in drawn:
-        scene = faded(scene, float(rng.uniform(0.1, 0.3)))
-    camera = _camera(drawn, rng)
-    views = _with_cameras(_walk(walk, place, camera, rng), drawn, rng)
+        scene = fade_colors(scene, float(rng.uniform(0.1, 0.3)))
+    camera = _draw_camera(drawn, rng)
+    views = _with_cameras(_draw_views(walk, place, camera, rng), drawn, rng)
     options = PhotoOptions(
         supersampling=1,
         noise=float(rng.uniform(0.5, 3.0)),
@@ -101,7 +101,7 @@ def troubled_folder(seed: int) -> TroubledFolder:
         scene=scene,
         views=views,
         options=options,
-        spoiling=_spoiling(drawn, views, rng),
+        spoiling=_draw_defects(drawn, views, rng),
     )
 
 
@@ -123,9 +123,9 @@ def write_troubled_folder(folder: Path, plan: TroubledFolder) -> Truth:
             camera, over = plan.views.cameras[name], plan.options.supersampling
             image = render_scene(still, camera, pose, over)
             if moving is not None:
-                at = pose_after(pose, spoiling.thing_at[name])
-                image = in_front(image, (still, pose), (moving, at), camera, over)
-            image = smeared(image, *spoiling.blur_px.get(name, (0.0, 0.0)))
+                at = cam_from_thing(pose, spoiling.thing_at[name])
+                image = composite_moving(image, (still, pose), (moving, at), camera, over)
+            image = apply_motion_blur(image, *spoiling.blur_px.get(name, (0.0, 0.0)))
             sharpness = replace(plan.options, blur_px=max(plan.options.blur_px, spoiling.defocus_px.get(name, 0.0)))
             photo = develop(image, sharpness, np.random.default_rng([plan.seed, k, 31]))
             Image.fromarray(photo).save(folder / name, format="JPEG", quality=plan.options.quality)
@@ -134,7 +134,7 @@ def write_troubled_folder(folder: Path, plan: TroubledFolder) -> Truth:
     return Truth(dict(plan.views.cameras), dict(plan.views.cam_from_world), plan.scene.vertices, plan.scene.faces)
 
 
-def smeared(image: FloatArray, length_px: float, direction: float) -> FloatArray:
+def apply_motion_blur(image: FloatArray, length_px: float, direction: float) -> FloatArray:
     """Apply the motion blur of a camera that turned during the exposure: average along a line.
 
     Args:
@@ -157,11 +157,13 @@ def smeared(image: FloatArray, length_px: float, direction: float) -> FloatArray
     return np.asarray(blurred, dtype=np.float64)
 
 
-Seen = tuple[PreparedScene, FloatArray]
+SceneView = tuple[PreparedScene, FloatArray]
 """A scene, and the pose (3, 4) of the camera in its frame."""
 
 
-def in_front(image: FloatArray, still: Seen, moving: Seen, camera: Camera, supersampling: int) -> FloatArray:
+def composite_moving(
+    image: FloatArray, still: SceneView, moving: SceneView, camera: Camera, supersampling: int
+) -> FloatArray:
     """Return the image of the still scene with the moving object where it is nearer; the object casts no shadow.
 
     Args:
@@ -174,14 +176,14 @@ def in_front(image: FloatArray, still: Seen, moving: Seen, camera: Camera, super
     depth = []
     for scene, pose in (still, moving):
         directions = pixel_rays(camera) @ pose[:, :3]
-        depth.append(cast(scene.rays, camera_center(pose), directions)["t_hit"].reshape(image.shape[:2]))
+        depth.append(cast_rays(scene.rays, camera_center(pose), directions)["t_hit"].reshape(image.shape[:2]))
     nearer = depth[1] < depth[0]
     if not nearer.any():
         return image
     return np.where(nearer[..., None], render_scene(moving[0], camera, moving[1], supersampling), image)
 
 
-def pose_after(cam_from_world: FloatArray, world_from_thing: FloatArray) -> FloatArray:
+def cam_from_thing(cam_from_world: FloatArray, world_from_thing: FloatArray) -> FloatArray:
     """Return the (3, 4) pose of the camera in the frame of an object.
 
     Args:
@@ -192,24 +194,24 @@ def pose_after(cam_from_world: FloatArray, world_from_thing: FloatArray) -> Floa
     return np.column_stack([R @ world_from_thing[:, :3], R @ world_from_thing[:, 3] + t])
 
 
-def _some(kinds: tuple[str, ...], shares: tuple[float, ...], rng: Random) -> list[str]:
+def _draw_kinds(kinds: tuple[str, ...], shares: tuple[float, ...], rng: Random) -> list[str]:
     """Draw k of the kinds, where k = 0, 1, ... has the probability shares[k]."""
     return [str(kind) for kind in rng.choice(kinds, int(rng.choice(len(shares), p=shares)), replace=False)]
 
 
-def _scene(place: str, rng: Random) -> SyntheticScene:
+def _draw_scene(place: str, rng: Random) -> SyntheticScene:
     if place == "plane":
         return wall(rng)
     things = heap_of_things(rng)
     if place == "repeats":
-        things = (*things, *panelled(rng))
+        things = (*things, *panel_wall(rng))
     elif place == "look-alikes":
-        things = (*things, *twins(rng))
+        things = (*things, *repeated_things(rng))
     light = (float(rng.uniform(-0.6, 0.6)), 0.8, float(rng.uniform(0.3, 0.8)))
     return SyntheticScene(place, things, to_light=light)
 
 
-def _camera(drawn: set[str], rng: Random) -> Camera:
+def _draw_camera(drawn: set[str], rng: Random) -> Camera:
     """Draw the camera of a folder; its optical center, pixel aspect and lens may be among the troubles."""
     width, height = (int(side) for side in rng.choice(SIZES))
     longer = math.exp(rng.uniform(math.log(0.75), math.log(1.6)))
@@ -220,10 +222,10 @@ def _camera(drawn: set[str], rng: Random) -> Camera:
     camera = make_camera(width, height, longer * max(width, height) / width, (center[0], center[1]), aspect)
     # relative displacement of a corner; phones correct their lenses to about half a percent
     bend = rng.choice((-1.0, 1.0)) * rng.uniform(0.03, 0.1) if "lens" in drawn else rng.normal(0.0, 0.003)
-    return bent(camera, float(bend))
+    return with_distortion(camera, float(bend))
 
 
-def bent(camera: Camera, bend: float) -> Camera:
+def with_distortion(camera: Camera, bend: float) -> Camera:
     """Return the camera with the radial distortion that moves the farthest corner outwards by a share.
 
     Args:
@@ -235,7 +237,7 @@ def bent(camera: Camera, bend: float) -> Camera:
     return replace(camera, radial=bend / float((seen**2).sum(axis=1).max()))
 
 
-def zoomed(camera: Camera, factor: float) -> Camera:
+def with_zoom(camera: Camera, factor: float) -> Camera:
     """Return the camera with another focal length and the same distortion in pixels.
 
     Args:
@@ -247,7 +249,7 @@ def zoomed(camera: Camera, factor: float) -> Camera:
     return replace(camera, K=K, radial=camera.radial * factor**2)
 
 
-def _walk(walk: str, place: str, camera: Camera, rng: Random) -> Views:
+def _draw_views(walk: str, place: str, camera: Camera, rng: Random) -> Views:
     count = int(rng.integers(PHOTOS[0], PHOTOS[1] + 1))
     longer = camera.K[0, 0] / max(camera.width, camera.height)
     distance = 4.6 * max(1.0, longer) * float(rng.uniform(0.9, 1.2))
@@ -256,7 +258,7 @@ def _walk(walk: str, place: str, camera: Camera, rng: Random) -> Views:
         sweep = float(rng.uniform(40, 150 if place == "things" else 80))
         return orbit(camera, count, sweep, distance, (AIM[0], AIM[1] + 0.4, AIM[2]))
     if walk in ("forward", "sideways"):
-        return _straight_on(walk, camera, count, distance, rng)
+        return _straight_walk(walk, camera, count, distance, rng)
     wide = walk == "wide steps"
     sweep = min(float(rng.uniform(18, 26) if wide else rng.uniform(5, 12)) * (count - 1), 150.0 if wide else 100.0)
     path = ArcOptions(
@@ -266,7 +268,7 @@ def _walk(walk: str, place: str, camera: Camera, rng: Random) -> Views:
     return arc(camera, path, seed)
 
 
-def _straight_on(walk: str, camera: Camera, count: int, distance: float, rng: Random) -> Views:
+def _straight_walk(walk: str, camera: Camera, count: int, distance: float, rng: Random) -> Views:
     """Return a straight path with a fixed viewing direction: ahead, as from a car, or sideways, as from a train."""
     along = np.linspace(0.5, -0.5, count) + rng.normal(0.0, 0.1 / count, count)
     way = np.zeros((count, 3))
@@ -276,7 +278,9 @@ def _straight_on(walk: str, camera: Camera, count: int, distance: float, rng: Ra
         way[:, 0], way[:, 2] = 3.2 * along, distance
     way += np.array([0.0, 1.3, 0.0]) + rng.normal(0.0, 0.02, (count, 3))
     aims = way + np.array([0.0, -0.1, -1.0]) + rng.normal(0.0, 0.02, (count, 3))
-    return Views.of(camera, [look_at(c, a, float(rng.normal(0.0, 1.0))) for c, a in zip(way, aims, strict=True)])
+    return Views.from_poses(
+        camera, [look_at(c, a, float(rng.normal(0.0, 1.0))) for c, a in zip(way, aims, strict=True)]
+    )
 
 
 def _with_cameras(views: Views, drawn: set[str], rng: Random) -> Views:
@@ -284,34 +288,34 @@ def _with_cameras(views: Views, drawn: set[str], rng: Random) -> Views:
     if "two cameras" in drawn:
         factor = float(rng.choice((0.65, 0.8, 1.25, 1.5)))
         center = rng.normal(0.0, 0.01, 2)
-        other = zoomed(views.cameras[names[0]], factor)
+        other = with_zoom(views.cameras[names[0]], factor)
         K = other.K.copy()
         K[:2, 2] += center * (other.width, other.height)
         # alternating or one after the other, as with two photographers or one with two cameras
         turn = names[1::2] if rng.uniform() < 0.5 else names[: len(names) // 2]
-        views = views.taken_with(replace(other, K=K), turn)
+        views = views.with_camera(replace(other, K=K), turn)
     if "zoom" in drawn:
         reach = float(rng.uniform(0.1, 0.4))
         for name in names:
-            views = views.taken_with(zoomed(views.cameras[name], math.exp(rng.uniform(-reach, reach))), [name])
+            views = views.with_camera(with_zoom(views.cameras[name], math.exp(rng.uniform(-reach, reach))), [name])
     return views
 
 
-def _spoiling(drawn: set[str], views: Views, rng: Random) -> Spoiling:
+def _draw_defects(drawn: set[str], views: Views, rng: Random) -> PhotoDefects:
     names = sorted(views.cameras)
     spoilt = [name for name in names if rng.uniform() < 0.6]
     blur = {name: (float(rng.uniform(2, 9)), float(rng.uniform(0, math.pi))) for name in spoilt}
     defocus = {name: float(rng.uniform(1.0, 2.5)) for name in names if rng.uniform() < 0.6}
     thing = moving_thing(rng)
-    return Spoiling(
+    return PhotoDefects(
         blur_px=blur if "motion blur" in drawn else {},
         defocus_px=defocus if "defocus" in drawn else {},
         thing=SyntheticScene("thing", thing) if "moving object" in drawn else None,
-        thing_at=_wandering(names, rng),
+        thing_at=_random_walk(names, rng),
     )
 
 
-def _wandering(names: list[str], rng: Random) -> dict[str, FloatArray]:
+def _random_walk(names: list[str], rng: Random) -> dict[str, FloatArray]:
     """Draw a random walk with random turns in front of the objects: (3, 4) world_from_thing by photo."""
     place, angle = np.array([rng.uniform(-1.0, 1.0), 0.0, rng.uniform(1.0, 1.8)]), rng.uniform(0.0, 360.0)
     found = {}

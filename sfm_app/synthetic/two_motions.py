@@ -54,17 +54,17 @@ def make_two_motions(options: PairOptions, moving: float, seed: int) -> TwoMotio
     exact1, exact2, moving_F = _moving_object(still, options, count, rng)
     order = rng.permutation(options.points)
 
-    def joined(of_scene: FloatArray, of_object: FloatArray) -> FloatArray:
+    def join(of_scene: FloatArray, of_object: FloatArray) -> FloatArray:
         return np.concatenate([of_scene, of_object])[order]
 
     is_moving = order >= still_count
     noise = rng.normal(scale=options.sigma_px, size=(2, count, 2))
     pair = replace(
         still,
-        x1=joined(still.x1, exact1 + noise[0]),
-        x2=joined(still.x2, exact2 + noise[1]),
-        exact_x1=joined(still.exact_x1, exact1),
-        exact_x2=joined(still.exact_x2, exact2),
+        x1=join(still.x1, exact1 + noise[0]),
+        x2=join(still.x2, exact2 + noise[1]),
+        exact_x1=join(still.exact_x1, exact1),
+        exact_x2=join(still.exact_x2, exact2),
         is_inlier=np.append(still.is_inlier, np.zeros(count, np.bool_))[order],
     )
     return TwoMotions(pair, is_moving, moving_F)
@@ -86,7 +86,7 @@ def _moving_object(
         X = center + radii * directions / np.linalg.norm(directions, axis=1, keepdims=True)
         depths = np.stack([X[:, 2], (X @ R.T + t)[:, 2]])
         X = X[(depths > NEAR / 4).all(axis=0)]
-        x1, x2 = _projected(still.K1, X), _projected(still.K2, X @ R.T + t)
+        x1, x2 = _project(still.K1, X), _project(still.K2, X @ R.T + t)
         seen = np.flatnonzero(((x1 >= 0) & (x1 <= size) & (x2 >= 0) & (x2 <= size)).all(axis=1))[:count]
         if len(seen) < count:
             continue
@@ -95,6 +95,6 @@ def _moving_object(
     raise ConfigError("no moving object is seen in both images", hint="lower max_rotation_deg or max_baseline")
 
 
-def _projected(K: FloatArray, X: FloatArray) -> FloatArray:
+def _project(K: FloatArray, X: FloatArray) -> FloatArray:
     h = X @ K.T
     return np.asarray(h[:, :2] / h[:, 2:])

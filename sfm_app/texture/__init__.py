@@ -1,8 +1,8 @@
 """Texture of a surface, from the photos that show it best."""
 
-from sfm_app.texture.appearance.view_scoring import Hidden
-from sfm_app.texture.assemble import Spread, texture_surface
+from sfm_app.texture.appearance.view_scoring import OcclusionTest
+from sfm_app.texture.assemble import ParallelMap, texture_surface
 from sfm_app.texture.store import Store
 from sfm_app.texture.views import PhotoView, photo_view
 
-__all__ = ["Hidden", "PhotoView", "Spread", "Store", "photo_view", "texture_surface"]
+__all__ = ["OcclusionTest", "ParallelMap", "PhotoView", "Store", "photo_view", "texture_surface"]

@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 from sfm_app.geometry.triangles import select_faces
 from sfm_app.settings import TextureSettings
 from sfm_app.texture.appearance.exposure import photo_gains
-from sfm_app.texture.appearance.photo_consistency import strangers
-from sfm_app.texture.appearance.view_scoring import FaceView, Hidden, look, sharpness_factors
+from sfm_app.texture.appearance.photo_consistency import outlier_mask
+from sfm_app.texture.appearance.view_scoring import FaceView, OcclusionTest, score_faces, sharpness_factors
 from sfm_app.texture.atlas import Pages
 from sfm_app.texture.blending import Blend, blend_weights
-from sfm_app.texture.charts import Charts, make_charts, without_specks
+from sfm_app.texture.charts import Charts, absorb_small_charts, make_charts
 from sfm_app.texture.facets import NONE, Facets, IntArray, facets
 from sfm_app.texture.packing import Layout, pack
-from sfm_app.texture.painting import Canvas, canvas, fill_background, finished, paint
-from sfm_app.texture.seam_leveling import level
+from sfm_app.texture.painting import Canvas, canvas, fill_background, finish_page, paint
+from sfm_app.texture.seam_leveling import level_seams
 from sfm_app.texture.store import Store
-from sfm_app.texture.unseen_faces import along_a_curve, block_sizes, square_texels, squares, vertex_colors
+from sfm_app.texture.unseen_faces import block_sizes, morton_order, square_texels, squares, vertex_colors
 from sfm_app.texture.view_selection import choose_photos
 from sfm_app.texture.views import PhotoView
 from sfm_app.types import Model, Rejected, Surface, Texture
 
 FloatArray = NDArray[np.float64]
-Spread = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
+ParallelMap = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
 """Applies a function to all items, possibly in parallel, and returns results in order; the label names the progress."""
 
 
@@ -46,7 +46,7 @@ class FaceViews:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class CheckedViews:
     """The views of all triangles, weighted by sharpness, with gains and outliers."""
 
     worth: NDArray[np.float32]
@@ -56,7 +56,7 @@ class Seen:
     """(P, T, 3)"""
     gains: FloatArray
     """(P, 3)"""
-    strange: int
+    outliers: int
     """Number of outliers: views of triangles that show something other than the surface."""
 
     @property
@@ -70,7 +70,7 @@ class TexturePlan:
     """Everything that is computed before photos are painted."""
 
     mesh: Facets
-    seen: Seen
+    seen: CheckedViews
     chosen: IntArray
     """(T,) photo of each triangle, -1 for none."""
     charts: Charts
@@ -82,12 +82,17 @@ class TexturePlan:
     squares: NDArray[np.int64]
     """(U, 3) page, x, y of the squares of the triangles that no photo sees."""
     blend: Blend
-    allowed: NDArray[np.float32]
+    allowed_weight: NDArray[np.float32]
     """(T, 3) sum of weights at each corner over the photos that may be used for the triangle."""
 
 
 def texture_surface(
-    surface: Surface, views: Sequence[PhotoView], store: Store, hidden: Hidden, options: TextureSettings, spread: Spread
+    surface: Surface,
+    views: Sequence[PhotoView],
+    store: Store,
+    hidden: OcclusionTest,
+    options: TextureSettings,
+    spread: ParallelMap,
 ) -> tuple[Model, dict[str, Any]]:
     """Paint a surface with photos.
 
@@ -103,14 +108,14 @@ def texture_surface(
         The surface with texture and colors from the photos, cut if the options say so; and figures for the manifest.
     """
     mesh = facets(surface)
-    looks = _look_at_all(views, mesh, store, hidden, spread)
-    seen = _believe(looks, mesh)
-    chosen = without_specks(choose_photos(seen.worth, mesh), seen.usable, mesh.neighbors)
+    looks = _score_photos(views, mesh, store, hidden, spread)
+    seen = _check_views(looks, mesh)
+    chosen = absorb_small_charts(choose_photos(seen.worth, mesh), seen.usable, mesh.neighbors)
     unseen = chosen == NONE
     if options.unseen_faces == "cut" and not unseen.all():
         mesh = facets(select_faces(surface, ~unseen))
         kept = ~unseen
-        seen = Seen(seen.worth[:, kept], seen.colors[:, kept], seen.gains, seen.strange)
+        seen = CheckedViews(seen.worth[:, kept], seen.colors[:, kept], seen.gains, seen.outliers)
         chosen = chosen[kept]
     plan = _plan(mesh, seen, chosen, views, options)
     canvases = [
@@ -123,36 +128,38 @@ def texture_surface(
     return _finish(plan, canvases), _figures(plan, views, looks.rejected, int(unseen.sum()))
 
 
-def _look_at_all(views: Sequence[PhotoView], mesh: Facets, store: Store, hidden: Hidden, spread: Spread) -> FaceViews:
+def _score_photos(
+    views: Sequence[PhotoView], mesh: Facets, store: Store, hidden: OcclusionTest, spread: ParallelMap
+) -> FaceViews:
     shape = (len(views), len(mesh.faces))
     worth, colors = np.zeros(shape, np.float32), np.zeros((*shape, 3), np.uint8)
     sharpness = np.zeros(len(views))
 
-    def look_at(photo: int) -> Rejected | None:
-        found = _look_at(f"look{photo}", views[photo], mesh, store, hidden)
+    def score(photo: int) -> Rejected | None:
+        found = _score_photo(f"look{photo}", views[photo], mesh, store, hidden)
         if isinstance(found, Rejected):
             return found
         worth[photo], colors[photo], sharpness[photo] = found.worth, found.color, found.sharpness
         return None
 
-    rejected = spread(look_at, range(len(views)), "looking at the surface")
+    rejected = spread(score, range(len(views)), "looking at the surface")
     return FaceViews(worth, colors, sharpness, rejected)
 
 
-def _look_at(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: Hidden) -> FaceView | Rejected:
+def _score_photo(name: str, view: PhotoView, mesh: Facets, store: Store, hidden: OcclusionTest) -> FaceView | Rejected:
     kept = store.recall(name)
     if kept is not None:
         return FaceView(kept["worth"], kept["color"], float(kept["sharpness"]))
     try:
-        photo, used = store.photo(view), store.used(view)
+        photo, used = store.photo(view), store.usable_pixels(view)
     except OSError as err:
         return Rejected(f"cannot be read: {err.strerror or 'damaged'}")
-    found = look(view, photo, used, mesh, hidden)
+    found = score_faces(view, photo, used, mesh, hidden)
     store.keep(name, {"worth": found.worth, "color": found.color, "sharpness": np.array(found.sharpness)})
     return found
 
 
-def _believe(looks: FaceViews, mesh: Facets) -> Seen:
+def _check_views(looks: FaceViews, mesh: Facets) -> CheckedViews:
     """Adjust the worths by sharpness, in place, estimate gains, and mark outliers by negative worths."""
     worth, colors = looks.worth, looks.colors
     read = looks.sharpness > 0
@@ -160,25 +167,25 @@ def _believe(looks: FaceViews, mesh: Facets) -> Seen:
     sharp[read] = sharpness_factors(looks.sharpness[read])
     worth *= sharp[:, None].astype(np.float32)
     gains = photo_gains(colors, worth > 0)
-    strange = strangers(colors, gains, worth > 0, mesh.neighbors)
+    strange = outlier_mask(colors, gains, worth > 0, mesh.neighbors)
     worth[strange] *= -1.0
-    return Seen(worth, colors, gains, int(strange.sum()))
+    return CheckedViews(worth, colors, gains, int(strange.sum()))
 
 
 def _plan(
-    mesh: Facets, seen: Seen, chosen: IntArray, views: Sequence[PhotoView], options: TextureSettings
+    mesh: Facets, seen: CheckedViews, chosen: IntArray, views: Sequence[PhotoView], options: TextureSettings
 ) -> TexturePlan:
     charts = make_charts(chosen, np.array([view.row for view in views]), mesh, options.max_atlas_px / 2)
     blocks = block_sizes(int((chosen == NONE).sum()))
     layout, places = pack(charts, blocks, options.max_atlas_px, options.max_pages)
     corners, page = charts.corners * layout.scale, np.zeros(len(chosen), np.int32)
     drawn = chosen != NONE
-    corners[drawn] += layout.shift[charts.of[drawn]][:, None, :]
-    page[drawn] = layout.page[charts.of[drawn]]
+    corners[drawn] += layout.shift[charts.chart_of_face[drawn]][:, None, :]
+    page[drawn] = layout.page[charts.chart_of_face[drawn]]
     cells = np.empty((int((~drawn).sum()), 3), np.int64)
-    cells[along_a_curve(mesh.vertices[mesh.faces[~drawn]].mean(axis=1))] = squares(places, blocks, len(cells))
+    cells[morton_order(mesh.vertices[mesh.faces[~drawn]].mean(axis=1))] = squares(places, blocks, len(cells))
     page[~drawn] = cells[:, 0]
-    blend = level(blend_weights(chosen, seen.usable, mesh), seen.colors, seen.gains, seen.usable, mesh)
+    blend = level_seams(blend_weights(chosen, seen.usable, mesh), seen.colors, seen.gains, seen.usable, mesh)
     allowed = _allowed_weight(blend, seen.usable, chosen, mesh)
     return TexturePlan(mesh, seen, chosen, charts, layout, corners, page, cells, blend, allowed)
 
@@ -194,9 +201,9 @@ def _paint_photo(photo: int, plan: TexturePlan, views: Sequence[PhotoView], stor
     rims = (beside == NONE) | (plan.seen.worth[photo, beside] == 0)
     view, scale = views[photo], plan.layout.scale
     if scale < 1.0:
-        view = view.scaled(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
+        view = view.with_size(max(1, round(view.width * scale)), max(1, round(view.height * scale)))
     pixels, points = store.photo(view), plan.mesh.vertices[plan.mesh.faces[triangles]]
-    with pages.painting(photo) as canvases:
+    with pages.lock_canvases(photo) as canvases:
         for number, page in enumerate(canvases):
             there = plan.page[triangles] == number
             what = triangles[there], plan.corners, points[there], shares[there], rims[there]
@@ -205,7 +212,7 @@ def _paint_photo(photo: int, plan: TexturePlan, views: Sequence[PhotoView], stor
 
 def _shares(photo: int, plan: TexturePlan) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Return the triangles that a photo contributes to, and its weight and offsets (N, 3, 4) at their corners."""
-    mesh, part = plan.mesh, plan.blend.of(photo)
+    mesh, part = plan.mesh, plan.blend.photo_rows(photo)
     weight = np.zeros(len(mesh.vertices), np.float32)
     offset = np.zeros((len(mesh.vertices), 3), np.float32)
     weight[plan.blend.vertex[part]], offset[plan.blend.vertex[part]] = plan.blend.weight[part], plan.blend.offset[part]
@@ -213,7 +220,7 @@ def _shares(photo: int, plan: TexturePlan) -> tuple[NDArray[np.int64], NDArray[n
     allowed = ((plan.seen.worth[photo] > 0) | own) & (plan.chosen != NONE)
     shares = np.where(allowed[:, None], weight[mesh.faces], 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        shares = np.where(plan.allowed > 0, shares / plan.allowed, own[:, None]).astype(np.float32)
+        shares = np.where(plan.allowed_weight > 0, shares / plan.allowed_weight, own[:, None]).astype(np.float32)
     triangles = np.flatnonzero((shares > 0).any(axis=1))
     return triangles, np.concatenate([shares[triangles][:, :, None], offset[mesh.faces[triangles]]], axis=2)
 
@@ -222,7 +229,7 @@ def _allowed_weight(blend: Blend, usable: NDArray[np.bool_], chosen: IntArray, m
     total = np.zeros(mesh.faces.shape, np.float32)
     weight = np.zeros(len(mesh.vertices), np.float32)
     for photo in range(len(usable)):
-        part = blend.of(photo)
+        part = blend.photo_rows(photo)
         weight[blend.vertex[part]] = blend.weight[part]
         allowed = usable[photo] | (chosen == photo)
         total += np.where(allowed[:, None], weight[mesh.faces], 0.0)
@@ -233,7 +240,7 @@ def _allowed_weight(blend: Blend, usable: NDArray[np.bool_], chosen: IntArray, m
 def _finish(plan: TexturePlan, canvases: Sequence[Canvas]) -> Model:
     """Round the pages, color triangles that no photo sees, and fill the space between charts."""
     drawn = plan.chosen != NONE
-    pages, painted = (list(part) for part in zip(*(finished(page) for page in canvases), strict=True))
+    pages, painted = (list(part) for part in zip(*(finish_page(page) for page in canvases), strict=True))
     corner_colors = np.zeros((len(drawn), 3, 3))
     for number, page in enumerate(pages):
         there = np.flatnonzero(drawn & (plan.page == number))
@@ -268,7 +275,7 @@ def _figures(
         "texels": covered,
         "scale": round(plan.layout.scale, 3),
         "unseen_triangles": unseen,
-        "strange_views_of_triangles": plan.seen.strange,
+        "strange_views_of_triangles": plan.seen.outliers,
         "gains": {
             view.name: [round(float(gain), 3) for gain in gains]
             for view, gains in zip(views, plan.seen.gains, strict=True)

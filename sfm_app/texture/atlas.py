@@ -10,7 +10,7 @@ import numpy as np
 from sfm_app.texture.painting import Canvas
 from sfm_app.texture.store import Store
 
-KEPT = "pages"
+GROUP_NAME = "pages"
 EVERY_S = 10.0
 """Shortest time between checkpoints, in seconds; a killed run loses the photos since the last one."""
 MOST_OF_THE_TIME = 0.05
@@ -24,7 +24,7 @@ class Pages:
         """Fill empty canvases from the checkpoint of a killed run."""
         self.canvases, self.has = canvases, np.zeros(photos, np.bool_)
         self._store, self._lock = store, Lock()
-        kept = store.recall(KEPT)
+        kept = store.recall(GROUP_NAME)
         if kept is not None:
             self.has[:] = kept["has"]
             for number, page in enumerate(canvases):
@@ -32,7 +32,7 @@ class Pages:
         self._due_s = time.monotonic() + EVERY_S
 
     @contextmanager
-    def painting(self, photo: int) -> Iterator[Sequence[Canvas]]:
+    def lock_canvases(self, photo: int) -> Iterator[Sequence[Canvas]]:
         """Provide the canvases to one photo at a time, and mark it as painted afterwards."""
         with self._lock:
             yield self.canvases
@@ -43,6 +43,6 @@ class Pages:
     def _keep(self) -> None:
         start = time.monotonic()
         totals = {f"page{number}": page.total for number, page in enumerate(self.canvases)}
-        self._store.keep(KEPT, {"has": self.has, **totals})
+        self._store.keep(GROUP_NAME, {"has": self.has, **totals})
         end = time.monotonic()
         self._due_s = end + max(EVERY_S, (end - start) / MOST_OF_THE_TIME)

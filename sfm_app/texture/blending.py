@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.texture.facets import NONE, Facets, IntArray, at_vertices
+from sfm_app.texture.facets import NONE, Facets, IntArray, sum_at_vertices
 
 FloatArray = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ class Blend:
     offset: NDArray[np.float32]
     """(N, 3) gray levels added to the photo at the vertex after gain correction."""
 
-    def of(self, photo: int) -> slice:
+    def photo_rows(self, photo: int) -> slice:
         """Return the rows of a photo."""
         return slice(int(self.starts[photo]), int(self.starts[photo + 1]))
 
@@ -47,14 +47,14 @@ def blend_weights(chosen: IntArray, usable: NDArray[np.bool_], mesh: Facets) -> 
         mesh: the surface.
     """
     size = len(mesh.vertices)
-    valence = np.maximum(at_vertices(np.ones(len(chosen)), mesh.faces, size), 1.0)
+    valence = np.maximum(sum_at_vertices(np.ones(len(chosen)), mesh.faces, size), 1.0)
     degree = np.maximum(np.bincount(mesh.edges.ravel(), minlength=size), 1)
     vertices, weights = [], []
     for photo in range(len(usable)):
         own = chosen == photo
         allowed = usable[photo] | own | (chosen == NONE)
-        barred = at_vertices((~allowed).astype(np.float64), mesh.faces, size) > 0
-        share = at_vertices(own.astype(np.float64), mesh.faces, size) / valence
+        barred = sum_at_vertices((~allowed).astype(np.float64), mesh.faces, size) > 0
+        share = sum_at_vertices(own.astype(np.float64), mesh.faces, size) / valence
         for _ in range(RINGS):
             share = np.where(barred, 0.0, _spread(share, mesh.edges, degree))
         at = np.flatnonzero(share > FAINT)

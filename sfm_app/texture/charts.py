@@ -28,7 +28,7 @@ EDGE = 1e-6
 class Charts:
     """The chart of each triangle, and its position in the chart's photo."""
 
-    of: IntArray
+    chart_of_face: IntArray
     """(T,) chart of each triangle, -1 for none."""
     photo: IntArray
     """(C,) photo of each chart."""
@@ -118,7 +118,7 @@ def components(group: NDArray[np.int64], neighbors: IntArray) -> tuple[IntArray,
     return of, _flood(group, neighbors, of)
 
 
-def without_specks(chosen: IntArray, usable: NDArray[np.bool_], neighbors: IntArray) -> IntArray:
+def absorb_small_charts(chosen: IntArray, usable: NDArray[np.bool_], neighbors: IntArray) -> IntArray:
     """Give small charts the photo of a neighboring chart that may be used for all their triangles.
 
     Args:

@@ -53,7 +53,7 @@ def facets(surface: Surface) -> Facets:
     return Facets(surface, neighbors.reshape(-1, 3), edges, spacing)
 
 
-def at_vertices(values: FloatArray, faces: NDArray[np.int64], size: int) -> FloatArray:
+def sum_at_vertices(values: FloatArray, faces: NDArray[np.int64], size: int) -> FloatArray:
     """Sum values of triangle corners at each vertex, (V,).
 
     Args:

@@ -21,7 +21,7 @@ MARGIN = 2
 """Width of the margin around a chart that belongs to it, in texels."""
 FILL = 0.7
 """Expected share of a page that charts cover."""
-TIGHTER = 0.95
+SCALE_STEP = 0.95
 """Factor on the scale for the next attempt if the charts do not fit."""
 LEAST_SCALE = 0.05
 """Below this scale the texture would be too coarse; pages are added instead."""
@@ -59,7 +59,7 @@ def pack(charts: Charts, blocks: IntArray, max_atlas_px: int, max_pages: int) ->
         if placed is not None:
             return placed
         if scale > LEAST_SCALE:
-            scale *= TIGHTER
+            scale *= SCALE_STEP
         else:  # many small charts: their margins fill the pages
             max_pages += 1
 
@@ -68,7 +68,7 @@ def _area(charts: Charts) -> float:
     """Return the area of all charts in square pixels."""
     a, b, c = (charts.corners[:, k] for k in range(3))
     turn = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
-    return float(np.sum(np.abs(turn[charts.of != NONE])) / 2)
+    return float(np.sum(np.abs(turn[charts.chart_of_face != NONE])) / 2)
 
 
 def _try_to_pack(
@@ -103,8 +103,8 @@ def _profiles(
 ) -> tuple[IntArray, IntArray, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return origins in texels (C, 2), sizes in cells (C, 2), starts of columns (C + 1,), lower and upper profiles."""
     count = len(charts.photo)
-    drawn = np.flatnonzero(charts.of != NONE)
-    of, corners = charts.of[drawn], charts.corners[drawn] * scale
+    drawn = np.flatnonzero(charts.chart_of_face != NONE)
+    of, corners = charts.chart_of_face[drawn], charts.corners[drawn] * scale
     least, most = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     for k in range(3):
         np.minimum.at(least, of, corners[:, k])

@@ -17,11 +17,11 @@ from sfm_app.texture.views import project, sample
 
 FloatArray = NDArray[np.float64]
 
-FINE = 256
+LEVELS_PER_GRAY = 256
 INSET_PX, MOST_INSET = 1.5, 0.3
 """At an edge where the visible surface ends, pixels mix with the background. Texels closer to it than this distance in
 texels, or this share of the triangle's height, repeat the color at that distance."""
-ANYTHING = -9.0
+NO_LIMIT = -9.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,14 +43,14 @@ def canvas(size: tuple[int, int], triangles: NDArray[np.int64], corners: FloatAr
         corners: (T, 3, 2) texels.
     """
     owner = np.full((size[1], size[0]), NONE, np.int32)
-    _own(triangles, corners, 0.0, owner)
+    _claim_texels(triangles, corners, 0.0, owner)
     for margin in range(1, MARGIN + 1):
-        _own(triangles, corners, margin - 0.5, owner)
+        _claim_texels(triangles, corners, margin - 0.5, owner)
     return Canvas(owner, np.zeros((size[1], size[0], 3), np.int32))
 
 
 @kernel
-def _own(triangles: NDArray[np.int64], corners: FloatArray, reach: float, owner: IntArray) -> None:
+def _claim_texels(triangles: NDArray[np.int64], corners: FloatArray, reach: float, owner: IntArray) -> None:
     """Claim free texels within `reach` of each triangle."""
     height, width = owner.shape
     for f in triangles:
@@ -133,7 +133,7 @@ def paint(
                 # margins of thin triangles must not be extrapolated far
                 part[1], part[2] = min(max(part[1], -1.0), 2.0), min(max(part[2], -1.0), 2.0)
                 part[0] = 1.0 - part[1] - part[2]
-                _keep_off(part, least)
+                _clamp_coordinates(part, least)
                 px = part[0] * points[n, 0, 0] + part[1] * points[n, 1, 0] + part[2] * points[n, 2, 0]
                 py = part[0] * points[n, 0, 1] + part[1] * points[n, 1, 1] + part[2] * points[n, 2, 1]
                 pz = part[0] * points[n, 0, 2] + part[1] * points[n, 1, 2] + part[2] * points[n, 2, 2]
@@ -162,7 +162,7 @@ def _add(
         value = brightness[channel] * sample(photo, position[0], position[1], channel)
         for k in range(3):
             value += part[k] / inner * share[k, 1 + channel]
-        texel[channel] += int(np.floor(FINE * weight * value + 0.5))
+        texel[channel] += int(np.floor(LEVELS_PER_GRAY * weight * value + 0.5))
 
 
 @kernel
@@ -172,11 +172,11 @@ def _set_insets(corner: FloatArray, rim: NDArray[np.bool_], double_area: float, 
         a, b = (k + 1) % 3, (k + 2) % 3
         length = np.hypot(corner[b, 0] - corner[a, 0], corner[b, 1] - corner[a, 1])
         height_px = max(double_area / max(length, 1e-9), 1e-9)
-        least[k] = min(INSET_PX / height_px, MOST_INSET) if rim[a] else ANYTHING
+        least[k] = min(INSET_PX / height_px, MOST_INSET) if rim[a] else NO_LIMIT
 
 
 @kernel
-def _keep_off(part: FloatArray, least: FloatArray) -> None:
+def _clamp_coordinates(part: FloatArray, least: FloatArray) -> None:
     """Raise barycentric coordinates to their lower bounds, and reduce the others so that the sum stays 1."""
     for k in range(3):
         lack = least[k] - part[k]
@@ -187,10 +187,10 @@ def _keep_off(part: FloatArray, least: FloatArray) -> None:
             part[k] = least[k]
 
 
-def finished(page: Canvas) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def finish_page(page: Canvas) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Return the page as 8-bit RGB, black at texels without an owner, and (H, W) whether a texel has one."""
-    levels = page.total + FINE // 2
-    levels //= FINE  # in place, because the sums of a page may take two hundred megabytes
+    levels = page.total + LEVELS_PER_GRAY // 2
+    levels //= LEVELS_PER_GRAY  # in place, because the sums of a page may take two hundred megabytes
     return np.clip(levels, 0, 255, out=levels).astype(np.uint8), page.owner != NONE
 
 

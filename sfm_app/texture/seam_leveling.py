@@ -6,20 +6,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.texture.blending import Blend
-from sfm_app.texture.facets import Facets, at_vertices
+from sfm_app.texture.facets import Facets, sum_at_vertices
 
 FloatArray = NDArray[np.float64]
 
 STIFFNESS = 4.0
 """Weight of differences of offsets along a chart, relative to 1 for differences at seams."""
-HOLD = 1e-3
+PRIOR_WEIGHT = 1e-3
 """Weight of the prior that offsets are zero."""
 STEPS = 100
-ENOUGH = 1e-2
+RESIDUAL_TOLERANCE = 1e-2
 """Norm of the preconditioned residual at which the solver stops, relative to its initial value."""
 
 
-def level(blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets) -> Blend:
+def level_seams(
+    blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: NDArray[np.bool_], mesh: Facets
+) -> Blend:
     """Estimate the offsets of a blend by least squares.
 
     Args:
@@ -36,7 +38,7 @@ def level(blend: Blend, colors: NDArray[np.uint8], gains: FloatArray, usable: ND
         right[:, channel] += np.bincount(first, gap[:, channel], len(right))
         right[:, channel] -= np.bincount(second, gap[:, channel], len(right))
     weights = np.concatenate([np.ones(len(first)), np.full(len(start), STIFFNESS)])
-    offsets = solve_ties(np.concatenate([first, start]), np.concatenate([second, end]), weights, HOLD, right)
+    offsets = solve_ties(np.concatenate([first, start]), np.concatenate([second, end]), weights, PRIOR_WEIGHT, right)
     return replace(blend, offset=offsets.astype(np.float32))
 
 
@@ -63,7 +65,7 @@ def solve_ties(
     residual = right.copy()
     scaled = residual / diagonal[:, None]
     way, energy = scaled.copy(), np.einsum("nc,nc->c", residual, scaled)
-    enough = ENOUGH**2 * energy
+    enough = RESIDUAL_TOLERANCE**2 * energy
     for _ in range(STEPS):
         if np.all(energy <= enough):
             break
@@ -91,7 +93,7 @@ def _gaps(
     Returns:
         (M,) node, (M,) node of the largest weight at its vertex, and (M, 3) color of the latter minus the former.
     """
-    others, heads = _meetings(blend, len(mesh.vertices))
+    others, heads = _seam_pairs(blend, len(mesh.vertices))
     photo_of = np.repeat(np.arange(len(usable)), np.diff(blend.starts))
     gaps = np.full((len(others), 3), np.nan)
     for photo in range(len(usable)):
@@ -104,15 +106,15 @@ def _gaps(
         both = (head >= 0) & usable[head, near[:, None]]
         difference = colors[head, near[:, None]] / gains[head] - (colors[photo, near] / gains[photo])[:, None]
         at = blend.vertex[others[rows]]
-        count = at_vertices(both.astype(np.float64), corners, len(mesh.vertices))[at]
+        count = sum_at_vertices(both.astype(np.float64), corners, len(mesh.vertices))[at]
         for channel in range(3):
-            total = at_vertices(np.where(both, difference[..., channel], 0.0), corners, len(mesh.vertices))[at]
+            total = sum_at_vertices(np.where(both, difference[..., channel], 0.0), corners, len(mesh.vertices))[at]
             gaps[rows, channel] = np.divide(total, count, out=np.full(len(rows), np.nan), where=count > 0)
     known = np.isfinite(gaps[:, 0])
     return others[known], heads[known], gaps[known]
 
 
-def _meetings(blend: Blend, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _seam_pairs(blend: Blend, size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return all nodes except the one of the largest weight at each vertex, and for each the one it is paired with."""
     order = np.lexsort((-blend.weight, blend.vertex))
     heads = np.full(size, -1, np.int64)
@@ -128,7 +130,7 @@ def _ties(blend: Blend, mesh: Facets) -> tuple[NDArray[np.int64], NDArray[np.int
     start, end = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     node = np.full(len(mesh.vertices), -1, np.int64)
     for photo in range(len(blend.starts) - 1):
-        part = blend.of(photo)
+        part = blend.photo_rows(photo)
         node[blend.vertex[part]] = np.arange(part.start, part.stop)
         ends = node[mesh.edges]
         both = (ends >= 0).all(axis=1)

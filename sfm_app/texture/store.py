@@ -15,7 +15,7 @@ class Store(Protocol):
     def photo(self, view: PhotoView, /) -> NDArray[np.uint8]:
         """Return (height, width, 3) RGB of a view at the view's size; OSError where it cannot be read."""
 
-    def used(self, view: PhotoView, /) -> NDArray[np.bool_] | None:
+    def usable_pixels(self, view: PhotoView, /) -> NDArray[np.bool_] | None:
         """Return (height, width) which pixels of a photo at full size may be used; None if all may.
 
         The other pixels have the color of a usable pixel in `photo`. OSError where the mask cannot be read.

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.texture.facets import Facets, at_vertices
+from sfm_app.texture.facets import Facets, sum_at_vertices
 from sfm_app.texture.seam_leveling import solve_ties
 
 FloatArray = NDArray[np.float64]
@@ -13,7 +13,7 @@ CELL = 2
 BLOCK = 64
 """Largest number of squares along a side of a block."""
 CURVE_BITS = 12
-HOLD = 1e-4
+PRIOR_WEIGHT = 1e-4
 """Weight of the previous color of an unseen vertex, relative to 1 per neighbor, for parts that no photo sees."""
 
 
@@ -29,7 +29,7 @@ def vertex_colors(mesh: Facets, seen: NDArray[np.bool_], corner_colors: FloatArr
         (V, 3) in 0..255.
     """
     faces, size = mesh.faces[seen], len(mesh.vertices)
-    count = at_vertices(np.ones(len(faces)), faces, size)
+    count = sum_at_vertices(np.ones(len(faces)), faces, size)
     sums = [np.bincount(faces.ravel(), corner_colors[..., channel].ravel(), size) for channel in range(3)]
     known = count > 0
     colors = mesh.surface.colors.astype(np.float64)
@@ -43,8 +43,8 @@ def vertex_colors(mesh: Facets, seen: NDArray[np.bool_], corner_colors: FloatArr
     rim = (ends >= 0).any(axis=1) & ~inner
     outside = np.where(ends[rim, 0] < 0, mesh.edges[rim, 0], mesh.edges[rim, 1])
     inside = ends[rim].max(axis=1)
-    hold = np.asarray(HOLD + np.bincount(inside, minlength=int((~known).sum())), np.float64)
-    right = HOLD * colors[~known]
+    hold = np.asarray(PRIOR_WEIGHT + np.bincount(inside, minlength=int((~known).sum())), np.float64)
+    right = PRIOR_WEIGHT * colors[~known]
     for channel in range(3):
         right[:, channel] += np.bincount(inside, colors[outside, channel], len(right))
     spread = solve_ties(ends[inner, 0], ends[inner, 1], np.ones(int(inner.sum())), hold, right)
@@ -78,7 +78,7 @@ def squares(places: NDArray[np.int32], sizes: NDArray[np.int32], triangles: int)
     return np.concatenate(found).astype(np.int64) if found else np.empty((0, 3), np.int64)
 
 
-def along_a_curve(points: FloatArray) -> NDArray[np.int64]:
+def morton_order(points: FloatArray) -> NDArray[np.int64]:
     """Return the Morton order (N,) of points (N, 3), in which nearby points are mostly adjacent (Morton 1966).
 
     Adjacent squares then have similar colors, and lossy compression of the page does little harm.

@@ -17,7 +17,7 @@ CANDIDATES = 8
 """Number of best photos considered for each triangle."""
 PRICE_OF_DETAIL = 0.35
 """Cost of a photo with 1/e of the best photo's worth, relative to 1 for a seam as long as the triangle's edge."""
-MOST_LOST = 3.0
+MAX_LOSS = 3.0
 """Upper bound of the loss, the natural logarithm of the best worth over the photo's worth."""
 ROUNDS = 12
 TINY = 1e-30
@@ -38,9 +38,9 @@ def choose_photos(worth: NDArray[np.float32], mesh: Facets) -> IntArray:
     labels, values = np.full((triangles, kept), NONE, np.int32), np.zeros((triangles, kept), np.float32)
     _keep_best(worth, labels, values)
     lost = np.log(np.maximum(values[:, :1], TINY) / np.maximum(values, TINY))
-    cost = (PRICE_OF_DETAIL * _relative_size(mesh)[:, None] * np.minimum(lost, MOST_LOST)).astype(np.float32)
+    cost = (PRICE_OF_DETAIL * _relative_size(mesh)[:, None] * np.minimum(lost, MAX_LOSS)).astype(np.float32)
     price = _edge_prices(mesh)
-    back = _places_at_neighbors(mesh.neighbors)
+    back = _reverse_edge_indices(mesh.neighbors)
     chosen = np.full(triangles, NONE, np.int32)
     messages = np.zeros((triangles, 3, kept), np.float32)
     for _ in range(ROUNDS):
@@ -68,7 +68,7 @@ def _edge_prices(mesh: Facets) -> NDArray[np.float32]:
     return np.asarray(lengths / max(mesh.spacing, 1e-300), np.float32)
 
 
-def _places_at_neighbors(neighbors: IntArray) -> IntArray:
+def _reverse_edge_indices(neighbors: IntArray) -> IntArray:
     """Return (T, 3) the column of each triangle in its neighbor's row of `neighbors`."""
     own = np.arange(len(neighbors))[:, None, None]
     return np.asarray(np.argmax(neighbors[neighbors] == own, axis=2), np.int32)
@@ -134,13 +134,9 @@ def _pass_messages(
 
 @kernel
 def _decode(
-    labels: IntArray,
-    cost: NDArray[np.float32],
-    neighbors: IntArray,
-    price: NDArray[np.float32],
-    messages: NDArray[np.float32],
-    chosen: IntArray,
-) -> None:
+    labels: IntArray, cost: NDArray[np.float32], neighbors: IntArray, price: NDArray[np.float32],
+    messages: NDArray[np.float32], chosen: IntArray,
+) -> None:  # fmt: skip
     """Choose labels in order, given the previous labels and the messages from later triangles."""
     for f in range(len(labels)):
         least = np.inf

@@ -39,7 +39,7 @@ class PhotoView:
         """(3,) center of projection in the world."""
         return np.asarray(-self.cam_from_world[:, :3].T @ self.cam_from_world[:, 3], np.float64)
 
-    def scaled(self, width: int, height: int) -> "PhotoView":
+    def with_size(self, width: int, height: int) -> "PhotoView":
         """Return the same view for a photo of another size.
 
         Args:

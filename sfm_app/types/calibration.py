@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.numerical import finite_only
+from sfm_app.numerical import finite_entries
 from sfm_app.types.matches import MatchedImage, PairId
 from sfm_app.types.photos import Photo
 
@@ -38,7 +38,7 @@ class Calibration:
     """Named figures that support K: pairs used, support at the peak, ..."""
 
     @property
-    def estimated(self) -> bool:
+    def is_estimated(self) -> bool:
         """Whether mapping may build on K: the photos determine it, at least roughly."""
         return self.identifiable or self.method == "estimate"
 
@@ -57,7 +57,7 @@ class Calibration:
     def from_dict(cls, values: Mapping[str, Any]) -> "Calibration":
         """Rebuild from `to_dict`."""
         pairs = tuple((int(first), int(second)) for first, second in values["key_pairs"])
-        tables = {name: finite_only(values[name]) for name in ("spread", "evidence")}
+        tables = {name: finite_entries(values[name]) for name in ("spread", "evidence")}
         plain = {"K": np.array(values["K"], np.float64), "held": tuple(values["held"]), "key_pairs": pairs}
         return cls(**{**values, **tables, **plain})
 
@@ -73,13 +73,13 @@ class Intrinsics:
     photos: Mapping[int, str] = field(default_factory=dict)
     """Name of the photo by the id that pairs use."""
 
-    def name_of(self, photo: Photo | MatchedImage) -> str:
+    def camera_name(self, photo: Photo | MatchedImage) -> str:
         """Return the name of the camera that took a photo."""
         return self.camera_of.get(photo.name, photo.group)
 
     def camera(self, photo: Photo | MatchedImage) -> Calibration:
         """Return the camera that took a photo."""
-        return self.cameras[self.name_of(photo)]
+        return self.cameras[self.camera_name(photo)]
 
     @property
     def main(self) -> Calibration:

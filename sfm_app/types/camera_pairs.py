@@ -30,7 +30,7 @@ class CameraPairs:
     """Focal lengths claimed by EXIF, in pixels, one per photo that has one; hints, never trusted."""
 
     @classmethod
-    def of(cls, Fs: ArrayLike, size: tuple[int, int], weights: ArrayLike | None = None) -> "CameraPairs":
+    def from_Fs(cls, Fs: ArrayLike, size: tuple[int, int], weights: ArrayLike | None = None) -> "CameraPairs":
         """Make pairs from matrices alone.
 
         Args:
@@ -60,11 +60,11 @@ class PhotoPairs:
     """By photo the group that is assumed to share one camera."""
     focal_hints_px: Mapping[int, float] = field(default_factory=dict)
     """Claimed focal (EXIF) by photo, where there is one."""
-    brought_to: Mapping[int, tuple[int, int]] = field(default_factory=dict)
+    padded_sizes: Mapping[int, tuple[int, int]] = field(default_factory=dict)
     """By photo with bars the size including the bars; `sizes` then has that of the picture inside them. Photos that
     bars bring to one size may each be of another camera."""
 
-    def moved(self, corners: Mapping[int, tuple[int, int]]) -> "PhotoPairs":
+    def with_origins(self, corners: Mapping[int, tuple[int, int]]) -> "PhotoPairs":
         """Return the pairs with pixels counted from new origins (left, top), given by photo.
 
         The sizes stay the same.
@@ -78,7 +78,7 @@ class PhotoPairs:
         inliers = tuple(x - corner.reshape(4) for x, corner in zip(self.inliers, at, strict=True))
         return replace(self, Fs=Fs, inliers=inliers)
 
-    def among(self, members: Collection[int]) -> CameraPairs:
+    def to_camera_pairs(self, members: Collection[int]) -> CameraPairs:
         """Return the pairs whose photos are both members; all members have one size."""
         wanted = set(members)
         kept = [k for k, pair in enumerate(self.photos) if wanted.issuperset(pair)]

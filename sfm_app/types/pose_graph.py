@@ -60,6 +60,6 @@ class PoseGraph:
     doubtful: tuple[LookAlikes, ...] = ()
     """Loops, or look-alikes: pairs that stayed although the photos between theirs do not confirm them."""
 
-    def group_of(self, photo: int) -> tuple[int, ...]:
+    def connected_photos(self, photo: int) -> tuple[int, ...]:
         """Return all photos connected with this one; empty where there are none."""
         return next((group for group in self.groups if photo in group), ())

@@ -72,7 +72,7 @@ def calibrate(request):
 
 
 def run(calibrate, Fs, seed=0, weights=None, size=SIZE):
-    return calibrate(CameraPairs.of(Fs, size, weights), OPTIONS, seed)
+    return calibrate(CameraPairs.from_Fs(Fs, size, weights), OPTIONS, seed)
 
 
 def is_well_formed(found):
@@ -109,7 +109,7 @@ def test_finds_the_camera(calibrate, seed):
 @pytest.mark.parametrize("name", ["huang-faugeras", "geometric", "perturbation", "multi-start"])
 def test_every_form_of_the_constraint_finds_the_camera(name, form):
     options = OPTIONS.model_copy(update={"constraint_form": form})
-    found = CALIBRATORS[name].calibrate(CameraPairs.of(fundamentals(5, 0), SIZE), options, 0)
+    found = CALIBRATORS[name].calibrate(CameraPairs.from_Fs(fundamentals(5, 0), SIZE), options, 0)
 
     assert is_well_formed(found)
     assert found.identifiable, found.reason
@@ -121,7 +121,7 @@ def test_every_form_of_the_constraint_finds_the_camera(name, form):
 @pytest.mark.parametrize("case", UNDETERMINED)
 def test_no_form_of_the_constraint_invents_a_camera(case, form):
     options = OPTIONS.model_copy(update={"constraint_form": form})
-    found = CALIBRATORS["huang-faugeras"].calibrate(CameraPairs.of(UNDETERMINED[case], SIZE), options, 0)
+    found = CALIBRATORS["huang-faugeras"].calibrate(CameraPairs.from_Fs(UNDETERMINED[case], SIZE), options, 0)
 
     assert is_well_formed(found)
     assert (found.identifiable, found.method) == (False, "guess")
@@ -181,7 +181,7 @@ def test_matrices_and_weights_that_are_not_finite_are_refused(calibrate, bad):
 )
 def test_malformed_input_is_refused(calibrate, Fs, weights, size):
     with pytest.raises(ValueError, match=r"shape|zero|weights|size"):
-        calibrate(CameraPairs.of(Fs, size, weights), OPTIONS, 0)
+        calibrate(CameraPairs.from_Fs(Fs, size, weights), OPTIONS, 0)
 
 
 def test_scale_sign_order_and_direction_do_not_matter(calibrate):

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.api import opened_run
+from sfm_app.api import open_run
 from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.estimation.matching import fill_database
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.photos import save_used
+from sfm_app.photos import save_mask
 from sfm_app.plugins import load_plugins
 from sfm_app.settings import Settings
 from sfm_app.types import Photo, PhotoSet
@@ -37,7 +37,7 @@ def place(rendered, tmp_path_factory):
     used = np.ones((320, 480), bool)
     used[:, :240] = False
     for name in (*names, "white photo.png"):
-        save_used(root / "masks", name, used if name == names[2] else np.ones((320, 480), bool))
+        save_mask(root / "masks", name, used if name == names[2] else np.ones((320, 480), bool))
     photos = PhotoSet(root / "photos", tuple(Photo(name, 480, 320, "g") for name in (*names, "white photo.png")))
     return root, photos, truth
 
@@ -46,7 +46,7 @@ def found(method, place, out, pairs=PAIRS, workers=1, masks=False, **matching):
     root, photos, _ = place
     settings = {"workers": workers, "matching": matching, "photos": {"masks": str(root / "masks") if masks else ""}}
     out.mkdir(exist_ok=True)
-    with opened_run(out, Settings.from_mapping(settings), None) as run:
+    with open_run(out, Settings.from_mapping(settings), None) as run:
         for name in ("photos", "masks"):
             if not (out / name).exists():
                 (out / name).symlink_to(root / name)

@@ -64,15 +64,15 @@ def at_rename(when: str, number: int, disturb: Callable[[], None]) -> None:
 
 def in_process(label: str, milliseconds: float, disturb: Callable[[], None]) -> None:
     """Disturb so long after a process of COLMAP's has begun with a part of its work."""
-    messages = worker_process.Apart.messages
+    messages = worker_process.WorkerProcess.messages
 
-    def heard(process: worker_process.Apart) -> Iterator[dict[str, Any]]:
+    def heard(process: worker_process.WorkerProcess) -> Iterator[dict[str, Any]]:
         for message in messages(process):
             if message.get("start") == label:
                 threading.Timer(milliseconds / 1000, disturb).start()
             yield message
 
-    worker_process.Apart.messages = heard  # type: ignore[method-assign]
+    worker_process.WorkerProcess.messages = heard  # type: ignore[method-assign]
 
 
 def prepare(what: str, moment: str, arguments: list[str]) -> None:

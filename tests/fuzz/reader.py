@@ -10,7 +10,7 @@ import signal
 import sys
 from pathlib import Path
 
-from sfm_app.photos import Glance
+from sfm_app.photos import PhotoStats
 from sfm_app.settings import PhotoSettings
 from sfm_app.stages.photos import read_photo
 
@@ -25,7 +25,7 @@ def main(folder: Path, seconds: int, megabytes: int) -> None:
         signal.alarm(seconds)
         found = read_photo(folder, path.name, options=PhotoSettings())
         signal.alarm(0)
-        say("" if isinstance(found, Glance) else found.reason)
+        say("" if isinstance(found, PhotoStats) else found.reason)
     say(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image, features
 
-from sfm_app.api import opened_run
-from sfm_app.photos import Glance, read_photo, read_source
+from sfm_app.api import open_run
+from sfm_app.photos import PhotoStats, read_photo, read_source
 from sfm_app.settings import PhotoSettings, Settings
 from sfm_app.stages import match_graph
 from sfm_app.stages import photos as photo_stage
@@ -175,7 +175,7 @@ def accepted(folder):
     for seed, data, _ in mutants("jpg", range(2 * PER_FORMAT, 6 * PER_FORMAT)):
         path = folder / f"{seed:04d}.jpg"
         path.write_bytes(data)
-        if not isinstance(read_photo(folder, path.name, options=PhotoSettings()), Glance):
+        if not isinstance(read_photo(folder, path.name, options=PhotoSettings()), PhotoStats):
             path.unlink()
         elif len(list(folder.iterdir())) == ACCEPTED:
             break
@@ -219,7 +219,7 @@ def another_size(path):
 def test_photos_that_colmap_cannot_read_have_no_keypoints(photos, tmp_path, change):
     """Neither a crash nor the end of the run: the scene says that no features were found."""
     settings = Settings.from_mapping({"matching": {"max_features": 300}})
-    with opened_run(tmp_path / "out", settings, None) as run:
+    with open_run(tmp_path / "out", settings, None) as run:
         run.workspace.create()
         photo_set = photo_stage.make(read_source(photos, run.workspace.root, settings.photos, map), run)
         path = run.workspace.photos / "view_02.jpg"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sfm_app.engine.stage import Products
-from sfm_app.engine.staleness import why_again
+from sfm_app.engine.staleness import rerun_reason
 from sfm_app.errors import SfmError
 from sfm_app.photos import read_source
 from sfm_app.pipeline import NAMES, STAGES, stored_model
@@ -161,7 +161,7 @@ def decide(made, run):
     """All that a run asks of the manifest, and what `export` reads."""
     before = made.outside()
     for stage in STAGES:
-        why_again(stage, "abc", run)
+        rerun_reason(stage, "abc", run)
         load(made, run, stage.name)
     for points in (False, True):
         try:

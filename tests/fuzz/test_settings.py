@@ -4,9 +4,9 @@ import pytest
 from click.testing import CliRunner
 
 from sfm_app.cli import main
-from sfm_app.cli.options import assigned
+from sfm_app.cli.options import parse_assignment
 from sfm_app.errors import ConfigError, InputError
-from sfm_app.photos import list_files, place_of
+from sfm_app.photos import list_files, resolve_file
 from sfm_app.settings import MOST_TOML_BYTES, Settings
 
 from .mutations import ANYTHING, damaged, text_values
@@ -73,7 +73,7 @@ def test_strange_settings_are_refused(tmp_path, case):
 def test_strange_assignments_are_refused(case):
     name, _, value = STRANGE[case].partition("=")
     try:
-        settings = assigned(f"{name}={value}")
+        settings = parse_assignment(f"{name}={value}")
         Settings.from_mapping(settings)
     except ConfigError:
         return
@@ -99,7 +99,7 @@ def test_strange_names_in_a_list_are_left_out(tmp_path, line):
 
     (name,) = list_files(folder, tmp_path / "out", tmp_path / "list.txt")
 
-    assert isinstance(place_of(folder, name), str)
+    assert isinstance(resolve_file(folder, name), str)
 
 
 def test_a_list_that_no_file_can_be(tmp_path):

@@ -19,7 +19,7 @@ from sfm_app.colmap.dense import DenseStore
 from sfm_app.pipeline import NAMES
 from sfm_app.runtime.workspace import LOCK, Workspace
 from sfm_app.settings import Settings
-from sfm_app.stages.texture import PARTS, Files
+from sfm_app.stages.texture import PARTS, FileStore
 from sfm_app.synthetic.cameras import camera_center
 from sfm_app.synthetic.compare import center_error_percent, focal_error_percent, surface_error
 from sfm_app.texture import atlas
@@ -179,12 +179,12 @@ def test_a_run_killed_in_its_texture_ends_with_the_same_bytes(finished, rendered
     monkeypatch.setattr(atlas, "EVERY_S", -1.0)
     monkeypatch.setattr(atlas, "MOST_OF_THE_TIME", np.inf)
 
-    killed_at(4, monkeypatch, Files, "keep", rendered[0], out, DRAFT, first="texture")
+    killed_at(4, monkeypatch, FileStore, "keep", rendered[0], out, DRAFT, first="texture")
     looks = stamps(parts, "look*.npz")
     assert len(looks) == 3
-    killed_at(len(whole.scene.registered), monkeypatch, Files, "keep", rendered[0], out, DRAFT)
+    killed_at(len(whole.scene.registered), monkeypatch, FileStore, "keep", rendered[0], out, DRAFT)
     assert stamps(parts, "look*.npz").items() > looks.items()
-    assert (parts / f"{atlas.KEPT}.npz").exists()
+    assert (parts / f"{atlas.GROUP_NAME}.npz").exists()
     run = sfm_app.reconstruct(rendered[0], out, DRAFT)
 
     assert run.mesh_path.read_bytes() == whole.mesh_path.read_bytes()

@@ -1,12 +1,12 @@
 import pytest
 
-from sfm_app.atomic_io import replacing
+from sfm_app.atomic_io import replace_atomically
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
     target = tmp_path / "x.txt"
     target.write_text("old")
-    with pytest.raises(RuntimeError), replacing(target) as path:
+    with pytest.raises(RuntimeError), replace_atomically(target) as path:
         path.write_text("half")
         raise RuntimeError
 

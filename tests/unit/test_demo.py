@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from sfm_app.api import Run
-from sfm_app.demo import compared, demo_lines, draw
+from sfm_app.demo import demo_lines, draw, evaluate
 from sfm_app.types import CameraModel, Model, Scene, Surface, Texture
 
 pytestmark = pytest.mark.slow
@@ -37,7 +37,7 @@ def model(rendered) -> Model:
 def test_what_was_found_is_set_beside_the_truth(rendered, scene, model, tmp_path):
     truth = rendered[1]
     run = Run(tmp_path, None, scene, None, None, {})
-    result = compared(run, scene, model, truth, (1.0, 2.0), tmp_path)
+    result = evaluate(run, scene, model, truth, (1.0, 2.0), tmp_path)
 
     assert result.photos == result.registered == 7
     assert result.refined_focal_error_percent == pytest.approx(1.0) and result.refined_center_error_percent == 0.0
@@ -54,7 +54,7 @@ def test_a_surface_partly_beside_the_truth_is_less_accurate(rendered, scene, mod
     truth = rendered[1]
     lifted = model.surface.vertices + np.array([0.0, 0.02 * np.linalg.norm(np.ptp(truth.vertices, axis=0)), 0.0])
     beside = replace(model, surface=replace(model.surface, vertices=lifted), texture=None)
-    result = compared(Run(tmp_path, None, scene, None, None, {}), scene, beside, truth, (1.0, 2.0), tmp_path)
+    result = evaluate(Run(tmp_path, None, scene, None, None, {}), scene, beside, truth, (1.0, 2.0), tmp_path)
 
     # walls slide along themselves, the ground rises
     assert 5.0 < result.surface_accuracy_percent < 90.0

@@ -6,10 +6,10 @@ import pickle
 import numpy as np
 import pytest
 
-from sfm_app.colmap.backend import backend, pycolmap
+from sfm_app.colmap.backend import pycolmap, translate_errors
 from sfm_app.errors import BackendError, ConfigError, NumericalError
 from sfm_app.geometry.similarity import robust_similarity
-from sfm_app.numerical import FAILURES, finite_only, json_text, reason_of
+from sfm_app.numerical import FAILURES, error_reason, finite_entries, json_text
 from sfm_app.runtime.manifest import Manifest, StageRecord
 from sfm_app.types import Calibration
 
@@ -30,7 +30,7 @@ OURS = {
 def test_an_error_of_ours_is_not_called_colmaps(case):
     with (
         pytest.raises(NumericalError, match="computation failed while adjusting: ") as caught,
-        backend("adjusting"),
+        translate_errors("adjusting"),
     ):
         OURS[case]()
 
@@ -40,11 +40,11 @@ def test_an_error_of_ours_is_not_called_colmaps(case):
 
 
 def test_what_pycolmap_raises_is_colmaps_and_other_bugs_stay_what_they_are(tmp_path):
-    with pytest.raises(BackendError, match="COLMAP failed while reading"), backend("reading"):
+    with pytest.raises(BackendError, match="COLMAP failed while reading"), translate_errors("reading"):
         pycolmap.Reconstruction(tmp_path / "nowhere")
-    with pytest.raises(BackendError), backend("reading"):
+    with pytest.raises(BackendError), translate_errors("reading"):
         raise RuntimeError("from C++, which has no frames")
-    with pytest.raises(ConfigError), backend("reading"):
+    with pytest.raises(ConfigError), translate_errors("reading"):
         raise ConfigError("ours")
 
 
@@ -54,7 +54,7 @@ def test_json_has_no_infinity_and_no_nan():
     assert json.loads(json_text(given), parse_constant=pytest.fail) == {
         "a": None, "b": [1.0, None, [None, "x"]], "c": {"d": None, "e": True, "f": None},
     }  # fmt: skip
-    assert finite_only({"fx": 1.0, "fy": np.inf, "cx": np.nan, "cy": None}) == {"fx": 1.0}
+    assert finite_entries({"fx": 1.0, "fy": np.inf, "cx": np.nan, "cy": None}) == {"fx": 1.0}
 
 
 def test_a_record_with_what_is_no_number_is_a_record(tmp_path):
@@ -74,5 +74,5 @@ def test_a_calibration_comes_back_without_what_is_no_number():
 
 
 def test_the_reason_is_one_line():
-    assert reason_of(ValueError("first\nat last\n")) == "at last"
-    assert reason_of(ZeroDivisionError()) == "ZeroDivisionError"
+    assert error_reason(ValueError("first\nat last\n")) == "at last"
+    assert error_reason(ZeroDivisionError()) == "ZeroDivisionError"

@@ -8,7 +8,7 @@ import pytest
 
 from sfm_app import errors
 from sfm_app.cli import main
-from sfm_app.cli.options import assigned
+from sfm_app.cli.options import parse_assignment
 from sfm_app.errors import SfmError
 from sfm_app.settings import QUALITY_PRESETS, Settings
 
@@ -45,7 +45,7 @@ def test_flags_of_the_readme_are_there():
 @pytest.mark.parametrize("page", PAGES)
 def test_settings_that_are_printed_can_be_set(page):
     for assignment in re.findall(r"--set ([a-z_]+\.[a-z_]+=[^\s`]+)", read(page)):
-        Settings.from_mapping(assigned(assignment))
+        Settings.from_mapping(parse_assignment(assignment))
 
 
 @pytest.mark.parametrize("page", PAGES)

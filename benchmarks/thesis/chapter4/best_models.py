@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from sfm_app.ransac.points import Matches, prepare
 from sfm_app.ransac.refine.sampson_refit import fit_eight_point, refine_sampson
 from sfm_app.ransac.sampling.minimal_samples import SAMPLE_SIZE, RandomState, draw_uniform, draw_weighted, random_state
-from sfm_app.ransac.sampling.stopping import trials_needed
-from sfm_app.ransac.scoring.leverage import cook_distances, leverages, mad_sigma, priors, studentised_residuals
+from sfm_app.ransac.sampling.stopping import required_trials
+from sfm_app.ransac.scoring.leverage import cook_distances, leverages, mad_sigma, priors, studentized_residuals
 from sfm_app.ransac.scoring.robust_costs import squared_distances
-from sfm_app.ransac.solvers.minimal import MOST_MODELS, models_through
+from sfm_app.ransac.solvers.minimal import MOST_MODELS, solve_sample
 from sfm_app.settings import EpipolarSettings
 
 FloatArray = NDArray[np.float64]
@@ -51,11 +51,11 @@ def trace(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int, 
         residuals = np.sqrt(squared_distances(points, f))
         fitted = residuals <= threshold
         leverage = leverages(points, f, fitted)
-        cook = cook_distances(studentised_residuals(residuals, leverage, fitted), leverage)
+        cook = cook_distances(studentized_residuals(residuals, leverage, fitted), leverage)
         validity = priors(cook, mad_sigma(cook))
         cumulative = np.cumsum(validity) if guided else cumulative
-        limit = min(limit, trials_needed(float(fitted.mean()) ** SAMPLE_SIZE, options.confidence))
-        yield BestModel(trial, *_as_given(matches, residuals * matches.unit_px, cook, validity))
+        limit = min(limit, required_trials(float(fitted.mean()) ** SAMPLE_SIZE, options.confidence))
+        yield BestModel(trial, *_to_caller_order(matches, residuals * matches.unit_px, cook, validity))
 
 
 def refits(
@@ -88,9 +88,9 @@ def _candidates(points: FloatArray, state: RandomState, cumulative: FloatArray) 
     sample, models = np.empty(SAMPLE_SIZE, np.int64), np.empty((MOST_MODELS, 9))
     if not (len(cumulative) and draw_weighted(state, cumulative, sample)):
         draw_uniform(state, len(points), sample)
-    return [models[k].copy() for k in range(models_through(points, sample, models))]
+    return [models[k].copy() for k in range(solve_sample(points, sample, models))]
 
 
-def _as_given(matches: Matches, *values: FloatArray) -> Iterator[FloatArray]:
+def _to_caller_order(matches: Matches, *values: FloatArray) -> Iterator[FloatArray]:
     """Reorder values from the shuffled order of `Matches` back to the caller's."""
     return (value[matches.rows] for value in values)

@@ -30,7 +30,7 @@ class Comparison:
     """Least ratio of the others' value to the winner's."""
 
 
-def _with_verification(figure: str, title: str, suffix: str) -> tuple[Comparison, ...]:
+def _verification_comparisons(figure: str, title: str, suffix: str) -> tuple[Comparison, ...]:
     plain, guided = f"ransac-{suffix}", f"lev-ransac-{suffix}"
     return (
         Comparison(f"{figure}a", f"the error with {title} is lower with LEV-RANSAC", guided, (plain,), ERROR),
@@ -49,14 +49,14 @@ COMPARISONS = (
     Comparison("4.11b", "MLESAC takes much longer than RANSAC (here: twice)", "ransac", ("mlesac",), TIME, factor=2.0),
     Comparison("4.6", "RES-RANSAC's error is lower than RANSAC's, MSAC's and MLESAC's", RES, CLASSICS, ERROR),
     Comparison("4.6", "RES-RANSAC needs fewer trials than they do", RES, CLASSICS, TRIALS),
-    *_with_verification("4.12", "T(d,d)", "tdd"),
-    *_with_verification("4.13", "SPRT", "sprt"),
+    *_verification_comparisons("4.12", "T(d,d)", "tdd"),
+    *_verification_comparisons("4.13", "SPRT", "sprt"),
     Comparison(
         "4.4.4", "LEV-RANSAC with SPRT is the fastest of all", "lev-ransac-sprt",
         (*CLASSICS, RES, LEV, "ransac-tdd", "lev-ransac-tdd", "ransac-sprt"), TIME,
     ),
 )  # fmt: skip
-STEADY_ONES = (
+STEADINESS_CLAIMS = (
     ("4.11b", LEV, "ransac"),
     ("4.12b", "lev-ransac-tdd", "ransac-tdd"),
     ("4.13b", "lev-ransac-sprt", "ransac-sprt"),
@@ -73,8 +73,10 @@ TRACED = (
 
 def claims_of_sweep(rows: Sequence[Row]) -> list[Claim]:
     """Judge the claims of Figures 4.11 to 4.13; `rows` has one row per estimator and level."""
-    claims = [_compared(rows, comparison) for comparison in COMPARISONS]
-    return sorted(claims + [_steady(rows, *names) for names in STEADY_ONES], key=lambda claim: claim.figure)
+    claims = [_judge_comparison(rows, comparison) for comparison in COMPARISONS]
+    return sorted(
+        claims + [_judge_steadiness(rows, *names) for names in STEADINESS_CLAIMS], key=lambda claim: claim.figure
+    )
 
 
 def claims_of_traces(traces: Mapping[str, Sequence[Row]], figures: Sequence[str]) -> list[Claim]:
@@ -105,7 +107,7 @@ def curve(rows: Sequence[Row], method: str, column: str) -> dict[float, float]:
     return {row["outliers"]: row[column] for row in rows if row["method"] == method}
 
 
-def _compared(rows: Sequence[Row], claim: Comparison) -> Claim:
+def _judge_comparison(rows: Sequence[Row], claim: Comparison) -> Claim:
     curves = {name: curve(rows, name, claim.column) for name in (claim.winner, *claim.others)}
     missing = [name for name, found in curves.items() if not found]
     low, high = claim.ratios
@@ -121,7 +123,7 @@ def _compared(rows: Sequence[Row], claim: Comparison) -> Claim:
     return Claim(claim.figure, claim.says, verdict(holds), f"{what} of {rival} : {claim.winner} at {listed}")
 
 
-def _steady(rows: Sequence[Row], figure: str, steady: str, other: str) -> Claim:
+def _judge_steadiness(rows: Sequence[Row], figure: str, steady: str, other: str) -> Claim:
     says = f"the time of {steady} is steady over the ratios, that of {other} degrades"
     curves = {name: curve(rows, name, TIME) for name in (steady, other)}
     if not all({0.1, 0.7} <= set(found) for found in curves.values()):

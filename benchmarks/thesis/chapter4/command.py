@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.command_line import add_pictures, is_wanted, new_parser, on_one_thread
-from benchmarks.common.figures import curves, label, legend_beside, pyplot, save
+from benchmarks.common.command_line import add_pictures, ensure_single_thread, is_wanted, new_parser
+from benchmarks.common.figures import add_legend, draw_curves, label, pyplot, save
 from benchmarks.common.metrics import CAP_PX, mean_sampson_px, summary_px
-from benchmarks.common.results import RESULTS, Row, document, finite, pivot, table, write
+from benchmarks.common.results import RESULTS, Row, document, finite_or_none, pivot, table, write
 from benchmarks.common.timing import take_turns, timing
 from benchmarks.thesis.chapter4.best_models import refits, trace
 from benchmarks.thesis.chapter4.claims import claim_of_refits, claims_of_sweep, claims_of_traces, curve
@@ -50,7 +50,7 @@ TRACED = {
 """Columns of each figure, and the name of its axis."""
 
 
-def sweep(tests: int, levels: Sequence[float], options: EpipolarSettings, seed: int) -> list[Row]:
+def run_sweep(tests: int, levels: Sequence[float], options: EpipolarSettings, seed: int) -> list[Row]:
     """Run every estimator on the same pairs at every level (section 4.8); one row each."""
     methods = searches(list(dict.fromkeys(name for names in SWEEPS.values() for name in names)), options)
     rows = []
@@ -65,7 +65,7 @@ def sweep(tests: int, levels: Sequence[float], options: EpipolarSettings, seed: 
     return rows
 
 
-def traced(data: Path, options: EpipolarSettings, seed: int, *, guided: bool) -> dict[str, list[Row]]:
+def run_traces(data: Path, options: EpipolarSettings, seed: int, *, guided: bool) -> dict[str, list[Row]]:
     """Return mean and standard deviation over true inliers and outliers, per sequence and best model."""
     found: dict[str, list[Row]] = {}
     for name, (folder, share) in SEQUENCES.items():
@@ -97,9 +97,9 @@ def draw_sweep(figure_name: str, rows: Sequence[Row], folder: Path) -> bool:
         (axes[1], "b", "ms mean", "mean time, ms"),
     ):
         lines = {name: [curve(chosen, name, column)[level] for level in levels] for name in names}
-        curves(axis, [100 * level for level in levels], lines, heavy)
+        draw_curves(axis, [100 * level for level in levels], lines, heavy)
         label(axis, "outliers, %", title, f"{figure_name}{part}", log=True)
-    legend_beside(figure, axes[0])
+    add_legend(figure, axes[0])
     save(figure, folder, f"chapter4-figure-{figure_name}")
     return True
 
@@ -112,7 +112,7 @@ def draw_traces(figure_name: str, traces: dict[str, list[Row]], folder: Path) ->
         numbers = [row["best model"] for row in found]
         for i, column in enumerate(columns):
             lines = {who: [row[f"{who} {column}"] for row in found] for who in ("inliers", "outliers")}
-            curves(axes[i][j], numbers, lines)
+            draw_curves(axes[i][j], numbers, lines)
             label(
                 axes[i][j],
                 "best model, in the order found",
@@ -130,7 +130,8 @@ def rows_of_traces(figure_name: str, traces: dict[str, list[Row]]) -> list[Row]:
     quantity = TRACED[figure_name][0][0].split()[0]
     rows = [{"sequence": name, **row} for name, found in traces.items() for row in found]
     return [
-        {key: finite(value) for key, value in row.items() if len(key.split()) != 3 or quantity in key} for row in rows
+        {key: finite_or_none(value) for key, value in row.items() if len(key.split()) != 3 or quantity in key}
+        for row in rows
     ]
 
 
@@ -192,15 +193,15 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     """Measure, judge the claims, and write the results."""
     args = parser().parse_args()
-    on_one_thread()
+    ensure_single_thread()
     tests, most, levels = (3, 10_000, QUICK_LEVELS) if args.quick else (args.tests, args.max_trials, LEVELS)
     options = EpipolarSettings(max_error_px=THRESHOLD_PX, confidence=CONFIDENCE, max_trials=most)
     args.results.mkdir(parents=True, exist_ok=True)
 
     merton = load_corners(args.data / "vgg-corners" / SEQUENCES["Merton"][0], 1, 2)
     refitted = list(refits(*merton, options, REPEATS, args.seed))
-    uniform, guided = (traced(args.data, options, args.seed, guided=guided) for guided in (False, True))
-    rows = sweep(tests, levels, options, args.seed)
+    uniform, guided = (run_traces(args.data, options, args.seed, guided=guided) for guided in (False, True))
+    rows = run_sweep(tests, levels, options, args.seed)
 
     traces = {name: uniform if name == "4.7" else guided for name in TRACED}
     drawn = draw_all(args, refitted, traces, rows)

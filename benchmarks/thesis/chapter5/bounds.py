@@ -4,8 +4,8 @@ import numpy as np
 
 from benchmarks.common.figures import label, pyplot
 from benchmarks.thesis.chapter5.fits import FloatArray, fit_to_all
-from benchmarks.thesis.chapter5.lab import Drawn, Lab
-from benchmarks.thesis.chapter5.panels import Panel, draw, rows_of
+from benchmarks.thesis.chapter5.lab import FigureResult, Lab
+from benchmarks.thesis.chapter5.panels import Panel, draw, panel_rows
 from benchmarks.thesis.chapter5.sequences import ImageSequence
 from benchmarks.thesis.chapter5.setups import REACH_PX
 from benchmarks.thesis.claims import Claim, verdict
@@ -13,9 +13,9 @@ from benchmarks.thesis.corners import with_outliers
 from sfm_app.selfcal.thesis.constraint_forms import essential
 from sfm_app.selfcal.thesis.perturbation import error_discrepancies
 
-OFF = np.linspace(-0.3, 0.3, 120)
+FOCAL_ERRORS = np.linspace(-0.3, 0.3, 120)
 """Relative errors of the focal, without 0, where all curves but the bound of a noisy F vanish."""
-SHARE = 0.1
+OUTLIER_SHARE = 0.1
 """Share of outliers in a noisy F."""
 OUTLYING = 3
 FOCAL_OFF = 0.1
@@ -38,21 +38,21 @@ def reduced_bound(noisy: FloatArray, K: FloatArray, change: FloatArray) -> float
     return 2.0 * float(np.linalg.norm(essential(noisy, K + change) - essential(noisy, K), ord=2))
 
 
-def bounds(lab: Lab) -> Drawn:
+def draw_bounds(lab: Lab) -> FigureResult:
     """Draw Figures 5.7 and 5.8: objective, bound and reduced bound over the error of the focal."""
     panels = []
     for name in ("Merton1", "Wadham"):
         sequence = lab.sequence(name)
         pair, F = next(iter(sequence.Fs.items()))
-        F = _of_one_camera(F, sequence.Ks[pair[0]], sequence.Ks[pair[1]], sequence.K)
-        for title, rough in (("exact F", F), ("noisy F", _noisy(sequence, pair, F, lab.seed))):
-            panels.append(Panel(f"{name}, {title}", 100 * OFF, _bounds(F, rough, sequence.K)))
+        F = _with_common_camera(F, sequence.Ks[pair[0]], sequence.Ks[pair[1]], sequence.K)
+        for title, rough in (("exact F", F), ("noisy F", _noisy_fundamental(sequence, pair, F, lab.seed))):
+            panels.append(Panel(f"{name}, {title}", 100 * FOCAL_ERRORS, _bounds(F, rough, sequence.K)))
     figure = draw(panels, "error of the focal, %", "s1 - s2", log=True, columns=2)
-    lab.keep("5.7-5.8", figure, rows_of(panels))
-    return Drawn([_claim_of_bound(panels), _claim_of_reduced(panels)], note=_BOUND_NOTE)
+    lab.keep("5.7-5.8", figure, panel_rows(panels))
+    return FigureResult([_claim_of_bound(panels), _claim_of_reduced(panels)], note=_BOUND_NOTE)
 
 
-def discrepancies(lab: Lab) -> Drawn:
+def draw_discrepancies(lab: Lab) -> FigureResult:
     """Draw Figure 5.9: Error Discrepancy of ten F's, the first three outlying, at a focal that is 10 % off."""
     figure, axes = pyplot().subplots(1, 2, figsize=(8.6, 3.2))
     rows, holds, numbers = [], [], []
@@ -75,7 +75,7 @@ def discrepancies(lab: Lab) -> Drawn:
         numbers.append(f"{name}: median {medians}; all three above all others in {apart:.0%} of {len(ED)} draws")
     lab.keep("5.9", figure, rows)
     says = "the Error Discrepancy of outlying F's is significantly higher"
-    return Drawn([Claim("5.9", says, verdict(holds), "; ".join(numbers))])
+    return FigureResult([Claim("5.9", says, verdict(holds), "; ".join(numbers))])
 
 
 _BOUND_NOTE = (
@@ -86,7 +86,7 @@ _BOUND_NOTE = (
 
 
 def _bounds(F: FloatArray, noisy: FloatArray, K: FloatArray) -> dict[str, FloatArray]:
-    changes = [K @ np.diag([1.0 + off, 1.0 + off, 1.0]) - K for off in OFF]
+    changes = [K @ np.diag([1.0 + off, 1.0 + off, 1.0]) - K for off in FOCAL_ERRORS]
     return {
         "objective": np.array([float(gap(essential(noisy, K + change))) for change in changes]),
         "bound (5.21)": np.array([full_bound(F, noisy, K, change) for change in changes]),
@@ -112,27 +112,27 @@ def _claim_of_reduced(panels: list[Panel]) -> Claim:
     )
 
 
-def _of_one_camera(F: FloatArray, K1: FloatArray, K2: FloatArray, K: FloatArray) -> FloatArray:
+def _with_common_camera(F: FloatArray, K1: FloatArray, K2: FloatArray, K: FloatArray) -> FloatArray:
     """Return F as if both views had the camera matrix K; largest singular value 1."""
     back = np.linalg.inv(K)
     same = back.T @ K2.T @ F @ K1 @ back
     return np.asarray(same / np.linalg.norm(same, ord=2))
 
 
-def _noisy(sequence: ImageSequence, pair: tuple[int, int], F: FloatArray, seed: int) -> FloatArray:
-    found = _outlying(sequence.matches[pair], seed)
+def _noisy_fundamental(sequence: ImageSequence, pair: tuple[int, int], F: FloatArray, seed: int) -> FloatArray:
+    found = _outlying_fundamental(sequence.matches[pair], seed)
     found = found / np.linalg.norm(found, ord=2)
     return np.asarray(found if np.sum(found * F) > 0 else -found)
 
 
-def _outlying(rows: FloatArray, seed: int) -> FloatArray:
-    moved, _ = with_outliers(rows[:, 2:], SHARE, REACH_PX, seed)
+def _outlying_fundamental(rows: FloatArray, seed: int) -> FloatArray:
+    moved, _ = with_outliers(rows[:, 2:], OUTLIER_SHARE, REACH_PX, seed)
     return fit_to_all(np.column_stack([rows[:, :2], moved])).F
 
 
 def _discrepancies(sequence: ImageSequence, seed: int) -> FloatArray:
     Fs = [
-        _outlying(rows, 100 * seed + k) if k < OUTLYING else fit_to_all(rows).F
+        _outlying_fundamental(rows, 100 * seed + k) if k < OUTLYING else fit_to_all(rows).F
         for k, rows in enumerate(sequence.matches.values())
     ]
     K = sequence.K @ np.diag([1.0 + FOCAL_OFF, 1.0 + FOCAL_OFF, 1.0])

@@ -19,47 +19,59 @@ from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
-from benchmarks.common.command_line import add_pictures, is_wanted, new_parser, on_one_thread
+from benchmarks.common.command_line import add_pictures, ensure_single_thread, is_wanted, new_parser
 from benchmarks.common.figures import pyplot
 from benchmarks.common.results import RESULTS, document, table, write
-from benchmarks.thesis.chapter5.bounds import bounds, discrepancies
+from benchmarks.thesis.chapter5.bounds import draw_bounds, draw_discrepancies
 from benchmarks.thesis.chapter5.contests import CAP_PERCENT, METHODS, MULTI_START, PRODUCTION
-from benchmarks.thesis.chapter5.lab import Drawn, Lab
+from benchmarks.thesis.chapter5.lab import FigureResult, Lab
 from benchmarks.thesis.chapter5.setups import NOISE_PX
-from benchmarks.thesis.chapter5.slices import kruppa_under_noise, one_outlier, parallel_axes, surfaces, wrong_center
+from benchmarks.thesis.chapter5.slices import (
+    draw_kruppa_noise,
+    draw_one_outlier,
+    draw_parallel_axes,
+    draw_surfaces,
+    draw_wrong_center,
+)
 from benchmarks.thesis.chapter5.sweeps import FIGURES as SWEEPS
-from benchmarks.thesis.chapter5.sweeps import sweep
-from benchmarks.thesis.chapter5.tables import real_sequences
-from benchmarks.thesis.chapter5.zero_curve_plots import degenerate, examples, outlying, timing, two_cameras
+from benchmarks.thesis.chapter5.sweeps import draw_sweep
+from benchmarks.thesis.chapter5.tables import compare_real_sequences
+from benchmarks.thesis.chapter5.zero_curve_plots import (
+    draw_degenerate_pairs,
+    draw_example_curves,
+    draw_outlying_curves,
+    draw_timing,
+    draw_two_cameras,
+)
 
 TABLES = "tables"
-PARTS: Mapping[str, Callable[[Lab], Drawn]] = {
-    "5.1": one_outlier,
-    "5.2": parallel_axes,
-    "5.3": wrong_center,
-    "5.4": surfaces,
-    "5.5": kruppa_under_noise,
-    "5.7-5.8": bounds,
-    "5.9": discrepancies,
-    "5.11": examples,
-    "5.12": outlying,
-    "5.14": timing,
-    "5.15": two_cameras,
-    "5.16": degenerate,
-    **{number: partial(sweep, number=number) for number in SWEEPS},
-    TABLES: real_sequences,
+PARTS: Mapping[str, Callable[[Lab], FigureResult]] = {
+    "5.1": draw_one_outlier,
+    "5.2": draw_parallel_axes,
+    "5.3": draw_wrong_center,
+    "5.4": draw_surfaces,
+    "5.5": draw_kruppa_noise,
+    "5.7-5.8": draw_bounds,
+    "5.9": draw_discrepancies,
+    "5.11": draw_example_curves,
+    "5.12": draw_outlying_curves,
+    "5.14": draw_timing,
+    "5.15": draw_two_cameras,
+    "5.16": draw_degenerate_pairs,
+    **{number: partial(draw_sweep, number=number) for number in SWEEPS},
+    TABLES: compare_real_sequences,
 }
 """The function that draws each figure."""
-IN_ORDER = sorted(PARTS, key=lambda name: 99 if name == TABLES else int(name.removeprefix("5.").split("-")[0]))
-MOST = ((MULTI_START, 20), (PRODUCTION, 20))
+ORDERED_PARTS = sorted(PARTS, key=lambda name: 99 if name == TABLES else int(name.removeprefix("5.").split("-")[0]))
+TEST_LIMITS = ((MULTI_START, 20), (PRODUCTION, 20))
 """Limits on the tests of slow methods; all else is done in about ten minutes."""
 CACHE = Path.home() / ".cache" / "sfm-app-benchmarks"
 
 
-def setting_of(lab: Lab) -> str:
+def setting_text(lab: Lab) -> str:
     """Describe the setting that all figures share."""
     return (
-        f"{lab.tests} tests a level, {lab.runs} runs a sequence ({lab.fewer}), "
+        f"{lab.tests} tests a level, {lab.runs} runs a sequence ({lab.test_limits_text}), "
         f"seed {lab.seed}. Synthetic sequences are those of section 5.5.3: five cameras, 512 x 512, 200 points, fx 500 "
         f"to 1000, fy/fx 0.8 to 1.2, the center up to 10 % off, and {NOISE_PX} px of noise, which the thesis does not "
         "name. F's come from LEV-RANSAC; an outlying F is fitted to all its matches by the 8-point algorithm. e_focal "
@@ -70,15 +82,15 @@ def setting_of(lab: Lab) -> str:
     )
 
 
-def page(lab: Lab, drawn: Mapping[str, Drawn]) -> str:
+def page(lab: Lab, drawn: Mapping[str, FigureResult]) -> str:
     """Return the Markdown page."""
     claimed = [
         {"figure": claim.figure, "the thesis": claim.says, "here": claim.verdict, "numbers": claim.numbers}
         for part in drawn.values()
         for claim in part.claims
     ]
-    parts = ["# Chapter 5: the thesis's figures and ours", setting_of(lab), "## Claims", table(claimed)]
-    declined = answers(drawn)
+    parts = ["# Chapter 5: the thesis's figures and ours", setting_text(lab), "## Claims", table(claimed)]
+    declined = answer_shares(drawn)
     if declined:
         parts += [f"## Share of tests that {PRODUCTION} answers", table(declined)]
     for name in sorted(drawn, key=lambda name: name != TABLES):
@@ -90,7 +102,7 @@ def page(lab: Lab, drawn: Mapping[str, Drawn]) -> str:
     return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
 
 
-def answers(drawn: Mapping[str, Drawn]) -> list[dict[str, object]]:
+def answer_shares(drawn: Mapping[str, FigureResult]) -> list[dict[str, object]]:
     """Return, per experiment and level, the share of tests that the production method answers."""
     rows = [row for part in drawn.values() for row in part.rows if row["method"] == PRODUCTION and "part" in row]
     found: dict[str, dict[str, object]] = {}
@@ -100,7 +112,7 @@ def answers(drawn: Mapping[str, Drawn]) -> list[dict[str, object]]:
     return list(found.values())
 
 
-def most_of(text: str) -> tuple[str, int]:
+def parse_test_limit(text: str) -> tuple[str, int]:
     """Parse METHOD=N of the command line."""
     method, _, count = text.partition("=")
     return method, int(count)
@@ -115,13 +127,18 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--most",
         nargs="*",
-        default=MOST,
-        type=most_of,
+        default=TEST_LIMITS,
+        type=parse_test_limit,
         metavar="METHOD=N",
         help="limit both for slow methods",
     )
     parser.add_argument(
-        "--only", nargs="+", choices=IN_ORDER, default=IN_ORDER, metavar="FIGURE", help=", ".join(IN_ORDER)
+        "--only",
+        nargs="+",
+        choices=ORDERED_PARTS,
+        default=ORDERED_PARTS,
+        metavar="FIGURE",
+        help=", ".join(ORDERED_PARTS),
     )
     parser.add_argument("--methods", nargs="+", default=METHODS, help="calibrators; all by default")
     parser.add_argument("--quick", action="store_true", help="2 seeds of everything")
@@ -136,7 +153,7 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     """Draw every figure, judge the claims, and write the results."""
     args = parser().parse_args()
-    on_one_thread()
+    ensure_single_thread()
     pyplot()  # fails here if matplotlib is missing, not after an hour of work
     tests, runs = (2, 2) if args.quick else (args.tests, args.runs)
     most = dict(args.most)
@@ -144,7 +161,7 @@ def main() -> None:
     drawn = {}
     with ProcessPoolExecutor(args.workers, mp_context=get_context("spawn")) as pool:
         lab = Lab(args.data, args.cache, args.results, args.methods, tests, runs, most, args.seed, pool, args.pictures)
-        for name in (name for name in IN_ORDER if name in args.only):
+        for name in (name for name in ORDERED_PARTS if name in args.only):
             start = time.perf_counter()
             drawn[name] = PARTS[name](lab)
             print(f"{name}: {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
@@ -153,5 +170,5 @@ def main() -> None:
     rows = [{"figure": name, **row} for name, part in drawn.items() for row in part.rows]
     rows = rows or [{"figure": name, "method": "none"} for name in drawn]
     text = page(lab, drawn)
-    write(args.results, "chapter5", document("chapter 5", setting_of(lab), options, {"claims": claims}, rows), text)
+    write(args.results, "chapter5", document("chapter 5", setting_text(lab), options, {"claims": claims}, rows), text)
     print(text)

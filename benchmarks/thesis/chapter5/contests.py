@@ -12,7 +12,7 @@ import numpy as np
 import sfm_app
 from benchmarks.common.results import Row
 from benchmarks.thesis.chapter5.fits import Fits, FloatArray
-from benchmarks.thesis.chapter5.panels import rounded
+from benchmarks.thesis.chapter5.panels import round_significant
 from benchmarks.thesis.chapter5.setups import Trial
 from sfm_app.selfcal import pair_weights
 from sfm_app.types import Calibration
@@ -40,7 +40,7 @@ class Attempt(NamedTuple):
     ms: float
 
 
-def ask(method: str, fits: Fits, size: tuple[int, int], seed: int) -> Calibration:
+def calibrate(method: str, fits: Fits, size: tuple[int, int], seed: int) -> Calibration:
     """Run a calibrator by its name, with all that is known about the pairs."""
     lens = method != WITHOUT_LENS
     return sfm_app.calibrate_fundamentals(
@@ -55,7 +55,7 @@ def ask(method: str, fits: Fits, size: tuple[int, int], seed: int) -> Calibratio
     )
 
 
-def answer_of(method: str, found: Calibration) -> FloatArray | None:
+def answered_K(method: str, found: Calibration) -> FloatArray | None:
     """Return K; for a method of the thesis, which always answers, also the K that our verdict rejects."""
     if found.identifiable:
         return found.K
@@ -76,19 +76,19 @@ def e_center(K: FloatArray, true_K: FloatArray) -> float:
     return float(50.0 * sum(abs(K[k, 2] / true_K[k, 2] - 1.0) for k in (0, 1)))
 
 
-def attempts(experiment: Experiment, methods: Sequence[str], seed: int) -> list[Attempt]:
+def run_attempts(experiment: Experiment, methods: Sequence[str], seed: int) -> list[Attempt]:
     """Run the methods on all levels of one seed."""
     found = []
     for trial in experiment(seed):
         for method in methods:
             start = time.perf_counter()
-            answer = ask(method, trial.fits, trial.size, seed)
+            answer = calibrate(method, trial.fits, trial.size, seed)
             ms = 1e3 * (time.perf_counter() - start)
-            found.append(Attempt(method, trial.x, answer_of(method, answer), trial.K, ms))
+            found.append(Attempt(method, trial.x, answered_K(method, answer), trial.K, ms))
     return found
 
 
-def contest(experiment: Experiment, tests: dict[str, int], seed: int, pool: Executor, title: str) -> list[Row]:
+def run_contest(experiment: Experiment, tests: dict[str, int], seed: int, pool: Executor, title: str) -> list[Row]:
     """Return one row per method and level.
 
     Args:
@@ -101,7 +101,9 @@ def contest(experiment: Experiment, tests: dict[str, int], seed: int, pool: Exec
     seeds = range(max(tests.values(), default=0))
     lists = [[name for name, count in tests.items() if n < count] for n in seeds]
     start = time.perf_counter()
-    jobs = [pool.submit(partial(attempts, experiment, names, seed + n)) for n, names in zip(seeds, lists, strict=True)]
+    jobs = [
+        pool.submit(partial(run_attempts, experiment, names, seed + n)) for n, names in zip(seeds, lists, strict=True)
+    ]
     found = [attempt for job in jobs for attempt in job.result()]
     print(f"{title}: {len(seeds)} seeds in {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
     levels = sorted({attempt.x for attempt in found})
@@ -115,11 +117,16 @@ def contest(experiment: Experiment, tests: dict[str, int], seed: int, pool: Exec
 def summary(method: str, x: float, tries: Sequence[Attempt]) -> Row:
     """Return mean and median errors over the answers, and the share of answers."""
     answers = [(attempt.K, attempt.true_K) for attempt in tries if attempt.K is not None]
-    row: Row = {"method": method, "x": rounded(x), "tests": len(tries), "answered": len(answers) / max(len(tries), 1)}
+    row: Row = {
+        "method": method,
+        "x": round_significant(x),
+        "tests": len(tries),
+        "answered": len(answers) / max(len(tries), 1),
+    }
     for title, error in (("e_focal", e_focal), ("e_OC", e_center)):
         errors = [min(error(K, true_K), CAP_PERCENT) for K, true_K in answers]
-        row[title] = rounded(float(np.mean(errors))) if errors else None
-        row[f"{title} median"] = rounded(float(np.median(errors))) if errors else None
+        row[title] = round_significant(float(np.mean(errors))) if errors else None
+        row[f"{title} median"] = round_significant(float(np.median(errors))) if errors else None
     for name, entry in (("fx", (0, 0)), ("fy", (1, 1)), ("cx", (0, 2)), ("cy", (1, 2))):
-        row[name] = rounded(float(np.median([K[entry] for K, _ in answers]))) if answers else None
-    return row | {"ms": rounded(float(np.median([attempt.ms for attempt in tries])), 4) if tries else None}
+        row[name] = round_significant(float(np.median([K[entry] for K, _ in answers]))) if answers else None
+    return row | {"ms": round_significant(float(np.median([attempt.ms for attempt in tries])), 4) if tries else None}

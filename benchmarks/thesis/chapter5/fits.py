@@ -44,6 +44,6 @@ def fit_to_all(rows: FloatArray) -> Fit:
     return Fit(matches.to_pixels(fit_eight_point(matches.points, np.ones(len(matches.points)))), rows)
 
 
-def with_outlying(clean: Fits, spoilt: Mapping[PairId, FloatArray]) -> dict[PairId, Fit]:
+def with_outlying_fits(clean: Fits, spoilt: Mapping[PairId, FloatArray]) -> dict[PairId, Fit]:
     """Replace the clean matrices of some pairs by fits to all of the given matches."""
     return {**clean, **{pair: fit_to_all(rows) for pair, rows in spoilt.items()}}

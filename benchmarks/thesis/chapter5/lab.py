@@ -10,13 +10,13 @@ from typing import Any
 from benchmarks.common.command_line import is_wanted
 from benchmarks.common.figures import pyplot, save
 from benchmarks.common.results import Row, write_csv
-from benchmarks.thesis.chapter5.contests import Experiment, contest
+from benchmarks.thesis.chapter5.contests import Experiment, run_contest
 from benchmarks.thesis.chapter5.sequences import CORNERS, ImageSequence, corner_sequence, photo_sequence
 from benchmarks.thesis.claims import Claim
 
 
 @dataclass(frozen=True, slots=True)
-class Drawn:
+class FigureResult:
     """A finished figure or table."""
 
     claims: Sequence[Claim] = ()
@@ -56,7 +56,7 @@ class Lab:
             self._sequences[name] = found
         return self._sequences[name]
 
-    def contest(
+    def run_contest(
         self,
         experiment: Callable[..., Any],
         sequence: str = "",
@@ -70,11 +70,11 @@ class Lab:
             each = {name: min(count, self.most.get(name, count)) for name in self.methods}
             each |= {name: each[like] for name, like in (also or {}).items() if like in each}
             bound: Experiment = partial(experiment, self.sequence(sequence)) if sequence else experiment
-            self._contests[title] = contest(bound, each, self.seed, self.pool, title)
+            self._contests[title] = run_contest(bound, each, self.seed, self.pool, title)
         return self._contests[title]
 
     @property
-    def fewer(self) -> str:
+    def test_limits_text(self) -> str:
         """Methods that have fewer tests or runs, as text."""
         most = max(self.tests, self.runs)
         return (

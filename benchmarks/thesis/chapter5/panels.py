@@ -46,21 +46,21 @@ def draw(panels: Sequence[Panel], x: str, y: str, *, log: bool = False, columns:
     return figure
 
 
-def rows_of(panels: Sequence[Panel]) -> list[Row]:
+def panel_rows(panels: Sequence[Panel]) -> list[Row]:
     """Return one row per point of every line, to six digits."""
     return [
-        {"panel": panel.title, "line": name, "x": rounded(x), "y": rounded(y)}
+        {"panel": panel.title, "line": name, "x": round_significant(x), "y": round_significant(y)}
         for panel in panels
         for name, values in panel.lines.items()
         for x, y in zip(panel.x, values, strict=True)
     ]
 
 
-def lowest(panel: Panel, line: str) -> float:
+def minimum_x(panel: Panel, line: str) -> float:
     """Return the x of the lowest point of a line."""
     return float(panel.x[int(np.nanargmin(panel.lines[line]))])
 
 
-def rounded(value: float, digits: int = 6) -> float:
+def round_significant(value: float, digits: int = 6) -> float:
     """Round to a number of significant digits."""
     return float(f"{value:.{digits}g}")

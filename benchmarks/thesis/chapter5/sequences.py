@@ -11,7 +11,7 @@ from scipy.linalg import rq
 
 from benchmarks.common.metrics import load_truth
 from benchmarks.thesis.corners import load_corners
-from sfm_app.api import opened_run
+from sfm_app.api import open_run
 from sfm_app.pipeline import MATCH_GRAPH, VIEW_GRAPH, run_stages
 from sfm_app.settings import Settings
 from sfm_app.types.matches import PairId
@@ -64,14 +64,14 @@ def corner_sequence(data: Path, name: str) -> ImageSequence:
         pair: np.hstack(load_corners(folder, pair[0] + 1, pair[1] + 1)) for pair in combinations(range(len(Ps)), 2)
     }
     matches = {pair: rows for pair, rows in found.items() if len(rows) >= LEAST_CORNERS}
-    Fs = {(i, j): fundamental_of(Ps[i], Ps[j]) for i, j in matches}
-    return ImageSequence(name, size, np.array([camera_matrix_of(P) for P in Ps]), matches, Fs)
+    Fs = {(i, j): fundamental_from_projections(Ps[i], Ps[j]) for i, j in matches}
+    return ImageSequence(name, size, np.array([camera_matrix_from_projection(P) for P in Ps]), matches, Fs)
 
 
 def photo_sequence(data: Path, name: str, cache: Path) -> ImageSequence:
     """Read the raw matches of the pairs that the program keeps, from CACHE/NAME, or make them from DATA/NAME/images."""
     place = data / PHOTOS[name]
-    with opened_run(cache / PHOTOS[name], Settings(), None) as run:
+    with open_run(cache / PHOTOS[name], Settings(), None) as run:
         products = run_stages(place / "images", run, last=VIEW_GRAPH.name)
         graph = products[MATCH_GRAPH]
         views = products[VIEW_GRAPH]
@@ -81,14 +81,14 @@ def photo_sequence(data: Path, name: str, cache: Path) -> ImageSequence:
     return ImageSequence(name, (first.width, first.height), np.array([K for K, _ in truth.values()]), matches, {})
 
 
-def camera_matrix_of(P: FloatArray) -> FloatArray:
+def camera_matrix_from_projection(P: FloatArray) -> FloatArray:
     """Decompose a projection matrix P ~ K [R | t] (3, 4), and return K (3, 3), positive diagonal, K[2, 2] = 1."""
     K, _ = rq(P[:, :3])
     K = K * np.sign(np.diag(K))
     return np.asarray(K / K[2, 2])
 
 
-def fundamental_of(P1: FloatArray, P2: FloatArray) -> FloatArray:
+def fundamental_from_projections(P1: FloatArray, P2: FloatArray) -> FloatArray:
     """Compute F (3, 3) of unit norm with x2' F x1 = 0 (Hartley & Zisserman, eq. 9.1)."""
     center = np.linalg.svd(P1)[2][-1]
     e2 = P2 @ center

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.thesis.chapter5.fits import Fits, FloatArray, robust_fits, with_outlying
+from benchmarks.thesis.chapter5.fits import Fits, FloatArray, robust_fits, with_outlying_fits
 from benchmarks.thesis.chapter5.sequences import ImageSequence
 from benchmarks.thesis.corners import with_outliers
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks, pair_matches
@@ -19,7 +19,7 @@ from sfm_app.types.matches import PairId
 NOISE_PX = 0.5
 """Noise of all matches; the thesis states the noise for Figure 5.21 only."""
 REACH_PX = 256.0
-HEAVY = 0.5
+HEAVY_OUTLIER_SHARE = 0.5
 """Share of outliers in an outlying F where the number of outlying F's or frames varies."""
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
 DEVIATIONS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -44,10 +44,10 @@ def matching_outliers(seed: int) -> Iterator[Trial]:
     """Vary the share of outliers in two of ten F's (Figures 5.6a, 5.10a, 5.17a, 5.18a and c)."""
     tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX), seed)
     clean = robust_fits(dict(pair_matches(tracks)), seed)
-    chosen = _shuffled(tracks.pairs, seed)[:2]
+    chosen = _shuffled_pairs(tracks.pairs, seed)[:2]
     for share in SHARES:
         spoilt = dict(pair_matches(tracks, dict.fromkeys(chosen, share), REACH_PX, seed))
-        yield Trial(100 * share, with_outlying(clean, _of(spoilt, chosen)), tracks.size, tracks.K[0])
+        yield Trial(100 * share, with_outlying_fits(clean, _select(spoilt, chosen)), tracks.size, tracks.K[0])
 
 
 def focal_deviation(seed: int) -> Iterator[Trial]:
@@ -61,32 +61,32 @@ def outlying_matrices(seed: int) -> Iterator[Trial]:
     """Vary the number of outlying F's, each from 50 % outliers (Figure 5.19a)."""
     tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX), seed)
     clean = robust_fits(dict(pair_matches(tracks)), seed)
-    order = _shuffled(tracks.pairs, seed)
-    spoilt = dict(pair_matches(tracks, dict.fromkeys(order, HEAVY), REACH_PX, seed))
+    order = _shuffled_pairs(tracks.pairs, seed)
+    spoilt = dict(pair_matches(tracks, dict.fromkeys(order, HEAVY_OUTLIER_SHARE), REACH_PX, seed))
     for count in COUNTS:
-        yield Trial(count, with_outlying(clean, _of(spoilt, order[:count])), tracks.size, tracks.K[0])
+        yield Trial(count, with_outlying_fits(clean, _select(spoilt, order[:count])), tracks.size, tracks.K[0])
 
 
 def outlying_corners(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
     """Vary the number of outlying F's, with the corners of a real sequence (Figure 5.19b)."""
     clean = robust_fits(sequence.matches, seed)
-    order = _shuffled(clean, seed)
+    order = _shuffled_pairs(clean, seed)
     spoilt = {}
     for number, pair in enumerate(order):
         rows = sequence.matches[pair]
-        moved, _ = with_outliers(rows[:, 2:], HEAVY, REACH_PX, 100 * seed + number)
+        moved, _ = with_outliers(rows[:, 2:], HEAVY_OUTLIER_SHARE, REACH_PX, 100 * seed + number)
         spoilt[pair] = np.column_stack([rows[:, :2], moved])
     for count in COUNTS:
-        yield Trial(count, with_outlying(clean, _of(spoilt, order[:count])), sequence.size, sequence.K)
+        yield Trial(count, with_outlying_fits(clean, _select(spoilt, order[:count])), sequence.size, sequence.K)
 
 
 def raw_pairs(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
     """Vary the number of F's that are fitted to all raw matches, with seven photos (Figure 5.20)."""
     seven = sequence.first(7)
     clean = robust_fits(seven.matches, seed)
-    order = _shuffled(clean, seed)
+    order = _shuffled_pairs(clean, seed)
     for count in RAW_COUNTS:
-        yield Trial(count, with_outlying(clean, _of(seven.matches, order[:count])), sequence.size, sequence.K)
+        yield Trial(count, with_outlying_fits(clean, _select(seven.matches, order[:count])), sequence.size, sequence.K)
 
 
 def gaussian_noise(seed: int) -> Iterator[Trial]:
@@ -102,8 +102,8 @@ def noisy_frame(seed: int) -> Iterator[Trial]:
         tracks = make_tracks(TrackOptions(sigma_px=NOISE_PX, cameras=count), seed)
         clean = robust_fits(dict(pair_matches(tracks)), seed)
         chosen = [pair for pair in tracks.pairs if count - 1 in pair]
-        spoilt = dict(pair_matches(tracks, dict.fromkeys(chosen, HEAVY), REACH_PX, seed))
-        yield Trial(count, with_outlying(clean, _of(spoilt, chosen)), tracks.size, tracks.K[0])
+        spoilt = dict(pair_matches(tracks, dict.fromkeys(chosen, HEAVY_OUTLIER_SHARE), REACH_PX, seed))
+        yield Trial(count, with_outlying_fits(clean, _select(spoilt, chosen)), tracks.size, tracks.K[0])
 
 
 def clean_frames(seed: int) -> Iterator[Trial]:
@@ -118,10 +118,10 @@ def whole_sequence(sequence: ImageSequence, seed: int) -> Iterator[Trial]:
     yield Trial(0, robust_fits(sequence.matches, seed), sequence.size, sequence.K)
 
 
-def _shuffled(pairs: Mapping[PairId, object], seed: int) -> list[PairId]:
+def _shuffled_pairs(pairs: Mapping[PairId, object], seed: int) -> list[PairId]:
     names = list(pairs)
     return [names[k] for k in np.random.default_rng([seed, 59]).permutation(len(names))]
 
 
-def _of(rows: Mapping[PairId, FloatArray], chosen: list[PairId]) -> dict[PairId, FloatArray]:
+def _select(rows: Mapping[PairId, FloatArray], chosen: list[PairId]) -> dict[PairId, FloatArray]:
     return {pair: rows[pair] for pair in chosen}

@@ -4,8 +4,8 @@ import numpy as np
 
 from benchmarks.common.figures import label, pyplot
 from benchmarks.thesis.chapter5.fits import Fit, FloatArray, fit_to_all, robust_fits
-from benchmarks.thesis.chapter5.lab import Drawn, Lab
-from benchmarks.thesis.chapter5.panels import Panel, draw, lowest, rounded, rows_of
+from benchmarks.thesis.chapter5.lab import FigureResult, Lab
+from benchmarks.thesis.chapter5.panels import Panel, draw, minimum_x, panel_rows, round_significant
 from benchmarks.thesis.chapter5.sequences import ImageSequence
 from benchmarks.thesis.chapter5.setups import NOISE_PX
 from benchmarks.thesis.claims import Claim, verdict
@@ -20,7 +20,7 @@ SHOWN = ("Wadham", "Merton1")
 SCALES = np.linspace(0.4, 2.0, 161)
 """Focal lengths of a slice, relative to the true one."""
 CENTER_OFF_PX = 100.0
-MUCH = 0.05
+MOVED_SHARE = 0.05
 """Share of the focal by which a minimum must move to count as moved."""
 HUANG_FAUGERAS, KRUPPA, SINES = FORMS = ("Huang-Faugeras", "Kruppa (5.6)", "Kruppa, sines")
 F_NOISE = 1e-3
@@ -37,7 +37,7 @@ def focal_slice(Fs: FloatArray, K: FloatArray, scales: FloatArray = SCALES) -> F
     return np.array([objective(Fs, K @ np.diag([scale, scale, 1.0])) for scale in scales])
 
 
-def one_outlier(lab: Lab) -> Drawn:
+def draw_one_outlier(lab: Lab) -> FigureResult:
     """Draw Figure 5.1: one wrong match in every pair."""
     panels, shifts, robust = [], {}, {}
     for name in SHOWN:
@@ -46,22 +46,25 @@ def one_outlier(lab: Lab) -> Drawn:
         found = [_fitted_slice(sequence, seed) for seed in range(lab.seed, lab.seed + lab.tests)]
         lines |= {"one outlier": found[0], "one outlier, LEV-RANSAC": _fitted_slice(sequence, 0, robust=True)}
         panel = _panel(sequence, lines)
-        least = lowest(panel, "all matches right")
+        least = minimum_x(panel, "all matches right")
         moved = [abs(panel.x[int(np.argmin(line))] / least - 1.0) for line in found]
-        shifts[name], robust[name] = np.array(moved), abs(lowest(panel, "one outlier, LEV-RANSAC") / least - 1.0)
+        shifts[name], robust[name] = np.array(moved), abs(minimum_x(panel, "one outlier, LEV-RANSAC") / least - 1.0)
         panels.append(panel)
-    lab.keep("5.1", draw(panels, "fx, px", "objective (5.8)"), rows_of(panels))
+    lab.keep("5.1", draw(panels, "fx, px", "objective (5.8)"), panel_rows(panels))
     numbers = "; ".join(
         f"{name}: the minimum moves by {100 * np.median(moved):.0f} % in the median of {len(moved)} outliers, by more "
-        f"than {100 * MUCH:.0f} % in {np.mean(moved > MUCH):.0%}; with LEV-RANSAC by {100 * robust[name]:.1f} %"
+        f"than {100 * MOVED_SHARE:.0f} % in {np.mean(moved > MOVED_SHARE):.0%}; "
+        f"with LEV-RANSAC by {100 * robust[name]:.1f} %"
         for name, moved in shifts.items()
     )
-    holds = [bool(np.median(moved) > MUCH) for moved in shifts.values()]
+    holds = [bool(np.median(moved) > MOVED_SHARE) for moved in shifts.values()]
     says = "a single outlier significantly changes the objective function"
-    return Drawn([Claim("5.1", says, verdict(holds), numbers)], note="F's by the 8-point algorithm on all corners.")
+    return FigureResult(
+        [Claim("5.1", says, verdict(holds), numbers)], note="F's by the 8-point algorithm on all corners."
+    )
 
 
-def parallel_axes(lab: Lab) -> Drawn:
+def draw_parallel_axes(lab: Lab) -> FigureResult:
     """Draw Figure 5.2: two of three synthetic cameras have parallel axes."""
     panels, flat, sharp = [], [], []
     for seed in range(lab.seed, lab.seed + 2):
@@ -69,17 +72,17 @@ def parallel_axes(lab: Lab) -> Drawn:
         named = {"parallel pair": (0, 1), "other pair": (0, 2)}
         lines = {name: focal_slice(fit_to_all(matches[pair]).F[None], K) for name, pair in named.items()}
         panels.append(Panel(f"synthetic, {size[0]} x {size[1]}", K[0, 0] * SCALES, lines, (K[0, 0],)))
-        flat.append(abs(lowest(panels[-1], "parallel pair") / K[0, 0] - 1.0))
-        sharp.append(abs(lowest(panels[-1], "other pair") / K[0, 0] - 1.0))
-    lab.keep("5.2", draw(panels, "fx, px", "objective (5.8)"), rows_of(panels))
+        flat.append(abs(minimum_x(panels[-1], "parallel pair") / K[0, 0] - 1.0))
+        sharp.append(abs(minimum_x(panels[-1], "other pair") / K[0, 0] - 1.0))
+    lab.keep("5.2", draw(panels, "fx, px", "objective (5.8)"), panel_rows(panels))
     numbers = ", ".join(
         f"minimum {100 * a:.0f} % off against {100 * b:.0f} %" for a, b in zip(flat, sharp, strict=True)
     )
     says = "the objective of a pair with parallel axes is invalid"
-    return Drawn([Claim("5.2", says, verdict([a > b for a, b in zip(flat, sharp, strict=True)]), numbers)])
+    return FigureResult([Claim("5.2", says, verdict([a > b for a, b in zip(flat, sharp, strict=True)]), numbers)])
 
 
-def wrong_center(lab: Lab) -> Drawn:
+def draw_wrong_center(lab: Lab) -> FigureResult:
     """Draw Figure 5.3: the optical center is assumed 100 px beside the true one."""
     panels, moved, numbers = [], [], []
     for name in SHOWN:
@@ -89,15 +92,15 @@ def wrong_center(lab: Lab) -> Drawn:
         off[0, 2] += CENTER_OFF_PX
         lines = {"right center": focal_slice(Fs, sequence.K), "center 100 px off": focal_slice(Fs, off)}
         panels.append(_panel(sequence, lines))
-        least = [lowest(panels[-1], line) for line in lines]
-        moved.append(abs(least[1] / least[0] - 1.0) > MUCH)
+        least = [minimum_x(panels[-1], line) for line in lines]
+        moved.append(abs(least[1] / least[0] - 1.0) > MOVED_SHARE)
         numbers.append(f"{name}: minimum at {least[0]:.0f} px, with the wrong center at {least[1]:.0f} px")
-    lab.keep("5.3", draw(panels, "fx, px", "objective (5.8)"), rows_of(panels))
+    lab.keep("5.3", draw(panels, "fx, px", "objective (5.8)"), panel_rows(panels))
     says = "an error of 100 px in the optical center moves the minimum"
-    return Drawn([Claim("5.3", says, verdict(moved), "; ".join(numbers))])
+    return FigureResult([Claim("5.3", says, verdict(moved), "; ".join(numbers))])
 
 
-def surfaces(lab: Lab) -> Drawn:
+def draw_surfaces(lab: Lab) -> FigureResult:
     """Draw Figure 5.4: the objective over fx and cx, for the Corridor and, in place of Valbonne, for Wadham."""
     figure, axes = pyplot().subplots(1, 2, figsize=(9.6, 3.6))
     rows = []
@@ -106,34 +109,42 @@ def surfaces(lab: Lab) -> Drawn:
         Fs = np.array([fit.F for fit in robust_fits(sequence.matches, lab.seed).values()])
         width = sequence.size[0]
         fx, cx = np.linspace(0.4, 2.0, 41) * sequence.K[0, 0], np.linspace(0.3, 0.7, 33) * width
-        values = np.array([[_at(Fs, sequence.K, f, u) for f in fx] for u in cx])
+        values = np.array([[_objective_at(Fs, sequence.K, f, u) for f in fx] for u in cx])
         shown = axis.contourf(fx, cx, np.log10(values), 24, cmap="viridis")
         axis.plot(sequence.K[0, 0], sequence.K[0, 2], "r+", markersize=10, markeredgewidth=2)
         label(axis, "fx, px", "cx, px", f"{name}; +: truth")
         axis.grid(False)
         figure.colorbar(shown, ax=axis, label="log10 of the objective (5.8)")
         rows += [
-            {"panel": name, "fx": rounded(f), "cx": rounded(u), "y": rounded(values[i, j])}
+            {
+                "panel": name,
+                "fx": round_significant(f),
+                "cx": round_significant(u),
+                "y": round_significant(values[i, j]),
+            }
             for i, u in enumerate(cx)
             for j, f in enumerate(fx)
         ]
     lab.keep("5.4", figure, rows)
-    return Drawn(note="Valbonne, which the thesis shows beside the Corridor, is not at hand.")
+    return FigureResult(note="Valbonne, which the thesis shows beside the Corridor, is not at hand.")
 
 
-def kruppa_under_noise(lab: Lab) -> Drawn:
+def draw_kruppa_noise(lab: Lab) -> FigureResult:
     """Draw Figure 5.5: the Kruppa equations and the Huang-Faugeras constraint before and after noise on F."""
     panels, worse, numbers = [], [], []
     for name in SHOWN:
         sequence = lab.sequence(name)
-        before, after = _forms(sequence), [_forms(sequence, seed) for seed in range(lab.seed, lab.seed + lab.tests)]
+        before, after = (
+            _form_slices(sequence),
+            [_form_slices(sequence, seed) for seed in range(lab.seed, lab.seed + lab.tests)],
+        )
         shifts = 100.0 * np.abs(_lowest_scales(np.array(after)) - _lowest_scales(before))
         medians = dict(zip(FORMS, np.median(shifts, axis=0), strict=True))
         worse.append(bool(medians[KRUPPA] > 2.0 * medians[HUANG_FAUGERAS]))
         numbers.append(f"{name}: " + ", ".join(f"{form} {shift:.1f} %" for form, shift in medians.items()))
         for k, form in enumerate(FORMS):
             panels.append(_panel(sequence, {"before": before[k], "after noise": after[0][k]}, f"{name}, {form}"))
-    lab.keep("5.5", draw(panels, "fx, px", "objective", log=True, columns=3), rows_of(panels))
+    lab.keep("5.5", draw(panels, "fx, px", "objective", log=True, columns=3), panel_rows(panels))
     says = "the Kruppa equations suffer far more (here: twice) from noise on F than the Huang-Faugeras constraint"
     note = (
         "Noise of standard deviation 0.001 on every entry of F of unit norm, in units of the image width about the "
@@ -141,7 +152,7 @@ def kruppa_under_noise(lab: Lab) -> Drawn:
         f"{lab.tests} draws, and about the ratios of (5.6). As the sine of the angle between the two sides of (5.5), "
         "the form of `kruppa`, the same equations have their minimum where Huang-Faugeras has it, and hold out as well."
     )
-    return Drawn([Claim("5.5", says, verdict(worse), "minimum moves by: " + "; ".join(numbers))], note=note)
+    return FigureResult([Claim("5.5", says, verdict(worse), "minimum moves by: " + "; ".join(numbers))], note=note)
 
 
 def _panel(sequence: ImageSequence, lines: dict[str, FloatArray], title: str = "") -> Panel:
@@ -179,23 +190,23 @@ def parallel_pair(seed: int) -> Fit:
     return fit_to_all(matches[0, 1])
 
 
-def _at(Fs: FloatArray, K: FloatArray, fx: float, cx: float) -> float:
+def _objective_at(Fs: FloatArray, K: FloatArray, fx: float, cx: float) -> float:
     moved = K.copy()
     moved[0, 0], moved[0, 2] = fx, cx
     return objective(Fs, moved)
 
 
-def _forms(sequence: ImageSequence, seed: int | None = None) -> FloatArray:
+def _form_slices(sequence: ImageSequence, seed: int | None = None) -> FloatArray:
     """Compute (3, S) the objectives named by FORMS over the focal; `seed` of the noise on F, or None for none."""
     width, height = sequence.size
     Fs = np.array(list(sequence.Fs.values()))
-    pairs = prepare(CameraPairs.of(Fs, sequence.size), unit_px=width, origin_px=(width / 2, height / 2))
+    pairs = prepare(CameraPairs.from_Fs(Fs, sequence.size), unit_px=width, origin_px=(width / 2, height / 2))
     K = np.array([[1 / width, 0, -0.5], [0, 1 / width, -0.5 * height / width], [0, 0, 1]]) @ sequence.K
     if seed is not None:
         noise = np.random.default_rng([seed, 55]).normal(scale=F_NOISE, size=pairs.F.shape)
-        pairs = prepare(CameraPairs.of(pairs.F + noise, (1, 1)), unit_px=1.0, origin_px=(0.0, 0.0))
+        pairs = prepare(CameraPairs.from_Fs(pairs.F + noise, (1, 1)), unit_px=1.0, origin_px=(0.0, 0.0))
     cameras = np.array([[scale * K[0, 0], scale * K[1, 1], K[0, 2], K[1, 2]] for scale in SCALES])
-    halves = Halves.of(pairs.F)[np.arange(len(pairs))[:, None]]
+    halves = Halves.from_fundamentals(pairs.F)[np.arange(len(pairs))[:, None]]
     ratios = kruppa_ratios(halves, cameras)
     unlike = np.sum((ratios - np.roll(ratios, 1, axis=-1)) ** 2, axis=-1)
     sines = np.linalg.norm(kruppa_equations(halves, cameras), axis=-1)

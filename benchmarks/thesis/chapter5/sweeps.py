@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.common.figures import curves, label, legend_beside, pyplot
+from benchmarks.common.figures import add_legend, draw_curves, label, pyplot
 from benchmarks.common.results import Row
 from benchmarks.thesis.chapter5 import setups
 from benchmarks.thesis.chapter5.contests import (
@@ -17,8 +17,8 @@ from benchmarks.thesis.chapter5.contests import (
     PRODUCTION,
     ZERO_CURVES,
 )
-from benchmarks.thesis.chapter5.lab import Drawn, Lab
-from benchmarks.thesis.chapter5.sweep_claims import claims_of, value
+from benchmarks.thesis.chapter5.lab import FigureResult, Lab
+from benchmarks.thesis.chapter5.sweep_claims import judge_claims, value
 
 STANDARD = (NON_ROBUST, GEOMETRIC)
 ROBUST = (ZERO_CURVES, MULTI_START, PERTURBATION)
@@ -82,7 +82,7 @@ TIMED_TESTS = 5
 """Seeds of Figure 5.22b."""
 
 
-def sweep(lab: Lab, number: str) -> Drawn:
+def draw_sweep(lab: Lab, number: str) -> FigureResult:
     """Draw a figure and judge its claims."""
     plots = FIGURES[number]
     found = {plot.part: _rows(lab, plot) for plot in plots}
@@ -92,17 +92,17 @@ def sweep(lab: Lab, number: str) -> Drawn:
         rows = found[plot.part]
         levels = sorted({row["x"] for row in rows})
         lines = {name: [value(rows, name, level, plot.column) for level in levels] for name in _methods(rows)}
-        curves(axis, levels, lines, [PRODUCTION] if PRODUCTION in lines else [plot.methods[0]], ALL)
+        draw_curves(axis, levels, lines, [PRODUCTION] if PRODUCTION in lines else [plot.methods[0]], ALL)
         label(axis, plot.axis, TITLES[plot.column], plot.title, log=True)
-    legend_beside(figure, np.ravel(axes)[0])
+    add_legend(figure, np.ravel(axes)[0])
     rows = [{"part": part, **row} for part, several in found.items() for row in several]
     lab.keep(number, figure, rows)
-    return Drawn(claims_of(found), rows)
+    return FigureResult(judge_claims(found), rows)
 
 
 def _rows(lab: Lab, plot: Plot) -> list[Row]:
     tests = TIMED_TESTS if plot.column == "ms" else None
-    rows = lab.contest(getattr(setups, plot.experiment), plot.sequence, tests)
+    rows = lab.run_contest(getattr(setups, plot.experiment), plot.sequence, tests)
     return [row for name in plot.methods for row in rows if row["method"] == name]
 
 

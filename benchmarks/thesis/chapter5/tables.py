@@ -15,7 +15,7 @@ from benchmarks.thesis.chapter5.contests import (
     WITHOUT_LENS,
     ZERO_CURVES,
 )
-from benchmarks.thesis.chapter5.lab import Drawn, Lab
+from benchmarks.thesis.chapter5.lab import FigureResult, Lab
 from benchmarks.thesis.claims import Claim, verdict
 
 PRINTED_ORDER = (ZERO_CURVES, MULTI_START, NON_ROBUST, GEOMETRIC, PERTURBATION)
@@ -53,12 +53,12 @@ TARGET = ("Wadham", "Merton1", "Merton2", "Merton3", "Castle-P19", "Fountain-P11
 K_ENTRIES = ("fx", "fy", "cx", "cy")
 
 
-def real_sequences(lab: Lab) -> Drawn:
+def compare_real_sequences(lab: Lab) -> FigureResult:
     """Run every sequence `runs` times."""
     rows: list[Row] = []
     for name in PRINTED_E_FOCAL:
-        found = lab.contest(setups.whole_sequence, name, lab.runs, also={WITHOUT_LENS: PRODUCTION})
-        rows += [{"sequence": name, **with_printed(name, row)} for row in found]
+        found = lab.run_contest(setups.whole_sequence, name, lab.runs, also={WITHOUT_LENS: PRODUCTION})
+        rows += [{"sequence": name, **with_printed_errors(name, row)} for row in found]
     truths = {name: lab.sequence(name).K for name in PRINTED_K}
     shown = {
         "Mean e_focal over Wadham, Merton I-III, Castle-P19 and Fountain-P11, %": means(rows),
@@ -66,7 +66,7 @@ def real_sequences(lab: Lab) -> Drawn:
         "Table 5.2: K in px, medians": cameras(rows, truths),
     }
     parts = [f"### {title}\n\n{table(lines)}" for title, lines in shown.items()]
-    return Drawn(claims(rows), rows, _NOTE.format(runs=lab.runs, fewer=lab.fewer), "\n".join(parts))
+    return FigureResult(claims(rows), rows, _NOTE.format(runs=lab.runs, fewer=lab.test_limits_text), "\n".join(parts))
 
 
 _NOTE = (
@@ -82,7 +82,7 @@ _NOTE = (
 )
 
 
-def with_printed(name: str, row: Row) -> Row:
+def with_printed_errors(name: str, row: Row) -> Row:
     """Add the thesis's errors to a row; None for methods that Table 5.3 lacks."""
     known = row["method"] in PRINTED_ORDER
     column = PRINTED_ORDER.index(row["method"]) if known else 0
@@ -140,10 +140,13 @@ def means(rows: Sequence[Row]) -> list[Row]:
             }
         )
     best = [min(PRINTED_E_FOCAL[name]) for name in TARGET]
-    return [*found, {"method": "the best of the thesis's on each", "thesis": _mean(best), "here": _mean(_best(rows))}]
+    return [
+        *found,
+        {"method": "the best of the thesis's on each", "thesis": _mean(best), "here": _mean(_best_errors(rows))},
+    ]
 
 
-def _best(rows: Sequence[Row]) -> list[float | None]:
+def _best_errors(rows: Sequence[Row]) -> list[float | None]:
     """Return, per sequence, the smallest mean error of the methods that Table 5.3 has."""
     printed = [row for row in rows if row["method"] in PRINTED_ORDER and row["e_focal"] is not None]
     return [min((row["e_focal"] for row in printed if row["sequence"] == name), default=None) for name in TARGET]
@@ -164,17 +167,17 @@ def claims(rows: Sequence[Row]) -> list[Claim]:
     poor = {name: value for name, value in poor.items() if value is not None}
     says = "all are poor on the Corridor (here: over 30 %)"
     found = [
-        _ranked("Zero Curves has the lowest mean e_focal", focal, ZERO_CURVES, lowest=True),
-        _ranked("the non-robust method has the highest", focal, NON_ROBUST, lowest=False),
-        _ranked("Perturbation has the lowest mean e_OC", center, PERTURBATION, lowest=True),
-        Claim("5.3", says, verdict([value > 30 for value in poor.values()]), _listed(poor)),
+        _ranking_claim("Zero Curves has the lowest mean e_focal", focal, ZERO_CURVES, lowest=True),
+        _ranking_claim("the non-robust method has the highest", focal, NON_ROBUST, lowest=False),
+        _ranking_claim("Perturbation has the lowest mean e_OC", center, PERTURBATION, lowest=True),
+        Claim("5.3", says, verdict([value > 30 for value in poor.values()]), _format_percents(poor)),
     ]
     if PRODUCTION in average:
-        found += _targets(average[PRODUCTION], corridor[PRODUCTION])
+        found += _target_claims(average[PRODUCTION], corridor[PRODUCTION])
     return found
 
 
-def _targets(six: Row, corridor: Row) -> list[Claim]:
+def _target_claims(six: Row, corridor: Row) -> list[Claim]:
     mean, share = six["here"], corridor["answered"]
     met = mean is not None and mean <= 3
     text = "no answer"
@@ -189,13 +192,13 @@ def _targets(six: Row, corridor: Row) -> list[Claim]:
     ]
 
 
-def _listed(values: Mapping[str, float]) -> str:
+def _format_percents(values: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {value:.1f} %" for name, value in values.items())
 
 
-def _ranked(says: str, values: Mapping[str, float | None], method: str, *, lowest: bool) -> Claim:
+def _ranking_claim(says: str, values: Mapping[str, float | None], method: str, *, lowest: bool) -> Claim:
     known = {name: value for name, value in values.items() if name in PRINTED_ORDER and value is not None}
-    numbers = _listed(known)
+    numbers = _format_percents(known)
     if method not in known:
         return Claim("5.3", says, "not measured", numbers)
     first = (min if lowest else max)(known, key=lambda name: known[name])

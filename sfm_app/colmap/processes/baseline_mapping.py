@@ -1,10 +1,10 @@
-"""COLMAP's own pipeline on our matches, as a separate process; see `mapping.map_as_colmap_does`."""
+"""COLMAP's own pipeline on our matches, as a separate process; see `mapping.map_with_colmap_defaults`."""
 
 from pathlib import Path
 
 from sfm_app.colmap.backend import check_written, pycolmap
-from sfm_app.colmap.mapping import largest
-from sfm_app.colmap.processes.worker_process import MappingTask, served
+from sfm_app.colmap.mapping import largest_model
+from sfm_app.colmap.processes.worker_process import MappingTask, serve
 
 
 def work(task: MappingTask) -> None:
@@ -20,7 +20,7 @@ def work(task: MappingTask) -> None:
     options.extract_colors = False
     options.num_threads = options.mapper.num_threads = 1
     options.random_seed = options.mapper.random_seed = options.triangulation.random_seed = seed
-    model = largest(pycolmap.incremental_mapping(database, Path(task["photos"]), scratch / "all", options))
+    model = largest_model(pycolmap.incremental_mapping(database, Path(task["photos"]), scratch / "all", options))
     if model is not None:
         (scratch / "model").mkdir()
         model.write(scratch / "model")
@@ -37,4 +37,4 @@ def _verify(database: Path, seed: int) -> None:
 
 
 if __name__ == "__main__":
-    served(work)
+    serve(work)

@@ -6,9 +6,9 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from sfm_app.colmap.backend import counted, plain, pycolmap
-from sfm_app.colmap.database import opened
-from sfm_app.colmap.processes.worker_process import FeatureTask, Reported, SiftOption, report, served
+from sfm_app.colmap.backend import json_options, pycolmap, run_with_progress
+from sfm_app.colmap.database import open_database
+from sfm_app.colmap.processes.worker_process import FeatureTask, ProgressReporter, SiftOption, report, serve
 from sfm_app.numerical import Json
 from sfm_app.settings import MatchSettings
 
@@ -63,7 +63,7 @@ def extract(
         extraction: see `extraction_options`.
     """
     wanted = set(names)
-    with opened(database) as before:
+    with open_database(database) as before:
         ids = [image.image_id for image in before.read_all_images() if image.name in wanted]
 
     def call(token: pycolmap.CancellationToken) -> None:
@@ -72,11 +72,11 @@ def extract(
             device=pycolmap.Device.cpu, cancellation_token=token,
         )  # fmt: skip
 
-    def done(reader: pycolmap.Database) -> int:
+    def count_finished(reader: pycolmap.Database) -> int:
         return sum(reader.exists_keypoints(image_id) for image_id in ids)
 
-    _counted(call, database, done, "features", len(names))
-    return plain(extraction.todict())
+    _run_with_progress(call, database, count_finished, "features", len(names))
+    return json_options(extraction.todict())
 
 
 def match(
@@ -98,18 +98,18 @@ def match(
     matching.sift.max_ratio = options.max_ratio
     if pairs is not None:
         _match_pairs(database, matching, pairs)
-        return plain(matching.todict())
+        return json_options(matching.todict())
 
     def call(token: pycolmap.CancellationToken) -> None:
         pycolmap.match_exhaustive(
             database, matching_options=matching, device=pycolmap.Device.cpu, cancellation_token=token
         )
 
-    def done(reader: pycolmap.Database) -> int:
+    def count_finished(reader: pycolmap.Database) -> int:
         return int(reader.num_matched_image_pairs())
 
-    _counted(call, database, done, "matching", math.comb(photos, 2))
-    return plain(matching.todict())
+    _run_with_progress(call, database, count_finished, "matching", math.comb(photos, 2))
+    return json_options(matching.todict())
 
 
 def _match_pairs(database: Path, matching: pycolmap.FeatureMatchingOptions, pairs: Sequence[tuple[int, int]]) -> None:
@@ -117,7 +117,7 @@ def _match_pairs(database: Path, matching: pycolmap.FeatureMatchingOptions, pair
     with tempfile.TemporaryDirectory(dir=database.parent, prefix=".matching") as folder:
         copy, pairing = Path(folder) / database.name, pycolmap.ImportedPairingOptions()
         shutil.copyfile(database, copy)
-        with opened(copy) as renamed:
+        with open_database(copy) as renamed:
             renamed.clear_two_view_geometries()
             renamed.clear_matches()
             for image in renamed.read_all_images():
@@ -132,15 +132,15 @@ def _match_pairs(database: Path, matching: pycolmap.FeatureMatchingOptions, pair
                 cancellation_token=token,
             )  # fmt: skip
 
-        _counted(call, copy, lambda reader: int(reader.num_matched_image_pairs()), "matching", len(pairs))
-        with opened(copy) as found:
+        _run_with_progress(call, copy, lambda reader: int(reader.num_matched_image_pairs()), "matching", len(pairs))
+        with open_database(copy) as found:
             rows = {pair: found.read_matches(*pair) for pair in pairs}
-    with opened(database) as target:
+    with open_database(database) as target:
         for pair in (pair for pair in pairs if not target.exists_matches(*pair)):
             target.write_matches(*pair, rows[pair])
 
 
-def _counted(
+def _run_with_progress(
     call: Callable[[pycolmap.CancellationToken], None],
     database: Path,
     done: Callable[[pycolmap.Database], int],
@@ -152,9 +152,9 @@ def _counted(
     The reader is COLMAP's own SQLite, opened once before the call: a second SQLite in the process (Python's) would drop
     the locks of the first whenever it closes the file, and COLMAP would abort.
     """
-    with opened(database) as reader:
-        counted(call, lambda: done(reader), label, total, Reported())
+    with open_database(database) as reader:
+        run_with_progress(call, lambda: done(reader), label, total, ProgressReporter())
 
 
 if __name__ == "__main__":
-    served(work)
+    serve(work)

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sfm_app.colmap.backend import check_written, pycolmap
-from sfm_app.colmap.mapping import largest
-from sfm_app.colmap.processes.worker_process import GlobalMappingTask, served
+from sfm_app.colmap.mapping import largest_model
+from sfm_app.colmap.processes.worker_process import GlobalMappingTask, serve
 
 ADJUSTMENTS, GAIN = 2, 1e-3
 """Rounds of adjustment, and the share of the cost that a step must gain, else the adjustment ends."""
@@ -16,7 +16,7 @@ def work(task: GlobalMappingTask) -> None:
     scratch, options = Path(task["scratch"]), global_options(task["seed"], task["names"])
     (scratch / "all").mkdir()
     models = pycolmap.global_mapping(scratch / "database.db", Path(task["photos"]), scratch / "all", options)
-    model = largest(models)
+    model = largest_model(models)
     if model is not None:
         (scratch / "model").mkdir()
         model.write(scratch / "model")
@@ -46,4 +46,4 @@ def global_options(seed: int, names: Sequence[str]) -> pycolmap.GlobalPipelineOp
 
 
 if __name__ == "__main__":
-    served(work)
+    serve(work)

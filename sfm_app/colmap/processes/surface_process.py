@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm_app.colmap.backend import check_written, pycolmap
-from sfm_app.colmap.processes.worker_process import FuseTask, PoissonTask, SimplifyTask, served
+from sfm_app.colmap.processes.worker_process import FuseTask, PoissonTask, SimplifyTask, serve
 
 MAX_NORMAL_ERROR_DEG = 25.0
 BORDER_WEIGHT = 10.0
@@ -21,7 +21,7 @@ def work(task: FuseTask | PoissonTask | SimplifyTask) -> None:
     if task["do"] == "fuse":
         fuse(task)
     elif task["do"] == "poisson":
-        poisson(task)
+        mesh_poisson(task)
     else:
         simplify(task)
     check_written(Path(task["target"]))
@@ -40,7 +40,7 @@ def fuse(task: FuseTask) -> None:
     pycolmap.stereo_fusion(Path(task["target"]), Path(task["dense"]), options=options, output_type="ply")
 
 
-def poisson(task: PoissonTask) -> None:
+def mesh_poisson(task: PoissonTask) -> None:
     """Span a closed surface over points (Poisson)."""
     options = pycolmap.PoissonMeshingOptions()
     options.depth, options.trim = task["depth"], 0.0
@@ -58,4 +58,4 @@ def simplify(task: SimplifyTask) -> None:
 
 
 if __name__ == "__main__":
-    served(work)
+    serve(work)

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from sfm_app.colmap.backend import check_written, counted, pycolmap
-from sfm_app.colmap.processes.worker_process import Reported, UndistortTask, served
+from sfm_app.colmap.backend import check_written, pycolmap, run_with_progress
+from sfm_app.colmap.processes.worker_process import ProgressReporter, UndistortTask, serve
 
 JPEG_QUALITY = 98
 
@@ -21,12 +21,14 @@ def work(task: UndistortTask) -> None:
             num_threads=task["workers"], cancellation_token=token,
         )  # fmt: skip
 
-    def done() -> int:
+    def count_finished() -> int:
         return sum(path.is_file() for path in photos.rglob("*"))
 
-    counted(call, done, "undistorting", pycolmap.Reconstruction(model_dir).num_reg_images(), Reported())
+    run_with_progress(
+        call, count_finished, "undistorting", pycolmap.Reconstruction(model_dir).num_reg_images(), ProgressReporter()
+    )
     check_written(*(path for path in dense_dir.rglob("*") if path.is_file()))
 
 
 if __name__ == "__main__":
-    served(work)
+    serve(work)

@@ -18,10 +18,10 @@ from typing import IO, Any, Literal, TypeAlias, TypedDict, TypeVar
 from sfm_app.colmap.backend import log_level, show_log
 from sfm_app.errors import BackendError
 from sfm_app.numerical import Json
-from sfm_app.progress import Progress, Silent
+from sfm_app.progress import Progress, SilentProgress
 
 ENDED_EARLY = 1
-REPORTS = 3
+REPORT_FD = 3
 """File descriptor for messages of a worker process to its parent."""
 
 SiftOption: TypeAlias = bool | int | float
@@ -45,7 +45,7 @@ class FeatureTask(TypedDict):
 
 
 class MappingTask(TypedDict):
-    """Task of `baseline_mapping`, with the arguments of `mapping.map_as_colmap_does`."""
+    """Task of `baseline_mapping`, with the arguments of `mapping.map_with_colmap_defaults`."""
 
     scratch: str
     photos: str
@@ -80,7 +80,7 @@ class FuseTask(TypedDict):
 
 
 class PoissonTask(TypedDict):
-    """Task of `surface_process`, with the arguments of `surface.poisson`."""
+    """Task of `surface_process`, with the arguments of `surface.poisson_surface`."""
 
     do: Literal["poisson"]
     points: str
@@ -98,7 +98,7 @@ class SimplifyTask(TypedDict):
     max_error: float
 
 
-class Apart:
+class WorkerProcess:
     """A running worker process."""
 
     def __init__(self, process: "subprocess.Popen[str]", said: IO[bytes]) -> None:
@@ -110,7 +110,7 @@ class Apart:
             if line.endswith("\n"):  # else the process was killed while writing it
                 yield json.loads(line)
 
-    def ended(self, wait_s: float) -> bool:
+    def has_ended(self, wait_s: float) -> bool:
         """Return whether the process has ended, or ends within that time."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.process.wait(wait_s)
@@ -139,11 +139,11 @@ class Apart:
 
 
 @contextlib.contextmanager
-def started(module: str, task: Mapping[str, object]) -> Iterator[Apart]:
+def start_worker(module: str, task: Mapping[str, object]) -> Iterator[WorkerProcess]:
     """Start a worker process on a task, and provide it; it is killed at the end of the block if it still runs.
 
     Args:
-        module: module that calls `served`.
+        module: module that calls `serve`.
         task: task of the process; valid JSON.
     """
     command = [sys.executable, "-P", "-m", module]  # -P: nothing is imported from the current folder
@@ -158,17 +158,19 @@ def started(module: str, task: Mapping[str, object]) -> Iterator[Apart]:
         try:
             with contextlib.suppress(BrokenPipeError):  # the process has failed already; `check` reports why
                 print(json.dumps({"log_level": loud, **task}), file=process.stdin, flush=True)
-            yield Apart(process, said)
+            yield WorkerProcess(process, said)
         finally:
             if process.poll() is None:
                 process.kill()
 
 
-def finished(module: str, task: Mapping[str, object], doing: str, progress: Progress | None = None) -> dict[str, Json]:
+def run_worker(
+    module: str, task: Mapping[str, object], doing: str, progress: Progress | None = None
+) -> dict[str, Json]:
     """Run a worker process to its end, and return what it has reported.
 
     Args:
-        module: module that calls `served`.
+        module: module that calls `serve`.
         task: task of the process; valid JSON.
         doing: description of the work, for error messages.
         progress: shows the progress of the process.
@@ -176,16 +178,16 @@ def finished(module: str, task: Mapping[str, object], doing: str, progress: Prog
     Raises:
         BackendError: COLMAP failed.
     """
-    with started(module, task) as process:
-        found = relay(process, progress or Silent())
+    with start_worker(module, task) as process:
+        found = relay(process, progress or SilentProgress())
         process.check(doing)
     return found
 
 
-def served(work: Callable[[Task], None]) -> None:
+def serve(work: Callable[[Task], None]) -> None:
     """Do the task in the worker process, and end when its parent does."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    os.dup2(sys.stdout.fileno(), REPORTS)
+    os.dup2(sys.stdout.fileno(), REPORT_FD)
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output of libraries must not mix with the reports
     line = sys.stdin.readline()
     if not line:
@@ -204,10 +206,10 @@ def served(work: Callable[[Task], None]) -> None:
 
 def report(**message: Json) -> None:
     """Send a message from the worker process to its parent."""
-    os.write(REPORTS, f"{json.dumps(message)}\n".encode())
+    os.write(REPORT_FD, f"{json.dumps(message)}\n".encode())
 
 
-class Reported(Silent):
+class ProgressReporter(SilentProgress):
     """Progress that is sent to the parent process; only the parent has stages."""
 
     def start(self, label: str, total: int) -> None:
@@ -228,7 +230,7 @@ class Reported(Silent):
         report(finish=True)
 
 
-def relay(process: Apart, progress: Progress) -> dict[str, Json]:
+def relay(process: WorkerProcess, progress: Progress) -> dict[str, Json]:
     """Show the progress of a process until it ends, and return its other messages.
 
     Args:

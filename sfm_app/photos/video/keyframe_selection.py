@@ -26,20 +26,20 @@ class Choice:
     """Number of frames by reason; each measured frame is either chosen or counted once."""
 
 
-def choose(looks: Sequence[TrackedFrame], most: int) -> Choice:
+def select_keyframes(looks: Sequence[TrackedFrame], most: int) -> Choice:
     """Choose one frame per step of motion; the spacing grows if that would be more than `most` frames.
 
     Args:
         looks, most: measurements of the frames, in order; largest number of chosen frames, >= 2.
     """
-    way = np.array([look.way for look in looks], np.float64)
+    way = np.array([look.path_steps for look in looks], np.float64)
     sharpness = np.array([look.sharpness for look in looks], np.float64)
     if not len(way):
         return Choice((), {})
-    every, near = sharpest(way, sharpness, 1.0)
+    every, near = sharpest_frames(way, sharpness, 1.0)
     chosen = every
     if len(every) > most:
-        chosen, near = sharpest(way, sharpness, float(way.max()) / (most - 1) * (1 - 1e-12))
+        chosen, near = sharpest_frames(way, sharpness, float(way.max()) / (most - 1) * (1 - 1e-12))
     others = set(range(len(looks))) - set(chosen)
     too_many = others & set(every)
     less_sharp = (others & near) - too_many
@@ -51,7 +51,7 @@ def choose(looks: Sequence[TrackedFrame], most: int) -> Choice:
     return Choice(tuple(looks[k].frame for k in chosen), {reason: count for reason, count in counts.items() if count})
 
 
-def sharpest(way: FloatArray, sharpness: FloatArray, spacing: float) -> tuple[list[int], set[int]]:
+def sharpest_frames(way: FloatArray, sharpness: FloatArray, spacing: float) -> tuple[list[int], set[int]]:
     """Return the sharpest frame around every multiple of a spacing, and all candidates.
 
     Args:
@@ -65,22 +65,22 @@ def sharpest(way: FloatArray, sharpness: FloatArray, spacing: float) -> tuple[li
         if chosen and moment <= chosen[-1]:
             continue
         first = chosen[-1] + 1 if chosen else 0
-        near = _around(way, moment, target, NEAR, first)
-        sharp = BLURRED * sharpness[_around(way, moment, target, 1.0, 0)].max()
-        best = _best(sharpness, near)
+        near = _nearby_frames(way, moment, target, NEAR, first)
+        sharp = BLURRED * sharpness[_nearby_frames(way, moment, target, 1.0, 0)].max()
+        best = _sharpest_frame(sharpness, near)
         if sharpness[best] < sharp:
-            best = _best(sharpness, _around(way, moment, target, FAR, first))
+            best = _sharpest_frame(sharpness, _nearby_frames(way, moment, target, FAR, first))
         candidates.update(map(int, near))
         if sharpness[best] >= sharp or not chosen or way[best] - way[chosen[-1]] >= GAP:
             chosen.append(best)
     return chosen, candidates
 
 
-def _best(sharpness: FloatArray, frames: NDArray[np.int64]) -> int:
+def _sharpest_frame(sharpness: FloatArray, frames: NDArray[np.int64]) -> int:
     return int(frames[np.argmax(sharpness[frames])])
 
 
-def _around(way: FloatArray, moment: int, target: float, reach: float, first: int) -> NDArray[np.int64]:
+def _nearby_frames(way: FloatArray, moment: int, target: float, reach: float, first: int) -> NDArray[np.int64]:
     """Return the consecutive frames around a moment whose accumulated motion lies within reach of the target."""
     outside = np.abs(way - target) > reach
     outside[:first] = True

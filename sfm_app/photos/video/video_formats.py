@@ -14,7 +14,7 @@ ATOMS = (b"moov", b"mdat", b"wide", b"free", b"skip")
 """First atoms of QuickTime files without a brand."""
 
 
-def head_of(path: Path) -> bytes:
+def read_head(path: Path) -> bytes:
     """Return the first bytes of a regular file; empty if it cannot be read."""
     try:
         if not path.is_file():  # reading a pipe would never end
@@ -34,11 +34,11 @@ def is_video(head: bytes) -> bool:
         or head[:4] == b"\x1a\x45\xdf\xa3"
         or (head[:4] == b"RIFF" and head[8:12] == b"AVI ")
         or head[:4] == b"\0\0\x01\xba"
-        or _packets(head, first=0, length=188)
-        or _packets(head, first=4, length=192)
+        or _has_packets(head, first=0, length=188)
+        or _has_packets(head, first=4, length=192)
     )
 
 
-def _packets(head: bytes, first: int, length: int) -> bool:
+def _has_packets(head: bytes, first: int, length: int) -> bool:
     """Return whether the sync bytes of an MPEG transport stream are in place."""
     return len(head) == HEAD_BYTES and all(head[k] == 0x47 for k in range(first, HEAD_BYTES, length))

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.photos.decode import UnreadableError
-from sfm_app.photos.video.video_formats import head_of, is_video
+from sfm_app.photos.video.video_formats import is_video, read_head
 
 Picture = NDArray[np.uint8]
 
 SMALL_PX = 480
 """Longer side of the pictures that frames are selected from."""
-LOOKS_PER_S = 30
+SAMPLES_PER_S = 30
 """Faster videos are subsampled to about this rate."""
 FASTEST = 240
 """Frames per second; a higher rate in the file is taken as wrong."""
@@ -32,14 +32,14 @@ FFMPEG = {
 
 
 @contextmanager
-def opened(path: Path) -> Iterator["Video"]:
+def open_video(path: Path) -> Iterator["Video"]:
     """Provide a video that is open for one pass, with FFmpeg's messages silenced.
 
     Raises:
         UnreadableError: the file is not a video, or nothing in it can be read.
     """
     place = path.resolve()  # FFmpeg takes a relative name with a colon for a protocol
-    if not is_video(head_of(place)):
+    if not is_video(read_head(place)):
         raise UnreadableError("not a video")
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -74,15 +74,15 @@ class Video:
     @property
     def stride(self) -> int:
         """Sampling interval in frames."""
-        return max(1, round(self.rate / LOOKS_PER_S)) if self.rate <= FASTEST else 1
+        return max(1, round(self.rate / SAMPLES_PER_S)) if self.rate <= FASTEST else 1
 
     @property
-    def looks(self) -> int:
+    def sample_count(self) -> int:
         """Approximate number of frames that will be sampled."""
         return max(1, self.claimed // self.stride)
 
     @property
-    def cut_short(self) -> bool:
+    def is_cut_short(self) -> bool:
         """Whether the file ended before its stated length; known once all frames were read."""
         if not (self.rate and self.claimed):
             return False
@@ -92,7 +92,7 @@ class Video:
     def small_frames(self) -> Iterator[tuple[int, Picture]]:
         """Yield small gray pictures of the sampled frames, with their numbers."""
         size: tuple[int, int] | None = None
-        for number in self._grabbed():
+        for number in self._grab_frames():
             if number % self.stride:
                 continue
             found, picture = self._capture.retrieve()
@@ -104,12 +104,12 @@ class Video:
             if size is None:
                 shrunk = min(1.0, SMALL_PX / max(picture.shape[:2]))
                 size = max(1, round(picture.shape[1] * shrunk)), max(1, round(picture.shape[0] * shrunk))
-            yield number, _gray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
+            yield number, _to_gray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
     def jpegs(self, numbers: Sequence[int]) -> Iterator[tuple[int, bytes]]:
         """Yield frames at full size as JPEG, with their numbers, in ascending order; fewer if the file has changed."""
         wanted = set(numbers)
-        for number in self._grabbed():
+        for number in self._grab_frames():
             if number in wanted:
                 found, picture = self._capture.retrieve()
                 if found:
@@ -118,7 +118,7 @@ class Video:
             if not wanted:
                 return
 
-    def _grabbed(self) -> Iterator[int]:
+    def _grab_frames(self) -> Iterator[int]:
         """Yield frame numbers in order; a frame can be retrieved only until the next one is grabbed."""
         while self._capture.grab():
             self.frames += 1
@@ -126,7 +126,7 @@ class Video:
             yield self.frames - 1
 
 
-def _gray(picture: NDArray[np.uint8]) -> Picture:
+def _to_gray(picture: NDArray[np.uint8]) -> Picture:
     return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY) if picture.ndim == 3 else picture, np.uint8)
 
 

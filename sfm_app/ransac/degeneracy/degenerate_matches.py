@@ -28,13 +28,13 @@ hand; not measured on its own."""
 _LINES, _MOST_SCORED = 16, 300
 """Sampled lines, and the inliers that each is scored on. A relevant line holds most inliers, so few samples find it:
 one of 16 pairs lies on a line that holds half of them 99 times in 100. Chosen by hand; not measured on their own."""
-_EXTENT = (0.01, 0.99)
+_EXTENT_QUANTILES = (0.01, 0.99)
 """Quantiles that bound the points of a view, without a few gross outliers. Chosen by hand; not measured on their
 own."""
 _FOCALS = np.geomspace(0.4, 6.0, 60)
 """Focal lengths that are tried for a rotation, in sides of the box around the points. Chosen by hand; not measured on
 their own."""
-_PARALLAX_OF_A_MOTION = 0.05
+_LEAST_PARALLAX_SHARE = 0.05
 """Share of the inliers off the plane below which a rotation counts as one. Mismatches on rows of bricks share a
 vanishing point: they agree with an epipole there far more often than by chance. On the real photo sets no pair has such
 a homography and less than 40 % off it (docs/algorithms.md, All estimators)."""
@@ -52,7 +52,7 @@ def find_degeneracy(
         points: (N, 4) matches in random order.
         F: (3, 3) the model.
         inliers: (N,) mask, at least 3 of them True.
-        wrong: (M,) squared distances of mismatches to F, from `a_contrario.squared_mismatches`.
+        wrong: (M,) squared distances of mismatches to F, from `a_contrario.squared_mismatch_distances`.
         threshold: largest distance of an inlier.
         centers: (4,) the origin of `points` in a frame that both views share, in the same units.
 
@@ -63,25 +63,25 @@ def find_degeneracy(
     """
     chance = accidental_share(wrong, threshold)
     for view in range(2):
-        off_line = off_dominant_line(points, inliers, view, _OFF_LINE * threshold)
-        if _may_be_accident(off_line, inliers, _LINE_SAMPLE, chance):
+        off_line = off_line_mask(points, inliers, view, _OFF_LINE * threshold)
+        if _can_be_accident(off_line, inliers, _LINE_SAMPLE, chance):
             return "collinear"
     H = dominant_homography(np.asfortranarray(points[inliers]), F, threshold)
     off_plane = transfer_distance(H, points) > OFF_PLANE * threshold
-    planar = _may_be_accident(off_plane, inliers, _PARALLAX_SAMPLE, chance)
+    planar = _can_be_accident(off_plane, inliers, _PARALLAX_SAMPLE, chance)
     parallax = np.count_nonzero(off_plane & inliers) / np.count_nonzero(inliers)
-    if (planar or parallax < _PARALLAX_OF_A_MOTION) and is_rotation(H, points, centers):
+    if (planar or parallax < _LEAST_PARALLAX_SHARE) and is_rotation(H, points, centers):
         return "rotation"
     return "planar" if planar else ""
 
 
-def _may_be_accident(off: BoolArray, inliers: BoolArray, sample_size: int, chance: float) -> bool:
+def _can_be_accident(off: BoolArray, inliers: BoolArray, sample_size: int, chance: float) -> bool:
     """Return whether the inliers among the matches `off` a line or plane could all be mismatches."""
     agreeing = int(np.count_nonzero(off & inliers))
     return false_alarms(int(np.count_nonzero(off)), agreeing, sample_size, chance) > MOST_FALSE_ALARMS
 
 
-def off_dominant_line(points: FloatArray, inliers: BoolArray, view: int, width: float) -> BoolArray:
+def off_line_mask(points: FloatArray, inliers: BoolArray, view: int, width: float) -> BoolArray:
     """Return which matches lie further than `width` from the line that holds the most inliers of a view.
 
     Args:
@@ -125,9 +125,9 @@ def is_rotation(H: FloatArray, points: FloatArray, centers: FloatArray) -> bool:
         centers: (4,) the origin of `points` in a frame that both views share, in the same units.
     """
     placed = points + centers
-    low, high = np.quantile(np.vstack([placed[:, :2], placed[:, 2:]]), _EXTENT, axis=0)
+    low, high = np.quantile(np.vstack([placed[:, :2], placed[:, 2:]]), _EXTENT_QUANTILES, axis=0)
     middle, side = (low + high) / 2, float((high - low).max())
-    to1, to2 = _shift(middle - centers[:2]), _shift(centers[2:] - middle)
+    to1, to2 = _translation(middle - centers[:2]), _translation(centers[2:] - middle)
     for focal in _FOCALS * side:
         K = np.diag([focal, focal, 1.0])
         stretch = np.linalg.svd(np.linalg.inv(K) @ to2 @ H @ to1 @ K, compute_uv=False)
@@ -136,5 +136,5 @@ def is_rotation(H: FloatArray, points: FloatArray, centers: FloatArray) -> bool:
     return False
 
 
-def _shift(by: FloatArray) -> FloatArray:
+def _translation(by: FloatArray) -> FloatArray:
     return np.array([[1, 0, by[0]], [0, 1, by[1]], [0, 0, 1]], dtype=np.float64)

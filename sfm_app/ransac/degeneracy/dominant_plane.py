@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
-from sfm_app.ransac.refine.rank_two import factors
+from sfm_app.ransac.refine.rank_two import factorize
 from sfm_app.ransac.sampling.minimal_samples import uniform
-from sfm_app.ransac.solvers.eigenvalues import symmetric_eigen
+from sfm_app.ransac.solvers.eigenvalues import decompose_symmetric
 
 FloatArray = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
     Returns:
         (3, 3), x2 ~ H x1.
     """
-    U, _, _ = factors(F)
+    U, _, _ = factorize(F)
     e2, A = np.empty(3), np.empty((3, 3))
     for i in range(3):
         e2[i] = U[i, 2]
@@ -56,9 +56,9 @@ def dominant_homography(points: FloatArray, F: FloatArray, threshold: float) -> 
         for n in range(3):
             A[i, n] = e2[j] * F[k, n] - e2[k] * F[j, n]
     b, weights = _plane_equations(points, A, e2)
-    best = _sampled_plane(points, b, A, e2, 2.0 * threshold * threshold)
+    best = _sample_plane(points, b, A, e2, 2.0 * threshold * threshold)
     H = _homography(A, e2, best)
-    squared, on_plane = _squared_transfer(points, H), 0
+    squared, on_plane = _squared_transfer_distances(points, H), 0
     for i in range(points.shape[0]):
         if squared[i] <= threshold * threshold:
             on_plane += 1
@@ -108,7 +108,7 @@ def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray, plane: Fl
             right[j] += weights[i] * row[j] * b[i]
             for k in range(3):
                 gram[j, k] += weights[i] * row[j] * row[k]
-    symmetric_eigen(gram, values, vectors)
+    decompose_symmetric(gram, values, vectors)
     if not values[0] > _LEAST_SUPPORT * values[2]:
         return False
     for j in range(3):
@@ -123,7 +123,7 @@ def _fit_plane(points: FloatArray, b: FloatArray, weights: FloatArray, plane: Fl
 
 
 @kernel
-def _sampled_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatArray, limit: float) -> FloatArray:
+def _sample_plane(points: FloatArray, b: FloatArray, A: FloatArray, e2: FloatArray, limit: float) -> FloatArray:
     """Return the v through three sampled matches whose H maps most of the first matches to within sqrt(limit)."""
     count, most, state = min(points.shape[0], _MOST_SCORED), -1, np.empty(1, dtype=np.uint64)
     best, corner, v = np.zeros(3), np.empty(3, dtype=np.int64), np.empty(3)
@@ -165,11 +165,11 @@ def transfer_distance(H: FloatArray, points: FloatArray) -> FloatArray:
         H: (3, 3) homography, view 2 from view 1.
         points: (N, 4) matches, in the same frame.
     """
-    return np.sqrt(_squared_transfer(points, H))
+    return np.sqrt(_squared_transfer_distances(points, H))
 
 
 @kernel
-def _squared_transfer(points: FloatArray, H: FloatArray) -> FloatArray:
+def _squared_transfer_distances(points: FloatArray, H: FloatArray) -> FloatArray:
     squared = np.empty(points.shape[0])
     for i in range(points.shape[0]):
         x, y = points[i, 0], points[i, 1]

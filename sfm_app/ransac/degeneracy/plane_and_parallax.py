@@ -23,7 +23,7 @@ _MOST_INLIERS = 300
 """Largest number of inliers that the plane is fitted to. Chosen by hand; not measured on its own."""
 
 
-def with_another_epipole(
+def recover_epipole(
     points: FloatArray, F: FloatArray, threshold: float, loss: Loss, pretest: PreTest, state: RandomState
 ) -> FloatArray | None:
     """Estimate the best model with the dominant plane of F's inliers; None without a plane and two matches off it.
@@ -44,12 +44,12 @@ def with_another_epipole(
     if len(off_plane) < 2:
         return None
     best = np.empty(9)
-    found = _best_epipole(points, H, off_plane, loss, pretest, state, best)
+    found = _search_epipole(points, H, off_plane, loss, pretest, state, best)
     return best.reshape(3, 3) if np.isfinite(found) else None
 
 
 @kernel
-def _best_epipole(
+def _search_epipole(
     points: FloatArray, H: FloatArray, off_plane: NDArray[np.int64], loss: Loss, pretest: PreTest, state: RandomState,
     best: FloatArray,
 ) -> float:  # fmt: skip

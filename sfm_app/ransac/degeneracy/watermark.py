@@ -23,18 +23,18 @@ Fit = Callable[[FloatArray, FloatArray, EpipolarSettings, int], EpipolarFit | Re
 SAME_PHOTO = "the same photo twice, or nearly"
 ONLY_A_LOGO = "nothing in common but a logo or time stamp"
 
-PEAK, STATIONARY, AROUND = 1.0, 2.0, 4.0
+PEAK, STATIONARY, RING = 1.0, 2.0, 4.0
 """Largest displacements at the peak, of stationary matches, and of the ring around the peak, in units of keypoint
 noise. Checked on the real photo sets, where they affect one pair of 456 (docs/algorithms.md, All estimators)."""
-LEAST = 8
+LEAST_PEAK = 8
 """Least number of matches at the peak; fewer are left to the estimator. Chosen by hand; not measured on its own."""
 MOST_LOST = 0.2
 """Share of the stationary matches, or of the others, that may be removed from the scene with a logo.
 docs/algorithms.md, All estimators. Chosen by hand; not measured on its own."""
-CELLS, WIDE = 8, 0.25
+CELLS, WIDE_SHARE = 8, 0.25
 """Cells of the photo along each side, and the share of the cells with keypoints that a logo does not exceed. Chosen by
 hand; not measured on their own."""
-EXPLAINED = 0.9
+EXPLAINED_SHARE = 0.9
 """Share of the stationary matches that a motion without rotation explains. Chosen by hand; not measured on its own."""
 
 
@@ -54,15 +54,15 @@ def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> Boo
         (N,) mask; all False where there is no such peak.
     """
     squared = np.square(x2 - x1).sum(axis=1) / unit_px**2
-    peak, held, reached = (int(np.count_nonzero(squared <= steps**2)) for steps in (PEAK, STATIONARY, AROUND))
+    peak, held, reached = (int(np.count_nonzero(squared <= steps**2)) for steps in (PEAK, STATIONARY, RING))
     ring = reached - peak
     # of a scene on a line through 0, each unit of displacement holds a third of the ring
-    lost = ring * STATIONARY / (AROUND - PEAK)
-    is_peak = peak >= max(LEAST, ring) and lost <= MOST_LOST * max(held, len(x1) - held)
+    lost = ring * STATIONARY / (RING - PEAK)
+    is_peak = peak >= max(LEAST_PEAK, ring) and lost <= MOST_LOST * max(held, len(x1) - held)
     return squared <= STATIONARY**2 if is_peak else np.zeros(len(x1), bool)
 
 
-def covers(points: FloatArray, keypoints: FloatArray, size: tuple[int, int]) -> bool:
+def is_widespread(points: FloatArray, keypoints: FloatArray, size: tuple[int, int]) -> bool:
     """Return whether points are spread over a large part of a photo.
 
     Args:
@@ -70,7 +70,7 @@ def covers(points: FloatArray, keypoints: FloatArray, size: tuple[int, int]) -> 
         keypoints: (M, 2) pixels of all keypoints of the photo.
         size: (width, height) of the photo in pixels.
     """
-    return len(_cells(points, size)) > WIDE * len(_cells(keypoints, size))
+    return len(_occupied_cells(points, size)) > WIDE_SHARE * len(_occupied_cells(keypoints, size))
 
 
 def fit_moving(
@@ -86,7 +86,7 @@ def fit_moving(
         fit: the estimator.
         points: x1, x2, each (N, 2) pixels.
         stationary: (N,) mask from `find_stationary`.
-        wide: whether these lie all over the photo, see `watermark.covers`.
+        wide: whether these lie all over the photo, see `watermark.is_widespread`.
         options: settings of the estimator.
         seed: seed of the estimator.
 
@@ -100,13 +100,13 @@ def fit_moving(
     if wide and not found.degeneracy:
         still = np.asfortranarray(np.hstack([x1[stationary], x2[stationary]]))
         agreeing = squared_distances(still, np.ascontiguousarray(found.F).reshape(9)) <= options.max_error_px**2
-        if agreeing.mean() >= EXPLAINED:
+        if agreeing.mean() >= EXPLAINED_SHARE:
             return fit(x1, x2, options, seed)
     inliers, priors = np.zeros(len(x1), bool), np.zeros(len(x1))
     inliers[~stationary], priors[~stationary] = found.inliers, found.priors
     return EpipolarFit(found.F, inliers, priors, found.trials, found.rms_px, found.degeneracy)
 
 
-def _cells(points: FloatArray, size: tuple[int, int]) -> NDArray[np.int64]:
+def _occupied_cells(points: FloatArray, size: tuple[int, int]) -> NDArray[np.int64]:
     columns, rows = (points / size * CELLS).astype(np.int64).clip(0, CELLS - 1).T
     return np.unique(CELLS * rows + columns)

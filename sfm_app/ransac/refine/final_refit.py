@@ -51,7 +51,7 @@ REFITS: dict[str, Refit] = {
 """Values of `EpipolarSettings.refit` besides "auto"."""
 
 
-def last_fit(name: str, own: Refit) -> Refit:
+def choose_refit(name: str, own: Refit) -> Refit:
     """Return the estimator's own fit, followed by the named fit to its inliers unless the name is "auto".
 
     The own fit always comes first: its inliers are better than those of the best sample.

@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.damping import DampingRange, damped_step
 from sfm_app.geometry.distances import nearest_exact_matches
-from sfm_app.geometry.epipolar import homogeneous, nearest_rank_two, unit_norm
+from sfm_app.geometry.epipolar import nearest_rank_two, to_homogeneous, to_unit_norm
 
 FloatArray = NDArray[np.float64]
 
 DAMPING = DampingRange(first=1e-4, least=1e-12, most=1e12)
 """Damping of Levenberg-Marquardt steps. Chosen by hand; not measured on its own."""
-_ENOUGH = 1e-9
+_COST_TOLERANCE = 1e-9
 """Relative decrease of the cost below which the iteration ends. Chosen by hand; not measured on its own."""
-_FLOOR = 1e-12
+_LEAST_CURVATURE = 1e-12
 """Least curvature, relative to the largest: some matches leave a direction of F free. Chosen by hand; not measured on
 its own."""
 
@@ -46,13 +46,13 @@ def refine_reprojection(
         ValueError: F is zero or not finite.
     """
     softness = 1.0 / (scale * scale)
-    F = unit_norm(nearest_rank_two(unit_norm(F)))
+    F = to_unit_norm(nearest_rank_two(to_unit_norm(F)))
     moves = _moves(points, F)
     cost, damping = _cost(moves, softness), DAMPING.first
 
     def attempt(tried: float) -> tuple[FloatArray, FloatArray, float] | None:
         step = np.linalg.solve(normal + tried * np.diag(curvature), right)
-        trial = unit_norm(nearest_rank_two(F + (step @ basis).reshape(3, 3)))
+        trial = to_unit_norm(nearest_rank_two(F + (step @ basis).reshape(3, 3)))
         reached = _moves(points, trial)
         lower = _cost(reached, softness)
         return (trial, reached, lower) if lower < cost else None
@@ -60,14 +60,14 @@ def refine_reprojection(
     for _ in range(most_steps):
         if not 0 < cost < np.inf:
             break
-        basis = _tangent(F)
+        basis = _tangent_basis(F)
         normal, right = _normal_equations(points, F, moves, softness, basis)
-        curvature = np.maximum(np.diag(normal), _FLOOR * np.diag(normal).max())
+        curvature = np.maximum(np.diag(normal), _LEAST_CURVATURE * np.diag(normal).max())
         found, damping = damped_step(attempt, damping, DAMPING)
         if found is None:
             break
         before, (F, moves, cost) = cost, found
-        if before - cost <= _ENOUGH * before:
+        if before - cost <= _COST_TOLERANCE * before:
             break
     return F
 
@@ -82,7 +82,7 @@ def _cost(moves: FloatArray, softness: float) -> float:
     return float((np.log1p(softness * squared) / softness if softness > 0 else squared).sum())
 
 
-def _tangent(F: FloatArray) -> FloatArray:
+def _tangent_basis(F: FloatArray) -> FloatArray:
     """Return (7, 9) orthonormal directions that to first order keep the rank 2 and the norm 1 of F."""
     U, _, Vt = np.linalg.svd(F)
     basis: FloatArray = np.linalg.svd(np.stack([np.outer(U[:, 2], Vt[2]).ravel(), F.ravel()]))[2][2:]
@@ -93,7 +93,7 @@ def _normal_equations(
     points: FloatArray, F: FloatArray, moves: FloatArray, softness: float, basis: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return weighted J'J (7, 7) and -J'r (7,) over the directions of `basis`, the points eliminated."""
-    exact1, exact2 = homogeneous(points[:, :2] + moves[:, :2]), homogeneous(points[:, 2:] + moves[:, 2:])
+    exact1, exact2 = to_homogeneous(points[:, :2] + moves[:, :2]), to_homogeneous(points[:, 2:] + moves[:, 2:])
     gradient = np.hstack([(exact2 @ F)[:, :2], (exact1 @ F.T)[:, :2]])
     length = np.linalg.norm(gradient, axis=1)
     inverse = np.divide(1.0, length, out=np.zeros_like(length), where=length > 0)  # 0 at both epipoles

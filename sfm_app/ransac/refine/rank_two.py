@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.ransac.scoring.robust_costs import FIRST
-from sfm_app.ransac.solvers.eigenvalues import symmetric_eigen
+from sfm_app.ransac.solvers.eigenvalues import decompose_symmetric
 
 FloatArray = NDArray[np.float64]
 
@@ -19,14 +19,14 @@ LEAST_RATIO = 1e-12
 
 
 @kernel
-def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
+def factorize(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
     """Decompose the nearest matrix of rank 2, up to scale, into U diag(1, s, 0) V'; return U, s, V."""
     gram, values, vectors = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
     for i in range(3):
         for j in range(3):
             for k in range(3):
                 gram[i, j] += F[k, i] * F[k, j]
-    symmetric_eigen(gram, values, vectors)
+    decompose_symmetric(gram, values, vectors)
     U, V = np.empty((3, 3)), np.empty((3, 3))
     for k in range(2):
         for i in range(3):
@@ -34,7 +34,7 @@ def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
         for i in range(3):
             U[i, k] = F[i, 0] * V[0, k] + F[i, 1] * V[1, k] + F[i, 2] * V[2, k]
     first = _normalize(U, FIRST)
-    _turn_away(U)  # removes rounding errors, which matter where s is small
+    _orthogonalize(U)  # removes rounding errors, which matter where s is small
     second = _normalize(U, 1)
     if not second > LEAST_RATIO * first:  # rank 1: any second column will do
         least = 0
@@ -42,7 +42,7 @@ def factors(F: FloatArray) -> tuple[FloatArray, float, FloatArray]:
             least = i if abs(U[i, 0]) < abs(U[least, 0]) else least
         for i in range(3):
             U[i, 1] = 1.0 if i == least else 0.0
-        _turn_away(U)
+        _orthogonalize(U)
         _normalize(U, 1)
     for i in range(3):  # the third columns, of singular value 0, make both matrices rotations
         j, k = (i + 1) % 3, (i + 2) % 3
@@ -61,7 +61,7 @@ def _normalize(U: FloatArray, k: int) -> float:
 
 
 @kernel
-def _turn_away(U: FloatArray) -> None:
+def _orthogonalize(U: FloatArray) -> None:
     """Make the second column perpendicular to the first, a unit vector."""
     dot = U[0, 0] * U[0, 1] + U[1, 0] * U[1, 1] + U[2, 0] * U[2, 1]
     for i in range(3):
@@ -85,7 +85,7 @@ def compose(U: FloatArray, s: float, V: FloatArray) -> FloatArray:
 
 
 @kernel
-def tangent(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
+def fill_tangent_basis(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
     """Write the derivatives of F by the seven parameters, one row each: U [e_k]x S V', -U S [e_k]x V', u2 v2'.
 
     Args:
@@ -107,7 +107,7 @@ def tangent(U: FloatArray, s: float, V: FloatArray, basis: FloatArray) -> None:
 
 
 @kernel
-def turned(R: FloatArray, w: FloatArray) -> FloatArray:
+def rotate(R: FloatArray, w: FloatArray) -> FloatArray:
     """Return R exp([w]x) by Rodrigues' formula.
 
     Args:

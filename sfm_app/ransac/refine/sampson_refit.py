@@ -11,18 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.jit import kernel, summing_kernel
-from sfm_app.ransac.refine.rank_two import compose, factors, tangent, turned
+from sfm_app.ransac.refine.rank_two import compose, factorize, fill_tangent_basis, rotate
 from sfm_app.ransac.scoring.leverage import mad_sigma
-from sfm_app.ransac.scoring.robust_costs import FIRST, distances_of_block, squared_distances
+from sfm_app.ransac.scoring.robust_costs import FIRST, fill_squared_distances, squared_distances
 from sfm_app.ransac.solvers.design_matrix import LANES, add_products, gather, mirror, weighted_gram
 
 FloatArray = NDArray[np.float64]
 
 _FIRST_DAMPING, _SMALLEST_DAMPING, _LARGEST_DAMPING = 1e-4, 1e-12, 1e12
 """Damping of Levenberg-Marquardt steps, relative to the curvature. Chosen by hand; not measured on their own."""
-_ENOUGH = 1e-9
+_COST_TOLERANCE = 1e-9
 """Relative decrease of the cost below which the iteration ends. Chosen by hand; not measured on its own."""
-_ENOUGH_LIKELIHOOD = 1e-4
+_LIKELIHOOD_TOLERANCE = 1e-4
 """Relative decrease of the cost below which the mixture fit ends. Chosen by hand; not measured on its own."""
 _NEGLIGIBLE = 1e-3
 """Weight below which a match is left out of a step. Chosen by hand; not measured on its own."""
@@ -40,7 +40,7 @@ _LEAST_CURVATURE = 1e-9
 hand; not measured on its own."""
 
 
-class Weighing(NamedTuple):
+class Weighting(NamedTuple):
     """How squared distances become weights: by a robust cost, or by a mixture of two densities."""
 
     is_mixture: bool = False
@@ -55,7 +55,7 @@ class Weighing(NamedTuple):
 
 
 def refine_sampson(
-    points: FloatArray, F: FloatArray, *, scale: float = np.inf, most_steps: int = 20, enough: float = _ENOUGH
+    points: FloatArray, F: FloatArray, *, scale: float = np.inf, most_steps: int = 20, enough: float = _COST_TOLERANCE
 ) -> FloatArray:
     """Move F towards a minimum of sum_i r_i^2 / (1 + r_i^2 / c^2) (Geman and McClure 1987).
 
@@ -69,8 +69,8 @@ def refine_sampson(
     Returns:
         (3, 3), rank 2, its largest singular value 1.
     """
-    weighing = Weighing(softness=float(scale**-2))
-    return _reweighted(points, *factors(F), weighing, most_steps, enough, np.empty((10, 10)))
+    weighing = Weighting(softness=float(scale**-2))
+    return _reweighted_least_squares(points, *factorize(F), weighing, most_steps, enough, np.empty((10, 10)))
 
 
 def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach: float, most_steps: int) -> FloatArray:
@@ -89,18 +89,18 @@ def refine_mixture(points: FloatArray, F: FloatArray, *, threshold: float, reach
     Returns:
         (3, 3), rank 2, its largest singular value 1.
     """
-    U, s, V = factors(F)
+    U, s, V = factorize(F)
     squared = squared_distances(points, compose(U, s, V))
     inside = squared[squared <= threshold * threshold]
     sigma = mad_sigma(np.sqrt(inside)) if len(inside) else threshold
     squared_reach = float((reach * threshold) ** 2)
-    weighing = Weighing(
+    weighing = Weighting(
         is_mixture=squared_reach > 0.0,  # where the squared threshold underflows, fall back to least squares
         squared_reach=squared_reach,
         largest_variance=float(threshold**2),
         first_variance=float(min(sigma, threshold) ** 2),
     )
-    return _reweighted(points, U, s, V, weighing, most_steps, _ENOUGH_LIKELIHOOD, np.empty((10, 10)))
+    return _reweighted_least_squares(points, U, s, V, weighing, most_steps, _LIKELIHOOD_TOLERANCE, np.empty((10, 10)))
 
 
 def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
@@ -113,7 +113,7 @@ def fit_eight_point(points: FloatArray, weights: FloatArray) -> FloatArray:
     Returns:
         (3, 3), rank 2.
     """
-    U, s, V = factors(fit_algebraic(points, weights))
+    U, s, V = factorize(fit_algebraic(points, weights))
     return compose(U, s, V).reshape(3, 3)
 
 
@@ -129,8 +129,8 @@ def fit_algebraic(points: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 @kernel
-def _reweighted(
-    points: FloatArray, U: FloatArray, s: float, V: FloatArray, weighing: Weighing, most_steps: int, enough: float,
+def _reweighted_least_squares(
+    points: FloatArray, U: FloatArray, s: float, V: FloatArray, weighing: Weighting, most_steps: int, enough: float,
     gram: FloatArray,
 ) -> FloatArray:  # fmt: skip
     """Weigh and step in turn until a step lowers the cost by less than the relative decrease `enough`.
@@ -141,7 +141,7 @@ def _reweighted(
     weights, squared, trial = np.empty(count), np.empty(count), np.empty(count)
     normal, right, step = np.empty((7, 7)), np.empty(7), np.empty(7)
     f = compose(U, s, V)
-    distances_of_block(points, f, FIRST, squared)
+    fill_squared_distances(points, f, FIRST, squared)
     damping, variance, share = _FIRST_DAMPING, weighing.first_variance, _FIRST_SHARE
     for n in range(most_steps):
         if weighing.is_mixture:
@@ -154,9 +154,9 @@ def _reweighted(
         improved = False
         while not improved and damping < _LARGEST_DAMPING:
             if _solve(normal, right, damping, step):
-                U_new, V_new, s_new = turned(U, step[0:3]), turned(V, step[3:6]), s + step[6]
+                U_new, V_new, s_new = rotate(U, step[0:3]), rotate(V, step[3:6]), s + step[6]
                 new = compose(U_new, s_new, V_new)
-                distances_of_block(points, new, FIRST, trial)
+                fill_squared_distances(points, new, FIRST, trial)
                 new_cost = _weighted_sum(trial, weights)
                 improved = new_cost < cost
             damping = max(damping * 0.1, _SMALLEST_DAMPING) if improved else damping * 10.0
@@ -179,7 +179,7 @@ def _weigh_robustly(squared: FloatArray, softness: float, weights: FloatArray) -
 
 @kernel
 def _weigh_by_mixture(
-    squared: FloatArray, weighing: Weighing, variance: float, share: float, rounds: int, weights: FloatArray
+    squared: FloatArray, weighing: Weighting, variance: float, share: float, rounds: int, weights: FloatArray
 ) -> tuple[float, float]:
     """Weigh matches by their probability to be inliers; return the new variance and share of inliers."""
     reach, largest = weighing.squared_reach, weighing.largest_variance
@@ -227,7 +227,7 @@ def _normal_equations(
         add_products(rows, count, gram)
     mirror(gram)
     basis = np.empty((7, 9))
-    tangent(U, s, V, basis)
+    fill_tangent_basis(U, s, V, basis)
     _project(gram, basis, normal, right)
 
 

@@ -79,7 +79,7 @@ def draw_weighted(state: RandomState, cumulative: FloatArray, sample: IntArray) 
     for k in range(sample.shape[0]):
         fresh = False
         while not fresh:
-            sample[k] = _first_above(cumulative, uniform(state) * total)
+            sample[k] = _search_sorted(cumulative, uniform(state) * total)
             fresh = _is_fresh(sample, k)
             redraws += not fresh
             if redraws > _MOST_REDRAWS:
@@ -96,7 +96,7 @@ def _is_fresh(sample: IntArray, last: int) -> bool:
 
 
 @kernel
-def _first_above(cumulative: FloatArray, target: float) -> int:
+def _search_sorted(cumulative: FloatArray, target: float) -> int:
     low, high = 0, cumulative.shape[0] - 1
     while low < high:
         middle = (low + high) // 2

@@ -9,7 +9,7 @@ CONVERGED = 0.05
 """G of the thesis (4.7.4, Eq. 4.18): priors have converged when the sum of their changes is below this."""
 
 
-def trials_needed(success: float, confidence: float, log_missed: float = 0.0) -> float:
+def required_trials(success: float, confidence: float, log_missed: float = 0.0) -> float:
     """Return how many samples make one success as probable as wanted (thesis 3.19); inf if none can succeed.
 
     Args:
@@ -25,7 +25,7 @@ def trials_needed(success: float, confidence: float, log_missed: float = 0.0) ->
     return left / math.log1p(-success) if success > 0 else math.inf
 
 
-def have_converged(before: NDArray[np.float64], after: NDArray[np.float64], limit: float = CONVERGED) -> bool:
+def has_converged(before: NDArray[np.float64], after: NDArray[np.float64], limit: float = CONVERGED) -> bool:
     """Return whether the priors, normalized to sum 1, changed less than a limit in sum (thesis 4.18).
 
     The printed sum grows with the number of matches; for probabilities that sum to 1 it lies in [0, 2].

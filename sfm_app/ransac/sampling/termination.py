@@ -13,19 +13,19 @@ from sfm_app.ransac.scoring.robust_costs import squared_distances
 from sfm_app.ransac.verification.a_contrario import (
     MOST_FALSE_ALARMS,
     accidental_share,
-    false_alarms_of,
-    squared_mismatches,
+    model_false_alarms,
+    squared_mismatch_distances,
 )
 
 FloatArray = NDArray[np.float64]
 
-_SURE = 1400.0
+_EVIDENCE_SCALE = 1400.0
 """Samples to wait are the square of this over z (docs/algorithms.md, Fundamental matrices). Chosen on the Strecha sets;
 `python -m benchmarks.fundamental --real DATA --ablation` compares with a search without it."""
-_MOST = 3000.0
+_MOST_PATIENCE = 3000.0
 """Samples to wait where the evidence is poor, z below 26. Chosen with the constant above (docs/algorithms.md,
 Fundamental matrices)."""
-_LEAST_IN_DOUBT = 250.0
+_LEAST_PATIENCE = 250.0
 """A quarter of these samples are drawn from the rest; a motion that holds two thirds of it fills one in 17 of them.
 Chosen on pairs with two motions: `python -m benchmarks.fundamental --two-motions 100`."""
 _LEAST_INLIERS = 8
@@ -33,7 +33,7 @@ _LEAST_INLIERS = 8
 its own."""
 
 
-def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> float:
+def search_patience(points: FloatArray, F: FloatArray, threshold: float) -> float:
     """Return how many samples without a better model are enough to accept this one.
 
     Wrong models are supported by one plane, or by repeated structure, and by little else. Let z be the number of
@@ -50,13 +50,16 @@ def samples_to_wait(points: FloatArray, F: FloatArray, threshold: float) -> floa
         The number; inf where even the whole support may be chance.
     """
     squared = squared_distances(points, np.ascontiguousarray(F).reshape(9))
-    inliers, wrong = squared <= threshold * threshold, squared_mismatches(points, np.ascontiguousarray(F).reshape(9))
-    if np.count_nonzero(inliers) < _LEAST_INLIERS or false_alarms_of(squared, wrong, threshold) > MOST_FALSE_ALARMS:
+    inliers, wrong = (
+        squared <= threshold * threshold,
+        squared_mismatch_distances(points, np.ascontiguousarray(F).reshape(9)),
+    )
+    if np.count_nonzero(inliers) < _LEAST_INLIERS or model_false_alarms(squared, wrong, threshold) > MOST_FALSE_ALARMS:
         return math.inf
     H = dominant_homography(np.asfortranarray(points[inliers]), F, threshold)
     off_plane = transfer_distance(H, points) > OFF_PLANE * threshold
     count, agreeing = np.count_nonzero(off_plane), np.count_nonzero(off_plane & inliers)
     chance = accidental_share(wrong, threshold)
     z = (agreeing - count * chance) / math.sqrt(count * chance * (1 - chance) + 1)
-    least = _LEAST_IN_DOUBT if 2 * np.count_nonzero(inliers) < len(points) else 0.0
-    return max(min((_SURE / max(z, 1.0)) ** 2, _MOST), least)
+    least = _LEAST_PATIENCE if 2 * np.count_nonzero(inliers) < len(points) else 0.0
+    return max(min((_EVIDENCE_SCALE / max(z, 1.0)) ** 2, _MOST_PATIENCE), least)

@@ -31,7 +31,7 @@ _LEAST_FREEDOM = 2.0**-52
 _LEAST_SUPPORT = 1e-14
 """Least eigenvalue of a direction, over the largest one. Double precision leaves 1e-16; the margin was chosen by
 hand."""
-_FAR = 700.0
+_LARGEST_EXPONENT = 700.0
 """Largest exponent x for which exp(-x) is computed and not taken as 0: in double precision exp(-746) is 0."""
 
 
@@ -49,17 +49,17 @@ def leverages(points: FloatArray, f: FloatArray, fitted: BoolArray) -> FloatArra
     Returns:
         (N,) in [0, 1].
     """
-    tangent = _perpendicular(f)
+    tangent = _tangent_basis(f)
     within = tangent.T @ weighted_gram(points, fitted.astype(np.float64)) @ tangent
     values, vectors = np.linalg.eigh(within)
     # no fitted match constrains such a direction: matches along it have leverage 1
     floor = max(values[-1], 2.0**-1000) * _LEAST_SUPPORT
     forms = quadratic_forms(points, tangent @ (vectors / np.sqrt(np.maximum(values, floor))))
-    return _of_forms(forms, fitted)
+    return _leverages_from_forms(forms, fitted)
 
 
 @kernel
-def _of_forms(forms: FloatArray, fitted: BoolArray) -> FloatArray:
+def _leverages_from_forms(forms: FloatArray, fitted: BoolArray) -> FloatArray:
     """Return h of the fitted matches, g / (1 + g) of the others; g may be inf in unconstrained directions."""
     leverage = np.empty(forms.shape[0])
     for i in range(forms.shape[0]):
@@ -68,7 +68,7 @@ def _of_forms(forms: FloatArray, fitted: BoolArray) -> FloatArray:
 
 
 @kernel
-def _perpendicular(f: FloatArray) -> FloatArray:
+def _tangent_basis(f: FloatArray) -> FloatArray:
     """Return (9, 8) orthonormal directions perpendicular to a unit vector.
 
     They are the columns of a Householder reflection that maps f to an axis.
@@ -83,7 +83,7 @@ def _perpendicular(f: FloatArray) -> FloatArray:
 
 
 @kernel
-def studentised_residuals(residuals: FloatArray, leverage: FloatArray, fitted: BoolArray) -> FloatArray:
+def studentized_residuals(residuals: FloatArray, leverage: FloatArray, fitted: BoolArray) -> FloatArray:
     """Divide residuals by their standard deviation (thesis 3.14, 3.15), with the variance of the fitted matches.
 
     Args:
@@ -114,7 +114,7 @@ def cook_distances(studentised: FloatArray, leverage: FloatArray) -> FloatArray:
     The square of d_i is missing in the thesis.
 
     Args:
-        studentised: (N,) from `leverage.studentised_residuals`.
+        studentised: (N,) from `leverage.studentized_residuals`.
         leverage: (N,) from `leverages`, in [0, 1].
     """
     distances = np.empty(studentised.shape[0])
@@ -139,7 +139,7 @@ def priors(distances: FloatArray, sigma: float) -> FloatArray:
         if sigma > 0.0:
             # minus the smallest exponent, so that the largest value is 1
             exponent = (distances[i] - least) / sigma * ((distances[i] + least) / sigma) / 2.0
-            probable[i] = np.exp(-exponent) if exponent < _FAR else 0.0
+            probable[i] = np.exp(-exponent) if exponent < _LARGEST_EXPONENT else 0.0
         else:
             probable[i] = 1.0 if distances[i] <= least else 0.0
     return probable
@@ -168,5 +168,5 @@ def prior_validity(points: FloatArray, f: FloatArray, threshold: float, *, sigma
     squared = squared_distances(points, f)
     fitted = squared <= threshold * threshold
     leverage = leverages(points, f, fitted)
-    distances = cook_distances(studentised_residuals(np.sqrt(squared), leverage, fitted), leverage)
+    distances = cook_distances(studentized_residuals(np.sqrt(squared), leverage, fitted), leverage)
     return priors(distances, mad_sigma(distances[fitted] if sigma_from_inliers else distances))

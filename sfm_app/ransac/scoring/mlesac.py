@@ -24,7 +24,7 @@ _NEGLIGIBLE = 1e-12
 hand; not measured on its own."""
 _MOST_STEPS = 100
 """Largest number of steps of expectation maximization. Chosen by hand; not measured on its own."""
-_SETTLED = 1e-5
+_GAMMA_TOLERANCE = 1e-5
 """Change of gamma that ends expectation maximization. Chosen by hand; not measured on its own."""
 
 
@@ -36,14 +36,14 @@ def mlesac(points: FloatArray, threshold: float, best: FloatArray | None) -> Los
         threshold: largest distance of an inlier, in the units of the points.
         best: (9,) entries of the best model; None before there is one.
     """
-    sigma, width = threshold / SIGMAS, window(points)
+    sigma, width = threshold / SIGMAS, outlier_window(points)
     gamma = 0.5 if best is None else inlier_share(squared_distances(points, best), sigma, width)
     odds = (1 - gamma) / gamma * sigma * math.sqrt(2 * math.pi) / width
     reach = -math.log(_NEGLIGIBLE * min(odds, 1.0)) * 2 * sigma * sigma
     return Loss(MLESAC, threshold * threshold, reach, math.log((1 + odds) / odds), 1 / (2 * sigma * sigma), odds)
 
 
-def window(points: FloatArray) -> float:
+def outlier_window(points: FloatArray) -> float:
     """Return the range w of an outlier's signed distance: the diagonal of the matches in a view, averaged over both."""
     extent = np.ptp(points, axis=0)
     return max(float(np.hypot(extent[[0, 2]], extent[[1, 3]]).mean()), np.finfo(float).tiny)
@@ -67,6 +67,6 @@ def inlier_share(squared: FloatArray, sigma: float, width: float) -> float:
         before = gamma
         gamma = float(np.mean(gamma * inlier / (gamma * inlier + (1 - gamma) / width)))
         gamma = min(max(gamma, least), 1 - least)
-        if abs(gamma - before) < _SETTLED:
+        if abs(gamma - before) < _GAMMA_TOLERANCE:
             break
     return gamma

@@ -24,10 +24,10 @@ def residual_validity(points: FloatArray, f: FloatArray, _threshold: float) -> F
         f: (9,) entries of F by rows.
         _threshold: not used; all such functions take it.
     """
-    return validity_of(np.sqrt(squared_distances(points, f)))
+    return validity_from_residuals(np.sqrt(squared_distances(points, f)))
 
 
-def validity_of(residuals: FloatArray) -> FloatArray:
+def validity_from_residuals(residuals: FloatArray) -> FloatArray:
     """Return p(v_i | r_i) of 4.10 to 4.15.
 
     The bins are a hundredth of the median wide, and the last one holds all larger residuals: there p(0 <= r <= r_i) is

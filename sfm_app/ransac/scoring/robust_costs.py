@@ -22,7 +22,7 @@ RANSAC, MSAC, MSAC_LINEAR, MLESAC, LMEDS, GEMAN_MCCLURE = range(6)
 """Kinds of `Loss`, one for each penalty below."""
 
 
-_FEW = 16
+_SMALL_BLOCK = 16
 """Matches whose distances are computed at once where the pre-test checks often. Chosen by hand for speed: no result
 depends on it."""
 
@@ -102,7 +102,7 @@ def geman_mcclure(_points: FloatArray, threshold: float, _best: FloatArray | Non
 
 
 @kernel
-def squared_sampson(f: FloatArray, x1: float, y1: float, x2: float, y2: float) -> float:
+def squared_sampson_distance(f: FloatArray, x1: float, y1: float, x2: float, y2: float) -> float:
     """Return the squared Sampson distance (thesis 4.2) of one match.
 
     Args:
@@ -128,12 +128,12 @@ def squared_distances(points: FloatArray, f: FloatArray) -> FloatArray:
         f: (9,) entries of F by rows.
     """
     squared = np.empty(points.shape[0])
-    distances_of_block(points, f, FIRST, squared)
+    fill_squared_distances(points, f, FIRST, squared)
     return squared
 
 
 @kernel
-def distances_of_block(points: FloatArray, f: FloatArray, start: int, squared: FloatArray) -> None:
+def fill_squared_distances(points: FloatArray, f: FloatArray, start: int, squared: FloatArray) -> None:
     """Write the squared Sampson distances of consecutive matches.
 
     Args:
@@ -187,19 +187,19 @@ def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: 
     squared = np.empty(BLOCK)
     while done < count:
         often = pretest.stride < BLOCK and done < pretest.stride * pretest.least_inliers.shape[0]
-        size = min(_FEW if often else BLOCK, count - done)
-        distances_of_block(points, f, start + done, squared[:size])
+        size = min(_SMALL_BLOCK if often else BLOCK, count - done)
+        fill_squared_distances(points, f, start + done, squared[:size])
         if often:  # the pre-test checks after every few matches, and rejects most models at the first checks
             for i in range(size):
                 inliers += squared[i] <= loss.limit
                 total += _cost(loss, squared[i])
-                if not _passes(pretest, done + i + 1, inliers):
+                if not _check_pretest(pretest, done + i + 1, inliers):
                     return np.inf
         else:
-            more, cost = _add_up(squared[:size], loss)
+            more, cost = _sum_costs(squared[:size], loss)
             inliers += more
             total += cost
-            if not _passes(pretest, done + size, inliers):
+            if not _check_pretest(pretest, done + size, inliers):
                 return np.inf
         if total >= to_beat:
             return np.inf
@@ -208,7 +208,7 @@ def penalty(points: FloatArray, start: int, f: FloatArray, loss: Loss, to_beat: 
 
 
 @kernel
-def _passes(pretest: PreTest, done: int, inliers: int) -> bool:
+def _check_pretest(pretest: PreTest, done: int, inliers: int) -> bool:
     """Return whether a model with this many inliers passes the pre-test; count it if it is rejected."""
     looks = done // pretest.stride
     if (
@@ -223,7 +223,7 @@ def _passes(pretest: PreTest, done: int, inliers: int) -> bool:
 
 
 @kernel
-def _add_up(squared: FloatArray, loss: Loss) -> tuple[int, float]:
+def _sum_costs(squared: FloatArray, loss: Loss) -> tuple[int, float]:
     """Return the number of inliers, and the sum of the penalties of the matches."""
     total, inliers = 0.0, 0
     for i in range(squared.shape[0]):
@@ -244,7 +244,7 @@ def _median_of_squares(points: FloatArray, f: FloatArray, to_beat: float) -> flo
     squared = np.empty(count)
     may_miss = count - count // 2 - 1
     for i in range(count):
-        squared[i] = squared_sampson(f, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
+        squared[i] = squared_sampson_distance(f, points[i, 0], points[i, 1], points[i, 2], points[i, 3])
         may_miss -= squared[i] >= to_beat
         if may_miss < 0:
             return np.inf

@@ -13,13 +13,13 @@ FloatArray = NDArray[np.float64]
 _MOST_SWEEPS = 30
 """Largest number of sweeps over all rotations; convergence is quadratic (Golub and Van Loan 2013). Chosen by hand; not
 measured on its own."""
-_SETTLED = 1e-32
+_OFF_DIAGONAL_TOLERANCE = 1e-32
 """Sum of the squared off-diagonal entries over that of the diagonal ones, at convergence: 1e-16, what double precision
 leaves, squared."""
 
 
 @kernel
-def symmetric_eigen(matrix: FloatArray, values: FloatArray, vectors: FloatArray) -> None:
+def decompose_symmetric(matrix: FloatArray, values: FloatArray, vectors: FloatArray) -> None:
     """Write the eigenvalues in ascending order and the unit eigenvectors, by Jacobi's rotations.
 
     Args:
@@ -37,7 +37,7 @@ def symmetric_eigen(matrix: FloatArray, values: FloatArray, vectors: FloatArray)
             diagonal += matrix[i, i] * matrix[i, i]
             for j in range(i):
                 off += matrix[i, j] * matrix[i, j]
-        if not off > _SETTLED * diagonal:
+        if not off > _OFF_DIAGONAL_TOLERANCE * diagonal:
             break
         for p in range(size - 1):
             for q in range(p + 1, size):

@@ -21,7 +21,7 @@ its own."""
 
 
 @kernel
-def models_through(points: FloatArray, sample: IntArray, models: FloatArray) -> int:
+def solve_sample(points: FloatArray, sample: IntArray, models: FloatArray) -> int:
     """Compute F from a minimal sample: all solutions through seven matches, or the linear one through eight.
 
     Seven constraints leave F = a + z b; one more determines z: det F = 0, a cubic with one or three real roots, or an
@@ -40,12 +40,12 @@ def models_through(points: FloatArray, sample: IntArray, models: FloatArray) -> 
     if not _null_space(points, sample, basis):
         return 0
     if sample.shape[0] > SAMPLE_SIZE:
-        return _through_eighth(points[sample[SAMPLE_SIZE]], basis, models[0])
-    return _of_rank_two(basis, models)
+        return _solve_eighth_match(points[sample[SAMPLE_SIZE]], basis, models[0])
+    return _solve_rank_constraint(basis, models)
 
 
 @kernel
-def _of_rank_two(basis: FloatArray, models: FloatArray) -> int:
+def _solve_rank_constraint(basis: FloatArray, models: FloatArray) -> int:
     """Write the matrices of the pencil a + z b with determinant 0; return their number."""
     a, b = basis[0], basis[1]
     c0, c1, c2, c3 = _det(a), _mixed_det(a, b), _mixed_det(b, a), _det(b)
@@ -63,7 +63,7 @@ def _of_rank_two(basis: FloatArray, models: FloatArray) -> int:
 
 
 @kernel
-def _through_eighth(point: FloatArray, basis: FloatArray, model: FloatArray) -> int:
+def _solve_eighth_match(point: FloatArray, basis: FloatArray, model: FloatArray) -> int:
     """Write the F of the pencil that fits `point` (4,), reduced to rank 2 as F - F v v'; return 0 or 1 models."""
     row, v = np.empty(9), np.empty(3)
     design_row(point, row)
@@ -73,7 +73,7 @@ def _through_eighth(point: FloatArray, basis: FloatArray, model: FloatArray) -> 
         b += basis[1, j] * row[j]
     for j in range(9):
         model[j] = b * basis[0, j] - a * basis[1, j]
-    if not _weakest_direction(model, v):
+    if not _smallest_singular_vector(model, v):
         return 0
     squared = 0.0
     for i in range(0, 9, 3):
@@ -87,7 +87,7 @@ def _through_eighth(point: FloatArray, basis: FloatArray, model: FloatArray) -> 
 
 
 @kernel
-def _weakest_direction(f: FloatArray, v: FloatArray) -> bool:
+def _smallest_singular_vector(f: FloatArray, v: FloatArray) -> bool:
     """Write the right singular vector of F's smallest singular value to v (3,); return False for a rank below 2.
 
     The cofactors C of F have the same singular vectors with the values s2 s3, s1 s3, s1 s2, so that this vector
@@ -209,7 +209,7 @@ def _null_space(points: FloatArray, sample: IntArray, basis: FloatArray) -> bool
         design_row(points[sample[k]], rows[k])
     largest = 0.0
     for k in range(SAMPLE_SIZE):
-        pivot = _bring_pivot(rows, place, k)
+        pivot = _swap_pivot(rows, place, k)
         largest = max(largest, pivot)
         if not pivot > _RANK_TOLERANCE * largest:
             return False
@@ -231,7 +231,7 @@ def _null_space(points: FloatArray, sample: IntArray, basis: FloatArray) -> bool
 
 
 @kernel
-def _bring_pivot(rows: FloatArray, place: IntArray, k: int) -> float:
+def _swap_pivot(rows: FloatArray, place: IntArray, k: int) -> float:
     """Swap the largest entry from (k, k) on to (k, k); return its magnitude; `place` records the column order."""
     largest, row, column = -1.0, k, k
     for i in range(k, SAMPLE_SIZE):

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.ransac.sampling.minimal_samples import SAMPLE_SIZE
-from sfm_app.ransac.scoring.robust_costs import squared_sampson
+from sfm_app.ransac.scoring.robust_costs import squared_sampson_distance
 from sfm_app.ransac.solvers.minimal import MOST_MODELS
 
 FloatArray = NDArray[np.float64]
@@ -21,16 +21,16 @@ _FRACTIONS = (1.0, 0.5, 0.25)
 estimators. Chosen by hand; not measured on their own."""
 _MISMATCHES = 8000
 """Approximate number of mismatches that measure chance agreement. Chosen by hand; not measured on its own."""
-_MOST = 1e300
+_LARGEST_COUNT = 1e300
 """Largest number of false alarms that is returned: near the largest number in double precision."""
 
 
-def false_alarms_of(squared: FloatArray, wrong: FloatArray, threshold: float) -> float:
+def model_false_alarms(squared: FloatArray, wrong: FloatArray, threshold: float) -> float:
     """Return the expected number of models with as much support among random matches of the same points.
 
     Args:
         squared: (N,) squared distances of the matches to the model.
-        wrong: (M,) those of mismatches, from `a_contrario.squared_mismatches`.
+        wrong: (M,) those of mismatches, from `a_contrario.squared_mismatch_distances`.
         threshold: largest distance of an inlier.
     """
     tried = []
@@ -38,7 +38,7 @@ def false_alarms_of(squared: FloatArray, wrong: FloatArray, threshold: float) ->
         inliers = int(np.count_nonzero(squared <= (fraction * threshold) ** 2))
         chance = accidental_share(wrong, fraction * threshold)
         tried.append(false_alarms(len(squared), inliers, SAMPLE_SIZE, chance))
-    return min(_MOST, len(_FRACTIONS) * MOST_MODELS * min(tried))
+    return min(_LARGEST_COUNT, len(_FRACTIONS) * MOST_MODELS * min(tried))
 
 
 def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> float:
@@ -57,12 +57,12 @@ def false_alarms(count: int, inliers: int, sample_size: int, chance: float) -> f
         An upper bound of the number, at most 1e300.
     """
     if inliers <= sample_size:
-        return _MOST
+        return _LARGEST_COUNT
     logarithm = _log_choose(count, sample_size) + log_binomial_tail(count - sample_size, inliers - sample_size, chance)
-    return min(_MOST, math.exp(min(logarithm, 700.0)))
+    return min(_LARGEST_COUNT, math.exp(min(logarithm, 700.0)))
 
 
-def squared_mismatches(points: FloatArray, f: FloatArray) -> FloatArray:
+def squared_mismatch_distances(points: FloatArray, f: FloatArray) -> FloatArray:
     """Return (M,) squared Sampson distances of deliberate mismatches.
 
     Each pairs a point of view 1 with the partner of another point.
@@ -71,17 +71,17 @@ def squared_mismatches(points: FloatArray, f: FloatArray) -> FloatArray:
         points: (N, 4) distinct matches in random order, N >= 2.
         f: (9,) model.
     """
-    return _shifted(points, f, min(len(points) - 1, max(1, _MISMATCHES // len(points))))
+    return _shifted_distances(points, f, min(len(points) - 1, max(1, _MISMATCHES // len(points))))
 
 
 @kernel
-def _shifted(points: FloatArray, f: FloatArray, shifts: int) -> FloatArray:
+def _shifted_distances(points: FloatArray, f: FloatArray, shifts: int) -> FloatArray:
     count = points.shape[0]
     wrong = np.empty(shifts * count)
     for shift in range(shifts):
         for i in range(count):
             partner = (i + shift + 1) % count
-            wrong[shift * count + i] = squared_sampson(
+            wrong[shift * count + i] = squared_sampson_distance(
                 f, points[i, 0], points[i, 1], points[partner, 2], points[partner, 3]
             )
     return wrong

@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.ransac.sampling.stopping import trials_needed
+from sfm_app.ransac.sampling.stopping import required_trials
 
 IntArray = NDArray[np.int64]
 
@@ -41,7 +41,7 @@ class PreTest(NamedTuple):
     """(2,) matches checked on rejected hypotheses, and how many of them were inliers; the loop adds to it."""
 
 
-def pretest(least_inliers: IntArray, stride: int, *, random_start: bool) -> PreTest:
+def make_pretest(least_inliers: IntArray, stride: int, *, random_start: bool) -> PreTest:
     """Make a pre-test with counts of 0.
 
     Args:
@@ -52,7 +52,7 @@ def pretest(least_inliers: IntArray, stride: int, *, random_start: bool) -> PreT
     return PreTest(least_inliers, stride, random_start, np.zeros(2, dtype=np.int64))
 
 
-OPEN = pretest(np.zeros(0, dtype=np.int64), BLOCK, random_start=False)
+NO_PRETEST = make_pretest(np.zeros(0, dtype=np.int64), BLOCK, random_start=False)
 """No test: every hypothesis is scored in full, or until it cannot win."""
 
 
@@ -71,7 +71,7 @@ class Verifier(Protocol):
     def expect(self, share: float) -> None:
         """Expect this share of inliers, that of the best model."""
 
-    def trials_needed(self, share: float, confidence: float) -> float:
+    def required_trials(self, share: float, confidence: float) -> float:
         """Return how many samples, those already drawn included, give a clean one that passes with this probability.
 
         Args:
@@ -87,7 +87,7 @@ class FullVerification:
 
     def __init__(self, count: int, sample_size: int) -> None:
         self.count, self.sample_size = count, sample_size
-        self.pretest = self.lenient = OPEN
+        self.pretest = self.lenient = NO_PRETEST
 
     def learn(self, trials: int) -> None:
         """Do nothing: the test does not depend on the samples."""
@@ -95,14 +95,14 @@ class FullVerification:
     def expect(self, share: float) -> None:
         """Do nothing: the test does not depend on the share of inliers."""
 
-    def trials_needed(self, share: float, confidence: float) -> float:
+    def required_trials(self, share: float, confidence: float) -> float:
         """Return how many samples give a clean one with this probability.
 
         Args:
             share: share of inliers, in [0, 1].
             confidence: wanted probability, in (0, 1).
         """
-        return trials_needed(share**self.sample_size, confidence)
+        return required_trials(share**self.sample_size, confidence)
 
 
 class BailOut(FullVerification):
@@ -111,11 +111,11 @@ class BailOut(FullVerification):
     def expect(self, share: float) -> None:
         """Make both tests for this share of inliers, that of the best model."""
         least = bail_out_table(self.count, share)
-        self.pretest = pretest(least, BLOCK, random_start=False)
-        self.lenient = pretest((LENIENCE * least).astype(np.int64), BLOCK, random_start=False)
+        self.pretest = make_pretest(least, BLOCK, random_start=False)
+        self.lenient = make_pretest((LENIENCE * least).astype(np.int64), BLOCK, random_start=False)
 
 
-class RandomisedTdd(FullVerification):
+class RandomizedTdd(FullVerification):
     """T(d,d): the first d matches must all be inliers (Matas and Chum 2004, who find d = 1 best).
 
     A clean model passes with probability share^d, so that more samples are needed.
@@ -125,16 +125,16 @@ class RandomisedTdd(FullVerification):
 
     def __init__(self, count: int, sample_size: int) -> None:
         super().__init__(count, sample_size)
-        self.pretest = self.lenient = pretest(np.arange(1, self.d + 1), 1, random_start=True)
+        self.pretest = self.lenient = make_pretest(np.arange(1, self.d + 1), 1, random_start=True)
 
-    def trials_needed(self, share: float, confidence: float) -> float:
+    def required_trials(self, share: float, confidence: float) -> float:
         """Return how many samples give a clean one that passes with this probability.
 
         Args:
             share: share of inliers, in [0, 1].
             confidence: wanted probability, in (0, 1).
         """
-        return trials_needed(share ** (self.sample_size + self.d), confidence)
+        return required_trials(share ** (self.sample_size + self.d), confidence)
 
 
 def bail_out_table(count: int, inlier_share: float) -> IntArray:

@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.ransac.sampling.stopping import trials_needed
+from sfm_app.ransac.sampling.stopping import required_trials
 from sfm_app.ransac.verification.pretests import PreTest
 
 IntArray = NDArray[np.int64]
@@ -30,7 +30,7 @@ _MOST_EPSILON = 0.999
 """Largest epsilon: beyond it the logarithm of 1 - epsilon is useless. Chosen by hand; not measured on its own."""
 _PRIOR_WEIGHT = 100.0
 """Weight of the initial delta, in checked matches. Chosen by hand; not measured on its own."""
-_MOVED = 0.05
+_DELTA_TOLERANCE = 0.05
 """Relative change of delta that requires a new test. docs/algorithms.md, Fundamental matrices. Chosen by hand; not
 measured on its own."""
 _REVIEW = 100
@@ -52,7 +52,7 @@ class SequentialTest:
         """Return (count,) numbers of inliers below which the ratio exceeds A after 1, 2, ... matches."""
         if math.isinf(self.log_threshold):
             return np.zeros(0, dtype=np.int64)
-        hit, miss = self._steps()
+        hit, miss = self._log_steps()
         seen = np.arange(1, count + 1)
         # k hits and m - k misses: reject if k hit + (m - k) miss > log A
         least: IntArray = np.maximum(np.ceil((seen * miss - self.log_threshold) / (miss - hit)), 0).astype(np.int64)
@@ -62,9 +62,9 @@ class SequentialTest:
         """Return the least probability that a good model with this true share of inliers passes: 1 - A^-h."""
         if math.isinf(self.log_threshold):
             return 1.0
-        return -math.expm1(-self.log_threshold * _exponent(*self._steps(), min(share, _MOST_EPSILON)))
+        return -math.expm1(-self.log_threshold * _exponent(*self._log_steps(), min(share, _MOST_EPSILON)))
 
-    def _steps(self) -> tuple[float, float]:
+    def _log_steps(self) -> tuple[float, float]:
         """Return the increments of the log-likelihood ratio for an inlier and for an outlier."""
         return math.log(self.delta / self.epsilon), math.log((1 - self.delta) / (1 - self.epsilon))
 
@@ -138,14 +138,14 @@ class Sprt:
     def learn(self, trials: int) -> None:
         """Count samples that were drawn and tested; design a new test if delta has changed."""
         self._trials += trials
-        if abs(self._delta() - self._test.delta) > _MOVED * self._test.delta:
+        if abs(self._delta() - self._test.delta) > _DELTA_TOLERANCE * self._test.delta:
             self._renew(self._test.epsilon)
 
     def expect(self, share: float) -> None:
         """Make a new test for this share of inliers, that of the best model."""
         self._renew(share)
 
-    def trials_needed(self, share: float, confidence: float) -> float:
+    def required_trials(self, share: float, confidence: float) -> float:
         """Return the number of samples by (3.19); each test so far passed clean samples with its own probability.
 
         Args:
@@ -158,4 +158,4 @@ class Sprt:
             # with a share of 1, past samples would be certain successes
             missed += trials * math.log1p(-min(clean * test.pass_rate(share), _MOST_EPSILON))
             drawn += trials
-        return drawn + trials_needed(clean * self._test.pass_rate(share), confidence, missed)
+        return drawn + required_trials(clean * self._test.pass_rate(share), confidence, missed)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.essential import essential_from_fundamental, relative_pose
-from sfm_app.geometry.spd_solve import lifted
+from sfm_app.geometry.spd_solve import lift_eigenvalues
 from sfm_app.ransac.refine.sampson_refit import refine_sampson
 from sfm_app.selfcal.adjustment.camera_priors import ASPECT, NAMES, CameraPriors, Evidence
 from sfm_app.selfcal.adjustment.structureless_ba import (
@@ -19,13 +19,13 @@ from sfm_app.selfcal.adjustment.structureless_ba import (
     Matches,
     Prior,
     State,
-    evenly,
-    informed,
-    reweighted,
-    settled,
+    adjust_cameras,
+    pair_information,
+    reweight,
+    subsample_rows,
 )
 from sfm_app.selfcal.lens import CENTER_U, CENTER_V, LOG_ASPECT, LOG_FOCAL
-from sfm_app.selfcal.undistort_pairs import straight_points
+from sfm_app.selfcal.undistort_pairs import undistort_points
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -36,17 +36,18 @@ FIRST_ROUNDS, LAST_ROUNDS = 8, 12
 """Rounds before starts are compared, and rounds with all matches. Chosen by hand; not measured on their own."""
 POSE_MATCHES = 30
 """Matches that decide which of the four poses of an E is right. Chosen by hand; not measured on its own."""
-CHOICES = 3
+EVIDENCE_ROUNDS = 3
 """Most rounds of choosing the free parameters by the evidence and adjusting again. Chosen by hand; not measured on its
 own."""
 JACKKNIFE_GROUPS = 8
 """Groups of neighboring photos that are left out in turn (docs/algorithms.md, Self-calibration, 4). Chosen by hand; not
 measured on its own."""
-LEAST_PHOTOS, LEAST_LEFT = 6, 4.0
+LEAST_PHOTOS, LEAST_REMAINING_WEIGHT = 6, 4.0
 """Photos, and weight of the remaining pairs, below which a jackknife reflects the missing pairs rather than errors.
 docs/algorithms.md, Self-calibration, 4. Chosen by hand; not measured on their own."""
-REFIT_REACH = 3.0
-"""Scale of the robust refit of an F, in sigma. As `two_view_cost.REACH`. Chosen by hand; not measured on its own."""
+REFIT_SCALE = 3.0
+"""Scale of the robust refit of an F, in sigma. As `two_view_cost.ROBUST_SCALE`. Chosen by hand; not measured on its
+own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,14 +63,14 @@ class Fit:
     held: BoolArray | None = None
     """(C, 4) parameters that stay at their usual values because the pairs do not determine them."""
 
-    def names_held(self, camera: int) -> tuple[str, ...]:
+    def held_names(self, camera: int) -> tuple[str, ...]:
         """Return the names of the parameters that one camera holds at their usual values."""
         return tuple(name for place, name in enumerate(NAMES) if self.held is not None and self.held[camera, place])
 
     @property
     def information(self) -> Information:
         """Information of each pair about the cameras."""
-        return informed(self.matches, self.state)
+        return pair_information(self.matches, self.state)
 
     @property
     def trust(self) -> FloatArray:
@@ -81,7 +82,7 @@ class Fit:
     @property
     def evidence(self) -> Evidence:
         """Joint likelihood of all pairs about the cameras."""
-        H, g = self.matches.scattered(self.information, self.trust)
+        H, g = self.matches.assemble(self.information, self.trust)
         return Evidence(self.state.thetas, H, g, float(np.sum(self.state.weights)), self.priors)
 
     def cost(self, sigma: float, scale: float) -> float:
@@ -91,15 +92,15 @@ class Fit:
             sigma: standard deviation of a distance, the same for all fits: its own larger one would favor a wrong fit.
             scale: scale of the disagreement, the same for all fits for that reason.
         """
-        state = reweighted(self.matches, replace(self.state, sigma=sigma))
-        gains = informed(self.matches, state).gains / (scale * self.matches.redundancy)
+        state = reweight(self.matches, replace(self.state, sigma=sigma))
+        gains = pair_information(self.matches, state).gains / (scale * self.matches.redundancy)
         H = replace(self, state=state).evidence.H + np.diag(self.prior.precision.ravel())
-        volume = 0.5 * float(np.linalg.slogdet(lifted(H))[1] - np.sum(np.log(self.prior.precision)))
+        volume = 0.5 * float(np.linalg.slogdet(lift_eigenvalues(H))[1] - np.sum(np.log(self.prior.precision)))
         bounded = float(np.sum(gains / (1.0 + gains / CONFLICT)))
         return bounded + self.prior.cost(state.thetas) + volume - self.priors.log_odds(self.free)
 
 
-def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], priors: CameraPriors) -> Fit:
+def fit_cameras(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], priors: CameraPriors) -> Fit:
     """Fit the cameras from all starts, then with non-square pixels, and return the best fit.
 
     Args:
@@ -108,25 +109,25 @@ def refined(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], prio
         starts: (C, 5) each, initial cameras, the most likely first.
         priors: prior knowledge about the cameras.
     """
-    few = matches.thinned(FEW_MATCHES)
-    best = _best([_begun(few, Fs, thetas, priors, square=True) for thetas in starts])
-    others = [_begun(few, Fs, thetas, priors, square=False) for thetas in (best.state.thetas, starts[0])]
-    fit = _best([best, *others])
-    state = settled(few, fit.state, fit.prior)
-    fit = replace(fit, matches=matches, state=settled(matches, state, fit.prior, LAST_ROUNDS))
-    for _ in range(CHOICES):
+    few = matches.subsample(FEW_MATCHES)
+    best = _select_best([_fit_from_start(few, Fs, thetas, priors, square=True) for thetas in starts])
+    others = [_fit_from_start(few, Fs, thetas, priors, square=False) for thetas in (best.state.thetas, starts[0])]
+    fit = _select_best([best, *others])
+    state = adjust_cameras(few, fit.state, fit.prior)
+    fit = replace(fit, matches=matches, state=adjust_cameras(matches, state, fit.prior, LAST_ROUNDS))
+    for _ in range(EVIDENCE_ROUNDS):
         free = fit.evidence.best(fit.free)
         if np.array_equal(free, fit.free):
             break
         prior = priors.prior(free, fit.state.thetas)
-        state = settled(few, fit.state, prior)
-        fit = Fit(matches, settled(matches, state, prior, LAST_ROUNDS), free, prior, priors)
+        state = adjust_cameras(few, fit.state, prior)
+        fit = Fit(matches, adjust_cameras(matches, state, prior, LAST_ROUNDS), free, prior, priors)
     held = fit.evidence.undetermined(fit.free)
     prior = priors.prior(fit.free, fit.state.thetas, held)
-    return replace(fit, prior=prior, held=held, state=settled(matches, fit.state, prior, LAST_ROUNDS))
+    return replace(fit, prior=prior, held=held, state=adjust_cameras(matches, fit.state, prior, LAST_ROUNDS))
 
 
-def of_all_pairs(fit: Fit, matches: Matches, Fs: FloatArray) -> Fit:
+def extend_to_all_pairs(fit: Fit, matches: Matches, Fs: FloatArray) -> Fit:
     """Return the fit with a pose for every pair, including pairs that it was not adjusted to.
 
     Args:
@@ -136,11 +137,11 @@ def of_all_pairs(fit: Fit, matches: Matches, Fs: FloatArray) -> Fit:
     """
     if len(matches.cameras) == len(fit.matches.cameras):
         return fit
-    state = replace(fit.state, poses=_poses(matches, Fs, fit.state.thetas), weights=np.ones(len(Fs)))
+    state = replace(fit.state, poses=_estimate_poses(matches, Fs, fit.state.thetas), weights=np.ones(len(Fs)))
     return replace(fit, matches=matches, state=state)
 
 
-def scatter_by_photos(fit: Fit) -> FloatArray:
+def jackknife_deviations(fit: Fit) -> FloatArray:
     """Return (5C,) standard deviations of the cameras by a jackknife over the photos; 0 where the photos are too few.
 
     Consecutive photos form a group, because neighbors often share an error (blur, a rolling shutter, a repeated wall).
@@ -154,57 +155,57 @@ def scatter_by_photos(fit: Fit) -> FloatArray:
     information, trust, steps = fit.information, fit.trust, []
     for group in groups:
         left = ~np.isin(fit.matches.photos, group).any(axis=1)
-        if np.sum(fit.state.weights[left]) < LEAST_LEFT:
+        if np.sum(fit.state.weights[left]) < LEAST_REMAINING_WEIGHT:
             return nothing
-        H, g = fit.matches.scattered(information, np.where(left, trust, 0.0))
+        H, g = fit.matches.assemble(information, np.where(left, trust, 0.0))
         precision, away = fit.prior.precision.ravel(), (fit.prior.mean - fit.state.thetas).ravel()
         steps.append(np.linalg.solve(H + np.diag(precision), g + precision * away))
     spread = np.array(steps) - np.mean(steps, axis=0)
     return np.asarray(np.sqrt((len(groups) - 1) / len(groups) * np.sum(spread**2, axis=0)), np.float64)
 
 
-def straight_fundamentals(fit: Fit) -> FloatArray:
+def undistorted_fundamentals(fit: Fit) -> FloatArray:
     """Return (P, 3, 3) F's of the undistorted photos, refitted to the matches without assuming a K."""
     thetas, cameras = fit.state.thetas, fit.matches.cameras
     found = np.empty((len(cameras), 3, 3))
     for pair, (first, second) in enumerate(cameras):
-        x = fit.matches.of_pair(pair)
-        views = (straight_points(x[:, :2], thetas[first]), straight_points(x[:, 2:], thetas[second]))
-        inverses = [np.linalg.inv(camera_matrix_of(thetas[camera])) for camera in (first, second)]
-        E = _essential(fit.state.poses[pair])
+        x = fit.matches.pair_matches(pair)
+        views = (undistort_points(x[:, :2], thetas[first]), undistort_points(x[:, 2:], thetas[second]))
+        inverses = [np.linalg.inv(intrinsic_matrix(thetas[camera])) for camera in (first, second)]
+        E = _essential_matrix(fit.state.poses[pair])
         start = inverses[1].T @ E @ inverses[0]
-        refit = refine_sampson(np.asfortranarray(np.hstack(views)), start, scale=REFIT_REACH * fit.state.sigma)
+        refit = refine_sampson(np.asfortranarray(np.hstack(views)), start, scale=REFIT_SCALE * fit.state.sigma)
         found[pair] = refit if np.isfinite(refit).all() and refit.any() else start
     return found
 
 
-def camera_matrix_of(theta: FloatArray) -> FloatArray:
+def intrinsic_matrix(theta: FloatArray) -> FloatArray:
     """Return the (3, 3) camera matrix of the parameters (5,), in their units from the middle of the photo."""
     f, half = np.exp(theta[LOG_FOCAL]), np.exp(0.5 * theta[LOG_ASPECT])
     return np.array([[f / half, 0.0, theta[CENTER_U]], [0.0, f * half, theta[CENTER_V]], [0.0, 0.0, 1.0]])
 
 
-def _best(fits: Sequence[Fit]) -> Fit:
+def _select_best(fits: Sequence[Fit]) -> Fit:
     sigma, scale = (min(getattr(fit.state, name) for fit in fits) for name in ("sigma", "scale"))
     return min(fits, key=lambda fit: fit.cost(sigma, scale))
 
 
-def _begun(few: Matches, Fs: FloatArray, thetas: FloatArray, priors: CameraPriors, *, square: bool) -> Fit:
+def _fit_from_start(few: Matches, Fs: FloatArray, thetas: FloatArray, priors: CameraPriors, *, square: bool) -> Fit:
     free = np.ones((len(thetas), len(NAMES)), np.bool_)
     free[:, ASPECT] = not square
     prior = priors.prior(free, thetas)
-    state = State(thetas, _poses(few, Fs, thetas), np.ones(len(Fs)), few.least_sigma)
-    state = settled(few, replace(state, sigma=few.noise(state)), prior, FIRST_ROUNDS)
+    state = State(thetas, _estimate_poses(few, Fs, thetas), np.ones(len(Fs)), few.least_sigma)
+    state = adjust_cameras(few, replace(state, sigma=few.noise(state)), prior, FIRST_ROUNDS)
     return Fit(few, state, free, prior, priors)
 
 
-def _poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatArray:
+def _estimate_poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatArray:
     poses = np.empty((len(Fs), 12))
     for pair, (first, second) in enumerate(few.cameras):
-        K1, K2 = camera_matrix_of(thetas[first]), camera_matrix_of(thetas[second])
-        x = evenly(few.of_pair(pair), POSE_MATCHES)
+        K1, K2 = intrinsic_matrix(thetas[first]), intrinsic_matrix(thetas[second])
+        x = subsample_rows(few.pair_matches(pair), POSE_MATCHES)
         rays = [
-            (straight_points(points, thetas[camera]) - K[:2, 2]) / K[[0, 1], [0, 1]]
+            (undistort_points(points, thetas[camera]) - K[:2, 2]) / K[[0, 1], [0, 1]]
             for points, camera, K in ((x[:, :2], first, K1), (x[:, 2:], second, K2))
         ]
         R, t, _, _ = relative_pose(essential_from_fundamental(Fs[pair], K1, K2), *rays)
@@ -212,6 +213,6 @@ def _poses(few: Matches, Fs: FloatArray, thetas: FloatArray) -> FloatArray:
     return poses
 
 
-def _essential(pose: FloatArray) -> FloatArray:
+def _essential_matrix(pose: FloatArray) -> FloatArray:
     R, t = pose[:9].reshape(3, 3), pose[9:]
     return np.asarray(np.cross(t, R, axisb=0, axisc=0), np.float64)

@@ -4,8 +4,8 @@ Ours; the choice by marginal likelihood is that of `geometry.model_selection`.
 
 Most photos are uncropped, their pixels square, their lens nearly straight; some are not. So center, aspect and lens
 each have two priors: a narrow one about the usual value, and a wide one. A parameter is freed only where the evidence
-for the wide prior outweighs how rare such photos are; otherwise it stays near its usual value. A focal that EXIF claims is one more narrow prior, which loses against pairs that
-contradict it.
+for the wide prior outweighs how rare such photos are; otherwise it stays near its usual value. A focal that EXIF
+claims is one more narrow prior, which loses against pairs that contradict it.
 """
 
 from dataclasses import dataclass

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.damping import DampingRange, damped_step
-from sfm_app.geometry.pose_manifold import POSE, moved
+from sfm_app.geometry.pose_manifold import POSE_DOF, retract
 from sfm_app.geometry.spd_solve import solve_each
 from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.selfcal.adjustment.two_view_cost import CAMERA, distances, pair_costs, pair_systems
@@ -31,7 +31,7 @@ deviations are half as large again (docs/algorithms.md, Self-calibration, Tried 
 CONFLICT = 3.0
 """Log-likelihood gain from cameras of its own at which a pair's weight is a quarter. By definition of chi^2 with two
 degrees of freedom, noise alone gains as much once in twenty times: exp(-3)."""
-ALONE = np.array([0.3, 0.15, 0.15, 0.2, 0.2])
+OWN_CAMERA_SIGMAS = np.array([0.3, 0.15, 0.15, 0.2, 0.2])
 """How far a pair's own cameras may deviate: standard deviations of log f, u, v, log a, kappa. Chosen by hand; not
 measured on their own."""
 LOWER_QUARTILE = 0.288
@@ -39,7 +39,7 @@ LOWER_QUARTILE = 0.288
 LEAST_SIGMA_PX = 0.1
 """Least standard deviation of a distance: noise-free synthetic matches would otherwise have unbounded weight. Chosen by
 hand; not measured on its own."""
-FEW_PHOTOS, CAUTION = 5, 0.25
+FEW_PHOTOS, FEW_PHOTOS_TRUST = 5, 0.25
 """A camera of fewer photos absorbs unmodeled effects (a lens, a wall that is not quite still) into its focal and
 center; the information of its pairs counts as if their noise were twice as large. Chosen by hand; not measured on their
 own."""
@@ -47,7 +47,7 @@ ROUNDS = 25
 """Most rounds of reweighting and stepping. Chosen by hand; not measured on its own."""
 DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e8)
 """Damping of Levenberg-Marquardt steps, relative to the diagonal. Chosen by hand; not measured on their own."""
-ARRIVED = 2e-5
+CONVERGED = 2e-5
 """Largest change of a camera's parameter that ends the rounds. Chosen by hand; not measured on its own."""
 
 
@@ -72,7 +72,7 @@ class State:
     thetas: FloatArray
     """(C, 5) parameters of the cameras, see `lens`."""
     poses: FloatArray
-    """(P, 12), see `pose_manifold.essential`."""
+    """(P, 12), see `pose_manifold.write_essential`."""
     weights: FloatArray
     """(P,) in [0, 1]: how well a pair agrees with the others."""
     sigma: float
@@ -110,7 +110,7 @@ class Matches:
         most: int = MOST_MATCHES, count: int = 1,
     ) -> None:  # fmt: skip
         # points outside of the photos are no matches, and would overflow
-        kept = [evenly(x[np.all(np.abs(x) <= 1.0, axis=1)], most) for x in inliers]
+        kept = [subsample_rows(x[np.all(np.abs(x) <= 1.0, axis=1)], most) for x in inliers]
         self.unit_px = unit_px
         self.points = np.ascontiguousarray(np.concatenate([*kept, np.empty((0, 4))]))
         self.ends = np.concatenate([[0], np.cumsum([len(x) for x in kept])]).astype(np.int64)
@@ -120,7 +120,7 @@ class Matches:
         self.least_sigma = LEAST_SIGMA_PX / unit_px
         taken = [len(np.unique(self.photos[self.cameras == camera])) for camera in range(count)]
         few = np.array(taken, np.int64) < FEW_PHOTOS
-        self.trust = np.where(few[self.cameras].any(axis=1), CAUTION, 1.0)
+        self.trust = np.where(few[self.cameras].any(axis=1), FEW_PHOTOS_TRUST, 1.0)
 
     @cached_property
     def redundancy(self) -> float:
@@ -136,20 +136,20 @@ class Matches:
         each = 2 * len(self.points) / len(np.unique(np.concatenate(views), axis=0))
         return max(1.0, 0.5 * each * (each + 1.0) / (2.0 * each - 1.0))
 
-    def of_pair(self, pair: int) -> FloatArray:
+    def pair_matches(self, pair: int) -> FloatArray:
         """Return the matches (N, 4) of one pair."""
         return self.points[self.ends[pair] : self.ends[pair + 1]]
 
-    def chosen(self, which: IndexArray) -> "Matches":
+    def select(self, which: IndexArray) -> "Matches":
         """Return the matches of the given pairs only."""
         if len(which) == len(self.cameras):
             return self
-        inliers = [self.of_pair(pair) for pair in which]
+        inliers = [self.pair_matches(pair) for pair in which]
         return Matches(inliers, self.cameras[which], self.photos[which], self.unit_px, count=self.count)
 
-    def thinned(self, most: int) -> "Matches":
+    def subsample(self, most: int) -> "Matches":
         """Return at most `most` matches of each pair, evenly chosen."""
-        inliers = [self.of_pair(pair) for pair in range(len(self.cameras))]
+        inliers = [self.pair_matches(pair) for pair in range(len(self.cameras))]
         return Matches(inliers, self.cameras, self.photos, self.unit_px, most, self.count)
 
     def costs(self, state: State) -> FloatArray:
@@ -165,11 +165,11 @@ class Matches:
         """
         counts = np.diff(self.ends)
         found = np.abs(distances(self.points, self.ends, state.thetas, self.cameras, state.poses))
-        found *= np.repeat(np.sqrt(counts / np.maximum(counts - POSE, 1)), counts)
+        found *= np.repeat(np.sqrt(counts / np.maximum(counts - POSE_DOF, 1)), counts)
         agreeing = np.repeat(state.weights > 0.5, counts)
         return max(MAD_TO_SIGMA * float(np.median(found[agreeing])) if agreeing.any() else 0.0, self.least_sigma)
 
-    def scattered(self, information: Information, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def assemble(self, information: Information, factors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Sum the information of the pairs into (5C, 5C) and (5C,) over the parameters of all cameras.
 
         Args:
@@ -183,7 +183,7 @@ class Matches:
         return H, b
 
 
-def evenly(rows: FloatArray, most: int) -> FloatArray:
+def subsample_rows(rows: FloatArray, most: int) -> FloatArray:
     """Return at most `most` rows, evenly chosen.
 
     Args:
@@ -193,7 +193,7 @@ def evenly(rows: FloatArray, most: int) -> FloatArray:
     return rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(np.int64)]
 
 
-def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) -> State:
+def adjust_cameras(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) -> State:
     """Adjust cameras and poses: reweight the pairs and take a Levenberg-Marquardt step until the cameras converge.
 
     Args:
@@ -204,62 +204,65 @@ def settled(matches: Matches, state: State, prior: Prior, rounds: int = ROUNDS) 
     """
     damping = DAMPING.first
     for _ in range(rounds):
-        system = _system(matches, state)
-        state = _weighed(state, system)
-        trial, damping = _stepped(matches, state, prior, system, damping)
+        system = _normal_equations(matches, state)
+        state = _weigh_pairs(state, system)
+        trial, damping = _take_step(matches, state, prior, system, damping)
         moved_by = np.max(np.abs(trial.thetas - state.thetas), initial=0.0)
         state = replace(trial, sigma=matches.noise(trial))
-        if moved_by < ARRIVED:
+        if moved_by < CONVERGED:
             break
-    return reweighted(matches, state)
+    return reweight(matches, state)
 
 
-def reweighted(matches: Matches, state: State) -> State:
+def reweight(matches: Matches, state: State) -> State:
     """Weigh every pair by the log-likelihood that it would gain from cameras of its own.
 
     Args:
         matches: inliers of P pairs.
         state: current state; only the weights and their scale change.
     """
-    return _weighed(state, _system(matches, state))
+    return _weigh_pairs(state, _normal_equations(matches, state))
 
 
-def informed(matches: Matches, state: State) -> Information:
+def pair_information(matches: Matches, state: State) -> Information:
     """Eliminate the poses and return the information of each pair about the cameras.
 
     Args:
         matches: inliers of P pairs.
         state: cameras and poses.
     """
-    return _information(_system(matches, state))
+    return _reduce_to_cameras(_normal_equations(matches, state))
 
 
-def _system(matches: Matches, state: State) -> tuple[FloatArray, FloatArray]:
+def _normal_equations(matches: Matches, state: State) -> tuple[FloatArray, FloatArray]:
     return pair_systems(matches.points, matches.ends, state.thetas, matches.cameras, state.poses, state.sigma)
 
 
-def _information(system: tuple[FloatArray, FloatArray]) -> Information:
-    """Return the information of the pairs about their cameras, with the gains g = b' H^-1 b / 2 (see `_weighed`)."""
+def _reduce_to_cameras(system: tuple[FloatArray, FloatArray]) -> Information:
+    """Return the information of the pairs about their cameras, and the gains g = b' H^-1 b / 2 (see `_weigh_pairs`)."""
     H, b, _, _ = _eliminate_poses(*system, 0.0)
-    gains = 0.5 * np.einsum("pi,pi->p", b, solve_each(H + np.diag(np.tile(ALONE**-2.0, 2)), b[..., None])[..., 0])
+    gains = 0.5 * np.einsum(
+        "pi,pi->p", b, solve_each(H + np.diag(np.tile(OWN_CAMERA_SIGMAS**-2.0, 2)), b[..., None])[..., 0]
+    )
     return Information(H, b, gains)
 
 
-def _weighed(state: State, system: tuple[FloatArray, FloatArray]) -> State:
+def _weigh_pairs(state: State, system: tuple[FloatArray, FloatArray]) -> State:
     """Weigh every pair by the log-likelihood g that it would gain from cameras of its own::
 
         g = b' H^-1 b / 2,      w = (1 + g / (3 s))^-2,      s = max(1, lower quartile of all g / 0.288)
 
-    H and b are the pair's Hessian and negative gradient in its cameras, the poses eliminated, with the prior `ALONE`.
+    H and b are the pair's Hessian and negative gradient in its cameras, the poses eliminated, with the prior
+    `OWN_CAMERA_SIGMAS`.
     With noise alone, g is half of a chi^2 variable of two degrees of freedom, whose lower quartile is 0.288. w is the
     derivative of Geman and McClure's cost (1987) g / (1 + g / (3 s)): iteratively reweighted least squares.
     """
-    gains = _information(system).gains
+    gains = _reduce_to_cameras(system).gains
     scale = max(1.0, float(np.quantile(gains, 0.25)) / LOWER_QUARTILE) if len(gains) else 1.0
     return replace(state, weights=(1.0 + gains / (CONFLICT * scale)) ** -2, scale=scale)
 
 
-class Eliminated(NamedTuple):
+class ReducedSystem(NamedTuple):
     """Normal equations of P pairs reduced to their cameras, and the terms for back substitution of the poses."""
 
     hessians: FloatArray
@@ -276,7 +279,7 @@ class Eliminated(NamedTuple):
         return np.asarray(self.pose_alone - (self.pose_by_cameras @ camera_steps[..., None])[..., 0], np.float64)
 
 
-def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> Eliminated:
+def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> ReducedSystem:
     """Eliminate the poses from the systems of all pairs by the Schur complement::
 
         A = | U   W |     (U - W V^-1 W') d_cameras = b_cameras - W V^-1 b_pose
@@ -296,7 +299,7 @@ def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> Eliminated
     solved = np.linalg.solve(V, np.concatenate([A[:, n:, :n], b[:, n:, None]], axis=2))
     pose_by_cameras, pose_alone = np.split(solved, [n], axis=2)
     W = A[:, :n, n:]
-    return Eliminated(
+    return ReducedSystem(
         hessians=A[:, :n, :n] - W @ pose_by_cameras,
         gradients=b[:, :n] - (W @ pose_alone)[..., 0],
         pose_by_cameras=pose_by_cameras,
@@ -304,7 +307,7 @@ def _eliminate_poses(A: FloatArray, b: FloatArray, damping: float) -> Eliminated
     )
 
 
-def _stepped(
+def _take_step(
     matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
 ) -> tuple[State, float]:
     """Take one step that lowers the cost, damped as far as needed; return the state and the next damping."""
@@ -312,23 +315,23 @@ def _stepped(
     cost = float(factors @ matches.costs(state)) + prior.cost(state.thetas)
 
     def attempt(tried: float) -> State | None:
-        trial = _step_of(matches, state, prior, system, tried)
+        trial = _solve_step(matches, state, prior, system, tried)
         return trial if float(factors @ matches.costs(trial)) + prior.cost(trial.thetas) <= cost else None
 
     found, damping = damped_step(attempt, damping, DAMPING)
     return found or state, damping
 
 
-def _step_of(
+def _solve_step(
     matches: Matches, state: State, prior: Prior, system: tuple[FloatArray, FloatArray], damping: float
 ) -> State:
     """Return the state after one damped step: cameras from all pairs and the prior, then each pose from its pair."""
     reduced = _eliminate_poses(*system, damping)
     said = Information(reduced.hessians, reduced.gradients, np.empty(0))
-    H, g = matches.scattered(said, matches.trust * state.weights / state.scale)
+    H, g = matches.assemble(said, matches.trust * state.weights / state.scale)
     H += np.diag(prior.precision.ravel())
     g += (prior.precision * (prior.mean - state.thetas)).ravel()
     step = solve_each(H + damping * np.diag(np.diag(H)), g[:, None]).reshape(-1, CAMERA)
     turns = reduced.pose_steps(step[matches.cameras].reshape(-1, 2 * CAMERA))
-    poses = np.array([moved(pose, turn) for pose, turn in zip(state.poses, turns, strict=True)]).reshape(-1, 12)
+    poses = np.array([retract(pose, turn) for pose, turn in zip(state.poses, turns, strict=True)]).reshape(-1, 12)
     return replace(state, thetas=state.thetas + step, poses=poses)

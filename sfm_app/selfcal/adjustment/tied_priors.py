@@ -19,15 +19,15 @@ from sfm_app.selfcal.adjustment.camera_priors import (
 from sfm_app.selfcal.adjustment.structureless_ba import Prior
 from sfm_app.selfcal.lens import LOG_FOCAL
 
-TIE = 0.3
+FAMILY_SPREAD = 0.3
 """Standard deviation of log f among the photos of one folder. Of reichstag10's ten cameras it is 0.31; photos without
 informative pairs follow the others. The set that it was compared with is named in benchmarks/corpus/tuning_sets.py."""
-LEAST = 2
+LEAST_MEMBERS = 2
 """Least number of photos that are tied: a single photo has no others to follow. By definition."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tied(CameraPriors):
+class TiedPriors(CameraPriors):
     """Hierarchical priors: the focals of a family scatter about their own mean, which is set to its optimum."""
 
     families: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
@@ -46,12 +46,12 @@ class Tied(CameraPriors):
         claimed = ~free[:, FOCAL] & np.isfinite(self.hints)
         for family in np.unique(self.families[self.families >= 0]):
             members = np.flatnonzero(self.families == family)
-            if len(members) < LEAST:
+            if len(members) < LEAST_MEMBERS:
                 continue
             priors = USUAL_FOCAL + np.log(self.sides[members])
-            weight = len(members) / TIE**2
-            away = np.sum(thetas[members, LOG_FOCAL] - priors) / TIE**2 / (weight + FOCAL_SPREAD**-2)
+            weight = len(members) / FAMILY_SPREAD**2
+            away = np.sum(thetas[members, LOG_FOCAL] - priors) / FAMILY_SPREAD**2 / (weight + FOCAL_SPREAD**-2)
             asked = ~claimed[members]
             mean[members[asked], LOG_FOCAL] = (priors + away)[asked]
-            precision[members[asked], LOG_FOCAL] = TIE**-2
+            precision[members[asked], LOG_FOCAL] = FAMILY_SPREAD**-2
         return Prior(mean, precision)

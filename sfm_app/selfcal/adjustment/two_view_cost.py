@@ -12,20 +12,20 @@ downweighted by the cost r^2 / (1 + r^2 / c^2) with c = 3 sigma (Geman and McClu
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.pose_manifold import POSE, essential, moved
+from sfm_app.geometry.pose_manifold import POSE_DOF, retract, write_essential
 from sfm_app.jit import kernel
-from sfm_app.selfcal.lens import camera_of, ray
+from sfm_app.selfcal.lens import write_camera, write_ray
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 CAMERA = 5
 """Parameters of one camera. Counted: log f, u, v, log a, kappa, by definition in `lens`."""
-PAIR = 2 * CAMERA + POSE
+PAIR = 2 * CAMERA + POSE_DOF
 """Parameters of a pair: two cameras and a pose, by definition."""
-REACH = 3.0
+ROBUST_SCALE = 3.0
 """c of the robust cost, in sigma. docs/algorithms.md, Self-calibration, 2. Chosen by hand; not measured on its own."""
-HOPELESS = 1e60
+OVERFLOW_LIMIT = 1e60
 """Squared distances in sigma^2, or derivatives, above this count as not finite. Its square is finite in double
 precision."""
 _STEP = 1e-6
@@ -35,7 +35,7 @@ precision 1e-10. Chosen by hand; not measured on its own."""
 
 @kernel
 def _distance(p: FloatArray, q: FloatArray, E: FloatArray) -> float:
-    """Return the distance r of the rays p of view 1 and q of view 2, each (7,) as `lens.ray` writes it."""
+    """Return the distance r of the rays p of view 1 and q of view 2, each (7,) as `lens.write_ray` writes it."""
     l0 = E[0, 0] * p[0] + E[0, 1] * p[1] + E[0, 2]
     l1 = E[1, 0] * p[0] + E[1, 1] * p[1] + E[1, 2]
     l2 = E[2, 0] * p[0] + E[2, 1] * p[1] + E[2, 2]
@@ -56,18 +56,18 @@ def distances(
         matches: (M, 4) of all pairs, one after the other.
         ends: (P + 1,) where each pair begins, and the end of the last.
         thetas: (C, 5) parameters of the cameras.
-        cameras, poses: (P, 2) camera of view 1 and of view 2; (P, 12), see `essential`.
+        cameras, poses: (P, 2) camera of view 1 and of view 2; (P, 12), see `write_essential`.
     """
     E, first, second = np.empty((3, 3)), np.empty(5), np.empty(5)
     p, q = np.empty(7), np.empty(7)
     found = np.empty(len(matches))
     for k in range(len(poses)):
-        essential(poses[k], E)
-        camera_of(thetas[cameras[k, 0]], first)
-        camera_of(thetas[cameras[k, 1]], second)
+        write_essential(poses[k], E)
+        write_camera(thetas[cameras[k, 0]], first)
+        write_camera(thetas[cameras[k, 1]], second)
         for i in range(ends[k], ends[k + 1]):
-            ray(matches[i, 0], matches[i, 1], first, -1.0, p)
-            ray(matches[i, 2], matches[i, 3], second, -1.0, q)
+            write_ray(matches[i, 0], matches[i, 1], first, -1.0, p)
+            write_ray(matches[i, 2], matches[i, 3], second, -1.0, q)
             found[i] = _distance(p, q, E)
     return found
 
@@ -83,7 +83,7 @@ def pair_costs(
         ends: (P + 1,) where each pair begins, and the end of the last.
         thetas: (C, 5) parameters of the cameras.
         cameras: (P, 2) camera of view 1 and of view 2.
-        poses: (P, 12), see `essential`.
+        poses: (P, 12), see `write_essential`.
         sigma: standard deviation of a distance, in the units of the matches.
     """
     found = distances(matches, ends, thetas, cameras, poses)
@@ -91,7 +91,7 @@ def pair_costs(
     for k in range(len(poses)):
         for i in range(ends[k], ends[k + 1]):
             r2 = (found[i] / sigma) ** 2
-            costs[k] += 0.5 * r2 / (1.0 + r2 / REACH**2) if r2 < HOPELESS else 0.5 * REACH**2
+            costs[k] += 0.5 * r2 / (1.0 + r2 / ROBUST_SCALE**2) if r2 < OVERFLOW_LIMIT else 0.5 * ROBUST_SCALE**2
     return costs
 
 
@@ -106,7 +106,7 @@ def pair_systems(
         ends: (P + 1,) where each pair begins, and the end of the last.
         thetas: (C, 5) parameters of the cameras.
         cameras: (P, 2) camera of view 1 and of view 2.
-        poses: (P, 12), see `essential`.
+        poses: (P, 12), see `write_essential`.
         sigma: standard deviation of a distance, in the units of the matches.
 
     Returns:
@@ -115,7 +115,7 @@ def pair_systems(
     """
     A, b = np.zeros((len(poses), PAIR, PAIR)), np.zeros((len(poses), PAIR))
     # derivatives are finite differences: index 0 is unchanged, 1 to 5 have one parameter moved
-    lenses, Es = np.empty((2, 1 + CAMERA, 5)), np.empty((1 + POSE, 3, 3))
+    lenses, Es = np.empty((2, 1 + CAMERA, 5)), np.empty((1 + POSE_DOF, 3, 3))
     rays, J = np.empty((2, 1 + CAMERA, 7)), np.empty(PAIR)
     for k in range(len(poses)):
         shared = cameras[k, 0] == cameras[k, 1]
@@ -127,8 +127,8 @@ def pair_systems(
             for view in range(2):
                 _write_rays(matches[i, 2 * view], matches[i, 2 * view + 1], lenses[view], rays[view])
             r = _write_derivatives(rays, Es, sigma, shared, J)
-            if _are_numbers(r, J):
-                _add(A[k], b[k], J, r, (1.0 + r * r / REACH**2) ** -2)
+            if _is_finite(r, J):
+                _add_match(A[k], b[k], J, r, (1.0 + r * r / ROBUST_SCALE**2) ** -2)
         _mirror(A[k])
     return A, b
 
@@ -136,11 +136,11 @@ def pair_systems(
 @kernel
 def _write_poses(pose: FloatArray, Es: FloatArray) -> None:
     """Write E of a pose, and with each of its five parameters moved, into `Es` (6, 3, 3)."""
-    step = np.zeros(POSE)
-    essential(pose, Es[0])
-    for j in range(POSE):
+    step = np.zeros(POSE_DOF)
+    write_essential(pose, Es[0])
+    for j in range(POSE_DOF):
         step[j] = _STEP
-        essential(moved(pose, step), Es[1 + j])
+        write_essential(retract(pose, step), Es[1 + j])
         step[j] = 0.0
 
 
@@ -148,11 +148,11 @@ def _write_poses(pose: FloatArray, Es: FloatArray) -> None:
 def _write_cameras(theta: FloatArray, lenses: FloatArray) -> None:
     """Write the camera of the parameters (5,), and with each of them moved, into `lenses` (6, 5)."""
     trial = theta.copy()
-    camera_of(trial, lenses[0])
+    write_camera(trial, lenses[0])
     for j in range(CAMERA):
         kept = trial[j]
         trial[j] = kept + _STEP
-        camera_of(trial, lenses[1 + j])
+        write_camera(trial, lenses[1 + j])
         trial[j] = kept
 
 
@@ -161,7 +161,7 @@ def _write_rays(x: float, y: float, lenses: FloatArray, rays: FloatArray) -> Non
     """Write the ray of a pixel through each of `lenses` (6, 5) into `rays` (6, 7); the first initializes the others."""
     guess = -1.0
     for j in range(1 + CAMERA):
-        ray(x, y, lenses[j], guess, rays[j])
+        write_ray(x, y, lenses[j], guess, rays[j])
         guess = rays[0, 6]
 
 
@@ -183,18 +183,18 @@ def _write_derivatives(rays: FloatArray, Es: FloatArray, sigma: float, shared: b
         else:
             J[j] = (_distance(rays[0, 1 + j], rays[1, 0], Es[0]) / sigma - r) / _STEP
             J[CAMERA + j] = (_distance(rays[0, 0], rays[1, 1 + j], Es[0]) / sigma - r) / _STEP
-    for j in range(POSE):
+    for j in range(POSE_DOF):
         J[2 * CAMERA + j] = (_distance(rays[0, 0], rays[1, 0], Es[1 + j]) / sigma - r) / _STEP
     return float(r)
 
 
 @kernel
-def _are_numbers(r: float, J: FloatArray) -> bool:
+def _is_finite(r: float, J: FloatArray) -> bool:
     """Return whether a distance and its derivatives are finite; at an epipole the gradient vanishes."""
     total = r * r
     for j in range(PAIR):
         total += abs(J[j])
-    return bool(total < HOPELESS)
+    return bool(total < OVERFLOW_LIMIT)
 
 
 @kernel
@@ -206,7 +206,7 @@ def _mirror(A: FloatArray) -> None:
 
 
 @kernel
-def _add(A: FloatArray, b: FloatArray, J: FloatArray, r: float, weight: float) -> None:
+def _add_match(A: FloatArray, b: FloatArray, J: FloatArray, r: float, weight: float) -> None:
     """Add one match: weight J'J to the lower triangle of A, -weight J'r to b."""
     for i in range(PAIR):
         scaled = weight * J[i]

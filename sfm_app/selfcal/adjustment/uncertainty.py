@@ -6,9 +6,9 @@ Ours; leaving out photos is the jackknife (Efron 1982). Key pairs are what chapt
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.spd_solve import lifted
-from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, scatter_by_photos
-from sfm_app.selfcal.adjustment.structureless_ba import ALONE
+from sfm_app.geometry.spd_solve import lift_eigenvalues
+from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, jackknife_deviations
+from sfm_app.selfcal.adjustment.structureless_ba import OWN_CAMERA_SIGMAS
 from sfm_app.selfcal.adjustment.two_view_cost import CAMERA
 from sfm_app.selfcal.lens import CENTER_U, CENTER_V, KAPPA, LOG_ASPECT, LOG_FOCAL
 from sfm_app.types import PairId
@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 MODEL_ERROR = np.array([1e-3, 1e-3, 1e-3, 1e-3, 3e-3])
 """Standard deviations of errors that no lens model covers: of log f, u and v in longer sides, log a, and k1.
 docs/algorithms.md, Self-calibration, 4. Chosen by hand; not measured on their own."""
-AGREES = 0.5
+LEAST_KEY_WEIGHT = 0.5
 """A pair with a smaller weight in the fit is no key pair. docs/algorithms.md, Self-calibration, 7. Chosen by hand; not
 measured on its own."""
 
@@ -34,7 +34,7 @@ def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> Float
     found = fit.evidence.covariance(fit.free)
     if resampled:
         deviations = np.sqrt(np.diag(found))
-        wider = np.maximum(scatter_by_photos(fit) / deviations, 1.0)
+        wider = np.maximum(jackknife_deviations(fit) / deviations, 1.0)
         found = found * np.outer(wider, wider)
     floor = np.tile(MODEL_ERROR, (len(sides), 1))
     floor[:, CENTER_U : CENTER_V + 1] *= sides[:, None]
@@ -42,7 +42,7 @@ def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> Float
     return np.asarray(found + np.diag(floor.ravel() ** 2), np.float64)
 
 
-def spread_of(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, float]:
+def spread_from_covariance(theta: FloatArray, cov: FloatArray, unit_px: float) -> dict[str, float]:
     """Return the standard deviations of fx, fy, cx, cy in pixels and of k1.
 
     Args:
@@ -73,8 +73,10 @@ def key_pairs(fit: Fit, photos: tuple[PairId, ...]) -> tuple[PairId, ...]:
     """
     if not photos:
         return ()
-    alone = np.tile(ALONE, 2)
-    news = np.linalg.slogdet(lifted(np.eye(2 * CAMERA) + alone[:, None] * fit.information.hessians * alone))[1]
+    alone = np.tile(OWN_CAMERA_SIGMAS, 2)
+    news = np.linalg.slogdet(lift_eigenvalues(np.eye(2 * CAMERA) + alone[:, None] * fit.information.hessians * alone))[
+        1
+    ]
     worth = fit.state.weights * news
-    order = [pair for pair in np.argsort(-worth, kind="stable") if fit.state.weights[pair] >= AGREES]
+    order = [pair for pair in np.argsort(-worth, kind="stable") if fit.state.weights[pair] >= LEAST_KEY_WEIGHT]
     return tuple(photos[pair] for pair in order)

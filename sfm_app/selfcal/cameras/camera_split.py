@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.selfcal.cameras.multi_camera import Tables
+from sfm_app.selfcal.cameras.multi_camera import VoteTables
 from sfm_app.selfcal.consensus import consensus_peak
 from sfm_app.selfcal.consensus.consensus import Consensus
 from sfm_app.selfcal.inputs import FloatArray
@@ -25,13 +25,13 @@ FAIR_SHARE = 0.5
 measured on its own."""
 OTHER_FOCAL = 0.05
 """Difference in log f from which on it is another camera. Chosen by hand; not measured on its own."""
-CLEARLY = 0.25
+LEAST_FOCAL_GAIN = 0.25
 """Share of a photo's votes by which another focal must beat that of the peak. docs/algorithms.md, Self-calibration, 6.
 Chosen by hand; not measured on its own."""
 LEAST_GAIN = 0.25
 """Share of the votes of the photos of all other cameras together that a split must win. Chosen by hand; not measured on
 its own."""
-REACH, TRIALS = 1.1, 111
+FOCAL_REACH, TRIALS = 1.1, 111
 """Range in log f and number of the focals that are tried for a photo: up to three times longer or shorter. Chosen by
 hand; not measured on their own."""
 MOST_PEAKS = 4
@@ -40,8 +40,8 @@ ROUNDS = 10
 """Most rounds of assigning photos to cameras. Chosen by hand; not measured on its own."""
 
 
-def separated(
-    tables: Tables, photos: Sequence[PairId], starts: Sequence[FloatArray]
+def split_by_focal(
+    tables: VoteTables, photos: Sequence[PairId], starts: Sequence[FloatArray]
 ) -> tuple[FloatArray, dict[int, int]]:
     """Find cameras that share all but the focal, and which photo is of which.
 
@@ -54,38 +54,38 @@ def separated(
         (C, 5) cameras, and the number of the camera by photo; one camera where the photos agree.
     """
     everyone = sorted({photo for pair in photos for photo in pair})
-    pairs = _Pairs(tables, photos)
-    _, theta, core = max((pairs.core(theta, everyone) for theta in starts), key=lambda found: found[0])
+    pairs = _PairVotes(tables, photos)
+    _, theta, core = max((pairs.find_core(theta, everyone) for theta in starts), key=lambda found: found[0])
     one = theta[None]
-    named = [focal for photo in everyone if photo not in core for focal in pairs.named(photo, theta, core)]
-    focals = _clustered(named)
+    named = [focal for photo in everyone if photo not in core for focal in pairs.find_other_focal(photo, theta, core)]
+    focals = _cluster_medians(named)
     if not focals:
         return one, dict.fromkeys(everyone, 0)
     cameras = np.repeat(one, 1 + len(focals), axis=0)
     cameras[1:, LOG_FOCAL] += focals
-    labels = pairs.labeled(cameras, everyone, core)
+    labels = pairs.assign_cameras(cameras, everyone, core)
     gain = pairs.total(cameras, labels) - max(
         pairs.total(cameras, dict.fromkeys(everyone, k)) for k in range(len(cameras))
     )
-    if gain <= LEAST_GAIN * pairs.at_stake({photo for photo, label in labels.items() if label != 0}):
+    if gain <= LEAST_GAIN * pairs.most_votes({photo for photo, label in labels.items() if label != 0}):
         return one, dict.fromkeys(everyone, 0)
     used = sorted(set(labels.values()))
     return cameras[used], {photo: used.index(label) for photo, label in labels.items()}
 
 
-def peaks_of(consensus: Consensus) -> list[FloatArray]:
+def peak_cameras(consensus: Consensus) -> list[FloatArray]:
     """Return the peaks of the consensus as cameras (5,) without distortion, highest first."""
-    answer = consensus_peak.found(consensus)
+    answer = consensus_peak.find_peak(consensus)
     return [np.append(theta, 0.0) for theta in (answer.theta, *answer.others)][:MOST_PEAKS]
 
 
-class _Pairs:
+class _PairVotes:
     """Votes of pairs of photos for cameras."""
 
-    def __init__(self, tables: Tables, photos: Sequence[PairId]) -> None:
+    def __init__(self, tables: VoteTables, photos: Sequence[PairId]) -> None:
         self.tables, self.photos = tables, photos
 
-    def core(self, theta: FloatArray, everyone: Sequence[int]) -> tuple[float, FloatArray, set[int]]:
+    def find_core(self, theta: FloatArray, everyone: Sequence[int]) -> tuple[float, FloatArray, set[int]]:
         """Find the photos that agree on a camera; return their votes beyond the fair share, the camera, and them."""
         beyond = [
             float(self.tables.votes(k, theta[None], theta[None], SIGMA)[0, 0] - FAIR_SHARE * self.tables.weights[k])
@@ -105,9 +105,9 @@ class _Pairs:
         inside = [value for pair, value in zip(self.photos, beyond, strict=True) if core.issuperset(pair)]
         return float(sum(inside)), theta, core
 
-    def named(self, photo: int, theta: FloatArray, core: set[int]) -> list[float]:
+    def find_other_focal(self, photo: int, theta: FloatArray, core: set[int]) -> list[float]:
         """Return the step in log f to the focal that a photo's pairs with the core clearly prefer; empty for none."""
-        steps = np.linspace(-REACH, REACH, TRIALS)
+        steps = np.linspace(-FOCAL_REACH, FOCAL_REACH, TRIALS)
         trials = np.repeat(theta[None], TRIALS, axis=0)
         trials[:, LOG_FOCAL] += steps
         votes, most = np.zeros(TRIALS), 0.0
@@ -120,10 +120,10 @@ class _Pairs:
                 continue
             most += self.tables.weights[k]
         best = int(np.argmax(votes))
-        clear = votes[best] - votes[TRIALS // 2] > CLEARLY * most and votes[best] >= FAIR_SHARE * most
+        clear = votes[best] - votes[TRIALS // 2] > LEAST_FOCAL_GAIN * most and votes[best] >= FAIR_SHARE * most
         return [float(steps[best])] if clear and abs(steps[best]) > OTHER_FOCAL else []
 
-    def labeled(self, cameras: FloatArray, everyone: Sequence[int], core: set[int]) -> dict[int, int]:
+    def assign_cameras(self, cameras: FloatArray, everyone: Sequence[int], core: set[int]) -> dict[int, int]:
         """Give every photo in turn the camera for which its pairs vote most, until none changes."""
         labels = {photo: 0 if photo in core else -1 for photo in everyone}
         for _ in range(ROUNDS):
@@ -140,7 +140,7 @@ class _Pairs:
                 break
         return labels
 
-    def at_stake(self, asked: set[int]) -> float:
+    def most_votes(self, asked: set[int]) -> float:
         """Return the most votes that the pairs of the given photos can give."""
         touched = [bool(asked.intersection(pair)) for pair in self.photos]
         return float(np.sum(self.tables.weights[touched]))
@@ -155,7 +155,7 @@ class _Pairs:
         )
 
 
-def _clustered(steps: Sequence[float]) -> list[float]:
+def _cluster_medians(steps: Sequence[float]) -> list[float]:
     """Return the medians of clusters of values; gaps above `OTHER_FOCAL` separate clusters."""
     ordered: NDArray[np.float64] = np.sort(np.array(steps))
     cuts = np.flatnonzero(np.diff(ordered) > OTHER_FOCAL) + 1

@@ -15,19 +15,25 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.jit import kernel
-from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, refined, straight_fundamentals
+from sfm_app.selfcal.adjustment.calibrate_pairs import Fit, fit_cameras, undistorted_fundamentals
 from sfm_app.selfcal.adjustment.camera_priors import FOCAL_SPREAD, HINT_SPREAD, USUAL_FOCAL, CameraPriors
 from sfm_app.selfcal.adjustment.structureless_ba import Matches
-from sfm_app.selfcal.adjustment.tied_priors import Tied
+from sfm_app.selfcal.adjustment.tied_priors import TiedPriors
 from sfm_app.selfcal.adjustment.two_view_cost import CAMERA
-from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_of
+from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_from_covariance
+from sfm_app.selfcal.cameras.max_sum import best_places
 from sfm_app.selfcal.consensus import consensus_peak
 from sfm_app.selfcal.consensus.peak_evidence import MIN_LEAD, RIVAL_RATIO
 from sfm_app.selfcal.consensus.peak_search import FOCAL_RANGE, SIGMAS
-from sfm_app.selfcal.critical_motions import open_focal
+from sfm_app.selfcal.critical_motions import critical_motion
 from sfm_app.selfcal.inputs import FloatArray, prepare
-from sfm_app.selfcal.lens import LOG_FOCAL, camera_of
-from sfm_app.selfcal.results import calibration_of, guessed, parameters_of, roughly
+from sfm_app.selfcal.lens import LOG_FOCAL, write_camera
+from sfm_app.selfcal.results import (
+    calibration_from_parameters,
+    downgrade_to_estimate,
+    guess_calibration,
+    parameters_from_calibration,
+)
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs, PairId
 
@@ -36,10 +42,7 @@ IndexArray = NDArray[np.int64]
 FOCALS = 41
 """Focals on the grid of a camera, each 7 % above the one before. docs/algorithms.md, Self-calibration, 6. Chosen by
 hand; not measured on its own."""
-MESSAGE_ROUNDS, DAMPING = 30, 0.5
-"""Most rounds of max-sum message passing, and the share of the previous message that a new one keeps. Chosen by hand;
-not measured on their own."""
-FAIR_SHARE, BORNE_OUT, NOT_ALL = 0.5, 0.8, "not all of its photos support it"
+FAIR_SHARE, LEAST_SUPPORT, UNSUPPORTED_REASON = 0.5, 0.8, "not all of its photos support it"
 """Shares of their votes that every photo, and all together, must give to a camera split from photos of one size, and
 the reason where they do not. Chosen on folders 0 to 179 and 1000 to 1020 of `python -m benchmarks.trouble`: two cameras
 get 0.86 to 0.93 (0.57 and 0.69 with a moving object), those of a zoom and those over 5 % off 0.44 to 0.76."""
@@ -66,12 +69,12 @@ class CameraGroup:
     """Whether it was split from photos of one size: then each of its photos must support it."""
 
     @property
-    def whole(self) -> bool:
+    def is_whole(self) -> bool:
         """Whether it was calibrated from all of its own pairs and no others."""
         return self.family < 0 and not self.divided
 
 
-def calibrate_several(
+def calibrate_cameras(
     cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, options: CalibrationSettings, method: str
 ) -> list[Calibration]:
     """Return one calibration per camera, in their order; each is identifiable or a guess with the reason.
@@ -84,44 +87,44 @@ def calibrate_several(
         method: name that goes into the answers.
     """
     unit = float(max(max(camera.size) for camera in cameras))
-    kept, Fs, matches = _in_units(cameras, pairs, members, unit)
+    kept, Fs, matches = _convert_to_units(cameras, pairs, members, unit)
     members = members[kept]
     sides = np.array([max(camera.size) / unit for camera in cameras])
     hints = np.array([camera.hint_px for camera in cameras]) / unit
     families = np.array([camera.family for camera in cameras], np.int64)
-    priors = Tied(sides, hints, options.center_sigma, options.lens, families)
+    priors = TiedPriors(sides, hints, options.center_sigma, options.lens, families)
     weights = pairs.weights[kept]
-    thetas = np.array([_first(camera, side, unit) for camera, side in zip(cameras, sides, strict=True)])
+    thetas = np.array([_initial_parameters(camera, side, unit) for camera, side in zip(cameras, sides, strict=True)])
     unknown = np.array([camera.start is None for camera in cameras])
     if unknown.any():
-        thetas = _with_focals(thetas, unknown, Tables(Fs, members, weights), priors)
-    fit = refined(matches, Fs, [thetas], priors)
+        thetas = _find_focals(thetas, unknown, VoteTables(Fs, members, weights), priors)
+    fit = fit_cameras(matches, Fs, [thetas], priors)
     cov = covariance(fit, sides)
-    straight = Tables(straight_fundamentals(fit), members, weights)
+    straight = VoteTables(undistorted_fundamentals(fit), members, weights)
     best = key_pairs(fit, tuple(pairs.photos[k] for k in kept))
     of = {pairs.photos[k]: (int(first), int(second)) for k, (first, second) in zip(kept, members, strict=True)}
     shares = _least_shares(fit.state.thetas, straight, [pairs.photos[k] for k in kept])
-    motion = open_focal(fit)
+    motion = critical_motion(fit)
     found = [
         replace(
-            _judged(k, camera, fit, cov, straight, unit, method, "" if camera.whole else motion),
+            _judge_camera(k, camera, fit, cov, straight, unit, method, "" if camera.is_whole else motion),
             key_pairs=tuple(pair for pair in best if of[pair] == (k, k)),
         )
         for k, camera in enumerate(cameras)
     ]
     return [
-        _borne_out(one, shares.get(k, 0.0)) if one.identifiable and camera.divided else one
+        _downgrade_if_unsupported(one, shares.get(k, 0.0)) if one.identifiable and camera.divided else one
         for k, (one, camera) in enumerate(zip(found, cameras, strict=True))
     ]
 
 
-def _borne_out(found: Calibration, least: float) -> Calibration:
+def _downgrade_if_unsupported(found: Calibration, least: float) -> Calibration:
     """Return the calibration, as an estimate where all photos or the worst (`least`) give it too few votes."""
-    doubtful = least < FAIR_SHARE or found.evidence["support"] < BORNE_OUT
-    return roughly(found, NOT_ALL if doubtful else "")
+    doubtful = least < FAIR_SHARE or found.evidence["support"] < LEAST_SUPPORT
+    return downgrade_to_estimate(found, UNSUPPORTED_REASON if doubtful else "")
 
 
-class Tables:
+class VoteTables:
     """Votes of pairs for any two cameras of their photos.
 
     Args:
@@ -131,10 +134,10 @@ class Tables:
     """
 
     def __init__(self, Fs: FloatArray, members: IndexArray, weights: FloatArray) -> None:
-        ones = CameraPairs.of(Fs, (1, 1), weights)
+        ones = CameraPairs.from_Fs(Fs, (1, 1), weights)
         ready = prepare(ones, unit_px=1.0, origin_px=(0.0, 0.0))
         self.kept = ready.kept
-        self.packed, self.members, self.weights = ready.packed, members[ready.kept], ready.weights
+        self.packed_rows, self.members, self.weights = ready.packed_rows, members[ready.kept], ready.weights
 
     def votes(self, pair: int, first: FloatArray, second: FloatArray, sigma: float) -> FloatArray:
         """Return (A, B) w exp(-r / sigma) for all pairs of cameras.
@@ -145,10 +148,12 @@ class Tables:
             second: (B, 5) cameras of view 2.
             sigma: width of a vote, in units of r, > 0.
         """
-        return np.asarray(self.weights[pair] * np.exp(-_ratios(self.packed[pair], first, second) / sigma), np.float64)
+        return np.asarray(
+            self.weights[pair] * np.exp(-_ratios(self.packed_rows[pair], first, second) / sigma), np.float64
+        )
 
 
-def _least_shares(thetas: FloatArray, tables: Tables, photos: Sequence[PairId]) -> dict[int, float]:
+def _least_shares(thetas: FloatArray, tables: VoteTables, photos: Sequence[PairId]) -> dict[int, float]:
     """Return by camera the smallest share of possible votes that the pairs of one of its photos give."""
     got: dict[tuple[int, int], float] = {}
     most: dict[tuple[int, int], float] = {}
@@ -164,7 +169,7 @@ def _least_shares(thetas: FloatArray, tables: Tables, photos: Sequence[PairId]) 
     return least
 
 
-def _in_units(
+def _convert_to_units(
     cameras: Sequence[CameraGroup], pairs: CameraPairs, members: IndexArray, unit: float
 ) -> tuple[IndexArray, FloatArray, Matches]:
     """Return the usable pairs, and their F's and inliers in units from the middle of each photo."""
@@ -182,13 +187,15 @@ def _in_units(
     return ready.kept, Fs, Matches(inliers, used, photos, unit, count=len(cameras))
 
 
-def _first(camera: CameraGroup, side: float, unit: float) -> FloatArray:
+def _initial_parameters(camera: CameraGroup, side: float, unit: float) -> FloatArray:
     if camera.start is not None:
-        return parameters_of(camera.start, unit)
+        return parameters_from_calibration(camera.start, unit)
     return np.array([USUAL_FOCAL + np.log(side), 0.0, 0.0, 0.0, 0.0])
 
 
-def _with_focals(thetas: FloatArray, unknown: NDArray[np.bool_], tables: Tables, priors: CameraPriors) -> FloatArray:
+def _find_focals(
+    thetas: FloatArray, unknown: NDArray[np.bool_], tables: VoteTables, priors: CameraPriors
+) -> FloatArray:
     """Return the cameras with the unknown focals on which most pairs agree."""
     grid = np.log(np.geomspace(*FOCAL_RANGE, FOCALS))
     trials = np.repeat(thetas[:, None], FOCALS, axis=1)
@@ -211,55 +218,10 @@ def _with_focals(thetas: FloatArray, unknown: NDArray[np.bool_], tables: Tables,
     return chosen
 
 
-def best_places(own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> IndexArray:
-    """Choose a grid index for every camera so that the sum over cameras and over pairs of cameras is large.
-
-    Damped max-sum message passing (Pearl 1988; exact on trees), then coordinate ascent. Ascent also starts from the
-    best index of each camera by itself, which messages on loops do not always outdo.
-
-    Args:
-        own, between: (C, G) value of each camera by itself; (G, G) value of two cameras i < j together, by (i, j).
-    """
-    tables = {(i, j): table for (i, j), table in between.items()} | {(j, i): t.T for (i, j), t in between.items()}
-    messages = {edge: np.zeros(own.shape[1]) for edge in tables}
-    for _ in range(MESSAGE_ROUNDS):
-        belief = own.copy()
-        for (_, to), message in messages.items():
-            belief[to] += message
-        for (source, to), table in tables.items():
-            new = np.max((belief[source] - messages[to, source])[:, None] + table, axis=0)
-            messages[source, to] = DAMPING * messages[source, to] + (1.0 - DAMPING) * (new - np.max(new))
-    belief = own.copy()
-    for (_, to), message in messages.items():
-        belief[to] += message
-    ends = [_one_by_one(np.argmax(start, axis=1), own, tables) for start in (belief, own)]
-    return max(ends, key=lambda places: _gain(places, own, between))
-
-
-def _one_by_one(places: IndexArray, own: FloatArray, tables: dict[tuple[int, int], FloatArray]) -> IndexArray:
-    """Give every camera in turn its best index, with the others fixed, until none changes."""
-    places = places.astype(np.int64)
-    for _ in range(MESSAGE_ROUNDS):
-        before = places.copy()
-        for camera in range(len(places)):
-            value = own[camera].copy()
-            for (source, to), table in tables.items():
-                if to == camera:
-                    value += table[places[source]]
-            places[camera] = int(np.argmax(value))
-        if np.array_equal(places, before):
-            break
-    return places
-
-
-def _gain(places: IndexArray, own: FloatArray, between: dict[tuple[int, int], FloatArray]) -> float:
-    shared = sum(float(table[places[i], places[j]]) for (i, j), table in between.items())
-    return float(np.sum(own[np.arange(len(places)), places])) + shared
-
-
-def _judged(
-    index: int, camera: CameraGroup, fit: Fit, cov: FloatArray, straight: Tables, unit: float, method: str, motion: str
-) -> Calibration:
+def _judge_camera(
+    index: int, camera: CameraGroup, fit: Fit, cov: FloatArray, straight: VoteTables, unit: float, method: str,
+    motion: str,
+) -> Calibration:  # fmt: skip
     """Return the calibration of one camera, or a guess and why; `motion` names a motion that leaves all focals open."""
     theta = fit.state.thetas[index]
     block = cov[CAMERA * index : CAMERA * (index + 1), CAMERA * index : CAMERA * (index + 1)]
@@ -288,22 +250,26 @@ def _judged(
     reason = reason or (not (camera.divided and vague) and motion) or consensus_peak.objection(in_sides, spread, half)
     if reason and camera.family >= 0:
         # it contains the mean of the family: a better start for mapping than the usual focal
-        return replace(guessed(camera.size, reason, evidence), K=_of_its_family(theta, camera.size, unit))
+        return replace(
+            guess_calibration(camera.size, reason, evidence), K=_family_camera_matrix(theta, camera.size, unit)
+        )
     if reason:
-        return guessed(camera.size, reason, evidence)
-    found = calibration_of(theta, camera.size, method, unit)
-    found = replace(found, spread=spread_of(theta, block, unit), evidence=evidence, held=fit.names_held(index))
-    return roughly(found, vague)
+        return guess_calibration(camera.size, reason, evidence)
+    found = calibration_from_parameters(theta, camera.size, method, unit)
+    found = replace(
+        found, spread=spread_from_covariance(theta, block, unit), evidence=evidence, held=fit.held_names(index)
+    )
+    return downgrade_to_estimate(found, vague)
 
 
-def _of_its_family(theta: FloatArray, size: tuple[int, int], unit: float) -> FloatArray:
+def _family_camera_matrix(theta: FloatArray, size: tuple[int, int], unit: float) -> FloatArray:
     """Return the usual camera matrix with the most likely focal, though uncertain."""
     side = max(size)
     low, high = np.array(FOCAL_RANGE) * side
     return guessed_camera_matrix(size, float(np.clip(np.exp(theta[LOG_FOCAL]) * unit, low, high)))
 
 
-def _lead(index: int, thetas: FloatArray, tables: Tables) -> tuple[float, float]:
+def _lead(index: int, thetas: FloatArray, tables: VoteTables) -> tuple[float, float]:
     """Return votes by which a camera's focal leads all others, the other cameras fixed, and its share of its votes."""
     offsets = np.concatenate([[0.0], np.linspace(-1.5, 1.5, 61)])
     trials = np.repeat(thetas[None, index], len(offsets), axis=0)
@@ -332,13 +298,13 @@ def _ratios(pair: FloatArray, first: FloatArray, second: FloatArray) -> FloatArr
     k1, k2, G = np.empty(5), np.empty(5), np.empty((3, 3))
     found = np.empty((len(first), len(second)))
     for i in range(len(first)):
-        camera_of(first[i], k1)
+        write_camera(first[i], k1)
         for row in range(3):
             a, b, c = pair[3 * row], pair[3 * row + 1], pair[3 * row + 2]
             G[row, 0], G[row, 1], G[row, 2] = a * k1[0], b * k1[1], a * k1[2] + b * k1[3] + c
         n1 = _minor(pair[9], pair[10], pair[11], k1)
         for j in range(len(second)):
-            camera_of(second[j], k2)
+            write_camera(second[j], k2)
             square = 0.0
             for column in range(3):
                 p, q = G[0, column], G[1, column]

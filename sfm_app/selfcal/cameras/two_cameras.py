@@ -13,15 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_app.selfcal.cameras.focal_grid import FocalGrid, chosen_pairs
-from sfm_app.selfcal.cameras.multi_camera import FOCALS, IndexArray, Tables
+from sfm_app.selfcal.cameras.focal_grid import FocalGrid, subsample_pairs
+from sfm_app.selfcal.cameras.multi_camera import FOCALS, IndexArray, VoteTables
 from sfm_app.selfcal.inputs import FloatArray
 from sfm_app.selfcal.lens import LOG_FOCAL
 from sfm_app.types import PairId
 
-APART = 2
+LEAST_STEPS_APART = 2
 """Least distance of two cameras, in steps of 7 % on the grid of focals. Chosen by hand; not measured on its own."""
-NEAR = 4
+REFINE_STEPS = 4
 """Steps that both focals may move in each round of the final refinement. Chosen by hand; not measured on its own."""
 ROUNDS = 20
 """Most rounds of assigning photos to cameras. Chosen by hand; not measured on its own."""
@@ -30,7 +30,7 @@ LEAST_GAIN = 0.15
 (as for `camera_per_photo`; at most 0.02), and on rendered folders of `python -m benchmarks.trouble`, seeds 0 to 64: two
 cameras and zooms have 0.22 to 0.70. Of the photo sets of one camera, none of which was looked at before, 0.05 at most,
 but for a single photo of kitchen25."""
-CLEARLY, LEAST_PHOTOS = 2.5, 2
+LEAST_DEVIATIONS, LEAST_PHOTOS = 2.5, 2
 """Least gain in its standard deviations for two cameras to be certain, and least photos of the smaller one. The folders
 have 2.8 to 7.9. One photo alone is left to `camera_split`. Chosen on them, `python -m benchmarks.trouble`, seeds 0 to
 64."""
@@ -45,25 +45,25 @@ class TwoCameras(NamedTuple):
     """Number of the camera by photo, for photos that have pairs."""
     gain: float
     """Votes that the division wins against one camera."""
-    stake: float
+    most_votes: float
     """Most votes that the pairs of the smaller camera's photos can give."""
     deviations: float
     """The gain in its standard deviations, pairs taken as independent."""
-    fewest: int
+    smaller_count: int
     """Photos of the smaller camera."""
 
     @property
-    def perhaps(self) -> bool:
+    def is_possible(self) -> bool:
         """Whether there may be two cameras."""
-        return self.fewest >= LEAST_PHOTOS and self.gain >= LEAST_GAIN * self.stake
+        return self.smaller_count >= LEAST_PHOTOS and self.gain >= LEAST_GAIN * self.most_votes
 
     @property
-    def clearly(self) -> bool:
+    def is_certain(self) -> bool:
         """Whether there are certainly two cameras."""
-        return self.perhaps and self.deviations >= CLEARLY
+        return self.is_possible and self.deviations >= LEAST_DEVIATIONS
 
 
-def two_cameras(tables: Tables, photos: Sequence[PairId], starts: Sequence[FloatArray]) -> TwoCameras | None:
+def divide_photos(tables: VoteTables, photos: Sequence[PairId], starts: Sequence[FloatArray]) -> TwoCameras | None:
     """Divide photos among two cameras that share all but the focal, by the votes of their pairs; None for no gain.
 
     Args:
@@ -71,7 +71,7 @@ def two_cameras(tables: Tables, photos: Sequence[PairId], starts: Sequence[Float
         photos: the two photos of each pair.
         starts: (5,) each, candidates for the center and aspect of the photos.
     """
-    rows = chosen_pairs(len(photos))
+    rows = subsample_pairs(len(photos))
     everyone = sorted({photo for pair in photos for photo in pair})
     number = {photo: k for k, photo in enumerate(everyone)}
     members = np.array([[number[first], number[second]] for first, second in photos])[rows]
@@ -81,18 +81,18 @@ def two_cameras(tables: Tables, photos: Sequence[PairId], starts: Sequence[Float
     grid, priors = grids[best], int(np.argmax(shared[best]))
     division = _Division(grid, len(everyone))
     tried = [
-        division.settled(np.array([priors, other]), start)
+        division.assign_photos(np.array([priors, other]), start)
         for other in range(FOCALS)
-        if abs(other - priors) >= APART
+        if abs(other - priors) >= LEAST_STEPS_APART
         for start in division.starts(priors, other)
     ]
     places, labels = max(tried, key=lambda found: division.total(*found))
-    places, labels = division.refined(places, labels)
-    if len(set(labels.tolist())) == 1 or abs(places[0] - places[1]) < APART:
+    places, labels = division.refine(places, labels)
+    if len(set(labels.tolist())) == 1 or abs(places[0] - places[1]) < LEAST_STEPS_APART:
         return None
     if np.count_nonzero(labels) > len(labels) / 2:
         places, labels = places[::-1], 1 - labels
-    gains = division.each(places, labels) - grid.votes[:, priors, priors]
+    gains = division.pair_votes(places, labels) - grid.votes[:, priors, priors]
     smaller = labels[members].astype(bool)
     theta = np.repeat(np.asarray(starts[best], np.float64)[None], 2, axis=0)
     theta[:, LOG_FOCAL] = grid.grid[places]
@@ -101,9 +101,9 @@ def two_cameras(tables: Tables, photos: Sequence[PairId], starts: Sequence[Float
         theta,
         {photo: int(labels[k]) for photo, k in number.items()},
         gain=float(np.sum(gains)),
-        stake=float(np.sum(tables.weights[rows][smaller.any(axis=1)])),
+        most_votes=float(np.sum(tables.weights[rows][smaller.any(axis=1)])),
         deviations=float(np.sum(gains)) / noise if noise > 0.0 else 0.0,
-        fewest=int(np.count_nonzero(labels)),
+        smaller_count=int(np.count_nonzero(labels)),
     )
 
 
@@ -129,7 +129,7 @@ class _Division:
         wanted = np.array([np.sum(wants[rows]) for rows in self.of])
         return np.zeros(self.photos, np.int64), (wanted > 0).astype(np.int64)
 
-    def settled(self, places: IndexArray, labels: IndexArray) -> tuple[IndexArray, IndexArray]:
+    def assign_photos(self, places: IndexArray, labels: IndexArray) -> tuple[IndexArray, IndexArray]:
         """Give every photo in turn the camera for which its pairs vote most, until none changes."""
         labels = labels.copy()
         for _ in range(ROUNDS):
@@ -148,23 +148,23 @@ class _Division:
         mine[self.members[rows] == photo] = camera
         return float(np.sum(self.votes[rows, places[mine[:, 0]], places[mine[:, 1]]]))
 
-    def each(self, places: IndexArray, labels: IndexArray) -> FloatArray:
+    def pair_votes(self, places: IndexArray, labels: IndexArray) -> FloatArray:
         """Return (P,) votes of the pairs for a division."""
         first, second = places[labels][self.members].T
         return np.asarray(self.votes[self.rows, first, second], np.float64)
 
     def total(self, places: IndexArray, labels: IndexArray) -> float:
         """Return the sum of the votes for a division."""
-        return float(np.sum(self.each(places, labels)))
+        return float(np.sum(self.pair_votes(places, labels)))
 
-    def refined(self, places: IndexArray, labels: IndexArray) -> tuple[IndexArray, IndexArray]:
+    def refine(self, places: IndexArray, labels: IndexArray) -> tuple[IndexArray, IndexArray]:
         """Move both focals to where they win most votes, and every photo to its camera, until nothing changes."""
         for _ in range(ROUNDS):
-            near = [np.arange(max(0, place - NEAR), min(FOCALS, place + NEAR + 1)) for place in places]
+            near = [np.arange(max(0, place - REFINE_STEPS), min(FOCALS, place + REFINE_STEPS + 1)) for place in places]
             tried = [np.array([first, second]) for first in near[0] for second in near[1]]
             better = max(tried, key=lambda both: self.total(both, labels))
             stays = np.array_equal(better, places)
-            places, labels = self.settled(better, labels)
+            places, labels = self.assign_photos(better, labels)
             if stays:
                 break
         return places, labels

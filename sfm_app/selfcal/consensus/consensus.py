@@ -41,13 +41,13 @@ class Consensus:
         self.pairs = pairs
         self.center_sigma = center_sigma
         self.weights = pairs.weights if weights is None else weights
-        self._packed = pairs.packed
+        self._packed = pairs.packed_rows
 
-    def weighted(self, weights: FloatArray) -> "Consensus":
+    def with_weights(self, weights: FloatArray) -> "Consensus":
         """Return the consensus of the same pairs with other weights (P,)."""
         return Consensus(self.pairs, self.center_sigma, weights)
 
-    def at(self, thetas: FloatArray, sigma: float) -> FloatArray:
+    def evaluate(self, thetas: FloatArray, sigma: float) -> FloatArray:
         """Return (N,) supports plus log-priors at `thetas`.
 
         Args:
@@ -80,7 +80,7 @@ class Consensus:
                 simplex = np.tile(theta, (len(free) + 1, 1))
                 for row, index in enumerate(free):
                     simplex[row + 1, index] += steps[index]
-                theta, value = _climbed(self._packed, self.weights, self.center_sigma, simplex, sigma)
+                theta, value = _climb(self._packed, self.weights, self.center_sigma, simplex, sigma)
         return theta, value
 
 
@@ -114,7 +114,7 @@ def _values(
 
 
 @kernel
-def _climbed(
+def _climb(
     packed: FloatArray, weights: FloatArray, center_sigma: float, simplex: FloatArray, sigma: float
 ) -> tuple[FloatArray, float]:
     """Find a maximum by Nelder and Mead (1965) from a simplex (n + 1, 4), with their coefficients 1, 2, 1/2, 1/2."""
@@ -125,16 +125,16 @@ def _climbed(
         if values[0] - values[-1] <= FINISHED_VALUE and _extent(simplex) <= FINISHED_STEP:
             break
         worst = values[-1]
-        trial = _moved(simplex, 1.0)
+        trial = _reflect(simplex, 1.0)
         value = _value(packed, weights, center_sigma, trial, sigma)
         if value > values[0]:
-            further = _moved(simplex, 2.0)
+            further = _reflect(simplex, 2.0)
             better = _value(packed, weights, center_sigma, further, sigma)
             if better > value:
                 trial, value = further, better
         elif value <= values[-2]:
             floor = max(value, worst)
-            trial = _moved(simplex, 0.5 if value > worst else -0.5)
+            trial = _reflect(simplex, 0.5 if value > worst else -0.5)
             value = _value(packed, weights, center_sigma, trial, sigma)
             if value <= floor:
                 for k in range(1, count):
@@ -162,7 +162,7 @@ def _sort(simplex: FloatArray, values: FloatArray) -> None:
 
 
 @kernel
-def _moved(simplex: FloatArray, factor: float) -> FloatArray:
+def _reflect(simplex: FloatArray, factor: float) -> FloatArray:
     """Return the last corner reflected at the centroid of the others, its distance scaled by `factor`."""
     trial = np.empty(4)
     for column in range(4):

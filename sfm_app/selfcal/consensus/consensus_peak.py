@@ -16,7 +16,7 @@ from sfm_app.selfcal.consensus.peak_evidence import (
     effective_count,
     indecision,
     own_sigma,
-    resampled,
+    resample_peak,
     votes,
 )
 from sfm_app.selfcal.consensus.peak_search import FOCAL_RANGE, SIGMAS, Peak, Profile, peaks, scan
@@ -42,7 +42,7 @@ IDENTIFIED_LOG_FOCAL_SPREAD = 0.02
 much to be called identifiable. Between this and the limit above the answer is an estimate: a better start than a guess,
 and no more. Of 109 cameras of seeds 0 to 180, 1000 to 1035 and 2000 to 2139 of `python -m benchmarks.trouble` four lie
 between 0.02 and 0.03: off by 10, 7, 2 and 1 %."""
-CLEAR_LEAD_SHARE, FEW_ASTRAY = 0.2, 0.8
+SAFE_LEAD_SHARE, SAFE_SUPPORT = 0.2, 0.8
 """Where a focal a quarter away loses less than the first share of the votes (walks to the side or on one plane), the
 focal is poorly determined. Then pairs must win the second share of all votes: what misled the missing ones may have
 biased the others. Of the same 109 cameras eight are short of both: off by 43, 10, 6, 4, 4, 1, 0.3 and 0.2 %; no other
@@ -83,7 +83,7 @@ class Answer:
     def doubt_of_focal(self, weights: FloatArray) -> str:
         """Return why an answer to pairs of weights (P,) is an estimate despite a small deviation; empty for none."""
         mass = float(np.sum(self.votes))
-        doubtful = self.lead < CLEAR_LEAD_SHARE * mass and mass < FEW_ASTRAY * float(np.sum(weights))
+        doubtful = self.lead < SAFE_LEAD_SHARE * mass and mass < SAFE_SUPPORT * float(np.sum(weights))
         return "many pairs fit other focals nearly as well, and some fit none" if doubtful else ""
 
     def evidence(self, weights: FloatArray) -> dict[str, float]:
@@ -98,25 +98,25 @@ class Answer:
             "aspect_gain": self.gain,
         }
 
-    def contradicted(self, weights: FloatArray) -> str:
+    def contradiction(self, weights: FloatArray) -> str:
         """Return why pairs of the given weights (P,) do not determine a camera; empty where they do."""
         return disagreement(self.votes, weights) or indecision(self.lead, self.votes)
 
-    def scatter(self, consensus: Consensus, seed: int) -> FloatArray:
-        """Return (B, 4) the peak under resampled pairs, see `peak_evidence.resampled`.
+    def resample(self, consensus: Consensus, seed: int) -> FloatArray:
+        """Return (B, 4) the peak under resampled pairs, see `peak_evidence.resample_peak`.
 
         Args:
             consensus: of all pairs.
             seed: same seed, same result.
         """
-        return resampled(consensus, self.theta, self.free, self.sigma, seed)
+        return resample_peak(consensus, self.theta, self.free, self.sigma, seed)
 
     def deviation(self, values: FloatArray) -> float:
         """Return the standard deviation of an entry of theta from its resampled `values` (B,)."""
         return deviation(values, effective_count(self.votes), len(self.free))
 
 
-def found(consensus: Consensus) -> Answer:
+def find_peak(consensus: Consensus) -> Answer:
     """Find the highest peak with square pixels or, where the pairs clearly support it, with any aspect."""
     profile = scan(consensus, (0.0,))
     square = peaks(consensus, profile, SQUARE_PIXELS)
@@ -127,16 +127,16 @@ def found(consensus: Consensus) -> Answer:
     theta, value = consensus.climb(square[0].theta, SQUARE_PIXELS, sigmas)
     gain = max(consensus.climb(start, ANY_PIXELS, sigmas)[1] for start in (theta, free[0].theta)) - value
     if gain >= ASPECT_GAIN:
-        return _examined(consensus, free, free_profile, ANY_PIXELS, gain)
-    return _examined(consensus, square, profile, SQUARE_PIXELS, gain)
+        return _examine(consensus, free, free_profile, ANY_PIXELS, gain)
+    return _examine(consensus, square, profile, SQUARE_PIXELS, gain)
 
 
-def _examined(consensus: Consensus, ends: list[Peak], profile: Profile, free: tuple[int, ...], gain: float) -> Answer:
+def _examine(consensus: Consensus, ends: list[Peak], profile: Profile, free: tuple[int, ...], gain: float) -> Answer:
     """Refine the highest peak with the width that fits its pairs, and collect the evidence for it."""
     best = ends[0]
     sigma = own_sigma(consensus, best.theta)
     theta, _ = consensus.climb(best.theta, free, (sigma,))
-    value = float(consensus.at(theta[None, :], SIGMAS[-1])[0])
+    value = float(consensus.evaluate(theta[None, :], SIGMAS[-1])[0])
     far = [peak for peak in ends[1:] if abs(peak.theta[LOG_FOCAL] - theta[LOG_FOCAL]) > np.log(RIVAL_RATIO)]
     lead = value - max([best_rival(consensus, theta, free, SIGMAS, profile), *(peak.value for peak in far)])
     given = votes(consensus, theta, SIGMAS[-1])

@@ -130,7 +130,7 @@ def best_rival(
     return max(values)
 
 
-def resampled(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigma: float, seed: int) -> FloatArray:
+def resample_peak(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigma: float, seed: int) -> FloatArray:
     """Return the peak (RESAMPLES, 4) under randomly reweighted pairs: the Bayesian bootstrap (Rubin 1981).
 
     Weights instead of draws, because three pairs drawn with replacement are often one pair three times.
@@ -147,7 +147,7 @@ def resampled(consensus: Consensus, theta: FloatArray, free: Sequence[int], sigm
     found = []
     for _ in range(RESAMPLES):
         drawn = weights * rng.exponential(size=len(weights))
-        again = consensus.weighted(drawn * (np.sum(weights) / np.sum(drawn)))
+        again = consensus.with_weights(drawn * (np.sum(weights) / np.sum(drawn)))
         found.append(again.climb(theta, free, (max(sigma, STABLE_SIGMA),))[0])
     return np.array(found)
 

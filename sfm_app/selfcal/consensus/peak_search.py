@@ -57,7 +57,7 @@ def scan(consensus: Consensus, log_aspects: Sequence[float]) -> Profile:
     centers = np.arange(-CENTER_REACH, CENTER_REACH + CENTER_STEP / 2, CENTER_STEP)
     cells = np.meshgrid(np.log(focals), centers, centers, np.asarray(log_aspects), indexing="ij")
     thetas = np.stack(cells, axis=-1).reshape(FOCALS, -1, 4)
-    values = consensus.at(thetas.reshape(-1, 4), SIGMAS[0]).reshape(FOCALS, -1)
+    values = consensus.evaluate(thetas.reshape(-1, 4), SIGMAS[0]).reshape(FOCALS, -1)
     best = np.argmax(values, axis=1)
     rows = np.arange(FOCALS)
     return Profile(thetas[rows, best], values[rows, best])

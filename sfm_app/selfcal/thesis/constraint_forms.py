@@ -89,7 +89,7 @@ class Halves:
     """(..., 2) singular values, falling."""
 
     @classmethod
-    def of(cls, F: FloatArray) -> "Halves":
+    def from_fundamentals(cls, F: FloatArray) -> "Halves":
         """Return the factors (P, ...) of matrices (P, 3, 3) of rank 2, scaled to Frobenius norm 1."""
         U, s, Vt = np.linalg.svd(F)
         s = s[:, :2] / np.linalg.norm(s[:, :2], axis=1, keepdims=True)
@@ -105,7 +105,7 @@ class Halves:
 
     def essential(self, cameras: FloatArray) -> FloatArray:
         """Return (..., 3, 3) E = K'FK for cameras (..., 4) of fx, fy, u, v."""
-        left, right = _through(self.U, cameras), _through(self.V, cameras)
+        left, right = _transform_basis(self.U, cameras), _transform_basis(self.V, cameras)
         return np.asarray(np.swapaxes(left * self.s[..., None], -1, -2) @ right)
 
 
@@ -173,7 +173,7 @@ EQUATIONS: Mapping[ConstraintForm, Equations] = MappingProxyType(
 """Equations whose squares are minimized, by the setting `calibration.constraint_form`."""
 
 
-def _through(basis: FloatArray, cameras: FloatArray) -> FloatArray:
+def _transform_basis(basis: FloatArray, cameras: FloatArray) -> FloatArray:
     """Return (..., 2, 3) rows K'b."""
     fx, fy, u, v = (cameras[..., column, None] for column in range(4))
     x, y, z = basis[..., 0], basis[..., 1], basis[..., 2]

@@ -30,7 +30,7 @@ def focal_curves(pairs: Pairs, fx: FloatArray, center: tuple[float, float]) -> F
     roots = np.sqrt(swept_roots(coefficients))
     # the imaginary part is to be "approximately zero": roots in which it prevails form tails near fy = 0 on which all
     # curves agree, whatever the camera
-    return _chosen(np.where(np.abs(roots.imag) <= np.abs(roots.real), roots, 0.0))
+    return _select_roots(np.where(np.abs(roots.imag) <= np.abs(roots.real), roots, 0.0))
 
 
 def center_curves(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> FloatArray:
@@ -41,7 +41,7 @@ def center_curves(pairs: Pairs, u: FloatArray, focal: tuple[float, float]) -> Fl
         u: (S,) swept values, in the units of the pairs.
         focal: fx, fy in the same units.
     """
-    return _chosen(swept_roots(center_polynomials(pairs, u, focal)))
+    return _select_roots(swept_roots(center_polynomials(pairs, u, focal)))
 
 
 def degeneracy(curves: FloatArray, upper: float) -> FloatArray:
@@ -54,7 +54,7 @@ def degeneracy(curves: FloatArray, upper: float) -> FloatArray:
     return np.asarray(np.mean((curves <= ROOT_IS_ZERO) | (curves >= upper), axis=1))
 
 
-def usable(curves: FloatArray, upper: float) -> FloatArray:
+def usable_curves(curves: FloatArray, upper: float) -> FloatArray:
     """Return the curves that are not degenerate.
 
     Args:
@@ -64,7 +64,7 @@ def usable(curves: FloatArray, upper: float) -> FloatArray:
     return curves[degeneracy(curves, upper) <= MAX_OUT_OF_RANGE]
 
 
-def _chosen(roots: ComplexArray) -> FloatArray:
+def _select_roots(roots: ComplexArray) -> FloatArray:
     """Return, per sample, the real part of the root with non-zero real part and the smallest imaginary part."""
     imaginary = np.where(np.abs(roots.real) > ROOT_IS_ZERO, np.abs(roots.imag), np.inf)
     best = np.argmin(imaginary, axis=-1)[..., None]

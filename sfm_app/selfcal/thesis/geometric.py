@@ -6,9 +6,9 @@ from functools import partial
 import numpy as np
 
 from sfm_app.geometry.distances import sampson_distance
-from sfm_app.selfcal.inputs import FloatArray, Pairs, checked
+from sfm_app.selfcal.inputs import FloatArray, Pairs, check_pairs
 from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations
-from sfm_app.selfcal.thesis.least_squares import fitted
+from sfm_app.selfcal.thesis.least_squares import fit_camera
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
@@ -32,7 +32,7 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
     """
     del seed
     weighted = replace(pairs, weights=residual_weights(pairs)) if pairs.inliers else pairs
-    return calibrate_with(METHOD, weighted, partial(_found, equations=EQUATIONS[options.constraint_form]))
+    return calibrate_with(METHOD, weighted, partial(_find_camera, equations=EQUATIONS[options.constraint_form]))
 
 
 def residual_weights(pairs: CameraPairs) -> FloatArray:
@@ -43,7 +43,7 @@ def residual_weights(pairs: CameraPairs) -> FloatArray:
     Raises:
         ValueError: malformed input, see `selfcal.inputs.prepare`.
     """
-    checked(pairs)
+    check_pairs(pairs)
     residuals = [
         float(np.mean(sampson_distance(F, matches[:, :2], matches[:, 2:]))) if len(matches) else np.inf
         for F, matches in zip(pairs.Fs, pairs.inliers, strict=True)
@@ -53,6 +53,6 @@ def residual_weights(pairs: CameraPairs) -> FloatArray:
     return np.asarray(weights * np.count_nonzero(weights) / total if total > 0 else weights)
 
 
-def _found(pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations) -> CameraParameters:
+def _find_camera(pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations) -> CameraParameters:
     del evidence
-    return fitted(pairs, CameraParameters.initial(tall), pairs.weights, equations)
+    return fit_camera(pairs, CameraParameters.initial(tall), pairs.weights, equations)

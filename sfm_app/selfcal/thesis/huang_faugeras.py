@@ -4,7 +4,7 @@ from functools import partial
 
 from sfm_app.selfcal.inputs import Pairs
 from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations
-from sfm_app.selfcal.thesis.least_squares import fitted
+from sfm_app.selfcal.thesis.least_squares import fit_camera
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
@@ -24,9 +24,9 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
         As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
     """
     del seed
-    return calibrate_with(METHOD, pairs, partial(_found, equations=EQUATIONS[options.constraint_form]))
+    return calibrate_with(METHOD, pairs, partial(_find_camera, equations=EQUATIONS[options.constraint_form]))
 
 
-def _found(pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations) -> CameraParameters:
+def _find_camera(pairs: Pairs, tall: float, evidence: dict[str, float], equations: Equations) -> CameraParameters:
     del evidence
-    return fitted(pairs, CameraParameters.initial(tall), 0.0 * pairs.weights + 1.0, equations)
+    return fit_camera(pairs, CameraParameters.initial(tall), 0.0 * pairs.weights + 1.0, equations)

@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm_app.selfcal.inputs import FloatArray, Pairs
 from sfm_app.selfcal.thesis.constraint_forms import Halves
-from sfm_app.selfcal.thesis.least_squares import fitted
+from sfm_app.selfcal.thesis.least_squares import fit_camera
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
@@ -36,17 +36,17 @@ def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Ca
         As `selfcal.thesis.verdict.calibrate_with`, which also says what is raised.
     """
     del options, seed
-    return calibrate_with(METHOD, pairs, _found)
+    return calibrate_with(METHOD, pairs, _find_camera)
 
 
-def _found(pairs: Pairs, tall: float, evidence: dict[str, float]) -> CameraParameters:
-    focals = focals_of(pairs, (0.5, 0.5 * tall))
+def _find_camera(pairs: Pairs, tall: float, evidence: dict[str, float]) -> CameraParameters:
+    focals = pair_focals(pairs, (0.5, 0.5 * tall))
     known = focals[np.isfinite(focals)]
     evidence["focal_estimates"] = float(len(known))
     start = CameraParameters.initial(tall)
     if len(known):
         start = start._replace(fx=float(np.median(known)), fy=float(np.median(known)))
-    return fitted(pairs, start, pairs.weights, kruppa_equations)
+    return fit_camera(pairs, start, pairs.weights, kruppa_equations)
 
 
 def kruppa_ratios(halves: Halves, cameras: FloatArray) -> FloatArray:
@@ -84,7 +84,7 @@ def _sides(halves: Halves, cameras: FloatArray) -> tuple[FloatArray, FloatArray]
     return np.stack([a * a, a * b, b * b], axis=-1) * B, A[..., ::-1] * np.array([1.0, -1.0, 1.0])
 
 
-def focals_of(pairs: Pairs, center: tuple[float, float]) -> FloatArray:
+def pair_focals(pairs: Pairs, center: tuple[float, float]) -> FloatArray:
     """Return the focal of each pair, if the pixels are square and the center is known (Sturm 2001).
 
     The two equations with the off-diagonal entries are linear in f^2 once the trivial root f = 1 is divided out; they
@@ -99,7 +99,7 @@ def focals_of(pairs: Pairs, center: tuple[float, float]) -> FloatArray:
         (P,) in the units of the pairs; NaN where the equations hold for any focal, or for none.
     """
     to_center = np.array([[1.0, 0.0, center[0]], [0.0, 1.0, center[1]], [0.0, 0.0, 1.0]])
-    centered = Halves.of(to_center.T @ pairs.F @ to_center)
+    centered = Halves.from_fundamentals(to_center.T @ pairs.F @ to_center)
     linear, quadratic = _focal_polynomials(centered)
     squares = np.column_stack([_common_root(linear), *_roots(quadratic).T])
     focals = np.sqrt(np.where(squares > 0, squares, np.nan))

@@ -37,7 +37,7 @@ class Minima(NamedTuple):
     """(B,) weighted sums of squares there."""
 
 
-def fitted(
+def fit_camera(
     pairs: Pairs, start: CameraParameters, weights: FloatArray, equations: Equations = DEFAULT
 ) -> CameraParameters:
     """Return the local minimum of sum_i w_i |equations_i|^2 / sum_i w_i that is reached from `start`, over all pairs.
@@ -48,11 +48,13 @@ def fitted(
         weights: (P,) w_i >= 0.
         equations: form of the constraint.
     """
-    found = minima(Halves.of(pairs.F)[np.arange(len(pairs))[None]], weights[None], np.array([start]), equations)
+    found = find_minima(
+        Halves.from_fundamentals(pairs.F)[np.arange(len(pairs))[None]], weights[None], np.array([start]), equations
+    )
     return CameraParameters(*(float(value) for value in found.cameras[0]))
 
 
-def minima(halves: Halves, weights: FloatArray, starts: FloatArray, equations: Equations = DEFAULT) -> Minima:
+def find_minima(halves: Halves, weights: FloatArray, starts: FloatArray, equations: Equations = DEFAULT) -> Minima:
     """Run Levenberg-Marquardt from many starts at once, each on its own pairs.
 
     Thesis (5.8) sums the terms; Levenberg-Marquardt, which the thesis minimizes it with, sums their squares.

@@ -7,8 +7,8 @@ import numpy as np
 
 from sfm_app.selfcal.inputs import Pairs
 from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations, Halves
-from sfm_app.selfcal.thesis.kruppa import focals_of
-from sfm_app.selfcal.thesis.least_squares import DEFAULT, minima
+from sfm_app.selfcal.thesis.kruppa import pair_focals
+from sfm_app.selfcal.thesis.least_squares import DEFAULT, find_minima
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
@@ -65,9 +65,9 @@ def algorithm_2(
     center = rng.normal([0.5, 0.5 * tall], [1 / 6, tall / 6], (count, 2))
     starts = np.column_stack([focal, focal, center])
     # sorted by a value that depends on neither scale nor direction: the order of the pairs has no effect
-    halves = Halves.of(pairs.F)[np.argsort(pairs.product, kind="stable")]
+    halves = Halves.from_fundamentals(pairs.F)[np.argsort(pairs.product, kind="stable")]
     triples = np.argsort(rng.random((count, len(pairs))), axis=1)[:, :SAMPLE]
-    found = minima(halves[triples], np.ones(triples.shape), starts, equations)
+    found = find_minima(halves[triples], np.ones(triples.shape), starts, equations)
     return CameraParameters(*(float(value) for value in found.cameras[np.argmin(found.sums)]))
 
 
@@ -87,7 +87,7 @@ def focal_distribution(pairs: Pairs, tall: float) -> tuple[float, float]:
         pairs: P fundamental matrices in image widths.
         tall: height of the photos in widths.
     """
-    focals = focals_of(pairs, (0.5, 0.5 * tall))
+    focals = pair_focals(pairs, (0.5, 0.5 * tall))
     known = (focals > FOCAL_RANGE[0]) & (focals < FOCAL_RANGE[1])
     if not np.any(known):
         return USUAL_FOCAL

@@ -7,7 +7,7 @@ import numpy as np
 from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.selfcal.inputs import FloatArray, Pairs
 from sfm_app.selfcal.thesis.constraint_forms import EQUATIONS, Equations, essential
-from sfm_app.selfcal.thesis.least_squares import DEFAULT, fitted
+from sfm_app.selfcal.thesis.least_squares import DEFAULT, fit_camera
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import Calibration, CameraPairs
@@ -48,7 +48,7 @@ def algorithm_3(
     """
     camera, weights = CameraParameters.initial(tall), np.ones(len(pairs))
     for iteration in range(1, MOST_ITERATIONS + 1):
-        before, camera = camera, fitted(pairs, camera, weights, equations)
+        before, camera = camera, fit_camera(pairs, camera, weights, equations)
         evidence |= {"iterations": float(iteration), "weighted_pairs": float(np.sum(weights) ** 2 / np.sum(weights**2))}
         if np.linalg.norm(camera.K - before.K) <= TOLERANCE:
             break

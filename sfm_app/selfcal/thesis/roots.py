@@ -32,7 +32,7 @@ def companion_roots(coefficients: FloatArray) -> ComplexArray:
         (..., n) roots; a polynomial of lower degree has roots far out in place of the missing ones, one that vanishes
         has all roots 0.
     """
-    monic = _monic(coefficients)
+    monic = _make_monic(coefficients)
     degree = coefficients.shape[-1] - 1
     companion = np.zeros((*coefficients.shape[:-1], degree, degree))
     companion[..., np.arange(1, degree), np.arange(degree - 1)] = 1.0
@@ -57,14 +57,14 @@ def swept_roots(coefficients: FloatArray) -> ComplexArray:
     first = np.argmin(vanished, axis=1)
     roots = np.zeros((*vanished.shape, coefficients.shape[-1] - 1), dtype=np.complex128)
     start = companion_roots(coefficients[np.arange(len(first)), first])
-    settled = _follow(_monic(coefficients), start, first, roots)
+    settled = _follow(_make_monic(coefficients), start, first, roots)
     lost = ~(settled | vanished)
     roots[vanished] = 0.0
     roots[lost] = companion_roots(coefficients[lost])
     return roots
 
 
-def _monic(coefficients: FloatArray) -> FloatArray:
+def _make_monic(coefficients: FloatArray) -> FloatArray:
     """Divide by the leading coefficient; one that vanishes is replaced by the smallest that counts."""
     size = np.max(np.abs(coefficients), axis=-1, keepdims=True)
     scaled = coefficients / np.where(size == 0, 1.0, size)

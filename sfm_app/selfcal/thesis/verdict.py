@@ -14,7 +14,7 @@ from sfm_app.selfcal.consensus.consensus import Consensus
 from sfm_app.selfcal.consensus.peak_evidence import best_rival, disagreement, indecision, votes
 from sfm_app.selfcal.consensus.peak_search import SIGMAS
 from sfm_app.selfcal.inputs import FloatArray, Pairs, prepare
-from sfm_app.selfcal.results import guessed
+from sfm_app.selfcal.results import guess_calibration
 from sfm_app.types import Calibration, CameraPairs
 
 MIN_PAIRS = 3
@@ -70,15 +70,15 @@ def calibrate_with(method: str, pairs: CameraPairs, find: Find, sample: int = 0)
     usable = prepare(pairs, unit_px=width, origin_px=(0.0, 0.0))
     evidence = {"pairs": float(len(usable))}
     if len(usable) < MIN_PAIRS:
-        return guessed(size, f"{len(usable)} usable pairs, {MIN_PAIRS} are needed", evidence)
+        return guess_calibration(size, f"{len(usable)} usable pairs, {MIN_PAIRS} are needed", evidence)
     found = find(usable, height / width, evidence)
     if isinstance(found, str):
-        return guessed(size, found, evidence)
+        return guess_calibration(size, found, evidence)
     in_px = [float(width * value) for value in found]
     evidence |= dict(zip(("fx_px", "fy_px", "cx_px", "cy_px"), in_px, strict=True))
     reason = _objection(found, usable, sample, evidence)
     if reason:
-        return guessed(size, reason, evidence)
+        return guess_calibration(size, reason, evidence)
     return Calibration(camera_matrix(*in_px), width, height, method, identifiable=True, evidence=evidence)
 
 

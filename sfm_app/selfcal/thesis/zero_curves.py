@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 from sfm_app.selfcal.inputs import Pairs
-from sfm_app.selfcal.thesis.curves import center_curves, focal_curves, usable
+from sfm_app.selfcal.thesis.curves import center_curves, focal_curves, usable_curves
 from sfm_app.selfcal.thesis.meeting_point import meeting_point, meeting_points
 from sfm_app.selfcal.thesis.verdict import CameraParameters, calibrate_with
 from sfm_app.settings import CalibrationSettings
@@ -52,7 +52,7 @@ def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: 
     """
     sweep = np.arange(1, samples + 1) / samples
     fx = FOCAL_RANGE * sweep
-    curves = usable(focal_curves(pairs, fx, (0.5, 0.5 * tall)), FOCAL_RANGE)
+    curves = usable_curves(focal_curves(pairs, fx, (0.5, 0.5 * tall)), FOCAL_RANGE)
     evidence["focal_curves"] = float(len(curves))
     focal = meeting_point(curves, FOCAL_RANGE, SIGMA_SHARE * FOCAL_RANGE)
     if focal is None:
@@ -60,7 +60,7 @@ def algorithm_4(pairs: Pairs, tall: float, evidence: dict[str, float], samples: 
     evidence["focal_support"] = focal.support
     evidence["focal_peaks"] = float(len(meeting_points(curves, fx, PEAK_RANGE, PEAK_SIGMA)))
 
-    curves = usable(center_curves(pairs, sweep, (fx[focal.sample], focal.value)), tall)
+    curves = usable_curves(center_curves(pairs, sweep, (fx[focal.sample], focal.value)), tall)
     evidence["center_curves"] = float(len(curves))
     center = meeting_point(curves, tall, SIGMA_SHARE * tall)
     if center is None:

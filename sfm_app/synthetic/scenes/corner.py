@@ -7,7 +7,7 @@ import numpy as np
 from sfm_app.synthetic.cameras import ArcOptions, Camera, Views, arc
 from sfm_app.synthetic.scenes.bodies import Body, SyntheticScene
 from sfm_app.synthetic.scenes.courtyard import LEAVES, MARBLE, PAINT, POTTERY, TERRACOTTA, WOOD
-from sfm_app.synthetic.scenes.shapes import Shape, assembled, ball, box, ground, revolved, torus
+from sfm_app.synthetic.scenes.shapes import Shape, assemble, ball, box, ground, revolve, torus
 from sfm_app.synthetic.scenes.textures import Material
 
 PLASTER = Material(
@@ -42,7 +42,7 @@ TURN_DEG, MIDDLE = -45.0, (0.0, 0.0, -1.9)
 def corner() -> SyntheticScene:
     """Return the scene; the light comes over the photographer's shoulder."""
     bodies = [*_walls(), *_shelf(), *_pictures(), *_table(), *_armchair(), *_things()]
-    placed = tuple(replace(body, shape=body.shape.moved(MIDDLE, turn_deg=TURN_DEG)) for body in bodies)
+    placed = tuple(replace(body, shape=body.shape.move(MIDDLE, turn_deg=TURN_DEG)) for body in bodies)
     return SyntheticScene("corner", placed, to_light=(-0.25, 0.8, 0.75), sun=0.55, sky=0.75)
 
 
@@ -62,11 +62,11 @@ def corner_views(camera: Camera, seed: int = 0) -> Views:
 
 def _walls() -> list[Body]:
     # uneven ground turned upright, since plaster is not quite flat
-    plain = ground((0.0, SIDE), (-HEIGHT, 0.0), unevenness=0.003, spacing=0.06).moved(tilt_deg=90.0)
-    papered = box(0.1, HEIGHT, SIDE, spacing=0.08).moved((-0.05, 0.0, SIDE / 2))
-    floor = box(SIDE, SIDE, 0.05, spacing=0.08).moved((SIDE / 2, 0.0, 0.0), tilt_deg=90.0).moved((0.0, -0.025, 0.0))
-    skirting = assembled([
-        box(SIDE, 0.12, 0.03).moved((SIDE / 2, 0.0, 0.015)), box(0.03, 0.12, SIDE).moved((0.015, 0.0, SIDE / 2))
+    plain = ground((0.0, SIDE), (-HEIGHT, 0.0), unevenness=0.003, spacing=0.06).move(tilt_deg=90.0)
+    papered = box(0.1, HEIGHT, SIDE, spacing=0.08).move((-0.05, 0.0, SIDE / 2))
+    floor = box(SIDE, SIDE, 0.05, spacing=0.08).move((SIDE / 2, 0.0, 0.0), tilt_deg=90.0).move((0.0, -0.025, 0.0))
+    skirting = assemble([
+        box(SIDE, 0.12, 0.03).move((SIDE / 2, 0.0, 0.015)), box(0.03, 0.12, SIDE).move((0.015, 0.0, SIDE / 2))
     ])  # fmt: skip
     return [Body(plain, PLASTER), Body(papered, PAPER), Body(floor, BOARDS), Body(skirting, WHITE)]
 
@@ -74,9 +74,9 @@ def _walls() -> list[Body]:
 def _shelf() -> list[Body]:
     """Return a shelf of books against the papered wall."""
     rng = np.random.default_rng(17)
-    boards = [box(0.28, 0.03, 1.0).moved((0.15, y, 2.2)) for y in (0.02, 0.42, 0.82, 1.22)]
-    boards += [box(0.28, 1.25, 0.03).moved((0.15, 0.0, z)) for z in (1.7, 2.7)]
-    bodies = [Body(assembled(boards), OAK), Body(box(0.01, 1.22, 1.0).moved((0.01, 0.0, 2.2)), OAK)]
+    boards = [box(0.28, 0.03, 1.0).move((0.15, y, 2.2)) for y in (0.02, 0.42, 0.82, 1.22)]
+    boards += [box(0.28, 1.25, 0.03).move((0.15, 0.0, z)) for z in (1.7, 2.7)]
+    bodies = [Body(assemble(boards), OAK), Body(box(0.01, 1.22, 1.0).move((0.01, 0.0, 2.2)), OAK)]
     covers = [(148, 40, 38), (44, 70, 110), (58, 92, 60), (196, 168, 110), (92, 54, 88), (52, 48, 46), (206, 196, 180)]
     for y in (0.05, 0.45, 0.85):
         z = 1.73
@@ -84,13 +84,13 @@ def _shelf() -> list[Body]:
             thick, high, deep = rng.uniform((0.025, 0.2, 0.14), (0.06, 0.31, 0.2))
             color = covers[rng.integers(len(covers))]
             cover = Material(pattern="stone", base=color, second=(180, 150, 90), joint=(60, 50, 40), scale=0.06)
-            book = box(deep, high, thick, spacing=0.05).moved((0.03 + deep / 2, y, z + thick / 2))
+            book = box(deep, high, thick, spacing=0.05).move((0.03 + deep / 2, y, z + thick / 2))
             bodies.append(Body(book, cover))
             z += thick + 0.002
     return [
         *bodies,
-        Body(ball(0.12).moved((0.16, 1.37, 2.0)), MARBLE),
-        Body(_vase(0.6).moved((0.15, 1.25, 2.45)), PAINT),
+        Body(ball(0.12).move((0.16, 1.37, 2.0)), MARBLE),
+        Body(_vase(0.6).move((0.15, 1.25, 2.45)), PAINT),
     ]
 
 
@@ -99,59 +99,59 @@ def _pictures() -> list[Body]:
     for canvas, (y, z, high, wide) in zip(
         CANVAS, ((1.3, 1.0, 0.6, 0.75), (0.75, 0.45, 0.42, 0.34), (1.62, 2.15, 0.5, 0.7)), strict=True
     ):
-        rails = [box(0.04, 0.05, wide).moved((0.02, at, z)) for at in (y, y + high - 0.05)]
-        rails += [box(0.04, high, 0.05).moved((0.02, y, z + side * (wide / 2 - 0.025))) for side in (-1.0, 1.0)]
+        rails = [box(0.04, 0.05, wide).move((0.02, at, z)) for at in (y, y + high - 0.05)]
+        rails += [box(0.04, high, 0.05).move((0.02, y, z + side * (wide / 2 - 0.025))) for side in (-1.0, 1.0)]
         bodies += [
-            Body(assembled(rails), OAK),
-            Body(box(0.02, high - 0.06, wide - 0.06).moved((0.01, y + 0.03, z)), canvas),
+            Body(assemble(rails), OAK),
+            Body(box(0.02, high - 0.06, wide - 0.06).move((0.01, y + 0.03, z)), canvas),
         ]
     return bodies
 
 
 def _table() -> list[Body]:
     """Return a table in front of the plain wall, which is visible above and beside it."""
-    legs = [box(0.05, 0.6, 0.05).moved((1.35 + x, 0.0, 0.45 + z)) for x in (-0.4, 0.4) for z in (-0.22, 0.22)]
-    top = box(0.95, 0.04, 0.56, spacing=0.06).moved((1.35, 0.6, 0.45))
-    lamp = revolved(np.array([[0.1, 0.0], [0.1, 0.02], [0.02, 0.04], [0.02, 0.3], [0.0, 0.3]]), segments=40, sharp=True)
-    shade = revolved(np.array([[0.16, 0.0], [0.09, 0.2], [0.0, 0.2]]), segments=64, sharp=True)
+    legs = [box(0.05, 0.6, 0.05).move((1.35 + x, 0.0, 0.45 + z)) for x in (-0.4, 0.4) for z in (-0.22, 0.22)]
+    top = box(0.95, 0.04, 0.56, spacing=0.06).move((1.35, 0.6, 0.45))
+    lamp = revolve(np.array([[0.1, 0.0], [0.1, 0.02], [0.02, 0.04], [0.02, 0.3], [0.0, 0.3]]), segments=40, sharp=True)
+    shade = revolve(np.array([[0.16, 0.0], [0.09, 0.2], [0.0, 0.2]]), segments=64, sharp=True)
     return [
-        Body(assembled([*legs, top]), OAK),
-        Body(_vase(0.8).moved((1.2, 0.64, 0.42)), POTTERY),
-        Body(lamp.moved((1.65, 0.64, 0.4)), TERRACOTTA),
-        Body(shade.moved((1.65, 0.88, 0.4)), replace(CLOTH, base=(206, 176, 120), second=(176, 132, 84))),
-        Body(box(0.24, 0.05, 0.18, spacing=0.05).moved((1.4, 0.64, 0.58), turn_deg=24.0), CANVAS[2]),
-        Body(box(0.2, 0.04, 0.15, spacing=0.05).moved((1.41, 0.69, 0.57), turn_deg=-11.0), CANVAS[0]),
+        Body(assemble([*legs, top]), OAK),
+        Body(_vase(0.8).move((1.2, 0.64, 0.42)), POTTERY),
+        Body(lamp.move((1.65, 0.64, 0.4)), TERRACOTTA),
+        Body(shade.move((1.65, 0.88, 0.4)), replace(CLOTH, base=(206, 176, 120), second=(176, 132, 84))),
+        Body(box(0.24, 0.05, 0.18, spacing=0.05).move((1.4, 0.64, 0.58), turn_deg=24.0), CANVAS[2]),
+        Body(box(0.2, 0.04, 0.15, spacing=0.05).move((1.41, 0.69, 0.57), turn_deg=-11.0), CANVAS[0]),
     ]
 
 
 def _armchair() -> list[Body]:
     parts = [
-        box(0.66, 0.3, 0.62, spacing=0.06).moved((0.0, 0.12, 0.0)),
-        box(0.66, 0.5, 0.16, spacing=0.06).moved((0.0, 0.36, -0.26), tilt_deg=-9.0),
-        box(0.13, 0.5, 0.62, spacing=0.06).moved((-0.34, 0.1, 0.0)),
-        box(0.13, 0.5, 0.62, spacing=0.06).moved((0.34, 0.1, 0.0)),
+        box(0.66, 0.3, 0.62, spacing=0.06).move((0.0, 0.12, 0.0)),
+        box(0.66, 0.5, 0.16, spacing=0.06).move((0.0, 0.36, -0.26), tilt_deg=-9.0),
+        box(0.13, 0.5, 0.62, spacing=0.06).move((-0.34, 0.1, 0.0)),
+        box(0.13, 0.5, 0.62, spacing=0.06).move((0.34, 0.1, 0.0)),
     ]
-    cushion = ball(0.2, bumps=0.03, seed=3).moved((0.02, 0.56, -0.06))
-    feet = assembled([box(0.06, 0.12, 0.06).moved((x, 0.0, z)) for x in (-0.32, 0.32) for z in (-0.24, 0.24)])
+    cushion = ball(0.2, bumps=0.03, seed=3).move((0.02, 0.56, -0.06))
+    feet = assemble([box(0.06, 0.12, 0.06).move((x, 0.0, z)) for x in (-0.32, 0.32) for z in (-0.24, 0.24)])
     spot = (2.45, 0.0, 0.75)
     return [
-        Body(assembled(parts).moved(spot, turn_deg=-28.0), CLOTH),
-        Body(cushion.moved(spot, turn_deg=-28.0), replace(PAINT, scale=0.12)),
-        Body(feet.moved(spot, turn_deg=-28.0), OAK),
+        Body(assemble(parts).move(spot, turn_deg=-28.0), CLOTH),
+        Body(cushion.move(spot, turn_deg=-28.0), replace(PAINT, scale=0.12)),
+        Body(feet.move(spot, turn_deg=-28.0), OAK),
     ]
 
 
 def _things() -> list[Body]:
-    pot = revolved(
+    pot = revolve(
         np.array([[0.0, 0.0], [0.13, 0.0], [0.19, 0.28], [0.21, 0.28], [0.21, 0.33], [0.17, 0.33], [0.0, 0.31]]),
         sharp=True,
     )
     return [
-        Body(box(1.5, 0.015, 1.1, spacing=0.06).moved((1.5, 0.0, 1.6), turn_deg=8.0), RUG),
-        Body(pot.moved((0.4, 0.0, 0.42)), TERRACOTTA),
-        Body(ball(0.27, bumps=0.13, seed=9).moved((0.4, 0.55, 0.42)), LEAVES),
-        Body(torus(0.12, 0.04).moved((1.9, 0.055, 1.5), turn_deg=20.0), replace(PAINT, scale=0.1)),
-        Body(ball(0.11).moved((1.1, 0.125, 1.4), turn_deg=50.0, tilt_deg=30.0), MARBLE),
+        Body(box(1.5, 0.015, 1.1, spacing=0.06).move((1.5, 0.0, 1.6), turn_deg=8.0), RUG),
+        Body(pot.move((0.4, 0.0, 0.42)), TERRACOTTA),
+        Body(ball(0.27, bumps=0.13, seed=9).move((0.4, 0.55, 0.42)), LEAVES),
+        Body(torus(0.12, 0.04).move((1.9, 0.055, 1.5), turn_deg=20.0), replace(PAINT, scale=0.1)),
+        Body(ball(0.11).move((1.1, 0.125, 1.4), turn_deg=50.0, tilt_deg=30.0), MARBLE),
     ]
 
 
@@ -160,4 +160,4 @@ def _vase(scale: float) -> Shape:
         [0.0, 0.0], [0.08, 0.0], [0.07, 0.03], [0.13, 0.14], [0.15, 0.24], [0.1, 0.36], [0.06, 0.42], [0.09, 0.47],
         [0.07, 0.45], [0.04, 0.3],
     ])  # fmt: skip
-    return revolved(scale * profile, segments=96)
+    return revolve(scale * profile, segments=96)

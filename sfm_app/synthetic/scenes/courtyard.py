@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.synthetic.scenes.bodies import Body, SyntheticScene
-from sfm_app.synthetic.scenes.shapes import arch, ball, box, ground, revolved, torus
+from sfm_app.synthetic.scenes.shapes import arch, ball, box, ground, revolve, torus
 from sfm_app.synthetic.scenes.textures import Material
 
 SANDSTONE = Material(pattern="stone", base=(206, 186, 150), second=(158, 132, 98), scale=0.35)
@@ -47,34 +47,34 @@ def courtyard() -> SyntheticScene:
 
 def _back_wall() -> list[Body]:
     z = BACK_WALL_Z
-    wall = Body(box(10.4, 3.3, 0.4).moved((0.0, 0.0, z - 0.2)), BRICK)
-    plinth = Body(box(10.4, 0.35, 0.16).moved((0.0, -0.05, z + 0.08)), SANDSTONE)
-    cornice = Body(box(10.4, 0.22, 0.62).moved((0.0, 3.3, z - 0.1)), SANDSTONE)
-    brackets = [Body(box(0.16, 0.16, 0.2).moved((x, 3.14, z + 0.1)), SANDSTONE) for x in np.linspace(-5.0, 5.0, 26)]
+    wall = Body(box(10.4, 3.3, 0.4).move((0.0, 0.0, z - 0.2)), BRICK)
+    plinth = Body(box(10.4, 0.35, 0.16).move((0.0, -0.05, z + 0.08)), SANDSTONE)
+    cornice = Body(box(10.4, 0.22, 0.62).move((0.0, 3.3, z - 0.1)), SANDSTONE)
+    brackets = [Body(box(0.16, 0.16, 0.2).move((x, 3.14, z + 0.1)), SANDSTONE) for x in np.linspace(-5.0, 5.0, 26)]
     return [wall, plinth, cornice, *brackets]
 
 
 def _arcade() -> list[Body]:
     z = BACK_WALL_Z
-    column = revolved(_profile((0.17, 0.13), (0.0, 1.35)), segments=80, flutes=(20, 0.06))
-    ring = revolved(_profile((0.0, 0.2, 0.2, 0.16, 0.0), (0.0, 0.0, 0.07, 0.12, 0.12)), segments=48, sharp=True)
+    column = revolve(_profile((0.17, 0.13), (0.0, 1.35)), segments=80, flutes=(20, 0.06))
+    ring = revolve(_profile((0.0, 0.2, 0.2, 0.16, 0.0), (0.0, 0.0, 0.07, 0.12, 0.12)), segments=48, sharp=True)
     # intermediate rings, so that shading under the arch is not interpolated across the disc
     rims = _profile((0.65, 0.65, 0.5, 0.35, 0.2, 0.0), (0.0, 0.06, 0.06, 0.06, 0.06, 0.06))
-    half_disc = revolved(rims, segments=40, span_deg=180.0, sharp=True)
+    half_disc = revolve(rims, segments=40, span_deg=180.0, sharp=True)
     bodies = []
     for x in (-3.6, -1.8, 0.0, 1.8, 3.6):
         bodies += [
-            Body(box(0.5, 0.22, 0.42).moved((x, 0.28, z + 0.2)), SANDSTONE),
-            Body(ring.moved((x, 0.5, z + 0.22)), LIMESTONE),
-            Body(column.moved((x, 0.6, z + 0.22)), LIMESTONE),
-            Body(ring.moved((x, 2.06, z + 0.22), tilt_deg=180.0), LIMESTONE),
-            Body(box(0.52, 0.12, 0.44).moved((x, 2.05, z + 0.2)), SANDSTONE),
+            Body(box(0.5, 0.22, 0.42).move((x, 0.28, z + 0.2)), SANDSTONE),
+            Body(ring.move((x, 0.5, z + 0.22)), LIMESTONE),
+            Body(column.move((x, 0.6, z + 0.22)), LIMESTONE),
+            Body(ring.move((x, 2.06, z + 0.22), tilt_deg=180.0), LIMESTONE),
+            Body(box(0.52, 0.12, 0.44).move((x, 2.05, z + 0.2)), SANDSTONE),
         ]
     for x in (-2.7, -0.9, 0.9, 2.7):
         bodies += [
-            Body(arch(0.68, 0.2, 0.3).moved((x, 2.17, z)), SANDSTONE),
-            Body(box(1.3, 1.92, 0.12).moved((x, 0.25, z)), PLASTER),
-            Body(half_disc.moved((x, 2.17, z), tilt_deg=90.0), PLASTER),
+            Body(arch(0.68, 0.2, 0.3).move((x, 2.17, z)), SANDSTONE),
+            Body(box(1.3, 1.92, 0.12).move((x, 0.25, z)), PLASTER),
+            Body(half_disc.move((x, 2.17, z), tilt_deg=90.0), PLASTER),
         ]
     return bodies
 
@@ -82,60 +82,58 @@ def _arcade() -> list[Body]:
 def _side_walls() -> list[Body]:
     bodies = []
     for x in (-5.0, 5.0):
-        bodies.append(Body(box(0.5, 1.1, 6.4).moved((x, 0.0, 0.5)), BRICK))
-        bodies.append(Body(box(0.66, 0.12, 6.5).moved((x, 1.1, 0.5)), SANDSTONE))
-        bodies += [Body(ball(0.24, segments=48).moved((x, 1.42, z)), LIMESTONE) for z in (-0.6, 1.4, 3.4)]
+        bodies.append(Body(box(0.5, 1.1, 6.4).move((x, 0.0, 0.5)), BRICK))
+        bodies.append(Body(box(0.66, 0.12, 6.5).move((x, 1.1, 0.5)), SANDSTONE))
+        bodies += [Body(ball(0.24, segments=48).move((x, 1.42, z)), LIMESTONE) for z in (-0.6, 1.4, 3.4)]
     return bodies
 
 
 def _pedestal() -> list[Body]:
     steps = [(2.1, 0.18, 0.0), (1.6, 0.16, 0.18), (1.15, 0.16, 0.34)]
-    bodies = [Body(box(w, h, w, spacing=0.1).moved((0.0, y, 0.0)), LIMESTONE) for w, h, y in steps]
+    bodies = [Body(box(w, h, w, spacing=0.1).move((0.0, y, 0.0)), LIMESTONE) for w, h, y in steps]
     radius = (0.0, 0.42, 0.42, 0.33, 0.3, 0.3, 0.4, 0.4, 0.0)
     height = (0.0, 0.0, 0.08, 0.14, 0.2, 0.68, 0.76, 0.86, 0.86)
-    drum = revolved(_profile(radius, height), segments=8, sharp=True)
-    return [*bodies, Body(drum.moved((0.0, PEDESTAL_TOP_Y - 0.86, 0.0), turn_deg=22.5), GREEN_MARBLE)]
+    drum = revolve(_profile(radius, height), segments=8, sharp=True)
+    return [*bodies, Body(drum.move((0.0, PEDESTAL_TOP_Y - 0.86, 0.0), turn_deg=22.5), GREEN_MARBLE)]
 
 
 def _amphora() -> list[Body]:
     radius = (0.0, 0.15, 0.15, 0.08, 0.13, 0.25, 0.31, 0.29, 0.19, 0.105, 0.1, 0.13, 0.18, 0.16, 0.09, 0.07)
     height = (0.0, 0.0, 0.03, 0.07, 0.16, 0.36, 0.56, 0.72, 0.86, 0.95, 1.06, 1.13, 1.16, 1.19, 1.15, 0.9)
-    body = revolved(_smoothed(_profile(radius, height), 6), segments=128)
+    body = revolve(_catmull_rom(_profile(radius, height), 6), segments=128)
     # an open ring, turned so that its gap faces -x, then set upright
-    handle = torus(0.19, 0.026, span_deg=220.0).moved(turn_deg=-110.0).moved(tilt_deg=90.0)
+    handle = torus(0.19, 0.026, span_deg=220.0).move(turn_deg=-110.0).move(tilt_deg=90.0)
     y = PEDESTAL_TOP_Y
     return [
-        Body(body.moved((0.0, y, 0.0)), POTTERY),
-        Body(handle.moved((0.19, y + 0.93, 0.0)), GLAZE),
-        Body(handle.moved((-0.19, y + 0.93, 0.0), turn_deg=180.0), GLAZE),
+        Body(body.move((0.0, y, 0.0)), POTTERY),
+        Body(handle.move((0.19, y + 0.93, 0.0)), GLAZE),
+        Body(handle.move((-0.19, y + 0.93, 0.0), turn_deg=180.0), GLAZE),
     ]
 
 
 def _leaning_things() -> list[Body]:
-    drum = revolved(
-        _profile((0.0, 0.27, 0.27, 0.0), (0.0, 0.0, 0.62, 0.62)), segments=96, sharp=True, flutes=(16, 0.08)
-    )
+    drum = revolve(_profile((0.0, 0.27, 0.27, 0.0), (0.0, 0.0, 0.62, 0.62)), segments=96, sharp=True, flutes=(16, 0.08))
     small_brick = replace(BRICK, scale=0.1)
     return [
-        Body(box(0.8, 0.62, 0.62, spacing=0.08).moved((1.85, 0.0, 0.55), turn_deg=28.0), WOOD),
-        Body(box(0.44, 0.36, 0.4, spacing=0.08).moved((1.8, 0.62, 0.5), turn_deg=-15.0), WOOD),
-        Body(torus(0.34, 0.11).moved((1.42, 0.39, 1.15), turn_deg=28.0, tilt_deg=68.0), replace(SANDSTONE, scale=0.2)),
-        Body(drum.moved((0.75, 0.27, 2.0), turn_deg=65.0, tilt_deg=90.0), LIMESTONE),
-        Body(box(0.5, 0.3, 0.36).moved((-0.55, 0.0, 2.1), turn_deg=-20.0), small_brick),
+        Body(box(0.8, 0.62, 0.62, spacing=0.08).move((1.85, 0.0, 0.55), turn_deg=28.0), WOOD),
+        Body(box(0.44, 0.36, 0.4, spacing=0.08).move((1.8, 0.62, 0.5), turn_deg=-15.0), WOOD),
+        Body(torus(0.34, 0.11).move((1.42, 0.39, 1.15), turn_deg=28.0, tilt_deg=68.0), replace(SANDSTONE, scale=0.2)),
+        Body(drum.move((0.75, 0.27, 2.0), turn_deg=65.0, tilt_deg=90.0), LIMESTONE),
+        Body(box(0.5, 0.3, 0.36).move((-0.55, 0.0, 2.1), turn_deg=-20.0), small_brick),
     ]
 
 
 def _round_things() -> list[Body]:
     radius = (0.0, 0.22, 0.34, 0.39, 0.39, 0.33, 0.31, 0.0)
     height = (0.0, 0.0, 0.5, 0.5, 0.58, 0.58, 0.52, 0.52)
-    pot = revolved(_profile(radius, height), sharp=True)
+    pot = revolve(_profile(radius, height), sharp=True)
     bodies = [
-        Body(ball(0.36).moved((-1.75, 0.36, 1.2), turn_deg=20.0, tilt_deg=30.0), MARBLE),
-        Body(ball(0.2, segments=64).moved((-1.15, 0.2, 1.75), tilt_deg=70.0), PAINT),
+        Body(ball(0.36).move((-1.75, 0.36, 1.2), turn_deg=20.0, tilt_deg=30.0), MARBLE),
+        Body(ball(0.2, segments=64).move((-1.15, 0.2, 1.75), tilt_deg=70.0), PAINT),
     ]
     for k, x in enumerate((-2.9, 2.95)):
-        bodies.append(Body(pot.moved((x, 0.0, -1.3)), TERRACOTTA))
-        bodies.append(Body(ball(0.55, bumps=0.09, seed=k).moved((x, 0.98, -1.3)), LEAVES))
+        bodies.append(Body(pot.move((x, 0.0, -1.3)), TERRACOTTA))
+        bodies.append(Body(ball(0.55, bumps=0.09, seed=k).move((x, 0.98, -1.3)), LEAVES))
     return bodies
 
 
@@ -143,7 +141,7 @@ def _profile(radius: tuple[float, ...], height: tuple[float, ...]) -> NDArray[np
     return np.column_stack([radius, height])
 
 
-def _smoothed(knots: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
+def _catmull_rom(knots: NDArray[np.float64], steps: int) -> NDArray[np.float64]:
     # Catmull-Rom through the knots, ends doubled
     p = np.concatenate([knots[:1], knots, knots[-1:]])
     u = np.linspace(0.0, 1.0, steps, endpoint=False)[None, :, None]

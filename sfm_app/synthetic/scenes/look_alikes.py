@@ -28,9 +28,9 @@ SEEN, MATCHED = 0.8, 0.75
 WIDE_DEG, SCALE = 25.0, 0.5
 """Angle, and logarithm of the ratio of distances, at which the share of matches drops by a factor e."""
 NOISE_PX = 0.3
-LEAST = 16
+MIN_MATCHES = 16
 """Matches that must agree on a pose; a pair with fewer has no pose."""
-NEAR, FAR, STEEP = 0.3, 30.0, 0.2
+NEAR, FAR, MIN_FACING_COSINE = 0.3, 30.0, 0.2
 """Range of depths of visible points, and least cosine between a point's normal and the direction to the camera."""
 
 
@@ -42,9 +42,9 @@ class Place:
     """(N, 3)"""
     normals: FloatArray
     """(N, 3) of length 1; zeros where a point is seen from all sides."""
-    looks: IndexArray
+    appearances: IndexArray
     """(N,) appearance numbers; equal for points that look the same."""
-    stands: IndexArray
+    placement_ids: IndexArray
     """(N,) index of each point's placement; -1 for unique points."""
     placements: tuple[Placement, ...]
     """Placements of the objects; the last one, the identity, is that of the unique points."""
@@ -59,11 +59,11 @@ class LookAlikeScene:
     matches: MatchGraph
     cameras: dict[int, Calibration]
     poses: dict[PairId, RelativePose]
-    true: frozenset[PairId]
+    true_pairs: frozenset[PairId]
     """Pairs with a correct relative pose."""
 
 
-def gathered(unique: Things, repeated: Sequence[tuple[Things, Sequence[Placement]]], pillar: float = 0.0) -> Place:
+def make_place(unique: Things, repeated: Sequence[tuple[Things, Sequence[Placement]]], pillar: float = 0.0) -> Place:
     """Build a place from unique points and repeated objects.
 
     Args:
@@ -94,7 +94,7 @@ def gathered(unique: Things, repeated: Sequence[tuple[Things, Sequence[Placement
     )
 
 
-def matched(place: Place, views: Sequence[Placement], seed: int = 0) -> LookAlikeScene:
+def match_photos(place: Place, views: Sequence[Placement], seed: int = 0) -> LookAlikeScene:
     """Make simulated photos of a place and their matches.
 
     Args:
@@ -106,20 +106,20 @@ def matched(place: Place, views: Sequence[Placement], seed: int = 0) -> LookAlik
     K = camera_matrix(FOCAL, FOCAL, SIZE[0] / 2, SIZE[1] / 2)
     seen, keypoints = {}, {}
     for photo, view in enumerate(views, start=1):
-        seen[photo], keypoints[photo] = _photographed(place, view, rng)
+        seen[photo], keypoints[photo] = _photograph(place, view, rng)
     matches, poses, true = {}, {}, set()
     for a, b in combinations(seen, 2):
         chosen, shown = (seen[a], seen[b]), (views[a - 1], views[b - 1])
-        rows = _rows(place, chosen, shown, rng)
-        kinds = np.stack([place.stands[one[column]] for one, column in zip(chosen, rows.T, strict=True)], axis=1)
+        rows = _matching_rows(place, chosen, shown, rng)
+        kinds = np.stack([place.placement_ids[one[column]] for one, column in zip(chosen, rows.T, strict=True)], axis=1)
         kinds[kinds[:, 0] == kinds[:, 1]] = -1  # an object that is matched to itself agrees with the unique points
         names, which, counts = np.unique(kinds, axis=0, return_inverse=True, return_counts=True)
-        if not len(rows) or counts.max() < LEAST:
+        if not len(rows) or counts.max() < MIN_MATCHES:
             continue
         best = int(np.argmax(counts))
         stands = (place.placements[names[best][0]], place.placements[names[best][1]])
         matches[a, b] = rows.astype(np.uint32)
-        poses[a, b] = _relative(shown, stands, which.ravel() == best)
+        poses[a, b] = _relative_pose(shown, stands, which.ravel() == best)
         if names[best][0] == names[best][1]:
             true.add((a, b))
     images = {photo: MatchedImage(photo, f"{photo:04d}.jpg", "camera", *SIZE) for photo in seen}
@@ -127,7 +127,7 @@ def matched(place: Place, views: Sequence[Placement], seed: int = 0) -> LookAlik
     return LookAlikeScene(MatchGraph(images, keypoints, matches), dict.fromkeys(seen, camera), poses, frozenset(true))
 
 
-def _photographed(place: Place, view: Placement, rng: np.random.Generator) -> tuple[IndexArray, FloatArray]:
+def _photograph(place: Place, view: Placement, rng: np.random.Generator) -> tuple[IndexArray, FloatArray]:
     """Return the indices of the points visible in a photo, and their pixels."""
     R, t = view
     Y = place.X @ R.T + t
@@ -135,17 +135,17 @@ def _photographed(place: Place, view: Placement, rng: np.random.Generator) -> tu
         x = Y[:, :2] / Y[:, 2:] * FOCAL + 0.5 * np.array(SIZE)
     center = -R.T @ t
     way = center - place.X
-    facing = (place.normals * way).sum(1) >= STEEP * np.linalg.norm(way, axis=1)
+    facing = (place.normals * way).sum(1) >= MIN_FACING_COSINE * np.linalg.norm(way, axis=1)
     facing |= ~place.normals.any(axis=1)
     good = (Y[:, 2] > NEAR) & (Y[:, 2] < FAR) & ((x > 0) & (x < SIZE)).all(axis=1) & facing
     good &= rng.uniform(size=len(good)) < SEEN
     if place.pillar:
-        good &= ~_hidden(place.X, center, place.pillar)
+        good &= ~_is_hidden(place.X, center, place.pillar)
     chosen = np.flatnonzero(good)
     return chosen, x[chosen] + rng.normal(0.0, NOISE_PX, (len(chosen), 2))
 
 
-def _hidden(X: FloatArray, center: FloatArray, radius: float) -> NDArray[np.bool_]:
+def _is_hidden(X: FloatArray, center: FloatArray, radius: float) -> NDArray[np.bool_]:
     """Return (N,) whether the line of sight to a point passes through the cylinder.
 
     Points on the cylinder itself count as visible.
@@ -157,18 +157,20 @@ def _hidden(X: FloatArray, center: FloatArray, radius: float) -> NDArray[np.bool
     return np.asarray((closest < radius) & (np.linalg.norm(ground, axis=1) > 1.01 * radius), np.bool_)
 
 
-def _rows(place: Place, seen: Sequence[IndexArray], views: Sequence[Placement], rng: np.random.Generator) -> IndexArray:
+def _matching_rows(
+    place: Place, seen: Sequence[IndexArray], views: Sequence[Placement], rng: np.random.Generator
+) -> IndexArray:
     """Return (M, 2) pairs of keypoints that look the same, are unique in both photos, and seen from similar sides."""
-    looks = [place.looks[one] for one in seen]
+    looks = [place.appearances[one] for one in seen]
     common, *ends = np.intersect1d(looks[0], looks[1], return_indices=True)
-    once = [np.bincount(one, minlength=int(place.looks.max()) + 1)[common] == 1 for one in looks]
+    once = [np.bincount(one, minlength=int(place.appearances.max()) + 1)[common] == 1 for one in looks]
     rows = np.stack(ends, axis=1)[once[0] & once[1]]
     turns = np.array([R for R, _ in place.placements])
     ways = []
     for (R, t), one, column in zip(views, seen, rows.T, strict=True):
         way = -R.T @ t - place.X[one[column]]
         # in the frame of the point's object
-        ways.append(np.einsum("nji,nj->ni", turns[place.stands[one[column]]], way))
+        ways.append(np.einsum("nji,nj->ni", turns[place.placement_ids[one[column]]], way))
     lengths = [np.linalg.norm(way, axis=1) for way in ways]
     cosines = (ways[0] * ways[1]).sum(1) / (lengths[0] * lengths[1])
     angles = np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
@@ -176,7 +178,7 @@ def _rows(place: Place, seen: Sequence[IndexArray], views: Sequence[Placement], 
     return np.asarray(rows[rng.uniform(size=len(rows)) < likely], np.int64)
 
 
-def _relative(views: Sequence[Placement], stands: Sequence[Placement], inliers: NDArray[np.bool_]) -> RelativePose:
+def _relative_pose(views: Sequence[Placement], stands: Sequence[Placement], inliers: NDArray[np.bool_]) -> RelativePose:
     """Return the pose of view 2 from view 1 if the objects of two placements are taken for the same object."""
     (R1, t1), (R2, t2) = ((R @ S, R @ s + t) for (R, t), (S, s) in zip(views, stands, strict=True))
     R = R2 @ R1.T

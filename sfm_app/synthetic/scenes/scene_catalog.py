@@ -33,7 +33,7 @@ def build_scene(name: str = "courtyard") -> SyntheticScene:
     Raises:
         ConfigError: there is no such scene; the message names the known ones.
     """
-    return _named(name, SCENES)()
+    return _look_up(name, SCENES)()
 
 
 def scene_views(name: str = "courtyard", seed: int = 0) -> Views:
@@ -46,10 +46,10 @@ def scene_views(name: str = "courtyard", seed: int = 0) -> Views:
     Raises:
         ConfigError: there is no such scene; the message names the known ones.
     """
-    return _named(name, WALKS)(seed)
+    return _look_up(name, WALKS)(seed)
 
 
-def _named(name: str, known: Mapping[str, Item]) -> Item:
+def _look_up(name: str, known: Mapping[str, Item]) -> Item:
     if name not in known:
         raise ConfigError(f"no synthetic scene is named '{name}'", hint=f"known: {', '.join(known)}")
     return known[name]

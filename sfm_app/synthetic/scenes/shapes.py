@@ -26,7 +26,7 @@ class Shape:
     texture: FloatArray
     """(V, 3): vertices before the shape was moved into the scene, so that its texture moves with it."""
 
-    def moved(
+    def move(
         self, to: tuple[float, float, float] = (0.0, 0.0, 0.0), turn_deg: float = 0.0, tilt_deg: float = 0.0
     ) -> "Shape":
         """Tilt about x, then turn about y, then move.
@@ -61,10 +61,10 @@ def box(width: float, height: float, depth: float, spacing: float = 0.15) -> Sha
             vertices[:, axis] = 0.5 * sign * size[axis]
             vertices[:, u], vertices[:, v] = side[:, 0], side[:, 1]
             parts.append((vertices, faces if sign > 0 else faces[:, ::-1]))
-    return _joined([(vertices + np.array([0.0, height / 2, 0.0]), faces) for vertices, faces in parts])
+    return _build_shape([(vertices + np.array([0.0, height / 2, 0.0]), faces) for vertices, faces in parts])
 
 
-def revolved(
+def revolve(
     profile: FloatArray,
     segments: int = 64,
     span_deg: float = 360.0,
@@ -82,7 +82,7 @@ def revolved(
         flutes: number of grooves around the axis, and their depth as a share of the radius.
     """
     strips = [profile[k : k + 2] for k in range(len(profile) - 1)] if sharp else [profile]
-    return _joined([_turned(strip, segments, span_deg, flutes) for strip in strips])
+    return _build_shape([_revolve_profile(strip, segments, span_deg, flutes) for strip in strips])
 
 
 def torus(radius: float, tube: float, span_deg: float = 360.0) -> Shape:
@@ -95,7 +95,7 @@ def torus(radius: float, tube: float, span_deg: float = 360.0) -> Shape:
     """
     angle = np.linspace(0.0, 2.0 * math.pi, 25)
     section = np.column_stack([radius + tube * np.cos(angle), tube * np.sin(angle)])
-    return revolved(section, segments=max(8, round(span_deg / 5.0)), span_deg=span_deg)
+    return revolve(section, segments=max(8, round(span_deg / 5.0)), span_deg=span_deg)
 
 
 def arch(radius: float, thickness: float, depth: float) -> Shape:
@@ -108,7 +108,7 @@ def arch(radius: float, thickness: float, depth: float) -> Shape:
     """
     inner, outer = radius, radius + thickness
     section = np.array([[inner, 0.0], [outer, 0.0], [outer, depth], [inner, depth], [inner, 0.0]])
-    lying = revolved(section, segments=40, span_deg=180.0, sharp=True)
+    lying = revolve(section, segments=40, span_deg=180.0, sharp=True)
     # the ring lies on the ground in the half z <= 0; standing it up brings its height to +z
     R = axis_rotation(np.array([1.0, 0.0, 0.0]), 90.0)
     vertices = lying.vertices @ R.T
@@ -125,9 +125,9 @@ def ball(radius: float, segments: int = 96, bumps: float = 0.0, seed: int = 0) -
         seed: same seed, same dents.
     """
     angle = np.linspace(-0.5, 0.5, segments // 2 + 1) * math.pi
-    round_ball = _turned(np.column_stack([np.cos(angle), np.sin(angle)]), segments, 360.0, (0, 0.0))
+    round_ball = _revolve_profile(np.column_stack([np.cos(angle), np.sin(angle)]), segments, 360.0, (0, 0.0))
     dents = waves(round_ball[0], seed)
-    return _joined([(round_ball[0] * radius * (1.0 + bumps * dents[:, None]), round_ball[1])])
+    return _build_shape([(round_ball[0] * radius * (1.0 + bumps * dents[:, None]), round_ball[1])])
 
 
 def waves(points: FloatArray, seed: int) -> FloatArray:
@@ -143,7 +143,7 @@ def waves(points: FloatArray, seed: int) -> FloatArray:
     return np.asarray(found)
 
 
-def carved(
+def carve(
     field: Callable[[FloatArray], FloatArray],
     height: tuple[float, float],
     reach: float,
@@ -165,13 +165,13 @@ def carved(
     # turning from +x towards -z is right-handed about +y
     ways = np.column_stack([np.cos(angle), np.zeros(segments), -np.sin(angle)])
     levels = np.linspace(*height, rows)
-    radius = np.stack([_outermost(field, ways, level, reach) for level in levels], axis=1)
+    radius = np.stack([_outer_radius(field, ways, level, reach) for level in levels], axis=1)
     radius[:, [0, -1]] = 0.0
     vertices = ways[:, None] * radius[..., None] + np.array([0.0, 1.0, 0.0]) * levels[:, None]
-    return _joined([(vertices.reshape(-1, 3), _strips(segments, rows, segments))])
+    return _build_shape([(vertices.reshape(-1, 3), _strips(segments, rows, segments))])
 
 
-def assembled(parts: Sequence[Shape]) -> Shape:
+def assemble(parts: Sequence[Shape]) -> Shape:
     """Join several shapes into one; the texture continues across the parts."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     vertices = np.concatenate([part.vertices for part in parts])
@@ -191,10 +191,10 @@ def ground(x: tuple[float, float], z: tuple[float, float], unevenness: float, sp
     xs, zs = (np.linspace(a, b, 1 + max(1, round((b - a) / spacing))) for a, b in (x, z))
     grid, faces = _grid(zs, xs)
     height = np.sin(1.3 * grid[:, 1] + 0.7) * np.sin(1.7 * grid[:, 0] + 2.1) + 0.5 * np.sin(3.1 * grid.sum(axis=1))
-    return _joined([(np.column_stack([grid[:, 1], unevenness * height, grid[:, 0]]), faces)])
+    return _build_shape([(np.column_stack([grid[:, 1], unevenness * height, grid[:, 0]]), faces)])
 
 
-def _turned(
+def _revolve_profile(
     profile: FloatArray, segments: int, span_deg: float, flutes: tuple[int, float]
 ) -> tuple[FloatArray, IndexArray]:
     closed = span_deg >= 360.0
@@ -218,7 +218,7 @@ def _strips(segments: int, rows: int, count: int) -> IndexArray:
     return faces.reshape(-1, 3)
 
 
-def _outermost(
+def _outer_radius(
     field: Callable[[FloatArray], FloatArray], ways: FloatArray, level: float, reach: float, steps: int = 32
 ) -> FloatArray:
     """Return the radius (N,) at which rays from outside along -`ways` (N, 3) enter the body at a level.
@@ -226,18 +226,18 @@ def _outermost(
     0 for rays that miss it.
     """
 
-    def inside(radius: FloatArray) -> NDArray[np.bool_]:
+    def is_inside(radius: FloatArray) -> NDArray[np.bool_]:
         points = ways[:, None] * radius[..., None] + np.array([0.0, level, 0.0])
         return np.asarray(field(points.reshape(-1, 3)).reshape(radius.shape) > 0)
 
     radii = np.broadcast_to(np.linspace(reach, 0.0, steps + 1), (len(ways), steps + 1))
-    found = inside(radii)
+    found = is_inside(radii)
     at = found.argmax(axis=1)
     outer = np.take_along_axis(radii, np.maximum(at - 1, 0)[:, None], axis=1)
     inner = np.take_along_axis(radii, at[:, None], axis=1)
     for _ in range(8):
         middle = 0.5 * (outer + inner)
-        is_in = inside(middle)
+        is_in = is_inside(middle)
         inner, outer = np.where(is_in, middle, inner), np.where(is_in, outer, middle)
     return np.where(found.any(axis=1), inner[:, 0], 0.0)
 
@@ -249,7 +249,7 @@ def _grid(a: FloatArray, b: FloatArray) -> tuple[FloatArray, IndexArray]:
     return points, np.concatenate([np.stack([corner, right, right + 1], -1), np.stack([corner, right + 1, up], -1)])
 
 
-def _joined(parts: list[tuple[FloatArray, IndexArray]]) -> Shape:
+def _build_shape(parts: list[tuple[FloatArray, IndexArray]]) -> Shape:
     starts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
     vertices = np.concatenate([vertices for vertices, _ in parts])
     faces = np.concatenate([faces + start for (_, faces), start in zip(parts, starts[:-1], strict=True)])

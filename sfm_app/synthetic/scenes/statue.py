@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sfm_app.synthetic.cameras import ArcOptions, Camera, Views, arc
 from sfm_app.synthetic.scenes.bodies import Body, SyntheticScene
 from sfm_app.synthetic.scenes.courtyard import GREEN_MARBLE, LIMESTONE, PAVING, SANDSTONE, TERRACOTTA
-from sfm_app.synthetic.scenes.shapes import Shape, ball, box, carved, ground, revolved, torus, waves
+from sfm_app.synthetic.scenes.shapes import Shape, ball, box, carve, ground, revolve, torus, waves
 from sfm_app.synthetic.scenes.textures import Material
 
 FloatArray = NDArray[np.float64]
@@ -72,7 +72,7 @@ def statue_views(camera: Camera, seed: int = 0, photos: int = 22) -> Views:
 @cache
 def bust() -> Shape:
     """Return the shape of the bust, standing on y = 0."""
-    return carved(bust_field, (0.02, 1.24), reach=0.62)
+    return carve(bust_field, (0.02, 1.24), reach=0.62)
 
 
 def bust_field(points: FloatArray) -> FloatArray:
@@ -95,50 +95,50 @@ def bust_field(points: FloatArray) -> FloatArray:
 
 
 def _bust() -> list[Body]:
-    foot = revolved(
+    foot = revolve(
         np.array([[0.0, 0.0], [0.36, 0.0], [0.36, 0.05], [0.26, 0.08], [0.2, 0.14], [0.2, 0.24], [0.0, 0.24]]),
         segments=72,
         sharp=True,
     )
-    wreath = torus(0.205, 0.026).moved((0.0, PLINTH_TOP_Y + 1.14, -0.04), tilt_deg=12.0)
+    wreath = torus(0.205, 0.026).move((0.0, PLINTH_TOP_Y + 1.14, -0.04), tilt_deg=12.0)
     return [
-        Body(foot.moved((0.0, PLINTH_TOP_Y, 0.0)), GREEN_MARBLE),
-        Body(bust().moved((0.0, PLINTH_TOP_Y + 0.12, 0.0)), STONE),
+        Body(foot.move((0.0, PLINTH_TOP_Y, 0.0)), GREEN_MARBLE),
+        Body(bust().move((0.0, PLINTH_TOP_Y + 0.12, 0.0)), STONE),
         Body(wreath, BRONZE),
     ]
 
 
 def _plinth() -> list[Body]:
     blocks = [(1.5, 0.14, 0.0), (1.2, 0.14, 0.14), (0.84, 0.6, 0.28), (1.0, 0.08, 0.86), (0.9, 0.08, 0.94)]
-    bodies = [Body(box(width, high, width, spacing=0.08).moved((0.0, y, 0.0)), SANDSTONE) for width, high, y in blocks]
+    bodies = [Body(box(width, high, width, spacing=0.08).move((0.0, y, 0.0)), SANDSTONE) for width, high, y in blocks]
     # each side has its own relief: with four equal sides, photos could be matched to the wrong side
-    shield = revolved(np.array([[0.21, 0.0], [0.19, 0.03], [0.1, 0.07], [0.0, 0.09]]), segments=48)
+    shield = revolve(np.array([[0.21, 0.0], [0.19, 0.03], [0.1, 0.07], [0.0, 0.09]]), segments=48)
     plaque = box(0.5, 0.3, 0.06, spacing=0.06)
     rosette = ball(0.17, bumps=0.08, seed=5)
     return [
         *bodies,
-        Body(plaque.moved((0.0, 0.42, 0.42)), GREEN_MARBLE),
-        Body(shield.moved((0.42, 0.57, 0.0), tilt_deg=90.0, turn_deg=90.0), replace(TERRACOTTA, scale=0.1)),
-        Body(rosette.moved((-0.40, 0.57, 0.0)), LIMESTONE),
-        Body(torus(0.17, 0.05).moved((0.0, 0.57, -0.44), tilt_deg=90.0), LIMESTONE),
+        Body(plaque.move((0.0, 0.42, 0.42)), GREEN_MARBLE),
+        Body(shield.move((0.42, 0.57, 0.0), tilt_deg=90.0, turn_deg=90.0), replace(TERRACOTTA, scale=0.1)),
+        Body(rosette.move((-0.40, 0.57, 0.0)), LIMESTONE),
+        Body(torus(0.17, 0.05).move((0.0, 0.57, -0.44), tilt_deg=90.0), LIMESTONE),
     ]
 
 
 def _terrace() -> list[Body]:
-    drum = revolved(
+    drum = revolve(
         np.array([[0.0, 0.0], [0.17, 0.0], [0.17, 0.5], [0.0, 0.5]]), segments=72, sharp=True, flutes=(14, 0.1)
     )
-    pot = revolved(
+    pot = revolve(
         np.array([[0.0, 0.0], [0.13, 0.0], [0.2, 0.3], [0.22, 0.3], [0.22, 0.35], [0.17, 0.35], [0.0, 0.33]]),
         sharp=True,
     )
     return [
         Body(ground((-1.7, 1.7), (-1.7, 1.7), unevenness=0.015), replace(PAVING, scale=0.35)),
-        Body(drum.moved((1.15, 0.17, 0.95), turn_deg=35.0, tilt_deg=90.0), LIMESTONE),
-        Body(pot.moved((-1.2, 0.0, 0.9)), TERRACOTTA),
-        Body(ball(0.24, bumps=0.09, seed=2).moved((-1.2, 0.5, 0.9)), LEAVES_OF_BOX),
-        Body(box(0.5, 0.22, 0.34, spacing=0.06).moved((-1.0, 0.0, -1.1), turn_deg=25.0), SANDSTONE),
-        Body(ball(0.2).moved((1.2, 0.2, -1.05), turn_deg=40.0, tilt_deg=20.0), GREEN_MARBLE),
+        Body(drum.move((1.15, 0.17, 0.95), turn_deg=35.0, tilt_deg=90.0), LIMESTONE),
+        Body(pot.move((-1.2, 0.0, 0.9)), TERRACOTTA),
+        Body(ball(0.24, bumps=0.09, seed=2).move((-1.2, 0.5, 0.9)), LEAVES_OF_BOX),
+        Body(box(0.5, 0.22, 0.34, spacing=0.06).move((-1.0, 0.0, -1.1), turn_deg=25.0), SANDSTONE),
+        Body(ball(0.2).move((1.2, 0.2, -1.05), turn_deg=40.0, tilt_deg=20.0), GREEN_MARBLE),
     ]
 
 

@@ -16,13 +16,13 @@ LEAST_VIEWS = 3
 """If only two photos disagree, it is unknown which of them is right."""
 LEVELS = 10.0
 """Normal difference between colors of one triangle, in gray levels."""
-OUTLYING = 3.0
+OUTLIER_FACTOR = 3.0
 """Deviation beyond which a photo is left out, relative to the usual deviation of a triangle."""
 ROUNDS = 4
 """Rounds of averaging over neighbors: about the number of adjacent triangles that make an outlier."""
 
 
-def strangers(
+def outlier_mask(
     colors: NDArray[np.uint8], gains: NDArray[np.float64], seen: NDArray[np.bool_], neighbors: IntArray
 ) -> NDArray[np.bool_]:
     """Mark photos at the triangles where they show something other than the surface.
@@ -46,7 +46,7 @@ def strangers(
             _average(before, seen[photo], neighbors, smooth)
         _mark(smooth, seen[photo], neighbors, found[photo])
     found &= seen.sum(axis=0) >= LEAST_VIEWS
-    _spare_the_last(found, seen)
+    _keep_majority(found, seen)
     return found
 
 
@@ -111,15 +111,15 @@ def _mark(score: NDArray[np.float32], seen: NDArray[np.bool_], neighbors: IntArr
     for f in range(len(score)):
         if not seen[f]:
             continue
-        found[f] = score[f] > OUTLYING
+        found[f] = score[f] > OUTLIER_FACTOR
         for k in range(3):
             g = neighbors[f, k]
-            if g != NONE and seen[g] and score[g] > OUTLYING:
+            if g != NONE and seen[g] and score[g] > OUTLIER_FACTOR:
                 found[f] = True
 
 
 @kernel
-def _spare_the_last(found: NDArray[np.bool_], seen: NDArray[np.bool_]) -> None:
+def _keep_majority(found: NDArray[np.bool_], seen: NDArray[np.bool_]) -> None:
     """Keep all photos of a triangle where at most half would remain: without agreement none is an outlier."""
     for f in range(found.shape[1]):
         left = total = 0

@@ -13,7 +13,7 @@ from sfm_app.texture.facets import Facets
 from sfm_app.texture.views import PhotoView, project, sample
 
 FloatArray = NDArray[np.float64]
-Hidden = Callable[[FloatArray, float, FloatArray], NDArray[np.bool_]]
+OcclusionTest = Callable[[FloatArray, float, FloatArray], NDArray[np.bool_]]
 """Takes a camera center (3,), the slack at a point, and points (N, 3); returns whether each is hidden, (N,)."""
 
 SLACK = 1.0
@@ -42,8 +42,8 @@ class FaceView:
     """Energy of the finest detail relative to that at half size; decreases with blur, hardly depends on content."""
 
 
-def look(
-    view: PhotoView, photo: NDArray[np.uint8], used: NDArray[np.bool_] | None, mesh: Facets, hidden: Hidden
+def score_faces(
+    view: PhotoView, photo: NDArray[np.uint8], used: NDArray[np.bool_] | None, mesh: Facets, hidden: OcclusionTest
 ) -> FaceView:
     """Score every triangle in one photo.
 
@@ -62,7 +62,7 @@ def look(
         np.cumsum(np.cumsum(~used, axis=0, dtype=np.int32), axis=1, out=masked[1:, 1:])
         _drop_masked(view.row, masked, mesh.vertices, mesh.faces, worth)
     candidates = np.flatnonzero(worth)
-    worth[candidates[_blocked(candidates, mesh, partial(hidden, view.center, SLACK * mesh.spacing))]] = 0.0
+    worth[candidates[_occluded_mask(candidates, mesh, partial(hidden, view.center, SLACK * mesh.spacing))]] = 0.0
     color[worth == 0] = 0
     beyond = worth == 0
     for _ in range(RIM_RINGS):
@@ -73,7 +73,7 @@ def look(
     return FaceView(worth, color, sharpness(photo, used))
 
 
-def _blocked(
+def _occluded_mask(
     candidates: NDArray[np.int64], mesh: Facets, hidden: Callable[[FloatArray], NDArray[np.bool_]]
 ) -> NDArray[np.bool_]:
     """Mark triangles that are hidden at the center or at two corners, (N,)."""

@@ -3,9 +3,9 @@ import json
 import numpy as np
 import pytest
 
-from benchmarks.cameras.bars import BARS, least, most, verdict
-from benchmarks.cameras.methods import methods, taking_turns
-from benchmarks.cameras.report import DEVIATIONS, medians, page, same_bytes
+from benchmarks.cameras.bars import BARS, lower_bound, upper_bound, verdict
+from benchmarks.cameras.methods import methods, rotate_methods
+from benchmarks.cameras.report import DEVIATIONS, compare_bytes, medians, page
 from benchmarks.cameras.score import Model, TruePhoto, accuracy, camera_errors, stated_deviations, times, true_photos
 from benchmarks.common.metrics import area_under_recall, pose_errors_deg, position_rms_percent
 from benchmarks.common.photo_sets import steps
@@ -156,12 +156,12 @@ def test_methods_take_turns_and_other_settings_are_methods():
     these = methods({"scene.max_init_pairs=2": {"scene": {"max_init_pairs": 2}}})
 
     assert [method.name for method in these] == ["sfm-app", "sfm-app, scene.max_init_pairs=2", "incremental", "global"]
-    assert taking_turns(these, 6)[0].name == "incremental"
+    assert rotate_methods(these, 6)[0].name == "incremental"
     assert [method.kind for method in methods({}, ours_only=True)] == ["sfm-app"]
 
 
 def test_bars_are_met_up_to_the_bound_and_misses_are_named():
-    bars = (least("AUC@1", 0.8), most("rms", 0.1), most("px", "incremental"))
+    bars = (lower_bound("AUC@1", 0.8), upper_bound("rms", 0.1), upper_bound("px", "incremental"))
     others = {"incremental": {"px": 0.4}}
 
     assert verdict({"AUC@1": 0.8, "rms": 0.1, "px": 0.4}, others, bars) == "yes"
@@ -198,9 +198,9 @@ def test_a_run_that_failed_has_no_time():
 def test_equal_bytes_are_told_from_unequal_ones():
     first, second = {"cameras.bin": "1", "images.bin": "2"}, {"cameras.bin": "1", "images.bin": "3"}
 
-    assert same_bytes([first, first]) == "yes"
-    assert same_bytes([first, second]) == "no: images.bin"
-    assert same_bytes([first]) is None
+    assert compare_bytes([first, first]) == "yes"
+    assert compare_bytes([first, second]) == "no: images.bin"
+    assert compare_bytes([first]) is None
 
 
 def test_bars_stand_on_sets_and_columns_that_there_are():

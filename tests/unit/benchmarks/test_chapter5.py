@@ -8,25 +8,30 @@ import pytest
 
 from benchmarks.thesis.chapter5 import contests, setups, sweep_claims, tables
 from benchmarks.thesis.chapter5.bounds import full_bound, gap, reduced_bound
-from benchmarks.thesis.chapter5.command import IN_ORDER, MOST, PARTS, most_of
+from benchmarks.thesis.chapter5.command import ORDERED_PARTS, PARTS, TEST_LIMITS, parse_test_limit
 from benchmarks.thesis.chapter5.contests import (
     CAP_PERCENT,
     NON_ROBUST,
     PRODUCTION,
     Attempt,
-    answer_of,
-    contest,
+    answered_K,
     e_center,
     e_focal,
+    run_contest,
     summary,
 )
-from benchmarks.thesis.chapter5.fits import Fit, fit_to_all, robust_fits, with_outlying
+from benchmarks.thesis.chapter5.fits import Fit, fit_to_all, robust_fits, with_outlying_fits
 from benchmarks.thesis.chapter5.lab import Lab
-from benchmarks.thesis.chapter5.panels import Panel, lowest, rows_of
-from benchmarks.thesis.chapter5.sequences import ImageSequence, camera_matrix_of, corner_sequence, fundamental_of
+from benchmarks.thesis.chapter5.panels import Panel, minimum_x, panel_rows
+from benchmarks.thesis.chapter5.sequences import (
+    ImageSequence,
+    camera_matrix_from_projection,
+    corner_sequence,
+    fundamental_from_projections,
+)
 from benchmarks.thesis.chapter5.setups import Trial
 from benchmarks.thesis.chapter5.slices import SCALES, focal_slice
-from benchmarks.thesis.chapter5.sweep_claims import CLAIMS, Said, claims_of, holds
+from benchmarks.thesis.chapter5.sweep_claims import CLAIMS, CurveClaim, check_levels, judge_claims
 from benchmarks.thesis.chapter5.sweeps import FIGURES
 from benchmarks.thesis.chapter5.zero_curve_plots import SIGMA, support
 from sfm_app.geometry.camera import camera_matrix
@@ -48,7 +53,7 @@ def test_a_projection_matrix_falls_apart_into_K_and_the_rest():
     R = axis_rotation(np.array([0.6, 0.0, 0.8]), 160.0)
     P = -3.0 * K @ np.column_stack([R, [0.3, -2.0, 5.0]])
 
-    assert np.allclose(camera_matrix_of(P), K)
+    assert np.allclose(camera_matrix_from_projection(P), K)
 
 
 def test_the_fundamental_matrix_of_two_cameras_joins_their_images():
@@ -57,8 +62,8 @@ def test_the_fundamental_matrix_of_two_cameras_joins_their_images():
     X = np.random.default_rng(0).uniform([-1, -1, 4, 1], [1, 1, 6, 1], (20, 4))
     x1, x2 = ((X @ P.T)[:, :2] / (X @ P.T)[:, 2:] for P in (P1, P2))
 
-    assert sampson_distance(fundamental_of(P1, P2), x1, x2).max() < 1e-9
-    assert sampson_distance(fundamental_of(P2, P1), x1, x2).max() > 1.0, "the direction matters"
+    assert sampson_distance(fundamental_from_projections(P1, P2), x1, x2).max() < 1e-9
+    assert sampson_distance(fundamental_from_projections(P2, P1), x1, x2).max() > 1.0, "the direction matters"
 
 
 def test_a_sequence_of_corners_has_the_pairs_that_share_enough(tmp_path, monkeypatch):
@@ -91,7 +96,7 @@ def test_outliers_spoil_a_fit_to_all_and_no_robust_one(tracks):
     clean = robust_fits(dict(pair_matches(tracks)), seed=0)
     assert error(clean[pair].F) < 0.3 and error(robust_fits({pair: spoilt[pair]}, seed=0)[pair].F) < 0.3
     assert error(fit_to_all(spoilt[pair]).F) > 2.0 > 0.3 > error(fit_to_all(np.hstack([exact.x1, exact.x2])).F)
-    mixed = with_outlying(clean, {pair: spoilt[pair]})
+    mixed = with_outlying_fits(clean, {pair: spoilt[pair]})
     assert [name for name in mixed if mixed[name] is not clean[name]] == [pair]
     assert len(mixed[pair].matches) == 200 and list(mixed) == list(clean)
 
@@ -136,10 +141,10 @@ def calibration(method, identifiable, **evidence):
 def test_doubt_is_an_answer_of_the_program_alone():
     told = {"fx_px": 1.0, "fy_px": 2.0, "cx_px": 3.0, "cy_px": 4.0}
 
-    assert answer_of(PRODUCTION, calibration("guess", False, **told)) is None
-    assert answer_of(NON_ROBUST, calibration("guess", False, **told)).tolist() == [[1, 0, 3], [0, 2, 4], [0, 0, 1]]
-    assert answer_of(NON_ROBUST, calibration("guess", False)) is None
-    assert answer_of(PRODUCTION, calibration(PRODUCTION, True, **told)).tolist() == np.eye(3).tolist()
+    assert answered_K(PRODUCTION, calibration("guess", False, **told)) is None
+    assert answered_K(NON_ROBUST, calibration("guess", False, **told)).tolist() == [[1, 0, 3], [0, 2, 4], [0, 0, 1]]
+    assert answered_K(NON_ROBUST, calibration("guess", False)) is None
+    assert answered_K(PRODUCTION, calibration(PRODUCTION, True, **told)).tolist() == np.eye(3).tolist()
 
 
 def test_a_summary_says_how_many_answered_and_caps_the_rest():
@@ -160,7 +165,7 @@ def two_levels(seed, tracks):
 
 def test_a_contest_has_a_row_per_method_and_level_and_its_own_number_of_tests(tracks):
     with ThreadPoolExecutor(1) as pool:
-        rows = contest(partial(two_levels, tracks=tracks), {NON_ROBUST: 2, "kruppa": 1}, 0, pool, "two levels")
+        rows = run_contest(partial(two_levels, tracks=tracks), {NON_ROBUST: 2, "kruppa": 1}, 0, pool, "two levels")
 
     assert [(row["method"], row["x"], row["tests"]) for row in rows] == [
         (NON_ROBUST, 0.0, 2), (NON_ROBUST, 1.0, 2), ("kruppa", 0.0, 1), ("kruppa", 1.0, 1),
@@ -171,24 +176,24 @@ def test_a_contest_has_a_row_per_method_and_level_and_its_own_number_of_tests(tr
 @pytest.mark.parametrize(
     ("said", "own", "others", "expected"),
     [
-        (Said("", "", "below", "a", ("b",)), [1, 5], [[2, 4]], [True, False]),
-        (Said("", "", "below", "a", ("b", "c")), [1], [[2], [0.5]], [False]),
-        (Said("", "", "below", "a", ("b",), limit=10), [1, 1], [[11, 9]], [True, False]),
-        (Said("", "", "under", "a", limit=5), [4, 6, float("nan")], [], [True, False, False]),
-        (Said("", "", "over", "a", limit=5), [4, 6], [], [False, True]),
-        (Said("", "", "steady", "a"), [2, 4, 3], [], [True]),
-        (Said("", "", "steady", "a"), [2, 4.1], [], [False]),
-        (Said("", "", "rising", "a"), [2, 1, 5], [], [True]),
-        (Said("", "", "falling", "a"), [2, 3], [], [False]),
+        (CurveClaim("", "", "below", "a", ("b",)), [1, 5], [[2, 4]], [True, False]),
+        (CurveClaim("", "", "below", "a", ("b", "c")), [1], [[2], [0.5]], [False]),
+        (CurveClaim("", "", "below", "a", ("b",), limit=10), [1, 1], [[11, 9]], [True, False]),
+        (CurveClaim("", "", "under", "a", limit=5), [4, 6, float("nan")], [], [True, False, False]),
+        (CurveClaim("", "", "over", "a", limit=5), [4, 6], [], [False, True]),
+        (CurveClaim("", "", "steady", "a"), [2, 4, 3], [], [True]),
+        (CurveClaim("", "", "steady", "a"), [2, 4.1], [], [False]),
+        (CurveClaim("", "", "rising", "a"), [2, 1, 5], [], [True]),
+        (CurveClaim("", "", "falling", "a"), [2, 3], [], [False]),
     ],
 )
 def test_sentences_are_judged(said, own, others, expected):
-    assert holds(said, own, others) == expected
+    assert check_levels(said, own, others) == expected
 
 
 def test_an_unknown_kind_of_sentence_is_no_claim():
     with pytest.raises(ValueError, match="no such kind"):
-        holds(Said("", "", "better", "a"), [1.0])
+        check_levels(CurveClaim("", "", "better", "a"), [1.0])
 
 
 def test_every_sentence_is_about_a_plot_that_shows_its_methods():
@@ -203,16 +208,16 @@ def test_claims_take_their_levels_and_say_what_is_missing():
     rows = [
         {"method": name, "x": x, "e_focal": x + k} for k, name in enumerate(sweep_claims.BUT_RMS) for x in (0, 1, 2)
     ]
-    found = claims_of({"5.10b": rows})
+    found = judge_claims({"5.10b": rows})
     assert [claim.verdict for claim in found] == ["holds"] and found[0].numbers.startswith(
         "at 1, 2: perturbation 1, 2 %"
     )
-    assert claims_of({"5.6b": rows})[0].verdict == "not measured"
+    assert judge_claims({"5.6b": rows})[0].verdict == "not measured"
 
 
 def table_row(sequence, method, e, answered=1.0):
     given = {"e_focal": e, "e_OC": e, "e_focal median": e, "answered": answered, "method": method, "tests": 1}
-    return {"sequence": sequence, **tables.with_printed(sequence, given)}
+    return {"sequence": sequence, **tables.with_printed_errors(sequence, given)}
 
 
 def test_the_printed_means_are_those_of_the_thesis():
@@ -252,8 +257,8 @@ def test_bounds_hold_and_the_reduced_one_ignores_the_error_of_F(tracks):
 
 def test_the_objective_of_exact_matrices_is_lowest_at_the_true_focal(tracks):
     panel = Panel("exact", tracks.K[0][0, 0] * SCALES, {"all": focal_slice(tracks.F, tracks.K[0])})
-    assert lowest(panel, "all") == pytest.approx(tracks.K[0][0, 0])
-    assert len(rows_of([panel])) == len(SCALES)
+    assert minimum_x(panel, "all") == pytest.approx(tracks.K[0][0, 0])
+    assert len(panel_rows([panel])) == len(SCALES)
 
 
 def test_support_is_highest_where_curves_meet():
@@ -266,7 +271,7 @@ def test_support_is_highest_where_curves_meet():
 
 def test_every_figure_of_the_issue_is_drawn():
     asked = {f"5.{n}" for n in (1, 2, 3, 5, 6, 9, 10, 11, 12, *range(14, 23))} | {"5.7-5.8", "tables"}
-    assert asked <= set(PARTS) == set(IN_ORDER) and IN_ORDER[0] == "5.1" and IN_ORDER[-1] == "tables"
+    assert asked <= set(PARTS) == set(ORDERED_PARTS) and ORDERED_PARTS[0] == "5.1" and ORDERED_PARTS[-1] == "tables"
 
 
 def test_slow_methods_have_fewer_tests(tmp_path, tracks, monkeypatch):
@@ -274,9 +279,9 @@ def test_slow_methods_have_fewer_tests(tmp_path, tracks, monkeypatch):
     setups.two_levels.__name__ = "two_levels"
     with ThreadPoolExecutor(1) as pool:
         lab = Lab(tmp_path, tmp_path, tmp_path, [NON_ROBUST, "kruppa"], 2, 1, {"kruppa": 1}, 0, pool)
-        rows = lab.contest(setups.two_levels)
-        assert lab.contest(setups.two_levels) is rows, "an experiment is run once"
+        rows = lab.run_contest(setups.two_levels)
+        assert lab.run_contest(setups.two_levels) is rows, "an experiment is run once"
 
     assert {row["method"]: row["tests"] for row in rows} == {NON_ROBUST: 2, "kruppa": 1}
-    assert lab.fewer == "at most 1 of `kruppa`"
-    assert most_of("kruppa=3") == ("kruppa", 3) and dict(MOST).keys() <= set(contests.METHODS)
+    assert lab.test_limits_text == "at most 1 of `kruppa`"
+    assert parse_test_limit("kruppa=3") == ("kruppa", 3) and dict(TEST_LIMITS).keys() <= set(contests.METHODS)

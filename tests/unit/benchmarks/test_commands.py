@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import benchmarks
-from benchmarks.common.command_line import add_pictures, is_wanted, on_one_thread
+from benchmarks.common.command_line import add_pictures, ensure_single_thread, is_wanted
 from benchmarks.common.processes import environment, module_command
 
 PACKAGE = Path(benchmarks.__file__).parent
@@ -77,7 +77,7 @@ def test_a_command_starts_anew_as_it_was_called(monkeypatch):
     monkeypatch.setattr("os.execve", lambda *given: calls.append(given))
     monkeypatch.setattr(sys, "orig_argv", ["python", "-X", "dev", "-m", "benchmarks.fundamental", "--seed", "1"])
     monkeypatch.setenv("OMP_NUM_THREADS", "2")
-    on_one_thread()
+    ensure_single_thread()
 
     ((path, command, given),) = calls
     assert path == sys.executable == command[0]

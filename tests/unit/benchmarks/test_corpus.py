@@ -10,17 +10,17 @@ import pytest
 from PIL import Image
 
 import sfm_app
-from benchmarks.cameras.methods import by_size, in_folders, methods
+from benchmarks.cameras.methods import group_by_size, methods, split_into_folders
 from benchmarks.cameras.score import Model, TruePhoto
 from benchmarks.common.photo_sets import photo_set, steps, stride
-from benchmarks.common.processes import end_of
+from benchmarks.common.processes import run_command
 from benchmarks.corpus import command as corpus
 from benchmarks.corpus import kept_runs, tuning_sets
-from benchmarks.corpus.bars import bars_of, behind, demands, folded
+from benchmarks.corpus.bars import deficits, demands, required_bars, unreported_fold
 from benchmarks.corpus.report import corpus_page
-from benchmarks.corpus.score import Doubt, claims, counted, fold_lines, of_walk, parameters
+from benchmarks.corpus.score import Doubt, claimed_errors, fold_lines, parameter_counts, parameter_errors, walk_figures
 from benchmarks.corpus.trajectory import offset_errors, order_scores
-from benchmarks.corpus.tuning_sets import GROUPS, groups_table, seen_sets, unseen
+from benchmarks.corpus.tuning_sets import GROUPS, groups_table, seen_sets, unseen_rows
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at
 
@@ -89,7 +89,7 @@ def test_errors_are_counted_in_what_is_stated(tmp_path):
     )
     truth = left_behind(tmp_path, before, (after, {"fx": 10.0, "fy": 10.0, "cx": 1.0, "cy": 1.0}))
 
-    rows = parameters(tmp_path, truth, Doubt(2.0, 0.5))
+    rows = parameter_errors(tmp_path, truth, Doubt(2.0, 0.5))
 
     fx, _, cx, _ = (row for row in rows if row["when"] == "before")
     assert (fx["error %"], fx["in sd"], fx["identifiable"], fx["its photos"]) == (2.0, 2.0, "yes", 2)
@@ -97,22 +97,22 @@ def test_errors_are_counted_in_what_is_stated(tmp_path):
     far = next(row for row in rows if row["when"] == "after" and row["parameter"] == "fx")
     assert (far["error %"], far["in sd"]) == (5.0, 5.0)
     assert far["in sd, truth's doubt granted"] == pytest.approx(50 / np.hypot(10, 20), abs=0.01)
-    assert counted(rows) == {
+    assert parameter_counts(rows) == {
         "stated": 6, "beyond 3 sd": 1, "beyond 3 sd, truth's doubt granted": 0, "focals called identifiable": 4,
         "of them over 3 % off": 1,
     }  # fmt: skip
-    assert claims(rows) == {"claimed focal %": 2.0, "claimed center %": 1.0, "focal of 3 % or 3 sd": 1.667}
+    assert claimed_errors(rows) == {"claimed focal %": 2.0, "claimed center %": 1.0, "focal of 3 % or 3 sd": 1.667}
 
 
 def test_a_guess_claims_nothing_before_and_a_wide_deviation_nothing_after(tmp_path):
     truth = left_behind(tmp_path, None, (camera_matrix(1400.0, 1400.0, 400.0, 300.0), {"fx": 200.0, "fy": 200.0}))
 
-    rows = parameters(tmp_path, truth, Doubt(0.0, 0.0))
+    rows = parameter_errors(tmp_path, truth, Doubt(0.0, 0.0))
 
     assert {row["when"] for row in rows} == {"after"}
-    assert counted(rows)["focals called identifiable"] == 0
-    assert claims(rows) == {"claimed focal %": 0.0, "claimed center %": 0.0, "focal of 3 % or 3 sd": 0.667}
-    assert parameters(tmp_path / "nothing", truth, Doubt(0.0, 0.0)) == []
+    assert parameter_counts(rows)["focals called identifiable"] == 0
+    assert claimed_errors(rows) == {"claimed focal %": 0.0, "claimed center %": 0.0, "focal of 3 % or 3 sd": 0.667}
+    assert parameter_errors(tmp_path / "nothing", truth, Doubt(0.0, 0.0)) == []
 
 
 def model(places):
@@ -121,13 +121,13 @@ def model(places):
 
 def test_a_fold_counts_unless_it_is_said_or_cut_into_honest_parts():
     two_ways = [*range(10), *range(10)]
-    silent = of_walk([model(two_ways)], ["scene  20 of 20 photos placed"])
-    said = of_walk([model(two_ways)], ["photos 003 and 013 may be folded onto one place"])
-    parts = of_walk([model(range(10)), model(range(8))], [])
-    sure = of_walk([model(two_ways)], ["look-alikes separated, 20 pairs of photos"])
+    silent = walk_figures([model(two_ways)], ["scene  20 of 20 photos placed"])
+    said = walk_figures([model(two_ways)], ["photos 003 and 013 may be folded onto one place"])
+    parts = walk_figures([model(range(10)), model(range(8))], [])
+    sure = walk_figures([model(two_ways)], ["look-alikes separated, 20 pairs of photos"])
 
-    assert [folded("oats23", row) for row in (silent, said, parts, sure)] == [1, 0, 0, 1]
-    assert folded("oats23", {}) is None and folded("castle-P19", silent) is None
+    assert [unreported_fold("oats23", row) for row in (silent, said, parts, sure)] == [1, 0, 0, 1]
+    assert unreported_fold("oats23", {}) is None and unreported_fold("castle-P19", silent) is None
     assert parts["axis of the worst part"] == pytest.approx(1.0)
 
 
@@ -144,10 +144,10 @@ def test_what_runs_say_today_is_no_word_of_folds():
 def test_worse_than_stock_is_said_by_how_much():
     stock = {"registered": 24, "AUC@1": None, "AUC@5": 0.79}
 
-    assert behind({"registered": 18, "AUC@5": 0.5}, stock) == "registered 18, stock 24; AUC@5 0.5, stock 0.79"
-    assert behind({"registered": 24, "AUC@5": 0.79}, stock) == ""
-    assert behind({"registered": 24, "AUC@5": 0.785}, stock, 0.01) == "" != behind({"registered": 24}, stock, 0.01)
-    assert behind({"registered": 23, "AUC@5": 0.9}, stock, 0.01) == "registered 23, stock 24"
+    assert deficits({"registered": 18, "AUC@5": 0.5}, stock) == "registered 18, stock 24; AUC@5 0.5, stock 0.79"
+    assert deficits({"registered": 24, "AUC@5": 0.79}, stock) == ""
+    assert deficits({"registered": 24, "AUC@5": 0.785}, stock, 0.01) == "" != deficits({"registered": 24}, stock, 0.01)
+    assert deficits({"registered": 23, "AUC@5": 0.9}, stock, 0.01) == "registered 23, stock 24"
 
 
 def run_row(**figures):
@@ -177,7 +177,7 @@ def test_one_parameter_of_twenty_may_be_off_and_no_exception_passes():
 def test_sets_that_constants_have_seen_are_left_out():
     rows = [run_row(photos="kitti51"), run_row(photos="castle-P19 crop:460,200"), run_row(photos="merton1")]
 
-    assert [row["photos"] for row in unseen(rows, seen_sets())] == ["kitti51"]
+    assert [row["photos"] for row in unseen_rows(rows, seen_sets())] == ["kitti51"]
     ransac = next(row for row in groups_table(rows) if row["stand in"] == "ransac")
     assert ransac["bars met on sets not seen"] == "2 of 2"
     assert "Left out: " in corpus_page("", rows[1:], []) and "None of those above." in corpus_page("", rows[1:], [])
@@ -220,14 +220,14 @@ def test_sets_are_found_and_the_smallest_come_first(tmp_path):
 
     assert titles[:3] == ["merton1", "castle-P19", "kitchen1000 every:5"]
     assert "castle-P19 crop:460,200" in titles and not any("fountain" in title for title in titles)
-    assert all(bars_of(title) for title in ("kitchen1000 every:5", "reichstag10 pad:9,9", "oats23", "castle-P19"))
+    assert all(required_bars(title) for title in ("kitchen1000 every:5", "reichstag10 pad:9,9", "oats23", "castle-P19"))
 
 
 def test_stock_gets_a_folder_for_each_size(tmp_path):
     photos_in(tmp_path / "set", 2)
     Image.new("RGB", (30, 40)).save(tmp_path / "set" / "0009.png")
 
-    into = in_folders(by_size(tmp_path / "set"), tmp_path / "by-size")
+    into = split_into_folders(group_by_size(tmp_path / "set"), tmp_path / "by-size")
 
     assert sorted(str(path.relative_to(into)) for path in into.rglob("*.png")) == [
         "30x40/0009.png", "40x30/0000.png", "40x30/0001.png",
@@ -239,12 +239,12 @@ def test_what_takes_too_long_is_ended_with_all_that_it_started(tmp_path):
     child = f"import time, pathlib; time.sleep(2); pathlib.Path({str(alive)!r}).touch()"
     parent = f"import subprocess, sys, time; subprocess.Popen([sys.executable, '-c', {child!r}]); time.sleep(60)"
 
-    assert end_of([sys.executable, "-c", parent], 1.0)[0] is None
+    assert run_command([sys.executable, "-c", parent], 1.0)[0] is None
     time.sleep(2)
     assert not alive.exists()
-    assert end_of([sys.executable, "-c", "import sys; sys.exit('no photos')"]) == (1, "no photos")
+    assert run_command([sys.executable, "-c", "import sys; sys.exit('no photos')"]) == (1, "no photos")
     hinted = "import sys; sys.exit('error: no photos\\nhint: take some')"
-    assert end_of([sys.executable, "-c", hinted]) == (1, "error: no photos")
+    assert run_command([sys.executable, "-c", hinted]) == (1, "error: no photos")
 
 
 def options(tmp_path, **changed):
@@ -260,25 +260,25 @@ def test_finished_runs_are_kept_until_program_settings_or_photos_change(tmp_path
     monkeypatch.setattr(kept_runs, "run", lambda *_: said)
     out = tmp_path / "out"
 
-    assert kept_runs.kept(ours, photos, out, options(tmp_path)) is None
-    done = kept_runs.run_anew(ours, photos, out, 60.0)
-    assert kept_runs.kept(ours, photos, out, options(tmp_path)) == done
-    assert kept_runs.kept(ours, photos, out, options(tmp_path, keep=False)) is None
-    assert kept_runs.kept(stock, photos, out, options(tmp_path)) is None
-    assert kept_runs.kept(stock, photos, out, options(tmp_path, score_only=True)) == done
+    assert kept_runs.reusable_run(ours, photos, out, options(tmp_path)) is None
+    done = kept_runs.run_and_record(ours, photos, out, 60.0)
+    assert kept_runs.reusable_run(ours, photos, out, options(tmp_path)) == done
+    assert kept_runs.reusable_run(ours, photos, out, options(tmp_path, keep=False)) is None
+    assert kept_runs.reusable_run(stock, photos, out, options(tmp_path)) is None
+    assert kept_runs.reusable_run(stock, photos, out, options(tmp_path, score_only=True)) == done
     said |= {"exit code": None, "wall seconds": 60.0}
-    kept_runs.run_anew(ours, photos, out, 60.0)
-    assert kept_runs.kept(ours, photos, out, options(tmp_path)) is not None
-    assert kept_runs.kept(ours, photos, out, options(tmp_path, limit_min=2.0)) is None, "it gets more time"
+    kept_runs.run_and_record(ours, photos, out, 60.0)
+    assert kept_runs.reusable_run(ours, photos, out, options(tmp_path)) is not None
+    assert kept_runs.reusable_run(ours, photos, out, options(tmp_path, limit_min=2.0)) is None, "it gets more time"
     photos_in(photos.folder / "more", 1)
     (photos.folder / "more" / "0000.png").rename(photos.folder / "0002.png")
-    assert kept_runs.kept(ours, photos, out, options(tmp_path)) is None
+    assert kept_runs.reusable_run(ours, photos, out, options(tmp_path)) is None
 
 
 def test_a_set_that_cannot_be_read_is_no_end_of_the_others(tmp_path, monkeypatch, capsys):
     args = options(tmp_path, sets=["gone", "gone crop:1,1"], results=tmp_path, name="corpus")
 
-    rows = [row for row, _ in corpus.all_runs(args, methods({}, ours_only=True))]
+    rows = [row for row, _ in corpus.run_all(args, methods({}, ours_only=True))]
 
     assert [row["photos"] for row in rows] == ["gone", "gone crop:1,1"]
     assert all(row["failed"].startswith("benchmark: FileNotFoundError") for row in rows)

@@ -5,7 +5,7 @@ from PIL import Image
 from benchmarks.common import photo_sets
 from benchmarks.selfcal import coverage as selfcal_coverage
 from benchmarks.selfcal import score as selfcal_score
-from benchmarks.selfcal.methods import Found
+from benchmarks.selfcal.methods import MethodResult
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration
@@ -67,7 +67,7 @@ def test_who_took_photos_that_were_brought_to_one_size_is_not_told(tmp_path):
     (tmp_path / "set" / "images").mkdir(parents=True)
     spotted(0, 0, (80, 60)).save(tmp_path / "set" / "images" / "a.png")
     told = {
-        change: photo_sets.photo_set(tmp_path, "set", change, tmp_path / "cache", "each").told
+        change: photo_sets.photo_set(tmp_path, "set", change, tmp_path / "cache", "each").cameras_given
         for change in ("", "scale:0.5,0.5", "pad:90,90")
     }
     assert told == {"": True, "scale:0.5,0.5": True, "pad:90,90": False}
@@ -84,7 +84,7 @@ def test_copies_are_upright_and_tell_nothing(tmp_path):
     exif[0x0112], exif[0x010F] = 6, "Maker"
     spotted(0, 0, (80, 60)).save(tmp_path / "a.jpg", exif=exif)
 
-    photo_sets.save_plain(tmp_path / "a.jpg", tmp_path / "out" / "a.png", ())
+    photo_sets.save_without_exif(tmp_path / "a.jpg", tmp_path / "out" / "a.png", ())
 
     with Image.open(tmp_path / "out" / "a.png") as copy:
         assert copy.size == (60, 80)
@@ -98,7 +98,7 @@ def found(K, **values):
 
 def test_errors_are_counted_in_stated_deviations():
     camera = found(camera_matrix(1020.0, 1010.0, 400.0, 324.0), spread={"fx": 10.0, "fy": 10.0, "cx": 5.0, "cy": 6.0})
-    answer = Found("zero-curves", {"a": camera, "b": camera}, 0.1, 3)
+    answer = MethodResult("zero-curves", {"a": camera, "b": camera}, 0.1, 3)
 
     row = selfcal_score.row("set", answer, dict.fromkeys("ab", photo_sets.TrueCamera(K, -0.02)))
 
@@ -114,13 +114,13 @@ def test_of_several_cameras_the_median_and_the_worst_count():
     }
     cameras = {name: found(camera_matrix(800.0, 800.0, 400.0, 300.0), identifiable=name == "a") for name in "abc"}
 
-    row = selfcal_score.row("set", Found("zero-curves", cameras, 0.1, 3), truth)
+    row = selfcal_score.row("set", MethodResult("zero-curves", cameras, 0.1, 3), truth)
 
     assert (row["known"], row["e_focal %"], row["worst e_focal %"]) == ("1/3", 20.0, 60.0)
 
 
 def test_trials_of_the_coverage_repeat_and_are_told_apart():
-    trials = [selfcal_coverage.trial(seed, Settings()) for seed in (1, 1)]
+    trials = [selfcal_coverage.run_trial(seed, Settings()) for seed in (1, 1)]
     total = {row["method"]: row for row in selfcal_coverage.summary(trials)}
 
     assert trials[0].row == trials[1].row

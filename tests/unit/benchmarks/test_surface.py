@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks.cameras.bars import least, most
+from benchmarks.cameras.bars import lower_bound, upper_bound
 from benchmarks.common.results import document, problems
-from benchmarks.surface.bars import BARS, asked
+from benchmarks.surface.bars import BARS, bar_rows
 from benchmarks.surface.measure import cost
-from benchmarks.surface.photos import Likeness, likeness, photo_scores, psnr_db, spread_out
+from benchmarks.surface.photos import Likeness, likeness, photo_scores, psnr_db, subsample
 from benchmarks.surface.pictures import BYTES, WIDTHS_PX, save_page
 from benchmarks.surface.report import page
-from benchmarks.surface.sets import REAL, RENDERED, SurfaceSet, part_of, surface_set
+from benchmarks.surface.sets import REAL, RENDERED, SurfaceSet, first_photos, surface_set
 from benchmarks.surface.sparse_poisson import points_ply
 from benchmarks.surface.truth import seen_places, truth_scores
-from benchmarks.surface.worker import Said
+from benchmarks.surface.worker import StageCost
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.synthetic.cameras import Views, axis_rotation, look_at, make_camera
 from sfm_app.synthetic.photo_folder import Truth
@@ -43,7 +43,7 @@ def truth_of(*parts):
     """Three photos from above, which see all of a square of side 2 at the origin."""
     camera = make_camera(120, 120, center=(0.5, 0.5))
     eyes = ((0.0, 3.0, 0.6), (0.7, 3.0, -0.3), (-0.7, 3.2, -0.3))
-    views = Views.of(camera, [look_at(np.array(eye), np.zeros(3)) for eye in eyes])
+    views = Views.from_poses(camera, [look_at(np.array(eye), np.zeros(3)) for eye in eyes])
     return Truth(dict(views.cameras), dict(views.cam_from_world), *joined(*parts))
 
 
@@ -141,33 +141,33 @@ def test_the_worst_photo_stands_beside_the_mean():
 
 def test_photos_to_leave_out_are_spread_evenly():
     names = [f"{k}" for k in range(11)]
-    assert spread_out(names, 1) == ["5"] and spread_out(names, 3) == ["2", "5", "8"]
-    assert spread_out(names, 11) == spread_out(names, 20) == names
+    assert subsample(names, 1) == ["5"] and subsample(names, 3) == ["2", "5", "8"]
+    assert subsample(names, 11) == subsample(names, 20) == names
 
 
 def test_cost_is_that_of_all_stages_but_the_files():
     said = {
-        "scene": Said("", 50.0, 900), "depth_maps": Said("", 10.0, 500), "mesh": Said("", 7.5, 700),
-        "texture": Said("", 2.0, 400), "files": Said("", 1.0, 300),
+        "scene": StageCost("", 50.0, 900), "depth_maps": StageCost("", 10.0, 500), "mesh": StageCost("", 7.5, 700),
+        "texture": StageCost("", 2.0, 400), "files": StageCost("", 1.0, 300),
     }  # fmt: skip
     row = cost(said)
     stages = [name for name in ("depth_maps", "mesh", "texture") if f"s of {name}" in row]
     assert {"depth_maps", "mesh"} <= set(stages)
     assert row["seconds together"] == sum(said[name].seconds for name in stages)
     assert row["MB mesh"] == 700 and row["s of files"] == 1.0 and row["failed"] == ""
-    stopped = cost({"scene": Said("", 50.0, 900), "depth_maps": Said("depth_maps: no", None, 100)})
+    stopped = cost({"scene": StageCost("", 50.0, 900), "depth_maps": StageCost("depth_maps: no", None, 100)})
     assert stopped["failed"] == "depth_maps: no" and stopped["seconds together"] is None
 
 
 def test_every_set_has_its_bars_and_they_are_judged_both_ways():
     assert set(BARS) == set(RENDERED) | set(REAL) and set(RENDERED) <= set(WALKS)
-    assert BARS["statue"] == (least("accuracy %", 90.0), least("completeness %", 85.0))
-    assert most("seconds together", 90.0) in BARS["fountain-P11"]
-    assert least("worst coverage %", 75.0) in BARS["Herz-Jesus-P8"]
-    assert least("worst coverage %", 50.0) in BARS["castle-P19"]
-    rows = asked([{"photos": "statue", "accuracy %": 90.0, "completeness %": 84.9}, {"photos": "corner"}])
+    assert BARS["statue"] == (lower_bound("accuracy %", 90.0), lower_bound("completeness %", 85.0))
+    assert upper_bound("seconds together", 90.0) in BARS["fountain-P11"]
+    assert lower_bound("worst coverage %", 75.0) in BARS["Herz-Jesus-P8"]
+    assert lower_bound("worst coverage %", 50.0) in BARS["castle-P19"]
+    rows = bar_rows([{"photos": "statue", "accuracy %": 90.0, "completeness %": 84.9}, {"photos": "corner"}])
     assert [row["met"] for row in rows] == ["yes", "**no**", "not measured", "not measured"]
-    late = asked([{"photos": "fountain-P11", "seconds together": 90.1}])
+    late = bar_rows([{"photos": "fountain-P11", "seconds together": 90.1}])
     assert [row["met"] for row in late if "seconds" in row["asked"]] == ["**no**"]
 
 
@@ -192,7 +192,7 @@ def test_sets_are_rendered_scenes_or_folders_and_parts_are_the_same_files(tmp_pa
         Image.new("RGB", (8, 8)).save(images / f"{k}.png")
     whole = surface_set("pond", tmp_path / "data", tmp_path)
     assert whole.count == 4 and whole.truth is None
-    part = part_of(whole, 3, tmp_path / "cache")
+    part = first_photos(whole, 3, tmp_path / "cache")
     assert [path.name for path in sorted(part.photos.iterdir())] == ["0.png", "1.png", "2.png"]
     assert (
         isinstance(part, SurfaceSet)

@@ -38,16 +38,16 @@ def test_what_is_called_a_guess_is_not_wrong(tmp_path):
         cam_from_world={f"{name}.jpg": photo.pose for name, photo in PHOTOS.items()},
     )
 
-    row = trouble.scored(tmp_path, truth)
+    row = trouble.score_run(tmp_path, truth)
 
     assert (row["known"], row["focal %"], row["wrong"]) == ("0/2", None, 0)
     assert (row["known after"], row["wrong after"], row["beyond 3 sd"]) == ("0/2", 0, 0)
     assert (row["placed"], row["share placed"], row["models"]) == ("0/2", 0.0, 0)
     left_behind(tmp_path, identifiable=False, sd=1.0)
-    row = trouble.scored(tmp_path, truth)
+    row = trouble.score_run(tmp_path, truth)
     assert (row["known after"], row["wrong after"]) == ("2/2", 1)
     assert (row["stated"], row["beyond 3 sd"], row["worst in sd"]) == (2, 2, 30.0)
-    assert trouble.scored(tmp_path / "nothing", truth)["known"] == "0/2"
+    assert trouble.score_run(tmp_path / "nothing", truth)["known"] == "0/2"
 
 
 def folder_row(seed=1, troubles="plane, zoom", **figures):
@@ -83,6 +83,6 @@ def test_only_a_scene_or_a_reason_why_there_is_none_is_expected(code, fails):
 def test_every_trouble_has_a_line_of_its_own():
     rows = [folder_row(), folder_row(2, troubles="zoom", wrong=1), folder_row(3, troubles="none")]
 
-    found = {row["trouble"]: (row["folders"], row["K wrong"]) for row in trouble.by_trouble(rows)}
+    found = {row["trouble"]: (row["folders"], row["K wrong"]) for row in trouble.trouble_rows(rows)}
 
     assert found == {"all": (3, 1), "none": (1, 0), "plane": (1, 0), "zoom": (2, 1)}

@@ -25,7 +25,7 @@ def subject(model, place):
 
 
 def test_the_sample_is_as_it_should_be(tmp_path):
-    row = viewers.checked(subject(viewers.sample(), tmp_path), SILENT)
+    row = viewers.check_model(subject(viewers.sample_model(), tmp_path), SILENT)
 
     assert row["ok"] == "yes"
     assert (row["Open3D"], row["trimesh"]) == ("5120 triangles + 2 pages", "5120 triangles")
@@ -50,13 +50,13 @@ STANDING = {
     ],
 )
 def test_a_model_stands_upright_when_people_would_turn_its_photos_alike(tmp_path, run, found, ok):
-    stands = replace(subject(viewers.sample(), tmp_path), orientation=STANDING | found, run=run)
+    stands = replace(subject(viewers.sample_model(), tmp_path), orientation=STANDING | found, run=run)
 
-    assert viewers.checked(stands, SILENT)["ok"] == ok
+    assert viewers.check_model(stands, SILENT)["ok"] == ok
 
 
 def changed(**parts):
-    model = viewers.sample()
+    model = viewers.sample_model()
     return replace(model, surface=replace(model.surface, **{key: make(model.surface) for key, make in parts.items()}))
 
 
@@ -71,7 +71,7 @@ def changed(**parts):
     ids=["inside out", "far away", "a line", "twice"],
 )
 def test_what_is_wrong_with_a_surface_is_named(tmp_path, model, fault):
-    assert fault in viewers.checked(subject(model, tmp_path), SILENT)["ok"].split("; ")
+    assert fault in viewers.check_model(subject(model, tmp_path), SILENT)["ok"].split("; ")
 
 
 @pytest.mark.parametrize(
@@ -88,17 +88,17 @@ def test_what_is_wrong_with_a_surface_is_named(tmp_path, model, fault):
 def test_what_viewers_do_not_like_is_named(tmp_path, part, value, fault):
     seen = {**SILENT, part: {**SILENT[part], **value}}
 
-    assert viewers.checked(subject(viewers.sample(), tmp_path), seen)["ok"] == fault
+    assert viewers.check_model(subject(viewers.sample_model(), tmp_path), seen)["ok"] == fault
 
 
 def test_normals_that_look_at_no_camera_count(cloud, ball):
     vertices = ball.surface.vertices
-    assert viewers.facing(vertices, vertices, cloud.cameras) == pytest.approx(0.6, abs=0.15)
-    assert viewers.facing(vertices, vertices, ()) == 0
+    assert viewers.facing_share(vertices, vertices, cloud.cameras) == pytest.approx(0.6, abs=0.15)
+    assert viewers.facing_share(vertices, vertices, ()) == 0
 
 
 def test_a_page_has_both_tables_and_the_pictures_that_were_drawn(tmp_path):
-    rows = [viewers.checked(subject(viewers.sample(), tmp_path), SILENT)]
+    rows = [viewers.check_model(subject(viewers.sample_model(), tmp_path), SILENT)]
 
     assert viewers.markdown(rows).count("| sample |") == 2 and ".png" not in viewers.markdown(rows)
     assert viewers.markdown(rows, ["sample"]).endswith("\n\n![sample](viewers-sample.png)\n")

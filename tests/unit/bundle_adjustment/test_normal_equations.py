@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.bundle_adjustment.normal_equations import LOST_PX, Bundle, cost, in_sight, lost_points, project, reduce
+from sfm_app.bundle_adjustment.normal_equations import LOST_PX, Bundle, cost, lost_points, project, reduce, usable_mask
 
 CAMERA = np.array([[900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]])
 SCALE_PX = 0.5
@@ -66,8 +66,10 @@ def test_whatever_is_seen_the_answer_is_numbers(scene):
 
     found = reduce(bundle, SCALE_PX)
 
-    assert all(np.isfinite(getattr(found, name)).all() for name in ("H", "g", "pose_step", "pose_give", "point_step"))
-    assert np.isfinite(found.point_give.data).all()
+    assert all(
+        np.isfinite(getattr(found, name)).all() for name in ("H", "g", "pose_step", "pose_response", "point_step")
+    )
+    assert np.isfinite(found.point_response.data).all()
     assert 0 < found.noise_px < 1
     assert np.linalg.eigvalsh(found.H).min() >= -1e-9 * np.abs(found.H).max()
     assert np.isfinite(cost(bundle, SCALE_PX))
@@ -109,5 +111,5 @@ def test_what_cannot_be_seen_costs_more_than_what_is_off():
     off.x[:4] += 500.0
 
     assert lost_points(bundle).nonzero()[0].tolist() == [60] and not lost_points(off).any()
-    assert np.count_nonzero(~in_sight(bundle, np.zeros_like(bundle.x))) == 4
+    assert np.count_nonzero(~usable_mask(bundle, np.zeros_like(bundle.x))) == 4
     assert cost(bundle, SCALE_PX) > 3 * SCALE_PX * LOST_PX > 10 * cost(off, SCALE_PX)

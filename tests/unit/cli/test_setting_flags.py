@@ -6,8 +6,8 @@ import click
 import pytest
 
 from sfm_app.cli import main
-from sfm_app.cli.options import settings_from
-from sfm_app.cli.setting_flags import SETTING_FLAGS, default_text, field_of, help_text, range_text, value_of
+from sfm_app.cli.options import settings_from_flags
+from sfm_app.cli.setting_flags import SETTING_FLAGS, default_text, help_text, range_text, setting_field, setting_value
 from sfm_app.errors import ConfigError
 from sfm_app.settings import QUALITY_PRESETS, Settings
 
@@ -33,7 +33,7 @@ def printed():
 
 @pytest.mark.parametrize("flag", SETTING_FLAGS, ids=lambda flag: flag.flag)
 def test_the_help_is_that_of_the_setting(flag, printed):
-    description = field_of(flag.setting).description
+    description = setting_field(flag.setting).description
     said = PARAMETERS[flag.parameter].help
 
     assert said.lower().startswith(f"{description.lower()}.")
@@ -46,7 +46,7 @@ def test_the_help_is_that_of_the_setting(flag, printed):
 def test_the_default_is_true_with_every_quality(flag):
     text = default_text(flag.setting)
     for quality in QUALITY_PRESETS:
-        value = value_of(Settings.from_mapping({"quality": quality}), flag.setting)
+        value = setting_value(Settings.from_mapping({"quality": quality}), flag.setting)
         if flag.setting != "quality" and value != "" and not isinstance(value, bool):
             assert text == f"default: {value}" or f"{value} for {quality}" in text
 
@@ -65,15 +65,15 @@ def test_ranges_are_written_as_click_does():
 
 @pytest.mark.parametrize("flag", SETTING_FLAGS, ids=lambda flag: flag.flag)
 def test_a_flag_changes_its_setting_and_no_other(flag):
-    changed = settings_from(flags(**{flag.parameter: GIVEN[flag.parameter]}))
+    changed = settings_from_flags(flags(**{flag.parameter: GIVEN[flag.parameter]}))
 
-    assert value_of(changed, flag.setting) == GIVEN[flag.parameter] != value_of(Settings(), flag.setting)
-    assert changed == Settings.from_mapping(flag.nested(GIVEN[flag.parameter]))
+    assert setting_value(changed, flag.setting) == GIVEN[flag.parameter] != setting_value(Settings(), flag.setting)
+    assert changed == Settings.from_mapping(flag.to_mapping(GIVEN[flag.parameter]))
 
 
 def test_no_flag_changes_nothing():
-    assert settings_from(flags()) == Settings()
-    assert not settings_from(flags(no_plugins=True)).plugins
+    assert settings_from_flags(flags()) == Settings()
+    assert not settings_from_flags(flags(no_plugins=True)).plugins
 
 
 def test_every_flag_of_a_command_that_takes_settings_is_known():
@@ -83,4 +83,4 @@ def test_every_flag_of_a_command_that_takes_settings_is_known():
 
 def test_values_out_of_range_are_refused_by_the_settings():
     with pytest.raises(ConfigError, match=r"'photos\.max_frames'"):
-        settings_from(flags(max_frames=1))
+        settings_from_flags(flags(max_frames=1))

@@ -5,8 +5,8 @@ import pytest
 
 from sfm_app.colmap import bundle as module
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.bundle import adjust, adjusted_or_as_it_was
-from sfm_app.colmap.database import opened
+from sfm_app.colmap.bundle import adjust, adjust_or_keep
+from sfm_app.colmap.database import open_database
 from sfm_app.errors import BackendError, NumericalError
 
 pytestmark = pytest.mark.slow
@@ -36,7 +36,7 @@ def test_points_that_have_gone_astray_do_not_end_it_and_the_camera_is_found(mapp
     found = adjust(ASTRAY[case](model), database)
 
     camera, deviations = found.model.cameras[1], found.deviations[1]
-    assert not found.trouble and not found.held
+    assert not found.failure and not found.held
     assert abs(camera.params[0] - 900) < 3 * deviations["fx"] and deviations["fx"] < 20
     assert found.model.num_points3D() > 250
     assert all(np.isfinite(point.xyz).all() for point in found.model.points3D.values())
@@ -44,7 +44,7 @@ def test_points_that_have_gone_astray_do_not_end_it_and_the_camera_is_found(mapp
 
 def test_a_photo_that_no_pair_in_the_database_connects_stays_in_the_model(mapped):
     model, database = mapped(photos=6)
-    with opened(database) as known:
+    with open_database(database) as known:
         for other in range(2, 7):
             known.delete_two_view_geometry(1, other)
 
@@ -61,9 +61,9 @@ def test_photos_from_one_place_leave_numbers_or_the_model_as_it_was(mapped):
         pose.translation = pose.rotation.matrix() @ (model.images[1].cam_from_world().inverse().translation * -1.0)
         model.frames[image.frame_id].set_cam_from_world(image.camera_id, pose)
 
-    found = adjusted_or_as_it_was(model, database)
+    found = adjust_or_keep(model, database)
 
-    assert found.trouble or found.deviations[1]["fx"] > 1.0
+    assert found.failure or found.deviations[1]["fx"] > 1.0
     assert np.isfinite(found.model.cameras[1].params).all()
     assert all(np.isfinite(list(values.values())).all() for values in found.deviations.values())
 
@@ -77,9 +77,9 @@ def test_a_model_that_loses_its_points_stays_as_mapping_left_it(mapped):
 
     with pytest.raises(NumericalError, match=r"it left \d+ of \d+ points"):
         adjust(model, database)
-    found = adjusted_or_as_it_was(model, database)
+    found = adjust_or_keep(model, database)
 
-    assert found.model is model and "points" in found.trouble
+    assert found.model is model and "points" in found.failure
     assert found.model.cameras[1].params.tolist() == [880.0, 500.0, 400.0, 0.0]
     assert (found.deviations, found.determined) == ({1: {}}, {1: ()})
 
@@ -87,9 +87,9 @@ def test_a_model_that_loses_its_points_stays_as_mapping_left_it(mapped):
 def test_a_camera_without_a_focal_length_stays_as_mapping_left_it(mapped):
     model, database = mapped(start=(np.nan, 500.0, 400.0, 0.0))
 
-    found = adjusted_or_as_it_was(model, database)
+    found = adjust_or_keep(model, database)
 
-    assert found.trouble == "a camera has no focal length" and found.model is model
+    assert found.failure == "a camera has no focal length" and found.model is model
 
 
 @pytest.mark.parametrize(
@@ -105,6 +105,6 @@ def test_what_fails_in_our_numbers_is_a_reason_and_what_fails_in_colmap_an_error
     monkeypatch.setattr(module, "reduce" if expected is None else "_correspondences", failing)
     if expected:
         with pytest.raises(expected, match=str(error)):
-            adjusted_or_as_it_was(model, database)
+            adjust_or_keep(model, database)
     else:
-        assert str(error) in adjusted_or_as_it_was(model, database).trouble
+        assert str(error) in adjust_or_keep(model, database).failure

@@ -13,7 +13,7 @@ from sfm_app.colmap.database import (
     TWO_FOCALS,
     camera_model,
     create_database,
-    opened,
+    open_database,
     read_match_graph,
     write_calibrations,
     write_match_graph,
@@ -39,7 +39,7 @@ def stored(tmp_path):
     create_database(path, photos)
     keypoints = rng.uniform(0, 90, (20, 2)).astype(np.float32)
     matches = np.column_stack([np.arange(12), np.arange(12)[::-1]]).astype(np.uint32)
-    with opened(path) as database:
+    with open_database(path) as database:
         for image_id in (1, 2, 3):
             database.write_keypoints(image_id, keypoints)
         database.write_matches(1, 2, matches)
@@ -56,7 +56,7 @@ def test_photos_are_numbered_by_name_and_share_cameras_by_group(stored):
     assert list(graph.matches) == [(1, 2)]
     x1, x2 = graph.points((1, 2))
     assert np.allclose(x1, keypoints[:12]) and np.allclose(x2, keypoints[:12][::-1])
-    with opened(path) as database:
+    with open_database(path) as database:
         cameras = [database.read_image(image_id).camera_id for image_id in (1, 2, 3)]
     assert cameras[0] == cameras[1] != cameras[2]
 
@@ -95,7 +95,7 @@ def test_relative_poses_replace_the_two_view_geometries(stored, kind):
 
     write_pose_graph(path, graph, PoseGraph({(1, 2): pose}, {(1, 3): "contradicts other pairs"}, ()))
 
-    with opened(path) as database:
+    with open_database(path) as database:
         geometry = database.read_two_view_geometry(1, 2)
         assert database.num_verified_image_pairs() == 1
     assert geometry.config == getattr(pycolmap.TwoViewGeometryConfiguration, KINDS[kind]).value
@@ -105,7 +105,7 @@ def test_relative_poses_replace_the_two_view_geometries(stored, kind):
     assert np.array_equal(geometry.inlier_matches, matches[inliers])
 
     write_pose_graph(path, graph, PoseGraph({}, {}, ()))
-    with opened(path) as database:
+    with open_database(path) as database:
         assert database.num_verified_image_pairs() == 0
 
 
@@ -119,7 +119,7 @@ TWO = Calibration(np.array([[120.0, 0, 50], [0, 90, 50], [0, 0, 1]]), 100, 100, 
 
 def cameras_of(path):
     """What COLMAP reads: the camera of each photo, and what the database holds besides."""
-    with opened(path) as database:
+    with open_database(path) as database:
         used = [database.read_image(image_id).camera_id for image_id in (1, 2, 3)]
         return [database.read_camera(camera_id) for camera_id in used]
 

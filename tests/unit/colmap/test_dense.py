@@ -18,9 +18,9 @@ from sfm_app.colmap.dense import (
     write_fusion_views,
     write_maps,
 )
-from sfm_app.colmap.surface import FUSED, fuse, poisson, read_fused, simplify
+from sfm_app.colmap.surface import FUSED, fuse, poisson_surface, read_fused, simplify
 from sfm_app.errors import BackendError
-from sfm_app.progress import Silent
+from sfm_app.progress import SilentProgress
 from sfm_app.stereo import DepthEstimate, DepthMap
 from sfm_app.types import Surface
 
@@ -57,7 +57,7 @@ def workspace(tmp_path_factory):
             track.add_element(image_id, index)
         model.add_point3D(xyz, track, np.zeros(3, np.uint8))
     model.write(place / "sparse")
-    undistort(place / "sparse", place / "photos", place / "dense", 1000, 1, Silent())
+    undistort(place / "sparse", place / "photos", place / "dense", 1000, 1, SilentProgress())
     views = read_views(place / "dense")
     for view in views:
         y, x = np.mgrid[: view.height, : view.width] + view.sample_px
@@ -148,7 +148,7 @@ def test_the_surface_has_the_shape_and_the_colors_of_the_points(workspace):
     dense, _ = workspace
     fuse(dense, 3, BOX, dense / FUSED)
 
-    surface = poisson(dense, 6)
+    surface = poisson_surface(dense, 6)
 
     inside = np.all(np.abs(surface.vertices[:, :2]) < 1, axis=1) & (np.abs(surface.vertices @ NORMAL - DISTANCE) < 0.3)
     assert np.count_nonzero(inside) > 100
@@ -172,7 +172,7 @@ def test_a_surface_does_not_depend_on_those_before_it(workspace):
     dense, _ = workspace
     fuse(dense, 3, BOX, dense / FUSED)
 
-    before, _, after = (poisson(dense, depth) for depth in (6, 2, 6))
+    before, _, after = (poisson_surface(dense, depth) for depth in (6, 2, 6))
 
     np.testing.assert_array_equal(after.vertices, before.vertices)
     np.testing.assert_array_equal(after.faces, before.faces)
@@ -210,13 +210,13 @@ def test_points_in_one_spot_give_a_surface_without_triangles(tmp_path):
     header += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue")) + "end_header\n"
     (tmp_path / FUSED).write_text(header + "1 1 1 0 0 1 9 9 9\n" * 120)
 
-    surface = poisson(tmp_path, 2)
+    surface = poisson_surface(tmp_path, 2)
 
     assert (surface.vertices.shape, surface.faces.shape, surface.colors.shape) == ((0, 3), (0, 3), (0, 3))
 
 
 def test_missing_inputs_are_backend_errors(tmp_path, workspace):
     with pytest.raises(BackendError, match="undistorting photos"):
-        undistort(tmp_path / "none", tmp_path, tmp_path / "dense", 100, 1, Silent())
+        undistort(tmp_path / "none", tmp_path, tmp_path / "dense", 100, 1, SilentProgress())
     with pytest.raises(BackendError, match=r"depth map of 1\.png"):
         read_depth(tmp_path, workspace[1][0], "geometric")

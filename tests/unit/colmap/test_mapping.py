@@ -7,7 +7,7 @@ import pytest
 
 from sfm_app.colmap import mapping
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.database import opened
+from sfm_app.colmap.database import open_database
 from sfm_app.colmap.processes.global_mapping import global_options
 from sfm_app.errors import BackendError
 
@@ -59,7 +59,7 @@ def synthetic(tmp_path_factory):
     options.camera_has_prior_focal_length = True
     noise = pycolmap.SyntheticNoiseOptions()
     noise.point2D_stddev = 0.2
-    with opened(place / "database.db") as database:
+    with open_database(place / "database.db") as database:
         model = pycolmap.synthesize_dataset(options, database)
         pycolmap.synthesize_noise(noise, model, database)
     return place, model
@@ -141,5 +141,5 @@ def test_options_are_ours_for_both_mappers():
 def test_of_several_models_the_one_with_most_photos_counts():
     models = {key: SimpleNamespace(num_reg_images=lambda count=count: count) for key, count in ((0, 2), (1, 5), (2, 3))}
 
-    assert mapping.largest(models) is models[1]
-    assert mapping.largest({}) is None
+    assert mapping.largest_model(models) is models[1]
+    assert mapping.largest_model({}) is None

@@ -10,7 +10,7 @@ from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.colmap.dense import (
     MASKED,
     DenseStore,
-    hide_masked,
+    mask_depths,
     read_depth,
     read_views,
     undistort,
@@ -20,8 +20,8 @@ from sfm_app.colmap.dense import (
 from sfm_app.colmap.features import find_and_match
 from sfm_app.colmap.masks import REACH_PX, mask_undistorter, used_pixels
 from sfm_app.colmap.surface import FUSED, fuse, read_fused
-from sfm_app.photos import save_used
-from sfm_app.progress import Silent
+from sfm_app.photos import save_mask
+from sfm_app.progress import SilentProgress
 from sfm_app.settings import MatchSettings
 from sfm_app.stereo import DepthEstimate, DepthMap
 from sfm_app.types import Photo, PhotoSet
@@ -45,7 +45,7 @@ def place(tmp_path_factory):
     for seed, name in enumerate(NAMES):
         (root / "photos" / name).parent.mkdir(parents=True, exist_ok=True)
         blots(seed).save(root / "photos" / name)
-        save_used(root / "masks", name, used[name])
+        save_mask(root / "masks", name, used[name])
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(
         pycolmap.Camera(camera_id=1, model="OPENCV", width=240, height=160, params=[200, 205, 118, 83, -0.2, 0, 0, 0])
@@ -61,7 +61,7 @@ def place(tmp_path_factory):
 @pytest.fixture
 def dense(place, tmp_path):
     root, _ = place
-    undistort(root / "sparse", root / "photos", tmp_path, 120, 1, Silent())
+    undistort(root / "sparse", root / "photos", tmp_path, 120, 1, SilentProgress())
     views = read_views(tmp_path)
     for view in views:
         mask_undistorter(root / "sparse", root / "masks", tmp_path)(view)
@@ -77,7 +77,7 @@ def test_no_keypoint_lies_in_what_is_masked(place, tmp_path):
     for masks in (None, root / "masks"):
         database = tmp_path / f"{masks is None}.db"
         create_database(database, photos)
-        find_and_match(database, root / "photos", NAMES, MatchSettings(), 1, Silent(), masks)
+        find_and_match(database, root / "photos", NAMES, MatchSettings(), 1, SilentProgress(), masks)
         graph = read_match_graph(database, photos)
         found[masks] = {graph.images[key].name: np.floor(at).astype(int) for key, at in graph.keypoints.items()}
 
@@ -109,14 +109,14 @@ def test_masks_are_undistorted_as_photos_are(place, dense):
 
 def test_without_masks_all_is_used(place, tmp_path):
     root, _ = place
-    undistort(root / "sparse", root / "photos", tmp_path, 120, 1, Silent())
+    undistort(root / "sparse", root / "photos", tmp_path, 120, 1, SilentProgress())
     view = read_views(tmp_path)[0]
     depth = np.full((view.height, view.width), 3.0, np.float32)
 
     assert used_pixels(tmp_path, view) is None
     DenseStore(tmp_path).write_estimate(view, DepthEstimate(depth, depth / 4))
     write_maps(tmp_path, view, DepthMap(depth, np.zeros((*depth.shape, 3), np.float32)))
-    hide_masked(tmp_path, view)
+    mask_depths(tmp_path, view)
 
     assert (DenseStore(tmp_path).read_estimate(view).depth == 3).all()
     assert (read_depth(tmp_path, view, "geometric") == 3).all()
@@ -141,8 +141,8 @@ def test_nothing_is_fused_from_what_is_masked(dense):
     normals[..., 2] = -1
     for view in views.values():
         write_maps(folder, view, DepthMap(np.full(normals.shape[:2], 4.0, np.float32), normals))
-        hide_masked(folder, view)
-        hide_masked(folder, view)  # a killed run does it twice
+        mask_depths(folder, view)
+        mask_depths(folder, view)  # a killed run does it twice
     view = views["1.png"]
     used = used_pixels(folder, view)
     np.testing.assert_array_equal(read_depth(folder, view, "geometric"), np.where(used, 4, np.float32(MASKED)))

@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from sfm_app.colmap.backend import backend, plain, pycolmap
+from sfm_app.colmap.backend import json_options, pycolmap, translate_errors
 from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.database import SQUARE_PIXELS, TWO_FOCALS, camera_params
 from sfm_app.colmap.model import (
-    cameras_of,
+    cameras_by_photo,
     focal_px,
     move,
-    part_of,
-    photos_of,
     placed_views,
-    posed_photos,
+    posed_photo_ids,
+    poses_and_points,
     sparse_model,
+    submodel,
     viewing_rays,
 )
 from sfm_app.errors import BackendError, ConfigError
@@ -24,11 +24,11 @@ from sfm_app.geometry.similarity import Similarity
 def test_a_model_moves_as_a_whole(synthetic):
     model, _ = synthetic([900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0])
     error = model.compute_mean_reprojection_error()
-    poses, points = posed_photos(model)
+    poses, points = poses_and_points(model)
     similarity = Similarity(7.0, np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([30.0, -5, 2]))
 
     move(model, similarity)
-    moved_poses, moved_points = posed_photos(model)
+    moved_poses, moved_points = poses_and_points(model)
 
     assert list(moved_poses) == list(poses) == sorted(model.images)
     assert np.allclose(moved_points, similarity(points))
@@ -39,7 +39,7 @@ def test_a_model_moves_as_a_whole(synthetic):
 
 def test_rays_of_a_lens_meet_the_points_that_the_photo_shows(synthetic):
     model, _ = synthetic([900.0, 900.0, 530.0, 380.0, -0.08, 0.0, 0.0, 0.0])
-    poses, _ = posed_photos(model)
+    poses, _ = poses_and_points(model)
     key = min(poses)
     seen = [point for point in model.images[key].points2D if point.has_point3D()]
     center = -poses[key][:, :3].T @ poses[key][:, 3]
@@ -80,7 +80,7 @@ def test_cameras_are_read_with_their_first_radial_term(synthetic, name, params, 
         camera.model = getattr(pycolmap.CameraModelId, name)
         camera.params = params
 
-    found = cameras_of(model)
+    found = cameras_by_photo(model)
 
     assert sorted(found) == [1, 3]
     for K, radial in found.values():
@@ -90,11 +90,11 @@ def test_cameras_are_read_with_their_first_radial_term(synthetic, name, params, 
 def test_a_part_of_a_model_can_be_adjusted_and_the_whole_stays(synthetic):
     model, database = synthetic([900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0], photos=6)
 
-    part = part_of(model, (1, 3, 4))
+    part = submodel(model, (1, 3, 4))
     adjusted = adjust(part, database)
     found = adjusted.model
 
-    assert photos_of(found) == sorted(found.images) == [1, 3, 4] and photos_of(model) == [1, 2, 3, 4, 5, 6]
+    assert posed_photo_ids(found) == sorted(found.images) == [1, 3, 4] and posed_photo_ids(model) == [1, 2, 3, 4, 5, 6]
     assert all(point.track.length() >= 2 for point in found.points3D.values())
     assert found.num_points3D() > 350
     assert all(0 < deviations["fx"] < 20 for deviations in adjusted.deviations.values())
@@ -110,16 +110,16 @@ def test_camera_parameters_of_both_models():
 def test_what_colmap_raises_becomes_one_of_ours():
     with (
         pytest.raises(BackendError, match=r"COLMAP failed while reading: .*cannot find it") as caught,
-        backend("reading"),
+        translate_errors("reading"),
     ):
         raise ValueError("[reconstruction.cc:1] cannot find it\n")
     assert isinstance(caught.value.__cause__, ValueError)
-    with pytest.raises(ConfigError), backend("reading"):
+    with pytest.raises(ConfigError), translate_errors("reading"):
         raise ConfigError("ours stays ours")
 
 
 def test_options_become_plain_values():
-    options = plain(pycolmap.FeatureMatchingOptions().todict())
+    options = json_options(pycolmap.FeatureMatchingOptions().todict())
 
     assert options["sift"]["max_ratio"] == 0.8
     assert isinstance(options["type"], str)
@@ -132,7 +132,7 @@ def test_points_and_cameras_of_a_model_on_disk(synthetic, tmp_path):
 
     found = sparse_model(tmp_path)
 
-    poses, points = posed_photos(model)
+    poses, points = poses_and_points(model)
     np.testing.assert_array_equal(found.surface.vertices, points)
     assert len(found.surface.colors) == len(points) and found.surface.faces.shape == (0, 3)
     assert [camera.name for camera in found.cameras] == [model.images[key].name for key in poses]
@@ -143,7 +143,7 @@ def test_points_and_cameras_of_a_model_on_disk(synthetic, tmp_path):
 
 def test_points_of_two_photos_count_where_three_photos_see_the_scene(synthetic, tmp_path):
     model, _ = synthetic(noise_px=0.0)
-    _, points = posed_photos(model)
+    _, points = poses_and_points(model)
     before = len(points)
     for place in (points.mean(axis=0), points.max(axis=0) + 1.0, points.mean(axis=0) - [0, 0, 1e3]):
         track = pycolmap.Track()

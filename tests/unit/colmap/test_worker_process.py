@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sfm_app.colmap.processes.worker_process import relay, started
+from sfm_app.colmap.processes.worker_process import relay, start_worker
 from sfm_app.errors import BackendError
 
 pytestmark = pytest.mark.slow
@@ -38,7 +38,7 @@ def child(tmp_path, monkeypatch):
 
 
 def call(module, **task):
-    with started(module, task) as process:
+    with start_worker(module, task) as process:
         found = list(process.messages())
         process.check("working")
     return found
@@ -75,7 +75,7 @@ def test_progress_comes_through(child):
     seen = Seen()
     module = child("bar = Reported(); bar.start('photos', 7); bar.advance(3); bar.finish(); report(a=1); report(b=2)")
 
-    with started(module, {}) as process:
+    with start_worker(module, {}) as process:
         found = relay(process, seen)
 
     assert (seen[:3], found) == ([("photos", 7), 3, "end"], {"a": 1, "b": 2})
@@ -97,9 +97,9 @@ def test_a_process_that_fails_is_an_error_with_its_last_line(child, work, messag
 
 
 def test_a_process_is_ended_with_the_block(child):
-    with started(child("report(begun=True); time.sleep(600)"), {}) as process:
+    with start_worker(child("report(begun=True); time.sleep(600)"), {}) as process:
         next(process.messages())
-        assert not process.ended(0.0)
+        assert not process.has_ended(0.0)
 
     assert process.process.returncode == -signal.SIGKILL
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from sfm_app.engine.stage import Stage
-from sfm_app.engine.staleness import fingerprint_of, made_with, manifest_head, value_of, why_again
+from sfm_app.engine.staleness import manifest_head, nested_value, rerun_reason, settings_and_versions, stage_fingerprint
 from sfm_app.runtime.manifest import StageRecord
 from sfm_app.settings import Settings
 
@@ -18,13 +18,13 @@ def finished(run):
     """A stage that was finished with what is in force."""
     run.workspace.create()
     (run.workspace.root / "x.txt").write_text("12")
-    made_from, used = fingerprint_of(STAGE, ["abc"], run), made_with(STAGE, run)
+    made_from, used = stage_fingerprint(STAGE, ["abc"], run), settings_and_versions(STAGE, run)
     record = StageRecord(made_from, 1.0, {}, run.workspace.manifest.sizes(STAGE.files), made_with=used)
     run.workspace.manifest.finish("match_graph", record, manifest_head(run))
 
 
 def why(run, inputs="abc"):
-    return why_again(STAGE, fingerprint_of(STAGE, [inputs], run), run)
+    return rerun_reason(STAGE, stage_fingerprint(STAGE, [inputs], run), run)
 
 
 def test_a_stage_that_was_never_done_needs_no_reason(run):
@@ -61,5 +61,5 @@ def test_photos_files_and_versions(run, monkeypatch):
 
 
 def test_values_are_found_by_dotted_names():
-    assert value_of({"a": {"b": 3}}, "a.b") == 3
-    assert value_of({"a": 1}, "a.b") is None
+    assert nested_value({"a": {"b": 3}}, "a.b") == 3
+    assert nested_value({"a": 1}, "a.b") is None

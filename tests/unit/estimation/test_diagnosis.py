@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfm_app.errors import ReconstructionError
-from sfm_app.estimation.diagnosis import HINTS, NOTHING_MATCHED, why_no_depth, why_no_scene
+from sfm_app.estimation.diagnosis import HINTS, NOTHING_MATCHED, diagnose_depth, diagnose_scene
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.ransac.degeneracy.watermark import ONLY_A_LOGO, SAME_PHOTO
@@ -65,7 +65,7 @@ def turned(moved, kinds, photos=4, noise=0.4):
     ],
 )
 def test_photos_that_no_pair_connects(matches, views, cause, says):
-    found = why_no_scene(matches, views, MatchSettings())
+    found = diagnose_scene(matches, views, MatchSettings())
 
     assert (found.cause, says in found.message) == (cause, True)
 
@@ -73,8 +73,8 @@ def test_photos_that_no_pair_connects(matches, views, cause, says):
 def test_features_are_counted_in_the_photo_as_it_was_searched():
     large = MatchGraph({1: MatchedImage(1, "1.jpg", "one", 6400, 4800)}, {1: np.zeros((3000, 2))}, {})
 
-    assert why_no_scene(large, NOTHING_MATCHED, MatchSettings()).cause != "texture"
-    assert why_no_scene(large, NOTHING_MATCHED, MatchSettings(max_image_size_px=6400)).cause == "texture"
+    assert diagnose_scene(large, NOTHING_MATCHED, MatchSettings()).cause != "texture"
+    assert diagnose_scene(large, NOTHING_MATCHED, MatchSettings(max_image_size_px=6400)).cause == "texture"
 
 
 @pytest.mark.parametrize(
@@ -90,7 +90,7 @@ def test_pairs_vote_with_their_inliers(kinds, cause, says):
     fits = {(1, key): fit(count, kind) for key, (kind, count) in enumerate(kinds.items(), start=2)}
     views = ViewGraph(fits, {(2, 3): Rejected("too few inliers")})
 
-    found = why_no_scene(photos((900,) * 5), views, MatchSettings())
+    found = diagnose_scene(photos((900,) * 5), views, MatchSettings())
 
     assert (found.cause, says in found.message) == (cause, True)
 
@@ -101,15 +101,15 @@ MOSTLY_TURNED = ["rotation", "planar", "rotation", "", "rotation", ""]
 def test_a_panorama_is_one_although_pairs_are_misjudged():
     matches, views = turned((0.0, 0.0, 0.0), MOSTLY_TURNED)
 
-    assert why_no_scene(matches, views, MatchSettings()).cause == "rotation"
-    assert why_no_depth(matches, views, [1, 2, 3, 4], EpipolarSettings(), camera_known=True).cause == "rotation"
+    assert diagnose_scene(matches, views, MatchSettings()).cause == "rotation"
+    assert diagnose_depth(matches, views, [1, 2, 3, 4], EpipolarSettings(), camera_known=True).cause == "rotation"
 
 
 @pytest.mark.parametrize("moved", [(0.2, 0.0, 0.0), (0.4, 0.0, 0.0)])
 def test_a_few_pairs_with_parallax_hold_depth_whatever_the_others_say(moved):
     matches, views = turned(moved, MOSTLY_TURNED)
 
-    assert why_no_depth(matches, views, [1, 2, 3, 4], EpipolarSettings(), camera_known=False) is None
+    assert diagnose_depth(matches, views, [1, 2, 3, 4], EpipolarSettings(), camera_known=False) is None
 
 
 @pytest.mark.parametrize(
@@ -125,17 +125,17 @@ def test_a_few_pairs_with_parallax_hold_depth_whatever_the_others_say(moved):
 def test_a_model_needs_depth_or_a_plane_and_its_camera(kind, count, camera_known, cause):
     matches, views = turned((0.4, 0.0, 0.0), [kind] * 6)
 
-    found = why_no_depth(matches, views, range(1, count + 1), EpipolarSettings(), camera_known=camera_known)
+    found = diagnose_depth(matches, views, range(1, count + 1), EpipolarSettings(), camera_known=camera_known)
 
     assert (found.cause if found else None) == cause
 
 
 def test_a_model_that_no_pair_supports_is_not_judged():
-    assert why_no_depth(photos((900,) * 3), NOTHING_MATCHED, [1, 2], EpipolarSettings(), camera_known=False) is None
+    assert diagnose_depth(photos((900,) * 3), NOTHING_MATCHED, [1, 2], EpipolarSettings(), camera_known=False) is None
 
 
 def test_a_diagnosis_ends_the_run_with_exit_code_4():
-    error = why_no_scene(photos((0, 0)), NOTHING_MATCHED, MatchSettings()).error("two seeds tried")
+    error = diagnose_scene(photos((0, 0)), NOTHING_MATCHED, MatchSettings()).error("two seeds tried")
 
     assert isinstance(error, ReconstructionError) and error.exit_code == 4
     assert str(error).endswith("; two seeds tried") and error.hint == HINTS["texture"]

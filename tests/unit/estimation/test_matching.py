@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.api import opened_run
+from sfm_app.api import open_run
 from sfm_app.colmap.database import create_database, read_match_graph
 from sfm_app.errors import ConfigError, PluginError
-from sfm_app.estimation.matching import fill_database, pairs_of
+from sfm_app.estimation.matching import all_pairs, fill_database
 from sfm_app.plugins import FeatureMethod, hookimpl, load_plugins
 from sfm_app.settings import Settings
 from sfm_app.types import Features, Photo, PhotoSet
@@ -49,13 +49,13 @@ def filled(tmp_path):
     photos = PhotoSet(tmp_path, tuple(Photo(name, *SIZE, "g") for name in NAMES))
 
     def fill(method, pairs=None, **matching):
-        with opened_run(tmp_path / "out", Settings.from_mapping({"workers": 1, "matching": matching}), None) as run:
+        with open_run(tmp_path / "out", Settings.from_mapping({"workers": 1, "matching": matching}), None) as run:
             run.workspace.photos.mkdir(parents=True, exist_ok=True)
             for name, color in zip(NAMES, ("red", "lime", "blue"), strict=True):
                 Image.new("RGB", SIZE, color).save(run.workspace.photos / name)
             if not run.workspace.database.exists():
                 create_database(run.workspace.database, photos)
-            fill_database(method, run.for_stage("same"), pairs)
+            fill_database(method, run.with_fingerprint("same"), pairs)
             assert not run.workspace.feature_parts.exists()
             return read_match_graph(run.workspace.database, photos)
 
@@ -67,7 +67,7 @@ def test_every_photo_is_seen_once_in_its_colors_and_every_pair_matched(filled):
     graph = filled(ways.method)
 
     assert ways.seen == [(200, 100, (255, 0, 0)), (200, 100, (0, 255, 0)), (200, 100, (0, 0, 255))]
-    assert list(graph.matches) == pairs_of([3, 1, 2]) == [(1, 2), (1, 3), (2, 3)]
+    assert list(graph.matches) == all_pairs([3, 1, 2]) == [(1, 2), (1, 3), (2, 3)]
     np.testing.assert_array_equal(graph.keypoints[2], [[50, 25], [150, 25], [50, 75], [150, 75]])
     np.testing.assert_array_equal(graph.matches[1, 3], np.column_stack([np.arange(4), np.arange(4)]))
 

@@ -13,7 +13,7 @@ from sfm_app.geometry.distances import (
     sampson_distance,
     symmetric_epipolar_distance,
 )
-from sfm_app.geometry.epipolar import canonical_cameras, cross_matrix, epipoles, homogeneous, nearest_rank_two
+from sfm_app.geometry.epipolar import canonical_cameras, cross_matrix, epipoles, nearest_rank_two, to_homogeneous
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 SEEDS = st.integers(0, 2**31)
@@ -39,11 +39,13 @@ def test_sampson_distance_is_the_distance_to_the_nearest_exact_match(seed):
     for k in range(4):
         step = np.eye(4)[k] * 1e-3
         ahead, behind = (
-            np.einsum("ni,ij,nj->n", homogeneous(pair.x2 + s * step[2:]), pair.F, homogeneous(pair.x1 + s * step[:2]))
+            np.einsum(
+                "ni,ij,nj->n", to_homogeneous(pair.x2 + s * step[2:]), pair.F, to_homogeneous(pair.x1 + s * step[:2])
+            )
             for s in (1, -1)
         )
         gradient[:, k] = (ahead - behind) / 2e-3
-    algebraic = np.einsum("ni,ij,nj->n", homogeneous(pair.x2), pair.F, homogeneous(pair.x1))
+    algebraic = np.einsum("ni,ij,nj->n", to_homogeneous(pair.x2), pair.F, to_homogeneous(pair.x1))
 
     np.testing.assert_allclose(distance, np.abs(algebraic) / np.linalg.norm(gradient, axis=1), rtol=1e-6)
     assert 0.2 < np.sqrt(np.mean(distance**2)) < 0.8
@@ -86,7 +88,7 @@ def test_measures_ignore_the_scale_of_the_matrix_and_the_order_of_the_views(seed
 
 def test_algebraic_distance_is_a_row_of_the_design_matrix_times_the_unit_vector():
     F, x1, x2 = random_case(3)
-    design = np.einsum("ni,nj->nij", homogeneous(x2), homogeneous(x1)).reshape(-1, 9)
+    design = np.einsum("ni,nj->nij", to_homogeneous(x2), to_homogeneous(x1)).reshape(-1, 9)
     np.testing.assert_allclose(algebraic_distance(F, x1, x2), np.abs(design @ F.ravel()) / np.linalg.norm(F))
     assert algebraic_distance(np.zeros((3, 3)), [[1, 2]], [[3, 4]]) == [np.inf]
 
@@ -109,7 +111,8 @@ def test_reprojection_distance_is_the_least_over_the_pencil_of_epipolar_lines(se
     lines1 = np.cos(angle) * across[0] + np.sin(angle) * across[1]
     lines2 = np.cross(lines1, e1) @ F.T
     squared = sum(
-        (homogeneous(x) @ lines.T) ** 2 / (lines[:, :2] ** 2).sum(axis=1) for x, lines in ((x1, lines1), (x2, lines2))
+        (to_homogeneous(x) @ lines.T) ** 2 / (lines[:, :2] ** 2).sum(axis=1)
+        for x, lines in ((x1, lines1), (x2, lines2))
     )
     swept = np.sqrt(squared.min(axis=1))
 
@@ -139,7 +142,7 @@ def test_reprojection_distance_is_the_least_over_the_point_in_every_projective_f
 def test_nearest_exact_matches_are_exact_and_as_near_as_the_distance_says():
     F, x1, x2 = random_case(11, 300)
     exact1, exact2 = nearest_exact_matches(F, x1, x2)
-    assert np.abs(np.einsum("ni,ij,nj->n", homogeneous(exact2), F, homogeneous(exact1))).max() < 1e-12
+    assert np.abs(np.einsum("ni,ij,nj->n", to_homogeneous(exact2), F, to_homogeneous(exact1))).max() < 1e-12
     moved = np.linalg.norm(np.hstack([exact1 - x1, exact2 - x2]), axis=1)
     np.testing.assert_allclose(reprojection_distance(F, x1, x2), moved)
     assert moved.max() > 0.1

@@ -13,9 +13,9 @@ from sfm_app.geometry.epipolar import (
     epipoles,
     fundamental_from_pose,
     hartley_normalization,
-    homogeneous,
     nearest_rank_two,
-    unit_norm,
+    to_homogeneous,
+    to_unit_norm,
 )
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
@@ -30,7 +30,7 @@ def same_up_to_sign(F, G):
 def test_hartley_normalization_centers_and_scales(seed, shift, scale):
     x = np.random.default_rng(seed).normal(size=(30, 2)) * scale + shift
 
-    y = homogeneous(x) @ hartley_normalization(x).T
+    y = to_homogeneous(x) @ hartley_normalization(x).T
 
     assert np.abs(y[:, :2].mean(axis=0)).max() < 1e-6
     assert np.hypot(y[:, 0], y[:, 1]).mean() == pytest.approx(np.sqrt(2))
@@ -57,7 +57,7 @@ def test_eight_point_finds_the_exact_matrix(seed):
 def test_eight_point_on_eight_matches():
     pair = make_pair(PairOptions(points=8), 1)
     F = eight_point(pair.exact_x1, pair.exact_x2)
-    assert same_up_to_sign(F, unit_norm(pair.F)) < 1e-6
+    assert same_up_to_sign(F, to_unit_norm(pair.F)) < 1e-6
 
 
 def test_eight_point_follows_its_weights():
@@ -93,9 +93,9 @@ def test_no_rank_two_matrix_is_nearer(seed):
 def test_unit_norm_forgets_scale_and_sign(seed, scale):
     F = np.random.default_rng(seed).normal(size=(3, 3))
 
-    G = unit_norm(scale * F)
+    G = to_unit_norm(scale * F)
 
-    np.testing.assert_allclose(G, unit_norm(F), rtol=1e-9)
+    np.testing.assert_allclose(G, to_unit_norm(F), rtol=1e-9)
     assert np.linalg.norm(G) == pytest.approx(1)
     assert G.flat[np.argmax(np.abs(G))] > 0
 
@@ -103,7 +103,7 @@ def test_unit_norm_forgets_scale_and_sign(seed, scale):
 @pytest.mark.parametrize("F", [np.zeros((3, 3)), np.full((3, 3), np.nan), np.full((3, 3), np.inf)])
 def test_unit_norm_refuses_what_has_none(F):
     with pytest.raises(ValueError, match="zero or not finite"):
-        unit_norm(F)
+        to_unit_norm(F)
 
 
 def test_pose_gives_the_matrix_of_the_synthetic_pair():
@@ -127,12 +127,12 @@ def test_pose_without_baseline_has_none():
 @pytest.mark.parametrize("scale", [1.0, -40.0])
 def test_canonical_cameras_have_the_matrix_they_come_from(scale):
     rng = np.random.default_rng(0)
-    F = unit_norm(nearest_rank_two(rng.normal(size=(3, 3))))
+    F = to_unit_norm(nearest_rank_two(rng.normal(size=(3, 3))))
 
     P1, P2 = canonical_cameras(scale * F)
 
     np.testing.assert_array_equal(P1, np.eye(3, 4))
-    assert same_up_to_sign(unit_norm(cross_matrix(P2[:, 3]) @ P2[:, :3]), F) < 1e-12
+    assert same_up_to_sign(to_unit_norm(cross_matrix(P2[:, 3]) @ P2[:, :3]), F) < 1e-12
     X = rng.normal(size=(20, 4))
     assert np.abs(np.einsum("ni,ij,nj->n", X @ P2.T, F, X @ P1.T)).max() < 1e-12
     s = np.linalg.svd(F, compute_uv=False)

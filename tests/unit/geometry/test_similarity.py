@@ -30,7 +30,7 @@ def test_similarities_combine_and_undo():
     rng = np.random.default_rng(1)
     first, second, x = random_similarity(rng), random_similarity(rng), rng.normal(size=(5, 3))
 
-    assert np.allclose(second.after(first)(x), second(first(x)))
+    assert np.allclose(second.compose(first)(x), second(first(x)))
     assert np.allclose(first.inverse()(first(x)), x)
 
 

@@ -5,10 +5,10 @@ from sfm_app.errors import NumericalError
 from sfm_app.geometry.spd_solve import (
     inverse_of_positive,
     inverses_of_positive,
-    lifted,
+    lift_eigenvalues,
+    project_to_psd,
     solve_each,
     solve_positive,
-    without_negative,
 )
 
 
@@ -64,8 +64,8 @@ def test_what_is_positive_is_left_as_it_is_and_what_is_not_becomes_so():
     bad[2] = np.outer(np.arange(5.0), np.arange(5.0))
     bad[3] -= 2.0 * np.diag(np.diag(bad[3]))
 
-    assert lifted(good) is good
-    found = lifted(bad)
+    assert lift_eigenvalues(good) is good
+    found = lift_eigenvalues(bad)
     assert np.array_equal(found[0], good[0])
     assert np.isfinite(inverses_of_positive(bad)).all()
     assert (np.diagonal(inverses_of_positive(bad), axis1=1, axis2=2) > 0).all()
@@ -75,10 +75,10 @@ def test_what_is_positive_is_left_as_it_is_and_what_is_not_becomes_so():
 def test_rounding_leaves_no_less_than_nothing():
     S = np.diag([1.0, -1e-9, 2.0])
 
-    found = without_negative(S, np.array([1.0, 1e3, 2.0]))
+    found = project_to_psd(S, np.array([1.0, 1e3, 2.0]))
 
     assert np.linalg.eigvalsh(found).min() >= 0 and found == pytest.approx(np.diag([1.0, 0.0, 2.0]), abs=1e-15)
-    assert without_negative(np.diag([1.0, 0.0]), np.ones(2)).tolist() == [[1, 0], [0, 0]]
+    assert project_to_psd(np.diag([1.0, 0.0]), np.ones(2)).tolist() == [[1, 0], [0, 0]]
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

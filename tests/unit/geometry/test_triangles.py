@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sfm_app.geometry.triangles import areas, edges_of, median_edge, vertex_normals
+from sfm_app.geometry.triangles import areas, median_edge_length, unique_edges, vertex_normals
 
 SQUARE = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0], [5.0, 5.0, 5.0]])
 FACES = np.array([[0, 1, 2], [0, 2, 3]])
@@ -15,7 +15,7 @@ def test_normals_stand_on_the_surface_where_there_is_one():
 
 
 def test_edges_are_listed_once_with_those_of_each_triangle():
-    edges, edge_of = edges_of(FACES)
+    edges, edge_of = unique_edges(FACES)
 
     assert {tuple(edge) for edge in edges} == {(0, 1), (1, 2), (0, 2), (2, 3), (0, 3)}
     for face, of_face in zip(FACES, edge_of, strict=True):
@@ -25,5 +25,5 @@ def test_edges_are_listed_once_with_those_of_each_triangle():
 
 def test_sizes_and_nothing_at_all():
     np.testing.assert_allclose(areas(2 * SQUARE, FACES), [2.0, 2.0])
-    assert median_edge(3 * SQUARE, FACES) == 3.0
-    assert [len(part) for part in edges_of(np.empty((0, 3), np.int64))] == [0, 0]
+    assert median_edge_length(3 * SQUARE, FACES) == 3.0
+    assert [len(part) for part in unique_edges(np.empty((0, 3), np.int64))] == [0, 0]

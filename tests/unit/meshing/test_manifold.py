@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.geometry.triangles import areas, edges_of
+from sfm_app.geometry.triangles import areas, unique_edges
 from sfm_app.meshing import make_manifold
 from sfm_app.types import Surface
 
@@ -17,7 +17,7 @@ def with_faces(surface, faces, vertices=None):
 
 def is_clean(surface):
     faces = surface.faces
-    edges, edge_of = edges_of(faces)
+    edges, edge_of = unique_edges(faces)
     forward = faces < np.roll(faces, -1, axis=1)
     uses = [np.bincount(edge_of[way], minlength=len(edges)) for way in (forward, ~forward)]
     border = edges[np.sum(uses, axis=0) == 1]

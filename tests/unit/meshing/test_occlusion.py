@@ -9,17 +9,17 @@ FACES = np.array([[0, 1, 2], [0, 2, 3]])
 def test_what_stands_behind_a_wall_is_hidden():
     occluders = Occluders(WALL, FACES)
     points = np.array([[0.2, 0.1, -1.0], [0.2, 0.1, 1.0], [5.0, 0.1, -1.0], [0.2, 0.1, 0.0]])
-    found = occluders.hidden(np.array([0.0, 0.0, 3.0]), 0.01, points)
+    found = occluders.is_hidden(np.array([0.0, 0.0, 3.0]), 0.01, points)
     assert found.tolist() == [True, False, False, False]
 
 
 def test_what_is_behind_the_camera_hides_nothing():
-    assert not Occluders(WALL, FACES).hidden(np.array([0.0, 0.0, 1.0]), 0.01, np.array([[0.0, 0.1, 2.0]])).any()
-    assert not Occluders(WALL, FACES).hidden(np.array([0.2, 0.1, -1.0]), 0.01, np.array([[0.2, 0.1, -2.0]])).any()
+    assert not Occluders(WALL, FACES).is_hidden(np.array([0.0, 0.0, 1.0]), 0.01, np.array([[0.0, 0.1, 2.0]])).any()
+    assert not Occluders(WALL, FACES).is_hidden(np.array([0.2, 0.1, -1.0]), 0.01, np.array([[0.2, 0.1, -2.0]])).any()
 
 
 def test_a_point_within_the_slack_is_not_hidden_by_its_own_surface():
     occluders = Occluders(WALL, FACES)
     below, camera = np.array([[0.2, 0.1, -0.05]]), np.array([0.2, 0.1, 3.0])
-    assert not occluders.hidden(camera, 0.1, below).any()
-    assert occluders.hidden(camera, 0.01, below).all()
+    assert not occluders.is_hidden(camera, 0.1, below).any()
+    assert occluders.is_hidden(camera, 0.01, below).all()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.geometry.triangles import areas
-from sfm_app.meshing import Support, bridge_gaps, cut, drop_doubtful, smooth_support, trim
+from sfm_app.meshing import Support, bridge_gaps, cut, drop_doubtful_parts, smooth_support, trim
 
 
 def nowhere(surface):
@@ -78,7 +78,7 @@ def test_parts_that_few_photos_confirm_are_dropped(sheet, together):
     x = surface.vertices[:, 0]
     confirmed = np.select([x < 20, x < 60], [3, 2], np.arange(len(x)) % 2 * 3).astype(np.int32)  # 3, 2, 1.5
 
-    found = drop_doubtful(surface, np.ones(len(x)), confirmed, 2.0)
+    found = drop_doubtful_parts(surface, np.ones(len(x)), confirmed, 2.0)
 
     np.testing.assert_array_equal(found > 0, x < 60)
 
@@ -86,10 +86,10 @@ def test_parts_that_few_photos_confirm_are_dropped(sheet, together):
 def test_trimming_keeps_what_is_confirmed_with_its_pinholes_closed(sheet, together):
     surface = together(sheet(40), sheet(6, origin=(60, 0, 0)))
     x, y = surface.vertices[:, 0], surface.vertices[:, 1]
-    support = Support.none(len(x))
+    support = Support.zeros(len(x))
     support.confirmed[(x < 30) | (x > 50)] = 3
     support.confirmed[(np.abs(x - 10) < 1.5) & (np.abs(y - 10) < 1.5)] = 0  # a pinhole
-    support.through[x > 50] = 4
+    support.seen_through[x > 50] = 4
 
     found = trim(surface, support, 12.0, 2.0)
 
@@ -100,7 +100,7 @@ def test_trimming_keeps_what_is_confirmed_with_its_pinholes_closed(sheet, togeth
 @pytest.mark.parametrize(("empty", "kept"), [(2, 1.0), (5, 1.0), (7, 0.5), (40, 0.5)])
 def test_what_most_photos_know_nothing_about_is_dropped_however_many_there_are(sheet, empty, kept):
     surface = sheet(40)
-    support = Support.none(len(surface.vertices))
+    support = Support.zeros(len(surface.vertices))
     support.confirmed[:] = 2
     support.empty[surface.vertices[:, 0] > 20] = empty
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.meshing import CONFIRMED, EMPTY, SEEN_THROUGH, SILENT, Eye, Paint, judge, sample_colors
+from sfm_app.meshing import CONFIRMED, EMPTY, NO_EVIDENCE, SEEN_THROUGH, DepthView, Paint, judge, sample_colors
 
 FACING = np.array([[0.0, 0.0, -1.0]])
 
@@ -15,7 +15,7 @@ def eye():
     depth[:, 60:] = 0
     depth[40:] = 5
     K = np.array([[100.0, 0, 40], [0, 100, 30], [0, 0, 1]])
-    return Eye(K, np.eye(3), np.zeros(3), depth, 0.5)
+    return DepthView(K, np.eye(3), np.zeros(3), depth, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -23,14 +23,14 @@ def eye():
     [
         ((0, 0, 10.0), CONFIRMED),
         ((0, 0, 9.95), CONFIRMED),
-        ((0, 0, 9.8), SILENT),
+        ((0, 0, 9.8), NO_EVIDENCE),
         ((0, 0, 9.0), SEEN_THROUGH),
-        ((0, 0, 11.0), SILENT),
+        ((0, 0, 11.0), NO_EVIDENCE),
         ((3, 0, 10.0), EMPTY),
         ((0, 1.0, 5.0), CONFIRMED),
-        ((0, 0.745, 7.4), SILENT),  # on the step from 10 to 5
-        ((0, 0, -10.0), SILENT),
-        ((9, 0, 10.0), SILENT),
+        ((0, 0.745, 7.4), NO_EVIDENCE),  # on the step from 10 to 5
+        ((0, 0, -10.0), NO_EVIDENCE),
+        ((9, 0, 10.0), NO_EVIDENCE),
     ],
 )
 def test_verdicts(eye, point, verdict):
@@ -38,8 +38,8 @@ def test_verdicts(eye, point, verdict):
 
 
 def test_the_back_of_a_surface_is_not_confirmed(eye):
-    assert judge(np.array([[0, 0, 10.0]]), -FACING, eye, 0.01) == SILENT
-    assert judge(np.array([[3, 0, 10.0]]), -FACING, eye, 0.01) == SILENT
+    assert judge(np.array([[0, 0, 10.0]]), -FACING, eye, 0.01) == NO_EVIDENCE
+    assert judge(np.array([[3, 0, 10.0]]), -FACING, eye, 0.01) == NO_EVIDENCE
 
 
 def test_what_is_masked_says_nothing(eye):
@@ -49,7 +49,7 @@ def test_what_is_masked_says_nothing(eye):
 
     verdict = judge(points, FACING.repeat(4, axis=0), eye, 0.01)
 
-    assert verdict.tolist() == [SILENT, EMPTY, CONFIRMED, SILENT]
+    assert verdict.tolist() == [NO_EVIDENCE, EMPTY, CONFIRMED, NO_EVIDENCE]
 
 
 def test_colors_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
@@ -59,17 +59,17 @@ def test_colors_are_those_of_the_pixels_and_the_closer_photo_weighs_more(eye):
     normals = np.repeat(FACING, 3, axis=0)
 
     paint = sample_colors(points, normals, judge(points, normals, eye, 0.01), eye, image)
-    near = Eye(np.diag([2.0, 2, 1]) @ eye.K, eye.R, eye.t, np.full((120, 160), 10.0, np.float32), 0.5)
+    near = DepthView(np.diag([2.0, 2, 1]) @ eye.K, eye.R, eye.t, np.full((120, 160), 10.0, np.float32), 0.5)
     white = np.full((120, 160, 3), 255, np.uint8)
     closer = sample_colors(points, normals, judge(points, normals, near, 0.01), near, white)
 
-    np.testing.assert_allclose(paint.over(np.full((3, 3), 7, np.uint8))[:, 0], [79, 89, 7], atol=1)
+    np.testing.assert_allclose(paint.mean_colors(np.full((3, 3), 7, np.uint8))[:, 0], [79, 89, 7], atol=1)
     np.testing.assert_allclose(closer.weight[:2], 4 * paint.weight[:2])
     large = sample_colors(
         points, normals, judge(points, normals, eye, 0.01), eye, image.repeat(2, axis=0).repeat(2, axis=1)
     )
     np.testing.assert_allclose(large.total[:2], paint.total[:2], rtol=0.02)
-    both = Paint.none(3)
+    both = Paint.zeros(3)
     both.add(paint)
     both.add(closer)
-    np.testing.assert_allclose(both.over(np.zeros((3, 3), np.uint8))[0, 0], (79 + 4 * 255) / 5, atol=1)
+    np.testing.assert_allclose(both.mean_colors(np.zeros((3, 3), np.uint8))[0, 0], (79 + 4 * 255) / 5, atol=1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.orientation.vanishing_points import Segments, joined, segment_planes
+from sfm_app.orientation.vanishing_points import Segments, concatenate_segments, segment_planes
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at
 
 FOCAL_PX = 1000.0
@@ -61,7 +61,7 @@ def house(rolls_deg, *, aim_y=2.0, lines=(150, 150), clutter=100, noise_px=0.5, 
         rotations.append(R)
         centers.append(turned @ camera_center(pose))
     points = rng.uniform([-2, 0, -1.5], [2, 3, 1.5], (400, 3)) @ turned.T
-    return House(np.array(rotations), np.array(centers), points, joined(parts), turned)
+    return House(np.array(rotations), np.array(centers), points, concatenate_segments(parts), turned)
 
 
 @pytest.fixture

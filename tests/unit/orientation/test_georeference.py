@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.orientation.georeference import enu_m, georeference, position_at
+from sfm_app.orientation.georeference import enu_m, georeference, position_from_enu
 from sfm_app.types import GpsPosition
 
 ORIGIN = GpsPosition(48.2, 16.37, 180.0)
@@ -22,7 +22,7 @@ def walk(count, radius_m, noise_m, seed=0, altitude_noise_m=None):
     enu = np.column_stack([radius_m * np.cos(angles), radius_m * np.sin(angles), 1.5 + 0.2 * rng.normal(size=count)])
     noise = rng.normal(size=(count, 3)) * [noise_m, noise_m, altitude_noise_m or 2 * noise_m]
     R = Rotation.random(random_state=seed).as_matrix()
-    return enu @ R.T / METRES + [3, -2, 5], [position_at(row, ORIGIN) for row in enu + noise], R[:, 2], enu
+    return enu @ R.T / METRES + [3, -2, 5], [position_from_enu(row, ORIGIN) for row in enu + noise], R[:, 2], enu
 
 
 def test_meters_on_the_ellipsoid_and_back():
@@ -32,7 +32,7 @@ def test_meters_on_the_ellipsoid_and_back():
 
     assert enu[0] == pytest.approx([0.0002 * 55800.0, 0, -10], abs=0.02), "a degree of longitude at 60 N is 55.80 km"
     assert enu[1] == pytest.approx([0, 111.41, 0], abs=0.02), "a degree of latitude at 60 N is 111.41 km"
-    there = position_at(enu[0], here)
+    there = position_from_enu(enu[0], here)
     assert (there.latitude_deg, there.longitude_deg) == pytest.approx((60.0, -179.9999), abs=1e-9)
 
 
@@ -48,7 +48,7 @@ def test_scale_heading_and_place(seed):
     assert 1.5 < found.rms_m < 6
     assert np.allclose(found.enu_from_world.R @ up, [0, 0, 1])
     moved = found.enu_from_world(centers)
-    places = enu_m([position_at(row, found.origin) for row in moved], ORIGIN)
+    places = enu_m([position_from_enu(row, found.origin) for row in moved], ORIGIN)
     assert 0.1 < np.linalg.norm((places - enu)[:, :2], axis=1).max() < 8
     assert found.up_deviation_deg is None
 
@@ -106,7 +106,7 @@ def test_a_mirrored_walk_does_not_agree():
 def test_a_drone_says_where_up_is_when_its_cameras_do_not():
     rng = np.random.default_rng(0)
     enu = np.column_stack([rng.uniform(-100, 100, (20, 2)), rng.uniform(55, 65, 20)])
-    positions = [position_at(row + rng.normal(scale=1.0, size=3), ORIGIN) for row in enu]
+    positions = [position_from_enu(row + rng.normal(scale=1.0, size=3), ORIGIN) for row in enu]
     wrong = np.array([0.0, 1.0, 0.0])
 
     found = georeference(enu / METRES, positions, wrong, up_is_sure=False)

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 
 from sfm_app.geometry.unit_vectors import axis_angle_deg
-from sfm_app.orientation.gravity import CAMERAS, GROUND, LINES, ROLL, WALL, facing, up_direction, viewer_frame
+from sfm_app.orientation.gravity import CAMERAS, GROUND, LINES, ROLL, WALL, up_direction, viewer_direction, viewer_frame
 from sfm_app.orientation.ground_plane import dominant_plane
 from sfm_app.orientation.up_direction import Scenery
-from sfm_app.orientation.vanishing_points import joined, vanishing_near
+from sfm_app.orientation.vanishing_points import concatenate_segments, find_vanishing_direction
 
 HAND_HELD = (1.0, -2.0, 0.5, 1.5, -1.0, 2.0, -0.5, -1.5)
 
@@ -32,18 +32,18 @@ def test_vertical_edges_say_where_up_is_better_than_the_cameras(build_house, see
 
     upright = found_up(scene)
 
-    assert upright.found_by == LINES
+    assert upright.method == LINES
     assert error_deg(upright.up, scene.up) < 0.1 < 0.3 < error_deg(upright.roll.up, scene.up) < 12
-    assert upright.off_roll_deg == pytest.approx(error_deg(upright.roll.up, upright.up), abs=1e-6)
+    assert upright.angle_to_roll_deg == pytest.approx(error_deg(upright.roll.up, upright.up), abs=1e-6)
     assert 0.001 < upright.deviation_deg < 0.2
 
 
 def test_without_lines_it_is_the_direction_that_the_cameras_are_level_to(build_house):
     scene = build_house(HAND_HELD, sweep_deg=120.0)
 
-    upright = found_up(scene, joined([]))
+    upright = found_up(scene, concatenate_segments([]))
 
-    assert upright.found_by == ROLL
+    assert upright.method == ROLL
     assert error_deg(upright.up, scene.up) < 2 < upright.deviation_deg * 3
     assert 0.5 < upright.roll.spread_deg < 3
 
@@ -51,7 +51,7 @@ def test_without_lines_it_is_the_direction_that_the_cameras_are_level_to(build_h
 def test_clutter_does_not_pass_for_vertical_edges(build_house):
     scene = build_house(HAND_HELD, lines=(0, 0), clutter=400)
 
-    assert found_up(scene).found_by == ROLL
+    assert found_up(scene).method == ROLL
 
 
 @pytest.mark.parametrize("turn_deg", [90, -90])
@@ -86,9 +86,9 @@ def test_what_is_near_is_down(build_house, turn_deg):
     floor = np.random.default_rng(3).uniform([-4, 0, -4], [4, 0, 4], (300, 3)) @ scene.turned.T
 
     for ground, up in ((floor, scene.up), (floor + 4.0 * scene.up, -scene.up)):
-        upright = found_up(scene, joined([]), np.concatenate([scene.points, ground]))
+        upright = found_up(scene, concatenate_segments([]), np.concatenate([scene.points, ground]))
         assert error_deg(upright.up, up) < 8
-        assert 3 < upright.standing.not_upside_down < 7
+        assert 3 < upright.selection.sign_log_odds < 7
 
 
 @pytest.mark.parametrize("turn_deg", [0, 90, 180, 270])
@@ -99,7 +99,7 @@ def test_who_knows_how_the_photos_are_turned_is_believed(build_house, turn_deg):
 
     assert (
         upright.roll.turn_deg == turn_deg
-        and min(upright.standing.not_upside_down, upright.standing.not_on_its_side) == np.inf
+        and min(upright.selection.sign_log_odds, upright.selection.axis_log_odds) == np.inf
     )
     # what has to be turned clockwise to be upright has its top on the left
     top = {0: [0, -1], 90: [-1, 0], 180: [0, 1], 270: [1, 0]}[turn_deg]
@@ -112,9 +112,9 @@ def test_cameras_that_nobody_held_level_stand_on_the_ground(build_house):
     floor = rng.uniform([-4, -0.01, -4], [4, 0.01, 4], (300, 3)) @ scene.turned.T
     standing = np.concatenate([scene.points, floor])
 
-    upright = found_up(scene, joined([]), standing)
+    upright = found_up(scene, concatenate_segments([]), standing)
 
-    assert upright.found_by == GROUND
+    assert upright.method == GROUND
     assert error_deg(upright.up, scene.up) < 1
 
 
@@ -123,7 +123,7 @@ def test_the_front_faces_the_viewer(build_house, level_deg):
     scene = build_house(HAND_HELD, level_deg=level_deg)
     upright = found_up(scene)
 
-    towards, found_by = facing(upright, scene.rotations, scene.points)
+    towards, found_by = viewer_direction(upright, scene.rotations, scene.points)
 
     assert found_by == LINES
     assert error_deg(towards, scene.front) == pytest.approx(abs(level_deg), abs=0.3)
@@ -133,7 +133,7 @@ def test_the_front_faces_the_viewer(build_house, level_deg):
 def test_a_view_across_a_corner_stays_one(build_house):
     scene = build_house(HAND_HELD, level_deg=44.0)
 
-    towards, found_by = facing(found_up(scene), scene.rotations, scene.points)
+    towards, found_by = viewer_direction(found_up(scene), scene.rotations, scene.points)
 
     assert found_by == CAMERAS
     assert error_deg(towards, scene.front) < 6
@@ -145,7 +145,7 @@ def test_a_wall_of_points_is_a_front_too(build_house):
     flat = rng.uniform([-3, 0, -0.01], [3, 3, 0.01], (300, 3))
     wall = flat @ np.array([[np.cos(0.2), 0, -np.sin(0.2)], [0, 1, 0], [np.sin(0.2), 0, np.cos(0.2)]]) @ scene.turned.T
 
-    towards, found_by = facing(found_up(scene, joined([])), scene.rotations, wall)
+    towards, found_by = viewer_direction(found_up(scene, concatenate_segments([])), scene.rotations, wall)
 
     assert found_by == WALL
     assert error_deg(towards, scene.front) == pytest.approx(np.degrees(0.2), abs=3)
@@ -187,5 +187,5 @@ def test_a_few_segments_are_no_direction(build_house):
     few = np.zeros(len(scene.segments), bool)
     few[:11] = True
 
-    assert vanishing_near(scene.up, scene.segments.take(few)) is None
-    assert vanishing_near(scene.up, scene.segments).share == pytest.approx(0.4, abs=0.15)
+    assert find_vanishing_direction(scene.up, scene.segments.take(few)) is None
+    assert find_vanishing_direction(scene.up, scene.segments).share == pytest.approx(0.4, abs=0.15)

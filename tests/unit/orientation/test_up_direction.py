@@ -3,19 +3,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.orientation.camera_roll import TURNED, ups_from_roll
+from sfm_app.orientation.camera_roll import TURN_COSTS, roll_hypotheses
 from sfm_app.orientation.up_cues import (
-    ledges_are_lit,
-    low_is_near,
-    sky_is_above,
+    brightness_normal_correlation,
+    depth_height_correlation,
+    fit_surfaces,
+    mean_upward_normal,
+    sky_asymmetry,
+    slope_asymmetry,
     small_picture,
-    surfaces_of,
-    tops_are_bright,
-    tops_are_seen,
 )
-from sfm_app.orientation.up_direction import CUES, MOST, Cue, Scenery, odds, stand
+from sfm_app.orientation.up_direction import CUES, MAX_NATS, Cue, Scenery, odds, select_roll
 from sfm_app.synthetic.cameras import axis_rotation, camera_center, look_at, pixel_rays
-from sfm_app.synthetic.render import GAMMA, cast, prepare, render_scene
+from sfm_app.synthetic.render import GAMMA, cast_rays, prepare, render_scene
 from sfm_app.synthetic.scenes.scene_catalog import build_scene, scene_views
 
 UP = np.array([0.0, 1.0, 0.0])
@@ -64,7 +64,7 @@ def rendered(request):
         image = 255 * np.clip(render_scene(scene, camera, pose, supersampling=1), 0, 1) ** (1 / GAMMA)
         gray = image.mean(axis=2).astype(np.uint8)
         directions = pixel_rays(camera) @ pose[:, :3]
-        depth = cast(scene.rays, camera_center(pose), directions)["t_hit"].astype(np.float64)
+        depth = cast_rays(scene.rays, camera_center(pose), directions)["t_hit"].astype(np.float64)
         known = np.isfinite(depth) & (np.arange(depth.size) % 53 == 0)
         seen.append(np.arange(np.count_nonzero(known)) + sum(map(len, points)))
         points.append(camera_center(pose) + directions[known] * depth[known, None])
@@ -81,14 +81,16 @@ def test_rendered_photos_stand_upright_whichever_way_they_were_held(rendered, tu
     rotations, centers, scenery = rendered
     R, shown = turned_by(turn_deg, rotations, scenery)
 
-    standing = stand(ups_from_roll(R, centers), R, centers, shown)
+    standing = select_roll(roll_hypotheses(R, centers), R, centers, shown)
 
     assert standing.roll.turn_deg == turn_deg
     assert standing.roll.up @ UP > np.cos(np.radians(20))
     # upside down, the habit of holding cameras upright speaks against what the scene shows
-    habit = TURNED[turn_deg // 90]
-    assert standing.not_upside_down == pytest.approx(sum(standing.evidence.values()) + TURNED[2] - 2 * habit, abs=1e-6)
-    assert 2 < min(standing.not_upside_down, standing.not_on_its_side) < 20
+    habit = TURN_COSTS[turn_deg // 90]
+    assert standing.sign_log_odds == pytest.approx(
+        sum(standing.evidence.values()) + TURN_COSTS[2] - 2 * habit, abs=1e-6
+    )
+    assert 2 < min(standing.sign_log_odds, standing.axis_log_odds) < 20
 
 
 @pytest.mark.parametrize("turn_deg", [90, 270])
@@ -100,7 +102,7 @@ def test_photos_on_their_side_of_a_walk_around_something(build_house, turn_deg):
     scenery = Scenery(points, np.full(len(points), 100.0), (np.arange(len(points)),) * 6, (None,) * 6)
     R, shown = turned_by(turn_deg, house.rotations, scenery)
 
-    standing = stand(ups_from_roll(R, house.centers), R, house.centers, shown)
+    standing = select_roll(roll_hypotheses(R, house.centers), R, house.centers, shown)
 
     assert standing.roll.turn_deg == turn_deg
     assert standing.roll.up @ house.up > np.cos(np.radians(20))
@@ -113,27 +115,27 @@ def test_no_single_cue_turns_photos_that_are_held_upright(build_house):
     ceiling = np.random.default_rng(3).uniform([-4, 4, -4], [4, 4, 9], (900, 3)) @ house.turned.T
     scenery = Scenery(ceiling, np.full(900, 100.0), (np.arange(900),) * 6, (None,) * 6)
 
-    standing = stand(ups_from_roll(house.rotations, house.centers), house.rotations, house.centers, scenery)
+    standing = select_roll(roll_hypotheses(house.rotations, house.centers), house.rotations, house.centers, scenery)
 
     assert standing.roll.turn_deg == 0 and standing.roll.up @ house.up > 0.9
-    assert standing.evidence["low is near"] == -MOST and standing.evidence["tops are seen"] == -MOST
-    assert 0 <= standing.not_upside_down < 0.1, "it is as likely as not, and says so"
+    assert standing.evidence["low is near"] == -MAX_NATS and standing.evidence["tops are seen"] == -MAX_NATS
+    assert 0 <= standing.sign_log_odds < 0.1, "it is as likely as not, and says so"
 
 
 def test_without_scenery_cameras_are_held_upright(build_house):
     house = build_house((1.0, -2.0, 0.5, 1.5), sweep_deg=90.0)
     nothing = Scenery(np.zeros((0, 3)), np.zeros(0), (np.zeros(0, np.int64),) * 4, (None,) * 4)
 
-    standing = stand(ups_from_roll(house.rotations, house.centers), house.rotations, house.centers, nothing)
+    standing = select_roll(roll_hypotheses(house.rotations, house.centers), house.rotations, house.centers, nothing)
 
     assert standing.roll.turn_deg == 0 and not any(standing.evidence.values())
-    assert standing.not_upside_down == pytest.approx(TURNED[2])
+    assert standing.sign_log_odds == pytest.approx(TURN_COSTS[2])
 
 
 def test_opposite_turns_have_opposite_directions(build_house):
     house = build_house((1.0, 88.0, 0.5, 31.0, -1.0, 2.0))
 
-    rolls = ups_from_roll(house.rotations, house.centers)
+    rolls = roll_hypotheses(house.rotations, house.centers)
 
     assert [roll.turn_deg for roll in rolls] == [0, 90, 180, 270]
     for roll, opposite in zip(rolls[:2], rolls[2:], strict=True):
@@ -146,21 +148,21 @@ def test_three_steps_along_a_wall_are_level(build_house, turn_deg):
     house = build_house((turn_deg + 1.0, turn_deg - 2.0, turn_deg + 0.5), sweep_deg=15.0, lines=(0, 0))
     nothing = Scenery(np.zeros((0, 3)), np.zeros(0), (np.zeros(0, np.int64),) * 3, (None,) * 3)
 
-    standing = stand(ups_from_roll(house.rotations, house.centers), house.rotations, house.centers, nothing)
+    standing = select_roll(roll_hypotheses(house.rotations, house.centers), house.rotations, house.centers, nothing)
 
     assert abs(standing.roll.up @ house.up) > 0.98
-    assert 0.2 < standing.not_on_its_side < 8
+    assert 0.2 < standing.axis_log_odds < 8
 
 
 def test_ledges_are_lit_from_above():
     upright, sideways = look_at(np.array([0, 0, 5.0]), np.zeros(3))[:, :3], stripes(ledge_rows()).T
-    found = ledges_are_lit(UP, [upright], [stripes(ledge_rows())])
+    found = slope_asymmetry(UP, [upright], [stripes(ledge_rows())])
 
     assert 0.4 < found < 1
-    assert ledges_are_lit(-UP, [upright], [stripes(ledge_rows())]) == pytest.approx(-found)
-    assert ledges_are_lit(UP, [upright], [stripes(ledge_rows()[::-1])]) == pytest.approx(-found, abs=0.05)
-    assert abs(ledges_are_lit(UP, [upright], [sideways])) < 0.1
-    assert ledges_are_lit(UP, [upright], [None]) == 0.0
+    assert slope_asymmetry(-UP, [upright], [stripes(ledge_rows())]) == pytest.approx(-found)
+    assert slope_asymmetry(UP, [upright], [stripes(ledge_rows()[::-1])]) == pytest.approx(-found, abs=0.05)
+    assert abs(slope_asymmetry(UP, [upright], [sideways])) < 0.1
+    assert slope_asymmetry(UP, [upright], [None]) == 0.0
 
 
 def test_the_border_of_a_black_background_is_no_ledge():
@@ -168,7 +170,7 @@ def test_the_border_of_a_black_background_is_no_ledge():
     below = 80 + ledge_rows(3) / 3
     gray, black = (stripes(np.concatenate([np.full(60, level), below])) for level in (30.0, 0.0))
 
-    assert ledges_are_lit(UP, [upright], [gray]) < -0.3 < 0.3 < ledges_are_lit(UP, [upright], [black])
+    assert slope_asymmetry(UP, [upright], [gray]) < -0.3 < 0.3 < slope_asymmetry(UP, [upright], [black])
 
 
 def test_the_sky_is_even_and_bright():
@@ -176,30 +178,30 @@ def test_the_sky_is_even_and_bright():
     picture = stripes(np.repeat([200.0, 90.0], [40, 60]))
     picture[40:] = np.random.default_rng(1).integers(20, 160, picture[40:].shape)
 
-    assert 0.7 < sky_is_above(UP, [upright], [picture]) <= 1
-    assert sky_is_above(-UP, [upright], [picture]) == pytest.approx(-sky_is_above(UP, [upright], [picture]))
-    assert sky_is_above(UP, [upright], [255 - picture]) < 0.1, "even and dark is a shadow"
-    assert abs(sky_is_above(UP, [upright], [np.full((90, 120), 230, np.uint8)])) < 0.1, "and even all over is a wall"
+    assert 0.7 < sky_asymmetry(UP, [upright], [picture]) <= 1
+    assert sky_asymmetry(-UP, [upright], [picture]) == pytest.approx(-sky_asymmetry(UP, [upright], [picture]))
+    assert sky_asymmetry(UP, [upright], [255 - picture]) < 0.1, "even and dark is a shadow"
+    assert abs(sky_asymmetry(UP, [upright], [np.full((90, 120), 230, np.uint8)])) < 0.1, "and even all over is a wall"
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_light_from_above_and_from_below(side):
     points, brightness = terrain(side * UP)
-    above = surfaces_of(points, brightness, [np.arange(len(points))], np.array([[0.0, 6.0, 0.0]]))
+    above = fit_surfaces(points, brightness, [np.arange(len(points))], np.array([[0.0, 6.0, 0.0]]))
 
-    assert 0.15 < side * tops_are_bright(UP, above) < 0.8
-    assert tops_are_bright(-UP, above) == pytest.approx(-tops_are_bright(UP, above))
-    assert 0.5 < tops_are_seen(UP, above) < 0.9
-    plain = surfaces_of(points, np.full(len(points), 77.7), [np.arange(len(points))], np.array([[0.0, 6.0, 0.0]]))
-    assert tops_are_bright(UP, plain) == 0.0
+    assert 0.15 < side * brightness_normal_correlation(UP, above) < 0.8
+    assert brightness_normal_correlation(-UP, above) == pytest.approx(-brightness_normal_correlation(UP, above))
+    assert 0.5 < mean_upward_normal(UP, above) < 0.9
+    plain = fit_surfaces(points, np.full(len(points), 77.7), [np.arange(len(points))], np.array([[0.0, 6.0, 0.0]]))
+    assert brightness_normal_correlation(UP, plain) == 0.0
 
 
 def test_what_no_photo_sees_says_nothing():
     points, brightness = terrain(UP)
-    unseen = surfaces_of(points, brightness, [np.zeros(0, np.int64)], np.array([[0.0, 6.0, 0.0]]))
+    unseen = fit_surfaces(points, brightness, [np.zeros(0, np.int64)], np.array([[0.0, 6.0, 0.0]]))
 
     assert len(unseen.normals) == 0
-    assert tops_are_seen(UP, unseen) == tops_are_bright(UP, unseen) == 0.0
+    assert mean_upward_normal(UP, unseen) == brightness_normal_correlation(UP, unseen) == 0.0
 
 
 def test_low_is_near_on_the_ground_and_not_on_a_distant_thing():
@@ -210,9 +212,9 @@ def test_low_is_near_on_the_ground_and_not_on_a_distant_thing():
     far = rng.uniform([-0.01, 0.99, -0.01], [0.01, 1.01, 0.01], (500, 3))
     tilted = far + 0.5 * np.outer(far[:, 1] - 1.0, [0, 0, -1])
 
-    assert 0.5 < low_is_near(UP, *places, ground, [np.arange(500)]) < 1
-    assert 0 < low_is_near(UP, *places, tilted, [np.arange(500)]) < 0.05
-    assert low_is_near(UP, *places, ground, [np.arange(5)]) == 0.0
+    assert 0.5 < depth_height_correlation(UP, *places, ground, [np.arange(500)]) < 1
+    assert 0 < depth_height_correlation(UP, *places, tilted, [np.arange(500)]) < 0.05
+    assert depth_height_correlation(UP, *places, ground, [np.arange(5)]) == 0.0
 
 
 def test_nats_grow_with_the_cue_and_with_the_points_and_end():
@@ -220,7 +222,7 @@ def test_nats_grow_with_the_cue_and_with_the_points_and_end():
 
     assert cue.nats(0.05, 10**9) == pytest.approx(1.0) and cue.nats(-0.05, 10**9) == pytest.approx(-1.0)
     assert 0.1 < cue.nats(0.05, 100) < 0.25
-    assert cue.nats(5.0, 100) == MOST
+    assert cue.nats(5.0, 100) == MAX_NATS
     assert all(0 < CUES[name].mean < 0.5 and 0.05 < CUES[name].deviation < 0.5 for name in CUES)
 
 

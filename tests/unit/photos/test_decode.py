@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image, features
 
-from sfm_app.photos import UnreadableError, read_picture, upright
+from sfm_app.photos import UnreadableError, read_picture, upright_image
 from sfm_app.photos.decode import FORMATS
-from sfm_app.photos.tiff import PLACES
+from sfm_app.photos.tiff import LIBRARY_DIRS
 
 BARS = np.repeat(np.arange(0, 256, 8, np.uint8)[None], 24, axis=0)
 COLORS = np.stack([BARS, BARS[:, ::-1], 255 - BARS // 2], axis=-1)
@@ -19,14 +19,14 @@ LOSSLESS = {"PNG": {}, "TIFF": {"compression": "tiff_lzw"}, "BMP": {}, "WEBP": {
 def test_formats(tmp_path, kind):
     Image.fromarray(COLORS).save(tmp_path / "x", kind, **LOSSLESS[kind])
 
-    assert np.array_equal(np.asarray(upright(read_picture(tmp_path / "x"))), COLORS)
+    assert np.array_equal(np.asarray(upright_image(read_picture(tmp_path / "x"))), COLORS)
 
 
 @pytest.mark.parametrize("options", [{"progressive": True}, {"optimize": True}, {"subsampling": 0}])
 def test_jpeg(tmp_path, options):
     Image.fromarray(COLORS).save(tmp_path / "x.jpg", quality=98, **options)
 
-    seen = np.asarray(upright(read_picture(tmp_path / "x.jpg")), int)
+    seen = np.asarray(upright_image(read_picture(tmp_path / "x.jpg")), int)
     assert 0 < np.abs(seen - COLORS).mean() < 3
 
 
@@ -34,7 +34,7 @@ def test_jpeg(tmp_path, options):
 def test_avif(tmp_path):
     Image.fromarray(COLORS).save(tmp_path / "x.avif", quality=95)
 
-    assert np.abs(np.asarray(upright(read_picture(tmp_path / "x.avif")), int) - COLORS).mean() < 5
+    assert np.abs(np.asarray(upright_image(read_picture(tmp_path / "x.avif")), int) - COLORS).mean() < 5
 
 
 def test_heic_is_read_where_the_extra_is_there(tmp_path):
@@ -43,7 +43,7 @@ def test_heic_is_read_where_the_extra_is_there(tmp_path):
     cut = (tmp_path / "x.heic").read_bytes()[:-60]
     (tmp_path / "cut.heic").write_bytes(cut)
 
-    assert np.abs(np.asarray(upright(read_picture(tmp_path / "x.heic")), int) - COLORS).mean() < 5
+    assert np.abs(np.asarray(upright_image(read_picture(tmp_path / "x.heic")), int) - COLORS).mean() < 5
     with pytest.raises(UnreadableError, match=r"^truncated or damaged$"):
         read_picture(tmp_path / "cut.heic")
 
@@ -61,20 +61,20 @@ def test_heic_names_the_extra_where_it_is_not(tmp_path, monkeypatch):
 def test_sixteen_bits_become_eight(tmp_path, kind):
     Image.fromarray(BARS.astype(np.uint16) * 257).save(tmp_path / "x", kind)
 
-    assert np.array_equal(np.asarray(upright(read_picture(tmp_path / "x"))), BARS)
+    assert np.array_equal(np.asarray(upright_image(read_picture(tmp_path / "x"))), BARS)
 
 
 def test_dark_sixteen_bits_are_not_made_bright(tmp_path):
     dark = BARS.astype(np.uint16) * 10
     Image.fromarray(dark).save(tmp_path / "x.png")
 
-    assert np.array_equal(np.asarray(upright(read_picture(tmp_path / "x.png"))), dark // 257)
+    assert np.array_equal(np.asarray(upright_image(read_picture(tmp_path / "x.png"))), dark // 257)
 
 
 def test_floating_point_fills_the_range(tmp_path):
     Image.fromarray(BARS.astype(np.float32) / 100 - 1).save(tmp_path / "x.tif")
 
-    seen = np.asarray(upright(read_picture(tmp_path / "x.tif")), int)
+    seen = np.asarray(upright_image(read_picture(tmp_path / "x.tif")), int)
     assert seen.min() == 0 and seen.max() == 255
     assert np.abs(seen - BARS.astype(int) * 255 / 248).max() <= 1
 
@@ -83,7 +83,7 @@ def test_what_is_transparent_is_white(tmp_path):
     clear = np.dstack([COLORS, np.where(BARS < 128, 0, 255).astype(np.uint8)])
     Image.fromarray(clear).save(tmp_path / "x.png")
 
-    seen = np.asarray(upright(read_picture(tmp_path / "x.png")))
+    seen = np.asarray(upright_image(read_picture(tmp_path / "x.png")))
     assert (seen[:, :16] == 255).all()
     assert np.array_equal(seen[:, 16:], COLORS[:, 16:])
 
@@ -97,7 +97,7 @@ def test_of_many_pictures_the_first(tmp_path, kind):
 
     picture = read_picture(tmp_path / "x")
     assert picture.frames == 3
-    assert np.array_equal(np.asarray(upright(picture)), COLORS)
+    assert np.array_equal(np.asarray(upright_image(picture)), COLORS)
 
 
 @pytest.mark.parametrize("content", [b"", b"GIF89a, or so it says", b"%PDF-1.7", b"\x00" * 5000])
@@ -145,7 +145,7 @@ def test_damaged_exif_does_no_harm(tmp_path):
 
 
 @pytest.mark.parametrize("compression", ["group4", "jpeg"])
-@pytest.mark.skipif(not any(place.is_dir() for place in PLACES), reason="this Pillow has no libtiff of its own")
+@pytest.mark.skipif(not any(place.is_dir() for place in LIBRARY_DIRS), reason="this Pillow has no libtiff of its own")
 def test_what_libtiff_prints_makes_a_file_a_damaged_one(tmp_path, capfd, compression):
     noise = np.random.default_rng(0).integers(0, 255, (96, 128), np.uint8)
     image = Image.fromarray(noise).convert("1" if compression == "group4" else "RGB")

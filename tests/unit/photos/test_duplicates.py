@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.photos import without_copies
-from sfm_app.photos.thumbnail_stats import glance as look
+from sfm_app.photos import drop_duplicates
+from sfm_app.photos.thumbnail_stats import measure_photo as look
 from sfm_app.types import Photo
 
 
@@ -46,18 +46,20 @@ def names(photos):
     ],
 )
 def test_the_largest_of_each_picture_stays(change):
-    kept, copies = without_copies([glance("copy.jpg", change(scene())), glance("b.jpg", scene(1))])
+    kept, copies = drop_duplicates([glance("copy.jpg", change(scene())), glance("b.jpg", scene(1))])
     assert names(kept) == ["copy.jpg", "b.jpg"] and not copies
 
     bigger = scene().resize((640, 480), Image.Resampling.LANCZOS)
-    kept, copies = without_copies([glance("copy.jpg", change(scene())), glance("b.jpg", scene(1)), glance("c", bigger)])
+    kept, copies = drop_duplicates(
+        [glance("copy.jpg", change(scene())), glance("b.jpg", scene(1)), glance("c", bigger)]
+    )
     assert names(kept) == ["b.jpg", "c"]
     assert [(photo.name, photo.reason) for photo in copies] == [("copy.jpg", "the same picture as c")]
 
 
 @pytest.mark.parametrize("shift", [4, 10, 20])
 def test_a_step_to_the_side_is_another_photo(shift):
-    kept, _ = without_copies([glance("a", scene()), glance("b", scene(0, shift))])
+    kept, _ = drop_duplicates([glance("a", scene()), glance("b", scene(0, shift))])
 
     assert len(kept) == 2
 
@@ -65,18 +67,18 @@ def test_a_step_to_the_side_is_another_photo(shift):
 def test_a_bright_and_a_dark_exposure_are_two_photos():
     dark = scene().point(lambda gray: gray // 2)
 
-    assert len(without_copies([glance("a", scene()), glance("b", dark)])[0]) == 2
+    assert len(drop_duplicates([glance("a", scene()), glance("b", dark)])[0]) == 2
 
 
 def test_blank_pictures_say_nothing():
     blank = Image.new("RGB", (320, 240), "gray")
 
-    assert len(without_copies([glance(name, blank) for name in "abc"])[0]) == 3
-    assert without_copies([]) == ([], [])
+    assert len(drop_duplicates([glance(name, blank) for name in "abc"])[0]) == 3
+    assert drop_duplicates([]) == ([], [])
 
 
 def test_all_copies_of_one_go_to_one():
-    kept, copies = without_copies([glance(name, scene()) for name in ("c", "a", "b")])
+    kept, copies = drop_duplicates([glance(name, scene()) for name in ("c", "a", "b")])
 
     assert names(kept) == ["c"]
     assert {photo.reason for photo in copies} == {"the same picture as c"}
@@ -87,5 +89,5 @@ def test_of_copies_the_one_with_a_mask_stays():
     large, small = glance("a.jpg", scene()), glance("b.jpg", scene().resize((160, 120), Image.Resampling.LANCZOS))
     masked = replace(small, photo=replace(small.photo, mask="b.jpg.png"))
 
-    assert names(without_copies([large, small])[0]) == ["a.jpg"]
-    assert names(without_copies([large, masked])[0]) == ["b.jpg"]
+    assert names(drop_duplicates([large, small])[0]) == ["a.jpg"]
+    assert names(drop_duplicates([large, masked])[0]) == ["b.jpg"]

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from sfm_app.errors import InputError
-from sfm_app.photos import list_files, place_of
+from sfm_app.photos import list_files, resolve_file
 
 
 @pytest.fixture
@@ -23,13 +23,13 @@ def out(tmp_path):
 
 
 def reasons(folder, out):
-    places = {name: place_of(folder, name) for name in list_files(folder, out)}
+    places = {name: resolve_file(folder, name) for name in list_files(folder, out)}
     return {name: place for name, place in places.items() if isinstance(place, str)}
 
 
 def test_all_files_below_in_order(folder, out):
     assert list_files(folder, out) == ["a.jpg", "b.jpg", "inner/a.jpg"]
-    assert place_of(folder, "inner/a.jpg") == (folder / "inner/a.jpg").resolve()
+    assert resolve_file(folder, "inner/a.jpg") == (folder / "inner/a.jpg").resolve()
 
 
 def test_hidden_files_and_folders_are_named_and_not_opened(folder, out):
@@ -51,7 +51,7 @@ def test_links_are_followed_inside_the_folder_only(folder, out, tmp_path):
     (folder / "rooms").symlink_to("inner")
     (folder / "home").symlink_to(tmp_path)
 
-    assert place_of(folder, "inside.jpg") == (folder / "inner/a.jpg").resolve()
+    assert resolve_file(folder, "inside.jpg") == (folder / "inner/a.jpg").resolve()
     assert reasons(folder, out) == {
         "outside.jpg": "a link out of the folder",
         "through.jpg": "a link out of the folder",
@@ -80,7 +80,7 @@ def test_a_list_names_the_photos(folder, out, tmp_path):
     names = tmp_path / "list.txt"
     names.write_text("\ufeffinner/a.jpg\r\n\nb.jpg\nb.jpg\nmissing.jpg\n../secret.jpg\n/etc/passwd\n", "utf-8")
 
-    found = {name: place_of(folder, name) for name in list_files(folder, out, names)}
+    found = {name: resolve_file(folder, name) for name in list_files(folder, out, names)}
 
     assert [name for name, place in found.items() if not isinstance(place, str)] == ["b.jpg", "inner/a.jpg"]
     assert found["missing.jpg"] == "not there"

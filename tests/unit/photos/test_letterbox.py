@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.photos.camera_groups import grouped
-from sfm_app.photos.letterbox import shown_part, with_one_frame
+from sfm_app.photos.camera_groups import group_by_camera
+from sfm_app.photos.letterbox import shown_part, unify_frames
 from sfm_app.types import Photo
 
 
@@ -74,32 +74,32 @@ def test_a_sky_of_one_color_above_a_level_horizon_is_no_bar():
 
 def test_frames_that_nearly_agree_become_one():
     frames = [(0, 50, 600, 300), (0, 51, 600, 299), (0, 50, 600, 301), (0, 90, 600, 220)]
-    found = [one.shown for one in with_one_frame([photo(shown=frame) for frame in frames])]
+    found = [one.shown for one in unify_frames([photo(shown=frame) for frame in frames])]
     assert found == [(0, 50, 600, 300)] * 3 + [(0, 90, 600, 220)]
 
 
 def test_bars_that_are_not_seen_are_those_of_the_others():
     shown = [(0, 50, 600, 300), (0, 50, 600, 300), None]
-    assert [one.shown for one in with_one_frame([photo(shown=frame) for frame in shown])] == [(0, 50, 600, 300)] * 3
+    assert [one.shown for one in unify_frames([photo(shown=frame) for frame in shown])] == [(0, 50, 600, 300)] * 3
     few = [(0, 50, 600, 300), None, None]  # a wall before an empty ground, perhaps
-    assert [one.shown for one in with_one_frame([photo(shown=frame) for frame in few])] == [None] * 3
+    assert [one.shown for one in unify_frames([photo(shown=frame) for frame in few])] == [None] * 3
     half = [(0, 50, 600, 300), None]
-    assert [one.shown for one in with_one_frame([photo(shown=frame) for frame in half])] == [(0, 50, 600, 300)] * 2
+    assert [one.shown for one in unify_frames([photo(shown=frame) for frame in half])] == [(0, 50, 600, 300)] * 2
     mixed = [(0, 50, 600, 300), (0, 90, 600, 220), None]
-    assert [one.shown for one in with_one_frame([photo(shown=frame) for frame in mixed])] == mixed
+    assert [one.shown for one in unify_frames([photo(shown=frame) for frame in mixed])] == mixed
 
 
 def test_pictures_of_other_sizes_are_of_other_groups():
     photos = [photo("a", (0, 50, 600, 300)), photo("b"), photo("c", (0, 52, 600, 298)), photo("d", (90, 0, 420, 400))]
-    assert [one.group for one in grouped(photos, "auto")] == [
+    assert [one.group for one in group_by_camera(photos, "auto")] == [
         "600x299 in 600x400", "600x400", "600x299 in 600x400", "420x400 in 600x400",
     ]  # fmt: skip
-    assert [one.name for one in grouped(photos, "auto")] == ["a", "b", "c", "d"]
+    assert [one.name for one in group_by_camera(photos, "auto")] == ["a", "b", "c", "d"]
 
 
 @pytest.mark.parametrize("cameras", ["single", "each"])
 def test_who_says_whose_photos_they_are_is_believed(cameras):
-    found = list(grouped([photo("a", (0, 50, 600, 300)), photo("b", (0, 90, 600, 220))], cameras))
+    found = list(group_by_camera([photo("a", (0, 50, 600, 300)), photo("b", (0, 90, 600, 220))], cameras))
     assert [one.shown for one in found] == [None, None]
     assert len({one.group for one in found}) == (1 if cameras == "single" else 2)
 
@@ -107,7 +107,7 @@ def test_who_says_whose_photos_they_are_is_believed(cameras):
 def test_bars_turn_with_a_photo_that_is_turned():
     lying = [photo(f"{k}", (0, 50, 600, 300)) for k in range(3)]
     on_end = photo("on end", (50, 10, 300, 580), size=(400, 600))
-    *_, turned = grouped([*lying, on_end], "auto")
+    *_, turned = group_by_camera([*lying, on_end], "auto")
     assert (turned.width, turned.height, turned.turn_deg) == (600, 400, 90)
     # its right becomes the top
     assert turned.shown == (10, 50, 580, 300)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sfm_app.errors import InputError
-from sfm_app.photos import find_mask, lay_out_mask, list_masks, read_used, unused_masks, without_masked
+from sfm_app.photos import fill_masked, find_mask, lay_out_mask, list_masks, read_mask, unused_masks
 from sfm_app.types import Photo, UnusablePhoto
 
 USED = np.zeros((40, 60), bool)
@@ -39,7 +39,7 @@ def photo(name="a.jpg", width=60, height=40):
 
 def laid_out(found, photos, masks, tmp_path):
     lay_out_mask(found, photos, masks, tmp_path / "laid out")
-    return read_used(tmp_path / "laid out", found.name)
+    return read_mask(tmp_path / "laid out", found.name)
 
 
 @pytest.mark.parametrize(
@@ -219,7 +219,7 @@ def test_masked_pixels_take_the_color_of_the_nearest_that_is_not(seed, share):
     used[rng.integers(9), rng.integers(13)] = True
     pixels = rng.integers(0, 255, (9, 13, 3), np.uint8)
 
-    seen = without_masked(pixels, used)
+    seen = fill_masked(pixels, used)
 
     np.testing.assert_array_equal(seen[used], pixels[used])
     y, x = np.nonzero(used)

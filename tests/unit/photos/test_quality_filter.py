@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw, ImageFilter
 
-from sfm_app.photos import screened
-from sfm_app.photos.thumbnail_stats import glance
+from sfm_app.photos import drop_unusable
+from sfm_app.photos.thumbnail_stats import measure_photo
 from sfm_app.types import Photo
 
 SIZE = (1024, 768)
@@ -40,8 +40,8 @@ def window(size):
 
 
 def left_out(*images):
-    glances = [glance(Photo(f"{k}.jpg", *image.size, ""), image) for k, image in enumerate(images)]
-    kept, gone = screened(glances)
+    glances = [measure_photo(Photo(f"{k}.jpg", *image.size, ""), image) for k, image in enumerate(images)]
+    kept, gone = drop_unusable(glances)
     assert len(kept) + len(gone) == len(images)
     return {int(photo.name[:-4]): photo.reason for photo in gone}
 

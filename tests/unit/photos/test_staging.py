@@ -5,14 +5,14 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from sfm_app.photos import UnreadableError, grouped, lay_out, stored_names
+from sfm_app.photos import UnreadableError, assign_names, group_by_camera, lay_out
 from sfm_app.types import Photo
 
 PIXELS = np.random.default_rng(0).integers(0, 255, (40, 60, 3), np.uint8)
 
 
 def named(*paths, lossy=True):
-    return [photo.name for photo in stored_names([Photo(path, 60, 40, "g", lossy=lossy) for path in paths])]
+    return [photo.name for photo in assign_names([Photo(path, 60, 40, "g", lossy=lossy) for path in paths])]
 
 
 @pytest.mark.parametrize(
@@ -43,7 +43,7 @@ def test_no_two_photos_get_one_name():
 
 
 def test_what_it_was_called_is_kept():
-    (photo,) = stored_names([Photo("a.webp", 60, 40, "g")])
+    (photo,) = assign_names([Photo("a.webp", 60, 40, "g")])
 
     assert (photo.name, photo.path) == ("a.webp.jpg", "a.webp")
 
@@ -65,13 +65,13 @@ def test_groups(cameras, expected):
         Photo("in/d", 40, 60, "X"),
     ]
 
-    assert [photo.group for photo in grouped(photos, cameras)] == expected
+    assert [photo.group for photo in group_by_camera(photos, cameras)] == expected
 
 
 def laid(sizes):
     """Sizes and turns of photos of these sizes, laid out."""
     photos = [Photo(f"{number}.jpg", *size, "") for number, size in enumerate(sizes)]
-    return [(photo.width, photo.height, photo.turn_deg, photo.needs_copy) for photo in grouped(photos, "auto")]
+    return [(photo.width, photo.height, photo.turn_deg, photo.needs_copy) for photo in group_by_camera(photos, "auto")]
 
 
 def test_photos_on_end_lie_as_most_of_their_camera():
@@ -97,7 +97,7 @@ def test_colmap_reads_and_writes_what_is_laid_out(tmp_path, kind):
     (tmp_path / "photos" / "in").mkdir(parents=True)
     path = f"in/x.{kind.lower()}"
     Image.fromarray(PIXELS).save(tmp_path / "photos" / path, kind)
-    (photo,) = stored_names([Photo(path, 60, 40, "g", needs_copy=kind != "PNG", lossy=kind == "WEBP")])
+    (photo,) = assign_names([Photo(path, 60, 40, "g", needs_copy=kind != "PNG", lossy=kind == "WEBP")])
 
     lay_out(photo, tmp_path / "photos", tmp_path / "target")
 

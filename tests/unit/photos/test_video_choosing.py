@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.photos import Follower, TrackedFrame, choose
+from sfm_app.photos import CornerTracker, TrackedFrame, select_keyframes
 
 pytestmark = pytest.mark.slow
 
@@ -33,8 +33,8 @@ def film(wall, places, blurred=(), noise=0.0):
 
 
 def looks_at(frames):
-    follower = Follower()
-    return [follower.look(k, frame) for k, frame in enumerate(frames)]
+    follower = CornerTracker()
+    return [follower.track(k, frame) for k, frame in enumerate(frames)]
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def slide(wall):
 
 
 def chosen_from(frames, most=100):
-    return list(choose(looks_at(frames), most).frames)
+    return list(select_keyframes(looks_at(frames), most).frames)
 
 
 @pytest.mark.parametrize("speed_px", [0.7, 2.5, 5.0])
@@ -102,13 +102,15 @@ def test_a_rest_adds_nothing(wall):
 def test_no_more_than_wanted_and_evenly(slide, most):
     places = np.arange(0, 600, 3.0)
 
-    choice = choose(slide, most)
+    choice = select_keyframes(slide, most)
     gaps = np.diff(places[list(choice.frames)])
 
     assert len(choice.frames) == most
     assert gaps.max() < 600 / (most - 1) + STEP_PX + 3
     assert gaps.min() > 0.5 * 600 / (most - 1) - STEP_PX
-    assert choice.left_out["more than max_frames"] == pytest.approx(len(choose(slide, 2000).frames) - most, abs=most)
+    assert choice.left_out["more than max_frames"] == pytest.approx(
+        len(select_keyframes(slide, 2000).frames) - most, abs=most
+    )
 
 
 def test_every_shot_of_a_cut_video_is_seen(wall):
@@ -133,11 +135,11 @@ def test_forward_and_back_counts_both_ways(wall):
 
 @pytest.mark.parametrize("value", [0, 255])
 def test_an_empty_picture_shows_nothing_to_follow(value):
-    follower = Follower()
-    looks = [follower.look(k, np.full((HEIGHT, WIDTH), value, np.uint8)) for k in range(5)]
+    follower = CornerTracker()
+    looks = [follower.track(k, np.full((HEIGHT, WIDTH), value, np.uint8)) for k in range(5)]
 
     assert not follower.seen
-    assert [look.way for look in looks] == [0.0] * 5
+    assert [look.path_steps for look in looks] == [0.0] * 5
 
 
 def test_the_same_frames_give_the_same_choice(wall):
@@ -146,7 +148,7 @@ def test_the_same_frames_give_the_same_choice(wall):
     first, second = (looks_at(film(wall, places, noise=4.0)) for _ in range(2))
 
     assert first == second
-    assert choose(first, 9) == choose(second, 9)
+    assert select_keyframes(first, 9) == select_keyframes(second, 9)
 
 
 @given(st.lists(st.tuples(st.floats(0, 1e5), st.floats(-0.9, 1.2)), min_size=1, max_size=60), st.integers(2, 20))
@@ -154,7 +156,7 @@ def test_any_looks_give_a_choice_in_order(steps, most):
     way = np.maximum(0.0, np.cumsum([step for _, step in steps]) - steps[0][1])
     looks = [TrackedFrame(3 * k, sharp, float(at)) for k, ((sharp, _), at) in enumerate(zip(steps, way, strict=True))]
 
-    choice = choose(looks, most)
+    choice = select_keyframes(looks, most)
 
     assert 1 <= len(choice.frames) <= most
     assert list(choice.frames) == sorted(set(choice.frames))
@@ -164,4 +166,4 @@ def test_any_looks_give_a_choice_in_order(steps, most):
 
 
 def test_no_looks_no_frames():
-    assert choose([], 10).frames == ()
+    assert select_keyframes([], 10).frames == ()

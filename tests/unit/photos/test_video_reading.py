@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sfm_app.photos import UnreadableError, head_of, is_video, opened
+from sfm_app.photos import UnreadableError, is_video, open_video, read_head
 from sfm_app.photos.video import video_reader as video
 
 pytestmark = pytest.mark.slow
@@ -28,7 +28,7 @@ def write(path, code="MJPG", count=COUNT):
 
 
 def brightness(path, numbers):
-    with opened(path) as found:
+    with open_video(path) as found:
         return {number: decoded(data)[:, -20:].mean() for number, data in found.jpegs(numbers)}
 
 
@@ -46,10 +46,10 @@ CONTAINERS = [
 def test_frames_keep_their_numbers(tmp_path, name, code):
     path = write(tmp_path / name, code)
 
-    assert is_video(head_of(path))
-    with opened(path) as found:
+    assert is_video(read_head(path))
+    with open_video(path) as found:
         small = list(found.small_frames())
-    assert found.frames == COUNT and not found.cut_short
+    assert found.frames == COUNT and not found.is_cut_short
     assert [number for number, _ in small] == list(range(COUNT))
     assert all(picture.shape == (HEIGHT, WIDTH) for _, picture in small)
     full = brightness(path, [3, 10, 23])
@@ -64,9 +64,9 @@ def test_large_frames_are_looked_at_small_and_kept_whole(tmp_path):
         writer.write(np.full((720, 960, 3), 90, np.uint8))
     writer.release()
 
-    with opened(tmp_path / "a.avi") as found:
+    with open_video(tmp_path / "a.avi") as found:
         small = list(found.small_frames())
-    with opened(tmp_path / "a.avi") as found:
+    with open_video(tmp_path / "a.avi") as found:
         full = list(found.jpegs([5]))
 
     assert [number for number, _ in small] == [0, 4, 8]  # 30 in a second
@@ -80,7 +80,7 @@ def test_phones_that_were_turned_give_upright_frames(tmp_path):
     data[matrix : matrix + 36] = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, HEIGHT << 16, 0, 1 << 30)
     (tmp_path / "a.mp4").write_bytes(data)
 
-    with opened(tmp_path / "a.mp4") as found:
+    with open_video(tmp_path / "a.mp4") as found:
         _, picture = next(found.small_frames())
 
     assert picture.shape == (WIDTH, HEIGHT)
@@ -97,18 +97,18 @@ def test_what_comes_before_the_damage_is_read(tmp_path, name, code):
     path = write(tmp_path / name, code)
     cut(path)
 
-    with opened(path) as found:
+    with open_video(path) as found:
         frames = len(list(found.small_frames()))
 
     assert 5 <= frames <= 20
-    assert found.cut_short
+    assert found.is_cut_short
 
 
 def test_a_file_without_its_index_is_damaged(tmp_path):
     path = write(tmp_path / "a.mp4", "mp4v")
     cut(path)
 
-    with pytest.raises(UnreadableError, match="damaged"), opened(path):
+    with pytest.raises(UnreadableError, match="damaged"), open_video(path):
         pass
 
 
@@ -134,7 +134,7 @@ def test_a_name_is_but_a_name(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "plain.avi").rename(tmp_path / name)
 
-    with opened((tmp_path / name).relative_to(tmp_path)) as found:
+    with open_video((tmp_path / name).relative_to(tmp_path)) as found:
         assert len(list(found.small_frames())) == COUNT
 
 
@@ -152,19 +152,19 @@ def test_lists_of_other_files_are_not_followed(tmp_path, monkeypatch, kind, endi
     path = tmp_path / f"x.{kind if ending == 'list' else ending}"
     path.write_text(LISTS[kind].format("a.ts"))
 
-    with pytest.raises(UnreadableError, match="not a video"), opened(path):
+    with pytest.raises(UnreadableError, match="not a video"), open_video(path):
         pass
     monkeypatch.setattr(video, "is_video", bool)  # and FFmpeg would not, either
-    with pytest.raises(UnreadableError, match="damaged"), opened(path):
+    with pytest.raises(UnreadableError, match="damaged"), open_video(path):
         pass
 
 
 def test_nothing_but_regular_files_is_opened(tmp_path):
     os.mkfifo(tmp_path / "pipe.mp4")
 
-    assert not is_video(head_of(tmp_path / "pipe.mp4"))
-    assert not is_video(head_of(tmp_path))
-    assert not is_video(head_of(tmp_path / "nothing.mp4"))
+    assert not is_video(read_head(tmp_path / "pipe.mp4"))
+    assert not is_video(read_head(tmp_path))
+    assert not is_video(read_head(tmp_path / "nothing.mp4"))
 
 
 def test_other_users_of_opencv_notice_nothing(tmp_path, monkeypatch):
@@ -172,7 +172,7 @@ def test_other_users_of_opencv_notice_nothing(tmp_path, monkeypatch):
     monkeypatch.delenv("OPENCV_FFMPEG_LOGLEVEL", raising=False)
     before = dict(os.environ), cv2.utils.logging.getLogLevel()
 
-    with opened(write(tmp_path / "a.avi")) as found:
+    with open_video(write(tmp_path / "a.avi")) as found:
         next(found.small_frames())
 
     assert (dict(os.environ), cv2.utils.logging.getLogLevel()) == before

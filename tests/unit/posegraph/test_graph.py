@@ -8,7 +8,7 @@ from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.geometry.epipolar import eight_point
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph, with_model
-from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, NO_NUMBERS, TOO_FEW, averaged
+from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, NOT_COMPUTABLE, TOO_FEW, average_pair_rotations
 from sfm_app.posegraph.groups import connected_groups
 from sfm_app.types import (
     Calibration,
@@ -114,7 +114,7 @@ def test_photos_of_one_place_hang_together():
 
     assert list(graph.poses) == list(combinations(SIX, 2)) and graph.dropped == {}
     assert graph.groups == (SIX,)
-    rotations = averaged(graph.poses)[0]
+    rotations = average_pair_rotations(graph.poses)[0]
     errors = [photos.error_deg(rotations[j] @ rotations[i].T, (i, j)) for i, j in graph.poses]
     assert 0.001 < max(errors) < 0.3
     assert not any(pose.guided for pose in graph.poses.values())
@@ -174,8 +174,10 @@ def test_two_places_are_two_groups_the_larger_one_first():
 
     assert graph.groups == ((3, 4, 5, 6), (1, 2, 9))
     assert (2, 3) not in graph.poses
-    assert graph.group_of(9) == (1, 2, 9) and graph.group_of(7) == ()
-    np.testing.assert_allclose([averaged(graph.poses)[0][photo] for photo in (1, 3)], [np.eye(3)] * 2, atol=0.01)
+    assert graph.connected_photos(9) == (1, 2, 9) and graph.connected_photos(7) == ()
+    np.testing.assert_allclose(
+        [average_pair_rotations(graph.poses)[0][photo] for photo in (1, 3)], [np.eye(3)] * 2, atol=0.01
+    )
 
 
 def test_where_cameras_are_guesses_pairs_keep_the_inliers_of_F():
@@ -252,7 +254,7 @@ def test_a_pair_whose_inliers_lie_in_one_point_has_no_pose_and_the_others_have_t
 
     graph = build_pose_graph(photos.matches, ViewGraph(fits, views.rejected), bent, OPTIONS, in_turn)
 
-    assert graph.dropped == {(1, 2): NO_NUMBERS}
+    assert graph.dropped == {(1, 2): NOT_COMPUTABLE}
     assert sorted(graph.poses) == [(1, 3), (2, 3)] and graph.groups == ((1, 2, 3),)
 
 
@@ -265,8 +267,8 @@ def test_pairs_on_a_plane_count_little_where_rotations_are_averaged():
         return RelativePose(R, np.array([1.0, 0.0, 0.0]), np.ones(60, bool), 10.0, 1.0, "calibrated", False)
 
     poses = {(1, 2): pose(turn[1]), (2, 3): pose(turn[1]), (1, 3): pose(aside @ turn[2])}
-    off = averaged(poses, {(1, 3)})[1]
-    even = averaged(poses)[1]
+    off = average_pair_rotations(poses, {(1, 3)})[1]
+    even = average_pair_rotations(poses)[1]
 
     assert off[1, 3] > 30.0 > 10.0 > max(off[1, 2], off[2, 3])
     assert off[1, 3] >= even[1, 3]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.posegraph.guided import guided_pose, sampled_direction
+from sfm_app.posegraph.guided import guided_pose, sample_direction
 
 LEAST = 16
 
@@ -81,7 +81,7 @@ def test_the_direction_points_to_where_the_matches_lie_before_both_cameras(two_v
         t = sign * two_views().t * [1, 1, 0.2]
         views = two_views(t=t / np.linalg.norm(t), noise_px=0.1)
 
-        found = sampled_direction(views.pair(), views.R, np.random.default_rng(0))
+        found = sample_direction(views.pair(), views.R, np.random.default_rng(0))
 
         assert views.errors_deg(views.R, found)[1] < 3.0
 

@@ -7,9 +7,9 @@ from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
 from sfm_app.posegraph import look_alikes as module
 from sfm_app.posegraph.coverage import backbone
 from sfm_app.posegraph.graph import LOOKS_ALIKE
-from sfm_app.posegraph.look_alikes import joins_of, tell_apart
+from sfm_app.posegraph.look_alikes import find_look_alikes, group_doubted_pairs
 from sfm_app.synthetic.cameras import look_at
-from sfm_app.synthetic.scenes.look_alikes import gathered, matched
+from sfm_app.synthetic.scenes.look_alikes import make_place, match_photos
 from sfm_app.types import EpipolarFit, Intrinsics, ViewGraph
 
 
@@ -38,11 +38,11 @@ def walk(seed, *, twice):
     first, last = box(rng, 250), box(rng, 250)
     home, away = (turn(0), np.zeros(3)), (turn(5), np.array([9.0, 0.0, 0.2]))
     things = [(first, [home, away])] if twice else [(first, [home]), (last, [away])]
-    place = gathered(
+    place = make_place(
         from_all_sides(np.vstack([wall, *between])), [(from_all_sides(thing), stands) for thing, stands in things]
     )
     ways = [view([x, 0.1 * np.sin(3 * x), -3.0], [x + 0.1 * np.cos(x), 0.0, 0.0]) for x in np.linspace(-0.5, 9.5, 24)]
-    return matched(place, ways, seed)
+    return match_photos(place, ways, seed)
 
 
 def orbit(seed, photos=24, nearer=4.0, farther=4.0):
@@ -50,11 +50,11 @@ def orbit(seed, photos=24, nearer=4.0, farther=4.0):
     rng = np.random.default_rng(seed)
     ball, room = (X / np.linalg.norm(X, axis=1)[:, None] for X in (rng.normal(size=(n, 3)) for n in (2500, 300)))
     X = np.vstack([ball, room * rng.uniform(8.0, 12.0, (300, 1))])
-    place = gathered((X, np.vstack([ball, np.zeros_like(room)])), [])
+    place = make_place((X, np.vstack([ball, np.zeros_like(room)])), [])
     angles = np.linspace(0, 2 * np.pi, photos, endpoint=False)
     ways = np.linspace(nearer, farther, photos)
     centers = [[r * np.cos(t), 0.2 * np.sin(2 * t), r * np.sin(t)] for t, r in zip(angles, ways, strict=True)]
-    return matched(place, [view(center, [0, 0, 0]) for center in centers], seed)
+    return match_photos(place, [view(center, [0, 0, 0]) for center in centers], seed)
 
 
 def can(seed, photos=36):
@@ -66,21 +66,21 @@ def can(seed, photos=36):
     sides, far = rng.uniform(0, 2 * np.pi, 500), rng.uniform(3.0, 6.0, 500)
     room = np.column_stack([far * np.cos(sides), rng.uniform(-2.0, 2.0, 500), far * np.sin(sides)])
     stands = [(turn(0), np.zeros(3)), (turn(180), np.zeros(3))]
-    place = gathered(from_all_sides(room), [((printed, normals), stands)], pillar=1.0)
+    place = make_place(from_all_sides(room), [((printed, normals), stands)], pillar=1.0)
     turns = np.linspace(0, 2 * np.pi, photos, endpoint=False)
     centers = [[5.5 * np.cos(t), 0.2 * np.sin(3 * t) - 1.0, 5.5 * np.sin(t)] for t in turns]
-    return matched(place, [view(center, [0, 0, 0]) for center in centers], seed)
+    return match_photos(place, [view(center, [0, 0, 0]) for center in centers], seed)
 
 
 def told_apart(scene):
-    found = tell_apart(scene.matches, scene.poses, scene.cameras)
+    found = find_look_alikes(scene.matches, scene.poses, scene.cameras)
     return found, {pair for join in found.joins for pair in join.pairs}
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_two_equal_boxes_at_the_ends_of_a_walk_are_told_apart(seed):
     scene = walk(seed, twice=True)
-    false = scene.poses.keys() - scene.true
+    false = scene.poses.keys() - scene.true_pairs
 
     found, dropped = told_apart(scene)
 
@@ -93,7 +93,7 @@ def test_two_equal_boxes_at_the_ends_of_a_walk_are_told_apart(seed):
 def test_boxes_that_differ_join_nothing(seed):
     scene = walk(seed, twice=False)
 
-    assert len(scene.true) == len(scene.poses) > 100
+    assert len(scene.true_pairs) == len(scene.poses) > 100
     found, _ = told_apart(scene)
     assert found.joins == found.doubtful == ()
 
@@ -109,7 +109,7 @@ def test_an_orbit_stays_closed(farther):
 
 def test_the_two_sides_of_a_can_are_told_apart_by_the_room_behind_it():
     scene = can(0)
-    false = scene.poses.keys() - scene.true
+    false = scene.poses.keys() - scene.true_pairs
 
     _, dropped = told_apart(scene)
 
@@ -130,24 +130,27 @@ def test_a_loop_that_its_tracks_do_not_bear_out_stays_where_nothing_is_missing(m
     found, dropped = told_apart(scene)
 
     rows = {pair: scene.matches.matches[pair][scene.poses[pair].inliers].astype(np.int64) for pair in loose}
-    assert any(found.tracks.contradict(pair, rows[pair]) for pair in loose)
+    assert any(found.tracks.is_contradicted_by(pair, rows[pair]) for pair in loose)
     assert not dropped and found.doubtful == (), "it turns as the way does, and nothing is missing"
 
 
 def test_a_pair_that_is_found_later_is_asked_as_well():
     scene = walk(0, twice=True)
     found, dropped = told_apart(scene)
-    true, false = max(scene.true, key=lambda pair: len(scene.matches.matches[pair])), max(dropped)
+    true, false = max(scene.true_pairs, key=lambda pair: len(scene.matches.matches[pair])), max(dropped)
 
     rows = {pair: scene.matches.matches[pair][scene.poses[pair].inliers] for pair in (true, false)}
 
-    assert found.strange(false, rows[false]) and not found.strange(true, rows[true])
+    assert found.is_look_alike(false, rows[false]) and not found.is_look_alike(true, rows[true])
 
 
 def test_doubted_pairs_between_the_same_places_are_one_join():
     trusted = [(1, 2), (2, 3), (11, 12), (21, 22)]
 
-    assert joins_of([(1, 11), (2, 12), (3, 21), (12, 3)], trusted) == [((1, 11), (2, 12), (12, 3)), ((3, 21),)]
+    assert group_doubted_pairs([(1, 11), (2, 12), (3, 21), (12, 3)], trusted) == [
+        ((1, 11), (2, 12), (12, 3)),
+        ((3, 21),),
+    ]
 
 
 def test_the_backbone_holds_what_no_better_way_leads_round():
@@ -159,7 +162,7 @@ def test_the_backbone_holds_what_no_better_way_leads_round():
 def test_nothing_is_found_among_no_pairs():
     scene = walk(0, twice=True)
 
-    assert tell_apart(scene.matches, {}, scene.cameras).joins == ()
+    assert find_look_alikes(scene.matches, {}, scene.cameras).joins == ()
 
 
 def test_the_pose_graph_does_without_look_alikes():
@@ -186,5 +189,5 @@ def test_the_pose_graph_does_without_look_alikes():
     apart = {pair for pair, reason in graph.dropped.items() if reason == LOOKS_ALIKE}
     assert len(graph.groups[0]) == 24 and graph.doubtful == ()
     assert apart == {pair for join in graph.look_alikes for pair in join.pairs} and len(apart) > 15
-    assert len(apart - scene.true) >= len(apart) - 1 and apart.isdisjoint(graph.poses)
-    assert len(graph.poses.keys() & scene.true) > 0.8 * len(scene.true)
+    assert len(apart - scene.true_pairs) >= len(apart) - 1 and apart.isdisjoint(graph.poses)
+    assert len(graph.poses.keys() & scene.true_pairs) > 0.8 * len(scene.true_pairs)

@@ -6,9 +6,9 @@ from scipy.spatial.transform import Rotation
 
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import cross_matrix, eight_point
-from sfm_app.posegraph.guided import held_direction
-from sfm_app.posegraph.pair_pose import Pair, estimated
-from sfm_app.posegraph.refine import refined
+from sfm_app.posegraph.guided import refine_direction
+from sfm_app.posegraph.pair_pose import Pair, estimate_pose
+from sfm_app.posegraph.refine import refine_pose
 from sfm_app.posegraph.starts import TURNS_DEG, planar_starts, turned_starts
 from sfm_app.types import Calibration, EpipolarFit
 
@@ -58,8 +58,8 @@ def test_where_F_turns_the_camera_elsewhere_the_pair_is_posed_all_the_same(seed,
     E = cross_matrix(np.array([0.0, 0.0, 9.0]) - wrong @ [0.0, 0.0, 9.0]) @ wrong
     fit = EpipolarFit(np.linalg.inv(K).T @ E @ np.linalg.inv(K), np.ones(150, bool), np.ones(150), 10, 0.5)
 
-    alone = refined(pair.rays, pair.focals, *pair.start(fit))
-    pose = estimated(pair, fit)
+    alone = refine_pose(pair.rays, pair.focals, *pair.initial_pose(fit))
+    pose = estimate_pose(pair, fit)
 
     assert errors_deg(*alone, R, t)[0] > 20.0
     assert 0.0 < errors_deg(pose.R, pose.t, R, t)[0] < 2.0
@@ -92,6 +92,6 @@ def test_with_the_rotation_held_the_direction_is_found_from_nearby():
     pair, _, R, t = orbit_pair(3, 20.0)
     aside = Rotation.from_rotvec([0.0, 0.1, 0.1]).as_matrix() @ t
     for sign in (1.0, -1.0):
-        found = held_direction(pair, R, sign * aside)
+        found = refine_direction(pair, R, sign * aside)
         assert 0.0 < np.degrees(np.arccos(sign * found @ t)) < 1.0
         assert np.linalg.norm(found) == pytest.approx(1.0)

@@ -7,12 +7,12 @@ from functools import partial
 import numpy as np
 import pytest
 
-from sfm_app.ransac.best_model import Best
+from sfm_app.ransac.best_model import BestModel
 from sfm_app.ransac.estimator_config import Recipe
 from sfm_app.ransac.inner_loop import GUIDED, UNGUIDED
 from sfm_app.ransac.points import prepare
 from sfm_app.ransac.scoring.robust_costs import geman_mcclure, msac, penalty, ransac, squared_distances
-from sfm_app.ransac.verification.pretests import OPEN
+from sfm_app.ransac.verification.pretests import NO_PRETEST
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 PAIR = make_pair(PairOptions(points=300, outliers=0.3, sigma_px=0.5), 1)
@@ -39,11 +39,11 @@ TWO = replace(ONE, score=partial(geman_mcclure, scale=0.5), fine_score=partial(g
 
 
 def score_of(F, score):
-    return penalty(POINTS, 0, F.reshape(9), score(POINTS, THRESHOLD, None), math.inf, OPEN)
+    return penalty(POINTS, 0, F.reshape(9), score(POINTS, THRESHOLD, None), math.inf, NO_PRETEST)
 
 
 def best_of(recipe):
-    return Best(POINTS, THRESHOLD, recipe)
+    return BestModel(POINTS, THRESHOLD, recipe)
 
 
 def meet(best, F, score, kind=GUIDED):
@@ -66,9 +66,9 @@ def test_one_score_is_the_one_to_beat():
     np.testing.assert_array_equal(best.f, ROUGH.reshape(9))
     assert best.inlier_share() == np.mean(squared_distances(POINTS, ROUGH.reshape(9)) <= THRESHOLD**2)
 
-    assert best.challenged_by(7.0 * GOOD)
+    assert best.replace_if_better(7.0 * GOOD)
     np.testing.assert_allclose(best.f, GOOD.reshape(9), atol=1e-15)
-    assert not best.challenged_by(ROUGH)
+    assert not best.replace_if_better(ROUGH)
 
 
 @pytest.mark.parametrize(("improved", "kept"), [(GOOD, GOOD), (BAD, ROUGH)])
@@ -93,7 +93,7 @@ def test_with_two_scores_samples_compete_with_samples_and_improved_models_with_e
     assert best.to_beat[0] == score_of(ROUGH, TWO.score)
     np.testing.assert_allclose(best.f, GOOD.reshape(9), atol=1e-15)
 
-    assert not best.challenged_by(ROUGH)
+    assert not best.replace_if_better(ROUGH)
     assert best.to_beat[0] == score_of(ROUGH, TWO.score)
 
 
@@ -122,10 +122,10 @@ def test_the_finer_score_decides_between_improved_models():
     coarse, fine = partial(geman_mcclure, scale=1.0), partial(geman_mcclure, scale=0.05)
     points, won = np.asfortranarray(flat), {}
     for scores in ((coarse, fine), (fine, coarse), (fine, fine)):
-        best = Best(points, 1.0, replace(ONE, score=scores[0], fine_score=scores[1]))
+        best = BestModel(points, 1.0, replace(ONE, score=scores[0], fine_score=scores[1]))
         best.samples[0], best.to_beat[0] = middle / np.linalg.norm(middle), 50.0
         best.update(GUIDED)
-        won[scores] = best.challenged_by(shift.reshape(3, 3))
+        won[scores] = best.replace_if_better(shift.reshape(3, 3))
     assert won == {(coarse, fine): True, (fine, coarse): False, (fine, fine): True}
 
 

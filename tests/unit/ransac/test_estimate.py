@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfm_app.geometry.distances import sampson_distance
-from sfm_app.geometry.epipolar import unit_norm
+from sfm_app.geometry.epipolar import to_unit_norm
 from sfm_app.ransac import estimate_with, judge
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
@@ -27,7 +27,7 @@ def judge_with(F):
 @pytest.mark.parametrize("scale", [1.0, -1e-200, 1e200])
 def test_the_true_matrix_is_accepted_at_any_scale(scale):
     for found, trials in ((judge(PAIR.x1, PAIR.x2, scale * PAIR.F, OPTIONS), 1), (judge_with(scale * PAIR.F), 7)):
-        np.testing.assert_allclose(unit_norm(found.F), unit_norm(PAIR.F), atol=1e-12)
+        np.testing.assert_allclose(to_unit_norm(found.F), to_unit_norm(PAIR.F), atol=1e-12)
         np.testing.assert_array_equal(found.inliers, sampson_distance(PAIR.F, PAIR.x1, PAIR.x2) <= 2.0)
         assert found.trials == trials
         assert found.degeneracy == ""

@@ -8,7 +8,7 @@ import pytest
 
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.ransac import ESTIMATORS
-from sfm_app.ransac.estimator_configs import RECIPES, classical, median_sigma
+from sfm_app.ransac.estimator_configs import RECIPES, classical_estimator, median_sigma
 from sfm_app.ransac.loop import search
 from sfm_app.ransac.points import prepare
 from sfm_app.settings import EpipolarSettings
@@ -34,7 +34,7 @@ def test_every_estimator_is_registered_with_a_line_about_it():
 
 
 def test_estimators_pickle_by_name():
-    fit = classical("mlesac")
+    fit = classical_estimator("mlesac")
     assert pickle.loads(pickle.dumps(fit)) is fit  # noqa: S301 - our own bytes
     assert fit.__name__ == "mlesac"
 
@@ -60,7 +60,7 @@ def test_lmeds_draws_for_half_outliers_and_holds_up_to_there():
     assert (trials_of("lmeds", 0.1, range(2)) == expected).all()
     for seed in range(3):
         pair = make_pair(PairOptions(points=600, outliers=0.4), seed)
-        fit = classical("lmeds")(pair.x1, pair.x2, OPTIONS, seed)
+        fit = classical_estimator("lmeds")(pair.x1, pair.x2, OPTIONS, seed)
         assert sampson_distance(fit.F, pair.exact_x1, pair.exact_x2).mean() < 0.4
 
 

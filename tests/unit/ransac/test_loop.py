@@ -7,13 +7,13 @@ import pytest
 
 import sfm_app.ransac.loop as loop
 from sfm_app.ransac.estimator_config import Recipe
-from sfm_app.ransac.inner_loop import Draws, next_better
+from sfm_app.ransac.inner_loop import SamplingPlan, draw_until_better
 from sfm_app.ransac.loop import search
 from sfm_app.ransac.points import prepare
 from sfm_app.ransac.sampling.minimal_samples import random_state
 from sfm_app.ransac.scoring.mlesac import mlesac
 from sfm_app.ransac.scoring.robust_costs import msac, squared_distances
-from sfm_app.ransac.verification.pretests import OPEN, FullVerification, RandomisedTdd
+from sfm_app.ransac.verification.pretests import NO_PRETEST, FullVerification, RandomizedTdd
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
@@ -104,13 +104,15 @@ def test_local_optimization_is_kept_only_if_better():
     assert search(m, options(), 0, misled).F.tobytes() == search(m, options(), 0, PLAIN).F.tobytes()
 
 
-def draw(points, draws, to_beat, best, limit=25, pretests=(OPEN, OPEN), seed=0):
-    return next_better(points, draws, msac(points, 0.01, None), pretests, to_beat, limit, random_state(seed), best)
+def draw(points, draws, to_beat, best, limit=25, pretests=(NO_PRETEST, NO_PRETEST), seed=0):
+    return draw_until_better(
+        points, draws, msac(points, 0.01, None), pretests, to_beat, limit, random_state(seed), best
+    )
 
 
 def blind(count, batch=1):
     """Uniform samples only."""
-    return Draws(7, False, batch, 0.0, np.cumsum(np.ones(count)), 0.0, np.zeros(1))
+    return SamplingPlan(7, False, batch, 0.0, np.cumsum(np.ones(count)), 0.0, np.zeros(1))
 
 
 def test_next_better_leaves_the_best_alone_when_nothing_is_better():
@@ -127,8 +129,8 @@ def test_a_batch_is_drawn_to_its_end_and_its_best_model_returned(batch, limit, d
     one_by_one, lowest, state = np.zeros((2, 9)), np.full(2, np.inf), random_state(0)
     left = drawn
     while left:
-        left -= next_better(
-            m.points, blind(300), msac(m.points, 0.01, None), (OPEN, OPEN), lowest, left, state, one_by_one
+        left -= draw_until_better(
+            m.points, blind(300), msac(m.points, 0.01, None), (NO_PRETEST, NO_PRETEST), lowest, left, state, one_by_one
         )
     np.testing.assert_array_equal(best, one_by_one)
     np.testing.assert_array_equal(to_beat, lowest)
@@ -182,7 +184,7 @@ def scripted(monkeypatch):
 
     def run(recipe, *better, model=truth, **values):
         script = Script(model, *better)
-        monkeypatch.setattr(loop, "next_better", script)
+        monkeypatch.setattr(loop, "draw_until_better", script)
         return search(m, options(**values), 0, recipe), script.calls
 
     return run
@@ -224,7 +226,7 @@ def test_a_last_attempt_may_beat_the_best_model_and_else_is_dropped(scripted):
     np.testing.assert_array_equal(found.F, truth)
     found, _ = scripted(replace(PLAIN, recover=recover), (1, 290.0), model=wrong.reshape(9), max_trials=10)
     np.testing.assert_allclose(found.F, truth, atol=1e-15)
-    assert seen[1][2] is OPEN
+    assert seen[1][2] is NO_PRETEST
     assert scripted(replace(PLAIN, recover=recover), max_trials=10)[0] is None
     assert len(seen) == 2
 
@@ -275,8 +277,8 @@ def test_only_kinds_of_samples_that_improved_are_asked(monkeypatch, improved, as
         best.to_beat[:] = 0.5  # as a new best model does: the bar of the other kind falls too
         return True
 
-    monkeypatch.setattr(loop, "next_better", script)
-    monkeypatch.setattr(loop.Best, "update", update)
+    monkeypatch.setattr(loop, "draw_until_better", script)
+    monkeypatch.setattr(loop.BestModel, "update", update)
     search(m, options(max_trials=120), 0, replace(PLAIN, least_trials=50, patience=always(200)))
     assert seen == asked
 
@@ -288,7 +290,7 @@ def test_first_priors_come_at_their_share_of_the_trials(scripted):
         seen.append(best.copy())
         return np.ones(300)
 
-    recipe = replace(PLAIN, assumed_share=0.5, validity=validity, guided_after=0.1)
+    recipe = replace(PLAIN, assumed_share=0.5, validity=validity, warmup_share=0.1)
     _, calls = scripted(recipe, (10, 3.0), (60, 2.0), (200, 1.0), (300, 0.5))
 
     # a tenth of 1175 is 118: until then no priors, then those of the best model, then those of every new one
@@ -328,7 +330,7 @@ def test_an_outlier_in_front_does_not_spoil_a_randomized_test():
     inlier[m.rows] = pair.is_inlier
     spoilt = replace(m, points=np.asfortranarray(m.points[np.argsort(inlier)]))  # all outliers come first
 
-    found = search(spoilt, options(), 0, replace(PLAIN, verifier=RandomisedTdd))
+    found = search(spoilt, options(), 0, replace(PLAIN, verifier=RandomizedTdd))
 
     near = squared_distances(spoilt.points, found.F.reshape(9)) < (3 / m.unit_px) ** 2
     assert near[np.sort(inlier)].mean() > 0.9

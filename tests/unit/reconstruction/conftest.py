@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.database import opened
+from sfm_app.colmap.database import open_database
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import eight_point
-from sfm_app.progress import Silent
+from sfm_app.progress import SilentProgress
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchedImage, MatchGraph, ViewGraph
@@ -37,7 +37,7 @@ class Synthetic:
 
 def _graph(database, model):
     keypoints, rows, rng = {}, {}, np.random.default_rng(0)
-    with opened(database) as db:
+    with open_database(database) as db:
         for key in sorted(model.images):
             keypoints[key] = np.asarray(db.read_keypoints(key), np.float64)[:, :2]
         pairs = [(a, b) for a in sorted(keypoints) for b in sorted(keypoints) if a < b]
@@ -68,7 +68,7 @@ def synthetic(tmp_path_factory):
     options.camera_params = [FOCAL, WIDTH / 2, HEIGHT / 2, 0.0]
     noise = pycolmap.SyntheticNoiseOptions()
     noise.point2D_stddev = 0.2
-    with opened(place / "database.db") as database:
+    with open_database(place / "database.db") as database:
         model = pycolmap.synthesize_dataset(options, database)
         pycolmap.synthesize_noise(noise, model, database)
     matches = _graph(place / "database.db", model)
@@ -99,7 +99,7 @@ def run(synthetic, tmp_path):
             workspace=Workspace(tmp_path),
             seed=0,
             workers=2,
-            progress=Silent(),
+            progress=SilentProgress(),
             map=lambda function, items, _: [function(item) for item in items],
         )
 

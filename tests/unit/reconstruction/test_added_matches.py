@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.reconstruction.added_matches import with_added
+from sfm_app.reconstruction.added_matches import add_matches
 from sfm_app.types import MatchGraph
 
 GRID = np.array([[10.0 * k, 5.0] for k in range(4)])
@@ -16,7 +16,7 @@ def graph(known=()):
 def test_keypoints_in_one_place_are_one_and_others_are_appended():
     found = {1: np.array([[10.3, 5.0], [14.0, 5.0]]), 2: np.array([[1.0, 6.0], [90.0, 9.0]])}
 
-    merged, changed = with_added(graph(known=[[0, 3]]), found, {(1, 2): np.array([[0, 0], [1, 1]], np.uint32)})
+    merged, changed = add_matches(graph(known=[[0, 3]]), found, {(1, 2): np.array([[0, 0], [1, 1]], np.uint32)})
 
     np.testing.assert_array_equal(merged.keypoints[1], np.vstack([GRID, found[1]]))
     np.testing.assert_array_equal(merged.matches[1, 2], [[0, 3], [1, 0], [5, 5]])
@@ -25,7 +25,7 @@ def test_keypoints_in_one_place_are_one_and_others_are_appended():
 
 def test_a_keypoint_that_has_a_match_gets_no_other():
     found = {1: GRID, 2: GRID + 1.0}
-    merged, changed = with_added(graph(known=[[0, 3]]), found, {(1, 2): np.array([[0, 1], [2, 3]], np.uint32)})
+    merged, changed = add_matches(graph(known=[[0, 3]]), found, {(1, 2): np.array([[0, 1], [2, 3]], np.uint32)})
 
     np.testing.assert_array_equal(merged.matches[1, 2], [[0, 3]])
     assert changed == ()
@@ -33,7 +33,7 @@ def test_a_keypoint_that_has_a_match_gets_no_other():
 
 def test_a_pair_and_a_photo_without_anything_get_what_was_found():
     found = {1: GRID, 3: GRID}
-    merged, changed = with_added(graph(), found, {(1, 3): np.array([[3, 1]], np.uint32)})
+    merged, changed = add_matches(graph(), found, {(1, 3): np.array([[3, 1]], np.uint32)})
 
     np.testing.assert_array_equal(merged.matches[1, 3], [[3, 1]])
     assert changed == ((1, 3),) and len(merged.keypoints[3]) == 4
@@ -47,7 +47,7 @@ def test_matches_stay_one_to_one_and_lie_where_they_were_found(seed):
     found[1][:2] = GRID[:2] + 0.2
     added = np.column_stack([rng.permutation(6), rng.permutation(6)]).astype(np.uint32)
 
-    merged, _ = with_added(graph(known=known), found, {(1, 2): added})
+    merged, _ = add_matches(graph(known=known), found, {(1, 2): added})
     rows = merged.matches[1, 2]
 
     np.testing.assert_array_equal(rows[:2], known)

@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.model import posed_photos
-from sfm_app.orientation.georeference import enu_m, position_at
+from sfm_app.colmap.model import poses_and_points
+from sfm_app.orientation.georeference import enu_m, position_from_enu
 from sfm_app.orientation.gravity import up_direction
 from sfm_app.reconstruction import align_upright
-from sfm_app.reconstruction.align_upright import look_at, look_at_photos, orient, orient_or_leave, turned
+from sfm_app.reconstruction.align_upright import (
+    extract_cues,
+    orient,
+    orient_or_keep,
+    submit_cue_extraction,
+    turn_camera,
+)
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.synthetic.cameras import arc, make_camera
 from sfm_app.types import GpsPosition, MatchedImage, MatchGraph
@@ -59,7 +65,7 @@ def true_positions(views):
     ahead, right = np.array([np.sin(turn), np.cos(turn), 0.0]), np.array([np.cos(turn), -np.sin(turn), 0.0])
     axes = np.stack([right, [0, 0, 1.0], -ahead])
     centers = [-pose[:, :3].T @ pose[:, 3] for pose in views.cam_from_world.values()]
-    return [position_at(METRES * center @ axes, GpsPosition(48.2, 16.37, 170.0)) for center in centers]
+    return [position_from_enu(METRES * center @ axes, GpsPosition(48.2, 16.37, 170.0)) for center in centers]
 
 
 ROTATIONS = {
@@ -74,8 +80,8 @@ ROTATIONS = {
 def test_without_gps_the_model_has_size_one_and_stands_upright(tmp_path):
     views, model, matches, run = scene(tmp_path, lambda views: [None] * len(views.cam_from_world))
 
-    entry = orient(model, matches, look_at_photos([model], matches, run))
-    poses, points = posed_photos(model)
+    entry = orient(model, matches, submit_cue_extraction([model], matches, run))
+    poses, points = poses_and_points(model)
 
     assert entry["up"] == "camera roll" and entry["gps"] == "not used: the photos have no positions"
     assert np.allclose(np.median(points, axis=0), 0, atol=0.1)
@@ -88,10 +94,10 @@ def test_without_gps_the_model_has_size_one_and_stands_upright(tmp_path):
 
 def test_with_gps_the_model_is_in_meters_and_knows_its_place(tmp_path):
     _, model, matches, run = scene(tmp_path, true_positions)
-    shape = posed_photos(model)[1]
+    shape = poses_and_points(model)[1]
 
-    entry = orient(model, matches, look_at_photos([model], matches, run))
-    points = posed_photos(model)[1]
+    entry = orient(model, matches, submit_cue_extraction([model], matches, run))
+    points = poses_and_points(model)[1]
 
     assert entry["unit"] == "meter" and entry["gps"] == "12 of 12 positions agree"
     assert np.ptp(points, axis=0).max() / np.linalg.norm(np.ptp(shape, axis=0)) > 5
@@ -105,7 +111,7 @@ def test_with_gps_the_model_is_in_meters_and_knows_its_place(tmp_path):
     assert abs(turned_deg) < 30, "the front may be turned to the viewer, not further"
     h = np.radians(place["heading_deg"])
     origin = GpsPosition(place["latitude_deg"], place["longitude_deg"], place["altitude_m"])
-    for key, pose in posed_photos(model)[0].items():
+    for key, pose in poses_and_points(model)[0].items():
         x, y, z = -pose[:, :3].T @ pose[:, 3]
         enu = np.array([x * np.cos(h) - z * np.sin(h), -x * np.sin(h) - z * np.cos(h), y])
         assert enu == pytest.approx(enu_m([matches.images[key].gps], origin)[0], abs=4), "up is only that of roll"
@@ -113,10 +119,10 @@ def test_with_gps_the_model_is_in_meters_and_knows_its_place(tmp_path):
 
 def test_the_manifest_says_why_up_is_up(tmp_path):
     _, model, matches, run = scene(tmp_path, lambda views: [None] * len(views.cam_from_world))
-    looks = look_at_photos([model], matches, run)
+    looks = submit_cue_extraction([model], matches, run)
 
     entry = orient(model, matches, looks)
-    ups = [pose[1, 1] for pose in posed_photos(model)[0].values()]
+    ups = [pose[1, 1] for pose in poses_and_points(model)[0].values()]
     again = orient(model, matches, looks, turn_deg=180)
 
     assert entry["photos_turned_deg"] == 0 and again["photos_turned_deg"] == 180
@@ -124,14 +130,14 @@ def test_the_manifest_says_why_up_is_up(tmp_path):
     assert entry["up_axis_odds"] > 5
     assert set(entry["up_evidence_nats"].values()) == {0.0} and again["up_evidence_nats"] == {}
     assert again["up_sign_odds"] > 1e6
-    assert [pose[1, 1] for pose in posed_photos(model)[0].values()] == pytest.approx([-up for up in ups], abs=1e-6)
+    assert [pose[1, 1] for pose in poses_and_points(model)[0].values()] == pytest.approx([-up for up in ups], abs=1e-6)
 
 
 @pytest.mark.parametrize("turn", [0, 90, 180, 270])
 def test_a_turned_photo_is_upright_once_it_is_turned(turn):
     R = np.array(ROTATIONS[turn], float)  # a level camera, held so that its picture has to be turned by that
 
-    assert np.allclose(turned(R, turn), np.eye(3))
+    assert np.allclose(turn_camera(R, turn), np.eye(3))
 
 
 def test_a_turned_photo_is_looked_at_upright(tmp_path):
@@ -139,7 +145,7 @@ def test_a_turned_photo_is_looked_at_upright(tmp_path):
     picture[:, 150:] = 200
     cv2.imwrite(str(tmp_path / "a.png"), picture)
 
-    looks = [look_at(tmp_path / "a.png", turn).picture for turn in (0, 90, 180, 270)]
+    looks = [extract_cues(tmp_path / "a.png", turn).picture for turn in (0, 90, 180, 270)]
 
     assert looks[0][:, -1].mean() > 150 and looks[1][-1].mean() > 150  # what is right goes down, left, up
     assert looks[2][:, 0].mean() > 150 and looks[3][0].mean() > 150
@@ -150,7 +156,7 @@ def test_a_photo_that_is_gone_tells_nothing(tmp_path):
     picture[:, 150:] = 200
     cv2.imwrite(str(tmp_path / "a.png"), picture)
 
-    seen, gone = look_at(tmp_path / "a.png"), look_at(Path(tmp_path / "b.png"))
+    seen, gone = extract_cues(tmp_path / "a.png"), extract_cues(Path(tmp_path / "b.png"))
 
     assert seen.lines == pytest.approx(np.array([[150, 0, 150, 200]]), abs=2)
     assert seen.picture.shape == (171, 256) and seen.picture[:, 200].min() > 190
@@ -162,8 +168,8 @@ def test_points_that_are_nowhere_do_not_keep_the_model_from_standing_upright(tmp
     for xyz in ([np.inf, 0, 0], [np.nan] * 3, [1e200, 1e200, 0]):
         model.add_point3D(np.array(xyz), pycolmap.Track(), np.zeros(3, np.uint8))
 
-    entry = orient(model, matches, look_at_photos([model], matches, run))
-    points = posed_photos(model)[1][:300]
+    entry = orient(model, matches, submit_cue_extraction([model], matches, run))
+    points = poses_and_points(model)[1][:300]
 
     assert entry["up"] == "camera roll"
     assert np.percentile(np.linalg.norm(points, axis=1), 80) == pytest.approx(1, abs=1e-6)
@@ -173,12 +179,12 @@ def test_a_model_without_points_stays_as_it_is_and_the_entry_says_why(tmp_path):
     _, model, matches, run = scene(tmp_path, true_positions)
     for key in list(model.points3D):
         model.delete_point3D(key)
-    before = {key: pose.copy() for key, pose in posed_photos(model)[0].items()}
+    before = {key: pose.copy() for key, pose in poses_and_points(model)[0].items()}
 
-    entry = orient_or_leave(model, matches, look_at_photos([model], matches, run))
+    entry = orient_or_keep(model, matches, submit_cue_extraction([model], matches, run))
 
     assert entry["failed"] == "it has no points" and entry["unit"] == "that of mapping"
-    assert all(np.array_equal(pose, before[key]) for key, pose in posed_photos(model)[0].items())
+    assert all(np.array_equal(pose, before[key]) for key, pose in poses_and_points(model)[0].items())
 
 
 def test_gps_that_fails_leaves_the_model_upright_without_meters(tmp_path, monkeypatch):
@@ -188,7 +194,7 @@ def test_gps_that_fails_leaves_the_model_upright_without_meters(tmp_path, monkey
     _, model, matches, run = scene(tmp_path, true_positions)
     monkeypatch.setattr(align_upright, "georeference", failing)
 
-    entry = orient_or_leave(model, matches, look_at_photos([model], matches, run))
+    entry = orient_or_keep(model, matches, submit_cue_extraction([model], matches, run))
 
     assert entry["up"] == "camera roll" and entry["unit"] == "about the size of the scene"
     assert entry["gps"] == "not used: the computation failed: Eigenvalues did not converge"
@@ -201,4 +207,4 @@ def test_up_that_nobody_knows_how_exactly_is_null_and_no_infinity(tmp_path, monk
     _, model, matches, run = scene(tmp_path, lambda views: [None] * len(views.cam_from_world))
     monkeypatch.setattr(align_upright, "up_direction", unsure)
 
-    assert orient_or_leave(model, matches, look_at_photos([model], matches, run))["up_deviation_deg"] is None
+    assert orient_or_keep(model, matches, submit_cue_extraction([model], matches, run))["up_deviation_deg"] is None

@@ -5,21 +5,21 @@ from types import SimpleNamespace
 
 import pytest
 
-from sfm_app.colmap.database import opened
+from sfm_app.colmap.database import open_database
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.reconstruction import camera_per_photo
 from sfm_app.reconstruction import mapping_passes as module
 from sfm_app.reconstruction.camera_per_photo import (
-    LEAST,
-    explains_as_much,
-    explains_more,
-    may_have_one_each,
-    with_one_each,
-    with_two,
+    MIN_PHOTOS,
+    can_have_own_cameras,
+    is_as_good,
+    is_better,
+    with_camera_per_photo,
+    with_two_cameras,
 )
 from sfm_app.reconstruction.mapping_passes import reconstruct
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel
-from sfm_app.reconstruction.support import Explained, explained_pairs
+from sfm_app.reconstruction.support import PairSupport, explained_pairs
 from sfm_app.settings import Settings
 from sfm_app.types import ViewGraph
 
@@ -30,7 +30,7 @@ AUTO = Settings()
 
 
 def attempt(model, contradicted, matches=100, inliers=100):
-    return Attempt("incremental", model, {(1, 2): Explained(matches, inliers, contradicted)}, "")
+    return Attempt("incremental", model, {(1, 2): PairSupport(matches, inliers, contradicted)}, "")
 
 
 def photos(number):
@@ -49,7 +49,7 @@ def views(number):
         (6, 6, 1, AUTO, False),
         (4, 6, 0, AUTO, True),
         (5, 6, 0, AUTO, False),
-        (LEAST - 1, LEAST - 1, 2, AUTO, False),
+        (MIN_PHOTOS - 1, MIN_PHOTOS - 1, 2, AUTO, False),
         (61, 61, 2, AUTO, False),
         (6, 6, 2, Settings.from_mapping({"photos": {"cameras": "single"}}), False),
     ],
@@ -58,35 +58,39 @@ def test_it_is_asked_where_one_camera_does_not_explain_photos_that_nobody_groupe
     cameras, placed, number, contradicted, settings, asked
 ):
     guess = cameras(method="guess", identifiable=False)
-    assert may_have_one_each(attempt(photos(placed), contradicted), guess, views(number), settings) is asked
+    assert can_have_own_cameras(attempt(photos(placed), contradicted), guess, views(number), settings) is asked
 
 
 def test_it_is_asked_of_photos_of_a_plane_whose_pairs_are_all_degenerate(cameras):
     none = ViewGraph({}, {})
     guess = cameras(method="guess", identifiable=False)
 
-    assert may_have_one_each(attempt(photos(6), 2), guess, none, AUTO)
-    assert not may_have_one_each(attempt(photos(LEAST - 1), 2), guess, none, AUTO)
+    assert can_have_own_cameras(attempt(photos(6), 2), guess, none, AUTO)
+    assert not can_have_own_cameras(attempt(photos(MIN_PHOTOS - 1), 2), guess, none, AUTO)
 
 
 def test_without_a_model_it_is_not_asked(cameras):
-    assert not may_have_one_each(None, cameras(), views(6), AUTO)
+    assert not can_have_own_cameras(None, cameras(), views(6), AUTO)
 
 
 def test_every_photo_gets_a_guess_of_its_own_that_begins_where_mapping_ended(synthetic, cameras):
     model = synthetic.copy()
     model.cameras[1].params = [1111.0, 512.0, 384.0, 0.01]
 
-    found = with_one_each(attempt(model, 2), cameras(700.0, identifiable=False, method="guess"), synthetic.matches)
+    found = with_camera_per_photo(
+        attempt(model, 2), cameras(700.0, identifiable=False, method="guess"), synthetic.matches
+    )
 
     images = sorted(synthetic.matches.images.values(), key=lambda image: image.name)
-    assert [found.name_of(image) for image in images] == ["one", *(f"one #{k}" for k in range(2, 7))]
+    assert [found.camera_name(image) for image in images] == ["one", *(f"one #{k}" for k in range(2, 7))]
     assert sorted(found.cameras) == sorted(found.camera_of.values())
-    assert all(camera.focal_px == pytest.approx(1111.0) and not camera.estimated for camera in found.cameras.values())
+    assert all(
+        camera.focal_px == pytest.approx(1111.0) and not camera.is_estimated for camera in found.cameras.values()
+    )
 
 
 def test_a_camera_that_pairs_determine_is_not_divided(synthetic, cameras):
-    assert with_one_each(attempt(synthetic.copy(), 2), cameras(), synthetic.matches) is None
+    assert with_camera_per_photo(attempt(synthetic.copy(), 2), cameras(), synthetic.matches) is None
 
 
 @pytest.mark.parametrize(
@@ -101,13 +105,13 @@ def test_a_camera_that_pairs_determine_is_not_divided(synthetic, cameras):
     ],
 )
 def test_it_is_taken_where_it_explains_more_and_contradictions_go(own, better):
-    assert explains_more(own, attempt(photos(6), 10)) is better
+    assert is_better(own, attempt(photos(6), 10)) is better
 
 
 def each_of(synthetic, cameras, focals):
     """A model whose photos have these focals, and its cameras."""
     model = synthetic.copy()
-    each = with_one_each(attempt(model, 2), cameras(method="guess", identifiable=False), synthetic.matches)
+    each = with_camera_per_photo(attempt(model, 2), cameras(method="guess", identifiable=False), synthetic.matches)
     found = {photo: (camera_matrix(focal, focal, 512, 384), 0.0) for photo, focal in enumerate(focals, start=1)}
     return attempt(model, 0), each, found
 
@@ -116,9 +120,9 @@ def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
     model, each, found = each_of(synthetic, cameras, [1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0])
     monkeypatch.setattr(camera_per_photo, "cameras_of", lambda _: found)
 
-    two = with_two(model, each, synthetic.matches)
+    two = with_two_cameras(model, each, synthetic.matches)
 
-    names = {photo: two.name_of(synthetic.matches.images[photo]) for photo in range(1, 7)}
+    names = {photo: two.camera_name(synthetic.matches.images[photo]) for photo in range(1, 7)}
     assert len(two.cameras) == 2 and names[1] == names[3] == names[5] != names[2] == names[4] == names[6]
     assert [two.cameras[names[photo]].focal_px for photo in (1, 2)] == pytest.approx([1000.0, 1300.0])
     assert all(camera.identifiable and camera.method == "mapping" for camera in two.cameras.values())
@@ -128,7 +132,7 @@ def test_a_single_photo_of_another_focal_is_no_second_camera(synthetic, cameras,
     model, each, found = each_of(synthetic, cameras, [1000.0, 1005.0, 1010.0, 1310.0, 990.0, 1001.0])
     monkeypatch.setattr(camera_per_photo, "cameras_of", lambda _: found)
 
-    assert with_two(model, each, synthetic.matches) is None
+    assert with_two_cameras(model, each, synthetic.matches) is None
 
 
 @pytest.mark.parametrize(
@@ -143,7 +147,7 @@ def test_a_single_photo_of_another_focal_is_no_second_camera(synthetic, cameras,
     ],
 )
 def test_two_cameras_are_taken_where_they_explain_as_much(two, as_good):
-    assert explains_as_much(two, attempt(photos(6), 0, 1000, 1000)) is as_good
+    assert is_as_good(two, attempt(photos(6), 0, 1000, 1000)) is as_good
 
 
 @pytest.fixture
@@ -154,7 +158,7 @@ def zoom(monkeypatch, synthetic):
         asked = []
 
         def attempts(group, run):
-            names = {group.intrinsics.name_of(image) for image in group.matches.images.values()}
+            names = {group.intrinsics.camera_name(image) for image in group.matches.images.values()}
             asked.append(len(names))
             model = synthetic.copy()
             explained = explained_pairs(model, synthetic.matches, synthetic.views, 1.5)
@@ -167,7 +171,7 @@ def zoom(monkeypatch, synthetic):
 
         monkeypatch.setattr(module, "attempts", attempts)
         monkeypatch.setattr(module, "map_baseline", lambda *_: NoModel("colmap", "no rival"))
-        monkeypatch.setattr(module, "with_two", lambda *_: None)
+        monkeypatch.setattr(module, "with_two_cameras", lambda *_: None)
         monkeypatch.setattr(module, "MOST_PASSES", 1)
         return asked
 
@@ -175,7 +179,7 @@ def zoom(monkeypatch, synthetic):
 
 
 def cameras_in(path):
-    with opened(path) as database:
+    with open_database(path) as database:
         return len(database.read_all_cameras())
 
 
@@ -190,7 +194,7 @@ def test_photos_of_a_zoom_are_mapped_with_a_camera_each(synthetic, run, cameras,
 
 
 def test_photos_of_one_camera_keep_it_and_so_does_the_database(synthetic, run, cameras, zoom, monkeypatch):
-    monkeypatch.setattr(module, "may_have_one_each", lambda *_: True)
+    monkeypatch.setattr(module, "can_have_own_cameras", lambda *_: True)
     asked = zoom(right=False)
     guess = cameras(method="guess", identifiable=False)
 

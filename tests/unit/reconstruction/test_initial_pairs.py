@@ -3,8 +3,8 @@ import pytest
 
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import eight_point
-from sfm_app.posegraph.pair_pose import Pair, estimated
-from sfm_app.reconstruction.initial_pairs import agreement, coverage, rank_seeds, seed_of
+from sfm_app.posegraph.pair_pose import Pair, estimate_pose
+from sfm_app.reconstruction.initial_pairs import agreement, coverage, rank_seeds, triangulate_seed
 from sfm_app.types import Calibration, EpipolarFit, Intrinsics, MatchedImage, MatchGraph, PoseGraph, RelativePose
 
 K = camera_matrix(800.0, 800.0, 320.0, 240.0)
@@ -33,9 +33,9 @@ def seeded(matches, intrinsics):
     cameras = [intrinsics.camera(matches.images[key]) for key in (1, 2)]
     x1, x2 = matches.points((1, 2))
     fit = EpipolarFit(eight_point(x1, x2), np.ones(POINTS, bool), np.ones(POINTS), 10, 0.3)
-    graph = PoseGraph({(1, 2): estimated(Pair((x1, x2), cameras, 1.5), fit)}, {}, ())
+    graph = PoseGraph({(1, 2): estimate_pose(Pair((x1, x2), cameras, 1.5), fit)}, {}, ())
     [candidate] = rank_seeds(matches, graph, intrinsics, (1, 2), 2.0)
-    return seed_of(matches, candidate, intrinsics)
+    return triangulate_seed(matches, candidate, intrinsics)
 
 
 def test_a_seed_is_made_from_what_the_photos_show_without_their_lens():

@@ -3,7 +3,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfm_app.reconstruction.look_alikes import in_words, jumps, sides, with_earlier, without_look_alikes
+from sfm_app.reconstruction.look_alikes import (
+    jumps,
+    look_alike_entries,
+    sides,
+    with_earlier_look_alikes,
+    without_look_alikes,
+)
 from sfm_app.types import EpipolarFit, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
 
 COUNTS = {(1, 2): 90, (1, 11): 80, (2, 12): 70, (2, 11): 20, (11, 12): 90}
@@ -38,7 +44,7 @@ def test_a_second_pass_knows_what_the_first_told_apart():
     later = LookAlikes(((3, 4),), 0.5)
     first = graph(JOIN, dropped=dict.fromkeys(JOIN.pairs, "alike") | {(7, 8): "else"})
 
-    found = with_earlier(graph(later, dropped={(3, 4): "alike"}), first)
+    found = with_earlier_look_alikes(graph(later, dropped={(3, 4): "alike"}), first)
 
     assert found.look_alikes == (JOIN, later)
     assert found.dropped == dict.fromkeys((*JOIN.pairs, (3, 4)), "alike")
@@ -46,7 +52,7 @@ def test_a_second_pass_knows_what_the_first_told_apart():
 
 def test_the_photos_of_a_join_fall_into_two_places(matches):
     assert sides(JOIN.pairs, matches) == ([1, 2], [11, 12])
-    assert in_words([JOIN], matches) == [
+    assert look_alike_entries([JOIN], matches) == [
         {"pairs": 3, "between": [["1.jpg", "2.jpg"], ["11.jpg", "12.jpg"]], "missing": 0.346}
     ]
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 
 from sfm_app.colmap.bundle import adjust
-from sfm_app.colmap.database import opened
-from sfm_app.colmap.model import photos_of
+from sfm_app.colmap.database import open_database
+from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError
 from sfm_app.reconstruction import baseline
 from sfm_app.reconstruction import mapping_passes as module
-from sfm_app.reconstruction.mapping_passes import learned_intrinsics, reconstruct, taken_apart
+from sfm_app.reconstruction.mapping_passes import learned_intrinsics, reconstruct, split_attempt
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel
-from sfm_app.reconstruction.support import Explained, explained_pairs
+from sfm_app.reconstruction.support import PairSupport, explained_pairs
 from sfm_app.types import PoseGraph
 
 pytestmark = pytest.mark.slow
@@ -62,7 +62,7 @@ def outcome(synthetic, intrinsics, run):
 
 
 def focals_in(path):
-    with opened(path) as database:
+    with open_database(path) as database:
         return [camera.params[0] for camera in database.read_all_cameras()]
 
 
@@ -103,7 +103,7 @@ def test_a_second_pass_that_explains_less_is_thrown_away_with_all_that_it_wrote(
     guess = cameras(FOCAL * 1.1, method="guess", identifiable=False)
     place = run().workspace
     mapped(without(synthetic.copy(), [4, 5, 6]))
-    module._pass(synthetic.matches, synthetic.views, guess, run())
+    module._run_pass(synthetic.matches, synthetic.views, guess, run())
     first = geometries_in(place.database)
 
     seen = mapped(with_camera(synthetic.copy(), TRUE), without(with_camera(synthetic.copy(), TRUE), [5, 6]))
@@ -167,7 +167,7 @@ def test_later_steps_know_the_pairs_of_a_rival_that_goes_on(synthetic, run, came
 
     assert found.models[0].photos == 6 and {(k, 6) for k in range(1, 6)} <= found.graph.poses.keys()
     assert len(geometries_in(made.workspace.database)) == 15
-    assert photos_of(adjust(found.models[0].model, made.workspace.database).model) == [1, 2, 3, 4, 5, 6]
+    assert posed_photo_ids(adjust(found.models[0].model, made.workspace.database).model) == [1, 2, 3, 4, 5, 6]
 
 
 def test_a_rival_that_explains_less_is_named_and_left(synthetic, run, cameras, mapped, monkeypatch):
@@ -233,7 +233,7 @@ def learned(model, synthetic, intrinsics):
 def worth(model, synthetic, intrinsics, photos=6):
     graph = PoseGraph({}, {}, (tuple(range(1, photos + 1)),))
     found = module.Outcome((Attempt("global", model, {}, ""),), graph, intrinsics, ())
-    return module.worth_another(found, intrinsics, synthetic.matches)
+    return module.is_pass_worthwhile(found, intrinsics, synthetic.matches)
 
 
 def test_two_photos_teach_no_camera(synthetic, cameras):
@@ -277,18 +277,18 @@ def test_a_camera_of_no_photo_in_the_model_stays_what_it_was(synthetic, cameras)
 def joined(inside, between):
     """What a model of photos 1 to 3 and 4 to 6 explains within and between these."""
     pairs = {(a, b): inside for part in ((1, 2, 3), (4, 5, 6)) for a in part for b in part if a < b}
-    return pairs | {(3, 4): Explained(40, 30, 0), (2, 5): between, (1, 6): between}
+    return pairs | {(3, 4): PairSupport(40, 30, 0), (2, 5): between, (1, 6): between}
 
 
-GOOD, AGAINST, FOR = Explained(100, 100, 0), Explained(5, 60, 55), Explained(30, 30, 0)
+GOOD, AGAINST, FOR = PairSupport(100, 100, 0), PairSupport(5, 60, 55), PairSupport(30, 30, 0)
 
 
 def test_a_model_whose_join_is_contradicted_gives_its_parts(synthetic):
     attempt = Attempt("global", synthetic.copy(), joined(GOOD, AGAINST), "how")
 
-    first, second = taken_apart(attempt)
+    first, second = split_attempt(attempt)
 
-    assert [photos_of(part.model) for part in (first, second)] == [[1, 2, 3], [4, 5, 6]]
+    assert [posed_photo_ids(part.model) for part in (first, second)] == [[1, 2, 3], [4, 5, 6]]
     assert set(first.explained) == {(1, 2), (1, 3), (2, 3)} and set(second.explained) == {(4, 5), (4, 6), (5, 6)}
     assert (first.mapper, first.note) == ("global", "how")
     assert attempt.photos == 6  # the model itself is as it was
@@ -298,15 +298,15 @@ def test_a_model_whose_join_is_contradicted_gives_its_parts(synthetic):
 def test_a_model_whose_join_holds_stays_as_it_is(synthetic):
     attempt = Attempt("global", synthetic.copy(), joined(GOOD, FOR), "how")
 
-    assert taken_apart(attempt) == [attempt]
+    assert split_attempt(attempt) == [attempt]
 
 
 def test_lonely_photos_and_lesser_pairs_are_left_out(synthetic):
     pairs = {(1, 2): GOOD, (1, 3): GOOD, (4, 5): GOOD}
 
-    [part] = taken_apart(Attempt("global", synthetic.copy(), pairs, "how"))
+    [part] = split_attempt(Attempt("global", synthetic.copy(), pairs, "how"))
 
-    assert photos_of(part.model) == [1, 2, 3]
+    assert posed_photo_ids(part.model) == [1, 2, 3]
 
 
 def test_the_parts_of_a_cut_model_are_models_of_their_own_and_named(synthetic, run, cameras, mapped, monkeypatch):
@@ -314,14 +314,14 @@ def test_the_parts_of_a_cut_model_are_models_of_their_own_and_named(synthetic, r
     monkeypatch.setattr(module, "join_models", lambda models, *_: models)  # what contradicts is made up
     cut = joined(GOOD, AGAINST)
     del cut[5, 6]
-    attempts = module.attempts
+    attempts = module.map_group
     monkeypatch.setattr(
         module, "attempts", lambda group, run: [replace(found, explained=cut) for found in attempts(group, run)]
     )
 
     found = outcome(synthetic, cameras(), run())
 
-    assert [photos_of(part.model) for part in found.models] == [[1, 2, 3], [4, 5, 6]]
+    assert [posed_photo_ids(part.model) for part in found.models] == [[1, 2, 3], [4, 5, 6]]
     assert found.cuts == tuple(
         ", ".join(synthetic.matches.images[key].name for key in part) for part in ((1, 2, 3), (4, 5, 6))
     )
@@ -340,7 +340,7 @@ def test_a_group_of_two_photos_is_mapped_when_there_is_no_other(synthetic, run, 
     found = reconstruct(*only(synthetic, (3, 5)), cameras(), run())
 
     assert [photos for photos, _ in seen] == [(3, 5)]
-    assert photos_of(found.models[0].model) == [3, 5]
+    assert posed_photo_ids(found.models[0].model) == [3, 5]
 
 
 def test_the_model_with_most_photos_is_the_main_one(synthetic, run, cameras, mapped):
@@ -349,7 +349,7 @@ def test_the_model_with_most_photos_is_the_main_one(synthetic, run, cameras, map
 
     found = reconstruct(*only(synthetic, *pairs), cameras(), run())
 
-    assert [photos_of(attempt.model) for attempt in found.models] == [[4, 5, 6], [1, 2]]
+    assert [posed_photo_ids(attempt.model) for attempt in found.models] == [[4, 5, 6], [1, 2]]
     assert found.tried == ("2 photos", "3 photos", "no rival")
 
 
@@ -361,4 +361,4 @@ def test_every_group_is_mapped_but_lesser_ones_of_two_photos(synthetic, run, cam
 
     assert found.graph.groups == ((3, 4, 5), (1, 2))
     assert [photos for photos, _ in seen] == [(3, 4, 5)]
-    assert photos_of(found.models[0].model) == [3, 4, 5]
+    assert posed_photo_ids(found.models[0].model) == [3, 4, 5]

@@ -6,8 +6,8 @@ import pytest
 
 from sfm_app.errors import BackendError
 from sfm_app.reconstruction import mapping_runs as module
-from sfm_app.reconstruction.mapping_runs import Attempt, Group, NoModel, attempts, better, why
-from sfm_app.reconstruction.support import Explained
+from sfm_app.reconstruction.mapping_runs import Attempt, Group, NoModel, best_attempt, choice_reason, map_group
+from sfm_app.reconstruction.support import PairSupport
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, RelativePose, ViewGraph
 
 pytestmark = pytest.mark.slow
@@ -19,33 +19,35 @@ def model(photos, points=500):
 
 def attempt(photos, support, points=500, mapper="incremental"):
     """One whose pairs are worth so much in all: each of them with 100 matches counts as 50."""
-    explained = {(0, k): Explained(100, 100, 0) for k in range(support // 50)}
+    explained = {(0, k): PairSupport(100, 100, 0) for k in range(support // 50)}
     left = support % 50
     if left:
-        explained[0, -1] = Explained(round(left / (1 - left / 100)), 0, 0)
+        explained[0, -1] = PairSupport(round(left / (1 - left / 100)), 0, 0)
     return Attempt(mapper, model(photos, points), explained, "")
 
 
 def test_the_attempt_that_explains_more_is_better_whatever_it_holds():
     more, most_photos = attempt(8, 1000, 100), attempt(10, 900, 9000)
 
-    assert better([most_photos, more]) is more
-    assert better([more, most_photos]) is more
+    assert best_attempt([most_photos, more]) is more
+    assert best_attempt([more, most_photos]) is more
 
 
 def test_of_equal_ones_the_one_with_more_photos_and_then_with_more_points():
     fewer, denser, more = attempt(9, 10050, 900), attempt(9, 10000, 901), attempt(10, 10000, 10)
 
-    assert better([fewer, denser]) is denser
-    assert better([fewer, denser, more]) is more
-    assert better([attempt(9, 10000, 10, "global"), attempt(9, 10000, 10)]).mapper == "global"  # the first of twins
+    assert best_attempt([fewer, denser]) is denser
+    assert best_attempt([fewer, denser, more]) is more
+    assert (
+        best_attempt([attempt(9, 10000, 10, "global"), attempt(9, 10000, 10)]).mapper == "global"
+    )  # the first of twins
 
 
 def test_what_gave_no_model_is_never_better():
     nothing = NoModel("incremental", "")
 
-    assert better([]) is None and better([nothing]) is None
-    assert better([nothing, attempt(2, 0)]).photos == 2
+    assert best_attempt([]) is None and best_attempt([nothing]) is None
+    assert best_attempt([nothing, attempt(2, 0)]).photos == 2
 
 
 COUNT = 10
@@ -97,9 +99,9 @@ def try_out(run, cameras, monkeypatch):
         monkeypatch.setattr(module, "map_incrementally", grow)
         monkeypatch.setattr(module, "map_globally", place)
         monkeypatch.setattr(module, "copy_database", lambda *_: None)
-        explained = {(0, 1): Explained(100, 100, contradicted)}
+        explained = {(0, 1): PairSupport(100, 100, contradicted)}
         monkeypatch.setattr(module, "explained_pairs", lambda *_: explained)
-        return attempts(group, run(**scene)), calls
+        return map_group(group, run(**scene)), calls
 
     return make
 
@@ -135,11 +137,13 @@ def test_a_model_of_all_photos_that_matches_contradict_is_not_flawless(try_out):
 
 def test_why_a_model_was_taken_is_said():
     best, rival, nothing = attempt(10, 1000), attempt(9, 900), NoModel("global", "")
-    contradicted = Attempt("global", model(10), {(0, 1): Explained(90, 100, 10)}, "")
+    contradicted = Attempt("global", model(10), {(0, 1): PairSupport(90, 100, 10)}, "")
 
-    assert why(best, [best, nothing], 10) == "it places all 10 photos and next to nothing contradicts it"
-    assert why(contradicted, [contradicted, nothing], 10) == "nothing else gave a model"
-    assert why(best, [rival, best], 11) == "it explains 2000 matches with 10 photos, the next best 1800 with 9"
+    assert choice_reason(best, [best, nothing], 10) == "it places all 10 photos and next to nothing contradicts it"
+    assert choice_reason(contradicted, [contradicted, nothing], 10) == "nothing else gave a model"
+    assert (
+        choice_reason(best, [rival, best], 11) == "it explains 2000 matches with 10 photos, the next best 1800 with 9"
+    )
 
 
 def test_a_global_mapper_that_fails_leaves_the_other_model(try_out):

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_app.colmap.model import move, part_of, photos_of, posed_photos
+from sfm_app.colmap.model import move, posed_photo_ids, poses_and_points, submodel
 from sfm_app.geometry.similarity import Similarity, umeyama
 from sfm_app.reconstruction import mapping_passes
 from sfm_app.reconstruction.mapping_passes import reconstruct
-from sfm_app.reconstruction.mapping_runs import judged
+from sfm_app.reconstruction.mapping_runs import judge_model
 from sfm_app.reconstruction.model_merge import LEAST_SHARED, join_models, shared_points
 from sfm_app.types import ViewGraph
 
@@ -22,10 +22,11 @@ ELSEWHERE = Similarity(3.7, Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix(), 
 @pytest.fixture
 def halves(synthetic, run):
     """Photos 1 to 3, and 4 to 6 elsewhere."""
-    first, second = part_of(synthetic.model, (1, 2, 3)), part_of(synthetic.model, (4, 5, 6))
+    first, second = submodel(synthetic.model, (1, 2, 3)), submodel(synthetic.model, (4, 5, 6))
     move(second, ELSEWHERE)
     return tuple(
-        judged(synthetic.matches, synthetic.views, ("incremental", "half"), model, run()) for model in (first, second)
+        judge_model(synthetic.matches, synthetic.views, ("incremental", "half"), model, run())
+        for model in (first, second)
     )
 
 
@@ -35,7 +36,7 @@ def within(pair):
 
 
 def centers(model):
-    return np.array([-pose[:, :3].T @ pose[:, 3] for pose in posed_photos(model)[0].values()])
+    return np.array([-pose[:, :3].T @ pose[:, 3] for pose in poses_and_points(model)[0].values()])
 
 
 def test_points_that_both_know_are_found_once_with_both_their_places(synthetic, halves):
@@ -48,7 +49,7 @@ def test_points_that_both_know_are_found_once_with_both_their_places(synthetic, 
 def test_halves_become_one_model_as_exact_as_the_whole(synthetic, halves, run):
     (found,) = join_models(halves, synthetic.matches, synthetic.views, run())
 
-    assert photos_of(found.model) == [1, 2, 3, 4, 5, 6]
+    assert posed_photo_ids(found.model) == [1, 2, 3, 4, 5, 6]
     assert found.note.startswith("3 and 3 photos joined by ")
     true, got = centers(synthetic.model), centers(found.model)
     size = np.linalg.norm(true - true.mean(axis=0), axis=1).max()

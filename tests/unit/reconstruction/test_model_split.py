@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from sfm_app.reconstruction.model_split import sound_parts
-from sfm_app.reconstruction.support import Explained
+from sfm_app.reconstruction.support import PairSupport
 
 
 def explained(worths):
     """By pair: matches that the model explains, less those that it contradicts."""
     return {
-        pair: Explained(worth + 50, 50, 50) if worth > 0 else Explained(10, 10 - worth, 10 - worth)
+        pair: PairSupport(worth + 50, 50, 50) if worth > 0 else PairSupport(10, 10 - worth, 10 - worth)
         for pair, worth in worths.items()
     }
 

@@ -5,14 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.api import opened_run
+from sfm_app.api import open_run
 from sfm_app.colmap.database import write_keypoints, write_matches
-from sfm_app.colmap.model import photos_of
+from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError
 from sfm_app.reconstruction import second_look as module
 from sfm_app.reconstruction.mapping_passes import Outcome
 from sfm_app.reconstruction.mapping_runs import Attempt
-from sfm_app.reconstruction.second_look import LOOSE_RATIO, Found, look_again, lost_photos, pairs_to_see
+from sfm_app.reconstruction.second_look import LOOSE_RATIO, MappedScene, candidate_pairs, lost_photos, retry_lost_photos
 from sfm_app.reconstruction.support import explained_pairs
 from sfm_app.settings import Settings
 from sfm_app.types import MatchedImage, MatchGraph, PoseGraph, ViewGraph
@@ -38,9 +38,11 @@ def first(synthetic, cameras, tmp_path):
         synthetic.matches, matches={pair: rows for pair, rows in synthetic.matches.matches.items() if LOST not in pair}
     )
     views = ViewGraph({pair: fit for pair, fit in synthetic.views.fits.items() if LOST not in pair}, {})
-    with opened_run(tmp_path / "out", Settings.from_mapping({"workers": 1}), None) as run:
+    with open_run(tmp_path / "out", Settings.from_mapping({"workers": 1}), None) as run:
         run.workspace.root.mkdir(parents=True)
-        yield Found(outcome_of(synthetic, matches, views, 5), matches, views, cameras(), run.for_stage("these"))
+        yield MappedScene(
+            outcome_of(synthetic, matches, views, 5), matches, views, cameras(), run.with_fingerprint("these")
+        )
 
 
 @pytest.fixture
@@ -73,14 +75,14 @@ def finer(monkeypatch, synthetic):
 def test_a_lost_photo_finds_its_place_by_finer_features(first, finer):
     asked = finer()
 
-    found = look_again(first)
+    found = retry_lost_photos(first)
 
     assert asked[0] == ("sift-dsp", [(k, LOST) for k in range(1, LOST)], LOOSE_RATIO)
     matches, views, intrinsics = asked[1]
     assert intrinsics is first.intrinsics  # it was known
     assert all((k, LOST) in views.fits and len(matches.matches[k, LOST]) >= 100 for k in range(1, LOST))
     assert all(views.fits[pair] is fit for pair, fit in first.views.fits.items())
-    assert photos_of(found.outcome.models[0].model) == [1, 2, 3, 4, 5, 6]
+    assert posed_photo_ids(found.outcome.models[0].model) == [1, 2, 3, 4, 5, 6]
     assert found.run.workspace.database != first.run.workspace.database
     said = first.run.statistics["second_look"]
     assert (said["placed"], said["taken"], said["pairs_with_geometry"]) == ([5, 6], True, [10, 15])
@@ -90,7 +92,7 @@ def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras, monke
     asked, anew = finer(), cameras(focal=1200.0)
     monkeypatch.setattr(module, "find_intrinsics", lambda *_: (anew, ()))
 
-    look_again(replace(first, intrinsics=cameras(method="guess", identifiable=False)))
+    retry_lost_photos(replace(first, intrinsics=cameras(method="guess", identifiable=False)))
 
     assert asked[1][2] is anew
 
@@ -98,14 +100,14 @@ def test_cameras_that_were_not_known_are_found_anew(first, finer, cameras, monke
 def test_what_was_found_first_stays_where_no_more_photos_find_a_place(first, finer):
     finer(places=5)
 
-    assert look_again(first) is first
+    assert retry_lost_photos(first) is first
     assert first.run.statistics["second_look"]["taken"] is False
 
 
 def test_a_second_look_that_fails_costs_nothing(first, finer):
     finer(failing=BackendError("the disk is full"))
 
-    assert look_again(first) is first
+    assert retry_lost_photos(first) is first
     assert first.run.statistics["second_look"]["failed"] == "the disk is full"
 
 
@@ -113,7 +115,7 @@ def test_nobody_looks_twice_where_all_photos_have_a_place(first, finer, syntheti
     asked = finer()
     whole = replace(first, outcome=outcome_of(synthetic, first.matches, first.views, 6))
 
-    assert look_again(whole) is whole and asked == [] and "second_look" not in first.run.statistics
+    assert retry_lost_photos(whole) is whole and asked == [] and "second_look" not in first.run.statistics
 
 
 @pytest.mark.parametrize("chosen", [{"scene": {"second_look": False}}, {"matching": {"features": "sift-dsp"}}])
@@ -121,7 +123,7 @@ def test_nobody_looks_twice_where_that_is_not_wanted(first, finer, chosen):
     asked = finer()
     unasked = replace(first, run=replace(first.run, settings=Settings.from_mapping(chosen)))
 
-    assert look_again(unasked) is unasked and asked == []
+    assert retry_lost_photos(unasked) is unasked and asked == []
 
 
 def photos(count, matches=()):
@@ -131,13 +133,13 @@ def photos(count, matches=()):
 
 
 def test_in_small_sets_a_lost_photo_is_matched_with_all_others():
-    assert pairs_to_see([2], photos(4)) == [(1, 2), (2, 3), (2, 4)]
+    assert candidate_pairs([2], photos(4)) == [(1, 2), (2, 3), (2, 4)]
 
 
 def test_in_large_sets_it_is_matched_with_its_neighbors():
     graph = photos(100, [((50, k), 100 + k) for k in range(80, 100)] + [((10, 50), 500)])
 
-    found = pairs_to_see([50], graph)
+    found = candidate_pairs([50], graph)
 
     near = {(48, 50), (49, 50), (50, 51), (50, 52)}
     likely = {(10, 50)} | {(50, k) for k in range(93, 100)}
@@ -146,7 +148,7 @@ def test_in_large_sets_it_is_matched_with_its_neighbors():
 
 @pytest.mark.parametrize(("count", "lost", "seen"), [(59, 1, 1), (100, 4, 0), (100, 5, 5)])
 def test_few_lost_photos_of_many_are_left(monkeypatch, count, lost, seen):
-    monkeypatch.setattr(module, "photos_of", lambda _: range(1, count - lost + 1))
+    monkeypatch.setattr(module, "posed_photo_ids", lambda _: range(1, count - lost + 1))
     outcome = Outcome((Attempt("incremental", object(), {}, ""),), PoseGraph({}, {}, ()), None, ())
 
-    assert len(lost_photos(Found(outcome, photos(count), ViewGraph({}, {}), None, None))) == seen
+    assert len(lost_photos(MappedScene(outcome, photos(count), ViewGraph({}, {}), None, None))) == seen

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.reconstruction.support import Explained, explained_pairs, model_poses, support
+from sfm_app.reconstruction.support import PairSupport, explained_pairs, model_poses, support
 from sfm_app.types import MatchGraph, ViewGraph
 
 
@@ -77,7 +77,7 @@ def test_a_model_does_not_explain_matches_that_nobody_made(synthetic):
 
 
 def pairs(*counts):
-    return {(0, k): Explained(count, count, 0) for k, count in enumerate(counts, start=1)}
+    return {(0, k): PairSupport(count, count, 0) for k, count in enumerate(counts, start=1)}
 
 
 def test_many_matches_of_one_pair_count_less_than_some_of_many():

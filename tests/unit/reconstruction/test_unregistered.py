@@ -1,7 +1,7 @@
 import numpy as np
 
 from sfm_app.posegraph.graph import BEHIND, CONTRADICTS, TOO_FEW
-from sfm_app.reconstruction.unregistered import left_out, names_of
+from sfm_app.reconstruction.unregistered import photo_names, unregistered_reasons
 from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, PoseGraph, RelativePose, ViewGraph
 
 
@@ -19,7 +19,7 @@ def photos(count, blank=()):
 
 
 def test_a_photo_without_features_says_so():
-    reasons = left_out({1, 2}, [], photos(4, blank=(4,)), ViewGraph({(1, 2): fit(40)}, {}), pose_graph())
+    reasons = unregistered_reasons({1, 2}, [], photos(4, blank=(4,)), ViewGraph({(1, 2): fit(40)}, {}), pose_graph())
 
     assert reasons == {"3.jpg": "shares no scene with any other photo", "4.jpg": "no features were found in it"}
 
@@ -31,7 +31,7 @@ def pose_graph(dropped=None, poses=None):
 def test_every_photo_without_a_place_has_a_reason():
     views = ViewGraph({(1, 2): fit(40), (1, 3): fit(17), (2, 3): fit(20), (4, 5): fit(30), (2, 7): fit(25)}, {})
 
-    reasons = left_out({1, 2}, [(7, 8, 9)], photos(9), views, pose_graph())
+    reasons = unregistered_reasons({1, 2}, [(7, 8, 9)], photos(9), views, pose_graph())
 
     assert reasons == {
         "3.jpg": "could not be placed: 20 inliers with the nearest placed photo",
@@ -48,7 +48,7 @@ def test_a_photo_whose_nearest_pair_was_dropped_says_why():
     views = ViewGraph({(1, 2): fit(40), (1, 3): fit(17), (2, 3): fit(20), (2, 4): fit(30), (1, 5): fit(18)}, {})
     dropped = {(1, 3): BEHIND, (2, 3): CONTRADICTS, (1, 5): TOO_FEW}
 
-    reasons = left_out({1, 2}, [], photos(5), views, pose_graph(dropped))
+    reasons = unregistered_reasons({1, 2}, [], photos(5), views, pose_graph(dropped))
     near = "inliers with the nearest placed photo"
 
     assert reasons == {
@@ -61,13 +61,16 @@ def test_a_photo_whose_nearest_pair_was_dropped_says_why():
 def test_of_photos_equally_near_the_first_is_the_nearest():
     views = ViewGraph({(1, 3): fit(20), (2, 3): fit(20)}, {})
 
-    assert CONTRADICTS not in left_out({1, 2}, [], photos(3), views, pose_graph({(2, 3): CONTRADICTS}))["3.jpg"]
-    assert CONTRADICTS in left_out({1, 2}, [], photos(3), views, pose_graph({(1, 3): CONTRADICTS}))["3.jpg"]
+    assert (
+        CONTRADICTS
+        not in unregistered_reasons({1, 2}, [], photos(3), views, pose_graph({(2, 3): CONTRADICTS}))["3.jpg"]
+    )
+    assert CONTRADICTS in unregistered_reasons({1, 2}, [], photos(3), views, pose_graph({(1, 3): CONTRADICTS}))["3.jpg"]
 
 
 def test_when_all_photos_have_a_place_none_has_a_reason():
-    assert left_out({1, 2}, [], photos(2), ViewGraph({(1, 2): fit(40)}, {}), pose_graph()) == {}
+    assert unregistered_reasons({1, 2}, [], photos(2), ViewGraph({(1, 2): fit(40)}, {}), pose_graph()) == {}
 
 
 def test_names_come_in_the_order_of_the_photos_given():
-    assert names_of((3, 1), photos(3)) == ["3.jpg", "1.jpg"]
+    assert photo_names((3, 1), photos(3)) == ["3.jpg", "1.jpg"]

@@ -2,7 +2,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from sfm_app.reconstruction.weak_scale import LEAST, weakly_joined
+from sfm_app.reconstruction.weak_scale import MIN_SHARED_POINTS, weakly_joined_parts
 
 pytestmark = pytest.mark.slow
 
@@ -22,18 +22,18 @@ def model(*tracks):
 
 
 def test_photos_that_see_what_two_others_see_are_well_joined():
-    assert weakly_joined(model(((1, 2, 3), 40), ((2, 3, 4), 40), ((3, 4, 5), LEAST))) == []
+    assert weakly_joined_parts(model(((1, 2, 3), 40), ((2, 3, 4), 40), ((3, 4, 5), MIN_SHARED_POINTS))) == []
 
 
 def test_parts_that_share_hardly_a_point_of_three_photos_are_named():
-    tracks = ((1, 2, 3), 40), ((3, 4), 200), ((2, 3, 4), LEAST - 1), ((4, 5, 6), 30)
+    tracks = ((1, 2, 3), 40), ((3, 4), 200), ((2, 3, 4), MIN_SHARED_POINTS - 1), ((4, 5, 6), 30)
     # 4 hangs on four points, and 5 and 6 on photo 4 alone
-    assert weakly_joined(model(*tracks)) == [["1.jpg", "2.jpg"], ["5.jpg", "6.jpg"]]
+    assert weakly_joined_parts(model(*tracks)) == [["1.jpg", "2.jpg"], ["5.jpg", "6.jpg"]]
 
 
 def test_a_chain_of_pairs_has_no_scale_at_all():
-    assert weakly_joined(model(((1, 2), 50), ((2, 3), 40), ((3, 4), 30))) == [["3.jpg"], ["4.jpg"]]
+    assert weakly_joined_parts(model(((1, 2), 50), ((2, 3), 40), ((3, 4), 30))) == [["3.jpg"], ["4.jpg"]]
 
 
 def test_two_photos_and_none_have_nothing_to_be_joined_to():
-    assert weakly_joined(model(((1, 2), 50))) == [] and weakly_joined(model()) == []
+    assert weakly_joined_parts(model(((1, 2), 50))) == [] and weakly_joined_parts(model()) == []

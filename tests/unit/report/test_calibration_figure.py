@@ -8,12 +8,12 @@ from sfm_app.errors import ConfigError
 from sfm_app.report.calibration_figure import (
     MOST_CAMERAS,
     Panel,
+    calibration_text,
     center_plane,
     check_figure,
     draw_calibration,
     focal_plane,
-    in_words,
-    votes,
+    vote_shares,
 )
 from sfm_app.selfcal.inputs import prepare
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
@@ -27,7 +27,7 @@ def panel():
     """A camera that is known exactly, and exact fundamental matrices."""
     tracks = make_tracks(TrackOptions(cameras=5, sigma_px=0.0), seed=3)
     camera = Calibration(tracks.K[0], *tracks.size, "zero-curves", True, spread=SPREAD)
-    return Panel("one", camera, CameraPairs.of(tracks.F, tracks.size))
+    return Panel("one", camera, CameraPairs.from_Fs(tracks.F, tracks.size))
 
 
 def prepared(panel):
@@ -61,7 +61,7 @@ def test_votes_are_unanimous_at_the_camera_and_nowhere_higher(panel, make):
     plane = make(panel.camera, prepared(panel))
     left, right, bottom, top = plane.extent
 
-    shares = votes(plane, panel.camera, prepared(panel))
+    shares = vote_shares(plane, panel.camera, prepared(panel))
 
     row, column = np.unravel_index(np.argmax(shares), shares.shape)
     cells = len(shares)
@@ -83,7 +83,7 @@ def test_curves_pass_through_the_camera(panel, make):
 
 def test_a_guess_is_drawn_without_pairs(panel, tmp_path):
     guess = replace(panel.camera, identifiable=False, method="guess", reason="no pairs", spread={})
-    nothing = CameraPairs.of(np.zeros((0, 3, 3)), panel.pairs.size)
+    nothing = CameraPairs.from_Fs(np.zeros((0, 3, 3)), panel.pairs.size)
 
     draw_calibration(tmp_path / "guess.svg", [Panel("one", guess, nothing)])
 
@@ -102,7 +102,7 @@ def test_of_many_cameras_the_first_are_drawn(panel, tmp_path):
 
 
 def test_the_words_leave_no_line_empty(panel):
-    lines = in_words(panel.camera).splitlines()
+    lines = calibration_text(panel.camera).splitlines()
 
     assert lines[0] == "Known: the photos agree on this camera."
     assert "± 4:" in lines[1]

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from sfm_app.pipeline import NAMES
-from sfm_app.runtime.cost_estimate import cache_gb, machine_memory_mb, megapixels_within, plan_of, plan_within
+from sfm_app.runtime.cost_estimate import cache_gb, choose_plan, largest_photo_megapixels, machine_memory_mb, make_plan
 from sfm_app.settings import Settings
 from sfm_app.types import Photo
 
@@ -18,19 +18,19 @@ def photos(count, width=4000, height=3000):
 
 
 def test_a_run_is_put_into_one_line():
-    text = plan_of(photos(200), Settings(), 2).text(STAGES)
+    text = make_plan(photos(200), Settings(), 2).text(STAGES)
 
     assert text.startswith("200 photos, 19900 pairs: about ") and text.endswith(" GB with 2 workers")
-    assert plan_of(photos(2), DRAFT, 1).text(["files"]).split(": ")[1].startswith("about a minute or two")
+    assert make_plan(photos(2), DRAFT, 1).text(["files"]).split(": ")[1].startswith("about a minute or two")
 
 
 @pytest.mark.parametrize(("count", "low", "high"), [(10, 1, 5), (100, 20, 45), (200, 60, 150)])
 def test_minutes_are_those_of_the_benchmark_to_a_factor(count, low, high):
-    assert low < plan_of(photos(count), Settings(), 2).minutes(STAGES) < high
+    assert low < make_plan(photos(count), Settings(), 2).minutes(STAGES) < high
 
 
 def test_pairs_and_nothing_else_grow_as_the_square():
-    once, twice = (plan_of(photos(count), Settings(), 2).core_seconds for count in (1000, 2000))
+    once, twice = (make_plan(photos(count), Settings(), 2).core_seconds for count in (1000, 2000))
 
     growth = {name: twice[name] / once[name] for name in STAGES}
     assert all(3.5 < growth[name] < 4.1 for name in ("match_graph", "view_graph", "intrinsics"))
@@ -38,31 +38,31 @@ def test_pairs_and_nothing_else_grow_as_the_square():
 
 
 def test_a_draft_is_cheaper():
-    normal, draft = (plan_of(photos(50), settings, 2) for settings in (Settings(), DRAFT))
+    normal, draft = (make_plan(photos(50), settings, 2) for settings in (Settings(), DRAFT))
 
     assert draft.minutes(STAGES) < 0.5 * normal.minutes(STAGES)
     assert draft.peak_mb(STAGES) < normal.peak_mb(STAGES)
 
 
 def test_workers_are_as_many_as_the_memory_holds():
-    chosen = [plan_within(photos(20), Settings(), 16, limit, STAGES) for limit in (math.inf, 6000, 3000, 100)]
+    chosen = [choose_plan(photos(20), Settings(), 16, limit, STAGES) for limit in (math.inf, 6000, 3000, 100)]
 
     assert chosen[0].workers == 16 > chosen[1].workers > chosen[2].workers >= chosen[3].workers == 1
     assert all(plan.peak_mb(STAGES) <= limit for plan, limit in zip(chosen[1:3], (6000, 3000), strict=True))
 
 
 def test_small_photos_need_little():
-    assert plan_of(photos(11, 640, 480), Settings(), 2).peak_mb(STAGES) < 1700
+    assert make_plan(photos(11, 640, 480), Settings(), 2).peak_mb(STAGES) < 1700
 
 
 @pytest.mark.parametrize(("limit_gb", "low", "high"), [(1, 2, 2), (1.8, 12, 24), (3, 120, 240)])
 def test_photos_may_be_as_large_as_one_worker_can_paint_with(limit_gb, low, high):
-    largest = megapixels_within(1000 * limit_gb)
+    largest = largest_photo_megapixels(1000 * limit_gb)
 
     assert low <= largest <= high
     side = int((1e6 * largest) ** 0.5)
     if largest > 2:
-        assert plan_of(photos(10, side, side), DRAFT, 1, 1000 * limit_gb).memory_mb["texture"] <= 1000 * limit_gb
+        assert make_plan(photos(10, side, side), DRAFT, 1, 1000 * limit_gb).memory_mb["texture"] <= 1000 * limit_gb
 
 
 def test_fusion_keeps_what_is_left():
@@ -70,10 +70,10 @@ def test_fusion_keeps_what_is_left():
 
 
 def test_two_hundred_photos_of_twelve_megapixels_need_no_more_than_eight_gigabytes():
-    plan = plan_within(photos(200), Settings(), 8, 8000, STAGES)
+    plan = choose_plan(photos(200), Settings(), 8, 8000, STAGES)
 
     assert plan.peak_mb(STAGES) <= 8000 and plan.workers >= 2
-    assert 3000 < plan_of(photos(200), Settings(), 2).memory_mb["mesh"] < 6000
+    assert 3000 < make_plan(photos(200), Settings(), 2).memory_mb["mesh"] < 6000
 
 
 def test_the_machine_has_some_memory():

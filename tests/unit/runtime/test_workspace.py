@@ -14,15 +14,15 @@ def test_a_file_in_place_of_the_folder_is_an_input_error(tmp_path):
 @pytest.mark.parametrize("inside", ["photos", "photos/2024", "sparse", "dense/images", "other_models/1"])
 def test_photos_are_never_where_the_run_writes(tmp_path, inside):
     with pytest.raises(InputError, match="keeps its own files") as caught:
-        Workspace(tmp_path).keep_apart(tmp_path / inside)
+        Workspace(tmp_path).check_no_overlap(tmp_path / inside)
     assert "-o" in caught.value.hint
 
 
 def test_photos_beside_what_the_run_writes_are_fine(tmp_path):
-    Workspace(tmp_path).keep_apart(tmp_path / "my photos")
-    Workspace(tmp_path / "photos" / "out").keep_apart(tmp_path / "photos")
+    Workspace(tmp_path).check_no_overlap(tmp_path / "my photos")
+    Workspace(tmp_path / "photos" / "out").check_no_overlap(tmp_path / "photos")
     with pytest.raises(InputError, match="cannot be both the photos and the output"):
-        Workspace(tmp_path).keep_apart(tmp_path)
+        Workspace(tmp_path).check_no_overlap(tmp_path)
 
 
 def test_what_a_run_wrote_after_its_folder_was_removed_is_not_foreign_to_the_next(tmp_path):
@@ -30,7 +30,7 @@ def test_what_a_run_wrote_after_its_folder_was_removed_is_not_foreign_to_the_nex
     place.create()
     (place.dense / "images").mkdir(parents=True)  # no lock, as after `rm -r out`
     with pytest.raises(InputError, match="was removed while"):
-        place.check_there()
+        place.check_exists()
 
     place.create()
 
@@ -41,7 +41,7 @@ def test_a_folder_that_somebody_put_in_the_place_of_the_output_stays_foreign(tmp
     place.dense.mkdir()
     (place.root / "my notes.txt").touch()
     with pytest.raises(InputError, match="was removed while"):
-        place.check_there()
+        place.check_exists()
 
     with pytest.raises(InputError, match="no run has made it"):
         place.create()

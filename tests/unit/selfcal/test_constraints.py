@@ -15,7 +15,7 @@ seeds = st.integers(0, 2**32 - 1)
 def random_pairs(seed, count=3):
     rng = np.random.default_rng(seed)
     return prepare(
-        CameraPairs.of(rng.normal(size=(count, 3, 3)), (1, 1), np.ones(count)), unit_px=1.0, origin_px=(0.0, 0.0)
+        CameraPairs.from_Fs(rng.normal(size=(count, 3, 3)), (1, 1), np.ones(count)), unit_px=1.0, origin_px=(0.0, 0.0)
     )
 
 
@@ -30,7 +30,7 @@ def thesis_5_25(E):
 
 
 def ratio(pairs, i, *camera):
-    return singular_value_ratio(pairs.packed[i], *camera)
+    return singular_value_ratio(pairs.packed_rows[i], *camera)
 
 
 @settings(max_examples=60, deadline=None)
@@ -69,7 +69,7 @@ def test_every_swept_sample_has_its_polynomial():
 
 def test_the_true_camera_satisfies_the_constraint(views):
     made = views(4, noise=0.0, focal=900, aspect=1.2, center=(420, 400))
-    pairs = prepare(CameraPairs.of(made.Fs, made.size, made.weights), unit_px=1000.0, origin_px=(0.0, 0.0))
+    pairs = prepare(CameraPairs.from_Fs(made.Fs, made.size, made.weights), unit_px=1000.0, origin_px=(0.0, 0.0))
     K = made.K / 1000
     for i in range(len(pairs)):
         assert ratio(pairs, i, K[0, 0], K[1, 1], K[0, 2], K[1, 2]) < 1e-6
@@ -78,7 +78,7 @@ def test_the_true_camera_satisfies_the_constraint(views):
 
 def test_translation_satisfies_it_with_any_camera(views):
     made = views(3, noise=0.0, motion=views.translation)
-    pairs = prepare(CameraPairs.of(made.Fs, made.size, made.weights), unit_px=1000.0, origin_px=(0.0, 0.0))
+    pairs = prepare(CameraPairs.from_Fs(made.Fs, made.size, made.weights), unit_px=1000.0, origin_px=(0.0, 0.0))
     assert ratio(pairs, 0, 0.4, 2.0, 0.9, -0.3) < 1e-6
     assert not np.any(focal_polynomials(pairs, np.array([0.3, 1.0, 3.0]), (0.5, 0.4)))
     assert not np.any(center_polynomials(pairs, np.array([0.3, 1.0]), (1.0, 1.1)))
@@ -86,6 +86,6 @@ def test_translation_satisfies_it_with_any_camera(views):
 
 def test_a_matrix_of_rank_one_is_as_far_from_it_as_can_be():
     pairs = prepare(
-        CameraPairs.of(np.outer([1, 2, 3], [4, 5, 6])[None], (1, 1), [1.0]), unit_px=1.0, origin_px=(0.0, 0.0)
+        CameraPairs.from_Fs(np.outer([1, 2, 3], [4, 5, 6])[None], (1, 1), [1.0]), unit_px=1.0, origin_px=(0.0, 0.0)
     )
     assert ratio(pairs, 0, 1.0, 1.0, 0.0, 0.0) == pytest.approx(1)

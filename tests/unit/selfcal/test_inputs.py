@@ -16,7 +16,7 @@ def test_weights_rise_with_the_inliers_up_to_one():
 
 def test_epipolar_geometry_survives_the_change_of_units(views):
     made = views(3, noise=0.0)
-    pairs = prepare(CameraPairs.of(made.Fs, made.size, made.weights), **FRAME)
+    pairs = prepare(CameraPairs.from_Fs(made.Fs, made.size, made.weights), **FRAME)
     to_units = np.array([[1e-3, 0, -0.5], [0, 1e-3, -0.375], [0, 0, 1]])
     rng = np.random.default_rng(0)
     x1, x2 = (np.column_stack([rng.uniform(0, 700, (20, 2)), np.ones(20)]) for _ in range(2))
@@ -28,7 +28,7 @@ def test_epipolar_geometry_survives_the_change_of_units(views):
 
 def test_parts_belong_to_the_matrix(views):
     made = views(4, noise=0.05)
-    pairs = prepare(CameraPairs.of(made.Fs, made.size, made.weights), **FRAME)
+    pairs = prepare(CameraPairs.from_Fs(made.Fs, made.size, made.weights), **FRAME)
     s = np.linalg.svd(pairs.F, compute_uv=False)
     assert len(pairs) == 6
     assert np.all(s[:, 2] < 1e-15)
@@ -42,15 +42,15 @@ def test_parts_belong_to_the_matrix(views):
 @pytest.mark.parametrize("scale", [1e-200, -1.0, 1e200])
 def test_scale_does_not_matter(views, scale):
     made = views(3)
-    plain = prepare(CameraPairs.of(made.Fs, made.size, made.weights), **FRAME)
-    scaled = prepare(CameraPairs.of(scale * made.Fs, made.size, made.weights), **FRAME)
+    plain = prepare(CameraPairs.from_Fs(made.Fs, made.size, made.weights), **FRAME)
+    scaled = prepare(CameraPairs.from_Fs(scale * made.Fs, made.size, made.weights), **FRAME)
     np.testing.assert_allclose(np.abs(scaled.F), np.abs(plain.F), rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(scaled.product, plain.product)
 
 
 def test_pairs_without_weight_are_left_out(views):
     made = views(3)
-    pairs = prepare(CameraPairs.of(made.Fs, made.size, [1.0, 0.0, 0.5]), **FRAME)
+    pairs = prepare(CameraPairs.from_Fs(made.Fs, made.size, [1.0, 0.0, 0.5]), **FRAME)
     np.testing.assert_array_equal(pairs.weights, [1, 0.5])
     assert len(pairs) == 2
 
@@ -58,13 +58,15 @@ def test_pairs_without_weight_are_left_out(views):
 def test_repeated_matrices_count_once(views):
     made = views(3)
     Fs = np.concatenate([made.Fs, -3 * made.Fs, made.Fs.transpose(0, 2, 1), 1e9 * made.Fs])
-    pairs = prepare(CameraPairs.of(Fs, made.size, np.arange(1.0, 13)), **FRAME)
+    pairs = prepare(CameraPairs.from_Fs(Fs, made.size, np.arange(1.0, 13)), **FRAME)
     np.testing.assert_array_equal(pairs.weights, [1, 2, 3])
-    assert len(prepare(CameraPairs.of(made.Fs + 1e-6 * np.abs(made.Fs).max(), made.size, made.weights), **FRAME)) == 3
+    assert (
+        len(prepare(CameraPairs.from_Fs(made.Fs + 1e-6 * np.abs(made.Fs).max(), made.size, made.weights), **FRAME)) == 3
+    )
 
 
 def test_no_pairs_are_fine():
-    assert len(prepare(CameraPairs.of([], (4, 3), []), **FRAME)) == 0
+    assert len(prepare(CameraPairs.from_Fs([], (4, 3), []), **FRAME)) == 0
 
 
 F = np.eye(3)[None]
@@ -88,4 +90,4 @@ F = np.eye(3)[None]
 )
 def test_malformed_input_is_refused(Fs, weights, size, message):
     with pytest.raises(ValueError, match=message):
-        prepare(CameraPairs.of(Fs, size, weights), **FRAME)
+        prepare(CameraPairs.from_Fs(Fs, size, weights), **FRAME)

@@ -3,21 +3,21 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.lens import LEAST_SLOPE, camera_of, ray, straightened
+from sfm_app.selfcal.lens import LEAST_SLOPE, undistort_kernel, write_camera, write_ray
 
 F, U, V, LOG_A = 1.1, 0.03, -0.02, 0.04
 
 
 def camera(k1, f=F):
     theta, out = np.array([np.log(f), U, V, LOG_A, k1 / f**2]), np.empty(5)
-    camera_of(theta, out)
+    write_camera(theta, out)
     return theta, out
 
 
 def seen(xy, k1):
-    """`ray` of one pixel: a, b, their four derivatives, r_u."""
+    """`write_ray` of one pixel: a, b, their four derivatives, r_u."""
     out = np.empty(7)
-    ray(xy[0], xy[1], camera(k1)[1], -1.0, out)
+    write_ray(xy[0], xy[1], camera(k1)[1], -1.0, out)
     return out
 
 
@@ -81,20 +81,20 @@ def test_a_lens_that_would_fold_goes_on_evenly(k1):
 
 def test_how_far_points_move_does_not_depend_on_the_focal():
     points = np.random.default_rng(2).uniform(-0.5, 0.5, (50, 2))
-    moves = [straightened(points, np.array([np.log(f), U, V, 0.0, -0.05])) - points for f in (0.8, 1.6)]
+    moves = [undistort_kernel(points, np.array([np.log(f), U, V, 0.0, -0.05])) - points for f in (0.8, 1.6)]
     np.testing.assert_allclose(moves[0], moves[1], atol=1e-12)
     assert 0.01 < np.abs(moves[0]).max() < 0.1
 
 
 def test_without_a_lens_points_stay():
     points = np.random.default_rng(3).uniform(-0.5, 0.5, (50, 2))
-    np.testing.assert_allclose(straightened(points, camera(0.0)[0]), points, atol=1e-15)
+    np.testing.assert_allclose(undistort_kernel(points, camera(0.0)[0]), points, atol=1e-15)
 
 
 def test_a_first_guess_changes_nothing():
     cam, results = camera(-0.2)[1], []
     for guess in (-1.0, 0.3, 0.45, 0.6):
         out = np.empty(7)
-        ray(0.4, 0.3, cam, guess, out)
+        write_ray(0.4, 0.3, cam, guess, out)
         results.append(out)
     np.testing.assert_allclose(results, [results[0]] * 4, atol=1e-12)

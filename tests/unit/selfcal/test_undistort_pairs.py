@@ -1,7 +1,7 @@
 import numpy as np
 
 from sfm_app.geometry.distances import sampson_distance
-from sfm_app.selfcal.undistort_pairs import without_lens
+from sfm_app.selfcal.undistort_pairs import undistort_pairs
 from sfm_app.synthetic.correspondences import TrackOptions, make_tracks
 from sfm_app.types import Calibration, CameraPairs
 
@@ -20,7 +20,7 @@ def test_without_its_lens_a_camera_has_the_true_fundamental_matrices():
     pairs = CameraPairs(tracks.F, np.ones(len(views)), tracks.size, tuple(tracks.pairs), tuple(bent))
     camera = Calibration(K, *tracks.size, "zero-curves", True, radial=K1)
 
-    found = without_lens(pairs, camera)
+    found = undistort_pairs(pairs, camera)
 
     for F, view, straight in zip(found.Fs, views, found.inliers, strict=True):
         np.testing.assert_allclose(straight, np.hstack([view.exact_x1, view.exact_x2]), atol=1e-6)
@@ -29,7 +29,7 @@ def test_without_its_lens_a_camera_has_the_true_fundamental_matrices():
 
 
 def test_without_a_lens_or_matches_nothing_changes():
-    pairs = CameraPairs.of(np.eye(3)[None], (640, 480))
+    pairs = CameraPairs.from_Fs(np.eye(3)[None], (640, 480))
     bent = Calibration(np.eye(3), 640, 480, "zero-curves", True, radial=K1)
 
-    assert without_lens(pairs, bent) is pairs
+    assert undistort_pairs(pairs, bent) is pairs

@@ -15,7 +15,7 @@ OPTIONS = CalibrationSettings()
 
 
 def run(made, seed=0, weights=None):
-    return calibrate(CameraPairs.of(made.Fs, made.size, weights), OPTIONS, seed)
+    return calibrate(CameraPairs.from_Fs(made.Fs, made.size, weights), OPTIONS, seed)
 
 
 def errors(found, K, size):
@@ -103,7 +103,7 @@ def test_wrong_pairs_are_outvoted(views, random_fundamentals):
     made = views(6)
     Fs = made.Fs.copy()
     Fs[:6] = random_fundamentals(6)
-    found = calibrate(CameraPairs.of(Fs, made.size, made.weights), OPTIONS, 0)
+    found = calibrate(CameraPairs.from_Fs(Fs, made.size, made.weights), OPTIONS, 0)
     assert found.identifiable
     assert max(errors(found, made.K, made.size)) < 0.03
     assert 7 < found.evidence["agreeing_pairs"] < 11
@@ -116,7 +116,7 @@ def test_a_zoomed_photo_is_outvoted(views):
     # photo 0 was taken at 1.5 times the focal: its pixels are those of the others, 1.5 times further from the center
     zoom = made.K @ np.linalg.inv(zoomed.K)
     Fs[with_photo_0] = made.Fs[with_photo_0] @ zoom
-    found = calibrate(CameraPairs.of(Fs, made.size, made.weights), OPTIONS, 0)
+    found = calibrate(CameraPairs.from_Fs(Fs, made.size, made.weights), OPTIONS, 0)
     assert found.identifiable
     assert max(errors(found, made.K, made.size)) < 0.05
 
@@ -125,7 +125,7 @@ def test_weights_decide_between_two_cameras(views):
     one, other = views(5, 1, noise=3e-4), views(5, 2, noise=3e-4, focal=2000)
     Fs = np.concatenate([one.Fs, other.Fs])
     for weights, focal in (([1.0] * 10 + [0.2] * 10, 1000), ([0.2] * 10 + [1.0] * 10, 2000)):
-        found = calibrate(CameraPairs.of(Fs, one.size, np.array(weights)), OPTIONS, 0)
+        found = calibrate(CameraPairs.from_Fs(Fs, one.size, np.array(weights)), OPTIONS, 0)
         assert found.K[0, 0] == pytest.approx(focal, rel=0.05)
 
 
@@ -143,7 +143,7 @@ def test_motions_that_do_not_determine_the_focal(views, motion, noise, count):
 @pytest.mark.parametrize("count", [3, 10, 45])
 def test_matrices_without_a_camera(random_fundamentals, count):
     for seed in range(4):
-        found = calibrate(CameraPairs.of(random_fundamentals(count, seed), (1000, 750)), OPTIONS, 0)
+        found = calibrate(CameraPairs.from_Fs(random_fundamentals(count, seed), (1000, 750)), OPTIONS, 0)
         assert not found.identifiable
         assert "do not agree" in found.reason
 
@@ -151,7 +151,7 @@ def test_matrices_without_a_camera(random_fundamentals, count):
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_pairs(views, count):
     made = views(3)
-    found = calibrate(CameraPairs.of(made.Fs[:count], made.size), OPTIONS, 0)
+    found = calibrate(CameraPairs.from_Fs(made.Fs[:count], made.size), OPTIONS, 0)
     assert not found.identifiable
     assert found.reason == f"{count} usable pairs, 3 are needed"
     assert found.evidence == {"pairs": count}
@@ -160,13 +160,13 @@ def test_too_few_pairs(views, count):
 def test_one_pair_repeated_is_one_pair(views):
     for seed in range(4):
         made = views(2, seed)
-        found = calibrate(CameraPairs.of(np.repeat(made.Fs, 10, axis=0), made.size), OPTIONS, 0)
+        found = calibrate(CameraPairs.from_Fs(np.repeat(made.Fs, 10, axis=0), made.size), OPTIONS, 0)
         assert not found.identifiable
 
 
 def test_three_pairs_leave_the_center_near_the_middle(views):
     made = views(3, 1, noise=4e-3)
-    found = calibrate(CameraPairs.of(made.Fs, made.size), OPTIONS.model_copy(update={"center_sigma": 1.0}), 0)
+    found = calibrate(CameraPairs.from_Fs(made.Fs, made.size), OPTIONS.model_copy(update={"center_sigma": 1.0}), 0)
 
     assert 0 < np.linalg.norm(found.K[:2, 2] - [500, 375]) < 60
 
@@ -176,7 +176,7 @@ def test_the_prior_holds_the_center_of_few_pairs(views):
     offsets = []
     for sigma in (0.01, 1.0):
         options = OPTIONS.model_copy(update={"center_sigma": sigma})
-        found = calibrate(CameraPairs.of(made.Fs, made.size), options, 0)
+        found = calibrate(CameraPairs.from_Fs(made.Fs, made.size), options, 0)
         offsets.append(np.linalg.norm(found.K[:2, 2] - [500, 375]))
     assert offsets[0] < 20
     assert offsets[0] <= offsets[1]
@@ -185,9 +185,9 @@ def test_the_prior_holds_the_center_of_few_pairs(views):
 def test_the_prior_is_measured_in_widths(views):
     made = views(4, 1, noise=3e-3)
     swap = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]])
-    lying = calibrate(CameraPairs.of(made.Fs, (1000, 750)), OPTIONS.model_copy(update={"center_sigma": 0.06}), 0)
+    lying = calibrate(CameraPairs.from_Fs(made.Fs, (1000, 750)), OPTIONS.model_copy(update={"center_sigma": 0.06}), 0)
     standing = calibrate(
-        CameraPairs.of(swap @ made.Fs @ swap, (750, 1000)), OPTIONS.model_copy(update={"center_sigma": 0.08}), 0
+        CameraPairs.from_Fs(swap @ made.Fs @ swap, (750, 1000)), OPTIONS.model_copy(update={"center_sigma": 0.08}), 0
     )
     assert lying.identifiable
     np.testing.assert_allclose(swap @ standing.K @ swap, lying.K, rtol=1e-3)

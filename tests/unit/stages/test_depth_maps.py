@@ -11,9 +11,9 @@ from sfm_app.atomic_io import UNFINISHED
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import MASKED, DenseStore, read_depth, read_views
 from sfm_app.errors import ConfigError, ReconstructionError
-from sfm_app.photos import save_used
+from sfm_app.photos import save_mask
 from sfm_app.plugins import DepthMethod, hookimpl, load_plugins
-from sfm_app.progress import Silent
+from sfm_app.progress import SilentProgress
 from sfm_app.settings import DepthSettings, Settings
 from sfm_app.stages import depth_maps
 from sfm_app.stereo import DepthMap
@@ -75,7 +75,7 @@ def run_stage(scene, ways, fingerprint="", mask_dir=None, **settings):
     place = SimpleNamespace(photos=scene.photo_dir, dense=scene.dense_dir)
     run = SimpleNamespace(
         plugins=ways.plugins, record=lambda **more: counts.update(more), map=one_by_one, fingerprint=fingerprint,
-        settings=Settings(depth=options), workspace=place, workers=2, progress=Silent(), mask_dir=mask_dir,
+        settings=Settings(depth=options), workspace=place, workers=2, progress=SilentProgress(), mask_dir=mask_dir,
     )  # fmt: skip
     assert depth_maps.make(scene, run) == scene.dense_dir
     return counts
@@ -138,7 +138,7 @@ def test_what_is_masked_has_no_depth_whatever_method_made_it(scene, tmp_path):
     used = np.ones((60, 80), bool)
     used[:, :40] = False
     for name in scene.registered:
-        save_used(tmp_path / "masks", name, used if name == "1.png" else used | True)
+        save_mask(tmp_path / "masks", name, used if name == "1.png" else used | True)
     kill_at(scene, "3.png", mask_dir=tmp_path / "masks")
 
     counts = run_stage(scene, Method(), mask_dir=tmp_path / "masks")

@@ -9,7 +9,7 @@ import pytest
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.dense import map_file, read_views, write_fusion_views, write_maps
 from sfm_app.errors import ReconstructionError
-from sfm_app.geometry.triangles import edges_of, vertex_normals
+from sfm_app.geometry.triangles import unique_edges, vertex_normals
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
@@ -92,7 +92,7 @@ def ball(dense):
 def test_a_closed_thing_seen_all_round_is_closed(ball):
     surface, counts = ball
     corners = surface.vertices[surface.faces]
-    edges, edge_of = edges_of(surface.faces)
+    edges, edge_of = unique_edges(surface.faces)
 
     assert np.array_equal(np.bincount(edge_of.ravel()), np.full(len(edges), 2))
     assert len(surface.vertices) - len(edges) + len(surface.faces) == 2

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.estimation.calibrating import camera_pairs, of_whole_photo, photo_pairs
+from sfm_app.estimation.calibrating import camera_pairs, photo_pairs, to_whole_photo
 from sfm_app.selfcal import CalibratedCamera, pair_weights
-from sfm_app.selfcal.results import guessed
+from sfm_app.selfcal.results import guess_calibration
 from sfm_app.types import EpipolarFit, MatchedImage, MatchGraph, Rejected, ViewGraph
 
 
@@ -68,14 +68,14 @@ def test_pixels_are_counted_within_bars_and_the_camera_is_that_of_the_whole_phot
     images = {**IMAGES, 7: image}
     pairs = photo_pairs(list(images.values()), replace(MATCHES, images=images), VIEWS)
     plain = photo_pairs(list(IMAGES.values()), MATCHES, VIEWS)
-    assert (pairs.sizes[7], pairs.brought_to) == ((800, 600), {7: (1000, 750)})
+    assert (pairs.sizes[7], pairs.padded_sizes) == ((800, 600), {7: (1000, 750)})
     assert pairs.focal_hints_px[7] == pytest.approx(720)  # 900 px were reckoned with a width of 1000
     np.testing.assert_allclose(pairs.inliers[0], plain.inliers[0] - [0, 0, 0, 100])
     np.testing.assert_array_equal(pairs.inliers[1], plain.inliers[1])
 
-    camera = of_whole_photo(CalibratedCamera("big", (7,), guessed((800, 600), "", {})), image)
+    camera = to_whole_photo(CalibratedCamera("big", (7,), guess_calibration((800, 600), "", {})), image)
 
     assert (camera.found.width, camera.found.height) == (1000, 750)
     np.testing.assert_allclose(camera.found.K, [[960, 0, 400], [0, 960, 400], [0, 0, 1]])
-    whole = CalibratedCamera("big", (2,), guessed((1000, 750), "", {}))
-    assert of_whole_photo(whole, IMAGES[2]) is whole
+    whole = CalibratedCamera("big", (2,), guess_calibration((1000, 750), "", {}))
+    assert to_whole_photo(whole, IMAGES[2]) is whole

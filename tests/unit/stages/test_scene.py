@@ -11,14 +11,14 @@ import pytest
 from sfm_app.cli.scene_text import scene_lines
 from sfm_app.colmap import bundle
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.database import opened
-from sfm_app.colmap.model import part_of, photos_of
+from sfm_app.colmap.database import open_database
+from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.plugins import load_plugins
 from sfm_app.reconstruction import Outcome
 from sfm_app.reconstruction.mapping_runs import Attempt
-from sfm_app.reconstruction.support import Explained
+from sfm_app.reconstruction.support import PairSupport
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import MAPPING, Workspace
 from sfm_app.settings import Settings
@@ -49,7 +49,7 @@ def synthetic(tmp_path_factory):
     options.num_points3D, options.camera_params = 100, [1280.0, 512.0, 384.0, 0.0]
     noise = pycolmap.SyntheticNoiseOptions()
     noise.point2D_stddev = 0.2
-    with opened(place / "database.db") as database:
+    with open_database(place / "database.db") as database:
         model = pycolmap.synthesize_dataset(options, database)
         pycolmap.synthesize_noise(noise, model, database)
     return place / "database.db", model
@@ -102,7 +102,7 @@ def inputs(model, fits=((1, 8),)):
 
 def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthetic, run, mapped):
     true = synthetic[1]
-    main, other = part_of(true, (1, 2, 3, 4)), part_of(true, (5, 6, 7))
+    main, other = submodel(true, (1, 2, 3, 4)), submodel(true, (5, 6, 7))
     for camera in main.cameras.values():
         camera.params = [1270.0, 512.0, 384.0, 0.0]
     made = outcome(attempt(main), attempt(other), graph=PoseGraph({}, {(1, 8): "contradicts other pairs"}, ()))
@@ -123,7 +123,7 @@ def test_the_main_model_is_adjusted_and_read_and_the_others_lie_beside_it(synthe
     assert run.statistics["registered"] == 4 and run.statistics["of"] == 8
     assert run.statistics["other_models"] == [[name[key] for key in (5, 6, 7)]]
     assert run.statistics["pairs_dropped"] == {"contradicts other pairs": 1}
-    assert photos_of(pycolmap.Reconstruction(run.workspace.other_models / "1")) == [5, 6, 7]
+    assert posed_photo_ids(pycolmap.Reconstruction(run.workspace.other_models / "1")) == [5, 6, 7]
 
     assert list(run.statistics["bytes"]) == ["points.ply", "points.glb"]
     for file, size in run.statistics["bytes"].items():
@@ -166,7 +166,7 @@ def test_what_a_second_look_found_stays_when_it_is_interrupted(run, monkeypatch,
     assert (place / "found").exists() is stays
     if stays:
         assert (scene.mapping_run(run).workspace.root / "found").exists()
-        other = run.for_stage("other photos")
+        other = run.with_fingerprint("other photos")
         assert not (scene.mapping_run(other).workspace.root / "found").exists()
 
 
@@ -175,7 +175,7 @@ def test_a_model_that_cannot_be_adjusted_is_kept_and_the_run_says_so(synthetic, 
         raise np.linalg.LinAlgError("Matrix is not positive definite")
 
     true = synthetic[1]
-    made = outcome(attempt(part_of(true, (1, 2, 3, 4))), attempt(part_of(true, (5, 6, 7))))
+    made = outcome(attempt(submodel(true, (1, 2, 3, 4))), attempt(submodel(true, (5, 6, 7))))
     mapped(made)
     monkeypatch.setattr(bundle, "reduce", failing)
     matches, views = inputs(true)
@@ -208,10 +208,10 @@ def test_how_it_was_made_counts_pairs_and_matches():
         for pair, kind in zip(combinations(range(4), 2), kinds, strict=False)
     }  # fmt: skip
     dropped = {(1, 3): "contradicts other pairs", (2, 3): "contradicts other pairs", (1, 2): "points behind a camera"}
-    explained = {(0, 1): Explained(50, 40, 3), (0, 2): Explained(60, 50, 4)}
+    explained = {(0, 1): PairSupport(50, 40, 3), (0, 2): PairSupport(60, 50, 4)}
     model = SimpleNamespace(num_reg_images=lambda: 4)
 
-    found = scene.how_it_was_made(
+    found = scene.mapping_figures(
         outcome(attempt(model, explained), graph=PoseGraph(poses, dropped, ()), cuts=("c, d",), passes=2)
     )
 
@@ -236,7 +236,7 @@ def files(folder):
 
 def test_models_are_written_as_a_whole_and_nothing_of_an_earlier_run_is_left(synthetic, run):
     place = run.workspace
-    parts = [part_of(synthetic[1], photos) for photos in ((1, 2, 3, 4), (5, 6), (7, 8))]
+    parts = [submodel(synthetic[1], photos) for photos in ((1, 2, 3, 4), (5, 6), (7, 8))]
     for folder in (place.sparse, place.other_models / "7", place.root / ".sparse"):
         folder.mkdir(parents=True)
         (folder / "old.bin").write_bytes(b"old")
@@ -248,11 +248,11 @@ def test_models_are_written_as_a_whole_and_nothing_of_an_earlier_run_is_left(syn
     assert sorted(path.name for path in place.other_models.iterdir()) == ["1", "2"]
     assert sorted(path.name for path in place.root.iterdir()) == ["other_models", "sparse"]
     found = [place.sparse, place.other_models / "1", place.other_models / "2"]
-    assert [photos_of(pycolmap.Reconstruction(folder)) for folder in found] == [[1, 2, 3, 4], [5, 6], [7, 8]]
+    assert [posed_photo_ids(pycolmap.Reconstruction(folder)) for folder in found] == [[1, 2, 3, 4], [5, 6], [7, 8]]
 
     scene.write_models(parts[1:2], run)
 
-    assert photos_of(pycolmap.Reconstruction(place.sparse)) == [5, 6]
+    assert posed_photo_ids(pycolmap.Reconstruction(place.sparse)) == [5, 6]
     assert not place.other_models.exists()
 
 
@@ -283,7 +283,7 @@ def test_what_is_known_of_refined_cameras_goes_by_their_names():
         determined={7: ("k1",), 8: ()},
     )
 
-    found = scene.refined_by_name(adjusted, {"1.jpg": "a", "2.jpg": "a", "3.jpg": "b", "4.jpg": "c"})
+    found = scene.refined_cameras(adjusted, {"1.jpg": "a", "2.jpg": "a", "3.jpg": "b", "4.jpg": "c"})
 
     assert found == {
         "a": {"deviations": {"fx": 1.0}, "determined": ("k1",)},

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from sfm_app.photos import save_used
+from sfm_app.photos import save_mask
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
 from sfm_app.stages import texture
-from sfm_app.stages.texture import Files, read_photo, read_texture, save_texture, surface_digest
+from sfm_app.stages.texture import FileStore, read_photo, read_texture, save_texture, surface_digest
 from sfm_app.texture import PhotoView
 from sfm_app.types import CameraModel, Model, Surface, Texture
 
@@ -47,7 +47,7 @@ def test_photos_are_rgb_and_of_the_view_s_size(tmp_path):
     view = PhotoView("a.png", (50.0, 50.0, 30.0, 20.0, 0, 0, 0, 0), np.eye(3, 4), 60, 40)
 
     np.testing.assert_array_equal(read_photo(tmp_path, view), np.repeat(gray[:, :, None], 3, axis=2))
-    small = read_photo(tmp_path, view.scaled(20, 10))
+    small = read_photo(tmp_path, view.with_size(20, 10))
     assert small.shape == (10, 20, 3)
     assert (small[:, :10] == 0).all()
     assert (small[:, 10:] == 200).all()
@@ -59,19 +59,19 @@ def test_nothing_is_seen_of_what_is_masked_at_any_size(tmp_path, scale):
     used[10:31, 17:44] = used[:, 3] = False
     photo[~used] = (255, 0, 255)
     Image.fromarray(photo).save(tmp_path / "a.png")
-    save_used(tmp_path / "masks", "a.png", used)
+    save_mask(tmp_path / "masks", "a.png", used)
     view = PhotoView("a.png", (50.0, 50.0, 30.0, 20.0, 0, 0, 0, 0), np.eye(3, 4), 60, 40)
-    files = Files(tmp_path, tmp_path / "parts", tmp_path / "masks")
+    files = FileStore(tmp_path, tmp_path / "parts", tmp_path / "masks")
 
-    seen = files.photo(view.scaled(round(60 * scale), round(40 * scale)))
+    seen = files.photo(view.with_size(round(60 * scale), round(40 * scale)))
 
-    np.testing.assert_array_equal(files.used(view), used)
+    np.testing.assert_array_equal(files.usable_pixels(view), used)
     assert (seen == (20, 120, 90)).all()
-    assert Files(tmp_path, tmp_path / "parts").used(view) is None
+    assert FileStore(tmp_path, tmp_path / "parts").usable_pixels(view) is None
 
 
 def test_arrays_come_back_by_name_and_damaged_ones_count_as_none(tmp_path):
-    files = Files(tmp_path, tmp_path / "parts")
+    files = FileStore(tmp_path, tmp_path / "parts")
     assert files.recall("look0") is None
 
     files.keep("look0", {"worth": np.arange(3), "sharpness": np.array(0.5)})

@@ -11,7 +11,7 @@ from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.stages.video_frames import stem_of, video_frames
+from sfm_app.stages.video_frames import frame_stem, video_frames
 
 pytestmark = pytest.mark.slow
 
@@ -99,7 +99,7 @@ def test_a_marker_that_cannot_be_read_counts_as_none(clip, run, text):
 def test_other_inputs_choose_anew(clip, tmp_path, run):
     killed(clip, run)
 
-    assert len(frames_of(write(clip, range(0, 40, 4)), run.for_stage("another"))) <= 6
+    assert len(frames_of(write(clip, range(0, 40, 4)), run.with_fingerprint("another"))) <= 6
 
 
 def test_a_video_that_is_cut_off_says_so(clip, run):
@@ -147,4 +147,4 @@ def test_a_video_that_is_black_all_over_is_refused(tmp_path, run):
     ],
 )
 def test_frames_have_names_that_can_be_used(tmp_path, name, stem):
-    assert stem_of(tmp_path / name) == stem
+    assert frame_stem(tmp_path / name) == stem

@@ -87,7 +87,7 @@ def test_parts_come_back_as_they_were(build, tmp_path):
     again = fitting.read_part(tmp_path / "part.npz", list(found))
 
     assert [count for _, count in again.values()] == [3, 0]
-    arrays = [fitting.graph_of(parts).to_arrays() for parts in (found, again)]
+    arrays = [fitting.to_view_graph(parts).to_arrays() for parts in (found, again)]
     assert all(np.array_equal(arrays[0][name], arrays[1][name]) for name in arrays[0])
 
 

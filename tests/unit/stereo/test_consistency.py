@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sfm_app.stereo.consistency import MIN_PATCH, count_agreeing, merge_hypotheses, without_specks
+from sfm_app.stereo.consistency import MIN_PATCH, count_confirming_maps, filter_speckles, merge_hypotheses
 
 
 def pixels(*values: float) -> np.ndarray:
@@ -48,7 +48,7 @@ def test_true_depths_are_confirmed_and_wrong_ones_are_not(plane, make_view):
     depth[80:100, 100:140] *= 1.05
     depth[100:110, 100:140] = 0
 
-    agreeing = count_agreeing(view, depth, maps, 0.01)
+    agreeing = count_confirming_maps(view, depth, maps, 0.01)
 
     assert not agreeing[80:110, 100:140].any()
     assert np.all(agreeing[30:70, 60:180] == 2)
@@ -57,7 +57,7 @@ def test_true_depths_are_confirmed_and_wrong_ones_are_not(plane, make_view):
 
 def test_a_depth_behind_the_other_camera_is_not_confirmed(plane, make_view):
     view, ahead = make_view((0, 0, 0)), make_view((0, 0, 9))
-    assert not count_agreeing(view, plane.depth(view), [(ahead, np.abs(plane.depth(ahead)))], 0.01).any()
+    assert not count_confirming_maps(view, plane.depth(view), [(ahead, np.abs(plane.depth(ahead)))], 0.01).any()
 
 
 def test_specks_go_and_thin_things_stay():
@@ -67,7 +67,7 @@ def test_specks_go_and_thin_things_stay():
     depth[10:14, 10:14] = 5.0
     depth[280:282, 20:220] = 3.0
 
-    found = without_specks(depth, 0.01)
+    found = filter_speckles(depth, 0.01)
 
     assert 16 < MIN_PATCH * depth.size < 400
     assert not found[100:104, 150:154].any()
@@ -78,4 +78,4 @@ def test_specks_go_and_thin_things_stay():
 
 def test_nothing_has_no_specks():
     empty = np.zeros((30, 40), np.float32)
-    assert not without_specks(empty, 0.01).any()
+    assert not filter_speckles(empty, 0.01).any()

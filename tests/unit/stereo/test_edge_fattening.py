@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sfm_app.stereo.edge_fattening import REACH_PX, rims, without_spill
+from sfm_app.stereo.edge_fattening import REACH_PX, remove_spill, rim_mask
 
 SIDE = 80
 ROW, COL = np.indices((SIDE, SIDE))
@@ -28,7 +28,7 @@ def depths(known):
 def test_the_seam_around_a_thing_goes_and_the_thing_stays(inside, outside, spread):
     given_depth = depths(DISC | SEAM)
 
-    found = without_spill(given_depth, photo(inside, outside, spread))
+    found = remove_spill(given_depth, photo(inside, outside, spread))
 
     assert np.mean(found[SEAM] > 0) < 0.05
     assert np.mean(found[DISC] > 0) > 0.98
@@ -36,7 +36,7 @@ def test_the_seam_around_a_thing_goes_and_the_thing_stays(inside, outside, sprea
 
 
 def test_a_true_outline_stays_as_it_is():
-    found = without_spill(depths(DISC), photo(120, 200, 15))
+    found = remove_spill(depths(DISC), photo(120, 200, 15))
 
     assert np.mean(found[DISC] > 0) > 0.995
 
@@ -44,7 +44,7 @@ def test_a_true_outline_stays_as_it_is():
 def test_nothing_goes_around_a_hole_in_a_surface_of_one_look():
     known = ~DISC
 
-    found = without_spill(depths(known), photo(150, 150, 1.5))
+    found = remove_spill(depths(known), photo(150, 150, 1.5))
 
     assert np.mean(found[known] > 0) > 0.995
 
@@ -53,9 +53,9 @@ def test_a_narrow_gap_lies_in_a_surface_and_keeps_its_rim():
     crack = np.abs(COL - 40) < REACH_PX
     gray = np.where(np.abs(COL - 40) < REACH_PX + 4, 60, 200).astype(np.uint8)
 
-    np.testing.assert_array_equal(without_spill(depths(~crack), gray), depths(~crack))
+    np.testing.assert_array_equal(remove_spill(depths(~crack), gray), depths(~crack))
     broad = np.abs(COL - 40) <= REACH_PX + 1
-    assert np.all(without_spill(depths(~broad), gray)[np.abs(COL - 40) < REACH_PX + 4] == 0)
+    assert np.all(remove_spill(depths(~broad), gray)[np.abs(COL - 40) < REACH_PX + 4] == 0)
 
 
 def test_what_is_thin_keeps_what_does_not_look_like_the_empty_side():
@@ -63,7 +63,7 @@ def test_what_is_thin_keeps_what_does_not_look_like_the_empty_side():
     gray = photo(200, 200)
     gray[wire] = 120
 
-    found = without_spill(depths(seam), gray)
+    found = remove_spill(depths(seam), gray)
 
     np.testing.assert_array_equal(found > 0, wire)
 
@@ -71,7 +71,7 @@ def test_what_is_thin_keeps_what_does_not_look_like_the_empty_side():
 def test_rims_lie_beside_what_is_broadly_empty():
     away = np.abs(COL - 20) - 2 * REACH_PX  # of the columns to the right of a gap four rims wide
 
-    found = rims((away > 0) & (np.abs(COL - 60) > 1))
+    found = rim_mask((away > 0) & (np.abs(COL - 60) > 1))
 
     np.testing.assert_array_equal(found, (away > 0) & (away <= REACH_PX))
 
@@ -82,7 +82,7 @@ def test_depths_are_kept_or_dropped_and_never_far_from_nothing(seed, share):
     known = np.repeat(np.repeat(rng.random((4, 4)) < share, 20, 0), 20, 1)
     given_depth = depths(known)
 
-    found = without_spill(given_depth, rng.integers(0, 256, known.shape).astype(np.uint8))
+    found = remove_spill(given_depth, rng.integers(0, 256, known.shape).astype(np.uint8))
 
     dropped = (found == 0) & known
     np.testing.assert_array_equal(found[~dropped], given_depth[~dropped])
@@ -93,4 +93,4 @@ def test_depths_are_kept_or_dropped_and_never_far_from_nothing(seed, share):
 
 @pytest.mark.parametrize("known", [np.zeros((SIDE, SIDE), bool), np.ones((SIDE, SIDE), bool)])
 def test_all_or_nothing_stays(known):
-    np.testing.assert_array_equal(without_spill(depths(known), photo(120, 200)), depths(known))
+    np.testing.assert_array_equal(remove_spill(depths(known), photo(120, 200)), depths(known))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_app.settings import DepthSettings
-from sfm_app.stereo import DepthTask, make_on_cpu, method, rank_neighbors
+from sfm_app.stereo import DepthTask, make_depth_maps_on_cpu, method, rank_neighbors
 from sfm_app.types import Rejected
 
 pytestmark = pytest.mark.slow
@@ -57,19 +57,19 @@ def task_for(views, store):
 
 def test_a_killed_run_goes_on_with_the_photo_it_stopped_at(plane, views):
     whole, killed = Memory(plane), Memory(plane, full=2)
-    assert make_on_cpu(task_for(views, whole)) == [None, None, None]
+    assert make_depth_maps_on_cpu(task_for(views, whole)) == [None, None, None]
     with pytest.raises(KeyboardInterrupt):
-        make_on_cpu(task_for(views, killed))
+        make_depth_maps_on_cpu(task_for(views, killed))
     assert killed.written == ["0.jpg", "1.jpg"]
 
     killed.full = 100
-    assert make_on_cpu(task_for(views, killed)) == [None, None, None]
+    assert make_depth_maps_on_cpu(task_for(views, killed)) == [None, None, None]
 
     assert killed.written == ["0.jpg", "1.jpg", "2.jpg", "0.jpg", "1.jpg", "2.jpg"]
     for name, maps in whole.maps.items():
         assert maps.depth.tobytes() == killed.maps[name].depth.tobytes()
         assert np.mean(maps.depth > 0) > 0.3
-    make_on_cpu(task_for(views, killed))
+    make_depth_maps_on_cpu(task_for(views, killed))
     assert len(killed.written) == 6
 
 
@@ -77,7 +77,7 @@ def test_a_photo_that_nothing_confirms_has_a_reason_and_no_map(plane, views, mak
     stranger = make_view((0, 0, 0), name="stranger.jpg", turn=(0, 2.0, 0), size=(160, 120))
     store = Memory(plane)
 
-    found = make_on_cpu(task_for([*views, stranger], store))
+    found = make_depth_maps_on_cpu(task_for([*views, stranger], store))
 
     assert found == [None, None, None, Rejected("no photo shares enough points")]
     assert "stranger.jpg" not in store.estimates | store.maps
@@ -95,7 +95,7 @@ def test_a_photo_whose_numbers_fail_has_a_reason_and_the_others_their_maps(plane
 
     monkeypatch.setattr(method, step, failing)
 
-    found = make_on_cpu(task_for(views, Memory(plane)))
+    found = make_depth_maps_on_cpu(task_for(views, Memory(plane)))
 
     assert found[2] == Rejected("the computation failed: Singular matrix")
     assert found[1] is None

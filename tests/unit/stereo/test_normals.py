@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sfm_app.stereo.normals import fit_planes, normals_of
+from sfm_app.stereo.normals import fit_planes, plane_normals
 from sfm_app.stereo.view import View
 
 slope = st.floats(-1.0, 1.0)
@@ -28,7 +28,7 @@ def test_a_plane_comes_back_exactly(a, b, skew, sample_px):
     depth = plane_depth(view, normal, 5.0)
 
     planes = fit_planes(depth)
-    normals = normals_of(planes, view)
+    normals = plane_normals(planes, view)
 
     np.testing.assert_allclose(planes[..., 0] * depth, 1, rtol=2e-6)
     np.testing.assert_allclose(normals, np.broadcast_to(-normal, normals.shape), atol=1e-3)
@@ -53,7 +53,7 @@ def test_steps_stay_sharp():
     planes = fit_planes(depth)
 
     np.testing.assert_allclose(planes[..., 0] * depth, 1, rtol=1e-6)
-    np.testing.assert_allclose(normals_of(planes, view)[..., 2], -1.0, atol=1e-5)
+    np.testing.assert_allclose(plane_normals(planes, view)[..., 2], -1.0, atol=1e-5)
 
 
 def test_specks_and_empty_pixels_get_nothing():
@@ -63,4 +63,4 @@ def test_specks_and_empty_pixels_get_nothing():
     planes = fit_planes(depth)
 
     assert not planes.any()
-    assert not normals_of(planes, view_with(np.diag([100.0, 100.0, 1.0]))).any()
+    assert not plane_normals(planes, view_with(np.diag([100.0, 100.0, 1.0]))).any()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.stereo.planar_fill import bridge_even_areas
+from sfm_app.stereo.planar_fill import fill_planar_areas
 
 HEIGHT, WIDTH = 240, 320
 ROW, COL = np.mgrid[:HEIGHT, :WIDTH]
@@ -30,7 +30,7 @@ def patches(truth: np.ndarray, share: float, noise: float, seed: int = 2) -> np.
 def test_a_plain_wall_is_found_between_what_is_known_of_it(share):
     depth = patches(WALL, share, noise=0.003)
 
-    found = bridge_even_areas(depth, paint(240), 0.01)
+    found = fill_planar_areas(depth, paint(240), 0.01)
 
     wall = (COL > 20) & (COL < 220) & (ROW > 20) & (ROW < 220)
     assert np.mean(depth[wall] > 0) < share + 0.1
@@ -44,7 +44,7 @@ def test_a_plain_wall_is_found_between_what_is_known_of_it(share):
 def test_nothing_is_carried_beyond_what_is_known():
     depth = np.where(ROW > 120, patches(WALL, 0.5, 0.003), 0).astype(np.float32)
 
-    found = bridge_even_areas(depth, paint(WIDTH), 0.01)
+    found = fill_planar_areas(depth, paint(WIDTH), 0.01)
 
     assert np.mean(found[130:230] > 0) > 0.9
     assert not found[:118].any()
@@ -62,10 +62,10 @@ def test_nothing_is_carried_beyond_what_is_known():
 def test_what_is_no_plane_stays_as_it_is(truth):
     depth = patches(truth, 0.4, 0.001)
 
-    np.testing.assert_array_equal(bridge_even_areas(depth, paint(WIDTH), 0.01), depth)
+    np.testing.assert_array_equal(fill_planar_areas(depth, paint(WIDTH), 0.01), depth)
 
 
 def test_a_few_specks_make_no_wall():
     depth = patches(WALL, 0.04, 0.0)
 
-    np.testing.assert_array_equal(bridge_even_areas(depth, paint(WIDTH), 0.01), depth)
+    np.testing.assert_array_equal(fill_planar_areas(depth, paint(WIDTH), 0.01), depth)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.stereo.textureless import without_surface
+from sfm_app.stereo.textureless import surfaceless_areas
 
 SHAPE = (120, 160)
 
@@ -25,7 +25,7 @@ def confirmed_rim(rows: int) -> np.ndarray:
 
 @pytest.mark.parametrize("noise", [0.0, 0.1])
 def test_a_sky_that_is_confirmed_along_its_rim_has_no_surface(noise):
-    found = without_surface(blank_half(noise), confirmed_rim(1))
+    found = surfaceless_areas(blank_half(noise), confirmed_rim(1))
 
     assert found[:58].mean() > 0.98
     assert not found[62:].any()
@@ -33,7 +33,7 @@ def test_a_sky_that_is_confirmed_along_its_rim_has_no_surface(noise):
 
 @pytest.mark.parametrize("rows", [5, 30, 60])
 def test_a_wall_of_which_some_is_confirmed_stays(rows):
-    assert not without_surface(blank_half(), confirmed_rim(rows)).any()
+    assert not surfaceless_areas(blank_half(), confirmed_rim(rows)).any()
 
 
 def test_areas_are_told_apart():
@@ -42,7 +42,7 @@ def test_areas_are_told_apart():
     confirmed = np.ones(SHAPE, bool)
     confirmed[10:50, 90:150] = False
 
-    found = without_surface(confidence, confirmed)
+    found = surfaceless_areas(confidence, confirmed)
 
     assert not found[:, :80].any()
     assert found[12:48, 92:148].all()
@@ -52,11 +52,11 @@ def test_areas_are_told_apart():
 def test_photos_that_are_all_alike(confidence):
     everywhere = np.full(SHAPE, confidence, np.float32)
 
-    assert without_surface(everywhere, np.zeros(SHAPE, bool)).all() == (confidence == 0.0)
-    assert not without_surface(everywhere, np.ones(SHAPE, bool)).any()
+    assert surfaceless_areas(everywhere, np.zeros(SHAPE, bool)).all() == (confidence == 0.0)
+    assert not surfaceless_areas(everywhere, np.ones(SHAPE, bool)).any()
 
 
 def test_weak_likeness_is_not_blank():
     weak = np.full(SHAPE, 0.15, np.float32)
 
-    assert not without_surface(weak, np.zeros(SHAPE, bool)).any()
+    assert not surfaceless_areas(weak, np.zeros(SHAPE, bool)).any()

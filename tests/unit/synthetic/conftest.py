@@ -16,8 +16,8 @@ def still_life() -> SyntheticScene:
     red = Material(pattern="brick", base=(170, 60, 50), second=(200, 120, 90))
     bodies = (
         Body(ground((-3.0, 3.0), (-3.0, 3.0), unevenness=0.0, spacing=0.5), gray),
-        Body(box(1.0, 0.8, 1.0).moved(turn_deg=30.0), red),
-        Body(ball(0.5, segments=48).moved((0.0, 1.3, 0.0)), gray),
+        Body(box(1.0, 0.8, 1.0).move(turn_deg=30.0), red),
+        Body(ball(0.5, segments=48).move((0.0, 1.3, 0.0)), gray),
     )
     return SyntheticScene("still life", bodies)
 

@@ -158,12 +158,12 @@ def test_an_orbit_leaves_the_focal_undetermined():
 
 def test_photos_can_be_taken_with_another_camera():
     wide, tele = make_camera(96, 64), make_camera(96, 64, focal_widths=2.0)
-    views = orbit(wide, 4).taken_with(tele, ["view_01.jpg", "view_03.jpg"])
+    views = orbit(wide, 4).with_camera(tele, ["view_01.jpg", "view_03.jpg"])
 
     assert [camera is tele for camera in views.cameras.values()] == [False, True, False, True]
     assert list(views.cameras) == list(views.cam_from_world)
     with pytest.raises(ConfigError, match=r"no such photo: view_09\.jpg"):
-        views.taken_with(tele, ["view_09.jpg"])
+        views.with_camera(tele, ["view_09.jpg"])
 
 
 @pytest.mark.parametrize("wrong", [{"photos": 1}, {"sweep_deg": 400.0}, {"distance": 0.0}])

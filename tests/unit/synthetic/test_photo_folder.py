@@ -55,7 +55,7 @@ def test_the_same_seed_gives_the_same_bytes(photos, still_life, four_views, tmp_
 def test_truth_survives_the_disk_and_pickling(photos, tmp_path):
     _, truth = photos
     odd = Camera(np.array([[150.0, 0, 61.5], [0, 140.0, 38.25], [0, 0, 1]]), 124, 77, radial=-0.125)
-    truth = replace(truth, cameras=Views(truth.cameras, truth.cam_from_world).taken_with(odd, ["view_02.jpg"]).cameras)
+    truth = replace(truth, cameras=Views(truth.cameras, truth.cam_from_world).with_camera(odd, ["view_02.jpg"]).cameras)
     save_truth(truth, tmp_path / "truth")
     for copy in (load_truth(tmp_path / "truth"), pickle.loads(pickle.dumps(truth))):  # noqa: S301
         for name, camera in truth.cameras.items():
@@ -83,7 +83,9 @@ def test_truth_file_says_x_is_K_RX_plus_t(photos, tmp_path):
 def test_every_photo_is_taken_with_its_own_camera(photos, still_life, four_views, tmp_path):
     folder, truth = photos
     tele = make_camera(120, 80, focal_widths=1.6)
-    mixed = write_photo_folder(tmp_path, still_life, four_views.taken_with(tele, ["view_01.jpg"]), PhotoOptions(seed=3))
+    mixed = write_photo_folder(
+        tmp_path, still_life, four_views.with_camera(tele, ["view_01.jpg"]), PhotoOptions(seed=3)
+    )
 
     for name in truth.cam_from_world:
         same = (tmp_path / name).read_bytes() == (folder / name).read_bytes()

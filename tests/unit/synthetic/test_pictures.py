@@ -3,12 +3,12 @@ import pytest
 
 from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera
 from sfm_app.synthetic.pictures import (
-    beside_photo,
+    comparison_image,
+    orbited_pose,
     prepare_model,
     render_model,
+    render_rays,
     render_shape,
-    view_along,
-    walked_around,
 )
 from sfm_app.types import Surface
 from sfm_app.types.model import Model, Texture
@@ -40,7 +40,7 @@ def test_a_model_without_texture_has_the_colors_of_its_vertices():
     share = (np.arange(20) + 0.5) / 20
     assert np.allclose(picture.colors[:, 20:, 0], np.round(250 * (1 - share))[:, None], atol=1)
     assert np.allclose(picture.colors[:, 20:, 2], np.round(250 * share)[:, None], atol=1)
-    assert not picture.colors[:, :20].any() and np.all(picture.on((1, 2, 3))[:, :20] == [1, 2, 3])
+    assert not picture.colors[:, :20].any() and np.all(picture.with_background((1, 2, 3))[:, :20] == [1, 2, 3])
 
 
 @pytest.mark.parametrize("pages", [1, 3])
@@ -72,7 +72,7 @@ def test_any_rays_give_the_picture_of_their_camera():
     model = prepare_model(Model(square()))
     x, y = np.meshgrid(np.arange(40) + 0.5, np.arange(20) + 0.5)
     rays = np.stack([(x - 20) / 20, (y - 10) / 20, np.ones_like(x)], axis=-1)
-    same = view_along(model, np.zeros(3), 3.0 * rays)
+    same = render_rays(model, np.zeros(3), 3.0 * rays)
     assert np.array_equal(same.colors, render_model(model, CAMERA, STRAIGHT).colors)
 
 
@@ -100,13 +100,13 @@ def test_a_model_without_triangles_is_not_seen():
     camera = make_camera(20, 16)
     for picture in (render_model(empty, camera, STRAIGHT), render_shape(empty, camera, STRAIGHT)):
         assert picture.colors.shape == (16, 20, 3) and not picture.covered.any()
-        assert np.all(picture.on() == 255)
+        assert np.all(picture.with_background() == 255)
 
 
 def test_beside_a_photo_stand_the_model_from_its_camera_from_aside_and_its_bare_shape():
     camera = Camera(np.array([[20.0, 0, 40.0], [0, 20.0, 20.0], [0, 0, 1]]), 80, 40)
     photo = np.full((80, 160, 3), (10, 200, 30), np.uint8)
-    page = beside_photo(photo, textured(np.full((8, 8, 3), (200, 40, 30), np.uint8)), camera, STRAIGHT)
+    page = comparison_image(photo, textured(np.full((8, 8, 3), (200, 40, 30), np.uint8)), camera, STRAIGHT)
     views = {"photo": page[:40, :80], "model": page[:40, 80:], "aside": page[40:, :80], "shape": page[40:, 80:]}
     seen = {name: np.any(view != 255, axis=2) for name, view in views.items()}
 
@@ -124,7 +124,7 @@ def test_beside_a_photo_stand_the_model_from_its_camera_from_aside_and_its_bare_
 def test_walking_around_keeps_height_distance_and_what_is_in_the_middle(angle_deg):
     surface = Surface(np.random.default_rng(0).normal(size=(99, 3)), FACES, RED_TO_BLUE)
     pose = look_at(np.array([1.0, 2.0, 6.0]), np.zeros(3))
-    walked = walked_around(pose, surface, angle_deg)
+    walked = orbited_pose(pose, surface, angle_deg)
     depth = np.median(surface.vertices @ pose[2, :3] + pose[2, 3])
     middle = pose[:, :3].T @ (np.array([0.0, 0.0, depth]) - pose[:, 3])
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera, pixel_rays
-from sfm_app.synthetic.render import cast, prepare, ray_caster, render_scene
+from sfm_app.synthetic.render import cast_rays, prepare, ray_caster, render_scene
 from sfm_app.synthetic.scenes.bodies import Body, SyntheticScene
 from sfm_app.synthetic.scenes.shapes import box
 from sfm_app.synthetic.scenes.textures import Material
@@ -24,7 +24,7 @@ def test_two_views_show_the_same_surface_in_the_right_pixels(prepared, still_lif
     first, second = (render_scene(prepared, camera, pose, supersampling=3) for pose in poses)
     directions = pixel_rays(camera) @ poses[0][:, :3]
     caster = ray_caster(still_life.vertices, still_life.faces)
-    hits = cast(caster, camera_center(poses[0]), directions)
+    hits = cast_rays(caster, camera_center(poses[0]), directions)
     hit = np.isfinite(hits["t_hit"])
     points = camera_center(poses[0]) + directions[hit] * hits["t_hit"][hit, None]
     h = (points @ poses[1][:, :3].T + poses[1][:, 3]) @ camera.K.T
@@ -48,7 +48,7 @@ def test_two_views_show_the_same_surface_in_the_right_pixels(prepared, still_lif
 def test_a_pixel_is_seen_through_its_center():
     """A wall whose edges lie at x = 10.25 and 30.75, y = 4.25 and 15.75 pixels covers whole pixels by their centers."""
     white = Material(pattern="stone", base=(230, 230, 230), second=(230, 230, 230), joint=(230, 230, 230))
-    wall = box(20.5, 11.5, 1.0, spacing=50.0).moved((-4.5, -15.75 + 15.0, -20.5))
+    wall = box(20.5, 11.5, 1.0, spacing=50.0).move((-4.5, -15.75 + 15.0, -20.5))
     scene = prepare(SyntheticScene("wall", (Body(wall, white),), to_light=(0.0, 0.0, 1.0)))
     camera = Camera(np.array([[20.0, 0, 25.0], [0, 20.0, 15.0], [0, 0, 1]]), 50, 30)
     pose = look_at(np.zeros(3), np.array([0.0, 0.0, -1.0]))  # the front of the wall is 20 units away
@@ -87,7 +87,7 @@ def test_the_sky_is_blue_and_darker_above(prepared):
 
 def test_bodies_of_one_material_have_their_own_stains():
     white = Material(pattern="stone", base=(200, 200, 200), second=(100, 100, 100))
-    twins = tuple(Body(box(1.0, 1.0, 1.0).moved((x, 0.0, 0.0)), white) for x in (-0.5, 0.5))
+    twins = tuple(Body(box(1.0, 1.0, 1.0).move((x, 0.0, 0.0)), white) for x in (-0.5, 0.5))
     pose = look_at(np.array([0.0, 0.5, 9.0]), np.array([0.0, 0.5, 0.0]))
     camera = make_camera(200, 100, focal_widths=3.0, center=(0.5, 0.5))
     image = render_scene(prepare(SyntheticScene("twins", twins, to_light=(0.0, 0.0, 1.0))), camera, pose)[..., 1]

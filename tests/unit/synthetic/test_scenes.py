@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from sfm_app.errors import ConfigError
-from sfm_app.synthetic.cameras import PastOptions, camera_center, make_camera, past, pixel_rays
-from sfm_app.synthetic.render import GAMMA, cast, prepare, ray_caster, render_scene
+from sfm_app.synthetic.cameras import WallWalkOptions, camera_center, make_camera, pixel_rays, wall_walk
+from sfm_app.synthetic.render import GAMMA, cast_rays, prepare, ray_caster, render_scene
 from sfm_app.synthetic.scenes.corner import PLASTER, corner
 from sfm_app.synthetic.scenes.scene_catalog import WALKS, build_scene, scene_views
-from sfm_app.synthetic.scenes.shapes import assembled, ball, box, carved, waves
+from sfm_app.synthetic.scenes.shapes import assemble, ball, box, carve, waves
 from sfm_app.synthetic.scenes.statue import bust_field
 
 pytestmark = pytest.mark.slow
@@ -23,7 +23,7 @@ def egg(points):
 
 
 def test_a_carved_body_is_what_its_field_says():
-    shape = carved(egg, (-1.1, 1.1), reach=0.8)
+    shape = carve(egg, (-1.1, 1.1), reach=0.8)
     assert signed_volume(shape) == pytest.approx(4 / 3 * np.pi * 0.5 * 0.25, rel=0.02)
     sides = shape.vertices[np.hypot(shape.vertices[:, 0], shape.vertices[:, 2]) > 0]
     assert np.abs(egg(sides)).max() < 0.02, "every vertex lies on it"
@@ -32,7 +32,7 @@ def test_a_carved_body_is_what_its_field_says():
 
 
 def test_a_carved_body_is_closed():
-    shape = carved(egg, (-1.1, 1.1), reach=0.8, rows=40, segments=24)
+    shape = carve(egg, (-1.1, 1.1), reach=0.8, rows=40, segments=24)
     _, whole = np.unique(np.round(shape.vertices, 9), axis=0, return_inverse=True)
     faces = whole.ravel()[shape.faces]
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
@@ -41,8 +41,8 @@ def test_a_carved_body_is_closed():
 
 
 def test_an_assembled_body_has_one_texture_that_runs_on():
-    parts = [box(1.0, 1.0, 1.0).moved((x, 0.0, 0.0), turn_deg=90.0) for x in (0.0, 2.0)]
-    both = assembled(parts)
+    parts = [box(1.0, 1.0, 1.0).move((x, 0.0, 0.0), turn_deg=90.0) for x in (0.0, 2.0)]
+    both = assemble(parts)
     assert np.array_equal(both.texture, both.vertices) and len(both.vertices) == 2 * len(parts[0].vertices)
     assert signed_volume(both) == pytest.approx(2.0)
     assert np.array_equal(both.normals[: len(parts[0].normals)], parts[0].normals)
@@ -79,7 +79,7 @@ def test_photos_look_at_their_scene_from_outside_of_it(name):
         camera = views.cameras[photo]
         assert 1000 <= max(camera.width, camera.height) <= 1200
         coarse = type(camera)(np.diag([0.05, 0.05, 1.0]) @ camera.K, camera.width // 20, camera.height // 20)
-        hits = cast(caster, camera_center(pose), pixel_rays(coarse) @ pose[:, :3])
+        hits = cast_rays(caster, camera_center(pose), pixel_rays(coarse) @ pose[:, :3])
         depth = hits["t_hit"][np.isfinite(hits["t_hit"])]
         assert 0.35 < np.isfinite(hits["t_hit"]).mean() <= 1.0, "the scene fills a good part of every photo"
         assert depth.min() > 0.5, "nobody stands in a wall"
@@ -99,7 +99,7 @@ def test_the_plain_wall_is_plain_but_not_even():
     prepared, pose = prepare(scene), next(iter(scene_views("corner").cam_from_world.values()))
     camera = make_camera(288, 192, focal_widths=0.9)
     levels = 255 * np.clip(render_scene(prepared, camera, pose, supersampling=1), 0, 1) ** (1 / GAMMA)
-    hits = cast(prepared.rays, camera_center(pose), pixel_rays(camera) @ pose[:, :3])
+    hits = cast_rays(prepared.rays, camera_center(pose), pixel_rays(camera) @ pose[:, :3])
     seen = np.isfinite(hits["t_hit"])
     body = np.full(seen.shape, -1)
     body[seen] = prepared.face_material[hits["primitive_ids"][seen]]
@@ -112,17 +112,17 @@ def test_the_plain_wall_is_plain_but_not_even():
 
 
 def test_a_walk_past_a_wall_turns_its_head():
-    views = past(make_camera(120, 80), PastOptions(photos=8, length=6.0), seed=1)
+    views = wall_walk(make_camera(120, 80), WallWalkOptions(photos=8, length=6.0), seed=1)
     poses = np.array(list(views.cam_from_world.values()))
     eyes = np.array([camera_center(pose) for pose in poses])
     assert np.allclose(np.diff(eyes[:, 0]), 6.0 / 7) and np.all((eyes[:, 2] > 5) & (eyes[:, 2] < 7))
     ways = poses[:, 2, :3]
     angles = np.degrees(np.arccos(np.clip(ways @ ways.T, -1, 1)))
     assert np.all(ways[:, 2] < -0.7) and 10 < angles.max() < 80, "parallel axes would leave the focal undetermined"
-    other = past(make_camera(120, 80), PastOptions(photos=8, length=6.0), seed=2)
+    other = wall_walk(make_camera(120, 80), WallWalkOptions(photos=8, length=6.0), seed=2)
     assert not np.allclose(poses, np.array(list(other.cam_from_world.values())))
     with pytest.raises(ConfigError, match="photos, length or roll_deg"):
-        PastOptions(photos=1)
+        WallWalkOptions(photos=1)
 
 
 def test_walks_are_of_known_scenes():
@@ -133,5 +133,5 @@ def test_walks_are_of_known_scenes():
 
 
 def test_a_body_of_several_balls_is_as_large_as_they_are():
-    both = assembled([ball(0.5), ball(0.5).moved((3.0, 0.0, 0.0))])
+    both = assemble([ball(0.5), ball(0.5).move((3.0, 0.0, 0.0))])
     assert signed_volume(both) == pytest.approx(np.pi / 3, rel=0.02)

@@ -5,7 +5,7 @@ import pytest
 
 from sfm_app.errors import ConfigError
 from sfm_app.synthetic.scenes.scene_catalog import SCENES, build_scene
-from sfm_app.synthetic.scenes.shapes import arch, ball, box, ground, revolved, torus
+from sfm_app.synthetic.scenes.shapes import arch, ball, box, ground, revolve, torus
 
 VASE = np.array([[0.0, 0.0], [0.3, 0.0], [0.2, 0.5], [0.4, 1.0], [0.0, 1.0]])
 
@@ -23,11 +23,11 @@ def cone(bottom, top, height):
     ("shape", "volume"),
     [
         (box(1.0, 2.0, 3.0), 6.0),
-        (box(1.0, 2.0, 3.0).moved((5.0, -1.0, 2.0), turn_deg=20.0, tilt_deg=50.0), 6.0),
+        (box(1.0, 2.0, 3.0).move((5.0, -1.0, 2.0), turn_deg=20.0, tilt_deg=50.0), 6.0),
         (ball(0.5), math.pi / 6),
         (torus(1.0, 0.2), 2 * math.pi**2 * 0.04),
-        (revolved(VASE, segments=200), cone(0.3, 0.2, 0.5) + cone(0.2, 0.4, 0.5)),
-        (revolved(VASE, segments=200, sharp=True), cone(0.3, 0.2, 0.5) + cone(0.2, 0.4, 0.5)),
+        (revolve(VASE, segments=200), cone(0.3, 0.2, 0.5) + cone(0.2, 0.4, 0.5)),
+        (revolve(VASE, segments=200, sharp=True), cone(0.3, 0.2, 0.5) + cone(0.2, 0.4, 0.5)),
         (arch(1.0, 0.5, 0.4), math.pi / 2 * (1.5**2 - 1.0**2) * 0.4),  # its open feet lie in y = 0
     ],
     ids=["box", "moved box", "ball", "torus", "vase", "sharp vase", "arch"],
@@ -36,7 +36,7 @@ def test_triangles_enclose_the_right_volume_from_outside(shape, volume):
     assert signed_volume(shape) == pytest.approx(volume, rel=0.02)
 
 
-@pytest.mark.parametrize("shape", [box(1.0, 1.0, 1.0), ball(1.0), torus(1.0, 0.2), revolved(VASE, sharp=True)])
+@pytest.mark.parametrize("shape", [box(1.0, 1.0, 1.0), ball(1.0), torus(1.0, 0.2), revolve(VASE, sharp=True)])
 def test_normals_are_unit_and_point_as_the_triangles(shape):
     a, b, c = (shape.vertices[shape.faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
@@ -48,7 +48,7 @@ def test_normals_are_unit_and_point_as_the_triangles(shape):
 
 def test_moving_turns_normals_and_keeps_texture_places():
     still = ball(1.0, segments=32)
-    moved = still.moved((1.0, 2.0, 3.0), turn_deg=90.0)
+    moved = still.move((1.0, 2.0, 3.0), turn_deg=90.0)
 
     assert np.array_equal(moved.texture, still.texture)
     assert np.allclose(moved.vertices.mean(axis=0) - still.vertices.mean(axis=0), [1.0, 2.0, 3.0])
@@ -56,7 +56,7 @@ def test_moving_turns_normals_and_keeps_texture_places():
 
 
 def test_flutes_cut_into_a_column():
-    column = revolved(np.array([[1.0, 0.0], [1.0, 2.0]]), segments=200, flutes=(20, 0.1))
+    column = revolve(np.array([[1.0, 0.0], [1.0, 2.0]]), segments=200, flutes=(20, 0.1))
     radius = np.hypot(column.vertices[:, 0], column.vertices[:, 2])
     assert radius.max() == pytest.approx(1.0, abs=1e-6) and radius.min() == pytest.approx(0.9, abs=1e-3)
 

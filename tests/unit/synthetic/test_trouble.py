@@ -7,16 +7,16 @@ from PIL import Image
 from sfm_app.errors import InputError
 from sfm_app.synthetic.cameras import Views, camera_center, make_camera, pixel_rays
 from sfm_app.synthetic.scenes.bodies import Body
-from sfm_app.synthetic.scenes.strewn import faded, moving_thing, twins
+from sfm_app.synthetic.scenes.strewn import fade_colors, moving_thing, repeated_things
 from sfm_app.synthetic.trouble import (
     KINDS,
     PHOTOS,
-    bent,
-    pose_after,
-    smeared,
+    apply_motion_blur,
+    cam_from_thing,
     troubled_folder,
+    with_distortion,
+    with_zoom,
     write_troubled_folder,
-    zoomed,
 )
 
 pytestmark = pytest.mark.slow
@@ -92,29 +92,29 @@ def test_a_way_straight_ahead_and_one_to_the_side():
 
 
 def test_a_lens_pushes_the_farthest_corner_by_what_is_asked_and_zooming_keeps_the_bend():
-    camera = bent(make_camera(640, 480, 1.0, center=(0.4, 0.55)), -0.08)
+    camera = with_distortion(make_camera(640, 480, 1.0, center=(0.4, 0.55)), -0.08)
     corner = np.array([640.0, 0.0])
     seen = (corner - camera.K[:2, 2]) / camera.K[0, 0]
 
     assert camera.radial * (seen @ seen) == pytest.approx(-0.08)
-    assert zoomed(camera, 2.0).radial == pytest.approx(4 * camera.radial)
-    assert zoomed(camera, 2.0).K[1, 1] == 2 * camera.K[1, 1] and zoomed(camera, 2.0).K[0, 2] == camera.K[0, 2]
+    assert with_zoom(camera, 2.0).radial == pytest.approx(4 * camera.radial)
+    assert with_zoom(camera, 2.0).K[1, 1] == 2 * camera.K[1, 1] and with_zoom(camera, 2.0).K[0, 2] == camera.K[0, 2]
 
 
 def test_motion_blur_smears_along_its_direction_and_keeps_the_light():
     image = np.zeros((31, 31, 3))
     image[15, 15] = 1.0
 
-    level = smeared(image, 8.0, 0.0)[..., 0]
+    level = apply_motion_blur(image, 8.0, 0.0)[..., 0]
     rows, columns = np.mgrid[:31, :31] - 15
     assert level.sum() == pytest.approx(1.0)
     assert (level * columns**2).sum() == pytest.approx(8.0**2 / 12, rel=0.2)
     assert (level * rows**2).sum() == pytest.approx(0.0, abs=1e-9)
-    assert np.array_equal(smeared(image, 0.0, 1.0), image)
+    assert np.array_equal(apply_motion_blur(image, 0.0, 1.0), image)
 
 
 def test_equal_things_are_equal_stain_by_stain():
-    for body in twins(np.random.default_rng(5)):
+    for body in repeated_things(np.random.default_rng(5)):
         half = len(body.shape.vertices) // 2
         shift = body.shape.vertices[half:] - body.shape.vertices[:half]
         assert np.allclose(shift, shift[0], atol=1e-9) and abs(shift[0, 0]) > 3
@@ -138,13 +138,13 @@ def test_what_moves_is_seen_elsewhere_and_the_rest_stays(tmp_path):
 
     changed = np.abs(without - there).max(axis=2) > 40
     assert 0.02 < changed.mean() < 0.8
-    assert np.allclose(pose_after(np.column_stack([R, t]), moving.spoiling.thing_at[name])[:, 3], R @ ahead + t)
+    assert np.allclose(cam_from_thing(np.column_stack([R, t]), moving.spoiling.thing_at[name])[:, 3], R @ ahead + t)
 
 
 def test_faded_scenes_show_less(tmp_path):
     plan = small(plan_with("plane"), photos=1)
     plan = replace(plan, spoiling=replace(plan.spoiling, blur_px={}, defocus_px={}, thing=None))
-    pale = replace(plan, scene=faded(plan.scene, 0.1))
+    pale = replace(plan, scene=fade_colors(plan.scene, 0.1))
 
     rich, poor = (written(p, tmp_path / str(k))["view_00.jpg"] for k, p in enumerate((plan, pale)))
 

@@ -88,7 +88,7 @@ class Album:
     def keep(self, name, arrays):
         self.kept[name] = {key: array.copy() for key, array in arrays.items()}
 
-    def used(self, view):
+    def usable_pixels(self, view):
         return self.masks.get(view.name)
 
     def photo(self, view):

@@ -20,7 +20,7 @@ BOX = box()
 
 
 def textured(album, surface=BOX, views=VIEWS, spread=one_by_one, **options) -> tuple[Model, dict]:
-    hidden = Occluders(surface.vertices, surface.faces).hidden
+    hidden = Occluders(surface.vertices, surface.faces).is_hidden
     return texture_surface(surface, views, album, hidden, TextureSettings(**options), spread)
 
 

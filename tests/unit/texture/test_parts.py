@@ -13,15 +13,15 @@ from sfm_app.errors import ReconstructionError
 from sfm_app.texture import PhotoView, photo_view
 from sfm_app.texture.appearance.exposure import photo_gains
 from sfm_app.texture.appearance.median import median
-from sfm_app.texture.appearance.photo_consistency import strangers
+from sfm_app.texture.appearance.photo_consistency import outlier_mask
 from sfm_app.texture.appearance.view_scoring import sharpness, sharpness_factors
 from sfm_app.texture.blending import blend_weights
-from sfm_app.texture.charts import Charts, components, folds, without_specks
+from sfm_app.texture.charts import Charts, absorb_small_charts, components, folds
 from sfm_app.texture.facets import NONE, facets
 from sfm_app.texture.packing import MARGIN, pack
 from sfm_app.texture.painting import canvas, fill_background
-from sfm_app.texture.seam_leveling import level, solve_ties
-from sfm_app.texture.unseen_faces import along_a_curve, block_sizes, square_texels, squares
+from sfm_app.texture.seam_leveling import level_seams, solve_ties
+from sfm_app.texture.unseen_faces import block_sizes, morton_order, square_texels, squares
 from sfm_app.texture.view_selection import PRICE_OF_DETAIL, choose_photos
 from sfm_app.texture.views import project, sample
 from sfm_app.types import CameraModel, Surface
@@ -57,7 +57,7 @@ def test_projection_is_opencvs():
 
 def test_a_scaled_view_sees_the_same_in_another_size():
     view = around(1)[0]
-    half = view.scaled(160, 120)
+    half = view.with_size(160, 120)
     point = (0.3, 0.2, -0.1)
     np.testing.assert_allclose(np.array(project(half.row, *point)[:2]) * 2, project(view.row, *point)[:2])
 
@@ -130,11 +130,11 @@ def test_strangers_are_areas_not_specks():
     speck = int(np.argmax(centers[:, 1]))
     colors[1, speck] = 200
     seen = np.ones((4, count), bool)
-    found = strangers(colors, np.ones((4, 3)), seen, mesh.neighbors)
+    found = outlier_mask(colors, np.ones((4, 3)), seen, mesh.neighbors)
     assert found[2, person].all()
     assert 0 < found[2].sum() - person.sum() < 0.6 * person.sum()  # a rim around it, no more
     assert not found[[0, 1, 3]].any()
-    two = strangers(colors[1:3], np.ones((2, 3)), seen[:2], mesh.neighbors)
+    two = outlier_mask(colors[1:3], np.ones((2, 3)), seen[:2], mesh.neighbors)
     assert not two.any()
 
 
@@ -177,7 +177,7 @@ def test_specks_go_over_to_their_neighbors():
     chosen[100], chosen[200] = 1, 1
     usable = np.ones((2, len(chosen)), bool)
     usable[0, 200] = False
-    found = without_specks(chosen, usable, mesh.neighbors)
+    found = absorb_small_charts(chosen, usable, mesh.neighbors)
     assert np.flatnonzero(found).tolist() == [200]
 
 
@@ -263,7 +263,7 @@ def test_weights_blend_near_the_seam_only():
     sums = np.bincount(blend.vertex, blend.weight)
     np.testing.assert_allclose(sums, 1.0, atol=1e-6)
     first = np.zeros(26)
-    first[blend.vertex[blend.of(0)]] = blend.weight[blend.of(0)]
+    first[blend.vertex[blend.photo_rows(0)]] = blend.weight[blend.photo_rows(0)]
     assert first[6] == pytest.approx(0.5, abs=0.1)
     assert (first[:2] == 1.0).all()
     assert (first[11:13] == 0.0).all()
@@ -277,10 +277,10 @@ def test_leveling_takes_the_step_out_of_a_seam():
     colors = np.empty((2, 80, 3), np.uint8)
     colors[0], colors[1] = 100, 120
     gains = np.ones((2, 3))
-    blend = level(blend_weights(chosen, usable, mesh), colors, gains, usable, mesh)
-    both = np.intersect1d(blend.vertex[blend.of(0)], blend.vertex[blend.of(1)])
+    blend = level_seams(blend_weights(chosen, usable, mesh), colors, gains, usable, mesh)
+    both = np.intersect1d(blend.vertex[blend.photo_rows(0)], blend.vertex[blend.photo_rows(1)])
     for vertex in both:
-        one, other = (blend.offset[blend.of(p)][blend.vertex[blend.of(p)] == vertex] for p in (0, 1))
+        one, other = (blend.offset[blend.photo_rows(p)][blend.vertex[blend.photo_rows(p)] == vertex] for p in (0, 1))
         np.testing.assert_allclose(100 + one, 120 + other, atol=1.5)
     assert len(both) > 4
 
@@ -302,6 +302,6 @@ def test_ties_are_solved_as_by_elimination():
 
 def test_points_near_each_other_come_after_each_other():
     points = np.random.default_rng(4).uniform(-3, 5, (2000, 3))
-    steps = np.linalg.norm(np.diff(points[along_a_curve(points)], axis=0), axis=1)
+    steps = np.linalg.norm(np.diff(points[morton_order(points)], axis=0), axis=1)
     assert np.median(steps) < 0.15 * np.median(np.linalg.norm(np.diff(points, axis=0), axis=1))
-    assert len(along_a_curve(np.empty((0, 3)))) == 0
+    assert len(morton_order(np.empty((0, 3)))) == 0

@@ -25,7 +25,7 @@ class Shaky(Album):
 
 
 def textured(album):
-    hidden = Occluders(BOX.vertices, BOX.faces).hidden
+    hidden = Occluders(BOX.vertices, BOX.faces).is_hidden
     return texture_surface(BOX, VIEWS, album, hidden, TextureSettings(), one_by_one)
 
 
@@ -73,7 +73,7 @@ def test_photos_are_painted_once(whole, monkeypatch):
 
 def test_pages_are_kept_now_and_then_only(whole):
     album = interrupted_after(len(VIEWS) + 2)
-    assert atlas.KEPT not in album.kept
+    assert atlas.GROUP_NAME not in album.kept
 
     same(textured(album), whole)
 
@@ -87,10 +87,10 @@ def test_large_pages_are_kept_less_often(monkeypatch):
     work = atlas.Pages([], 40, album)
     kept_after = []
     for photo in range(40):
-        before = album.kept.pop(atlas.KEPT, None)
+        before = album.kept.pop(atlas.GROUP_NAME, None)
         assert before is None or before["has"].sum() == photo
-        with work.painting(photo):
+        with work.lock_canvases(photo):
             pass
-        kept_after += [photo] if atlas.KEPT in album.kept else []
+        kept_after += [photo] if atlas.GROUP_NAME in album.kept else []
 
     assert kept_after == [0, 20]

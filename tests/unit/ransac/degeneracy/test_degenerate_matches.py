@@ -6,8 +6,8 @@ import pytest
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import fundamental_from_pose
 from sfm_app.ransac import ESTIMATORS, judge
-from sfm_app.ransac.degeneracy.degenerate_matches import is_rotation, off_dominant_line
-from sfm_app.ransac.estimate import matches_off_plane
+from sfm_app.ransac.degeneracy.degenerate_matches import is_rotation, off_line_mask
+from sfm_app.ransac.estimate import count_matches_off_plane
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.cameras import axis_rotation
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
@@ -77,7 +77,7 @@ def test_a_rotation_stays_one_although_rows_of_bricks_are_mismatched(seed, rows,
 def test_matches_off_the_plane_are_counted(scene, off_plane):
     x1, x2 = views(scene, 1, off_plane=off_plane, outliers=0)
 
-    count = matches_off_plane(x1 + 3000.0, x2 + 3000.0, moved_by(TRUTH, 3000.0), EpipolarSettings())
+    count = count_matches_off_plane(x1 + 3000.0, x2 + 3000.0, moved_by(TRUTH, 3000.0), EpipolarSettings())
 
     assert 0.7 * off_plane <= count <= off_plane
 
@@ -139,16 +139,16 @@ def test_the_line_with_most_inliers_is_found(view):
     points[on_line, 2 * view + 1] = 0.5 - 0.8 * points[on_line, 2 * view]
     inliers = on_line | (rng.random(400) < 0.3)
 
-    off = off_dominant_line(points, inliers, view, 1e-6)
+    off = off_line_mask(points, inliers, view, 1e-6)
 
     np.testing.assert_array_equal(off, ~on_line)
-    assert np.mean(off_dominant_line(points, inliers, 1 - view, 1e-6)) > 0.99
+    assert np.mean(off_line_mask(points, inliers, 1 - view, 1e-6)) > 0.99
 
 
 def test_points_in_one_place_lie_on_a_line():
     points = np.asfortranarray(np.random.default_rng(0).normal(size=(50, 4)))
     points[:, :2] = 3.0
-    assert not off_dominant_line(points, np.ones(50, dtype=bool), 0, 1e-9).any()
+    assert not off_line_mask(points, np.ones(50, dtype=bool), 0, 1e-9).any()
 
 
 def test_an_absurd_match_does_not_hide_a_rotation():

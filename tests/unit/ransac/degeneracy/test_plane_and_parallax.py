@@ -7,10 +7,10 @@ import pytest
 
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import fundamental_from_pose
-from sfm_app.ransac.degeneracy.plane_and_parallax import with_another_epipole
+from sfm_app.ransac.degeneracy.plane_and_parallax import recover_epipole
 from sfm_app.ransac.sampling.minimal_samples import random_state
 from sfm_app.ransac.scoring.robust_costs import geman_mcclure, penalty, squared_distances
-from sfm_app.ransac.verification.pretests import OPEN
+from sfm_app.ransac.verification.pretests import NO_PRETEST
 from sfm_app.synthetic.correspondences import random_rotation
 
 UNIT, THRESHOLD = 400.0, 1.5 / 400.0
@@ -39,8 +39,8 @@ def wrong_epipole(H, seed):
     return F / np.linalg.norm(F)
 
 
-def found_from(points, F, pretest=OPEN, seed=0):
-    return with_another_epipole(points, F, THRESHOLD, SCORE(points, THRESHOLD, None), pretest, random_state(seed))
+def found_from(points, F, pretest=NO_PRETEST, seed=0):
+    return recover_epipole(points, F, THRESHOLD, SCORE(points, THRESHOLD, None), pretest, random_state(seed))
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -54,7 +54,7 @@ def test_the_right_epipole_is_found(seed):
     residuals = np.sqrt(squared_distances(points, found.reshape(9)))
     assert np.mean(residuals[off] < THRESHOLD) > 0.8
     loss = SCORE(points, THRESHOLD, None)
-    scores = [penalty(points, 0, F.reshape(9), loss, np.inf, OPEN) for F in (found, start)]
+    scores = [penalty(points, 0, F.reshape(9), loss, np.inf, NO_PRETEST) for F in (found, start)]
     assert scores[0] < scores[1] - 0.5 * off.sum()
     assert np.linalg.norm(found) == pytest.approx(1)
     assert np.linalg.svd(found, compute_uv=False)[2] < 1e-12

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.ransac.degeneracy.watermark import ONLY_A_LOGO, SAME_PHOTO, covers, find_stationary, fit_moving
+from sfm_app.ransac.degeneracy.watermark import ONLY_A_LOGO, SAME_PHOTO, find_stationary, fit_moving, is_widespread
 from sfm_app.ransac.lev_ransac import fit_lev_ransac
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.cameras import axis_rotation
@@ -42,7 +42,9 @@ def together(*parts):
 
 def fitted(points):
     mask = find_stationary(*points)
-    return mask, fit_moving(fit_lev_ransac, points, mask, covers(points[0][mask], points[0], SIZE), OPTIONS, seed=3)
+    return mask, fit_moving(
+        fit_lev_ransac, points, mask, is_widespread(points[0][mask], points[0], SIZE), OPTIONS, seed=3
+    )
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.25, 0.4])
@@ -135,7 +137,7 @@ def test_what_stays_in_place_alone_is_a_copy_or_a_logo(stays, reason):
     points = together(stays, wrong)
     mask = find_stationary(*points)
 
-    found = fit_moving(fit_lev_ransac, points, mask, covers(points[0][mask], keypoints, SIZE), OPTIONS, seed=3)
+    found = fit_moving(fit_lev_ransac, points, mask, is_widespread(points[0][mask], keypoints, SIZE), OPTIONS, seed=3)
 
     assert found == Rejected(reason)
 
@@ -144,6 +146,6 @@ def test_what_covers_a_photo_is_counted_where_it_shows_something():
     rng = np.random.default_rng(6)
     thing = rng.uniform([250, 150], [400, 300], (500, 2))  # before a white wall
 
-    assert covers(thing[:200], thing, SIZE)
-    assert not covers(thing, rng.uniform([0, 0], SIZE, (2000, 2)), SIZE)
-    assert not covers(np.zeros((0, 2)), thing, SIZE)
+    assert is_widespread(thing[:200], thing, SIZE)
+    assert not is_widespread(thing, rng.uniform([0, 0], SIZE, (2000, 2)), SIZE)
+    assert not is_widespread(np.zeros((0, 2)), thing, SIZE)

@@ -6,7 +6,7 @@ import pytest
 from sfm_app.geometry.distances import reprojection_distance, sampson_distance
 from sfm_app.ransac import ESTIMATORS
 from sfm_app.ransac.points import prepare
-from sfm_app.ransac.refine.final_refit import REFITS, last_fit
+from sfm_app.ransac.refine.final_refit import REFITS, choose_refit
 from sfm_app.ransac.refine.sampson_refit import fit_eight_point
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
@@ -81,9 +81,9 @@ def test_the_estimators_own_fit_comes_first():
         return F
 
     points, F = np.asfortranarray(np.random.default_rng(0).normal(size=(30, 4))), np.eye(3)
-    assert last_fit("auto", own) is own
+    assert choose_refit("auto", own) is own
     for name in REFITS:
-        last_fit(name, own)(points, F, 1.0)
+        choose_refit(name, own)(points, F, 1.0)
     assert calls == [1.0] * 3
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.geometry.distances import nearest_exact_matches, reprojection_distance, sampson_distance
-from sfm_app.geometry.epipolar import canonical_cameras, fundamental_from_pose, homogeneous, nearest_rank_two
+from sfm_app.geometry.epipolar import canonical_cameras, fundamental_from_pose, nearest_rank_two, to_homogeneous
 from sfm_app.ransac.points import prepare
 from sfm_app.ransac.refine.gold_standard import refine_reprojection
 from sfm_app.ransac.refine.sampson_refit import fit_eight_point, refine_sampson
@@ -94,7 +94,7 @@ def test_it_is_the_minimum_over_cameras_and_points():
     gradients = []
     for model in (start, F):
         P2 = canonical_cameras(model)[1]
-        exact1, exact2 = (homogeneous(x) for x in nearest_exact_matches(model, m.points[:, :2], m.points[:, 2:]))
+        exact1, exact2 = (to_homogeneous(x) for x in nearest_exact_matches(model, m.points[:, :2], m.points[:, 2:]))
         across = np.cross(exact2, P2[:, 3])
         w = -(np.cross(exact2, exact1 @ P2[:, :3].T) * across).sum(axis=1) / (across**2).sum(axis=1)
         state = np.concatenate([P2.ravel(), np.column_stack([exact1[:, :2], w]).ravel()])
@@ -136,7 +136,7 @@ def test_matches_near_the_epipole_do_not_hold_it_back(seed):
 def test_points_at_infinity_are_points():
     pair, _, _ = scene(5, points=100, sigma_px=0)
     rng = np.random.default_rng(5)
-    far = homogeneous(pair.exact_x1[:50]) @ (pair.K2 @ pair.R @ np.linalg.inv(pair.K1)).T
+    far = to_homogeneous(pair.exact_x1[:50]) @ (pair.K2 @ pair.R @ np.linalg.inv(pair.K1)).T
     x1, x2 = pair.exact_x1, np.vstack([far[:, :2] / far[:, 2:], pair.exact_x2[50:]])
     m = prepare(x1 + rng.normal(size=x1.shape), x2 + rng.normal(size=x2.shape), 0)
 

@@ -7,7 +7,7 @@ import pytest
 
 from sfm_app.geometry.distances import sampson_distance
 from sfm_app.ransac.points import prepare
-from sfm_app.ransac.refine.rank_two import factors
+from sfm_app.ransac.refine.rank_two import factorize
 from sfm_app.ransac.refine.sampson_refit import fit_algebraic, fit_eight_point, refine_mixture, refine_sampson
 from sfm_app.ransac.scoring.robust_costs import squared_distances
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
@@ -194,7 +194,7 @@ def test_factors_are_those_of_the_nearest_matrix_of_rank_two(rank, seed):
     rng = np.random.default_rng([rank, seed])
     F = rng.normal(size=(3, rank)) @ rng.normal(size=(rank, 3)) * 10.0 ** rng.integers(-5, 5)
 
-    U, s, V = factors(F)
+    U, s, V = factorize(F)
 
     for R in (U, V):
         np.testing.assert_allclose(R.T @ R, np.eye(3), atol=1e-9)
@@ -207,6 +207,6 @@ def test_factors_are_those_of_the_nearest_matrix_of_rank_two(rank, seed):
 
 def test_factors_of_equal_singular_values():
     F = np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 0]])
-    U, s, V = factors(F)
+    U, s, V = factorize(F)
     assert s == pytest.approx(1)
     np.testing.assert_allclose(U @ np.diag([1, s, 0]) @ V.T, F, atol=1e-12)

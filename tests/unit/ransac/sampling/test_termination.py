@@ -7,7 +7,7 @@ import pytest
 
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import cross_matrix, fundamental_from_pose
-from sfm_app.ransac.sampling.termination import samples_to_wait
+from sfm_app.ransac.sampling.termination import search_patience
 from sfm_app.synthetic.correspondences import random_rotation
 
 UNIT = 400.0
@@ -34,7 +34,7 @@ def scene(seed, *, on_plane, off_plane, outliers):
 @pytest.mark.parametrize("seed", range(5))
 def test_a_scene_with_parallax_needs_little_patience(seed):
     points, _, F = scene(seed, on_plane=150, off_plane=250, outliers=200)
-    assert 1 < samples_to_wait(points, F, THRESHOLD) < 300
+    assert 1 < search_patience(points, F, THRESHOLD) < 300
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -42,23 +42,23 @@ def test_a_plane_with_a_wrong_epipole_needs_much(seed):
     points, H, F = scene(seed, on_plane=200, off_plane=60, outliers=200)
     epipole = np.append(np.random.default_rng(seed).uniform(-1, 1, 2), 1.0)
     wrong = cross_matrix(epipole) @ H
-    long = samples_to_wait(points, wrong / np.linalg.norm(wrong), THRESHOLD)
+    long = search_patience(points, wrong / np.linalg.norm(wrong), THRESHOLD)
     assert long > 1000
     # the right epipole has all of the matches off the plane for it
-    assert 1 < samples_to_wait(points, F, THRESHOLD) < 0.6 * long
+    assert 1 < search_patience(points, F, THRESHOLD) < 0.6 * long
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_luck_is_waited_out_for_ever(seed):
     points, _, F = scene(seed, on_plane=0, off_plane=0, outliers=400)
-    assert samples_to_wait(points, F, THRESHOLD) == math.inf
-    assert samples_to_wait(points[:7].copy("F"), F, THRESHOLD) == math.inf
+    assert search_patience(points, F, THRESHOLD) == math.inf
+    assert search_patience(points[:7].copy("F"), F, THRESHOLD) == math.inf
 
 
 def test_patience_falls_as_matches_off_the_plane_come_in():
     waits = []
     for off_plane in (0, 60, 120, 240):
         points, _, F = scene(1, on_plane=200, off_plane=off_plane, outliers=100)
-        waits.append(samples_to_wait(points, F, THRESHOLD))
+        waits.append(search_patience(points, F, THRESHOLD))
     assert waits == sorted(waits, reverse=True)
     assert waits[0] > 10 * waits[-1]

@@ -12,7 +12,7 @@ from sfm_app.ransac.scoring.leverage import (
     mad_sigma,
     prior_validity,
     priors,
-    studentised_residuals,
+    studentized_residuals,
 )
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
@@ -96,7 +96,7 @@ def test_studentised_residuals_have_unit_variance():
     X = rng.normal(size=(500, PARAMETERS))
     hat = X @ np.linalg.inv(X.T @ X) @ X.T
     residuals = (np.eye(500) - hat) @ rng.normal(scale=7.0, size=500)
-    d = studentised_residuals(residuals, np.diag(hat), np.ones(500, dtype=bool))
+    d = studentized_residuals(residuals, np.diag(hat), np.ones(500, dtype=bool))
     assert 0.9 < d.std() < 1.1
 
 

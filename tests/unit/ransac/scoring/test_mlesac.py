@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.ransac.scoring.mlesac import SIGMAS, inlier_share, mlesac, window
+from sfm_app.ransac.scoring.mlesac import SIGMAS, inlier_share, mlesac, outlier_window
 from sfm_app.ransac.scoring.robust_costs import penalty, squared_distances
-from sfm_app.ransac.verification.pretests import OPEN
+from sfm_app.ransac.verification.pretests import NO_PRETEST
 
 SHIFT = cross_matrix([1.0, 0, 0]).reshape(9) / np.sqrt(2)
 SIGMA = 0.5
@@ -38,14 +38,14 @@ def test_penalty_is_the_log_likelihood_less_its_peak(best):
     y = np.concatenate([rng.normal(scale=SIGMA, size=200), rng.uniform(-50, 50, 300)])
     points = np.asfortranarray(rng.uniform(0, 100, (500, 4)))
     points[:, 3] = points[:, 1] + y * np.sqrt(2)
-    r, w = np.sqrt(squared_distances(points, SHIFT)), window(points)
+    r, w = np.sqrt(squared_distances(points, SHIFT)), outlier_window(points)
     gamma = 0.5 if best is None else inlier_share(r**2, SIGMA, w)
 
     def log_p(r):
         inlier = np.exp(-(r**2) / (2 * SIGMA**2)) / (SIGMA * math.sqrt(2 * math.pi))
         return np.log(gamma * inlier + (1 - gamma) / w)
 
-    found = penalty(points, 0, SHIFT, mlesac(points, SIGMAS * SIGMA, best), np.inf, OPEN)
+    found = penalty(points, 0, SHIFT, mlesac(points, SIGMAS * SIGMA, best), np.inf, NO_PRETEST)
 
     assert found == pytest.approx(float((log_p(np.zeros(500)) - log_p(r)).sum()), rel=1e-9)
     assert best is None or 0.35 < gamma < 0.45
@@ -53,6 +53,6 @@ def test_penalty_is_the_log_likelihood_less_its_peak(best):
 
 def test_window_is_the_diagonal_whatever_the_origin():
     points = np.array([[0, 0, 10, 10], [3, 4, 16, 18.0], [1, 1, 11, 11]])
-    assert window(points) == pytest.approx((5 + 10) / 2)
-    assert window(points - 100) == pytest.approx(7.5)
-    assert window(np.zeros((3, 4))) > 0
+    assert outlier_window(points) == pytest.approx((5 + 10) / 2)
+    assert outlier_window(points - 100) == pytest.approx(7.5)
+    assert outlier_window(np.zeros((3, 4))) > 0

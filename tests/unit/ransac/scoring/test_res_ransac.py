@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_app.ransac.points import prepare
-from sfm_app.ransac.scoring.res_ransac import residual_validity, validity_of
+from sfm_app.ransac.scoring.res_ransac import residual_validity, validity_from_residuals
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 
@@ -19,14 +19,16 @@ def test_a_small_example():
 
     expected = [1 - first / total, *[1 - (first + second) / total] * 2, 0, 0, 0, 0]
 
-    np.testing.assert_allclose(validity_of(residuals), expected, rtol=1e-12)
+    np.testing.assert_allclose(validity_from_residuals(residuals), expected, rtol=1e-12)
     assert 0.84 < expected[0] < 0.86
 
 
 def test_units_do_not_matter_and_order_is_kept():
     residuals = np.abs(np.random.default_rng(0).normal(size=501))
-    valid = validity_of(residuals)
-    np.testing.assert_allclose(validity_of(1e-3 * residuals), valid, atol=0.01)  # a match may change its bin
+    valid = validity_from_residuals(residuals)
+    np.testing.assert_allclose(
+        validity_from_residuals(1e-3 * residuals), valid, atol=0.01
+    )  # a match may change its bin
     assert (np.diff(valid[np.argsort(residuals)]) <= 0).all()
     assert (valid == 0).sum() == pytest.approx(250, abs=5)
 
@@ -42,7 +44,7 @@ def test_units_do_not_matter_and_order_is_kept():
     ],
 )
 def test_residuals_that_tell_little_still_give_priors(residuals, expected):
-    valid = validity_of(np.array(residuals, dtype=float))
+    valid = validity_from_residuals(np.array(residuals, dtype=float))
     assert valid.max() > 0
     assert expected is None or valid.tolist() == expected
 

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from sfm_app.ransac.solvers.eigenvalues import symmetric_eigen
+from sfm_app.ransac.solvers.eigenvalues import decompose_symmetric
 
 
 def solve(matrix):
     size = len(matrix)
     values, vectors = np.empty(size), np.empty((size, size))
-    symmetric_eigen(matrix.copy(), values, vectors)
+    decompose_symmetric(matrix.copy(), values, vectors)
     return values, vectors
 
 

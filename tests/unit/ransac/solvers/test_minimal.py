@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from sfm_app.geometry.epipolar import cross_matrix, nearest_rank_two
 from sfm_app.ransac.points import prepare
-from sfm_app.ransac.solvers.minimal import design_row, is_oriented, models_through, real_cubic_roots
+from sfm_app.ransac.solvers.minimal import design_row, is_oriented, real_cubic_roots, solve_sample
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
 
 ROOTS = st.floats(-10, 10)
@@ -21,7 +21,7 @@ def exact_sample(seed):
 
 def solve(points):
     models = np.zeros((3, 9))
-    count = models_through(points, np.arange(7), models)
+    count = solve_sample(points, np.arange(7), models)
     return models[:count]
 
 
@@ -114,7 +114,7 @@ def test_eight_exact_matches_give_the_one_model():
     pair = make_pair(PairOptions(points=40, sigma_px=0), 3)
     m, models = prepare(pair.x1, pair.x2, 0), np.empty((3, 9))
     for start in range(0, 32, 8):
-        assert models_through(m.points, np.arange(start, start + 8), models) == 1
+        assert solve_sample(m.points, np.arange(start, start + 8), models) == 1
         F = m.to_pixels(models[0].reshape(3, 3))
         np.testing.assert_allclose(F, pair.F * np.sign((F * pair.F).sum()), atol=1e-8)
 
@@ -128,7 +128,7 @@ def test_eight_noisy_matches_give_the_nearest_matrix_of_rank_two(seed):
     linear = np.linalg.svd(design)[2][8].reshape(3, 3)
     expected = nearest_rank_two(linear)
 
-    assert models_through(points, np.arange(8), models) == 1
+    assert solve_sample(points, np.arange(8), models) == 1
 
     F = models[0].reshape(3, 3)
     assert np.linalg.norm(F) == pytest.approx(1)
@@ -141,4 +141,4 @@ def test_eight_noisy_matches_give_the_nearest_matrix_of_rank_two(seed):
 
 def test_eight_points_in_general_but_repeated_give_nothing():
     points = np.asfortranarray(np.random.default_rng(0).normal(size=(4, 4)).repeat(2, axis=0))
-    assert models_through(points, np.arange(8), np.empty((3, 9))) == 0
+    assert solve_sample(points, np.arange(8), np.empty((3, 9))) == 0

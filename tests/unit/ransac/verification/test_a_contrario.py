@@ -14,7 +14,7 @@ from sfm_app.ransac.verification.a_contrario import (
     accidental_share,
     false_alarms,
     log_binomial_tail,
-    squared_mismatches,
+    squared_mismatch_distances,
 )
 from sfm_app.settings import EpipolarSettings
 from sfm_app.synthetic.correspondences import PairOptions, make_pair
@@ -45,7 +45,7 @@ def test_false_alarms_by_hand():
 def test_accidental_share_is_the_area_of_the_band():
     # a shift along x in a square of side 1: |y1 - y2| < w has probability 2 w - w^2
     points = np.asfortranarray(np.random.default_rng(0).uniform(size=(300, 4)))
-    wrong = squared_mismatches(points, cross_matrix([1.0, 0, 0]).reshape(9))
+    wrong = squared_mismatch_distances(points, cross_matrix([1.0, 0, 0]).reshape(9))
     width = 0.1
     assert accidental_share(wrong, width / np.sqrt(2)) == pytest.approx(2 * width - width**2, rel=0.1)
     assert 0 < accidental_share(wrong, 0.0) < accidental_share(wrong, 10.0) < 1
@@ -56,7 +56,7 @@ def test_mismatches_never_pair_a_point_with_its_partner():
     m = prepare(pair.x1, pair.x2, 0)
     f = eight_point(m.points[:, :2], m.points[:, 2:]).reshape(9)
 
-    wrong = squared_mismatches(m.points, f)
+    wrong = squared_mismatch_distances(m.points, f)
 
     assert 7_800 <= len(wrong) <= 8_000
     assert wrong.min() > 1e4 * squared_distances(m.points, f).max()

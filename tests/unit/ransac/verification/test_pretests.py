@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.ransac.sampling.stopping import trials_needed
+from sfm_app.ransac.sampling.stopping import required_trials
 from sfm_app.ransac.scoring.robust_costs import msac, penalty
 from sfm_app.ransac.verification.pretests import (
     BLOCK,
     BailOut,
     FullVerification,
     PreTest,
-    RandomisedTdd,
+    RandomizedTdd,
     bail_out_table,
 )
 
@@ -39,7 +39,7 @@ def passes(pretest: PreTest, inlier) -> np.ndarray:
 def test_a_good_model_passes_tdd_with_probability_share_to_the_d(share, d):
     rng, count = np.random.default_rng(d), 4000
     inlier = rng.permutation(count) < share * count
-    test = type("Tdd", (RandomisedTdd,), {"d": d})(count, 7)
+    test = type("Tdd", (RandomizedTdd,), {"d": d})(count, 7)
 
     rate = passes(test.pretest, inlier).mean()
 
@@ -47,15 +47,15 @@ def test_a_good_model_passes_tdd_with_probability_share_to_the_d(share, d):
     assert test.pretest.random_start
     assert test.pretest.rejected[0] >= (1 - rate) * count
     # 3.19 with that probability: one more match per d that has to be an inlier by luck
-    assert test.trials_needed(share, 0.99) == pytest.approx(trials_needed(share ** (7 + d), 0.99))
+    assert test.required_trials(share, 0.99) == pytest.approx(required_trials(share ** (7 + d), 0.99))
 
 
 def test_tdd_beginning_at_its_own_match_reaches_the_stated_confidence():
     rng, share, runs, count = np.random.default_rng(3), 0.7, 4000, 500
-    pretest = RandomisedTdd(count, 7).pretest
+    pretest = RandomizedTdd(count, 7).pretest
     pass_rate = passes(pretest, rng.permutation(count) < share * count).mean()
-    trials = math.ceil(RandomisedTdd(count, 7).trials_needed(share, 0.9))
-    plain = math.ceil(FullVerification(count, 7).trials_needed(share, 0.9))
+    trials = math.ceil(RandomizedTdd(count, 7).required_trials(share, 0.9))
+    plain = math.ceil(FullVerification(count, 7).required_trials(share, 0.9))
 
     def missed(trials):
         found = (rng.uniform(size=(runs, trials)) < share**7) & (rng.uniform(size=(runs, trials)) < pass_rate)
@@ -68,10 +68,10 @@ def test_tdd_beginning_at_its_own_match_reaches_the_stated_confidence():
 def test_full_verification_has_no_test_and_plain_trials():
     test = FullVerification(100, 8)
     assert len(test.pretest.least_inliers) == 0
-    assert test.trials_needed(0.5, 0.99) == pytest.approx(trials_needed(0.5**8, 0.99))
+    assert test.required_trials(0.5, 0.99) == pytest.approx(required_trials(0.5**8, 0.99))
     test.expect(0.3)
     test.learn(10)
-    assert test.trials_needed(0.5, 0.99) == pytest.approx(trials_needed(0.5**8, 0.99))
+    assert test.required_trials(0.5, 0.99) == pytest.approx(required_trials(0.5**8, 0.99))
 
 
 def test_bail_out_learns_from_the_best_model():

@@ -79,7 +79,7 @@ def test_perfect_and_hopeless_shares_are_no_trouble():
     test = design(1.0, 0.01, 8)
     assert test.pass_rate(1.0) > 0.99
     assert test.pass_rate(0.0) == 0.0
-    assert Sprt(100, 7).trials_needed(0.0, 0.99) == math.inf
+    assert Sprt(100, 7).required_trials(0.0, 0.99) == math.inf
 
 
 def test_delta_follows_the_rejected_models_and_the_gate_follows_delta():
@@ -110,7 +110,7 @@ def test_trials_reach_the_confidence_though_good_models_fall():
     test.learn(first)
     test.expect(share)
     right = design(share, FIRST_DELTA, 7)
-    total = math.ceil(test.trials_needed(share, 0.9))
+    total = math.ceil(test.required_trials(share, 0.9))
     passed = [1 - decisions(t, share, runs=5000, seed=k)[0].mean() for k, t in enumerate((wrong, right))]
 
     def missed(trials):
@@ -122,4 +122,4 @@ def test_trials_reach_the_confidence_though_good_models_fall():
     # enough drawn already: not one more
     test.learn(10 * total)
     test.expect(share)
-    assert test.trials_needed(share, 0.9) <= first + 10 * total
+    assert test.required_trials(share, 0.9) <= first + 10 * total

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.adjustment.calibrate_pairs import refined
+from sfm_app.selfcal.adjustment.calibrate_pairs import fit_cameras
 from sfm_app.selfcal.adjustment.camera_priors import CameraPriors
 from sfm_app.selfcal.adjustment.structureless_ba import (
     MOST_MATCHES,
     Matches,
     Prior,
     State,
-    evenly,
-    informed,
-    reweighted,
-    settled,
+    adjust_cameras,
+    pair_information,
+    reweight,
+    subsample_rows,
 )
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
@@ -37,7 +37,7 @@ def laid_out(pairs, **options):
 
 
 def fitted(pairs, start=(0.0, 0.0, 0.0, 0.0, 0.0)):
-    return refined(*laid_out(pairs), [np.array([start])], CameraPriors(np.ones(1), np.array([np.nan])))
+    return fit_cameras(*laid_out(pairs), [np.array([start])], CameraPriors(np.ones(1), np.array([np.nan])))
 
 
 def scores(found, K, k1):
@@ -159,9 +159,9 @@ def test_noise_of_few_matches_is_not_underestimated(shots):
     ratios = []
     for seed in range(4):
         made = shots(6, seed, points=250).pairs
-        few = replace(made, inliers=tuple(evenly(x, 16) for x in made.inliers))
+        few = replace(made, inliers=tuple(subsample_rows(x, 16) for x in made.inliers))
         matches, Fs = laid_out(few)
-        fit = refined(matches, Fs, [np.zeros((1, 5))], CameraPriors(np.ones(1), np.array([np.nan])))
+        fit = fit_cameras(matches, Fs, [np.zeros((1, 5))], CameraPriors(np.ones(1), np.array([np.nan])))
         ratios.append(fit.state.sigma * SIDE / 0.5)
     assert 0.72 < np.mean(ratios) < 1.1
 
@@ -169,23 +169,23 @@ def test_noise_of_few_matches_is_not_underestimated(shots):
 def test_settled_lowers_the_cost_and_stays_where_it_is_best(shots):
     matches, _ = laid_out(shots(4, 1, points=80).pairs)
     fit = fitted(shots(4, 1, points=80).pairs)
-    there = settled(matches, fit.state, fit.prior)
+    there = adjust_cameras(matches, fit.state, fit.prior)
     np.testing.assert_allclose(there.thetas, fit.state.thetas, atol=1e-4)
     away = replace(fit.state, thetas=fit.state.thetas + np.array([0.1, 0.01, 0, 0, 0]))
-    back = settled(matches, away, fit.prior)
+    back = adjust_cameras(matches, away, fit.prior)
     np.testing.assert_allclose(back.thetas, there.thetas, atol=1e-3)
 
 
 def test_a_pair_is_measured_by_what_it_would_gain_alone(shots):
     matches, _ = laid_out(shots(5, 1, points=120).pairs)
     state = fitted(shots(5, 1, points=120).pairs).state
-    gains = informed(matches, state).gains
+    gains = pair_information(matches, state).gains
     assert gains.min() >= 0
     assert np.quantile(gains, 0.25) < 1.5  # chi^2 of two degrees of freedom over 2
     sure = Prior(state.thetas + np.array([0.05, 0, 0, 0, 0]), np.full((1, 5), 1e9))
-    off = reweighted(matches, settled(matches, replace(state, thetas=sure.mean), sure))
+    off = reweight(matches, adjust_cameras(matches, replace(state, thetas=sure.mean), sure))
     np.testing.assert_allclose(off.thetas, sure.mean, atol=1e-3)
-    assert informed(matches, off).gains.mean() > 5 * gains.mean()
+    assert pair_information(matches, off).gains.mean() > 5 * gains.mean()
     assert off.scale > 2
 
 
@@ -193,7 +193,7 @@ def test_without_pairs_the_prior_is_all_there_is():
     nothing = Matches([], np.empty((0, 2), np.int64), np.empty((0, 2), np.int64), SIDE)
     prior = Prior(np.array([[0.2, 0, 0, 0, 0]]), np.full((1, 5), 4.0))
     state = State(np.zeros((1, 5)), np.empty((0, 12)), np.empty(0), 1e-3)
-    np.testing.assert_allclose(settled(nothing, state, prior).thetas, prior.mean, atol=1e-4)
+    np.testing.assert_allclose(adjust_cameras(nothing, state, prior).thetas, prior.mean, atol=1e-4)
 
 
 def test_matches_are_thinned_and_those_outside_left_out():
@@ -202,8 +202,8 @@ def test_matches_are_thinned_and_those_outside_left_out():
     matches = Matches([x, x[:10]], np.zeros((2, 2)), np.array([[0, 1], [1, 2]]), SIDE)
     assert np.diff(matches.ends).tolist() == [MOST_MATCHES, 8]
     assert np.abs(matches.points).max() < 0.5
-    np.testing.assert_array_equal(matches.of_pair(0)[[0, -1]], x[[0, -1]])
-    assert np.diff(matches.thinned(5).ends).tolist() == [5, 5]
+    np.testing.assert_array_equal(matches.pair_matches(0)[[0, -1]], x[[0, -1]])
+    assert np.diff(matches.subsample(5).ends).tolist() == [5, 5]
 
 
 @pytest.mark.parametrize(("views", "redundancy"), [(2, 1.0), (3, 1.0), (4, 6 / 5), (6, 15 / 9)])

@@ -6,9 +6,9 @@ from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from sfm_app.geometry.distances import sampson_distance
-from sfm_app.geometry.pose_manifold import essential, moved
-from sfm_app.selfcal.adjustment.two_view_cost import REACH, distances, pair_costs, pair_systems
-from sfm_app.selfcal.lens import straightened
+from sfm_app.geometry.pose_manifold import retract, write_essential
+from sfm_app.selfcal.adjustment.two_view_cost import ROBUST_SCALE, distances, pair_costs, pair_systems
+from sfm_app.selfcal.lens import undistort_kernel
 
 SIGMA = 2e-3
 THETAS = np.array([[0.1, 0.02, -0.03, 0.05, -0.08], [0.3, -0.04, 0.01, -0.1, 0.05]])
@@ -44,7 +44,7 @@ def matrix(theta):
 
 def essential_of(pose):
     E = np.empty((3, 3))
-    essential(pose, E)
+    write_essential(pose, E)
     return E
 
 
@@ -64,7 +64,7 @@ def test_with_a_lens_it_is_the_shortest_move_in_the_bent_photos():
     E = essential_of(rest[-1][0])
 
     def constraint(z):
-        views = [straightened(z[None, 2 * k : 2 * k + 2], THETAS[k])[0] for k in range(2)]
+        views = [undistort_kernel(z[None, 2 * k : 2 * k + 2], THETAS[k])[0] for k in range(2)]
         p, q = (np.linalg.solve(matrix(THETAS[k]), [*views[k], 1.0]) for k in range(2))
         return 1e4 * float(q @ E @ p)
 
@@ -80,10 +80,10 @@ def test_with_a_lens_it_is_the_shortest_move_in_the_bent_photos():
 def test_costs_are_robust():
     x, ends, *rest = scene(THETAS, (0, 1), 3e-3)
     r2 = (distances(x, ends, *rest) / SIGMA) ** 2
-    assert pair_costs(x, ends, *rest, SIGMA)[0] == pytest.approx(0.5 * np.sum(r2 / (1 + r2 / REACH**2)))
+    assert pair_costs(x, ends, *rest, SIGMA)[0] == pytest.approx(0.5 * np.sum(r2 / (1 + r2 / ROBUST_SCALE**2)))
     x[0] += [0.3, -0.2, 0.1, 0.4]
     far = pair_costs(x, ends, *rest, SIGMA)[0] - pair_costs(x[1:], np.array([0, 39]), *rest, SIGMA)[0]
-    assert 0.95 * REACH**2 / 2 < far < REACH**2 / 2
+    assert 0.95 * ROBUST_SCALE**2 / 2 < far < ROBUST_SCALE**2 / 2
 
 
 @pytest.mark.parametrize("cameras", [(0, 1), (0, 0), (1, 0)])
@@ -96,7 +96,7 @@ def test_systems_are_the_derivatives_of_the_costs(cameras):
         trial[cameras[0]] += step[:5]
         if cameras[0] != cameras[1]:
             trial[cameras[1]] += step[5:10]
-        return pair_costs(x, ends, trial, members, moved(poses[0], step[10:])[None], SIGMA)[0]
+        return pair_costs(x, ends, trial, members, retract(poses[0], step[10:])[None], SIGMA)[0]
 
     own = [*range(5), *(() if cameras[0] == cameras[1] else range(5, 10)), *range(10, 15)]
     numeric = np.array([(cost(1e-6 * e) - cost(-1e-6 * e)) / 2e-6 for e in np.eye(15)[own]])
@@ -109,11 +109,11 @@ def test_systems_are_the_derivatives_of_the_costs(cameras):
 
 def test_a_gauss_newton_step_finds_exact_matches_again():
     x, ends, thetas, members, poses = scene(THETAS, (0, 1), 0.0, seed=2, count=100)
-    start = moved(poses[0], np.array([0.01, -0.01, 0.005, 0.01, 0.01]))[None]
+    start = retract(poses[0], np.array([0.01, -0.01, 0.005, 0.01, 0.01]))[None]
     before = pair_costs(x, ends, thetas, members, start, SIGMA)[0]
     for _ in range(8):
         A, b = pair_systems(x, ends, thetas, members, start, SIGMA)
-        start = moved(start[0], np.linalg.solve(A[0, 10:, 10:], b[0, 10:]))[None]
+        start = retract(start[0], np.linalg.solve(A[0, 10:, 10:], b[0, 10:]))[None]
     assert before > 10
     assert pair_costs(x, ends, thetas, members, start, SIGMA)[0] < 1e-10
     np.testing.assert_allclose(start, poses, atol=1e-6)

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.adjustment.calibrate_pairs import refined, scatter_by_photos
+from sfm_app.selfcal.adjustment.calibrate_pairs import fit_cameras, jackknife_deviations
 from sfm_app.selfcal.adjustment.camera_priors import CameraPriors
 from sfm_app.selfcal.adjustment.structureless_ba import Matches
-from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_of
-from sfm_app.selfcal.results import calibration_of, parameters_of
+from sfm_app.selfcal.adjustment.uncertainty import covariance, key_pairs, spread_from_covariance
+from sfm_app.selfcal.results import calibration_from_parameters, parameters_from_calibration
 
 pytestmark = pytest.mark.slow
 
@@ -19,7 +19,7 @@ def fitted(pairs):
     inliers = [(x - [500, 375, 500, 375]) / SIDE for x in pairs.inliers]
     matches = Matches(inliers, np.zeros((len(inliers), 2), np.int64), np.array(pairs.photos), SIDE)
     priors = CameraPriors(np.ones(1), np.array([np.nan]))
-    return refined(matches, TO_SIDES.T @ pairs.Fs @ TO_SIDES, [np.zeros((1, 5))], priors)
+    return fit_cameras(matches, TO_SIDES.T @ pairs.Fs @ TO_SIDES, [np.zeros((1, 5))], priors)
 
 
 def test_standard_deviations_are_those_of_repeated_photos(shots):
@@ -29,8 +29,8 @@ def test_standard_deviations_are_those_of_repeated_photos(shots):
         made = shots(5, 40 + seed, k1=-0.1, center=(0.56, 0.46), points=90, noise_px=1.0)
         fit = fitted(made.pairs)
         theta = fit.state.thetas[0]
-        said = spread_of(theta, covariance(fit, np.ones(1)), SIDE)
-        found = calibration_of(theta, (1000, 750), "mine")
+        said = spread_from_covariance(theta, covariance(fit, np.ones(1)), SIDE)
+        found = calibration_from_parameters(theta, (1000, 750), "mine")
         errors = [*(found.K - made.Ks[0])[[0, 1, 0, 1], [0, 1, 2, 2]], found.radial + 0.1]
         scores.append(np.array(errors) / [said[name] for name in ("fx", "fy", "cx", "cy", "k1")])
     rms = np.sqrt(np.mean(np.square(scores), axis=0))
@@ -41,9 +41,9 @@ def test_standard_deviations_are_those_of_repeated_photos(shots):
 def test_spread_is_the_first_order_of_the_answer():
     theta = np.array([0.2, 0.03, -0.02, 0.1, -0.05])
     root = np.random.default_rng(0).normal(size=(5, 5)) * 1e-4
-    said = spread_of(theta, root @ root.T, SIDE)
+    said = spread_from_covariance(theta, root @ root.T, SIDE)
     drawn = theta + np.random.default_rng(1).normal(size=(4000, 5)) @ root.T
-    answers = [calibration_of(one, (1000, 750), "mine") for one in drawn]
+    answers = [calibration_from_parameters(one, (1000, 750), "mine") for one in drawn]
     values = np.array([[*a.K[[0, 1, 0, 1], [0, 1, 2, 2]], a.radial] for a in answers])
     assert list(said) == ["fx", "fy", "cx", "cy", "k1"]
     np.testing.assert_allclose(list(said.values()), values.std(axis=0), rtol=0.04)
@@ -52,7 +52,9 @@ def test_spread_is_the_first_order_of_the_answer():
 def test_parameters_survive_the_answer():
     theta = np.array([0.2, 0.03, -0.02, 0.1, -0.05])
     for unit in (1000.0, 640.0):
-        np.testing.assert_allclose(parameters_of(calibration_of(theta, (1000, 750), "mine", unit), unit), theta)
+        np.testing.assert_allclose(
+            parameters_from_calibration(calibration_from_parameters(theta, (1000, 750), "mine", unit), unit), theta
+        )
 
 
 def test_more_matches_say_more(shots):
@@ -86,5 +88,5 @@ def test_photos_that_disagree_widen_the_deviations(shots, seed):
 
 
 def test_few_photos_are_not_resampled(shots):
-    assert np.all(scatter_by_photos(fitted(shots(5, 1).pairs)) == 0)
-    assert np.all(scatter_by_photos(fitted(shots(8, 1).pairs))[:3] > 0)
+    assert np.all(jackknife_deviations(fitted(shots(5, 1).pairs)) == 0)
+    assert np.all(jackknife_deviations(fitted(shots(8, 1).pairs))[:3] > 0)

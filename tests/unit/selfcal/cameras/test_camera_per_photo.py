@@ -7,9 +7,9 @@ import pytest
 
 from sfm_app.selfcal import calibrate_photo_set
 from sfm_app.selfcal.adjustment.camera_priors import USUAL_FOCAL
-from sfm_app.selfcal.adjustment.tied_priors import TIE, Tied
-from sfm_app.selfcal.cameras.camera_per_photo import LEAST_PHOTOS, predicted
-from sfm_app.selfcal.cameras.multi_camera import CameraGroup, Tables, calibrate_several
+from sfm_app.selfcal.adjustment.tied_priors import FAMILY_SPREAD, TiedPriors
+from sfm_app.selfcal.cameras.camera_per_photo import LEAST_PHOTOS, cross_validate
+from sfm_app.selfcal.cameras.multi_camera import CameraGroup, VoteTables, calibrate_cameras
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import CameraPairs
@@ -24,8 +24,8 @@ UNLIKE = 1000 * np.geomspace(0.7, 1.75, 10)
 def asked(made, Fs=None, labels=None, seed=0):
     """What held pairs say."""
     Fs = MIDDLE.T @ (made.pairs.Fs if Fs is None else Fs) @ MIDDLE
-    tables = Tables(Fs, np.zeros((len(Fs), 2), np.int64), made.pairs.weights)
-    return predicted(tables, made.pairs.photos, [np.zeros(5)], labels or {}, seed)
+    tables = VoteTables(Fs, np.zeros((len(Fs), 2), np.int64), made.pairs.weights)
+    return cross_validate(tables, made.pairs.photos, [np.zeros(5)], labels or {}, seed)
 
 
 def with_wrong(Fs, share, rng):
@@ -43,7 +43,7 @@ def test_one_camera_stays_one_whatever_some_pairs_say(shots, share):
     for seed in range(8):
         made = shots(8, 300 + seed, noise_px=1.5, points=120)
         found = asked(made, with_wrong(made.pairs.Fs, share, np.random.default_rng(seed)))
-        assert not found.each_its_own
+        assert not found.is_camera_per_photo
         assert 0.5 < found.shared < 0.97
         assert found.own < found.shared + 0.04
 
@@ -51,7 +51,7 @@ def test_one_camera_stays_one_whatever_some_pairs_say(shots, share):
 def test_motions_that_leave_the_focal_open_are_no_reason_to_split(shots):
     for motion in (shots.orbit, shots.parallel, shots.onward, shots.turning):
         made = shots(8, 310, motion=motion, noise_px=1.0, points=120)
-        assert not asked(made).each_its_own
+        assert not asked(made).is_camera_per_photo
 
 
 def test_photos_of_unlike_cameras_are_told_apart(shots):
@@ -59,7 +59,7 @@ def test_photos_of_unlike_cameras_are_told_apart(shots):
     for seed in range(8):
         focals = np.random.default_rng(seed).permutation(UNLIKE)
         found = asked(shots(10, 320 + seed, focal=focals, noise_px=1.0, points=200))
-        right += found.each_its_own
+        right += found.is_camera_per_photo
         assert 0.1 < found.shared < 0.6
         assert found.own < 0.97
     assert 6 <= right <= 8
@@ -70,7 +70,7 @@ def test_few_cameras_that_say_as_much_are_preferred(shots):
     for seed in range(4):
         made = shots(10, 330 + seed, focal=focals, points=200)
         halves = asked(made, labels={photo: int(photo >= 5) for photo in range(10)})
-        assert not halves.each_its_own
+        assert not halves.is_camera_per_photo
         assert 0.85 < halves.shared < 1.0
 
 
@@ -92,7 +92,7 @@ def test_a_folder_of_unlike_cameras_gets_one_for_each_photo(shots):
     assert len({camera.name for camera in found}) == 10 and "web" in {camera.name for camera in found}
     off = {camera.photos[0]: np.log(camera.found.focal_px / UNLIKE[camera.photos[0]]) for camera in found}
     known = [off[camera.photos[0]] for camera in found if camera.found.identifiable]
-    assert 5 <= len(known) <= 10 and sum(camera.found.estimated for camera in found) >= 7
+    assert 5 <= len(known) <= 10 and sum(camera.found.is_estimated for camera in found) >= 7
     assert 0 < np.median(np.abs(known)) < 0.02
     assert max(map(abs, known)) < 0.1
 
@@ -104,10 +104,10 @@ def test_zooms_on_an_orbit_leave_all_focals_open(shots):
     members = np.array(pairs.photos)
     own = [CameraGroup((1000, 750), family=0) for _ in focals]
 
-    found = calibrate_several(own, CameraPairs(pairs.Fs, pairs.weights, (1, 1), pairs.photos, pairs.inliers), members,
+    found = calibrate_cameras(own, CameraPairs(pairs.Fs, pairs.weights, (1, 1), pairs.photos, pairs.inliers), members,
                               CalibrationSettings(), "here")  # fmt: skip
 
-    assert not any(one.estimated for one in found)
+    assert not any(one.is_estimated for one in found)
     assert all("orbit" in one.reason for one in found)
 
 
@@ -125,7 +125,7 @@ def test_a_photo_about_which_nobody_says_anything_follows_the_others(shots):
 def prior(families, free_focal=False, hints=None, focals=(1.0, 2.0, 4.0)):
     thetas = np.zeros((3, 5))
     thetas[:, 0] = np.log(focals)
-    priors = Tied(np.ones(3), np.full(3, np.nan) if hints is None else hints, families=np.array(families))
+    priors = TiedPriors(np.ones(3), np.full(3, np.nan) if hints is None else hints, families=np.array(families))
     free = np.zeros((3, 4), np.bool_)
     free[:, 3] = free_focal
     return priors.prior(free, thetas)
@@ -133,9 +133,9 @@ def prior(families, free_focal=False, hints=None, focals=(1.0, 2.0, 4.0)):
 
 def test_focals_of_a_family_scatter_about_their_mean():
     found = prior([0, 0, 0])
-    assert found.precision[:, 0] == pytest.approx(TIE**-2)
+    assert found.precision[:, 0] == pytest.approx(FAMILY_SPREAD**-2)
     # drawn towards the usual focal by a prior of 0.7 beside three of 0.3
-    share = 3 / TIE**2 / (3 / TIE**2 + 0.7**-2)
+    share = 3 / FAMILY_SPREAD**2 / (3 / FAMILY_SPREAD**2 + 0.7**-2)
     assert found.mean[:, 0] == pytest.approx(USUAL_FOCAL + share * (np.log(2) - USUAL_FOCAL))
 
 

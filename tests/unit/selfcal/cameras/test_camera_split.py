@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.cameras.camera_split import separated
-from sfm_app.selfcal.cameras.multi_camera import Tables
+from sfm_app.selfcal.cameras.camera_split import split_by_focal
+from sfm_app.selfcal.cameras.multi_camera import VoteTables
 from sfm_app.selfcal.lens import LOG_FOCAL
 
 pytestmark = pytest.mark.slow
@@ -18,7 +18,9 @@ def groups(made, Fs=None, weights=None, starts=(1.0, 1.5, 0.7)):
     weights = np.ones(len(Fs)) if weights is None else weights
     thetas = np.zeros((len(starts), 5))
     thetas[:, LOG_FOCAL] = np.log(starts)
-    cameras, labels = separated(Tables(Fs, np.zeros((len(Fs), 2), np.int64), weights), made.pairs.photos, list(thetas))
+    cameras, labels = split_by_focal(
+        VoteTables(Fs, np.zeros((len(Fs), 2), np.int64), weights), made.pairs.photos, list(thetas)
+    )
     return np.exp(cameras[:, LOG_FOCAL]), [labels[photo] for photo in sorted(labels)]
 
 

@@ -1,11 +1,9 @@
 """Several cameras from the pairs within and between them."""
 
-from itertools import combinations, product
-
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.cameras.multi_camera import CameraGroup, Tables, best_places, calibrate_several
+from sfm_app.selfcal.cameras.multi_camera import CameraGroup, VoteTables, calibrate_cameras
 from sfm_app.selfcal.lens import LOG_FOCAL
 from sfm_app.settings import CalibrationSettings
 
@@ -19,7 +17,7 @@ def answers(made, members, cameras=None, options=OPTIONS):
     sizes = [made.sizes[int(np.argmax(members == k))] for k in range(members.max() + 1)]
     cameras = cameras or [CameraGroup(size) for size in sizes]
     of_pair = np.array([[members[i], members[j]] for i, j in made.pairs.photos], np.int64).reshape(-1, 2)
-    return calibrate_several(cameras, made.pairs, of_pair, options, "mine")
+    return calibrate_cameras(cameras, made.pairs, of_pair, options, "mine")
 
 
 def score(found, K):
@@ -81,7 +79,7 @@ def test_motions_that_leave_the_focal_open_leave_it_open(shots, motion):
 def test_tables_agree_on_the_right_focals(shots):
     made = shots(2, 4, focal=[900.0, 1400.0], noise_px=0.0)
     middle = np.array([[1e3, 0, 500], [0, 1e3, 375], [0, 0, 1]])
-    tables = Tables(middle.T @ made.pairs.Fs @ middle, np.array([[0, 1]]), np.array([0.5]))
+    tables = VoteTables(middle.T @ made.pairs.Fs @ middle, np.array([[0, 1]]), np.array([0.5]))
     focals = np.linspace(0.6, 2.0, 29)
     thetas = np.zeros((29, 5))
     thetas[:, LOG_FOCAL] = np.log(focals)
@@ -89,46 +87,5 @@ def test_tables_agree_on_the_right_focals(shots):
     assert votes.shape == (29, 29)
     assert votes[6, 16] == pytest.approx(0.5, abs=1e-3)
     assert votes[16, 6] < 0.3
-    back = Tables(middle.T @ made.pairs.Fs.transpose(0, 2, 1) @ middle, np.array([[1, 0]]), np.array([0.5]))
+    back = VoteTables(middle.T @ made.pairs.Fs.transpose(0, 2, 1) @ middle, np.array([[1, 0]]), np.array([0.5]))
     np.testing.assert_allclose(back.votes(0, thetas, thetas, 0.01), votes.T, atol=1e-5)
-
-
-def value_of(places, own, between):
-    gain = sum(own[k, place] for k, place in enumerate(places))
-    return gain + sum(table[places[i], places[j]] for (i, j), table in between.items())
-
-
-def icm(own, between):
-    places = list(np.argmax(own, axis=1))
-    for _ in range(20):
-        for k in range(len(places)):
-            trials = [[*places[:k], g, *places[k + 1 :]] for g in range(own.shape[1])]
-            places = max(trials, key=lambda trial: value_of(trial, own, between))
-    return value_of(places, own, between)
-
-
-def test_best_places_are_nearly_always_the_best():
-    exact = lower = 0
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        own, count = rng.uniform(0, 1, (4, 4)), 4
-        between = {edge: rng.uniform(0, 1.5, (4, 4)) for edge in combinations(range(count), 2) if rng.random() < 0.8}
-        best = max(value_of(places, own, between) for places in product(range(4), repeat=count))
-        value = value_of(best_places(own, between), own, between)
-        assert value <= best + 1e-12
-        exact += value > best - 1e-9
-        lower += value < icm(own, between) - 1e-9
-    assert exact >= 32
-    assert lower == 0
-
-
-def test_best_places_of_a_chain_are_the_best():
-    for seed in range(10):
-        rng = np.random.default_rng(seed)
-        own, between = rng.uniform(size=(5, 4)), {(k, k + 1): rng.uniform(0, 2, (4, 4)) for k in range(4)}
-        best = max(product(range(4), repeat=5), key=lambda places: value_of(places, own, between))
-        assert tuple(best_places(own, between)) == best
-
-
-def test_without_pairs_every_camera_takes_its_own_best():
-    assert best_places(np.array([[0, 1.0, 0], [2, 1, 0]]), {}).tolist() == [1, 0]

@@ -7,7 +7,7 @@ import pytest
 
 from sfm_app.selfcal import calibrate_photo_set
 from sfm_app.selfcal.cameras import photo_set
-from sfm_app.selfcal.results import guessed
+from sfm_app.selfcal.results import guess_calibration
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
 from sfm_app.types import PhotoPairs
@@ -23,7 +23,7 @@ def cameras_of(pairs, together=True):
 
 
 def unknown(pairs, options, seed):
-    return guessed(pairs.size, "an orbit", {})
+    return guess_calibration(pairs.size, "an orbit", {})
 
 
 def alone(count, size=(1000, 750), hints=None):

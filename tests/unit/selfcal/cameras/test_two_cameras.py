@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from sfm_app.selfcal.cameras.multi_camera import Tables
-from sfm_app.selfcal.cameras.two_cameras import two_cameras
+from sfm_app.selfcal.cameras.multi_camera import VoteTables
+from sfm_app.selfcal.cameras.two_cameras import divide_photos
 from sfm_app.selfcal.lens import LOG_FOCAL
 
 pytestmark = pytest.mark.slow
@@ -18,8 +18,8 @@ def divided(made, Fs=None, kept=None, starts=(1.0,)):
     rows = [k for k in range(len(Fs)) if kept is None or kept(*made.pairs.photos[k])]
     thetas = np.zeros((len(starts), 5))
     thetas[:, LOG_FOCAL] = np.log(starts)
-    tables = Tables(Fs[rows], np.zeros((len(rows), 2), np.int64), np.ones(len(rows)))
-    return two_cameras(tables, [made.pairs.photos[k] for k in rows], list(thetas))
+    tables = VoteTables(Fs[rows], np.zeros((len(rows), 2), np.int64), np.ones(len(rows)))
+    return divide_photos(tables, [made.pairs.photos[k] for k in rows], list(thetas))
 
 
 @pytest.mark.parametrize("ratio", [1.5, 0.65])
@@ -29,7 +29,7 @@ def test_two_cameras_that_hardly_see_each_other_are_told_apart(shots, ratio):
     for seed in range(10):
         made = shots(12, seed, focal=[1000.0] * 7 + [1000.0 * ratio] * 5, points=120)
         two = divided(made, kept=lambda a, b: (a < 7) == (b < 7) or (a, b) == (6, 7))
-        assert two is not None and two.clearly
+        assert two is not None and two.is_certain
         right += [two.labels[k] for k in range(12)] == [0] * 7 + [1] * 5
         assert np.exp(two.cameras[:, LOG_FOCAL]) == pytest.approx([1.0, ratio], rel=0.1)
     assert right >= 9
@@ -38,7 +38,7 @@ def test_two_cameras_that_hardly_see_each_other_are_told_apart(shots, ratio):
 def test_photos_of_one_camera_are_not_divided(shots):
     for seed in range(20):
         two = divided(shots(8, seed, noise_px=1.0, points=120), starts=(1.0, 1.5))
-        assert two is None or not two.perhaps
+        assert two is None or not two.is_possible
 
 
 def test_wrong_pairs_are_no_other_camera(shots):
@@ -50,17 +50,17 @@ def test_wrong_pairs_are_no_other_camera(shots):
         wrong = rng.permutation(most)[: most // 3]
         Fs[wrong] = other.pairs.Fs[wrong]
         two = divided(made, Fs)
-        assert two is None or not two.perhaps
+        assert two is None or not two.is_possible
 
 
 def test_motions_that_leave_the_focal_open_say_nothing(shots):
     for seed in range(10):
         two = divided(shots(8, seed, motion=shots.parallel))
-        assert two is None or not two.perhaps
+        assert two is None or not two.is_possible
 
 
 def test_one_photo_alone_is_no_camera(shots):
     """`split` asks single photos, and wants more of them."""
     two = divided(shots(8, 3, focal=[1000.0] * 7 + [1500.0], points=120))
 
-    assert two is not None and two.fewest == 1 and not two.perhaps
+    assert two is not None and two.smaller_count == 1 and not two.is_possible

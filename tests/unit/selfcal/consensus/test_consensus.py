@@ -11,7 +11,7 @@ from sfm_app.selfcal.consensus.peak_evidence import (
     effective_count,
     indecision,
     own_sigma,
-    resampled,
+    resample_peak,
     spread_px,
     votes,
 )
@@ -27,7 +27,7 @@ def consensus(views):
     def make(**knobs):
         made = views(**knobs)
         frame = {"unit_px": float(made.size[0]), "origin_px": (made.size[0] / 2, made.size[1] / 2)}
-        return Consensus(prepare(CameraPairs.of(made.Fs, made.size, made.weights), **frame), 0.15)
+        return Consensus(prepare(CameraPairs.from_Fs(made.Fs, made.size, made.weights), **frame), 0.15)
 
     return make
 
@@ -37,10 +37,10 @@ def truth(focal=1.0, u=0.0, v=0.0, aspect=1.0):
 
 
 def test_value_is_votes_plus_prior(consensus):
-    made = consensus().weighted(np.linspace(0.1, 1, 15))
+    made = consensus().with_weights(np.linspace(0.1, 1, 15))
     theta = truth(1.1, 0.06, -0.03, 1.1)
     expected = np.sum(made.weights * np.exp(-made.ratios(theta) / 0.02)) - 0.5 * (0.06**2 + 0.03**2) / 0.15**2
-    np.testing.assert_allclose(made.at(np.stack([theta, truth()]), 0.02)[0], expected)
+    np.testing.assert_allclose(made.evaluate(np.stack([theta, truth()]), 0.02)[0], expected)
     assert votes(made, theta, 0.02).sum() == pytest.approx(expected + 0.5 * (0.06**2 + 0.03**2) / 0.15**2)
 
 
@@ -55,8 +55,8 @@ def test_climbing_moves_what_is_free_and_never_down(consensus):
     start = truth(1.2, 0.05, 0.05, 1.1)
     theta, value = made.climb(start, (0, 2), (0.05,))
     np.testing.assert_array_equal(theta[[1, 3]], start[[1, 3]])
-    assert value > made.at(start[None], 0.05)[0] + 0.1
-    assert value == pytest.approx(made.at(theta[None], 0.05)[0])
+    assert value > made.evaluate(start[None], 0.05)[0] + 0.1
+    assert value == pytest.approx(made.evaluate(theta[None], 0.05)[0])
     np.testing.assert_array_equal(start, truth(1.2, 0.05, 0.05, 1.1))
 
 
@@ -106,7 +106,7 @@ def test_a_lead_must_count_and_weigh():
 def test_rivals_are_far_below_the_truth_and_level_with_it_on_an_orbit(views, consensus):
     for motion, low, high in ((None, 3.0, 15.0), (views.orbit, -0.1, 0.05)):
         made = consensus(noise=3e-4, **({"motion": motion} if motion else {}))
-        value = made.at(truth()[None], SIGMAS[-1])[0]
+        value = made.evaluate(truth()[None], SIGMAS[-1])[0]
         for profile in (None, scan(made, (0.0,))):
             assert low < value - best_rival(made, truth(), FREE, SIGMAS, profile) < high
 
@@ -116,8 +116,8 @@ def test_resampling_scatters_with_the_noise_and_repeats(consensus):
     for noise in (2e-4, 4e-3):
         made = consensus(noise=noise)
         start, _ = made.climb(truth(), FREE, (0.01,))
-        thetas = resampled(made, start, FREE, 0.01, seed=1)
-        np.testing.assert_array_equal(thetas, resampled(made, start, FREE, 0.01, seed=1))
+        thetas = resample_peak(made, start, FREE, 0.01, seed=1)
+        np.testing.assert_array_equal(thetas, resample_peak(made, start, FREE, 0.01, seed=1))
         assert np.all(thetas[:, 3] == 0)
         scatter.append(np.std(thetas[:, 0]))
     assert 1e-5 < scatter[0] < 0.3 * scatter[1] < 0.02

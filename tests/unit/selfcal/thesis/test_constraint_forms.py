@@ -87,8 +87,8 @@ def test_rank_one_is_infinitely_far():
 
 
 def halves_of(Fs):
-    pairs = prepare(CameraPairs.of(Fs, (1, 1)), unit_px=1.0, origin_px=(0.0, 0.0))
-    return pairs, Halves.of(pairs.F)
+    pairs = prepare(CameraPairs.from_Fs(Fs, (1, 1)), unit_px=1.0, origin_px=(0.0, 0.0))
+    return pairs, Halves.from_fundamentals(pairs.F)
 
 
 @settings(max_examples=60, deadline=None)

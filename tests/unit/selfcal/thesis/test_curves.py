@@ -5,13 +5,13 @@ import pytest
 
 from sfm_app.selfcal.constraints import center_polynomials, focal_polynomials
 from sfm_app.selfcal.inputs import prepare
-from sfm_app.selfcal.thesis.curves import center_curves, degeneracy, focal_curves, usable
+from sfm_app.selfcal.thesis.curves import center_curves, degeneracy, focal_curves, usable_curves
 from sfm_app.selfcal.thesis.roots import companion_roots
 from sfm_app.types import CameraPairs
 
 
 def in_widths(made):
-    return prepare(CameraPairs.of(made.Fs, made.size, made.weights), unit_px=made.size[0], origin_px=(0.0, 0.0))
+    return prepare(CameraPairs.from_Fs(made.Fs, made.size, made.weights), unit_px=made.size[0], origin_px=(0.0, 0.0))
 
 
 def thesis_curve(roots):
@@ -66,17 +66,17 @@ def test_degenerate_motions_lose_their_curves(views, motion):
     pairs = in_widths(views(4, noise=0.0, motion=getattr(views, motion)))
     curves = focal_curves(pairs, np.linspace(0.03, 3, 50), (0.5, 0.375))
     assert np.all(degeneracy(curves, 3.0) > 0.5)
-    assert len(usable(curves, 3.0)) == 0
+    assert len(usable_curves(curves, 3.0)) == 0
 
 
 def test_degeneracy_is_the_share_out_of_range():
     curves = np.array([[1.0, 2, 3, 4], [0, 0, 1, 2], [-1, 0, 5, 1], [1, 1, 1, 1]])
     np.testing.assert_array_equal(degeneracy(curves, 3.0), [0.5, 0.5, 0.75, 0])
-    np.testing.assert_array_equal(usable(curves, 3.0), curves[[0, 1, 3]])
+    np.testing.assert_array_equal(usable_curves(curves, 3.0), curves[[0, 1, 3]])
 
 
 def test_no_pairs_no_curves():
-    pairs = prepare(CameraPairs.of(np.empty((0, 3, 3)), (4, 3), []), unit_px=4.0, origin_px=(0.0, 0.0))
+    pairs = prepare(CameraPairs.from_Fs(np.empty((0, 3, 3)), (4, 3), []), unit_px=4.0, origin_px=(0.0, 0.0))
     assert focal_curves(pairs, np.ones(7), (0.5, 0.4)).shape == (0, 7)
     assert center_curves(pairs, np.ones(7), (1.0, 1.0)).shape == (0, 7)
-    assert len(usable(np.empty((0, 7)), 3.0)) == 0
+    assert len(usable_curves(np.empty((0, 7)), 3.0)) == 0

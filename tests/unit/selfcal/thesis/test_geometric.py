@@ -19,7 +19,7 @@ def tracked(seed, **options):
     tracks = make_tracks(TrackOptions(sigma_px=0.5, **options), seed)
     Fs = np.array([eight_point(pair.x1, pair.x2) for pair in tracks.pairs.values()])
     inliers = tuple(np.hstack([pair.x1, pair.x2]) for pair in tracks.pairs.values())
-    return replace(CameraPairs.of(Fs, tracks.size), inliers=inliers), tracks.K[0]
+    return replace(CameraPairs.from_Fs(Fs, tracks.size), inliers=inliers), tracks.K[0]
 
 
 def focal_error(found, K):
@@ -49,7 +49,7 @@ def test_residuals_tell_corrupted_pairs():
 def test_without_matches_the_given_weights_stand_in(views, random_fundamentals):
     made = views(5, noise=5e-4)
     Fs = np.concatenate([made.Fs, random_fundamentals(2)])
-    pairs = CameraPairs.of(Fs, made.size, np.r_[np.ones(10), 1e-5, 1e-5])
+    pairs = CameraPairs.from_Fs(Fs, made.size, np.r_[np.ones(10), 1e-5, 1e-5])
     assert geometric.calibrate(pairs, OPTIONS, 0).evidence["fx_px"] == pytest.approx(1000, rel=0.03)
     assert huang_faugeras.calibrate(pairs, OPTIONS, 0).evidence["fx_px"] != pytest.approx(1000, rel=0.1)
 
@@ -65,19 +65,19 @@ def test_pairs_that_do_not_take_part_get_no_weight():
 def test_exact_matches_count_alike():
     tracks = make_tracks(TrackOptions(sigma_px=0.0), 0)
     inliers = tuple(np.hstack([pair.x1, pair.x2]) for pair in tracks.pairs.values())
-    pairs = replace(CameraPairs.of(tracks.F, tracks.size), inliers=inliers)
+    pairs = replace(CameraPairs.from_Fs(tracks.F, tracks.size), inliers=inliers)
     np.testing.assert_allclose(geometric.residual_weights(pairs), np.ones(10), rtol=1e-12)
 
 
 def test_without_any_match_there_is_no_answer(views):
     made = views(3, noise=0.0)
-    pairs = replace(CameraPairs.of(made.Fs, made.size), inliers=(np.zeros((0, 4)),) * 3)
+    pairs = replace(CameraPairs.from_Fs(made.Fs, made.size), inliers=(np.zeros((0, 4)),) * 3)
     np.testing.assert_array_equal(geometric.residual_weights(pairs), np.zeros(3))
     assert "0 usable pairs" in geometric.calibrate(pairs, OPTIONS, 0).reason
 
 
 def test_matches_for_other_pairs_are_refused(views):
     made = views(3)
-    pairs = replace(CameraPairs.of(made.Fs, made.size), inliers=(np.zeros((5, 4)),))
+    pairs = replace(CameraPairs.from_Fs(made.Fs, made.size), inliers=(np.zeros((5, 4)),))
     with pytest.raises(ValueError, match="inliers of 1 pairs"):
         geometric.calibrate(pairs, OPTIONS, 0)

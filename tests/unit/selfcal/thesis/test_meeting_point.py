@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.selfcal.inputs import prepare
-from sfm_app.selfcal.thesis.curves import focal_curves, usable
+from sfm_app.selfcal.thesis.curves import focal_curves, usable_curves
 from sfm_app.selfcal.thesis.meeting_point import meeting_point, meeting_points
 from sfm_app.types import CameraPairs
 
@@ -68,9 +68,9 @@ def test_one_camera_is_one_peak(views):
 
 def focal_peaks(Fs):
     """Focals sqrt(fx fy) in pixels, the best supported first."""
-    pairs = prepare(CameraPairs.of(Fs, (1000, 750)), unit_px=1000.0, origin_px=(0.0, 0.0))
+    pairs = prepare(CameraPairs.from_Fs(Fs, (1000, 750)), unit_px=1000.0, origin_px=(0.0, 0.0))
     fx = 3 * np.arange(1, 201) / 200
-    curves = usable(focal_curves(pairs, fx, (0.5, 0.375)), 3.0)
+    curves = usable_curves(focal_curves(pairs, fx, (0.5, 0.375)), 3.0)
     return [1000 * np.sqrt(fx[m.sample] * m.value) for m in meeting_points(curves, fx, (0.3, 3.0), 0.1)]
 
 

@@ -21,7 +21,7 @@ OPTIONS = CalibrationSettings()
 
 
 def run(Fs, size=(1000, 750), seed=0):
-    return calibrate(CameraPairs.of(Fs, size), OPTIONS, seed)
+    return calibrate(CameraPairs.from_Fs(Fs, size), OPTIONS, seed)
 
 
 @pytest.mark.parametrize(("pairs", "starts"), [(3, 1), (4, 11), (10, 358), (21, 3983), (45, MOST_STARTS)])
@@ -36,7 +36,7 @@ def test_more_pairs_mean_no_fewer_starts():
 
 def test_focals_are_drawn_around_what_the_pairs_say(views):
     made = views(6, noise=1e-3, focal=1300)
-    pairs = prepare(CameraPairs.of(made.Fs, made.size), unit_px=1000.0, origin_px=(0.0, 0.0))
+    pairs = prepare(CameraPairs.from_Fs(made.Fs, made.size), unit_px=1000.0, origin_px=(0.0, 0.0))
     mean, deviation = focal_distribution(pairs, 0.75)
     assert 0 < abs(mean - 1.3) < 0.2
     assert 0.001 < deviation < 0.5
@@ -44,7 +44,7 @@ def test_focals_are_drawn_around_what_the_pairs_say(views):
 
 def test_pairs_that_say_nothing_leave_the_usual_focal(views):
     made = views(4, noise=0.0, motion=views.translation)
-    pairs = prepare(CameraPairs.of(made.Fs, made.size), unit_px=1000.0, origin_px=(0.0, 0.0))
+    pairs = prepare(CameraPairs.from_Fs(made.Fs, made.size), unit_px=1000.0, origin_px=(0.0, 0.0))
     assert focal_distribution(pairs, 0.75) == USUAL_FOCAL
 
 

@@ -12,7 +12,7 @@ OPTIONS = CalibrationSettings()
 
 
 def run(Fs, size=(1000, 750)):
-    return calibrate(CameraPairs.of(Fs, size), OPTIONS, 0)
+    return calibrate(CameraPairs.from_Fs(Fs, size), OPTIONS, 0)
 
 
 def test_an_error_of_k_alone_stays_within_the_bound(views):
@@ -63,7 +63,7 @@ def test_it_outdoes_equal_weights_where_pairs_are_wrong(views, random_fundamenta
         Fs = made.Fs.copy()
         Fs[[2, 9]] = random_fundamentals(2, seed)
         for method, found in errors.items():
-            evidence = method(CameraPairs.of(Fs, made.size), OPTIONS, 0).evidence
+            evidence = method(CameraPairs.from_Fs(Fs, made.size), OPTIONS, 0).evidence
             found.append(abs(evidence["fx_px"] - 1000) + abs(evidence["fy_px"] - 1000))
     assert np.median(errors[calibrate]) < 0.2 * np.median(errors[calibrate_without_weights])
 

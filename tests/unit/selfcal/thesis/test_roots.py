@@ -58,7 +58,7 @@ def test_a_vanishing_polynomial_collapses_to_zero():
 @pytest.mark.parametrize("noise", [1e-3, 0.1])
 def test_swept_roots_are_the_companion_roots(views, noise, to_eigenvalues):
     made = views(6, noise=noise)
-    pairs = prepare(CameraPairs.of(made.Fs, made.size, made.weights), unit_px=made.size[0], origin_px=(0.0, 0.0))
+    pairs = prepare(CameraPairs.from_Fs(made.Fs, made.size, made.weights), unit_px=made.size[0], origin_px=(0.0, 0.0))
     sweep = np.linspace(0.01, 1, 100)
     for polynomials in (
         focal_polynomials(pairs, 3 * sweep, (0.5, 0.375)),

@@ -8,7 +8,7 @@ from sfm_app.types import CameraPairs
 
 
 def judged(made, answer):
-    return calibrate_with("mine", CameraPairs.of(made.Fs, made.size), lambda *_: answer)
+    return calibrate_with("mine", CameraPairs.from_Fs(made.Fs, made.size), lambda *_: answer)
 
 
 def camera_of(made, factor=1.0):
@@ -46,7 +46,7 @@ def test_any_camera_that_parallel_axes_fit_is_undecided(views):
 def test_pairs_that_were_fitted_do_not_speak_for_the_answer(views, random_fundamentals, sample, known):
     Fs = np.concatenate([views(3).Fs, random_fundamentals(7)])
     found = calibrate_with(
-        "mine", CameraPairs.of(Fs, (1000, 750)), lambda *_: CameraParameters(1.0, 1.0, 0.5, 0.375), sample
+        "mine", CameraPairs.from_Fs(Fs, (1000, 750)), lambda *_: CameraParameters(1.0, 1.0, 0.5, 0.375), sample
     )
     assert found.identifiable == known
     assert 0.2 < found.evidence["support"] < 0.4
@@ -59,7 +59,7 @@ def test_a_method_may_have_no_answer(views):
 
 def test_two_pairs_are_too_few_to_ask(views):
     made = views(3)
-    pairs = CameraPairs.of(made.Fs[:2], made.size)
+    pairs = CameraPairs.from_Fs(made.Fs[:2], made.size)
     found = calibrate_with("mine", pairs, lambda *_: pytest.fail("asked"))
     assert found.reason == "2 usable pairs, 3 are needed"
 

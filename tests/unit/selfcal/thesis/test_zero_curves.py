@@ -11,7 +11,7 @@ OPTIONS = CalibrationSettings()
 
 
 def run(made, options=OPTIONS, seed=0):
-    return calibrate(CameraPairs.of(made.Fs, made.size, made.weights), options, seed)
+    return calibrate(CameraPairs.from_Fs(made.Fs, made.size, made.weights), options, seed)
 
 
 @pytest.mark.parametrize("aspect", [0.8, 1.0, 1.2])
@@ -41,7 +41,7 @@ def test_two_cameras_are_told_by_their_peaks(views):
     one = run(views(5, 2, noise=5e-4, focal=1100), fine)
     pairs = [views(5, 1 + 100 * i, noise=5e-4, focal=focal) for i, focal in enumerate((700, 1500))]
     Fs = np.concatenate([made.Fs for made in pairs])
-    several = calibrate(CameraPairs.of(Fs, pairs[0].size), fine, 0)
+    several = calibrate(CameraPairs.from_Fs(Fs, pairs[0].size), fine, 0)
 
     assert one.evidence["focal_peaks"] == 1
     assert several.evidence["focal_peaks"] >= 2
@@ -51,7 +51,7 @@ def test_outlying_curves_are_outvoted(views, random_fundamentals):
     made = views(6, noise=3e-4)
     Fs = made.Fs.copy()
     Fs[:3] = random_fundamentals(3)
-    found = calibrate(CameraPairs.of(Fs, made.size, made.weights), OPTIONS, 0)
+    found = calibrate(CameraPairs.from_Fs(Fs, made.size, made.weights), OPTIONS, 0)
     assert found.identifiable
     assert found.K[0, 0] == pytest.approx(1000, rel=0.07)
     assert found.K[1, 1] == pytest.approx(1000, rel=0.07)
