@@ -17,7 +17,7 @@ class Progress(Protocol):
             note: why it is skipped or done again; empty where it is new.
         """
 
-    def stage_done(self, seconds: float) -> None:
+    def finish_stage(self, seconds: float) -> None:
         """Announce the end of the current stage, with its duration in seconds."""
 
     def say(self, text: str) -> None:
@@ -48,7 +48,7 @@ class SilentProgress:
             name, note: not used.
         """
 
-    def stage_done(self, seconds: float) -> None:
+    def finish_stage(self, seconds: float) -> None:
         """Show nothing."""
 
     def say(self, text: str) -> None:

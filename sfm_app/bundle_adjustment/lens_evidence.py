@@ -1,4 +1,4 @@
-"""What a whole bundle of photos says about its cameras, and how much of that is believed.
+"""Cameras from the normal equations of a bundle: which parts are freed, their estimates and deviations.
 
 Ours; the choice by marginal likelihood is that of `geometry.model_selection`.
 
@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 LOG_FOCAL, LOG_ASPECT = FX, FY
-"""What stands in place of fx and fy: log sqrt(fx fy) and log fy/fx."""
+"""Columns of log sqrt(fx fy) and log fy/fx, which replace fx and fy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +36,8 @@ class Part:
     share: float
     """Share of cameras for which the wide prior is the right one."""
     stays: bool
-    """Whether it stays as it is where the photos do not determine it; else it is drawn to its usual value. Mapping
-    knows center and aspect from the calibration, but finds a lens with nothing to hold it."""
+    """Whether it keeps its value where the photos do not determine it; otherwise it moves to its usual value. Mapping
+    starts from a calibrated center and aspect, but estimates distortion without a prior."""
 
 
 PARTS = (
@@ -50,42 +50,42 @@ PARTS = (
 """The priors of center, aspect and k1 are those of `camera_priors`; k2, p1 and p2: docs/algorithms.md, Bundle
 adjustment. Chosen by hand; not measured on their own."""
 FOCAL_SPREAD = 0.7
-"""Prior standard deviation of log f about what mapping found: none to speak of. Chosen by hand; not measured on its
-own."""
+"""Prior standard deviation of log f about the value from mapping: hardly a constraint. Chosen by hand; not measured on
+its own."""
 UNDETERMINED = 0.5
-"""A part whose prior the photos do not make narrower than this stays as it is: freeing it adds more than it removes.
+"""A part keeps its value unless the photos shrink its prior deviation below this share: freeing it adds error.
 docs/algorithms.md, Bundle adjustment. Chosen by hand; not measured on its own."""
 FEW = 2.0
-"""So much further off are cameras of few photos, whose misfit does not average out. docs/algorithms.md, Bundle
+"""Factor on the deviations of cameras with few photos, whose misfit does not average out. docs/algorithms.md, Bundle
 adjustment. Chosen by hand; not measured on its own."""
 SWEEPS = 5
-"""At most so many times all cameras are asked which of their parts are free. Chosen by hand; not measured on its
+"""Most sweeps over all cameras in the choice of free parts. Chosen by hand; not measured on its
 own."""
 LONGEST_STEP = 1.0
-"""Of log f in one step: a camera that wants more after mapping has placed the photos is not determined by them. Chosen
+"""Longest step of log f: a camera that moves further after mapping is not determined by its photos. Chosen
 by hand, on no set: it is more than the prior's standard deviation, and none of six sets that were run reached it."""
 FOCALS = (0.05, 100.0)
 """In longer sides: a view of 169 degrees, and one of half a degree. What lies outside has run away. docs/algorithms.md,
 Bundle adjustment. Chosen by hand; not measured on their own."""
 MISFIT = 4.0
-"""Errors of cameras, in what independent noise in the observations explains: lenses are not quite of the model's form,
-neighboring observations err alike. Chosen on the photo sets with known cameras (docs/algorithms.md, Bundle
+"""Ratio of the errors of cameras to those that independent noise explains: lens models are inexact, and errors of
+neighboring observations are correlated. Chosen on the photo sets with known cameras (docs/algorithms.md, Bundle
 adjustment)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensPriors:
-    """What is believed about the cameras before the bundle is asked, one row each."""
+    """Priors on the cameras, one row each."""
 
     centers: FloatArray
-    """(C, 2) where the center usually is, in pixels: the middle of the photo."""
+    """(C, 2) usual optical centers in pixels: the middle of the photo."""
     sides: FloatArray
     """(C,) longer side in pixels."""
     asked: BoolArray
-    """(C, 5) whether the photos are asked about a part, in the order of PARTS; else it stays as it is."""
+    """(C, 5) parts that are estimated, in the order of PARTS; the others keep their values."""
 
     def precision(self, free: BoolArray) -> FloatArray:
-        """Return (C, 8) of the prior when `free` (C, 5) says what has the wide one."""
+        """Return (C, 8) precisions of the prior, the wide one for the parts in `free` (C, 5)."""
         deviation = np.full((len(free), CAMERA), FOCAL_SPREAD)
         for k, part in enumerate(PARTS):
             unit = self.sides if part.name == "center" else np.ones(len(free))
@@ -93,7 +93,7 @@ class LensPriors:
             deviation[:, list(part.places)] = sigma[:, None]
         return np.asarray(deviation**-2.0, np.float64)
 
-    def of_choices(self, trials: BoolArray, camera: int, away: FloatArray) -> NormalPriors:
+    def choice_priors(self, trials: BoolArray, camera: int, away: FloatArray) -> NormalPriors:
         """Return the priors of one camera under each of K choices.
 
         Args:
@@ -106,21 +106,18 @@ class LensPriors:
         log_odds = np.sum(np.log(np.where(trials, share, 1.0 - share)), axis=1)
         return NormalPriors(alike.precision(trials), np.tile(away, (len(trials), 1)), log_odds)
 
-    def away(self, params: FloatArray) -> FloatArray:
-        """Return (C, 8) from the cameras to their usual values.
-
-        None for the focal, nor for what the photos are not asked.
-        """
+    def prior_offsets(self, params: FloatArray) -> FloatArray:
+        """Return (C, 8) offsets from the cameras to their usual values; 0 for the focal and for parts not estimated."""
         away = np.zeros_like(params)
         away[:, [CX, CY]] = self.centers - params[:, [CX, CY]]
         away[:, LOG_ASPECT] = np.log(params[:, FX] / params[:, FY])
         away[:, [K1, K2, P1, P2]] = -params[:, [K1, K2, P1, P2]]
-        return np.where(spread(self.asked), away, 0.0)
+        return np.where(parameter_mask(self.asked), away, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensEstimate:
-    """Where the cameras are most probably."""
+    """The most probable cameras, with their uncertainty."""
 
     params: FloatArray
     """(C, 8) as in `Bundle`."""
@@ -129,44 +126,44 @@ class LensEstimate:
     free: BoolArray
     """(C, 5) the parts that have the wide prior, in the order of PARTS."""
     determined: BoolArray
-    """(C, 5) the parts about which the photos say more than the prior."""
+    """(C, 5) the parts that the photos determine better than the prior."""
     step: float
     """The largest change of a parameter, in standard deviations."""
     held: BoolArray
-    """(C,) cameras that would have run away: they stay, and nothing about them counts as determined."""
+    """(C,) cameras whose step was refused because it diverged; no part of them counts as determined."""
 
 
-def estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors) -> LensEstimate:
-    """Return the most probable cameras, with the most probable choice of freed parts; undetermined parts stay.
+def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: LensPriors) -> LensEstimate:
+    """Return the most probable cameras under the most probable choice of freed parts; undetermined parts stay.
 
-    The deviations are those of all parts, about the value that was chosen, even where that is the present one, and over
-    all choices of freed parts. Where photos pull at the cameras in different directions (a zoom, a moving shutter,
-    look-alikes), they are at least as large as that scatter makes them (a sandwich with photos as clusters).
+    Deviations are root mean squares about the returned values, over all choices of freed parts. They are at least
+    those of the sandwich estimator with photos as clusters, which grows where photos contradict each other (a zoom, a
+    rolling shutter, look-alikes).
 
     Args:
         params: (C, 8) cameras as in `Bundle`.
         reduced: the cost about these cameras.
-        priors: what is believed about them before.
+        priors: on the cameras.
     """
-    T = _by_logarithms(params)
+    T = _logarithm_jacobian(params)
     weight = (MISFIT * reduced.noise_px) ** -2.0
-    H, g = weight * _product(T.T, _product(reduced.H, T)), weight * _product(T.T, reduced.g)
-    away = priors.away(params)
+    H, g = weight * _multiply(T.T, _multiply(reduced.H, T)), weight * _multiply(T.T, reduced.g)
+    away = priors.prior_offsets(params)
     free = _choose(H, g, away, priors)
     precision = priors.precision(free)
     _, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
-    determined = priors.asked & _determined(covariance, precision)
-    changing = spread(determined | (priors.asked & ~np.array([part.stays for part in PARTS])))
+    determined = priors.asked & _find_determined(covariance, precision)
+    changing = parameter_mask(determined | (priors.asked & ~np.array([part.stays for part in PARTS])))
     step, own = _posterior(H, g, precision, away, changing)
     about = _mean_squares(step, H, g, away, priors, free)
-    photos = weight * _product(reduced.scores, T)
+    photos = weight * _multiply(reduced.scores, T)
     variances = np.maximum(
-        np.sum(_product(T, about) * T, axis=1), np.sum(_product(photos, _product(covariance, T.T)) ** 2, axis=0)
+        np.sum(_multiply(T, about) * T, axis=1), np.sum(_multiply(photos, _multiply(covariance, T.T)) ** 2, axis=0)
     )
     deviations = np.sqrt(variances).reshape(params.shape) * np.where(priors.asked.all(axis=1), 1.0, FEW)[:, None]
     largest = np.abs(step) / np.sqrt(np.diag(own), out=np.ones_like(step), where=changing.ravel())
-    moved, held = _moved(params, step.reshape(params.shape), priors.sides)
-    deviations[held] = np.maximum(deviations[held], _unknown(params, priors)[held])
+    moved, held = _apply_step(params, step.reshape(params.shape), priors.sides)
+    deviations[held] = np.maximum(deviations[held], _prior_deviations(params, priors)[held])
     determined[held] = False
     return LensEstimate(
         np.where(held[:, None], params, moved), deviations, free & determined, determined,
@@ -174,8 +171,8 @@ def estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors) -> 
     )  # fmt: skip
 
 
-def spread(parts: BoolArray) -> BoolArray:
-    """Return (C, 8) the parameters of some parts (C, 5), and of the focal."""
+def parameter_mask(parts: BoolArray) -> BoolArray:
+    """Return (C, 8) mask of the parameters of some parts (C, 5), and of the focal."""
     chosen = np.ones((len(parts), CAMERA), np.bool_)
     for k, part in enumerate(PARTS):
         chosen[:, list(part.places)] = parts[:, [k]]
@@ -185,16 +182,16 @@ def spread(parts: BoolArray) -> BoolArray:
 def _posterior(
     H: FloatArray, g: FloatArray, precision: FloatArray, away: FloatArray, changing: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean step (8C,) and covariance (8C, 8C) of what is changing (C, 8); 0 elsewhere."""
+    """Return mean step (8C,) and covariance (8C, 8C) of the parameters in `changing` (C, 8); 0 elsewhere."""
     places = np.flatnonzero(changing)
     step, covariance = np.zeros(len(g)), np.zeros_like(H)
     block = np.ix_(places, places)
     covariance[block] = inverse_of_positive((H + np.diag(precision.ravel()))[block])
-    step[places] = _product(covariance[block], (g + (precision * away).ravel())[places])
+    step[places] = _multiply(covariance[block], (g + (precision * away).ravel())[places])
     return step, covariance
 
 
-def _determined(covariance: FloatArray, precision: FloatArray) -> BoolArray:
+def _find_determined(covariance: FloatArray, precision: FloatArray) -> BoolArray:
     """Return (C, 5) as in `LensEstimate`."""
     narrower = np.sqrt(np.diag(covariance)).reshape(precision.shape) < UNDETERMINED * precision**-0.5
     return np.stack([narrower[:, list(part.places)].all(axis=1) for part in PARTS], axis=1)
@@ -215,7 +212,7 @@ def _choose(H: FloatArray, g: FloatArray, away: FloatArray, priors: LensPriors) 
             trials = binary_choices(len(PARTS))
             trials = trials[~np.any(trials & ~priors.asked[camera], axis=1)]
             said = cavity(covariance[np.ix_(own, own)], step[own], precision[camera], away[camera])
-            found = posteriors(*said, priors.of_choices(trials, camera, away[camera]))
+            found = posteriors(*said, priors.choice_priors(trials, camera, away[camera]))
             free[camera] = trials[np.argmax(found.log_evidence)]
         if np.array_equal(free, before):
             break
@@ -235,12 +232,12 @@ def _mean_squares(
     for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
         block = np.ix_(own, own)
         said = cavity(covariance[block], mean[own], precision[camera], away[camera])
-        choices = priors.of_choices(binary_choices(len(PARTS)), camera, away[camera])
+        choices = priors.choice_priors(binary_choices(len(PARTS)), camera, away[camera])
         found[block] = posteriors(*said, choices).mean_squares(step[own])
     return found
 
 
-def _by_logarithms(params: FloatArray) -> FloatArray:
+def _logarithm_jacobian(params: FloatArray) -> FloatArray:
     """Return (8C, 8C) derivatives of the parameters by those with log f and log fy/fx in place of fx and fy."""
     T = np.eye(params.size)
     for camera, values in enumerate(params):
@@ -250,13 +247,13 @@ def _by_logarithms(params: FloatArray) -> FloatArray:
     return T
 
 
-def _product(A: FloatArray, B: FloatArray) -> FloatArray:
-    """Return a B without BLAS, whose sums depend on its threads."""
+def _multiply(A: FloatArray, B: FloatArray) -> FloatArray:
+    """Return A B without BLAS, whose sums depend on its threads."""
     return np.asarray(np.einsum("ij,j...->i...", A, B), np.float64)
 
 
-def _moved(params: FloatArray, step: FloatArray, sides: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return the cameras (C, 8) after a step, and (C,) which have run away with it."""
+def _apply_step(params: FloatArray, step: FloatArray, sides: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Return the cameras (C, 8) after a step, and (C,) those that it makes diverge."""
     moved = params + step
     with np.errstate(over="ignore", invalid="ignore"):
         moved[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
@@ -266,8 +263,8 @@ def _moved(params: FloatArray, step: FloatArray, sides: FloatArray) -> tuple[Flo
     return moved, ~priors | (np.abs(step[:, LOG_FOCAL]) > LONGEST_STEP)
 
 
-def _unknown(params: FloatArray, priors: LensPriors) -> FloatArray:
-    """Return (C, 8) standard deviations of cameras about which the photos say nothing."""
+def _prior_deviations(params: FloatArray, priors: LensPriors) -> FloatArray:
+    """Return (C, 8) standard deviations of cameras that the photos do not determine."""
     deviations = priors.precision(np.ones((len(params), len(PARTS)), np.bool_)) ** -0.5
     deviations[:, [FX, FY]] = FOCAL_SPREAD * params[:, [FX, FY]]
     return np.asarray(deviations, np.float64)

@@ -54,7 +54,7 @@ class Terminal:
         number = f"{steps.index(name) + 1}/{len(steps)} " if name in steps else ""
         self.console.print(f"{number}{STAGE_TITLES.get(name, name)}{f' [dim]({escape(note)})[/dim]' if note else ''}")
 
-    def stage_done(self, seconds: float) -> None:
+    def finish_stage(self, seconds: float) -> None:
         """Print how many seconds the stage took."""
         self.console.print(f"    [dim]{seconds:.1f} s[/dim]")
 

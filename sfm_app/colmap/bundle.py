@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_app.bundle_adjustment.lens_evidence import PARTS, LensEstimate, LensPriors, estimate
+from sfm_app.bundle_adjustment.lens_evidence import PARTS, LensEstimate, LensPriors, estimate_lenses
 from sfm_app.bundle_adjustment.normal_equations import (
     FX,
     FY,
@@ -94,7 +94,7 @@ def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjustment:
             raise NumericalError("a camera has no focal length")
         reduced = reduce(bundle, LOSS_SCALE_PX)
         open_points.append(reduced.open_points)
-        found = estimate(bundle.params, reduced, _lens_priors(model, ids))
+        found = estimate_lenses(bundle.params, reduced, _lens_priors(model, ids))
         _write_bundle(model, ids, _best_step(bundle, reduced, found))
         if found.step > LONG_STEP:
             solve(model)

@@ -156,7 +156,7 @@ class _Execution:
         )  # fmt: skip
         place.manifest.finish(stage.name, record, manifest_head(run))
         logger.info("%s took %.2f s", stage.name, seconds)
-        run.progress.stage_done(seconds)
+        run.progress.finish_stage(seconds)
         self.products.keep(stage, product)
 
     def make_product(self, stage: Stage[Product], run: RunContext) -> Product:

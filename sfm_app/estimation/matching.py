@@ -83,9 +83,9 @@ def _find(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> N
             used = read_mask(run.mask_dir, names[photo])
             column, row = np.clip(keypoints.astype(np.int64), 0, np.array(size) - 1).T
             seen = used[row, column]
-            features, keypoints = features.only(seen), keypoints[seen]
+            features, keypoints = features.select(seen), keypoints[seen]
         rows = np.arange(min(len(keypoints), run.settings.matching.max_features))
-        _save(features.only(rows), part_path(photo, run))
+        _save(features.select(rows), part_path(photo, run))
         return photo, keypoints[rows].astype(np.float32)
 
     left = [photo for photo in names if not part_path(photo, run).exists()]

@@ -19,7 +19,7 @@ JUMP, MOST_JUMPS = 5.0, 0.1
 the usual order of castle-P19, fountain-P11, Herz-Jesus-P8, kitti51 and oats23 has no jump."""
 
 
-def without_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph) -> tuple[MatchGraph, ViewGraph]:
+def drop_look_alikes(matches: MatchGraph, views: ViewGraph, graph: PoseGraph) -> tuple[MatchGraph, ViewGraph]:
     """Return matches and fundamental matrices without those of look-alikes.
 
     Pairs of look-alikes are evidence neither for a model nor against it.

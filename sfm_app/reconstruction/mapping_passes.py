@@ -17,7 +17,7 @@ from sfm_app.reconstruction.camera_per_photo import (
     with_camera_per_photo,
     with_two_cameras,
 )
-from sfm_app.reconstruction.look_alikes import with_earlier_look_alikes, without_look_alikes
+from sfm_app.reconstruction.look_alikes import drop_look_alikes, with_earlier_look_alikes
 from sfm_app.reconstruction.mapping_runs import Attempt, Group, NoModel, best_attempt, choice_reason, map_group
 from sfm_app.reconstruction.model_merge import join_models
 from sfm_app.reconstruction.model_split import sound_parts
@@ -86,7 +86,7 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
     with translate_errors("entering photos"):
         write_match_graph(run.workspace.database, matches)
     best = _run_pass(matches, views, intrinsics, run)
-    matches, views = without_look_alikes(matches, views, best.graph)
+    matches, views = drop_look_alikes(matches, views, best.graph)
     best = try_rival(best, matches, views, intrinsics, run)
     best = _try_other_focals(best, matches, views, intrinsics, run)
     best = _try_camera_per_photo(best, matches, views, intrinsics, run)
@@ -102,7 +102,7 @@ def reconstruct(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, r
         best = replace(
             again, passes=number, thin=best.thin, graph=graph, tried=tried, one_camera_each=best.one_camera_each
         )
-        matches, views = without_look_alikes(matches, views, best.graph)
+        matches, views = drop_look_alikes(matches, views, best.graph)
     return _with_joined_models(best, matches, views, run)
 
 
@@ -249,7 +249,7 @@ def _run_pass(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, run
     options = PoseGraphOptions(epipolar.max_error_px, epipolar.min_inliers, run.seed)
     graph = build_pose_graph(matches, views, intrinsics, options, run.map)
     _write_graph(graph, intrinsics, matches, run)
-    matches, views = without_look_alikes(matches, views, graph)
+    matches, views = drop_look_alikes(matches, views, graph)
     models: list[Attempt] = []
     reasons: dict[str, str] = {}
     tried: list[str] = []

@@ -22,6 +22,6 @@ class Features:
     def __len__(self) -> int:
         return len(self.keypoints)
 
-    def only(self, rows: NDArray[Any]) -> "Features":
+    def select(self, rows: NDArray[Any]) -> "Features":
         """Return the features in these rows."""
         return Features(self.size, self.keypoints[rows], {name: value[rows] for name, value in self.values.items()})

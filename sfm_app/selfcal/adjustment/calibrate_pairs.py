@@ -116,13 +116,13 @@ def fit_cameras(matches: Matches, Fs: FloatArray, starts: Sequence[FloatArray], 
     state = adjust_cameras(few, fit.state, fit.prior)
     fit = replace(fit, matches=matches, state=adjust_cameras(matches, state, fit.prior, LAST_ROUNDS))
     for _ in range(EVIDENCE_ROUNDS):
-        free = fit.evidence.best(fit.free)
+        free = fit.evidence.choose(fit.free)
         if np.array_equal(free, fit.free):
             break
         prior = priors.prior(free, fit.state.thetas)
         state = adjust_cameras(few, fit.state, prior)
         fit = Fit(matches, adjust_cameras(matches, state, prior, LAST_ROUNDS), free, prior, priors)
-    held = fit.evidence.undetermined(fit.free)
+    held = fit.evidence.undetermined_parts(fit.free)
     prior = priors.prior(fit.free, fit.state.thetas, held)
     return replace(fit, prior=prior, held=held, state=adjust_cameras(matches, fit.state, prior, LAST_ROUNDS))
 

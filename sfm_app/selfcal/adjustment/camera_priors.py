@@ -1,4 +1,4 @@
-"""What is believed about a camera before a photo is seen, and how far the pairs may change that.
+"""Priors on cameras, and the choice of the parameters that the pairs free from their usual values.
 
 Ours; the choice by marginal likelihood is that of `geometry.model_selection`.
 
@@ -23,34 +23,34 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 CENTER, ASPECT, LENS, FOCAL = range(4)
-"""Places in `free`: what may be freed from its usual value."""
+"""Columns of `free`: the parts of a camera that may be freed from their usual values."""
 NAMES = ("center", "aspect", "k1", "focal")
-"""What `held` calls them."""
+"""Names of the parts in `Calibration.held`."""
 USUAL_FOCAL, FOCAL_SPREAD = np.log(1.2), 0.7
-"""Mean and standard deviation of log f, f in longer sides, where nobody claims one. The mean is COLMAP's guess; the
-deviation, a factor of two, was chosen by hand."""
+"""Prior mean and standard deviation of log f, f in longer sides, without a claimed focal. The mean is COLMAP's guess;
+the deviation, a factor of two, was chosen by hand."""
 HINT_SPREAD = 0.05
-"""Of a claimed focal: EXIF rounds millimeters, and the sensor's size to 35 mm. Chosen by hand; not measured on its
-own."""
+"""Standard deviation of the logarithm of a claimed focal: EXIF rounds millimeters, and the sensor size to 35 mm. Chosen
+by hand; not measured on its own."""
 NARROW = {CENTER: 0.012, ASPECT: 0.002, LENS: 0.005}
 """Standard deviations about the usual value: of the center in longer sides, of log fy/fx, of k1. docs/algorithms.md,
 Self-calibration, 3. Chosen by hand; not measured on their own."""
 WIDE = {CENTER: 0.15, ASPECT: 0.25, LENS: 0.2}
-"""The same where the parameter is freed. docs/algorithms.md, Self-calibration, 3. Chosen by hand; not measured on their
-own."""
+"""Standard deviations of freed parts, in the same units. docs/algorithms.md, Self-calibration, 3. Chosen by hand;
+not measured on their own."""
 COLUMNS = {CENTER: [CENTER_U, CENTER_U + 1], ASPECT: [LOG_ASPECT], LENS: [KAPPA]}
-"""Places in the parameters of a camera, by definition in `lens`."""
+"""Columns of each part in the parameters of a camera, by definition in `lens`."""
 UNDETERMINED = 0.5
-"""A parameter whose narrow prior the pairs do not make narrower than this stays at its usual value. docs/algorithms.md,
-Self-calibration, 3. Chosen by hand; not measured on its own."""
+"""A part stays at its usual value unless the pairs shrink the deviation of its narrow prior below this share.
+docs/algorithms.md, Self-calibration, 3. Chosen by hand; not measured on its own."""
 STAYS = 1e-3
-"""What then becomes of that prior's deviation. Chosen by hand; not measured on its own."""
+"""Factor on the prior deviation of a part that stays at its usual value. Chosen by hand; not measured on its own."""
 LEAST_SPARE = 0.25
 """Share of the constraints that must be left to contradict the cameras, or nothing more is freed. Three pairs fit
 almost any center (docs/algorithms.md, Self-calibration, 3). Chosen by hand; not measured on its own."""
 STRAIGHT = 1e-6
-"""Deviation of k1, and share of the photos that have one, where distortion is not estimated: none to speak of. Chosen
-by hand; not measured on its own."""
+"""Deviation of k1, and share of distorted photos, when distortion is not estimated: practically zero. Chosen by hand;
+not measured on its own."""
 FREE_SHARE = {CENTER: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
 """Share of photo sets in which the wide prior is the right one; for FOCAL, in which a claim is wrong.
 docs/algorithms.md, Self-calibration, 3. Chosen by hand; not measured on their own."""
@@ -58,7 +58,7 @@ docs/algorithms.md, Self-calibration, 3. Chosen by hand; not measured on their o
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPriors:
-    """What is known about the cameras, one row each."""
+    """Priors on the cameras, one row each."""
 
     sides: FloatArray
     """(C,) longer side of the photos, in the units of the matches."""
@@ -67,15 +67,15 @@ class CameraPriors:
     center_sigma: float = WIDE[CENTER]
     """Wide prior on the center, in longer sides."""
     lens: bool = True
-    """False: every lens is taken as straight."""
+    """Whether distortion is estimated."""
 
     def prior(self, free: BoolArray, thetas: FloatArray, held: BoolArray | None = None) -> Prior:
-        """Return the prior for a choice of what is freed.
+        """Return the prior for a choice of freed parts.
 
         Args:
-            free: (C, 4) what is freed.
-            thetas: (C, 5) parameters of the cameras; they turn k1 into kappa.
-            held: (C, 4) what stays at its usual value; nothing where None.
+            free: (C, 4) the freed parts.
+            thetas: (C, 5) parameters of the cameras; they convert k1 to kappa.
+            held: (C, 4) the parts that stay at their usual values; none if None.
         """
         mean, deviation = np.zeros((len(self.sides), CAMERA)), np.empty((len(self.sides), CAMERA))
         hinted = ~free[:, FOCAL] & np.isfinite(self.hints)
@@ -94,7 +94,7 @@ class CameraPriors:
         return Prior(mean, deviation**-2.0)
 
     def log_odds(self, free: BoolArray) -> float:
-        """Return log-probability of a choice, before the pairs are asked."""
+        """Return the prior log-probability of a choice (C, 4)."""
         total = 0.0
         for place, share in FREE_SHARE.items():
             counts = np.isfinite(self.hints) if place == FOCAL else np.ones(len(self.sides), np.bool_)
@@ -105,7 +105,7 @@ class CameraPriors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """What all pairs together say about a step d of the cameras from `thetas`: -g'd + d'Hd / 2."""
+    """The negative log-likelihood of all pairs near `thetas`: -g'd + d'Hd / 2 for a step d of the cameras."""
 
     thetas: FloatArray
     """(C, 5) parameters of the cameras."""
@@ -118,13 +118,10 @@ class Evidence:
     priors: CameraPriors
 
     def posterior(self, free: BoolArray) -> tuple[float, FloatArray, FloatArray]:
-        """Return log-probability of a choice of freed parameters, up to a constant.
-
-        Mean step and covariance under it.
-        """
+        """Return the log-probability of a choice (C, 4) up to a constant, and the mean step and covariance under it."""
         prior = self.priors.prior(free, self.thetas)
         precision, away = prior.precision.ravel(), (prior.mean - self.thetas).ravel()
-        share = spare(free, self.pairs)
+        share = spare_share(free, self.pairs)
         covariance = inverses_of_positive(share * self.H + np.diag(precision))
         pull = share * self.g + precision * away
         step = covariance @ pull
@@ -135,7 +132,7 @@ class Evidence:
     def choices(self, free: BoolArray, camera: int) -> BoolArray:
         """Return (K, C, 4) all choices for one camera; those that free less come first.
 
-        What would leave hardly a constraint to contradict it is no choice: three pairs fit almost any center.
+        Choices that leave hardly any redundant constraint are left out: three pairs fit almost any center.
 
         Args:
             free: (C, 4) the choices for the other cameras.
@@ -144,10 +141,10 @@ class Evidence:
         switches = binary_choices(free.shape[1])
         trials = np.repeat(free[None], len(switches), axis=0)
         trials[:, camera] = switches
-        allowed = [k == 0 or spare(trial, self.pairs) >= LEAST_SPARE for k, trial in enumerate(trials)]
+        allowed = [k == 0 or spare_share(trial, self.pairs) >= LEAST_SPARE for k, trial in enumerate(trials)]
         return np.asarray(trials[allowed], np.bool_)
 
-    def best(self, free: BoolArray) -> BoolArray:
+    def choose(self, free: BoolArray) -> BoolArray:
         """Return the most probable choice.
 
         One camera after the other is asked, with the choices for the others as they stand, until none changes.
@@ -159,14 +156,16 @@ class Evidence:
             before = free
             for camera in range(len(free)):
                 _, step, covariance = self.posterior(free)
-                trials, found = self.alternatives(free, camera, step, covariance)
+                trials, found = self.camera_posteriors(free, camera, step, covariance)
                 free = trials[np.argmax(found.log_evidence)]
             if np.array_equal(free, before):
                 return free
 
-    def undetermined(self, free: BoolArray) -> BoolArray:
-        """Return (C, 4) what is not freed, about which the pairs say hardly more than the prior, and nothing against
-        it.
+    def undetermined_parts(self, free: BoolArray) -> BoolArray:
+        """Return (C, 4) the parts that are not freed, not narrowed by the pairs, and not contradicted by them.
+
+        Args:
+            free: (C, 4) the choices for all cameras.
         """
         prior = self.priors.prior(free, self.thetas)
         before = prior.precision**-0.5
@@ -188,12 +187,12 @@ class Evidence:
         _, step, covariance = self.posterior(free)
         total = covariance.copy()
         for camera in range(len(free)):
-            _, found = self.alternatives(free, camera, step, covariance)
+            _, found = self.camera_posteriors(free, camera, step, covariance)
             block = slice(CAMERA * camera, CAMERA * (camera + 1))
             total[block, block] = found.mean_squares(np.zeros(CAMERA))
         return total
 
-    def alternatives(
+    def camera_posteriors(
         self, free: BoolArray, camera: int, step: FloatArray, covariance: FloatArray
     ) -> tuple[BoolArray, Posteriors]:
         """Return all choices (K, C, 4) for one camera, and its posterior under each.
@@ -209,7 +208,7 @@ class Evidence:
         away = prior.mean - self.thetas
         H, g = cavity(covariance[block, block], step[block], prior.precision[camera], away[camera])
         others = [self.priors.prior(trial, self.thetas) for trial in trials]
-        scale = np.array([spare(trial, self.pairs) for trial in trials]) / spare(free, self.pairs)
+        scale = np.array([spare_share(trial, self.pairs) for trial in trials]) / spare_share(free, self.pairs)
         found = posteriors(
             scale[:, None, None] * H, scale[:, None] * g,
             NormalPriors(
@@ -221,10 +220,10 @@ class Evidence:
         return trials, found
 
 
-def spare(free: BoolArray, pairs: float) -> float:
-    """Return share of the constraints that is left to contradict the cameras, in [0.1, 1].
+def spare_share(free: BoolArray, pairs: float) -> float:
+    """Return the share of redundant constraints, in [0.1, 1].
 
-    A pair gives two. The fewer are left, the less the pairs' scatter about the fit says about their errors.
+    A pair gives two constraints. With fewer redundant ones, residuals underestimate the errors.
 
     Args:
         free: (C, 4) what is freed.

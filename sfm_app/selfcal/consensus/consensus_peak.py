@@ -15,8 +15,8 @@ from sfm_app.selfcal.consensus.peak_evidence import (
     disagreement,
     effective_count,
     indecision,
-    own_sigma,
     resample_peak,
+    residual_sigma,
     votes,
 )
 from sfm_app.selfcal.consensus.peak_search import FOCAL_RANGE, SIGMAS, Peak, Profile, peaks, scan
@@ -123,7 +123,7 @@ def find_peak(consensus: Consensus) -> Answer:
     free_profile = scan(consensus, LOG_ASPECTS)
     free = peaks(consensus, free_profile, ANY_PIXELS)
     # both use the width that fits the freer one: a wrong square answer would choose a lenient width
-    sigmas = (own_sigma(consensus, free[0].theta),)
+    sigmas = (residual_sigma(consensus, free[0].theta),)
     theta, value = consensus.climb(square[0].theta, SQUARE_PIXELS, sigmas)
     gain = max(consensus.climb(start, ANY_PIXELS, sigmas)[1] for start in (theta, free[0].theta)) - value
     if gain >= ASPECT_GAIN:
@@ -134,7 +134,7 @@ def find_peak(consensus: Consensus) -> Answer:
 def _examine(consensus: Consensus, ends: list[Peak], profile: Profile, free: tuple[int, ...], gain: float) -> Answer:
     """Refine the highest peak with the width that fits its pairs, and collect the evidence for it."""
     best = ends[0]
-    sigma = own_sigma(consensus, best.theta)
+    sigma = residual_sigma(consensus, best.theta)
     theta, _ = consensus.climb(best.theta, free, (sigma,))
     value = float(consensus.evaluate(theta[None, :], SIGMAS[-1])[0])
     far = [peak for peak in ends[1:] if abs(peak.theta[LOG_FOCAL] - theta[LOG_FOCAL]) > np.log(RIVAL_RATIO)]

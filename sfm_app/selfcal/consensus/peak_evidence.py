@@ -40,7 +40,7 @@ STABLE_SIGMA = 0.01
 own."""
 
 
-def own_sigma(consensus: Consensus, theta: FloatArray) -> float:
+def residual_sigma(consensus: Consensus, theta: FloatArray) -> float:
     """Return the width that fits the scatter of the agreeing pairs: 1.5 times the weighted median of their r.
 
     Args:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.bundle_adjustment.lens_evidence import PARTS, LensPriors, estimate
+from sfm_app.bundle_adjustment.lens_evidence import PARTS, LensPriors, estimate_lenses
 from sfm_app.bundle_adjustment.normal_equations import Bundle, project, reduce
 
 SIZE = np.array([1000.0, 800.0])
@@ -55,7 +55,7 @@ def asked(*cameras):
 
 
 def answer(bundle, *cameras):
-    return estimate(bundle.params, reduce(bundle, 1.0), asked(*(cameras or (True,) * len(bundle.params))))
+    return estimate_lenses(bundle.params, reduce(bundle, 1.0), asked(*(cameras or (True,) * len(bundle.params))))
 
 
 def freed(found, camera=0):
@@ -189,7 +189,7 @@ def test_a_camera_that_runs_away_stays_and_is_not_determined(off):
     reduced = reduce(bundle, 1.0)
     far = replace(reduced, g=reduced.H @ (900.0 * (off - 1.0) * np.eye(8)[0] + 900.0 * (off - 1.0) * np.eye(8)[1]))
 
-    held, found = estimate(start, far, asked(True)), estimate(start, reduced, asked(True))
+    held, found = estimate_lenses(start, far, asked(True)), estimate_lenses(start, reduced, asked(True))
 
     assert held.held.tolist() == [True] and found.held.tolist() == [False]
     assert np.array_equal(held.params, start) and not held.determined.any() and held.step == 0

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from sfm_app.reconstruction.look_alikes import (
+    drop_look_alikes,
     jumps,
     look_alike_entries,
     sides,
     with_earlier_look_alikes,
-    without_look_alikes,
 )
 from sfm_app.types import EpipolarFit, LookAlikes, MatchedImage, MatchGraph, PoseGraph, ViewGraph
 
@@ -34,10 +34,10 @@ def test_matches_of_look_alikes_do_not_speak(matches):
     fit = EpipolarFit(np.eye(3), np.ones(1, bool), np.ones(1), 1, 0.1)
     views = ViewGraph({(1, 2): fit, (1, 11): fit}, {})
 
-    kept, seen = without_look_alikes(matches, views, graph(JOIN))
+    kept, seen = drop_look_alikes(matches, views, graph(JOIN))
 
     assert set(kept.matches) == {(1, 2), (11, 12)} and set(seen.fits) == {(1, 2)}
-    assert without_look_alikes(matches, views, graph()) == (matches, views)
+    assert drop_look_alikes(matches, views, graph()) == (matches, views)
 
 
 def test_a_second_pass_knows_what_the_first_told_apart():

@@ -14,7 +14,7 @@ from sfm_app.selfcal.adjustment.camera_priors import (
     WIDE,
     CameraPriors,
     Evidence,
-    spare,
+    spare_share,
 )
 from sfm_app.selfcal.zero_curves import calibrate
 from sfm_app.settings import CalibrationSettings
@@ -43,17 +43,17 @@ SURE = [1e-3] * 5
     ("offset", "place"), [((0, 0.05, 0, 0, 0), CENTER), ((0, 0, 0, 0.1, 0), ASPECT), ((0, 0, 0, 0, 0.08), LENS)]
 )
 def test_what_sure_pairs_contradict_is_freed_and_nothing_else(offset, place):
-    np.testing.assert_array_equal(evidence(SURE, offset).best(NOTHING), freed(place))
+    np.testing.assert_array_equal(evidence(SURE, offset).choose(NOTHING), freed(place))
 
 
 def test_usual_cameras_stay_usual():
     for deviation in (1e-3, 0.01, 0.1, 1.0):
-        np.testing.assert_array_equal(evidence([deviation] * 5).best(freed(CENTER, ASPECT, LENS)), NOTHING)
+        np.testing.assert_array_equal(evidence([deviation] * 5).choose(freed(CENTER, ASPECT, LENS)), NOTHING)
 
 
 def test_unsure_pairs_free_nothing():
     found = evidence([0.1] * 5, (0, 0.05, 0, 0.1, 0.08))
-    np.testing.assert_array_equal(found.best(NOTHING), NOTHING)
+    np.testing.assert_array_equal(found.choose(NOTHING), NOTHING)
 
 
 def test_the_log_evidence_is_the_integral():
@@ -83,7 +83,7 @@ def test_mean_step_and_covariance_are_those_of_two_measurements():
     prior = found.priors.prior(NOTHING, found.thetas)
     _, step, covariance = found.posterior(NOTHING)
     weights = np.array([100.0, prior.precision[0, 0]])
-    share = spare(NOTHING, 1e6)
+    share = spare_share(NOTHING, 1e6)
     weights[0] *= share
     assert step[0] == pytest.approx(weights @ [0.2, prior.mean[0, 0]] / weights.sum())
     assert covariance[0, 0] == pytest.approx(1 / weights.sum())
@@ -93,17 +93,17 @@ def test_a_claim_counts_where_pairs_are_weak_and_loses_against_strong_ones():
     claim = np.array([1.0])
     weak, strong = evidence([0.3] * 5, (0.1, 0, 0, 0, 0), claim), evidence(SURE, (0.3, 0, 0, 0, 0), claim)
 
-    assert not weak.best(NOTHING)[0, FOCAL]
+    assert not weak.choose(NOTHING)[0, FOCAL]
     assert abs(weak.posterior(NOTHING)[1][0]) < 0.01
     assert 0.8 * HINT_SPREAD < np.sqrt(weak.covariance(NOTHING)[0, 0]) < 0.3
-    assert strong.best(NOTHING)[0, FOCAL]
-    assert strong.posterior(strong.best(NOTHING))[1][0] == pytest.approx(0.3, abs=1e-3)
+    assert strong.choose(NOTHING)[0, FOCAL]
+    assert strong.posterior(strong.choose(NOTHING))[1][0] == pytest.approx(0.3, abs=1e-3)
 
 
 def test_where_nobody_claims_a_focal_none_is_freed():
     found = evidence(SURE)
     assert found.posterior(freed(FOCAL))[0] == pytest.approx(found.posterior(NOTHING)[0])
-    assert not found.best(NOTHING)[0, FOCAL]
+    assert not found.choose(NOTHING)[0, FOCAL]
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.015, 0.022, 0.03, 0.1])
@@ -112,7 +112,7 @@ def test_the_covariance_covers_all_choices(offset):
     H = found.H.copy()
     H[0, 1] = H[1, 0] = 0.5 * np.sqrt(H[0, 0] * H[1, 1])
     found = replace(found, H=H)
-    best = found.best(NOTHING)
+    best = found.choose(NOTHING)
     mixed = found.covariance(best)
 
     np.testing.assert_allclose(mixed, mixed.T, rtol=1e-9)
@@ -130,17 +130,17 @@ def test_what_is_nearly_free_is_nearly_as_uncertain():
 
 def test_few_pairs_say_less_than_their_scatter():
     free = freed(CENTER, ASPECT, LENS)
-    assert spare(free, 1e9) == pytest.approx(1.0)
-    assert spare(NOTHING, 3.0) == pytest.approx(1 - 1 / 6)
-    assert spare(free, 5.0) == pytest.approx(0.5)
-    assert spare(free, 0.0) == spare(free, 1.0) == 0.1
+    assert spare_share(free, 1e9) == pytest.approx(1.0)
+    assert spare_share(NOTHING, 3.0) == pytest.approx(1 - 1 / 6)
+    assert spare_share(free, 5.0) == pytest.approx(0.5)
+    assert spare_share(free, 0.0) == spare_share(free, 1.0) == 0.1
 
 
 def test_every_camera_has_its_own_choice():
     H = np.diag([1e6] * 10)
     g = H @ [0, 0, 0, 0, 0, 0, 0, 0, 0.1, 0]
     both = Evidence(np.zeros((2, 5)), H, g, 1e6, CameraPriors(np.ones(2), np.full(2, np.nan)))
-    np.testing.assert_array_equal(both.best(np.zeros((2, 4), np.bool_)), np.vstack([NOTHING, freed(ASPECT)]))
+    np.testing.assert_array_equal(both.choose(np.zeros((2, 4), np.bool_)), np.vstack([NOTHING, freed(ASPECT)]))
 
 
 def test_k1_is_held_in_focal_lengths():

@@ -10,8 +10,8 @@ from sfm_app.selfcal.consensus.peak_evidence import (
     disagreement,
     effective_count,
     indecision,
-    own_sigma,
     resample_peak,
+    residual_sigma,
     spread_px,
     votes,
 )
@@ -75,14 +75,14 @@ def test_the_highest_peak_is_the_truth(consensus, focal):
 
 
 def test_own_sigma_follows_the_scatter_within_bounds(consensus):
-    sigmas = [own_sigma(consensus(noise=noise), truth()) for noise in (0.0, 5e-3, 0.2)]
+    sigmas = [residual_sigma(consensus(noise=noise), truth()) for noise in (0.0, 5e-3, 0.2)]
     assert sigmas[0] == 0.005
     assert 0.005 < sigmas[1] < 0.02
     assert sigmas[2] == 0.02
 
 
 def test_own_sigma_where_nothing_agrees(consensus):
-    assert own_sigma(consensus(), truth(0.01)) == 0.02
+    assert residual_sigma(consensus(), truth(0.01)) == 0.02
 
 
 def test_effective_count():
