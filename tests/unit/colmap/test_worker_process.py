@@ -16,12 +16,12 @@ pytestmark = pytest.mark.slow
 
 CHILD = """
 import os, signal, sys, time
-from sfm_app.colmap.processes.worker_process import Reported, report, served
+from sfm_app.colmap.processes.worker_process import ProgressReporter, report, serve
 
 def work(task):
     {work}
 
-served(work)
+serve(work)
 """
 
 
@@ -73,7 +73,9 @@ def test_progress_comes_through(child):
             self.append("end")
 
     seen = Seen()
-    module = child("bar = Reported(); bar.start('photos', 7); bar.advance(3); bar.finish(); report(a=1); report(b=2)")
+    module = child(
+        "bar = ProgressReporter(); bar.start('photos', 7); bar.advance(3); bar.finish(); report(a=1); report(b=2)"
+    )
 
     with start_worker(module, {}) as process:
         found = relay(process, seen)
@@ -106,8 +108,8 @@ def test_a_process_is_ended_with_the_block(child):
 
 def test_a_process_ends_when_the_one_that_started_it_is_killed(child):
     parent = (
-        "import sys; from sfm_app.colmap.processes.worker_process import started\n"
-        "with started(sys.argv[1], {}) as process:\n"
+        "import sys; from sfm_app.colmap.processes.worker_process import start_worker\n"
+        "with start_worker(sys.argv[1], {}) as process:\n"
         "    for message in process.messages(): print(message['me'], flush=True)"
     )
     command = [sys.executable, "-c", parent, child("report(me=os.getpid()); time.sleep(600)")]

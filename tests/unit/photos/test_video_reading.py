@@ -115,10 +115,9 @@ def test_a_file_without_its_index_is_damaged(tmp_path):
 def test_ffmpeg_is_silent(tmp_path):
     """In a process of its own: FFmpeg learns how much to say when it is first used."""
     paths = [write(tmp_path / name, code) for name, code in (("a.avi", "MJPG"), ("a.mkv", "MJPG"), ("a.mp4", "mp4v"))]
-    script = "import sys, pathlib, contextlib; from sfm_app.photos import opened, UnreadableError\n"
-    script += (
-        "for name in sys.argv[1:]:\n with contextlib.suppress(UnreadableError), opened(pathlib.Path(name)) as found:\n"
-    )
+    script = "import sys, pathlib, contextlib; from sfm_app.photos import open_video, UnreadableError\n"
+    script += "for name in sys.argv[1:]:\n"
+    script += " with contextlib.suppress(UnreadableError), open_video(pathlib.Path(name)) as found:\n"
     script += "  print(len(list(found.small_frames())))"
     for path in paths:
         cut(path)

@@ -118,7 +118,7 @@ def each_of(synthetic, cameras, focals):
 
 def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
     model, each, found = each_of(synthetic, cameras, [1000.0, 1300.0, 1010.0, 1310.0, 990.0, 1290.0])
-    monkeypatch.setattr(camera_per_photo, "cameras_of", lambda _: found)
+    monkeypatch.setattr(camera_per_photo, "cameras_by_photo", lambda _: found)
 
     two = with_two_cameras(model, each, synthetic.matches)
 
@@ -130,7 +130,7 @@ def test_photos_of_two_focals_get_two_cameras(synthetic, cameras, monkeypatch):
 
 def test_a_single_photo_of_another_focal_is_no_second_camera(synthetic, cameras, monkeypatch):
     model, each, found = each_of(synthetic, cameras, [1000.0, 1005.0, 1010.0, 1310.0, 990.0, 1001.0])
-    monkeypatch.setattr(camera_per_photo, "cameras_of", lambda _: found)
+    monkeypatch.setattr(camera_per_photo, "cameras_by_photo", lambda _: found)
 
     assert with_two_cameras(model, each, synthetic.matches) is None
 
@@ -169,7 +169,7 @@ def zoom(monkeypatch, synthetic):
                 }
             return [Attempt("incremental", model, explained, f"{len(names)} cameras")]
 
-        monkeypatch.setattr(module, "attempts", attempts)
+        monkeypatch.setattr(module, "map_group", attempts)
         monkeypatch.setattr(module, "map_baseline", lambda *_: NoModel("colmap", "no rival"))
         monkeypatch.setattr(module, "with_two_cameras", lambda *_: None)
         monkeypatch.setattr(module, "MOST_PASSES", 1)

@@ -50,7 +50,7 @@ def mapped(monkeypatch, synthetic):
             explained = explained_pairs(model, synthetic.matches, synthetic.views, 1.5)
             return [Attempt("incremental", model, explained, f"{model.num_reg_images()} photos")]
 
-        monkeypatch.setattr(module, "attempts", attempts)
+        monkeypatch.setattr(module, "map_group", attempts)
         monkeypatch.setattr(module, "map_baseline", lambda *_: NoModel("colmap", "no rival"))
         return seen
 
@@ -217,7 +217,7 @@ def test_a_rival_that_fails_costs_nothing(synthetic, run, cameras, mapped, monke
     def fail(*_):
         raise BackendError("COLMAP failed")
 
-    monkeypatch.setattr(baseline, "map_as_colmap_does", fail)
+    monkeypatch.setattr(baseline, "map_with_colmap_defaults", fail)
     monkeypatch.setattr(module, "map_baseline", baseline.map_baseline)
 
     found = outcome(synthetic, cameras(method="guess", identifiable=False), run())
@@ -316,7 +316,7 @@ def test_the_parts_of_a_cut_model_are_models_of_their_own_and_named(synthetic, r
     del cut[5, 6]
     attempts = module.map_group
     monkeypatch.setattr(
-        module, "attempts", lambda group, run: [replace(found, explained=cut) for found in attempts(group, run)]
+        module, "map_group", lambda group, run: [replace(found, explained=cut) for found in attempts(group, run)]
     )
 
     found = outcome(synthetic, cameras(), run())

@@ -76,8 +76,8 @@ def test_matches_that_disagree_about_the_place_join_nothing(synthetic, halves, r
 
 def test_models_that_mapping_left_apart_are_joined_in_the_end(synthetic, halves, run, cameras, monkeypatch):
     made = mapping_passes.Outcome(halves, _graph(synthetic), cameras(), ("half", "half"))
-    monkeypatch.setattr(mapping_passes, "_pass", lambda *_: made)
-    monkeypatch.setattr(mapping_passes, "with_rival", lambda outcome, *_: outcome)
+    monkeypatch.setattr(mapping_passes, "_run_pass", lambda *_: made)
+    monkeypatch.setattr(mapping_passes, "try_rival", lambda outcome, *_: outcome)
     monkeypatch.setattr(mapping_passes, "MOST_PASSES", 1)
 
     found = reconstruct(synthetic.matches, synthetic.views, cameras(), run())

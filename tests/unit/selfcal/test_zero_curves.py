@@ -225,5 +225,5 @@ def test_wrong_pairs_do_not_pull_a_camera_away_however_many_they_are(shots, monk
     scores = [abs((found.K - K)[place]) / found.spread[name] for place, name in (((0, 0), "fx"), ((1, 2), "cy"))]
     assert max(scores) < 3 and found.spread["fx"] < 15
     assert 0.95 < found.evidence["votes_kept"] < 1.05
-    monkeypatch.setattr(zero_curves, "KEPT", 0.0)
+    monkeypatch.setattr(zero_curves, "LEAST_KEPT_SHARE", 0.0)
     assert calibrate(pairs, OPTIONS, 0).evidence["votes_kept"] < 0.5  # what the adjustment to all of them comes to

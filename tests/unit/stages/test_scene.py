@@ -152,13 +152,13 @@ def test_cameras_that_mapping_divided_are_read_back(synthetic, run, mapped):
 
 @pytest.mark.parametrize(("end", "stays"), [(KeyboardInterrupt(), True), (ReconstructionError("no depth"), False)])
 def test_what_a_second_look_found_stays_when_it_is_interrupted(run, monkeypatch, end, stays):
-    def look_again(first):
+    def retry_lost_photos(first):
         (place / "found").mkdir()
         raise end
 
     place = run.workspace.root / MAPPING
     monkeypatch.setattr(scene, "reconstruct", lambda *_: None)
-    monkeypatch.setattr(scene, "look_again", look_again)
+    monkeypatch.setattr(scene, "retry_lost_photos", retry_lost_photos)
 
     with pytest.raises(type(end)):
         scene.make(None, None, None, run)

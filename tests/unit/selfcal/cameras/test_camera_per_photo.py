@@ -158,7 +158,7 @@ def test_a_claim_comes_before_the_family():
 def within_bars(made, groups):
     """Pictures of several shapes that bars have brought to one size."""
     pairs = made.as_set(groups)
-    return replace(pairs, brought_to=dict.fromkeys(pairs.sizes, (1000, 1000)))
+    return replace(pairs, padded_sizes=dict.fromkeys(pairs.sizes, (1000, 1000)))
 
 
 def test_pictures_of_one_shape_are_of_no_camera_where_all_others_are_of_their_own(shots):
@@ -183,7 +183,7 @@ def test_two_cameras_within_bars_are_two(shots):
 def test_pairs_move_with_the_corners_that_pixels_are_counted_from(shots):
     pairs = shots(4, 1).as_set(["one"] * 4)
     corners = {1: (30, 0), 3: (-12, 7)}
-    moved = pairs.moved(corners)
+    moved = pairs.with_origins(corners)
     for k, (first, second) in enumerate(pairs.photos):
         shift = np.array([*corners.get(first, (0, 0)), *corners.get(second, (0, 0))])
         assert moved.inliers[k] + shift == pytest.approx(pairs.inliers[k])
@@ -191,7 +191,7 @@ def test_pairs_move_with_the_corners_that_pixels_are_counted_from(shots):
             _residuals(F, x) for F, x in ((pairs.Fs[k], pairs.inliers[k]), (moved.Fs[k], moved.inliers[k]))
         )
         assert after == pytest.approx(before, abs=1e-9)
-    assert pairs.moved({}) is pairs
+    assert pairs.with_origins({}) is pairs
 
 
 def _residuals(F, x):

@@ -158,7 +158,7 @@ def test_cameras_that_cannot_be_compared_stay_what_they_are_alone(shots, monkeyp
     def failing(*_):
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr(photo_set, "calibrate_several", failing)
+    monkeypatch.setattr(photo_set, "calibrate_cameras", failing)
     made = shots(6, 1).as_set(["one"] * 5 + ["two"])
 
     found = {camera.name: camera.found for camera in cameras_of(made)}
