@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from sfm_app.errors import ConfigError
 from sfm_app.geometry.camera import camera_matrix
+from sfm_app.synthetic.lenses import Lens
 
 FloatArray = NDArray[np.float64]
-NEWTON_STEPS = 100
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,9 +22,13 @@ class Camera:
     """(3, 3) camera matrix in pixels, zero skew."""
     width: int
     height: int
-    radial: float = 0.0
-    """k1 of COLMAP's SIMPLE_RADIAL and OPENCV: x_d = x_u (1 + k1 r^2) about the optical center, with
-    x = (X/Z, Y/Z) and r = |x_u|, so r is in focal lengths; < 0: barrel."""
+    lens: Lens = Lens()  # noqa: RUF009 -- frozen
+    """Projection and distortion, on the plane whose unit is the focal length."""
+
+    @property
+    def radial(self) -> float:
+        """k1 of COLMAP's SIMPLE_RADIAL and OPENCV: x_d = x_u (1 + k1 r^2) about the optical center; < 0: barrel."""
+        return self.lens.k1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +120,7 @@ def make_camera(
         width, height: pixels, >= 16.
         focal_widths: fx as a share of the width, > 0.
         center: optical center as shares of width and height.
-        aspect, radial: fy / fx, > 0; k1 as in `Camera`.
+        aspect, radial: fy / fx, > 0; k1 of a perspective lens.
 
     Raises:
         ConfigError: a value is out of range.
@@ -124,7 +128,42 @@ def make_camera(
     if min(width, height) < 16 or not (0 < focal_widths < math.inf and 0 < aspect < math.inf):
         raise ConfigError("synthetic camera: size, focal_widths or aspect is out of range")
     fx = focal_widths * width
-    return Camera(camera_matrix(fx, fx * aspect, center[0] * width, center[1] * height), width, height, radial)
+    K = camera_matrix(fx, fx * aspect, center[0] * width, center[1] * height)
+    return Camera(K, width, height, Lens(radial=(radial,) if radial else ()))
+
+
+def make_wide_camera(
+    width: int, height: int, field_deg: float, lens: Lens, center: tuple[float, float] = (0.51, 0.495)
+) -> Camera:
+    """Return a camera with a given field of view along the longer side, measured from the middle of the photo.
+
+    Args:
+        width, height: pixels, >= 16.
+        field_deg: from one end of the longer side to the other, in degrees, (0, 360); below 180 with "perspective".
+        lens: projection and distortion.
+        center: optical center as shares of width and height.
+
+    Raises:
+        ConfigError: a value is out of range.
+    """
+    limit = 180.0 if lens.projection == "perspective" else 360.0
+    if min(width, height) < 16 or not 0 < field_deg < limit:
+        raise ConfigError("synthetic camera: size or field_deg is out of range")
+    half = math.radians(field_deg / 2.0)
+    reach = float(lens.project(np.array([[math.sin(half), 0.0, math.cos(half)]]))[0, 0])
+    focal = 0.5 * max(width, height) / reach
+    return Camera(camera_matrix(focal, focal, center[0] * width, center[1] * height), width, height, lens)
+
+
+def panorama_camera(width: int) -> Camera:
+    """Return the camera of an equirectangular photo: all round, twice as wide as high.
+
+    Args:
+        width: pixels, >= 32.
+    """
+    focal = width / (2.0 * math.pi)
+    K = camera_matrix(focal, focal, width / 2, width / 4)
+    return Camera(K, width, width // 2, Lens("equirectangular"))
 
 
 def arc(camera: Camera, options: ArcOptions | None = None, seed: int = 0) -> Views:
@@ -288,11 +327,11 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
     """Return viewing directions in the camera frame, row by row.
 
     Args:
-        camera: its lens distortion is undone exactly.
+        camera: its lens is undone exactly.
         offset_px: position of the ray in each pixel; (0.5, 0.5) is the center.
 
     Returns:
-        (height * width, 3), z = 1.
+        (height * width, 3), z = 1 with a perspective lens, else of length 1; NaN where the lens shows nothing.
 
     Raises:
         ConfigError: the radial distortion folds within the photo, so that a pixel has no unique ray.
@@ -300,23 +339,7 @@ def pixel_rays(camera: Camera, offset_px: tuple[float, float] = (0.5, 0.5)) -> F
     x, y = np.meshgrid(np.arange(camera.width) + offset_px[0], np.arange(camera.height) + offset_px[1])
     x = (x.ravel() - camera.K[0, 2]) / camera.K[0, 0]
     y = (y.ravel() - camera.K[1, 2]) / camera.K[1, 1]
-    stretch = _undistortion_factor(np.hypot(x, y), camera.radial)
-    return np.column_stack([x * stretch, y * stretch, np.ones(x.size)])
-
-
-def _undistortion_factor(distorted: FloatArray, k1: float) -> FloatArray:
-    """Return r / d where r (1 + k1 r^2) = d, on the branch through the center."""
-    # for k1 < 0 the left side rises up to r^2 = -1 / (3 k1), where it is 2 r / 3, and then falls
-    if k1 < 0 and distorted.max(initial=0.0) >= 2.0 / 3.0 / math.sqrt(-3.0 * k1):
-        raise ConfigError(f"synthetic camera: a radial distortion of {k1:g} folds within the photo")
-    r = distorted.copy()
-    # the cubic is convex or concave throughout, so Newton from d converges from one side and cannot overshoot
-    for _ in range(NEWTON_STEPS if k1 != 0 else 0):
-        step = (r * (1.0 + k1 * r * r) - distorted) / (1.0 + 3.0 * k1 * r * r)
-        r -= step
-        if np.all(np.abs(step) <= 2.0 * np.finfo(np.float64).eps * r):
-            break
-    return np.divide(r, distorted, out=np.ones_like(r), where=distorted > 0)
+    return camera.lens.rays(np.column_stack([x, y]))
 
 
 def _stratified_samples(limits: tuple[float, float], count: int, rng: np.random.Generator) -> FloatArray:

@@ -226,7 +226,7 @@ def _distances_to_truth(
 def _coarse_camera(camera: Camera) -> Camera:
     shrink = SEEN_RAYS / max(camera.width, camera.height)
     K = np.diag([shrink, shrink, 1.0]) @ camera.K
-    return Camera(K, round(camera.width * shrink), round(camera.height * shrink), camera.radial)
+    return Camera(K, round(camera.width * shrink), round(camera.height * shrink), camera.lens)
 
 
 def _triangle_areas(vertices: FloatArray, faces: IndexArray) -> FloatArray:

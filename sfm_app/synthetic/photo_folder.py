@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from PIL import Image
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.progress import Progress, SilentProgress, track
 from sfm_app.synthetic.cameras import Camera, Views, camera_center
+from sfm_app.synthetic.lenses import Lens
 from sfm_app.synthetic.render import GAMMA, prepare, render_scene
 from sfm_app.synthetic.scenes.bodies import SyntheticScene
 
@@ -148,21 +149,21 @@ def save_truth(truth: Truth, folder: Path) -> None:
     """
     images = []
     for name, pose in truth.cam_from_world.items():
-        width, height, K, radial = _camera_values(truth.cameras[name])
+        width, height, K, lens = _camera_values(truth.cameras[name])
         images.append(
             {
                 "file": name,
                 "width": width,
                 "height": height,
                 "K": K,
-                "radial": radial,
+                "lens": asdict(lens),
                 "R": pose[:, :3].tolist(),
                 "t": pose[:, 3].tolist(),
             }
         )
     text = {
         "convention": "x ~ K d(R X + t); world to camera; x right, y down, z forward; pixel centers at +0.5; "
-        "d(x) = x (1 + radial |x|^2) on x = (X/Z, Y/Z)",
+        "d: the lens, x on the plane whose unit is the focal length",
         "images": images,
     }
     try:
@@ -193,13 +194,16 @@ def load_truth(folder: Path) -> Truth:
         raise InputError(f"no truth in {folder}: {err}", hint="it holds truth.json and surface.ply") from err
 
 
-def _camera_values(camera: Camera) -> tuple[int, int, list[list[float]], float]:
-    return camera.width, camera.height, camera.K.tolist(), camera.radial
+def _camera_values(camera: Camera) -> tuple[int, int, list[list[float]], Lens]:
+    return camera.width, camera.height, camera.K.tolist(), camera.lens
 
 
 def _camera_from_dict(image: Mapping[str, Any]) -> Camera:
     K = np.array(image["K"], dtype=np.float64)
-    return Camera(K, int(image["width"]), int(image["height"]), float(image["radial"]))
+    terms = image["lens"]
+    p1, p2 = map(float, terms["tangential"])
+    lens = Lens(str(terms["projection"]), tuple(map(float, terms["radial"])), (p1, p2))
+    return Camera(K, int(image["width"]), int(image["height"]), lens)
 
 
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])

@@ -135,7 +135,7 @@ def comparison_image(photo: Colors, model: Model | PreparedModel, camera: Camera
         np.diag([SUPERSAMPLING, SUPERSAMPLING, 1.0]) @ camera.K,
         SUPERSAMPLING * size[0],
         SUPERSAMPLING * size[1],
-        camera.radial,
+        camera.lens,
     )
     aside = orbited_pose(cam_from_world, prepared.model.surface, SIDE_VIEW_DEG)
     views = [

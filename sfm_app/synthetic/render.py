@@ -77,16 +77,19 @@ def render_scene(
     offsets = (np.arange(supersampling) + 0.5) / supersampling
     for dy in offsets:
         for dx in offsets:
-            directions = pixel_rays(camera, (float(dx), float(dy))) @ R
+            rays = pixel_rays(camera, (float(dx), float(dy)))
+            shows = np.isfinite(rays[:, 0])
+            directions = np.where(shows[:, None], rays, [0.0, 0.0, 1.0]) @ R
             hits = cast_rays(scene.rays, center, directions)
             lit = _is_sunlit(scene, center, directions, hits)
-            # t_hit is the z depth, since the rays have z = 1; a pixel covers depth / f on the surface
+            # t_hit is the z depth where rays have z = 1, else the distance; a pixel covers t_hit / f on the surface
             pixel = np.where(np.isfinite(hits["t_hit"]), hits["t_hit"], 1.0) / camera.K[0, 0]
             shade(
                 (directions, hits["primitive_ids"], hits["primitive_uvs"], pixel, lit),
                 (scene.faces, scene.vertex_table, scene.face_material, scene.materials, scene.lights),
                 total,
             )
+    total[~shows] = 0.0  # outside of the image circle
     return (total / supersampling**2).reshape(camera.height, camera.width, 3)
 
 

@@ -26,6 +26,7 @@ from sfm_app.synthetic.cameras import (
     orbit,
     pixel_rays,
 )
+from sfm_app.synthetic.lenses import Lens
 from sfm_app.synthetic.photo_folder import PhotoOptions, Truth, develop
 from sfm_app.synthetic.render import PreparedScene, cast_rays, prepare, render_scene
 from sfm_app.synthetic.scenes.bodies import SyntheticScene
@@ -234,7 +235,7 @@ def with_distortion(camera: Camera, bend: float) -> Camera:
     """
     corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
     seen = (corners - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
-    return replace(camera, radial=bend / float((seen**2).sum(axis=1).max()))
+    return replace(camera, lens=Lens(radial=(bend / float((seen**2).sum(axis=1).max()),)))
 
 
 def with_zoom(camera: Camera, factor: float) -> Camera:
@@ -246,7 +247,7 @@ def with_zoom(camera: Camera, factor: float) -> Camera:
     """
     K = camera.K.copy()
     K[[0, 1], [0, 1]] *= factor
-    return replace(camera, K=K, radial=camera.radial * factor**2)
+    return replace(camera, K=K, lens=Lens(radial=(camera.radial * factor**2,)))
 
 
 def _draw_views(walk: str, place: str, camera: Camera, rng: Random) -> Views:

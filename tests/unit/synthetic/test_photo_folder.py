@@ -8,6 +8,7 @@ from PIL import Image
 
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.synthetic.cameras import Camera, Views, make_camera
+from sfm_app.synthetic.lenses import Lens
 from sfm_app.synthetic.photo_folder import PhotoOptions, develop, load_truth, save_truth, write_photo_folder
 
 pytestmark = pytest.mark.slow
@@ -54,7 +55,7 @@ def test_the_same_seed_gives_the_same_bytes(photos, still_life, four_views, tmp_
 
 def test_truth_survives_the_disk_and_pickling(photos, tmp_path):
     _, truth = photos
-    odd = Camera(np.array([[150.0, 0, 61.5], [0, 140.0, 38.25], [0, 0, 1]]), 124, 77, radial=-0.125)
+    odd = Camera(np.array([[150.0, 0, 61.5], [0, 140.0, 38.25], [0, 0, 1]]), 124, 77, lens=Lens(radial=(-0.125,)))
     truth = replace(truth, cameras=Views(truth.cameras, truth.cam_from_world).with_camera(odd, ["view_02.jpg"]).cameras)
     save_truth(truth, tmp_path / "truth")
     for copy in (load_truth(tmp_path / "truth"), pickle.loads(pickle.dumps(truth))):  # noqa: S301

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera
+from sfm_app.synthetic.lenses import Lens
 from sfm_app.synthetic.pictures import (
     comparison_image,
     orbited_pose,
@@ -61,7 +62,7 @@ def test_texels_are_mixed_between_their_centers_and_repeated_at_the_border():
 
 
 def test_the_lens_bends_the_picture():
-    wide = Camera(np.array([[20.0, 0, 20.0], [0, 20.0, 10.0], [0, 0, 1]]), 40, 20, radial=0.2)
+    wide = Camera(np.array([[20.0, 0, 20.0], [0, 20.0, 10.0], [0, 0, 1]]), 40, 20, Lens(radial=(0.2,)))
     far = square(vertices=SQUARE * [0.8, 0.5, 1.0])
     plain, bent = (render_model(Model(far), camera, STRAIGHT).covered[10].sum() for camera in (CAMERA, wide))
     # x = 0.8 (1 + 0.2 0.64) = 0.902, in pixels 18.05 instead of 16

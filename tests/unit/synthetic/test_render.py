@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_app.synthetic.cameras import Camera, camera_center, look_at, make_camera, pixel_rays
+from sfm_app.synthetic.lenses import Lens
 from sfm_app.synthetic.render import cast_rays, prepare, ray_caster, render_scene
 from sfm_app.synthetic.scenes.bodies import Body, SyntheticScene
 from sfm_app.synthetic.scenes.shapes import box
@@ -104,6 +105,6 @@ def test_rendering_repeats_to_the_bit(prepared, four_views):
 def test_distortion_moves_the_rim_but_not_the_center(prepared, four_views):
     pose = next(iter(four_views.cam_from_world.values()))
     plain = make_camera(120, 80, center=(0.5, 0.5))
-    barrel = Camera(plain.K, 120, 80, radial=-0.4)
+    barrel = Camera(plain.K, 120, 80, lens=Lens(radial=(-0.4,)))
     difference = np.abs(render_scene(prepared, plain, pose) - render_scene(prepared, barrel, pose)).mean(axis=2)
     assert difference[38:42, 58:62].mean() < 0.3 * difference[:, :10].mean()
