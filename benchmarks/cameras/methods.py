@@ -28,7 +28,7 @@ class Method:
     kind: str = OURS
     """`OURS`, or one of `STOCK`."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the program that differ from its defaults."""
+    """Settings of the program that differ from its defaults; of stock, the camera model if it is not the default."""
 
 
 def methods(also: Mapping[str, Mapping[str, Any]], *, ours_only: bool = False) -> list[Method]:
@@ -50,11 +50,12 @@ def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = Non
     """
     shutil.rmtree(out, ignore_errors=True)
     out.parent.mkdir(parents=True, exist_ok=True)
-    settings = merge_nested(
-        {"photos": {"cameras": photos.cameras if photos.cameras_given else "auto"}}, method.settings
-    )
+    ours = method.settings if method.kind == OURS else {}
+    settings = merge_nested({"photos": {"cameras": photos.cameras if photos.cameras_given else "auto"}}, ours)
     cap = MatchSettings(**settings.get("matching", {})).max_image_size_px
     options = {"settings": settings, "cameras": photos.cameras, "max_image_size_px": cap}
+    if method.kind in STOCK and "camera_model" in method.settings:
+        options["camera_model"] = method.settings["camera_model"]
     folder = photos.folder
     if method.kind in STOCK and photos.cameras != "each" and len(sizes := group_by_size(folder)) > 1:
         folder, options["cameras"] = split_into_folders(sizes, folder.with_name(f"{folder.name}-by-size")), "folder"

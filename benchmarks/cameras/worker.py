@@ -51,6 +51,8 @@ def run_stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) 
     pycolmap.set_random_seed(0)
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.max_image_size = options["max_image_size_px"]
+    reader = pycolmap.ImageReaderOptions()
+    reader.camera_model = options.get("camera_model") or reader.camera_model
     mode = getattr(pycolmap.CameraMode, MODES.get(options["cameras"], "SINGLE"))
     database, sparse, seconds = out / "database.db", out / "sparse", {}
     start = time.perf_counter()
@@ -59,7 +61,7 @@ def run_stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) 
         nonlocal start
         seconds[step], start = round(time.perf_counter() - start, 2), time.perf_counter()
 
-    pycolmap.extract_features(database, photos, camera_mode=mode, extraction_options=extraction)
+    pycolmap.extract_features(database, photos, camera_mode=mode, reader_options=reader, extraction_options=extraction)
     lap("features")
     pycolmap.match_exhaustive(database)
     lap("match_and_verify")

@@ -1,0 +1,1 @@
+"""Photos through wide-angle and fisheye lenses."""

@@ -1,0 +1,158 @@
+"""Photos through wide-angle and fisheye lenses: cameras before and after bundle adjustment, beside stock pycolmap.
+
+    python -m benchmarks.lenses --cache CACHE
+    python -m benchmarks.lenses --cache CACHE --scenes courtyard --projections equidistant --fields 90 120
+
+Rendered folders without EXIF. Stock runs with its default camera model and with COLMAP's model for such lenses. What
+has been run stays in CACHE, and is taken as it is with --keep.
+"""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.cameras.methods import Method, run
+from benchmarks.cameras.score import TruePhoto, accuracy, read_models
+from benchmarks.cameras.worker import INCREMENTAL, OURS, RESULT
+from benchmarks.common.command_line import new_parser
+from benchmarks.common.photo_sets import PhotoSet
+from benchmarks.common.results import RESULTS, Row, document, table, write
+from benchmarks.lenses.folders import FIELDS_DEG, PROJECTIONS, SCENES, Folder, render_folder
+from benchmarks.lenses.radius import projection_of, radius_error_percent
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.database import read_features
+from sfm_app.synthetic.photo_folder import Truth
+from sfm_app.types import Intrinsics
+
+ABOUT = (
+    "Rendered folders of 12 photos of 960 x 640 without EXIF, field of view along the longer side. Stock is pycolmap's "
+    "incremental mapper with one camera for all photos, which it is told: by default (SIMPLE_RADIAL), and with "
+    "OPENCV_FISHEYE, which it is told, too. radius %: the largest error of the radius of a point about the optical "
+    "center, in percent of the photo's width, over the part of the photo where 95 % of the keypoints lie: before and "
+    "after bundle adjustment; 100 where a lens cannot show a point at all. K known: what is said of K before."
+)
+FISHEYE = "OPENCV_FISHEYE"
+METHODS = (
+    Method(OURS),
+    Method(INCREMENTAL, INCREMENTAL),
+    Method(f"{INCREMENTAL}, {FISHEYE}", INCREMENTAL, {"camera_model": FISHEYE}),
+)
+COLUMNS = (
+    "scene", "projection", "field deg", "method", "placed", "AUC@1", "AUC@5", "radius % before", "radius % after",
+    "K known", "seconds",
+)  # fmt: skip
+FEATURES_SHARE = 0.95
+
+
+def score_run(out: Path, truth: Truth, reach_px: float) -> Row:
+    """Score what a method has left in OUT."""
+    photos = {
+        Path(name).stem: TruePhoto(camera.K, truth.cam_from_world[name], camera.width)
+        for name, camera in truth.cameras.items()
+    }
+    models = read_models(out)
+    found = accuracy(models, photos, len(photos))
+    before, known = initial_radius(out, truth, reach_px)
+    return {
+        "placed": f"{found['registered']}/{found['of']}",
+        "AUC@1": found["AUC@1"],
+        "AUC@5": found["AUC@5"],
+        "radius % before": before,
+        "radius % after": refined_radius(out, truth, reach_px),
+        "K known": known,
+    }
+
+
+def initial_radius(out: Path, truth: Truth, reach_px: float) -> tuple[float | None, str]:
+    """Return the worst error of the cameras before bundle adjustment, and what is said of them."""
+    path = out / "calibration.json"
+    if not path.exists():
+        return None, ""
+    intrinsics = Intrinsics.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    errors = [
+        radius_error_percent(truth.camera, projection_of(camera), camera.K[:2, 2], reach_px)
+        for camera in intrinsics.cameras.values()
+    ]
+    known = sorted({"yes" if camera.identifiable else camera.method for camera in intrinsics.cameras.values()})
+    return round(max(errors), 3), ", ".join(known)
+
+
+def refined_radius(out: Path, truth: Truth, reach_px: float) -> float | None:
+    """Return the worst error of the cameras of the first model; None without a model."""
+    folders = sorted(path.parent for path in out.rglob("cameras.bin") if not path.parent.name.startswith("."))
+    if not folders:
+        return None
+    first = min(folders, key=lambda folder: (folder != out / "sparse", -len(pycolmap.Reconstruction(folder).images)))
+    errors = []
+    for camera in pycolmap.Reconstruction(first).cameras.values():
+        found = camera
+
+        def project(rays: np.ndarray) -> np.ndarray:
+            return np.asarray(found.img_from_cam(rays, False), np.float64)  # noqa: B023 -- called before the next one
+
+        center = np.asarray(camera.calibration_matrix(), np.float64)[:2, 2]
+        errors.append(radius_error_percent(truth.camera, project, center, reach_px))
+    return round(max(errors), 3)
+
+
+def reach_of_features(database: Path, truth: Truth) -> float:
+    """Return the radius about the true center within which most keypoints lie, in pixels."""
+    keypoints = np.concatenate(list(read_features(database)[0].values()))
+    radius = np.hypot(keypoints[:, 0] - truth.K[0, 2], keypoints[:, 1] - truth.K[1, 2])
+    return float(np.quantile(radius, FEATURES_SHARE))
+
+
+def run_folder(folder: Folder, args: argparse.Namespace) -> Iterator[Row]:
+    """Yield one row for each method."""
+    photos, truth = render_folder(folder, args.cache)
+    outs = {method.name: args.cache / "runs" / folder.name / method.name.replace(", ", "-") for method in METHODS}
+    seconds: dict[str, float | None] = {}
+    for method in METHODS:
+        done = outs[method.name] / RESULT
+        if not (args.keep and done.exists()):
+            run(method, PhotoSet(folder.name, photos, {}, cameras="auto"), outs[method.name])
+        said = json.loads(done.read_text(encoding="utf-8")) if done.exists() else {"seconds": {}}
+        seconds[method.name] = round(sum(said["seconds"].values()), 1) or None
+    reach = reach_of_features(outs[INCREMENTAL] / "database.db", truth)
+    for method in METHODS:
+        yield {
+            "method": method.name, "scene": folder.scene, "projection": folder.projection,
+            "field deg": folder.field_deg, **score_run(outs[method.name], truth, reach),
+            "seconds": seconds[method.name],
+        }  # fmt: skip
+
+
+def page(rows: Sequence[Mapping[str, object]]) -> str:
+    """The table."""
+    return f"# Lenses\n\n{ABOUT}\n\n{table([dict(row) for row in rows], COLUMNS)}"
+
+
+def parser() -> argparse.ArgumentParser:
+    """Give the command line."""
+    parser = new_parser("lenses", __doc__)
+    parser.add_argument("--cache", type=Path, required=True, help="keeps rendered photos and runs")
+    parser.add_argument("--scenes", nargs="+", default=list(SCENES))
+    parser.add_argument("--projections", nargs="+", default=list(PROJECTIONS), choices=PROJECTIONS)
+    parser.add_argument("--fields", nargs="+", type=float, default=list(FIELDS_DEG), metavar="DEG")
+    parser.add_argument("--keep", action="store_true", help="do not run again what was run")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+    return parser
+
+
+def main() -> None:
+    """Run all folders, and publish after each."""
+    args = parser().parse_args()
+    rows: list[Row] = []
+    for scene in args.scenes:
+        for projection in args.projections:
+            for field_deg in args.fields:
+                for row in run_folder(Folder(scene, projection, field_deg), args):
+                    rows.append(row)
+                    print(json.dumps(row), file=sys.stderr, flush=True)
+                options = {"scenes": args.scenes, "projections": args.projections, "fields": args.fields}
+                write(args.results, "lenses", document("lenses", ABOUT, options, {}, rows), page(rows))
+    print(page(rows))
