@@ -28,7 +28,7 @@ class Method:
     kind: str = OURS
     """`OURS`, or one of `STOCK`."""
     settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of the program that differ from its defaults; of stock, the camera model if it is not the default."""
+    """Settings of the program that differ from its defaults; of stock, camera_model and camera_params if it is told."""
 
 
 def methods(also: Mapping[str, Mapping[str, Any]], *, ours_only: bool = False) -> list[Method]:
@@ -54,8 +54,8 @@ def run(method: Method, photos: PhotoSet, out: Path, limit_s: float | None = Non
     settings = merge_nested({"photos": {"cameras": photos.cameras if photos.cameras_given else "auto"}}, ours)
     cap = MatchSettings(**settings.get("matching", {})).max_image_size_px
     options = {"settings": settings, "cameras": photos.cameras, "max_image_size_px": cap}
-    if method.kind in STOCK and "camera_model" in method.settings:
-        options["camera_model"] = method.settings["camera_model"]
+    if method.kind in STOCK:
+        options |= method.settings
     folder = photos.folder
     if method.kind in STOCK and photos.cameras != "each" and len(sizes := group_by_size(folder)) > 1:
         folder, options["cameras"] = split_into_folders(sizes, folder.with_name(f"{folder.name}-by-size")), "folder"

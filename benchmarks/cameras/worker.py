@@ -53,6 +53,7 @@ def run_stock(photos: Path, out: Path, options: Mapping[str, Any], mapper: str) 
     extraction.max_image_size = options["max_image_size_px"]
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = options.get("camera_model") or reader.camera_model
+    reader.camera_params = options.get("camera_params") or reader.camera_params
     mode = getattr(pycolmap.CameraMode, MODES.get(options["cameras"], "SINGLE"))
     database, sparse, seconds = out / "database.db", out / "sparse", {}
     start = time.perf_counter()
