@@ -1,0 +1,82 @@
+"""Fisheye lenses of one exponent: from points of a photo to directions, also behind the camera.
+
+Ours; the projections are the textbook's. A ray at the angle theta to the optical axis comes to lie at the radius, in
+focal lengths,
+
+    r = tan(e theta) / e  (e > 0),      theta  (e = 0),      sin(-e theta) / -e  (e < 0).
+
+e = 1 is a perspective lens, 1/2 stereographic, 0 equidistant, -1/2 equisolid, -1 orthographic. All have the same scale
+about the center, the focal length.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+PERSPECTIVE, STEREOGRAPHIC, EQUIDISTANT, EQUISOLID = 1.0, 0.5, 0.0, -0.5
+"""Exponents, by definition of the family."""
+EQUIDISTANT_BELOW = 1e-6
+"""Exponents nearer to 0 are taken as 0: the series agree to double precision."""
+STEP = 1e-5
+"""Step of the derivatives by finite differences, in longer sides: curvature and rounding in double precision cost about
+1e-10 of them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fisheye:
+    """A lens with one focal, in any unit of length."""
+
+    focal: float
+    exponent: float
+    center: tuple[float, float] = (0.0, 0.0)
+
+    def radius(self, theta: FloatArray) -> FloatArray:
+        """Return the radius about the center of rays at angles `theta` (N,), in radians, to the optical axis."""
+        e = self.exponent
+        if abs(e) < EQUIDISTANT_BELOW:
+            return np.asarray(self.focal * theta, np.float64)
+        return np.asarray(self.focal * (np.tan(e * theta) / e if e > 0 else np.sin(-e * theta) / -e), np.float64)
+
+    def angle(self, radius: FloatArray) -> FloatArray:
+        """Return the angle to the optical axis, in radians; points beyond the image circle lie on it."""
+        r, e = np.asarray(radius) / self.focal, self.exponent
+        if abs(e) < EQUIDISTANT_BELOW:
+            return np.asarray(np.minimum(r, np.pi), np.float64)
+        angle = np.arctan(e * r) / e if e > 0 else np.arcsin(np.minimum(-e * r, 1.0)) / -e
+        return np.asarray(np.minimum(angle, np.pi), np.float64)
+
+    def rays(self, points: FloatArray) -> FloatArray:
+        """Return (N, 3) directions of length 1 of points (N, 2)."""
+        about = points - np.array(self.center)
+        radius = np.hypot(about[:, 0], about[:, 1])
+        theta = self.angle(radius)
+        along = np.divide(np.sin(theta), radius, out=np.full_like(radius, 1.0 / self.focal), where=radius > 0.0)
+        return np.column_stack([about * along[:, None], np.cos(theta)])
+
+    def project(self, rays: FloatArray) -> FloatArray:
+        """Return (N, 2) points of rays (N, 3) of any length."""
+        side = np.hypot(rays[:, 0], rays[:, 1])
+        radius = self.radius(np.arctan2(side, rays[:, 2]))
+        return rays[:, :2] * np.divide(radius, side, out=np.zeros_like(side), where=side > 0.0)[:, None] + self.center
+
+    def field_deg(self, width: float) -> float:
+        """Return the angle between the rays to both ends of a width about the center, in degrees.
+
+        Args:
+            width: in the units of the focal.
+        """
+        return float(2.0 * np.degrees(self.angle(np.array([0.5 * width]))[0]))
+
+
+def rays_and_slopes(lens: Fisheye, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return rays (N, 3) and their derivatives by x and y of the points.
+
+    Args:
+        lens: in longer sides of the photo.
+        points: (N, 2) in the same unit.
+    """
+    rays = lens.rays(points)
+    return rays, (lens.rays(points + [STEP, 0.0]) - rays) / STEP, (lens.rays(points + [0.0, STEP]) - rays) / STEP
