@@ -6,7 +6,7 @@ Each run is a process of its own and imports only what the method needs, so that
 import json
 import sys
 import time
-import zlib  # before pycolmap, see CONTRIBUTING.md
+import zlib  # before pycolmap, see docs/libraries/pycolmap.md
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any

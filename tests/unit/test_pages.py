@@ -1,5 +1,6 @@
-"""What the pages say of flags, settings, exit codes and layers is what the code has."""
+"""What the pages say of flags, settings, exit codes, layers and modules is what the code has."""
 
+import pkgutil
 import re
 import tomllib
 from pathlib import Path
@@ -13,7 +14,8 @@ from sfm_app.errors import SfmError
 from sfm_app.settings import QUALITY_PRESETS, Settings
 
 ROOT = Path(__file__).parents[2]
-PAGES = ["README.md", "docs/algorithms.md", "docs/architecture.md", "docs/plugins.md"]
+LIBRARIES = [path.relative_to(ROOT).as_posix() for path in sorted((ROOT / "docs" / "libraries").glob("*.md"))]
+PAGES = ["README.md", "docs/algorithms.md", "docs/architecture.md", "docs/plugins.md", *LIBRARIES]
 NOT_OURS = {"--left-out", "--sets", "--without"}
 """Flags of benchmarks."""
 
@@ -73,3 +75,28 @@ def test_layers_are_those_that_import_linter_checks():
     printed = re.search(r"Imports go down only;[^\n]*\n\n```\n(.*?)```", read("docs/architecture.md"), re.DOTALL)
     assert printed is not None
     assert printed[1].split("\n")[:-1] == layers
+
+
+def test_every_page_of_a_library_is_in_their_table():
+    table = read("docs/libraries/README.md")
+    rows = re.findall(r"^\| \[([a-z0-9-]+\.md)\]\(([a-z0-9-]+\.md)\) \|", table, re.MULTILINE)
+    assert all(name == target for name, target in rows)
+    pages = {page.removeprefix("docs/libraries/") for page in LIBRARIES} - {"README.md"}
+    assert len(pages) > 1
+    assert sorted(name for name, _ in rows) == sorted(pages)
+
+
+def modules_named_on(page):
+    """What stands in code as `package/module.py`, `package/module.function` or `package.module.function`."""
+    packages = "|".join(sorted(path.parent.name for path in (ROOT / "sfm_app").glob("*/__init__.py")))
+    return re.findall(rf"`((?:{packages})(?:(?:/\w+)+(?:\.\w+)?|\.\w+\.\w+))`", read(page))
+
+
+@pytest.mark.parametrize("page", ["CONTRIBUTING.md", *LIBRARIES])
+def test_modules_that_are_named_exist(page):
+    for name in modules_named_on(page):
+        pkgutil.resolve_name(f"sfm_app.{name.removesuffix('.py').replace('/', '.')}")
+
+
+def test_pages_of_libraries_name_modules():
+    assert sum(len(modules_named_on(page)) for page in LIBRARIES) > 5
