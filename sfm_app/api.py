@@ -19,6 +19,7 @@ from sfm_app.ransac import check_points
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor, worker_count
 from sfm_app.runtime.workspace import Workspace
+from sfm_app.selfcal.wide_angle.lens_search import LensEstimate, find_lens
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, CameraPairs, EpipolarFit, Intrinsics, Rejected, Scene
 
@@ -200,6 +201,30 @@ def calibrate_fundamentals(
     found = [np.asarray(pair, np.float64) for pair in matches]
     pairs = replace(CameraPairs.from_Fs(Fs, size, weights), photos=tuple(photos), inliers=tuple(found))
     return load_plugins().calibrator(method).calibrate(pairs, (settings or Settings()).calibration, seed)
+
+
+def estimate_lens(matches: Sequence[ArrayLike], size: tuple[int, int], seed: int = 0) -> LensEstimate | None:
+    """Find the focal, projection and center of wide-angle and fisheye photos from the raw matches of their pairs.
+
+    It knows perspective, stereographic, equidistant and equisolid lenses and all between, with fields of view up to
+    more than 180 degrees. `is_fisheye` says whether any of them explains more than a perspective lens.
+
+    Args:
+        matches: per pair of photos (N, 4) x1, y1, x2, y2 in pixels; half of them may be wrong. At most 16 pairs with 60
+            matches or more are used.
+        size: (width, height) of all photos in pixels.
+        seed: same seed, same result.
+
+    Returns:
+        The lens in pixels with its covariance; None where fewer than three pairs agree on one.
+
+    Raises:
+        ValueError: shapes are wrong or values are not finite.
+    """
+    found = [np.asarray(pair, np.float64) for pair in matches]
+    if any(pair.ndim != 2 or pair.shape[1] != 4 or not np.isfinite(pair).all() for pair in found) or min(size) < 1:
+        raise ValueError("matches must be finite arrays of shape (N, 4), and size positive")
+    return find_lens(found, size, seed)
 
 
 @contextmanager

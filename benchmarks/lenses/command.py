@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.cameras.methods import Method, run
+from benchmarks.cameras.methods import Method
+from benchmarks.cameras.methods import run as run_method
 from benchmarks.cameras.score import TruePhoto, accuracy, read_models
 from benchmarks.cameras.worker import INCREMENTAL, OURS, RESULT
 from benchmarks.common.command_line import new_parser
@@ -23,8 +24,12 @@ from benchmarks.common.photo_sets import PhotoSet
 from benchmarks.common.results import RESULTS, Row, document, table, write
 from benchmarks.lenses.folders import FIELDS_DEG, PROJECTIONS, SCENES, Folder, render_folder
 from benchmarks.lenses.radius import projection_of, radius_error_percent
+from sfm_app import estimate_lens
+from sfm_app.api import open_run
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import read_features
+from sfm_app.pipeline import MATCH_GRAPH, run_stages
+from sfm_app.settings import Settings
 from sfm_app.synthetic.photo_folder import Truth
 from sfm_app.types import Intrinsics
 
@@ -34,12 +39,13 @@ ABOUT = (
     "model OPENCV_FISHEYE with the true focal and center (told only the model it places no photo). radius %: the "
     "largest error of the radius of a point about the optical center, in percent of the photo's width, over the part "
     "of the photo where 95 % of the keypoints lie: before and after bundle adjustment; 100 where a lens cannot show a "
-    "point at all. K known: what is said of K before."
+    "point at all. K known: what is said of K before. radius % of lens: the same of `sfm_app.estimate_lens`, from raw "
+    "matches alone, in sd: the largest error in stated deviations; fisheye: its verdict."
 )
 FISHEYE = "OPENCV_FISHEYE"
 COLUMNS = (
     "scene", "projection", "field deg", "method", "placed", "AUC@1", "AUC@5", "radius % before", "radius % after",
-    "K known", "seconds",
+    "K known", "radius % of lens", "in sd", "fisheye", "seconds",
 )  # fmt: skip
 FEATURES_SHARE = 0.95
 
@@ -95,6 +101,27 @@ def refined_radius(out: Path, truth: Truth, reach_px: float) -> float | None:
     return round(max(errors), 3)
 
 
+def lens_row(database: Path, truth: Truth, reach_px: float) -> Row:
+    """Score the lens that the raw matches of a database give."""
+    keypoints, matches = read_features(database)
+    rows = [
+        np.hstack([keypoints[a][pair[:, 0]], keypoints[b][pair[:, 1]]])
+        for (a, b), pair in sorted(matches.items())
+        if len(pair)
+    ]
+    true = truth.camera
+    found = estimate_lens(rows, (true.width, true.height))
+    if found is None:
+        return {"radius % of lens": None, "in sd": None, "fisheye": "none"}
+    error = radius_error_percent(true, found.lens.project, np.array(found.lens.center), reach_px)
+    radius = np.linspace(1.0, reach_px, 50)
+    rays = true.lens.rays(np.column_stack([radius / true.K[0, 0], np.zeros(len(radius))]))
+    theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+    away = np.abs(found.lens.radius(theta) - radius) / found.radius_deviation_px(theta)
+    verdict = "yes" if found.is_fisheye else "no"
+    return {"radius % of lens": round(error, 4), "in sd": round(float(away.max()), 2), "fisheye": verdict}
+
+
 def reach_of_features(database: Path, truth: Truth) -> float:
     """Return the radius about the true center within which most keypoints lie, in pixels."""
     keypoints = np.concatenate(list(read_features(database)[0].values()))
@@ -109,8 +136,23 @@ def methods_for(truth: Truth) -> list[Method]:
     return [Method(OURS), Method(INCREMENTAL, INCREMENTAL), Method(f"{INCREMENTAL}, told the lens", INCREMENTAL, lens)]
 
 
+def lens_alone(folder: Folder, args: argparse.Namespace) -> Row:
+    """Match the photos, and score the lens that their matches give."""
+    photos, truth = render_folder(folder, args.cache)
+    out = args.cache / "matches" / folder.name
+    with open_run(out, Settings(), None) as run:
+        run_stages(photos, run, last=MATCH_GRAPH.name)
+    row = lens_row(out / "database.db", truth, reach_of_features(out / "database.db", truth))
+    return {
+        "method": OURS, "scene": folder.scene, "projection": folder.projection, "field deg": folder.field_deg, **row
+    }  # fmt: skip
+
+
 def run_folder(folder: Folder, args: argparse.Namespace) -> Iterator[Row]:
     """Yield one row for each method."""
+    if args.lens_only:
+        yield lens_alone(folder, args)
+        return
     photos, truth = render_folder(folder, args.cache)
     methods = methods_for(truth)
     outs = {method.name: args.cache / "runs" / folder.name / method.name.replace(", ", "-") for method in methods}
@@ -118,7 +160,7 @@ def run_folder(folder: Folder, args: argparse.Namespace) -> Iterator[Row]:
     for method in methods:
         done = outs[method.name] / RESULT
         if not (args.keep and done.exists()):
-            run(method, PhotoSet(folder.name, photos, {}, cameras="auto"), outs[method.name])
+            run_method(method, PhotoSet(folder.name, photos, {}, cameras="auto"), outs[method.name])
         said = json.loads(done.read_text(encoding="utf-8")) if done.exists() else {"seconds": {}}
         seconds[method.name] = round(sum(said["seconds"].values()), 1) or None
     reach = reach_of_features(outs[INCREMENTAL] / "database.db", truth)
@@ -126,6 +168,7 @@ def run_folder(folder: Folder, args: argparse.Namespace) -> Iterator[Row]:
         yield {
             "method": method.name, "scene": folder.scene, "projection": folder.projection,
             "field deg": folder.field_deg, **score_run(outs[method.name], truth, reach),
+            **(lens_row(outs[OURS] / "database.db", truth, reach) if method.name == OURS else {}),
             "seconds": seconds[method.name],
         }  # fmt: skip
 
@@ -142,6 +185,8 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES))
     parser.add_argument("--projections", nargs="+", default=list(PROJECTIONS), choices=PROJECTIONS)
     parser.add_argument("--fields", nargs="+", type=float, default=list(FIELDS_DEG), metavar="DEG")
+    parser.add_argument("--lens-only", action="store_true", help="only match, and find the lens")
+    parser.add_argument("--name", default="lenses", help="name of the result files")
     parser.add_argument("--keep", action="store_true", help="do not run again what was run")
     parser.add_argument("--results", type=Path, default=RESULTS)
     return parser
@@ -158,5 +203,5 @@ def main() -> None:
                     rows.append(row)
                     print(json.dumps(row), file=sys.stderr, flush=True)
                 options = {"scenes": args.scenes, "projections": args.projections, "fields": args.fields}
-                write(args.results, "lenses", document("lenses", ABOUT, options, {}, rows), page(rows))
+                write(args.results, args.name, document("lenses", ABOUT, options, {}, rows), page(rows))
     print(page(rows))

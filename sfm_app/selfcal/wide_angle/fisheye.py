@@ -78,5 +78,5 @@ def rays_and_slopes(lens: Fisheye, points: FloatArray) -> tuple[FloatArray, Floa
         lens: in longer sides of the photo.
         points: (N, 2) in the same unit.
     """
-    rays = lens.rays(points)
-    return rays, (lens.rays(points + [STEP, 0.0]) - rays) / STEP, (lens.rays(points + [0.0, STEP]) - rays) / STEP
+    rays, right, down = lens.rays(points), np.array([STEP, 0.0]), np.array([0.0, STEP])
+    return rays, (lens.rays(points + right) - rays) / STEP, (lens.rays(points + down) - rays) / STEP

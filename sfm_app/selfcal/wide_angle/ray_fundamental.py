@@ -59,6 +59,22 @@ def squared_distances(Fs: FloatArray, pair: RayPair) -> FloatArray:
     return np.asarray(algebraic**2 / (slopes + LEAST), np.float64)
 
 
+def signed_distances(E: FloatArray, pair: RayPair) -> FloatArray:
+    """Return (N,) signed Sampson distances of one matrix, in the unit of the photos.
+
+    Args:
+        E: (3, 3) essential or fundamental matrix of rays.
+        pair: N matches.
+    """
+    (p, p_x, p_y), (q, q_x, q_y) = pair
+    line2, line1 = p @ E.T, q @ E
+    slopes = sum(
+        np.einsum("ni,ni->n", slope, line) ** 2
+        for slope, line in ((q_x, line2), (q_y, line2), (p_x, line1), (p_y, line1))
+    )
+    return np.asarray(np.einsum("ni,ni->n", q, line2) / np.sqrt(slopes + LEAST), np.float64)
+
+
 def fit_rays(p: FloatArray, q: FloatArray, weights: FloatArray | None = None) -> FloatArray:
     """Return (..., 3, 3) of rank two with the least weighted sum of (q' F p)^2.
 

@@ -1,0 +1,112 @@
+"""The lens of wide photos is found from their matches alone, with a deviation that covers the truth."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import sfm_app
+from sfm_app.selfcal.wide_angle.fisheye import Fisheye
+from sfm_app.selfcal.wide_angle.lens_search import find_lens
+from sfm_app.selfcal.wide_angle.ray_fundamental import make_ray_pair, search_rays, signed_distances, squared_distances
+
+pytestmark = pytest.mark.slow
+
+SIZE = (960, 640)
+CENTER = (491.0, 313.0)
+
+
+def photos_through(lens, seed=0, *, photos=6, points=700, noise_px=0.5, wrong=0.3):
+    """Raw matches of all pairs of photos taken inside a cloud of points, some of them wrong."""
+    rng = np.random.default_rng(seed)
+    X = rng.normal(size=(points, 3)) * [4.0, 2.0, 3.0] + [0.0, 0.0, 3.0]
+    seen = []
+    for k in range(photos):
+        R = Rotation.from_euler("xyz", rng.normal(0.0, 0.25, 3)).as_matrix()
+        C = np.array([1.2 * (k - photos / 2) / photos, rng.normal(0.0, 0.3), rng.normal(0.0, 0.4)]) * 1.5
+        rays = (X - C) @ R.T
+        x = lens.project(rays) + rng.normal(0.0, noise_px, (points, 2))
+        deep = np.linalg.norm(rays, axis=1) > 0.3
+        theta = np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2])
+        limit = lens.angle(np.array([0.5 * np.hypot(*SIZE)]))[0]
+        seen.append((x, deep & (theta < limit) & (x > 0).all(axis=1) & (x < SIZE).all(axis=1)))
+    found = []
+    for (x1, ok1), (x2, ok2) in combinations(seen, 2):
+        both = np.flatnonzero(ok1 & ok2)
+        matches = np.hstack([x1[both], x2[both]])
+        bad = rng.random(len(both)) < wrong
+        matches[bad, 2:] = rng.uniform(0, SIZE, (int(bad.sum()), 2))
+        found.append(matches)
+    return found
+
+
+def lens_of(field_deg, exponent):
+    return Fisheye(480.0 / float(Fisheye(1.0, exponent).radius(np.radians(field_deg / 2))), exponent, CENTER)
+
+
+@pytest.mark.parametrize(
+    ("field_deg", "exponent"), [(90.0, 0.0), (120.0, -0.5), (150.0, 0.5), (175.0, 0.0), (140.0, 0.25)]
+)
+def test_the_lens_is_found(field_deg, exponent):
+    true = lens_of(field_deg, exponent)
+
+    found = find_lens(photos_through(true), SIZE)
+
+    assert found is not None and found.is_fisheye
+    theta = np.linspace(0.05, np.radians(field_deg / 2), 30)
+    errors = np.abs(found.lens.radius(theta) - true.radius(theta))
+    assert errors.max() / SIZE[0] < 0.003
+    assert 0 < (errors / found.radius_deviation_px(theta)).max() < 4
+    deviations = np.sqrt(np.diag(np.array(found.covariance))[2:])
+    assert np.all(np.abs(np.array(found.lens.center) - CENTER) < 4 * deviations)
+    assert np.all(deviations < 5)
+    assert found.lens.field_deg(SIZE[0]) == pytest.approx(field_deg, abs=1.0)
+
+
+def test_a_perspective_lens_is_none():
+    found = find_lens(photos_through(Fisheye(800.0, 1.0, CENTER)), SIZE)
+    assert found is not None and not found.is_fisheye
+    assert found.perspective_support > found.support - 0.01
+
+
+def test_the_same_seed_gives_the_same_lens():
+    matches = photos_through(lens_of(120.0, 0.0), photos=4)
+    first, second, other = (find_lens(matches, SIZE, seed) for seed in (0, 0, 1))
+    assert first == second
+    assert other is not None and other.lens.focal == pytest.approx(first.lens.focal, rel=0.02)
+
+
+@pytest.mark.parametrize("matches", [[], [np.zeros((3, 4))], [np.full((200, 4), 300.0)] * 2])
+def test_too_few_pairs_give_no_lens(matches):
+    assert find_lens(matches, SIZE) is None
+
+
+@pytest.mark.parametrize("kind", ["noise", "one point", "same photo"])
+def test_hostile_matches_give_an_answer_or_none(kind):
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0, SIZE[1], (5, 300, 2))
+    given = {
+        "noise": [np.hstack([a, rng.uniform(0, SIZE[1], (300, 2))]) for a in x],
+        "one point": [np.full((300, 4), 200.0)] * 5,
+        "same photo": [np.hstack([a, a]) for a in x],
+    }
+    found = find_lens(given[kind], SIZE)
+    assert found is None or np.isfinite(found.lens.focal)
+
+
+def test_the_two_distances_agree():
+    lens = lens_of(150.0, 0.0)
+    matches = photos_through(lens, noise_px=0.0, wrong=0.0)[0]
+    pair = make_ray_pair(lens, matches)
+    support, F = search_rays(pair, np.random.default_rng(0).integers(0, len(matches), (50, 8)), 2.0)
+    assert support == pytest.approx(len(matches), rel=0.02)
+    signed = signed_distances(F, pair)
+    np.testing.assert_allclose(signed**2, squared_distances(F[None], pair)[0], atol=1e-12)
+    assert np.median(np.abs(signed)) < 1e-3
+
+
+@pytest.mark.parametrize("matches", [[np.zeros((5, 3))], [np.full((5, 4), np.nan)]])
+def test_bad_input_is_refused(matches):
+    with pytest.raises(ValueError, match="finite arrays of shape"):
+        sfm_app.estimate_lens(matches, SIZE)
