@@ -174,8 +174,9 @@ def run_folder(folder: Folder, args: argparse.Namespace) -> Iterator[Row]:
 
 
 def page(rows: Sequence[Mapping[str, object]]) -> str:
-    """The table."""
-    return f"# Lenses\n\n{ABOUT}\n\n{table([dict(row) for row in rows], COLUMNS)}"
+    """Return the table, without the columns in which nothing stands."""
+    columns = [column for column in COLUMNS if any(row.get(column) not in (None, "") for row in rows)]
+    return f"# Lenses\n\n{ABOUT}\n\n{table([dict(row) for row in rows], columns)}"
 
 
 def parser() -> argparse.ArgumentParser:
