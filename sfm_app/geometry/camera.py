@@ -8,7 +8,7 @@ GUESSED_FOCAL = 1.2
 
 NEWTON_STEPS, LEAST_SLOPE = 10, 0.2
 """Steps of Newton's method in `rays`, and the least slope that it divides by: the slope is 0 where the lens folds.
-Chosen by hand; not measured on their own."""
+Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:

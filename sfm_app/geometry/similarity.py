@@ -11,10 +11,10 @@ from sfm_app.numerical import MAD_TO_SIGMA
 FloatArray = NDArray[np.float64]
 
 MAX_TRIPLES = 500
-"""Triples of points that are tried. Chosen by hand; not measured on its own."""
+"""Triples of points that are tried. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 MOST_LISTED = 60
 """Most points whose triples are all listed before some are drawn; a thousand points have 166 million. Chosen by hand;
-not measured on its own."""
+halved and doubled by `benchmarks.sensitivity`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 GOOD_ANGLE_DEG = 12.0
 """Wider angles than this make no better seed: depth is well determined already, and matches get rarer.
-docs/algorithms.md, Mapping. Chosen by hand; not measured on its own."""
+docs/algorithms.md, Mapping. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,8 +18,8 @@ CELLS = 12
 """Cells along the longer side of a photo. 16 give the same on oats23 and books21; with 24 one wrong pair enters the
 backbone of oats23, and nothing is found there. docs/algorithms.md, Look-alikes."""
 MIN_OTHER_PHOTOS = 2
-"""A keypoint is known to the set if it has partners in this many photos besides that of the pair. Chosen by hand; not
-measured on its own."""
+"""A keypoint is known to the set if it has partners in this many photos besides that of the pair. Chosen by hand;
+halved and doubled by `benchmarks.sensitivity`."""
 BACKBONE_SHARE = 0.9
 """A pair belongs to the backbone if its coverage is at least this share of that of the weakest pair on the best path
 between its photos. On oats23 and books21 equal things in different places reach 0.84 at most. docs/algorithms.md,

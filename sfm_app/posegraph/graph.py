@@ -24,21 +24,21 @@ ParallelMap = Callable[[Callable[[Any], Any], Sequence[Any], str], list[Any]]
 
 LEAST_IN_FRONT = 0.75
 """A pair with a smaller share of its inliers in front of both cameras has a wrong pose or wrong matches. Chosen by
-hand; not measured on its own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 AGREEMENT_DEG, GUESSED_DEG, SPREADS = 5.0, 15.0, 4.0
 """Largest angle between the rotation of a pair and those of its photos, the same if a camera is a guess, and the limit
 as a multiple of the median angle; the larger limit holds. docs/algorithms.md, From K to relative poses. Chosen by hand;
-not measured on their own."""
+halved and doubled by `benchmarks.sensitivity`."""
 SATURATION_INLIERS = 100.0
 """Number of inliers above which the weight of a pair hardly grows. docs/algorithms.md, From K to relative poses. Chosen
-by hand; not measured on its own."""
+by hand; halved and doubled by `benchmarks.sensitivity`."""
 FLAT_WEIGHT = 0.1
 """Weight factor of a pair whose matches lie on a plane: two poses explain it, and often the wrong one is chosen. Chosen
 on kitchen25, where such pairs outvoted those that join its two halves; nothing changes on castle-P19, fountain-P11 and
 temple16. All sets: benchmarks/corpus/tuning_sets.py."""
 WEAK_FACTOR = 2.0
 """A pair with fewer inliers than this multiple of the minimum must be confirmed by a loop of other pairs.
-docs/algorithms.md, From K to relative poses. Chosen by hand; not measured on its own."""
+docs/algorithms.md, From K to relative poses. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 CONTRADICTS, BEHIND, TOO_FEW = "contradicts other pairs", "points behind a camera", "too few matches fit the cameras"
 NOT_COMPUTABLE = "its pose cannot be computed"
 UNCONFIRMED = "few matches, and no other pair bears it out"

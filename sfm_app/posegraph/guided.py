@@ -16,17 +16,17 @@ FloatArray = NDArray[np.float64]
 
 SAMPLES = 200
 """Samples of two matches, each of which gives a direction (docs/algorithms.md, From K to relative poses). Chosen by
-hand; not measured on its own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 MIN_KEPT_SHARE = 0.9
 """A pose whose rotation diverges is accepted with the rotation of the other pairs, if that keeps this share of its
 inliers: a long lens does not determine how far the camera has turned. docs/algorithms.md, From K to relative poses.
-Chosen by hand; not measured on its own."""
+Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 HELD_ROUNDS, HELD_SIGMA = 8, 0.2
-"""Rounds of reweighted least squares with fixed rotation, and the scale of the loss in thresholds. Chosen by hand; not
-measured on their own."""
+"""Rounds of reweighted least squares with fixed rotation, and the scale of the loss in thresholds. Chosen by hand;
+halved and doubled by `benchmarks.sensitivity`."""
 NEAR_THRESHOLDS = 3.0
-"""With the rotation of the other pairs, matches within this many thresholds are used. Chosen by hand; not measured on
-its own."""
+"""With the rotation of the other pairs, matches within this many thresholds are used. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 LEAST_IN_FRONT, MOST_TURN_DEG = 0.95, 2.0
 """A guided pose is accepted if at least this share of its inliers lies in front of both cameras and its rotation
 changed by at most this angle. On the photo sets with truth none of the pairs found so was wrong (docs/algorithms.md,

@@ -34,14 +34,14 @@ IndexArray = NDArray[np.int64]
 ALIKE, LOOP, EITHER = "alike", "loop", "either"
 LEAST_TRACKED, FEW_TRACKED = 30, 15
 """Least number of matches with both ends on tracks for a pair to be tested, and for one beside known look-alikes.
-docs/algorithms.md, Look-alikes. Chosen by hand; not measured on their own."""
+docs/algorithms.md, Look-alikes. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 SAME_TRACK_SHARE = 0.02
 """A pair with at most this share of its tracked matches on the same track contradicts the backbone. On oats23 and
 books21 look-alikes have 0; no pair of kitti51, castle-P19, temple16 and five more sets is below 0.07; where kitchen1000
 closes a loop, some have 0. docs/algorithms.md, Look-alikes."""
 CONFIRMED_SHARE = 0.1
-"""A pair with at least this share of its tracked matches on the same track is confirmed. Chosen by hand; not measured
-on its own."""
+"""A pair with at least this share of its tracked matches on the same track is confirmed. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 LOW_PERCENTILE, MAX_MISSING, MAX_MISSING_SAME_TURN = 25.0, 0.2, 0.3
 """Contradicting pairs join look-alikes if this percentile, over the photos, of the share of expected cells that are
 missing exceeds the limit; the second limit is for pairs whose rotation agrees with the path between them. It is 0.30 on
@@ -52,7 +52,7 @@ SAME_TURN_DEG = 3.0
 9 on oats23 and 58 on books21. docs/algorithms.md, Look-alikes."""
 LEAST_CELLS, LEAST_PHOTOS = 15, 3
 """Least number of expected cells of a photo, and of such photos of a join, for missing cells to be evidence. Chosen by
-hand; not measured on their own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,15 +27,16 @@ MOST_DEG, MOST_SCALE = 20.0, 1.5
 """Largest change of viewing angle, and of scale, at which a point is matched again. 30 degrees and 2 give the same on
 oats23 and books21. docs/algorithms.md, Look-alikes."""
 BORDER = 0.05
-"""Share of width and height: points that project this near the border may be outside. Chosen by hand; not measured on
-its own."""
+"""Share of width and height: points that project this near the border may be outside. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 WIDE_RAD = 0.2
-"""Depths from wider angles get no more weight. Chosen by hand; not measured on its own."""
+"""Depths from wider angles get no more weight. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 MIN_COMMON_POINTS = 8
-"""Least number of points that two pairs of a photo must share to determine their relative scale. Chosen by hand; not
-measured on its own."""
+"""Least number of points that two pairs of a photo must share to determine their relative scale. Chosen by hand; halved
+and doubled by `benchmarks.sensitivity`."""
 MIN_CELL_POINTS = 2
-"""A cell of a photo with fewer expected points expects no match. Chosen by hand; not measured on its own."""
+"""A cell of a photo with fewer expected points expects no match. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,18 +19,19 @@ Pose = tuple[FloatArray, FloatArray]
 
 CLEAR_SHARE = 0.95
 """A pair is planar, or a rotation, if this share of its inliers fits that. docs/algorithms.md, From K to relative
-poses. Chosen by hand; not measured on its own."""
+poses. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 SAMPLE_SIZE = 200
-"""Number of points that decide between the four poses of an essential matrix. Chosen by hand; not measured on its
-own."""
+"""Number of points that decide between the four poses of an essential matrix. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 MIN_INLIERS = 8
-"""Least number of inliers that determine the pose of a pair. Chosen by hand; not measured on its own."""
+"""Least number of inliers that determine the pose of a pair. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 MIN_IN_FRONT, MIN_IMPROVEMENT = 0.9, 0.01
 """A pose from a start other than that of F needs this share of its inliers in front of both cameras, and a cost lower
-by this share. Chosen by hand; not measured on their own."""
+by this share. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 ROTATION_ROUNDS, ROTATION_DEG = 10, 5.0
-"""Rounds of reweighted fits of a rotation, and the median angle of rays above which none is tried. Chosen by hand; not
-measured on their own."""
+"""Rounds of reweighted fits of a rotation, and the median angle of rays above which none is tried. Chosen by hand;
+halved and doubled by `benchmarks.sensitivity`."""
 
 
 class Pair:

@@ -18,13 +18,14 @@ SIGMAS_PX = (0.5, 0.2)
 mismatches that a second structure explains pull the pose to a compromise between both. docs/algorithms.md, From K to
 relative poses."""
 STEPS = 12
-"""Largest number of steps at each scale. Chosen by hand; not measured on its own."""
+"""Largest number of steps at each scale. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e6)
-"""Damping of the Levenberg-Marquardt steps. Chosen by hand; not measured on its own."""
+"""Damping of the Levenberg-Marquardt steps. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 GAIN = 1e-6
-"""Relative decrease of the cost below which they end. Chosen by hand; not measured on its own."""
+"""Relative decrease of the cost below which they end. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 _DIFFERENCE_STEP = 1e-6
-"""Step of the parameters for finite differences. Chosen by hand; not measured on its own."""
+"""Step of the parameters for finite differences. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 def refine_pose(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:

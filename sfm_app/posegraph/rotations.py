@@ -18,16 +18,17 @@ FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 LOOP_DEG = 5.0
-"""The three rotations of a loop agree if the angle of their product is smaller. Chosen by hand; not measured on its
-own."""
+"""The three rotations of a loop agree if the angle of their product is smaller. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 SCALE_DEG = 3.0
 """Scale of the robust sum of squares (Geman and McClure). docs/algorithms.md, From K to relative poses. Chosen by hand;
-not measured on its own."""
+halved and doubled by `benchmarks.sensitivity`."""
 SUM_ROUNDS, SQUARE_ROUNDS = 15, 50
-"""Rounds of the sum of angles, and of the robust sum of squares after it. Chosen by hand; not measured on their own."""
+"""Rounds of the sum of angles, and of the robust sum of squares after it. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 LEAST_ANGLE, LEAST_STEP = 1e-3, 1e-7
-"""In radians: smaller angles get no more weight; smaller steps end the search. Chosen by hand; not measured on their
-own."""
+"""In radians: smaller angles get no more weight; smaller steps end the search. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 
 
 def average_rotations(

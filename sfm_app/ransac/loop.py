@@ -19,7 +19,8 @@ from sfm_app.settings import EpipolarSettings
 FloatArray = NDArray[np.float64]
 
 _EXPLAINED = 2.0
-"""Thresholds within which a match counts as explained by the best model. Chosen by hand; not measured on its own."""
+"""Thresholds within which a match counts as explained by the best model. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

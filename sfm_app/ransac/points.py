@@ -17,7 +17,7 @@ _LARGEST_PX = 1e15
 """Largest coordinate of a pixel: beyond it double precision resolves only an eighth of a pixel."""
 _FRAME_QUANTILE, _QUANTILE_TO_RMS = 0.9, 1.56
 """Quantile of the deviations that measures the spread, and its ratio to their root mean square, if uniform. The second
-follows from the first: 0.9 sqrt(3). Chosen by hand; not measured on its own."""
+follows from the first: 0.9 sqrt(3). Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 def check_points(x1: ArrayLike, x2: ArrayLike) -> tuple[FloatArray, FloatArray]:

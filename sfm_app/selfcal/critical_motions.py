@@ -11,10 +11,11 @@ from sfm_app.selfcal.adjustment.calibrate_pairs import Fit
 FloatArray = NDArray[np.float64]
 
 LEAST_ROTATION_DEG = 3.0
-"""Median rotation of pairs below which the axes count as parallel. Chosen by hand; not measured on its own."""
+"""Median rotation of pairs below which the axes count as parallel. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 ISOSCELES = 0.1
-"""Largest median deviation, in cosines, of pairs whose axes meet at one distance from both cameras. Chosen by hand; not
-measured on its own."""
+"""Largest median deviation, in cosines, of pairs whose axes meet at one distance from both cameras. Chosen by hand;
+halved and doubled by `benchmarks.sensitivity`."""
 
 
 def critical_motion(fit: Fit) -> str:

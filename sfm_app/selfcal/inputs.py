@@ -13,7 +13,8 @@ from sfm_app.types import CameraPairs
 FloatArray = NDArray[np.float64]
 
 FULL_WEIGHT_INLIERS = 300
-"""A pair with this many inliers or more counts fully. Chosen by hand; not measured on its own."""
+"""A pair with this many inliers or more counts fully. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,10 +18,10 @@ LOG_FOCAL, CENTER_U, CENTER_V, LOG_ASPECT, KAPPA = range(5)
 """Places in the parameters of a camera: log f with f = sqrt(fx fy), center from the middle, log fy/fx, kappa."""
 LEAST_SLOPE = 0.2
 """Least slope of the distorted over the undistorted radius; beyond it the lens continues linearly, so that it does not
-fold. Chosen by hand; not measured on its own."""
+fold. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 NEWTON_STEPS = 20
-"""Most steps; three or four are enough except for the strongest pincushions. Chosen by hand; not measured on its
-own."""
+"""Most steps; three or four are enough except for the strongest pincushions. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 
 
 @kernel

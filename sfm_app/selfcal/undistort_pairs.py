@@ -14,7 +14,7 @@ from sfm_app.selfcal.results import parameters_from_calibration
 from sfm_app.types import Calibration, CameraPairs
 
 REACH_PX = 3.0
-"""Scale of the robust refit of an F. Chosen by hand; not measured on its own."""
+"""Scale of the robust refit of an F. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 def undistort_pairs(pairs: CameraPairs, camera: Calibration) -> CameraPairs:

@@ -30,10 +30,10 @@ MIN_PAIRS = 3
 the constraint (thesis 5.2.4)."""
 FEW_PAIRS = 3
 """Pairs up to which almost any center fits: without their matches it is held where uncropped photos have it. Chosen by
-hand; not measured on its own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 UNCROPPED_SIGMA = 0.02
-"""Standard deviation of the center of uncropped photos from the middle, in widths. Chosen by hand; not measured on its
-own."""
+"""Standard deviation of the center of uncropped photos from the middle, in widths. Chosen by hand; halved and doubled
+by `benchmarks.sensitivity`."""
 VOTES_SIGMA, LEAST_KEPT_SHARE = 0.01, 0.8
 """Width of votes, and share of the votes for the peak of the consensus that the adjusted camera must keep: with less,
 it follows matches that most pairs contradict. On fourteen sets and variants right adjustments keep 0.97 to 1, the one
@@ -42,16 +42,16 @@ benchmarks/corpus/tuning_sets.py."""
 ENOUGH_PAIRS = 6.0
 """Effective pairs that must agree on the peak to contradict the camera: twelve constraints on five parameters of a
 camera. With three pairs (merton1) the peak's center is anywhere. docs/algorithms.md, Self-calibration, 2. Chosen by
-hand; not measured on its own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 AGREEING_RATIO = 0.1
 """A contradicted camera is adjusted again, only to pairs with r below this at the peak; on the same sets 0.03 and 0.05
 move no focal by more than 0.1 %. Chosen on those sets, benchmarks/corpus/tuning_sets.py."""
 ANOTHER_FOCAL = 1.25
 """Factor by which focals of the consensus and of the matches may differ. docs/algorithms.md, Self-calibration, 5.
-Chosen by hand; not measured on its own."""
+Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 RESTART_DISTANCE = float(np.log(1.1))
 """A consensus of undistorted pairs that lies this far in log f from the adjusted camera is tried as a start. Chosen by
-hand; not measured on its own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:

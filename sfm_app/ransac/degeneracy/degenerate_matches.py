@@ -24,23 +24,24 @@ _LINE_SAMPLE, _PARALLAX_SAMPLE = 4, 2
 (docs/algorithms.md, All estimators)."""
 _OFF_LINE = 2.0
 """Distance in thresholds beyond which a match is off the line, as for planes `dominant_plane.OFF_PLANE`. Chosen by
-hand; not measured on its own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 _LINES, _MOST_SCORED = 16, 300
 """Sampled lines, and the inliers that each is scored on. A relevant line holds most inliers, so few samples find it:
-one of 16 pairs lies on a line that holds half of them 99 times in 100. Chosen by hand; not measured on their own."""
+one of 16 pairs lies on a line that holds half of them 99 times in 100. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 _EXTENT_QUANTILES = (0.01, 0.99)
-"""Quantiles that bound the points of a view, without a few gross outliers. Chosen by hand; not measured on their
-own."""
+"""Quantiles that bound the points of a view, without a few gross outliers. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 _FOCALS = np.geomspace(0.4, 6.0, 60)
-"""Focal lengths that are tried for a rotation, in sides of the box around the points. Chosen by hand; not measured on
-their own."""
+"""Focal lengths that are tried for a rotation, in sides of the box around the points. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 _LEAST_PARALLAX_SHARE = 0.05
 """Share of the inliers off the plane below which a rotation counts as one. Mismatches on rows of bricks share a
 vanishing point: they agree with an epipole there far more often than by chance. On the real photo sets no pair has such
 a homography and less than 40 % off it (docs/algorithms.md, All estimators)."""
 _ROTATION_TOLERANCE = 0.05
 """Largest relative stretch of a homography that counts as a rotation, for some focal length; a rotation has none.
-Chosen by hand; not measured on its own."""
+Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 def find_degeneracy(

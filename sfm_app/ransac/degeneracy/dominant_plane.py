@@ -17,18 +17,19 @@ from sfm_app.ransac.solvers.eigenvalues import decompose_symmetric
 FloatArray = NDArray[np.float64]
 
 OFF_PLANE = 2.0
-"""Transfer distance in thresholds beyond which a match is off the plane. Chosen by hand; not measured on its own."""
+"""Transfer distance in thresholds beyond which a match is off the plane. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 _SAMPLES, _SAMPLE_SIZE = 64, 3
 """Samples of three matches: a plane that holds half of them is missed twice in ten thousand times, (7/8)^64. Chosen by
-hand; not measured on its own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 _LEAST_AREA = 1e-3
 """Twice the area of the triangle of a sample, in squares of the points' spread: thinner ones determine no plane. Chosen
-by hand; not measured on its own."""
+by hand; halved and doubled by `benchmarks.sensitivity`."""
 _MOST_SCORED = 300
-"""Matches that a sampled plane is scored on. Chosen by hand; not measured on its own."""
+"""Matches that a sampled plane is scored on. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 _LEAST_SUPPORT = 1e-12
 """Smallest over largest eigenvalue of the regression for a plane. Double precision leaves 1e-16 of the largest. Chosen
-by hand; not measured on its own."""
+by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 @kernel

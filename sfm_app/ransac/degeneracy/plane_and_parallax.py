@@ -16,11 +16,12 @@ from sfm_app.ransac.verification.pretests import PreTest
 FloatArray = NDArray[np.float64]
 
 _SAMPLES = 100
-"""Samples of two matches off the plane. Chosen by hand; not measured on its own."""
+"""Samples of two matches off the plane. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 _LEAST_INLIERS = 8
-"""Fewer do not determine the dominant plane. Chosen by hand; not measured on its own."""
+"""Fewer do not determine the dominant plane. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 _MOST_INLIERS = 300
-"""Largest number of inliers that the plane is fitted to. Chosen by hand; not measured on its own."""
+"""Largest number of inliers that the plane is fitted to. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 
 
 def recover_epipole(

@@ -27,15 +27,17 @@ PEAK, STATIONARY, RING = 1.0, 2.0, 4.0
 """Largest displacements at the peak, of stationary matches, and of the ring around the peak, in units of keypoint
 noise. Checked on the real photo sets, where they affect one pair of 456 (docs/algorithms.md, All estimators)."""
 LEAST_PEAK = 8
-"""Least number of matches at the peak; fewer are left to the estimator. Chosen by hand; not measured on its own."""
+"""Least number of matches at the peak; fewer are left to the estimator. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 MOST_LOST = 0.2
 """Share of the stationary matches, or of the others, that may be removed from the scene with a logo.
-docs/algorithms.md, All estimators. Chosen by hand; not measured on its own."""
+docs/algorithms.md, All estimators. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 CELLS, WIDE_SHARE = 8, 0.25
 """Cells of the photo along each side, and the share of the cells with keypoints that a logo does not exceed. Chosen by
-hand; not measured on their own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 EXPLAINED_SHARE = 0.9
-"""Share of the stationary matches that a motion without rotation explains. Chosen by hand; not measured on its own."""
+"""Share of the stationary matches that a motion without rotation explains. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 
 
 def find_stationary(x1: FloatArray, x2: FloatArray, unit_px: float = 1.0) -> BoolArray:

@@ -20,12 +20,13 @@ from sfm_app.geometry.epipolar import nearest_rank_two, to_homogeneous, to_unit_
 FloatArray = NDArray[np.float64]
 
 DAMPING = DampingRange(first=1e-4, least=1e-12, most=1e12)
-"""Damping of Levenberg-Marquardt steps. Chosen by hand; not measured on its own."""
+"""Damping of Levenberg-Marquardt steps. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 _COST_TOLERANCE = 1e-9
-"""Relative decrease of the cost below which the iteration ends. Chosen by hand; not measured on its own."""
+"""Relative decrease of the cost below which the iteration ends. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 _LEAST_CURVATURE = 1e-12
-"""Least curvature, relative to the largest: some matches leave a direction of F free. Chosen by hand; not measured on
-its own."""
+"""Least curvature, relative to the largest: some matches leave a direction of F free. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 
 
 def refine_reprojection(

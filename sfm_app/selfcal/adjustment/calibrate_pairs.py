@@ -31,23 +31,26 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 FEW_MATCHES = 100
-"""Matches per pair until the cameras have nearly converged. Chosen by hand; not measured on its own."""
+"""Matches per pair until the cameras have nearly converged. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 FIRST_ROUNDS, LAST_ROUNDS = 8, 12
-"""Rounds before starts are compared, and rounds with all matches. Chosen by hand; not measured on their own."""
+"""Rounds before starts are compared, and rounds with all matches. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 POSE_MATCHES = 30
-"""Matches that decide which of the four poses of an E is right. Chosen by hand; not measured on its own."""
+"""Matches that decide which of the four poses of an E is right. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 EVIDENCE_ROUNDS = 3
-"""Most rounds of choosing the free parameters by the evidence and adjusting again. Chosen by hand; not measured on its
-own."""
+"""Most rounds of choosing the free parameters by the evidence and adjusting again. Chosen by hand; halved and doubled
+by `benchmarks.sensitivity`."""
 JACKKNIFE_GROUPS = 8
-"""Groups of neighboring photos that are left out in turn (docs/algorithms.md, Self-calibration, 4). Chosen by hand; not
-measured on its own."""
+"""Groups of neighboring photos that are left out in turn (docs/algorithms.md, Self-calibration, 4). Chosen by hand;
+halved and doubled by `benchmarks.sensitivity`."""
 LEAST_PHOTOS, LEAST_REMAINING_WEIGHT = 6, 4.0
 """Photos, and weight of the remaining pairs, below which a jackknife reflects the missing pairs rather than errors.
-docs/algorithms.md, Self-calibration, 4. Chosen by hand; not measured on their own."""
+docs/algorithms.md, Self-calibration, 4. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 REFIT_SCALE = 3.0
-"""Scale of the robust refit of an F, in sigma. As `two_view_cost.ROBUST_SCALE`. Chosen by hand; not measured on its
-own."""
+"""Scale of the robust refit of an F, in sigma. As `two_view_cost.ROBUST_SCALE`. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

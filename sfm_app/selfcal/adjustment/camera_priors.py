@@ -31,29 +31,31 @@ USUAL_FOCAL, FOCAL_SPREAD = np.log(1.2), 0.7
 the deviation, a factor of two, was chosen by hand."""
 HINT_SPREAD = 0.05
 """Standard deviation of the logarithm of a claimed focal: EXIF rounds millimeters, and the sensor size to 35 mm. Chosen
-by hand; not measured on its own."""
+by hand; halved and doubled by `benchmarks.sensitivity`."""
 NARROW = {CENTER: 0.012, ASPECT: 0.002, LENS: 0.005}
 """Standard deviations about the usual value: of the center in longer sides, of log fy/fx, of k1. docs/algorithms.md,
-Self-calibration, 3. Chosen by hand; not measured on their own."""
+Self-calibration, 3. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 WIDE = {CENTER: 0.15, ASPECT: 0.25, LENS: 0.2}
 """Standard deviations of freed parts, in the same units. docs/algorithms.md, Self-calibration, 3. Chosen by hand;
-not measured on their own."""
+halved and doubled by `benchmarks.sensitivity`."""
 COLUMNS = {CENTER: [CENTER_U, CENTER_U + 1], ASPECT: [LOG_ASPECT], LENS: [KAPPA]}
 """Columns of each part in the parameters of a camera, by definition in `lens`."""
 UNDETERMINED = 0.5
 """A part stays at its usual value unless the pairs shrink the deviation of its narrow prior below this share.
-docs/algorithms.md, Self-calibration, 3. Chosen by hand; not measured on its own."""
+docs/algorithms.md, Self-calibration, 3. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 STAYS = 1e-3
-"""Factor on the prior deviation of a part that stays at its usual value. Chosen by hand; not measured on its own."""
+"""Factor on the prior deviation of a part that stays at its usual value. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 LEAST_SPARE = 0.25
 """Share of the constraints that must be left to contradict the cameras, or nothing more is freed. Three pairs fit
-almost any center (docs/algorithms.md, Self-calibration, 3). Chosen by hand; not measured on its own."""
+almost any center (docs/algorithms.md, Self-calibration, 3). Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 STRAIGHT = 1e-6
 """Deviation of k1, and share of distorted photos, when distortion is not estimated: practically zero. Chosen by hand;
-not measured on its own."""
+halved and doubled by `benchmarks.sensitivity`."""
 FREE_SHARE = {CENTER: 0.3, ASPECT: 0.05, LENS: 0.5, FOCAL: 0.3}
 """Share of photo sets in which the wide prior is the right one; for FOCAL, in which a claim is wrong.
-docs/algorithms.md, Self-calibration, 3. Chosen by hand; not measured on their own."""
+docs/algorithms.md, Self-calibration, 3. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,23 +32,25 @@ CONFLICT = 3.0
 """Log-likelihood gain from cameras of its own at which a pair's weight is a quarter. By definition of chi^2 with two
 degrees of freedom, noise alone gains as much once in twenty times: exp(-3)."""
 OWN_CAMERA_SIGMAS = np.array([0.3, 0.15, 0.15, 0.2, 0.2])
-"""How far a pair's own cameras may deviate: standard deviations of log f, u, v, log a, kappa. Chosen by hand; not
-measured on their own."""
+"""How far a pair's own cameras may deviate: standard deviations of log f, u, v, log a, kappa. Chosen by hand; halved
+and doubled by `benchmarks.sensitivity`."""
 LOWER_QUARTILE = 0.288
 """Lower quartile of that gain for noise in two degrees of freedom: by definition of chi^2, -ln(3/4)."""
 LEAST_SIGMA_PX = 0.1
 """Least standard deviation of a distance: noise-free synthetic matches would otherwise have unbounded weight. Chosen by
-hand; not measured on its own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 FEW_PHOTOS, FEW_PHOTOS_TRUST = 5, 0.25
 """A camera of fewer photos absorbs unmodeled effects (a lens, a wall that is not quite still) into its focal and
-center; the information of its pairs counts as if their noise were twice as large. Chosen by hand; not measured on their
-own."""
+center; the information of its pairs counts as if their noise were twice as large. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 ROUNDS = 25
-"""Most rounds of reweighting and stepping. Chosen by hand; not measured on its own."""
+"""Most rounds of reweighting and stepping. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e8)
-"""Damping of Levenberg-Marquardt steps, relative to the diagonal. Chosen by hand; not measured on their own."""
+"""Damping of Levenberg-Marquardt steps, relative to the diagonal. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 CONVERGED = 2e-5
-"""Largest change of a camera's parameter that ends the rounds. Chosen by hand; not measured on its own."""
+"""Largest change of a camera's parameter that ends the rounds. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

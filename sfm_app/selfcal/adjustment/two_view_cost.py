@@ -24,13 +24,14 @@ CAMERA = 5
 PAIR = 2 * CAMERA + POSE_DOF
 """Parameters of a pair: two cameras and a pose, by definition."""
 ROBUST_SCALE = 3.0
-"""c of the robust cost, in sigma. docs/algorithms.md, Self-calibration, 2. Chosen by hand; not measured on its own."""
+"""c of the robust cost, in sigma. docs/algorithms.md, Self-calibration, 2. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 OVERFLOW_LIMIT = 1e60
 """Squared distances in sigma^2, or derivatives, above this count as not finite. Its square is finite in double
 precision."""
 _STEP = 1e-6
 """Step of the parameters for finite differences: curvature causes a relative error of about 1e-6, rounding in double
-precision 1e-10. Chosen by hand; not measured on its own."""
+precision 1e-10. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 @kernel

@@ -17,10 +17,10 @@ FloatArray = NDArray[np.float64]
 
 MODEL_ERROR = np.array([1e-3, 1e-3, 1e-3, 1e-3, 3e-3])
 """Standard deviations of errors that no lens model covers: of log f, u and v in longer sides, log a, and k1.
-docs/algorithms.md, Self-calibration, 4. Chosen by hand; not measured on their own."""
+docs/algorithms.md, Self-calibration, 4. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 LEAST_KEY_WEIGHT = 0.5
-"""A pair with a smaller weight in the fit is no key pair. docs/algorithms.md, Self-calibration, 7. Chosen by hand; not
-measured on its own."""
+"""A pair with a smaller weight in the fit is no key pair. docs/algorithms.md, Self-calibration, 7. Chosen by hand;
+halved and doubled by `benchmarks.sensitivity`."""
 
 
 def covariance(fit: Fit, sides: FloatArray, *, resampled: bool = False) -> FloatArray:

@@ -19,11 +19,11 @@ from sfm_app.selfcal.inputs import FloatArray
 from sfm_app.types import PairId
 
 LEAST_PHOTOS = 5
-"""With fewer photos, the pairs that are not held out do not determine the focal of a photo. Chosen by hand; not
-measured on its own."""
+"""With fewer photos, the pairs that are not held out do not determine the focal of a photo. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 FOLDS = 5
-"""Parts of the pairs that are held out in turn (docs/algorithms.md, Self-calibration, 6). Chosen by hand; not measured
-on its own."""
+"""Parts of the pairs that are held out in turn (docs/algorithms.md, Self-calibration, 6). Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 EXPLAINED_SHARE = 0.88
 """A camera that wins this share of all votes explains the photos: of fountain-P11 and Herz-Jesus-P8 it wins 0.94, of
 ten cameras brought to one size 0.68, of one camera with four pairs in ten wrong 0.5 to 0.7. What it was chosen on:
@@ -40,7 +40,7 @@ their number, in addition. The same scenes: at most 3.0 with six photos; reichst
 sets: benchmarks/corpus/tuning_sets.py."""
 LEAST_PHOTOS_EACH = 3.0
 """Photos that each of several cameras must have on average: more cameras suggest a camera per photo. Chosen by hand;
-not measured on its own."""
+halved and doubled by `benchmarks.sensitivity`."""
 
 
 class Prediction(NamedTuple):

@@ -18,26 +18,27 @@ from sfm_app.selfcal.lens import LOG_FOCAL
 from sfm_app.types import PairId
 
 SIGMA = 0.03
-"""Width of the votes, in units of r: focals 3 % apart still agree, those 10 % apart do not. Chosen by hand; not
-measured on its own."""
+"""Width of the votes, in units of r: focals 3 % apart still agree, those 10 % apart do not. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 FAIR_SHARE = 0.5
-"""Share of its possible votes that a photo needs to belong to a peak, or to have another focal. Chosen by hand; not
-measured on its own."""
+"""Share of its possible votes that a photo needs to belong to a peak, or to have another focal. Chosen by hand; halved
+and doubled by `benchmarks.sensitivity`."""
 OTHER_FOCAL = 0.05
-"""Difference in log f from which on it is another camera. Chosen by hand; not measured on its own."""
+"""Difference in log f from which on it is another camera. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 LEAST_FOCAL_GAIN = 0.25
 """Share of a photo's votes by which another focal must beat that of the peak. docs/algorithms.md, Self-calibration, 6.
-Chosen by hand; not measured on its own."""
+Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 LEAST_GAIN = 0.25
-"""Share of the votes of the photos of all other cameras together that a split must win. Chosen by hand; not measured on
-its own."""
+"""Share of the votes of the photos of all other cameras together that a split must win. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 FOCAL_REACH, TRIALS = 1.1, 111
 """Range in log f and number of the focals that are tried for a photo: up to three times longer or shorter. Chosen by
-hand; not measured on their own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 MOST_PEAKS = 4
-"""Peaks of the consensus that serve as starts. Chosen by hand; not measured on its own."""
+"""Peaks of the consensus that serve as starts. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 ROUNDS = 10
-"""Most rounds of assigning photos to cameras. Chosen by hand; not measured on its own."""
+"""Most rounds of assigning photos to cameras. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 def split_by_focal(

@@ -15,10 +15,10 @@ from sfm_app.selfcal.lens import LOG_FOCAL
 
 SIGMA = 0.05
 """Width of the votes, in units of r: neighbors on the grid of focals, 7 % apart, still vote for each other. Chosen by
-hand; not measured on its own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 MOST_PAIRS = 1500
-"""Most pairs that vote, evenly chosen: tables of all focals of both photos take 13 kB a pair. Chosen by hand; not
-measured on its own."""
+"""Most pairs that vote, evenly chosen: tables of all focals of both photos take 13 kB a pair. Chosen by hand; halved
+and doubled by `benchmarks.sensitivity`."""
 
 
 def subsample_pairs(count: int) -> IndexArray:

@@ -41,7 +41,7 @@ IndexArray = NDArray[np.int64]
 
 FOCALS = 41
 """Focals on the grid of a camera, each 7 % above the one before. docs/algorithms.md, Self-calibration, 6. Chosen by
-hand; not measured on its own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 FAIR_SHARE, LEAST_SUPPORT, UNSUPPORTED_REASON = 0.5, 0.8, "not all of its photos support it"
 """Shares of their votes that every photo, and all together, must give to a camera split from photos of one size, and
 the reason where they do not. Chosen on folders 0 to 179 and 1000 to 1020 of `python -m benchmarks.trouble`: two cameras

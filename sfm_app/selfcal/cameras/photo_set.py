@@ -36,19 +36,19 @@ logger = logging.getLogger("sfm_app")
 CalibrateFunction = Callable[[CameraPairs, CalibrationSettings, int], Calibration]
 
 LEAST_TO_SPLIT = 4
-"""Photos below which a group is not split: too few to tell which of them disagree. Chosen by hand; not measured on its
-own."""
+"""Photos below which a group is not split: too few to tell which of them disagree. Chosen by hand; halved and doubled
+by `benchmarks.sensitivity`."""
 SAME_FOCAL = 0.03
 """Parts of a group whose log f differ by less are one camera. docs/algorithms.md, Self-calibration, 6. Chosen by hand;
-not measured on its own."""
+halved and doubled by `benchmarks.sensitivity`."""
 MANY_PARTS, PERHAPS_ZOOM = 3, "photos of one size fall into {count} cameras, as those of a zoom do"
 """Parts of a group from which on the borders between them may be anywhere, so that none is relied on; and the reason.
-Chosen by hand; not measured on its own."""
+Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 PERHAPS_TWO = "its photos may be of two cameras"
 UNASSIGNED_REASON = "no usable pair shows which camera took its photos"
 LEAST_DISTORTION = 0.01
-"""|k1| from which on photos are undistorted before they are tested for one camera. Chosen by hand; not measured on its
-own."""
+"""|k1| from which on photos are undistorted before they are tested for one camera. Chosen by hand; halved and doubled
+by `benchmarks.sensitivity`."""
 
 
 @dataclass(frozen=True, slots=True)

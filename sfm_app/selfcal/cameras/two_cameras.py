@@ -20,11 +20,13 @@ from sfm_app.selfcal.lens import LOG_FOCAL
 from sfm_app.types import PairId
 
 LEAST_STEPS_APART = 2
-"""Least distance of two cameras, in steps of 7 % on the grid of focals. Chosen by hand; not measured on its own."""
+"""Least distance of two cameras, in steps of 7 % on the grid of focals. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 REFINE_STEPS = 4
-"""Steps that both focals may move in each round of the final refinement. Chosen by hand; not measured on its own."""
+"""Steps that both focals may move in each round of the final refinement. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 ROUNDS = 20
-"""Most rounds of assigning photos to cameras. Chosen by hand; not measured on its own."""
+"""Most rounds of assigning photos to cameras. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 LEAST_GAIN = 0.15
 """Share of the smaller camera's votes that two cameras must win against one. Chosen on 120 random scenes of one camera
 (as for `camera_per_photo`; at most 0.02), and on rendered folders of `python -m benchmarks.trouble`, seeds 0 to 64: two

@@ -21,11 +21,12 @@ from sfm_app.selfcal.inputs import FloatArray, Pairs
 LOG_FOCAL, CENTER_U, CENTER_V, LOG_ASPECT = range(4)
 """Places in theta."""
 FIRST_STEPS = np.array([0.05, 0.03, 0.03, 0.05])
-"""First steps of the local search along theta. Chosen by hand; not measured on their own."""
+"""First steps of the local search along theta. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 FINISHED_STEP, FINISHED_VALUE = 1e-5, 1e-6
-"""A simplex of this extent in theta and in value has converged. Chosen by hand; not measured on their own."""
+"""A simplex of this extent in theta and in value has converged. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 MOST_STEPS = 300
-"""Most steps of a simplex. Chosen by hand; not measured on its own."""
+"""Most steps of a simplex. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 class Consensus:

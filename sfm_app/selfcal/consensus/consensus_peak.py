@@ -27,16 +27,16 @@ SQUARE_PIXELS = (LOG_FOCAL, CENTER_U, CENTER_V)
 ANY_PIXELS = (*SQUARE_PIXELS, LOG_ASPECT)
 """Places in theta that are sought when they need not be."""
 LOG_ASPECTS = tuple(np.linspace(-0.6, 0.6, 9))
-"""log fy/fx on the grid: 0.55 to 1.8. Chosen by hand; not measured on their own."""
+"""log fy/fx on the grid: 0.55 to 1.8. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 ASPECT_GAIN = float(np.log(50))
 """Votes that freeing fy/fx must win: about one photo set in fifty has pixels that are not square. docs/algorithms.md,
-Self-calibration, 1. Chosen by hand; not measured on its own."""
+Self-calibration, 1. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 PERHAPS_ASPECT_GAIN = float(np.log(50 * 0.05))
 """Votes from which on square pixels are less than 95 % sure. Of 47 answers with square pixels on the photo sets and on
 folders 0 to 170 of `python -m benchmarks.trouble`, one had more (1.55), and its pixels were not square."""
 MAX_LOG_FOCAL_SPREAD = 0.1
 """Largest standard deviation of log f: a focal that is less certain starts bundle adjustment no better than a guess.
-docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured on its own."""
+docs/algorithms.md, Self-calibration, 5. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 IDENTIFIED_LOG_FOCAL_SPREAD = 0.02
 """Largest standard deviation of log f that counts as known: with 0.025 one focal of twenty is off by 5 %, which is too
 much to be called identifiable. Between this and the limit above the answer is an estimate: a better start than a guess,
@@ -49,10 +49,10 @@ biased the others. Of the same 109 cameras eight are short of both: off by 43, 1
 of them whose deviation is below 0.02 is off by more than 2.5 %. docs/algorithms.md, Self-calibration, 5."""
 IDENTIFIED_OF_MANY = 0.015
 """Largest such deviation where every photo has its own focal: the worst of many is further off than a single one.
-docs/algorithms.md, Self-calibration, 6. Chosen by hand; not measured on its own."""
+docs/algorithms.md, Self-calibration, 6. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 EDGE = 1.02
-"""A focal within this factor of an end of the range counts as having run to that end. Chosen by hand; not measured on
-its own."""
+"""A focal within this factor of an end of the range counts as having run to that end. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

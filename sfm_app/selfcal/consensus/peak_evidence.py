@@ -12,32 +12,32 @@ from sfm_app.selfcal.consensus.peak_search import SIGMAS, Profile
 from sfm_app.selfcal.inputs import FloatArray
 
 OWN_SIGMA_RANGE = (0.005, 0.02)
-"""The last width of the consensus follows the data within these bounds, in units of r. Chosen by hand; not measured on
-their own."""
+"""The last width of the consensus follows the data within these bounds, in units of r. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 OWN_SIGMA_FACTOR = 1.5
 """That width in medians of r: half of the agreeing pairs then vote with more than half their weight.
-docs/algorithms.md, Self-calibration, 1. Chosen by hand; not measured on its own."""
+docs/algorithms.md, Self-calibration, 1. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 MIN_AGREEING = 2.25
 """Effective number of pairs that must agree; three parameters satisfy one and a half pairs in any case.
-docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured on its own."""
+docs/algorithms.md, Self-calibration, 5. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 MIN_SUPPORT = 0.12
 """Share of the votes that K must win; many pairs without any common K give up to 0.06. docs/algorithms.md,
 Self-calibration, 5. The command that gave 0.06 is not on record."""
 RIVAL_RATIO = 1.25
 """A K with a focal this many times longer or shorter is another answer. docs/algorithms.md, Self-calibration, 5. Chosen
-by hand; not measured on its own."""
+by hand; halved and doubled by `benchmarks.sensitivity`."""
 MIN_LEAD = 0.5
-"""Votes by which K must lead every other focal. docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured
-on its own."""
+"""Votes by which K must lead every other focal. docs/algorithms.md, Self-calibration, 5. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 MIN_LEAD_SHARE = 0.03
 """That lead as a share of the votes for K: many pairs that barely distinguish focals do not determine one.
-docs/algorithms.md, Self-calibration, 5. Chosen by hand; not measured on its own."""
+docs/algorithms.md, Self-calibration, 5. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 RESAMPLES = 25
 """Number of resamples of the Bayesian bootstrap (docs/algorithms.md, Self-calibration, without matches). Chosen by
-hand; not measured on its own."""
+hand; halved and doubled by `benchmarks.sensitivity`."""
 STABLE_SIGMA = 0.01
-"""Resampled fits use at least this width: below it they snap to single pairs. Chosen by hand; not measured on its
-own."""
+"""Resampled fits use at least this width: below it they snap to single pairs. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 
 
 def residual_sigma(consensus: Consensus, theta: FloatArray) -> float:

@@ -13,19 +13,20 @@ from sfm_app.selfcal.inputs import FloatArray
 
 FOCAL_RANGE = (0.3, 5.0)
 """Focals that are tried, in units of the longer side: 118 to 11 degrees of view. docs/algorithms.md, Self-calibration,
-5. Chosen by hand; not measured on their own."""
+5. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 FOCALS = 29
-"""Focals on the grid, each 10 % above the one before. Chosen by hand; not measured on its own."""
+"""Focals on the grid, each 10 % above the one before. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 CENTER_REACH = 0.4
-"""Centers are tried up to this far from the middle, in units of the longer side. Chosen by hand; not measured on its
-own."""
+"""Centers are tried up to this far from the middle, in units of the longer side. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 CENTER_STEP = 0.08
-"""Between centers on the grid, in the same units. Chosen by hand; not measured on its own."""
+"""Between centers on the grid, in the same units. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 SIGMAS = (0.05, 0.02)
 """Widths of the consensus, in units of r: the first finds a peak, the second refines it and compares it with others.
-docs/algorithms.md, Self-calibration, 1. Chosen by hand; not measured on their own."""
+docs/algorithms.md, Self-calibration, 1. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 MOST_STARTS = 4
-"""Tops of the grid that a local search begins from. Chosen by hand; not measured on its own."""
+"""Tops of the grid that a local search begins from. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 class Peak(NamedTuple):

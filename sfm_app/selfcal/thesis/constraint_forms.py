@@ -26,7 +26,7 @@ _TINY = float(np.finfo(np.float64).tiny)
 """The smallest normal number in double precision; added to divisors, so that none is zero."""
 LEAST_COMPLEMENT = 1e-6
 """(5.8) divides by s2; 1 - r is held above this, so that a matrix of rank 1 gets a large number, not infinity. Chosen
-by hand; not measured on its own."""
+by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 def essential(F: FloatArray, K: FloatArray) -> FloatArray:

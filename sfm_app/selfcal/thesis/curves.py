@@ -7,8 +7,8 @@ from sfm_app.selfcal.inputs import FloatArray, Pairs
 from sfm_app.selfcal.thesis.roots import ComplexArray, swept_roots
 
 ROOT_IS_ZERO = 1e-9
-"""A real part below this, in image widths, counts as zero: such roots are spurious. Chosen by hand; not measured on its
-own."""
+"""A real part below this, in image widths, counts as zero: such roots are spurious. Chosen by hand; halved and doubled
+by `benchmarks.sensitivity`."""
 MAX_OUT_OF_RANGE = 0.5
 """A curve with a larger share of samples out of range is degenerate (thesis 5.8.4, Eq. 5.35)."""
 

@@ -14,18 +14,21 @@ from sfm_app.selfcal.thesis.verdict import CameraParameters
 DEFAULT = EQUATIONS["huang-faugeras"]
 """The form that the thesis chooses (5.5.1)."""
 FIRST_DAMPING = 1e-2
-"""First damping of Levenberg-Marquardt steps, relative to the diagonal. Chosen by hand; not measured on its own."""
+"""First damping of Levenberg-Marquardt steps, relative to the diagonal. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 DAMPING_RANGE = (1e-9, 1e9)
-"""Least and largest damping. Chosen by hand; not measured on their own."""
+"""Least and largest damping. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 MOST_STEPS = 60
-"""Most steps of one search. Chosen by hand; not measured on its own."""
+"""Most steps of one search. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 LONGEST_STEP = 0.5
-"""Longest step in any parameter; the focals are logarithms. Chosen by hand; not measured on its own."""
+"""Longest step in any parameter; the focals are logarithms. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 DIFFERENCE = 1e-7
-"""Step of the parameters for finite differences: near the square root of double precision. Chosen by hand; not measured
-on its own."""
+"""Step of the parameters for finite differences: near the square root of double precision. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 FINISHED = 1e-9
-"""A search whose step lowers the sum by a smaller share has converged. Chosen by hand; not measured on its own."""
+"""A search whose step lowers the sum by a smaller share has converged. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 
 
 class Minima(NamedTuple):

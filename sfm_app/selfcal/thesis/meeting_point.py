@@ -9,10 +9,10 @@ from sfm_app.selfcal.inputs import FloatArray
 
 SEPARATION = 1.25
 """Peaks whose focals sqrt(fx fy) differ by a smaller factor are one. docs/algorithms.md, The thesis's methods. Chosen
-by hand; not measured on its own."""
+by hand; halved and doubled by `benchmarks.sensitivity`."""
 LEAST_SHARE = 0.5
 """A peak has at least this share of the highest one's support; accidental meeting points mostly have less.
-docs/algorithms.md, The thesis's methods. Chosen by hand; not measured on its own."""
+docs/algorithms.md, The thesis's methods. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 class Meeting(NamedTuple):

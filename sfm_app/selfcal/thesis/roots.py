@@ -9,15 +9,15 @@ from sfm_app.selfcal.inputs import FloatArray
 ComplexArray = NDArray[np.complex128]
 
 _MOST_ROUNDS = 30
-"""Most rounds of Aberth's iteration for one sample. Chosen by hand; not measured on its own."""
+"""Most rounds of Aberth's iteration for one sample. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 _NUDGE = 1e-3
 """Roots start off those of the sample before by this share of their size, each in another direction. Chosen by hand;
-not measured on its own."""
+halved and doubled by `benchmarks.sensitivity`."""
 _ROUNDING = 1e-16
 """Rounding error of a polynomial's value, as a share of the sizes of its terms: double precision."""
 _BLUR = 1e-10
-"""A root that rounding may shift by a larger share of its size counts as a multiple one. Chosen by hand; not measured
-on its own."""
+"""A root that rounding may shift by a larger share of its size counts as a multiple one. Chosen by hand; halved and
+doubled by `benchmarks.sensitivity`."""
 _NO_STEP = 1e-15
 """A step that no longer counts, as a share of the root's size: double precision, times ten."""
 

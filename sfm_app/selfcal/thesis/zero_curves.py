@@ -18,7 +18,7 @@ SIGMA_SHARE = 0.1
 """sigma of rho, as a share of the range that is searched (thesis 5.8.4)."""
 PEAK_RANGE, PEAK_SIGMA = (0.3, FOCAL_RANGE), 0.1
 """Where peaks are sought and how wide they are, in image widths: small beside the distance between two cameras. Chosen
-by hand; not measured on its own."""
+by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
 def calibrate(pairs: CameraPairs, options: CalibrationSettings, seed: int) -> Calibration:

@@ -1,5 +1,6 @@
 """Constants are changed one at a time, and nothing else is."""
 
+import ast
 import json
 import subprocess
 import sys
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 
 from benchmarks.common.processes import environment
-from benchmarks.sensitivity.command import difference, page, row_of
-from benchmarks.sensitivity.constants import Constant, constants, install, is_compiled, scale
+from benchmarks.common.results import RESULTS
+from benchmarks.sensitivity.command import difference, label, page, row_of
+from benchmarks.sensitivity.constants import ROOT, Constant, assignments, constants, install, is_compiled, scale
 
 
 class Limits(NamedTuple):
@@ -79,3 +81,15 @@ def test_rows_show_differences_and_failures():
     row = row_of("room: NAME", better, difference({"one": {"failed": "ValueError: no"}}, usual))
     assert (row["AUC@5, halved"], row["AUC@5, doubled"], row["worst"]) == (0.0, "ValueError: no", -0.1)
     assert "room: NAME" in page([row])
+
+
+def test_what_is_said_to_be_measured_has_a_row():
+    rows = {row["constant"] for row in json.loads((RESULTS / "sensitivity.json").read_text(encoding="utf-8"))["rows"]}
+    said = {
+        label(Constant(path.relative_to(ROOT).as_posix(), names))
+        for path in (ROOT / "sfm_app").rglob("*.py")
+        for names, _, about in assignments(ast.parse(path.read_text(encoding="utf-8")))
+        if "halved and doubled by `benchmarks.sensitivity`" in about
+    }
+    assert len(said) > 100
+    assert said - rows == set()
