@@ -34,7 +34,7 @@ def pose_errors_deg(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> NDA
     errors = []
     for a, b in combinations(sorted(truth), 2):
         if a in found and b in found:
-            errors.append(_angle_deg(_relative_pose(found[a], found[b]), _relative_pose(truth[a], truth[b])))
+            errors.append(pose_error_deg(relative_pose(found[a], found[b]), relative_pose(truth[a], truth[b])))
         else:
             errors.append(LOST_DEG)
     return np.array(errors)
@@ -50,7 +50,7 @@ def fundamental_pose_error_deg(
     if F is None:
         return LOST_DEG
     poses = decompose_essential(essential_from_fundamental(F, *cameras))
-    return min(_angle_deg(pose, (R, t)) for pose in poses)
+    return min(pose_error_deg(pose, (R, t)) for pose in poses)
 
 
 def rms_sampson_px(F: NDArray[np.float64] | None, x1: NDArray[np.float64], x2: NDArray[np.float64]) -> float:
@@ -114,12 +114,12 @@ def _position(pose: Pose) -> NDArray[np.float64]:
     return -pose[:, :3].T @ pose[:, 3]
 
 
-def _angle_deg(a: tuple[Pose, Pose], b: tuple[Pose, Pose]) -> float:
+def pose_error_deg(a: tuple[Pose, Pose], b: tuple[Pose, Pose]) -> float:
     (R, t), (S, u) = a, b
     cosines = ((np.trace(R.T @ S) - 1) / 2, t @ u / (np.linalg.norm(t) * np.linalg.norm(u)))
     return float(max(np.degrees(np.arccos(np.clip(cosines, -1, 1)))))
 
 
-def _relative_pose(a: Pose, b: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def relative_pose(a: Pose, b: Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     R = b[:, :3] @ a[:, :3].T
     return R, b[:, 3] - R @ a[:, 3]

@@ -86,11 +86,12 @@ def initial_radius(out: Path, truth: Truth, reach_px: float) -> tuple[float | No
 def refined_radius(out: Path, truth: Truth, reach_px: float) -> float | None:
     """Return the worst error of the cameras of the first model; None without a model."""
     folders = sorted(path.parent for path in out.rglob("cameras.bin") if not path.parent.name.startswith("."))
-    if not folders:
+    models = {folder: pycolmap.Reconstruction(folder) for folder in folders}
+    if not models:
         return None
-    first = min(folders, key=lambda folder: (folder != out / "sparse", -len(pycolmap.Reconstruction(folder).images)))
+    first = min(models, key=lambda folder: (folder != out / "sparse", -models[folder].num_reg_images()))
     errors = []
-    for camera in pycolmap.Reconstruction(first).cameras.values():
+    for camera in models[first].cameras.values():
         found = camera
 
         def project(rays: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.common.metrics import LOST_DEG, area_under_recall, focal_error_percent
+from benchmarks.common.metrics import LOST_DEG, area_under_recall, focal_error_percent, pose_error_deg, relative_pose
 from sfm_app.api import open_run
 from sfm_app.errors import ReconstructionError
 from sfm_app.posegraph import PoseGraphOptions, build_pose_graph
@@ -62,18 +62,9 @@ def pair_errors_deg(problem: Problem, graph: PoseGraph) -> FloatArray:
         names = [Path(problem.matches.images[photo].name).stem for photo in pair]
         if not all(name in problem.poses for name in names):
             continue
-        first, second = (problem.poses[name] for name in names)
-        R = second[:, :3] @ first[:, :3].T
-        t = second[:, 3] - R @ first[:, 3]
-        found = graph.poses.get(pair)
-        errors.append(LOST_DEG if found is None else angle_deg(found.R, found.t, R, t))
+        true, found = relative_pose(*(problem.poses[name] for name in names)), graph.poses.get(pair)
+        errors.append(LOST_DEG if found is None else pose_error_deg((found.R, found.t), true))
     return np.array(errors)
-
-
-def angle_deg(R: FloatArray, t: FloatArray, true_R: FloatArray, true_t: FloatArray) -> float:
-    """Return the larger of the angles between rotations (3, 3) and between translations (3,)."""
-    cosines = (np.trace(R.T @ true_R) - 1) / 2, t @ true_t / (np.linalg.norm(t) * np.linalg.norm(true_t))
-    return float(np.degrees(np.arccos(np.clip(cosines, -1, 1))).max())
 
 
 def focal_errors_percent(problem: Problem, intrinsics: Intrinsics) -> list[float]:

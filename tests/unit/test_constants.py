@@ -2,12 +2,12 @@
 
 import ast
 import re
-from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 import sfm_app
+from benchmarks.sensitivity.constants import assignments
 
 PACKAGE, ROOT = Path(sfm_app.__file__).parent, Path(__file__).parents[2]
 METHODS = ("ransac", "selfcal")
@@ -35,17 +35,11 @@ def named(path):
 
 def constants(text):
     """Every module-level constant that holds numbers, with its docstring; numbered places are no quantities."""
-    found = {}
-    for statement, after in pairwise([*ast.parse(text).body, None]):
-        if not isinstance(statement, ast.Assign | ast.AnnAssign) or statement.value is None:
-            continue
-        targets = statement.targets if isinstance(statement, ast.Assign) else [statement.target]
-        names = [node.id for target in targets for node in ast.walk(target) if isinstance(node, ast.Name)]
-        if not any(NAME.fullmatch(name) for name in names) or not holds_numbers(statement.value):
-            continue
-        is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
-        found[", ".join(names)] = " ".join(str(after.value.value).split()) if is_text else ""
-    return found
+    return {
+        names: about
+        for names, statement, about in assignments(ast.parse(text))
+        if any(NAME.fullmatch(name) for name in names.split(", ")) and holds_numbers(statement.value)
+    }
 
 
 def holds_numbers(value):

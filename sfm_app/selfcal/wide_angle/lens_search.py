@@ -84,16 +84,17 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
     samples = [rng.integers(0, len(x), (SAMPLES, 8)) for x in thinned]
     threshold, total = THRESHOLD_PX / side, float(sum(map(len, thinned)))
 
-    def support(lens: Fisheye) -> float:
-        found = (search_rays(make_ray_pair(lens, x), s, threshold)[0] for x, s in zip(thinned, samples, strict=True))
-        return sum(found) / total
+    def search(lens: Fisheye) -> list[tuple[float, FloatArray]]:
+        return [search_rays(make_ray_pair(lens, x), s, threshold) for x, s in zip(thinned, samples, strict=True)]
+
+    def support(found: list[tuple[float, FloatArray]]) -> float:
+        return sum(count for count, _ in found) / total
 
     grid = [_lens_of(field, exponent) for exponent in EXPONENTS for field in FIELDS_DEG]
-    supports = [support(lens) for lens in grid]
-    best = grid[int(np.argmax(supports))]
-    found = [search_rays(make_ray_pair(best, x), s, threshold) for x, s in zip(thinned, samples, strict=True)]
+    searches = [search(lens) for lens in grid]
+    first = int(np.argmax([support(found) for found in searches]))
+    best, found = grid[first], searches[first]
     kept = [(x, F) for x, (count, F) in zip(thinned, found, strict=True) if count >= MIN_KEPT * len(x)]
-    perspective = support(Fisheye(1.0, PERSPECTIVE))
     if len(kept) < MIN_PAIRS:
         return None
     parameters, covariance = refine_lens(best, kept, THRESHOLD_PX / side)
@@ -102,7 +103,7 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
     scaled = covariance * np.outer(unit, unit)
     return LensEstimate(
         Fisheye(float(np.exp(parameters[0])) * side, float(parameters[1]), (float(center[0]), float(center[1]))),
-        tuple(map(tuple, scaled.tolist())), max(supports), perspective, len(thinned),
+        tuple(map(tuple, scaled.tolist())), support(found), support(search(Fisheye(1.0, PERSPECTIVE))), len(thinned),
     )  # fmt: skip
 
 

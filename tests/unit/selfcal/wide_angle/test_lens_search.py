@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import sfm_app
 from sfm_app.selfcal.wide_angle.fisheye import Fisheye
+from sfm_app.selfcal.wide_angle.lens_refinement import redundancy
 from sfm_app.selfcal.wide_angle.lens_search import find_lens
 from sfm_app.selfcal.wide_angle.ray_fundamental import make_ray_pair, search_rays, signed_distances, squared_distances
 
@@ -110,3 +111,11 @@ def test_the_two_distances_agree():
 def test_bad_input_is_refused(matches):
     with pytest.raises(ValueError, match="finite arrays of shape"):
         sfm_app.estimate_lens(matches, SIZE)
+
+
+def test_keypoints_in_many_photos_are_worth_less_than_their_matches():
+    photos = np.random.default_rng(0).uniform(0, 1, (6, 40, 2))
+    alone = [np.hstack([photos[0], photos[1]])]
+    everywhere = [np.hstack([a, b]) for a, b in combinations(photos, 2)]
+    assert redundancy(alone) == 1.0
+    assert redundancy(everywhere) == pytest.approx(15 / 9)
