@@ -49,7 +49,9 @@ class Plan:
         minutes, gigabytes = self.minutes(names), self.peak_mb(names) / 1000
         how_long = f"{_round_minutes(minutes)} minutes" if minutes >= 1.5 else "a minute or two"
         workers = f"{self.workers} worker{'s' if self.workers > 1 else ''}"
-        return f"{self.photos} photos, {self.pairs} pairs: about {how_long} and up to {gigabytes:.1f} GB with {workers}"
+        hard = "; hard photos take longer" if "scene" in names else ""
+        cost = f"about {how_long} and up to {gigabytes:.1f} GB with {workers}{hard}"
+        return f"{self.photos} photos, {self.pairs} pairs: {cost}"
 
 
 def largest_photo_megapixels(limit_mb: float) -> float:

@@ -20,7 +20,8 @@ def photos(count, width=4000, height=3000):
 def test_a_run_is_put_into_one_line():
     text = make_plan(photos(200), Settings(), 2).text(STAGES)
 
-    assert text.startswith("200 photos, 19900 pairs: about ") and text.endswith(" GB with 2 workers")
+    assert text.startswith("200 photos, 19900 pairs: about ") and " GB with 2 workers; hard photos take longer" in text
+    assert "hard photos" not in make_plan(photos(200), Settings(), 2).text(["match_graph"])
     assert make_plan(photos(2), DRAFT, 1).text(["files"]).split(": ")[1].startswith("about a minute or two")
 
 
