@@ -11,6 +11,9 @@ from sfm_app.numerical import finite_entries
 from sfm_app.types.matches import MatchedImage, PairId
 from sfm_app.types.photos import Photo
 
+PERSPECTIVE, FISHEYE, EQUIRECTANGULAR = "perspective", "fisheye", "equirectangular"
+PROJECTIONS = (PERSPECTIVE, FISHEYE, EQUIRECTANGULAR)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
@@ -27,7 +30,14 @@ class Calibration:
     reason: str = ""
     """Why K is not identifiable; empty when it is."""
     radial: float = 0.0
-    """k1 of COLMAP's SIMPLE_RADIAL: x_d = x_u (1 + k1 r^2) with r in focal lengths; 0 where it was not estimated."""
+    """k1 of COLMAP's SIMPLE_RADIAL: x_d = x_u (1 + k1 r^2) with r in focal lengths; 0 where it was not estimated. Only
+    with the projection "perspective"."""
+    projection: str = PERSPECTIVE
+    """One of `PROJECTIONS`. With "equirectangular", a whole turn is as wide as the photo, and K only states the scale
+    at its middle."""
+    fisheye: tuple[float, ...] = ()
+    """k1, ..., k4 of COLMAP's OPENCV_FISHEYE with the projection "fisheye": the radius in focal lengths is
+    theta (1 + k1 theta^2 + ... + k4 theta^8), theta the angle to the optical axis. Empty otherwise."""
     spread: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations where the calibrator estimates them: "fx", "fy", "cx", "cy" in pixels, "k1"."""
     held: tuple[str, ...] = ()
@@ -51,7 +61,8 @@ class Calibration:
         """Return plain values for JSON."""
         plain = {field.name: getattr(self, field.name) for field in fields(self)}
         tables = {"K": self.K.tolist(), "spread": dict(self.spread), "evidence": dict(self.evidence)}
-        return plain | tables | {"held": list(self.held), "key_pairs": [list(pair) for pair in self.key_pairs]}
+        lists = {"held": list(self.held), "fisheye": list(self.fisheye)}
+        return plain | tables | lists | {"key_pairs": [list(pair) for pair in self.key_pairs]}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "Calibration":
@@ -59,7 +70,7 @@ class Calibration:
         pairs = tuple((int(first), int(second)) for first, second in values["key_pairs"])
         tables = {name: finite_entries(values[name]) for name in ("spread", "evidence")}
         plain = {"K": np.array(values["K"], np.float64), "held": tuple(values["held"]), "key_pairs": pairs}
-        return cls(**{**values, **tables, **plain})
+        return cls(**{**values, **tables, **plain, "fisheye": tuple(values.get("fisheye", ()))})
 
 
 @dataclass(frozen=True, slots=True)
