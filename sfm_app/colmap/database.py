@@ -23,12 +23,16 @@ from sfm_app.types import (
     PoseGraph,
     RelativePose,
 )  # fmt: skip
+from sfm_app.types.calibration import EQUIRECTANGULAR, FISHEYE
 
 SQUARE_PIXELS = "SIMPLE_RADIAL"
 """f, cx, cy, k: the model used in mapping where K has one focal; a second radial term diverges on the first photos."""
 
 TWO_FOCALS = "OPENCV"
 """fx, fy, cx, cy, k1, k2, p1, p2: COLMAP's smallest model with two focals and lens distortion."""
+
+WIDE_MODELS = {FISHEYE: "OPENCV_FISHEYE", EQUIRECTANGULAR: "EQUIRECTANGULAR"}
+"""COLMAP's models of projections that are not perspective."""
 
 KINDS = {
     "calibrated": "CALIBRATED",
@@ -277,7 +281,7 @@ def _write_camera(database: pycolmap.Database, camera_id: int, calibration: Cali
         model=pycolmap.CameraModelId.__members__[name],
         width=calibration.width,
         height=calibration.height,
-        params=camera_params(calibration.K, name, calibration.radial),
+        params=params_of_calibration(calibration),
         has_prior_focal_length=calibration.is_estimated,
     )
     if database.exists_camera(camera_id):
@@ -298,13 +302,23 @@ def _write_frame(database: pycolmap.Database, image: pycolmap.Image) -> None:
 
 def camera_model(calibration: Calibration) -> str:
     """Return COLMAP's name of the smallest camera model for a calibration."""
+    if calibration.projection in WIDE_MODELS:
+        return WIDE_MODELS[calibration.projection]
     K = calibration.K
     square = "aspect" in calibration.held or abs(K[1, 1] / K[0, 0] - 1.0) < SQUARE_TOLERANCE
     return SQUARE_PIXELS if square else TWO_FOCALS
 
 
+def params_of_calibration(calibration: Calibration) -> list[float]:
+    """Return the parameters of the model that `camera_model` names."""
+    if calibration.projection == EQUIRECTANGULAR:
+        return [float(calibration.width), float(calibration.height)]
+    found = camera_params(calibration.K, camera_model(calibration), calibration.radial)
+    return [*found[:4], *calibration.fisheye] if calibration.projection == FISHEYE else found
+
+
 def camera_params(K: NDArray[np.float64], camera_model: str, radial: float = 0.0) -> list[float]:
-    """Return COLMAP's parameters of a camera.
+    """Return COLMAP's parameters of a perspective camera.
 
     Args:
         K: (3, 3) camera matrix, pixels.

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypedDict
+from typing import NamedTuple, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.types import all_images, all_points
+from sfm_app.geometry.bearings import BEARING, RAY
+from sfm_app.geometry.camera import panorama_matrix
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.geometry.two_view_init import TwoViewSeed
 from sfm_app.numerical import finite_entries
@@ -20,6 +22,8 @@ MIN_CONFIRMED_POINTS = 100
 """Points seen by three or more photos from which on their bounding box limits the scene."""
 
 
+STEP_PX = 1e-3
+"""Step of the derivatives of bearing vectors: curvature and rounding in double precision cost about 1e-9 of them."""
 MAX_COORDINATE = 1e100
 """Largest coordinate of a finite point: squares of much larger ones overflow."""
 
@@ -59,16 +63,14 @@ def model_from_seed(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlacedView:
-    """A posed photo and the rays of its keypoints."""
+    """A posed photo and the bearing vectors of its keypoints."""
 
     R: NDArray[np.float64]
     """(3, 3) rotation, camera from world."""
     t: NDArray[np.float64]
     """(3,) translation, camera from world."""
-    rays: NDArray[np.float64]
-    """(N, 2) keypoints on the plane z = 1."""
-    focals: NDArray[np.float64]
-    """(2,) fx, fy in pixels."""
+    lines: NDArray[np.float64]
+    """(N, 9) bearing vectors of keypoints, see `geometry.bearings`."""
 
 
 def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray[np.float64]]) -> dict[int, PlacedView]:
@@ -81,9 +83,20 @@ def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray
     found = {}
     for image in posed_images(model):
         camera, pose = model.cameras[image.camera_id], image.cam_from_world().matrix()
-        rays = np.asarray(camera.cam_from_img(keypoints[image.image_id]), np.float64).reshape(-1, 2)
-        focals = np.diag(camera.calibration_matrix())[:2].copy()
-        found[image.image_id] = PlacedView(pose[:, :3].copy(), pose[:, 3].copy(), rays, focals)
+        lines = _bearings(camera, keypoints[image.image_id])
+        found[image.image_id] = PlacedView(pose[:, :3].copy(), pose[:, 3].copy(), lines)
+    return found
+
+
+def _bearings(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N, 9) as `geometry.bearings` does."""
+    if camera.is_perspective_fisheye() or camera.is_spherical():
+        steps = np.vstack([x + step for step in ([0.0, 0.0], [STEP_PX, 0.0], [0.0, STEP_PX])])
+        here, right, down = np.asarray(camera.cam_ray_from_img(steps), np.float64).reshape(3, -1, 3)
+        return np.hstack([here, (right - here) / STEP_PX, (down - here) / STEP_PX])
+    found = np.zeros((len(x), BEARING))
+    found[:, :2], found[:, 2] = np.asarray(camera.cam_from_img(x), np.float64).reshape(-1, 2), 1.0
+    found[:, 3], found[:, 7] = 1.0 / camera.focal_length_x, 1.0 / camera.focal_length_y
     return found
 
 
@@ -92,14 +105,29 @@ def posed_photo_ids(model: pycolmap.Reconstruction) -> list[int]:
     return [image.image_id for image in posed_images(model)]
 
 
-def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, tuple[NDArray[np.float64], float]]:
-    """Return K (3, 3) and the first radial term of the camera of every posed photo, by photo id."""
-    found = {}
-    for image in posed_images(model):
-        camera = model.cameras[image.camera_id]
-        radial = float(camera.params[camera.extra_params_idxs()[0]])
-        found[image.image_id] = np.asarray(camera.calibration_matrix(), np.float64), radial
-    return found
+class MappedCamera(NamedTuple):
+    """A camera as mapping left it; see `Calibration`."""
+
+    K: NDArray[np.float64]
+    radial: float = 0.0
+    fisheye: tuple[float, ...] = ()
+
+
+def cameras_by_photo(model: pycolmap.Reconstruction) -> dict[int, MappedCamera]:
+    """Return the camera of every posed photo, by photo id."""
+    return {image.image_id: _mapped_camera(model.cameras[image.camera_id]) for image in posed_images(model)}
+
+
+def _mapped_camera(camera: pycolmap.Camera) -> MappedCamera:
+    if camera.is_spherical():
+        return MappedCamera(panorama_matrix((camera.width, camera.height)))
+    K, terms = (
+        np.asarray(camera.calibration_matrix(), np.float64),
+        [camera.params[k] for k in camera.extra_params_idxs()],
+    )
+    if camera.is_perspective_fisheye():
+        return MappedCamera(K, fisheye=tuple(float(term) for term in terms))
+    return MappedCamera(K, float(terms[0]))
 
 
 def color_points(model: pycolmap.Reconstruction, photo_dir: Path, workers: int) -> None:
@@ -236,8 +264,15 @@ def sparse_model(model_dir: Path) -> Model:
 
 
 def _frustum(image: pycolmap.Image, camera: pycolmap.Camera) -> Frustum:
-    K, pose = camera.calibration_matrix(), image.cam_from_world().matrix()
-    return Frustum(image.name, np.asarray(K, np.float64), np.asarray(pose, np.float64), camera.width, camera.height)
+    K, pose = _scale_matrix(camera), image.cam_from_world().matrix()
+    return Frustum(image.name, K, np.asarray(pose, np.float64), camera.width, camera.height)
+
+
+def _scale_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
+    """Return K (3, 3) of a camera; of a panorama, the scale at its middle."""
+    if camera.is_spherical():
+        return panorama_matrix((camera.width, camera.height))
+    return np.asarray(camera.calibration_matrix(), np.float64)
 
 
 def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -249,9 +284,8 @@ def viewing_rays(model: pycolmap.Reconstruction, image_id: int, x: NDArray[np.fl
         x: (N, 2) pixels.
     """
     image = model.images[image_id]
-    plane = np.asarray(model.cameras[image.camera_id].cam_from_img(x), np.float64).reshape(-1, 2)
     R = image.cam_from_world().matrix()[:, :3]
-    return np.asarray(np.column_stack([plane, np.ones(len(plane))]) @ R)
+    return np.asarray(_bearings(model.cameras[image.camera_id], np.asarray(x, np.float64))[:, RAY] @ R)
 
 
 def focal_px(model: pycolmap.Reconstruction, image_id: int) -> float:
@@ -261,7 +295,7 @@ def focal_px(model: pycolmap.Reconstruction, image_id: int) -> float:
         model: COLMAP's reconstruction.
         image_id: id of the photo.
     """
-    return float(model.cameras[model.images[image_id].camera_id].mean_focal_length())
+    return float(np.sqrt(np.prod(np.diag(_scale_matrix(model.cameras[model.images[image_id].camera_id]))[:2])))
 
 
 def move(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
@@ -308,7 +342,7 @@ def read_scene(
 
 
 def _camera(camera: pycolmap.Camera, refined: RefinedCamera) -> CameraModel:
-    K = np.asarray(camera.calibration_matrix(), np.float64)
+    K = _scale_matrix(camera)
     params = tuple(float(value) for value in camera.params)
     deviations, determined = finite_entries(refined.get("deviations", {})), tuple(refined.get("determined", ()))
     return CameraModel(camera.model.name, params, K, camera.width, camera.height, deviations, determined)

@@ -34,6 +34,15 @@ def guessed_camera_matrix(size: tuple[int, int], focal_px: float | None = None) 
     return camera_matrix(focal, focal, size[0] / 2, size[1] / 2)
 
 
+def panorama_matrix(size: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the (3, 3) matrix that states the scale of an equirectangular photo at its middle, in pixels per radian.
+
+    Args:
+        size: (width, height) in pixels, of a whole turn and of half a turn.
+    """
+    return camera_matrix(size[0] / (2.0 * np.pi), size[1] / np.pi, size[0] / 2, size[1] / 2)
+
+
 def rays(x: NDArray[np.float64], K: NDArray[np.float64], radial: float = 0.0) -> NDArray[np.float64]:
     """Undistort pixels to (N, 2) points of the plane z = 1, for a lens x_d = x_u (1 + radial r_u^2).
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.essential import nearest_essential, relative_pose
+from sfm_app.geometry.ray_epipolar import FIRST, SECOND, depths
 from sfm_app.geometry.triangulation import triangulation_angle_deg
 
 Array = NDArray[np.float64]
@@ -39,8 +40,24 @@ def two_view_seed(E: Array, x1: Array, x2: Array) -> TwoViewSeed:
         x1: (N, 2) inliers as points of the plane z = 1, see `geometry.camera.rays`.
         x2: (N, 2) partners.
     """
-    R, t, X, in_front = relative_pose(nearest_essential(E), x1, x2)
+    return _judge_seed(*relative_pose(nearest_essential(E), x1, x2))
+
+
+def ray_seed(R: Array, t: Array, lines: Array) -> TwoViewSeed:
+    """Triangulate inliers of a pose by the points midway between their rays.
+
+    Args:
+        R: (3, 3) rotation of view 2 from view 1.
+        t: (3,) unit vector along its translation.
+        lines: (N, 18) inliers as bearing vectors, see `geometry.bearings`, view 1 and view 2.
+    """
+    first, second = depths(lines, R, t)
+    X = 0.5 * (first[:, None] * lines[:, FIRST] + (second[:, None] * lines[:, SECOND] - t) @ R)
+    return _judge_seed(R, t, X, (first > 0) & (second > 0))
+
+
+def _judge_seed(R: Array, t: Array, X: Array, in_front: NDArray[np.bool_]) -> TwoViewSeed:
     angles = triangulation_angle_deg(X, np.zeros(3), -R.T @ t)
     angle = float(np.median(angles[in_front])) if in_front.any() else 0.0
     usable = in_front & (angles > min(1.0, angle / 4))
-    return TwoViewSeed(R, t, X, usable, angle, float(in_front.mean()) if len(x1) else 0.0)
+    return TwoViewSeed(R, t, X, usable, angle, float(in_front.mean()) if len(X) else 0.0)

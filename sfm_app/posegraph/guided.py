@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from sfm_app.geometry.ray_epipolar import FIRST, SECOND
 from sfm_app.posegraph.pair_pose import Pair, is_in_front
 from sfm_app.posegraph.refine import pose_distances, refine_pose
 from sfm_app.types import RelativePose
@@ -42,15 +43,15 @@ def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> Relat
         min_inliers: least number of inliers of a pose.
         seed: seed of the sampling.
     """
-    if len(pair.rays) < min_inliers:
+    if len(pair.lines) < min_inliers:
         return None
     t = sample_direction(pair, R, np.random.default_rng(seed))
     if t is None:
         return None
-    near = pose_distances(pair.rays, pair.focals, R, t) <= NEAR_THRESHOLDS * pair.max_error_px
+    near = pose_distances(pair.lines, R, t) <= NEAR_THRESHOLDS * pair.max_error_px
     if np.count_nonzero(near) < min_inliers:
         return None
-    turned, moved = refine_pose(pair.rays[near], pair.focals, R, t)
+    turned, moved = refine_pose(pair.lines[near], R, t)
     inliers = pair.inliers(turned, moved)
     if np.count_nonzero(inliers) < min_inliers:
         return None
@@ -66,9 +67,7 @@ def guided_pose(pair: Pair, R: FloatArray, min_inliers: int, seed: int) -> Relat
 
 def _epipolar_normals(pair: Pair, R: FloatArray) -> FloatArray:
     """Return (N, 3), for each match the vector that the translation is perpendicular to, given R."""
-    h1 = np.column_stack([pair.rays[:, :2], np.ones(len(pair.rays))]) @ R.T
-    h2 = np.column_stack([pair.rays[:, 2:], np.ones(len(pair.rays))])
-    return np.asarray(np.cross(h1, h2), np.float64)
+    return np.asarray(np.cross(pair.lines[:, FIRST] @ R.T, pair.lines[:, SECOND]), np.float64)
 
 
 def refine_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
@@ -82,7 +81,7 @@ def refine_direction(pair: Pair, R: FloatArray, t: FloatArray) -> FloatArray:
     normals = _epipolar_normals(pair, R)
     best = t
     for _ in range(HELD_ROUNDS):
-        distances = pose_distances(pair.rays, pair.focals, R, best) / (HELD_SIGMA * pair.max_error_px)
+        distances = pose_distances(pair.lines, R, best) / (HELD_SIGMA * pair.max_error_px)
         algebraic = np.abs(np.einsum("ni,i->n", normals, best))
         # Sampson's distance is the algebraic one over its gradient, which hardly changes with t
         gradients = np.where(distances > 0, algebraic / np.maximum(distances, 1e-12), 1.0)
@@ -108,12 +107,12 @@ def sample_direction(pair: Pair, R: FloatArray, rng: np.random.Generator) -> Flo
     lengths = np.linalg.norm(found, axis=1)
     best, lowest = None, np.inf
     for t in found[lengths > 1e-12] / lengths[lengths > 1e-12, None]:
-        distances = pose_distances(pair.rays, pair.focals, R, t) / pair.max_error_px
+        distances = pose_distances(pair.lines, R, t) / pair.max_error_px
         cost = float(np.sum(distances**2 / (1.0 + distances**2)))
         if cost < lowest:
             best, lowest = np.asarray(t, np.float64), cost
     if best is None:
         return None
     # t and -t have the same epipolar lines
-    front, behind = (np.count_nonzero(is_in_front(pair.rays, R, sign * best)) for sign in (1.0, -1.0))
+    front, behind = (np.count_nonzero(is_in_front(pair.lines, R, sign * best)) for sign in (1.0, -1.0))
     return best if front >= behind else -best

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.camera import rays
+from sfm_app.geometry.bearings import bearings, depths_along, project
+from sfm_app.geometry.ray_epipolar import FIRST, SECOND, depths
 from sfm_app.posegraph.coverage import Visibility
-from sfm_app.posegraph.pair_pose import depths
 from sfm_app.types import Calibration, MatchGraph, PairId, RelativePose
 
 FloatArray = NDArray[np.float64]
@@ -63,15 +63,14 @@ class Depths:
 
     def __init__(self, matches: MatchGraph, cameras: Cameras, poses: Poses, sight: Visibility) -> None:
         self.matches, self.cameras, self.poses, self.sight = matches, cameras, poses, sight
-        self.rays: dict[int, FloatArray] = {}
+        self.lines: dict[int, FloatArray] = {}
         self.known: dict[tuple[int, int], PairDepths] = {}
 
-    def keypoint_rays(self, photo: int) -> FloatArray:
-        """Return the keypoints of a photo as (K, 2) points of the plane z = 1."""
-        if photo not in self.rays:
-            camera = self.cameras[photo]
-            self.rays[photo] = rays(self.matches.keypoints[photo], camera.K, camera.radial)
-        return self.rays[photo]
+    def keypoint_bearings(self, photo: int) -> FloatArray:
+        """Return the keypoints of a photo as (K, 9) bearing vectors."""
+        if photo not in self.lines:
+            self.lines[photo] = bearings(self.matches.keypoints[photo], self.cameras[photo])
+        return self.lines[photo]
 
     def pair_depths(self, photo: int, other: int) -> PairDepths:
         """Return the depths of a photo's points from one pair.
@@ -84,11 +83,11 @@ class Depths:
             return self.known[photo, other]
         pair = (min(photo, other), max(photo, other))
         pose, rows = self.poses[pair], self.sight.rows[pair]
-        used = np.hstack([self.keypoint_rays(one)[column] for one, column in zip(pair, rows.T, strict=True)])
+        used = np.hstack([self.keypoint_bearings(one)[column] for one, column in zip(pair, rows.T, strict=True)])
         found, front = depths(used, pose.R, pose.t), np.ones(len(rows), np.bool_)
         for one in found:
             front &= one > 0
-        h1, h2 = _to_homogeneous(used[:, :2]) @ pose.R.T, _to_homogeneous(used[:, 2:])
+        h1, h2 = used[:, FIRST] @ pose.R.T, used[:, SECOND]
         lengths = np.linalg.norm(h1, axis=1) * np.linalg.norm(h2, axis=1)
         sines = np.linalg.norm(np.cross(h1, h2), axis=1) / lengths
         weights = np.minimum(sines, WIDE_RAD) ** 2 + 1e-6
@@ -134,17 +133,17 @@ class Depths:
             logs: (N,) logarithms of their depths in the scale of the pair.
         """
         R, t = _directed_pose(self.poses, photo, other)
-        rays_here = _to_homogeneous(self.keypoint_rays(photo)[points])
+        rays_here = self.keypoint_bearings(photo)[points, FIRST]
         z = np.exp(logs)
         turned = rays_here @ R.T
         there = turned * z[:, None] + t
         image, here, camera = self.matches.images[other], self.cameras[photo], self.cameras[other]
         with np.errstate(invalid="ignore", divide="ignore"):
-            x = (there @ camera.K.T)[:, :2] / there[:, 2:]
-            smaller = there[:, 2] / z * here.K[0, 0] / camera.K[0, 0]
+            x = project(there, camera)
+            smaller = depths_along(there, camera) / z * here.K[0, 0] / camera.K[0, 0]
             cosines = (turned * there).sum(1) / np.linalg.norm(turned, axis=1) / np.linalg.norm(there, axis=1)
         size = np.array([image.width, image.height], np.float64)
-        inside = (there[:, 2] > 0) & ((x > BORDER * size) & (x < (1.0 - BORDER) * size)).all(axis=1)
+        inside = ((x > BORDER * size) & (x < (1.0 - BORDER) * size)).all(axis=1)  # NaN where it cannot be seen
         alike = (smaller < MOST_SCALE) & (smaller > 1.0 / MOST_SCALE) & (cosines > np.cos(np.radians(MOST_DEG)))
         return np.asarray(points[inside & alike], np.int64)
 
@@ -187,7 +186,3 @@ def _log_scale(end: PairDepths, total: FloatArray) -> float:
     both = total[1, end.rows] > 0
     rows = end.rows[both]
     return float(np.median(end.logs[both] - total[0, rows] / total[1, rows]))
-
-
-def _to_homogeneous(x: FloatArray) -> FloatArray:
-    return np.column_stack([x, np.ones(len(x))])

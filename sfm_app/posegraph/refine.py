@@ -28,65 +28,69 @@ _DIFFERENCE_STEP = 1e-6
 """Step of the parameters for finite differences. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 
 
-def refine_pose(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
+def refine_pose(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Refine the pose (R, t) by robust least squares of Sampson distances (Levenberg-Marquardt).
 
     Args:
-        rays: (N, 4) matches as points of the plane z = 1, view 1 and view 2.
-        focals: (4,) fx, fy of view 1 and of view 2, in pixels.
+        lines: (N, 18) matches as bearing vectors with derivatives (`geometry.bearings`), view 1 and view 2.
         R: (3, 3) rotation of view 2 from view 1.
         t: (3,) direction of its translation.
     """
     pose = np.concatenate([R.ravel(), t / np.linalg.norm(t)])
     for sigma in SIGMAS_PX:
-        pose = _descend(rays, focals, pose, sigma)
+        pose = _descend(lines, pose, sigma)
     return pose[:9].reshape(3, 3).copy(), pose[9:].copy()
 
 
-def pose_distances(rays: FloatArray, focals: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
+def pose_distances(lines: FloatArray, R: FloatArray, t: FloatArray) -> FloatArray:
     """Return the Sampson distances (N,) of matches to a relative pose, in pixels, >= 0.
 
     Args:
-        rays: (N, 4) matches as points of the plane z = 1, view 1 and view 2.
-        focals: (4,) fx, fy of view 1 and of view 2, in pixels.
+        lines: (N, 18) matches as bearing vectors with derivatives (`geometry.bearings`), view 1 and view 2.
         R: (3, 3) rotation of view 2 from view 1.
         t: (3,) unit vector along its translation.
     """
     pose = np.concatenate([R.ravel(), t])
-    return np.abs(_distances(rays, focals, pose))
+    return np.abs(_distances(lines, pose))
 
 
 @kernel
-def _distance(ray: FloatArray, E: FloatArray, focals: FloatArray) -> float:
-    l0 = E[0, 0] * ray[0] + E[0, 1] * ray[1] + E[0, 2]
-    l1 = E[1, 0] * ray[0] + E[1, 1] * ray[1] + E[1, 2]
-    l2 = E[2, 0] * ray[0] + E[2, 1] * ray[1] + E[2, 2]
-    k0 = E[0, 0] * ray[2] + E[1, 0] * ray[3] + E[2, 0]
-    k1 = E[0, 1] * ray[2] + E[1, 1] * ray[3] + E[2, 1]
-    g0, g1, h0, h1 = k0 / focals[0], k1 / focals[1], l0 / focals[2], l1 / focals[3]
-    return float((ray[2] * l0 + ray[3] * l1 + l2) / np.sqrt(g0 * g0 + g1 * g1 + h0 * h0 + h1 * h1 + 1e-300))
+def _distance(line: FloatArray, E: FloatArray) -> float:
+    """Return the signed distance of one match, (18,)."""
+    l0 = E[0, 0] * line[0] + E[0, 1] * line[1] + E[0, 2] * line[2]
+    l1 = E[1, 0] * line[0] + E[1, 1] * line[1] + E[1, 2] * line[2]
+    l2 = E[2, 0] * line[0] + E[2, 1] * line[1] + E[2, 2] * line[2]
+    k0 = E[0, 0] * line[9] + E[1, 0] * line[10] + E[2, 0] * line[11]
+    k1 = E[0, 1] * line[9] + E[1, 1] * line[10] + E[2, 1] * line[11]
+    k2 = E[0, 2] * line[9] + E[1, 2] * line[10] + E[2, 2] * line[11]
+    g0 = k0 * line[3] + k1 * line[4] + k2 * line[5]
+    g1 = k0 * line[6] + k1 * line[7] + k2 * line[8]
+    h0 = l0 * line[12] + l1 * line[13] + l2 * line[14]
+    h1 = l0 * line[15] + l1 * line[16] + l2 * line[17]
+    algebraic = line[9] * l0 + line[10] * l1 + line[11] * l2
+    return float(algebraic / np.sqrt(g0 * g0 + g1 * g1 + h0 * h0 + h1 * h1 + 1e-300))
 
 
 @kernel
-def _distances(rays: FloatArray, focals: FloatArray, pose: FloatArray) -> FloatArray:
-    E, found = np.empty((3, 3)), np.empty(rays.shape[0])
+def _distances(lines: FloatArray, pose: FloatArray) -> FloatArray:
+    E, found = np.empty((3, 3)), np.empty(lines.shape[0])
     write_essential(pose, E)
-    for i in range(rays.shape[0]):
-        found[i] = _distance(rays[i], E, focals)
+    for i in range(lines.shape[0]):
+        found[i] = _distance(lines[i], E)
     return found
 
 
 @kernel
-def _cost(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) -> float:
+def _cost(lines: FloatArray, pose: FloatArray, sigma: float) -> float:
     E, cost = np.empty((3, 3)), 0.0
     write_essential(pose, E)
-    for i in range(rays.shape[0]):
-        cost += np.log1p((_distance(rays[i], E, focals) / sigma) ** 2)
+    for i in range(lines.shape[0]):
+        cost += np.log1p((_distance(lines[i], E) / sigma) ** 2)
     return cost
 
 
 @kernel
-def _system(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
+def _system(lines: FloatArray, pose: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
     """Return the approximate Hessian (5, 5) and the negative gradient (5,) of half the cost."""
     Es, J, step = np.empty((1 + POSE_DOF, 3, 3)), np.empty(POSE_DOF), np.zeros(POSE_DOF)
     A, b = np.zeros((POSE_DOF, POSE_DOF)), np.zeros(POSE_DOF)
@@ -95,11 +99,11 @@ def _system(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float
         step[j] = _DIFFERENCE_STEP
         write_essential(retract(pose, step), Es[1 + j])
         step[j] = 0.0
-    for i in range(rays.shape[0]):
-        r = _distance(rays[i], Es[0], focals) / sigma
+    for i in range(lines.shape[0]):
+        r = _distance(lines[i], Es[0]) / sigma
         weight = 1.0 / (1.0 + r * r)
         for j in range(POSE_DOF):
-            J[j] = (_distance(rays[i], Es[1 + j], focals) / sigma - r) / _DIFFERENCE_STEP
+            J[j] = (_distance(lines[i], Es[1 + j]) / sigma - r) / _DIFFERENCE_STEP
         for j in range(POSE_DOF):
             b[j] -= weight * r * J[j]
             for k in range(POSE_DOF):
@@ -107,17 +111,17 @@ def _system(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float
     return A, b
 
 
-def _descend(rays: FloatArray, focals: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
-    cost, damping = _cost(rays, focals, pose, sigma), DAMPING.first
+def _descend(lines: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
+    cost, damping = _cost(lines, pose, sigma), DAMPING.first
 
     def attempt(tried: float) -> tuple[FloatArray, float] | None:
         step = np.asarray(np.linalg.solve(A + np.diag(tried * np.diag(A) + 1e-9), b), np.float64)
         trial = retract(pose, step)
-        lower = _cost(rays, focals, trial, sigma)
+        lower = _cost(lines, trial, sigma)
         return (trial, lower) if lower < cost else None
 
     for _ in range(STEPS):
-        A, b = _system(rays, focals, pose, sigma)
+        A, b = _system(lines, pose, sigma)
         found, damping = damped_step(attempt, damping, DAMPING)
         if found is None:
             break

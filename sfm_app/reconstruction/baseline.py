@@ -18,6 +18,7 @@ from sfm_app.geometry.camera import GUESSED_FOCAL, guessed_camera_matrix
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, judge_model
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, ViewGraph
+from sfm_app.types.calibration import PERSPECTIVE
 from sfm_app.types.epipolar import EpipolarFit
 
 logger = logging.getLogger("sfm_app")
@@ -110,14 +111,16 @@ def has_many_unplaced(model: Attempt | None, intrinsics: Intrinsics, views: View
 
 
 def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> Intrinsics:
-    """Replace every camera by a guess, except those with a focal from EXIF.
+    """Replace every perspective camera by a guess, except those with a focal from EXIF.
+
+    With a perspective camera, COLMAP cannot place photos of a fisheye lens.
 
     Args:
         intrinsics: cameras from pairs.
         sides: guess of the focal, in longer sides of the photo.
     """
     cameras = {
-        name: camera if camera.method == "exif" else _guess(camera, sides)
+        name: camera if camera.method == "exif" or camera.projection != PERSPECTIVE else _guess(camera, sides)
         for name, camera in intrinsics.cameras.items()
     }
     return replace(intrinsics, cameras=cameras)

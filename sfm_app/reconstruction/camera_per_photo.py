@@ -55,7 +55,7 @@ def with_camera_per_photo(model: Attempt, found: Intrinsics, matches: MatchGraph
         found: the shared cameras.
         matches: all photos.
     """
-    focals = {photo: float(K[0, 0] * K[1, 1]) ** 0.5 for photo, (K, _) in cameras_by_photo(model.model).items()}
+    focals = {photo: float(K[0, 0] * K[1, 1]) ** 0.5 for photo, (K, *_) in cameras_by_photo(model.model).items()}
     placed = posed_photo_ids(model.model)
     usual = {found.camera_name(matches.images[photo]): focals[photo] for photo in placed if photo in focals}
     members: dict[str, list[MatchedImage]] = {}
@@ -84,7 +84,7 @@ def with_two_cameras(model: Attempt, each: Intrinsics, matches: MatchGraph) -> I
         matches: all photos.
     """
     of_size: dict[tuple[int, int], dict[str, float]] = {}
-    for photo, (K, _) in cameras_by_photo(model.model).items():
+    for photo, (K, *_) in cameras_by_photo(model.model).items():
         name = each.camera_name(matches.images[photo])
         if not each.cameras[name].identifiable:
             size = each.cameras[name].width, each.cameras[name].height

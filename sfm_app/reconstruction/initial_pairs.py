@@ -5,10 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sfm_app.geometry.bearings import bearings
 from sfm_app.geometry.camera import rays
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.geometry.two_view_init import GOOD_ANGLE_DEG, TwoViewSeed, two_view_seed
+from sfm_app.geometry.two_view_init import GOOD_ANGLE_DEG, TwoViewSeed, ray_seed, two_view_seed
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose
+from sfm_app.types.calibration import PERSPECTIVE
 
 DISSENT_WEIGHT = 0.1
 """Weight of a seed whose pair contradicts the camera matrix that other pairs agree on."""
@@ -62,6 +64,9 @@ def triangulate_seed(matches: MatchGraph, candidate: Candidate, intrinsics: Intr
     """
     pose, cameras = candidate.pose, [intrinsics.camera(matches.images[photo]) for photo in candidate.pair]
     points = matches.points(candidate.pair)
+    if any(camera.projection != PERSPECTIVE for camera in cameras):
+        lines = np.hstack([bearings(x[pose.inliers], camera) for x, camera in zip(points, cameras, strict=True)])
+        return ray_seed(pose.R, pose.t, lines)
     x1, x2 = (rays(x[pose.inliers], camera.K, camera.radial) for x, camera in zip(points, cameras, strict=True))
     return two_view_seed(cross_matrix(pose.t) @ pose.R, x1, x2)
 

@@ -232,11 +232,10 @@ def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGra
     with translate_errors("reading cameras"):
         found = cameras_by_photo(model.model)
     cameras = dict(intrinsics.cameras)
-    for photo, (K, radial) in found.items():
+    for photo, camera in found.items():
         name = intrinsics.camera_name(matches.images[photo])
-        cameras[name] = replace(
-            intrinsics.cameras[name], K=K, radial=radial, identifiable=True, reason="", method="mapping"
-        )
+        known = replace(intrinsics.cameras[name], K=camera.K, radial=camera.radial, fisheye=camera.fisheye)
+        cameras[name] = replace(known, identifiable=True, reason="", method="mapping")
     return replace(intrinsics, cameras=cameras)
 
 

@@ -69,7 +69,7 @@ def model_poses(
     for pair, seen in _placed_pairs(model, matches):
         right = seen.inlier_mask(max_error_px)
         if np.count_nonzero(right) >= least:
-            angle_deg = float(np.median(ray_angles_deg(seen.rays[right], seen.R)))
+            angle_deg = float(np.median(ray_angles_deg(seen.lines[right], seen.R)))
             found[pair] = RelativePose(seen.R, seen.t, right, angle_deg=angle_deg, in_front=1.0, kind="calibrated")
     return found
 
@@ -78,18 +78,16 @@ def model_poses(
 class _PlacedPair:
     """The raw matches of two posed photos."""
 
-    rays: FloatArray
-    """(M, 4) matches on the planes z = 1 of view 1 and of view 2."""
-    focals: FloatArray
-    """(4,) fx, fy of view 1 and of view 2, in pixels."""
+    lines: FloatArray
+    """(M, 18) matches as bearing vectors of view 1 and of view 2."""
     R: FloatArray
     t: FloatArray
     """Rotation and translation, view 2 from view 1; t has length 1, or is 0 for equal positions."""
 
     def inlier_mask(self, max_error_px: float) -> NDArray[np.bool_]:
         """Return (M,) which matches lie on their epipolar lines, in front of both cameras."""
-        distances = pose_distances(self.rays, self.focals, self.R, self.t)
-        return np.asarray((distances <= max_error_px) & is_in_front(self.rays, self.R, self.t), bool)
+        distances = pose_distances(self.lines, self.R, self.t)
+        return np.asarray((distances <= max_error_px) & is_in_front(self.lines, self.R, self.t), bool)
 
 
 def _placed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[PairId, _PlacedPair]]:
@@ -100,9 +98,8 @@ def _placed_pairs(model: Reconstruction, matches: MatchGraph) -> Iterator[tuple[
         first, second = placed[pair[0]], placed[pair[1]]
         R = second.R @ first.R.T
         t = second.t - R @ first.t
-        rays = np.hstack([first.rays[rows[:, 0]], second.rays[rows[:, 1]]])
-        focals = np.concatenate([first.focals, second.focals])
-        yield pair, _PlacedPair(rays, focals, R, t / max(float(np.linalg.norm(t)), 1e-300))
+        lines = np.hstack([first.lines[rows[:, 0]], second.lines[rows[:, 1]]])
+        yield pair, _PlacedPair(lines, R, t / max(float(np.linalg.norm(t)), 1e-300))
 
 
 def support(explained: Mapping[PairId, PairSupport]) -> float:

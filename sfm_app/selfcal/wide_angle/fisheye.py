@@ -71,12 +71,16 @@ class Fisheye:
         return float(2.0 * np.degrees(self.angle(np.array([0.5 * width]))[0]))
 
 
-def rays_and_slopes(lens: Fisheye, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return rays (N, 3) and their derivatives by x and y of the points.
+def bearings_through(lens: Fisheye, matches: FloatArray) -> FloatArray:
+    """Return (N, 18) bearing vectors of matches, with their derivatives by x and y: view 1, view 2.
 
     Args:
-        lens: in longer sides of the photo.
-        points: (N, 2) in the same unit.
+        lens: of both photos, in longer sides.
+        matches: (N, 4) x1, y1, x2, y2 in the same unit.
     """
+    return np.hstack([_rays_and_slopes(lens, matches[:, :2]), _rays_and_slopes(lens, matches[:, 2:])])
+
+
+def _rays_and_slopes(lens: Fisheye, points: FloatArray) -> FloatArray:
     rays, right, down = lens.rays(points), np.array([STEP, 0.0]), np.array([0.0, STEP])
-    return rays, (lens.rays(points + right) - rays) / STEP, (lens.rays(points + down) - rays) / STEP
+    return np.hstack([rays, (lens.rays(points + right) - rays) / STEP, (lens.rays(points + down) - rays) / STEP])

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from sfm_app.geometry.damping import DampingRange, damped_step
 from sfm_app.geometry.essential import decompose_essential
 from sfm_app.geometry.pose_manifold import POSE_DOF, retract, write_essential
+from sfm_app.geometry.ray_epipolar import signed_distances
 from sfm_app.geometry.spd_solve import inverse_of_positive, solve_each
 from sfm_app.numerical import MAD_TO_SIGMA
-from sfm_app.selfcal.wide_angle.fisheye import Fisheye
-from sfm_app.selfcal.wide_angle.ray_fundamental import make_ray_pair, signed_distances
+from sfm_app.selfcal.wide_angle.fisheye import Fisheye, bearings_through
 
 FloatArray = NDArray[np.float64]
 
@@ -145,9 +145,9 @@ def _systems(matches: Sequence[FloatArray], state: State, sigma: float) -> list[
 
 
 def _system(x: FloatArray, parameters: FloatArray, moved: list[Fisheye], pose: FloatArray, sigma: float) -> System:
-    pair, E = make_ray_pair(lens_from_parameters(parameters), x), _essential(pose)
+    pair, E = bearings_through(lens_from_parameters(parameters), x), _essential(pose)
     r = signed_distances(E, pair)
-    by_lens = [signed_distances(E, make_ray_pair(lens, x)) - r for lens in moved]
+    by_lens = [signed_distances(E, bearings_through(lens, x)) - r for lens in moved]
     by_pose = [signed_distances(_essential(retract(pose, STEP * axis)), pair) - r for axis in np.eye(POSE_DOF)]
     J, r = np.column_stack(by_lens + by_pose) / (STEP * sigma), r / sigma
     weights = (1.0 + (r / ROBUST_SCALE) ** 2) ** -2
@@ -174,7 +174,7 @@ def _noise(matches: Sequence[FloatArray], state: State) -> float:
 def _distances(matches: Sequence[FloatArray], state: State) -> list[FloatArray]:
     lens = lens_from_parameters(state.parameters)
     pairs = zip(matches, state.poses, strict=True)
-    return [signed_distances(_essential(pose), make_ray_pair(lens, x)) for x, pose in pairs]
+    return [signed_distances(_essential(pose), bearings_through(lens, x)) for x, pose in pairs]
 
 
 def lens_from_parameters(parameters: FloatArray) -> Fisheye:

@@ -12,9 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.selfcal.wide_angle.fisheye import EQUIDISTANT, EQUISOLID, PERSPECTIVE, STEREOGRAPHIC, Fisheye
+from sfm_app.selfcal.wide_angle.fisheye import (
+    EQUIDISTANT,
+    EQUISOLID,
+    PERSPECTIVE,
+    STEREOGRAPHIC,
+    Fisheye,
+    bearings_through,
+)
 from sfm_app.selfcal.wide_angle.lens_refinement import refine_lens
-from sfm_app.selfcal.wide_angle.ray_fundamental import make_ray_pair, search_rays
+from sfm_app.selfcal.wide_angle.lens_support import search_rays
 
 FloatArray = NDArray[np.float64]
 
@@ -85,7 +92,7 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
     threshold, total = THRESHOLD_PX / side, float(sum(map(len, thinned)))
 
     def search(lens: Fisheye) -> list[tuple[float, FloatArray]]:
-        return [search_rays(make_ray_pair(lens, x), s, threshold) for x, s in zip(thinned, samples, strict=True)]
+        return [search_rays(bearings_through(lens, x), s, threshold) for x, s in zip(thinned, samples, strict=True)]
 
     def support(found: list[tuple[float, FloatArray]]) -> float:
         return sum(count for count, _ in found) / total

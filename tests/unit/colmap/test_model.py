@@ -64,8 +64,9 @@ def test_placed_views_see_the_points_where_they_are(synthetic):
     for key, view in views.items():
         seen = [(k, p.point3D_id) for k, p in enumerate(model.images[key].points2D) if p.has_point3D()]
         X = np.array([model.points3D[number].xyz for _, number in seen]) @ view.R.T + view.t
-        np.testing.assert_allclose(view.rays[[k for k, _ in seen]], X[:, :2] / X[:, 2:], atol=1e-5)
-        assert view.focals.tolist() == [900.0, 850.0]
+        lines = view.lines[[k for k, _ in seen]]
+        np.testing.assert_allclose(lines[:, :3], X / X[:, 2:], atol=1e-5)
+        np.testing.assert_allclose(1.0 / lines[:, [3, 7]], [[900.0, 850.0]] * len(lines))
 
 
 @pytest.mark.parametrize(
@@ -83,7 +84,7 @@ def test_cameras_are_read_with_their_first_radial_term(synthetic, name, params, 
     found = cameras_by_photo(model)
 
     assert sorted(found) == [1, 3]
-    for K, radial in found.values():
+    for K, radial, _ in found.values():
         assert (K[0, 0], K[1, 1], K[0, 2], K[1, 2], radial) == (*focals, 510.0, 390.0, -0.1)
 
 

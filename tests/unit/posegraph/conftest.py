@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from sfm_app.geometry.bearings import bearings
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import cross_matrix
 from sfm_app.posegraph.pair_pose import Pair
@@ -42,11 +43,13 @@ class TwoViews:
 
     @property
     def rays(self):
+        """(N, 4) points of the planes z = 1."""
         return np.hstack([(x - K[:2, 2]) / np.diag(K)[:2] for x in (self.x1, self.x2)])
 
     @property
-    def focals(self):
-        return np.tile(np.diag(K)[:2], 2)
+    def lines(self):
+        """(N, 18) bearing vectors."""
+        return np.hstack([bearings(x, camera()) for x in (self.x1, self.x2)])
 
     @property
     def F(self):

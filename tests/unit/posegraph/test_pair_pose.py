@@ -2,11 +2,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_app.geometry.bearings import project
 from sfm_app.geometry.epipolar import cross_matrix, eight_point
 from sfm_app.geometry.essential import relative_pose
+from sfm_app.geometry.ray_epipolar import depths
 from sfm_app.geometry.triangulation import triangulate, triangulation_angle_deg
-from sfm_app.posegraph.pair_pose import depths, estimate_pose, is_in_front, ray_angles_deg, rotation_residuals
-from sfm_app.types import EpipolarFit
+from sfm_app.posegraph.pair_pose import Pair, estimate_pose, is_in_front, ray_angles_deg, rotation_residuals
+from sfm_app.types import Calibration, EpipolarFit
 
 
 def fit_of(views, F=None):
@@ -102,24 +104,25 @@ def test_depths_are_those_of_triangulated_points(two_views):
     x1, x2 = views.rays[:, :2], views.rays[:, 2:]
     X = triangulate(np.eye(3, 4), np.column_stack([views.R, views.t]), x1, x2)
 
-    first, second = depths(views.rays, views.R, views.t)
+    first, second = depths(views.lines, views.R, views.t)
 
     np.testing.assert_allclose(first, X[:, 2], rtol=1e-6)
     np.testing.assert_allclose(second, (X @ views.R.T + views.t)[:, 2], rtol=1e-6)
     angles = triangulation_angle_deg(X, np.zeros(3), -views.R.T @ views.t)
-    np.testing.assert_allclose(ray_angles_deg(views.rays, views.R), angles, atol=1e-5)
+    np.testing.assert_allclose(ray_angles_deg(views.lines, views.R), angles, atol=1e-5)
 
 
 def test_the_points_before_both_cameras_are_those_that_triangulation_finds_there(two_views):
     views = two_views(noise_px=0.0)
-    rays = views.rays.copy()
-    rays[:60] = rays[:60][:, [2, 3, 0, 1]]  # matches the wrong way round
+    lines, rays = views.lines, views.rays
+    lines[:60] = np.roll(lines[:60], 9, axis=1)  # matches the wrong way round
+    rays[:60] = rays[:60][:, [2, 3, 0, 1]]
 
-    front = is_in_front(rays, views.R, views.t)
+    front = is_in_front(lines, views.R, views.t)
     expected = relative_pose(cross_matrix(views.t) @ views.R, rays[:, :2], rays[:, 2:])[3]
 
     assert front[60:].all()
-    assert not is_in_front(views.rays, views.R, -views.t).any()
+    assert not is_in_front(views.lines, views.R, -views.t).any()
     assert np.array_equal(front[60:], expected[60:])
 
 
@@ -127,8 +130,35 @@ def test_a_turn_explains_matches_without_parallax_and_no_others(two_views):
     tilted = Rotation.from_euler("y", 8.0, degrees=True).as_matrix()
     turn, box = two_views(scene="turn"), two_views(false=0)
 
-    assert np.median(rotation_residuals(turn.rays, turn.focals, tilted @ turn.R)) < 0.5
-    assert np.median(rotation_residuals(box.rays, box.focals, box.R)) > 5.0
-    mixed = np.vstack([turn.rays, two_views(3).rays[:80]])
-    distances = rotation_residuals(mixed, turn.focals, turn.R)
+    assert np.median(rotation_residuals(turn.lines, tilted @ turn.R)) < 0.5
+    assert np.median(rotation_residuals(box.lines, box.R)) > 5.0
+    mixed = np.vstack([turn.lines, two_views(3).lines[:80]])
+    distances = rotation_residuals(mixed, turn.R)
     assert np.median(distances[:200]) < 0.6 and np.median(distances[200:]) > 5.0
+
+
+WIDE = {
+    "fisheye": Calibration(np.array([[300.0, 0, 400], [0, 300, 300], [0, 0, 1]]), 800, 600, "lens", True,
+                           projection="fisheye", fisheye=(0.05, 0.0, 0.0, 0.0)),
+    "equirectangular": Calibration(np.eye(3), 800, 400, "panorama", True, projection="equirectangular"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WIDE)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pose_is_found_through_a_wide_lens(two_views, name, seed):
+    """Points all round where a panorama sees them; a tenth of the matches is wrong."""
+    rng, lens, truth = np.random.default_rng([seed, 5]), WIDE[name], two_views()
+    X = rng.normal(size=(200, 3))
+    X *= rng.uniform(3.0, 8.0, (200, 1)) / np.linalg.norm(X, axis=1, keepdims=True)
+    X[:, 2] = X[:, 2] if name == "equirectangular" else np.abs(X[:, 2]) + 2.0
+    x1, x2 = (project(Y, lens) + rng.normal(0.0, 0.3, (200, 2)) for Y in (X, X @ truth.R.T + truth.t))
+    x2[:20] = rng.uniform([100, 50], [700, 350], (20, 2))
+    inliers = np.arange(200) >= 20
+    fit = EpipolarFit(np.eye(3), inliers, np.ones(200), 1, 0.3)
+
+    pose = estimate_pose(Pair((x1, x2), (lens, lens), 1.5), fit)
+
+    assert 0.0 < truth.errors_deg(pose.R, pose.t).max() < 0.5
+    assert pose.kind == "calibrated" and pose.in_front > 0.98
+    assert np.count_nonzero(pose.inliers[:20]) < 6 and pose.inliers[20:].mean() > 0.95

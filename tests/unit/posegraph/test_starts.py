@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.geometry.epipolar import cross_matrix, eight_point
 from sfm_app.posegraph.guided import refine_direction
-from sfm_app.posegraph.pair_pose import Pair, estimate_pose
+from sfm_app.posegraph.pair_pose import Pair, estimate_pose, points_ahead
 from sfm_app.posegraph.refine import refine_pose
 from sfm_app.posegraph.starts import TURNS_DEG, planar_starts, turned_starts
 from sfm_app.types import Calibration, EpipolarFit
@@ -39,7 +39,7 @@ def errors_deg(R, t, true_R, true_t):
 @pytest.mark.parametrize("roll_deg", [0.0, 100.0])
 def test_the_nearest_of_the_starts_is_near(turn_deg, roll_deg):
     pair, F, R, t = orbit_pair(1, turn_deg, noise_px=0.0, roll_deg=roll_deg)
-    found = [errors_deg(*start, R, t) for start in turned_starts(pair.rays, K.T @ F @ K)]
+    found = [errors_deg(*start, R, t) for start in turned_starts(points_ahead(pair.lines), K.T @ F @ K)]
 
     assert len(found) == len(TURNS_DEG)
     nearest = min(found)
@@ -58,7 +58,7 @@ def test_where_F_turns_the_camera_elsewhere_the_pair_is_posed_all_the_same(seed,
     E = cross_matrix(np.array([0.0, 0.0, 9.0]) - wrong @ [0.0, 0.0, 9.0]) @ wrong
     fit = EpipolarFit(np.linalg.inv(K).T @ E @ np.linalg.inv(K), np.ones(150, bool), np.ones(150), 10, 0.5)
 
-    alone = refine_pose(pair.rays, pair.focals, *pair.initial_pose(fit))
+    alone = refine_pose(pair.lines, *pair.initial_pose(fit))
     pose = estimate_pose(pair, fit)
 
     assert errors_deg(*alone, R, t)[0] > 20.0

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from sfm_app.colmap.database import open_database
+from sfm_app.colmap.model import MappedCamera
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.reconstruction import camera_per_photo
 from sfm_app.reconstruction import mapping_passes as module
@@ -112,7 +113,7 @@ def each_of(synthetic, cameras, focals):
     """A model whose photos have these focals, and its cameras."""
     model = synthetic.copy()
     each = with_camera_per_photo(attempt(model, 2), cameras(method="guess", identifiable=False), synthetic.matches)
-    found = {photo: (camera_matrix(focal, focal, 512, 384), 0.0) for photo, focal in enumerate(focals, start=1)}
+    found = {photo: MappedCamera(camera_matrix(focal, focal, 512, 384)) for photo, focal in enumerate(focals, start=1)}
     return attempt(model, 0), each, found
 
 

@@ -7,10 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_app
-from sfm_app.selfcal.wide_angle.fisheye import Fisheye
+from sfm_app.geometry.ray_epipolar import signed_distances, squared_distances
+from sfm_app.selfcal.wide_angle.fisheye import Fisheye, bearings_through
 from sfm_app.selfcal.wide_angle.lens_refinement import redundancy
 from sfm_app.selfcal.wide_angle.lens_search import find_lens
-from sfm_app.selfcal.wide_angle.ray_fundamental import make_ray_pair, search_rays, signed_distances, squared_distances
+from sfm_app.selfcal.wide_angle.lens_support import search_rays
 
 pytestmark = pytest.mark.slow
 
@@ -99,7 +100,7 @@ def test_hostile_matches_give_an_answer_or_none(kind):
 def test_the_two_distances_agree():
     lens = lens_of(150.0, 0.0)
     matches = photos_through(lens, noise_px=0.0, wrong=0.0)[0]
-    pair = make_ray_pair(lens, matches)
+    pair = bearings_through(lens, matches)
     support, F = search_rays(pair, np.random.default_rng(0).integers(0, len(matches), (50, 8)), 2.0)
     assert support == pytest.approx(len(matches), rel=0.02)
     signed = signed_distances(F, pair)
