@@ -21,19 +21,33 @@ def find_intrinsics(
     """
     options = run.settings.calibration
     calibrator = run.plugins.calibrator(options.calibrator)
-    pairs = photo_pairs(list(matches.images.values()), matches, views)
+    pairs = photo_pairs([image for image in matches.images.values() if image.group not in views.lenses], matches, views)
     # groups that the user defined are not split
     split = run.settings.photos.cameras == "auto"
     cameras = calibrate_photo_set(
         pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split
     )
     cameras = [to_whole_photo(camera, matches.images[camera.photos[0]]) for camera in cameras]
+    cameras = sorted(cameras + cameras_with_lens(matches, views), key=lambda one: (-len(one.photos), one.name))
     intrinsics = Intrinsics(
         cameras={camera.name: explain_failure(camera, views) for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
         photos={image.id: image.name for image in matches.images.values()},
     )
     return intrinsics, cameras
+
+
+def cameras_with_lens(matches: MatchGraph, views: ViewGraph) -> list[CalibratedCamera]:
+    """Return the cameras with a wide lens, which were found before the fundamental matrices.
+
+    Args:
+        matches: all photos.
+        views: has the lenses.
+    """
+    return [
+        CalibratedCamera(group, tuple(photo for photo, one in matches.images.items() if one.group == group), lens)
+        for group, lens in views.lenses.items()
+    ]
 
 
 def explain_failure(camera: CalibratedCamera, views: ViewGraph) -> Calibration:

@@ -3,23 +3,29 @@
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
+from sfm_app.geometry.bearings import bearings
+from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.hashing import load_arrays
 from sfm_app.numerical import FAILURES
 from sfm_app.progress import track
+from sfm_app.ransac import FitFundamentalLike
 from sfm_app.ransac.degeneracy.watermark import find_stationary, fit_moving, is_widespread
+from sfm_app.ransac.lev_ransac_rays import fit_lev_ransac_rays
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import ordered_map
-from sfm_app.settings import Settings
-from sfm_app.types import EpipolarFit, MatchGraph, PairId, Rejected, ViewGraph
+from sfm_app.settings import EpipolarSettings, Settings
+from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, PairId, Rejected, ViewGraph
 
 logger = logging.getLogger("sfm_app")
 
 BoolArray = NDArray[np.bool_]
+FloatArray = NDArray[np.float64]
 
 
 PairFit = tuple[EpipolarFit | Rejected, int]
@@ -29,7 +35,9 @@ PART = 64
 """Pairs per file; after a killed run, finished pairs outside complete files are fitted again."""
 
 
-def fit_pairs(matches: MatchGraph, pairs: Sequence[PairId], run: RunContext) -> dict[PairId, PairFit]:
+def fit_pairs(
+    matches: MatchGraph, pairs: Sequence[PairId], run: RunContext, lenses: Mapping[str, Calibration]
+) -> dict[PairId, PairFit]:
     """Fit every pair on its own, seeded by the run's seed and its ids.
 
     Finished pairs stay in `view_graph_parts` until the caller removes it, so that a killed run can resume.
@@ -38,6 +46,7 @@ def fit_pairs(matches: MatchGraph, pairs: Sequence[PairId], run: RunContext) -> 
         matches: keypoints and raw matches.
         pairs: the pairs to fit.
         run: the run.
+        lenses: cameras with a wide lens, by camera group; their pairs are fitted by bearing vectors.
     """
     options = run.settings.epipolar
     estimator = run.plugins.estimator(options.estimator)
@@ -52,20 +61,53 @@ def fit_pairs(matches: MatchGraph, pairs: Sequence[PairId], run: RunContext) -> 
     def fit_or_raise(pair: PairId) -> PairFit:
         seed = int(np.random.SeedSequence([run.seed, *pair]).generate_state(1)[0])
         points, still = matches.points(pair), _stationary_matches(matches, pair, run.settings)
+        by_rays = ray_estimator([matches.images[photo] for photo in pair], lenses)
+        fit = by_rays or estimator.fit
         if not still.any():
-            return estimator.fit(*points, options, seed), 0
+            return fit(*points, options, seed), 0
         image = matches.images[pair[0]]
         wide = is_widespread(points[0][still], matches.keypoints[image.id], (image.width, image.height))
-        return fit_moving(estimator.fit, points, still, wide, options, seed), int(np.count_nonzero(still))
+        wide = wide and by_rays is None  # its test needs an F of pixels
+        return fit_moving(fit, points, still, wide, options, seed), int(np.count_nonzero(still))
 
     return _fit_all(fit_pair, pairs, run)
 
 
-def to_view_graph(found: Mapping[PairId, PairFit]) -> ViewGraph:
-    """Return the view graph of fitted and rejected pairs."""
+def ray_estimator(images: Sequence[MatchedImage], lenses: Mapping[str, Calibration]) -> FitFundamentalLike | None:
+    """Return an estimator by bearing vectors for a pair of photos; None where neither has a wide lens.
+
+    The other camera of a pair is taken as the usual guess.
+
+    Args:
+        images: both photos.
+        lenses: cameras with a wide lens, by camera group.
+    """
+    if not any(image.group in lenses for image in images):
+        return None
+    sizes = [(image.width, image.height) for image in images]
+    guesses = [Calibration(guessed_camera_matrix(size), *size, "guess", identifiable=False) for size in sizes]
+    cameras = [lenses.get(image.group, guess) for image, guess in zip(images, guesses, strict=True)]
+
+    def fit(x1: FloatArray, x2: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
+        lines = np.hstack([bearings(x, camera) for x, camera in zip((x1, x2), cameras, strict=True)])
+        return fit_lev_ransac_rays(lines, options, seed)
+
+    return fit
+
+
+def to_view_graph(
+    found: Mapping[PairId, PairFit], lenses: Mapping[str, Calibration] = MappingProxyType({})
+) -> ViewGraph:
+    """Return the view graph of fitted and rejected pairs.
+
+    Args:
+        found: fit of every pair, or why it has none.
+        lenses: cameras with a wide lens, by camera group.
+    """
     return ViewGraph(
         fits={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, EpipolarFit)},
         rejected={pair: fit for pair, (fit, _) in found.items() if isinstance(fit, Rejected)},
+        lenses=lenses,
     )
 
 

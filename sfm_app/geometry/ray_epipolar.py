@@ -7,11 +7,15 @@ Matches are rows of 18 numbers: the bearing vectors of `bearings` in view 1 and 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry.bearings import pixels_per_radian
+
 FloatArray = NDArray[np.float64]
 
 FIRST, SECOND = slice(0, 3), slice(9, 12)
 """Columns of the rays of view 1 and of view 2."""
 _SLOPES_1, _SLOPES_2 = (slice(3, 6), slice(6, 9)), (slice(12, 15), slice(15, 18))
+ROTATION_ROUNDS = 10
+"""Rounds of reweighted fits of a rotation. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 LEAST = 1e-30
 """Added to squared derivatives. Its square root is far above rounding in double precision."""
 
@@ -91,3 +95,26 @@ def depths(used: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatArray, 
     p, q = h1 @ t, h2 @ t
     determinant = np.maximum(a * c - b * b, 1e-300)
     return (b * q - c * p) / determinant, (a * q - b * p) / determinant
+
+
+def rotation_residuals(used: FloatArray, R: FloatArray) -> FloatArray:
+    """Return residuals (N,), in pixels of view 2, of the rotation near R that explains most matches.
+
+    Rays are rotated onto their partners (Kabsch), with robust weights.
+
+    Args:
+        used: (N, 18) matches as bearing vectors, view 1 and view 2.
+        R: (3, 3) rotation of view 2 from view 1, to start from.
+    """
+    h1, h2 = (_normalize(used[:, view]) for view in (FIRST, SECOND))
+    focal = pixels_per_radian(used.reshape(-1, 9))
+    for _ in range(ROTATION_ROUNDS):
+        distances = focal * np.linalg.norm(h1 @ R.T - h2, axis=1)
+        weights = 1.0 / (1.0 + distances**2)
+        U, _, Vt = np.linalg.svd(np.einsum("ni,nj->ij", h2 * weights[:, None], h1))
+        R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return np.asarray(focal * np.linalg.norm(h1 @ R.T - h2, axis=1), np.float64)
+
+
+def _normalize(h: FloatArray) -> FloatArray:
+    return np.asarray(h / np.linalg.norm(h, axis=1, keepdims=True), np.float64)

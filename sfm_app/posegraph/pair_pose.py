@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from sfm_app.geometry.bearings import bearings, pixels_per_radian
 from sfm_app.geometry.epipolar import cross_matrix, eight_point
 from sfm_app.geometry.essential import decompose_essential, nearest_essential
-from sfm_app.geometry.ray_epipolar import FIRST, SECOND, depths, fit_rays, gradients
+from sfm_app.geometry.ray_epipolar import FIRST, SECOND, depths, fit_rays, gradients, rotation_residuals
 from sfm_app.posegraph.refine import SIGMAS_PX, pose_distances, refine_pose
 from sfm_app.posegraph.starts import planar_starts, turned_starts
 from sfm_app.ransac.degeneracy.dominant_plane import OFF_PLANE, dominant_homography, transfer_distance
@@ -31,11 +31,9 @@ MIN_INLIERS = 8
 MIN_IN_FRONT, MIN_IMPROVEMENT = 0.9, 0.01
 """A pose from a start other than that of F needs this share of its inliers in front of both cameras, and a cost lower
 by this share. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-ROTATION_ROUNDS, ROTATION_DEG = 10, 5.0
-"""Rounds of reweighted fits of a rotation, and the median angle of rays above which none is tried. Chosen by hand;
-halved and doubled by `benchmarks.sensitivity`."""
-
-
+ROTATION_DEG = 5.0
+"""Median angle of rays above which no rotation is tried. Chosen by hand; halved and doubled by
+`benchmarks.sensitivity`."""
 LEAST_AHEAD = 0.5
 """Least cosine of the angle to the optical axis of rays of length 1 in tests for planes: the plane z = 1 stretches the
 noise of wider ones. Rays of a perspective camera end on that plane and are all used. Chosen by hand; not measured on
@@ -198,25 +196,6 @@ def ray_angles_deg(used: FloatArray, R: FloatArray) -> FloatArray:
     return np.asarray(np.degrees(np.arctan2(sine, (h1 * h2).sum(axis=1))), np.float64)
 
 
-def rotation_residuals(used: FloatArray, R: FloatArray) -> FloatArray:
-    """Return residuals (N,), in pixels of view 2, of the rotation near R that explains most matches.
-
-    Rays are rotated onto their partners (Kabsch), with robust weights.
-
-    Args:
-        used: (N, 18) matches as bearing vectors, view 1 and view 2.
-        R: (3, 3) rotation of view 2 from view 1, to start from.
-    """
-    h1, h2 = (_normalize(used[:, view]) for view in (FIRST, SECOND))
-    focal = pixels_per_radian(used.reshape(-1, 9))
-    for _ in range(ROTATION_ROUNDS):
-        distances = focal * np.linalg.norm(h1 @ R.T - h2, axis=1)
-        weights = 1.0 / (1.0 + distances**2)
-        U, _, Vt = np.linalg.svd(np.einsum("ni,nj->ij", h2 * weights[:, None], h1))
-        R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return np.asarray(focal * np.linalg.norm(h1 @ R.T - h2, axis=1), np.float64)
-
-
 def points_ahead(used: FloatArray) -> FloatArray:
     """Return (M, 4) points of the planes z = 1 of view 1 and view 2, of the matches that both views see far ahead.
 
@@ -233,7 +212,3 @@ def _essential_of_rays(used: FloatArray) -> FloatArray:
     for _ in range(REWEIGHTED_FITS):
         E = fit_rays(used[:, FIRST], used[:, SECOND], gradients(E, used) ** -2.0)
     return E
-
-
-def _normalize(h: FloatArray) -> FloatArray:
-    return np.asarray(h / np.linalg.norm(h, axis=1, keepdims=True), np.float64)

@@ -117,11 +117,13 @@ def _retry_pairs(first: MappedScene, pairs: Sequence[PairId], report: dict[str, 
         matches, changed = add_matches(first.matches, *read_features(finer.workspace.database))
         if not changed:
             return None
-    fitted = to_view_graph(fit_pairs(matches, changed, run))
+    fitted = to_view_graph(fit_pairs(matches, changed, run, first.views.lenses))
     asked = set(changed)
     kept = {pair: fit for pair, fit in first.views.fits.items() if pair not in asked}
     refused = {pair: why for pair, why in first.views.rejected.items() if pair not in asked}
-    views = ViewGraph(dict(sorted((kept | dict(fitted.fits)).items())), refused | dict(fitted.rejected))
+    views = ViewGraph(
+        dict(sorted((kept | dict(fitted.fits)).items())), refused | dict(fitted.rejected), first.views.lenses
+    )
     report |= {"pairs_with_more_matches": len(changed), "pairs_with_geometry": [len(first.views.fits), len(views.fits)]}
     intrinsics = first.intrinsics if _is_mostly_calibrated(first) else find_intrinsics(matches, views, run)[0]
     return MappedScene(reconstruct(matches, views, intrinsics, run), matches, views, intrinsics, run)

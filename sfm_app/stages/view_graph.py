@@ -7,6 +7,7 @@ import numpy as np
 from sfm_app.atomic_io import replace_atomically
 from sfm_app.estimation.diagnosis import diagnose_scene
 from sfm_app.estimation.fitting import fit_pairs, to_view_graph
+from sfm_app.estimation.lenses import find_lenses
 from sfm_app.hashing import digest_files, load_arrays
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
@@ -14,7 +15,7 @@ from sfm_app.types import MatchGraph, ViewGraph
 
 
 def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
-    """Fit every pair on its own, and count why pairs were rejected.
+    """Find wide lenses, fit every pair on its own, and count why pairs were rejected.
 
     Args:
         matches: keypoints and raw matches.
@@ -23,8 +24,9 @@ def make(matches: MatchGraph, run: RunContext) -> ViewGraph:
     Raises:
         ReconstructionError: no pair has a usable epipolar geometry.
     """
-    found = fit_pairs(matches, list(matches.matches), run)
-    graph = to_view_graph(found)
+    lenses = find_lenses(matches, run)
+    found = fit_pairs(matches, list(matches.matches), run, lenses)
+    graph = to_view_graph(found, lenses)
     run.record(
         kept=len(graph.fits),
         rejected=graph.reasons,

@@ -1,13 +1,16 @@
 """Fundamental matrices of pairs of photos."""
 
+import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.numerical import json_text
+from sfm_app.types.calibration import Calibration
 from sfm_app.types.matches import PairId
 
 
@@ -16,7 +19,8 @@ class EpipolarFit:
     """A fundamental matrix with its evidence."""
 
     F: NDArray[np.float64]
-    """(3, 3), rank 2, Frobenius norm 1; x2' F x1 = 0 in pixels."""
+    """(3, 3), rank 2, Frobenius norm 1; x2' F x1 = 0 in pixels, or of bearing vectors where a lens is known before (see
+    `ViewGraph.lenses`)."""
     inliers: NDArray[np.bool_]
     """(N,) per match: within the threshold of the returned F."""
     priors: NDArray[np.float64]
@@ -50,6 +54,9 @@ class ViewGraph:
 
     fits: Mapping[PairId, EpipolarFit]
     rejected: Mapping[PairId, Rejected]
+    lenses: Mapping[str, Calibration] = field(default_factory=dict)
+    """Cameras with a wide lens, by camera group: the curves of epipolar lines show them before there is any F. The F of
+    their pairs are of bearing vectors."""
 
     @property
     def reasons(self) -> dict[str, int]:
@@ -70,6 +77,8 @@ class ViewGraph:
             "degeneracy": np.array([fit.degeneracy for fit in fits], np.str_),
             "rejected_pairs": np.array(list(self.rejected), np.uint32).reshape(-1, 2),
             "rejected_reasons": np.array([rejected.reason for rejected in self.rejected.values()], np.str_),
+            "lens_groups": np.array(list(self.lenses), np.str_),
+            "lenses": np.array([json_text(lens.to_dict()) for lens in self.lenses.values()], np.str_),
         }
 
     @classmethod
@@ -86,7 +95,11 @@ class ViewGraph:
         )
         fits = {_pair(row): EpipolarFit(*values) for row, *values in zip(arrays["pairs"], *columns, strict=True)}
         rejected = zip(arrays["rejected_pairs"], arrays["rejected_reasons"].tolist(), strict=True)
-        return cls(fits, {_pair(row): Rejected(reason) for row, reason in rejected})
+        lenses = {
+            group: Calibration.from_dict(json.loads(text))
+            for group, text in zip(arrays["lens_groups"].tolist(), arrays["lenses"].tolist(), strict=True)
+        }
+        return cls(fits, {_pair(row): Rejected(reason) for row, reason in rejected}, lenses)
 
 
 def _pair(row: NDArray[np.uint32]) -> PairId:

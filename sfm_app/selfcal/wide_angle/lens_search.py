@@ -43,6 +43,15 @@ hand; not measured on its own."""
 CLEAR_GAIN = 0.05
 """Share of the matches that a fisheye must let the pairs keep beyond a perspective lens. Chosen by hand; not measured
 on its own."""
+FIRST_FIELDS_DEG, FIRST_PAIRS, FIRST_MATCHES, FIRST_GAIN = (80.0, 120.0, 170.0), 8, 300, 0.02
+"""A first look: fields of view of an equidistant lens, pairs, matches of each, and the gain from which on all lenses
+are asked. Chosen by hand; not measured on their own."""
+ANGLES, WIDEST_PERSPECTIVE = 100, np.radians(75.0)
+"""Angles of the comparison, and the half field of view from which on no perspective lens compares. Chosen by hand; not
+measured on their own."""
+LARGEST_SIDEWAYS_PX = 1.0
+"""Largest distance in pixels, at the best focal and radial term, between a fisheye and a perspective lens that take its
+place. Chosen by hand: features are accurate to half of it; not measured on its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +68,22 @@ class LensEstimate:
     """The same with a perspective lens, whatever its focal."""
     pairs: int
     """Number of pairs that were asked."""
+    size: tuple[int, int]
+    """(width, height) of the photos."""
 
     @property
     def is_fisheye(self) -> bool:
-        """Whether a fisheye explains clearly more than any perspective lens."""
-        return self.support - self.perspective_support > CLEAR_GAIN
+        """Whether a fisheye explains clearly more than any perspective lens, and no radial term could replace it."""
+        return self.support - self.perspective_support > CLEAR_GAIN and self.sideways_px() > LARGEST_SIDEWAYS_PX
+
+    def sideways_px(self) -> float:
+        """Return by how many pixels the best perspective lens with one radial term departs from it; inf if none can."""
+        theta = np.linspace(0.0, float(self.lens.angle(np.array([0.5 * np.hypot(*self.size)]))[0]), ANGLES)[1:]
+        if theta[-1] >= WIDEST_PERSPECTIVE:
+            return float("inf")
+        plain, radius = np.tan(theta), self.lens.radius(theta)
+        terms, *_ = np.linalg.lstsq(np.column_stack([plain, plain**3]), radius, rcond=None)
+        return float(np.max(np.abs(terms[0] * plain + terms[1] * plain**3 - radius)))
 
     def radius_deviation_px(self, theta: FloatArray) -> FloatArray:
         """Return (N,) standard deviations of the radius at angles (N,) to the optical axis, in pixels."""
@@ -81,27 +101,15 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
         size: (width, height) of the photos.
         seed: of the samples.
     """
-    side, rng = float(max(size)), np.random.default_rng(seed)
-    middle = np.tile(np.array(size) / 2.0, 2)
-    usable = [(np.asarray(x, np.float64) - middle) / side for x in matches if len(x) >= MIN_MATCHES]
-    if len(usable) < MIN_PAIRS:
+    side = float(max(size))
+    given = _prepare(matches, size, np.random.default_rng(seed), MAX_PAIRS, MAX_MATCHES)
+    if given is None:
         return None
-    chosen = np.linspace(0, len(usable) - 1, min(len(usable), MAX_PAIRS)).astype(np.int64)
-    thinned = [x[rng.permutation(len(x))[:MAX_MATCHES]] for x in (usable[k] for k in chosen)]
-    samples = [rng.integers(0, len(x), (SAMPLES, 8)) for x in thinned]
-    threshold, total = THRESHOLD_PX / side, float(sum(map(len, thinned)))
-
-    def search(lens: Fisheye) -> list[tuple[float, FloatArray]]:
-        return [search_rays(bearings_through(lens, x), s, threshold) for x, s in zip(thinned, samples, strict=True)]
-
-    def support(found: list[tuple[float, FloatArray]]) -> float:
-        return sum(count for count, _ in found) / total
-
     grid = [_lens_of(field, exponent) for exponent in EXPONENTS for field in FIELDS_DEG]
-    searches = [search(lens) for lens in grid]
-    first = int(np.argmax([support(found) for found in searches]))
+    searches = [given.search(lens) for lens in grid]
+    first = int(np.argmax([given.support(found) for found in searches]))
     best, found = grid[first], searches[first]
-    kept = [(x, F) for x, (count, F) in zip(thinned, found, strict=True) if count >= MIN_KEPT * len(x)]
+    kept = [(x, F) for x, (count, F) in zip(given.matches, found, strict=True) if count >= MIN_KEPT * len(x)]
     if len(kept) < MIN_PAIRS:
         return None
     parameters, covariance = refine_lens(best, kept, THRESHOLD_PX / side)
@@ -110,8 +118,51 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
     scaled = covariance * np.outer(unit, unit)
     return LensEstimate(
         Fisheye(float(np.exp(parameters[0])) * side, float(parameters[1]), (float(center[0]), float(center[1]))),
-        tuple(map(tuple, scaled.tolist())), support(found), support(search(Fisheye(1.0, PERSPECTIVE))), len(thinned),
+        tuple(map(tuple, scaled.tolist())), given.support(found),
+        given.support(given.search(Fisheye(1.0, PERSPECTIVE))), len(given.matches), size,
     )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Given:
+    """Matches (N, 4) of some pairs in longer sides about the middle, and samples (S, 8) of each."""
+
+    matches: tuple[FloatArray, ...]
+    samples: tuple[NDArray[np.int64], ...]
+    threshold: float
+
+    def search(self, lens: Fisheye) -> list[tuple[float, FloatArray]]:
+        both = zip(self.matches, self.samples, strict=True)
+        return [search_rays(bearings_through(lens, x), rows, self.threshold) for x, rows in both]
+
+    def support(self, found: list[tuple[float, FloatArray]]) -> float:
+        return sum(count for count, _ in found) / float(sum(map(len, self.matches)))
+
+
+def _prepare(
+    matches: Sequence[FloatArray], size: tuple[int, int], rng: np.random.Generator, most_pairs: int, most_matches: int
+) -> _Given | None:
+    side, middle = float(max(size)), np.tile(np.array(size) / 2.0, 2)
+    usable = [(np.asarray(x, np.float64) - middle) / side for x in matches if len(x) >= MIN_MATCHES]
+    if len(usable) < MIN_PAIRS:
+        return None
+    chosen = np.linspace(0, len(usable) - 1, min(len(usable), most_pairs)).astype(np.int64)
+    thinned = [x[rng.permutation(len(x))[:most_matches]] for x in (usable[k] for k in chosen)]
+    return _Given(tuple(thinned), tuple(rng.integers(0, len(x), (SAMPLES, 8)) for x in thinned), THRESHOLD_PX / side)
+
+
+def needs_fisheye(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 0) -> bool:
+    """Return whether a first look at a few pairs shows that some fisheye explains more than any perspective lens.
+
+    Args:
+        matches, size, seed: as for `find_lens`.
+    """
+    given = _prepare(matches, size, np.random.default_rng(seed), FIRST_PAIRS, FIRST_MATCHES)
+    if given is None:
+        return False
+    fields = [_lens_of(field, EQUIDISTANT) for field in FIRST_FIELDS_DEG]
+    supports = [given.support(given.search(lens)) for lens in (Fisheye(1.0, PERSPECTIVE), *fields)]
+    return max(supports[1:]) - supports[0] > FIRST_GAIN
 
 
 def _lens_of(field_deg: float, exponent: float) -> Fisheye:

@@ -1,0 +1,103 @@
+"""Wide lenses of camera groups, from raw matches: before them, no fundamental matrix fits."""
+
+import logging
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.camera import camera_matrix, panorama_matrix
+from sfm_app.numerical import FAILURES
+from sfm_app.runtime.context import RunContext
+from sfm_app.selfcal.wide_angle.lens_search import LensEstimate, find_lens, needs_fisheye
+from sfm_app.types import Calibration, MatchedImage, MatchGraph
+from sfm_app.types.calibration import EQUIRECTANGULAR, FISHEYE
+
+logger = logging.getLogger("sfm_app")
+
+FloatArray = NDArray[np.float64]
+
+METHOD, PANORAMA = "lens", "panorama"
+"""Names of what found a camera: curved epipolar lines, and the photos themselves."""
+MAX_DEVIATION = 0.01
+"""Largest standard deviation of a radius, as a share of the width, of a lens that counts as determined. Chosen by
+hand; not measured on its own."""
+TERMS, ANGLES = 4, 200
+"""Terms of COLMAP's OPENCV_FISHEYE, and angles at which they are fitted. Counted; chosen by hand."""
+
+
+def find_lenses(matches: MatchGraph, run: RunContext) -> dict[str, Calibration]:
+    """Find the cameras whose lens no perspective camera describes, by camera group.
+
+    Args:
+        matches: keypoints and raw matches.
+        run: the run.
+    """
+    groups: dict[str, list[MatchedImage]] = {}
+    for _, image in sorted(matches.images.items()):
+        groups.setdefault(image.group, []).append(image)
+    found = {}
+    for group, images in groups.items():
+        lens = _find_lens(images, matches, run)
+        if lens is not None:
+            found[group] = lens
+            run.progress.say(f"the photos {group} are taken with a wide lens: {describe_lens(lens)}")
+    run.record(lenses={group: describe_lens(lens) for group, lens in found.items()})
+    return found
+
+
+def describe_lens(lens: Calibration) -> str:
+    """Return a wide lens in a few words."""
+    if lens.projection == EQUIRECTANGULAR:
+        return "panoramas of a whole turn"
+    return f"a fisheye with {lens.evidence['field_deg']:.0f} degrees along the longer side"
+
+
+def _find_lens(images: Sequence[MatchedImage], matches: MatchGraph, run: RunContext) -> Calibration | None:
+    """Return the camera of a group with a wide lens; None where a perspective camera is enough."""
+    size = images[0].width, images[0].height
+    if getattr(images[0], "projection", "") == EQUIRECTANGULAR:
+        K = panorama_matrix(size)
+        return Calibration(K, *size, PANORAMA, identifiable=True, projection=EQUIRECTANGULAR)
+    ids = {image.id for image in images}
+    pairs = [np.hstack(matches.points(pair)) for pair in matches.matches if ids.issuperset(pair)]
+    try:
+        found = find_lens(pairs, size, run.seed) if needs_fisheye(pairs, size, run.seed) else None
+    except FAILURES as err:
+        logger.info("the lens of a group could not be found", exc_info=err)
+        return None
+    return to_calibration(found, size) if found is not None and found.is_fisheye else None
+
+
+def to_calibration(found: LensEstimate, size: tuple[int, int]) -> Calibration:
+    """Return a lens as the camera that a run uses, with its radius as a polynomial of the angle.
+
+    Args:
+        found: the lens in pixels.
+        size: (width, height) of the photos.
+    """
+    lens, side = found.lens, float(max(size))
+    corners = np.array([[x, y] for x in (0.0, size[0]) for y in (0.0, size[1])], np.float64)
+    farthest = float(np.max(np.hypot(*(corners - np.array(lens.center)).T)))
+    theta = np.linspace(0.0, float(lens.angle(np.array([farthest]))[0]), ANGLES + 1)[1:]
+    powers = theta[:, None] ** (2.0 * np.arange(1, TERMS + 1) + 1.0)
+    terms = np.linalg.lstsq(powers, lens.radius(theta) / lens.focal - theta, rcond=None)[0]
+    deviations = np.sqrt(np.diag(np.array(found.covariance)))
+    radius_px = float(np.max(found.radius_deviation_px(theta)))
+    determined = radius_px <= MAX_DEVIATION * side
+    focal_px = float(deviations[0]) * lens.focal
+    evidence = {
+        "pairs": float(found.pairs), "exponent": lens.exponent, "field_deg": lens.field_deg(side),
+        "support": found.support, "support of a perspective lens": found.perspective_support,
+        "radius_deviation_px": radius_px,
+    }  # fmt: skip
+    return Calibration(
+        camera_matrix(lens.focal, lens.focal, *lens.center), *size, METHOD if determined else "estimate",
+        identifiable=determined,
+        reason="" if determined else "the pairs determine the lens only roughly",
+        projection=FISHEYE,
+        fisheye=tuple(terms.tolist()),
+        spread={"fx": focal_px, "fy": focal_px, "cx": float(deviations[2]), "cy": float(deviations[3])},
+        held=("aspect",),
+        evidence=evidence,
+    )  # fmt: skip
