@@ -5,8 +5,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.geometry import bearings
 from sfm_app.synthetic.cameras import Camera, pixel_rays
 from sfm_app.types import Calibration
+from sfm_app.types.calibration import PERSPECTIVE
 
 FloatArray = NDArray[np.float64]
 Project = Callable[[FloatArray], FloatArray]
@@ -36,7 +38,9 @@ def radius_error_percent(true: Camera, project: Project, center: FloatArray, rea
 
 
 def projection_of(camera: Calibration) -> Project:
-    """Return how a calibration projects: square pixels or not, and one radial term."""
+    """Return how a calibration projects: any projection, and one radial term of a perspective lens."""
+    if camera.projection != PERSPECTIVE:
+        return lambda rays: bearings.project(rays, camera)
 
     def project(rays: FloatArray) -> FloatArray:
         ahead = rays[:, 2] > 1e-6

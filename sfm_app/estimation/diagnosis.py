@@ -115,12 +115,19 @@ def diagnose_depth(
     if kinds[""] >= kinds.total() / 2:
         return None
     firm = [pair for pair in _pairs_among(views, photos) if not views.fits[pair].degeneracy]
-    parallax = sum(count_matches_off_plane(*matches.points(pair), views.fits[pair].F, options) for pair in firm)
+    parallax = sum(_count_parallax(pair, matches, views, options) for pair in firm)
     if parallax >= LEAST_PARALLAX * kinds.total():
         return None
     found = diagnose_fits(views, photos)
     by_plane = found.cause == "planar" and (camera_known or len(photos) >= PLANE_PHOTOS)
     return None if by_plane else found
+
+
+def _count_parallax(pair: PairId, matches: MatchGraph, views: ViewGraph, options: EpipolarSettings) -> int:
+    """Return the inliers of a pair off its dominant plane; with a known lens all, since no plane is degenerate then."""
+    if any(matches.images[photo].group in views.lenses for photo in pair):
+        return views.fits[pair].inlier_count
+    return count_matches_off_plane(*matches.points(pair), views.fits[pair].F, options)
 
 
 def inliers_by_degeneracy(views: ViewGraph, photos: Collection[int]) -> Counter[str]:

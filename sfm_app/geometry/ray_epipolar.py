@@ -27,14 +27,11 @@ def squared_distances(Fs: FloatArray, lines: FloatArray) -> FloatArray:
         Fs: (S, 3, 3) of rays.
         lines: (N, 18) matches.
     """
-    lines2, lines1 = np.einsum("sij,nj->sni", Fs, lines[:, FIRST]), np.einsum("sji,nj->sni", Fs, lines[:, SECOND])
-    algebraic = np.einsum("ni,sni->sn", lines[:, SECOND], lines2)
-    slopes = sum(
-        np.einsum("ni,sni->sn", lines[:, columns], across) ** 2
-        for across, both in ((lines2, _SLOPES_2), (lines1, _SLOPES_1))
-        for columns in both
-    )
-    return np.asarray(algebraic**2 / (slopes + LEAST), np.float64)
+    p, q = lines[:, FIRST], lines[:, SECOND]
+    terms = [(q, p), *((lines[:, side], p) for side in _SLOPES_2), *((q, lines[:, side]) for side in _SLOPES_1)]
+    design = np.concatenate([(b[:, :, None] * a[:, None, :]).reshape(-1, 9) for b, a in terms])
+    algebraic, *slopes = (design @ Fs.reshape(-1, 9).T).reshape(5, len(lines), len(Fs))
+    return np.asarray((algebraic**2 / (sum(slope**2 for slope in slopes) + LEAST)).T, np.float64)
 
 
 def signed_distances(E: FloatArray, lines: FloatArray) -> FloatArray:

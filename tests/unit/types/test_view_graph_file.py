@@ -33,6 +33,17 @@ def test_a_view_graph_survives_its_file():
     assert through_file(graph)[1] == data
 
 
+def test_wide_lenses_survive_with_it():
+    lens = Calibration(
+        np.diag([300.0, 300.0, 1.0]), 800, 600, "lens", True, projection="fisheye", fisheye=(0.1, 0, 0, 0)
+    )
+    graph = ViewGraph({(1, 2): fit(5)}, {}, {"800x600": lens})
+
+    back, _ = through_file(graph)
+
+    assert back.lenses["800x600"].to_dict() == lens.to_dict()
+
+
 def test_an_empty_view_graph_survives_too():
     back, _ = through_file(ViewGraph({}, {(1, 2): Rejected("x"), (1, 3): Rejected("x"), (2, 3): Rejected("y")}))
 

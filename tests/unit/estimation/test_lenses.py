@@ -1,0 +1,94 @@
+"""Wide lenses of camera groups: found, described, and left alone where a perspective camera is enough."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sfm_app.estimation.calibrating import find_intrinsics
+from sfm_app.estimation.fitting import ray_estimator
+from sfm_app.estimation.lenses import describe_lens, to_calibration
+from sfm_app.geometry.bearings import fisheye_radius, project
+from sfm_app.plugins import load_plugins
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.parallel import make_executor
+from sfm_app.runtime.workspace import Workspace
+from sfm_app.selfcal.wide_angle.fisheye import Fisheye
+from sfm_app.selfcal.wide_angle.lens_search import LensEstimate
+from sfm_app.settings import Settings
+from sfm_app.stages import view_graph
+from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, Rejected
+
+SIZE = (960, 640)
+K = np.array([[270.0, 0.0, 485.0], [0.0, 270.0, 316.0], [0.0, 0.0, 1.0]])
+WIDE = Calibration(K, *SIZE, "truth", True, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
+PLAIN = Calibration(np.array([[900.0, 0, 480], [0, 900, 320], [0, 0, 1]]), *SIZE, "truth", True)
+
+
+def photos_through(camera, photos=5, group="960x640", first=1, away=4.0):
+    rng = np.random.default_rng(first)
+    X = rng.normal(size=(500, 3)) * [4.0, 2.0, 2.0] + [0.0, 0.0, away]
+    keypoints, images = {}, {}
+    for key in range(first, first + photos):
+        turn = Rotation.from_euler("xyz", rng.normal(0.0, 0.15, 3)).as_matrix()
+        x = project((X - rng.normal(0.0, 0.7, 3)) @ turn.T, camera)
+        outside = ~((x > 0) & (x < SIZE)).all(axis=1)
+        x[outside] = rng.uniform((0, 0), SIZE, (int(outside.sum()), 2))
+        keypoints[key] = x + rng.normal(0.0, 0.4, x.shape)
+        images[key] = MatchedImage(key, f"{key}.jpg", group, *SIZE)
+    rows = np.tile(np.arange(500, dtype=np.uint32)[:, None], 2)
+    pairs = {(a, b): rows for a in images for b in images if a < b}
+    return MatchGraph(images, keypoints, pairs)
+
+
+@pytest.fixture
+def run(tmp_path):
+    with make_executor(2) as executor:
+        yield RunContext(Settings(), Workspace(tmp_path), load_plugins(), executor, 2, fingerprint="these")
+
+
+@pytest.mark.slow
+def test_a_fisheye_is_found_before_fundamental_matrices_and_becomes_the_camera(run):
+    matches = photos_through(WIDE)
+    views = view_graph.make(matches, run)
+    intrinsics, _ = find_intrinsics(matches, views, run)
+
+    assert run.statistics["lenses"] == {"960x640": "a fisheye with 204 degrees along the longer side"}
+    assert view_graph.load(run).lenses["960x640"].to_dict() == views.lenses["960x640"].to_dict()
+    camera = intrinsics.main
+    assert (camera.projection, camera.method, camera.identifiable) == ("fisheye", "lens", True)
+    theta = np.linspace(0.1, 1.6, 20)
+    assert np.abs(camera.focal_px * fisheye_radius(theta, camera) - 270.0 * theta).max() < 0.003 * SIZE[0]
+    assert all(fit.inlier_count > 200 for fit in views.fits.values())
+
+
+@pytest.mark.slow
+def test_a_perspective_camera_is_left_to_the_calibrators(run):
+    views = view_graph.make(photos_through(PLAIN, away=14.0), run)
+    assert not views.lenses and run.statistics["lenses"] == {}
+
+
+@pytest.mark.parametrize("exponent", [0.5, 0.2, 0.0, -0.5])
+def test_four_terms_describe_every_lens_of_the_family(exponent):
+    lens = Fisheye(480.0 / float(Fisheye(1.0, exponent).radius(np.radians(87.0))), exponent, (481.0, 322.0))
+    estimate = LensEstimate(lens, tuple(map(tuple, (np.eye(4) * 1e-8).tolist())), 0.9, 0.4, 12, SIZE)
+    camera = to_calibration(estimate, SIZE)
+
+    theta = np.linspace(0.0, np.radians(87.0), 100)
+    assert np.abs(camera.focal_px * fisheye_radius(theta, camera) - lens.radius(theta)).max() < 0.05
+    assert camera.identifiable and "174 degrees" in describe_lens(camera)
+
+
+def test_a_lens_that_pairs_hardly_determine_is_an_estimate():
+    loose = tuple(map(tuple, np.diag([0.1, 0.5, 1.0, 1.0]).tolist()))
+    camera = to_calibration(LensEstimate(Fisheye(300.0, 0.0, (480.0, 320.0)), loose, 0.9, 0.4, 12, SIZE), SIZE)
+    assert (camera.identifiable, camera.method) == (False, "estimate") and camera.reason
+
+
+def test_pairs_of_a_wide_lens_and_another_camera_are_fitted_by_rays():
+    wide, plain = MatchedImage(1, "1.jpg", "wide", *SIZE), MatchedImage(2, "2.jpg", "plain", *SIZE)
+    assert ray_estimator([plain, plain], {"wide": WIDE}) is None
+    fit = ray_estimator([wide, plain], {"wide": WIDE})
+    matches = photos_through(WIDE, 2)
+    assert fit is not None and isinstance(fit(*matches.points((1, 2)), Settings().epipolar, 0), (EpipolarFit, Rejected))
+    both = ray_estimator([wide, wide], {"wide": WIDE})
+    assert both is not None and isinstance(both(*matches.points((1, 2)), Settings().epipolar, 0), EpipolarFit)
