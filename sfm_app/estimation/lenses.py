@@ -59,6 +59,8 @@ def _find_lens(images: Sequence[MatchedImage], matches: MatchGraph, run: RunCont
     if getattr(images[0], "projection", "") == EQUIRECTANGULAR:
         K = panorama_matrix(size)
         return Calibration(K, *size, PANORAMA, identifiable=True, projection=EQUIRECTANGULAR)
+    if not run.settings.calibration.lens:
+        return None
     ids = {image.id for image in images}
     pairs = [np.hstack(matches.points(pair)) for pair in matches.matches if ids.issuperset(pair)]
     try:
