@@ -5,10 +5,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from sfm_app.estimation.bent_matches import choose_inliers_again
 from sfm_app.estimation.diagnosis import diagnose_fits, inliers_by_degeneracy
 from sfm_app.runtime.context import RunContext
 from sfm_app.selfcal import CalibratedCamera, calibrate_photo_set, pair_weights
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
+
+LENS_ROUNDS = 2
+"""Times the inliers are chosen again through the lens that the cameras so far have. Chosen on synthetic matches
+(`python -m benchmarks.lenses.distortion`)."""
 
 
 def find_intrinsics(
@@ -19,6 +24,23 @@ def find_intrinsics(
     Args:
         matches, views, run: keypoints and raw matches; fundamental matrices; the run.
     """
+    cameras = _calibrate(matches, views, run)
+    for _ in range(LENS_ROUNDS):
+        seen = choose_inliers_again(matches, views, cameras, run)
+        if seen is views:
+            break
+        cameras = _calibrate(matches, seen, run)
+    cameras = sorted(cameras + cameras_with_lens(matches, views), key=lambda one: (-len(one.photos), one.name))
+    intrinsics = Intrinsics(
+        cameras={camera.name: explain_failure(camera, views) for camera in cameras},
+        camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
+        photos={image.id: image.name for image in matches.images.values()},
+    )
+    return intrinsics, cameras
+
+
+def _calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> list[CalibratedCamera]:
+    """Return the cameras of all photos without a wide lens, in pixels of whole photos."""
     options = run.settings.calibration
     calibrator = run.plugins.calibrator(options.calibrator)
     pairs = photo_pairs([image for image in matches.images.values() if image.group not in views.lenses], matches, views)
@@ -27,14 +49,7 @@ def find_intrinsics(
     cameras = calibrate_photo_set(
         pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split
     )
-    cameras = [to_whole_photo(camera, matches.images[camera.photos[0]]) for camera in cameras]
-    cameras = sorted(cameras + cameras_with_lens(matches, views), key=lambda one: (-len(one.photos), one.name))
-    intrinsics = Intrinsics(
-        cameras={camera.name: explain_failure(camera, views) for camera in cameras},
-        camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
-        photos={image.id: image.name for image in matches.images.values()},
-    )
-    return intrinsics, cameras
+    return [to_whole_photo(camera, matches.images[camera.photos[0]]) for camera in cameras]
 
 
 def cameras_with_lens(matches: MatchGraph, views: ViewGraph) -> list[CalibratedCamera]:
