@@ -1,4 +1,4 @@
-"""Fisheye lenses of one exponent: from points of a photo to directions, also behind the camera.
+"""Lenses of two parameters: from points of a photo to directions, also behind the camera.
 
 Ours; the projections are the textbook's. A ray at the angle theta to the optical axis comes to lie at the radius, in
 focal lengths,
@@ -13,6 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sfm_app.geometry.camera import camera_matrix, rays
 
 FloatArray = NDArray[np.float64]
 
@@ -71,7 +73,25 @@ class Fisheye:
         return float(2.0 * np.degrees(self.angle(np.array([0.5 * width]))[0]))
 
 
-def bearings_through(lens: Fisheye, matches: FloatArray) -> FloatArray:
+@dataclass(frozen=True, slots=True)
+class RadialLens:
+    """A perspective lens with one radial term, as COLMAP's SIMPLE_RADIAL, in any unit of length."""
+
+    focal: float
+    radial: float
+    center: tuple[float, float] = (0.0, 0.0)
+
+    def rays(self, points: FloatArray) -> FloatArray:
+        """Return (N, 3) directions of length 1 of points (N, 2)."""
+        plane = rays(points, camera_matrix(self.focal, self.focal, *self.center), self.radial)
+        found = np.column_stack([plane, np.ones(len(plane))])
+        return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True), np.float64)
+
+
+Lens = Fisheye | RadialLens
+
+
+def bearings_through(lens: Lens, matches: FloatArray) -> FloatArray:
     """Return (N, 18) bearing vectors of matches, with their derivatives by x and y: view 1, view 2.
 
     Args:
@@ -81,6 +101,6 @@ def bearings_through(lens: Fisheye, matches: FloatArray) -> FloatArray:
     return np.hstack([_rays_and_slopes(lens, matches[:, :2]), _rays_and_slopes(lens, matches[:, 2:])])
 
 
-def _rays_and_slopes(lens: Fisheye, points: FloatArray) -> FloatArray:
-    rays, right, down = lens.rays(points), np.array([STEP, 0.0]), np.array([0.0, STEP])
-    return np.hstack([rays, (lens.rays(points + right) - rays) / STEP, (lens.rays(points + down) - rays) / STEP])
+def _rays_and_slopes(lens: Lens, points: FloatArray) -> FloatArray:
+    here, right, down = lens.rays(points), np.array([STEP, 0.0]), np.array([0.0, STEP])
+    return np.hstack([here, (lens.rays(points + right) - here) / STEP, (lens.rays(points + down) - here) / STEP])

@@ -17,7 +17,7 @@ from sfm_app.geometry.pose_manifold import POSE_DOF, retract, write_essential
 from sfm_app.geometry.ray_epipolar import signed_distances
 from sfm_app.geometry.spd_solve import inverse_of_positive, solve_each
 from sfm_app.numerical import MAD_TO_SIGMA
-from sfm_app.selfcal.wide_angle.fisheye import Fisheye, bearings_through
+from sfm_app.selfcal.wide_angle.fisheye import Fisheye, Lens, RadialLens, bearings_through
 
 FloatArray = NDArray[np.float64]
 
@@ -41,6 +41,7 @@ LEAST_SIGMA = 1e-4
 """Least standard deviation of a distance, in longer sides: matches without noise would weigh without bound. Chosen by
 hand; not measured on its own."""
 
+Family = type[Fisheye] | type[RadialLens]
 Pair = tuple[FloatArray, FloatArray]
 """Matches (N, 4) and F (3, 3) of a pair."""
 
@@ -49,9 +50,32 @@ class State(NamedTuple):
     """Where the adjustment stands."""
 
     parameters: FloatArray
-    """(4,) log focal, exponent, center."""
+    """(4,) log focal, exponent or radial term, center."""
     poses: tuple[FloatArray, ...]
     """(12,) of each pair, see `pose_manifold`."""
+    family: Family = Fisheye
+
+    @property
+    def lens(self) -> Lens:
+        """The lens, in longer sides."""
+        return self.lens_at(self.parameters)
+
+    def lens_at(self, parameters: FloatArray) -> Lens:
+        """Return the lens of the same family with other parameters (4,)."""
+        focal, shape, x, y = (float(value) for value in parameters)
+        return self.family(float(np.exp(focal)), shape, (x, y))
+
+
+class RefinedLens(NamedTuple):
+    """A lens with the least robust cost."""
+
+    parameters: FloatArray
+    """(4,) log focal, exponent or radial term, center, in longer sides."""
+    covariance: FloatArray
+    """(4, 4)"""
+    state: State
+    sigma: float
+    """Standard deviation of a distance, in longer sides."""
 
 
 class System(NamedTuple):
@@ -67,8 +91,8 @@ class System(NamedTuple):
     """(5,)"""
 
 
-def refine_lens(start: Fisheye, pairs: Sequence[Pair], sigma: float) -> tuple[FloatArray, FloatArray]:
-    """Return log focal, exponent and center (4,) with the least robust cost, and their covariance (4, 4).
+def refine_lens(start: Lens, pairs: Sequence[Pair], sigma: float) -> RefinedLens:
+    """Return the lens of the family of `start` with the least robust cost, with its covariance.
 
     The covariance is the sandwich with pairs as clusters; matches of one keypoint in several pairs count as what they
     are worth.
@@ -80,7 +104,8 @@ def refine_lens(start: Fisheye, pairs: Sequence[Pair], sigma: float) -> tuple[Fl
     """
     matches = [x for x, _ in pairs]
     poses = tuple(_pose_of(F) for _, F in pairs)
-    state = State(np.array([np.log(start.focal), start.exponent, *start.center]), poses)
+    shape = start.exponent if isinstance(start, Fisheye) else start.radial
+    state = State(np.array([np.log(start.focal), shape, *start.center]), poses, type(start))
     for _ in range(NOISE_ROUNDS):
         state = _adjust(matches, state, sigma)
         sigma = _noise(matches, state)
@@ -92,7 +117,7 @@ def refine_lens(start: Fisheye, pairs: Sequence[Pair], sigma: float) -> tuple[Fl
     sandwich = few * inverse @ (scores.T @ scores) @ inverse
     plain = redundancy(matches) * inverse
     wider = np.sqrt(np.maximum(np.diag(sandwich) / np.diag(plain), 1.0))
-    return state.parameters, np.asarray(plain * np.outer(wider, wider), np.float64)
+    return RefinedLens(state.parameters, np.asarray(plain * np.outer(wider, wider), np.float64), state, sigma)
 
 
 def redundancy(matches: Sequence[FloatArray]) -> float:
@@ -109,11 +134,11 @@ def redundancy(matches: Sequence[FloatArray]) -> float:
 def _adjust(matches: Sequence[FloatArray], state: State, sigma: float) -> State:
     damping = DAMPING.first
     for _ in range(MAX_ROUNDS):
-        systems, cost = _systems(matches, state, sigma), _cost(matches, state, sigma)
+        systems, cost = _systems(matches, state, sigma), robust_cost(matches, state, sigma)
 
         def attempt(tried: float, begin: State = state, systems: list[System] = systems) -> State | None:
             trial = _step(begin, systems, tried)
-            return trial if _cost(matches, trial, sigma) < cost else None  # noqa: B023 -- called in this round
+            return trial if robust_cost(matches, trial, sigma) < cost else None  # noqa: B023 -- called in this round
 
         found, damping = damped_step(attempt, damping, DAMPING)
         if found is None:
@@ -135,19 +160,21 @@ def _step(state: State, systems: list[System], damping: float) -> State:
         np.asarray(retract(pose, system.pose_alone - system.pose_by_lens @ step), np.float64)
         for pose, system in zip(state.poses, systems, strict=True)
     )
-    return State(state.parameters + step, poses)
+    return State(state.parameters + step, poses, state.family)
 
 
 def _systems(matches: Sequence[FloatArray], state: State, sigma: float) -> list[System]:
     """Return the normal equations of every pair, with derivatives by finite differences."""
-    moved = [lens_from_parameters(state.parameters + STEP * axis) for axis in np.eye(LENS)]
-    return [_system(x, state.parameters, moved, pose, sigma) for x, pose in zip(matches, state.poses, strict=True)]
+    lenses = [state.lens, *(state.lens_at(state.parameters + STEP * axis) for axis in np.eye(LENS))]
+    return [_system(x, lenses, pose, sigma) for x, pose in zip(matches, state.poses, strict=True)]
 
 
-def _system(x: FloatArray, parameters: FloatArray, moved: list[Fisheye], pose: FloatArray, sigma: float) -> System:
-    pair, E = bearings_through(lens_from_parameters(parameters), x), _essential(pose)
+def _system(x: FloatArray, lenses: list[Lens], pose: FloatArray, sigma: float) -> System:
+    """Return the normal equations of a pair; the first lens is where it stands, the others are a step away."""
+    (lens, *moved), E = lenses, _essential(pose)
+    pair = bearings_through(lens, x)
     r = signed_distances(E, pair)
-    by_lens = [signed_distances(E, bearings_through(lens, x)) - r for lens in moved]
+    by_lens = [signed_distances(E, bearings_through(other, x)) - r for other in moved]
     by_pose = [signed_distances(_essential(retract(pose, STEP * axis)), pair) - r for axis in np.eye(POSE_DOF)]
     J, r = np.column_stack(by_lens + by_pose) / (STEP * sigma), r / sigma
     weights = (1.0 + (r / ROBUST_SCALE) ** 2) ** -2
@@ -158,8 +185,14 @@ def _system(x: FloatArray, parameters: FloatArray, moved: list[Fisheye], pose: F
     return System(U - W @ by, g[:LENS] - W @ alone, by, alone)
 
 
-def _cost(matches: Sequence[FloatArray], state: State, sigma: float) -> float:
-    """Return half the robust squared distances in sigma^2, and the prior's."""
+def robust_cost(matches: Sequence[FloatArray], state: State, sigma: float) -> float:
+    """Return half the robust squared distances in sigma^2, and the prior's.
+
+    Args:
+        matches: (N, 4) of each pair, in longer sides.
+        state: the lens and the pose of each pair.
+        sigma: standard deviation of a distance.
+    """
     squared = [(r / sigma) ** 2 for r in _distances(matches, state)]
     robust = sum(float(np.sum(d / (1.0 + d / ROBUST_SCALE**2))) for d in squared)
     return 0.5 * (robust + float(np.sum((state.parameters[2:] / CENTER_SIGMA) ** 2)))
@@ -172,14 +205,9 @@ def _noise(matches: Sequence[FloatArray], state: State) -> float:
 
 
 def _distances(matches: Sequence[FloatArray], state: State) -> list[FloatArray]:
-    lens = lens_from_parameters(state.parameters)
+    lens = state.lens
     pairs = zip(matches, state.poses, strict=True)
     return [signed_distances(_essential(pose), bearings_through(lens, x)) for x, pose in pairs]
-
-
-def lens_from_parameters(parameters: FloatArray) -> Fisheye:
-    """Return the lens of log focal, exponent and center (4,)."""
-    return Fisheye(float(np.exp(parameters[0])), float(parameters[1]), (float(parameters[2]), float(parameters[3])))
 
 
 def _pose_of(F: FloatArray) -> FloatArray:

@@ -18,9 +18,10 @@ from sfm_app.selfcal.wide_angle.fisheye import (
     PERSPECTIVE,
     STEREOGRAPHIC,
     Fisheye,
+    RadialLens,
     bearings_through,
 )
-from sfm_app.selfcal.wide_angle.lens_refinement import refine_lens
+from sfm_app.selfcal.wide_angle.lens_refinement import refine_lens, robust_cost
 from sfm_app.selfcal.wide_angle.lens_support import search_rays
 
 FloatArray = NDArray[np.float64]
@@ -46,6 +47,8 @@ on its own."""
 FIRST_FIELDS_DEG, FIRST_PAIRS, FIRST_MATCHES, FIRST_GAIN = (80.0, 120.0, 170.0), 8, 300, 0.02
 """A first look: fields of view of an equidistant lens, pairs, matches of each, and the gain from which on all lenses
 are asked. Chosen by hand; not measured on their own."""
+LEAST_RADIAL = -0.5
+"""Radial term of the perspective rival to start from, at least. Chosen by hand; not measured on its own."""
 ANGLES, WIDEST_PERSPECTIVE = 100, np.radians(75.0)
 """Angles of the comparison, and the half field of view from which on no perspective lens compares. Chosen by hand; not
 measured on their own."""
@@ -70,20 +73,19 @@ class LensEstimate:
     """Number of pairs that were asked."""
     size: tuple[int, int]
     """(width, height) of the photos."""
+    log_odds: float = np.inf
+    """By how much its robust cost is below that of the best perspective lens with one radial term."""
 
     @property
     def is_fisheye(self) -> bool:
         """Whether a fisheye explains clearly more than any perspective lens, and no radial term could replace it."""
-        return self.support - self.perspective_support > CLEAR_GAIN and self.sideways_px() > LARGEST_SIDEWAYS_PX
+        clear = self.support - self.perspective_support > CLEAR_GAIN and self.log_odds > 0.0
+        return clear and self.sideways_px() > LARGEST_SIDEWAYS_PX
 
     def sideways_px(self) -> float:
         """Return by how many pixels the best perspective lens with one radial term departs from it; inf if none can."""
-        theta = np.linspace(0.0, float(self.lens.angle(np.array([0.5 * np.hypot(*self.size)]))[0]), ANGLES)[1:]
-        if theta[-1] >= WIDEST_PERSPECTIVE:
-            return float("inf")
-        plain, radius = np.tan(theta), self.lens.radius(theta)
-        terms, *_ = np.linalg.lstsq(np.column_stack([plain, plain**3]), radius, rcond=None)
-        return float(np.max(np.abs(terms[0] * plain + terms[1] * plain**3 - radius)))
+        found = _fit_radial(self.lens, 0.5 * float(np.hypot(*self.size)))
+        return found[2] if found is not None else float("inf")
 
     def radius_deviation_px(self, theta: FloatArray) -> FloatArray:
         """Return (N,) standard deviations of the radius at angles (N,) to the optical axis, in pixels."""
@@ -112,7 +114,11 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
     kept = [(x, F) for x, (count, F) in zip(given.matches, found, strict=True) if count >= MIN_KEPT * len(x)]
     if len(kept) < MIN_PAIRS:
         return None
-    parameters, covariance = refine_lens(best, kept, THRESHOLD_PX / side)
+    parameters, covariance, state, sigma = refine_lens(best, kept, THRESHOLD_PX / side)
+    rival = _radial_rival(best, size)
+    other = refine_lens(rival, kept, sigma) if rival is not None else None
+    seen = [x for x, _ in kept]
+    ahead = robust_cost(seen, other.state, sigma) - robust_cost(seen, state, sigma) if other is not None else np.inf
     unit = np.array([1.0, 1.0, side, side])
     center = side * parameters[2] + size[0] / 2.0, side * parameters[3] + size[1] / 2.0
     scaled = covariance * np.outer(unit, unit)
@@ -120,6 +126,7 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
         Fisheye(float(np.exp(parameters[0])) * side, float(parameters[1]), (float(center[0]), float(center[1]))),
         tuple(map(tuple, scaled.tolist())), given.support(found),
         given.support(given.search(Fisheye(1.0, PERSPECTIVE))), len(given.matches), size,
+        ahead,
     )  # fmt: skip
 
 
@@ -163,6 +170,23 @@ def needs_fisheye(matches: Sequence[FloatArray], size: tuple[int, int], seed: in
     fields = [_lens_of(field, EQUIDISTANT) for field in FIRST_FIELDS_DEG]
     supports = [given.support(given.search(lens)) for lens in (Fisheye(1.0, PERSPECTIVE), *fields)]
     return max(supports[1:]) - supports[0] > FIRST_GAIN
+
+
+def _radial_rival(lens: Fisheye, size: tuple[int, int]) -> RadialLens | None:
+    """Return the perspective lens with one radial term next to a fisheye in longer sides; None where none compares."""
+    found = _fit_radial(lens, 0.5 * float(np.hypot(*size)) / max(size))
+    return RadialLens(found[0], max(found[1], LEAST_RADIAL)) if found is not None else None
+
+
+def _fit_radial(lens: Fisheye, reach: float) -> tuple[float, float, float] | None:
+    """Return focal, radial term and largest departure of the perspective lens nearest to a fisheye up to a radius."""
+    theta = np.linspace(0.0, float(lens.angle(np.array([reach]))[0]), ANGLES)[1:]
+    if theta[-1] >= WIDEST_PERSPECTIVE:
+        return None
+    plain, radius = np.tan(theta), lens.radius(theta)
+    terms, *_ = np.linalg.lstsq(np.column_stack([plain, plain**3]), radius, rcond=None)
+    departure = float(np.max(np.abs(terms[0] * plain + terms[1] * plain**3 - radius)))
+    return float(terms[0]), float(terms[1] / terms[0]), departure
 
 
 def _lens_of(field_deg: float, exponent: float) -> Fisheye:
