@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from sfm_app.bundle_adjustment.lens_parts import (
     COUNT,
@@ -127,8 +128,7 @@ def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: LensPrio
 def _weigh(params: FloatArray, reduced: ReducedSystem, priors: LensPriors) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return H (12C, 12C) and g (12C,) by the logarithms of focal and aspect, and the offsets of the priors (C, 12)."""
     T, weight = _logarithm_jacobian(params), evidence_weight(reduced.noise_px)
-    H = weight * _multiply(T.T, _multiply(reduced.H, T))
-    return H, weight * _multiply(T.T, reduced.g), priors.prior_offsets(params)
+    return weight * (T.T @ (reduced.H @ T)), weight * (T.T @ reduced.g), priors.prior_offsets(params)
 
 
 def evidence_weight(noise_px: float) -> float:
@@ -141,17 +141,16 @@ def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, fr
     H, g, away = _weigh(params, reduced, priors)
     T = _logarithm_jacobian(params)
     precision = priors.precision(free)
-    _, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
+    mean, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
     determined = priors.asked & _find_determined(covariance, precision, priors)
     changing = priors.parameter_mask(determined | (priors.asked & ~priors.part_mask("stays")))
     absent = priors.parameter_mask(priors.asked & ~free & priors.part_mask("exact"))
     absent[:, [FX, FY]] = False
     step, own = _posterior(H, g, np.where(absent, EXACTLY, 1.0) * precision, away, changing)
-    about = _mean_squares(step, H, g, away, priors, free)
-    photos = evidence_weight(reduced.noise_px) * _multiply(reduced.scores, T)
-    variances = np.maximum(
-        np.sum(_multiply(T, about) * T, axis=1), np.sum(_multiply(photos, _multiply(covariance, T.T)) ** 2, axis=0)
-    )
+    about = _mean_squares(step, (mean, covariance), precision, away, priors)
+    photos = evidence_weight(reduced.noise_px) * (reduced.scores @ T)
+    by_photo = _multiply(photos, covariance) @ T.T
+    variances = np.maximum(np.einsum("ii->i", (T @ about) @ T.T), np.sum(by_photo**2, axis=0))
     deviations = np.sqrt(variances).reshape(params.shape) * np.where(priors.asked.all(axis=1), 1.0, FEW)[:, None]
     largest = np.abs(step) / np.sqrt(np.diag(own), out=np.ones_like(step), where=(changing & ~absent).ravel())
     largest = np.where(absent.ravel(), 0.0, largest)
@@ -223,16 +222,16 @@ def _rank(family: int, trials: BoolArray, log_evidence: FloatArray) -> tuple[Len
 
 
 def _mean_squares(
-    step: FloatArray, H: FloatArray, g: FloatArray, away: FloatArray, priors: LensPriors, free: BoolArray
-) -> FloatArray:
-    """Return (12C, 12C) mean squares of the cameras about a step, over all choices for each, the others as in `free`.
+    step: FloatArray, posterior: tuple[FloatArray, FloatArray], precision: FloatArray, away: FloatArray,
+    priors: LensPriors,
+) -> FloatArray:  # fmt: skip
+    """Return (12C, 12C) mean squares of the cameras about a step, over all choices for each, the others as they are.
 
     Choices that the photos were not asked about count, too: a part is no better known because nobody asked.
     """
-    precision = priors.precision(free)
-    mean, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
+    mean, covariance = posterior
     found = covariance + np.outer(mean - step, mean - step)
-    for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
+    for camera, own in enumerate(np.arange(len(step)).reshape(away.shape)):
         block = np.ix_(own, own)
         said = cavity(covariance[block], mean[own], precision[camera], away[camera])
         choices = priors.choice_priors(consistent_choices(int(priors.family[camera])), camera, away[camera])
@@ -240,14 +239,14 @@ def _mean_squares(
     return found
 
 
-def _logarithm_jacobian(params: FloatArray) -> FloatArray:
+def _logarithm_jacobian(params: FloatArray) -> sparse.csr_array:
     """Return (12C, 12C) derivatives of the parameters by those with log f and log fy/fx in place of fx and fy."""
-    T = np.eye(params.size)
+    T = sparse.eye_array(params.size, format="lil")
     for camera, values in enumerate(params):
         x, y = CAMERA * camera + FX, CAMERA * camera + FY
-        T[x, [x, y]] = values[FX], -0.5 * values[FX]
-        T[y, [x, y]] = values[FY], 0.5 * values[FY]
-    return T
+        T[x, x], T[x, y] = values[FX], -0.5 * values[FX]
+        T[y, x], T[y, y] = values[FY], 0.5 * values[FY]
+    return T.tocsr()
 
 
 def _multiply(A: FloatArray, B: FloatArray) -> FloatArray:

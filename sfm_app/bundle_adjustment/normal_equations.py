@@ -196,6 +196,27 @@ def apply_step(bundle: Bundle, params: FloatArray, poses: FloatArray, points: Fl
     return replace(bundle, params=params, R=R, t=bundle.t + poses[:, 3:], X=bundle.X + points)
 
 
+def best_step(bundle: Bundle, reduced: ReducedSystem, params: FloatArray, scale_px: float) -> Bundle:
+    """Return the bundle with new cameras, and with poses and points moved if that does not raise the cost.
+
+    A point that would move behind a camera stays: along an undetermined direction a linear step has no bound.
+
+    Args:
+        bundle: bundle to change; not changed in place.
+        reduced: the cost about it.
+        params: (C, 12) the new cameras.
+        scale_px: as in `reduce`.
+    """
+    nowhere = np.zeros((len(bundle.R), POSE)), np.zeros_like(bundle.X)
+    poses, points = reduced.back_substitute(params - bundle.params)
+    tried = [apply_step(bundle, params, *nowhere)]
+    if np.isfinite(poses).all():
+        points[~np.isfinite(points).all(axis=1)] = 0.0
+        points[lost_points(apply_step(bundle, params, poses, points)) & ~lost_points(bundle)] = 0.0
+        tried.insert(0, apply_step(bundle, params, poses, points))
+    return min(tried, key=lambda one: cost(one, scale_px))
+
+
 def cost(bundle: Bundle, scale_px: float) -> float:
     """Return half the sum of the loss of `reduce`; lost observations count with a residual of LOST_PX.
 

@@ -6,15 +6,7 @@ import numpy as np
 
 from sfm_app.bundle_adjustment.lens_evidence import LensEstimate, estimate_lenses
 from sfm_app.bundle_adjustment.lens_parts import COUNT, PARTS, LensPriors
-from sfm_app.bundle_adjustment.normal_equations import (
-    POSE,
-    Bundle,
-    ReducedSystem,
-    apply_step,
-    cost,
-    lost_points,
-    reduce,
-)
+from sfm_app.bundle_adjustment.normal_equations import Bundle, best_step, reduce
 from sfm_app.bundle_adjustment.projections import FX, FY, PANORAMA
 from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread
 from sfm_app.colmap.bundle_arrays import photos_per_camera, read_bundle, write_bundle
@@ -76,7 +68,7 @@ def adjust_in_rounds(model: pycolmap.Reconstruction, graph: pycolmap.Corresponde
         reduced = reduce(bundle, LOSS_SCALE_PX)
         open_points.append(reduced.open_points)
         found = estimate_lenses(bundle.params, reduced, lens_priors(model, ids, bundle))
-        write_bundle(model, ids, _best_step(bundle, reduced, found))
+        write_bundle(model, ids, best_step(bundle, reduced, found.params, LOSS_SCALE_PX))
         if found.step > LONG_STEP:
             solve(model)
         changed = _improve_tracks(model, graph) if graph else 0
@@ -119,21 +111,6 @@ def _improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.Corresponden
     triangulator.retriangulate(options)
     observations.filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
     return abs(int(model.compute_num_observations() - before))
-
-
-def _best_step(bundle: Bundle, reduced: ReducedSystem, found: LensEstimate) -> Bundle:
-    """Return the bundle with the estimated cameras, and with poses and points moved if that does not raise the cost.
-
-    A point that would move behind a camera stays: along an undetermined direction a linear step has no bound.
-    """
-    nowhere = np.zeros((len(bundle.R), POSE)), np.zeros_like(bundle.X)
-    poses, points = reduced.back_substitute(found.params - bundle.params)
-    tried = [apply_step(bundle, found.params, *nowhere)]
-    if np.isfinite(poses).all():
-        points[~np.isfinite(points).all(axis=1)] = 0.0
-        points[lost_points(apply_step(bundle, found.params, poses, points)) & ~lost_points(bundle)] = 0.0
-        tried.insert(0, apply_step(bundle, found.params, poses, points))
-    return min(tried, key=lambda one: cost(one, LOSS_SCALE_PX))
 
 
 def lens_priors(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle) -> LensPriors:
