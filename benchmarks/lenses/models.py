@@ -35,7 +35,7 @@ from sfm_app.bundle_adjustment.lens_evidence import estimate_lenses
 from sfm_app.bundle_adjustment.lens_parts import PARTS, model_name
 from sfm_app.bundle_adjustment.normal_equations import Bundle, best_step, project, reduce, residuals
 from sfm_app.bundle_adjustment.projections import FISHEYE, PERSPECTIVE
-from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.backend import pycolmap, show_log
 from sfm_app.colmap.bundle import Adjustment, adjust
 from sfm_app.colmap.bundle_arrays import read_bundle
 from sfm_app.colmap.bundle_rounds import LOSS_SCALE_PX, lens_priors
@@ -161,7 +161,7 @@ def shown_reach(case: Case) -> float:
 
 
 def held_out_row(model: pycolmap.Reconstruction, family: int, free: tuple[str, ...], seed: int) -> Row:
-    """Return which model explains held-out observations best, and by how many standard errors the chosen one is worse."""
+    """Return which model explains held-out observations best, and how much worse the chosen one does."""
     ids, bundle = read_bundle(model)
     names = [part.name for part in PARTS[family]]
     kept = tuple(name for name in free if name in ("center", "aspect"))
@@ -235,6 +235,7 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     """Run all bundles and publish."""
     args = parser().parse_args()
+    show_log(0)
     rows: list[Row] = []
     for group in args.groups:
         for seed in range(args.first_seed, args.first_seed + args.seeds):

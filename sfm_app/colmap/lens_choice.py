@@ -21,7 +21,7 @@ OUTERMOST = 0.999
 """Share of the observations that reach the radius up to which a lens is made like another: the rest may be wrong.
 Chosen by hand; not measured on its own."""
 RUNNERS_UP = 3
-"""Number of rivals in the manifest. Chosen by hand."""
+"""Number of rivals of the same family in the manifest. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +118,8 @@ def record_lenses(
     for row, camera_id in enumerate(rounds.ids):
         best, *rest = rounds.found.ranking[row]
         rivals = [replace(one, log_evidence=best.log_evidence - one.log_evidence) for one in rest]
-        rivals += [others[camera_id]] if camera_id in others else []
-        rivals = sorted(rivals, key=lambda one: one.log_evidence)[:RUNNERS_UP]
+        rivals = rivals[:RUNNERS_UP] + ([others[camera_id]] if camera_id in others else [])
+        rivals.sort(key=lambda one: one.log_evidence)
         name = model.cameras[camera_id].model.name
         found[camera_id] = LensRecord(best, name, tuple(rivals), bool(rounds.found.folding[row]))
     return found
