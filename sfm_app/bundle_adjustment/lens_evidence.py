@@ -4,54 +4,35 @@ Ours; the choice by marginal likelihood is that of `geometry.model_selection`.
 
 As for pairs (`camera_priors`): each part of a camera has a narrow prior about its usual value and a wide one, and is
 freed where the evidence for the wide one outweighs how rare such cameras are. Freed or not, the prior stays in the
-estimate: what the photos do not determine stays where it usually is.
+estimate: what the photos do not determine stays where it usually is. A lens that would fold inside the photo is not
+taken.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
-from sfm_app.bundle_adjustment.normal_equations import CAMERA, CX, CY, FX, FY, K1, K2, P1, P2, ReducedSystem
-from sfm_app.geometry.model_selection import NormalPriors, binary_choices, cavity, posteriors
+from sfm_app.bundle_adjustment.lens_parts import (
+    COUNT,
+    FOCAL_SPREAD,
+    LOG_ASPECT,
+    LOG_FOCAL,
+    PARTS,
+    LensPriors,
+    consistent_choices,
+    model_name,
+    part_names,
+)
+from sfm_app.bundle_adjustment.normal_equations import ReducedSystem
+from sfm_app.bundle_adjustment.projections import CAMERA, FX, FY
+from sfm_app.geometry.model_selection import cavity, posteriors
 from sfm_app.geometry.spd_solve import inverse_of_positive
-from sfm_app.selfcal.adjustment.camera_priors import ASPECT, CENTER, FREE_SHARE, LENS, NARROW, WIDE
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-LOG_FOCAL, LOG_ASPECT = FX, FY
-"""Columns of log sqrt(fx fy) and log fy/fx, which replace fx and fy."""
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """Parameters of a camera that are freed together."""
-
-    name: str
-    places: tuple[int, ...]
-    narrow: float
-    """Standard deviation about the usual value; the center's in longer sides."""
-    wide: float
-    share: float
-    """Share of cameras for which the wide prior is the right one."""
-    stays: bool
-    """Whether it keeps its value where the photos do not determine it; otherwise it moves to its usual value. Mapping
-    starts from a calibrated center and aspect, but estimates distortion without a prior."""
-
-
-PARTS = (
-    Part("center", (CX, CY), NARROW[CENTER], WIDE[CENTER], FREE_SHARE[CENTER], True),
-    Part("aspect", (LOG_ASPECT,), NARROW[ASPECT], WIDE[ASPECT], FREE_SHARE[ASPECT], True),
-    Part("k1", (K1,), NARROW[LENS], WIDE[LENS], FREE_SHARE[LENS], False),
-    Part("k2", (K2,), 0.01, 0.2, 0.3, False),
-    Part("p1 p2", (P1, P2), 0.0002, 0.002, 0.05, True),
-)
-"""The priors of center, aspect and k1 are those of `camera_priors`; k2, p1 and p2: docs/algorithms.md, Bundle
-adjustment. Chosen by hand; not measured on their own."""
-FOCAL_SPREAD = 0.7
-"""Prior standard deviation of log f about the value from mapping: hardly a constraint. Chosen by hand; not measured on
-its own."""
 UNDETERMINED = 0.5
 """A part keeps its value unless the photos shrink its prior deviation below this share: freeing it adds error.
 docs/algorithms.md, Bundle adjustment. Chosen by hand; not measured on its own."""
@@ -71,48 +52,23 @@ MISFIT = 4.0
 """Ratio of the errors of cameras to those that independent noise explains: lens models are inexact, and errors of
 neighboring observations are correlated. Chosen on the photo sets with known cameras (docs/algorithms.md, Bundle
 adjustment)."""
+EXACTLY = 1e6
+"""Factor on the precision of a part that is set to its usual value, so that the others adapt to it. Chosen by hand; not
+measured on its own."""
+CLAMPS = 8
+"""How often a step is halved that makes a lens fold inside the photo. Chosen by hand; not measured on its own."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LensPriors:
-    """Priors on the cameras, one row each."""
+@dataclass(frozen=True, slots=True)
+class LensChoice:
+    """A camera model, and how well the photos support it."""
 
-    centers: FloatArray
-    """(C, 2) usual optical centers in pixels: the middle of the photo."""
-    sides: FloatArray
-    """(C,) longer side in pixels."""
-    asked: BoolArray
-    """(C, 5) parts that are estimated, in the order of PARTS; the others keep their values."""
-
-    def precision(self, free: BoolArray) -> FloatArray:
-        """Return (C, 8) precisions of the prior, the wide one for the parts in `free` (C, 5)."""
-        deviation = np.full((len(free), CAMERA), FOCAL_SPREAD)
-        for k, part in enumerate(PARTS):
-            unit = self.sides if part.name == "center" else np.ones(len(free))
-            sigma = np.where(free[:, k], part.wide, part.narrow) * unit
-            deviation[:, list(part.places)] = sigma[:, None]
-        return np.asarray(deviation**-2.0, np.float64)
-
-    def choice_priors(self, trials: BoolArray, camera: int, away: FloatArray) -> NormalPriors:
-        """Return the priors of one camera under each of K choices.
-
-        Args:
-            trials: (K, 5) the choices.
-            camera: row of the camera.
-            away: (8,) from it to its usual values.
-        """
-        alike = LensPriors(np.zeros((len(trials), 2)), np.full(len(trials), self.sides[camera]), trials)
-        share = np.array([part.share for part in PARTS])
-        log_odds = np.sum(np.log(np.where(trials, share, 1.0 - share)), axis=1)
-        return NormalPriors(alike.precision(trials), np.tile(away, (len(trials), 1)), log_odds)
-
-    def prior_offsets(self, params: FloatArray) -> FloatArray:
-        """Return (C, 8) offsets from the cameras to their usual values; 0 for the focal and for parts not estimated."""
-        away = np.zeros_like(params)
-        away[:, [CX, CY]] = self.centers - params[:, [CX, CY]]
-        away[:, LOG_ASPECT] = np.log(params[:, FX] / params[:, FY])
-        away[:, [K1, K2, P1, P2]] = -params[:, [K1, K2, P1, P2]]
-        return np.where(parameter_mask(self.asked), away, 0.0)
+    model: str
+    """COLMAP's name of the smallest camera model with these parts."""
+    free: tuple[str, ...]
+    """Names of the freed parts."""
+    log_evidence: float
+    """Log-probability up to a constant that all models of a camera share."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,17 +76,21 @@ class LensEstimate:
     """The most probable cameras, with their uncertainty."""
 
     params: FloatArray
-    """(C, 8) as in `Bundle`."""
+    """(C, 12) as in `Bundle`."""
     deviations: FloatArray
-    """(C, 8) their standard deviations."""
+    """(C, 12) their standard deviations."""
     free: BoolArray
-    """(C, 5) the parts that have the wide prior, in the order of PARTS."""
+    """(C, 7) the parts that have the wide prior, in the order of PARTS."""
     determined: BoolArray
-    """(C, 5) the parts that the photos determine better than the prior."""
+    """(C, 7) the parts that the photos determine better than the prior."""
     step: float
     """The largest change of a parameter, in standard deviations."""
     held: BoolArray
     """(C,) cameras whose step was refused because it diverged; no part of them counts as determined."""
+    ranking: tuple[tuple[LensChoice, ...], ...]
+    """For each camera the best choice of every model, the most probable first."""
+    folding: BoolArray
+    """(C,) cameras of which a more probable lens was refused, because it folds inside the photo."""
 
 
 def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: LensPriors) -> LensEstimate:
@@ -138,51 +98,76 @@ def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: LensPrio
 
     Deviations are root mean squares about the returned values, over all choices of freed parts. They are at least
     those of the sandwich estimator with photos as clusters, which grows where photos contradict each other (a zoom, a
-    rolling shutter, look-alikes).
+    rolling shutter, look-alikes). Choices whose lens folds inside the photo are barred; where all do, the step is
+    shortened.
 
     Args:
-        params: (C, 8) cameras as in `Bundle`.
+        params: (C, 12) cameras as in `Bundle`.
         reduced: the cost about these cameras.
         priors: on the cameras.
     """
+    barred = np.zeros(len(params), np.bool_)
+    while True:
+        chosen, ranking = _choose(*_weigh(params, reduced, priors), priors)
+        found = _estimate(params, reduced, priors, chosen)
+        folding = [camera for camera, row in enumerate(found.params) if priors.folds(camera, row)]
+        others = {camera: priors.without(camera, chosen[camera]) for camera in folding}
+        ways_out = [camera for camera, other in others.items() if len(other.choices[camera])]
+        if not ways_out:
+            break
+        for camera in ways_out:
+            priors = priors.without(camera, chosen[camera])
+        barred[ways_out] = True
+    clamped = found.params.copy()
+    for camera in folding:
+        clamped[camera] = _shorten_step(params[camera], clamped[camera], camera, priors)
+    barred[folding] = True
+    return replace(found, params=clamped, ranking=ranking, folding=barred)
+
+
+def _weigh(params: FloatArray, reduced: ReducedSystem, priors: LensPriors) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return H (12C, 12C) and g (12C,) by the logarithms of focal and aspect, and the offsets of the priors (C, 12)."""
+    T, weight = _logarithm_jacobian(params), evidence_weight(reduced.noise_px)
+    return weight * (T.T @ (reduced.H @ T)), weight * (T.T @ reduced.g), priors.prior_offsets(params)
+
+
+def evidence_weight(noise_px: float) -> float:
+    """Return the weight of a squared residual in pixels in the log-likelihood."""
+    return 1.0 / (MISFIT * noise_px) ** 2
+
+
+def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, free: BoolArray) -> LensEstimate:
+    """Return the most probable cameras for a choice of freed parts (C, 7), without a ranking."""
+    H, g, away = _weigh(params, reduced, priors)
     T = _logarithm_jacobian(params)
-    weight = (MISFIT * reduced.noise_px) ** -2.0
-    H, g = weight * _multiply(T.T, _multiply(reduced.H, T)), weight * _multiply(T.T, reduced.g)
-    away = priors.prior_offsets(params)
-    free = _choose(H, g, away, priors)
     precision = priors.precision(free)
-    _, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
-    determined = priors.asked & _find_determined(covariance, precision)
-    changing = parameter_mask(determined | (priors.asked & ~np.array([part.stays for part in PARTS])))
-    step, own = _posterior(H, g, precision, away, changing)
-    about = _mean_squares(step, H, g, away, priors, free)
-    photos = weight * _multiply(reduced.scores, T)
-    variances = np.maximum(
-        np.sum(_multiply(T, about) * T, axis=1), np.sum(_multiply(photos, _multiply(covariance, T.T)) ** 2, axis=0)
-    )
+    mean, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
+    determined = priors.asked & _find_determined(covariance, precision, priors)
+    changing = priors.parameter_mask(determined | (priors.asked & ~priors.part_mask("stays")))
+    absent = priors.parameter_mask(priors.asked & ~free & priors.part_mask("exact"))
+    absent[:, [FX, FY]] = False
+    step, own = _posterior(H, g, np.where(absent, EXACTLY, 1.0) * precision, away, changing)
+    about = _mean_squares(step, (mean, covariance), precision, away, priors)
+    photos = evidence_weight(reduced.noise_px) * (reduced.scores @ T)
+    by_photo = _multiply(photos, covariance) @ T.T
+    variances = np.maximum(np.einsum("ii->i", (T @ about) @ T.T), np.sum(by_photo**2, axis=0))
     deviations = np.sqrt(variances).reshape(params.shape) * np.where(priors.asked.all(axis=1), 1.0, FEW)[:, None]
-    largest = np.abs(step) / np.sqrt(np.diag(own), out=np.ones_like(step), where=changing.ravel())
+    largest = np.abs(step) / np.sqrt(np.diag(own), out=np.ones_like(step), where=(changing & ~absent).ravel())
+    largest = np.where(absent.ravel(), 0.0, largest)
     moved, held = _apply_step(params, step.reshape(params.shape), priors.sides)
+    moved[absent] = 0.0
     deviations[held] = np.maximum(deviations[held], _prior_deviations(params, priors)[held])
     determined[held] = False
     return LensEstimate(
         np.where(held[:, None], params, moved), deviations, free & determined, determined,
-        float(np.max(largest.reshape(params.shape)[~held], initial=0.0)), held,
+        float(np.max(largest.reshape(params.shape)[~held], initial=0.0)), held, (), held,
     )  # fmt: skip
-
-
-def parameter_mask(parts: BoolArray) -> BoolArray:
-    """Return (C, 8) mask of the parameters of some parts (C, 5), and of the focal."""
-    chosen = np.ones((len(parts), CAMERA), np.bool_)
-    for k, part in enumerate(PARTS):
-        chosen[:, list(part.places)] = parts[:, [k]]
-    return chosen
 
 
 def _posterior(
     H: FloatArray, g: FloatArray, precision: FloatArray, away: FloatArray, changing: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return mean step (8C,) and covariance (8C, 8C) of the parameters in `changing` (C, 8); 0 elsewhere."""
+    """Return mean step (12C,) and covariance (12C, 12C) of the parameters in `changing` (C, 12); 0 elsewhere."""
     places = np.flatnonzero(changing)
     step, covariance = np.zeros(len(g)), np.zeros_like(H)
     block = np.ix_(places, places)
@@ -191,60 +176,77 @@ def _posterior(
     return step, covariance
 
 
-def _find_determined(covariance: FloatArray, precision: FloatArray) -> BoolArray:
-    """Return (C, 5) as in `LensEstimate`."""
+def _find_determined(covariance: FloatArray, precision: FloatArray, priors: LensPriors) -> BoolArray:
+    """Return (C, 7) as in `LensEstimate`."""
     narrower = np.sqrt(np.diag(covariance)).reshape(precision.shape) < UNDETERMINED * precision**-0.5
-    return np.stack([narrower[:, list(part.places)].all(axis=1) for part in PARTS], axis=1)
+    rows = [
+        [row[list(part.places)].all() for part in PARTS[int(kind)]]
+        for row, kind in zip(narrower, priors.family, strict=True)
+    ]
+    return np.array(rows, np.bool_).reshape(-1, COUNT)
 
 
-def _choose(H: FloatArray, g: FloatArray, away: FloatArray, priors: LensPriors) -> BoolArray:
-    """Return the most probable choice (C, 5).
+def _choose(
+    H: FloatArray, g: FloatArray, away: FloatArray, priors: LensPriors
+) -> tuple[BoolArray, tuple[tuple[LensChoice, ...], ...]]:
+    """Return the most probable choice (C, 7), and the ranking of `LensEstimate`.
 
     In one sweep all cameras are asked, with the choices for the others as they were before it. `camera_priors` asks
     one after the other: a posterior of all for each of them, which is too slow for hundreds of cameras.
     """
-    free, everything = np.zeros((len(away), len(PARTS)), np.bool_), np.ones_like(away, np.bool_)
+    free, everything = np.zeros((len(away), COUNT), np.bool_), np.ones_like(away, np.bool_)
+    ranking: list[tuple[LensChoice, ...]] = []
     for _ in range(SWEEPS):
-        before, precision = free, priors.precision(free)
+        before, precision, ranking = free, priors.precision(free), []
         step, covariance = _posterior(H, g, precision, away, everything)
         free = np.empty_like(before)
         for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
-            trials = binary_choices(len(PARTS))
-            trials = trials[~np.any(trials & ~priors.asked[camera], axis=1)]
+            trials = priors.choices[camera]
             said = cavity(covariance[np.ix_(own, own)], step[own], precision[camera], away[camera])
-            found = posteriors(*said, priors.choice_priors(trials, camera, away[camera]))
-            free[camera] = trials[np.argmax(found.log_evidence)]
+            found = posteriors(*said, priors.choice_priors(trials, camera, away[camera])).log_evidence
+            free[camera] = trials[np.argmax(found)]
+            ranking.append(_rank(int(priors.family[camera]), trials, found))
         if np.array_equal(free, before):
             break
-    return free
+    return free, tuple(ranking)
+
+
+def _rank(family: int, trials: BoolArray, log_evidence: FloatArray) -> tuple[LensChoice, ...]:
+    """Return the best choice of every model, best first."""
+    best: dict[str, LensChoice] = {}
+    for k in np.argsort(-log_evidence, kind="stable"):
+        free = part_names(family, trials[k])
+        name = model_name(family, free)
+        best.setdefault(name, LensChoice(name, free, float(log_evidence[k])))
+    return tuple(best.values())
 
 
 def _mean_squares(
-    step: FloatArray, H: FloatArray, g: FloatArray, away: FloatArray, priors: LensPriors, free: BoolArray
-) -> FloatArray:
-    """Return (8C, 8C) mean squares of the cameras about a step, over all choices for each, the others as in `free`.
+    step: FloatArray, posterior: tuple[FloatArray, FloatArray], precision: FloatArray, away: FloatArray,
+    priors: LensPriors,
+) -> FloatArray:  # fmt: skip
+    """Return (12C, 12C) mean squares of the cameras about a step, over all choices for each, the others as they are.
 
     Choices that the photos were not asked about count, too: a part is no better known because nobody asked.
     """
-    precision = priors.precision(free)
-    mean, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
+    mean, covariance = posterior
     found = covariance + np.outer(mean - step, mean - step)
-    for camera, own in enumerate(np.arange(len(g)).reshape(away.shape)):
+    for camera, own in enumerate(np.arange(len(step)).reshape(away.shape)):
         block = np.ix_(own, own)
         said = cavity(covariance[block], mean[own], precision[camera], away[camera])
-        choices = priors.choice_priors(binary_choices(len(PARTS)), camera, away[camera])
+        choices = priors.choice_priors(consistent_choices(int(priors.family[camera])), camera, away[camera])
         found[block] = posteriors(*said, choices).mean_squares(step[own])
     return found
 
 
-def _logarithm_jacobian(params: FloatArray) -> FloatArray:
-    """Return (8C, 8C) derivatives of the parameters by those with log f and log fy/fx in place of fx and fy."""
-    T = np.eye(params.size)
+def _logarithm_jacobian(params: FloatArray) -> sparse.csr_array:
+    """Return (12C, 12C) derivatives of the parameters by those with log f and log fy/fx in place of fx and fy."""
+    T = sparse.eye_array(params.size, format="lil")
     for camera, values in enumerate(params):
         x, y = CAMERA * camera + FX, CAMERA * camera + FY
-        T[x, [x, y]] = values[FX], -0.5 * values[FX]
-        T[y, [x, y]] = values[FY], 0.5 * values[FY]
-    return T
+        T[x, x], T[x, y] = values[FX], -0.5 * values[FX]
+        T[y, x], T[y, y] = values[FY], 0.5 * values[FY]
+    return T.tocsr()
 
 
 def _multiply(A: FloatArray, B: FloatArray) -> FloatArray:
@@ -253,7 +255,7 @@ def _multiply(A: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def _apply_step(params: FloatArray, step: FloatArray, sides: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Return the cameras (C, 8) after a step, and (C,) those that it makes diverge."""
+    """Return the cameras (C, 12) after a step, and (C,) those that it makes diverge."""
     moved = params + step
     with np.errstate(over="ignore", invalid="ignore"):
         moved[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
@@ -264,7 +266,15 @@ def _apply_step(params: FloatArray, step: FloatArray, sides: FloatArray) -> tupl
 
 
 def _prior_deviations(params: FloatArray, priors: LensPriors) -> FloatArray:
-    """Return (C, 8) standard deviations of cameras that the photos do not determine."""
-    deviations = priors.precision(np.ones((len(params), len(PARTS)), np.bool_)) ** -0.5
+    """Return (C, 12) standard deviations of cameras that the photos do not determine."""
+    deviations = priors.precision(np.ones((len(params), COUNT), np.bool_)) ** -0.5
     deviations[:, [FX, FY]] = FOCAL_SPREAD * params[:, [FX, FY]]
     return np.asarray(deviations, np.float64)
+
+
+def _shorten_step(before: FloatArray, after: FloatArray, camera: int, priors: LensPriors) -> FloatArray:
+    """Return a camera (12,) between two that does not fold; the second where the first folds, too."""
+    if priors.folds(camera, before):
+        return after
+    halves = (before + 0.5**k * (after - before) for k in range(1, CLAMPS + 1))
+    return next((one for one in halves if not priors.folds(camera, one)), before)

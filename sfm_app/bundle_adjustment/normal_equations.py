@@ -7,17 +7,16 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
+from sfm_app.bundle_adjustment.projections import CAMERA, PANORAMA, project_points, wrap_residuals
 from sfm_app.geometry.spd_solve import project_to_psd, solve_positive
 
 FloatArray = NDArray[np.float64]
 
-FX, FY, CX, CY, K1, K2, P1, P2 = range(8)
-"""Indices of the parameters of a camera, as in COLMAP's OPENCV model."""
 DAMPING = 1e-6
 """Added to the diagonal, so that a photo with no observation left does not make the system singular. Chosen by hand;
 not measured on its own."""
-CAMERA, POSE = 8, 6
-"""Numbers of parameters of a camera and of a pose. By definition."""
+POSE = 6
+"""Number of parameters of a pose. By definition."""
 MIN_INFORMATION = 1e-11
 """Share of a point's information below which a direction counts as undetermined: rounding leaves this much of the depth
 of rays that nearly coincide. Two rays 1.5 degrees apart leave 2e-4. Chosen on no set. docs/algorithms.md, Bundle
@@ -36,7 +35,7 @@ class Bundle:
     """Cameras, posed photos, points, and observations of the points."""
 
     params: FloatArray
-    """(C, 8) fx, fy, cx, cy in pixels, k1, k2, p1, p2."""
+    """(C, 12) parameters as in `projections`: fx, fy, cx, cy in pixels, k1, k2, p1, p2, ..."""
     camera: NDArray[np.int64]
     """(I,) row of the camera of each photo."""
     R: FloatArray
@@ -51,6 +50,8 @@ class Bundle:
     """(N,) row of the point of each observation."""
     x: FloatArray
     """(N, 2) observed positions, in pixels."""
+    family: NDArray[np.int64]
+    """(C,) PERSPECTIVE, FISHEYE or PANORAMA of `projections`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,65 +59,55 @@ class ReducedSystem:
     """Cost as a function of a change d of the cameras, minimized over poses and points: cost - g'd + d'Hd / 2."""
 
     H: FloatArray
-    """(8C, 8C) Hessian, in the order of `Bundle.params`."""
+    """(12C, 12C) Hessian, in the order of `Bundle.params`."""
     g: FloatArray
-    """(8C,) negative gradient."""
+    """(12C,) negative gradient."""
     noise_px: float
     """Standard deviation of a coordinate, from the residuals after the best linear step."""
     pose_step: FloatArray
     """(6I,) best change of the poses with fixed cameras."""
     pose_response: FloatArray
-    """(6I, 8C) decrease of that change per change of the cameras."""
+    """(6I, 12C) decrease of that change per change of the cameras."""
     point_step: FloatArray
     """(3P,) best change of the points with fixed poses and cameras."""
     point_response: sparse.csr_array
-    """(3P, 6I + 8C) decrease of that change per change of poses and cameras."""
+    """(3P, 6I + 12C) decrease of that change per change of poses and cameras."""
     lost: int
     """Number of observations that are not used: behind their camera, or not finite."""
     scores: FloatArray
-    """(I, 8C) contributions of each photo's observations to g, with poses and points eliminated; they add up to g."""
+    """(I, 12C) contributions of each photo's observations to g, with poses and points eliminated; they add up to g."""
     open_points: int
     """Number of points that their rays do not determine: at infinity, or seen from one position only. They do not move
     along undetermined directions."""
 
     def back_substitute(self, cameras: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the best changes of poses (I, 6) and points (P, 3) for a given change of the cameras (C, 8)."""
+        """Return the best changes of poses (I, 6) and points (P, 3) for a given change of the cameras (C, 12)."""
         poses = self.pose_step - np.einsum("ij,j->i", self.pose_response, cameras.ravel())
         points = self.point_step - self.point_response @ np.concatenate([poses, cameras.ravel()])
         return poses.reshape(-1, POSE), points.reshape(-1, 3)
 
 
 def project(bundle: Bundle) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return predictions (N, 2), and their derivatives by camera (N, 2, 8), pose (N, 2, 6) and point (N, 2, 3).
+    """Return predictions (N, 2), and their derivatives by camera (N, 2, 12), pose (N, 2, 6) and point (N, 2, 3).
 
     A pose changes by a rotation vector in the camera's axes, applied to R from the left, and by a shift of t.
     """
-    fx, fy, cx, cy, k1, k2, p1, p2 = bundle.params[bundle.camera[bundle.photo]].T
-    R = bundle.R[bundle.photo]
+    rows, R = bundle.camera[bundle.photo], bundle.R[bundle.photo]
     turned = np.einsum("nij,nj->ni", R, bundle.X[bundle.point])
-    X, Y, Z = (turned + bundle.t[bundle.photo]).T
-    u, v = X / Z, Y / Z
-    r2 = u * u + v * v
-    gain, slope = k1 * r2 + k2 * r2 * r2, k1 + 2.0 * k2 * r2
-    ud = u + u * gain + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)
-    vd = v + v * gain + 2.0 * p2 * u * v + p1 * (r2 + 2.0 * v * v)
-    nil, one = np.zeros_like(u), np.ones_like(u)
-    by_camera = np.stack(
-        [
-            np.stack([ud, nil, one, nil, fx * u * r2, fx * u * r2 * r2, 2 * fx * u * v, fx * (r2 + 2 * u * u)], -1),
-            np.stack([nil, vd, nil, one, fy * v * r2, fy * v * r2 * r2, fy * (r2 + 2 * v * v), 2 * fy * u * v], -1),
-        ],
-        1,
-    )
-    cross = 2.0 * (u * v * slope + p1 * u + p2 * v)
-    uu = 1.0 + gain + 2.0 * u * u * slope + 2.0 * p1 * v + 6.0 * p2 * u
-    vv = 1.0 + gain + 2.0 * v * v * slope + 2.0 * p2 * u + 6.0 * p1 * v
-    by_uv = np.stack([np.stack([fx * uu, fx * cross], -1), np.stack([fy * cross, fy * vv], -1)], 1)
-    uv_by_x = np.stack([np.stack([one, nil, -u], -1), np.stack([nil, one, -v], -1)], 1) / Z[:, None, None]
-    by_x = np.einsum("nij,njk->nik", by_uv, uv_by_x)
-    by_pose = np.concatenate([np.cross(turned[:, None], by_x), by_x], 2)
-    predicted = np.stack([fx * ud + cx, fy * vd + cy], -1)
-    return predicted, by_camera, by_pose, np.einsum("nij,njk->nik", by_x, R)
+    found = project_points(turned + bundle.t[bundle.photo], bundle.params[rows], bundle.family[rows])
+    by_pose = np.concatenate([np.cross(turned[:, None], found.by_point), found.by_point], 2)
+    return found.x, found.by_camera, by_pose, np.einsum("nij,njk->nik", found.by_point, R)
+
+
+def residuals(bundle: Bundle, predicted: FloatArray) -> FloatArray:
+    """Return (N, 2) observed less predicted positions, in pixels; in panoramas the short way round.
+
+    Args:
+        bundle: the model.
+        predicted: (N, 2) from `project`.
+    """
+    rows = bundle.camera[bundle.photo]
+    return wrap_residuals(bundle.x - predicted, bundle.params[rows], bundle.family[rows])
 
 
 def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
@@ -176,7 +167,7 @@ def _scores(
     system: tuple[sparse.csr_array, sparse.csr_array, sparse.csr_array],
     pose_give: FloatArray, left_over: FloatArray, photo: NDArray[np.int64], photos: int,
 ) -> FloatArray:  # fmt: skip
-    """Return the scores (I, 8C), from derivatives by views and points, and residuals (2N,) after poses and points.
+    """Return the scores (I, 12C), from derivatives by views and points, and residuals (2N,) after poses and points.
 
     The cameras are processed one by one, so that many of them take no more memory than one.
     """
@@ -197,12 +188,33 @@ def apply_step(bundle: Bundle, params: FloatArray, poses: FloatArray, points: Fl
 
     Args:
         bundle: bundle to change; not changed in place.
-        params: (C, 8) the new cameras, see `Bundle.params`.
+        params: (C, 12) the new cameras, see `Bundle.params`.
         poses: (I, 6) changes: a rotation vector in the camera's axes, and a shift of t.
         points: (P, 3) shifts of the points.
     """
     R = Rotation.from_rotvec(poses[:, :3]).as_matrix() @ bundle.R
     return replace(bundle, params=params, R=R, t=bundle.t + poses[:, 3:], X=bundle.X + points)
+
+
+def best_step(bundle: Bundle, reduced: ReducedSystem, params: FloatArray, scale_px: float) -> Bundle:
+    """Return the bundle with new cameras, and with poses and points moved if that does not raise the cost.
+
+    A point that would move behind a camera stays: along an undetermined direction a linear step has no bound.
+
+    Args:
+        bundle: bundle to change; not changed in place.
+        reduced: the cost about it.
+        params: (C, 12) the new cameras.
+        scale_px: as in `reduce`.
+    """
+    nowhere = np.zeros((len(bundle.R), POSE)), np.zeros_like(bundle.X)
+    poses, points = reduced.back_substitute(params - bundle.params)
+    tried = [apply_step(bundle, params, *nowhere)]
+    if np.isfinite(poses).all():
+        points[~np.isfinite(points).all(axis=1)] = 0.0
+        points[lost_points(apply_step(bundle, params, poses, points)) & ~lost_points(bundle)] = 0.0
+        tried.insert(0, apply_step(bundle, params, poses, points))
+    return min(tried, key=lambda one: cost(one, scale_px))
 
 
 def cost(bundle: Bundle, scale_px: float) -> float:
@@ -213,7 +225,7 @@ def cost(bundle: Bundle, scale_px: float) -> float:
         scale_px: s of the loss, in pixels, > 0.
     """
     with np.errstate(all="ignore"):
-        r = bundle.x - project(bundle)[0]
+        r = residuals(bundle, project(bundle)[0])
         squares = np.einsum("ni,ni->n", r, r)
     squares = np.where(usable_mask(bundle, r), squares, LOST_PX**2)
     return float(scale_px**2 * np.sum(np.sqrt(1.0 + squares / scale_px**2) - 1.0))
@@ -222,30 +234,33 @@ def cost(bundle: Bundle, scale_px: float) -> float:
 def usable_mask(bundle: Bundle, r: FloatArray) -> NDArray[np.bool_]:
     """Return (N,) which observations are of points in front of their camera, with residuals below LOST_PX.
 
+    A panorama also sees what is behind it.
+
     Args:
         bundle: the model.
         r: (N, 2) residuals in pixels.
     """
     with np.errstate(all="ignore"):
         depth = np.einsum("nj,nj->n", bundle.R[bundle.photo, 2], bundle.X[bundle.point]) + bundle.t[bundle.photo, 2]
-        return np.asarray((depth > 0.0) & (np.abs(r) < LOST_PX).all(axis=1), np.bool_)
+        ahead = (depth > 0.0) | (bundle.family[bundle.camera[bundle.photo]] == PANORAMA)
+        return np.asarray(ahead & (np.abs(r) < LOST_PX).all(axis=1), np.bool_)
 
 
 def lost_points(bundle: Bundle) -> NDArray[np.bool_]:
     """Return (P,) which points have a lost observation."""
     with np.errstate(all="ignore"):
-        r = bundle.x - project(bundle)[0]
+        r = residuals(bundle, project(bundle)[0])
     return np.bincount(bundle.point[~usable_mask(bundle, r)], minlength=len(bundle.X)) > 0
 
 
 def _linearize(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Return weighted residuals (N, 2), derivatives by view (N, 2, 14) and point (N, 2, 3), and which are used (N,).
+    """Return weighted residuals (N, 2), derivatives by view (N, 2, 18) and point (N, 2, 3), and which are used (N,).
 
     The others are 0: points behind their camera, or in its principal plane, would distort all that is near.
     """
     with np.errstate(all="ignore"):
         predicted, by_camera, by_pose, by_point = project(bundle)
-        r, by_view = bundle.x - predicted, np.concatenate([by_pose, by_camera], 2)
+        r, by_view = residuals(bundle, predicted), np.concatenate([by_pose, by_camera], 2)
         largest = np.maximum(np.abs(by_view).max(axis=(1, 2), initial=0.0), np.abs(by_point).max(axis=(1, 2)))
         seen = usable_mask(bundle, r) & (largest < MAX_DERIVATIVE)
     r, by_view, by_point = (np.where(seen.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in (r, by_view, by_point))

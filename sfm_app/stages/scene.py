@@ -105,6 +105,7 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
         mean_reprojection_px=round(scene.mean_reprojection_px, 4),
         orientation=orientations[0],
         adjustment=_adjustment_problems(adjusted, names),
+        lenses=_lens_choices(adjusted[0], names),
         **mapping_figures(outcome),
         look_alikes=look_alike_entries(outcome.graph.look_alikes, matches),
         perhaps_look_alikes=look_alike_entries(outcome.graph.doubtful, matches),
@@ -170,6 +171,17 @@ def _adjustment_problems(adjusted: Sequence[Adjustment], names: Mapping[str, str
         "points_left_open": main.open_points,
     }
     return {key: value for key, value in found.items() if value}
+
+
+def _lens_choices(adjusted: Adjustment, names: Mapping[str, str]) -> dict[str, Json]:
+    """Return the manifest's entries about the camera models: the chosen one of each camera, and its rivals."""
+    cameras = {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
+    found: dict[str, Json] = {
+        name: adjusted.lenses[camera_id].to_dict()
+        for name, camera_id in cameras.items()
+        if camera_id in adjusted.lenses
+    }
+    return found
 
 
 def write_models(models: list[Reconstruction], run: RunContext) -> None:

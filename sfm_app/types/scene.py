@@ -14,14 +14,14 @@ class CameraModel:
     """One camera after bundle adjustment."""
 
     model: str
-    """COLMAP's name of the camera model, such as OPENCV."""
+    """COLMAP's name of the camera model: OPENCV, FULL_OPENCV, OPENCV_FISHEYE, THIN_PRISM_FISHEYE, EQUIRECTANGULAR."""
     params: tuple[float, ...]
     """COLMAP's parameters of that model."""
     K: NDArray[np.float64]
     width: int
     height: int
     deviations: Mapping[str, float] = field(default_factory=dict)
-    """Standard deviations: "fx", "fy", "cx", "cy" in pixels, "k1", "k2", "p1", "p2"."""
+    """Standard deviations: "fx", "fy", "cx", "cy" in pixels, and the others by COLMAP's names; none of a panorama."""
     determined: tuple[str, ...] = ()
     """What the photos determine besides the focal: "center", "aspect", "k1", ...; the others kept their values."""
 

@@ -5,12 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_app.bundle_adjustment.lens_evidence import PARTS, LensPriors, estimate_lenses
+from sfm_app.bundle_adjustment.lens_evidence import estimate_lenses
+from sfm_app.bundle_adjustment.lens_parts import PERSPECTIVE_PARTS, LensPriors
 from sfm_app.bundle_adjustment.normal_equations import Bundle, project, reduce
+from sfm_app.bundle_adjustment.projections import CAMERA, PERSPECTIVE
 
 SIZE = np.array([1000.0, 800.0])
 PLAIN = (900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0)
-NAMES = [part.name for part in PARTS]
+NAMES = [part.name for part in PERSPECTIVE_PARTS]
+
+
+def padded(*params):
+    """Cameras of eight parameters, with zeros for the others."""
+    return np.array([[*row, *[0.0] * (CAMERA - len(row))] for row in params])
 
 
 def seen(*true, photos=8, noise_px=0.3, seed=0, points=600):
@@ -22,13 +29,15 @@ def seen(*true, photos=8, noise_px=0.3, seed=0, points=600):
     t = np.tile([0.0, 0.0, depth], (len(R), 1)) + rng.uniform(-0.1, 0.1, (len(R), 3))
     photo, point = (index.ravel() for index in np.meshgrid(range(len(R)), range(points), indexing="ij"))
     camera = np.repeat(np.arange(len(true)), photos)
-    bundle = Bundle(np.array(true), camera, R, t, X, photo, point, np.zeros((len(photo), 2)))
+    family = np.full(len(true), PERSPECTIVE)
+    bundle = Bundle(padded(*true), camera, R, t, X, photo, point, np.zeros((len(photo), 2)), family)
     x = project(bundle)[0]
     inside = np.all((x > 0) & (x < SIZE), axis=1)
     kept = np.bincount(point[inside], minlength=points) > 2
     inside &= kept[point]
     x += rng.normal(scale=noise_px, size=x.shape)
-    return Bundle(np.array(true), camera, R, t, X[kept], photo[inside], (np.cumsum(kept) - 1)[point[inside]], x[inside])
+    places = (np.cumsum(kept) - 1)[point[inside]]
+    return replace(bundle, X=X[kept], photo=photo[inside], point=places, x=x[inside])
 
 
 def turn(pan, tilt, roll):
@@ -42,20 +51,19 @@ def turn(pan, tilt, roll):
 
 
 def starting_at(bundle, *params):
-    return Bundle(
-        np.array(params), bundle.camera, bundle.R, bundle.t, bundle.X, bundle.photo, bundle.point, bundle.x
-    )  # fmt: skip
+    return replace(bundle, params=padded(*params))
 
 
-def asked(*cameras):
+def asked(bundle, *cameras):
     """All about some cameras, of others only k1."""
     only_k1 = np.array([name == "k1" for name in NAMES])
     rows = np.array([only_k1 | bool(all_of) for all_of in cameras])
-    return LensPriors(np.tile(SIZE / 2, (len(rows), 1)), np.full(len(rows), SIZE.max()), rows)
+    return LensPriors.from_cameras(bundle.params, bundle.family, np.tile(SIZE, (len(rows), 1)), rows)
 
 
 def answer(bundle, *cameras):
-    return estimate_lenses(bundle.params, reduce(bundle, 1.0), asked(*(cameras or (True,) * len(bundle.params))))
+    cameras = cameras or (True,) * len(bundle.params)
+    return estimate_lenses(bundle.params, reduce(bundle, 1.0), asked(bundle, *cameras))
 
 
 def freed(found, camera=0):
@@ -81,7 +89,7 @@ def test_a_part_is_freed_where_the_photos_ask_for_it(change, parts):
     found = answer(seen(true))
 
     assert freed(found) == parts
-    assert np.all(np.abs(found.params[0] - true) < 3 * found.deviations[0])
+    assert np.all(np.abs(found.params[0, :8] - true) < 3 * found.deviations[0, :8])
 
 
 def test_one_step_finds_a_camera_that_is_a_little_off():
@@ -90,7 +98,7 @@ def test_one_step_finds_a_camera_that_is_a_little_off():
 
     found = answer(bundle)
 
-    assert found.params[0] == pytest.approx(true, abs=1.5)
+    assert found.params[0, :8] == pytest.approx(true, abs=1.5)
     assert found.params[0, 4] == pytest.approx(-0.1, abs=0.004)
     assert found.step > 1
     assert answer(starting_at(bundle, found.params[0])).step < found.step / 3
@@ -125,7 +133,7 @@ def test_photos_that_pull_in_different_directions_widen_the_deviations():
         bundle = seen(
             *([900.0 * (1 + zoom * (-1) ** k), 900.0 * (1 + zoom * (-1) ** k), *true[2:]] for k in range(8)), photos=1
         )
-        one = replace(bundle, params=np.array([true]), camera=np.zeros_like(bundle.camera))
+        one = replace(bundle, params=padded(true), family=bundle.family[:1], camera=np.zeros_like(bundle.camera))
         stated.append(answer(one).deviations[0, 0] / 900.0)
     assert stated[0] < 0.004
     assert 0.01 < stated[1] < 0.1
@@ -134,7 +142,7 @@ def test_photos_that_pull_in_different_directions_widen_the_deviations():
 def test_what_photos_ask_of_the_cameras_adds_up():
     found = reduce(starting_at(seen(PLAIN), [905.0, 899.0, 503.0, 400.0, 0.01, 0.0, 0.0, 0.0]), 1.0)
 
-    assert found.scores.shape == (8, 8)
+    assert found.scores.shape == (8, CAMERA)
     assert found.scores.sum(axis=0) == pytest.approx(found.g, rel=1e-6, abs=1e-6 * np.abs(found.g).max())
 
 
@@ -146,50 +154,18 @@ def test_a_camera_of_few_photos_is_asked_for_focal_and_k1_only():
     found = answer(bundle, True, False)
 
     assert found.params[1, 2:4].tolist() == [500.0, 400.0]
-    assert found.params[1, 5:].tolist() == [0, 0, 0]
+    assert not found.params[1, 5:].any()
     assert freed(found, 1) <= {"k1"}
-
-
-def test_derivatives_are_those_of_differences():
-    bundle = seen([900.0, 950.0, 510.0, 390.0, -0.1, 0.05, 0.002, -0.003], photos=2, points=5)
-    _, by_camera, by_pose, by_point = project(bundle)
-    h = 1e-6
-
-    for k in range(8):
-        off = np.zeros((1, 8))
-        off[0, k] = h
-        ahead, behind = (project(starting_at(bundle, *(bundle.params + s * off)))[0] for s in (1, -1))
-        assert by_camera[:, :, k] == pytest.approx((ahead - behind) / (2 * h), rel=1e-4, abs=1e-4)
-    for k in range(3):
-        moved = [
-            Bundle(bundle.params, bundle.camera, bundle.R, bundle.t + s * h * np.eye(3)[k], bundle.X, bundle.photo,
-                   bundle.point, bundle.x) for s in (1, -1)
-        ]  # fmt: skip
-        assert by_pose[:, :, 3 + k] == pytest.approx((project(moved[0])[0] - project(moved[1])[0]) / (2 * h), rel=1e-4)
-        turned = [
-            Bundle(bundle.params, bundle.camera, turn(*(s * h * np.array([0, -1, 0]))) @ bundle.R if k == 0 else
-                   turn(*(s * h * np.array([1, 0, 0]))) @ bundle.R if k == 1 else
-                   turn(*(s * h * np.array([0, 0, 1]))) @ bundle.R,
-                   bundle.t, bundle.X, bundle.photo, bundle.point, bundle.x) for s in (1, -1)
-        ]  # fmt: skip
-        difference = (project(turned[0])[0] - project(turned[1])[0]) / (2 * h)
-        assert np.abs(by_pose[:, :, k]) == pytest.approx(np.abs(difference), rel=1e-3, abs=1e-3)
-        shifted = [
-            Bundle(bundle.params, bundle.camera, bundle.R, bundle.t, bundle.X + s * h * np.eye(3)[k], bundle.photo,
-                   bundle.point, bundle.x) for s in (1, -1)
-        ]  # fmt: skip
-        difference = (project(shifted[0])[0] - project(shifted[1])[0]) / (2 * h)
-        assert by_point[:, :, k] == pytest.approx(difference, rel=1e-4, abs=1e-4)
 
 
 @pytest.mark.parametrize("off", [-2.0, 30.0])
 def test_a_camera_that_runs_away_stays_and_is_not_determined(off):
     bundle = seen(list(PLAIN))
-    start = np.array([PLAIN])
+    start = padded(PLAIN)
     reduced = reduce(bundle, 1.0)
-    far = replace(reduced, g=reduced.H @ (900.0 * (off - 1.0) * np.eye(8)[0] + 900.0 * (off - 1.0) * np.eye(8)[1]))
+    far = replace(reduced, g=reduced.H @ (900.0 * (off - 1.0) * np.eye(CAMERA)[:2].sum(axis=0)))
 
-    held, found = estimate_lenses(start, far, asked(True)), estimate_lenses(start, reduced, asked(True))
+    held, found = estimate_lenses(start, far, asked(bundle, True)), estimate_lenses(start, reduced, asked(bundle, True))
 
     assert held.held.tolist() == [True] and found.held.tolist() == [False]
     assert np.array_equal(held.params, start) and not held.determined.any() and held.step == 0
@@ -202,6 +178,6 @@ def test_a_bundle_that_says_nothing_leaves_cameras_as_unsure_as_they_were_before
 
     found = answer(bundle)
 
-    assert found.params[0] == pytest.approx(PLAIN, abs=1)
+    assert found.params[0, :8] == pytest.approx(PLAIN, abs=1)
     assert 0.5 * 900 < found.deviations[0, 0] < 1.5 * 900
     assert not found.determined.any()

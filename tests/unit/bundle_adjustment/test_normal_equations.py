@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from sfm_app.bundle_adjustment.normal_equations import LOST_PX, Bundle, cost, lost_points, project, reduce, usable_mask
+from sfm_app.bundle_adjustment.projections import PERSPECTIVE
 
-CAMERA = np.array([[900.0, 900.0, 500.0, 400.0, 0.0, 0.0, 0.0, 0.0]])
+CAMERA = np.array([[900.0, 900.0, 500.0, 400.0, *[0.0] * 8]])
+FAMILY = np.array([PERSPECTIVE])
 SCALE_PX = 0.5
 
 
@@ -19,11 +21,11 @@ def bundle_of(X, R, centers, noise_px=0.3, seed=0):
     """Every photo sees every point; as measured through the camera with noise."""
     t = -np.einsum("nij,nj->ni", R, centers)
     photo, point = (index.ravel() for index in np.indices((len(R), len(X))))
-    empty = Bundle(CAMERA, np.zeros(len(R), np.int64), R, t, X, photo, point, np.zeros((len(photo), 2)))
+    empty = Bundle(CAMERA, np.zeros(len(R), np.int64), R, t, X, photo, point, np.zeros((len(photo), 2)), FAMILY)
     with np.errstate(all="ignore"):
         seen = project(empty)[0]
     x = np.where(np.isfinite(seen), seen, 500.0) + np.random.default_rng(seed).normal(0, noise_px, (len(photo), 2))
-    return Bundle(CAMERA, empty.camera, R, t, X, photo, point, x)
+    return Bundle(CAMERA, empty.camera, R, t, X, photo, point, x, FAMILY)
 
 
 def box(count=60, depth=5.0, seed=1):

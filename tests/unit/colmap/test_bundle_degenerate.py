@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_app.colmap import bundle as module
+from sfm_app.colmap import bundle, bundle_rounds
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import adjust, adjust_or_keep
 from sfm_app.colmap.database import open_database
@@ -102,7 +102,8 @@ def test_what_fails_in_our_numbers_is_a_reason_and_what_fails_in_colmap_an_error
         raise error
 
     model, database = mapped()
-    monkeypatch.setattr(module, "reduce" if expected is None else "_correspondences", failing)
+    where, name = (bundle_rounds, "reduce") if expected is None else (bundle, "_correspondences")
+    monkeypatch.setattr(where, name, failing)
     if expected:
         with pytest.raises(expected, match=str(error)):
             adjust_or_keep(model, database)

@@ -1,0 +1,271 @@
+"""Parts of a camera that are freed together, with their priors, for each family of lenses.
+
+Ours; the choice by marginal likelihood is that of `geometry.model_selection`. A part has a narrow prior about its usual
+value and a wide one.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.bundle_adjustment.projections import (
+    CAMERA,
+    CX,
+    CY,
+    FISHEYE,
+    FX,
+    FY,
+    K1,
+    K2,
+    K3,
+    K4,
+    K5,
+    K6,
+    P1,
+    P2,
+    PANORAMA,
+    PERSPECTIVE,
+    SEEN_ANGLE,
+    SX,
+    SY,
+    angle_limit,
+)
+from sfm_app.geometry.model_selection import NormalPriors, binary_choices
+from sfm_app.selfcal.adjustment.camera_priors import ASPECT, CENTER, FREE_SHARE, LENS, NARROW, WIDE
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+LOG_FOCAL, LOG_ASPECT = FX, FY
+"""Columns of log sqrt(fx fy) and log fy/fx, which replace fx and fy."""
+FOCAL_SPREAD = 0.7
+"""Prior standard deviation of log f about the value from mapping: hardly a constraint. Chosen by hand; not measured on
+its own."""
+ABSENT = 1e-4
+"""Standard deviation of the terms of `Part.exact` where they are not freed, as a share of the radius of the corner: a
+tenth of a pixel. They are then set to 0. Chosen by hand; not measured on its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """Parameters of a camera that are freed together."""
+
+    name: str
+    places: tuple[int, ...]
+    narrow: float
+    """Standard deviation about the usual value; the center's in longer sides."""
+    wide: float
+    share: float
+    """Share of cameras for which the wide prior is the right one."""
+    stays: bool = False
+    """Whether it keeps its value where the photos do not determine it; otherwise it moves to its usual value. Mapping
+    starts from a calibrated center and aspect, but estimates distortion without a prior."""
+    powers: tuple[int, ...] = ()
+    """Powers of the radius that the terms are multiplied with. Their deviations then state a share of the radius at the
+    corner of the photo; without powers they are those of the parameters."""
+    needs: tuple[str, ...] = ()
+    """Parts that are freed before this one."""
+    exact: bool = False
+    """Whether it is exactly at its usual value, 0, unless it is freed."""
+
+
+_CENTER = Part("center", (CX, CY), NARROW[CENTER], WIDE[CENTER], FREE_SHARE[CENTER], True)
+_ASPECT = Part("aspect", (LOG_ASPECT,), NARROW[ASPECT], WIDE[ASPECT], FREE_SHARE[ASPECT], True)
+PERSPECTIVE_PARTS = (
+    _CENTER,
+    _ASPECT,
+    Part("k1", (K1,), NARROW[LENS], WIDE[LENS], FREE_SHARE[LENS]),
+    Part("k2", (K2,), 0.01, 0.2, 0.3),
+    Part("p1 p2", (P1, P2), 0.0002, 0.002, 0.05, True),
+    Part("k3", (K3,), ABSENT, 0.03, 0.1, powers=(6,), needs=("k1", "k2"), exact=True),
+    Part("k4 k5 k6", (K4, K5, K6), ABSENT, 0.05, 0.05, powers=(2, 4, 6), needs=("k1", "k2", "k3"), exact=True),
+)
+"""The priors of center, aspect and k1 are those of `camera_priors`; the others: docs/algorithms.md, Bundle adjustment.
+Chosen by hand; not measured on their own."""
+FISHEYE_PARTS = (
+    _CENTER,
+    _ASPECT,
+    Part("k1", (K1,), 0.002, 0.2, 0.5, powers=(2,)),
+    Part("k2", (K2,), 0.002, 0.1, 0.3, powers=(4,)),
+    Part("p1 p2", (P1, P2), ABSENT, 0.002, 0.05, powers=(1, 1), exact=True),
+    Part("k3 k4", (K3, K4), ABSENT, 0.05, 0.3, powers=(6, 8), needs=("k1", "k2"), exact=True),
+    Part("thin prism", (SX, SY), ABSENT, 0.002, 0.05, powers=(1, 1), needs=("p1 p2",), exact=True),
+)
+"""An equidistant lens is the usual one. At 175 degrees a stereographic lens has k1 0.19 and k2 0.05 of the radius, an
+equisolid one k1 -0.1. docs/algorithms.md, Bundle adjustment. Chosen by hand; not measured on their own."""
+PARTS = {PERSPECTIVE: PERSPECTIVE_PARTS, FISHEYE: FISHEYE_PARTS, PANORAMA: PERSPECTIVE_PARTS}
+"""By family; a panorama is never asked about any."""
+COUNT = len(PERSPECTIVE_PARTS)
+"""Number of parts of a camera of any family."""
+
+
+def part_names(family: int, chosen: BoolArray) -> tuple[str, ...]:
+    """Return the names of some parts of a camera.
+
+    Args:
+        family: of the camera.
+        chosen: (7,) the parts.
+    """
+    return tuple(part.name for part, on in zip(PARTS[family], chosen, strict=True) if on)
+
+
+def model_name(family: int, freed: tuple[str, ...]) -> str:
+    """Return COLMAP's name of the smallest camera model that has some parts; the center alone makes no other model.
+
+    Args:
+        family: of the camera.
+        freed: names of the parts.
+    """
+    if family == PANORAMA:
+        return "EQUIRECTANGULAR"
+    steps = _FISHEYE_MODELS if family == FISHEYE else _PERSPECTIVE_MODELS
+    return next((name for name, wants in steps if set(freed) & wants), steps[-1][0])
+
+
+_PERSPECTIVE_MODELS = (
+    ("FULL_OPENCV", {"k3", "k4 k5 k6"}),
+    ("OPENCV", {"p1 p2"}),
+    ("RADIAL", {"k2"}),
+    ("SIMPLE_RADIAL", {"k1"}),
+    ("PINHOLE", {"aspect"}),
+    ("SIMPLE_PINHOLE", {""}),
+)
+_FISHEYE_MODELS = (
+    ("THIN_PRISM_FISHEYE", {"p1 p2", "thin prism"}),
+    ("OPENCV_FISHEYE", {"k3 k4", "aspect"}),
+    ("RADIAL_FISHEYE", {"k2"}),
+    ("SIMPLE_RADIAL_FISHEYE", {"k1"}),
+    ("SIMPLE_FISHEYE", {""}),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensPriors:
+    """Priors on the cameras, one row each."""
+
+    sizes: FloatArray
+    """(C, 2) widths and heights in pixels. The usual optical center is the middle of the photo."""
+    family: IntArray
+    """(C,) as in `Bundle`."""
+    reach: FloatArray
+    """(C,) radius of the corners in focal lengths, at most that of what a fisheye shows."""
+    asked: BoolArray
+    """(C, 7) parts that are estimated, in the order of PARTS; the others keep their values."""
+    choices: tuple[BoolArray, ...]
+    """For each camera (K, 7) which parts may be freed together; those that free less come first."""
+
+    @classmethod
+    def from_cameras(cls, params: FloatArray, family: IntArray, sizes: FloatArray, asked: BoolArray) -> "LensPriors":
+        """Return the priors before any evidence.
+
+        Args:
+            params: (C, 12) cameras as in `Bundle`.
+            family, sizes, asked: as in the class.
+        """
+        reach = np.hypot(*sizes.T) / (2.0 * np.sqrt(params[:, FX] * params[:, FY]))
+        reach = np.where(family == FISHEYE, np.minimum(reach, SEEN_ANGLE), reach)
+        choices = []
+        for kind, row in zip(family, asked, strict=True):
+            allowed = consistent_choices(int(kind))
+            choices.append(allowed[~np.any(allowed & ~row, axis=1)])
+        return cls(sizes, family, reach, asked, tuple(choices))
+
+    @property
+    def sides(self) -> FloatArray:
+        """(C,) longer sides in pixels."""
+        return np.asarray(self.sizes.max(axis=1), np.float64)
+
+    def without(self, camera: int, free: BoolArray) -> "LensPriors":
+        """Return the priors without some choices for a camera: those whose lens is that of one.
+
+        Args:
+            camera: its row.
+            free: (7,) the choice that is barred, with all of the same radial terms.
+        """
+        radial = [k for k, part in enumerate(PARTS[int(self.family[camera])]) if part.name.startswith("k")]
+        kept = np.any(self.choices[camera][:, radial] != free[radial], axis=1)
+        choices = list(self.choices)
+        choices[camera] = choices[camera][kept]
+        return replace(self, choices=tuple(choices))
+
+    def deviations(self, camera: int, free: BoolArray) -> FloatArray:
+        """Return (K, 12) standard deviations of the prior of a camera under choices (K, 7).
+
+        Args:
+            camera: its row.
+            free: the freed parts of each choice.
+        """
+        found = np.full((len(free), CAMERA), FOCAL_SPREAD)
+        for k, part in enumerate(PARTS[int(self.family[camera])]):
+            unit = self.sides[camera] if part.name == "center" else 1.0
+            sigma = np.where(free[:, k], part.wide, part.narrow) * unit
+            for place, power in zip(part.places, part.powers or (0,) * len(part.places), strict=True):
+                found[:, place] = sigma * self.reach[camera] ** -power
+        return found
+
+    def precision(self, free: BoolArray) -> FloatArray:
+        """Return (C, 12) precisions of the prior, the wide one for the parts in `free` (C, 7)."""
+        rows = [self.deviations(camera, free[[camera]])[0] for camera in range(len(free))]
+        return np.asarray(np.array(rows).reshape(-1, CAMERA) ** -2.0, np.float64)
+
+    def choice_priors(self, trials: BoolArray, camera: int, away: FloatArray) -> NormalPriors:
+        """Return the priors of one camera under each of K choices.
+
+        Args:
+            trials: (K, 7) the choices.
+            camera: row of the camera.
+            away: (12,) from it to its usual values.
+        """
+        share = np.array([part.share for part in PARTS[int(self.family[camera])]])
+        log_odds = np.sum(np.log(np.where(trials, share, 1.0 - share)), axis=1)
+        return NormalPriors(self.deviations(camera, trials) ** -2.0, np.tile(away, (len(trials), 1)), log_odds)
+
+    def prior_offsets(self, params: FloatArray) -> FloatArray:
+        """Return (C, 12) offsets from the cameras to their usual values; 0 for focals and for parts not estimated."""
+        away = -params
+        away[:, LOG_FOCAL] = 0.0
+        away[:, [CX, CY]] = self.sizes / 2.0 - params[:, [CX, CY]]
+        away[:, LOG_ASPECT] = np.log(params[:, FX] / params[:, FY])
+        return np.where(self.parameter_mask(self.asked), away, 0.0)
+
+    def parameter_mask(self, parts: BoolArray) -> BoolArray:
+        """Return (C, 12) mask of the parameters of some parts (C, 7), and of the focal."""
+        chosen = np.ones((len(parts), CAMERA), np.bool_)
+        for camera, row in enumerate(parts):
+            for part, on in zip(PARTS[int(self.family[camera])], row, strict=True):
+                chosen[camera, list(part.places)] = on
+        return chosen
+
+    def part_mask(self, quality: str) -> BoolArray:
+        """Return (C, 7) which parts have a quality: "stays" or "exact"."""
+        rows = [[bool(getattr(part, quality)) for part in PARTS[int(kind)]] for kind in self.family]
+        return np.array(rows, np.bool_).reshape(-1, COUNT)
+
+    def folds(self, camera: int, params: FloatArray) -> bool:
+        """Return whether the lens of a camera folds inside the photo.
+
+        Args:
+            camera: its row.
+            params: (12,) a candidate for it.
+        """
+        if self.family[camera] == PANORAMA or not np.isfinite(params).all() or min(params[FX], params[FY]) <= 0.0:
+            return False
+        corners = self.sizes[camera] * np.array([[0, 0], [0, 1], [1, 0], [1, 1]]) - params[[CX, CY]]
+        farthest = float(np.hypot(*(corners / params[[FX, FY]]).T).max())
+        return bool(np.isnan(angle_limit(params, int(self.family[camera]), farthest)))
+
+
+def consistent_choices(family: int) -> BoolArray:
+    """Return (K, 7) choices of what is freed in which no part lacks what it needs; those that free less come first.
+
+    Args:
+        family: of the camera.
+    """
+    names = [part.name for part in PARTS[family]]
+    trials = binary_choices(len(names))
+    for k, part in enumerate(PARTS[family]):
+        needed = [names.index(name) for name in part.needs]
+        trials = trials[~trials[:, k] | trials[:, needed].all(axis=1)]
+    return trials

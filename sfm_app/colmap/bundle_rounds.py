@@ -1,0 +1,128 @@
+"""Rounds of the last bundle adjustment: a step of everything, then tracks are completed and filtered."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_app.bundle_adjustment.lens_evidence import LensEstimate, estimate_lenses
+from sfm_app.bundle_adjustment.lens_parts import COUNT, PARTS, LensPriors
+from sfm_app.bundle_adjustment.normal_equations import Bundle, best_step, reduce
+from sfm_app.bundle_adjustment.projections import FX, FY, PANORAMA
+from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread
+from sfm_app.colmap.bundle_arrays import photos_per_camera, read_bundle, write_bundle
+from sfm_app.errors import NumericalError
+
+MIN_PHOTOS = 5
+"""Photos of a camera below which only its focal and k1 are refined: with fewer, effects that the camera model leaves
+out (a lens, a zoom) change its parameters more than the noise does."""
+
+LOSS_SCALE_PX = 0.5
+"""Scale of COLMAP's SOFT_L1 loss: about twice the noise of SIFT keypoints. Poses are better than with COLMAP's 1."""
+
+MAX_ERROR_PX, MIN_ANGLE_DEG = 4.0, 1.5
+"""COLMAP's own limits for a point: largest reprojection error, least angle between its rays."""
+
+ROUNDS, CHANGED_SHARE, STEP = 6, 0.0005, 0.2
+"""Largest number of rounds. They end early when less than this share of the observations changes, and no camera
+parameter by more than this share of its standard deviation."""
+
+MIN_KEPT_SHARE = 0.1
+"""Smallest share of the points that an adjustment must keep; one that drops more has diverged and is rejected. Chosen
+on no set; none of six that were run fell below it."""
+
+LONG_STEP = 1.0
+"""Step of the cameras, in standard deviations, above which the linear step of poses and points is too inaccurate and
+COLMAP's solver refines them."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rounds:
+    """What the last of some rounds found; its step is in the model."""
+
+    ids: list[int]
+    """Ids of the cameras, in the order of the arrays."""
+    bundle: Bundle
+    """Before the last step."""
+    found: LensEstimate
+    noise_px: float
+    """As in `ReducedSystem`."""
+    open_points: int
+    """Points that their rays did not determine when the rounds began."""
+
+
+def adjust_in_rounds(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph | None) -> Rounds:
+    """Refine cameras, poses, points and tracks of a model in place, until they no longer change.
+
+    Args:
+        model: COLMAP's reconstruction, with cameras of FILE_MODELS.
+        graph: of all matches; None to keep the tracks.
+
+    Raises:
+        NumericalError: the adjustment diverges.
+    """
+    points, open_points = model.num_points3D(), []
+    for _ in range(ROUNDS):
+        ids, bundle = read_bundle(model)
+        if not (np.isfinite(bundle.params).all() and (bundle.params[:, [FX, FY]] > 0).all()):
+            raise NumericalError("a camera has no focal length")
+        reduced = reduce(bundle, LOSS_SCALE_PX)
+        open_points.append(reduced.open_points)
+        found = estimate_lenses(bundle.params, reduced, lens_priors(model, ids, bundle))
+        write_bundle(model, ids, best_step(bundle, reduced, found.params, LOSS_SCALE_PX))
+        if found.step > LONG_STEP:
+            solve(model)
+        changed = _improve_tracks(model, graph) if graph else 0
+        if model.num_points3D() <= MIN_KEPT_SHARE * points:
+            raise NumericalError(f"it left {model.num_points3D()} of {points} points")
+        if found.step < STEP and changed < CHANGED_SHARE * len(bundle.x):
+            break
+    return Rounds(ids, bundle, found, reduced.noise_px, open_points[0])
+
+
+def solve(model: pycolmap.Reconstruction) -> None:
+    """Adjust poses and points in place, on one thread: the order of sums over several threads is not fixed."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = LOSS_SCALE_PX
+    options.ceres.solver_options.max_num_iterations = 50
+    options.ceres.solver_options.function_tolerance = 1e-5
+    options.ceres.solver_options.num_threads = 1
+    config = pycolmap.BundleAdjustmentConfig()
+    for image_id in sorted(model.reg_image_ids()):
+        config.add_image(image_id)
+    for camera_id in photos_per_camera(model):
+        config.set_constant_cam_intrinsics(camera_id)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    run_in_daemon_thread(pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve)
+
+
+def _improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph) -> int:
+    """Continue, merge and triangulate tracks, filter them, and return by how many observations their number changed.
+
+    Observations that are added and filtered again do not count: near the limits they come and go forever.
+    """
+    before = model.compute_num_observations()
+    observations = pycolmap.ObservationManager(model, graph)
+    triangulator = pycolmap.IncrementalTriangulator(graph, model, observations)
+    options = pycolmap.IncrementalTriangulatorOptions()
+    triangulator.complete_all_tracks(options)
+    triangulator.merge_all_tracks(options)
+    triangulator.retriangulate(options)
+    observations.filter_all_points3D(MAX_ERROR_PX, MIN_ANGLE_DEG)
+    return abs(int(model.compute_num_observations() - before))
+
+
+def lens_priors(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle) -> LensPriors:
+    """Return the priors of the cameras, before any evidence from the bundle.
+
+    Args:
+        model: has the photos and their sizes.
+        ids, bundle: from `read_bundle`.
+    """
+    used = photos_per_camera(model)
+    sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
+    many = np.array([used[camera_id] >= MIN_PHOTOS for camera_id in ids])
+    only_k1 = [[part.name == "k1" for part in PARTS[int(kind)]] for kind in bundle.family]
+    asked = (many[:, None] | np.array(only_k1).reshape(-1, COUNT)) & (bundle.family != PANORAMA)[:, None]
+    return LensPriors.from_cameras(bundle.params, bundle.family, sizes, asked)
