@@ -178,7 +178,7 @@ def unfolded_to_corner(camera: Camera) -> bool:
     r = np.linspace(0.0, 4.0 * reach, 4000)
     radius = r * (1.0 + sum(k * r ** (2 * power) for power, k in enumerate(camera.lens.radial, start=1)))
     falls = np.flatnonzero(np.diff(radius) <= 0.0)
-    return float(radius[falls[0]] if len(falls) else radius[-1]) > reach
+    return bool(float(radius[falls[0]] if len(falls) else radius[-1]) > reach)
 
 
 def fisheye_bundle(projection: str, field_deg: float, rng: np.random.Generator) -> Drawn:

@@ -155,7 +155,7 @@ def run_folder(folder: Folder, args: argparse.Namespace) -> Iterator[Row]:
         yield lens_alone(folder, args)
         return
     photos, truth = render_folder(folder, args.cache)
-    methods = methods_for(truth)
+    methods = methods_for(truth)[: 1 if args.ours_only else None]
     outs = {method.name: args.cache / "runs" / folder.name / method.name.replace(", ", "-") for method in methods}
     seconds: dict[str, float | None] = {}
     for method in methods:
@@ -164,7 +164,7 @@ def run_folder(folder: Folder, args: argparse.Namespace) -> Iterator[Row]:
             run_method(method, PhotoSet(folder.name, photos, {}, cameras="auto"), outs[method.name])
         said = json.loads(done.read_text(encoding="utf-8")) if done.exists() else {"seconds": {}}
         seconds[method.name] = round(sum(said["seconds"].values()), 1) or None
-    reach = reach_of_features(outs[INCREMENTAL] / "database.db", truth)
+    reach = reach_of_features(outs[OURS] / "database.db", truth)
     for method in methods:
         yield {
             "method": method.name, "scene": folder.scene, "projection": folder.projection,
@@ -188,6 +188,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument("--projections", nargs="+", default=list(PROJECTIONS), choices=PROJECTIONS)
     parser.add_argument("--fields", nargs="+", type=float, default=list(FIELDS_DEG), metavar="DEG")
     parser.add_argument("--lens-only", action="store_true", help="only match, and find the lens")
+    parser.add_argument("--ours-only", action="store_true", help="leave out stock")
     parser.add_argument("--name", default="lenses", help="name of the result files")
     parser.add_argument("--keep", action="store_true", help="do not run again what was run")
     parser.add_argument("--results", type=Path, default=RESULTS)

@@ -196,7 +196,8 @@ def held_out_likelihoods(
     test = replace(train, photo=bundle.photo[out], point=bundle.point[out], x=bundle.x[out])
     r2 = np.sum(residuals(test, project(test)[0]) ** 2, axis=1)
     # the first step's noise is that of the adjusted bundle, the same for all that are compared
-    return -((LOSS_SCALE_PX / noise_px[0]) ** 2) * (np.sqrt(1.0 + r2 / LOSS_SCALE_PX**2) - 1.0)
+    losses = (LOSS_SCALE_PX / noise_px[0]) ** 2 * (np.sqrt(1.0 + r2 / LOSS_SCALE_PX**2) - 1.0)
+    return np.asarray(-losses, np.float64)
 
 
 def summarize(rows: Sequence[Row]) -> Iterator[Row]:
