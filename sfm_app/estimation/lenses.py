@@ -58,7 +58,8 @@ def _find_lens(images: Sequence[MatchedImage], matches: MatchGraph, run: RunCont
     size = images[0].width, images[0].height
     if getattr(images[0], "projection", "") == EQUIRECTANGULAR:
         K = panorama_matrix(size)
-        return Calibration(K, *size, PANORAMA, identifiable=True, projection=EQUIRECTANGULAR)
+        nothing_open = dict.fromkeys(("fx", "fy", "cx", "cy"), 0.0)
+        return Calibration(K, *size, PANORAMA, identifiable=True, projection=EQUIRECTANGULAR, spread=nothing_open)
     if not run.settings.calibration.lens:
         return None
     ids = {image.id for image in images}

@@ -1,0 +1,71 @@
+"""Through a barrel or pincushion lens, pairs get back the inliers that straight epipolar lines have lost."""
+
+import numpy as np
+import pytest
+
+from benchmarks.lenses.distortion import calibrate, photograph
+from sfm_app.estimation.bent_matches import choose_inliers_again
+from sfm_app.plugins import load_plugins
+from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.parallel import make_executor
+from sfm_app.runtime.workspace import Workspace
+from sfm_app.selfcal import CalibratedCamera
+from sfm_app.settings import Settings
+from sfm_app.stages import view_graph
+from sfm_app.synthetic.lenses import Lens
+from sfm_app.types import Calibration
+
+PHOTOS = (1, 2, 3, 4)
+
+
+@pytest.fixture(scope="module")
+def bent(tmp_path_factory):
+    """Matches of four photos through a pincushion lens, their fundamental matrices, and K."""
+    matches, K = photograph(Lens(radial=(0.2,)), 3)
+    kept = {pair: rows for pair, rows in matches.matches.items() if set(PHOTOS) >= set(pair)}
+    matches = type(matches)({key: matches.images[key] for key in PHOTOS}, matches.keypoints, kept)
+    with make_executor(1) as executor:
+        run = RunContext(Settings(), Workspace(tmp_path_factory.mktemp("run")), load_plugins(), executor, 1)
+        yield matches, view_graph.make(matches, run), K, run
+
+
+def camera(K, radial, *, identifiable=True):
+    found = Calibration(K, 1200, 900, "zero-curves", identifiable, radial=radial)
+    return [CalibratedCamera("one", PHOTOS, found)]
+
+
+def inliers_of(views):
+    return sum(fit.inlier_count for fit in views.fits.values())
+
+
+def test_the_right_lens_gives_inliers_back(bent):
+    matches, views, K, run = bent
+    again = choose_inliers_again(matches, views, camera(K, 0.2), run)
+
+    right = sum(int(np.count_nonzero(rows[:, 0] == rows[:, 1])) for rows in matches.matches.values())
+    assert inliers_of(views) < 0.85 * right
+    assert 0.97 * right < inliers_of(again) < 1.03 * right
+    assert all(np.array_equal(again.fits[pair].F, fit.F) for pair, fit in views.fits.items())
+
+
+@pytest.mark.parametrize(("radial", "identifiable"), [(0.0, True), (0.01, True), (0.2, False)])
+def test_without_a_known_lens_nothing_changes(bent, radial, identifiable):
+    matches, views, K, run = bent
+    assert choose_inliers_again(matches, views, camera(K, radial, identifiable=identifiable), run) is views
+
+
+def test_a_wrong_lens_takes_no_inliers_away(bent):
+    matches, views, K, run = bent
+    again = choose_inliers_again(matches, views, camera(K, -0.3), run)
+    for pair, fit in views.fits.items():
+        assert again.fits[pair].inlier_count >= 0.7 * fit.inlier_count
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("k1", [-0.3, 0.15])
+def test_the_focal_is_right_before_adjustment(k1):
+    matches, K = photograph(Lens(radial=(k1,)), 5)
+    found = calibrate(matches, 5)
+    assert found.identifiable and found.projection == "perspective"
+    assert 0.0 < abs(found.focal_px / K[0, 0] - 1.0) < 0.004
+    assert found.radial == pytest.approx(k1, abs=0.01)
