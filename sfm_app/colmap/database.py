@@ -19,6 +19,7 @@ from sfm_app.types import (
     MatchedImage,
     MatchGraph,
     PairId,
+    Photo,
     PhotoSet,
     PoseGraph,
     RelativePose,
@@ -109,8 +110,7 @@ def create_database(path: Path, photos: PhotoSet) -> None:
     """
     with open_database(path) as database:
         for camera_id, members in enumerate(photos.groups.values(), start=1):
-            size = members[0].width, members[0].height
-            _write_camera(database, camera_id, Calibration(guessed_camera_matrix(size), *size, "guess", False))
+            _write_camera(database, camera_id, _guess_calibration(members[0]))
             for photo in sorted(members, key=lambda photo: photo.name):
                 image = pycolmap.Image(name=photo.name, camera_id=camera_id)
                 image.image_id = database.write_image(image)
@@ -131,13 +131,21 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
             photo = by_name[entry.name]
             images[entry.image_id] = MatchedImage(
                 entry.image_id, photo.name, photo.group, photo.width, photo.height,
-                photo.exif_focal_px, photo.gps, photo.turn_deg, photo.shown,
+                photo.exif_focal_px, photo.gps, photo.turn_deg, photo.shown, photo.projection,
             )  # fmt: skip
             found = np.asarray(database.read_keypoints(entry.image_id), np.float64)
             keypoints[entry.image_id] = found[:, :2].copy() if len(found) else np.zeros((0, 2))  # a white wall
         pair_ids, rows = database.read_all_matches()
     matches = {_pair(key): np.asarray(row, np.uint32) for key, row in zip(pair_ids, rows, strict=True) if len(row)}
     return MatchGraph(images, keypoints, dict(sorted(matches.items())))
+
+
+def panorama_names(path: Path) -> frozenset[str]:
+    """Return the names of the photos that are equirectangular panoramas."""
+    model = pycolmap.CameraModelId.__members__[WIDE_MODELS[EQUIRECTANGULAR]]
+    with open_database(path) as database:
+        cameras = {camera.camera_id for camera in database.read_all_cameras() if camera.model == model}
+        return frozenset(image.name for image in database.read_all_images() if image.camera_id in cameras)
 
 
 def photo_names(path: Path) -> dict[int, str]:
@@ -200,9 +208,9 @@ def write_match_graph(path: Path, matches: MatchGraph) -> None:
     numbers = {group: number for number, group in enumerate(groups, start=1)}
     with open_database(path) as database:
         for photo, known in sorted(matches.images.items()):
-            camera_id, size = numbers[known.group], (known.width, known.height)
+            camera_id = numbers[known.group]
             if not database.exists_camera(camera_id):
-                _write_camera(database, camera_id, Calibration(guessed_camera_matrix(size), *size, "guess", False))
+                _write_camera(database, camera_id, _guess_calibration(known))
             image = pycolmap.Image(name=known.name, camera_id=camera_id, image_id=photo)
             database.write_image(image, use_image_id=True)
             _write_frame(database, image)
@@ -271,6 +279,12 @@ def write_calibrations(path: Path, matches: MatchGraph, intrinsics: Intrinsics) 
     # pycolmap can only clear all cameras at once, and only while no image refers to one
     with contextlib.closing(sqlite3.connect(path)) as connection, connection:
         connection.execute("DELETE FROM cameras WHERE camera_id > ?", (len(ids),))
+
+
+def _guess_calibration(photo: Photo | MatchedImage) -> Calibration:
+    """Return what stands in for the camera of a photo until it is known; a panorama has nothing to find out."""
+    size = photo.width, photo.height
+    return Calibration(guessed_camera_matrix(size), *size, "guess", False, projection=photo.projection)
 
 
 def _write_camera(database: pycolmap.Database, camera_id: int, calibration: Calibration) -> None:

@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
 from sfm_app.colmap.backend import translate_errors
-from sfm_app.colmap.database import photo_names, unmatched_pairs, write_keypoints, write_matches
+from sfm_app.colmap.database import panorama_names, photo_names, unmatched_pairs, write_keypoints, write_matches
 from sfm_app.colmap.features import find_and_match
 from sfm_app.errors import InputError, PluginError
 from sfm_app.hashing import load_arrays
 from sfm_app.numerical import Json
 from sfm_app.photos.masks import read_mask
+from sfm_app.photos.panorama_views import PanoramaViews
 from sfm_app.plugins import FeatureMethod
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
@@ -75,12 +76,14 @@ def all_pairs(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
 
 def _find(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> None:
     """Write the features of every photo to its part, and its keypoints to the database."""
+    panoramas = panorama_names(run.workspace.database)
 
     def find(photo: int) -> tuple[int, NDArray[np.float32]]:
-        features, to_photo, size = _find_in_photo(method, names[photo], run)
+        name = names[photo]
+        features, to_photo, size = _find_in_photo(method, name, run, panorama=name in panoramas)
         keypoints = features.keypoints * to_photo
         if run.mask_dir is not None:
-            used = read_mask(run.mask_dir, names[photo])
+            used = read_mask(run.mask_dir, name)
             column, row = np.clip(keypoints.astype(np.int64), 0, np.array(size) - 1).T
             seen = used[row, column]
             features, keypoints = features.select(seen), keypoints[seen]
@@ -96,12 +99,14 @@ def _find(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> N
 
 
 def _find_in_photo(
-    method: FeatureMethod, name: str, run: RunContext
+    method: FeatureMethod, name: str, run: RunContext, *, panorama: bool
 ) -> tuple[Features, NDArray[np.float64], tuple[int, int]]:
     """Return the features of one photo, the scale (x, y) that takes them to its pixels, and its size."""
     options = run.settings.matching
     pixels = read_pixels(run.workspace.photos / name)
     height, width = pixels.shape[:2]
+    if panorama:
+        return _find_in_views(method, name, pixels, options), np.ones(2), (width, height)
     longer = max(width, height)
     if longer > options.max_image_size_px:
         scale = options.max_image_size_px / longer
@@ -110,6 +115,23 @@ def _find_in_photo(
     shown = pixels.shape[1], pixels.shape[0]
     features = _check_features(method, name, shown, _call_find(method, name, pixels, options))
     return features, np.array([width / shown[0], height / shown[1]]), (width, height)
+
+
+def _find_in_views(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
+    """Return the features of a panorama, found in its perspective views; the best of each view come first."""
+    size = pixels.shape[1], pixels.shape[0]
+    views = PanoramaViews.cover(size, options.max_image_size_px)
+    pixels, found, ranks = views.shrink(pixels), [], []
+    for view in range(len(views.rotations)):
+        shown = views.render(pixels, view)
+        features = _check_features(method, name, (views.side_px,) * 2, _call_find(method, name, shown, options))
+        own = np.flatnonzero(views.is_nearest(features.keypoints, view))
+        at = views.to_panorama(features.keypoints[own], view)
+        found.append(Features(size, at, features.select(own).values))
+        ranks.append(own)
+    together = {key: np.concatenate([one.values[key] for one in found]) for key in found[0].values}
+    every = Features(size, np.concatenate([one.keypoints for one in found]), together)
+    return every.select(np.argsort(np.concatenate(ranks), kind="stable"))
 
 
 def read_pixels(path: Path) -> NDArray[np.uint8]:

@@ -7,6 +7,7 @@ from pathlib import PurePosixPath
 
 from sfm_app.photos.letterbox import unify_frames
 from sfm_app.types import Photo
+from sfm_app.types.calibration import EQUIRECTANGULAR
 
 PORTRAIT_TURN_DEG = 90
 """Rotation assumed for a portrait photo whose EXIF does not give one. The opposite rotation would only mirror the
@@ -18,7 +19,7 @@ def group_by_camera(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
 
     A camera in COLMAP has one image size. Photos without an EXIF rotation are therefore turned to the more common
     orientation of their camera; photos that still differ in size get different groups. With "auto", so do letterboxed
-    photos whose pictures within the bars differ in size.
+    photos whose pictures within the bars differ in size. Panoramas of one size always share one, with no other photos.
 
     Args:
         photos: their group is the camera named in EXIF.
@@ -49,6 +50,8 @@ def _split_by_shown_size(photos: Sequence[Photo]) -> list[Photo]:
 
 
 def _camera_key(photo: Photo, cameras: str) -> str:
+    if photo.projection == EQUIRECTANGULAR:
+        return EQUIRECTANGULAR  # its projection is known, and no camera that was named has it
     return {
         "auto": photo.group,
         "single": "",

@@ -18,9 +18,11 @@ from sfm_app.photos.decode import (
 from sfm_app.photos.exif import camera_name, focal_px, gps_position, orientation, turn_deg
 from sfm_app.photos.files import resolve_file
 from sfm_app.photos.letterbox import shown_part
+from sfm_app.photos.panorama import is_panorama
 from sfm_app.photos.thumbnail_stats import PhotoStats, measure_photo
 from sfm_app.settings import PhotoSettings
 from sfm_app.types import Frame, Photo, UnusablePhoto
+from sfm_app.types.calibration import EQUIRECTANGULAR, PERSPECTIVE
 
 MEGA = 1_000_000
 LINKED_FORMATS = ("JPEG", "MPO", "PNG")
@@ -52,9 +54,14 @@ def describe(name: str, picture: DecodedPhoto, options: PhotoSettings) -> PhotoS
         name: path inside the folder.
         picture: what the file holds.
         options: smallest and largest size.
+
+    Raises:
+        UnreadableError: it is a panorama that does not show the whole sphere.
     """
     image, exif = picture.image, picture.exif
-    turn = turn_deg(exif)
+    upright = upright_image(picture)
+    panorama = is_panorama(picture, upright)
+    turn = 0 if panorama else turn_deg(exif)  # rows of a panorama are latitudes
     size = image.size[::-1] if orientation(exif) >= 5 and not turn else image.size
     if min(size) < options.min_side_px:
         return UnusablePhoto(name, f"smaller than {options.min_side_px} px")
@@ -63,13 +70,15 @@ def describe(name: str, picture: DecodedPhoto, options: PhotoSettings) -> PhotoS
     notes = [f"the first of {many} pictures"] if picture.frames > 1 else []
     if (width, height) != size:
         notes.append(f"scaled down from {size[0]} x {size[1]} to {width} x {height} pixels")
+    if panorama:
+        notes.append("a panorama of 360 x 180 degrees")
     eight_bit = image.mode in ("RGB", "L") and "transparency" not in image.info
     photo = Photo(
         name=name,
         width=width,
         height=height,
         group=camera_name(exif),
-        exif_focal_px=focal_px(exif, max(width, height)),
+        exif_focal_px=None if panorama else focal_px(exif, max(width, height)),
         needs_copy=not (
             image.format in LINKED_FORMATS and eight_bit and orientation(exif) == 1 and (width, height) == size
         ),
@@ -77,9 +86,9 @@ def describe(name: str, picture: DecodedPhoto, options: PhotoSettings) -> PhotoS
         lossy=image.format in LOSSY,
         turn_deg=turn,
         notes=tuple(notes),
+        projection=EQUIRECTANGULAR if panorama else PERSPECTIVE,
     )
-    seen = upright_image(picture)
-    return measure_photo(replace(photo, shown=_shown_frame(seen, photo)), seen)
+    return measure_photo(photo if panorama else replace(photo, shown=_shown_frame(upright, photo)), upright)
 
 
 def _shown_frame(seen: Image.Image, photo: Photo) -> Frame | None:

@@ -27,6 +27,8 @@ class MatchedImage:
     """Clockwise rotation that makes it upright, according to EXIF and its shape."""
     shown: Frame | None = None
     """The picture inside the bars; None where there are no bars."""
+    projection: str = "perspective"
+    """"equirectangular" for a panorama, "perspective" for every other photo, also for fisheyes."""
 
 
 @dataclass(frozen=True, slots=True)

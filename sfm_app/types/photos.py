@@ -49,6 +49,8 @@ class Photo:
     """The picture inside bars of one color, as it is laid out; None where there are no bars."""
     mask: str = ""
     """Path of its mask inside the folder of masks; empty where it has none."""
+    projection: str = "perspective"
+    """"equirectangular" for a panorama, "perspective" for every other photo, also for fisheyes: matches show those."""
 
     @property
     def path(self) -> str:

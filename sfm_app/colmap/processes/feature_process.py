@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from sfm_app.colmap.backend import json_options, pycolmap, run_with_progress
-from sfm_app.colmap.database import open_database
+from sfm_app.colmap.database import open_database, panorama_names
+from sfm_app.colmap.processes.panorama_features import extract_panoramas
 from sfm_app.colmap.processes.worker_process import FeatureTask, ProgressReporter, SiftOption, report, serve
 from sfm_app.numerical import Json
 from sfm_app.settings import MatchSettings
@@ -17,11 +18,17 @@ def work(task: FeatureTask) -> None:
     """Find features of all photos, match every photo with every other, and report the effective options."""
     database, photo_dir, names = Path(task["database"]), Path(task["photos"]), task["names"]
     options = MatchSettings.model_validate(task["options"])
+    masks = Path(task["masks"]) if task["masks"] else None
     reader = pycolmap.ImageReaderOptions()
-    if task["masks"]:
-        reader.mask_path = Path(task["masks"])
+    if masks is not None:
+        reader.mask_path = masks
     extraction = extraction_options(options, task["sift"], task["workers"])
-    report(extraction=extract(database, photo_dir, names, reader, extraction))
+    panoramas = panorama_names(database)
+    extract_panoramas(database, photo_dir, [name for name in names if name in panoramas], masks, extraction)
+    plain = [name for name in names if name not in panoramas]
+    if plain:
+        extract(database, photo_dir, plain, reader, extraction)
+    report(extraction=json_options(extraction.todict()))
     pairs = None if task["pairs"] is None else [(int(a), int(b)) for a, b in task["pairs"]]
     report(matching=match(database, len(names), options, task["workers"], pairs))
 
@@ -52,8 +59,8 @@ def extract(
     names: Sequence[str],
     reader: pycolmap.ImageReaderOptions,
     extraction: pycolmap.FeatureExtractionOptions,
-) -> dict[str, Json]:
-    """Find SIFT features of all photos, and return the effective options.
+) -> None:
+    """Find SIFT features of all photos.
 
     Args:
         database: holds the photos; keypoints are entered.
@@ -76,7 +83,6 @@ def extract(
         return sum(reader.exists_keypoints(image_id) for image_id in ids)
 
     _run_with_progress(call, database, count_finished, "features", len(names))
-    return json_options(extraction.todict())
 
 
 def match(
