@@ -89,7 +89,7 @@ def unfolded(camera: Camera, points: FloatArray) -> NDArray[np.bool_]:
     r = np.linspace(0.0, np.sqrt(r2.max(initial=0.0)), 2000)
     radius = r * (1.0 + sum(k * r ** (2 * power) for power, k in enumerate(camera.lens.radial, start=1)))
     falls = np.flatnonzero(np.diff(radius) <= 0.0)
-    return r2 < (r[falls[0]] ** 2 if len(falls) else np.inf)
+    return np.asarray(r2 < (r[falls[0]] ** 2 if len(falls) else np.inf), np.bool_)
 
 
 def write_model(drawn: Drawn, start: pycolmap.Camera, database: Path) -> pycolmap.Reconstruction:

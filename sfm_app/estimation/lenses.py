@@ -56,7 +56,7 @@ def describe_lens(lens: Calibration) -> str:
 def _find_lens(images: Sequence[MatchedImage], matches: MatchGraph, run: RunContext) -> Calibration | None:
     """Return the camera of a group with a wide lens; None where a perspective camera is enough."""
     size = images[0].width, images[0].height
-    if getattr(images[0], "projection", "") == EQUIRECTANGULAR:
+    if images[0].projection == EQUIRECTANGULAR:
         K = panorama_matrix(size)
         nothing_open = dict.fromkeys(("fx", "fy", "cx", "cy"), 0.0)
         return Calibration(K, *size, PANORAMA, identifiable=True, projection=EQUIRECTANGULAR, spread=nothing_open)

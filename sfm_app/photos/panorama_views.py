@@ -113,7 +113,7 @@ class PanoramaViews:
 def view_rotations() -> FloatArray:
     """Return (12, 3, 3) rotations from a panorama to views through the corners of an icosahedron, two at its poles."""
     latitude = math.atan(0.5)
-    turns = 2.0 * math.pi / 5.0 * np.arange(5)
+    turns = 2.0 * math.pi / 5.0 * np.arange(5.0)
     rings = [_axes(turns + shift, tilt) for shift, tilt in ((0.0, latitude), (math.pi / 5.0, -latitude))]
     axes = np.concatenate([[[0.0, 1.0, 0.0], [0.0, -1.0, 0.0]], *rings])
     return np.stack([_look_along(axis) for axis in axes])
