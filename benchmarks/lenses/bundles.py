@@ -72,7 +72,8 @@ def _draw_points(camera: Camera, poses: list[FloatArray], rng: np.random.Generat
     pixels = rng.uniform([0.0, 0.0], [camera.width, camera.height], (POINTS, 2))
     rays = camera.lens.rays((pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2])
     # a fisheye may show nothing in the corners
-    rays = np.where(np.isfinite(rays).all(axis=1)[:, None] & (rays[:, 2:] > 0.05), rays, [0.0, 0.0, 1.0])
+    shown = np.isfinite(rays).all(axis=1, keepdims=True) & (rays[:, 2:] > 0.05)
+    rays = np.where(shown, rays, [0.0, 0.0, 1.0])
     rays /= np.linalg.norm(rays, axis=1)[:, None]
     depths = rng.uniform(*DEPTHS, POINTS)
     from_photo = [poses[k] for k in rng.integers(len(poses), size=POINTS)]
