@@ -26,8 +26,8 @@ from sfm_app.bundle_adjustment.lens_parts import (
     part_names,
 )
 from sfm_app.bundle_adjustment.normal_equations import ReducedSystem
-from sfm_app.bundle_adjustment.projections import CAMERA, FX, FY
 from sfm_app.geometry.model_selection import cavity, posteriors
+from sfm_app.geometry.projections import CAMERA, FX, FY
 from sfm_app.geometry.spd_solve import inverse_of_positive
 
 FloatArray = NDArray[np.float64]

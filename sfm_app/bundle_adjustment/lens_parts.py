@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.bundle_adjustment.projections import (
+from sfm_app.geometry.model_selection import NormalPriors, binary_choices
+from sfm_app.geometry.projections import (
     CAMERA,
     CX,
     CY,
@@ -31,7 +32,6 @@ from sfm_app.bundle_adjustment.projections import (
     SY,
     angle_limit,
 )
-from sfm_app.geometry.model_selection import NormalPriors, binary_choices
 from sfm_app.selfcal.adjustment.camera_priors import ASPECT, CENTER, FREE_SHARE, LENS, NARROW, WIDE
 
 FloatArray = NDArray[np.float64]

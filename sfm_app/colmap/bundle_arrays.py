@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.bundle_adjustment.normal_equations import Bundle
-from sfm_app.bundle_adjustment.projections import (
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.geometry.projections import (
     CAMERA,
     CX,
     CY,
@@ -26,7 +27,6 @@ from sfm_app.bundle_adjustment.projections import (
     SX,
     SY,
 )
-from sfm_app.colmap.backend import pycolmap
 
 FloatArray = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ import numpy as np
 from sfm_app.bundle_adjustment.lens_evidence import LensChoice, estimate_lenses
 from sfm_app.bundle_adjustment.lens_family import asks_for_other_family, convert_lens, family_evidence
 from sfm_app.bundle_adjustment.normal_equations import Bundle, cost, reduce
-from sfm_app.bundle_adjustment.projections import CX, CY, FISHEYE, FX, FY, PERSPECTIVE
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle_arrays import read_bundle, write_camera
 from sfm_app.colmap.bundle_rounds import LOSS_SCALE_PX, MIN_PHOTOS, Rounds, adjust_in_rounds, lens_priors
+from sfm_app.geometry.projections import CX, CY, FISHEYE, FX, FY, PERSPECTIVE
 from sfm_app.numerical import FAILURES, Json, error_reason
 
 logger = logging.getLogger("sfm_app")

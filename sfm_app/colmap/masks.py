@@ -41,6 +41,15 @@ def mask_undistorter(model_dir: Path, mask_dir: Path, dense_dir: Path) -> Callab
     return undistort
 
 
+def has_masks(dense_dir: Path) -> bool:
+    """Return whether any undistorted photo has a mask.
+
+    Args:
+        dense_dir: folder with undistorted photos and their maps.
+    """
+    return (dense_dir / MASKS).is_dir()
+
+
 def used_pixels(dense_dir: Path, view: View) -> BoolImage | None:
     """Return (H, W) which pixels of an undistorted photo may be used; None if it has no mask.
 
@@ -62,7 +71,16 @@ def _undistort_mask(used: BoolImage, camera: pycolmap.Camera, view: View) -> Boo
     height, width = used.shape
     inside = (col >= 0) & (col < width) & (row >= 0) & (row < height)
     whole = _erode(used, ceil(max(camera.focal_length_x / view.K[0, 0], camera.focal_length_y / view.K[1, 1])))
-    return _erode(inside & whole[row.clip(0, height - 1), col.clip(0, width - 1)], REACH_PX)
+    return shrink_mask(inside & whole[row.clip(0, height - 1), col.clip(0, width - 1)])
+
+
+def shrink_mask(used: BoolImage) -> BoolImage:
+    """Return the mask of an undistorted photo without its border, where colors are mixed.
+
+    Args:
+        used: (H, W) which pixels may be used.
+    """
+    return _erode(used, REACH_PX)
 
 
 def _erode(used: BoolImage, reach: int) -> BoolImage:

@@ -8,12 +8,12 @@ other: so nothing is found twice where they overlap, at the borders of the panor
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.bearings import project
 from sfm_app.geometry.camera import panorama_matrix
+from sfm_app.photos.resample import resample, shrink
 from sfm_app.types.calibration import EQUIRECTANGULAR, Calibration
 
 FloatArray = NDArray[np.float64]
@@ -21,9 +21,6 @@ FloatArray = NDArray[np.float64]
 FIELD_DEG = 90.0
 """Field of view along the sides. The farthest point that a view is responsible for lies 37 degrees from its axis, so
 that the surroundings of every keypoint are inside. Chosen by hand; not measured on its own."""
-SEAM_PX = 4
-"""Columns of the other border that are added at either one, for interpolation. Chosen by hand; not measured on its
-own."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,15 +58,9 @@ class PanoramaViews:
             panorama: (H, W, 3), of the size of the panorama or smaller; see `shrink`.
             view: number of the view.
         """
-        height, width = panorama.shape[:2]
         row, column = np.mgrid[: self.side_px, : self.side_px]
-        at = self.to_panorama(np.column_stack([column.ravel(), row.ravel()]) + 0.5, view) * [
-            width / self.size[0], height / self.size[1],
-        ]  # fmt: skip
-        at = (at - 0.5 + [SEAM_PX, 0.0]).reshape(self.side_px, self.side_px, 2).astype(np.float32)
-        around = cv2.copyMakeBorder(panorama, 0, 0, SEAM_PX, SEAM_PX, cv2.BORDER_WRAP)
-        shown = cv2.remap(around, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(shown, np.uint8)
+        at = self.to_panorama(np.column_stack([column.ravel(), row.ravel()]) + 0.5, view)
+        return resample(panorama, at.reshape(self.side_px, self.side_px, 2), self.size, wraps=True)
 
     def shrink(self, panorama: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Return the panorama in the resolution of the views, so that they show it without aliasing.
@@ -77,11 +68,7 @@ class PanoramaViews:
         Args:
             panorama: (H, W, 3) of the size of the panorama.
         """
-        width = round(2.0 * math.pi * self.focal_px)
-        if width >= self.size[0]:
-            return panorama
-        size = width, max(1, round(width * self.size[1] / self.size[0]))
-        return np.asarray(cv2.resize(panorama, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return shrink(panorama, 2.0 * math.pi * self.focal_px / self.size[0])
 
     def to_panorama(self, x: FloatArray, view: int) -> FloatArray:
         """Return (N, 2) pixels of the panorama for pixels of a view.

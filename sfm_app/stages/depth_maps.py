@@ -1,7 +1,7 @@
 """depth_maps: Scene -> COLMAP dense workspace with depth and normal maps."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from hashlib import blake2b
@@ -21,7 +21,8 @@ from sfm_app.colmap.dense import (
     undistort,
     write_fusion_views,
 )
-from sfm_app.colmap.masks import mask_undistorter
+from sfm_app.colmap.masks import has_masks, mask_undistorter
+from sfm_app.colmap.wide_views import WideLens, split_wide_photos, write_model, write_views
 from sfm_app.errors import ReconstructionError
 from sfm_app.hashing import fingerprint
 from sfm_app.runtime.context import RunContext
@@ -58,7 +59,7 @@ def make(scene: Scene, run: RunContext) -> Path:
     ranked = rank_neighbors(views, CONFIRMING_FACTOR * options.neighbors)
     with single_threaded_opencv():
         found = method.make(DepthTask(dense_dir, views, ranked, options, DenseStore(dense_dir), run.map))
-    if run.mask_dir is not None:
+    if has_masks(dense_dir):
         run.map(partial(mask_depths, dense_dir), views, "masking depth maps")
     record(dense_dir, views, found, run)
     drop_estimates(dense_dir, views)
@@ -90,11 +91,33 @@ def prepare(scene: Scene, dense_dir: Path, method: str, run: RunContext) -> None
     made_from = fingerprint(run.fingerprint, method, model)
     if not resume_or_clear(dense_dir, made_from):
         largest = run.settings.depth.max_image_size_px
-        undistort(scene.model_dir, run.workspace.photos, dense_dir, largest, run.workers, run.progress)
-        if run.mask_dir is not None:
-            undistort_mask = mask_undistorter(scene.model_dir, run.mask_dir, dense_dir)
-            run.map(undistort_mask, read_views(dense_dir), "undistorting masks")
+        lenses = split_wide_photos(scene.model_dir, largest)
+        if lenses is None:
+            undistort(scene.model_dir, run.workspace.photos, dense_dir, largest, run.workers, run.progress)
+            if run.mask_dir is not None:
+                undistort_mask = mask_undistorter(scene.model_dir, run.mask_dir, dense_dir)
+                run.map(undistort_mask, read_views(dense_dir), "undistorting masks")
+        else:
+            look_into_photos(scene, lenses, dense_dir, run)
         mark_unfinished(dense_dir, made_from)
+
+
+def look_into_photos(scene: Scene, lenses: Mapping[int, WideLens], dense_dir: Path, run: RunContext) -> None:
+    """Write several perspective views of each photo of a wide lens.
+
+    Args:
+        scene: cameras, poses and points.
+        lenses: views by id of the camera.
+        dense_dir: dense workspace to fill.
+        run: the run.
+    """
+
+    def look_into(photo: tuple[str, int]) -> None:
+        name, camera_id = photo
+        write_views(name, lenses[camera_id], run.workspace.photos, run.mask_dir, dense_dir)
+
+    run.map(look_into, write_model(scene.model_dir, lenses, dense_dir), "looking into wide photos")
+    run.record(views_per_photo=max(len(lens.views) for lens in lenses.values()))
 
 
 def record(dense_dir: Path, views: Sequence[View], found: Sequence[Rejected | None], run: RunContext) -> None:

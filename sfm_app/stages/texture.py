@@ -14,12 +14,15 @@ from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_cle
 from sfm_app.hashing import digest_files, fingerprint, load_arrays
 from sfm_app.meshing.occlusion import Occluders
 from sfm_app.photos import fill_masked, read_mask
+from sfm_app.photos.panorama_parts import mask_part, panorama_parts, show_part
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
-from sfm_app.texture import PhotoView, photo_view, texture_surface
+from sfm_app.texture import PhotoView, part_view, photo_view, texture_surface
 from sfm_app.types import Model, Scene, Surface, Texture
 
 TEXTURE = "texture.npz"
+PANORAMA = "EQUIRECTANGULAR"
+"""COLMAP's name of the camera model of panoramas."""
 PARTS = "parts"
 """Folder beside it while the texture is made: the finished work on each photo."""
 
@@ -60,7 +63,10 @@ class FileStore:
 
     def usable_pixels(self, view: PhotoView) -> NDArray[np.bool_] | None:
         """Return a (height, width) mask of the pixels that may be used; None where no masks are given."""
-        return None if self.mask_dir is None else read_mask(self.mask_dir, view.name)
+        if self.mask_dir is None:
+            return None
+        used = read_mask(self.mask_dir, view.source)
+        return used if view.part is None else mask_part(used, view.part)
 
     def recall(self, name: str) -> dict[str, NDArray[np.generic]] | None:
         """Return the arrays that were kept under a name, if they are there and sound."""
@@ -92,8 +98,16 @@ def surface_digest(surface: Surface) -> str:
 
 
 def photo_views(scene: Scene) -> list[PhotoView]:
-    """Return the views of the registered photos for texturing."""
-    return [photo_view(name, scene.cameras[scene.camera_of[name]], pose) for name, pose in scene.cam_from_world.items()]
+    """Return the views of the registered photos for texturing; a panorama has several."""
+    found = list[PhotoView]()
+    for name, pose in scene.cam_from_world.items():
+        camera = scene.cameras[scene.camera_of[name]]
+        if camera.model != PANORAMA:
+            found.append(photo_view(name, camera, pose))
+            continue
+        views = panorama_parts((camera.width, camera.height))
+        found += [part_view(f"{name}.{number + 1}", name, view, pose) for number, view in enumerate(views)]
+    return found
 
 
 def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None = None) -> NDArray[np.uint8]:
@@ -102,15 +116,18 @@ def read_photo(photo_dir: Path, view: PhotoView, used: NDArray[np.bool_] | None 
     Args:
         photo_dir: folder with the photos.
         view: name and size of the photo.
-        used: (H, W) pixels of the photo that may be seen; None for all.
+        used: (H, W) pixels of the view that may be seen; None for all.
     """
-    with Image.open(photo_dir / view.name) as image:
-        photo = image.convert("RGB")
+    with Image.open(photo_dir / view.source) as image:
+        photo = np.asarray(image.convert("RGB"))
+    if view.part is not None:
+        photo = show_part(photo, view.part)
     if used is not None:
-        photo = Image.fromarray(fill_masked(np.asarray(photo), used))
-    if photo.size != (view.width, view.height):
-        photo = photo.resize((view.width, view.height), Image.Resampling.BOX)
-    return np.asarray(photo)
+        photo = fill_masked(photo, used)
+    if photo.shape[1::-1] != (view.width, view.height):
+        shown = Image.fromarray(photo).resize((view.width, view.height), Image.Resampling.BOX)
+        photo = np.asarray(shown)
+    return photo
 
 
 def save_texture(model: Model, run: RunContext) -> None:

@@ -10,6 +10,9 @@ from sfm_app.stereo.view import FloatArray, View
 MIN_SHARED_POINTS = 5
 BEST_ANGLE_DEG = 8.0
 """Smaller angles give inexact depths, larger ones images that look different."""
+SAME_PLACE_DEG = 1e-6
+"""Views whose largest triangulation angle is smaller have the same center: they are parts of one wide photo. By
+definition: rounding."""
 
 
 def rank_neighbors(views: Sequence[View], count: int) -> list[list[int]]:
@@ -32,7 +35,7 @@ def _rank(view: View, views: Sequence[View], count: int) -> list[int]:
         if other is view:
             continue
         shared = np.isin(view.point_ids, other.point_ids, assume_unique=True)
-        if np.count_nonzero(shared) >= MIN_SHARED_POINTS:
+        if np.count_nonzero(shared) >= MIN_SHARED_POINTS and not _is_same_place(view, other):
             weights[index] = np.where(shared, point_weights(view, other, view.points), 0.0)
     value, chosen = np.ones(len(view.point_ids)), list[int]()
     while weights and len(chosen) < count:
@@ -44,6 +47,11 @@ def _rank(view: View, views: Sequence[View], count: int) -> list[int]:
         chosen.append(best)
         value *= 1.0 - 0.5 * weight
     return chosen
+
+
+def _is_same_place(view: View, other: View) -> bool:
+    angles = triangulation_angles_deg(view.center, other.center, view.points)
+    return bool(angles.max(initial=0.0) < SAME_PLACE_DEG)
 
 
 def point_weights(view: View, other: View, points: FloatArray) -> FloatArray:

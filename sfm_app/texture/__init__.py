@@ -3,6 +3,6 @@
 from sfm_app.texture.appearance.view_scoring import OcclusionTest
 from sfm_app.texture.assemble import ParallelMap, texture_surface
 from sfm_app.texture.store import Store
-from sfm_app.texture.views import PhotoView, photo_view
+from sfm_app.texture.views import PhotoView, part_view, photo_view
 
-__all__ = ["OcclusionTest", "ParallelMap", "PhotoView", "Store", "photo_view", "texture_surface"]
+__all__ = ["OcclusionTest", "ParallelMap", "PhotoView", "Store", "part_view", "photo_view", "texture_surface"]

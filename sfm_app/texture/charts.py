@@ -41,7 +41,7 @@ def make_charts(chosen: IntArray, cameras: FloatArray, mesh: Facets, tile_px: fl
 
     Args:
         chosen: (T,) photo of each triangle, -1 for none.
-        cameras: (P, 20) from `PhotoView.row`.
+        cameras: (P, 26) from `PhotoView.row`.
         mesh: the surface.
         tile_px: charts are cut at multiples of this in the photo, so that each fits on a page.
     """

@@ -100,7 +100,7 @@ def paint(
 
     Args:
         photo: (height, width, 3) RGB.
-        camera: (20,) lens and pose of the photo at this size.
+        camera: (26,) lens and pose of the photo at this size.
         brightness: (3,) factors, the inverse of the photo's gains.
         triangles: (N,) indices of the page's triangles that the photo contributes to.
         corners: (T, 3, 2) texels.

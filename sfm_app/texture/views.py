@@ -6,33 +6,59 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import ReconstructionError
+from sfm_app.geometry.perspective_views import PerspectiveView
+from sfm_app.geometry.projections import FISHEYE, PERSPECTIVE, angle_limit
 from sfm_app.jit import kernel
 from sfm_app.types import CameraModel
 
 FloatArray = NDArray[np.float64]
 
-LENS = 8
-"""COLMAP's OPENCV parameters fx, fy, cx, cy, k1, k2, p1, p2 come first in a camera row; the pose [R | t] follows."""
+LENS, KIND, LIMIT, POSE = 12, 12, 13, 14
+"""A camera row begins with the parameters of COLMAP's FULL_OPENCV or THIN_PRISM_FISHEYE: fx, fy, cx, cy, k1, k2, p1,
+p2, k3, k4, then k5, k6 or sx1, sy1. The kind of lens follows, the squared radius before distortion up to which it
+shows anything, and the pose [R | t]."""
+OPENCV, RATIONAL, ANGULAR = 0.0, 1.0, 2.0
+"""Kinds of lenses: polynomial and rational perspective ones, and fisheyes."""
+KINDS = {
+    "OPENCV": (OPENCV, (0, 1, 2, 3, 4, 5, 6, 7)),
+    "FULL_OPENCV": (RATIONAL, (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11)),
+    "OPENCV_FISHEYE": (ANGULAR, (0, 1, 2, 3, 4, 5, 8, 9)),
+    "THIN_PRISM_FISHEYE": (ANGULAR, (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11)),
+}
+"""Kind of COLMAP's models, and the places of their parameters in a camera row."""
 LEAST_SLOPE = 0.1
 """Smallest derivative of the distorted radius by the undistorted one; below it, the distortion is near its fold."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PhotoView:
-    """A registered photo and its camera."""
+    """A registered photo and its camera, or a perspective view into a panorama."""
 
     name: str
     lens: tuple[float, ...]
-    """fx, fy, cx, cy in pixels, k1, k2, p1, p2 as in COLMAP's OPENCV."""
+    """Parameters as in a camera row, at least the first four; the others are 0."""
     cam_from_world: FloatArray
     """(3, 4) [R | t]."""
     width: int
     height: int
+    kind: float = OPENCV
+    limit: float = np.inf
+    """Squared radius before distortion up to which the lens shows anything: squared tangent or angle."""
+    part: PerspectiveView | None = None
+    """The view into the panorama `photo`; None where the whole photo is the view."""
+    photo: str = ""
+    """Name of the photo, where it differs from that of the view."""
 
     @property
     def row(self) -> FloatArray:
-        """(20,) lens and pose for the kernels."""
-        return np.concatenate([self.lens, self.cam_from_world.ravel()])
+        """(26,) lens and pose for the kernels."""
+        lens = (*self.lens, *(0.0,) * (LENS - len(self.lens)))
+        return np.concatenate([lens, [self.kind, self.limit], self.cam_from_world.ravel()])
+
+    @property
+    def source(self) -> str:
+        """Name of the photo that the view shows."""
+        return self.photo or self.name
 
     @property
     def center(self) -> FloatArray:
@@ -56,40 +82,94 @@ def photo_view(name: str, camera: CameraModel, cam_from_world: FloatArray) -> Ph
 
     Args:
         name: of the photo.
-        camera: of the model OPENCV.
+        camera: of one of the models `KINDS`.
         cam_from_world: (3, 4) [R | t].
 
     Raises:
-        ReconstructionError: the camera has a model other than OPENCV, which every run uses for its cameras.
+        ReconstructionError: the camera has another model; every run writes its cameras as one of these.
     """
-    if camera.model != "OPENCV":
+    if camera.model not in KINDS:
         raise ReconstructionError(f"the texture cannot use a camera of the model {camera.model}")
-    return PhotoView(name, tuple(camera.params), cam_from_world, camera.width, camera.height)
+    kind, places = KINDS[camera.model]
+    lens = np.zeros(LENS)
+    lens[list(places)] = camera.params
+    limit = np.inf if kind == OPENCV else _shown_limit(lens, kind, camera.width, camera.height)
+    return PhotoView(name, tuple(lens.tolist()), cam_from_world, camera.width, camera.height, kind, limit)
+
+
+def part_view(name: str, photo: str, part: PerspectiveView, cam_from_world: FloatArray) -> PhotoView:
+    """Return a perspective view into a panorama.
+
+    Args:
+        name: of the view.
+        photo: name of the panorama.
+        part: the view in the panorama's frame.
+        cam_from_world: (3, 4) [R | t] of the panorama.
+    """
+    lens = part.K[0, 0], part.K[1, 1], part.K[0, 2], part.K[1, 2]
+    return PhotoView(name, lens, part.R @ cam_from_world, part.width, part.height, part=part, photo=photo)
+
+
+def _shown_limit(lens: FloatArray, kind: float, width: int, height: int) -> float:
+    """Return the squared tangent or angle at which the radius of a lens reaches the corner; 0 if it folds before."""
+    corners = np.abs([[x - lens[2], y - lens[3]] for x in (0.0, width) for y in (0.0, height)]) / lens[:2]
+    family = FISHEYE if kind == ANGULAR else PERSPECTIVE
+    angle = angle_limit(lens, family, float(np.linalg.norm(corners, axis=1).max()))
+    if np.isnan(angle):
+        return 0.0
+    return float(angle if kind == ANGULAR else np.tan(angle)) ** 2
 
 
 @kernel
 def project(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Project a world point: return its pixel and depth.
+    """Project a world point: return its pixel, and its depth or, for a fisheye, its distance.
 
-    All are 0 if the point is behind the camera or outside the valid range of the distortion.
+    All are 0 if the camera cannot see the point: it is behind it, or outside the valid range of the distortion.
 
     Args:
-        camera: (20,) from `PhotoView.row`.
+        camera: (26,) from `PhotoView.row`.
         x, y, z: in the world.
     """
-    depth = camera[16] * x + camera[17] * y + camera[18] * z + camera[19]
+    depth = camera[22] * x + camera[23] * y + camera[24] * z + camera[25]
+    u = camera[14] * x + camera[15] * y + camera[16] * z + camera[17]
+    v = camera[18] * x + camera[19] * y + camera[20] * z + camera[21]
+    if camera[KIND] == ANGULAR:
+        return _project_fisheye(camera, u, v, depth)
     if depth <= 0.0:
         return 0.0, 0.0, 0.0
-    u = (camera[8] * x + camera[9] * y + camera[10] * z + camera[11]) / depth
-    v = (camera[12] * x + camera[13] * y + camera[14] * z + camera[15]) / depth
+    u, v = u / depth, v / depth
     k1, k2, p1, p2 = camera[4], camera[5], camera[6], camera[7]
     r2 = u * u + v * v
-    if 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) < LEAST_SLOPE:
-        return 0.0, 0.0, 0.0
-    radial = 1.0 + r2 * (k1 + k2 * r2)
+    if camera[KIND] == RATIONAL:
+        if r2 > camera[LIMIT]:
+            return 0.0, 0.0, 0.0
+        radial = (1.0 + r2 * (k1 + r2 * (k2 + r2 * camera[8]))) / (
+            1.0 + r2 * (camera[9] + r2 * (camera[10] + r2 * camera[11]))
+        )
+    else:
+        if 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) < LEAST_SLOPE:
+            return 0.0, 0.0, 0.0
+        radial = 1.0 + r2 * (k1 + k2 * r2)
     ud = u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)
     vd = v * radial + 2.0 * p2 * u * v + p1 * (r2 + 2.0 * v * v)
     return camera[0] * ud + camera[2], camera[1] * vd + camera[3], depth
+
+
+@kernel
+def _project_fisheye(camera: FloatArray, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Project a point of the camera's frame through COLMAP's THIN_PRISM_FISHEYE; see `project`."""
+    side = np.hypot(x, y)
+    theta = np.arctan2(side, z)
+    r2 = theta * theta
+    if r2 > camera[LIMIT] or (side == 0.0 and z <= 0.0):
+        return 0.0, 0.0, 0.0
+    gain = theta / side if side > 0.0 else 0.0
+    u, v = gain * x, gain * y
+    p1, p2 = camera[6], camera[7]
+    radial = 1.0 + r2 * (camera[4] + r2 * (camera[5] + r2 * (camera[8] + r2 * camera[9])))
+    ud = u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u) + camera[10] * r2
+    vd = v * radial + 2.0 * p2 * u * v + p1 * (r2 + 2.0 * v * v) + camera[11] * r2
+    return camera[0] * ud + camera[2], camera[1] * vd + camera[3], np.hypot(side, z)
 
 
 @kernel

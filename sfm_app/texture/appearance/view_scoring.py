@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfm_app.jit import kernel
 from sfm_app.texture.facets import Facets
-from sfm_app.texture.views import PhotoView, project, sample
+from sfm_app.texture.views import POSE, PhotoView, project, sample
 
 FloatArray = NDArray[np.float64]
 OcclusionTest = Callable[[FloatArray, float, FloatArray], NDArray[np.bool_]]
@@ -220,7 +220,7 @@ def _cosine(camera: FloatArray, corner: FloatArray) -> float:
     # -R'(R X + t) is the direction to the camera; its center need not be computed
     wx = wy = wz = 0.0
     for row in range(3):
-        at = 8 + 4 * row
+        at = POSE + 4 * row
         along = (
             camera[at] * corner[3, 0] + camera[at + 1] * corner[3, 1] + camera[at + 2] * corner[3, 2] + camera[at + 3]
         )

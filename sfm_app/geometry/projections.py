@@ -1,4 +1,4 @@
-"""Projections of bundle adjustment, with their derivatives: perspective, fisheye and equirectangular cameras.
+"""Projections of perspective, fisheye and equirectangular cameras, with their derivatives.
 
 The cameras are those of COLMAP: perspective ones FULL_OPENCV (Brown 1971, with a rational radial factor), fisheyes
 THIN_PRISM_FISHEYE (Kannala and Brandt 2006; Weng et al. 1992), panoramas EQUIRECTANGULAR. Smaller models of COLMAP are

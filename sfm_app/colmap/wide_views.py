@@ -1,0 +1,225 @@
+"""Photos of wide lenses in COLMAP's dense workspace: as several perspective views where one would lose too much."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.atomic_io import replace_atomically
+from sfm_app.colmap.backend import pycolmap, translate_errors
+from sfm_app.colmap.bundle_arrays import camera_family, read_camera
+from sfm_app.colmap.masks import MASKS, shrink_mask
+from sfm_app.colmap.processes.undistort_process import JPEG_QUALITY
+from sfm_app.colmap.types import all_images
+from sfm_app.geometry.perspective_views import PerspectiveView, cover_rays
+from sfm_app.geometry.projections import FISHEYE, FX, PANORAMA, SEEN_ANGLE, project_points
+from sfm_app.photos import read_mask, save_mask
+from sfm_app.photos.resample import resample, shrink
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+MOST_LOST = 0.1
+"""Largest share of a photo that one undistorted photo may lose. By definition."""
+GRID = 65
+"""Rows and columns of pixels of a photo whose rays are looked at. Chosen by hand; not measured on its own."""
+AGREE_PX = 0.5
+"""Largest distance between a pixel and its ray's projection, in pixels: where it is larger, the lens shows nothing or
+folds. Chosen by hand; not measured on its own."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WideLens:
+    """A camera, with the perspective views that show its photos."""
+
+    params: FloatArray
+    """(12,) as in `geometry.projections`."""
+    family: int
+    size: tuple[int, int]
+    """(width, height) of its photos."""
+    least_cosine: float
+    """Cosine of the largest angle to the optical axis that the photos show."""
+    views: tuple[PerspectiveView, ...]
+
+    def locate(self, rays: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Return the pixels (N, 2) of rays, and which of the rays the photos show, (N,).
+
+        Args:
+            rays: (N, 3) in the camera's frame.
+        """
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x = project_points(rays, np.tile(self.params, (len(rays), 1)), np.full(len(rays), self.family)).x
+            shown = rays[:, 2] >= self.least_cosine * np.linalg.norm(rays, axis=1)
+            shown &= np.all((x >= 0.0) & (x <= self.size), axis=1)
+        return np.where(shown[:, None], x, -1.0), shown
+
+
+def split_wide_photos(model_dir: Path, max_side_px: int) -> dict[int, WideLens] | None:
+    """Return the perspective views of every camera, by its id; None where no camera needs more than COLMAP's one.
+
+    Args:
+        model_dir: COLMAP model.
+        max_side_px: longest side of a view.
+    """
+    with translate_errors("reading the model"):
+        model = pycolmap.Reconstruction(model_dir)
+        used = sorted({image.camera_id for image in all_images(model) if image.has_pose})
+        cameras = {camera_id: model.cameras[camera_id] for camera_id in used}
+        single = {camera_id: _one_view(camera, max_side_px) for camera_id, camera in cameras.items()}
+        if all(view is not None for view in single.values()):
+            return None
+        return {camera_id: _make_lens(camera, single[camera_id], max_side_px) for camera_id, camera in cameras.items()}
+
+
+def view_name(photo: str, number: int) -> str:
+    """Return the name of a view in the dense workspace.
+
+    Args:
+        photo: name of the photo.
+        number: of the view in `WideLens.views`.
+    """
+    return f"{photo}.{number + 1}.jpg"
+
+
+def write_model(model_dir: Path, lenses: Mapping[int, WideLens], dense_dir: Path) -> list[tuple[str, int]]:
+    """Write the model of all views into a dense workspace, and return the name and the camera's id of each photo.
+
+    Args:
+        model_dir: COLMAP model of the photos.
+        lenses: from `split_wide_photos`.
+        dense_dir: dense workspace.
+    """
+    with translate_errors("writing the model of perspective views"):
+        model, found = pycolmap.Reconstruction(model_dir), pycolmap.Reconstruction()
+        images = sorted((image for image in all_images(model) if image.has_pose), key=lambda image: image.name)
+        ids = _add_cameras(found, lenses)
+        tracks = {point: pycolmap.Track() for point in sorted(model.points3D)}
+        for image in images:
+            for number, view in enumerate(lenses[image.camera_id].views):
+                _add_view(found, model, image, view, (ids[image.camera_id, number], number), tracks)
+        for point, track in tracks.items():
+            if track.length():
+                found.add_point3D(model.points3D[point].xyz, track, model.points3D[point].color)
+        (dense_dir / "sparse").mkdir(parents=True, exist_ok=True)
+        found.write(dense_dir / "sparse")
+        return [(image.name, image.camera_id) for image in images]
+
+
+def write_views(name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | None, dense_dir: Path) -> None:
+    """Write the views of a photo, and their masks where they have pixels that it does not show or that are masked.
+
+    Args:
+        name: of the photo.
+        lens: of the photo.
+        photo_dir: the photos.
+        mask_dir: their masks; None without masks.
+        dense_dir: dense workspace.
+
+    Raises:
+        BackendError: the photo cannot be read, or the views cannot be written.
+    """
+    with translate_errors(f"looking into {name}"):
+        photo = np.asarray(cv2.imdecode(np.fromfile(photo_dir / name, np.uint8), cv2.IMREAD_COLOR), np.uint8)
+        used = None if mask_dir is None else read_mask(mask_dir, name)
+        for number, view in enumerate(lens.views):
+            at, shown = lens.locate(view.rays().reshape(-1, 3))
+            at, shown = at.reshape(view.height, view.width, 2), shown.reshape(view.height, view.width)
+            small = shrink(photo, view.K[0, 0] / lens.params[FX])
+            target = dense_dir / "images" / view_name(name, number)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            pixels = resample(small, at, lens.size, wraps=lens.family == PANORAMA)
+            with replace_atomically(target) as path:
+                path.write_bytes(cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1].tobytes())
+            if used is not None:
+                row, column = (np.minimum(at[..., axis].astype(np.int64), lens.size[axis] - 1) for axis in (1, 0))
+                shown &= used[row, column]
+            if not shown.all():
+                save_mask(dense_dir / MASKS, view_name(name, number), shrink_mask(shown))
+
+
+def _one_view(camera: pycolmap.Camera, max_side_px: int) -> PerspectiveView | None:
+    """Return the undistorted photo of a camera as COLMAP makes it; None where that loses too much of it."""
+    rays = _shown_rays(camera)
+    if camera_family(camera) == PANORAMA or not len(rays):
+        return None
+    options = pycolmap.UndistortCameraOptions()
+    options.max_image_size = max_side_px
+    flat = pycolmap.undistort_camera(options, camera)
+    view = PerspectiveView(np.eye(3), np.array(flat.calibration_matrix()), flat.width, flat.height)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = (rays @ view.K.T)[:, :2] / rays[:, 2:]
+    kept = (rays[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1)
+    return view if np.mean(kept) >= 1.0 - MOST_LOST else None
+
+
+def _make_lens(camera: pycolmap.Camera, single: PerspectiveView | None, max_side_px: int) -> WideLens:
+    """Return a camera with the views that show its photos: the only one, or several."""
+    rays, params = _shown_rays(camera), read_camera(camera)
+    views = [single] if single is not None else cover_rays(rays, float(params[FX]), max_side_px)
+    least = float(rays[:, 2].min())
+    return WideLens(params, camera_family(camera), (camera.width, camera.height), least, tuple(views))
+
+
+def _shown_rays(camera: pycolmap.Camera) -> FloatArray:
+    """Return unit vectors (N, 3) of a grid of pixels, without pixels that no ray reaches."""
+    x, y = np.meshgrid(np.linspace(0.0, camera.width, GRID), np.linspace(0.0, camera.height, GRID))
+    pixels = np.column_stack([x.ravel(), y.ravel()])
+    rays, family = np.array(camera.cam_ray_from_img(pixels), np.float64), camera_family(camera)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        again = project_points(rays, np.tile(read_camera(camera), (len(rays), 1)), np.full(len(rays), family)).x
+        # the seam of a panorama is at both of its borders
+        sound = (family == PANORAMA) | (np.linalg.norm(again - pixels, axis=1) < AGREE_PX)
+        sound &= np.isfinite(rays).all(axis=1)
+        if family == FISHEYE:
+            sound &= rays[:, 2] >= np.cos(SEEN_ANGLE)
+    return np.asarray(rays[sound], np.float64)
+
+
+def _add_cameras(found: pycolmap.Reconstruction, lenses: Mapping[int, WideLens]) -> dict[tuple[int, int], int]:
+    """Add a camera for every view, and return its id by the camera of the photo and the number of the view."""
+    ids = dict[tuple[int, int], int]()
+    for camera_id, lens in sorted(lenses.items()):
+        for number, view in enumerate(lens.views):
+            ids[camera_id, number] = len(ids) + 1
+            K = view.K
+            camera = pycolmap.Camera(
+                camera_id=len(ids), model="PINHOLE", width=view.width, height=view.height,
+                params=[K[0, 0], K[1, 1], K[0, 2], K[1, 2]],
+            )  # fmt: skip
+            found.add_camera_with_trivial_rig(camera)
+    return ids
+
+
+def _add_view(
+    found: pycolmap.Reconstruction, model: pycolmap.Reconstruction, image: pycolmap.Image, view: PerspectiveView,
+    ids: tuple[int, int], tracks: Mapping[int, pycolmap.Track],
+) -> None:  # fmt: skip
+    """Add a view of a photo, and the points that it shows to their tracks.
+
+    Args:
+        found: model of the views.
+        model: model of the photos.
+        image: the photo.
+        view: the view.
+        ids: id of the view's camera, and the number of the view.
+        tracks: by id of the point in `model`.
+    """
+    camera_id, number = ids
+    pose = image.cam_from_world().matrix()
+    pose = view.R @ pose
+    points = [point.point3D_id for point in image.points2D if point.has_point3D()]
+    X = np.array([model.points3D[point].xyz for point in points], np.float64).reshape(-1, 3)
+    at = (X @ pose[:, :3].T + pose[:, 3]) @ view.K.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = at[:, :2] / at[:, 2:]
+    shown = np.flatnonzero((at[:, 2] > 0.0) & np.all((x >= 0.0) & (x <= [view.width, view.height]), axis=1))
+    image_id = found.num_images() + 1
+    for index, row in enumerate(shown):
+        tracks[points[row]].add_element(image_id, index)
+    added = pycolmap.Image(
+        name=view_name(image.name, number), keypoints=x[shown], camera_id=camera_id, image_id=image_id
+    )
+    found.add_image_with_trivial_frame(added, pycolmap.Rigid3d(pose))

@@ -1,0 +1,93 @@
+"""Perspective views that together show a photo of a wide lens.
+
+Depth maps and texture are made from perspective photos. One perspective photo cannot show 180 degrees, and stretches
+what is far from its axis long before. Ours.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.geometry.camera import camera_matrix
+
+FloatArray = NDArray[np.float64]
+
+MOST_FIELD_DEG = 95.0
+"""Largest angle along one side of a view, without its overlap. At its border, such a view shows things 2.2 times as
+large as at its middle. Chosen by hand; not measured on its own."""
+OVERLAP_DEG = 4.0
+"""Angle by which a view reaches beyond what it is responsible for, so that windows and triangles at the border are
+whole in one of the views. Chosen by hand; not measured on its own."""
+WHOLE_TURN_DEG = 300.0
+"""A photo that shows more than this is a panorama: its views look through the faces of a cube. Chosen by hand; no lens
+lies between a fisheye and a panorama."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PerspectiveView:
+    """A view into a photo from the same center."""
+
+    R: FloatArray
+    """(3, 3) from the photo's frame to that of the view; x right, y down, z forward."""
+    K: FloatArray
+    """(3, 3) camera matrix in pixels of the view."""
+    width: int
+    height: int
+
+    def rays(self) -> FloatArray:
+        """Return the rays (height, width, 3) of the pixels' centers, in the photo's frame."""
+        x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+        plain = np.stack([(x - self.K[0, 2]) / self.K[0, 0], (y - self.K[1, 2]) / self.K[1, 1], np.ones_like(x)], -1)
+        return np.asarray(plain @ self.R, np.float64)
+
+
+def cover_rays(rays: FloatArray, focal_px: float, most_px: int) -> list[PerspectiveView]:
+    """Return perspective views that together show all rays of a photo.
+
+    Args:
+        rays: (N, 3) unit vectors, dense over what the photo shows.
+        focal_px: focal length of the views in pixels; smaller where a view would become too large.
+        most_px: longest side of a view.
+    """
+    axes = _axes(rays)
+    nearest = np.argmax(rays @ axes[:, 2].T, axis=1)
+    views = [_fit_view(axis, rays[nearest == k], focal_px, most_px) for k, axis in enumerate(axes)]
+    return [view for view in views if view is not None]
+
+
+def _axes(rays: FloatArray) -> FloatArray:
+    """Return (V, 3, 3) rotations into views that look at equal parts of the angles that the rays take."""
+    longitude, latitude = np.arctan2(rays[:, 0], rays[:, 2]), np.arcsin(np.clip(rays[:, 1], -1.0, 1.0))
+    if np.degrees(np.ptp(longitude)) > WHOLE_TURN_DEG:
+        turns = [_rotation(0.5 * np.pi * k, 0.0) for k in range(4)]
+        return np.stack([*turns, _rotation(0.0, 0.5 * np.pi), _rotation(0.0, -0.5 * np.pi)])
+    yaws, pitches = _centers(longitude), _centers(latitude)
+    return np.stack([_rotation(yaw, pitch) for pitch in pitches for yaw in yaws])
+
+
+def _centers(angles: FloatArray) -> FloatArray:
+    """Return the middles of as few equal parts of a range of angles as a view is wide."""
+    low, high = float(angles.min()), float(angles.max())
+    count = max(1, int(np.ceil(np.degrees(high - low) / MOST_FIELD_DEG)))
+    return np.asarray(low + (high - low) * (np.arange(count) + 0.5) / count, np.float64)
+
+
+def _rotation(yaw: float, pitch: float) -> FloatArray:
+    """Return the (3, 3) rotation into a view turned right by yaw, then down by pitch, in radians."""
+    level = np.array([[np.cos(yaw), 0.0, -np.sin(yaw)], [0.0, 1.0, 0.0], [np.sin(yaw), 0.0, np.cos(yaw)]])
+    tilt = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(pitch), -np.sin(pitch)], [0.0, np.sin(pitch), np.cos(pitch)]])
+    return np.asarray(tilt @ level, np.float64)
+
+
+def _fit_view(R: FloatArray, rays: FloatArray, focal_px: float, most_px: int) -> PerspectiveView | None:
+    """Return the view with this axis that just shows some rays; None where there are none."""
+    if not len(rays):
+        return None
+    seen = rays @ R.T
+    slopes = np.arctan(seen[:, :2] / seen[:, 2:])
+    reach = np.radians(OVERLAP_DEG)
+    low, high = np.tan(slopes.min(axis=0) - reach), np.tan(slopes.max(axis=0) + reach)
+    focal = min(focal_px, most_px / float((high - low).max()))
+    width, height = (max(1, int(side)) for side in np.ceil(focal * (high - low)).clip(max=most_px))
+    return PerspectiveView(R, camera_matrix(focal, focal, -focal * low[0], -focal * low[1]), width, height)
