@@ -38,7 +38,7 @@ from sfm_app.colmap.backend import pycolmap, show_log
 from sfm_app.colmap.bundle import Adjustment, adjust
 from sfm_app.colmap.bundle_arrays import read_bundle
 from sfm_app.colmap.bundle_rounds import LOSS_SCALE_PX, lens_priors
-from sfm_app.geometry.projections import FISHEYE, PERSPECTIVE
+from sfm_app.geometry.lenses.projections import FISHEYE, PERSPECTIVE
 
 FloatArray = NDArray[np.float64]
 
@@ -49,8 +49,7 @@ ABOUT = (
     "the bundles each. faint: k2 and p1, p2 of any size down to 0.3 px. right: the chosen model is the smallest of "
     "COLMAP's that has the true terms. needless: most terms beyond the true ones. focal %: largest error. "
     "radius %: largest error of the radius of a point of the photo, in percent of its width. held-out: share of the "
-    "bundles in which no model explains a held-out fifth of the observations better than the chosen one, by more than "
-    "one standard error of the difference."
+    "bundles in which no model makes a held-out fifth of the observations 20 times as likely as the chosen one does."
 )
 GROUPS = ("plain", "faint", "fisheye")
 COLUMNS = (
@@ -64,8 +63,9 @@ MOST_PX = (15.0, 8.0)
 """Largest shift by k2, and by p1, p2."""
 FIELDS_DEG = (120.0, 150.0, 175.0)
 PROJECTIONS = ("equidistant", "equisolid", "stereographic")
-FOLDS, REFITS, EQUAL = 5, 3, 1.0
-"""A fifth is held out; so many steps refit the rest; the rule of one standard error (Breiman et al. 1984)."""
+FOLDS, REFITS, STRONG = 5, 3, 20.0
+"""A fifth is held out; so many steps refit the rest; a ratio of likelihoods that counts as strong evidence (Kass and
+Raftery 1995)."""
 RIVALS = {
     PERSPECTIVE: ((), ("k1",), ("k1", "k2"), ("k1", "p1 p2"), ("k1", "k2", "p1 p2"), ("k1", "k2", "k3")),
     FISHEYE: ((), ("k1",), ("k1", "k2"), ("k1", "k2", "k3 k4"), ("k1", "p1 p2")),
@@ -171,13 +171,8 @@ def held_out_row(model: pycolmap.Reconstruction, family: int, free: tuple[str, .
         choice = np.array([[name in (*kept, *parts) for name in names]])
         likelihoods[parts] = held_out_likelihoods(model, ids, bundle, choice, seed)
     best = max(likelihoods, key=lambda parts: float(likelihoods[parts].sum()))
-    lost = likelihoods[best] - likelihoods[bent]
-    error = float(np.sqrt(len(lost)) * np.std(lost))
-    return {
-        "best held out": " ".join(best),
-        "below": round(float(lost.sum()), 3),
-        "standard errors": round(float(lost.sum()) / error, 2) if error > 0.0 else 0.0,
-    }
+    below = float((likelihoods[best] - likelihoods[bent]).sum())
+    return {"best held out": " ".join(best), "below": round(below, 3)}
 
 
 def held_out_likelihoods(
@@ -207,7 +202,7 @@ def summarize(rows: Sequence[Row]) -> Iterator[Row]:
         for lens in ["all", *sorted({row["lens"] for row in own})]:
             some = [row for row in own if lens in ("all", row["lens"])]
             right = [row["right"] for row in some if row["right"] is not None]
-            asked = [row["standard errors"] for row in some if "standard errors" in row]
+            asked = [row["below"] for row in some if "below" in row]
             files = sorted({row["file"] for row in some})
             yield {
                 "group": group, "lens": lens, "bundles": len(some),
@@ -216,7 +211,7 @@ def summarize(rows: Sequence[Row]) -> Iterator[Row]:
                 "focal % median": round(float(np.median([row["focal %"] for row in some])), 4),
                 "focal % worst": round(max(row["focal %"] for row in some), 4),
                 "radius % worst": round(max(row["radius %"] for row in some), 4),
-                "held-out %": round(100.0 * float(np.mean(np.array(asked) <= EQUAL)), 1) if asked else None,
+                "held-out %": round(100.0 * float(np.mean(np.array(asked) <= np.log(STRONG))), 1) if asked else None,
                 "file models": ", ".join(files),
             }  # fmt: skip
 

@@ -26,8 +26,8 @@ from sfm_app.bundle_adjustment.lens_parts import (
     part_names,
 )
 from sfm_app.bundle_adjustment.normal_equations import ReducedSystem
+from sfm_app.geometry.lenses.projections import CAMERA, FX, FY
 from sfm_app.geometry.model_selection import cavity, posteriors
-from sfm_app.geometry.projections import CAMERA, FX, FY
 from sfm_app.geometry.spd_solve import inverse_of_positive
 
 FloatArray = NDArray[np.float64]
@@ -111,12 +111,12 @@ def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: LensPrio
         chosen, ranking = _choose(*_weigh(params, reduced, priors), priors)
         found = _estimate(params, reduced, priors, chosen)
         folding = [camera for camera, row in enumerate(found.params) if priors.folds(camera, row)]
-        others = {camera: priors.without(camera, chosen[camera]) for camera in folding}
+        others = {camera: priors.drop_lens(camera, chosen[camera]) for camera in folding}
         ways_out = [camera for camera, other in others.items() if len(other.choices[camera])]
         if not ways_out:
             break
         for camera in ways_out:
-            priors = priors.without(camera, chosen[camera])
+            priors = priors.drop_lens(camera, chosen[camera])
         barred[ways_out] = True
     clamped = found.params.copy()
     for camera in folding:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.bundle_adjustment.lens_evidence import LensChoice, evidence_weight
-from sfm_app.geometry.projections import (
+from sfm_app.geometry.lenses.projections import (
     CAMERA,
     CX,
     CY,

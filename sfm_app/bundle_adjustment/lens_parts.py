@@ -9,8 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.model_selection import NormalPriors, binary_choices
-from sfm_app.geometry.projections import (
+from sfm_app.geometry.lenses.projections import (
     CAMERA,
     CX,
     CY,
@@ -32,6 +31,7 @@ from sfm_app.geometry.projections import (
     SY,
     angle_limit,
 )
+from sfm_app.geometry.model_selection import NormalPriors, binary_choices
 from sfm_app.selfcal.adjustment.camera_priors import ASPECT, CENTER, FREE_SHARE, LENS, NARROW, WIDE
 
 FloatArray = NDArray[np.float64]
@@ -177,7 +177,7 @@ class LensPriors:
         """(C,) longer sides in pixels."""
         return np.asarray(self.sizes.max(axis=1), np.float64)
 
-    def without(self, camera: int, free: BoolArray) -> "LensPriors":
+    def drop_lens(self, camera: int, free: BoolArray) -> "LensPriors":
         """Return the priors without some choices for a camera: those whose lens is that of one.
 
         Args:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.projections import CAMERA, PANORAMA, project_points, wrap_residuals
+from sfm_app.geometry.lenses.projections import CAMERA, PANORAMA, project_points, wrap_residuals
 from sfm_app.geometry.spd_solve import project_to_psd, solve_positive
 
 FloatArray = NDArray[np.float64]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sfm_app.bundle_adjustment.normal_equations import Bundle
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.geometry.projections import (
+from sfm_app.geometry.lenses.projections import (
     CAMERA,
     CX,
     CY,

@@ -10,7 +10,7 @@ from sfm_app.bundle_adjustment.normal_equations import Bundle, best_step, reduce
 from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread
 from sfm_app.colmap.bundle_arrays import photos_per_camera, read_bundle, write_bundle
 from sfm_app.errors import NumericalError
-from sfm_app.geometry.projections import FX, FY, PANORAMA
+from sfm_app.geometry.lenses.projections import FX, FY, PANORAMA
 
 MIN_PHOTOS = 5
 """Photos of a camera below which only its focal and k1 are refined: with fewer, effects that the camera model leaves

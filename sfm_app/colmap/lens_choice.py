@@ -12,7 +12,7 @@ from sfm_app.bundle_adjustment.normal_equations import Bundle, cost, reduce
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle_arrays import read_bundle, write_camera
 from sfm_app.colmap.bundle_rounds import LOSS_SCALE_PX, MIN_PHOTOS, Rounds, adjust_in_rounds, lens_priors
-from sfm_app.geometry.projections import CX, CY, FISHEYE, FX, FY, PERSPECTIVE
+from sfm_app.geometry.lenses.projections import CX, CY, FISHEYE, FX, FY, PERSPECTIVE
 from sfm_app.numerical import FAILURES, Json, error_reason
 
 logger = logging.getLogger("sfm_app")
@@ -57,7 +57,7 @@ class Families:
 
 
 def best_families(model: pycolmap.Reconstruction, rounds: Rounds) -> Families:
-    """Try cameras that ask for it as ones of the other family, and keep what explains the observations better.
+    """Choose the better family for cameras that ask for the other one: what explains the observations better.
 
     Both are adjusted to the same tracks.
 

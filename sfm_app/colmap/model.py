@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.types import all_images, all_points
-from sfm_app.geometry.bearings import BEARING, RAY
 from sfm_app.geometry.camera import panorama_matrix
+from sfm_app.geometry.lenses.bearings import BEARING, RAY
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.geometry.two_view_init import TwoViewSeed
 from sfm_app.numerical import finite_entries
@@ -70,7 +70,7 @@ class PlacedView:
     t: NDArray[np.float64]
     """(3,) translation, camera from world."""
     lines: NDArray[np.float64]
-    """(N, 9) bearing vectors of keypoints, see `geometry.bearings`."""
+    """(N, 9) bearing vectors of keypoints, see `geometry.lenses.bearings`."""
 
 
 def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray[np.float64]]) -> dict[int, PlacedView]:
@@ -89,7 +89,7 @@ def placed_views(model: pycolmap.Reconstruction, keypoints: Mapping[int, NDArray
 
 
 def _bearings(camera: pycolmap.Camera, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (N, 9) as `geometry.bearings` does."""
+    """Return (N, 9) as `geometry.lenses.bearings` does."""
     if camera.is_perspective_fisheye() or camera.is_spherical():
         steps = np.vstack([x + step for step in ([0.0, 0.0], [STEP_PX, 0.0], [0.0, STEP_PX])])
         here, right, down = np.asarray(camera.cam_ray_from_img(steps), np.float64).reshape(3, -1, 3)

@@ -14,8 +14,8 @@ from sfm_app.colmap.bundle_arrays import camera_family, read_camera
 from sfm_app.colmap.masks import MASKS, shrink_mask
 from sfm_app.colmap.processes.undistort_process import JPEG_QUALITY
 from sfm_app.colmap.types import all_images
-from sfm_app.geometry.perspective_views import PerspectiveView, cover_rays
-from sfm_app.geometry.projections import FISHEYE, FX, PANORAMA, SEEN_ANGLE, project_points
+from sfm_app.geometry.lenses.perspective_views import PerspectiveView, cover_rays
+from sfm_app.geometry.lenses.projections import FISHEYE, FX, PANORAMA, SEEN_ANGLE, project_points
 from sfm_app.photos import read_mask, save_mask
 from sfm_app.photos.resample import resample, shrink
 
@@ -36,7 +36,7 @@ class WideLens:
     """A camera, with the perspective views that show its photos."""
 
     params: FloatArray
-    """(12,) as in `geometry.projections`."""
+    """(12,) as in `geometry.lenses.projections`."""
     family: int
     size: tuple[int, int]
     """(width, height) of its photos."""

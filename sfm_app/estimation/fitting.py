@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
-from sfm_app.geometry.bearings import bearings
 from sfm_app.geometry.camera import guessed_camera_matrix
+from sfm_app.geometry.lenses.bearings import bearings
 from sfm_app.hashing import load_arrays
 from sfm_app.numerical import FAILURES
 from sfm_app.progress import track

@@ -21,7 +21,7 @@ from sfm_app.errors import InputError, PluginError
 from sfm_app.hashing import load_arrays
 from sfm_app.numerical import Json
 from sfm_app.photos.masks import read_mask
-from sfm_app.photos.panorama_views import PanoramaViews
+from sfm_app.photos.panoramas.feature_views import PanoramaViews
 from sfm_app.plugins import FeatureMethod
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
@@ -42,7 +42,7 @@ def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId
         method: of finding and matching.
         run: its database lists the photos, which are laid out.
         pairs: the pairs to match, the smaller id first; features are found in their photos only. None for all pairs of
-            all photos.
+            all photos; without any pair, features are found in all photos.
 
     Returns:
         The options in force, for the manifest.
@@ -53,7 +53,7 @@ def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId
     """
     place, options = run.workspace, run.settings.matching
     names = photo_names(place.database)
-    if pairs is not None:
+    if pairs:
         names = {photo: names[photo] for photo in sorted({photo for pair in pairs for photo in pair})}
     if method.sift is not None:
         return find_and_match(

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.essential import nearest_essential, relative_pose
-from sfm_app.geometry.ray_epipolar import FIRST, SECOND, depths
+from sfm_app.geometry.lenses.ray_epipolar import FIRST, SECOND, depths
 from sfm_app.geometry.triangulation import triangulation_angle_deg
 
 Array = NDArray[np.float64]
@@ -44,12 +44,12 @@ def two_view_seed(E: Array, x1: Array, x2: Array) -> TwoViewSeed:
 
 
 def ray_seed(R: Array, t: Array, lines: Array) -> TwoViewSeed:
-    """Triangulate inliers of a pose by the points midway between their rays.
+    """Return the seed of a pose, with each inlier at the point midway between its rays.
 
     Args:
         R: (3, 3) rotation of view 2 from view 1.
         t: (3,) unit vector along its translation.
-        lines: (N, 18) inliers as bearing vectors, see `geometry.bearings`, view 1 and view 2.
+        lines: (N, 18) inliers as bearing vectors, see `geometry.lenses.bearings`, view 1 and view 2.
     """
     first, second = depths(lines, R, t)
     X = 0.5 * (first[:, None] * lines[:, FIRST] + (second[:, None] * lines[:, SECOND] - t) @ R)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sfm_app.geometry.ray_epipolar import FIRST, SECOND
+from sfm_app.geometry.lenses.ray_epipolar import FIRST, SECOND
 from sfm_app.posegraph.pair_pose import Pair, is_in_front
 from sfm_app.posegraph.refine import pose_distances, refine_pose
 from sfm_app.types import RelativePose

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.bearings import bearings, depths_along, project
-from sfm_app.geometry.ray_epipolar import FIRST, SECOND, depths
+from sfm_app.geometry.lenses.bearings import bearings, depths_along, project
+from sfm_app.geometry.lenses.ray_epipolar import FIRST, SECOND, depths
 from sfm_app.posegraph.coverage import Visibility
 from sfm_app.types import Calibration, MatchGraph, PairId, RelativePose
 

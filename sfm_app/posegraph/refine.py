@@ -32,7 +32,7 @@ def refine_pose(lines: FloatArray, R: FloatArray, t: FloatArray) -> tuple[FloatA
     """Refine the pose (R, t) by robust least squares of Sampson distances (Levenberg-Marquardt).
 
     Args:
-        lines: (N, 18) matches as bearing vectors with derivatives (`geometry.bearings`), view 1 and view 2.
+        lines: (N, 18) matches as bearing vectors with derivatives (`geometry.lenses.bearings`), view 1 and view 2.
         R: (3, 3) rotation of view 2 from view 1.
         t: (3,) direction of its translation.
     """
@@ -46,7 +46,7 @@ def pose_distances(lines: FloatArray, R: FloatArray, t: FloatArray) -> FloatArra
     """Return the Sampson distances (N,) of matches to a relative pose, in pixels, >= 0.
 
     Args:
-        lines: (N, 18) matches as bearing vectors with derivatives (`geometry.bearings`), view 1 and view 2.
+        lines: (N, 18) matches as bearing vectors with derivatives (`geometry.lenses.bearings`), view 1 and view 2.
         R: (3, 3) rotation of view 2 from view 1.
         t: (3,) unit vector along its translation.
     """

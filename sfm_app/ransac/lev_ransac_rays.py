@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.essential import decompose_essential, nearest_essential
-from sfm_app.geometry.ray_epipolar import (
+from sfm_app.geometry.lenses.ray_epipolar import (
     FIRST,
     SECOND,
     fit_rays,
@@ -36,12 +36,12 @@ by hand; not measured on their own."""
 MOST_SCORED = 500
 """Matches that samples are scored on. Chosen by hand; not measured on its own."""
 STEPS = (5, 3)
-"""Reweighted fits at either scale in local optimization, as in `lev_ransac`."""
+"""Reweighted fits at either scale in local optimization, as in `lev_ransac`. Chosen by hand."""
 MISMATCHES = 8
 """Shifts of the partners that measure chance. Chosen by hand; not measured on its own."""
 CLEAR_SHARE, ROTATION_FACTOR = 0.95, 2.0
 """A pair is a rotation if one explains this share of its inliers within so many thresholds. As in
-`posegraph.pair_pose`."""
+`posegraph.pair_pose`. Chosen by hand."""
 
 
 def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int) -> EpipolarFit | Rejected:
@@ -51,7 +51,7 @@ def fit_lev_ransac_rays(lines: FloatArray, options: EpipolarSettings, seed: int)
     of little worth, but its inliers are not.
 
     Args:
-        lines: (N, 18) matches as bearing vectors in pixels, see `geometry.bearings`.
+        lines: (N, 18) matches as bearing vectors in pixels, see `geometry.lenses.bearings`.
         options: threshold, confidence, largest number of samples, smallest number of inliers.
         seed: same seed, same result.
     """
@@ -118,7 +118,7 @@ def _search(lines: FloatArray, options: EpipolarSettings, rng: np.random.Generat
         if cost < lowest:
             best, lowest, chances = tried, cost, validity(lines, tried, threshold)
             share = float(np.mean(squared_distances(tried[None], lines)[0] <= threshold**2))
-            limit = min(options.max_trials, MOST_TRIALS, max(LEAST_TRIALS, _needed(share, options.confidence)))
+            limit = min(options.max_trials, MOST_TRIALS, max(LEAST_TRIALS, _samples_needed(share, options.confidence)))
     return best, trials
 
 
@@ -146,7 +146,7 @@ def _costs(squared: FloatArray, scale: float) -> FloatArray:
     return np.asarray(squared / (squared + scale**2), np.float64)
 
 
-def _needed(share: float, confidence: float) -> int:
+def _samples_needed(share: float, confidence: float) -> int:
     """Return the samples after which one of them is all inliers with this probability (thesis 3.19)."""
     good = share**SAMPLE_SIZE
     return math.ceil(math.log(1.0 - confidence) / math.log1p(-good)) if 0.0 < good < 1.0 else 1

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_app.geometry.bearings import bearings
 from sfm_app.geometry.camera import rays
 from sfm_app.geometry.epipolar import cross_matrix
+from sfm_app.geometry.lenses.bearings import bearings
 from sfm_app.geometry.two_view_init import GOOD_ANGLE_DEG, TwoViewSeed, ray_seed, two_view_seed
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose
 from sfm_app.types.calibration import PERSPECTIVE

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.errors import ReconstructionError
-from sfm_app.geometry.perspective_views import PerspectiveView
-from sfm_app.geometry.projections import FISHEYE, PERSPECTIVE, angle_limit
+from sfm_app.geometry.lenses.perspective_views import PerspectiveView
+from sfm_app.geometry.lenses.projections import FISHEYE, PERSPECTIVE, angle_limit
 from sfm_app.jit import kernel
 from sfm_app.types import CameraModel
 

@@ -13,7 +13,7 @@ from sfm_app.colmap.database import open_database
 from sfm_app.colmap.processes.worker_process import ProgressReporter
 from sfm_app.photos.decode import read_picture, upright_image
 from sfm_app.photos.masks import read_mask
-from sfm_app.photos.panorama_views import PanoramaViews
+from sfm_app.photos.panoramas.feature_views import PanoramaViews
 from sfm_app.progress import track
 
 

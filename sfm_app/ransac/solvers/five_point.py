@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 SAMPLE_SIZE = 5
+"""Matches of a sample. Counted: E has five degrees of freedom."""
 _MONOMIALS = (
     "xxx", "xxy", "xxz", "xyy", "xyz", "xzz", "yyy", "yyz", "yzz", "zzz",
     "xx1", "xy1", "xz1", "yy1", "yz1", "zz1", "x11", "y11", "z11", "111",
@@ -19,9 +20,11 @@ _MONOMIALS = (
 """Products of three of x, y, z and 1: the cubic ones, then the basis of what they leave."""
 _PLACES = {"".join(sorted(name)): place for place, name in enumerate(_MONOMIALS)}
 _SUM = np.zeros((64, 20))
+"""Adds up products of three letters to monomials. By definition."""
 for _row, _letters in enumerate(product("xyz1", repeat=3)):
     _SUM[_row, _PLACES["".join(sorted(_letters))]] = 1.0
 _LEVI_CIVITA = np.zeros((3, 3, 3))
+"""Signs of permutations. By definition."""
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _LEVI_CIVITA[_i, _j, _k], _LEVI_CIVITA[_i, _k, _j] = 1.0, -1.0
 _REAL = 1e-6

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from sfm_app.geometry.damping import DampingRange, damped_step
 from sfm_app.geometry.essential import decompose_essential
+from sfm_app.geometry.lenses.ray_epipolar import signed_distances
 from sfm_app.geometry.pose_manifold import POSE_DOF, retract, write_essential
-from sfm_app.geometry.ray_epipolar import signed_distances
 from sfm_app.geometry.spd_solve import inverse_of_positive, solve_each
 from sfm_app.numerical import MAD_TO_SIGMA
 from sfm_app.selfcal.wide_angle.fisheye import Fisheye, Lens, RadialLens, bearings_through
@@ -35,6 +35,9 @@ CONVERGED = 1e-6
 """Largest change of a parameter that ends them. Chosen by hand; not measured on its own."""
 DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e8)
 """Of Levenberg and Marquardt's steps, relative to the diagonal. Chosen by hand; not measured on their own."""
+MOST_LOG_FOCAL = 10.0
+"""Largest logarithm of a focal in longer sides, either way: beyond it there is no lens, and soon an overflow. Chosen by
+hand; not measured on its own."""
 NOISE_ROUNDS = 3
 """Times the noise is estimated from the distances. Chosen by hand; not measured on its own."""
 LEAST_SIGMA = 1e-4
@@ -138,6 +141,8 @@ def _adjust(matches: Sequence[FloatArray], state: State, sigma: float) -> State:
 
         def attempt(tried: float, begin: State = state, systems: list[System] = systems) -> State | None:
             trial = _step(begin, systems, tried)
+            if abs(trial.parameters[0]) > MOST_LOG_FOCAL:
+                return None
             return trial if robust_cost(matches, trial, sigma) < cost else None  # noqa: B023 -- called in this round
 
         found, damping = damped_step(attempt, damping, DAMPING)

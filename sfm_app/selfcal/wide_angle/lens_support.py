@@ -6,7 +6,7 @@ Samples are scored by a truncated loss (MSAC, Torr and Zisserman 2000).
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.ray_epipolar import FIRST, SECOND, fit_rays, squared_distances
+from sfm_app.geometry.lenses.ray_epipolar import FIRST, SECOND, fit_rays, squared_distances
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
@@ -23,7 +23,7 @@ def search_rays(lines: FloatArray, samples: IndexArray, threshold: float) -> tup
     A match counts 1 - d^2 / threshold^2, or nothing beyond the threshold.
 
     Args:
-        lines: (N, 18) matches, as in `geometry.ray_epipolar`.
+        lines: (N, 18) matches, as in `geometry.lenses.ray_epipolar`.
         samples: (S, 8) rows of them.
         threshold: largest distance of an inlier, in the unit of the photo, > 0.
     """

@@ -10,7 +10,7 @@ from sfm_app.colmap.bundle_arrays import read_bundle
 from sfm_app.colmap.bundle_rounds import LOSS_SCALE_PX, solve
 from sfm_app.colmap.database import camera_params
 from sfm_app.geometry.camera import camera_matrix
-from sfm_app.geometry.projections import CAMERA
+from sfm_app.geometry.lenses.projections import CAMERA
 
 pytestmark = pytest.mark.slow
 

@@ -7,7 +7,7 @@ from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import adjust
 from sfm_app.colmap.bundle_arrays import camera_family, file_model, read_camera, write_camera
 from sfm_app.colmap.bundle_rounds import solve
-from sfm_app.geometry.projections import CAMERA, CX, CY, FX, FY, PANORAMA
+from sfm_app.geometry.lenses.projections import CAMERA, CX, CY, FX, FY, PANORAMA
 from sfm_app.numerical import json_text
 
 WIDTH, HEIGHT = 1000, 800

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.estimation.fitting import ray_estimator
 from sfm_app.estimation.lenses import describe_lens, to_calibration
-from sfm_app.geometry.bearings import fisheye_radius, project
+from sfm_app.geometry.lenses.bearings import fisheye_radius, project
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.parallel import make_executor

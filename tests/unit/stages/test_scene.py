@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sfm_app.cli.scene_text import scene_lines
-from sfm_app.colmap import bundle
+from sfm_app.colmap import bundle_rounds
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import posed_photo_ids, submodel
@@ -177,7 +177,7 @@ def test_a_model_that_cannot_be_adjusted_is_kept_and_the_run_says_so(synthetic, 
     true = synthetic[1]
     made = outcome(attempt(submodel(true, (1, 2, 3, 4))), attempt(submodel(true, (5, 6, 7))))
     mapped(made)
-    monkeypatch.setattr(bundle, "reduce", failing)
+    monkeypatch.setattr(bundle_rounds, "reduce", failing)
     matches, views = inputs(true)
 
     found = scene.make(matches, views, made.intrinsics, run)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_app
-from sfm_app.geometry.ray_epipolar import signed_distances, squared_distances
+from sfm_app.geometry.lenses.ray_epipolar import signed_distances, squared_distances
 from sfm_app.selfcal.wide_angle.fisheye import Fisheye, bearings_through
 from sfm_app.selfcal.wide_angle.lens_refinement import redundancy
 from sfm_app.selfcal.wide_angle.lens_search import find_lens

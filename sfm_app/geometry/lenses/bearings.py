@@ -13,9 +13,9 @@ from sfm_app.types.calibration import EQUIRECTANGULAR, FISHEYE, Calibration
 FloatArray = NDArray[np.float64]
 
 RAY, SLOPES = slice(0, 3), slice(3, 9)
-"""Columns of `bearings`."""
+"""Columns of `bearings`. By definition."""
 BEARING = 9
-"""Number of these columns."""
+"""Number of these columns. Counted."""
 NEWTON_STEPS, LEAST_SLOPE = 20, 0.05
 """Steps of Newton's method for the angle, and the least slope of the radius: below it, the lens is near its fold.
 Chosen by hand; not measured on their own."""

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.bearings import RAY, bearings, project
 from sfm_app.geometry.camera import panorama_matrix
-from sfm_app.geometry.perspective_views import PerspectiveView, cover_rays
+from sfm_app.geometry.lenses.bearings import RAY, bearings, project
+from sfm_app.geometry.lenses.perspective_views import PerspectiveView, cover_rays
 from sfm_app.photos.resample import resample
 from sfm_app.types.calibration import EQUIRECTANGULAR, Calibration
 

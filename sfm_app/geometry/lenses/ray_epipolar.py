@@ -7,15 +7,16 @@ Matches are rows of 18 numbers: the bearing vectors of `bearings` in view 1 and 
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.bearings import pixels_per_radian
+from sfm_app.geometry.lenses.bearings import pixels_per_radian
 
 FloatArray = NDArray[np.float64]
 
 FIRST, SECOND = slice(0, 3), slice(9, 12)
-"""Columns of the rays of view 1 and of view 2."""
+"""Columns of the rays of view 1 and of view 2. By definition."""
 _SLOPES_1, _SLOPES_2 = (slice(3, 6), slice(6, 9)), (slice(12, 15), slice(15, 18))
+"""Columns of their derivatives. By definition."""
 ROTATION_ROUNDS = 10
-"""Rounds of reweighted fits of a rotation. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
+"""Rounds of reweighted fits of a rotation. Chosen by hand; not measured on its own."""
 LEAST = 1e-30
 """Added to squared derivatives. Its square root is far above rounding in double precision."""
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.bearings import project
 from sfm_app.geometry.camera import panorama_matrix
+from sfm_app.geometry.lenses.bearings import project
 from sfm_app.photos.resample import resample, shrink
 from sfm_app.types.calibration import EQUIRECTANGULAR, Calibration
 

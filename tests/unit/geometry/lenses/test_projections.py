@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_app.bundle_adjustment.normal_equations import DAMPING, Bundle, apply_step, project, reduce, residuals
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.geometry.projections import (
+from sfm_app.geometry.lenses.projections import (
     CAMERA,
     FISHEYE,
     PANORAMA,
