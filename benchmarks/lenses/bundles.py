@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.backend import log_level, pycolmap, show_log
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.synthetic.cameras import ArcOptions, Camera, Views, arc, make_wide_camera
 from sfm_app.synthetic.lenses import Lens
@@ -151,7 +151,9 @@ def adjust_like_mapping(model: pycolmap.Reconstruction, *, lens: bool) -> None:
     options.ceres.solver_options.max_num_iterations = 30
     options.ceres.solver_options.function_tolerance = 1e-5
     options.ceres.solver_options.num_threads = 1
+    loud = log_level()
     pycolmap.bundle_adjustment(model, options)
+    show_log(loud)  # COLMAP's function sets it to everything
 
 
 def perspective_bundle(
