@@ -24,7 +24,7 @@ BoolArray = NDArray[np.bool_]
 
 MOST_LOST = 0.1
 """Largest share of a photo that one undistorted photo may lose. By definition."""
-GRID = 65
+GRID = 257
 """Rows and columns of pixels of a photo whose rays are looked at. Chosen by hand; not measured on its own."""
 AGREE_PX = 0.5
 """Largest distance between a pixel and its ray's projection, in pixels: where it is larger, the lens shows nothing or

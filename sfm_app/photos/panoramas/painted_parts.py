@@ -9,7 +9,7 @@ from sfm_app.geometry.lenses.perspective_views import PerspectiveView, cover_ray
 from sfm_app.photos.resample import resample
 from sfm_app.types.calibration import EQUIRECTANGULAR, Calibration
 
-GRID = 65
+GRID = 257
 """Rows and columns of a panorama whose rays are covered. Chosen by hand; not measured on its own."""
 
 
