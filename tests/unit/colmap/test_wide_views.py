@@ -123,7 +123,7 @@ def test_masked_pixels_are_masked_in_every_view(tmp_path):
     assert has_masks(tmp_path / "dense")
     for number, part in enumerate(lenses[1].views):
         view = next(view for view in views if view.name == view_name("a.png", number))
-        at, _ = lenses[1].locate(part.rays().reshape(-1, 3))
+        at = lenses[1].locate(part.rays().reshape(-1, 3))
         left = (at[:, 0] < SIZE[0] / 2 - 1).reshape(view.height, view.width)
         used = used_pixels(tmp_path / "dense", view)
         assert not used[left].any()
