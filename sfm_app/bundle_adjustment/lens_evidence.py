@@ -143,7 +143,7 @@ def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, fr
     precision = priors.precision(free)
     mean, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
     determined = priors.asked & _find_determined(covariance, precision, priors)
-    changing = priors.parameter_mask(determined | (priors.asked & ~priors.part_mask("stays")))
+    changing = priors.parameter_mask(determined | (priors.asked & ~priors.part_mask("stays")) | priors.demanded)
     absent = priors.parameter_mask(priors.asked & ~free & priors.part_mask("exact"))
     absent[:, [FX, FY]] = False
     step, own = _posterior(H, g, np.where(absent, EXACTLY, 1.0) * precision, away, changing)

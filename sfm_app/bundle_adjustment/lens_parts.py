@@ -244,6 +244,11 @@ class LensPriors:
                 chosen[camera, list(part.places)] = on
         return chosen
 
+    @property
+    def demanded(self) -> BoolArray:
+        """(C, 7) parts that every choice frees, because the user named the model; they move, determined or not."""
+        return np.array([one.all(axis=0) & (len(one) > 0) for one in self.choices], np.bool_).reshape(-1, COUNT)
+
     def part_mask(self, quality: str) -> BoolArray:
         """Return (C, 7) which parts have a quality: "stays" or "exact"."""
         rows = [[bool(getattr(part, quality)) for part in PARTS[int(kind)]] for kind in self.family]

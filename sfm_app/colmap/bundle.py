@@ -7,10 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from sfm_app.bundle_adjustment.camera_rules import calibration_from_params, fit_to_model, params_of_calibration
-from sfm_app.bundle_adjustment.lens_evidence import estimate_lenses
 from sfm_app.bundle_adjustment.lens_family import convert_lens
 from sfm_app.bundle_adjustment.lens_parts import part_names
-from sfm_app.bundle_adjustment.normal_equations import reduce
 from sfm_app.colmap.backend import pycolmap, translate_errors
 from sfm_app.colmap.bundle_arrays import (
     FILE_MODELS,
@@ -20,11 +18,10 @@ from sfm_app.colmap.bundle_arrays import (
     camera_family,
     file_model,
     photos_per_camera,
-    read_bundle,
     read_camera,
     write_camera,
 )
-from sfm_app.colmap.bundle_rounds import LOSS_SCALE_PX, Rounds, adjust_in_rounds, lens_priors, solve
+from sfm_app.colmap.bundle_rounds import Rounds, adjust_in_rounds, solve
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.lens_choice import LensRecord, best_families, record_lenses
 from sfm_app.colmap.model import finite_mask
@@ -173,7 +170,7 @@ def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
 def given_estimates(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules) -> dict[int, Calibration]:
     """Return what the photos say of the cameras that the user gave, by id; not of those that they do not determine.
 
-    For a camera that is kept, this is the step that it would make if it were free.
+    Where one is kept, everything is adjusted once more with free cameras, to the same tracks.
 
     Args:
         model: adjusted.
@@ -182,13 +179,15 @@ def given_estimates(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules
     """
     if all(rule.given is None for rule in rules.values()):
         return {}
-    ids, bundle, found = rounds.ids, rounds.bundle, rounds.found
     if any(rule.kept for rule in rules.values()):
-        ids, bundle = read_bundle(model)
-        found = estimate_lenses(bundle.params, reduce(bundle, LOSS_SCALE_PX), lens_priors(model, ids, bundle))
-    estimates = {}
-    for row, camera_id in enumerate(ids):
-        family = int(bundle.family[row])
+        try:
+            rounds = adjust_in_rounds(pycolmap.Reconstruction(model), None)
+        except FAILURES as err:
+            logger.info("the given cameras could not be checked", exc_info=err)
+            return {}
+    estimates, found = {}, rounds.found
+    for row, camera_id in enumerate(rounds.ids):
+        family = int(rounds.bundle.family[row])
         if camera_id not in rules or rules[camera_id].given is None or found.held[row] or family == PANORAMA:
             continue
         camera = model.cameras[camera_id]
