@@ -6,14 +6,16 @@ from typing import Any
 
 from sfm_app.report import field_of_view_deg, held_text, lens_text
 from sfm_app.types import Intrinsics
+from sfm_app.types.calibration import GIVEN, KEPT
 
 BEST_PAIRS = 3
 PHOTOS_SHOWN = 4
 """Most key pairs and photos that the text names; --json has all."""
 
-
 SOURCES = {"exif": "EXIF's claim", "guess": "a guess", "estimate": "an estimate"}
 """Where the values of an undetermined camera come from, by its method."""
+GIVEN_TEXTS = {GIVEN: "as given, to be refined", KEPT: "as given, and kept"}
+"""What becomes of a camera that the user gave, by its method."""
 
 
 def intrinsics_summary(intrinsics: Intrinsics) -> dict[str, Any]:
@@ -39,10 +41,10 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
             more = f" and {len(mine) - PHOTOS_SHOWN} more" if len(mine) > PHOTOS_SHOWN else ""
             lines.append(f"            took {', '.join(mine[:PHOTOS_SHOWN])}{more}")
         if not camera.identifiable:
-            source = {"exif": "EXIF's claim", "guess": "a guess", "estimate": "an estimate"}.get(
-                camera.method, camera.method
-            )
+            source = SOURCES.get(camera.method, camera.method)
             lines.append(f"            these photos do not determine it ({camera.reason}): {source}")
+        if camera.method in GIVEN_TEXTS:
+            lines.append(f"            {GIVEN_TEXTS[camera.method]}")
         across, down = field_of_view_deg(camera)
         lines.append(f"            sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom")
         lines += [f"            {text}" for text in (lens_text(camera), held_text(camera)) if text]
@@ -51,6 +53,20 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
             best = ", ".join(f"{first} + {second}" for first, second in named)
             lines.append(f"            best pairs of photos to start from: {best}")
     return lines
+
+
+def contradiction_lines(counts: Mapping[str, Any]) -> list[str]:
+    """Return warnings about given cameras that the photos contradict.
+
+    Args:
+        counts: figures of a stage in the manifest.
+    """
+    given = counts.get("given_cameras", {})
+    return [
+        f"beware: the photos contradict the given camera {name}: {one['text']}"
+        for name, camera in given.items()
+        for one in camera["contradicted"]
+    ]
 
 
 def k_text(K: Any, spread: Mapping[str, float] = MappingProxyType({})) -> str:

@@ -129,7 +129,8 @@ def _summary(rounds: Rounds) -> tuple[dict[int, dict[str, float]], dict[int, tup
         family = int(rounds.bundle.family[row])
         determined[camera_id] = part_names(family, rounds.found.determined[row])
         deviations[camera_id] = {}
-        if family in FILE_MODELS:
+        is_fixed = rounds.bundle.fixed is not None and bool(rounds.bundle.fixed[row])
+        if family in FILE_MODELS and not is_fixed:
             keys = FILE_MODELS[family][file_model(rounds.found.params[row], family)]
             values = rounds.found.deviations[row]
             deviations[camera_id] = finite_entries({key: float(values[PLACES[key][0]]) for key in keys})

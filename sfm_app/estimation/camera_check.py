@@ -95,6 +95,8 @@ def _curve_contradictions(given: Calibration, found: Calibration) -> list[Contra
         return [Contradiction("focal length", *focals, of_focal)]
     worst = int(np.argmax(np.where(clear, difference / radii[1], 0.0)))
     what = f"radius of what is {np.degrees(theta[worst]):.0f} degrees off the axis"
+    if not same:
+        what = f"a {given.projection} lens is given, and the photos show a {found.projection} one; {what}"
     return [Contradiction(what, float(radii[0][worst]), float(radii[1][worst]), float(deviations[worst]))]
 
 
