@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from sfm_app.cli.camera_text import contradiction_lines, k_text
+from sfm_app.cli.camera_text import contradiction_lines, refined_text
 from sfm_app.types import Scene
 
 NAMES_SHOWN = 4
@@ -64,7 +64,7 @@ def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
     for name, camera in scene.cameras.items():
         kept = counts.get("given_cameras", {}).get(name, {}).get("kept", False)
         how = "as given" if kept else "refined"
-        yield f"            camera {f'{name} ' if many else ''}{how}: {k_text(camera.K, camera.deviations)}"
+        yield f"            camera {f'{name} ' if many else ''}{how}: {refined_text(camera)}"
     yield from (f"            {text}" for text in contradiction_lines(counts))
 
 
