@@ -38,7 +38,7 @@ def test_wide_lenses_say_what_they_see():
 
 
 def test_distortion_widens_the_field():
-    assert "sees 97 degrees" in field_text(camera(radial=-0.1))
+    assert "sees 98 degrees" in field_text(camera(radial=-0.1))
 
 
 @pytest.mark.parametrize(
