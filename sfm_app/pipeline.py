@@ -5,12 +5,13 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from sfm_app.camera_files import read_given_cameras
 from sfm_app.colmap.model import sparse_model
 from sfm_app.engine.execution import Pipeline
 from sfm_app.engine.stage import Products, Stage, check_undamaged, resume_hint
 from sfm_app.errors import InputError
 from sfm_app.photos import read_source
-from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.context import GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.parallel import ordered_map
 from sfm_app.stages import depth_maps, export, intrinsics, match_graph, mesh, photos, scene, texture, view_graph
 from sfm_app.types import Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surface, ViewGraph
@@ -18,7 +19,7 @@ from sfm_app.types import Intrinsics, MatchGraph, Model, PhotoSet, Scene, Surfac
 PHOTOS: Stage[PhotoSet] = Stage(
     name="photos",
     takes=(),
-    settings=("photos", "max_memory_gb"),
+    settings=("photos", "max_memory_gb", GIVEN_CAMERAS),
     files=("photos.json", "photos", "frames", "masks"),
     make=lambda given, run: photos.make(given.source, run),
     load=lambda given, run: photos.load(given.source, run),
@@ -36,7 +37,7 @@ MATCH_GRAPH: Stage[MatchGraph] = Stage(
 VIEW_GRAPH: Stage[ViewGraph] = Stage(
     name="view_graph",
     takes=(MATCH_GRAPH,),
-    settings=("epipolar", "seed"),
+    settings=("epipolar", *view_graph.LENS_SETTINGS, "seed"),
     files=("view_graph.npz",),
     make=lambda given, run: view_graph.make(given[MATCH_GRAPH], run),
     load=lambda _, run: view_graph.load(run),
@@ -45,7 +46,7 @@ VIEW_GRAPH: Stage[ViewGraph] = Stage(
 INTRINSICS: Stage[Intrinsics] = Stage(
     name="intrinsics",
     takes=(MATCH_GRAPH, VIEW_GRAPH),
-    settings=("calibration", "photos.cameras", "seed"),
+    settings=("calibration", "photos.cameras", GIVEN_CAMERAS, "seed"),
     files=("calibration.json",),
     make=lambda given, run: intrinsics.make(given[MATCH_GRAPH], given[VIEW_GRAPH], run),
     load=lambda _, run: intrinsics.load(run),
@@ -117,6 +118,8 @@ def run_stages(
     place.check_no_overlap(photo_dir)
     if options.masks:
         place.check_no_overlap(Path(options.masks), "masks")
+    if run.settings.calibration.file:
+        run = replace(run, given=read_given_cameras(Path(run.settings.calibration.file)))
     source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
     return PIPELINE.run(source, replace(run, settings=source.adapt(run.settings)), first, last, wanted)
 

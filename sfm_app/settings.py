@@ -20,6 +20,10 @@ MAX_PROBLEMS, MAX_VALUE_CHARS = 20, 100
 """Most problems that an error lists, and most characters of a wrong value that it shows."""
 
 Quality = Literal["draft", "normal", "high"]
+CameraModelName = Literal[
+    "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_FISHEYE",
+    "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE", "EQUIRECTANGULAR",
+]  # fmt: skip
 ConstraintForm = Literal["huang-faugeras", "frobenius", "trivedi", "polynomial"]
 
 
@@ -87,6 +91,14 @@ class CalibrationSettings(Section):
         "frobenius (5.9), trivedi (5.11) or polynomial (5.25)",
     )
     lens: bool = Field(True, description="estimate the radial distortion of the lens")
+    file: str = Field(
+        "",
+        description="calibration file or folder of COLMAP, OpenCV, OpenSfM or sfm-app with known cameras; none where "
+        "empty",
+    )
+    keep: bool = Field(
+        False, description="keep the cameras of the calibration file as they are, instead of refining them"
+    )
     center_sigma: float = Field(
         0.15,
         gt=0,
@@ -101,6 +113,11 @@ class SceneSettings(Section):
     mapper: Literal["auto", "incremental", "global"] = Field(
         "auto",
         description="incremental: photo after photo from a seed; global: all at once; auto: the one that explains more",
+    )
+    camera_model: CameraModelName = Field(
+        "auto",
+        description="COLMAP's camera model that the last adjustment ends with, such as OPENCV or OPENCV_FISHEYE; auto: "
+        "the one that the photos support best",
     )
     max_init_pairs: int = Field(5, ge=1, le=100, description="most seed pairs that are tried")
     min_seed_angle_deg: float = Field(

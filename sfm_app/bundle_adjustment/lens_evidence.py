@@ -110,7 +110,7 @@ def estimate_lenses(params: FloatArray, reduced: ReducedSystem, priors: LensPrio
     while True:
         chosen, ranking = _choose(*_weigh(params, reduced, priors), priors)
         found = _estimate(params, reduced, priors, chosen)
-        folding = [camera for camera, row in enumerate(found.params) if priors.folds(camera, row)]
+        folding = [k for k, row in enumerate(found.params) if not priors.fixed[k] and priors.folds(k, row)]
         others = {camera: priors.drop_lens(camera, chosen[camera]) for camera in folding}
         ways_out = [camera for camera, other in others.items() if len(other.choices[camera])]
         if not ways_out:
@@ -143,7 +143,7 @@ def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, fr
     precision = priors.precision(free)
     mean, covariance = _posterior(H, g, precision, away, np.ones_like(away, np.bool_))
     determined = priors.asked & _find_determined(covariance, precision, priors)
-    changing = priors.parameter_mask(determined | (priors.asked & ~priors.part_mask("stays")))
+    changing = priors.parameter_mask(determined | (priors.asked & ~priors.part_mask("stays")) | priors.demanded)
     absent = priors.parameter_mask(priors.asked & ~free & priors.part_mask("exact"))
     absent[:, [FX, FY]] = False
     step, own = _posterior(H, g, np.where(absent, EXACTLY, 1.0) * precision, away, changing)
@@ -155,12 +155,13 @@ def _estimate(params: FloatArray, reduced: ReducedSystem, priors: LensPriors, fr
     largest = np.abs(step) / np.sqrt(np.diag(own), out=np.ones_like(step), where=(changing & ~absent).ravel())
     largest = np.where(absent.ravel(), 0.0, largest)
     moved, held = _apply_step(params, step.reshape(params.shape), priors.sides)
-    moved[absent] = 0.0
+    moved[absent] = priors.usual[absent]
+    moved[priors.fixed], held[priors.fixed], deviations[priors.fixed] = params[priors.fixed], False, 0.0
     deviations[held] = np.maximum(deviations[held], _prior_deviations(params, priors)[held])
     determined[held] = False
     return LensEstimate(
         np.where(held[:, None], params, moved), deviations, free & determined, determined,
-        float(np.max(largest.reshape(params.shape)[~held], initial=0.0)), held, (), held,
+        float(np.max(largest.reshape(params.shape)[~held & ~priors.fixed], initial=0.0)), held, (), held,
     )  # fmt: skip
 
 

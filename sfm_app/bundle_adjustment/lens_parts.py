@@ -146,7 +146,7 @@ class LensPriors:
     """Priors on the cameras, one row each."""
 
     sizes: FloatArray
-    """(C, 2) widths and heights in pixels. The usual optical center is the middle of the photo."""
+    """(C, 2) widths and heights in pixels."""
     family: IntArray
     """(C,) as in `Bundle`."""
     reach: FloatArray
@@ -155,6 +155,11 @@ class LensPriors:
     """(C, 7) parts that are estimated, in the order of PARTS; the others keep their values."""
     choices: tuple[BoolArray, ...]
     """For each camera (K, 7) which parts may be freed together; those that free less come first."""
+    usual: FloatArray
+    """(C, 12) the usual values: of any camera, or those that the user gave for this one. Of fx and fy only the ratio
+    counts."""
+    fixed: BoolArray
+    """(C,) cameras that keep all of their parameters."""
 
     @classmethod
     def from_cameras(cls, params: FloatArray, family: IntArray, sizes: FloatArray, asked: BoolArray) -> "LensPriors":
@@ -170,7 +175,9 @@ class LensPriors:
         for kind, row in zip(family, asked, strict=True):
             allowed = consistent_choices(int(kind))
             choices.append(allowed[~np.any(allowed & ~row, axis=1)])
-        return cls(sizes, family, reach, asked, tuple(choices))
+        usual = np.zeros_like(params)
+        usual[:, [FX, FY]], usual[:, [CX, CY]] = 1.0, sizes / 2.0
+        return cls(sizes, family, reach, asked, tuple(choices), usual, np.zeros(len(params), np.bool_))
 
     @property
     def sides(self) -> FloatArray:
@@ -224,10 +231,9 @@ class LensPriors:
 
     def prior_offsets(self, params: FloatArray) -> FloatArray:
         """Return (C, 12) offsets from the cameras to their usual values; 0 for focals and for parts not estimated."""
-        away = -params
+        away = self.usual - params
         away[:, LOG_FOCAL] = 0.0
-        away[:, [CX, CY]] = self.sizes / 2.0 - params[:, [CX, CY]]
-        away[:, LOG_ASPECT] = np.log(params[:, FX] / params[:, FY])
+        away[:, LOG_ASPECT] = np.log(params[:, FX] / params[:, FY]) - np.log(self.usual[:, FX] / self.usual[:, FY])
         return np.where(self.parameter_mask(self.asked), away, 0.0)
 
     def parameter_mask(self, parts: BoolArray) -> BoolArray:
@@ -237,6 +243,11 @@ class LensPriors:
             for part, on in zip(PARTS[int(self.family[camera])], row, strict=True):
                 chosen[camera, list(part.places)] = on
         return chosen
+
+    @property
+    def demanded(self) -> BoolArray:
+        """(C, 7) parts that every choice frees, because the user named the model; they move, determined or not."""
+        return np.array([one.all(axis=0) & (len(one) > 0) for one in self.choices], np.bool_).reshape(-1, COUNT)
 
     def part_mask(self, quality: str) -> BoolArray:
         """Return (C, 7) which parts have a quality: "stays" or "exact"."""

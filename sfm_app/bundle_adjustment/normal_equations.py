@@ -52,6 +52,8 @@ class Bundle:
     """(N, 2) observed positions, in pixels."""
     family: NDArray[np.int64]
     """(C,) PERSPECTIVE, FISHEYE or PANORAMA of `projections`."""
+    fixed: NDArray[np.bool_] | None = None
+    """(C,) cameras that keep their parameters; None where all may change."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +97,8 @@ def project(bundle: Bundle) -> tuple[FloatArray, FloatArray, FloatArray, FloatAr
     rows, R = bundle.camera[bundle.photo], bundle.R[bundle.photo]
     turned = np.einsum("nij,nj->ni", R, bundle.X[bundle.point])
     found = project_points(turned + bundle.t[bundle.photo], bundle.params[rows], bundle.family[rows])
+    if bundle.fixed is not None:
+        found.by_camera[bundle.fixed[rows]] = 0.0
     by_pose = np.concatenate([np.cross(turned[:, None], found.by_point), found.by_point], 2)
     return found.x, found.by_camera, by_pose, np.einsum("nij,njk->nik", found.by_point, R)
 

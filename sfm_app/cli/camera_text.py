@@ -4,16 +4,20 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
-from sfm_app.report import field_of_view_deg, held_text, lens_text
-from sfm_app.types import Intrinsics
+from sfm_app.geometry.lenses.camera_models import calibration_from_model
+from sfm_app.geometry.lenses.lens_curve import field_of_view_deg
+from sfm_app.report import field_text, held_text, lens_text
+from sfm_app.types import Calibration, CameraModel, Intrinsics
+from sfm_app.types.calibration import EQUIRECTANGULAR, FISHEYE, GIVEN, KEPT
 
 BEST_PAIRS = 3
 PHOTOS_SHOWN = 4
 """Most key pairs and photos that the text names; --json has all."""
 
-
 SOURCES = {"exif": "EXIF's claim", "guess": "a guess", "estimate": "an estimate"}
 """Where the values of an undetermined camera come from, by its method."""
+GIVEN_TEXTS = {GIVEN: "as given, to be refined", KEPT: "as given, and kept"}
+"""What becomes of a camera that the user gave, by its method."""
 
 
 def intrinsics_summary(intrinsics: Intrinsics) -> dict[str, Any]:
@@ -33,24 +37,54 @@ def intrinsics_lines(intrinsics: Intrinsics) -> list[str]:
     many = len(intrinsics.cameras) > 1
     lines = []
     for name, camera in intrinsics.cameras.items():
-        lines.append(f"camera      {f'{name}: ' if many else ''}{k_text(camera.K, camera.spread)}")
+        lines.append(f"camera      {f'{name}: ' if many else ''}{_camera_text(camera)}")
         mine = [photo for photo, of in intrinsics.camera_of.items() if of == name]
         if many and mine:
             more = f" and {len(mine) - PHOTOS_SHOWN} more" if len(mine) > PHOTOS_SHOWN else ""
             lines.append(f"            took {', '.join(mine[:PHOTOS_SHOWN])}{more}")
         if not camera.identifiable:
-            source = {"exif": "EXIF's claim", "guess": "a guess", "estimate": "an estimate"}.get(
-                camera.method, camera.method
-            )
+            source = SOURCES.get(camera.method, camera.method)
             lines.append(f"            these photos do not determine it ({camera.reason}): {source}")
-        across, down = field_of_view_deg(camera)
-        lines.append(f"            sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom")
+        if camera.method in GIVEN_TEXTS:
+            lines.append(f"            {GIVEN_TEXTS[camera.method]}")
+        if camera.projection != EQUIRECTANGULAR:
+            lines.append(f"            {field_text(camera)}")
         lines += [f"            {text}" for text in (lens_text(camera), held_text(camera)) if text]
         if camera.key_pairs:
             named = [[intrinsics.photos.get(key, str(key)) for key in pair] for pair in camera.key_pairs[:BEST_PAIRS]]
             best = ", ".join(f"{first} + {second}" for first, second in named)
             lines.append(f"            best pairs of photos to start from: {best}")
     return lines
+
+
+def _camera_text(camera: Calibration) -> str:
+    """Return K with its deviations; of panoramas, which have no K, what they are."""
+    if camera.projection == EQUIRECTANGULAR:
+        return f"{field_text(camera)}, {camera.width} x {camera.height} px"
+    return k_text(camera.K, camera.spread)
+
+
+def refined_text(camera: CameraModel) -> str:
+    """Return K of a camera after bundle adjustment with its deviations, and what a wide lens sees."""
+    known = calibration_from_model(camera.model, camera.params, (camera.width, camera.height))
+    if known.projection == EQUIRECTANGULAR:
+        return _camera_text(known)
+    seen = f"; {field_text(known)}" if known.projection == FISHEYE else ""
+    return f"{k_text(camera.K, camera.deviations)}{seen}"
+
+
+def contradiction_lines(counts: Mapping[str, Any]) -> list[str]:
+    """Return warnings about given cameras that the photos contradict.
+
+    Args:
+        counts: figures of a stage in the manifest.
+    """
+    given = counts.get("given_cameras", {})
+    return [
+        f"beware: the photos contradict the given camera {name}: {one['text']}"
+        for name, camera in given.items()
+        for one in camera["contradicted"]
+    ]
 
 
 def k_text(K: Any, spread: Mapping[str, float] = MappingProxyType({})) -> str:

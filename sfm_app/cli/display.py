@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.progress import Progress as Bars
 
 from sfm_app.api import Run
-from sfm_app.cli.camera_text import intrinsics_lines, intrinsics_summary
+from sfm_app.cli.camera_text import contradiction_lines, intrinsics_lines, intrinsics_summary
 from sfm_app.cli.scene_text import scene_lines, scene_summary
 from sfm_app.numerical import json_text
 
@@ -105,12 +105,14 @@ def run_summary(run: Run) -> dict[str, Any]:
     stages = run.manifest.get("stages", {})
     counts = {name: stage["counts"] for name, stage in stages.items()}
     photos = counts.get("photos", {})
+    given = {name: figures["given_cameras"] for name, figures in counts.items() if "given_cameras" in figures}
     summary: dict[str, Any] = {
         "out": str(run.out),
         "photos": {key: photos.get(key, {}) for key in ("usable", "unusable", "notes")},
         **({"video": photos["video"]} if "video" in photos else {}),
         "masks": photos.get("masks"),
         "pairs": {key: counts.get("view_graph", {}).get(key) for key in ("kept", "rejected")},
+        **({"given_cameras": given} if given else {}),
         "calibration": intrinsics_summary(run.calibration) if run.calibration else None,
         "seconds": {name: stage["seconds"] for name, stage in stages.items()},
     }
@@ -126,7 +128,7 @@ def run_summary(run: Run) -> dict[str, Any]:
 
 def run_lines(run: Run) -> list[str]:
     """Return the figures of a run as lines of text."""
-    summary = run_summary(run)
+    summary, stages = run_summary(run), run.manifest.get("stages", {})
     lines = list(video_lines(summary["video"])) if "video" in summary else []
     lines.append(f"photos      {summary['photos']['usable']} usable")
     lines += [f"            {line}" for line in photo_lines(summary["photos"])]
@@ -140,8 +142,10 @@ def run_lines(run: Run) -> list[str]:
         )
     if run.calibration:
         lines += intrinsics_lines(run.calibration)
+        for name in ("view_graph", "intrinsics"):
+            lines += [f"            {text}" for text in contradiction_lines(stages.get(name, {}).get("counts", {}))]
     if run.scene:
-        lines += scene_lines(run.scene, run.manifest.get("stages", {}).get("scene", {}).get("counts", {}))
+        lines += scene_lines(run.scene, stages.get("scene", {}).get("counts", {}))
         lines += [f"            points and cameras: {line}" for line in file_lines(written_files(run, "scene"))]
     if run.mesh_path:
         lines.append(f"mesh        {summary['mesh']['triangles']} triangles{texture_text(summary['mesh'])}")

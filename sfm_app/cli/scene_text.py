@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from sfm_app.cli.camera_text import k_text
+from sfm_app.cli.camera_text import contradiction_lines, refined_text
 from sfm_app.types import Scene
 
 NAMES_SHOWN = 4
@@ -62,7 +62,10 @@ def scene_lines(scene: Scene, counts: Mapping[str, Any]) -> Iterator[str]:
             yield f"            not placed: {name}: {reason}"
     many = len(scene.cameras) > 1
     for name, camera in scene.cameras.items():
-        yield f"            camera {f'{name} ' if many else ''}refined: {k_text(camera.K, camera.deviations)}"
+        kept = counts.get("given_cameras", {}).get(name, {}).get("kept", False)
+        how = "as given" if kept else "refined"
+        yield f"            camera {f'{name} ' if many else ''}{how}: {refined_text(camera)}"
+    yield from (f"            {text}" for text in contradiction_lines(counts))
 
 
 def _remark_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iterator[str]:

@@ -4,23 +4,31 @@ import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
+from sfm_app.bundle_adjustment.camera_rules import calibration_from_params, fit_to_model, params_of_calibration
+from sfm_app.bundle_adjustment.lens_family import convert_lens
 from sfm_app.bundle_adjustment.lens_parts import part_names
 from sfm_app.colmap.backend import pycolmap, translate_errors
 from sfm_app.colmap.bundle_arrays import (
     FILE_MODELS,
+    NO_RULES,
     PLACES,
+    Rules,
     camera_family,
     file_model,
     photos_per_camera,
     read_camera,
     write_camera,
 )
-from sfm_app.colmap.bundle_rounds import Rounds, adjust_in_rounds
+from sfm_app.colmap.bundle_rounds import Rounds, adjust_in_rounds, solve
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.lens_choice import LensRecord, best_families, record_lenses
 from sfm_app.colmap.model import finite_mask
 from sfm_app.colmap.types import all_cameras, all_points
+from sfm_app.geometry.lenses.projections import FX, FY, PANORAMA
 from sfm_app.numerical import FAILURES, error_reason, finite_entries
+from sfm_app.types import Calibration
 
 logger = logging.getLogger("sfm_app")
 
@@ -42,9 +50,11 @@ class Adjustment:
     """Points that their rays did not determine when the adjustment began."""
     lenses: dict[int, LensRecord] = field(default_factory=dict)
     """The chosen camera model and its rivals, by camera id; empty where the adjustment failed."""
+    estimates: dict[int, Calibration] = field(default_factory=dict)
+    """What the photos say of the cameras that the user gave, by camera id; lacks those that they do not determine."""
 
 
-def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjustment:
+def adjust(model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES) -> Adjustment:
     """Refine cameras, poses, points and tracks in turn; only camera parameters that the photos determine are freed.
 
     In each round, poses and points are eliminated, and the likelihood of the cameras is weighed against their priors.
@@ -54,6 +64,7 @@ def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjustment:
     Args:
         model: result of mapping; not changed.
         database: has all keypoints and matches.
+        rules: what the user laid down about cameras, by id.
 
     Raises:
         NumericalError: the adjustment diverges; the given model is unchanged.
@@ -61,32 +72,35 @@ def adjust(model: pycolmap.Reconstruction, database: Path) -> Adjustment:
     model = pycolmap.Reconstruction(model)
     for camera in all_cameras(model):
         write_camera(camera, read_camera(camera), camera_family(camera))
+    if rules:
+        apply_rules(model, rules)
     drop_infinite_points(model)
     graph = _correspondences(model, database)
-    rounds = adjust_in_rounds(model, graph)
+    rounds = adjust_in_rounds(model, graph, rules)
     open_points = rounds.open_points
-    families = best_families(model, rounds)
+    families = best_families(model, rounds, rules)
     if families.model is not model:
         model = families.model
-        rounds = adjust_in_rounds(model, graph)
+        rounds = adjust_in_rounds(model, graph, rules)
     model.update_point_3d_errors()
     held = tuple(camera_id for camera_id, away in zip(rounds.ids, rounds.found.held, strict=True) if away)
     lenses = record_lenses(model, rounds, families.rivals)
-    return Adjustment(model, *_summary(rounds), held=held, open_points=open_points, lenses=lenses)
+    estimates = given_estimates(model, rounds, rules)
+    return Adjustment(model, *_summary(rounds), held=held, open_points=open_points, lenses=lenses, estimates=estimates)
 
 
-def adjust_or_keep(model: pycolmap.Reconstruction, database: Path) -> Adjustment:
+def adjust_or_keep(model: pycolmap.Reconstruction, database: Path, rules: Rules = NO_RULES) -> Adjustment:
     """Adjust a model; where that fails numerically, return the given model with the reason.
 
     Args:
-        model, database: as in `adjust`.
+        model, database, rules: as in `adjust`.
 
     Raises:
         BackendError: COLMAP failed.
     """
     try:
         with translate_errors("adjusting the bundle"):
-            return adjust(model, database)
+            return adjust(model, database, rules)
     except FAILURES as err:
         logger.info("the last adjustment failed", exc_info=err)
         nothing: dict[int, dict[str, float]] = {camera_id: {} for camera_id in photos_per_camera(model)}
@@ -115,8 +129,71 @@ def _summary(rounds: Rounds) -> tuple[dict[int, dict[str, float]], dict[int, tup
         family = int(rounds.bundle.family[row])
         determined[camera_id] = part_names(family, rounds.found.determined[row])
         deviations[camera_id] = {}
-        if family in FILE_MODELS:
+        is_fixed = rounds.bundle.fixed is not None and bool(rounds.bundle.fixed[row])
+        if family in FILE_MODELS and not is_fixed:
             keys = FILE_MODELS[family][file_model(rounds.found.params[row], family)]
             values = rounds.found.deviations[row]
             deviations[camera_id] = finite_entries({key: float(values[PLACES[key][0]]) for key in keys})
     return deviations, determined
+
+
+def apply_rules(model: pycolmap.Reconstruction, rules: Rules) -> None:
+    """Give cameras the values or the model that the user laid down, in place, and adjust poses and points to them.
+
+    Mapping may have changed a camera that is kept, and may have used another model.
+
+    Args:
+        model: as mapping left it, with cameras of FILE_MODELS.
+        rules: by camera id.
+    """
+    changed = False
+    for camera_id, rule in rules.items():
+        camera = model.cameras[camera_id]
+        family, before = camera_family(camera), read_camera(camera)
+        params, wanted = before, family if rule.family is None else rule.family
+        if PANORAMA in (family, wanted):
+            continue
+        if rule.given is not None and rule.kept:
+            params = params_of_calibration(rule.given)
+        elif wanted != family:
+            reach = np.hypot(camera.width, camera.height) / (2.0 * np.sqrt(before[FX] * before[FY]))
+            other = convert_lens(before, family, float(reach))
+            params, wanted = (before, family) if other is None else (other, wanted)
+        parts = None if rule.kept else rule.parts(wanted)
+        if parts is not None:
+            params = fit_to_model(params, parts, wanted)
+        changed = changed or wanted != family or not np.array_equal(params, before)
+        write_camera(camera, params, wanted)
+    if changed:
+        solve(model)
+
+
+def given_estimates(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules) -> dict[int, Calibration]:
+    """Return what the photos say of the cameras that the user gave, by id; not of those that they do not determine.
+
+    Where one is kept, everything is adjusted once more with free cameras, to the same tracks.
+
+    Args:
+        model: adjusted.
+        rounds: the last rounds of its adjustment.
+        rules: by camera id.
+    """
+    if all(rule.given is None for rule in rules.values()):
+        return {}
+    if any(rule.kept for rule in rules.values()):
+        try:
+            rounds = adjust_in_rounds(pycolmap.Reconstruction(model), None)
+        except FAILURES as err:
+            logger.info("the given cameras could not be checked", exc_info=err)
+            return {}
+    estimates, found = {}, rounds.found
+    for row, camera_id in enumerate(rounds.ids):
+        family = int(rounds.bundle.family[row])
+        if camera_id not in rules or rules[camera_id].given is None or found.held[row] or family == PANORAMA:
+            continue
+        camera = model.cameras[camera_id]
+        determined = part_names(family, found.determined[row])
+        estimates[camera_id] = calibration_from_params(
+            found.params[row], family, (camera.width, camera.height), found.deviations[row], determined
+        )
+    return estimates

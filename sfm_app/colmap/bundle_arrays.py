@@ -1,10 +1,13 @@
 """COLMAP's models as the arrays of our bundle adjustment, and back."""
 
 from collections import Counter
+from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.bundle_adjustment.camera_rules import CameraRule
 from sfm_app.bundle_adjustment.normal_equations import Bundle
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.geometry.lenses.projections import (
@@ -45,6 +48,9 @@ FILE_MODELS = {
 }
 """COLMAP's models that refined cameras are written as, with their parameters; the smaller one first."""
 EQUIRECTANGULAR = "EQUIRECTANGULAR"
+Rules = Mapping[int, CameraRule]
+"""What the user laid down about cameras, by id; cameras without a rule are free."""
+NO_RULES: Rules = MappingProxyType({})
 
 
 def camera_family(camera: pycolmap.Camera) -> int:
@@ -96,12 +102,18 @@ def file_model(params: FloatArray, family: int) -> str:
     return list(models)[-1]
 
 
-def read_bundle(model: pycolmap.Reconstruction) -> tuple[list[int], Bundle]:
-    """Return the ids of the cameras in use, and the model as arrays."""
+def read_bundle(model: pycolmap.Reconstruction, rules: Rules = NO_RULES) -> tuple[list[int], Bundle]:
+    """Return the ids of the cameras in use, and the model as arrays.
+
+    Args:
+        model: COLMAP's reconstruction.
+        rules: of some cameras, by id; those that are kept are fixed.
+    """
     images = [model.images[image_id] for image_id in sorted(model.reg_image_ids())]
     ids, points = sorted(photos_per_camera(model)), sorted(model.points3D)
     rows = {point: row for row, point in enumerate(points)}
     seen = [image.get_observation_points2D() for image in images]
+    fixed = np.array([camera_id in rules and rules[camera_id].kept for camera_id in ids], np.bool_)
     poses = np.array([image.cam_from_world().matrix() for image in images])
     return ids, Bundle(
         params=np.array([read_camera(model.cameras[camera_id]) for camera_id in ids]),
@@ -113,6 +125,7 @@ def read_bundle(model: pycolmap.Reconstruction) -> tuple[list[int], Bundle]:
         point=np.array([rows[keypoint.point3D_id] for one in seen for keypoint in one], np.int64),
         x=np.array([keypoint.xy for one in seen for keypoint in one], np.float64).reshape(-1, 2),
         family=np.array([camera_family(model.cameras[camera_id]) for camera_id in ids], np.int64),
+        fixed=fixed if fixed.any() else None,
     )
 
 

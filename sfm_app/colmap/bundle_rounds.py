@@ -1,14 +1,16 @@
 """Rounds of the last bundle adjustment: a step of everything, then tracks are completed and filtered."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm_app.bundle_adjustment.camera_rules import NO_RULE, CameraRule, choices_of_model
 from sfm_app.bundle_adjustment.lens_evidence import LensEstimate, estimate_lenses
-from sfm_app.bundle_adjustment.lens_parts import COUNT, PARTS, LensPriors
+from sfm_app.bundle_adjustment.lens_parts import COUNT, PARTS, LensPriors, consistent_choices
 from sfm_app.bundle_adjustment.normal_equations import Bundle, best_step, reduce
 from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread
-from sfm_app.colmap.bundle_arrays import photos_per_camera, read_bundle, write_bundle
+from sfm_app.colmap.bundle_arrays import NO_RULES, Rules, photos_per_camera, read_bundle, write_bundle
 from sfm_app.errors import NumericalError
 from sfm_app.geometry.lenses.projections import FX, FY, PANORAMA
 
@@ -50,24 +52,27 @@ class Rounds:
     """Points that their rays did not determine when the rounds began."""
 
 
-def adjust_in_rounds(model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph | None) -> Rounds:
+def adjust_in_rounds(
+    model: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph | None, rules: Rules = NO_RULES
+) -> Rounds:
     """Refine cameras, poses, points and tracks of a model in place, until they no longer change.
 
     Args:
         model: COLMAP's reconstruction, with cameras of FILE_MODELS.
         graph: of all matches; None to keep the tracks.
+        rules: of some cameras, by id.
 
     Raises:
         NumericalError: the adjustment diverges.
     """
     points, open_points = model.num_points3D(), []
     for _ in range(ROUNDS):
-        ids, bundle = read_bundle(model)
+        ids, bundle = read_bundle(model, rules)
         if not (np.isfinite(bundle.params).all() and (bundle.params[:, [FX, FY]] > 0).all()):
             raise NumericalError("a camera has no focal length")
         reduced = reduce(bundle, LOSS_SCALE_PX)
         open_points.append(reduced.open_points)
-        found = estimate_lenses(bundle.params, reduced, lens_priors(model, ids, bundle))
+        found = estimate_lenses(bundle.params, reduced, lens_priors(model, ids, bundle, rules))
         write_bundle(model, ids, best_step(bundle, reduced, found.params, LOSS_SCALE_PX))
         if found.step > LONG_STEP:
             solve(model)
@@ -113,16 +118,36 @@ def _improve_tracks(model: pycolmap.Reconstruction, graph: pycolmap.Corresponden
     return abs(int(model.compute_num_observations() - before))
 
 
-def lens_priors(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle) -> LensPriors:
+def lens_priors(model: pycolmap.Reconstruction, ids: list[int], bundle: Bundle, rules: Rules = NO_RULES) -> LensPriors:
     """Return the priors of the cameras, before any evidence from the bundle.
 
     Args:
         model: has the photos and their sizes.
         ids, bundle: from `read_bundle`.
+        rules: of some cameras, by id.
     """
     used = photos_per_camera(model)
     sizes = np.array([(model.cameras[camera_id].width, model.cameras[camera_id].height) for camera_id in ids], float)
     many = np.array([used[camera_id] >= MIN_PHOTOS for camera_id in ids])
     only_k1 = [[part.name == "k1" for part in PARTS[int(kind)]] for kind in bundle.family]
     asked = (many[:, None] | np.array(only_k1).reshape(-1, COUNT)) & (bundle.family != PANORAMA)[:, None]
-    return LensPriors.from_cameras(bundle.params, bundle.family, sizes, asked)
+    priors = LensPriors.from_cameras(bundle.params, bundle.family, sizes, asked)
+    return _apply_rules(priors, [rules.get(camera_id, NO_RULE) for camera_id in ids]) if rules else priors
+
+
+def _apply_rules(priors: LensPriors, rules: Sequence[CameraRule]) -> LensPriors:
+    """Return the priors with what the user laid down about each camera."""
+    asked, usual, choices = priors.asked.copy(), priors.usual.copy(), list(priors.choices)
+    for row, rule in enumerate(rules):
+        family = int(priors.family[row])
+        given, parts = rule.usual(family), rule.parts(family)
+        if given is not None:
+            usual[row] = given
+        if rule.kept:
+            asked[row] = False
+            choices[row] = priors.choices[row][:1]
+        elif parts is not None:
+            choices[row] = choices_of_model(parts, consistent_choices(family))
+            asked[row] = choices[row].any(axis=0)
+    fixed = np.array([rule.kept for rule in rules], np.bool_)
+    return replace(priors, asked=asked, usual=usual, choices=tuple(choices), fixed=fixed)

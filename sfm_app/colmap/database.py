@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.geometry.camera import guessed_camera_matrix
 from sfm_app.geometry.epipolar import cross_matrix
+from sfm_app.geometry.lenses.camera_models import model_of_calibration
 from sfm_app.types import (
     Calibration,
     Intrinsics,
@@ -316,10 +317,12 @@ def _write_frame(database: pycolmap.Database, image: pycolmap.Image) -> None:
 
 def camera_model(calibration: Calibration) -> str:
     """Return COLMAP's name of the smallest camera model for a calibration."""
+    if calibration.distortion:
+        return model_of_calibration(calibration)[0]
     if calibration.projection in WIDE_MODELS:
         return WIDE_MODELS[calibration.projection]
-    K = calibration.K
-    square = "aspect" in calibration.held or abs(K[1, 1] / K[0, 0] - 1.0) < SQUARE_TOLERANCE
+    K, tolerance = calibration.K, 0.0 if calibration.is_given else SQUARE_TOLERANCE
+    square = "aspect" in calibration.held or K[0, 0] == K[1, 1] or abs(K[1, 1] / K[0, 0] - 1.0) < tolerance
     return SQUARE_PIXELS if square else TWO_FOCALS
 
 
@@ -327,6 +330,8 @@ def params_of_calibration(calibration: Calibration) -> list[float]:
     """Return the parameters of the model that `camera_model` names."""
     if calibration.projection == EQUIRECTANGULAR:
         return [float(calibration.width), float(calibration.height)]
+    if calibration.distortion:
+        return model_of_calibration(calibration)[1]
     found = camera_params(calibration.K, camera_model(calibration), calibration.radial)
     return [*found[:4], *calibration.fisheye] if calibration.projection == FISHEYE else found
 

@@ -6,11 +6,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sfm_app.bundle_adjustment.camera_rules import NO_RULE
 from sfm_app.bundle_adjustment.lens_evidence import LensChoice, estimate_lenses
 from sfm_app.bundle_adjustment.lens_family import asks_for_other_family, convert_lens, family_evidence
 from sfm_app.bundle_adjustment.normal_equations import Bundle, cost, reduce
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.bundle_arrays import read_bundle, write_camera
+from sfm_app.colmap.bundle_arrays import NO_RULES, Rules, read_bundle, write_camera
 from sfm_app.colmap.bundle_rounds import LOSS_SCALE_PX, MIN_PHOTOS, Rounds, adjust_in_rounds, lens_priors
 from sfm_app.geometry.lenses.projections import CX, CY, FISHEYE, FX, FY, PERSPECTIVE
 from sfm_app.numerical import FAILURES, Json, error_reason
@@ -56,7 +57,7 @@ class Families:
     """By camera id the model of the family that lost; its evidence is what it lost by."""
 
 
-def best_families(model: pycolmap.Reconstruction, rounds: Rounds) -> Families:
+def best_families(model: pycolmap.Reconstruction, rounds: Rounds, rules: Rules = NO_RULES) -> Families:
     """Choose the better family for cameras that ask for the other one: what explains the observations better.
 
     Both are adjusted to the same tracks.
@@ -64,25 +65,27 @@ def best_families(model: pycolmap.Reconstruction, rounds: Rounds) -> Families:
     Args:
         model: adjusted; not changed.
         rounds: the last rounds of its adjustment.
+        rules: of some cameras, by id; those that must be of a family are not tried as another.
     """
     rivals = {}
     for row, camera_id in enumerate(rounds.ids):
         family, params = int(rounds.bundle.family[row]), rounds.found.params[row]
         reach, best = _observed_reach(rounds.bundle, row), rounds.found.ranking[row][0]
         many = np.count_nonzero(rounds.bundle.camera == row) >= MIN_PHOTOS
-        asks = many and asks_for_other_family(params, family, reach, best, bool(rounds.found.folding[row]))
+        is_open = many and rules.get(camera_id, NO_RULE).family is None
+        asks = is_open and asks_for_other_family(params, family, reach, best, bool(rounds.found.folding[row]))
         other = convert_lens(params, family, reach) if asks else None
         if other is None:
             continue
         trial, same = pycolmap.Reconstruction(model), pycolmap.Reconstruction(model)
         write_camera(trial.cameras[camera_id], other, FISHEYE if family == PERSPECTIVE else PERSPECTIVE)
         try:
-            adjust_in_rounds(same, None)
-            adjust_in_rounds(trial, None)
+            adjust_in_rounds(same, None, rules)
+            adjust_in_rounds(trial, None, rules)
         except FAILURES as err:
             logger.info("camera %d is not tried as another: %s", camera_id, error_reason(err))
             continue
-        (kept, choice), (gained, rival) = _compare(same, trial, row)
+        (kept, choice), (gained, rival) = _compare(same, trial, row, rules)
         if gained > kept:
             model, choice, rival = trial, rival, choice
         rivals[camera_id] = replace(rival, log_evidence=abs(gained - kept))
@@ -90,15 +93,15 @@ def best_families(model: pycolmap.Reconstruction, rounds: Rounds) -> Families:
 
 
 def _compare(
-    first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, row: int
+    first: pycolmap.Reconstruction, second: pycolmap.Reconstruction, row: int, rules: Rules
 ) -> tuple[tuple[float, LensChoice], ...]:
     """Return the evidence and the best model of a camera in two models with the same tracks."""
-    read = [(model, *read_bundle(model)) for model in (first, second)]
+    read = [(model, *read_bundle(model, rules)) for model in (first, second)]
     reduced = [reduce(bundle, LOSS_SCALE_PX) for _, _, bundle in read]
     noise_px = min(one.noise_px for one in reduced)
     found = []
     for (model, ids, bundle), system in zip(read, reduced, strict=True):
-        priors = lens_priors(model, ids, bundle)
+        priors = lens_priors(model, ids, bundle, rules)
         best = estimate_lenses(bundle.params, replace(system, noise_px=noise_px), priors).ranking[row][0]
         found.append((family_evidence(cost(bundle, LOSS_SCALE_PX), noise_px, best), best))
     return tuple(found)

@@ -5,7 +5,7 @@ that decided whether a model was right.
 """
 
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from sfm_app.colmap.backend import check_written, pycolmap
@@ -23,7 +23,7 @@ POLL_S = 0.1
 
 def map_incrementally(
     database: Path, photo_dir: Path, start: pycolmap.Reconstruction, scratch: Path, seed: int,
-    tick: Callable[[], None], token: pycolmap.CancellationToken, *, known: bool,
+    tick: Callable[[], None], token: pycolmap.CancellationToken, *, known: bool, kept: Collection[int] = (),
 ) -> pycolmap.Reconstruction | None:  # fmt: skip
     """Register photo by photo, beginning with those in `start`; return None when COLMAP gives no model.
 
@@ -36,6 +36,7 @@ def map_incrementally(
         tick: called before every further photo.
         token: stops the mapping.
         known: whether the cameras are known too well for mapping to improve them.
+        kept: ids of cameras that the user gave and wants unchanged.
     """
     shutil.rmtree(scratch, ignore_errors=True)
     for name in ("start", "found"):
@@ -43,6 +44,7 @@ def map_incrementally(
     start.write(scratch / "start")
     check_written(*(scratch / "start").iterdir())
     options = incremental_options(seed, known=known)
+    options.constant_cameras = set(kept)
     seek_lens = not known and all(_has_unknown_lens(camera) for camera in all_cameras(start))
     options.ba_refine_extra_params = options.mapper.abs_pose_refine_extra_params = seek_lens
     models = pycolmap.incremental_mapping(

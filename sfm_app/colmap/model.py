@@ -126,6 +126,8 @@ def _mapped_camera(camera: pycolmap.Camera) -> MappedCamera:
         [camera.params[k] for k in camera.extra_params_idxs()],
     )
     if camera.is_perspective_fisheye():
+        if camera.model.name == "THIN_PRISM_FISHEYE":
+            terms = [terms[k] for k in (0, 1, 4, 5)]
         return MappedCamera(K, fisheye=tuple(float(term) for term in terms))
     return MappedCamera(K, float(terms[0]))
 

@@ -6,7 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_app.estimation.bent_matches import choose_inliers_again
+from sfm_app.estimation.camera_check import report_checks
 from sfm_app.estimation.diagnosis import diagnose_fits, inliers_by_degeneracy
+from sfm_app.estimation.given_cameras import assign_cameras
 from sfm_app.runtime.context import RunContext
 from sfm_app.selfcal import CalibratedCamera, calibrate_photo_set, pair_weights
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
@@ -30,7 +32,8 @@ def find_intrinsics(
         if seen is views:
             break
         cameras = _calibrate(matches, seen, run)
-    cameras = sorted(cameras + cameras_with_lens(matches, views), key=lambda one: (-len(one.photos), one.name))
+    cameras = _take_given_cameras(cameras + cameras_with_lens(matches, views), matches, run)
+    cameras = sorted(cameras, key=lambda one: (-len(one.photos), one.name))
     intrinsics = Intrinsics(
         cameras={camera.name: explain_failure(camera, views) for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},
@@ -50,6 +53,29 @@ def _calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> list[C
         pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split
     )
     return [to_whole_photo(camera, matches.images[camera.photos[0]]) for camera in cameras]
+
+
+def _take_given_cameras(
+    cameras: Sequence[CalibratedCamera], matches: MatchGraph, run: RunContext
+) -> list[CalibratedCamera]:
+    """Return the cameras with those that the user gave in place of the calibrated ones, which are checked first.
+
+    Those with a wide lens were checked before the fundamental matrices.
+    """
+    given = assign_cameras(matches, run.given, keep=run.settings.calibration.keep).cameras
+    found, checked = [], {}
+    for camera in cameras:
+        group = matches.images[camera.photos[0]].group
+        if group not in given or camera.found.is_given:
+            found.append(camera)
+            continue
+        checked[camera.name] = given[group], camera.found
+        if camera.name == group:
+            photos = tuple(photo for photo, image in matches.images.items() if image.group == group)
+            own = replace(given[group], key_pairs=camera.found.key_pairs)
+            found.append(CalibratedCamera(group, photos, own))
+    report_checks(checked, run)
+    return found
 
 
 def cameras_with_lens(matches: MatchGraph, views: ViewGraph) -> list[CalibratedCamera]:

@@ -1,4 +1,4 @@
-"""Wide lenses of camera groups, from raw matches: before them, no fundamental matrix fits."""
+"""Wide lenses of camera groups, given or from raw matches: before them, no fundamental matrix fits."""
 
 import logging
 from collections.abc import Sequence
@@ -6,7 +6,12 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.errors import ConfigError
+from sfm_app.estimation.camera_check import report_checks
+from sfm_app.estimation.given_cameras import assign_cameras
 from sfm_app.geometry.camera import camera_matrix, panorama_matrix
+from sfm_app.geometry.lenses.camera_models import projection_of_model
+from sfm_app.geometry.lenses.lens_curve import field_of_view_deg
 from sfm_app.numerical import FAILURES
 from sfm_app.runtime.context import RunContext
 from sfm_app.selfcal.wide_angle.lens_search import LensEstimate, find_lens, needs_fisheye
@@ -29,19 +34,35 @@ TERMS, ANGLES = 4, 200
 def find_lenses(matches: MatchGraph, run: RunContext) -> dict[str, Calibration]:
     """Find the cameras whose lens no perspective camera describes, by camera group.
 
+    Those that the user gave are taken, and checked against what the matches say.
+
     Args:
         matches: keypoints and raw matches.
         run: the run.
+
+    Raises:
+        InputError: the calibration file fits no photo.
+        ConfigError: the photos are no panoramas, as the user says.
     """
+    _check_panoramas(matches, run)
+    given = assign_cameras(matches, run.given, keep=run.settings.calibration.keep)
+    for note in given.notes:
+        run.progress.say(note)
     groups: dict[str, list[MatchedImage]] = {}
     for _, image in sorted(matches.images.items()):
         groups.setdefault(image.group, []).append(image)
-    found = {}
+    found, checked = {}, {}
     for group, images in groups.items():
-        lens = _find_lens(images, matches, run)
+        known = given.cameras.get(group)
+        if known is not None:
+            checked[group] = known, _seen_lens(known, images, matches, run)
+            lens = known if known.projection == FISHEYE else None
+        else:
+            lens = _find_lens(images, matches, run)
         if lens is not None:
             found[group] = lens
             run.progress.say(f"the photos {group} are taken with a wide lens: {describe_lens(lens)}")
+    report_checks(checked, run)
     run.record(lenses={group: describe_lens(lens) for group, lens in found.items()})
     return found
 
@@ -50,7 +71,7 @@ def describe_lens(lens: Calibration) -> str:
     """Return a wide lens in a few words."""
     if lens.projection == EQUIRECTANGULAR:
         return "panoramas of a whole turn"
-    return f"a fisheye with {lens.evidence['field_deg']:.0f} degrees along the longer side"
+    return f"a fisheye with {max(field_of_view_deg(lens)):.0f} degrees along the longer side"
 
 
 def _find_lens(images: Sequence[MatchedImage], matches: MatchGraph, run: RunContext) -> Calibration | None:
@@ -60,16 +81,50 @@ def _find_lens(images: Sequence[MatchedImage], matches: MatchGraph, run: RunCont
         K = panorama_matrix(size)
         nothing_open = dict.fromkeys(("fx", "fy", "cx", "cy"), 0.0)
         return Calibration(K, *size, PANORAMA, identifiable=True, projection=EQUIRECTANGULAR, spread=nothing_open)
+    model = run.settings.scene.camera_model
+    if model != "auto":
+        asked = projection_of_model(model) == FISHEYE
+        return _search_lens(images, matches, run, is_wide=True) if asked else None
+    return _search_lens(images, matches, run, is_wide=False) if run.settings.calibration.lens else None
+
+
+def _seen_lens(
+    known: Calibration, images: Sequence[MatchedImage], matches: MatchGraph, run: RunContext
+) -> Calibration | None:
+    """Return what the matches of a group with a given camera say of its lens; None where they say nothing.
+
+    Of a given perspective camera, they only say something where the lens is a fisheye.
+    """
     if not run.settings.calibration.lens:
         return None
-    ids = {image.id for image in images}
+    return _search_lens(images, matches, run, is_wide=known.projection == FISHEYE)
+
+
+def _search_lens(
+    images: Sequence[MatchedImage], matches: MatchGraph, run: RunContext, *, is_wide: bool
+) -> Calibration | None:
+    """Return the lens that the raw matches of a group show; None where there is none, or a perspective one is enough.
+
+    Where it is known to be wide, the best one is returned whether or not it is better than a perspective one.
+    """
+    size, ids = (images[0].width, images[0].height), {image.id for image in images}
     pairs = [np.hstack(matches.points(pair)) for pair in matches.matches if ids.issuperset(pair)]
     try:
-        found = find_lens(pairs, size, run.seed) if needs_fisheye(pairs, size, run.seed) else None
+        found = find_lens(pairs, size, run.seed) if is_wide or needs_fisheye(pairs, size, run.seed) else None
     except FAILURES as err:
         logger.info("the lens of a group could not be found", exc_info=err)
         return None
-    return to_calibration(found, size) if found is not None and found.is_fisheye else None
+    return to_calibration(found, size) if found is not None and (is_wide or found.is_fisheye) else None
+
+
+def _check_panoramas(matches: MatchGraph, run: RunContext) -> None:
+    """Check that photos are panoramas where the user says so: no other photo can be one."""
+    others = [image.name for image in matches.images.values() if image.projection != EQUIRECTANGULAR]
+    if run.settings.scene.camera_model == "EQUIRECTANGULAR" and others:
+        raise ConfigError(
+            f"{len(others)} photos are no panoramas, such as {others[0]}",
+            hint="leave --camera-model EQUIRECTANGULAR out; panoramas are recognized without it",
+        )
 
 
 def to_calibration(found: LensEstimate, size: tuple[int, int]) -> Calibration:

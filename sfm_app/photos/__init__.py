@@ -1,6 +1,6 @@
 """Read folders of photos and videos: which files and frames are usable photos, and their metadata."""
 
-from sfm_app.photos.camera_groups import group_by_camera
+from sfm_app.photos.camera_groups import group_by_camera, split_by_given_camera
 from sfm_app.photos.decode import UnreadableError, read_picture, upright_image
 from sfm_app.photos.duplicates import drop_duplicates
 from sfm_app.photos.files import list_files, resolve_file
@@ -53,6 +53,7 @@ __all__ = [
     "resolve_file",
     "save_mask",
     "select_keyframes",
+    "split_by_given_camera",
     "unused_masks",
     "upright_image",
 ]

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import PurePosixPath
 
 from sfm_app.photos.letterbox import unify_frames
-from sfm_app.types import Photo
+from sfm_app.types import GivenCameras, Photo
 from sfm_app.types.calibration import EQUIRECTANGULAR
 
 PORTRAIT_TURN_DEG = 90
@@ -48,6 +48,25 @@ def _complete_panoramas(photos: Sequence[Photo]) -> list[Photo]:
     return [
         replace(photo, projection=EQUIRECTANGULAR) if (photo.width, photo.height) in most else photo for photo in photos
     ]
+
+
+def split_by_given_camera(photos: Sequence[Photo], given: GivenCameras) -> list[Photo]:
+    """Return the photos with groups of their own for those to which a calibration file gives different cameras.
+
+    Args:
+        photos: with the names that they have everywhere.
+        given: contents of the file.
+    """
+    names: dict[str, set[str]] = {}
+    for photo in photos:
+        if name := given.camera_name(photo.name):
+            names.setdefault(photo.group, set()).add(name)
+    mixed = {group for group, cameras in names.items() if len(cameras) > 1}
+    found = []
+    for photo in photos:
+        name = given.camera_name(photo.name) if photo.group in mixed else None
+        found.append(replace(photo, group=f"{photo.group} by {name}") if name else photo)
+    return found
 
 
 def _split_by_shown_size(photos: Sequence[Photo]) -> list[Photo]:

@@ -70,7 +70,7 @@ class Pair:
         first, second = self.cameras
         if any(camera.projection != PERSPECTIVE for camera in self.cameras):
             return _essential_of_rays(self.lines[fit.inliers])
-        if first.radial or second.radial:  # F does not model distortion
+        if first.is_bent or second.is_bent:  # F does not model distortion
             inliers = self.lines[fit.inliers]
             return eight_point(inliers[:, :2], inliers[:, 9:11])
         return second.K.T @ fit.F @ first.K

@@ -73,7 +73,7 @@ def map_baseline(matches: MatchGraph, views: ViewGraph, intrinsics: Intrinsics, 
     Args:
         matches: keypoints and raw matches.
         views: fundamental matrices.
-        intrinsics: cameras from pairs; only those with a focal from EXIF are used.
+        intrinsics: cameras from pairs; only those with a focal from EXIF or from the user are used.
         run: the run.
     """
     scratch = run.workspace.root / FOLDER
@@ -111,7 +111,7 @@ def has_many_unplaced(model: Attempt | None, intrinsics: Intrinsics, views: View
 
 
 def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> Intrinsics:
-    """Replace every perspective camera by a guess, except those with a focal from EXIF.
+    """Replace every perspective camera by a guess, except those with a focal from EXIF, or that the user gave.
 
     With a perspective camera, COLMAP cannot place photos of a fisheye lens.
 
@@ -120,10 +120,15 @@ def guessed_intrinsics(intrinsics: Intrinsics, sides: float = GUESSED_FOCAL) -> 
         sides: guess of the focal, in longer sides of the photo.
     """
     cameras = {
-        name: camera if camera.method == "exif" or camera.projection != PERSPECTIVE else _guess(camera, sides)
+        name: _guess(camera, sides) if camera.projection == PERSPECTIVE and not is_told(camera) else camera
         for name, camera in intrinsics.cameras.items()
     }
     return replace(intrinsics, cameras=cameras)
+
+
+def is_told(camera: Calibration) -> bool:
+    """Return whether the focal comes from EXIF or from the user."""
+    return camera.method == "exif" or camera.is_given
 
 
 def _guess(camera: Calibration, sides: float) -> Calibration:

@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_app.geometry.camera import rays
 from sfm_app.geometry.epipolar import cross_matrix
-from sfm_app.geometry.lenses.bearings import bearings
+from sfm_app.geometry.lenses.bearings import bearings, plane_points
 from sfm_app.geometry.two_view_init import GOOD_ANGLE_DEG, TwoViewSeed, ray_seed, two_view_seed
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, PoseGraph, RelativePose
 from sfm_app.types.calibration import PERSPECTIVE
@@ -67,7 +66,7 @@ def triangulate_seed(matches: MatchGraph, candidate: Candidate, intrinsics: Intr
     if any(camera.projection != PERSPECTIVE for camera in cameras):
         lines = np.hstack([bearings(x[pose.inliers], camera) for x, camera in zip(points, cameras, strict=True)])
         return ray_seed(pose.R, pose.t, lines)
-    x1, x2 = (rays(x[pose.inliers], camera.K, camera.radial) for x, camera in zip(points, cameras, strict=True))
+    x1, x2 = (plane_points(x[pose.inliers], camera) for x, camera in zip(points, cameras, strict=True))
     return two_view_seed(cross_matrix(pose.t) @ pose.R, x1, x2)
 
 

@@ -234,8 +234,12 @@ def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGra
     cameras = dict(intrinsics.cameras)
     for photo, camera in found.items():
         name = intrinsics.camera_name(matches.images[photo])
-        known = replace(intrinsics.cameras[name], K=camera.K, radial=camera.radial, fisheye=camera.fisheye)
-        cameras[name] = replace(known, identifiable=True, reason="", method="mapping")
+        before = intrinsics.cameras[name]
+        if before.is_kept:
+            continue
+        # mapping holds a lens with all terms as it was given
+        lens = before if before.distortion else replace(before, radial=camera.radial, fisheye=camera.fisheye)
+        cameras[name] = replace(lens, K=camera.K, identifiable=True, reason="", method="mapping")
     return replace(intrinsics, cameras=cameras)
 
 

@@ -234,16 +234,17 @@ def _attempt_completion(group: Group, best: Attempt, run: RunContext, token: Can
 
 
 def _grow(group: Group, start: Reconstruction, run: RunContext, token: CancellationToken) -> Reconstruction | None:
-    place = run.workspace
+    place, cameras = run.workspace, {k: group.intrinsics.camera(group.matches.images[k]) for k in group.photos}
+    kept = {start.images[k].camera_id for k, camera in cameras.items() if camera.is_kept and start.exists_image(k)}
     return map_incrementally(
         place.database, place.photos, start, place.root / INCREMENTAL_FOLDER, run.seed, run.progress.advance, token,
-        known=all(is_well_known(group.intrinsics.camera(group.matches.images[photo])) for photo in group.photos),
+        known=all(is_well_known(camera) for camera in cameras.values()), kept=kept,
     )  # fmt: skip
 
 
 def is_well_known(camera: Calibration) -> bool:
     """Return whether a focal is known so well that the first few photos of a mapping cannot improve it."""
-    spread = camera.spread.get("fx", np.inf)
+    spread = 0.0 if camera.is_kept else camera.spread.get("fx", np.inf)
     return camera.identifiable and spread <= MAX_FOCAL_DEVIATION * camera.K[0, 0]
 
 

@@ -1,8 +1,8 @@
 """A calibration in words that need no knowledge of cameras."""
 
-import numpy as np
-
+from sfm_app.geometry.lenses.lens_curve import field_of_view_deg
 from sfm_app.types import Calibration
+from sfm_app.types.calibration import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE
 
 SOURCES = {"exif": "what the camera wrote into the files", "guess": "the usual guess", "estimate": "an estimate"}
 HELD = {
@@ -13,16 +13,19 @@ HELD = {
 """The usual value, by the parameter that the photos do not determine."""
 
 
-def field_of_view_deg(camera: Calibration) -> tuple[float, float]:
-    """Return the horizontal and the vertical field of view in degrees, without lens distortion."""
-    (fx, _, cx), (_, fy, cy), _ = camera.K
-    across = np.arctan2([cx, camera.width - cx], fx)
-    down = np.arctan2([cy, camera.height - cy], fy)
-    return float(np.degrees(across.sum())), float(np.degrees(down.sum()))
+def field_text(camera: Calibration) -> str:
+    """Return what the camera sees, through its lens."""
+    if camera.projection == EQUIRECTANGULAR:
+        return "panoramas of a whole turn"
+    across, down = field_of_view_deg(camera)
+    seen = f"sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom"
+    return f"a fisheye that {seen}" if camera.projection == FISHEYE else seen
 
 
 def verdict(camera: Calibration) -> str:
     """Return whether K is known; if not, why, and where the given values come from."""
+    if camera.is_given:
+        return "Given: this is what the user knows about the camera."
     if camera.identifiable:
         return "Known: the photos agree on this camera."
     source = SOURCES.get(camera.method, camera.method)
@@ -31,17 +34,21 @@ def verdict(camera: Calibration) -> str:
 
 def focal_text(camera: Calibration) -> str:
     """Return focal length and field of view."""
-    across, down = field_of_view_deg(camera)
+    if camera.projection == EQUIRECTANGULAR:
+        return f"Panoramas of a whole turn, {camera.width} x {camera.height} px."
+    seen = field_text(camera)
     focal = f"Focal length {camera.focal_px:.0f} px{_deviation(camera, 'fx')}"
     tall = camera.K[0, 0] / camera.K[1, 1]
     shape = (
         "" if "aspect" in camera.held or abs(tall - 1) < 5e-4 else f"; its pixels are {tall:.3f} times as high as wide"
     )
-    return f"{focal}: the camera sees {across:.0f} degrees from left to right, {down:.0f} from top to bottom{shape}."
+    return f"{focal}: {'the camera ' if camera.projection == PERSPECTIVE else ''}{seen}{shape}."
 
 
 def center_text(camera: Calibration) -> str:
-    """Return the position of the optical center relative to the middle of the photo."""
+    """Return the position of the optical center relative to the middle of the photo; empty for panoramas."""
+    if camera.projection == EQUIRECTANGULAR:
+        return ""
     right, below = camera.K[0, 2] - camera.width / 2, camera.K[1, 2] - camera.height / 2
     if max(abs(right), abs(below)) < 0.5:
         return "Optical center in the middle of the photo."

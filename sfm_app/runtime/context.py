@@ -14,13 +14,16 @@ from sfm_app.runtime.cost_estimate import SHARE_OF_MACHINE, machine_memory_mb
 from sfm_app.runtime.parallel import make_executor, ordered_map
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.settings import Settings
-from sfm_app.types import Model
+from sfm_app.types import GivenCameras, Model
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 STANDARD_FORMATS = ("ply", "glb")
 """Formats in which every run writes its models; `sfm-app export` writes others."""
+
+GIVEN_CAMERAS = "given_cameras"
+"""Name by which a stage says, among its settings, that it depends on what the calibration file holds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +38,8 @@ class RunContext:
     progress: Progress = field(default_factory=SilentProgress)
     fingerprint: str = ""
     """Hash of everything that the stage's result depends on."""
+    given: GivenCameras = field(default_factory=GivenCameras)
+    """Cameras that the user knows."""
     statistics: dict[str, Any] = field(default_factory=dict)
     """What the stage has counted so far, for the manifest; no part of a product is read from here."""
 

@@ -29,6 +29,7 @@ from sfm_app.photos import (
     mask_path,
     read_photo,
     resolve_file,
+    split_by_given_camera,
     unused_masks,
 )
 from sfm_app.runtime.context import RunContext
@@ -84,7 +85,7 @@ def _read_photos(source: Source, folder: Path, names: Sequence[str], run: RunCon
             _too_few_message(folder, len(photos), unusable),
             hint="at least two photos of a place are needed; 10 to 50 work best",
         )
-    named = tuple(assign_names(group_by_camera(photos, options.cameras)))
+    named = tuple(split_by_given_camera(list(assign_names(group_by_camera(photos, options.cameras))), run.given))
     photo_set = PhotoSet(folder, named, tuple(unusable), source.mask_dir)
     for place in (run.workspace.photos, run.workspace.masks):
         shutil.rmtree(place, ignore_errors=True)

@@ -12,6 +12,8 @@ from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
 from sfm_app.colmap.model import RefinedCamera, color_points, posed_images, posed_photo_ids, read_scene, sparse_model
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import ReconstructionError
+from sfm_app.estimation.camera_check import report_checks
+from sfm_app.estimation.camera_rules import camera_rules, given_and_found
 from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
 from sfm_app.hashing import digest_files
 from sfm_app.numerical import Json, json_text
@@ -81,7 +83,14 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     matches, views, intrinsics = found.matches, found.views, found.intrinsics
     outcome = _drop_models_without_depth(found.outcome, matches, views, intrinsics, run)
     looks = submit_cue_extraction([attempt.model for attempt in outcome.models], matches, run)
-    adjusted = [adjust_or_keep(attempt.model, found.run.workspace.database) for attempt in outcome.models]
+    names = {image.name: outcome.intrinsics.camera_name(image) for image in matches.images.values()}
+    wanted = run.settings.scene.camera_model
+    adjusted = [
+        adjust_or_keep(
+            attempt.model, found.run.workspace.database, camera_rules(attempt.model, names, intrinsics, wanted)
+        )
+        for attempt in outcome.models
+    ]
     models = [found.model for found in adjusted]
     with translate_errors("reading colors"):
         for model in models:
@@ -92,7 +101,6 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     run.write_model(sparse_model(run.workspace.sparse), POINTS)
     members = [posed_photo_ids(model) for model in models]
     reasons = unregistered_reasons(set(members[0]), members[1:], matches, views, outcome.graph)
-    names = {image.name: outcome.intrinsics.camera_name(image) for image in matches.images.values()}
     scene = read_scene(run.workspace.sparse, names, reasons, refined_cameras(adjusted[0], names))
     write_scene(scene, run)
     run.record(
@@ -112,6 +120,7 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
         jumps=jumps(models[0]),
         weakly_joined=weakly_joined_parts(models[0]),
     )
+    report_checks(given_and_found(adjusted[0], names, intrinsics), run)
     return scene
 
 

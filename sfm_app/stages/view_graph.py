@@ -9,9 +9,12 @@ from sfm_app.estimation.diagnosis import diagnose_scene
 from sfm_app.estimation.fitting import fit_pairs, to_view_graph
 from sfm_app.estimation.lenses import find_lenses
 from sfm_app.hashing import digest_files, load_arrays
-from sfm_app.runtime.context import RunContext
+from sfm_app.runtime.context import GIVEN_CAMERAS, RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import MatchGraph, ViewGraph
+
+LENS_SETTINGS = ("calibration.lens", "calibration.keep", "scene.camera_model", "photos.cameras", GIVEN_CAMERAS)
+"""Settings that decide which camera groups have a wide lens."""
 
 
 def make(matches: MatchGraph, run: RunContext) -> ViewGraph:

@@ -12,6 +12,7 @@ from sfm_app.types.calibration import Calibration, Intrinsics
 from sfm_app.types.camera_pairs import CameraPairs, PhotoPairs
 from sfm_app.types.epipolar import EpipolarFit, Rejected, ViewGraph
 from sfm_app.types.features import Features
+from sfm_app.types.given_cameras import GivenCameras
 from sfm_app.types.matches import MatchedImage, MatchGraph, PairId
 from sfm_app.types.model import Frustum, Model, Texture
 from sfm_app.types.photos import Frame, GpsPosition, Photo, PhotoSet, UnusablePhoto
@@ -27,6 +28,7 @@ __all__ = [
     "Features",
     "Frame",
     "Frustum",
+    "GivenCameras",
     "GpsPosition",
     "Intrinsics",
     "LookAlikes",

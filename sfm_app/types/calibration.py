@@ -13,6 +13,8 @@ from sfm_app.types.photos import Photo
 
 PERSPECTIVE, FISHEYE, EQUIRECTANGULAR = "perspective", "fisheye", "equirectangular"
 PROJECTIONS = (PERSPECTIVE, FISHEYE, EQUIRECTANGULAR)
+GIVEN, KEPT = "given", "kept"
+"""Methods of cameras from a calibration file: a start that may be refined, and one that nothing changes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,7 +26,8 @@ class Calibration:
     width: int
     height: int
     method: str
-    """Name of the calibrator; "estimate" where the photos determine K roughly; "exif" or "guess" for a guess."""
+    """Name of the calibrator; "estimate" where the photos determine K roughly; "exif" or "guess" for a guess; `GIVEN`
+    or `KEPT` where the user gave it."""
     identifiable: bool
     """False when the fundamental matrices do not determine K; K is then a guess."""
     reason: str = ""
@@ -38,6 +41,9 @@ class Calibration:
     fisheye: tuple[float, ...] = ()
     """k1, ..., k4 of COLMAP's OPENCV_FISHEYE with the projection "fisheye": the radius in focal lengths is
     theta (1 + k1 theta^2 + ... + k4 theta^8), theta the angle to the optical axis. Empty otherwise."""
+    distortion: tuple[float, ...] = ()
+    """The eight terms of COLMAP's FULL_OPENCV or THIN_PRISM_FISHEYE in their order, where the user gave a camera with
+    more terms than `radial` or `fisheye`; these two then hold its radial terms as far as they go. Empty otherwise."""
     spread: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations where the calibrator estimates them: "fx", "fy", "cx", "cy" in pixels, "k1"."""
     held: tuple[str, ...] = ()
@@ -53,6 +59,21 @@ class Calibration:
         return self.identifiable or self.method == "estimate"
 
     @property
+    def is_given(self) -> bool:
+        """Whether the user gave the camera."""
+        return self.method in (GIVEN, KEPT)
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the user gave the camera and wants it unchanged."""
+        return self.method == KEPT
+
+    @property
+    def is_bent(self) -> bool:
+        """Whether a perspective lens distorts, so that F does not describe its pairs exactly."""
+        return bool(self.radial or self.distortion)
+
+    @property
     def focal_px(self) -> float:
         """Geometric mean of fx and fy."""
         return float(np.sqrt(self.K[0, 0] * self.K[1, 1]))
@@ -61,7 +82,9 @@ class Calibration:
         """Return plain values for JSON."""
         plain = {field.name: getattr(self, field.name) for field in fields(self)}
         tables = {"K": self.K.tolist(), "spread": dict(self.spread), "evidence": dict(self.evidence)}
-        lists = {"held": list(self.held), "fisheye": list(self.fisheye)}
+        lists = {"held": list(self.held), "fisheye": list(self.fisheye), "distortion": list(self.distortion)}
+        if not self.distortion:
+            del plain["distortion"], lists["distortion"]
         return plain | tables | lists | {"key_pairs": [list(pair) for pair in self.key_pairs]}
 
     @classmethod
@@ -70,7 +93,8 @@ class Calibration:
         pairs = tuple((int(first), int(second)) for first, second in values["key_pairs"])
         tables = {name: finite_entries(values[name]) for name in ("spread", "evidence")}
         plain = {"K": np.array(values["K"], np.float64), "held": tuple(values["held"]), "key_pairs": pairs}
-        return cls(**{**values, **tables, **plain, "fisheye": tuple(values.get("fisheye", ()))})
+        terms = {name: tuple(values.get(name, ())) for name in ("fisheye", "distortion")}
+        return cls(**{**values, **tables, **plain, **terms})
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,14 +1,16 @@
 """From pixels to bearing vectors through any lens, and back.
 
 The projections are those of COLMAP's models: perspective with one radial term, OPENCV_FISHEYE (Kannala and Brandt
-2006), and EQUIRECTANGULAR.
+2006), and EQUIRECTANGULAR. Cameras that the user gave may have all terms of FULL_OPENCV and THIN_PRISM_FISHEYE.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.geometry.camera import rays
-from sfm_app.types.calibration import EQUIRECTANGULAR, FISHEYE, Calibration
+from sfm_app.geometry.lenses.camera_models import distortion_terms
+from sfm_app.geometry.lenses.distortion import radial_factor, undistort
+from sfm_app.types.calibration import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Calibration
 
 FloatArray = NDArray[np.float64]
 
@@ -37,10 +39,23 @@ def bearings(x: FloatArray, camera: Calibration) -> FloatArray:
     if camera.projection == EQUIRECTANGULAR:
         return _panorama_bearings(np.asarray(x, np.float64), camera, found)
     if camera.projection == FISHEYE:
-        return _fisheye_bearings(np.asarray(x, np.float64), camera, found)
-    found[:, :2], found[:, 2] = rays(x, camera.K, camera.radial), 1.0
+        return _fisheye_bearings(_remove_shift(np.asarray(x, np.float64), camera), camera, found)
+    found[:, :2], found[:, 2] = plane_points(x, camera), 1.0
     found[:, 3], found[:, 7] = 1.0 / camera.K[0, 0], 1.0 / camera.K[1, 1]
     return found
+
+
+def plane_points(x: FloatArray, camera: Calibration) -> FloatArray:
+    """Return (N, 2) points of the plane z = 1 that pixels of a perspective camera see.
+
+    Args:
+        x: (N, 2) pixels.
+        camera: with the projection "perspective".
+    """
+    if camera.distortion:
+        about = (np.asarray(x, np.float64) - camera.K[:2, 2]) / np.diag(camera.K)[:2]
+        return undistort(about, distortion_terms(camera), PERSPECTIVE)
+    return rays(x, camera.K, camera.radial)
 
 
 def project(points: FloatArray, camera: Calibration) -> FloatArray:
@@ -108,6 +123,15 @@ def fold_angle(camera: Calibration) -> float:
     theta = np.linspace(0.0, np.pi, ANGLES)
     folds = np.flatnonzero(_slope(theta, camera.fisheye) < LEAST_SLOPE)
     return float(theta[folds[0]]) if len(folds) else float(np.pi)
+
+
+def _remove_shift(x: FloatArray, camera: Calibration) -> FloatArray:
+    """Return (N, 2) where pixels of a fisheye would lie with its radial terms alone."""
+    if not camera.distortion:
+        return x
+    terms, focals, center = distortion_terms(camera), np.diag(camera.K)[:2], camera.K[:2, 2]
+    w = undistort((x - center) / focals, terms, FISHEYE)
+    return np.asarray(w * radial_factor(np.hypot(*w.T), terms, FISHEYE)[:, None] * focals + center, np.float64)
 
 
 def _fisheye_bearings(x: FloatArray, camera: Calibration, found: FloatArray) -> FloatArray:

@@ -104,6 +104,7 @@ def test_a_read_only_output_folder_ends_with_exit_code_3(folder, tmp_path, as_or
         (("--config", "nowhere.toml"), "cannot read nowhere.toml"),
         (("--from", "nowhere"), "nowhere"),
         (("--quality", "best"), "best"),
+        (("--camera-model", "FOV"), "'scene.camera_model'"),
     ],
 )
 def test_wrong_settings_end_with_exit_code_2_before_any_work(folder, tmp_path, flags, says):
@@ -112,6 +113,13 @@ def test_wrong_settings_end_with_exit_code_2_before_any_work(folder, tmp_path, f
     assert result.exit_code == 2
     assert says in result.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_a_calibration_that_cannot_be_read_ends_with_exit_code_3_before_any_work(folder, tmp_path):
+    result = call("run", folder, "-o", tmp_path / "out", "--calibration", tmp_path / "nowhere.json")
+
+    assert (result.exit_code, "cannot read the calibration file" in result.stderr) == (3, True)
+    assert "cameras.txt" in result.stderr and not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

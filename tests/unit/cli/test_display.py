@@ -1,10 +1,13 @@
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from sfm_app.api import Run
+from sfm_app.cli.camera_text import contradiction_lines, refined_text
 from sfm_app.cli.display import intrinsics_lines, intrinsics_summary, run_lines, run_summary, size_text
-from sfm_app.geometry.camera import camera_matrix
+from sfm_app.geometry.camera import camera_matrix, panorama_matrix
 from sfm_app.types import Calibration, CameraModel, Intrinsics, Scene
 
 K = camera_matrix(500.0, 510.0, 480.0, 410.0)
@@ -21,11 +24,48 @@ def test_every_parameter_stands_beside_its_deviation():
 
     assert first == "camera      fx 500.0 +- 1.2  fy 510.0 +- 2.0  cx 480.0 +- 3.0  cy 410.0 +- 4.0 px"
     assert [line.strip() for line in others] == [
-        "sees 90 degrees from left to right, 76 from top to bottom",
+        "sees 93 degrees from left to right, 78 from top to bottom",
         "The lens bends lines outwards (barrel), k1 -0.050 +- 0.010.",
         "Assumed, since the photos do not determine it: square pixels.",
         "best pairs of photos to start from: a.jpg + b.jpg, b.jpg + c.jpg, c.jpg + 4",
     ]
+
+
+def test_a_fisheye_and_a_panorama_say_what_they_see():
+    wide = camera_matrix(500.0 / np.radians(60.0), 500.0 / np.radians(60.0), 500.0, 400.0)
+    fisheye = Calibration(wide, 1000, 800, "lens", True, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
+    panorama = Calibration(panorama_matrix((1000, 500)), 1000, 500, "panorama", True, projection="equirectangular")
+
+    lines = [line.strip() for line in intrinsics_lines(Intrinsics({"one": fisheye, "two": panorama}))]
+
+    assert lines[1] == "a fisheye that sees 120 degrees from left to right, 96 from top to bottom"
+    assert lines[2:] == ["camera      two: panoramas of a whole turn, 1000 x 500 px"]
+
+
+def test_a_given_camera_is_called_so():
+    lines = intrinsics_lines(Intrinsics({"one": replace(KNOWN, method="kept"), "two": replace(KNOWN, method="given")}))
+
+    assert [line.strip() for line in lines if "as given" in line] == ["as given, and kept", "as given, to be refined"]
+
+
+def test_refined_cameras_say_what_their_lens_sees():
+    focal = 500.0 / np.radians(60.0)
+    fisheye = CameraModel("OPENCV_FISHEYE", (focal, focal, 500, 400, 0, 0, 0, 0), K, 1000, 800, {"fx": 1.0})
+    panorama = CameraModel("EQUIRECTANGULAR", (1000.0, 500.0), K, 1000, 500)
+    plain = CameraModel("OPENCV", (500, 510, 480, 410, 0, 0, 0, 0), K, 1000, 800)
+
+    assert refined_text(fisheye).endswith("; a fisheye that sees 120 degrees from left to right, 96 from top to bottom")
+    assert refined_text(panorama) == "panoramas of a whole turn, 1000 x 500 px"
+    assert refined_text(plain) == "fx 500.0  fy 510.0  cx 480.0  cy 410.0 px"
+
+
+def test_a_contradicted_camera_is_warned_of_with_both_numbers():
+    counts = {"given_cameras": {"a": {"contradicted": [{"text": "focal length: given 9 px, the photos say 8 px"}]}}}
+
+    assert contradiction_lines(counts) == [
+        "beware: the photos contradict the given camera a: focal length: given 9 px, the photos say 8 px"
+    ]
+    assert contradiction_lines({}) == []
 
 
 def test_a_guess_is_called_one_right_after_its_figures():
@@ -47,7 +87,7 @@ def test_of_several_cameras_each_names_its_photos():
 def test_json_holds_everything_that_is_known_of_a_camera():
     found = json.loads(json.dumps(intrinsics_summary(Intrinsics({"one": KNOWN}))))["one"]
 
-    assert found["field_of_view_deg"] == pytest.approx([89.95, 76.23], abs=0.3)
+    assert found["field_of_view_deg"] == pytest.approx([93.27, 78.07], abs=0.01)
     beside = ("field_of_view_deg", "key_pairs")
     assert {k: v for k, v in found.items() if k not in beside} == {
         k: v for k, v in KNOWN.to_dict().items() if k not in beside

@@ -15,7 +15,8 @@ RUN = main.commands["run"]
 PARAMETERS = {parameter.name: parameter for parameter in RUN.params}
 GIVEN = {"seed": 3, "workers": 2, "max_memory": 4.0, "quality": "draft", "images": "list.txt", "masks": "masks",
          "cameras": "single", "max_frames": 50, "keep_low_quality": True, "features": "sift-dsp", "estimator": "msac",
-         "calibrator": "kruppa", "mapper": "global", "faces": 1000, "unseen_faces": "cut"}  # fmt: skip
+         "calibrator": "kruppa", "calibration": "cameras.txt", "keep_calibration": True, "camera_model": "RADIAL",
+         "mapper": "global", "faces": 1000, "unseen_faces": "cut"}  # fmt: skip
 """A value for every flag that is not the default."""
 
 

@@ -4,8 +4,10 @@ from dataclasses import replace
 
 from sfm_app.engine.stage import Stage
 from sfm_app.engine.staleness import manifest_head, nested_value, rerun_reason, settings_and_versions, stage_fingerprint
+from sfm_app.runtime.context import GIVEN_CAMERAS
 from sfm_app.runtime.manifest import StageRecord
 from sfm_app.settings import Settings
+from sfm_app.types import GivenCameras
 
 STAGE = Stage("match_graph", (), ("matching", "photos.cameras", "seed"), ("x.txt",), None, None, None)
 
@@ -42,6 +44,14 @@ def test_a_setting_that_changed_is_named_with_both_values(run):
     finished(run)
     assert why(set_to(run, matching={"max_features": 500})) == "matching.max_features 8192 -> 500"
     assert why(set_to(run, photos={"cameras": "single"}, seed=3)) == 'photos.cameras "auto" -> "single", seed 0 -> 3'
+
+
+def test_other_contents_of_a_calibration_file_are_a_change(run):
+    stage = replace(STAGE, settings=(GIVEN_CAMERAS,))
+    one, other = (replace(run, given=GivenCameras(digest=digest)) for digest in ("x", "y"))
+
+    assert stage_fingerprint(stage, [], one) != stage_fingerprint(stage, [], other)
+    assert settings_and_versions(stage, one)["settings"] == {GIVEN_CAMERAS: "x"}
 
 
 def test_no_more_than_three_are_named(run):

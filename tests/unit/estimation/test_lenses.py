@@ -1,12 +1,15 @@
 """Wide lenses of camera groups: found, described, and left alone where a perspective camera is enough."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_app.errors import ConfigError
 from sfm_app.estimation.calibrating import find_intrinsics
 from sfm_app.estimation.fitting import ray_estimator
-from sfm_app.estimation.lenses import describe_lens, to_calibration
+from sfm_app.estimation.lenses import describe_lens, find_lenses, to_calibration
 from sfm_app.geometry.lenses.bearings import fisheye_radius, project
 from sfm_app.plugins import load_plugins
 from sfm_app.runtime.context import RunContext
@@ -16,7 +19,7 @@ from sfm_app.selfcal.wide_angle.fisheye import Fisheye
 from sfm_app.selfcal.wide_angle.lens_search import LensEstimate
 from sfm_app.settings import Settings
 from sfm_app.stages import view_graph
-from sfm_app.types import Calibration, EpipolarFit, MatchedImage, MatchGraph, Rejected
+from sfm_app.types import Calibration, EpipolarFit, GivenCameras, MatchedImage, MatchGraph, Rejected
 
 SIZE = (960, 640)
 K = np.array([[270.0, 0.0, 485.0], [0.0, 270.0, 316.0], [0.0, 0.0, 1.0]])
@@ -65,6 +68,71 @@ def test_a_fisheye_is_found_before_fundamental_matrices_and_becomes_the_camera(r
 def test_a_perspective_camera_is_left_to_the_calibrators(run):
     views = view_graph.make(photos_through(PLAIN, away=14.0), run)
     assert not views.lenses and run.statistics["lenses"] == {}
+
+
+def given(run, camera, **settings):
+    """The run with a camera that the user gave for all photos."""
+    known = GivenCameras({"": replace(camera, method="given")}, source="a file", digest="x")
+    return replace(run, given=known, settings=Settings.from_mapping(settings))
+
+
+@pytest.mark.slow
+def test_a_given_fisheye_takes_the_place_of_the_one_that_is_found_and_is_checked(run):
+    matches = photos_through(WIDE)
+    right = given(run, replace(WIDE, K=WIDE.K + np.diag([0.5, 0.5, 0.0])), calibration={"keep": True})
+    lens = find_lenses(matches, right)["960x640"]
+
+    assert lens.is_kept and lens.focal_px == 270.5
+    assert run.statistics["given_cameras"]["960x640"] == {
+        "from": "a file", "kept": True, "checked": True, "contradicted": []
+    }  # fmt: skip
+    views = view_graph.make(matches, right)
+    intrinsics, _ = find_intrinsics(matches, views, right)
+    assert intrinsics.main.is_kept and intrinsics.main.focal_px == 270.5
+    wrong = given(run, replace(WIDE, K=WIDE.K * [[1.1], [1.1], [1.0]]))
+    assert find_lenses(matches, wrong)["960x640"].method == "given"
+    [said] = run.statistics["given_cameras"]["960x640"]["contradicted"][:1]
+    assert said["what"] == "focal length" and abs(said["found_px"] - 270.0) < 3.0
+
+
+@pytest.mark.slow
+def test_a_given_perspective_camera_is_used_and_contradicted_where_the_lens_is_a_fisheye(run):
+    matches, wrong = photos_through(WIDE), given(run, PLAIN)
+
+    assert find_lenses(matches, wrong) == {}
+    [said] = [one for one in run.statistics["given_cameras"]["960x640"]["contradicted"] if "fisheye" in one["what"]]
+    assert said["given_px"] > 1.5 * said["found_px"]
+
+
+@pytest.mark.slow
+def test_a_given_perspective_camera_is_checked_by_the_calibrator(run):
+    matches = photos_through(PLAIN, 6, away=14.0)
+    wrong = given(run, replace(PLAIN, K=PLAIN.K * [[1.2], [1.2], [1.0]]))
+    views = view_graph.make(matches, wrong)
+
+    intrinsics, cameras = find_intrinsics(matches, views, wrong)
+
+    assert [(camera.name, camera.found.method) for camera in cameras] == [("960x640", "given")]
+    assert intrinsics.main.focal_px == pytest.approx(1080.0)
+    [said] = run.statistics["given_cameras"]["960x640"]["contradicted"][:1]
+    assert said["what"] == "focal length" and said["found_px"] == pytest.approx(900.0, rel=0.02)
+
+
+@pytest.mark.slow
+def test_the_name_of_a_model_says_whether_the_lens_is_wide(run):
+    matches = photos_through(WIDE)
+    perspective = replace(run, settings=Settings.from_mapping({"scene": {"camera_model": "OPENCV"}}))
+    fisheye = replace(run, settings=Settings.from_mapping({"scene": {"camera_model": "RADIAL_FISHEYE"}}))
+
+    assert find_lenses(matches, perspective) == {}
+    assert find_lenses(photos_through(PLAIN, away=14.0), fisheye)["960x640"].projection == "fisheye"
+
+
+def test_only_panoramas_can_be_panoramas(run):
+    panoramic = replace(run, settings=Settings.from_mapping({"scene": {"camera_model": "EQUIRECTANGULAR"}}))
+
+    with pytest.raises(ConfigError, match=r"5 photos are no panoramas, such as 1\.jpg"):
+        find_lenses(photos_through(PLAIN), panoramic)
 
 
 @pytest.mark.parametrize("exponent", [0.5, 0.2, 0.0, -0.5])

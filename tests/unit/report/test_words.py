@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from sfm_app.geometry.camera import camera_matrix
-from sfm_app.report.words import center_text, field_of_view_deg, focal_text, held_text, lens_text, verdict
+from sfm_app.report.words import center_text, field_of_view_deg, field_text, focal_text, held_text, lens_text, verdict
 from sfm_app.types import Calibration
 
 
@@ -24,6 +24,21 @@ def test_the_focal_says_how_sure_it_is_and_how_wide_it_sees():
     )
     assert "pixels are 1.250 times as high as wide" in focal_text(camera(fx=625.0))
     assert "pixels" not in focal_text(camera(fx=501.0, held=("aspect",)))
+
+
+def test_wide_lenses_say_what_they_see():
+    wide = camera(fx=400.0, fy=400.0, projection="fisheye", fisheye=(0.0, 0.0, 0.0, 0.0))
+    panorama = camera(projection="equirectangular")
+
+    assert focal_text(wide) == (
+        "Focal length 400 px: a fisheye that sees 143 degrees from left to right, 115 from top to bottom."
+    )
+    assert focal_text(panorama) == "Panoramas of a whole turn, 1000 x 800 px." and center_text(panorama) == ""
+    assert verdict(camera(method="given")).startswith("Given: ")
+
+
+def test_distortion_widens_the_field():
+    assert "sees 98 degrees" in field_text(camera(radial=-0.1))
 
 
 @pytest.mark.parametrize(

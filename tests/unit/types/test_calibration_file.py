@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,6 +19,15 @@ def test_every_field_of_a_calibration_survives():
         for name in one.__slots__:
             assert name == "K" or getattr(back, name) == getattr(one, name)
             assert type(getattr(back, name)) is type(getattr(one, name))
+
+
+def test_distortion_is_written_only_where_there_is_any():
+    terms = (-0.1, 0.02, 0.001, -0.002, 0.0, 0.0, 0.0, 0.0)
+    one = replace(FOUND, distortion=terms, method="kept")
+
+    assert "distortion" not in FOUND.to_dict()
+    assert Calibration.from_dict(json.loads(json.dumps(one.to_dict()))).distortion == terms
+    assert one.is_kept and one.is_given and one.is_bent and not FOUND.is_given
 
 
 def test_cameras_keep_their_order_names_and_photos():
