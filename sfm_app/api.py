@@ -130,7 +130,7 @@ def calibrate_photos(
         photos: folder with photos, or a video.
         settings: None for the defaults.
         out: folder that keeps features and matches for a later run; None for a temporary one.
-        figure: PNG, SVG or PDF file to draw the pairs' votes and zero curves into; None for no figure.
+        figure: PNG, SVG or PDF file to draw the pairs' votes, the lens and the residuals into; None for no figure.
         progress: display of progress; silent by default.
 
     Raises:

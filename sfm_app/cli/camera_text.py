@@ -74,13 +74,15 @@ def refined_text(camera: CameraModel) -> str:
 
 
 def contradiction_lines(counts: Mapping[str, Any]) -> list[str]:
-    """Return warnings about given cameras that the photos contradict.
+    """Return warnings about given cameras, and about focals of EXIF, that the photos contradict.
 
     Args:
         counts: figures of a stage in the manifest.
     """
-    given = counts.get("given_cameras", {})
-    return [
+    given, claims = counts.get("given_cameras", {}), counts.get("exif_focals", {})
+    many = len(claims) > 1
+    said = [f"{f'{name}: ' if many else ''}{one['text']}" for name, one in claims.items() if "text" in one]
+    return said + [
         f"beware: the photos contradict the given camera {name}: {one['text']}"
         for name, camera in given.items()
         for one in camera["contradicted"]

@@ -117,7 +117,7 @@ def run(photos: Path, out: Path | None, first: str | None, last: str, **flags: A
 @click.option(
     "--figure",
     type=click.Path(path_type=Path),
-    help="Draw the pairs' votes and zero curves into this PNG, SVG or PDF file.",
+    help="Draw the pairs' votes, the curve of the lens and the residuals into this PNG, SVG or PDF file.",
 )
 @settings_options
 @output_options

@@ -8,10 +8,12 @@ import numpy as np
 from sfm_app.estimation.bent_matches import choose_inliers_again
 from sfm_app.estimation.camera_check import report_checks
 from sfm_app.estimation.diagnosis import diagnose_fits, inliers_by_degeneracy
+from sfm_app.estimation.exif_check import FocalClaim, focal_claim, report_claims, shown_share
 from sfm_app.estimation.given_cameras import assign_cameras
 from sfm_app.runtime.context import RunContext
 from sfm_app.selfcal import CalibratedCamera, calibrate_photo_set, pair_weights
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
+from sfm_app.types.calibration import EQUIRECTANGULAR
 
 LENS_ROUNDS = 2
 """Times the inliers are chosen again through the lens that the cameras so far have. Chosen on synthetic matches
@@ -32,7 +34,9 @@ def find_intrinsics(
         if seen is views:
             break
         cameras = _calibrate(matches, seen, run)
-    cameras = _take_given_cameras(cameras + cameras_with_lens(matches, views), matches, run)
+    cameras += cameras_with_lens(matches, views)
+    report_claims({camera.name: _exif_claim(camera, matches) for camera in cameras}, run)
+    cameras = _take_given_cameras(cameras, matches, run)
     cameras = sorted(cameras, key=lambda one: (-len(one.photos), one.name))
     intrinsics = Intrinsics(
         cameras={camera.name: explain_failure(camera, views) for camera in cameras},
@@ -53,6 +57,14 @@ def _calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> list[C
         pairs, calibrator.calibrate, options, run.seed, together=calibrator.together, split=split
     )
     return [to_whole_photo(camera, matches.images[camera.photos[0]]) for camera in cameras]
+
+
+def _exif_claim(camera: CalibratedCamera, matches: MatchGraph) -> FocalClaim | None:
+    """Return EXIF's claim about a camera that its photos determine."""
+    found, images = camera.found, [matches.images[photo] for photo in camera.photos]
+    if not found.identifiable or found.is_given or found.projection == EQUIRECTANGULAR:
+        return None
+    return focal_claim(images, found.focal_px, found.spread.get("fx", 0.0))
 
 
 def _take_given_cameras(
@@ -136,14 +148,9 @@ def photo_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGrap
         inliers=tuple(np.hstack(matches.points(pair))[fit.inliers] for pair, fit in fits.items()),
         sizes={image.id: image.shown[2:] if image.shown else (image.width, image.height) for image in images},
         groups={image.id: image.group for image in images},
-        focal_hints_px={image.id: image.exif_focal_px * _shown_share(image) for image in images if image.exif_focal_px},
+        focal_hints_px={image.id: image.exif_focal_px * shown_share(image) for image in images if image.exif_focal_px},
         padded_sizes={image.id: (image.width, image.height) for image in images if image.shown},
     ).with_origins({photo: frame[:2] for photo, frame in shown.items()})
-
-
-def _shown_share(image: MatchedImage) -> float:
-    """Return the longer side of the picture inside its bars over that of the photo, to which EXIF's focal refers."""
-    return max(image.shown[2:]) / max(image.width, image.height) if image.shown else 1.0
 
 
 def camera_pairs(images: list[MatchedImage], matches: MatchGraph, views: ViewGraph) -> CameraPairs:

@@ -1,12 +1,15 @@
-"""From the user's cameras to rules of the last adjustment, and what the photos then say of these cameras."""
+"""From what is known of cameras to rules of the last adjustment, and what the photos then say of this knowledge."""
 
 from collections.abc import Mapping
+
+import numpy as np
 
 from sfm_app.bundle_adjustment.camera_rules import CameraRule
 from sfm_app.colmap.bundle import Adjustment
 from sfm_app.colmap.model import posed_images
 from sfm_app.colmap.types import Reconstruction
-from sfm_app.types import Calibration, Intrinsics
+from sfm_app.estimation.exif_check import FocalClaim, focal_claim
+from sfm_app.types import Calibration, Intrinsics, MatchedImage, MatchGraph, Scene
 
 
 def camera_rules(
@@ -45,3 +48,23 @@ def given_and_found(
     ids = {names[image.name]: image.camera_id for image in posed_images(adjusted.model)}
     known = {name: intrinsics.cameras[name] for name in ids if name in intrinsics.cameras}
     return {name: (camera, adjusted.estimates.get(ids[name])) for name, camera in known.items() if camera.is_given}
+
+
+def refined_claims(scene: Scene, intrinsics: Intrinsics, matches: MatchGraph) -> dict[str, FocalClaim | None]:
+    """Return what EXIF claims about cameras that only the last adjustment determined, by name; None for nothing.
+
+    Args:
+        scene: with the cameras after their last adjustment.
+        intrinsics: cameras before mapping; of those that pairs determined, or the user gave, the claim is known.
+        matches: all photos.
+    """
+    known = {name for name, camera in intrinsics.cameras.items() if camera.identifiable}
+    photos: dict[str, list[MatchedImage]] = {name: [] for name in scene.cameras}
+    for image in matches.images.values():
+        if image.name in scene.camera_of:
+            photos[scene.camera_of[image.name]].append(image)
+    return {
+        name: focal_claim(photos[name], float(np.sqrt(camera.K[0, 0] * camera.K[1, 1])), camera.deviations["fx"])
+        for name, camera in scene.cameras.items()
+        if name not in known and "fx" in camera.deviations
+    }

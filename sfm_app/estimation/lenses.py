@@ -11,7 +11,7 @@ from sfm_app.estimation.camera_check import report_checks
 from sfm_app.estimation.given_cameras import assign_cameras
 from sfm_app.geometry.camera import camera_matrix, panorama_matrix
 from sfm_app.geometry.lenses.camera_models import projection_of_model
-from sfm_app.geometry.lenses.lens_curve import field_of_view_deg
+from sfm_app.geometry.lenses.lens_curve import SHARES, deviation_key, field_of_view_deg
 from sfm_app.numerical import FAILURES
 from sfm_app.runtime.context import RunContext
 from sfm_app.selfcal.wide_angle.lens_search import LensEstimate, find_lens, needs_fisheye
@@ -148,7 +148,7 @@ def to_calibration(found: LensEstimate, size: tuple[int, int]) -> Calibration:
         "pairs": float(found.pairs), "exponent": lens.exponent, "field_deg": lens.field_deg(side),
         "support": found.support, "support of a perspective lens": found.perspective_support,
         "radius_deviation_px": radius_px,
-    }  # fmt: skip
+    } | {deviation_key(share): float(found.radius_deviation_px(share * theta[-1:])[0]) for share in SHARES}  # fmt: skip
     return Calibration(
         camera_matrix(lens.focal, lens.focal, *lens.center), *size, METHOD if determined else "estimate",
         identifiable=determined,

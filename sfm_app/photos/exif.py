@@ -11,7 +11,12 @@ MAKE, MODEL, ORIENTATION, EXIF_IFD, GPS_IFD = 0x010F, 0x0110, 0x0112, 0x8769, 0x
 FOCAL_MM, FOCAL_35MM, ZOOM = 0x920A, 0xA405, 0xA404
 GPS_LATITUDE_REF, GPS_LATITUDE, GPS_LONGITUDE_REF, GPS_LONGITUDE, GPS_ALTITUDE_REF, GPS_ALTITUDE = range(1, 7)
 
+TAKEN_WIDTH, TAKEN_HEIGHT, SENSOR_RESOLUTION, SENSOR_UNIT = 0xA002, 0xA003, 0xA20E, 0xA210
+
 FULL_FRAME_WIDTH_MM = 36.0
+INCH = 2
+SENSOR_UNITS_MM = {INCH: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+"""Lengths of EXIF's units of the resolution of a sensor; the inch where nothing is said. By definition."""
 LOWEST_M, HIGHEST_M = -1000.0, 20_000.0
 """Range of plausible altitudes."""
 
@@ -35,17 +40,36 @@ def camera_name(exif: Image.Exif) -> str:
 
 
 def focal_px(exif: Image.Exif, longer_side: int) -> float | None:
-    """Return the focal length in pixels from the 35 mm equivalent; None if it is missing or implausible.
+    """Return the focal length in pixels that EXIF claims; None if it says nothing plausible.
+
+    It follows from the 35 mm equivalent; without that, from the focal length in millimeters and the resolution of the
+    sensor.
 
     Args:
         exif: of the photo.
         longer_side: of the photo, pixels.
     """
-    try:
-        focal = float(exif.get_ifd(EXIF_IFD).get(FOCAL_35MM)) * longer_side / FULL_FRAME_WIDTH_MM  # type: ignore[arg-type]
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return focal if 0.1 * longer_side < focal < 50 * longer_side else None
+    details = exif.get_ifd(EXIF_IFD)
+    for claim in (_equivalent_focal, _sensor_focal):
+        try:
+            focal = longer_side * claim(details)
+        except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
+            continue
+        if 0.1 * longer_side < focal < 50 * longer_side:
+            return focal
+    return None
+
+
+def _equivalent_focal(details: Mapping[int, Any]) -> float:
+    """Return the focal length of the 35 mm equivalent in longer sides."""
+    return float(details.get(FOCAL_35MM, 0.0)) / FULL_FRAME_WIDTH_MM
+
+
+def _sensor_focal(details: Mapping[int, Any]) -> float:
+    """Return the focal length in longer sides of the photo that the camera took, before it was scaled."""
+    unit_mm = SENSOR_UNITS_MM[int(details.get(SENSOR_UNIT, INCH))]
+    taken = max(float(details[TAKEN_WIDTH]), float(details[TAKEN_HEIGHT]))
+    return float(details[FOCAL_MM]) * float(details[SENSOR_RESOLUTION]) / unit_mm / taken
 
 
 def gps_position(exif: Image.Exif) -> GpsPosition | None:

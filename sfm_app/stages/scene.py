@@ -13,8 +13,9 @@ from sfm_app.colmap.model import RefinedCamera, color_points, posed_images, pose
 from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import ReconstructionError
 from sfm_app.estimation.camera_check import report_checks
-from sfm_app.estimation.camera_rules import camera_rules, given_and_found
+from sfm_app.estimation.camera_rules import camera_rules, given_and_found, refined_claims
 from sfm_app.estimation.diagnosis import diagnose_depth, diagnose_scene
+from sfm_app.estimation.exif_check import report_claims
 from sfm_app.hashing import digest_files
 from sfm_app.numerical import Json, json_text
 from sfm_app.reconstruction import MappedScene, Outcome, reconstruct, retry_lost_photos
@@ -121,6 +122,7 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
         weakly_joined=weakly_joined_parts(models[0]),
     )
     report_checks(given_and_found(adjusted[0], names, intrinsics), run)
+    report_claims(refined_claims(scene, intrinsics, matches), run)
     return scene
 
 

@@ -13,6 +13,10 @@ from sfm_app.types.calibration import EQUIRECTANGULAR, FISHEYE, PERSPECTIVE, Cal
 
 FloatArray = NDArray[np.float64]
 
+SHARES = (0.25, 0.5, 0.75, 1.0)
+"""Shares of the angle of the farthest corner at which the evidence of a wide lens states the deviation of the radius.
+Chosen by hand: the deviation is smooth."""
+
 
 def radius_px(theta: FloatArray, camera: Calibration) -> FloatArray:
     """Return (N,) radii in pixels of rays at angles (N,) to the optical axis; NaN where the lens does not show them.
@@ -34,17 +38,28 @@ def radius_px(theta: FloatArray, camera: Calibration) -> FloatArray:
 
 
 def radius_deviation_px(theta: FloatArray, camera: Calibration) -> FloatArray:
-    """Return (N,) standard deviations of `radius_px`, as far as they are known: from those of the focal and of k1.
+    """Return (N,) standard deviations of `radius_px`, as far as they are known.
+
+    They come from the evidence of a wide lens, else from the deviations of the focal and of k1 as if independent.
 
     Args:
         theta: radians, >= 0.
         camera: any projection.
     """
+    stated = [camera.evidence.get(deviation_key(share)) for share in SHARES]
+    values = [value for value in stated if value is not None]
+    if len(values) == len(SHARES):
+        return np.interp(theta / corner_angle(camera), (0.0, *SHARES), (0.0, *values))
     focal = camera.spread.get("fx", 0.0) / camera.K[0, 0]
     found = np.square(np.nan_to_num(radius_px(theta, camera)) * focal)
     if camera.projection == PERSPECTIVE and "k1" in camera.spread:
         found += np.square(camera.focal_px * np.tan(np.minimum(theta, 1.5)) ** 3 * camera.spread["k1"])
     return np.asarray(np.sqrt(found), np.float64)
+
+
+def deviation_key(share: float) -> str:
+    """Return the key in `Calibration.evidence` of the deviation of the radius at a share of the corner's angle."""
+    return f"radius_deviation_px at {100 * share:.0f} % of the field"
 
 
 def corner_angle(camera: Calibration) -> float:
