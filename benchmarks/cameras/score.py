@@ -22,6 +22,7 @@ from benchmarks.common.outputs import read_initial_cameras, read_refined_cameras
 from benchmarks.common.photo_sets import Step, changed_camera
 from benchmarks.common.results import Row
 from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.model import scale_matrix
 
 LIMITS_DEG = (1, 3, 5, 10)
 FILES = ("cameras.bin", "images.bin", "points3D.bin")
@@ -80,7 +81,7 @@ def read_model(folder: Path) -> Model:
     posed = {Path(image.name).stem: image for image in model.images.values() if image.has_pose}
     return Model(
         {name: np.asarray(posed[name].cam_from_world().matrix()) for name in sorted(posed)},
-        {name: np.asarray(model.cameras[image.camera_id].calibration_matrix()) for name, image in posed.items()},
+        {name: scale_matrix(model.cameras[image.camera_id]) for name, image in posed.items()},
         model.num_points3D(),
         model.compute_num_observations(),
         model.compute_mean_reprojection_error(),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread, translate_errors
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.types import all_images, all_points
-from sfm_app.geometry.camera import panorama_matrix
+from sfm_app.geometry.camera import camera_matrix, panorama_matrix
 from sfm_app.geometry.lenses.bearings import BEARING, RAY
 from sfm_app.geometry.similarity import Similarity
 from sfm_app.geometry.two_view_init import TwoViewSeed
@@ -266,12 +266,18 @@ def sparse_model(model_dir: Path) -> Model:
 
 
 def _frustum(image: pycolmap.Image, camera: pycolmap.Camera) -> Frustum:
-    K, pose = _scale_matrix(camera), image.cam_from_world().matrix()
+    K, pose = scale_matrix(camera), image.cam_from_world().matrix()
+    if camera.is_spherical():  # drawn as a view of 90 degrees to its front
+        K = camera_matrix(camera.width / 2, camera.width / 2, camera.width / 2, camera.height / 2)
     return Frustum(image.name, K, np.asarray(pose, np.float64), camera.width, camera.height)
 
 
-def _scale_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
-    """Return K (3, 3) of a camera; of a panorama, the scale at its middle."""
+def scale_matrix(camera: pycolmap.Camera) -> NDArray[np.float64]:
+    """Return K (3, 3) of a camera; of a panorama, the scale at its middle.
+
+    Args:
+        camera: of any model.
+    """
     if camera.is_spherical():
         return panorama_matrix((camera.width, camera.height))
     return np.asarray(camera.calibration_matrix(), np.float64)
@@ -297,7 +303,7 @@ def focal_px(model: pycolmap.Reconstruction, image_id: int) -> float:
         model: COLMAP's reconstruction.
         image_id: id of the photo.
     """
-    return float(np.sqrt(np.prod(np.diag(_scale_matrix(model.cameras[model.images[image_id].camera_id]))[:2])))
+    return float(np.sqrt(np.prod(np.diag(scale_matrix(model.cameras[model.images[image_id].camera_id]))[:2])))
 
 
 def move(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
@@ -344,7 +350,7 @@ def read_scene(
 
 
 def _camera(camera: pycolmap.Camera, refined: RefinedCamera) -> CameraModel:
-    K = _scale_matrix(camera)
+    K = scale_matrix(camera)
     params = tuple(float(value) for value in camera.params)
     deviations, determined = finite_entries(refined.get("deviations", {})), tuple(refined.get("determined", ()))
     return CameraModel(camera.model.name, params, K, camera.width, camera.height, deviations, determined)

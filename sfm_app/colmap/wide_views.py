@@ -24,7 +24,7 @@ BoolArray = NDArray[np.bool_]
 
 MOST_LOST = 0.1
 """Largest share of a photo that one undistorted photo may lose. By definition."""
-GRID = 65
+GRID = 257
 """Rows and columns of pixels of a photo whose rays are looked at. Chosen by hand; not measured on its own."""
 AGREE_PX = 0.5
 """Largest distance between a pixel and its ray's projection, in pixels: where it is larger, the lens shows nothing or
@@ -44,8 +44,8 @@ class WideLens:
     """Cosine of the largest angle to the optical axis that the photos show."""
     views: tuple[PerspectiveView, ...]
 
-    def locate(self, rays: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Return the pixels (N, 2) of rays, and which of the rays the photos show, (N,).
+    def locate(self, rays: FloatArray) -> FloatArray:
+        """Return the pixels (N, 2) of rays; -1 for those that the photos do not show.
 
         Args:
             rays: (N, 3) in the camera's frame.
@@ -54,7 +54,7 @@ class WideLens:
             x = project_points(rays, np.tile(self.params, (len(rays), 1)), np.full(len(rays), self.family)).x
             shown = rays[:, 2] >= self.least_cosine * np.linalg.norm(rays, axis=1)
             shown &= np.all((x >= 0.0) & (x <= self.size), axis=1)
-        return np.where(shown[:, None], x, -1.0), shown
+        return np.where(shown[:, None], x, -1.0)
 
 
 def split_wide_photos(model_dir: Path, max_side_px: int) -> dict[int, WideLens] | None:
@@ -125,8 +125,8 @@ def write_views(name: str, lens: WideLens, photo_dir: Path, mask_dir: Path | Non
         photo = np.asarray(cv2.imdecode(np.fromfile(photo_dir / name, np.uint8), cv2.IMREAD_COLOR), np.uint8)
         used = None if mask_dir is None else read_mask(mask_dir, name)
         for number, view in enumerate(lens.views):
-            at, shown = lens.locate(view.rays().reshape(-1, 3))
-            at, shown = at.reshape(view.height, view.width, 2), shown.reshape(view.height, view.width)
+            at = view.locate(lens.locate)
+            shown = at[..., 0] >= 0.0
             small = shrink(photo, view.K[0, 0] / lens.params[FX])
             target = dense_dir / "images" / view_name(name, number)
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -25,6 +25,7 @@ def group_by_camera(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
         photos: their group is the camera named in EXIF.
         cameras: "auto": by EXIF; "single": one camera for all; "folder": one per folder; "each": one per photo.
     """
+    photos = _complete_panoramas(photos)
     sizes = Counter((_camera_key(photo, cameras), photo.width, photo.height) for photo in photos)
     found = []
     for photo in photos:
@@ -34,6 +35,19 @@ def group_by_camera(photos: Sequence[Photo], cameras: str) -> Iterator[Photo]:
         laid = _rotate(photo) if across and on_end and not photo.turn_deg else photo
         found.append(replace(laid, group=" ".join(filter(None, (f"{laid.width}x{laid.height}", maker)))))
     yield from _split_by_shown_size(found) if cameras == "auto" else (replace(photo, shown=None) for photo in found)
+
+
+def _complete_panoramas(photos: Sequence[Photo]) -> list[Photo]:
+    """Return the photos, where most of a size are panoramas with all of that size as panoramas.
+
+    A panorama without metadata is known by its borders, which may be a blank wall.
+    """
+    sizes = Counter((photo.width, photo.height) for photo in photos)
+    around = Counter((photo.width, photo.height) for photo in photos if photo.projection == EQUIRECTANGULAR)
+    most = {size for size, count in around.items() if count > sizes[size] / 2 and size[0] == 2 * size[1]}
+    return [
+        replace(photo, projection=EQUIRECTANGULAR) if (photo.width, photo.height) in most else photo for photo in photos
+    ]
 
 
 def split_by_given_camera(photos: Sequence[Photo], given: GivenCameras) -> list[Photo]:

@@ -1,5 +1,7 @@
 """Photos sampled at other positions, such as those of a perspective view."""
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,7 @@ own."""
 
 
 def resample(
-    photo: NDArray[np.uint8], at: NDArray[np.float64], size: tuple[int, int], wraps: bool = False
+    photo: NDArray[np.uint8], at: NDArray[np.floating[Any]], size: tuple[int, int], wraps: bool = False
 ) -> NDArray[np.uint8]:
     """Return a photo (H, W, 3) at given positions, by cubic interpolation; beyond its border, the border is repeated.
 
@@ -21,11 +23,13 @@ def resample(
         wraps: whether its left and right border are the same place, as those of a panorama.
     """
     height, width = photo.shape[:2]
-    place = at * [width / size[0], height / size[1]] - 0.5
+    x, y = (
+        np.ascontiguousarray(at[..., axis] * (side / size[axis]) - 0.5, np.float32)
+        for axis, side in enumerate((width, height))
+    )
     if wraps:
         photo = cv2.copyMakeBorder(photo, 0, 0, SEAM_PX, SEAM_PX, cv2.BORDER_WRAP)
-        place[..., 0] += SEAM_PX
-    x, y = (np.ascontiguousarray(place[..., axis], np.float32) for axis in (0, 1))
+        x += SEAM_PX
     return np.asarray(cv2.remap(photo, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 

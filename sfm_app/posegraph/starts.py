@@ -51,6 +51,8 @@ def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray,
         used: (N, 4) inliers as points of the plane z = 1, view 1 and view 2.
         E: (3, 3) of any scale; only the directions of its epipolar lines through the middle are used.
     """
+    if not len(used):  # panoramas that look away from each other
+        return
     middles = np.median(used, axis=0)
     first, second = np.append(middles[:2], 1.0), np.append(middles[2:], 1.0)
     # near the middles g1 dx1 + g2 dx2 = 0: what moves along g1 in view 1 moves against g2 in view 2

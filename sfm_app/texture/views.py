@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sfm_app.errors import ReconstructionError
 from sfm_app.geometry.lenses.perspective_views import PerspectiveView
-from sfm_app.geometry.lenses.projections import FISHEYE, PERSPECTIVE, angle_limit
+from sfm_app.geometry.lenses.projections import FISHEYE, PERSPECTIVE, shown_angle
 from sfm_app.jit import kernel
 from sfm_app.types import CameraModel
 
@@ -111,12 +111,10 @@ def part_view(name: str, photo: str, part: PerspectiveView, cam_from_world: Floa
 
 
 def _shown_limit(lens: FloatArray, kind: float, width: int, height: int) -> float:
-    """Return the squared tangent or angle at which the radius of a lens reaches the corner; 0 if it folds before."""
+    """Return the squared tangent or angle at which the radius of a lens reaches the corner of the photo, or folds."""
     corners = np.abs([[x - lens[2], y - lens[3]] for x in (0.0, width) for y in (0.0, height)]) / lens[:2]
-    family = FISHEYE if kind == ANGULAR else PERSPECTIVE
-    angle = angle_limit(lens, family, float(np.linalg.norm(corners, axis=1).max()))
-    if np.isnan(angle):
-        return 0.0
+    reach = float(np.linalg.norm(corners, axis=1).max())
+    angle = shown_angle(lens, FISHEYE if kind == ANGULAR else PERSPECTIVE, reach)
     return float(angle if kind == ANGULAR else np.tan(angle)) ** 2
 
 

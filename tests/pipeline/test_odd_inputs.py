@@ -124,6 +124,12 @@ def video_as_photo(folder):
     (folder / "x.mp4").rename(folder / "x.jpg")
 
 
+def panorama(**entries):
+    """A picture with Google's Photo Sphere metadata."""
+    said = " ".join(f'GPano:{name}="{value}"' for name, value in entries.items())
+    return saved("x.jpg", xmp=f"<x:xmpmeta xmlns:x='adobe:ns:meta/'><rdf:Description {said}/></x:xmpmeta>".encode())
+
+
 def locked(folder):
     picture().save(folder / "x.jpg")
     (folder / "x.jpg").chmod(0)
@@ -162,6 +168,12 @@ FILES = {
     "a folder named like a photo": (folder_named_so, "in.jpg/x.jpg", USED),
     "HEIC": (written("x.heic", b"\0\0\0\x18ftypheic\0\0\0\0mif1heic" + bytes(90)), "x.heic", ""),
     "blurred": (lambda folder: picture(5, (800, 600)).save(folder / "x.jpg"), "x.jpg", "blurred beyond use"),
+    "cylindrical panorama": (panorama(ProjectionType="cylindrical"), "x.jpg", "a panorama of the projection"),
+    "part of a panorama": (
+        panorama(ProjectionType="equirectangular", FullPanoWidthPixels=600, CroppedAreaImageWidthPixels=300),
+        "x.jpg",
+        "a panorama of 180 x 180 degrees",
+    ),
     "GIF": (saved("x.gif"), "x.gif", "not a photo"),
     "text": (written("x.txt", b"a text"), "x.txt", "not a photo"),
     "PDF": (written("x.pdf", b"%PDF-1.7\n"), "x.pdf", "not a photo"),

@@ -4,6 +4,7 @@ Depth maps and texture are made from perspective photos. One perspective photo c
 what is far from its axis long before. Ours.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,8 @@ large as at its middle. Chosen by hand; not measured on its own."""
 OVERLAP_DEG = 4.0
 """Angle by which a view reaches beyond what it is responsible for, so that windows and triangles at the border are
 whole in one of the views. Chosen by hand; not measured on its own."""
+STRIP_PX = 256
+"""Rows that are projected at once, so that memory stays small. Chosen by hand; the result does not depend on it."""
 WHOLE_TURN_DEG = 300.0
 """A photo that shows more than this is a panorama: its views look through the faces of a cube. Chosen by hand; no lens
 lies between a fisheye and a panorama."""
@@ -35,9 +38,26 @@ class PerspectiveView:
     width: int
     height: int
 
-    def rays(self) -> FloatArray:
-        """Return the rays (height, width, 3) of the pixels' centers, in the photo's frame."""
-        x, y = np.meshgrid(np.arange(self.width) + 0.5, np.arange(self.height) + 0.5)
+    def locate(self, project: Callable[[FloatArray], FloatArray]) -> NDArray[np.float32]:
+        """Return the pixels (height, width, 2) of the photo that the view shows.
+
+        Args:
+            project: takes rays (N, 3) of the photo's frame and returns their pixels (N, 2).
+        """
+        found = np.empty((self.height, self.width, 2), np.float32)
+        for top in range(0, self.height, STRIP_PX):
+            rays = self.rays(top, top + STRIP_PX)
+            found[top : top + STRIP_PX] = project(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
+        return found
+
+    def rays(self, top: int = 0, bottom: int | None = None) -> FloatArray:
+        """Return the rays (rows, width, 3) of the centers of pixels, in the photo's frame.
+
+        Args:
+            top, bottom: rows from the first to before the second; all of them by default.
+        """
+        rows = np.arange(self.height)[top:bottom]
+        x, y = np.meshgrid(np.arange(self.width) + 0.5, rows + 0.5)
         plain = np.stack([(x - self.K[0, 2]) / self.K[0, 0], (y - self.K[1, 2]) / self.K[1, 1], np.ones_like(x)], -1)
         return np.asarray(plain @ self.R, np.float64)
 

@@ -110,6 +110,21 @@ def angle_limit(params: FloatArray, family: int, reach: float) -> float:
     return float(angle[end]) if grows and (len(ends) or family == FISHEYE) else float("nan")
 
 
+def shown_angle(params: FloatArray, family: int, reach: float) -> float:
+    """Return the largest angle that a lens shows: where its radius reaches the corner of the photo, or folds.
+
+    Args:
+        params: (12,) of the camera.
+        family: PERSPECTIVE or FISHEYE.
+        reach: radius of the corner in focal lengths.
+    """
+    angle = np.linspace(0.0, TANGENT_ANGLE if family == PERSPECTIVE else SEEN_ANGLE, ANGLES)
+    radius = radius_at(angle, params, family)
+    folds, ends = np.flatnonzero(~(np.diff(radius) > 0.0)), np.flatnonzero(radius >= reach)
+    last = ANGLES - 1
+    return float(angle[min(folds[0] if len(folds) else last, ends[0] if len(ends) else last)])
+
+
 def _project_perspective(points: FloatArray, params: FloatArray) -> Projected:
     X, Y, Z = points.T
     u, v = X / Z, Y / Z

@@ -1,5 +1,7 @@
 """The perspective views in which a panorama is painted onto a surface: the faces of a cube, in its own resolution."""
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,7 +11,7 @@ from sfm_app.geometry.lenses.perspective_views import PerspectiveView, cover_ray
 from sfm_app.photos.resample import resample
 from sfm_app.types.calibration import EQUIRECTANGULAR, Calibration
 
-GRID = 65
+GRID = 257
 """Rows and columns of a panorama whose rays are covered. Chosen by hand; not measured on its own."""
 
 
@@ -32,7 +34,8 @@ def show_part(panorama: NDArray[np.uint8], part: PerspectiveView) -> NDArray[np.
         part: the view.
     """
     height, width = panorama.shape[:2]
-    return resample(panorama, _positions(part, (width, height)), (width, height), wraps=True)
+    at = part.locate(partial(project, camera=_camera((width, height))))
+    return resample(panorama, at, (width, height), wraps=True)
 
 
 def mask_part(used: NDArray[np.bool_], part: PerspectiveView) -> NDArray[np.bool_]:
@@ -43,13 +46,9 @@ def mask_part(used: NDArray[np.bool_], part: PerspectiveView) -> NDArray[np.bool
         part: the view.
     """
     height, width = used.shape
-    column, row = np.moveaxis(_positions(part, (width, height)).astype(np.int64), -1, 0)
+    at = part.locate(partial(project, camera=_camera((width, height))))
+    column, row = np.moveaxis(at.astype(np.int64), -1, 0)
     return np.asarray(used[row.clip(0, height - 1), column.clip(0, width - 1)])
-
-
-def _positions(part: PerspectiveView, size: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the pixels (h, w, 2) of a panorama that a view shows."""
-    return project(part.rays().reshape(-1, 3), _camera(size)).reshape(part.height, part.width, 2)
 
 
 def _camera(size: tuple[int, int]) -> Calibration:

@@ -44,7 +44,7 @@ hand; not measured on its own."""
 CLEAR_GAIN = 0.05
 """Share of the matches that a fisheye must let the pairs keep beyond a perspective lens. Chosen by hand; not measured
 on its own."""
-FIRST_FIELDS_DEG, FIRST_PAIRS, FIRST_MATCHES, FIRST_GAIN = (80.0, 120.0, 170.0), 8, 300, 0.02
+FIRST_FIELDS_DEG, FIRST_PAIRS, FIRST_MATCHES, FIRST_GAIN = (55.0, 80.0, 120.0, 170.0), 8, 300, 0.02
 """A first look: fields of view of an equidistant lens, pairs, matches of each, and the gain from which on all lenses
 are asked. Chosen by hand; not measured on their own."""
 LEAST_RADIAL = -0.5

@@ -162,3 +162,19 @@ def test_a_pose_is_found_through_a_wide_lens(two_views, name, seed):
     assert 0.0 < truth.errors_deg(pose.R, pose.t).max() < 0.5
     assert pose.kind == "calibrated" and pose.in_front > 0.98
     assert np.count_nonzero(pose.inliers[:20]) < 6 and pose.inliers[20:].mean() > 0.95
+
+
+def test_panoramas_that_face_away_from_each_other_have_a_pose(two_views):
+    """What lies before the one lies behind the other, so that no plane z = 1 shows both."""
+    rng, lens, truth = np.random.default_rng(4), WIDE["equirectangular"], two_views()
+    X = rng.uniform([-3.0, -2.0, 4.0], [3.0, 2.0, 8.0], (150, 3))
+    turn = np.diag([-1.0, 1.0, -1.0])
+    R, t = turn @ truth.R, turn @ truth.t
+    x1, x2 = (project(Y, lens) + rng.normal(0.0, 0.3, (150, 2)) for Y in (X, X @ R.T + t))
+
+    pose = estimate_pose(
+        Pair((x1, x2), (lens, lens), 1.5), EpipolarFit(np.eye(3), np.full(150, True), np.ones(150), 1, 0.3)
+    )
+
+    turned = np.degrees(np.arccos(np.clip(0.5 * (np.trace(pose.R @ R.T) - 1.0), -1.0, 1.0)))
+    assert 0.0 < turned < 0.5 and t @ pose.t > 0.99 * np.linalg.norm(t)

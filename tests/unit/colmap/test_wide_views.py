@@ -1,0 +1,149 @@
+"""Photos of wide lenses in the dense workspace: what each view shows, and what it must not show."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.dense import read_color, read_views
+from sfm_app.colmap.masks import has_masks, used_pixels
+from sfm_app.colmap.wide_views import split_wide_photos, view_name, write_model, write_views
+from sfm_app.photos import save_mask
+from sfm_app.stereo import rank_neighbors
+
+SIZE = 480, 320
+FISHEYE = ("OPENCV_FISHEYE", [175.0, 176.0, 241.0, 158.0, 0.02, -0.003, 0.0, 0.0])
+CAMERAS = {
+    "fisheye": FISHEYE,
+    "thin prism": ("THIN_PRISM_FISHEYE", [175.0, 176.0, 241.0, 158.0, 0.02, -0.003, 2e-3, 1e-3, 0, 0, 1e-3, 0]),
+    "panorama": ("EQUIRECTANGULAR", [480.0, 240.0]),
+    "strong barrel": ("OPENCV", [260.0, 260.0, 240.0, 160.0, -0.2, 0.025, 0.0, 0.0]),
+}
+NAMES = ("a.png", "sub/b.png", "c.png")
+
+
+def colors_of(rays):
+    """Colors (..., 3) of rays of any length: each channel is an axis."""
+    return np.round(127.5 + 120.0 * rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.uint8)
+
+
+def make_place(root, kind):
+    """Three photos whose colors are directions in the world, and their model with points all round."""
+    rng = np.random.default_rng(0)
+    name, params = CAMERAS[kind]
+    size = (480, 240) if kind == "panorama" else SIZE
+    camera = pycolmap.Camera(camera_id=1, model=name, width=size[0], height=size[1], params=params)
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    X = rng.normal(size=(300, 3))
+    X *= 6.0 / np.linalg.norm(X, axis=1, keepdims=True)
+    tracks = [pycolmap.Track() for _ in X]
+    pixels = np.stack(np.meshgrid(np.arange(size[0]) + 0.5, np.arange(size[1]) + 0.5), -1).reshape(-1, 2)
+    rays = np.array(camera.cam_ray_from_img(pixels))
+    for index, photo in enumerate(NAMES, start=1):
+        R = cv2.Rodrigues(np.array([0.1, 0.3, 0.05]) * index)[0]
+        t = -R @ np.array([0.4 * index, 0.1, 0.0])
+        x = np.array(camera.img_from_cam(X @ R.T + t))
+        seen = np.flatnonzero(np.isfinite(x).all(axis=1) & (x > 0).all(axis=1) & (x < size).all(axis=1))
+        for row, point in enumerate(seen):
+            tracks[point].add_element(index, row)
+        image = pycolmap.Image(name=photo, keypoints=x[seen], camera_id=1, image_id=index)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
+        colors = colors_of(np.nan_to_num(rays, nan=1.0) @ R).reshape(size[1], size[0], 3)
+        (root / "photos" / photo).parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(root / "photos" / photo), colors[..., ::-1])
+    for point, track in zip(X, tracks, strict=True):
+        if track.length() > 1:
+            model.add_point3D(point, track, np.array([1, 2, 3], np.uint8))
+    (root / "sparse").mkdir()
+    model.write(root / "sparse")
+    return model
+
+
+def fill(root, masks=None, largest=1000):
+    lenses = split_wide_photos(root / "sparse", largest)
+    for name, camera_id in write_model(root / "sparse", lenses, root / "dense"):
+        write_views(name, lenses[camera_id], root / "photos", masks, root / "dense")
+    return lenses, read_views(root / "dense")
+
+
+@pytest.mark.parametrize(("kind", "count"), [("fisheye", 4), ("thin prism", 4), ("panorama", 6), ("strong barrel", 2)])
+def test_views_show_the_directions_of_the_photo(tmp_path, kind, count):
+    make_place(tmp_path, kind)
+    _, views = fill(tmp_path)
+
+    assert len(views) == 3 * count
+    for view in views:
+        x, y = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+        rays = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(view.K).T @ view.R
+        used = used_pixels(tmp_path / "dense", view)
+        used = np.ones(x.shape, bool) if used is None else used
+        assert (kind == "panorama") == used.all()
+        assert 0.4 < used.mean() <= 1.0
+        wrong = np.abs(read_color(tmp_path / "dense", view).astype(int) - colors_of(rays))[used]
+        assert np.mean(wrong) < 2.0 and np.quantile(wrong, 0.999) < 12
+
+
+@pytest.mark.parametrize("kind", ["fisheye", "panorama"])
+def test_points_are_seen_where_they_project(tmp_path, kind):
+    model = make_place(tmp_path, kind)
+    _, views = fill(tmp_path)
+
+    found = pycolmap.Reconstruction(tmp_path / "dense" / "sparse")
+    assert found.num_points3D() == model.num_points3D()
+    assert found.num_images() == len(views)
+    # overlaps show some points twice
+    assert model.compute_num_observations() <= found.compute_num_observations() < 1.6 * model.compute_num_observations()
+    errors = [
+        np.linalg.norm(image.project_point(found.points3D[point.point3D_id].xyz) - point.xy)
+        for image in found.images.values()
+        for point in image.points2D
+    ]
+    assert len(errors) == found.compute_num_observations() and max(errors) < 1e-6
+
+
+def test_views_from_one_place_are_not_matched_with_each_other(tmp_path):
+    make_place(tmp_path, "panorama")
+    _, views = fill(tmp_path)
+
+    for view, ranked in zip(views, rank_neighbors(views, 8), strict=True):
+        photo = view.name.rsplit(".", 2)[0]
+        assert all(views[other].name.rsplit(".", 2)[0] != photo for other in ranked)
+    assert sum(map(len, rank_neighbors(views, 8))) > len(views)
+
+
+def test_masked_pixels_are_masked_in_every_view(tmp_path):
+    make_place(tmp_path, "fisheye")
+    for name in NAMES:
+        used = np.ones(SIZE[::-1], bool)
+        used[:, : SIZE[0] // 2] = False
+        save_mask(tmp_path / "masks", name, used)
+    lenses, views = fill(tmp_path, tmp_path / "masks")
+
+    assert has_masks(tmp_path / "dense")
+    for number, part in enumerate(lenses[1].views):
+        view = next(view for view in views if view.name == view_name("a.png", number))
+        at = lenses[1].locate(part.rays().reshape(-1, 3))
+        left = (at[:, 0] < SIZE[0] / 2 - 1).reshape(view.height, view.width)
+        used = used_pixels(tmp_path / "dense", view)
+        assert not used[left].any()
+        assert used[~left].mean() > 0.3 or left.mean() > 0.8
+
+
+def test_ordinary_lenses_are_left_to_colmap(tmp_path):
+    make_place(tmp_path, "fisheye")
+    model = pycolmap.Reconstruction(tmp_path / "sparse")
+    camera = model.cameras[1]
+    camera.model = pycolmap.CameraModelId.OPENCV
+    camera.params = [500.0, 500.0, 240.0, 160.0, -0.1, 0.02, 0.0, 0.0]
+    model.write(tmp_path / "sparse")
+
+    assert split_wide_photos(tmp_path / "sparse", 1000) is None
+
+
+def test_large_views_are_scaled_down_without_aliasing(tmp_path):
+    make_place(tmp_path, "fisheye")
+    lenses, views = fill(tmp_path, largest=120)
+
+    assert max(max(view.width, view.height) for view in views) == 120
+    assert all(view.K[0, 0] < 120.0 for view in views) and len(lenses[1].views) == 4

@@ -1,0 +1,102 @@
+"""Texture through all lenses: the kernel projects as bundle adjustment does, and shows nothing that a lens cannot."""
+
+import numpy as np
+import pytest
+
+from sfm_app.geometry.lenses.projections import FISHEYE, PERSPECTIVE, project_points
+from sfm_app.photos.panoramas.painted_parts import panorama_parts
+from sfm_app.stages.texture import photo_views
+from sfm_app.texture.views import part_view, photo_view, project
+from sfm_app.types import CameraModel, Scene
+
+SIZE = 640, 480
+LENSES = {
+    "OPENCV": ((400.0, 410.0, 322.0, 238.0, -0.1, 0.02, 1e-3, -2e-3), PERSPECTIVE),
+    "FULL_OPENCV": ((400.0, 410.0, 322.0, 238.0, 0.3, 0.1, 1e-3, -2e-3, 0.05, 0.5, 0.2, 0.01), PERSPECTIVE),
+    "OPENCV_FISHEYE": ((250.0, 255.0, 322.0, 238.0, 0.02, -0.004, 1e-3, -1e-4), FISHEYE),
+    "THIN_PRISM_FISHEYE": ((250.0, 255.0, 322.0, 238.0, 0.02, -4e-3, 2e-3, 1e-3, 1e-3, -1e-4, 2e-3, 1e-3), FISHEYE),
+}
+PLACES = {"OPENCV": range(8), "FULL_OPENCV": range(12), "OPENCV_FISHEYE": (0, 1, 2, 3, 4, 5, 8, 9),
+          "THIN_PRISM_FISHEYE": range(12)}  # fmt: skip
+
+
+def view_of(model, pose=None):
+    params, _ = LENSES[model]
+    camera = CameraModel(model, params, np.eye(3), *SIZE)
+    return photo_view("a.jpg", camera, np.eye(3, 4) if pose is None else pose)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_projection_is_that_of_bundle_adjustment(model):
+    params, family = LENSES[model]
+    full = np.zeros(12)
+    full[list(PLACES[model])] = params
+    pixels = np.random.default_rng(0).uniform(-0.8, 0.8, (200, 2))
+    points = np.column_stack([pixels, np.ones(200)]) * np.linspace(0.5, 9.0, 200)[:, None]
+    R = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    R *= np.sign(np.linalg.det(R))
+    pose = np.column_stack([R, [0.1, -0.2, 0.3]])
+
+    row = view_of(model, pose).row
+    found = np.array([project(row, *((point - pose[:, 3]) @ R)) for point in points])
+
+    expected = project_points(points, np.tile(full, (200, 1)), np.full(200, family)).x
+    np.testing.assert_allclose(found[:, :2], expected, atol=1e-8)
+    assert (found[:, 2] > 0.0).all()
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_a_scaled_view_sees_the_same_in_another_size(model):
+    view = view_of(model)
+    half = view.with_size(SIZE[0] // 2, SIZE[1] // 2)
+
+    np.testing.assert_allclose(
+        2.0 * np.array(project(half.row, 0.3, 0.2, 1.1)[:2]), project(view.row, 0.3, 0.2, 1.1)[:2]
+    )
+
+
+def test_a_fisheye_shows_what_lies_at_its_side_and_nothing_beyond_its_corner():
+    params = (180.0, 180.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0)  # the corner is at 127 degrees
+    row = photo_view("a", CameraModel("OPENCV_FISHEYE", params, np.eye(3), *SIZE), np.eye(3, 4)).row
+
+    u, v, distance = project(row, 1.0, 0.0, 1e-3)
+    assert (u, v) == pytest.approx((320.0 + 180.0 * (np.pi / 2 - 1e-3), 240.0), abs=1e-3) and distance > 0.9
+    assert project(row, 1.0, 0.0, -0.5)[2] == 0.0
+    assert project(row, 0.0, 0.0, -1.0)[2] == 0.0
+    assert project(row, 0.0, 0.0, 1.0)[:2] == (320.0, 240.0)
+
+
+def test_a_lens_that_folds_inside_the_photo_shows_nothing_beyond_the_fold():
+    params = (300.0, 300.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0)  # r / (1 + r^2) folds at r = 1
+    row = photo_view("a", CameraModel("FULL_OPENCV", params, np.eye(3), *SIZE), np.eye(3, 4)).row
+
+    assert project(row, 0.9, 0.0, 1.0) == pytest.approx((320.0 + 300.0 * 0.9 / 1.81, 240.0, 1.0))
+    assert project(row, 1.1, 0.0, 1.0)[2] == 0.0
+
+
+def test_a_panorama_is_painted_through_views_that_show_all_of_it():
+    pose = np.column_stack([np.diag([-1.0, 1.0, -1.0]), [0.5, 0.0, 0.0]])
+    panorama = CameraModel("EQUIRECTANGULAR", (640.0, 320.0), np.eye(3), 640, 320)
+    scene = Scene(None, {"sub/a.jpg": pose}, {}, {"c": panorama}, 1, 1, 0.1, {"sub/a.jpg": "c"})
+
+    views = photo_views(scene)
+
+    assert [view.source for view in views] == ["sub/a.jpg"] * 6 and len({view.name for view in views}) == 6
+    for view in views:
+        np.testing.assert_allclose(view.center, -pose[:, :3].T @ pose[:, 3], atol=1e-12)
+    X = np.random.default_rng(0).normal(size=(500, 3)) * 4.0
+    depths = np.zeros(500)
+    for view in views:
+        u, v, depth = np.array([project(view.row, *point) for point in X]).T
+        inside = (depth > 0) & (u > 0) & (u < view.width) & (v > 0) & (v < view.height)
+        depths[inside] = depth[inside]
+    assert (depths > 0.0).all()
+
+
+def test_a_part_view_looks_where_its_part_looks():
+    part = panorama_parts((640, 320))[1]
+    view = part_view("a.2", "a", part, np.eye(3, 4))
+
+    u, v, _ = project(view.row, *(part.rays()[30, 40] * 5.0))
+
+    assert (u, v) == pytest.approx((40.5, 30.5), abs=1e-9) and view.source == "a"
