@@ -48,6 +48,19 @@ def test_mapping_seeks_the_lens_only_where_nothing_is_known_about_it(tmp_path, m
     assert seen == [sought]
 
 
+def test_kept_cameras_are_constant_for_colmap(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(
+        mapping.pycolmap, "incremental_mapping", lambda *given, **_: seen.append(given[3].constant_cameras) or {}
+    )
+    place = tmp_path / "database.db", tmp_path, pycolmap.Reconstruction(), tmp_path / "scratch"
+
+    for kept in ({2, 3}, ()):
+        mapping.map_incrementally(*place, 0, lambda: None, NEVER, known=False, kept=kept)
+
+    assert seen == [{2, 3}, set()]
+
+
 @pytest.fixture(scope="module")
 def synthetic(tmp_path_factory):
     """A folder with the database of five photos of COLMAP's making, and the true model."""

@@ -12,6 +12,7 @@ from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.errors import BackendError
 from sfm_app.reconstruction import baseline
 from sfm_app.reconstruction import mapping_passes as module
+from sfm_app.reconstruction.baseline import guessed_intrinsics
 from sfm_app.reconstruction.mapping_passes import learned_intrinsics, reconstruct, split_attempt
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel
 from sfm_app.reconstruction.support import PairSupport, explained_pairs
@@ -259,6 +260,19 @@ def test_what_is_learned_is_focal_center_and_lens(synthetic, cameras):
 
     assert found.K.tolist() == [[1300.0, 0, 500.0], [0, 1300.0, 390.0], [0, 0, 1]]
     assert (found.radial, found.reason, found.held) == (-0.07, "", ("center",))
+
+
+def test_of_given_cameras_nothing_is_learned_where_they_are_kept_and_all_terms_stay(synthetic, cameras):
+    terms = (-0.07, 0.02, 0.001, -0.002, 0.0, 0.0, 0.0, 0.0)
+    kept = cameras(FOCAL * 1.1, method="kept")
+    given = cameras(FOCAL * 1.1, method="given", radial=-0.07, distortion=terms)
+    model = with_camera(synthetic.copy(), [1300.0, 500.0, 390.0, -0.01])
+
+    assert learned(model, synthetic, kept).main is kept.main
+    found = learned(model, synthetic, given).main
+    assert (found.K[0, 0], found.distortion, found.radial) == (1300.0, terms, -0.07)
+    told = guessed_intrinsics(given).main, guessed_intrinsics(cameras(method="zero-curves")).main
+    assert [camera.method for camera in told] == ["given", "guess"]
 
 
 def test_a_camera_of_no_photo_in_the_model_stays_what_it_was(synthetic, cameras):
