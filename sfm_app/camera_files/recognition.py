@@ -87,6 +87,9 @@ def _read_json(text: str) -> tuple[str, Cameras]:
         raise ValueError("its JSON is not an object")
     if is_run_file(values):
         return "sfm-app", run_file_cameras(values)
+    if is_run_camera(values):
+        camera = run_camera(values)
+        return "sfm-app", ({"": camera} if camera is not None else {}, {})
     if is_opencv_camera(values):
         return "OpenCV", ({"": opencv_camera(values)}, {})
     for form, fits, read in _BY_NAME:

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from dataclasses import fields, replace
 from typing import Any
 
+import numpy as np
+
 from sfm_app.geometry.lenses.camera_models import calibration_from_model
 from sfm_app.numerical import finite_entries
 from sfm_app.types import Calibration
@@ -53,6 +55,8 @@ def run_camera(values: Mapping[str, Any]) -> Calibration | None:
         return None
     known = {name: value for name, value in values.items() if name in FIELDS}
     found = Calibration.from_dict({"evidence": {}, **known, "held": (), "key_pairs": (), "method": GIVEN})
-    if found.projection not in PROJECTIONS or found.K.shape != (3, 3) or not found.focal_px > 0.0:
+    if found.projection not in PROJECTIONS or found.K.shape != (3, 3) or not min(np.diag(found.K)) > 0.0:
+        raise ValueError("its values are not those of a camera")
+    if not np.isfinite([*found.K.ravel(), found.radial, *found.fisheye, *found.distortion]).all():
         raise ValueError("its values are not those of a camera")
     return replace(found, evidence={})

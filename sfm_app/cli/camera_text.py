@@ -74,7 +74,7 @@ def refined_text(camera: CameraModel) -> str:
 
 
 def contradiction_lines(counts: Mapping[str, Any]) -> list[str]:
-    """Return warnings about given cameras, and about focals of EXIF, that the photos contradict.
+    """Return remarks about given cameras, and warnings about these and focals of EXIF that the photos contradict.
 
     Args:
         counts: figures of a stage in the manifest.
@@ -82,7 +82,7 @@ def contradiction_lines(counts: Mapping[str, Any]) -> list[str]:
     given, claims = counts.get("given_cameras", {}), counts.get("exif_focals", {})
     many = len(claims) > 1
     said = [f"{f'{name}: ' if many else ''}{one['text']}" for name, one in claims.items() if "text" in one]
-    return said + [
+    return [*counts.get("given_camera_notes", ()), *said] + [
         f"beware: the photos contradict the given camera {name}: {one['text']}"
         for name, camera in given.items()
         for one in camera["contradicted"]

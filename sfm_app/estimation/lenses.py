@@ -46,6 +46,8 @@ def find_lenses(matches: MatchGraph, run: RunContext) -> dict[str, Calibration]:
     """
     _check_panoramas(matches, run)
     given = assign_cameras(matches, run.given, keep=run.settings.calibration.keep)
+    if given.notes:
+        run.record(given_camera_notes=list(given.notes))
     for note in given.notes:
         run.progress.say(note)
     groups: dict[str, list[MatchedImage]] = {}

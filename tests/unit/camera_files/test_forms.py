@@ -1,11 +1,14 @@
 """Every form of a calibration file is recognized by its content, and gives COLMAP's own rays."""
 
+import contextlib
 import json
 import struct
 
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given as given_values
+from hypothesis import strategies as st
 
 from sfm_app.camera_files import read_given_cameras
 from sfm_app.camera_files.colmap_files import MODEL_IDS
@@ -156,6 +159,11 @@ def test_a_panorama_of_opensfm(tmp_path):
     assert (camera.projection, camera.width, camera.height) == ("equirectangular", 1000, 500)
 
 
+KEYS = st.sampled_from([
+    "a", "K", "camera_matrix", "dist", "width", "height", "data", "projection_type", "focal", "focal_x", "k1",
+    "cameras", "camera_of", "identifiable", "projection", "fisheye", "spread", "params", "model", "image_size",
+])  # fmt: skip
+"""Keys of all forms."""
 KNOWN = Calibration(
     np.array([[900.5, 0, 501.25], [0, 901.5, 373.0], [0, 0, 1]]), 1000, 750, "zero-curves", True, radial=-0.0625,
     spread={"fx": 3.5, "k1": 0.01}, held=("aspect",), key_pairs=((1, 4),), evidence={"pairs": 12.0},
@@ -188,6 +196,40 @@ def test_what_calibrate_prints_as_json_is_read(tmp_path):
     printed = {"1000x750": {"field_of_view_deg": [58.1, 45.2], **KNOWN.to_dict(), "key_pairs": [["a.jpg", "b.jpg"]]}}
 
     assert only(tmp_path / "printed.json", json.dumps(printed)).radial == KNOWN.radial
+
+
+def test_a_single_camera_of_a_run_is_no_camera_of_opencv(tmp_path):
+    assert only(tmp_path / "one.json", json.dumps(KNOWN.to_dict())).radial == KNOWN.radial
+    with pytest.raises(InputError, match="no camera that is known"):
+        given(tmp_path / "guess.json", json.dumps(GUESS.to_dict()))
+    with pytest.raises(InputError, match="not those of a camera"):
+        given(tmp_path / "nan.json", json.dumps(KNOWN.to_dict() | {"radial": float("nan")}))
+
+
+VALUES = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-9, 9000)
+    | st.floats()
+    | st.sampled_from(["brown", "OPENCV", "fisheye", ""]),
+    lambda inner: st.lists(inner, max_size=9) | st.dictionaries(KEYS, inner, max_size=6),
+    max_leaves=20,
+)
+
+
+@given_values(st.dictionaries(KEYS, VALUES, min_size=1, max_size=6))
+def test_values_of_any_kind_end_in_cameras_or_in_one_error(tmp_path_factory, values):
+    path = tmp_path_factory.getbasetemp() / "any.json"
+    try:
+        assert all(camera.focal_px > 0 for camera in given(path, json.dumps(values)).cameras.values())
+    except InputError as err:
+        assert err.hint
+
+
+@given_values(st.binary(max_size=200))
+def test_bytes_of_any_kind_end_in_cameras_or_in_one_error(tmp_path_factory, data):
+    with contextlib.suppress(InputError):
+        given(tmp_path_factory.getbasetemp() / "any", data)
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,9 @@ def test_a_contradicted_camera_is_warned_of_with_both_numbers():
         "beware: the photos contradict the given camera a: focal length: given 9 px, the photos say 8 px"
     ]
     assert contradiction_lines({}) == []
+    assert contradiction_lines({"given_camera_notes": ["it is scaled"]}) == ["it is scaled"]
+    claims = {"a": {"text": "EXIF says 9 px"}, "b": {"contradicted": False}}
+    assert contradiction_lines({"exif_focals": claims}) == ["a: EXIF says 9 px"]
 
 
 def test_a_guess_is_called_one_right_after_its_figures():
