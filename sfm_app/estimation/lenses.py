@@ -14,7 +14,7 @@ from sfm_app.geometry.lenses.camera_models import projection_of_model
 from sfm_app.geometry.lenses.lens_curve import SHARES, deviation_key, field_of_view_deg
 from sfm_app.numerical import FAILURES
 from sfm_app.runtime.context import RunContext
-from sfm_app.selfcal.wide_angle.lens_search import LensEstimate, find_lens, needs_fisheye
+from sfm_app.selfcal.wide_angle.lens_search import LensEstimate, find_lens, needs_fisheye, shows_whole_turn
 from sfm_app.types import Calibration, MatchedImage, MatchGraph
 from sfm_app.types.calibration import EQUIRECTANGULAR, FISHEYE
 
@@ -80,14 +80,23 @@ def _find_lens(images: Sequence[MatchedImage], matches: MatchGraph, run: RunCont
     """Return the camera of a group with a wide lens; None where a perspective camera is enough."""
     size = images[0].width, images[0].height
     if images[0].projection == EQUIRECTANGULAR:
-        K = panorama_matrix(size)
-        nothing_open = dict.fromkeys(("fx", "fy", "cx", "cy"), 0.0)
-        return Calibration(K, *size, PANORAMA, identifiable=True, projection=EQUIRECTANGULAR, spread=nothing_open)
+        return panorama(size)
     model = run.settings.scene.camera_model
     if model != "auto":
         asked = projection_of_model(model) == FISHEYE
         return _search_lens(images, matches, run, is_wide=True) if asked else None
     return _search_lens(images, matches, run, is_wide=False) if run.settings.calibration.lens else None
+
+
+def panorama(size: tuple[int, int]) -> Calibration:
+    """Return the camera of panoramas.
+
+    Args:
+        size: (width, height) in pixels.
+    """
+    nothing_open = dict.fromkeys(("fx", "fy", "cx", "cy"), 0.0)
+    K = panorama_matrix(size)
+    return Calibration(K, *size, PANORAMA, identifiable=True, projection=EQUIRECTANGULAR, spread=nothing_open)
 
 
 def _seen_lens(
@@ -112,6 +121,8 @@ def _search_lens(
     size, ids = (images[0].width, images[0].height), {image.id for image in images}
     pairs = [np.hstack(matches.points(pair)) for pair in matches.matches if ids.issuperset(pair)]
     try:
+        if not is_wide and shows_whole_turn(pairs, size, run.seed):
+            return panorama(size)
         found = find_lens(pairs, size, run.seed) if is_wide or needs_fisheye(pairs, size, run.seed) else None
     except FAILURES as err:
         logger.info("the lens of a group could not be found", exc_info=err)

@@ -88,10 +88,21 @@ class RadialLens:
         return np.asarray(found / np.linalg.norm(found, axis=1, keepdims=True), np.float64)
 
 
+@dataclass(frozen=True, slots=True)
+class WholeTurn:
+    """An equirectangular photo with the origin in its middle and a width of 1; its columns are longitudes."""
+
+    def rays(self, points: FloatArray) -> FloatArray:
+        """Return (N, 3) directions of length 1 of points (N, 2)."""
+        longitude, latitude = 2.0 * np.pi * np.asarray(points, np.float64).T
+        level = np.cos(latitude)
+        return np.column_stack([level * np.sin(longitude), np.sin(latitude), level * np.cos(longitude)])
+
+
 Lens = Fisheye | RadialLens
 
 
-def bearings_through(lens: Lens, matches: FloatArray) -> FloatArray:
+def bearings_through(lens: Lens | WholeTurn, matches: FloatArray) -> FloatArray:
     """Return (N, 18) bearing vectors of matches, with their derivatives by x and y: view 1, view 2.
 
     Args:
@@ -101,6 +112,6 @@ def bearings_through(lens: Lens, matches: FloatArray) -> FloatArray:
     return np.hstack([_rays_and_slopes(lens, matches[:, :2]), _rays_and_slopes(lens, matches[:, 2:])])
 
 
-def _rays_and_slopes(lens: Lens, points: FloatArray) -> FloatArray:
+def _rays_and_slopes(lens: Lens | WholeTurn, points: FloatArray) -> FloatArray:
     here, right, down = lens.rays(points), np.array([STEP, 0.0]), np.array([0.0, STEP])
     return np.hstack([here, (lens.rays(points + right) - here) / STEP, (lens.rays(points + down) - here) / STEP])

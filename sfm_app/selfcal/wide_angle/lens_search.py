@@ -19,6 +19,7 @@ from sfm_app.selfcal.wide_angle.fisheye import (
     STEREOGRAPHIC,
     Fisheye,
     RadialLens,
+    WholeTurn,
     bearings_through,
 )
 from sfm_app.selfcal.wide_angle.lens_refinement import refine_lens, robust_cost
@@ -138,7 +139,7 @@ class _Given:
     samples: tuple[NDArray[np.int64], ...]
     threshold: float
 
-    def search(self, lens: Fisheye) -> list[tuple[float, FloatArray]]:
+    def search(self, lens: Fisheye | WholeTurn) -> list[tuple[float, FloatArray]]:
         both = zip(self.matches, self.samples, strict=True)
         return [search_rays(bearings_through(lens, x), rows, self.threshold) for x, rows in both]
 
@@ -170,6 +171,20 @@ def needs_fisheye(matches: Sequence[FloatArray], size: tuple[int, int], seed: in
     fields = [_lens_of(field, EQUIDISTANT) for field in FIRST_FIELDS_DEG]
     supports = [given.support(given.search(lens)) for lens in (Fisheye(1.0, PERSPECTIVE), *fields)]
     return max(supports[1:]) - supports[0] > FIRST_GAIN
+
+
+def shows_whole_turn(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 0) -> bool:
+    """Return whether photos are panoramas: as such, a few pairs keep clearly more matches than with any other lens.
+
+    Args:
+        matches, size, seed: as for `find_lens`.
+    """
+    given = _prepare(matches, size, np.random.default_rng(seed), FIRST_PAIRS, FIRST_MATCHES)
+    if given is None or size[0] != 2 * size[1]:
+        return False
+    others = (_lens_of(field, EQUIDISTANT) for field in FIRST_FIELDS_DEG)
+    rivals = [given.support(given.search(lens)) for lens in (Fisheye(1.0, PERSPECTIVE), *others)]
+    return given.support(given.search(WholeTurn())) - max(rivals) > CLEAR_GAIN
 
 
 def _radial_rival(lens: Fisheye, size: tuple[int, int]) -> RadialLens | None:

@@ -10,7 +10,7 @@ import sfm_app
 from sfm_app.geometry.lenses.ray_epipolar import signed_distances, squared_distances
 from sfm_app.selfcal.wide_angle.fisheye import Fisheye, bearings_through
 from sfm_app.selfcal.wide_angle.lens_refinement import redundancy
-from sfm_app.selfcal.wide_angle.lens_search import find_lens
+from sfm_app.selfcal.wide_angle.lens_search import find_lens, shows_whole_turn
 from sfm_app.selfcal.wide_angle.lens_support import search_rays
 
 pytestmark = pytest.mark.slow
@@ -120,3 +120,29 @@ def test_keypoints_in_many_photos_are_worth_less_than_their_matches():
     everywhere = [np.hstack([a, b]) for a, b in combinations(photos, 2)]
     assert redundancy(alone) == 1.0
     assert redundancy(everywhere) == pytest.approx(15 / 9)
+
+
+def panoramas_of(points=600, photos=5, wrong=0.3):
+    """Raw matches of all pairs of panoramas of 800 x 400 px in the middle of a cloud of points."""
+    rng, size = np.random.default_rng(2), np.array([800.0, 400.0])
+    X, seen = rng.normal(size=(points, 3)) * 4.0, []
+    for _ in range(photos):
+        turned = (X - rng.normal(0.0, 0.8, 3)) @ Rotation.from_euler("y", rng.uniform(0.0, 6.0)).as_matrix()
+        longitude, latitude = np.arctan2(*turned[:, [0, 2]].T), np.arctan2(turned[:, 1], np.hypot(*turned[:, [0, 2]].T))
+        x = (np.column_stack([longitude / (2.0 * np.pi), latitude / np.pi]) + 0.5) * size
+        seen.append(x + rng.normal(0.0, 0.3, x.shape))
+    pairs = [np.hstack(pair) for pair in combinations(seen, 2)]
+    for pair in pairs:
+        bad = rng.random(points) < wrong
+        pair[bad, 2:] = rng.uniform(0.0, size, (int(bad.sum()), 2))
+    return pairs
+
+
+def test_panoramas_are_told_from_photos_by_their_matches():
+    photos = photos_through(lens_of(120.0, 0.0))
+
+    assert shows_whole_turn(panoramas_of(), (800, 400))
+    assert not shows_whole_turn(panoramas_of(), (800, 401))
+    assert not shows_whole_turn(photos, SIZE)
+    assert not shows_whole_turn([pair / [1.2, 1.6, 1.2, 1.6] for pair in photos], (800, 400))
+    assert not shows_whole_turn([], (800, 400))
