@@ -121,7 +121,8 @@ def run_stages(
     if run.settings.calibration.file:
         run = replace(run, given=read_given_cameras(Path(run.settings.calibration.file)))
     source = read_source(photo_dir, place.root, options, partial(ordered_map, run.executor, ahead=4 * run.workers))
-    return PIPELINE.run(source, replace(run, settings=source.adapt(run.settings)), first, last, wanted)
+    source.check_settings(run.settings)
+    return PIPELINE.run(source, run, first, last, wanted)
 
 
 def stored_model(run: RunContext, *, points: bool = False) -> Model:

@@ -39,18 +39,14 @@ class Source:
         """Hash of the path, the files and the masks."""
         return fingerprint(str(self.path.resolve()), self.files, self.masks)
 
-    def adapt(self, settings: Settings) -> Settings:
-        """Adjust the settings to the source: frames of one video share a camera unless the user sets otherwise.
+    def check_settings(self, settings: Settings) -> None:
+        """Check that the settings can be used with the source.
 
         Raises:
             ConfigError: a setting cannot be used with a video.
         """
-        if not self.video:
-            return settings
-        if settings.photos.images:
+        if self.video and settings.photos.images:
             raise ConfigError("--images lists photos of a folder, not frames of a video", hint="leave --images out")
-        cameras = "single" if settings.photos.cameras == "auto" else settings.photos.cameras
-        return settings.model_copy(update={"photos": settings.photos.model_copy(update={"cameras": cameras})})
 
     def content_hash(self, photos: PhotoSet) -> str:
         """Return a hash of the used photos and their masks; other files of the folder do not enter.

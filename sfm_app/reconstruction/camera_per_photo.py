@@ -16,9 +16,9 @@ from sfm_app.reconstruction.mapping_runs import EQUAL_TOLERANCE, MAX_CONTRADICTE
 from sfm_app.settings import Settings
 from sfm_app.types import Calibration, Intrinsics, MatchedImage, MatchGraph, ViewGraph
 
-MIN_PHOTOS, MAX_PHOTOS = 5, 60
-"""Range of the number of photos: with fewer, a camera per photo fits almost anything; with more, a pass costs more than
-it promises."""
+MIN_PHOTOS, MAX_PHOTOS = 5, 100
+"""Range of the number of photos: with fewer, a camera per photo fits almost anything; with more than a video has
+by default, a pass costs more than it promises."""
 MAX_REMAINING_SHARE = 0.5
 """Largest share of the contradictions that may remain with a camera per photo; else shared cameras were not the cause.
 Chosen on folders 0 to 180 of `python -m benchmarks.trouble`."""

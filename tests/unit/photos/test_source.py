@@ -55,11 +55,11 @@ def test_photos_that_change_under_a_run_are_seen(folder, tmp_path, change, says)
         source.check(used)
 
 
-def test_frames_of_a_video_share_a_camera_unless_told_otherwise(folder, tmp_path):
-    clip = replace(source_of(folder, tmp_path / "out"), video=True)
+def test_a_video_has_no_list_of_photos(folder, tmp_path):
+    photos = source_of(folder, tmp_path / "out")
+    listed = Settings.from_mapping({"photos": {"images": "list.txt"}})
 
-    assert clip.adapt(Settings()).photos.cameras == "single"
-    assert clip.adapt(Settings.from_mapping({"photos": {"cameras": "each"}})).photos.cameras == "each"
-    assert source_of(folder, tmp_path / "out").adapt(Settings()).photos.cameras == "auto"
+    photos.check_settings(listed)
+    replace(photos, video=True).check_settings(Settings())
     with pytest.raises(ConfigError, match="--images"):
-        clip.adapt(Settings.from_mapping({"photos": {"images": "list.txt"}}))
+        replace(photos, video=True).check_settings(listed)

@@ -51,7 +51,7 @@ def views(number):
         (4, 6, 0, AUTO, True),
         (5, 6, 0, AUTO, False),
         (MIN_PHOTOS - 1, MIN_PHOTOS - 1, 2, AUTO, False),
-        (61, 61, 2, AUTO, False),
+        (101, 101, 2, AUTO, False),
         (6, 6, 2, Settings.from_mapping({"photos": {"cameras": "single"}}), False),
     ],
 )
