@@ -18,6 +18,7 @@ from sfm_app.numerical import Json, json_text
 from sfm_app.reconstruction import MappedScene, Outcome, reconstruct, retry_lost_photos
 from sfm_app.reconstruction.align_upright import orient_or_keep, submit_cue_extraction
 from sfm_app.reconstruction.look_alikes import jumps, look_alike_entries
+from sfm_app.reconstruction.rolling_shutter import follow_shutter
 from sfm_app.reconstruction.unregistered import photo_names, unregistered_reasons
 from sfm_app.reconstruction.weak_scale import weakly_joined_parts
 from sfm_app.runtime.context import RunContext
@@ -81,7 +82,10 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     matches, views, intrinsics = found.matches, found.views, found.intrinsics
     outcome = _drop_models_without_depth(found.outcome, matches, views, intrinsics, run)
     looks = submit_cue_extraction([attempt.model for attempt in outcome.models], matches, run)
-    adjusted = [adjust_or_keep(attempt.model, found.run.workspace.database) for attempt in outcome.models]
+    database = found.run.workspace.database
+    adjusted = [adjust_or_keep(attempt.model, database) for attempt in outcome.models]
+    followed = [follow_shutter(one, matches, database) for one in adjusted]
+    adjusted, readout = [straight for straight, _ in followed], followed[0][1]
     models = [found.model for found in adjusted]
     with translate_errors("reading colors"):
         for model in models:
@@ -95,6 +99,8 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     names = {image.name: outcome.intrinsics.camera_name(image) for image in matches.images.values()}
     scene = read_scene(run.workspace.sparse, names, reasons, refined_cameras(adjusted[0], names))
     write_scene(scene, run)
+    if readout is not None:
+        run.record(shutter=readout.to_dict())
     run.record(
         registered=len(scene.registered),
         of=len(matches.images),
