@@ -36,8 +36,8 @@ from sfm_app.bundle_adjustment.lens_parts import PARTS, model_name
 from sfm_app.bundle_adjustment.normal_equations import Bundle, best_step, project, reduce, residuals
 from sfm_app.colmap.backend import pycolmap, show_log
 from sfm_app.colmap.bundle import Adjustment, adjust
-from sfm_app.colmap.bundle_arrays import read_bundle
-from sfm_app.colmap.bundle_rounds import LOSS_SCALE_PX, lens_priors
+from sfm_app.colmap.bundles.bundle_arrays import read_bundle
+from sfm_app.colmap.bundles.bundle_rounds import LOSS_SCALE_PX, lens_priors
 from sfm_app.geometry.lenses.projections import FISHEYE, PERSPECTIVE
 
 FloatArray = NDArray[np.float64]

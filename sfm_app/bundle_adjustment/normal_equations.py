@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial.transform import Rotation
 
+from sfm_app.bundle_adjustment.elimination import POSE, block_diagonal, free_pose_columns, to_sparse, whiten_points
 from sfm_app.geometry.lenses.projections import CAMERA, PANORAMA, project_points, wrap_residuals
 from sfm_app.geometry.spd_solve import project_to_psd, solve_positive
 
@@ -15,12 +16,6 @@ FloatArray = NDArray[np.float64]
 DAMPING = 1e-6
 """Added to the diagonal, so that a photo with no observation left does not make the system singular. Chosen by hand;
 not measured on its own."""
-POSE = 6
-"""Number of parameters of a pose. By definition."""
-MIN_INFORMATION = 1e-11
-"""Share of a point's information below which a direction counts as undetermined: rounding leaves this much of the depth
-of rays that nearly coincide. Two rays 1.5 degrees apart leave 2e-4. Chosen on no set. docs/algorithms.md, Bundle
-adjustment."""
 USUAL_NOISE_PX, USUAL_COUNT = 0.25, 4.0
 """Prior noise of a keypoint coordinate (the usual noise of SIFT), and its weight as a number of measurements. It
 matters where there are hardly more observations than unknowns; beside thousands of observations it does not count.
@@ -124,7 +119,7 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
         scale_px: s of the loss s^2 (sqrt(1 + |r|^2 / s^2) - 1), which is COLMAP's SOFT_L1.
     """
     r, by_view, by_point, seen = _linearize(bundle, scale_px)
-    whiten, rank = _whiten(by_point, bundle.point, len(bundle.X))
+    whiten, rank = whiten_points(by_point, bundle.point, len(bundle.X))
     by_point = np.einsum("nki,nji->nkj", by_point, whiten[bundle.point])
     poses, cameras = POSE * len(bundle.R), CAMERA * len(bundle.params)
     columns = np.hstack(
@@ -133,14 +128,14 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
             poses + CAMERA * bundle.camera[bundle.photo][:, None] + np.arange(CAMERA),
         ]
     )
-    J = _to_sparse(by_view, columns, poses + cameras)
-    Jp = _to_sparse(by_point, 3 * bundle.point[:, None] + np.arange(3), 3 * len(bundle.X))
+    J = to_sparse(by_view, columns, poses + cameras)
+    Jp = to_sparse(by_point, 3 * bundle.point[:, None] + np.arange(3), 3 * len(bundle.X))
     A = (Jp.T @ J).tocsr()
     S = (J.T @ J - A.T @ A).toarray() + DAMPING * np.eye(poses + cameras)
     flat = r.ravel()
     along = Jp.T @ flat
     gradient = J.T @ flat - A.T @ along
-    free = _free_pose_columns(bundle)
+    free = free_pose_columns(bundle.R, bundle.t)
     give = solve_positive(S[np.ix_(free, free)], np.column_stack([S[free][:, poses:], gradient[free]]))
     across = np.einsum("ij,jk->ik", S[poses:][:, free], give)
     H, g = S[poses:, poses:] - across[:, :-1], gradient[poses:] - across[:, -1]
@@ -152,7 +147,7 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     pose_step, pose_give = np.zeros(poses), np.zeros((poses, cameras))
     pose_step[free], pose_give[free] = give[:, -1], give[:, :-1]
     left_over = flat - J[:, :poses] @ pose_step - Jp @ (along - A[:, :poses] @ pose_step)
-    unwhiten = _block_diagonal(whiten.transpose(0, 2, 1))
+    unwhiten = block_diagonal(whiten.transpose(0, 2, 1))
     return ReducedSystem(
         H=H,
         g=g,
@@ -270,54 +265,3 @@ def _linearize(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray,
     r, by_view, by_point = (np.where(seen.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in (r, by_view, by_point))
     root = (1.0 + np.einsum("ni,ni->n", r, r) / scale_px**2) ** -0.25
     return r * root[:, None], by_view * root[:, None, None], by_point * root[:, None, None], seen
-
-
-def _whiten(by_point: FloatArray, point: NDArray[np.int64], points: int) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Return W (P, 3, 3) that makes derivatives by W^-T X orthonormal over the observations of a point, and its rank.
-
-    Along directions that the observations do not determine, W is 0.
-    """
-    H = np.zeros((points, 3, 3))
-    products = np.einsum("nki,nkj->nij", by_point, by_point)
-    for i in range(3):
-        for j in range(3):
-            H[:, i, j] = np.bincount(point, products[:, i, j], points)
-    diagonal = np.einsum("pii->pi", H)
-    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    unit = H / (scale[:, :, None] * scale[:, None, :])
-    # the pivots of the Cholesky decomposition
-    second = unit[:, 1, 1] - unit[:, 1, 0] ** 2
-    across = unit[:, 2, 1] - unit[:, 2, 0] * unit[:, 1, 0]
-    third = unit[:, 2, 2] - unit[:, 2, 0] ** 2 - across**2 / np.maximum(second, MIN_INFORMATION)
-    fixed = (unit[:, 0, 0] > 0.0) & (second > MIN_INFORMATION) & (third > MIN_INFORMATION)
-    W, rank = np.zeros((points, 3, 3)), np.full(points, 3)
-    W[fixed] = np.linalg.inv(np.linalg.cholesky(H[fixed]))
-    values, vectors = np.linalg.eigh(unit[~fixed])
-    kept = values > MIN_INFORMATION
-    gains = np.where(kept, np.where(kept, values, 1.0) ** -0.5, 0.0)
-    W[~fixed] = gains[:, :, None] * vectors.transpose(0, 2, 1) / scale[~fixed, None, :]
-    rank[~fixed] = np.count_nonzero(kept, axis=1)
-    return W, rank
-
-
-def _block_diagonal(blocks: FloatArray) -> sparse.csr_array:
-    """Return the block-diagonal matrix (3P, 3P) of blocks (P, 3, 3)."""
-    P = len(blocks)
-    columns = np.repeat(3 * np.arange(P)[:, None] + np.arange(3), 3, axis=0)
-    return sparse.csr_array((blocks.ravel(), columns.ravel(), 3 * np.arange(3 * P + 1)), shape=(3 * P, 3 * P))
-
-
-def _free_pose_columns(bundle: Bundle) -> NDArray[np.int64]:
-    """Return the free pose columns when the gauge is fixed: the first photo, and one coordinate of the farthest one."""
-    centers = -np.einsum("nji,nj->ni", bundle.R, bundle.t)
-    far = int(np.argmax(np.linalg.norm(centers - centers[0], axis=1)))
-    relative = bundle.R[far] @ (centers[0] - centers[far])
-    held = {POSE * far + 3 + int(np.argmax(np.abs(relative)))} | set(range(POSE))
-    return np.array([k for k in range(POSE * len(bundle.R)) if k not in held], np.int64)
-
-
-def _to_sparse(blocks: FloatArray, columns: NDArray[np.int64], width: int) -> sparse.csr_array:
-    """Return the sparse matrix (2N, width) of blocks (N, 2, k), each in two rows and the k columns (N, k) given."""
-    N, _, k = blocks.shape
-    places = np.repeat(columns, 2, axis=0).ravel()
-    return sparse.csr_array((blocks.ravel(), places, k * np.arange(2 * N + 1)), shape=(2 * N, width))

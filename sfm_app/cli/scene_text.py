@@ -17,6 +17,8 @@ CAMERA_PER_PHOTO_TEXTS = {
     "left": "a camera for each photo was tried, too, and explains no more",
 }
 DOUBTS = ("look_alikes", "perhaps_look_alikes", "jumps", "weakly_joined")
+FIGURES = ("readout", "deviation", "interval")
+"""Of a shutter in the manifest."""
 UNSURE_ODDS = 10.0
 """Odds (to one) that the model is upright, below which the text warns."""
 
@@ -30,7 +32,7 @@ def scene_summary(scene: Scene, counts: Mapping[str, Any]) -> dict[str, Any]:
     """
     kept = (
         "mapper", "mapper_reason", "pairs", "pairs_dropped", "cut_apart", "other_models", "adjustment", "orientation",
-        "second_look",
+        "second_look", "shutter",
     )  # fmt: skip
     cameras = {name: {**camera.to_dict(), "K": camera.K.round(3).tolist()} for name, camera in scene.cameras.items()}
     return {
@@ -91,6 +93,7 @@ def _remark_lines(summary: Mapping[str, Any], counts: Mapping[str, Any]) -> Iter
             f"beware: {100 * against / (explained + against):.0f} % of the matches between these photos contradict it; "
             "look for places that look alike"
         )
+    yield from _shutter_lines(summary.get("shutter", {}))
     yield from _adjustment_warnings(summary.get("adjustment", {}))
     orientation = summary.get("orientation", {})
     if orientation.get("failed"):
@@ -109,6 +112,18 @@ def _second_look_lines(found: Mapping[str, Any]) -> Iterator[str]:
         brought = f"{after} photos placed instead of {before}" if found["taken"] else "no more photos placed"
         failed = f" (it failed: {found['failed']})" if found.get("failed") else ""
         yield f"finer features were sought in {len(found['photos'])} unplaced photos: {brought}{failed}"
+
+
+def _shutter_lines(found: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what is known of the shutter of a video."""
+    if not found:
+        return
+    if "readout_ms" in found:
+        figures, span = [found[f"{name}_ms"] for name in FIGURES], "{:.1f} +- {:.1f} ms, at {:.0f} ms per frame"
+    else:
+        figures, span = [found[f"{name}_intervals"] for name in FIGURES], "{:.3f} +- {:.3f} of the time between frames"
+    end = f"not compensated: {found['because']}" if "because" in found else "poses are those of the middle rows"
+    yield f"rolling shutter: rows are read within {span.format(*figures)}; {end}"
 
 
 def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:

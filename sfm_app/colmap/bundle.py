@@ -10,7 +10,7 @@ from sfm_app.bundle_adjustment.camera_rules import calibration_from_params, fit_
 from sfm_app.bundle_adjustment.lens_family import convert_lens
 from sfm_app.bundle_adjustment.lens_parts import part_names
 from sfm_app.colmap.backend import pycolmap, translate_errors
-from sfm_app.colmap.bundle_arrays import (
+from sfm_app.colmap.bundles.bundle_arrays import (
     FILE_MODELS,
     NO_RULES,
     PLACES,
@@ -21,9 +21,9 @@ from sfm_app.colmap.bundle_arrays import (
     read_camera,
     write_camera,
 )
-from sfm_app.colmap.bundle_rounds import Rounds, adjust_in_rounds, solve
+from sfm_app.colmap.bundles.bundle_rounds import Rounds, adjust_in_rounds, solve
+from sfm_app.colmap.bundles.lens_choice import LensRecord, best_families, record_lenses
 from sfm_app.colmap.database import open_database
-from sfm_app.colmap.lens_choice import LensRecord, best_families, record_lenses
 from sfm_app.colmap.model import finite_mask
 from sfm_app.colmap.types import all_cameras, all_points
 from sfm_app.geometry.lenses.projections import FX, FY, PANORAMA

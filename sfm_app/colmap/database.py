@@ -132,7 +132,7 @@ def read_match_graph(path: Path, photos: PhotoSet) -> MatchGraph:
             photo = by_name[entry.name]
             images[entry.image_id] = MatchedImage(
                 entry.image_id, photo.name, photo.group, photo.width, photo.height,
-                photo.exif_focal_px, photo.gps, photo.turn_deg, photo.shown, photo.projection,
+                photo.exif_focal_px, photo.gps, photo.turn_deg, photo.shown, photo.projection, photo.time_s,
             )  # fmt: skip
             found = np.asarray(database.read_keypoints(entry.image_id), np.float64)
             keypoints[entry.image_id] = found[:, :2].copy() if len(found) else np.zeros((0, 2))  # a white wall

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sfm_app.atomic_io import replace_atomically
 from sfm_app.colmap.backend import pycolmap, translate_errors
-from sfm_app.colmap.bundle_arrays import camera_family, read_camera
+from sfm_app.colmap.bundles.bundle_arrays import camera_family, read_camera
 from sfm_app.colmap.masks import MASKS, shrink_mask
 from sfm_app.colmap.processes.undistort_process import JPEG_QUALITY
 from sfm_app.colmap.types import all_images

@@ -36,8 +36,7 @@ def find_intrinsics(
         cameras = _calibrate(matches, seen, run)
     cameras += cameras_with_lens(matches, views)
     report_claims({camera.name: _exif_claim(camera, matches) for camera in cameras}, run)
-    cameras = _take_given_cameras(cameras, matches, run)
-    cameras = sorted(cameras, key=lambda one: (-len(one.photos), one.name))
+    cameras = sorted(_take_given_cameras(cameras, matches, run), key=lambda one: (-len(one.photos), one.name))
     intrinsics = Intrinsics(
         cameras={camera.name: explain_failure(camera, views) for camera in cameras},
         camera_of={matches.images[photo].name: camera.name for camera in cameras for photo in camera.photos},

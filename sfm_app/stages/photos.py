@@ -51,9 +51,10 @@ def make(source: Source, run: RunContext) -> PhotoSet:
         InputError: the source is missing, fewer than two photos are usable, or a mask is unusable.
     """
     if not source.video:
-        return _read_photos(source, source.path, list(source.files), run)
-    with video_frames(source.path, run) as folder:
-        return _read_photos(source, folder, list_files(folder, run.workspace.root), run)
+        return _read_photos(source, source.path, list(source.files), {}, run)
+    with video_frames(source.path, run) as frames:
+        names = list_files(frames.folder, run.workspace.root)
+        return _read_photos(source, frames.folder, names, frames.times_s, run)
 
 
 def load(source: Source, run: RunContext) -> PhotoSet:
@@ -71,7 +72,9 @@ def digest(place: Workspace) -> str:
     return digest_files(place.root, place.photo_set.name)
 
 
-def _read_photos(source: Source, folder: Path, names: Sequence[str], run: RunContext) -> PhotoSet:
+def _read_photos(
+    source: Source, folder: Path, names: Sequence[str], times_s: Mapping[str, float], run: RunContext
+) -> PhotoSet:
     """Read these files of a folder and lay the usable photos out for COLMAP; errors as in `make`."""
     options = limit_to_memory(run)
     found = run.map(partial(read_photo, folder, options=options), names, "photos")
@@ -85,7 +88,8 @@ def _read_photos(source: Source, folder: Path, names: Sequence[str], run: RunCon
             _too_few_message(folder, len(photos), unusable),
             hint="at least two photos of a place are needed; 10 to 50 work best",
         )
-    named = tuple(split_by_given_camera(list(assign_names(group_by_camera(photos, options.cameras))), run.given))
+    timed = [replace(photo, time_s=times_s.get(photo.path)) for photo in photos]
+    named = tuple(split_by_given_camera(list(assign_names(group_by_camera(timed, options.cameras))), run.given))
     photo_set = PhotoSet(folder, named, tuple(unusable), source.mask_dir)
     for place in (run.workspace.photos, run.workspace.masks):
         shutil.rmtree(place, ignore_errors=True)
@@ -176,7 +180,8 @@ def lay_out_photo(photo: Photo, *, folder: Path, target: Path) -> None:
 
 def _save_photo_set(photos: PhotoSet, run: RunContext) -> None:
     """Write photos.json, with hashes of the copies."""
-    known = {"photos": [asdict(photo) for photo in photos.photos], "unusable": [asdict(p) for p in photos.unusable]}
+    entries = [_photo_to_dict(photo) for photo in photos.photos]
+    known = {"photos": entries, "unusable": [asdict(photo) for photo in photos.unusable]}
     copies = {photo.name: _copy_digest(photo, run) for photo in photos.photos}
     with replace_atomically(run.workspace.photo_set) as path:
         path.write_text(json.dumps({**known, "copies": copies}, indent=1) + "\n", encoding="utf-8")
@@ -203,6 +208,10 @@ def _read_photo_set(folder: Path, masks: Path | None, run: RunContext) -> PhotoS
         if masks is not None and not mask_path(run.workspace.masks, photo.name).exists():
             lay_out_mask(photo, folder, masks, run.workspace.masks)
     return PhotoSet(folder, photos, tuple(UnusablePhoto(**photo) for photo in values["unusable"]), masks)
+
+
+def _photo_to_dict(photo: Photo) -> dict[str, Any]:
+    return {key: value for key, value in asdict(photo).items() if key != "time_s" or value is not None}
 
 
 def _photo_from_dict(entry: Mapping[str, Any]) -> Photo:

@@ -22,6 +22,7 @@ from sfm_app.reconstruction import MappedScene, Outcome, reconstruct, retry_lost
 from sfm_app.reconstruction.align_upright import orient_or_keep, submit_cue_extraction
 from sfm_app.reconstruction.look_alikes import jumps, look_alike_entries
 from sfm_app.reconstruction.unregistered import photo_names, unregistered_reasons
+from sfm_app.reconstruction.videos.rolling_shutter import follow_shutter
 from sfm_app.reconstruction.weak_scale import weakly_joined_parts
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import MAPPING, SubWorkspace, Workspace
@@ -85,13 +86,13 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     outcome = _drop_models_without_depth(found.outcome, matches, views, intrinsics, run)
     looks = submit_cue_extraction([attempt.model for attempt in outcome.models], matches, run)
     names = {image.name: outcome.intrinsics.camera_name(image) for image in matches.images.values()}
-    wanted = run.settings.scene.camera_model
+    wanted, database = run.settings.scene.camera_model, found.run.workspace.database
+    laid_down = [camera_rules(attempt.model, names, intrinsics, wanted) for attempt in outcome.models]
     adjusted = [
-        adjust_or_keep(
-            attempt.model, found.run.workspace.database, camera_rules(attempt.model, names, intrinsics, wanted)
-        )
-        for attempt in outcome.models
+        adjust_or_keep(attempt.model, database, rules) for attempt, rules in zip(outcome.models, laid_down, strict=True)
     ]
+    followed = [follow_shutter(one, matches, database, rules) for one, rules in zip(adjusted, laid_down, strict=True)]
+    adjusted, readout = [straight for straight, _ in followed], followed[0][1]
     models = [found.model for found in adjusted]
     with translate_errors("reading colors"):
         for model in models:
@@ -104,6 +105,8 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     reasons = unregistered_reasons(set(members[0]), members[1:], matches, views, outcome.graph)
     scene = read_scene(run.workspace.sparse, names, reasons, refined_cameras(adjusted[0], names))
     write_scene(scene, run)
+    if readout is not None:
+        run.record(shutter=readout.to_dict())
     run.record(
         registered=len(scene.registered),
         of=len(matches.images),

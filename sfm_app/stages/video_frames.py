@@ -29,12 +29,23 @@ class FrameChoice:
     """Fingerprint of the inputs."""
     frames: tuple[int, ...]
     """Numbers of the chosen frames."""
+    times_s: tuple[float, ...]
+    """When they were taken."""
     counts: Mapping[str, Any]
     """Figures for the manifest."""
 
 
+@dataclass(frozen=True, slots=True)
+class VideoFrames:
+    """The chosen frames of a video as a folder."""
+
+    folder: Path
+    times_s: Mapping[str, float]
+    """When they were taken, by file name."""
+
+
 @contextmanager
-def video_frames(source: Path, run: RunContext) -> Iterator[Path]:
+def video_frames(source: Path, run: RunContext) -> Iterator[VideoFrames]:
     """Provide a folder with the chosen frames of a video.
 
     If the run is killed before the block ends, the next one keeps the choice.
@@ -54,7 +65,8 @@ def video_frames(source: Path, run: RunContext) -> Iterator[Path]:
             path.write_text(json.dumps(asdict(chosen)), encoding="utf-8")
     _write_frames(source, chosen.frames, run)
     run.record(video=chosen.counts)
-    yield run.workspace.frames
+    names = (frame_name(source, frame) for frame in chosen.frames)
+    yield VideoFrames(run.workspace.frames, dict(zip(names, chosen.times_s, strict=True)))
     run.workspace.frames_marker.unlink()
 
 
@@ -62,10 +74,11 @@ def read_choice(run: RunContext) -> FrameChoice | None:
     """Return the choice of a killed run from the same inputs; None where there is none."""
     try:
         found = json.loads(run.workspace.frames_marker.read_text(encoding="utf-8"))
-        chosen = FrameChoice(found["made_from"], tuple(map(int, found["frames"])), dict(found["counts"]))
+        frames, times_s = tuple(map(int, found["frames"])), tuple(map(float, found["times_s"]))
+        chosen = FrameChoice(found["made_from"], frames, times_s, dict(found["counts"]))
     except (OSError, ValueError, TypeError, LookupError):
         return None
-    return chosen if chosen.made_from == run.fingerprint else None
+    return chosen if chosen.made_from == run.fingerprint and len(times_s) == len(frames) else None
 
 
 def choose_frames(source: Path, run: RunContext) -> FrameChoice:
@@ -80,7 +93,10 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
         with open_video(source) as video:
             follower = CornerTracker()
             pictures = track(run.progress, video.small_frames(), "looking at frames", video.sample_count)
-            looks = [follower.track(number, small) for number, small in pictures]
+            looks, moments = [], {}
+            for number, small in pictures:
+                looks.append(follower.track(number, small))
+                moments[number] = video.seconds
     except UnreadableError as err:
         raise InputError(f"cannot read {source}: {err}", hint=DAMAGED) from err
     looked_at, notes = len(looks) + video.black, []
@@ -103,14 +119,14 @@ def choose_frames(source: Path, run: RunContext) -> FrameChoice:
         "left_out": choice.left_out | ({BLACK: video.black} if video.black else {}),
         "notes": notes,
     }
-    return FrameChoice(run.fingerprint, choice.frames, counts)
+    return FrameChoice(run.fingerprint, choice.frames, tuple(moments[frame] for frame in choice.frames), counts)
 
 
 def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> None:
     """Write the frames that are not there yet."""
     for half in run.workspace.frames.glob(".*"):  # incomplete files of a killed run
         half.unlink()
-    places = {frame: run.workspace.frames / f"{frame_stem(source)}_{frame:06d}.jpg" for frame in frames}
+    places = {frame: run.workspace.frames / frame_name(source, frame) for frame in frames}
     missing = [frame for frame, place in places.items() if not place.exists()]
     if not missing:
         return
@@ -125,6 +141,16 @@ def _write_frames(source: Path, frames: tuple[int, ...], run: RunContext) -> Non
         raise InputError(f"cannot read {source}: {err}", hint=DAMAGED) from err
     if written < len(missing):
         raise InputError(f"{source} has changed while it was read", hint="run again once it is restored")
+
+
+def frame_name(source: Path, frame: int) -> str:
+    """Return the name of the file of a frame.
+
+    Args:
+        source: video file.
+        frame: its number.
+    """
+    return f"{frame_stem(source)}_{frame:06d}.jpg"
 
 
 def frame_stem(source: Path) -> str:

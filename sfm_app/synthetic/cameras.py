@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,8 @@ class Views:
     """By photo name; same names as in `cam_from_world`."""
     cam_from_world: Mapping[str, FloatArray]
     """By photo name: (3, 4) [R | t]."""
+    row_poses: Mapping[str, FloatArray] = field(default_factory=dict)
+    """By photo name, where a rolling shutter took it: (height, 3, 4) pose that each row is seen from."""
 
     @classmethod
     def from_poses(cls, camera: Camera, poses: Sequence[FloatArray]) -> "Views":

@@ -113,7 +113,7 @@ def write_photo_folder(
     """
     options = options or PhotoOptions()
     prepared = prepare(scene)
-    poses = list(enumerate(views.cam_from_world.items()))
+    poses = list(enumerate({**views.cam_from_world, **views.row_poses}.items()))
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for k, (name, pose) in track(progress or SilentProgress(), poses, "rendering photos", len(poses)):

@@ -65,21 +65,19 @@ def render_scene(
     Args:
         scene: from `prepare`.
         camera: intrinsics, size and distortion.
-        cam_from_world: (3, 4) pose.
+        cam_from_world: (3, 4) pose; with a rolling shutter (height, 3, 4), one for each row.
         supersampling: rays per pixel in x and in y, >= 1; each has its own shadow ray.
 
     Returns:
         (height, width, 3) linear RGB, about 0..1.
     """
-    R = cam_from_world[:, :3]
-    center = camera_center(cam_from_world)
     total = np.zeros((camera.height * camera.width, 3))
     offsets = (np.arange(supersampling) + 0.5) / supersampling
     for dy in offsets:
         for dx in offsets:
             rays = pixel_rays(camera, (float(dx), float(dy)))
             shows = np.isfinite(rays[:, 0])
-            directions = np.where(shows[:, None], rays, [0.0, 0.0, 1.0]) @ R
+            center, directions = _to_world(np.where(shows[:, None], rays, [0.0, 0.0, 1.0]), cam_from_world)
             hits = cast_rays(scene.rays, center, directions)
             lit = _is_sunlit(scene, center, directions, hits)
             # t_hit is the z depth where rays have z = 1, else the distance; a pixel covers t_hit / f on the surface
@@ -91,6 +89,15 @@ def render_scene(
             )
     total[~shows] = 0.0  # outside of the image circle
     return (total / supersampling**2).reshape(camera.height, camera.width, 3)
+
+
+def _to_world(rays: FloatArray, cam_from_world: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the origin (3,) of rays (N, 3) of a photo, or one for each (N, 3), and their directions (N, 3)."""
+    if cam_from_world.ndim == 2:
+        return camera_center(cam_from_world), rays @ cam_from_world[:, :3]
+    poses = np.repeat(cam_from_world, len(rays) // len(cam_from_world), axis=0)
+    R = poses[:, :, :3]
+    return -np.einsum("nji,nj->ni", R, poses[:, :, 3]), np.einsum("nj,nji->ni", rays, R)
 
 
 def ray_caster(vertices: FloatArray, faces: NDArray[np.int64]) -> Any:
@@ -131,7 +138,8 @@ def _is_sunlit(
     asked = np.flatnonzero(lit)
     rays = np.empty((len(asked), 6), dtype=np.float32)
     # a step towards the sun keeps the surface from shadowing itself
-    rays[:, :3] = center + directions[asked] * hits["t_hit"][asked, None] + 4e-3 * sun
+    origin = center if center.ndim == 1 else center[asked]
+    rays[:, :3] = origin + directions[asked] * hits["t_hit"][asked, None] + 4e-3 * sun
     rays[:, 3:] = sun
     lit[asked] = ~scene.rays.test_occlusions(load_open3d().core.Tensor(rays)).numpy()
     return np.asarray(lit)

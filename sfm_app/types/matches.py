@@ -29,6 +29,8 @@ class MatchedImage:
     """The picture inside the bars; None where there are no bars."""
     projection: str = "perspective"
     """"equirectangular" for a panorama, "perspective" for every other photo, also for fisheyes."""
+    time_s: float | None = None
+    """When it was taken, if it is a frame of a video: seconds from its start."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,6 +51,8 @@ class Photo:
     """Path of its mask inside the folder of masks; empty where it has none."""
     projection: str = "perspective"
     """"equirectangular" for a panorama, "perspective" for every other photo, also for fisheyes: matches show those."""
+    time_s: float | None = None
+    """When it was taken, in seconds from the start of the video that it is a frame of; None for other photos."""
 
     @property
     def path(self) -> str:

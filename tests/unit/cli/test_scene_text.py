@@ -133,3 +133,19 @@ def test_a_camera_for_each_photo_is_named_where_it_was_tried():
     assert "does not explain them, two do" in told(one_camera_each="two")[0]
     assert "was tried, too, and explains no more" in told(one_camera_each="left")[0]
     assert "each" not in told(one_camera_each="")[0]
+
+
+def test_a_compensated_shutter_is_named_with_its_deviation():
+    shutter = {"readout_ms": 20.94, "deviation_ms": 1.6, "interval_ms": 33.3, "compensated": True}
+    text, summary = told(shutter=shutter)
+
+    assert "rolling shutter: rows are read within 20.9 +- 1.6 ms, at 33 ms per frame; poses are those" in text
+    assert summary["shutter"] == shutter
+
+
+def test_why_a_shutter_is_not_compensated_is_said():
+    found = {"readout_intervals": 0.01, "deviation_intervals": 0.2, "interval_intervals": 1.0, "compensated": False}
+    text, _ = told(shutter=found | {"because": "nobody knows"})
+
+    assert "within 0.010 +- 0.200 of the time between frames; not compensated: nobody knows" in text
+    assert "shutter" not in told()[0]

@@ -5,7 +5,7 @@ import pytest
 
 from sfm_app.bundle_adjustment.camera_rules import CameraRule
 from sfm_app.colmap.bundle import adjust
-from sfm_app.colmap.bundle_arrays import camera_family, read_camera
+from sfm_app.colmap.bundles.bundle_arrays import camera_family, read_camera
 from sfm_app.estimation.camera_check import find_contradictions
 from sfm_app.geometry.lenses.camera_models import calibration_from_model
 from sfm_app.geometry.lenses.projections import FISHEYE, FX, K1, K2, K3, P1

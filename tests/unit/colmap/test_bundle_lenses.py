@@ -5,8 +5,8 @@ import pytest
 
 from sfm_app.colmap.backend import pycolmap
 from sfm_app.colmap.bundle import adjust
-from sfm_app.colmap.bundle_arrays import camera_family, file_model, read_camera, write_camera
-from sfm_app.colmap.bundle_rounds import solve
+from sfm_app.colmap.bundles.bundle_arrays import camera_family, file_model, read_camera, write_camera
+from sfm_app.colmap.bundles.bundle_rounds import solve
 from sfm_app.geometry.lenses.projections import CAMERA, CX, CY, FX, FY, PANORAMA
 from sfm_app.numerical import json_text
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from sfm_app.cli.scene_text import scene_lines
-from sfm_app.colmap import bundle_rounds
 from sfm_app.colmap.backend import pycolmap
+from sfm_app.colmap.bundles import bundle_rounds
 from sfm_app.colmap.database import open_database
 from sfm_app.colmap.model import posed_photo_ids, submodel
 from sfm_app.errors import ReconstructionError

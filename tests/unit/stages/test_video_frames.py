@@ -43,8 +43,8 @@ def write(path, places):
 
 
 def frames_of(source, run):
-    with video_frames(source, run) as folder:
-        return sorted(path.name for path in folder.iterdir())
+    with video_frames(source, run) as frames:
+        return sorted(path.name for path in frames.folder.iterdir())
 
 
 def test_a_video_becomes_a_folder_of_frames(clip, run):
@@ -73,7 +73,8 @@ def killed(source, run):
 def test_a_killed_run_does_not_choose_again(clip, run):
     killed(clip, run)
     marker = json.loads(run.workspace.frames_marker.read_text())
-    marker["frames"] = marker["frames"][:3]  # nobody would choose so
+    for part in ("frames", "times_s"):
+        marker[part] = marker[part][:3]  # nobody would choose so
     run.workspace.frames_marker.write_text(json.dumps(marker))
     first, second = sorted(run.workspace.frames.iterdir())[:2]
     second.unlink()
@@ -100,6 +101,15 @@ def test_other_inputs_choose_anew(clip, tmp_path, run):
     killed(clip, run)
 
     assert len(frames_of(write(clip, range(0, 40, 4)), run.with_fingerprint("another"))) <= 6
+
+
+def test_the_times_of_the_frames_are_those_of_the_video(clip, run):
+    with video_frames(clip, run) as frames:
+        numbers = {path.name: int(path.stem.rpartition("_")[2]) for path in frames.folder.iterdir()}
+
+    assert frames.times_s.keys() == numbers.keys()
+    for name, number in numbers.items():
+        assert frames.times_s[name] == pytest.approx(number / 30, abs=0.002)
 
 
 def test_a_video_that_is_cut_off_says_so(clip, run):

@@ -96,6 +96,19 @@ def test_bodies_of_one_material_have_their_own_stains():
     assert left.std() > 0.01 and abs(np.corrcoef(left.ravel(), right.ravel())[0, 1]) < 0.5
 
 
+def test_rows_are_seen_from_poses_of_their_own(prepared, four_views):
+    """The upper half of a frame whose lower rows are seen from elsewhere is that of the photo from the first pose."""
+    camera = make_camera(60, 40)
+    first, second, *_ = four_views.cam_from_world.values()
+    halves = np.concatenate([np.repeat(first[None], 20, axis=0), np.repeat(second[None], 20, axis=0)])
+
+    image = render_scene(prepared, camera, halves)
+
+    assert image[:20] == pytest.approx(render_scene(prepared, camera, first)[:20], abs=0.01)
+    assert image[20:] == pytest.approx(render_scene(prepared, camera, second)[20:], abs=0.01)
+    assert np.abs(image[20:] - render_scene(prepared, camera, first)[20:]).mean() > 0.02
+
+
 def test_rendering_repeats_to_the_bit(prepared, four_views):
     pose = next(iter(four_views.cam_from_world.values()))
     camera = make_camera(60, 40)

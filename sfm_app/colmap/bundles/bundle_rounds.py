@@ -10,7 +10,7 @@ from sfm_app.bundle_adjustment.lens_evidence import LensEstimate, estimate_lense
 from sfm_app.bundle_adjustment.lens_parts import COUNT, PARTS, LensPriors, consistent_choices
 from sfm_app.bundle_adjustment.normal_equations import Bundle, best_step, reduce
 from sfm_app.colmap.backend import pycolmap, run_in_daemon_thread
-from sfm_app.colmap.bundle_arrays import NO_RULES, Rules, photos_per_camera, read_bundle, write_bundle
+from sfm_app.colmap.bundles.bundle_arrays import NO_RULES, Rules, photos_per_camera, read_bundle, write_bundle
 from sfm_app.errors import NumericalError
 from sfm_app.geometry.lenses.projections import FX, FY, PANORAMA
 

@@ -11,8 +11,8 @@ from sfm_app.bundle_adjustment.lens_evidence import LensChoice, estimate_lenses
 from sfm_app.bundle_adjustment.lens_family import asks_for_other_family, convert_lens, family_evidence
 from sfm_app.bundle_adjustment.normal_equations import Bundle, cost, reduce
 from sfm_app.colmap.backend import pycolmap
-from sfm_app.colmap.bundle_arrays import NO_RULES, Rules, read_bundle, write_camera
-from sfm_app.colmap.bundle_rounds import LOSS_SCALE_PX, MIN_PHOTOS, Rounds, adjust_in_rounds, lens_priors
+from sfm_app.colmap.bundles.bundle_arrays import NO_RULES, Rules, read_bundle, write_camera
+from sfm_app.colmap.bundles.bundle_rounds import LOSS_SCALE_PX, MIN_PHOTOS, Rounds, adjust_in_rounds, lens_priors
 from sfm_app.geometry.lenses.projections import CX, CY, FISHEYE, FX, FY, PERSPECTIVE
 from sfm_app.numerical import FAILURES, Json, error_reason
 

@@ -1,0 +1,1 @@
+"""What holds for frames of a video only."""

@@ -1,0 +1,120 @@
+"""Follow the rolling shutter of a video: measure its readout, compensate the keypoints, adjust again, and repeat."""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from sfm_app.bundle_adjustment.readout import ReadoutEstimate
+from sfm_app.colmap.backend import translate_errors
+from sfm_app.colmap.bundle import Adjustment, adjust_or_keep
+from sfm_app.colmap.bundles.bundle_arrays import NO_RULES, Rules
+from sfm_app.colmap.bundles.rolling_shutter import measure_readout, read_keypoints, straighten_model
+from sfm_app.colmap.model import posed_photo_ids
+from sfm_app.numerical import FAILURES, Json
+from sfm_app.reconstruction.videos.frame_times import FrameTimes, frame_times
+from sfm_app.types import MatchGraph
+
+logger = logging.getLogger("sfm_app")
+
+ROUNDS, SETTLED = 4, 0.25
+"""Most rounds of measuring and compensating, and the change of the readout, in deviations, below which they end: two or
+three are needed (`python -m benchmarks.shutter`)."""
+SURE = 3.0
+"""Readout in deviations from which on it is taken for one. Chosen by hand."""
+LONGEST = 1.05
+"""Longest readout, in intervals between frames: no sensor reads longer than a frame lasts. By definition, with room for
+the error of the measurement."""
+
+
+@dataclass(frozen=True, slots=True)
+class Readout:
+    """What is known of the shutter of a video."""
+
+    readout: float
+    """In the unit of the interval; negative where the last row is read first."""
+    deviation: float
+    interval: float
+    """Between two frames of the video: in seconds, or 1 where only numbers of frames are known."""
+    in_seconds: bool
+    refused: str = ""
+    """Why nothing is compensated; empty where keypoints and poses are those of the middle rows."""
+
+    def to_dict(self) -> dict[str, Json]:
+        """Return plain values for the manifest, in milliseconds or in intervals."""
+        unit, scale = ("ms", 1e3) if self.in_seconds else ("intervals", 1.0)
+        figures = {"readout": self.readout, "deviation": self.deviation, "interval": self.interval}
+        found: dict[str, Json] = {f"{name}_{unit}": round(scale * value, 4) for name, value in figures.items()}
+        return found | {"compensated": not self.refused} | ({"because": self.refused} if self.refused else {})
+
+
+def follow_shutter(
+    adjusted: Adjustment, matches: MatchGraph, database: Path, rules: Rules = NO_RULES
+) -> tuple[Adjustment, Readout | None]:
+    """Return the model as a global shutter would have given it, and what is known of the shutter.
+
+    The given adjustment is returned where the photos are not known to be frames of a video, where no readout is found,
+    and where the compensated model explains the photos no better.
+
+    Args:
+        adjusted: a model after the last adjustment.
+        matches: all photos.
+        database: has all keypoints and matches.
+        rules: what the user laid down about its cameras, as in `adjust`.
+    """
+    if adjusted.failure or not adjusted.lenses:
+        return adjusted, None
+    images = [matches.images[photo] for photo in posed_photo_ids(adjusted.model)]
+    frames = frame_times(images, adjusted.model)
+    if frames is None:
+        return adjusted, None
+    try:
+        with translate_errors("following the shutter"):
+            measured = _compensate(adjusted, frames, database, rules)
+    except FAILURES as err:
+        logger.info("the shutter could not be followed", exc_info=err)
+        return adjusted, None
+    straight, estimate = measured[-1]
+    refused = _reason_to_refuse(adjusted, straight, estimate, frames)
+    found = Readout(estimate.readout, estimate.deviation, frames.interval, frames.in_seconds, refused)
+    return (adjusted if refused else straight), found
+
+
+def _compensate(
+    adjusted: Adjustment, frames: FrameTimes, database: Path, rules: Rules
+) -> Sequence[tuple[Adjustment, ReadoutEstimate]]:
+    """Return the adjusted models of all rounds with the readouts that they were compensated for.
+
+    The first round is the last one where the readout is smaller than its deviation; the model is then the given one.
+    """
+    found: list[tuple[Adjustment, ReadoutEstimate]] = []
+    keypoints, current = read_keypoints(adjusted.model), adjusted
+    estimate: ReadoutEstimate | None = None
+    for _ in range(ROUNDS):
+        before, estimate = estimate, measure_readout(current, keypoints, frames.times, estimate)
+        if abs(estimate.readout) <= estimate.deviation:
+            return [*found, (adjusted, estimate)]
+        current = adjust_or_keep(straighten_model(current.model, estimate, keypoints), database, rules)
+        found.append((current, estimate))
+        if current.failure or _is_settled(before, estimate):
+            break
+    return found
+
+
+def _is_settled(before: ReadoutEstimate | None, after: ReadoutEstimate) -> bool:
+    """Return whether the readout has not changed since the round before."""
+    return before is not None and abs(after.readout - before.readout) <= SETTLED * after.deviation
+
+
+def _reason_to_refuse(adjusted: Adjustment, straight: Adjustment, estimate: ReadoutEstimate, frames: FrameTimes) -> str:
+    """Return why the compensated model is not taken; empty where it is."""
+    if SURE * estimate.deviation >= frames.interval:
+        return "the motion of the camera does not tell it"
+    if abs(estimate.readout) < SURE * estimate.deviation:
+        return "it is not distinct from that of a global shutter"
+    if abs(estimate.readout) > LONGEST * frames.interval:
+        return "it is longer than a frame lasts, so it is something else"
+    if straight.failure:
+        return f"the adjustment failed: {straight.failure}"
+    before, after = (one.model.compute_mean_reprojection_error() for one in (adjusted, straight))
+    return "" if after < before else "the photos contradict it"
