@@ -17,8 +17,6 @@ CAMERA_PER_PHOTO_TEXTS = {
     "left": "a camera for each photo was tried, too, and explains no more",
 }
 DOUBTS = ("look_alikes", "perhaps_look_alikes", "jumps", "weakly_joined")
-FIGURES = ("readout", "deviation", "interval")
-"""Of a shutter in the manifest."""
 UNSURE_ODDS = 10.0
 """Odds (to one) that the model is upright, below which the text warns."""
 
@@ -118,12 +116,10 @@ def _shutter_lines(found: Mapping[str, Any]) -> Iterator[str]:
     """Yield what is known of the shutter of a video."""
     if not found:
         return
-    if "readout_ms" in found:
-        figures, span = [found[f"{name}_ms"] for name in FIGURES], "{:.1f} +- {:.1f} ms, at {:.0f} ms per frame"
-    else:
-        figures, span = [found[f"{name}_intervals"] for name in FIGURES], "{:.3f} +- {:.3f} of the time between frames"
+    readout, deviation, interval = (found[f"{name}_ms"] for name in ("readout", "deviation", "interval"))
+    span = f"{readout:.1f} +- {deviation:.1f} ms, at {interval:.0f} ms per frame"
     end = f"not compensated: {found['because']}" if "because" in found else "poses are those of the middle rows"
-    yield f"rolling shutter: rows are read within {span.format(*figures)}; {end}"
+    yield f"rolling shutter: rows are read within {span}; {end}"
 
 
 def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:

@@ -65,10 +65,9 @@ def epipolar_residuals(pairs: CameraPairs, camera: Calibration) -> EpipolarResid
         camera: any projection.
     """
     x, along, distances = [np.zeros((2, 0, 2))], [np.zeros((2, 0, 2))], [np.zeros(0)]
-    for F, match in zip(pairs.Fs, pairs.inliers, strict=False):
-        if not len(match):
-            continue
-        points = np.asarray(match, np.float64)[:, :2], np.asarray(match, np.float64)[:, 2:]
+    matched = ((F, np.asarray(x, np.float64)) for F, x in zip(pairs.Fs, pairs.inliers, strict=False) if len(x))
+    for F, match in matched:
+        points = match[:, :2], match[:, 2:]
         lines = np.hstack([bearings(one, camera) for one in points])
         E = _matrix_of_rays(F, lines, camera)
         length = gradients(E, lines)

@@ -32,19 +32,17 @@ class Readout:
     """What is known of the shutter of a video."""
 
     readout: float
-    """In the unit of the interval; negative where the last row is read first."""
+    """Seconds; negative where the last row is read first."""
     deviation: float
     interval: float
-    """Between two frames of the video: in seconds, or 1 where only numbers of frames are known."""
-    in_seconds: bool
+    """Seconds between two frames of the video."""
     refused: str = ""
     """Why nothing is compensated; empty where keypoints and poses are those of the middle rows."""
 
     def to_dict(self) -> dict[str, Json]:
-        """Return plain values for the manifest, in milliseconds or in intervals."""
-        unit, scale = ("ms", 1e3) if self.in_seconds else ("intervals", 1.0)
+        """Return plain values for the manifest, in milliseconds."""
         figures = {"readout": self.readout, "deviation": self.deviation, "interval": self.interval}
-        found: dict[str, Json] = {f"{name}_{unit}": round(scale * value, 4) for name, value in figures.items()}
+        found: dict[str, Json] = {f"{name}_ms": round(1e3 * value, 4) for name, value in figures.items()}
         return found | {"compensated": not self.refused} | ({"because": self.refused} if self.refused else {})
 
 
@@ -65,7 +63,7 @@ def follow_shutter(
     if adjusted.failure or not adjusted.lenses:
         return adjusted, None
     images = [matches.images[photo] for photo in posed_photo_ids(adjusted.model)]
-    frames = frame_times(images, adjusted.model)
+    frames = frame_times(images)
     if frames is None:
         return adjusted, None
     try:
@@ -76,7 +74,7 @@ def follow_shutter(
         return adjusted, None
     straight, estimate = measured[-1]
     refused = _reason_to_refuse(adjusted, straight, estimate, frames)
-    found = Readout(estimate.readout, estimate.deviation, frames.interval, frames.in_seconds, refused)
+    found = Readout(estimate.readout, estimate.deviation, frames.interval, refused)
     return (adjusted if refused else straight), found
 
 

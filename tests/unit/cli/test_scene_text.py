@@ -144,8 +144,8 @@ def test_a_compensated_shutter_is_named_with_its_deviation():
 
 
 def test_why_a_shutter_is_not_compensated_is_said():
-    found = {"readout_intervals": 0.01, "deviation_intervals": 0.2, "interval_intervals": 1.0, "compensated": False}
+    found = {"readout_ms": 0.3, "deviation_ms": 6.6, "interval_ms": 33.3, "compensated": False}
     text, _ = told(shutter=found | {"because": "nobody knows"})
 
-    assert "within 0.010 +- 0.200 of the time between frames; not compensated: nobody knows" in text
+    assert "within 0.3 +- 6.6 ms, at 33 ms per frame; not compensated: nobody knows" in text
     assert "shutter" not in told()[0]
