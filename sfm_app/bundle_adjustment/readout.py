@@ -27,7 +27,7 @@ FloatArray = NDArray[np.float64]
 
 STEPS, CONVERGED = 12, 1e-4
 """Most Gauss-Newton steps, and the relative decrease of the cost below which they end: after three to six. Chosen on
-`python -m benchmarks.shutter`."""
+`python -m benchmarks.videos.shutter`."""
 HALVINGS = 3
 """How often a step is halved that raises the cost. Chosen by hand; not measured on its own."""
 LEAST_READOUT = 1e-5
@@ -35,7 +35,7 @@ LEAST_READOUT = 1e-5
 offsets must be finite. Chosen by hand; not measured on its own."""
 SHAKE = (0.2, 5.0)
 """Range of the size of offsets, in deviations of the path's velocities times readout. Above it, offsets of all photos
-together bend the scene, and no readout is found. Chosen on `python -m benchmarks.shutter`."""
+together bend the scene, and no readout is found. Chosen on `python -m benchmarks.videos.shutter`."""
 LEAST_MEASURED = 3.0
 """Number of offsets that the photos must determine before their size is changed. Chosen by hand; not measured on its
 own."""

@@ -19,7 +19,7 @@ logger = logging.getLogger("sfm_app")
 
 ROUNDS, SETTLED = 4, 0.25
 """Most rounds of measuring and compensating, and the change of the readout, in deviations, below which they end: two or
-three are needed (`python -m benchmarks.shutter`)."""
+three are needed (`python -m benchmarks.videos.shutter`)."""
 SURE = 3.0
 """Readout in deviations from which on it is taken for one. Chosen by hand."""
 LONGEST = 1.05

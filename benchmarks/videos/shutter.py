@@ -1,7 +1,7 @@
 """Rolling shutters of synthetic videos: the measured readout, and the poses with and without it.
 
-    python -m benchmarks.shutter --seeds 5
-    python -m benchmarks.shutter --kinds "turn 60" --readouts-ms 20 --seeds 20
+    python -m benchmarks.videos.shutter --seeds 5
+    python -m benchmarks.videos.shutter --kinds "turn 60" --readouts-ms 20 --seeds 20
 
 Models as mapping leaves them, from noisy keypoints; nothing is rendered.
 """
@@ -19,7 +19,7 @@ import numpy as np
 from benchmarks.common.command_line import new_parser
 from benchmarks.common.metrics import area_under_recall, pose_errors_deg
 from benchmarks.common.results import RESULTS, Row, document, table, write
-from benchmarks.shutter.sequences import FRAMES_PER_S, SIZE, STRONG_LENS, Kind, draw_sequence, map_sequence
+from benchmarks.videos.sequences import FRAMES_PER_S, SIZE, STRONG_LENS, Kind, draw_sequence, map_sequence
 from sfm_app.bundle_adjustment.readout import ReadoutEstimate
 from sfm_app.colmap.backend import pycolmap, show_log
 from sfm_app.colmap.bundle import Adjustment, adjust
