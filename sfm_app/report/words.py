@@ -11,6 +11,8 @@ HELD = {
     "k1": "a lens that bends no lines",
 }
 """The usual value, by the parameter that the photos do not determine."""
+SURE = 2.0
+"""Distortion in deviations from which on its direction is said: 19 in 20. By convention."""
 
 
 def field_text(camera: Calibration) -> str:
@@ -61,6 +63,8 @@ def lens_text(camera: Calibration) -> str:
     """Return the radial distortion; empty where there is none or the photos do not determine it."""
     if camera.radial == 0.0 or "k1" in camera.held:
         return ""
+    if abs(camera.radial) < SURE * camera.spread.get("k1", 0.0):
+        return f"The lens hardly bends lines, k1 {camera.radial:.3f} +- {camera.spread['k1']:.3f}."
     shape = "outwards (barrel)" if camera.radial < 0 else "inwards (pincushion)"
     deviation = f" +- {camera.spread['k1']:.3f}" if "k1" in camera.spread else ""
     return f"The lens bends lines {shape}, k1 {camera.radial:.3f}{deviation}."

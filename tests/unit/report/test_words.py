@@ -68,3 +68,8 @@ def test_a_lens_and_what_is_held_are_told_only_where_there_is_something_to_tell(
     assert held_text(bent).endswith("optical center near the middle of the photo, square pixels.")
     assert held_text(camera(held=("center",), identifiable=False)) == ""
     assert lens_text(camera(radial=-0.003, held=("k1",))) == ""
+
+
+def test_no_direction_is_told_of_a_distortion_within_its_deviation():
+    assert lens_text(camera(radial=0.002, spread={"k1": 0.004})) == "The lens hardly bends lines, k1 0.002 +- 0.004."
+    assert "pincushion" in lens_text(camera(radial=0.009, spread={"k1": 0.004}))
