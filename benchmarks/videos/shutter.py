@@ -123,12 +123,12 @@ def summarize(rows: Sequence[Row]) -> Iterator[Row]:
 
 def parser() -> argparse.ArgumentParser:
     """Give the command line."""
-    parser = new_parser("shutter", __doc__)
+    parser = new_parser("videos.shutter", __doc__)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--kinds", nargs="+", default=[*KINDS, *MIMICS], choices=[*KINDS, *MIMICS])
     parser.add_argument("--readouts-ms", nargs="+", type=float, default=list(READOUTS_MS))
-    parser.add_argument("--name", default="shutter", help="name of the result files")
+    parser.add_argument("--name", default="videos-shutter", help="name of the result files")
     parser.add_argument("--results", type=Path, default=RESULTS)
     return parser
 
@@ -145,7 +145,7 @@ def main() -> None:
                 print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     page = f"# Rolling shutters\n\n{ABOUT}\n\n{table(list(summarize(rows)), COLUMNS)}"
     options = {"seeds": args.seeds, "first seed": args.first_seed, "kinds": args.kinds, "readouts": args.readouts_ms}
-    write(args.results, args.name, document("shutter", ABOUT, options | {"frames per s": FRAMES_PER_S}, {}, rows), page)
+    write(args.results, args.name, document("videos.shutter", ABOUT, options | {"frames per s": FRAMES_PER_S}, {}, rows), page)
     print(page)
 
 

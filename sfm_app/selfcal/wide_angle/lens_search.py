@@ -22,7 +22,7 @@ from sfm_app.selfcal.wide_angle.fisheye import (
     WholeTurn,
     bearings_through,
 )
-from sfm_app.selfcal.wide_angle.lens_refinement import refine_lens, robust_cost
+from sfm_app.selfcal.wide_angle.lens_refinement import Pair, RefinedLens, pair_costs, refine_lens
 from sfm_app.selfcal.wide_angle.lens_support import search_rays
 
 FloatArray = NDArray[np.float64]
@@ -75,7 +75,8 @@ class LensEstimate:
     size: tuple[int, int]
     """(width, height) of the photos."""
     log_odds: float = np.inf
-    """By how much its robust cost is below that of the best perspective lens with one radial term."""
+    """By how much its robust cost is below that of the best perspective lens with one radial term, without the pair that
+    says so most: repeated things can bring a pair to favor any lens, but only one at a time."""
 
     @property
     def is_fisheye(self) -> bool:
@@ -115,11 +116,10 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
     kept = [(x, F) for x, (count, F) in zip(given.matches, found, strict=True) if count >= MIN_KEPT * len(x)]
     if len(kept) < MIN_PAIRS:
         return None
-    parameters, covariance, state, sigma = refine_lens(best, kept, THRESHOLD_PX / side)
+    refined = refine_lens(best, kept, THRESHOLD_PX / side)
+    parameters, covariance = refined.parameters, refined.covariance
     rival = _radial_rival(best, size)
-    other = refine_lens(rival, kept, sigma) if rival is not None else None
-    seen = [x for x, _ in kept]
-    ahead = robust_cost(seen, other.state, sigma) - robust_cost(seen, state, sigma) if other is not None else np.inf
+    ahead = _log_odds(refined, rival, kept, given.threshold) if rival is not None else np.inf
     unit = np.array([1.0, 1.0, side, side])
     center = side * parameters[2] + size[0] / 2.0, side * parameters[3] + size[1] / 2.0
     scaled = covariance * np.outer(unit, unit)
@@ -185,6 +185,26 @@ def shows_whole_turn(matches: Sequence[FloatArray], size: tuple[int, int], seed:
     others = (_lens_of(field, EQUIDISTANT) for field in FIRST_FIELDS_DEG)
     rivals = [given.support(given.search(lens)) for lens in (Fisheye(1.0, PERSPECTIVE), *others)]
     return given.support(given.search(WholeTurn())) - max(rivals) > CLEAR_GAIN
+
+
+def _log_odds(refined: RefinedLens, rival: RadialLens, kept: Sequence[Pair], threshold: float) -> float:
+    """Return by how much less a lens costs than a perspective rival, without the pair in which it gains most.
+
+    Args:
+        refined: the lens.
+        rival: to start from.
+        kept: pairs, with fundamental matrices that suit the lens.
+        threshold: as of `_Given`.
+    """
+    seen = [x for x, _ in kept]
+    rng = np.random.default_rng(0)
+    own = [
+        (x, search_rays(bearings_through(rival, x), rng.integers(0, len(x), (SAMPLES, 8)), threshold)[1]) for x in seen
+    ]
+    others = [refine_lens(rival, pairs, threshold).state for pairs in (kept, own)]  # wide at first, as for the lens
+    costs = min((pair_costs(seen, state, refined.sigma) for state in others), key=np.sum)
+    ahead = costs - pair_costs(seen, refined.state, refined.sigma)
+    return float(np.sum(ahead) - np.max(ahead))
 
 
 def _radial_rival(lens: Fisheye, size: tuple[int, int]) -> RadialLens | None:

@@ -62,7 +62,7 @@ def test_the_lens_is_found(field_deg, exponent):
     assert 0 < (errors / found.radius_deviation_px(theta)).max() < 4
     deviations = np.sqrt(np.diag(np.array(found.covariance))[2:])
     assert np.all(np.abs(np.array(found.lens.center) - CENTER) < 4 * deviations)
-    assert np.all(deviations < 5)
+    assert np.all(deviations < 15)
     assert found.lens.field_deg(SIZE[0]) == pytest.approx(field_deg, abs=1.0)
 
 
@@ -70,6 +70,29 @@ def test_a_perspective_lens_is_none():
     found = find_lens(photos_through(Fisheye(800.0, 1.0, CENTER)), SIZE)
     assert found is not None and not found.is_fisheye
     assert found.perspective_support > found.support - 0.01
+
+
+class Barrel(Fisheye):
+    """A perspective lens with k1 = -0.22."""
+
+    def project(self, rays):
+        plane = rays[:, :2] / np.where(rays[:, 2:] > 0.3, rays[:, 2:], 0.3)
+        return self.focal * plane * (1.0 - 0.22 * np.sum(plane**2, axis=1, keepdims=True)) + self.center
+
+    def angle(self, radius):
+        return np.full(np.shape(radius), 0.9)
+
+
+@pytest.mark.parametrize("repeated", [(), (2,), (9,)])
+def test_a_barrel_lens_is_no_fisheye_even_where_a_pair_shows_repeated_things(repeated):
+    pairs = photos_through(Barrel(870.0, 1.0, CENTER), wrong=0.1)
+    for k in repeated:  # half of the matches are of the next window
+        pairs[k][::2, 2:] += [0.07 * SIZE[0], 0.002 * SIZE[1]]
+
+    found = find_lens(pairs, SIZE)
+
+    assert found is not None and found.support - found.perspective_support > 0.05
+    assert found.log_odds < 0.0 and not found.is_fisheye
 
 
 def test_the_same_seed_gives_the_same_lens():
