@@ -145,7 +145,12 @@ def main() -> None:
                 print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     page = f"# Rolling shutters\n\n{ABOUT}\n\n{table(list(summarize(rows)), COLUMNS)}"
     options = {"seeds": args.seeds, "first seed": args.first_seed, "kinds": args.kinds, "readouts": args.readouts_ms}
-    write(args.results, args.name, document("videos.shutter", ABOUT, options | {"frames per s": FRAMES_PER_S}, {}, rows), page)
+    write(
+        args.results,
+        args.name,
+        document("videos.shutter", ABOUT, options | {"frames per s": FRAMES_PER_S}, {}, rows),
+        page,
+    )
     print(page)
 
 

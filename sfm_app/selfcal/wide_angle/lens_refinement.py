@@ -40,8 +40,8 @@ MOST_LOG_FOCAL = 10.0
 hand; not measured on its own."""
 MISFIT = 3.0
 """Ratio of the errors of a lens to those that the scatter between pairs explains: what no lens of the family shows is
-alike in all pairs. Chosen on fountain-P11 through a fisheye (4 without it); castle-P19 (2 to 7), Herz-Jesus-P8 (2) and
-rendered folders (1 to 3) were left out."""
+alike in all pairs. Chosen on fountain-P11 through a fisheye, which needs 4.5 without it (`python -m
+benchmarks.lenses.warped`); left out: Herz-Jesus-P8 needs 2, castle-P19 2 to 7, rendered folders up to 3."""
 NOISE_ROUNDS = 3
 """Times the noise is estimated from the distances. Chosen by hand; not measured on its own."""
 LEAST_SIGMA = 1e-4
@@ -101,8 +101,8 @@ class System(NamedTuple):
 def refine_lens(start: Lens, pairs: Sequence[Pair], sigma: float) -> RefinedLens:
     """Return the lens of the family of `start` with the least robust cost, with its covariance.
 
-    The covariance is the sandwich with pairs as clusters, times MISFIT squared; matches of one keypoint in several pairs
-    count as what they are worth.
+    The covariance is the sandwich with pairs as clusters, times MISFIT squared; matches of one keypoint in several
+    pairs count as what they are worth.
 
     Args:
         start: in longer sides of the photos, the center in the middle.

@@ -75,8 +75,8 @@ class LensEstimate:
     size: tuple[int, int]
     """(width, height) of the photos."""
     log_odds: float = np.inf
-    """By how much its robust cost is below that of the best perspective lens with one radial term, without the pair that
-    says so most: repeated things can bring a pair to favor any lens, but only one at a time."""
+    """By how much its robust cost is below that of the best perspective lens with one radial term, without the pair
+    that says so most: repeated things can bring a pair to favor any lens."""
 
     @property
     def is_fisheye(self) -> bool:
