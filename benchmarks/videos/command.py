@@ -1,6 +1,6 @@
 """Rendered videos with a rolling shutter, from the MP4 file to the poses.
 
-    python -m benchmarks.videos.rolling --cache CACHE
+    python -m benchmarks.videos --cache CACHE
 
 The same walks are rendered with a global shutter too: what a known shutter could give at best. Stock has the same
 frames, as photos of one camera.
@@ -72,7 +72,7 @@ def run_video(scene: str, readout_ms: float, seed: int, args: argparse.Namespace
 
 def main() -> None:
     """Run all videos, and publish after each."""
-    parser = new_parser("videos.rolling", __doc__)
+    parser = new_parser("videos", __doc__)
     parser.add_argument("--cache", type=Path, required=True, help="keeps rendered videos and runs")
     parser.add_argument("--scenes", nargs="+", default=list(WALKS), choices=list(WALKS))
     parser.add_argument("--readouts-ms", nargs="+", type=float, default=list(READOUTS_MS))
@@ -88,7 +88,7 @@ def main() -> None:
                 print(json.dumps(row), file=sys.stderr, flush=True)
             page = f"# Rolling shutters, rendered\n\n{ABOUT}\n\n{table(rows, COLUMNS)}"
             options = {"scenes": args.scenes, "readouts": args.readouts_ms, "seed": args.seed}
-            write(args.results, "videos-rolling", document("videos.rolling", ABOUT, options, {}, rows), page)
+            write(args.results, "videos", document("videos", ABOUT, options, {}, rows), page)
     print(page)
 
 
