@@ -40,8 +40,8 @@ MOST_LOG_FOCAL = 10.0
 hand; not measured on its own."""
 MISFIT = 3.0
 """Ratio of the errors of a lens to those that the scatter between pairs explains: what no lens of the family shows is
-alike in all pairs. Chosen on fountain-P11 through a fisheye, which needs 4.5 without it (`python -m
-benchmarks.lenses.warped`); left out: Herz-Jesus-P8 needs 2, castle-P19 2 to 7, rendered folders up to 3."""
+alike in all pairs. Chosen on fountain-P11 through a fisheye, which needs 4.5 without it
+(`python -m benchmarks.lenses.warped`); left out: Herz-Jesus-P8 needs 2, castle-P19 2 to 7, rendered folders up to 3."""
 NOISE_ROUNDS = 3
 """Times the noise is estimated from the distances. Chosen by hand; not measured on its own."""
 LEAST_SIGMA = 1e-4
