@@ -17,13 +17,13 @@ from scipy import sparse
 from sfm_app.bundle_adjustment.lens_parts import (
     COUNT,
     FOCAL_SPREAD,
-    LOG_ASPECT,
     LOG_FOCAL,
     PARTS,
     LensPriors,
     consistent_choices,
     model_name,
     part_names,
+    step_cameras,
 )
 from sfm_app.bundle_adjustment.normal_equations import ReducedSystem
 from sfm_app.geometry.lenses.projections import CAMERA, FX, FY
@@ -257,10 +257,8 @@ def _multiply(A: FloatArray, B: FloatArray) -> FloatArray:
 
 def _apply_step(params: FloatArray, step: FloatArray, sides: FloatArray) -> tuple[FloatArray, BoolArray]:
     """Return the cameras (C, 12) after a step, and (C,) those that it makes diverge."""
-    moved = params + step
     with np.errstate(over="ignore", invalid="ignore"):
-        moved[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
-        moved[:, FY] = params[:, FY] * np.exp(step[:, LOG_FOCAL] + 0.5 * step[:, LOG_ASPECT])
+        moved = step_cameras(params, step)
         focals = moved[:, [FX, FY]] / sides[:, None]
     priors = np.isfinite(moved).all(axis=1) & np.all((focals > FOCALS[0]) & (focals < FOCALS[1]), axis=1)
     return moved, ~priors | (np.abs(step[:, LOG_FOCAL]) > LONGEST_STEP)

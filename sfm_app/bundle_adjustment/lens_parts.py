@@ -280,3 +280,16 @@ def consistent_choices(family: int) -> BoolArray:
         needed = [names.index(name) for name in part.needs]
         trials = trials[~trials[:, k] | trials[:, needed].all(axis=1)]
     return trials
+
+
+def step_cameras(params: FloatArray, step: FloatArray) -> FloatArray:
+    """Return cameras (C, 12) after a step.
+
+    Args:
+        params: (C, 12) before it.
+        step: (C, 12), with log sqrt(fx fy) and log fy/fx in place of fx and fy.
+    """
+    moved = params + step
+    moved[:, FX] = params[:, FX] * np.exp(step[:, LOG_FOCAL] - 0.5 * step[:, LOG_ASPECT])
+    moved[:, FY] = params[:, FY] * np.exp(step[:, LOG_FOCAL] + 0.5 * step[:, LOG_ASPECT])
+    return moved

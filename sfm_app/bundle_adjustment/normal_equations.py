@@ -225,12 +225,23 @@ def cost(bundle: Bundle, scale_px: float) -> float:
     """
     with np.errstate(all="ignore"):
         r = residuals(bundle, project(bundle)[0])
-        squares = np.einsum("ni,ni->n", r, r)
-    squares = np.where(usable_mask(bundle, r), squares, LOST_PX**2)
+    return loss(r, usable_mask(bundle, r), scale_px)
+
+
+def loss(r: FloatArray, usable: NDArray[np.bool_], scale_px: float) -> float:
+    """Return half the sum of the loss of `reduce`, in squared pixels; what is not usable counts with LOST_PX.
+
+    Args:
+        r: (N, 2) residuals in pixels.
+        usable: (N,) from `usable_mask`.
+        scale_px: s of the loss, in pixels, > 0.
+    """
+    with np.errstate(all="ignore"):
+        squares = np.where(usable, np.einsum("ni,ni->n", r, r), LOST_PX**2)
     return float(scale_px**2 * np.sum(np.sqrt(1.0 + squares / scale_px**2) - 1.0))
 
 
-def usable_mask(bundle: Bundle, r: FloatArray) -> NDArray[np.bool_]:
+def usable_mask(bundle: Bundle, r: FloatArray, depth: FloatArray | None = None) -> NDArray[np.bool_]:
     """Return (N,) which observations are of points in front of their camera, with residuals below LOST_PX.
 
     A panorama also sees what is behind it.
@@ -238,9 +249,11 @@ def usable_mask(bundle: Bundle, r: FloatArray) -> NDArray[np.bool_]:
     Args:
         bundle: the model.
         r: (N, 2) residuals in pixels.
+        depth: (N,) of the points before their cameras; from the poses if None.
     """
     with np.errstate(all="ignore"):
-        depth = np.einsum("nj,nj->n", bundle.R[bundle.photo, 2], bundle.X[bundle.point]) + bundle.t[bundle.photo, 2]
+        if depth is None:
+            depth = np.einsum("nj,nj->n", bundle.R[bundle.photo, 2], bundle.X[bundle.point]) + bundle.t[bundle.photo, 2]
         ahead = (depth > 0.0) | (bundle.family[bundle.camera[bundle.photo]] == PANORAMA)
         return np.asarray(ahead & (np.abs(r) < LOST_PX).all(axis=1), np.bool_)
 
@@ -260,8 +273,25 @@ def _linearize(bundle: Bundle, scale_px: float) -> tuple[FloatArray, FloatArray,
     with np.errstate(all="ignore"):
         predicted, by_camera, by_pose, by_point = project(bundle)
         r, by_view = residuals(bundle, predicted), np.concatenate([by_pose, by_camera], 2)
+    return weigh(r, by_view, by_point, usable_mask(bundle, r), scale_px)
+
+
+def weigh(
+    r: FloatArray, by_view: FloatArray, by_point: FloatArray, usable: NDArray[np.bool_], scale_px: float
+) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return residuals and their derivatives times the roots of their weights, and (N,) which of them are used.
+
+    The others are 0.
+
+    Args:
+        r: (N, 2) residuals in pixels.
+        by_view, by_point: (N, 2, k) and (N, 2, 3) derivatives of the projections.
+        usable: (N,) from `usable_mask`.
+        scale_px: as in `loss`.
+    """
+    with np.errstate(all="ignore"):
         largest = np.maximum(np.abs(by_view).max(axis=(1, 2), initial=0.0), np.abs(by_point).max(axis=(1, 2)))
-        seen = usable_mask(bundle, r) & (largest < MAX_DERIVATIVE)
+        seen = usable & (largest < MAX_DERIVATIVE)
     r, by_view, by_point = (np.where(seen.reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in (r, by_view, by_point))
     root = (1.0 + np.einsum("ni,ni->n", r, r) / scale_px**2) ** -0.25
     return r * root[:, None], by_view * root[:, None, None], by_point * root[:, None, None], seen

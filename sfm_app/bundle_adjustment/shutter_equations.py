@@ -10,26 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.bundle_adjustment.elimination import POSE, free_pose_columns, whiten_points
-from sfm_app.bundle_adjustment.lens_parts import LOG_ASPECT, LOG_FOCAL
+from sfm_app.bundle_adjustment.lens_evidence import MISFIT
+from sfm_app.bundle_adjustment.lens_parts import LOG_ASPECT, LOG_FOCAL, step_cameras
 from sfm_app.bundle_adjustment.normal_equations import (
     DAMPING,
-    LOST_PX,
     USUAL_COUNT,
     USUAL_NOISE_PX,
     Bundle,
     apply_step,
+    loss,
+    usable_mask,
+    weigh,
 )
 from sfm_app.bundle_adjustment.path_velocity import VELOCITY
-from sfm_app.bundle_adjustment.rolling_shutter import RowProjection, project_rows
+from sfm_app.bundle_adjustment.rolling_shutter import project_rows
 from sfm_app.geometry.lenses.projections import CAMERA, FX, FY
 from sfm_app.geometry.spd_solve import inverse_of_positive
 from sfm_app.jit import kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-
-MISFIT = 4.0
-"""Ratio of the errors of the readout to those that independent noise explains, as for cameras (`lens_evidence`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -168,18 +168,7 @@ def _weighted_derivatives(model: ShutterBundle, scale_px: float) -> tuple[FloatA
         by_camera[:, :, LOG_FOCAL], by_camera[:, :, LOG_ASPECT] = by_fx + by_fy, 0.5 * (by_fy - by_fx)
         by_readout = np.einsum("nij,nj->ni", seen.by_motion, model.velocity[bundle.photo])[:, :, None]
         by_view = np.concatenate([seen.by_pose, seen.by_motion, by_camera, by_readout], 2)
-        root = (1.0 + np.einsum("ni,ni->n", r, r) / scale_px**2) ** -0.25
-    used = _used_mask(r, seen)
-    return (
-        np.where(used[:, None], r * root[:, None], 0.0),
-        np.where(used[:, None, None], by_view * root[:, None, None], 0.0),
-        np.where(used[:, None, None], seen.by_point * root[:, None, None], 0.0),
-    )
-
-
-def _used_mask(r: FloatArray, seen: RowProjection) -> NDArray[np.bool_]:
-    """Return (N,) which observations are of points before their camera, with residuals below LOST_PX."""
-    return np.asarray((seen.depth > 0.0) & (np.abs(r) < LOST_PX).all(axis=1), np.bool_)
+    return weigh(r, by_view, seen.by_point, usable_mask(bundle, r, seen.depth), scale_px)[:3]
 
 
 @kernel
@@ -267,10 +256,7 @@ def apply_shutter_step(model: ShutterBundle, step: ShutterStep, share: float) ->
     """
     bundle = model.bundle
     poses, offsets, cameras = np.split(share * step.views[:-1], np.cumsum([POSE, VELOCITY]) * len(bundle.R))
-    change = cameras.reshape(-1, CAMERA)
-    params = bundle.params + change
-    params[:, FX] = bundle.params[:, FX] * np.exp(change[:, LOG_FOCAL] - 0.5 * change[:, LOG_ASPECT])
-    params[:, FY] = bundle.params[:, FY] * np.exp(change[:, LOG_FOCAL] + 0.5 * change[:, LOG_ASPECT])
+    params = step_cameras(bundle.params, cameras.reshape(-1, CAMERA))
     return replace(
         model,
         bundle=apply_step(bundle, params, poses.reshape(-1, POSE), share * step.points),
@@ -289,6 +275,4 @@ def shutter_cost(model: ShutterBundle, scale_px: float) -> float:
     with np.errstate(all="ignore"):
         seen = project_rows(model.bundle, model.share, model.motion)
         r = model.bundle.x - seen.x
-        squares = np.einsum("ni,ni->n", r, r)
-    squares = np.where(_used_mask(r, seen), squares, LOST_PX**2)
-    return float(scale_px**2 * np.sum(np.sqrt(1.0 + squares / scale_px**2) - 1.0))
+    return loss(r, usable_mask(model.bundle, r, seen.depth), scale_px)

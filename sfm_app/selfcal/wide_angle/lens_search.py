@@ -18,6 +18,7 @@ from sfm_app.selfcal.wide_angle.fisheye import (
     PERSPECTIVE,
     STEREOGRAPHIC,
     Fisheye,
+    Lens,
     RadialLens,
     WholeTurn,
     bearings_through,
@@ -113,13 +114,13 @@ def find_lens(matches: Sequence[FloatArray], size: tuple[int, int], seed: int = 
     searches = [given.search(lens) for lens in grid]
     first = int(np.argmax([given.support(found) for found in searches]))
     best, found = grid[first], searches[first]
-    kept = [(x, F) for x, (count, F) in zip(given.matches, found, strict=True) if count >= MIN_KEPT * len(x)]
-    if len(kept) < MIN_PAIRS:
+    kept, Fs = given.select(found)
+    if len(Fs) < MIN_PAIRS:
         return None
-    refined = refine_lens(best, kept, THRESHOLD_PX / side)
+    refined = refine_lens(best, kept.with_matrices(Fs), given.threshold)
     parameters, covariance = refined.parameters, refined.covariance
     rival = _radial_rival(best, size)
-    ahead = _log_odds(refined, rival, kept, given.threshold) if rival is not None else np.inf
+    ahead = _log_odds(refined, rival, kept, Fs) if rival is not None else np.inf
     unit = np.array([1.0, 1.0, side, side])
     center = side * parameters[2] + size[0] / 2.0, side * parameters[3] + size[1] / 2.0
     scaled = covariance * np.outer(unit, unit)
@@ -139,9 +140,18 @@ class _Given:
     samples: tuple[NDArray[np.int64], ...]
     threshold: float
 
-    def search(self, lens: Fisheye | WholeTurn) -> list[tuple[float, FloatArray]]:
+    def search(self, lens: Lens | WholeTurn) -> list[tuple[float, FloatArray]]:
         both = zip(self.matches, self.samples, strict=True)
         return [search_rays(bearings_through(lens, x), rows, self.threshold) for x, rows in both]
+
+    def select(self, found: list[tuple[float, FloatArray]]) -> tuple["_Given", list[FloatArray]]:
+        """Return the pairs that keep enough of their matches in a search, and their fundamental matrices."""
+        rows = [k for k, (count, _) in enumerate(found) if count >= MIN_KEPT * len(self.matches[k])]
+        matches, samples = tuple(self.matches[k] for k in rows), tuple(self.samples[k] for k in rows)
+        return _Given(matches, samples, self.threshold), [found[k][1] for k in rows]
+
+    def with_matrices(self, Fs: Sequence[FloatArray]) -> list[Pair]:
+        return list(zip(self.matches, Fs, strict=True))
 
     def support(self, found: list[tuple[float, FloatArray]]) -> float:
         return sum(count for count, _ in found) / float(sum(map(len, self.matches)))
@@ -187,23 +197,19 @@ def shows_whole_turn(matches: Sequence[FloatArray], size: tuple[int, int], seed:
     return given.support(given.search(WholeTurn())) - max(rivals) > CLEAR_GAIN
 
 
-def _log_odds(refined: RefinedLens, rival: RadialLens, kept: Sequence[Pair], threshold: float) -> float:
+def _log_odds(refined: RefinedLens, rival: RadialLens, kept: _Given, Fs: Sequence[FloatArray]) -> float:
     """Return by how much less a lens costs than a perspective rival, without the pair in which it gains most.
 
     Args:
         refined: the lens.
-        rival: to start from.
-        kept: pairs, with fundamental matrices that suit the lens.
-        threshold: as of `_Given`.
+        rival: to start from; it begins as wide as the lens did, with these matrices and with its own.
+        kept: the pairs.
+        Fs: their fundamental matrices, which suit the lens.
     """
-    seen = [x for x, _ in kept]
-    rng = np.random.default_rng(0)
-    own = [
-        (x, search_rays(bearings_through(rival, x), rng.integers(0, len(x), (SAMPLES, 8)), threshold)[1]) for x in seen
-    ]
-    others = [refine_lens(rival, pairs, threshold).state for pairs in (kept, own)]  # wide at first, as for the lens
-    costs = min((pair_costs(seen, state, refined.sigma) for state in others), key=np.sum)
-    ahead = costs - pair_costs(seen, refined.state, refined.sigma)
+    starts = Fs, [F for _, F in kept.search(rival)]
+    others = (refine_lens(rival, kept.with_matrices(start), kept.threshold).state for start in starts)
+    costs = min((pair_costs(kept.matches, state, refined.sigma) for state in others), key=np.sum)
+    ahead = costs - pair_costs(kept.matches, refined.state, refined.sigma)
     return float(np.sum(ahead) - np.max(ahead))
 
 
