@@ -62,6 +62,12 @@ class MatchSettings(Section):
     max_ratio: float = Field(
         0.8, gt=0, le=1, description="largest nearest over second nearest descriptor distance, for SIFT; 1: no limit"
     )
+    pairs: Literal["auto", "all", "retrieval", "sequence"] = Field(
+        "auto",
+        description="pairs to match: all; retrieval: photos that look alike; sequence: mostly neighbors by name or "
+        "time; auto: all where that is cheaper, else retrieval",
+    )
+    neighbors: int = Field(40, ge=4, le=1000, description="photos that each one is matched with, where not with all")
 
 
 class EpipolarSettings(Section):

@@ -47,6 +47,7 @@ SETTING_FLAGS = (
     SettingFlag("--max-frames", "photos.max_frames"),
     SettingFlag("--keep-low-quality", "photos.keep_low_quality"),
     SettingFlag("--features", "matching.features"),
+    SettingFlag("--pairs", "matching.pairs"),
     SettingFlag("--estimator", "epipolar.estimator"),
     SettingFlag("--calibrator", "calibration.calibrator"),
     SettingFlag("--calibration", "calibration.file", metavar="FILE"),

@@ -1,27 +1,22 @@
 """Features of photos and matches of pairs, found by the chosen method, in COLMAP's database.
 
-COLMAP's SIFT fills the database by itself. Any other method is two functions. They get pictures of the right size;
-their results are checked, scaled to the photos' pixels, freed of masked points and written to the database.
+COLMAP's SIFT fills the database by itself. Any other method is two functions; `feature_parts` calls the first of them.
 """
 
 import shutil
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.atomic_io import mark_unfinished, replace_atomically, resume_or_clear
+from sfm_app.atomic_io import mark_unfinished, resume_or_clear
 from sfm_app.colmap.backend import translate_errors
-from sfm_app.colmap.database import panorama_names, photo_names, unmatched_pairs, write_keypoints, write_matches
+from sfm_app.colmap.database import photo_names, unmatched_pairs, write_matches
 from sfm_app.colmap.features import find_and_match
-from sfm_app.errors import InputError, PluginError
-from sfm_app.hashing import load_arrays
+from sfm_app.errors import PluginError
+from sfm_app.estimation.feature_parts import find_features, load_features, method_error
 from sfm_app.numerical import Json
-from sfm_app.photos.masks import read_mask
-from sfm_app.photos.panoramas.feature_views import PanoramaViews
 from sfm_app.plugins import FeatureMethod
 from sfm_app.progress import track
 from sfm_app.runtime.context import RunContext
@@ -36,13 +31,30 @@ PHOTOS_IN_MEMORY = 32
 def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
     """Find features of photos and match them, in the run's database.
 
-    Results of a killed run in the database and in `feature_parts` are reused.
-
     Args:
         method: of finding and matching.
         run: its database lists the photos, which are laid out.
         pairs: the pairs to match, the smaller id first; features are found in their photos only. None for all pairs of
             all photos; without any pair, features are found in all photos.
+
+    Returns:
+        The options in force, for the manifest.
+
+    Raises:
+        PluginError: the method raises, or returns invalid results.
+        BackendError: COLMAP failed.
+    """
+    in_force = find_all_features(method, run, pairs)
+    in_force |= match_pairs(method, run, pairs)
+    forget_features(run)
+    return in_force
+
+
+def find_all_features(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
+    """Find features of photos; those that a killed run has found are kept.
+
+    Args:
+        method, run, pairs: as in `fill_database`.
 
     Returns:
         The options in force, for the manifest.
@@ -58,14 +70,47 @@ def fill_database(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId
     if method.sift is not None:
         return find_and_match(
             place.database, place.photos, list(names.values()), options, run.workers, run.progress, run.mask_dir,
-            method.sift, pairs,
+            method.sift, (),
         )  # fmt: skip
     if not resume_or_clear(place.feature_parts, run.fingerprint):
         mark_unfinished(place.feature_parts, run.fingerprint)
-    _find(method, names, run)
-    _match(method, all_pairs(names) if pairs is None else pairs, run)
-    shutil.rmtree(place.feature_parts)
+    find_features(method, names, run)
     return {"method": method.name, "max_image_size": options.max_image_size_px, "max_features": options.max_features}
+
+
+def match_pairs(method: FeatureMethod, run: RunContext, pairs: Sequence[PairId] | None = None) -> dict[str, Json]:
+    """Match pairs of photos whose features are known; matches that a killed run has found are kept.
+
+    Args:
+        method: of matching.
+        run: its database has the keypoints.
+        pairs: the pairs to match, the smaller id first; None for all.
+
+    Returns:
+        The options in force, for the manifest.
+
+    Raises:
+        PluginError: the method raises, or returns invalid results.
+        BackendError: COLMAP failed.
+    """
+    place, options = run.workspace, run.settings.matching
+    if pairs is not None and not pairs:
+        return {}
+    if method.sift is not None:
+        return find_and_match(
+            place.database, place.photos, [], options, run.workers, run.progress, sift=method.sift, pairs=pairs
+        )
+    _match(method, all_pairs(photo_names(place.database)) if pairs is None else pairs, run)
+    return {}
+
+
+def forget_features(run: RunContext) -> None:
+    """Remove the parts of features, which are of no use once all pairs are matched.
+
+    Args:
+        run: the run.
+    """
+    shutil.rmtree(run.workspace.feature_parts, ignore_errors=True)
 
 
 def all_pairs(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
@@ -74,108 +119,10 @@ def all_pairs(photos: Sequence[int] | Mapping[int, str]) -> list[PairId]:
     return [(first, second) for place, first in enumerate(ids) for second in ids[place + 1 :]]
 
 
-def _find(method: FeatureMethod, names: Mapping[int, str], run: RunContext) -> None:
-    """Write the features of every photo to its part, and its keypoints to the database."""
-    panoramas = panorama_names(run.workspace.database)
-
-    def find(photo: int) -> tuple[int, NDArray[np.float32]]:
-        name = names[photo]
-        features, to_photo, size = _find_in_photo(method, name, run, panorama=name in panoramas)
-        keypoints = features.keypoints * to_photo
-        if run.mask_dir is not None:
-            used = read_mask(run.mask_dir, name)
-            column, row = np.clip(keypoints.astype(np.int64), 0, np.array(size) - 1).T
-            seen = used[row, column]
-            features, keypoints = features.select(seen), keypoints[seen]
-        rows = np.arange(min(len(keypoints), run.settings.matching.max_features))
-        _save(features.select(rows), part_path(photo, run))
-        return photo, keypoints[rows].astype(np.float32)
-
-    left = [photo for photo in names if not part_path(photo, run).exists()]
-    found = track(run.progress, ordered_map(run.executor, find, left, run.workers), "features", len(left))
-    for photo, keypoints in found:
-        with translate_errors("writing keypoints"):
-            write_keypoints(run.workspace.database, photo, keypoints)
-
-
-def _find_in_photo(
-    method: FeatureMethod, name: str, run: RunContext, *, panorama: bool
-) -> tuple[Features, NDArray[np.float64], tuple[int, int]]:
-    """Return the features of one photo, the scale (x, y) that takes them to its pixels, and its size."""
-    options = run.settings.matching
-    pixels = read_pixels(run.workspace.photos / name)
-    height, width = pixels.shape[:2]
-    if panorama:
-        return _find_in_views(method, name, pixels, options), np.ones(2), (width, height)
-    longer = max(width, height)
-    if longer > options.max_image_size_px:
-        scale = options.max_image_size_px / longer
-        size = max(1, round(width * scale)), max(1, round(height * scale))
-        pixels = np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), np.uint8)
-    shown = pixels.shape[1], pixels.shape[0]
-    features = _check_features(method, name, shown, _call_find(method, name, pixels, options))
-    return features, np.array([width / shown[0], height / shown[1]]), (width, height)
-
-
-def _find_in_views(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
-    """Return the features of a panorama, found in its perspective views; the best of each view come first."""
-    size = pixels.shape[1], pixels.shape[0]
-    views = PanoramaViews.cover(size, options.max_image_size_px)
-    pixels, found, ranks = views.shrink(pixels), [], []
-    for view in range(len(views.rotations)):
-        shown = views.render(pixels, view)
-        features = _check_features(method, name, (views.side_px,) * 2, _call_find(method, name, shown, options))
-        own = np.flatnonzero(views.is_nearest(features.keypoints, view))
-        at = views.to_panorama(features.keypoints[own], view)
-        found.append(Features(size, at, features.select(own).values))
-        ranks.append(own)
-    together = {key: np.concatenate([one.values[key] for one in found]) for key in found[0].values}
-    every = Features(size, np.concatenate([one.keypoints for one in found]), together)
-    return every.select(np.argsort(np.concatenate(ranks), kind="stable"))
-
-
-def read_pixels(path: Path) -> NDArray[np.uint8]:
-    """Return (H, W, 3) RGB of a photo as it is laid out.
-
-    Raises:
-        InputError: it can no longer be read.
-    """
-    data = np.fromfile(path, np.uint8)
-    read = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION) if data.size else None
-    if read is None:
-        raise InputError(f"{path} can no longer be read", hint="run again with --from photos")
-    return np.asarray(read, np.uint8)
-
-
-def _call_find(method: FeatureMethod, name: str, pixels: NDArray[np.uint8], options: MatchSettings) -> Features:
-    if method.find is None:
-        raise PluginError(f"the features '{method.name}' have no `find`")
-    try:
-        return method.find(pixels, options)
-    except Exception as err:  # a plug-in may raise anything
-        raise _method_error(method, f"failed on {name}: {type(err).__name__}: {err}") from err
-
-
-def _check_features(method: FeatureMethod, name: str, size: tuple[int, int], features: Features) -> Features:
-    """Return the features after checking that they are valid for a picture of this size."""
-    points = np.asarray(features.keypoints, np.float64)
-    if features.size != size:
-        raise _method_error(method, f"report a size of {features.size} for {name} instead of {size}")
-    if points.ndim != 2 or points.shape[1] != 2 or any(len(value) != len(points) for value in features.values.values()):
-        raise _method_error(method, f"have arrays of other shapes than (N, 2) and (N, ...) for {name}")
-    if not (np.isfinite(points).all() and (points >= 0).all() and (points <= size).all()):
-        raise _method_error(method, f"put keypoints outside of {name}")
-    return Features(size, points, features.values)
-
-
-def _method_error(method: FeatureMethod, what: str) -> PluginError:
-    return PluginError(f"the features '{method.name}' {what}", hint="choose others with --features")
-
-
 def _match(method: FeatureMethod, pairs: Sequence[PairId], run: RunContext) -> None:
     """Write the matches of every pair into the database, also where there are none."""
     options, database = run.settings.matching, run.workspace.database
-    read = lru_cache(max(PHOTOS_IN_MEMORY, 2 * run.workers))(lambda photo: _load(part_path(photo, run)))
+    read = lru_cache(max(PHOTOS_IN_MEMORY, 2 * run.workers))(lambda photo: load_features(photo, run))
 
     def match(pair: PairId) -> tuple[PairId, NDArray[np.uint32]]:
         return pair, _match_pair(method, (read(pair[0]), read(pair[1])), options)
@@ -196,35 +143,12 @@ def _match_pair(method: FeatureMethod, pair: tuple[Features, Features], options:
     try:
         rows = np.asarray(method.match(*pair, options))
     except Exception as err:  # a plug-in may raise anything
-        raise _method_error(method, f"failed to match two photos: {type(err).__name__}: {err}") from err
+        raise method_error(method, f"failed to match two photos: {type(err).__name__}: {err}") from err
     if rows.size == 0:
         return np.zeros((0, 2), np.uint32)
     if rows.ndim != 2 or rows.shape[1] != 2 or not np.issubdtype(rows.dtype, np.integer):
-        raise _method_error(method, "have matches that are not (M, 2) integers")
+        raise method_error(method, "have matches that are not (M, 2) integers")
     for column, features in zip(rows.T, pair, strict=True):
         if column.min() < 0 or column.max() >= len(features) or len(np.unique(column)) < len(column):
-            raise _method_error(method, "match a keypoint twice, or one that does not exist")
+            raise method_error(method, "match a keypoint twice, or one that does not exist")
     return rows.astype(np.uint32)
-
-
-def part_path(photo: int, run: RunContext) -> Path:
-    """Return the file that keeps the features of a photo until all are matched.
-
-    Args:
-        photo: id.
-        run: the run.
-    """
-    return run.workspace.feature_parts / f"{photo:06d}.npz"
-
-
-def _save(features: Features, path: Path) -> None:
-    values = {f"value_{name}": value for name, value in features.values.items()}
-    with replace_atomically(path) as beside:
-        np.savez(beside, allow_pickle=False, size=np.array(features.size), keypoints=features.keypoints, **values)
-
-
-def _load(path: Path) -> Features:
-    arrays = load_arrays(path)
-    values = {name.removeprefix("value_"): value for name, value in arrays.items() if name.startswith("value_")}
-    width, height = arrays["size"]
-    return Features((int(width), int(height)), arrays["keypoints"], values)

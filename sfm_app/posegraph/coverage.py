@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sfm_app.posegraph.groups import DisjointGroups
 from sfm_app.types import MatchGraph, PairId, RelativePose
 
 IndexArray = NDArray[np.int64]
@@ -78,32 +79,23 @@ def coverages(sight: Visibility) -> dict[PairId, float]:
 
 
 def backbone(covered: Mapping[PairId, float]) -> set[PairId]:
-    """Return the pairs of the maximum spanning tree of coverage, and those nearly as good as the path along it."""
-    near: dict[int, list[tuple[int, float]]] = {photo: [] for pair in covered for photo in pair}
-    group = {photo: photo for photo in near}
-    for a, b in sorted(covered, key=lambda pair: (-covered[pair], pair)):
-        if group[a] != group[b]:
-            old, new = group[b], group[a]
-            group = {photo: new if name == old else name for photo, name in group.items()}
-            near[a].append((b, covered[a, b]))
-            near[b].append((a, covered[a, b]))
-    partners: dict[int, list[int]] = {}
+    """Return the pairs of the maximum spanning tree of coverage, and those nearly as good as the path along it.
+
+    Groups of photos grow along the best pairs. When two of them join, the pair that joins them is the weakest one on
+    the path between any photo of the one and any of the other.
+    """
+    partners: dict[int, list[int]] = {photo: [] for pair in covered for photo in pair}
     for a, b in covered:
-        partners.setdefault(a, []).append(b)
-    chosen = set()
-    for a, others in partners.items():
-        widest = _bottleneck_coverages(a, near)
-        chosen |= {(a, b) for b in others if covered[a, b] >= BACKBONE_SHARE * widest[b]}
+        partners[a].append(b)
+        partners[b].append(a)
+    groups, chosen = DisjointGroups(partners), set()
+    for a, b in sorted(covered, key=lambda pair: (-covered[pair], pair)):
+        moved = groups.join(a, b)
+        inside = set(moved)
+        for photo in moved:
+            across = (
+                other for other in partners[photo] if other not in inside and groups.name[other] == groups.name[a]
+            )
+            joined = ((min(photo, other), max(photo, other)) for other in across)
+            chosen |= {pair for pair in joined if covered[pair] >= BACKBONE_SHARE * covered[a, b]}
     return chosen
-
-
-def _bottleneck_coverages(root: int, near: Mapping[int, list[tuple[int, float]]]) -> dict[int, float]:
-    """Return, by photo, the weakest coverage on the path from the root along the tree."""
-    found, waiting = {root: np.inf}, [root]
-    while waiting:
-        photo = waiting.pop()
-        for other, value in near[photo]:
-            if other not in found:
-                found[other] = min(found[photo], value)
-                waiting.append(other)
-    return found

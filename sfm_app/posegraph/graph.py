@@ -1,6 +1,7 @@
 """The pose graph: relative poses of pairs that agree with each other."""
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -199,5 +200,8 @@ def _split_plausible(
 
 def _groups(poses: Mapping[PairId, RelativePose]) -> tuple[tuple[int, ...], ...]:
     groups = [tuple(sorted(group)) for group in connected_groups(poses)]
-    inliers = {group: sum(p.inlier_count for pair, p in poses.items() if pair[0] in group) for group in groups}
+    name = {photo: group for group in groups for photo in group}
+    inliers: Counter[tuple[int, ...]] = Counter()
+    for pair, pose in poses.items():
+        inliers[name[pair[0]]] += pose.inlier_count
     return tuple(sorted(groups, key=lambda group: (-len(group), -inliers[group], group)))

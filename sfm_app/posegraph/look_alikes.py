@@ -29,6 +29,7 @@ from sfm_app.posegraph.missing import Depths, count_missing_cells
 from sfm_app.posegraph.rotations import average_rotations
 from sfm_app.types import Calibration, LookAlikes, MatchGraph, PairId, RelativePose
 
+FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
 
 ALIKE, LOOP, EITHER = "alike", "loop", "either"
@@ -123,7 +124,9 @@ def find_look_alikes(
         return LookAlikeVerdict((), (), tracks)
     trusted = best | {pair for pair, rows in sight.rows.items() if _is_confirmed(*tracks.count_agreement(pair, rows))}
     places = Depths(matches, cameras, poses, sight)
-    judged = [_judge_join(join, trusted, places) for join in group_doubted_pairs(doubted, trusted)]
+    turns = _photo_rotations(trusted, poses)
+    friends = _partners(trusted)
+    judged = [_judge_join(join, friends, turns, places) for join in group_doubted_pairs(doubted, trusted)]
     joins = [join for join, verdict in judged if verdict == ALIKE]
     doubtful = tuple(join for join, verdict in judged if verdict == EITHER)
     left = poses.keys() - best - {pair for join in joins for pair in join.pairs}
@@ -160,14 +163,17 @@ def group_doubted_pairs(doubted: Iterable[PairId], trusted: Iterable[PairId]) ->
         doubted: pairs to group.
         trusted: pairs whose two photos count as one place.
     """
-    close = {frozenset(pair) for pair in trusted}
-    waiting, found = sorted(doubted), []
+    near = _partners(trusted)
+    waiting, found = dict.fromkeys(sorted(doubted)), []
     while waiting:
-        join = [waiting.pop(0)]
-        for pair in join:
-            beside = [other for other in waiting if _has_same_ends(pair, other, close)]
-            waiting = [other for other in waiting if other not in beside]
-            join += beside
+        join = [next(iter(waiting))]
+        del waiting[join[0]]
+        for a, b in join:
+            ends = ((c, d) for c in sorted({a, *near.get(a, ())}) for d in sorted({b, *near.get(b, ())}))
+            beside = [pair for c, d in ends if (pair := (min(c, d), max(c, d))) in waiting]
+            for pair in beside:
+                waiting.pop(pair, None)
+            join += dict.fromkeys(beside)
         found.append(tuple(sorted(join)))
     return found
 
@@ -184,27 +190,43 @@ def _is_confirmed(same: int, tracked: int) -> bool:
     return tracked > 0 and same >= CONFIRMED_SHARE * tracked
 
 
-def _judge_join(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> tuple[LookAlikes, str]:
+def _partners(pairs: Iterable[PairId]) -> dict[int, set[int]]:
+    """Return the other photos of the pairs of each photo."""
+    found: dict[int, set[int]] = {}
+    for a, b in pairs:
+        found.setdefault(a, set()).add(b)
+        found.setdefault(b, set()).add(a)
+    return found
+
+
+def _judge_join(
+    join: tuple[PairId, ...], friends: Mapping[int, set[int]], turns: Mapping[int, FloatArray], places: Depths
+) -> tuple[LookAlikes, str]:
     """Judge whether a join is of look-alikes, a loop, or either; return it with its share of missing cells."""
-    counts = []
-    for photo in sorted({photo for pair in join for photo in pair}):
-        friends, claimed = ({sum(pair) - photo for pair in pairs if photo in pair} for pairs in (trusted, join))
-        if friends:
-            counts.append(count_missing_cells(photo, claimed, friends, places))
+    claimed = _partners(join)
+    counts = [
+        count_missing_cells(photo, claimed[photo], friends[photo], places)
+        for photo in sorted(claimed)
+        if photo in friends
+    ]
     expected, missing = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
     shares = [lacking / wanted for wanted, lacking in counts if wanted >= LEAST_CELLS]
-    same_turn = _rotation_gap_deg(join, trusted, places) <= SAME_TURN_DEG
+    same_turn = _rotation_gap_deg(join, turns, places) <= SAME_TURN_DEG
     limit = MAX_MISSING_SAME_TURN if same_turn else MAX_MISSING
     alike = len(shares) >= LEAST_PHOTOS and float(np.percentile(shares, LOW_PERCENTILE)) > limit
     verdict = ALIKE if alike else LOOP if same_turn else EITHER
     return LookAlikes(join, missing / max(expected, 1)), verdict
 
 
-def _rotation_gap_deg(join: tuple[PairId, ...], trusted: set[PairId], places: Depths) -> float:
+def _photo_rotations(trusted: Iterable[PairId], poses: Mapping[PairId, RelativePose]) -> dict[int, FloatArray]:
+    """Return the rotations of photos along the trusted pairs."""
+    known = {pair: poses[pair] for pair in sorted(trusted)}
+    weights = {pair: float(pose.inlier_count) for pair, pose in known.items()}
+    return average_rotations({pair: pose.R for pair, pose in known.items()}, weights)[0]
+
+
+def _rotation_gap_deg(join: tuple[PairId, ...], turns: Mapping[int, FloatArray], places: Depths) -> float:
     """Return the median angle between the rotations of pairs and those along the trusted ones."""
-    poses = {pair: places.poses[pair] for pair in sorted(trusted)}
-    weights = {pair: float(pose.inlier_count) for pair, pose in poses.items()}
-    turns, _ = average_rotations({pair: pose.R for pair, pose in poses.items()}, weights)
     left = [places.poses[a, b].R.T @ turns[b] @ turns[a].T for a, b in join if a in turns and b in turns]
     if not left:
         return float("inf")

@@ -6,12 +6,16 @@ and Govindu 2013) tests all loops at once: find the R_i that minimize the angles
 which many wrong pairs do not move far, then a robust sum of squares, which they do not move at all.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import cg
 from scipy.spatial.transform import Rotation
 
+from sfm_app.jit import kernel
+from sfm_app.posegraph.groups import DisjointGroups
 from sfm_app.types import PairId
 
 FloatArray = NDArray[np.float64]
@@ -29,6 +33,13 @@ SUM_ROUNDS, SQUARE_ROUNDS = 15, 50
 LEAST_ANGLE, LEAST_STEP = 1e-3, 1e-7
 """In radians: smaller angles get no more weight; smaller steps end the search. Chosen by hand; halved and doubled by
 `benchmarks.sensitivity`."""
+
+LOOP_BLOCK = 100_000
+"""Loops that are checked at once."""
+DENSE_PHOTOS = 400
+"""Most photos for which a dense system is solved; conjugate gradients cost less for more. Counted."""
+STEP_PRECISION, MOST_ITERATIONS = 1e-6, 2000
+"""Relative precision of one step by conjugate gradients, and most iterations: the next rounds correct what is left."""
 
 
 def average_rotations(
@@ -91,32 +102,47 @@ def check_loops(edges: IndexArray, turns: FloatArray) -> tuple[IndexArray, NDArr
         edges: (E, 2) numbers of photos, the smaller first.
         turns: (E, 3, 3) rotation of photo 2 from photo 1.
     """
-    loops = np.array(list(_loops(edges.tolist())), np.int64).reshape(-1, 3)
-    if not len(loops):
-        return loops, np.zeros(0, np.bool_)
-    first, second, across = turns[loops[:, 0]], turns[loops[:, 1]], turns[loops[:, 2]]
-    around = np.einsum("nji,njk,nkl->nil", across, second, first)
-    return loops, np.degrees(Rotation.from_matrix(around).magnitude()) < LOOP_DEG
+    order = np.lexsort(edges.T[::-1])
+    loops = order[_find_loops(edges[order])] if len(edges) else np.zeros((0, 3), np.int64)
+    agree = np.zeros(len(loops), np.bool_)
+    for start in range(0, len(loops), LOOP_BLOCK):
+        first, second, across = (turns[column] for column in loops[start : start + LOOP_BLOCK].T)
+        around = np.einsum("nji,njk,nkl->nil", across, second, first)
+        agree[start : start + LOOP_BLOCK] = np.degrees(Rotation.from_matrix(around).magnitude()) < LOOP_DEG
+    return loops, agree
 
 
-def _loops(edges: Sequence[Sequence[int]]) -> Iterator[tuple[int, int, int]]:
-    """Yield numbers of the edges a-b, b-c and a-c of every three photos a < b < c that are all connected."""
-    number = {(a, b): k for k, (a, b) in enumerate(edges)}
-    after: dict[int, list[int]] = {}
-    for a, b in number:
-        after.setdefault(a, []).append(b)
-    for (a, b), k in number.items():
-        yield from ((k, number[b, c], number[a, c]) for c in after.get(b, ()) if (a, c) in number)
+@kernel
+def _find_loops(edges: IndexArray) -> IndexArray:
+    """Return (L, 3) numbers of the edges a-b, b-c and a-c of every three photos a < b < c that are all connected.
+
+    Args:
+        edges: (E, 2) sorted, the smaller photo first; E > 0.
+    """
+    starts = np.searchsorted(edges[:, 0], np.arange(edges.max() + 2))
+    found, count = np.empty((len(edges), 3), np.int64), 0
+    for k in range(len(edges)):
+        a, b = edges[k]
+        i, j = k + 1, starts[b]
+        while i < starts[a + 1] and j < starts[b + 1]:
+            if edges[i, 1] == edges[j, 1]:
+                if count == len(found):
+                    found = np.concatenate((found, np.empty_like(found)))
+                found[count, 0], found[count, 1], found[count, 2] = k, j, i
+                count += 1
+            if edges[i, 1] <= edges[j, 1]:
+                i += 1
+            else:
+                j += 1
+    return found[:count].copy()
 
 
 def _propagate_along_tree(count: int, edges: IndexArray, turns: FloatArray, strengths: FloatArray) -> FloatArray:
     """Return (count, 3, 3) rotations along the strongest edges, from the first photo of every group on."""
-    group, near = list(range(count)), [[] for _ in range(count)]  # type: ignore[var-annotated]
+    groups, near = DisjointGroups(range(count)), [[] for _ in range(count)]  # type: ignore[var-annotated]
     for k in np.argsort(-strengths, kind="stable"):
         a, b = edges[k].tolist()
-        if group[a] != group[b]:
-            old, new = group[b], group[a]
-            group = [new if name == old else name for name in group]
+        if groups.join(a, b):
             near[a].append((b, turns[k]))
             near[b].append((a, turns[k].T))
     rotations, placed = np.tile(np.eye(3), (count, 1, 1)), set[int]()
@@ -142,11 +168,15 @@ def _residuals(rotations: FloatArray, edges: IndexArray, turns: FloatArray) -> F
 def _solve_steps(count: int, edges: IndexArray, left: FloatArray, factors: FloatArray) -> FloatArray:
     """Fit steps (count, 3) by weighted least squares of step_j - step_i = left; the free turn of each group stays 0."""
     i, j = edges.T
-    L, b = 1e-9 * factors.max() * np.eye(count), np.zeros((count, 3))
-    np.add.at(L, (i, i), factors)
-    np.add.at(L, (j, j), factors)
-    np.add.at(L, (i, j), -factors)
-    np.add.at(L, (j, i), -factors)
+    b = np.zeros((count, 3))
     np.add.at(b, j, factors[:, None] * left)
     np.add.at(b, i, -factors[:, None] * left)
-    return np.asarray(np.linalg.solve(L, b), np.float64)
+    rows, columns = np.concatenate([i, j, i, j]), np.concatenate([i, j, j, i])
+    values = np.concatenate([factors, factors, -factors, -factors])
+    L = sparse.coo_array((values, (rows, columns)), shape=(count, count)).tocsr()
+    L = sparse.csr_array(L + sparse.diags_array(np.full(count, 1e-9 * factors.max())))
+    if count <= DENSE_PHOTOS:
+        return np.asarray(np.linalg.solve(L.toarray(), b), np.float64)
+    inverse = sparse.diags_array(1.0 / L.diagonal())
+    solved = [cg(L, column, rtol=STEP_PRECISION, maxiter=MOST_ITERATIONS, M=inverse)[0] for column in b.T]
+    return np.column_stack(solved)

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from sfm_app.retrieval.choice import expected_pairs
 from sfm_app.settings import Settings
 from sfm_app.types import Photo
 
@@ -78,7 +79,7 @@ def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_m
         limit_mb: most memory; fusion caches less where it is small.
     """
     sizes = [(photo.width, photo.height) for photo in photos]
-    count, pairs = len(sizes), math.comb(len(sizes), 2)
+    count, pairs = len(sizes), expected_pairs(len(sizes), settings.matching)
     largest = max((width * height for width, height in sizes), default=0) / MEGA
     searched = [_megapixels(size, settings.matching.max_image_size_px) for size in sizes]
     mapped = [_megapixels(size, settings.depth.max_image_size_px) for size in sizes]

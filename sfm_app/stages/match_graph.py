@@ -4,14 +4,16 @@ from sfm_app.atomic_io import is_made_from
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.database import create_database, digest_matches, is_sound, read_match_graph, remove_database
 from sfm_app.estimation.diagnosis import NOTHING_MATCHED, diagnose_scene
-from sfm_app.estimation.matching import fill_database
+from sfm_app.estimation.match_rounds import match_probable_pairs
+from sfm_app.estimation.matching import find_all_features, forget_features, match_pairs
+from sfm_app.retrieval.choice import wants_all_pairs
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import Workspace
 from sfm_app.types import MatchGraph, PhotoSet
 
 
 def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
-    """Find features and match every photo with every other, without geometric verification.
+    """Find features and match pairs of photos, without geometric verification.
 
     Features and matches that a killed run has found in the same photos are reused.
 
@@ -30,7 +32,13 @@ def make(photos: PhotoSet, run: RunContext) -> MatchGraph:
         with translate_errors("entering photos"):
             create_database(place.database, photos)
         marker.write_text(run.fingerprint, encoding="utf-8")
-    in_force = fill_database(run.plugins.feature_method(options.features), run)
+    method = run.plugins.feature_method(options.features)
+    in_force = find_all_features(method, run)
+    if wants_all_pairs(len(photos.photos), options):
+        in_force |= match_pairs(method, run)
+    else:
+        in_force |= match_probable_pairs(method, lambda: load(photos, run), run)
+    forget_features(run)
     graph = load(photos, run)
     run.record(
         keypoints={graph.images[key].name: len(points) for key, points in graph.keypoints.items()},

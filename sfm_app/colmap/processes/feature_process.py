@@ -1,6 +1,7 @@
 """COLMAP's SIFT features and raw matches, on CPU, without its geometric verification; see `features.py`."""
 
 import math
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -13,24 +14,29 @@ from sfm_app.colmap.processes.worker_process import FeatureTask, ProgressReporte
 from sfm_app.numerical import Json
 from sfm_app.settings import MatchSettings
 
+PLAIN = re.compile(r"[!-~]+")
+"""Names that COLMAP reads from a list as they are: ASCII without blanks."""
+
 
 def work(task: FeatureTask) -> None:
-    """Find features of all photos, match every photo with every other, and report the effective options."""
+    """Find features of photos, match pairs of photos, and report the effective options."""
     database, photo_dir, names = Path(task["database"]), Path(task["photos"]), task["names"]
     options = MatchSettings.model_validate(task["options"])
     masks = Path(task["masks"]) if task["masks"] else None
     reader = pycolmap.ImageReaderOptions()
     if masks is not None:
         reader.mask_path = masks
-    extraction = extraction_options(options, task["sift"], task["workers"])
-    panoramas = panorama_names(database)
-    extract_panoramas(database, photo_dir, [name for name in names if name in panoramas], masks, extraction)
-    plain = [name for name in names if name not in panoramas]
-    if plain:
-        extract(database, photo_dir, plain, reader, extraction)
-    report(extraction=json_options(extraction.todict()))
+    if names:
+        extraction = extraction_options(options, task["sift"], task["workers"])
+        panoramas = panorama_names(database)
+        extract_panoramas(database, photo_dir, [name for name in names if name in panoramas], masks, extraction)
+        plain = [name for name in names if name not in panoramas]
+        if plain:
+            extract(database, photo_dir, plain, reader, extraction)
+        report(extraction=json_options(extraction.todict()))
     pairs = None if task["pairs"] is None else [(int(a), int(b)) for a, b in task["pairs"]]
-    report(matching=match(database, len(names), options, task["workers"], pairs))
+    if pairs != []:
+        report(matching=match(database, options, task["workers"], pairs))
 
 
 def extraction_options(
@@ -86,13 +92,12 @@ def extract(
 
 
 def match(
-    database: Path, photos: int, options: MatchSettings, workers: int, pairs: Sequence[tuple[int, int]] | None
+    database: Path, options: MatchSettings, workers: int, pairs: Sequence[tuple[int, int]] | None
 ) -> dict[str, Json]:
     """Match pairs of photos, and return the effective options.
 
     Args:
         database: holds the keypoints; matches are entered.
-        photos: number of photos.
         options: largest ratio of descriptor distances.
         workers: threads.
         pairs: ids of the photos of each pair; None for every photo with every other.
@@ -114,14 +119,26 @@ def match(
     def count_finished(reader: pycolmap.Database) -> int:
         return int(reader.num_matched_image_pairs())
 
+    with open_database(database) as reader:
+        photos = reader.num_images()
     _run_with_progress(call, database, count_finished, "matching", math.comb(photos, 2))
     return json_options(matching.todict())
 
 
 def _match_pairs(database: Path, matching: pycolmap.FeatureMatchingOptions, pairs: Sequence[tuple[int, int]]) -> None:
-    """Match pairs in a copy of the database whose photos are named by ids: COLMAP's lists end names at blanks."""
+    """Match pairs of photos.
+
+    COLMAP's lists end names at blanks. Where a name has any, a copy of the database is matched in which photos are
+    named by ids.
+    """
+    with open_database(database) as reader:
+        names = {image.image_id: image.name for image in reader.read_all_images()}
+    if all(PLAIN.fullmatch(name) for name in names.values()):
+        with tempfile.TemporaryDirectory(dir=database.parent, prefix=".matching") as folder:
+            _match_listed(database, matching, [(names[a], names[b]) for a, b in pairs], Path(folder))
+        return
     with tempfile.TemporaryDirectory(dir=database.parent, prefix=".matching") as folder:
-        copy, pairing = Path(folder) / database.name, pycolmap.ImportedPairingOptions()
+        copy = Path(folder) / database.name
         shutil.copyfile(database, copy)
         with open_database(copy) as renamed:
             renamed.clear_two_view_geometries()
@@ -129,21 +146,34 @@ def _match_pairs(database: Path, matching: pycolmap.FeatureMatchingOptions, pair
             for image in renamed.read_all_images():
                 image.name = str(image.image_id)
                 renamed.update_image(image)
-        pairing.match_list_path = Path(folder) / "pairs.txt"
-        pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="ascii")
-
-        def call(token: pycolmap.CancellationToken) -> None:
-            pycolmap.match_image_pairs(
-                copy, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu,
-                cancellation_token=token,
-            )  # fmt: skip
-
-        _run_with_progress(call, copy, lambda reader: int(reader.num_matched_image_pairs()), "matching", len(pairs))
+        _match_listed(copy, matching, [(str(a), str(b)) for a, b in pairs], Path(folder))
         with open_database(copy) as found:
             rows = {pair: found.read_matches(*pair) for pair in pairs}
     with open_database(database) as target:
         for pair in (pair for pair in pairs if not target.exists_matches(*pair)):
             target.write_matches(*pair, rows[pair])
+
+
+def _match_listed(
+    database: Path, matching: pycolmap.FeatureMatchingOptions, pairs: Sequence[tuple[str, str]], folder: Path
+) -> None:
+    """Match pairs of photos by name; the folder gets a list of them."""
+    pairing = pycolmap.ImportedPairingOptions()
+    pairing.match_list_path = folder / "pairs.txt"
+    pairing.match_list_path.write_text("".join(f"{a} {b}\n" for a, b in pairs), encoding="ascii")
+    with open_database(database) as reader:
+        before = int(reader.num_matched_image_pairs())
+
+    def call(token: pycolmap.CancellationToken) -> None:
+        pycolmap.match_image_pairs(
+            database, matching_options=matching, pairing_options=pairing, device=pycolmap.Device.cpu,
+            cancellation_token=token,
+        )  # fmt: skip
+
+    def count_finished(reader: pycolmap.Database) -> int:
+        return int(reader.num_matched_image_pairs()) - before
+
+    _run_with_progress(call, database, count_finished, "matching", len(pairs))
 
 
 def _run_with_progress(

@@ -145,10 +145,10 @@ def test_a_pair_that_is_found_later_is_asked_as_well():
 
 
 def test_doubted_pairs_between_the_same_places_are_one_join():
-    trusted = [(1, 2), (2, 3), (11, 12), (21, 22)]
+    trusted = [(1, 2), (2, 3), (2, 30), (11, 12), (21, 22)]
 
-    assert group_doubted_pairs([(1, 11), (2, 12), (3, 21), (12, 3)], trusted) == [
-        ((1, 11), (2, 12), (12, 3)),
+    assert group_doubted_pairs([(1, 11), (2, 12), (3, 21), (12, 30)], trusted) == [
+        ((1, 11), (2, 12), (12, 30)),
         ((3, 21),),
     ]
 

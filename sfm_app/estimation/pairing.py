@@ -1,0 +1,127 @@
+"""Which pairs of photos are matched: all, or those that probably show the same place.
+
+The largest features of all photos are turned into visual words, photos that share words are looked at more closely, and
+where they seem to overlap they are matched, with neighbors in name, time and GPS. A second round follows the matches.
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sfm_app.retrieval.choice import choose_by_rank, spread
+from sfm_app.retrieval.friends import shared_through_others
+from sfm_app.retrieval.order import pairs_in_order, pairs_nearby
+from sfm_app.retrieval.preview import count_preview_matches
+from sfm_app.retrieval.similarity import most_similar
+from sfm_app.retrieval.vocabulary import learn_vocabulary, pool_descriptors
+from sfm_app.runtime.context import RunContext
+from sfm_app.settings import MatchSettings
+from sfm_app.types import MatchedImage, PairId
+
+DescriptorArray = NDArray[np.uint8]
+ReadDescriptors = Callable[[int], DescriptorArray]
+"""Returns (N, 128) descriptors of a photo, the largest features first."""
+
+LARGEST_FEATURES, PREVIEW_FEATURES = 1024, 256
+"""Features of a photo, the largest, that become words, and that are compared in a preview (Wu 2013 takes 100)."""
+WORDS_PER_PHOTO, FEWEST_WORDS, MOST_WORDS = 4, 512, 16384
+"""Size of the vocabulary. Chosen by hand."""
+POOLED = 300_000
+"""Most descriptors from which the vocabulary is learned. Chosen by hand."""
+RANKED, PREVIEWED = 10, 3
+"""Similar photos among which a photo looks for partners, and those that it looks at, as multiples of the partners."""
+SURE_SHARE = 0.25
+"""Share of its partners that a photo gets whatever their preview says: plain photos have few large features."""
+PREVIEW_SHARE = 0.04
+"""Least share of the compared features that match in the preview of a pair. Photos of different sets reach 0.03 in 19
+of 20 pairs (fountain-P11, castle-P19, temple16, kitchen1000)."""
+FEWEST_COMPARED = 64
+"""Features to which the share of a plainer photo refers, so that one chance match is not many."""
+STEPS = (1, 2, 4, 8)
+"""Photos so many steps before and after a photo by time or name are matched with it."""
+SEQUENCE_SHARE = 0.5
+"""Share of the partners that are neighbors in a sequence."""
+NEAREST_BY_GPS = 8
+"""Photos nearest by GPS that a photo is matched with."""
+FRIENDS_SHARE = 0.25
+"""Share of its partners that a photo gets in the second round."""
+FEWEST_SHARED = 30
+"""Least number of keypoints of other photos that match in both photos of a pair of the second round."""
+
+
+def first_pairs(images: Mapping[int, MatchedImage], read: ReadDescriptors, run: RunContext) -> list[PairId]:
+    """Choose pairs by what the photos show, and by name, time and GPS.
+
+    Args:
+        images: all photos by id.
+        read: called in several threads.
+        run: the run.
+    """
+    options = run.settings.matching
+    photos, count = sorted(images), options.neighbors
+    steps: Sequence[int] = STEPS
+    if options.pairs == "sequence":
+        count, steps = max(1, round((1 - SEQUENCE_SHARE) * count)), sequence_steps(count)
+    chosen = pairs_in_order(list(images.values()), steps) | pairs_nearby(list(images.values()), NEAREST_BY_GPS)
+    largest = run.map(read, photos, "largest features")
+    pooled = pool_descriptors(largest, POOLED)
+    if not len(pooled):
+        return sorted(chosen)
+    with run.step("visual words"):
+        size = min(MOST_WORDS, max(FEWEST_WORDS, WORDS_PER_PHOTO * len(photos)))
+        vocabulary = learn_vocabulary(pooled, size, run.seed)
+    words = run.map(vocabulary.quantize, largest, "words of photos")
+    ranked = most_similar(words, len(vocabulary), RANKED * count)
+    looks = _candidates([[photos[k] for k in row] for row in ranked], photos, count)
+    small = {photo: one[:PREVIEW_FEATURES] for photo, one in zip(photos, largest, strict=True)}
+    scores = dict(zip(looks, run.map(partial(_preview, small), looks, "previews"), strict=True))
+    chosen |= choose_by_rank(scores, 1, max(1, round(SURE_SHARE * count)))
+    return sorted(chosen | choose_by_rank(scores, round(PREVIEW_SHARE * PREVIEW_FEATURES), count))
+
+
+def sequence_steps(count: int) -> tuple[int, ...]:
+    """Return the steps to the neighbors in a sequence: half of them next to each other, the others twice as far each.
+
+    Args:
+        count: partners of each photo.
+    """
+    near = max(2, round(SEQUENCE_SHARE * count / 2))
+    return (*range(1, near + 1), *(near * 2**k for k in range(1, 4)))
+
+
+def second_pairs(
+    keypoints: Mapping[int, int],
+    matches: Mapping[PairId, NDArray[np.uint32]],
+    asked: Collection[PairId],
+    options: MatchSettings,
+) -> list[PairId]:
+    """Choose pairs whose photos match the same keypoints of others.
+
+    Args:
+        keypoints: number of keypoints of each photo.
+        matches: of the pairs so far.
+        asked: pairs that were matched already, with or without success.
+        options: settings of matching.
+    """
+    shared = shared_through_others(keypoints, matches)
+    left = {pair: count for pair, count in shared.items() if pair not in asked}
+    return sorted(choose_by_rank(left, FEWEST_SHARED, max(1, round(FRIENDS_SHARE * options.neighbors))))
+
+
+def _candidates(ranked: Sequence[Sequence[int]], photos: Sequence[int], count: int) -> list[PairId]:
+    """Return the pairs that are looked at more closely."""
+    looks = (
+        (photo, other)
+        for photo, others in zip(photos, ranked, strict=True)
+        for other in spread(others, PREVIEWED * count)
+    )
+    return sorted({(min(pair), max(pair)) for pair in looks})
+
+
+def _preview(small: Mapping[int, DescriptorArray], pair: PairId) -> int:
+    """Return how many of the largest features match, as if both photos had `PREVIEW_FEATURES`."""
+    first, second = (small[photo] for photo in pair)
+    fewest = max(min(len(first), len(second)), FEWEST_COMPARED)
+    return round(count_preview_matches(first, second) * PREVIEW_FEATURES / fewest)
