@@ -67,7 +67,7 @@ class MatchSettings(Section):
         description="pairs to match: all; retrieval: photos that look alike; sequence: mostly neighbors by name or "
         "time; auto: all where that is cheaper, else retrieval",
     )
-    neighbors: int = Field(40, ge=4, le=1000, description="photos that each one is matched with, where not with all")
+    neighbors: int = Field(30, ge=4, le=1000, description="photos that each one is matched with, where not with all")
 
 
 class EpipolarSettings(Section):

@@ -30,7 +30,7 @@ WORDS_PER_PHOTO, FEWEST_WORDS, MOST_WORDS = 4, 512, 16384
 """Size of the vocabulary. Chosen by hand."""
 POOLED = 300_000
 """Most descriptors from which the vocabulary is learned. Chosen by hand."""
-RANKED, PREVIEWED = 10, 3
+RANKED, PREVIEWED = 10, 2
 """Similar photos among which a photo looks for partners, and those that it looks at, as multiples of the partners."""
 SURE_SHARE = 0.25
 """Share of its partners that a photo gets whatever their preview says: plain photos have few large features."""
@@ -76,7 +76,7 @@ def first_pairs(images: Mapping[int, MatchedImage], read: ReadDescriptors, run: 
     ranked = most_similar(words, len(vocabulary), RANKED * count)
     looks = _candidates([[photos[k] for k in row] for row in ranked], photos, count)
     small = {photo: one[:PREVIEW_FEATURES] for photo, one in zip(photos, largest, strict=True)}
-    scores = dict(zip(looks, run.map(partial(_preview, small), looks, "previews"), strict=True))
+    scores = _merge(run.map(partial(_preview, small), list(looks.items()), "previews"))
     chosen |= choose_by_rank(scores, 1, max(1, round(SURE_SHARE * count)))
     return sorted(chosen | choose_by_rank(scores, round(PREVIEW_SHARE * PREVIEW_FEATURES), count))
 
@@ -110,18 +110,27 @@ def second_pairs(
     return sorted(choose_by_rank(left, FEWEST_SHARED, max(1, round(FRIENDS_SHARE * options.neighbors))))
 
 
-def _candidates(ranked: Sequence[Sequence[int]], photos: Sequence[int], count: int) -> list[PairId]:
-    """Return the pairs that are looked at more closely."""
+def _candidates(ranked: Sequence[Sequence[int]], photos: Sequence[int], count: int) -> dict[int, list[int]]:
+    """Return by photo the later photos with which it is looked at more closely."""
     looks = (
-        (photo, other)
+        (min(photo, other), max(photo, other))
         for photo, others in zip(photos, ranked, strict=True)
         for other in spread(others, PREVIEWED * count)
     )
-    return sorted({(min(pair), max(pair)) for pair in looks})
+    found: dict[int, list[int]] = {}
+    for first, second in sorted(set(looks)):
+        found.setdefault(first, []).append(second)
+    return found
 
 
-def _preview(small: Mapping[int, DescriptorArray], pair: PairId) -> int:
-    """Return how many of the largest features match, as if both photos had `PREVIEW_FEATURES`."""
-    first, second = (small[photo] for photo in pair)
-    fewest = max(min(len(first), len(second)), FEWEST_COMPARED)
-    return round(count_preview_matches(first, second) * PREVIEW_FEATURES / fewest)
+def _preview(small: Mapping[int, DescriptorArray], look: tuple[int, Sequence[int]]) -> dict[PairId, int]:
+    """Return for some pairs of a photo how many of their largest features match, as if all had `PREVIEW_FEATURES`."""
+    photo, others = look
+    counts = count_preview_matches(small[photo], [small[other] for other in others])
+    fewest = [max(min(len(small[photo]), len(small[other])), FEWEST_COMPARED) for other in others]
+    scaled = (round(count * PREVIEW_FEATURES / few) for count, few in zip(counts, fewest, strict=True))
+    return dict(zip(((photo, other) for other in others), scaled, strict=True))
+
+
+def _merge(parts: Sequence[Mapping[PairId, int]]) -> dict[PairId, int]:
+    return {pair: count for part in parts for pair, count in part.items()}
