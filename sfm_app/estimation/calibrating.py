@@ -10,11 +10,14 @@ from sfm_app.estimation.camera_check import report_checks
 from sfm_app.estimation.diagnosis import diagnose_fits, inliers_by_degeneracy
 from sfm_app.estimation.exif_check import FocalClaim, focal_claim, report_claims, shown_share
 from sfm_app.estimation.given_cameras import assign_cameras
+from sfm_app.retrieval.choice import choose_by_rank
 from sfm_app.runtime.context import RunContext
 from sfm_app.selfcal import CalibratedCamera, calibrate_photo_set, pair_weights
 from sfm_app.types import Calibration, CameraPairs, Intrinsics, MatchedImage, MatchGraph, PhotoPairs, ViewGraph
 from sfm_app.types.calibration import EQUIRECTANGULAR
 
+ENOUGH_PAIRS, PAIRS_PER_PHOTO = 2000, 4
+"""Pairs up to which all are used for calibration, and partners of each photo in a sample of more. Chosen by hand."""
 LENS_ROUNDS = 2
 """Times the inliers are chosen again through the lens that the cameras so far have. Chosen on synthetic matches
 (`python -m benchmarks.lenses.distortion`)."""
@@ -28,10 +31,12 @@ def find_intrinsics(
     Args:
         matches, views, run: keypoints and raw matches; fundamental matrices; the run.
     """
-    cameras = _calibrate(matches, views, run)
+    sample = sample_pairs(views, len(matches.images))
+    run.record(pairs_asked=len(sample.fits))
+    cameras = _calibrate(matches, sample, run)
     for _ in range(LENS_ROUNDS):
-        seen = choose_inliers_again(matches, views, cameras, run)
-        if seen is views:
+        seen = choose_inliers_again(matches, sample, cameras, run)
+        if seen is sample:
             break
         cameras = _calibrate(matches, seen, run)
     cameras += cameras_with_lens(matches, views)
@@ -43,6 +48,22 @@ def find_intrinsics(
         photos={image.id: image.name for image in matches.images.values()},
     )
     return intrinsics, cameras
+
+
+def sample_pairs(views: ViewGraph, photos: int) -> ViewGraph:
+    """Return the view graph with as many pairs as cameras need; all of them in small sets.
+
+    Each photo keeps some pairs: those with most inliers, and others of any number, which have more parallax.
+
+    Args:
+        views: fundamental matrices.
+        photos: number of photos.
+    """
+    counts = {pair: fit.inlier_count for pair, fit in views.fits.items() if not fit.degeneracy}
+    if len(counts) <= ENOUGH_PAIRS:
+        return views
+    chosen = choose_by_rank(counts, 0, max(PAIRS_PER_PHOTO, ENOUGH_PAIRS // max(photos, 1)))
+    return replace(views, fits={pair: fit for pair, fit in views.fits.items() if pair in chosen})
 
 
 def _calibrate(matches: MatchGraph, views: ViewGraph, run: RunContext) -> list[CalibratedCamera]:

@@ -1,7 +1,7 @@
 """Damping of Levenberg-Marquardt steps (Marquardt 1963), for every adjustment written in Python.
 
-The kernels of `ransac.refine.sampson_refit`, and `selfcal.thesis.least_squares` with its many simultaneous starts, do
-the same inside their loops.
+The kernels of `ransac.refine.sampson_refit` and `posegraph.refine`, and `selfcal.thesis.least_squares` with its many
+simultaneous starts, do the same inside their loops.
 """
 
 from collections.abc import Callable

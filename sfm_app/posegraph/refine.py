@@ -7,7 +7,7 @@ lie right, and repeated structure. On real photos that alone halves the error of
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.damping import DampingRange, damped_step
+from sfm_app.geometry.damping import DECREASE, INCREASE
 from sfm_app.geometry.pose_manifold import POSE_DOF, retract, write_essential
 from sfm_app.jit import kernel
 
@@ -19,7 +19,7 @@ mismatches that a second structure explains pull the pose to a compromise betwee
 relative poses."""
 STEPS = 12
 """Largest number of steps at each scale. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e6)
+DAMPING_FIRST, DAMPING_LEAST, DAMPING_MOST = 1e-4, 1e-9, 1e6
 """Damping of the Levenberg-Marquardt steps. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 GAIN = 1e-6
 """Relative decrease of the cost below which they end. Chosen by hand; halved and doubled by
@@ -111,21 +111,45 @@ def _system(lines: FloatArray, pose: FloatArray, sigma: float) -> tuple[FloatArr
     return A, b
 
 
+@kernel
 def _descend(lines: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
-    cost, damping = _cost(lines, pose, sigma), DAMPING.first
-
-    def attempt(tried: float) -> tuple[FloatArray, float] | None:
-        step = np.asarray(np.linalg.solve(A + np.diag(tried * np.diag(A) + 1e-9), b), np.float64)
-        trial = retract(pose, step)
-        lower = _cost(lines, trial, sigma)
-        return (trial, lower) if lower < cost else None
-
+    cost, damping = _cost(lines, pose, sigma), DAMPING_FIRST
     for _ in range(STEPS):
         A, b = _system(lines, pose, sigma)
-        found, damping = damped_step(attempt, damping, DAMPING)
-        if found is None:
-            break
-        before, (pose, cost) = cost, found
-        if before - cost < GAIN * before:
+        before, found = cost, False
+        while damping < DAMPING_MOST and not found:
+            step = _solve(A, b, damping)
+            trial = retract(pose, step)
+            lower = _cost(lines, trial, sigma)
+            if lower < cost:
+                pose, cost, found = trial, lower, True
+                damping = max(DECREASE * damping, DAMPING_LEAST)
+            else:
+                damping *= INCREASE
+        if not found or before - cost < GAIN * before:
             break
     return pose
+
+
+@kernel
+def _solve(A: FloatArray, b: FloatArray, damping: float) -> FloatArray:
+    """Solve the damped system by Cholesky's decomposition."""
+    L, x = np.zeros((POSE_DOF, POSE_DOF)), np.empty(POSE_DOF)
+    for i in range(POSE_DOF):
+        for j in range(i + 1):
+            value = A[i, j]
+            if i == j:
+                value += damping * A[i, i] + 1e-9
+            for k in range(j):
+                value -= L[i, k] * L[j, k]
+            L[i, j] = np.sqrt(max(value, 1e-300)) if i == j else value / L[j, j]
+    for i in range(POSE_DOF):
+        x[i] = b[i]
+        for k in range(i):
+            x[i] -= L[i, k] * x[k]
+        x[i] /= L[i, i]
+    for i in range(POSE_DOF - 1, -1, -1):
+        for k in range(i + 1, POSE_DOF):
+            x[i] -= L[k, i] * x[k]
+        x[i] /= L[i, i]
+    return x

@@ -10,7 +10,8 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+
+from sfm_app.geometry.epipolar import cross_matrix
 
 FloatArray = NDArray[np.float64]
 
@@ -61,9 +62,11 @@ def turned_starts(used: FloatArray, E: FloatArray) -> Iterator[tuple[FloatArray,
     if min(lengths) <= 1e-12 * max(*lengths, 1e-300):
         return
     roll = np.arctan2(-g2[1], -g2[0]) - np.arctan2(g1[1], g1[0])
-    axis = np.append(g1 / lengths[0], 0.0)
-    for turn_deg in TURNS_DEG:
-        R = (Rotation.from_rotvec([0.0, 0.0, roll]) * Rotation.from_rotvec(np.radians(turn_deg) * axis)).as_matrix()
-        t = lengths[1] / lengths[0] * second - R @ first  # the middle of the scene stays in the middle
-        if np.linalg.norm(t) > 1e-9:
-            yield np.asarray(R, np.float64), t / np.linalg.norm(t)
+    K = cross_matrix(np.append(g1 / lengths[0], 0.0))
+    angles = np.radians(TURNS_DEG)[:, None, None]
+    upright = np.array([[np.cos(roll), -np.sin(roll), 0.0], [np.sin(roll), np.cos(roll), 0.0], [0.0, 0.0, 1.0]])
+    turns = upright @ (np.eye(3) + np.sin(angles) * K + (1.0 - np.cos(angles)) * (K @ K))  # Rodrigues
+    steps = lengths[1] / lengths[0] * second - turns @ first  # the middle of the scene stays in the middle
+    for R, t, length in zip(turns, steps, np.linalg.norm(steps, axis=1), strict=True):
+        if length > 1e-9:
+            yield R, t / length

@@ -46,6 +46,8 @@ hand; halved and doubled by `benchmarks.sensitivity`."""
 AGREEING_RATIO = 0.1
 """A contradicted camera is adjusted again, only to pairs with r below this at the peak; on the same sets 0.03 and 0.05
 move no focal by more than 0.1 %. Chosen on those sets, benchmarks/corpus/tuning_sets.py."""
+MOST_ADJUSTED = 800
+"""Pairs to whose matches a camera is adjusted; all pairs vote for it and judge it. Chosen by hand."""
 ANOTHER_FOCAL = 1.25
 """Factor by which focals of the consensus and of the matches may differ. docs/algorithms.md, Self-calibration, 5.
 Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
@@ -178,7 +180,7 @@ def _adjust(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _Ad
     """Adjust the camera to the matches of all pairs, or only of those that agree on the peak of `before`."""
     matches, Fs = _convert_to_sides(pairs, usable)
     if before is None:
-        first, listened = consensus_peak.find_peak(Consensus(usable, priors.center_sigma)), np.arange(len(usable))
+        first, listened = consensus_peak.find_peak(Consensus(usable, priors.center_sigma)), _some_pairs(len(usable))
         plain = np.array([USUAL_FOCAL, 0.0, 0.0, 0.0])
         starts = [np.append(theta, 0.0)[None] for theta in (first.theta, *first.others[:1], plain)]
     else:
@@ -195,6 +197,11 @@ def _adjust(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _Ad
         again = np.append(answer.theta, fit.state.thetas[0, KAPPA])
         fit = fit_cameras(matches.select(listened), Fs[listened], [fit.state.thetas, again[None]], priors)
     return _Adjustment(fit, listened, consensus, answer)
+
+
+def _some_pairs(count: int) -> NDArray[np.int64]:
+    """Return the pairs to whose matches a camera is adjusted: all, or evenly chosen ones."""
+    return np.unique(np.linspace(0, count - 1, min(count, MOST_ADJUSTED)).astype(np.int64))
 
 
 def _prepare(pairs: CameraPairs) -> Pairs:

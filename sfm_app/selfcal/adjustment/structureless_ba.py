@@ -135,7 +135,9 @@ class Matches:
             return 1.0
         photos = self.photos.repeat(np.diff(self.ends), axis=0)
         views = [np.column_stack([photos[:, view], self.points[:, 2 * view : 2 * view + 2]]) for view in range(2)]
-        each = 2 * len(self.points) / len(np.unique(np.concatenate(views), axis=0))
+        seen = np.concatenate(views)
+        seen = seen[np.lexsort(seen.T)]
+        each = 2 * len(self.points) / (1 + np.count_nonzero((seen[1:] != seen[:-1]).any(axis=1)))
         return max(1.0, 0.5 * each * (each + 1.0) / (2.0 * each - 1.0))
 
     def pair_matches(self, pair: int) -> FloatArray:
