@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_app.bundle_adjustment.elimination import POSE, block_diagonal, free_pose_columns, to_sparse, whiten_points
 from sfm_app.geometry.lenses.projections import CAMERA, PANORAMA, project_points, wrap_residuals
-from sfm_app.geometry.spd_solve import project_to_psd, solve_positive
+from sfm_app.geometry.spd_solve import project_to_psd, solve_positive, solve_sparse_positive
 
 FloatArray = NDArray[np.float64]
 
@@ -131,14 +131,16 @@ def reduce(bundle: Bundle, scale_px: float) -> ReducedSystem:
     J = to_sparse(by_view, columns, poses + cameras)
     Jp = to_sparse(by_point, 3 * bundle.point[:, None] + np.arange(3), 3 * len(bundle.X))
     A = (Jp.T @ J).tocsr()
-    S = (J.T @ J - A.T @ A).toarray() + DAMPING * np.eye(poses + cameras)
+    S = sparse.csr_array(J.T @ J - A.T @ A + DAMPING * sparse.eye_array(poses + cameras))
     flat = r.ravel()
     along = Jp.T @ flat
     gradient = J.T @ flat - A.T @ along
     free = free_pose_columns(bundle.R, bundle.t)
-    give = solve_positive(S[np.ix_(free, free)], np.column_stack([S[free][:, poses:], gradient[free]]))
-    across = np.einsum("ij,jk->ik", S[poses:][:, free], give)
-    H, g = S[poses:, poses:] - across[:, :-1], gradient[poses:] - across[:, -1]
+    by_camera = S[poses:].toarray()
+    right = np.column_stack([by_camera[:, free].T, gradient[free]])
+    give = solve_sparse_positive(sparse.csr_array(S[free][:, free]), right)
+    across = np.einsum("ij,jk->ik", by_camera[:, free], give)
+    H, g = by_camera[:, poses:] - across[:, :-1], gradient[poses:] - across[:, -1]
     H = project_to_psd(0.5 * (H + H.T), np.asarray(J[:, poses:].power(2).sum(axis=0), np.float64))
     step = solve_positive(H, g[:, None])[:, 0]
     explained = np.sum(along**2) + np.sum(gradient[free] * give[:, -1]) + np.sum(g * step)

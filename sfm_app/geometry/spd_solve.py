@@ -2,6 +2,9 @@
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse.linalg import splu
 
 from sfm_app.errors import NumericalError
 
@@ -16,6 +19,14 @@ PIVOT_FLOOR = 1e-10
 """Share of a pivot that elimination must leave for a solution to move along it: a smaller pivot multiplies the rounding
 of all later steps by more than a million. Neither figure was chosen on a set: both follow from the precision of
 doubles. docs/algorithms.md, Where numbers end."""
+
+MOST_ELIMINATED = 1500
+"""Unknowns up to which systems are solved without LAPACK: the time grows with the cube. Chosen by hand for speed."""
+MOST_DENSE, LEAST_DENSE = 12_000, 0.05
+"""Unknowns, and share of entries that are not 0, at which a sparse system is solved as a dense one: such systems fill
+up in elimination. Chosen by hand for speed and memory."""
+RIDGES = (1e-13, 1e-11, 1e-9, 1e-7)
+"""Shares by which the diagonal of a large system is raised, one after the other. From the precision of doubles."""
 
 NOT_FINITE = "a matrix has infinite or NaN entries", "this is a bug; please report it with OUT/log.txt"
 
@@ -50,7 +61,8 @@ def lift_eigenvalues(S: FloatArray, least: float = EIGENVALUE_FLOOR, to: float =
 def solve_positive(S: FloatArray, B: FloatArray) -> FloatArray:
     """Compute S^-1 B by Gauss-Jordan elimination in small blocks, without pivoting.
 
-    Along directions that S does not determine, the solution stays near 0.
+    Along directions that S does not determine, the solution stays near 0. Large systems are solved by LAPACK, whose
+    sums depend on the number of its threads, but not on the workers of a run.
 
     Args:
         S: (n, n), symmetric and positive definite up to rounding.
@@ -59,7 +71,47 @@ def solve_positive(S: FloatArray, B: FloatArray) -> FloatArray:
     Raises:
         NumericalError: S has infinite or NaN entries.
     """
-    return _eliminate(S, B, PIVOT_FLOOR, 1.0)
+    return _eliminate(S, B, PIVOT_FLOOR, 1.0) if len(S) <= MOST_ELIMINATED else _solve_by_cholesky(S, B)
+
+
+def solve_sparse_positive(S: sparse.csr_array, B: FloatArray) -> FloatArray:
+    """Compute S^-1 B of a sparse matrix; one with few zeros is solved as a dense one.
+
+    Args:
+        S: (n, n), symmetric and positive definite up to rounding.
+        B: (n, k).
+
+    Raises:
+        NumericalError: S has infinite or NaN entries.
+    """
+    n = S.shape[0]
+    if n <= MOST_ELIMINATED or (n <= MOST_DENSE and S.nnz > LEAST_DENSE * n * n):
+        return solve_positive(S.toarray(), B)
+    if not np.isfinite(S.data).all():
+        raise NumericalError(*NOT_FINITE)
+    diagonal = S.diagonal()
+    scale = np.where(diagonal > 0.0, diagonal, 1.0) ** -0.5
+    balance = sparse.diags_array(scale)
+    unit = sparse.csc_array(balance @ S @ balance + RIDGES[0] * sparse.eye_array(n))
+    factor = splu(unit, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    return np.asarray(scale[:, None] * factor.solve(np.ascontiguousarray(scale[:, None] * B)), np.float64)
+
+
+def _solve_by_cholesky(S: FloatArray, B: FloatArray) -> FloatArray:
+    """Compute S^-1 B; where rounding has made S indefinite, the diagonal is raised until it no longer is."""
+    diagonal = np.diag(S)
+    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    unit = S / scale[:, None] / scale
+    if not np.isfinite(unit).all():
+        raise NumericalError(*NOT_FINITE)
+    for raised in RIDGES:
+        unit[np.diag_indices(len(unit))] = 1.0 + raised
+        try:
+            factor = cho_factor(unit, lower=True, check_finite=False)
+        except np.linalg.LinAlgError:
+            continue
+        return np.asarray(cho_solve(factor, B / scale[:, None], check_finite=False) / scale[:, None], np.float64)
+    raise NumericalError("a large linear system has no solution", "this is a bug; please report it with OUT/log.txt")
 
 
 def inverse_of_positive(S: FloatArray) -> FloatArray:

@@ -4,8 +4,10 @@ Facades that look alike join places that are apart. Such a join rests on few mat
 unexplained: those of pairs that see the true layout.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 
+from sfm_app.posegraph.groups import DisjointGroups
 from sfm_app.reconstruction.support import PairSupport
 from sfm_app.types import PairId
 
@@ -23,23 +25,24 @@ def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) 
         explained: explained and contradicting matches of each pair.
         photos: ids of the photos to divide.
     """
-    part = {photo: frozenset([photo]) for photo in photos}
+    groups = DisjointGroups(photos)
     worth = {pair: found.matches - found.contradicted for pair, found in explained.items()}
-    for pair in sorted(worth, key=lambda pair: (-worth[pair], pair)):
-        first, second = part[pair[0]], part[pair[1]]
-        if first == second or worth[pair] < LEAST_MATCHES:
+    between: dict[int, Counter[int]] = {photo: Counter() for photo in groups.members}
+    for (a, b), value in worth.items():
+        if abs(value) >= LEAST_MATCHES:
+            between[a][b] += value
+            between[b][a] += value
+    for a, b in sorted(worth, key=lambda pair: (-worth[pair], pair)):
+        first, second = groups.name[a], groups.name[b]
+        if first == second or worth[a, b] < LEAST_MATCHES or between[first][second] <= 0:
             continue
-        joins = (value for (a, b), value in worth.items() if _is_between(a, b, first, second))
-        if sum(value for value in joins if _is_significant(value)) > 0:
-            for photo in first | second:
-                part[photo] = first | second
-    parts = {tuple(sorted(members)) for members in part.values()}
+        groups.join(a, b)
+        kept = groups.name[a]
+        gone = second if kept == first else first
+        for other, value in between.pop(gone).items():
+            if other != kept:
+                between[kept][other] += value
+                between[other][kept] += value
+            del between[other][gone]
+    parts = [tuple(sorted(members)) for members in groups.members.values()]
     return sorted(parts, key=lambda members: (-len(members), members))
-
-
-def _is_between(a: int, b: int, first: frozenset[int], second: frozenset[int]) -> bool:
-    return (a in first and b in second) or (b in first and a in second)
-
-
-def _is_significant(worth: int) -> bool:
-    return abs(worth) >= LEAST_MATCHES

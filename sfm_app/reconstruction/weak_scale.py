@@ -4,8 +4,10 @@ Two photos do not determine the distance between them. The relative scale of a t
 three see. Where a part shares hardly any of them with the rest, its points may fit well and its scale still be wrong.
 """
 
+from heapq import heappop, heappush
+
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, triu
 
 from sfm_app.colmap.backend import translate_errors
 from sfm_app.colmap.model import posed_images
@@ -49,17 +51,28 @@ def _joining_order(seen: csr_array) -> list[tuple[int, int]]:
     if photos < 3 or points == 0:
         return []
     by_photo = seen.T.tocsr()
-    together = (by_photo @ seen).toarray()
-    np.fill_diagonal(together, -1)
-    first = np.unravel_index(np.argmax(together), together.shape)
-    left = np.ones(photos, np.bool_)
-    left[list(first)] = False
-    views = seen @ (~left).astype(np.int32)
-    joined = []
-    while left.any():
-        known = np.where(left, by_photo @ (views >= 2).astype(np.int32), -1)
-        photo = int(np.argmax(known))
-        joined.append((photo, int(known[photo])))
-        left[photo] = False
-        views = seen @ (~left).astype(np.int32)
+    together = csr_array(triu(by_photo @ seen, k=1)).tocoo()
+    best = np.lexsort((together.coords[1], together.coords[0], -together.data))[:1]
+    first = [int(axis[k]) for axis in together.coords for k in best] or [0, 1]
+    views, known = np.zeros(points, np.int64), np.zeros(photos, np.int64)
+    left, waiting, joined = set(range(photos)), [(0, photo) for photo in range(photos)], []
+
+    def join(photo: int) -> None:
+        own = by_photo.indices[by_photo.indptr[photo] : by_photo.indptr[photo + 1]]
+        views[own] += 1
+        now = own[views[own] == 2]  # the points that have just become known
+        viewers = np.concatenate([seen.indices[seen.indptr[k] : seen.indptr[k + 1]] for k in now] or [own[:0]])
+        for other, more in zip(*np.unique(viewers, return_counts=True), strict=True):
+            known[other] += more
+            if other in left:
+                heappush(waiting, (-int(known[other]), int(other)))
+        left.discard(photo)
+
+    for photo in first:
+        join(photo)
+    while left:
+        count, photo = heappop(waiting)
+        if photo in left and -count == known[photo]:
+            joined.append((photo, -count))
+            join(photo)
     return joined

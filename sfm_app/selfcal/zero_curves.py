@@ -184,7 +184,7 @@ def _adjust(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _Ad
         plain = np.array([USUAL_FOCAL, 0.0, 0.0, 0.0])
         starts = [np.append(theta, 0.0)[None] for theta in (first.theta, *first.others[:1], plain)]
     else:
-        first, listened = before.answer, before.agreeing_pairs
+        first, listened = before.answer, before.agreeing_pairs[_some_pairs(len(before.agreeing_pairs))]
         starts = [np.append(first.theta, before.fit.state.thetas[0, KAPPA])[None]]
     fit = fit_cameras(matches.select(listened), Fs[listened], starts, priors)
     consensus, answer = Consensus(usable, priors.center_sigma), first

@@ -52,7 +52,7 @@ def test_all_loops_of_three_are_found():
 
 
 def test_conjugate_gradients_give_the_rotations_of_the_dense_solution(monkeypatch):
-    steps = [(k, k + step) for step in (1, 2, 5) for k in range(0, 120 - step)]
+    steps = [(k, k + step) for step in (1, 2, 5) for k in range(120 - step)]
     turns = relative(truth(120), steps)
     weights = dict.fromkeys(steps, 1.0)
     dense, _ = average_rotations(turns, weights)
@@ -65,7 +65,7 @@ def test_conjugate_gradients_give_the_rotations_of_the_dense_solution(monkeypatc
 
 def test_the_photos_of_a_long_walk_agree():
     photos = 1500
-    steps = [(k, k + step) for step in (1, 2, 4, 8) for k in range(0, photos - step)]
+    steps = [(k, k + step) for step in (1, 2, 4, 8) for k in range(photos - step)]
     rotations = truth(photos)
 
     found, angles = average_rotations(relative(rotations, steps), dict.fromkeys(steps, 1.0))
