@@ -31,9 +31,10 @@ MIN_INLIERS = 8
 MIN_IN_FRONT, MIN_IMPROVEMENT = 0.9, 0.01
 """A pose from a start other than that of F needs this share of its inliers in front of both cameras, and a cost lower
 by this share. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-SCREENED, PROMISING = 60, 1.2
+SCREENED, PROMISING, SAME_POSE = 60, 1.2, 0.01
 """Inliers to which other starts are fitted first, and the largest ratio of their cost there to that of the best pose
-for a start to be fitted to all. A pose that is better on all inliers is not a fifth worse on sixty of them."""
+for a start to be fitted to all: a pose that is better on all inliers is not a fifth worse on sixty of them. Third, the
+largest difference of R and t of starts that led to one pose."""
 ROTATION_DEG = 5.0
 """Median angle of rays above which no rotation is tried. Chosen by hand; not measured on its own."""
 LEAST_AHEAD = 0.5
@@ -160,11 +161,13 @@ def _refine_best_start(pair: Pair, fit: EpipolarFit, start: Pose) -> Pose:
     ahead = points_ahead(used)
     planar = planar_starts(ahead) if fit.degeneracy == "planar" else ()
     few = used[np.linspace(0, len(used) - 1, min(len(used), SCREENED)).astype(np.int64)]
-    promising = PROMISING * _pose_cost(few, *best) if lowest < np.inf else np.inf
-    for other in (*turned_starts(ahead, pair.essential_matrix(fit)), *planar):
+    promising, tried = np.inf, [best]
+    for other in (best, *turned_starts(ahead, pair.essential_matrix(fit)), *planar):
         R, t = refine_pose(few, *other)
-        if _pose_cost(few, R, t) > promising:
+        promising = min(promising, PROMISING * _pose_cost(few, R, t))
+        if lowest < np.inf and (_pose_cost(few, R, t) > promising or _is_known((R, t), tried)):
             continue
+        tried.append((R, t))
         R, t = refine_pose(used, R, t)
         cost, count = _pose_cost(used, R, t), int(np.count_nonzero(pair.inliers(R, t)))
         if cost < (1.0 - MIN_IMPROVEMENT) * lowest and count >= most:
@@ -172,6 +175,13 @@ def _refine_best_start(pair: Pair, fit: EpipolarFit, start: Pose) -> Pose:
             if is_in_front(used, R, t).mean() >= MIN_IN_FRONT:
                 best, lowest, most = (R, t), cost, count
     return best
+
+
+def _is_known(found: Pose, tried: Sequence[Pose]) -> bool:
+    """Return whether a start led to a pose that was tried; t and -t have the same epipolar lines."""
+    R, t = found
+    off = (max(np.abs(R - A).max(), min(np.abs(t - b).max(), np.abs(t + b).max())) for A, b in tried)
+    return bool(min(off) < SAME_POSE)
 
 
 def _pose_cost(used: FloatArray, R: FloatArray, t: FloatArray) -> float:
