@@ -16,15 +16,15 @@ hand on the video kitchen1000."""
 
 
 def wants_all_pairs(photos: int, options: MatchSettings) -> bool:
-    """Return whether all pairs are matched: as the user says, or because a choice would not be cheaper.
+    """Return whether all pairs are matched: as the user says, or because there is little to choose.
 
     Args:
         photos: number of photos.
         options: settings of matching.
     """
-    return options.pairs == "all" or (
-        options.pairs == "auto" and math.comb(photos, 2) <= expected_pairs(photos, options)
-    )
+    if options.pairs == "all" or photos <= options.neighbors + 1:
+        return True
+    return options.pairs == "auto" and math.comb(photos, 2) <= expected_pairs(photos, options)
 
 
 def expected_pairs(photos: int, options: MatchSettings) -> int:

@@ -56,7 +56,8 @@ def test_gps_pairs_are_the_nearest_places():
 
 
 @pytest.mark.parametrize(("pairs", "photos", "wanted"), [
-    ("auto", 20, True), ("auto", 61, True), ("auto", 62, False), ("all", 5000, True), ("retrieval", 20, False),
+    ("auto", 20, True), ("auto", 61, True), ("auto", 62, False), ("all", 5000, True), ("retrieval", 31, True),
+    ("retrieval", 32, False), ("sequence", 31, True), ("sequence", 40, False),
 ])  # fmt: skip
 def test_all_pairs_are_matched_where_that_is_cheaper(pairs, photos, wanted):
     assert wants_all_pairs(photos, MatchSettings(pairs=pairs, neighbors=30)) is wanted
