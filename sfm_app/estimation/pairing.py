@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sfm_app.retrieval.choice import choose_by_rank, spread
-from sfm_app.retrieval.friends import shared_through_others
+from sfm_app.retrieval.friends import count_shared_keypoints
 from sfm_app.retrieval.order import pairs_in_order, pairs_nearby
 from sfm_app.retrieval.preview import count_preview_matches
-from sfm_app.retrieval.similarity import most_similar
+from sfm_app.retrieval.similarity import rank_similar
 from sfm_app.retrieval.vocabulary import learn_vocabulary, pool_descriptors
 from sfm_app.runtime.context import RunContext
 from sfm_app.settings import MatchSettings
@@ -65,20 +65,25 @@ def first_pairs(images: Mapping[int, MatchedImage], read: ReadDescriptors, run: 
     if options.pairs == "sequence":
         count, steps = max(1, round((1 - SEQUENCE_SHARE) * count)), sequence_steps(count)
     chosen = pairs_in_order(list(images.values()), steps) | pairs_nearby(list(images.values()), NEAREST_BY_GPS)
+    return sorted(chosen | _similar_pairs(photos, read, count, run))
+
+
+def _similar_pairs(photos: Sequence[int], read: ReadDescriptors, count: int, run: RunContext) -> set[PairId]:
+    """Return pairs of photos that show the same, some for each photo."""
     largest = run.map(read, photos, "largest features")
     pooled = pool_descriptors(largest, POOLED)
     if not len(pooled):
-        return sorted(chosen)
+        return set()
     with run.step("visual words"):
         size = min(MOST_WORDS, max(FEWEST_WORDS, WORDS_PER_PHOTO * len(photos)))
         vocabulary = learn_vocabulary(pooled, size, run.seed)
     words = run.map(vocabulary.quantize, largest, "words of photos")
-    ranked = most_similar(words, len(vocabulary), RANKED * count)
+    ranked = rank_similar(words, len(vocabulary), RANKED * count)
     looks = _candidates([[photos[k] for k in row] for row in ranked], photos, count)
     small = {photo: one[:PREVIEW_FEATURES] for photo, one in zip(photos, largest, strict=True)}
     scores = _merge(run.map(partial(_preview, small), list(looks.items()), "previews"))
-    chosen |= choose_by_rank(scores, 1, max(1, round(SURE_SHARE * count)))
-    return sorted(chosen | choose_by_rank(scores, round(PREVIEW_SHARE * PREVIEW_FEATURES), count))
+    sure = choose_by_rank(scores, 1, max(1, round(SURE_SHARE * count)))
+    return sure | choose_by_rank(scores, round(PREVIEW_SHARE * PREVIEW_FEATURES), count)
 
 
 def sequence_steps(count: int) -> tuple[int, ...]:
@@ -105,7 +110,7 @@ def second_pairs(
         asked: pairs that were matched already, with or without success.
         options: settings of matching.
     """
-    shared = shared_through_others(keypoints, matches)
+    shared = count_shared_keypoints(keypoints, matches)
     left = {pair: count for pair, count in shared.items() if pair not in asked}
     return sorted(choose_by_rank(left, FEWEST_SHARED, max(1, round(FRIENDS_SHARE * options.neighbors))))
 

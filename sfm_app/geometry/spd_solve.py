@@ -1,12 +1,14 @@
 """Linear systems with positive definite, even nearly singular matrices; no sum depends on LAPACK's threads."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
-from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse.linalg import splu
 
 from sfm_app.errors import NumericalError
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 FloatArray = NDArray[np.float64]
 
@@ -26,7 +28,8 @@ MOST_DENSE, LEAST_DENSE = 12_000, 0.05
 """Unknowns, and share of entries that are not 0, at which a sparse system is solved as a dense one: such systems fill
 up in elimination. Chosen by hand for speed and memory."""
 RIDGES = (1e-13, 1e-11, 1e-9, 1e-7)
-"""Shares by which the diagonal of a large system is raised, one after the other. From the precision of doubles."""
+"""Shares by which the diagonal of a large system is raised, one after the other. Not chosen on a set: they follow from
+the precision of doubles. docs/algorithms.md, Where numbers end."""
 
 NOT_FINITE = "a matrix has infinite or NaN entries", "this is a bug; please report it with OUT/log.txt"
 
@@ -74,7 +77,7 @@ def solve_positive(S: FloatArray, B: FloatArray) -> FloatArray:
     return _eliminate(S, B, PIVOT_FLOOR, 1.0) if len(S) <= MOST_ELIMINATED else _solve_by_cholesky(S, B)
 
 
-def solve_sparse_positive(S: sparse.csr_array, B: FloatArray) -> FloatArray:
+def solve_sparse_positive(S: "csr_array", B: FloatArray) -> FloatArray:
     """Compute S^-1 B of a sparse matrix; one with few zeros is solved as a dense one.
 
     Args:
@@ -84,6 +87,9 @@ def solve_sparse_positive(S: sparse.csr_array, B: FloatArray) -> FloatArray:
     Raises:
         NumericalError: S has infinite or NaN entries.
     """
+    from scipy import sparse
+    from scipy.sparse.linalg import splu
+
     n = S.shape[0]
     if n <= MOST_ELIMINATED or (n <= MOST_DENSE and S.nnz > LEAST_DENSE * n * n):
         return solve_positive(S.toarray(), B)
@@ -99,6 +105,8 @@ def solve_sparse_positive(S: sparse.csr_array, B: FloatArray) -> FloatArray:
 
 def _solve_by_cholesky(S: FloatArray, B: FloatArray) -> FloatArray:
     """Compute S^-1 B; where rounding has made S indefinite, the diagonal is raised until it no longer is."""
+    from scipy.linalg import cho_factor, cho_solve
+
     diagonal = np.diag(S)
     scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     unit = S / scale[:, None] / scale

@@ -17,7 +17,11 @@ class DisjointGroups:
         self.name = {photo: photo for photo in self.members}
 
     def join(self, a: int, b: int) -> list[int]:
-        """Join the groups of two photos, and return the photos that changed their group; none if it was the same."""
+        """Join the groups of two photos, and return the photos that changed their group; none if it was the same.
+
+        Args:
+            a, b: photos.
+        """
         kept, gone = self.name[a], self.name[b]
         if kept == gone:
             return []

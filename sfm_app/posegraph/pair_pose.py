@@ -34,7 +34,7 @@ by this share. Chosen by hand; halved and doubled by `benchmarks.sensitivity`.""
 SCREENED, PROMISING, SAME_POSE = 60, 1.2, 0.01
 """Inliers to which other starts are fitted first, and the largest ratio of their cost there to that of the best pose
 for a start to be fitted to all: a pose that is better on all inliers is not a fifth worse on sixty of them. Third, the
-largest difference of R and t of starts that led to one pose."""
+largest difference of R and t of starts that led to one pose. Chosen by hand; not measured on their own."""
 ROTATION_DEG = 5.0
 """Median angle of rays above which no rotation is tried. Chosen by hand; not measured on its own."""
 LEAST_AHEAD = 0.5

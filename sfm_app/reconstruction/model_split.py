@@ -4,7 +4,7 @@ Facades that look alike join places that are apart. Such a join rests on few mat
 unexplained: those of pairs that see the true layout.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 
 from sfm_app.posegraph.groups import DisjointGroups
@@ -27,11 +27,7 @@ def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) 
     """
     groups = DisjointGroups(photos)
     worth = {pair: found.matches - found.contradicted for pair, found in explained.items()}
-    between: dict[int, Counter[int]] = {photo: Counter() for photo in groups.members}
-    for (a, b), value in worth.items():
-        if abs(value) >= LEAST_MATCHES:
-            between[a][b] += value
-            between[b][a] += value
+    between = _joins(worth)
     for a, b in sorted(worth, key=lambda pair: (-worth[pair], pair)):
         first, second = groups.name[a], groups.name[b]
         if first == second or worth[a, b] < LEAST_MATCHES or between[first][second] <= 0:
@@ -39,10 +35,25 @@ def sound_parts(explained: Mapping[PairId, PairSupport], photos: Iterable[int]) 
         groups.join(a, b)
         kept = groups.name[a]
         gone = second if kept == first else first
-        for other, value in between.pop(gone).items():
-            if other != kept:
-                between[kept][other] += value
-                between[other][kept] += value
-            del between[other][gone]
+        _merge_joins(between, kept, gone)
     parts = [tuple(sorted(members)) for members in groups.members.values()]
     return sorted(parts, key=lambda members: (-len(members), members))
+
+
+def _joins(worth: Mapping[PairId, int]) -> defaultdict[int, Counter[int]]:
+    """Return for every photo the worth of its significant pairs by the other photo."""
+    found: defaultdict[int, Counter[int]] = defaultdict(Counter)
+    for (a, b), value in worth.items():
+        if abs(value) >= LEAST_MATCHES:
+            found[a][b] += value
+            found[b][a] += value
+    return found
+
+
+def _merge_joins(between: defaultdict[int, Counter[int]], kept: int, gone: int) -> None:
+    """Add the joins of a part that has become one with another."""
+    for other, value in between.pop(gone).items():
+        if other != kept:
+            between[kept][other] += value
+            between[other][kept] += value
+        del between[other][gone]

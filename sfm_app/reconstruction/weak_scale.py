@@ -50,29 +50,48 @@ def _joining_order(seen: csr_array) -> list[tuple[int, int]]:
     points, photos = seen.shape
     if photos < 3 or points == 0:
         return []
-    by_photo = seen.T.tocsr()
-    together = csr_array(triu(by_photo @ seen, k=1)).tocoo()
-    best = np.lexsort((together.coords[1], together.coords[0], -together.data))[:1]
-    first = [int(axis[k]) for axis in together.coords for k in best] or [0, 1]
-    views, known = np.zeros(points, np.int64), np.zeros(photos, np.int64)
-    left, waiting, joined = set(range(photos)), [(0, photo) for photo in range(photos)], []
-
-    def join(photo: int) -> None:
-        own = by_photo.indices[by_photo.indptr[photo] : by_photo.indptr[photo + 1]]
-        views[own] += 1
-        now = own[views[own] == 2]  # the points that have just become known
-        viewers = np.concatenate([seen.indices[seen.indptr[k] : seen.indptr[k + 1]] for k in now] or [own[:0]])
-        for other, more in zip(*np.unique(viewers, return_counts=True), strict=True):
-            known[other] += more
-            if other in left:
-                heappush(waiting, (-int(known[other]), int(other)))
-        left.discard(photo)
-
-    for photo in first:
-        join(photo)
-    while left:
-        count, photo = heappop(waiting)
-        if photo in left and -count == known[photo]:
+    growth = _Growth(seen)
+    for photo in growth.best_pair():
+        growth.join(photo)
+    joined = []
+    while growth.left:
+        count, photo = heappop(growth.waiting)
+        if photo in growth.left and -count == growth.known[photo]:
             joined.append((photo, -count))
-            join(photo)
+            growth.join(photo)
     return joined
+
+
+class _Growth:
+    """Photos that have joined a model, and what the others see of it.
+
+    Args:
+        seen: (P, N) with 1 where a point is seen by a photo.
+    """
+
+    def __init__(self, seen: csr_array) -> None:
+        self.seen, self.by_photo = seen, seen.T.tocsr()
+        points, photos = seen.shape
+        self.views = np.zeros(points, np.int64)
+        self.known = np.zeros(photos, np.int64)
+        """Points seen by a photo and by two that have joined."""
+        self.left = set(range(photos))
+        self.waiting = [(0, photo) for photo in range(photos)]
+        """Heap of photos by their number of known points; entries that have changed are out of date."""
+
+    def best_pair(self) -> tuple[int, int]:
+        """Return the two photos that share most points."""
+        together = csr_array(triu(self.by_photo @ self.seen, k=1)).tocoo()
+        i, j = together.coords
+        best = np.lexsort((j, i, -together.data))[:1]
+        return (int(i[best[0]]), int(j[best[0]])) if len(best) else (0, 1)
+
+    def join(self, photo: int) -> None:
+        """Add a photo."""
+        own = self.by_photo.indices[self.by_photo.indptr[photo] : self.by_photo.indptr[photo + 1]]
+        self.views[own] += 1
+        now = self.seen[own[self.views[own] == 2]]  # the points that have just become known
+        for other, more in zip(*np.unique(now.indices, return_counts=True), strict=True):
+            self.known[other] += more
+            heappush(self.waiting, (-int(self.known[other]), int(other)))
+        self.left.discard(photo)

@@ -17,7 +17,7 @@ BLOCK = 256
 """Photos whose keypoints are counted at once."""
 
 
-def shared_through_others(
+def count_shared_keypoints(
     keypoints: Mapping[int, int], matches: Mapping[PairId, NDArray[np.uint32]]
 ) -> dict[PairId, int]:
     """Count, for pairs without matches, the keypoints of third photos that match in both.

@@ -12,8 +12,8 @@ BLOCK = 256
 """Photos whose similarities to all others are held at once."""
 
 
-def most_similar(words: Sequence[IndexArray], size: int, most: int) -> list[IndexArray]:
-    """Return for each photo the photos that share most with it, the most similar first.
+def rank_similar(words: Sequence[IndexArray], size: int, most: int) -> list[IndexArray]:
+    """Rank for each photo the photos that share most with it, the most similar first.
 
     Photos that share no word are left out. A word counts with the root of its frequency in the photo, since patterns
     repeat within photos (Jegou 2009), and less if it is in many photos.

@@ -180,11 +180,11 @@ def _adjust(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _Ad
     """Adjust the camera to the matches of all pairs, or only of those that agree on the peak of `before`."""
     matches, Fs = _convert_to_sides(pairs, usable)
     if before is None:
-        first, listened = consensus_peak.find_peak(Consensus(usable, priors.center_sigma)), _some_pairs(len(usable))
+        first, listened = consensus_peak.find_peak(Consensus(usable, priors.center_sigma)), _rows_to_adjust(len(usable))
         plain = np.array([USUAL_FOCAL, 0.0, 0.0, 0.0])
         starts = [np.append(theta, 0.0)[None] for theta in (first.theta, *first.others[:1], plain)]
     else:
-        first, listened = before.answer, before.agreeing_pairs[_some_pairs(len(before.agreeing_pairs))]
+        first, listened = before.answer, before.agreeing_pairs[_rows_to_adjust(len(before.agreeing_pairs))]
         starts = [np.append(first.theta, before.fit.state.thetas[0, KAPPA])[None]]
     fit = fit_cameras(matches.select(listened), Fs[listened], starts, priors)
     consensus, answer = Consensus(usable, priors.center_sigma), first
@@ -199,7 +199,7 @@ def _adjust(pairs: CameraPairs, usable: Pairs, priors: CameraPriors, before: _Ad
     return _Adjustment(fit, listened, consensus, answer)
 
 
-def _some_pairs(count: int) -> NDArray[np.int64]:
+def _rows_to_adjust(count: int) -> NDArray[np.int64]:
     """Return the pairs to whose matches a camera is adjusted: all, or evenly chosen ones."""
     return np.unique(np.linspace(0, count - 1, min(count, MOST_ADJUSTED)).astype(np.int64))
 

@@ -55,18 +55,9 @@ def walk_town(photos: int, step_m: float, seed: int) -> TownWalk:
     rng = np.random.default_rng([seed, 721])
     length = photos * step_m
     blocks = max(2, round(math.sqrt(length / WALKED_TWICE / (2.0 * PITCH_M))))
-    at, stops, walked = (0, 0), [(0, 0)], set[frozenset[tuple[int, int]]]()
-    while (len(stops) - 1) * PITCH_M < length + TURN_M:
-        ways = [(at[0] + dx, at[1] + dz) for dx, dz in ((1, 0), (0, 1), (-1, 0), (0, -1))]
-        ways = [way for way in ways if min(way) >= 0 and max(way) <= blocks and way != (stops[-2:] or [at])[0]]
-        fresh = [way for way in ways if frozenset((at, way)) not in walked] or ways
-        chosen = fresh[int(rng.integers(len(fresh)))]
-        walked.add(frozenset((at, chosen)))
-        stops.append(chosen)
-        at = chosen
-    corners = PITCH_M * np.array(stops, np.float64)
+    corners = _walk_corners(blocks, length + TURN_M, rng)
     along = step_m * np.arange(photos)
-    before, place, behind = (_on_route(corners, along + shift) for shift in (-TURN_M, 0.0, TURN_M))
+    before, place, behind = (_route_points(corners, along + shift) for shift in (-TURN_M, 0.0, TURN_M))
     place += rng.normal(scale=0.4, size=(photos, 2))
     sway = np.radians(GLANCE_DEG) * np.sin(2 * np.pi * along / GLANCE_M)
     yaw = np.arctan2(*(behind - before).T) + sway + np.radians(rng.normal(scale=5.0, size=photos))
@@ -74,7 +65,21 @@ def walk_town(photos: int, step_m: float, seed: int) -> TownWalk:
     return TownWalk(blocks, centers, yaw, np.radians(8.0 + rng.normal(scale=3.0, size=photos)))
 
 
-def _on_route(corners: FloatArray, along: NDArray[np.floating]) -> FloatArray:
+def _walk_corners(blocks: int, length: float, rng: np.random.Generator) -> FloatArray:
+    """Return (N, 2) the crossings that a walk of some length comes to."""
+    at, stops, walked = (0, 0), [(0, 0)], set[frozenset[tuple[int, int]]]()
+    while (len(stops) - 1) * PITCH_M < length:
+        ways = [(at[0] + dx, at[1] + dz) for dx, dz in ((1, 0), (0, 1), (-1, 0), (0, -1))]
+        ways = [way for way in ways if min(way) >= 0 and max(way) <= blocks and way != (stops[-2:] or [at])[0]]
+        fresh = [way for way in ways if frozenset((at, way)) not in walked] or ways
+        chosen = fresh[int(rng.integers(len(fresh)))]
+        walked.add(frozenset((at, chosen)))
+        stops.append(chosen)
+        at = chosen
+    return PITCH_M * np.array(stops, np.float64)
+
+
+def _route_points(corners: FloatArray, along: NDArray[np.floating]) -> FloatArray:
     """Return (N, 2) points of a route at some lengths from its start; it goes on straight at its ends."""
     leg = np.clip(along // PITCH_M, 0, len(corners) - 2).astype(np.int64)
     start, end = corners[leg], corners[leg + 1]

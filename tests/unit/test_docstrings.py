@@ -11,11 +11,11 @@ PACKAGE = Path(sfm_app.__file__).parent
 VERBS = """
     Add Adjust Announce Apply Average Begin Blur Bring Build Change Check Choose Claim Collapse Collect Compile
     Compute Continue Copy Count Decode Decompose Describe Divide Do Draw Drop Eliminate Enter Estimate Even Expect
-    Fill Find Finish Fit Fuse Give Go Group Hold Import Improve Invert Join Judge Keep Lay Leave Let Lift Link List
-    Look Make Map Mark Match Measure Minimize Mix Move Note Paint Pass Photograph Pickle Place Prepare Print Project
-    Provide Put Raise Read Rebuild Reconstruct Refine Refit Refuse Register Remove Render Replace Return Round Run
-    Sample Say Score Send Set Show Simplify Sort Span Spread Start Sum Swap Take Tilt Turn Undistort Update Use
-    Verify Wait Warp Weigh Widen Write Yield
+    Fill Find Finish Fit Fuse Give Go Group Hold Import Improve Invert Join Judge Keep Lay Learn Leave Let Lift Link
+    List Look Make Map Mark Match Measure Minimize Mix Move Note Paint Pass Photograph Pickle Place Prepare Print
+    Project Provide Put Raise Rank Read Rebuild Reconstruct Refine Refit Refuse Register Remove Render Replace Return
+    Round Run Sample Say Score Send Set Show Simplify Solve Sort Span Spread Start Sum Swap Take Tilt Turn Undistort Update
+    Use Verify Wait Walk Warp Weigh Widen Write Yield
 """.split()  # noqa: SIM905 -- a list of a hundred lines reads worse
 """A new verb is entered here; a noun, a participle or a fragment is not."""
 

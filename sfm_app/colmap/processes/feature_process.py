@@ -137,6 +137,10 @@ def _match_pairs(database: Path, matching: pycolmap.FeatureMatchingOptions, pair
         with tempfile.TemporaryDirectory(dir=database.parent, prefix=".matching") as folder:
             _match_listed(database, matching, [(names[a], names[b]) for a, b in pairs], Path(folder))
         return
+    _match_in_copy(database, matching, pairs)
+
+
+def _match_in_copy(database: Path, matching: pycolmap.FeatureMatchingOptions, pairs: Sequence[tuple[int, int]]) -> None:
     with tempfile.TemporaryDirectory(dir=database.parent, prefix=".matching") as folder:
         copy = Path(folder) / database.name
         shutil.copyfile(database, copy)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sfm_app.retrieval.friends import shared_through_others
+from sfm_app.retrieval.friends import count_shared_keypoints
 from sfm_app.retrieval.picture_features import describe_picture
 from sfm_app.retrieval.preview import count_preview_matches
-from sfm_app.retrieval.similarity import most_similar
+from sfm_app.retrieval.similarity import rank_similar
 from sfm_app.retrieval.vocabulary import learn_vocabulary, pool_descriptors
 
 PHOTOS, SEEN, STEP = 40, 100, 20
@@ -25,10 +25,10 @@ def words_of(photos, size=300):
     return vocabulary, [vocabulary.quantize(one) for one in photos]
 
 
-def test_the_most_similar_photos_are_the_neighbors():
+def test_the_rank_similar_photos_are_the_neighbors():
     vocabulary, words = words_of(street())
 
-    ranked = most_similar(words, len(vocabulary), 4)
+    ranked = rank_similar(words, len(vocabulary), 4)
 
     for photo, others in enumerate(ranked[4:-4], start=4):
         assert {photo - 1, photo + 1} == set(others[:2].tolist())
@@ -38,7 +38,7 @@ def test_the_most_similar_photos_are_the_neighbors():
 def test_a_photo_without_words_has_no_similar_ones():
     vocabulary, words = words_of(street())
 
-    ranked = most_similar([*words, np.zeros(0, np.int64)], len(vocabulary), 5)
+    ranked = rank_similar([*words, np.zeros(0, np.int64)], len(vocabulary), 5)
 
     assert len(ranked[-1]) == 0 and all(PHOTOS not in others for others in ranked)
 
@@ -92,7 +92,7 @@ def test_friends_are_counted_by_the_points_that_a_third_photo_shares_with_both()
         (3, 4): np.column_stack([rows[:2], rows[:2]]),
     }
 
-    found = shared_through_others(dict.fromkeys(range(1, 6), 10), matches)
+    found = count_shared_keypoints(dict.fromkeys(range(1, 6), 10), matches)
 
     assert found == {(1, 3): 6}, "the points of (3, 4) are not those of (2, 3)"
 
@@ -102,11 +102,11 @@ def test_friends_of_many_photos_are_counted_block_by_block(monkeypatch):
     pairs = {(a, b) for a, b in rng.integers(1, 30, (80, 2)).tolist() if a < b}
     matches = {pair: np.unique(rng.integers(0, 50, (20, 2)), axis=0).astype(np.uint32) for pair in sorted(pairs)}
     keypoints = dict.fromkeys(range(1, 30), 50)
-    whole = shared_through_others(keypoints, matches)
+    whole = count_shared_keypoints(keypoints, matches)
 
     monkeypatch.setattr("sfm_app.retrieval.friends.BLOCK", 4)
 
-    assert shared_through_others(keypoints, matches) == whole and len(whole) > 50
+    assert count_shared_keypoints(keypoints, matches) == whole and len(whole) > 50
 
 
 def test_a_picture_is_described_whatever_its_features():

@@ -20,22 +20,31 @@ def photos(count, width=4000, height=3000):
 def test_a_run_is_put_into_one_line():
     text = make_plan(photos(200), Settings(), 2).text(STAGES)
 
-    assert text.startswith("200 photos, 19900 pairs: about ") and " GB with 2 workers; hard photos take longer" in text
+    assert text.startswith("200 photos, 6000 pairs: about ") and " GB with 2 workers; hard photos take longer" in text
     assert "hard photos" not in make_plan(photos(200), Settings(), 2).text(["match_graph"])
     assert make_plan(photos(2), DRAFT, 1).text(["files"]).split(": ")[1].startswith("about a minute or two")
 
 
 @pytest.mark.parametrize(("count", "low", "high"), [(10, 1, 5), (100, 20, 45), (200, 60, 150)])
 def test_minutes_are_those_of_the_benchmark_to_a_factor(count, low, high):
-    assert low < make_plan(photos(count), Settings(), 2).minutes(STAGES) < high
+    every = Settings.from_mapping({"matching": {"pairs": "all"}})
+
+    assert low < make_plan(photos(count), every, 2).minutes(STAGES) < high
 
 
-def test_pairs_and_nothing_else_grow_as_the_square():
-    once, twice = (make_plan(photos(count), Settings(), 2).core_seconds for count in (1000, 2000))
+def test_all_pairs_and_nothing_else_grow_as_the_square():
+    every = Settings.from_mapping({"matching": {"pairs": "all"}})
+    once, twice = (make_plan(photos(count), every, 2).core_seconds for count in (1000, 2000))
 
     growth = {name: twice[name] / once[name] for name in STAGES}
     assert all(3.5 < growth[name] < 4.1 for name in ("match_graph", "view_graph", "intrinsics"))
     assert all(growth[name] <= 2.0 for name in ("scene", "depth_maps", "mesh", "texture"))
+
+
+def test_chosen_pairs_grow_with_the_photos():
+    once, twice = (make_plan(photos(count), Settings(), 2).core_seconds for count in (1000, 2000))
+
+    assert all(twice[name] <= 2.001 * once[name] for name in STAGES)
 
 
 def test_a_draft_is_cheaper():
