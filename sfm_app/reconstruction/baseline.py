@@ -16,6 +16,7 @@ from sfm_app.colmap.types import Reconstruction
 from sfm_app.errors import BackendError
 from sfm_app.geometry.camera import GUESSED_FOCAL, guessed_camera_matrix
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, judge_model
+from sfm_app.reconstruction.unregistered import are_worth_another_try
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PairId, ViewGraph
 from sfm_app.types.calibration import PERSPECTIVE
@@ -49,7 +50,7 @@ def rival_reason(model: Attempt | None, intrinsics: Intrinsics, matches: MatchGr
     if refused:
         return "the pairs do not determine a camera"
     connected = connected_photos(views.fits)
-    if model.photos < len(connected):
+    if are_worth_another_try(len(connected) - model.photos, len(connected)):
         return f"photos that match others have no place: {len(connected) - model.photos}"
     inliers = sum(pair.inliers for pair in model.explained.values())
     against = sum(pair.contradicted for pair in model.explained.values())

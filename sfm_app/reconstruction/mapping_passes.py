@@ -22,7 +22,7 @@ from sfm_app.reconstruction.mapping_runs import Attempt, Group, NoModel, best_at
 from sfm_app.reconstruction.model_merge import join_models
 from sfm_app.reconstruction.model_split import sound_parts
 from sfm_app.reconstruction.support import model_poses
-from sfm_app.reconstruction.unregistered import photo_names
+from sfm_app.reconstruction.unregistered import are_worth_another_try, photo_names
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
 
@@ -218,7 +218,8 @@ def is_pass_worthwhile(outcome: Outcome, intrinsics: Intrinsics, matches: MatchG
     used = {intrinsics.camera_name(matches.images[photo]) for photo in placed}
     news = any(_has_changed(intrinsics.cameras[name], learned.cameras[name]) for name in used)
     anywhere = {photo for model in outcome.models for photo in posed_photo_ids(model.model)}
-    return news or not anywhere.issuperset(outcome.graph.connected_photos(placed[0]))
+    group = set(outcome.graph.connected_photos(placed[0]))
+    return news or are_worth_another_try(len(group - anywhere), len(group))
 
 
 def learned_intrinsics(model: Attempt, intrinsics: Intrinsics, matches: MatchGraph) -> Intrinsics:

@@ -21,7 +21,7 @@ from sfm_app.plugins import SIFT_DSP
 from sfm_app.reconstruction.added_matches import add_matches
 from sfm_app.reconstruction.mapping_passes import Outcome, reconstruct
 from sfm_app.reconstruction.mapping_runs import Attempt, NoModel, best_attempt, judge_model
-from sfm_app.reconstruction.unregistered import photo_names
+from sfm_app.reconstruction.unregistered import are_worth_another_try, photo_names
 from sfm_app.runtime.context import RunContext
 from sfm_app.runtime.workspace import SubWorkspace
 from sfm_app.types import Intrinsics, MatchGraph, PairId, ViewGraph
@@ -36,8 +36,6 @@ ALL_PAIRS = 30
 NEIGHBORS, IN_ORDER = 8, 2
 """In larger sets, each is matched with this number of photos with most raw matches, and with this number before and
 after it by name."""
-MANY, FEW_LOST = 60, 0.05
-"""In sets of at least this many photos, a smaller share of unregistered ones is not worth another reconstruction."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,7 +77,7 @@ def lost_photos(found: MappedScene) -> list[int]:
     models, images = found.outcome.models, found.matches.images
     placed = set(posed_photo_ids(models[0].model)) if models else set()
     lost = sorted(images.keys() - placed)
-    return [] if len(images) >= MANY and len(lost) < FEW_LOST * len(images) else lost
+    return lost if are_worth_another_try(len(lost), len(images)) else []
 
 
 def candidate_pairs(lost: Collection[int], matches: MatchGraph) -> list[PairId]:

@@ -4,6 +4,19 @@ from collections.abc import Iterator, Sequence
 
 from sfm_app.types import MatchGraph, PoseGraph, ViewGraph
 
+MANY, FEW_LOST = 60, 0.05
+"""In sets of at least this many photos, a smaller share of unregistered ones is not worth another reconstruction."""
+
+
+def are_worth_another_try(lost: int, photos: int) -> bool:
+    """Return whether photos without a place justify mapping all of them once more.
+
+    Args:
+        lost: photos without a place.
+        photos: photos of the set.
+    """
+    return lost > 0 and (photos < MANY or lost >= FEW_LOST * photos)
+
 
 def unregistered_reasons(
     posed: set[int], others: Sequence[Sequence[int]], matches: MatchGraph, views: ViewGraph, graph: PoseGraph
