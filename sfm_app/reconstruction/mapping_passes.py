@@ -23,6 +23,7 @@ from sfm_app.reconstruction.model_merge import join_models
 from sfm_app.reconstruction.model_split import sound_parts
 from sfm_app.reconstruction.support import model_poses
 from sfm_app.reconstruction.unregistered import are_worth_another_try, photo_names
+from sfm_app.retrieval.choice import choose_by_rank
 from sfm_app.runtime.context import RunContext
 from sfm_app.types import Calibration, Intrinsics, MatchGraph, PoseGraph, ViewGraph
 
@@ -33,6 +34,8 @@ MOST_PASSES = 4
 (true 3318), and the third places all photos with it."""
 OTHER_FOCALS = (0.6, 2.4, 4.8)
 """Guesses of the focal besides the usual one, in longer sides: steps of a factor of two over the range of cameras."""
+MOST_FULLY_MAPPED, MAPPED_PARTNERS = 250, 16
+"""Photos up to which mapping uses all pairs, and partners of each photo above. Chosen by hand."""
 FOCAL_TOLERANCE = 0.01
 """Relative change of a focal in mapping above which another pass over the pairs is worth it."""
 
@@ -307,7 +310,23 @@ def _update_graph(models: Sequence[Attempt], graph: PoseGraph, matches: MatchGra
     return graph
 
 
+def pairs_to_map(graph: PoseGraph) -> PoseGraph:
+    """Return the pose graph with as many pairs as mapping needs; all of them in small sets.
+
+    Tracks join along a few pairs of each photo. COLMAP follows all pairs of every point again and again.
+
+    Args:
+        graph: relative poses.
+    """
+    photos = {photo for pair in graph.poses for photo in pair}
+    if len(photos) <= MOST_FULLY_MAPPED:
+        return graph
+    counts = {pair: pose.inlier_count for pair, pose in graph.poses.items()}
+    chosen = choose_by_rank(counts, 0, MAPPED_PARTNERS)
+    return replace(graph, poses={pair: pose for pair, pose in graph.poses.items() if pair in chosen})
+
+
 def _write_graph(graph: PoseGraph, intrinsics: Intrinsics, matches: MatchGraph, run: RunContext) -> None:
     with translate_errors("writing relative poses"):
         write_calibrations(run.workspace.database, matches, intrinsics)
-        write_pose_graph(run.workspace.database, matches, graph)
+        write_pose_graph(run.workspace.database, matches, pairs_to_map(graph))

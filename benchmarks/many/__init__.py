@@ -1,0 +1,1 @@
+"""Thousands of photos: what a run costs, and what is lost by not matching all pairs."""
