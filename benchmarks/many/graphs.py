@@ -36,8 +36,8 @@ COUNTS = (1000, 2500, 10_000)
 ABOUT = (
     "A walk through a town with loops and look-alike houses: matches with noise of half a pixel and a quarter of wrong "
     "ones, 30 partners a photo, one pair in a hundred of look-alikes. K: calibration from a sample of pairs. Seconds "
-    "of two workers; MB: most memory of the process, the made-up matches among it. Rotation: of photos against the truth, "
-    "after the best turn of all."
+    "of two workers; MB: most memory of the process, the made-up matches among it. Rotation: of photos against the "
+    "truth, after the best turn of all."
 )
 COLUMNS = ("photos", "pairs", "K s", "focal %", "pose graph s", "in one group", "look-alikes kept", "right dropped",
            "rotation deg", "worst deg", "MB", "s per 1000 photos")  # fmt: skip

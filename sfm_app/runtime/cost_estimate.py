@@ -103,7 +103,7 @@ def make_plan(photos: Iterable[Photo], settings: Settings, workers: int, limit_m
             "match_graph": 450 + workers * (120 + 220 * max(searched, default=0) + 8 * largest) + 0.04 * pairs,
             "view_graph": 450 + 0.05 * pairs + 1.0 * count,
             "intrinsics": 500 + 0.06 * pairs,
-            "scene": 700 + 15.5 * count,
+            "scene": 700 + 15.5 * count * features / 8192,
             "depth_maps": 750 + workers * 150 * max(mapped, default=0) + 5.0 * count,
             "mesh": 950 + min(1000 * cache_gb(limit_mb), 28 * sum(mapped)),
             "texture": 1000 + 8 * pages + workers * 8 * largest + 9.0 * count,
