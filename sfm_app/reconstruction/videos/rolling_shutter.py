@@ -12,6 +12,7 @@ from sfm_app.colmap.bundles.bundle_arrays import NO_RULES, Rules
 from sfm_app.colmap.bundles.rolling_shutter import measure_readout, read_keypoints, straighten_model
 from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.numerical import FAILURES, Json
+from sfm_app.progress import Progress
 from sfm_app.reconstruction.videos.frame_times import FrameTimes, frame_times
 from sfm_app.types import MatchGraph
 
@@ -47,7 +48,7 @@ class Readout:
 
 
 def follow_shutter(
-    adjusted: Adjustment, matches: MatchGraph, database: Path, rules: Rules = NO_RULES
+    adjusted: Adjustment, matches: MatchGraph, database: Path, progress: Progress, rules: Rules = NO_RULES
 ) -> tuple[Adjustment, Readout | None]:
     """Return the model as a global shutter would have given it, and what is known of the shutter.
 
@@ -58,6 +59,7 @@ def follow_shutter(
         adjusted: a model after the last adjustment.
         matches: all photos.
         database: has all keypoints and matches.
+        progress: told of the measurement before it begins.
         rules: what the user laid down about its cameras, as in `adjust`.
     """
     if adjusted.failure or not adjusted.lenses:
@@ -66,6 +68,7 @@ def follow_shutter(
     frames = frame_times(images)
     if frames is None:
         return adjusted, None
+    progress.say(f"measuring the shutter of the video, with {len(images)} frames")
     try:
         with translate_errors("following the shutter"):
             measured = _compensate(adjusted, frames, database, rules)
