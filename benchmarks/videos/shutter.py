@@ -26,7 +26,7 @@ from sfm_app.colmap.bundle import Adjustment, adjust
 from sfm_app.colmap.bundles.rolling_shutter import measure_readout, read_keypoints, straighten_model
 from sfm_app.colmap.model import posed_images
 from sfm_app.progress import SilentProgress
-from sfm_app.reconstruction.videos.rolling_shutter import ROUNDS, follow_shutter
+from sfm_app.reconstruction.videos.rolling_shutter import ROUNDS, Readout, follow_shutter
 from sfm_app.synthetic.trajectory import WalkOptions
 from sfm_app.types import MatchedImage, MatchGraph
 
@@ -72,7 +72,7 @@ def measure(name: str, kind: Kind, readout_ms: float, seed: int) -> Row:
         followed, found = follow_shutter(ignored, matches, database, SilentProgress())
         seconds = time.perf_counter() - start
         known = follow_known(ignored, matches, 1e-3 * readout_ms, database)
-    if found is None:
+    if not isinstance(found, Readout):
         raise RuntimeError("the frames are not recognized as a video")
     row: Row = {
         "method": "follow_shutter", "kind": name, "seed": seed, "readout ms": readout_ms,

@@ -116,6 +116,9 @@ def _shutter_lines(found: Mapping[str, Any]) -> Iterator[str]:
     """Yield what is known of the shutter of a video."""
     if not found:
         return
+    if "readout_ms" not in found:
+        yield f"rolling shutter: {found['because']}, so nothing is compensated"
+        return
     readout, deviation, interval = (found[f"{name}_ms"] for name in ("readout", "deviation", "interval"))
     span = f"{readout:.1f} +- {deviation:.1f} ms, at {interval:.0f} ms per frame"
     end = f"not compensated: {found['because']}" if "because" in found else "poses are those of the middle rows"

@@ -18,6 +18,9 @@ from sfm_app.types import MatchGraph
 
 logger = logging.getLogger("sfm_app")
 
+MAX_FRAMES = 120
+"""Frames of which a readout is measured, at most: the time grows with the cube of their number (100 frames with 120 000
+observations: 2 minutes). Chosen by hand."""
 ROUNDS, SETTLED = 4, 0.25
 """Most rounds of measuring and compensating, and the change of the readout, in deviations, below which they end: two or
 three are needed (`python -m benchmarks.videos.shutter`)."""
@@ -47,13 +50,24 @@ class Readout:
         return found | {"compensated": not self.refused} | ({"because": self.refused} if self.refused else {})
 
 
+@dataclass(frozen=True, slots=True)
+class Unmeasured:
+    """A video whose shutter is not asked for."""
+
+    reason: str
+
+    def to_dict(self) -> dict[str, Json]:
+        """Return plain values for the manifest."""
+        return {"compensated": False, "because": self.reason}
+
+
 def follow_shutter(
     adjusted: Adjustment, matches: MatchGraph, database: Path, progress: Progress, rules: Rules = NO_RULES
-) -> tuple[Adjustment, Readout | None]:
+) -> tuple[Adjustment, Readout | Unmeasured | None]:
     """Return the model as a global shutter would have given it, and what is known of the shutter.
 
-    The given adjustment is returned where the photos are not known to be frames of a video, where no readout is found,
-    and where the compensated model explains the photos no better.
+    The given adjustment is returned where the photos are not known to be frames of a video, where they are too many,
+    where no readout is found, and where the compensated model explains the photos no better.
 
     Args:
         adjusted: a model after the last adjustment.
@@ -68,6 +82,8 @@ def follow_shutter(
     frames = frame_times(images)
     if frames is None:
         return adjusted, None
+    if len(images) > MAX_FRAMES:
+        return adjusted, Unmeasured(f"more than {MAX_FRAMES} frames would take too long to measure")
     progress.say(f"measuring the shutter of the video, with {len(images)} frames")
     try:
         with translate_errors("following the shutter"):

@@ -149,3 +149,10 @@ def test_why_a_shutter_is_not_compensated_is_said():
 
     assert "within 0.3 +- 6.6 ms, at 33 ms per frame; not compensated: nobody knows" in text
     assert "shutter" not in told()[0]
+
+
+def test_why_a_shutter_is_not_measured_is_said():
+    text, summary = told(shutter={"compensated": False, "because": "nobody has the time"})
+
+    assert "rolling shutter: nobody has the time, so nothing is compensated\n" in text
+    assert summary["shutter"]["because"] == "nobody has the time"
