@@ -128,9 +128,9 @@ def _reason_to_refuse(adjusted: Adjustment, straight: Adjustment, estimate: Read
     if SURE * estimate.deviation >= frames.interval:
         return "the motion of the camera does not tell it"
     if abs(estimate.readout) < SURE * estimate.deviation:
-        return "it is not distinct from that of a global shutter"
+        return "none is seen"
     if abs(estimate.readout) > LONGEST * frames.interval:
-        return "it is longer than a frame lasts, so it is something else"
+        return "it would be longer than a frame lasts"
     if straight.failure:
         return f"the adjustment failed: {straight.failure}"
     before, after = (one.model.compute_mean_reprojection_error() for one in (adjusted, straight))
