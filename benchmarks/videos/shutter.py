@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.command_line import new_parser
+from benchmarks.common.command_line import add_seeds, new_parser
 from benchmarks.common.metrics import area_under_recall, pose_errors_deg
-from benchmarks.common.results import RESULTS, Row, document, table, write
+from benchmarks.common.results import Row, document, table, write
 from benchmarks.videos.sequences import FRAMES_PER_S, SIZE, STRONG_LENS, Kind, draw_sequence, map_sequence
 from sfm_app.bundle_adjustment.readout import ReadoutEstimate
 from sfm_app.colmap.backend import pycolmap, show_log
@@ -125,12 +125,9 @@ def summarize(rows: Sequence[Row]) -> Iterator[Row]:
 def parser() -> argparse.ArgumentParser:
     """Give the command line."""
     parser = new_parser("videos.shutter", __doc__)
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--first-seed", type=int, default=0)
+    add_seeds(parser, 5, "videos-shutter")
     parser.add_argument("--kinds", nargs="+", default=[*KINDS, *MIMICS], choices=[*KINDS, *MIMICS])
     parser.add_argument("--readouts-ms", nargs="+", type=float, default=list(READOUTS_MS))
-    parser.add_argument("--name", default="videos-shutter", help="name of the result files")
-    parser.add_argument("--results", type=Path, default=RESULTS)
     return parser
 
 
