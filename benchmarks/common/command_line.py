@@ -4,8 +4,10 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
+from benchmarks.common.results import RESULTS
 from sfm_app.cli.options import parse_assignment
 from sfm_app.settings import merge_nested
 
@@ -24,6 +26,34 @@ def new_parser(subject: str, text: str | None) -> argparse.ArgumentParser:
         description=text,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def add_rendered(parser: argparse.ArgumentParser, scenes: Sequence[str]) -> None:
+    """Add the options of a benchmark that renders videos of scenes, and runs stock beside ours.
+
+    Args:
+        parser: where they are added.
+        scenes: that can be rendered; all by default.
+    """
+    parser.add_argument("--cache", type=Path, required=True, help="keeps rendered videos and runs")
+    parser.add_argument("--scenes", nargs="+", default=list(scenes), choices=list(scenes))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--ours-only", action="store_true", help="leave out stock")
+    parser.add_argument("--results", type=Path, default=RESULTS)
+
+
+def add_seeds(parser: argparse.ArgumentParser, seeds: int, name: str) -> None:
+    """Add the options of a benchmark that draws everything anew for each seed.
+
+    Args:
+        parser: where they are added.
+        seeds: how many by default.
+        name: of the result files by default.
+    """
+    parser.add_argument("--seeds", type=int, default=seeds)
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--name", default=name, help="name of the result files")
+    parser.add_argument("--results", type=Path, default=RESULTS)
 
 
 def add_pictures(parser: argparse.ArgumentParser, named_by: str) -> None:

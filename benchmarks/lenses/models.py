@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.common.command_line import new_parser
-from benchmarks.common.results import RESULTS, Row, document, table, write
+from benchmarks.common.command_line import add_seeds, new_parser
+from benchmarks.common.results import Row, document, table, write
 from benchmarks.lenses.bundles import (
     SIZE,
     Drawn,
@@ -219,12 +219,9 @@ def summarize(rows: Sequence[Row]) -> Iterator[Row]:
 def parser() -> argparse.ArgumentParser:
     """Give the command line."""
     parser = new_parser("lenses.models", __doc__)
-    parser.add_argument("--seeds", type=int, default=100)
-    parser.add_argument("--first-seed", type=int, default=0)
+    add_seeds(parser, 100, "lens-models")
     parser.add_argument("--groups", nargs="+", default=list(GROUPS), choices=GROUPS)
     parser.add_argument("--hold-out", type=int, default=20, help="bundles of each group with held-out observations")
-    parser.add_argument("--name", default="lens-models", help="name of the result files")
-    parser.add_argument("--results", type=Path, default=RESULTS)
     return parser
 
 

@@ -11,12 +11,11 @@ import json
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.command_line import new_parser
-from benchmarks.common.results import RESULTS, Row, document, table, write
+from benchmarks.common.command_line import add_rendered, new_parser
+from benchmarks.common.results import Row, document, table, write
 from benchmarks.videos.rendered import RATE, frame_name, render_video, run_both
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.synthetic.cameras import Camera, Views
@@ -73,12 +72,8 @@ def run_video(scene: str, readout_ms: float, seed: int, args: argparse.Namespace
 def main() -> None:
     """Run all videos, and publish after each."""
     parser = new_parser("videos", __doc__)
-    parser.add_argument("--cache", type=Path, required=True, help="keeps rendered videos and runs")
-    parser.add_argument("--scenes", nargs="+", default=list(WALKS), choices=list(WALKS))
+    add_rendered(parser, list(WALKS))
     parser.add_argument("--readouts-ms", nargs="+", type=float, default=list(READOUTS_MS))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--ours-only", action="store_true", help="leave out stock")
-    parser.add_argument("--results", type=Path, default=RESULTS)
     args = parser.parse_args()
     rows: list[Row] = []
     for scene in args.scenes:

@@ -89,7 +89,7 @@ def _shutter(manifest: Mapping[str, Any]) -> Row:
     found = manifest["stages"]["scene"]["counts"].get("shutter")
     if found is None:
         return {}
-    figures = {"measured ms": found["readout_ms"], "deviation ms": found["deviation_ms"]}
+    figures = {"measured ms": found.get("readout_ms"), "deviation ms": found.get("deviation_ms")}
     return figures | {"compensated": found["compensated"], "because": found.get("because", "")}
 
 

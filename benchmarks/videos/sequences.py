@@ -40,6 +40,8 @@ class Kind:
     """Its length follows from the frames."""
     every: int = 3
     """Every such frame is used."""
+    frames: int = FRAMES
+    points: int = POINTS
     lens: Lens = LENS
     moving_share: float = 0.0
     """Share of the points that move by themselves, together, at 0.5 m/s."""
@@ -67,13 +69,13 @@ def draw_sequence(kind: Kind, readout_s: float, seed: int) -> Sequence:
         seed: same seed, same frames.
     """
     rng = np.random.default_rng([seed, 37])
-    times = np.asarray(kind.every / FRAMES_PER_S * np.arange(FRAMES), np.float64)
+    times = np.asarray(kind.every / FRAMES_PER_S * np.arange(kind.frames), np.float64)
     trajectory = walk(with_length(kind.walk, float(times[-1])), seed)
     center = np.array(SIZE) * (0.5 + rng.normal(scale=0.005, size=2))
     camera = Camera(camera_matrix(FOCAL_PX, FOCAL_PX, *center), *SIZE, kind.lens)
     poses = trajectory.poses(times)
-    X = _draw_points(camera, poses, rng)
-    own = np.where((rng.random(POINTS) < kind.moving_share)[:, None], rng.normal(size=3), 0.0)
+    X = _draw_points(camera, poses, kind.points, rng)
+    own = np.where((rng.random(kind.points) < kind.moving_share)[:, None], rng.normal(size=3), 0.0)
     own *= 0.5 / max(float(np.linalg.norm(own, axis=1).max()), 1e-9)
     seen, x = {}, {}
     for number, (time, pose) in enumerate(zip(times, poses, strict=True), start=1):
@@ -100,7 +102,7 @@ def _frame_camera(camera: Camera, kind: Kind, number: int, rng: np.random.Genera
     """Return the camera at the time of a frame."""
     K = camera.K.copy()
     K[:2, 2] += rng.normal(scale=kind.center_jitter_px, size=2)
-    K[[0, 1], [0, 1]] *= 1.0 + kind.breathing * (number - 1) / (FRAMES - 1)
+    K[[0, 1], [0, 1]] *= 1.0 + kind.breathing * (number - 1) / (kind.frames - 1)
     return Camera(K, camera.width, camera.height, camera.lens)
 
 
@@ -112,13 +114,13 @@ def _errors(count: int, rng: np.random.Generator) -> FloatArray:
     return off
 
 
-def _draw_points(camera: Camera, poses: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return points (P, 3), each on the ray of a random pixel of a random frame."""
-    pixels = rng.uniform([0.0, 0.0], SIZE, (POINTS, 2))
+def _draw_points(camera: Camera, poses: FloatArray, count: int, rng: np.random.Generator) -> FloatArray:
+    """Return points (N, 3), each on the ray of a random pixel of a random frame."""
+    pixels = rng.uniform([0.0, 0.0], SIZE, (count, 2))
     rays = camera.lens.rays((pixels - camera.K[:2, 2]) / np.diag(camera.K)[:2])
     rays /= np.linalg.norm(rays, axis=1)[:, None]
-    depths = rng.uniform(*DEPTHS, (POINTS, 1))
-    chosen = poses[rng.integers(len(poses), size=POINTS)]
+    depths = rng.uniform(*DEPTHS, (count, 1))
+    chosen = poses[rng.integers(len(poses), size=count)]
     return np.asarray(np.einsum("nji,nj->ni", chosen[:, :, :3], depths * rays - chosen[:, :, 3]), np.float64)
 
 

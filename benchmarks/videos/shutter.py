@@ -16,16 +16,17 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.command_line import new_parser
+from benchmarks.common.command_line import add_seeds, new_parser
 from benchmarks.common.metrics import area_under_recall, pose_errors_deg
-from benchmarks.common.results import RESULTS, Row, document, table, write
+from benchmarks.common.results import Row, document, table, write
 from benchmarks.videos.sequences import FRAMES_PER_S, SIZE, STRONG_LENS, Kind, draw_sequence, map_sequence
 from sfm_app.bundle_adjustment.readout import ReadoutEstimate
 from sfm_app.colmap.backend import pycolmap, show_log
 from sfm_app.colmap.bundle import Adjustment, adjust
 from sfm_app.colmap.bundles.rolling_shutter import measure_readout, read_keypoints, straighten_model
 from sfm_app.colmap.model import posed_images
-from sfm_app.reconstruction.videos.rolling_shutter import ROUNDS, follow_shutter
+from sfm_app.progress import SilentProgress
+from sfm_app.reconstruction.videos.rolling_shutter import ROUNDS, Readout, follow_shutter
 from sfm_app.synthetic.trajectory import WalkOptions
 from sfm_app.types import MatchedImage, MatchGraph
 
@@ -68,10 +69,10 @@ def measure(name: str, kind: Kind, readout_ms: float, seed: int) -> Row:
         ignored = adjust(model, database)
         matches = timed_matches(ignored.model, sequence.times_s)
         start = time.perf_counter()
-        followed, found = follow_shutter(ignored, matches, database)
+        followed, found = follow_shutter(ignored, matches, database, SilentProgress())
         seconds = time.perf_counter() - start
         known = follow_known(ignored, matches, 1e-3 * readout_ms, database)
-    if found is None:
+    if not isinstance(found, Readout):
         raise RuntimeError("the frames are not recognized as a video")
     row: Row = {
         "method": "follow_shutter", "kind": name, "seed": seed, "readout ms": readout_ms,
@@ -124,12 +125,9 @@ def summarize(rows: Sequence[Row]) -> Iterator[Row]:
 def parser() -> argparse.ArgumentParser:
     """Give the command line."""
     parser = new_parser("videos.shutter", __doc__)
-    parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--first-seed", type=int, default=0)
+    add_seeds(parser, 5, "videos-shutter")
     parser.add_argument("--kinds", nargs="+", default=[*KINDS, *MIMICS], choices=[*KINDS, *MIMICS])
     parser.add_argument("--readouts-ms", nargs="+", type=float, default=list(READOUTS_MS))
-    parser.add_argument("--name", default="videos-shutter", help="name of the result files")
-    parser.add_argument("--results", type=Path, default=RESULTS)
     return parser
 
 

@@ -9,13 +9,12 @@ with a camera for each.
 import argparse
 import json
 import sys
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.common.command_line import new_parser
-from benchmarks.common.results import RESULTS, Row, document, table, write
+from benchmarks.common.command_line import add_rendered, new_parser
+from benchmarks.common.results import Row, document, table, write
 from benchmarks.videos.rendered import frame_name, render_video, run_both
 from sfm_app.geometry.camera import camera_matrix
 from sfm_app.synthetic.cameras import Camera, Views, look_at
@@ -84,11 +83,7 @@ def run_scene(scene: str, seed: int, args: argparse.Namespace) -> list[Row]:
 def main() -> None:
     """Run all videos, and publish after each."""
     parser = new_parser("videos.zooms", __doc__)
-    parser.add_argument("--cache", type=Path, required=True, help="keeps rendered videos and runs")
-    parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--ours-only", action="store_true", help="leave out stock")
-    parser.add_argument("--results", type=Path, default=RESULTS)
+    add_rendered(parser, SCENES)
     args = parser.parse_args()
     rows: list[Row] = []
     for scene in args.scenes:

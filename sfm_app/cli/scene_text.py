@@ -116,10 +116,12 @@ def _shutter_lines(found: Mapping[str, Any]) -> Iterator[str]:
     """Yield what is known of the shutter of a video."""
     if not found:
         return
-    readout, deviation, interval = (found[f"{name}_ms"] for name in ("readout", "deviation", "interval"))
-    span = f"{readout:.1f} +- {deviation:.1f} ms, at {interval:.0f} ms per frame"
-    end = f"not compensated: {found['because']}" if "because" in found else "poses are those of the middle rows"
-    yield f"rolling shutter: rows are read within {span}; {end}"
+    time = f"{found['readout_ms']:.1f} +- {found['deviation_ms']:.1f} ms" if "readout_ms" in found else ""
+    if found["compensated"]:
+        interval = f"at {found['interval_ms']:.0f} ms per frame"
+        yield f"rolling shutter: rows are read within {time}, {interval}; poses are those of the middle rows"
+    else:
+        yield f"rolling shutter: {found['because']}{f' ({time})' if time else ''}, so nothing is compensated"
 
 
 def _adjustment_warnings(adjustment: Mapping[str, Any]) -> Iterator[str]:

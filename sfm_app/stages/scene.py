@@ -91,7 +91,10 @@ def _finish_scene(found: MappedScene, run: RunContext) -> Scene:
     adjusted = [
         adjust_or_keep(attempt.model, database, rules) for attempt, rules in zip(outcome.models, laid_down, strict=True)
     ]
-    followed = [follow_shutter(one, matches, database, rules) for one, rules in zip(adjusted, laid_down, strict=True)]
+    followed = [
+        follow_shutter(one, matches, database, run.progress, rules)
+        for one, rules in zip(adjusted, laid_down, strict=True)
+    ]
     adjusted, readout = [straight for straight, _ in followed], followed[0][1]
     models = [found.model for found in adjusted]
     with translate_errors("reading colors"):

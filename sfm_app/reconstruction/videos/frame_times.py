@@ -9,9 +9,8 @@ import numpy as np
 
 from sfm_app.types import MatchedImage
 
-MIN_FRAMES, MAX_FRAMES = 10, 120
-"""Range of the number of frames of which a readout is measured: a path needs some, and the time grows with the cube of
-their number (100 frames with 120 000 observations: 2 minutes). Chosen by hand."""
+MIN_FRAMES = 10
+"""Frames of which a readout is measured, at least: a path needs some. Chosen by hand."""
 NUMBERED = re.compile(r"(.*?)(\d+)")
 
 
@@ -33,7 +32,7 @@ def frame_times(images: Sequence[MatchedImage]) -> FrameTimes | None:
     """
     numbers = _frame_numbers(images)
     moments = {image.id: image.time_s for image in images if image.time_s is not None}
-    if numbers is None or len(moments) < len(images) or not MIN_FRAMES <= len(images) <= MAX_FRAMES:
+    if numbers is None or len(moments) < len(images) or len(images) < MIN_FRAMES:
         return None
     order = sorted(numbers, key=numbers.__getitem__)
     seconds, steps = (np.diff([of[key] for key in order]) for of in (moments, numbers))

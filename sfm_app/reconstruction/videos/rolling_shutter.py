@@ -12,11 +12,15 @@ from sfm_app.colmap.bundles.bundle_arrays import NO_RULES, Rules
 from sfm_app.colmap.bundles.rolling_shutter import measure_readout, read_keypoints, straighten_model
 from sfm_app.colmap.model import posed_photo_ids
 from sfm_app.numerical import FAILURES, Json
+from sfm_app.progress import Progress
 from sfm_app.reconstruction.videos.frame_times import FrameTimes, frame_times
 from sfm_app.types import MatchGraph
 
 logger = logging.getLogger("sfm_app")
 
+MAX_FRAMES = 120
+"""Frames of which a readout is measured, at most: the time grows with the cube of their number (100 frames with 120 000
+observations: 2 minutes). Chosen by hand."""
 ROUNDS, SETTLED = 4, 0.25
 """Most rounds of measuring and compensating, and the change of the readout, in deviations, below which they end: two or
 three are needed (`python -m benchmarks.videos.shutter`)."""
@@ -46,18 +50,30 @@ class Readout:
         return found | {"compensated": not self.refused} | ({"because": self.refused} if self.refused else {})
 
 
+@dataclass(frozen=True, slots=True)
+class Unmeasured:
+    """A video whose shutter is not asked for."""
+
+    reason: str
+
+    def to_dict(self) -> dict[str, Json]:
+        """Return plain values for the manifest."""
+        return {"compensated": False, "because": self.reason}
+
+
 def follow_shutter(
-    adjusted: Adjustment, matches: MatchGraph, database: Path, rules: Rules = NO_RULES
-) -> tuple[Adjustment, Readout | None]:
+    adjusted: Adjustment, matches: MatchGraph, database: Path, progress: Progress, rules: Rules = NO_RULES
+) -> tuple[Adjustment, Readout | Unmeasured | None]:
     """Return the model as a global shutter would have given it, and what is known of the shutter.
 
-    The given adjustment is returned where the photos are not known to be frames of a video, where no readout is found,
-    and where the compensated model explains the photos no better.
+    The given adjustment is returned where the photos are not known to be frames of a video, where they are too many,
+    where no readout is found, and where the compensated model explains the photos no better.
 
     Args:
         adjusted: a model after the last adjustment.
         matches: all photos.
         database: has all keypoints and matches.
+        progress: told of the measurement before it begins.
         rules: what the user laid down about its cameras, as in `adjust`.
     """
     if adjusted.failure or not adjusted.lenses:
@@ -66,6 +82,9 @@ def follow_shutter(
     frames = frame_times(images)
     if frames is None:
         return adjusted, None
+    if len(images) > MAX_FRAMES:
+        return adjusted, Unmeasured(f"more than {MAX_FRAMES} frames would take too long to measure")
+    progress.say(f"measuring the shutter of the video, with {len(images)} frames")
     try:
         with translate_errors("following the shutter"):
             measured = _compensate(adjusted, frames, database, rules)
@@ -109,9 +128,9 @@ def _reason_to_refuse(adjusted: Adjustment, straight: Adjustment, estimate: Read
     if SURE * estimate.deviation >= frames.interval:
         return "the motion of the camera does not tell it"
     if abs(estimate.readout) < SURE * estimate.deviation:
-        return "it is not distinct from that of a global shutter"
+        return "none is seen"
     if abs(estimate.readout) > LONGEST * frames.interval:
-        return "it is longer than a frame lasts, so it is something else"
+        return "it would be longer than a frame lasts"
     if straight.failure:
         return f"the adjustment failed: {straight.failure}"
     before, after = (one.model.compute_mean_reprojection_error() for one in (adjusted, straight))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import benchmarks
-from benchmarks.common.command_line import add_pictures, ensure_single_thread, is_wanted
+from benchmarks.common.command_line import add_pictures, add_rendered, add_seeds, ensure_single_thread, is_wanted
 from benchmarks.common.processes import environment, module_command
 
 PACKAGE = Path(benchmarks.__file__).parent
@@ -61,6 +61,22 @@ def test_a_worker_is_found_from_anywhere_and_brings_nothing_but_itself(worker, t
     done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
 
     assert done.stdout.strip() == "set()", done.stderr
+
+
+def test_shared_options_keep_the_defaults_of_their_command():
+    rendered, drawn = argparse.ArgumentParser(), argparse.ArgumentParser()
+    add_rendered(rendered, ["statue", "facade"])
+    add_seeds(drawn, 5, "lens-models")
+
+    every, one = (rendered.parse_args(["--cache", "c", *line]) for line in ([], ["--scenes", "facade", "--ours-only"]))
+    few = drawn.parse_args(["--first-seed", "7"])
+
+    assert (every.cache, every.scenes, every.seed, every.ours_only) == (Path("c"), ["statue", "facade"], 0, False)
+    assert (one.scenes, one.ours_only) == (["facade"], True)
+    assert (few.seeds, few.first_seed, few.name) == (5, 7, "lens-models")
+    assert every.results == few.results == PACKAGE / "results"
+    with pytest.raises(SystemExit):
+        rendered.parse_args(["--cache", "c", "--scenes", "corner"])
 
 
 def test_pictures_are_drawn_where_they_are_asked_for():

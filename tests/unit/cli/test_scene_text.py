@@ -144,8 +144,16 @@ def test_a_compensated_shutter_is_named_with_its_deviation():
 
 
 def test_why_a_shutter_is_not_compensated_is_said():
-    found = {"readout_ms": 0.3, "deviation_ms": 6.6, "interval_ms": 33.3, "compensated": False}
-    text, _ = told(shutter=found | {"because": "nobody knows"})
+    found = {"readout_ms": -0.12, "deviation_ms": 0.31, "interval_ms": 33.3, "compensated": False}
+    text, _ = told(shutter=found | {"because": "none is seen"})
 
-    assert "within 0.3 +- 6.6 ms, at 33 ms per frame; not compensated: nobody knows" in text
+    assert "rolling shutter: none is seen (-0.1 +- 0.3 ms), so nothing is compensated\n" in text
+    assert "rows" not in text
     assert "shutter" not in told()[0]
+
+
+def test_why_a_shutter_is_not_measured_is_said():
+    text, summary = told(shutter={"compensated": False, "because": "nobody has the time"})
+
+    assert "rolling shutter: nobody has the time, so nothing is compensated\n" in text
+    assert summary["shutter"]["because"] == "nobody has the time"

@@ -1,0 +1,121 @@
+"""The shutter of a synthetic video is followed where there is one, and else the model stays as it is."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.common.metrics import pose_errors_deg
+from benchmarks.videos.sequences import Kind, draw_sequence, map_sequence
+from benchmarks.videos.shutter import timed_matches
+from sfm_app.colmap.bundle import Adjustment, adjust
+from sfm_app.colmap.model import posed_images
+from sfm_app.progress import SilentProgress
+from sfm_app.reconstruction.videos import rolling_shutter
+from sfm_app.reconstruction.videos.rolling_shutter import Readout, Unmeasured, follow_shutter
+from sfm_app.synthetic.trajectory import WalkOptions
+from sfm_app.types import MatchGraph
+
+pytestmark = pytest.mark.slow
+
+KIND = Kind(walk=WalkOptions(swing_deg_s=60.0), frames=16, points=400)
+
+
+@dataclass(frozen=True)
+class Video:
+    """Frames of a video after the last adjustment, which knows of no shutter."""
+
+    adjusted: Adjustment
+    matches: MatchGraph
+    database: Path
+    truth: dict[str, np.ndarray]
+
+
+class Said(SilentProgress):
+    """A display that keeps its messages."""
+
+    def __init__(self):
+        self.texts = []
+
+    def say(self, text):
+        self.texts.append(text)
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory):
+    """Makes a video with a readout in seconds."""
+
+    def shoot(readout_s):
+        sequence = draw_sequence(KIND, readout_s, 0)
+        model, database = map_sequence(sequence, 0, tmp_path_factory.mktemp("video"))
+        adjusted = adjust(model, database)
+        matches = timed_matches(adjusted.model, sequence.times_s)
+        return Video(adjusted, matches, database, dict(sequence.drawn.views.cam_from_world))
+
+    return shoot
+
+
+@pytest.fixture(scope="module")
+def still(video):
+    """A video with a global shutter."""
+    return video(0.0)
+
+
+def follow(video, said=None):
+    return follow_shutter(video.adjusted, video.matches, video.database, said or Said())
+
+
+def turn_errors_deg(found, truth):
+    poses = {image.name: np.asarray(image.cam_from_world().matrix()) for image in posed_images(found.model)}
+    return float(np.median(pose_errors_deg(poses, truth)))
+
+
+def test_a_rolling_shutter_is_measured_and_its_poses_are_put_right(video):
+    rolling, said = video(0.02), Said()
+
+    straight, found = follow(rolling, said)
+
+    assert isinstance(found, Readout) and not found.refused
+    assert found.readout == pytest.approx(0.02, rel=0.1)
+    assert abs(found.readout - 0.02) < 3.0 * found.deviation
+    assert 1e-4 < found.deviation < 0.003
+    assert found.interval == pytest.approx(1 / 30)
+    assert turn_errors_deg(straight, rolling.truth) < 0.5 * turn_errors_deg(rolling.adjusted, rolling.truth)
+    assert said.texts == ["measuring the shutter of the video, with 16 frames"]
+
+
+def test_a_global_shutter_is_measured_and_left_alone(still):
+    model, found = follow(still)
+
+    assert model is still.adjusted
+    assert found.refused == "none is seen" and found.to_dict()["because"] == "none is seen"
+    assert abs(found.readout) < 3.0 * found.deviation < 0.01
+
+
+def test_photos_of_a_folder_have_no_shutter_to_follow(still):
+    images = {key: replace(image, time_s=None) for key, image in still.matches.images.items()}
+    said = Said()
+
+    model, found = follow(replace(still, matches=MatchGraph(images, {}, {})), said)
+
+    assert model is still.adjusted and found is None and not said.texts
+
+
+def test_a_model_that_could_not_be_adjusted_is_not_asked(still):
+    failed = replace(still.adjusted, failure="it diverged")
+
+    assert follow(replace(still, adjusted=failed)) == (failed, None)
+
+
+def test_too_many_frames_are_not_asked_and_the_reason_is_given(still, monkeypatch):
+    monkeypatch.setattr(rolling_shutter, "MAX_FRAMES", KIND.frames - 1)
+    said = Said()
+
+    model, found = follow(still, said)
+
+    assert model is still.adjusted and not said.texts
+    assert isinstance(found, Unmeasured)
+    assert found.to_dict() == {
+        "compensated": False, "because": "more than 15 frames would take too long to measure"
+    }  # fmt: skip
