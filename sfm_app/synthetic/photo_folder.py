@@ -2,7 +2,9 @@
 
 import json
 from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from sfm_app.atomic_io import replace_atomically
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.progress import Progress, SilentProgress, track
 from sfm_app.synthetic.cameras import Camera, Views, camera_center
 from sfm_app.synthetic.lenses import Lens
-from sfm_app.synthetic.render import GAMMA, prepare, render_scene
+from sfm_app.synthetic.render import GAMMA, PreparedScene, prepare, render_scene
 from sfm_app.synthetic.scenes.bodies import SyntheticScene
 
 FloatArray = NDArray[np.float64]
@@ -111,18 +114,93 @@ def write_photo_folder(
     Raises:
         InputError: the folder cannot be written.
     """
-    options = options or PhotoOptions()
-    prepared = prepare(scene)
-    poses = list(enumerate({**views.cam_from_world, **views.row_poses}.items()))
+    work = _FolderWork(folder, prepare(scene), views, options or PhotoOptions())
+    numbers = range(len(views.cam_from_world))
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        for k, (name, pose) in track(progress or SilentProgress(), poses, "rendering photos", len(poses)):
-            image = render_scene(prepared, views.cameras[name], pose, options.supersampling)
-            photo = develop(image, options, np.random.default_rng([options.seed, k, 255]))
-            Image.fromarray(photo).save(folder / name, format="JPEG", quality=options.quality)
+        for k in track(progress or SilentProgress(), numbers, "rendering photos", len(numbers)):
+            work.write_photo(k)
     except OSError as err:
         raise InputError(f"cannot write photos to {folder}: {err}", hint="choose another folder") from err
     return Truth(dict(views.cameras), dict(views.cam_from_world), scene.vertices, scene.faces)
+
+
+def add_missing_photos(
+    folder: Path,
+    scene: SyntheticScene,
+    views: Views,
+    options: PhotoOptions | None = None,
+    processes: int = 1,
+    progress: Progress | None = None,
+) -> Truth:
+    """Render the photos that a folder does not have yet, in parallel processes: a killed run resumes.
+
+    They have the bytes that `write_photo_folder` gives. A photo that is there must be of the same scene, views and
+    options, which is not checked.
+
+    Args:
+        folder: created if missing.
+        scene: what is photographed; each process prepares it, and holds one photo at a time.
+        views: camera and pose of each photo.
+        options: quality and noise of the photos; defaults if None.
+        processes: >= 1; with 1, this process renders. A script that asks for more needs a `__main__` guard.
+        progress: advances with every photo that was missing.
+
+    Raises:
+        InputError: the folder cannot be written.
+    """
+    missing = [k for k, name in enumerate(views.cam_from_world) if not (folder / name).exists()]
+    arguments, shown = (folder, scene, views, options or PhotoOptions()), progress or SilentProgress()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if processes == 1 and missing:
+            _start_process(*arguments)
+            for k in track(shown, missing, "rendering photos", len(missing)):
+                _write_in_process(k)
+        elif missing:
+            # a fork would copy the locks of Open3D's threads, but not the threads
+            with ProcessPoolExecutor(
+                min(processes, len(missing)), get_context("spawn"), _start_process, arguments
+            ) as pool:
+                done = pool.map(_write_in_process, missing)
+                for _ in track(shown, done, "rendering photos", len(missing)):
+                    pass
+    except OSError as err:
+        raise InputError(f"cannot write photos to {folder}: {err}", hint="choose another folder") from err
+    finally:
+        _WORK.clear()
+    return Truth(dict(views.cameras), dict(views.cam_from_world), scene.vertices, scene.faces)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _FolderWork:
+    """What is needed to write any photo of a folder."""
+
+    folder: Path
+    prepared: PreparedScene
+    views: Views
+    options: PhotoOptions
+
+    def write_photo(self, number: int) -> None:
+        """Render and write one photo, by its place among the views; the file is complete or missing."""
+        name = list(self.views.cam_from_world)[number]
+        pose = self.views.row_poses.get(name, self.views.cam_from_world[name])
+        image = render_scene(self.prepared, self.views.cameras[name], pose, self.options.supersampling)
+        photo = develop(image, self.options, np.random.default_rng([self.options.seed, number, 255]))
+        with replace_atomically(self.folder / name) as path:
+            Image.fromarray(photo).save(path, format="JPEG", quality=self.options.quality)
+
+
+_WORK: dict[str, _FolderWork] = {}
+"""What this process renders, under "work"; filled once, when it starts."""
+
+
+def _start_process(folder: Path, scene: SyntheticScene, views: Views, options: PhotoOptions) -> None:
+    _WORK["work"] = _FolderWork(folder, prepare(scene), views, options)
+
+
+def _write_in_process(number: int) -> None:
+    _WORK["work"].write_photo(number)
 
 
 def develop(image: FloatArray, options: PhotoOptions, rng: np.random.Generator) -> NDArray[np.uint8]:

@@ -44,7 +44,7 @@ def prepare(scene: SyntheticScene) -> PreparedScene:
     shapes = [body.shape for body in scene.bodies]
     normals = np.concatenate([shape.normals for shape in shapes])
     caster = ray_caster(vertices, faces)
-    openness = _openness(caster, vertices, normals)
+    openness = scene.bounced + (1.0 - scene.bounced) * _openness(caster, vertices, normals)
     sun = np.array(scene.to_light) / np.linalg.norm(scene.to_light)
     texture = np.concatenate([shape.texture for shape in shapes])
     return PreparedScene(

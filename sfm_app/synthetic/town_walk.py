@@ -38,12 +38,12 @@ class TownWalk:
         """(N, 3, 3) camera from world: x right, y down, z forward."""
         (sy, cy), (sp, cp) = ((np.sin(angle), np.cos(angle)) for angle in (self.yaw, self.pitch))
         forward = np.column_stack([sy * cp, sp, cy * cp])
-        right = np.column_stack([cy, np.zeros_like(cy), -sy])
+        right = np.column_stack([-cy, np.zeros_like(cy), sy])
         return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
 def walk_town(photos: int, step_m: float, seed: int) -> TownWalk:
-    """Walk from crossing to crossing, along streets not seen before where there are any.
+    """Return a walk from crossing to crossing, along streets not seen before where there are any.
 
     The town is as large as the walk can cover.
 

@@ -32,6 +32,9 @@ class SyntheticScene:
     sky: float = 0.5
     """Brightness of the sky on a surface that faces up."""
 
+    bounced: float = 0.0
+    """Share of the sky's light that reaches what sees no sky, such as panes in deep windows; 0..1."""
+
     @property
     def vertices(self) -> FloatArray:
         """(V, 3) vertices of all bodies."""

@@ -12,15 +12,21 @@ from sfm_app.synthetic.scenes.courtyard import courtyard
 from sfm_app.synthetic.scenes.facade import facade, facade_views
 from sfm_app.synthetic.scenes.small_scenes import heap, poster
 from sfm_app.synthetic.scenes.statue import statue, statue_views
+from sfm_app.synthetic.scenes.town import town
+from sfm_app.synthetic.town.photos import TownPhotos, town_views
 
 SCENES: Mapping[str, Callable[[], SyntheticScene]] = MappingProxyType({
     "courtyard": courtyard, "poster": poster, "heap": heap, "statue": statue, "facade": facade, "corner": corner,
+    "town": town,
 })  # fmt: skip
 WALKS: Mapping[str, Callable[[int], Views]] = MappingProxyType({
     "courtyard": lambda seed: arc(make_camera(960, 640), seed=seed),
     "statue": lambda seed: statue_views(make_camera(800, 1152, focal_widths=1.35), seed),
     "facade": lambda seed: facade_views(make_camera(1152, 768), seed),
     "corner": lambda seed: corner_views(make_camera(1152, 768, focal_widths=0.9), seed),
+    "town": lambda seed: town_views(
+        make_camera(1200, 900, focal_widths=0.8), TownPhotos(photos=40, step_m=1.5, seed=seed)
+    ),
 })  # fmt: skip
 """By scene: a walk with a suitable camera; the seed varies the poses."""
 

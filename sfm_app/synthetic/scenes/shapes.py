@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,17 @@ from sfm_app.synthetic.cameras import axis_rotation
 
 FloatArray = NDArray[np.float64]
 IndexArray = NDArray[np.int64]
+Span = tuple[float, float, float, float, float, float]
+"""From and to along x, along y and along z."""
+
+BOX_SIDES = np.array([
+    [[1, 0, 1], [1, 0, 0], [1, 1, 0], [1, 1, 1]],
+    [[0, 0, 0], [0, 0, 1], [0, 1, 1], [0, 1, 0]],
+    [[0, 1, 1], [1, 1, 1], [1, 1, 0], [0, 1, 0]],
+    [[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]],
+    [[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]],
+])  # fmt: skip
+"""Corners of a box, 0 for from and 1 for to along x, y and z, of its sides that face x, -x, y, -y and z."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,6 +189,64 @@ def assemble(parts: Sequence[Shape]) -> Shape:
     vertices = np.concatenate([part.vertices for part in parts])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts[:-1], strict=True)])
     return Shape(vertices, faces, np.concatenate([part.normals for part in parts]), vertices)
+
+
+def quads(corners: FloatArray) -> Shape:
+    """Return flat quadrangles, each with corners of its own.
+
+    Args:
+        corners: (N, 4, 3), counterclockwise seen from outside; two may coincide.
+    """
+    across = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    normals = across / np.linalg.norm(across, axis=1, keepdims=True)
+    first = 4 * np.arange(len(corners))[:, None, None]
+    faces = (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+    vertices = corners.reshape(-1, 3)
+    return Shape(vertices, faces, np.repeat(normals, 4, axis=0), vertices)
+
+
+def panels(spans: Sequence[Span]) -> Shape:
+    """Return boxes whose sides are not divided, for small parts on a wall: nothing closes their backs.
+
+    Args:
+        spans: from and to along x, y and z of each; the back is at the lower z.
+    """
+    spread = np.asarray(spans, dtype=np.float64).reshape(-1, 3, 2)
+    axes = np.arange(3)[None, None]
+    return quads(spread[:, axes, BOX_SIDES].reshape(-1, 4, 3))
+
+
+def plate(reach: tuple[float, float, float, float], holes: FloatArray, thickness: float, spacing: float) -> Shape:
+    """Return an upright wall with holes, its front at z = 0: the front, and the reveals down to its thickness.
+
+    Args:
+        reach: from and to along x, and along y.
+        holes: (N, 4) likewise.
+        thickness: along -z.
+        spacing: largest side of a division of the front.
+    """
+    x, y = (_cut(reach[k : k + 2], holes[:, k : k + 2], spacing) for k in (0, 2))
+    u, v = np.meshgrid((x[1:] + x[:-1]) / 2, (y[1:] + y[:-1]) / 2, indexing="ij")
+    solid = np.ones(u.shape, np.bool_)
+    for left, right, low, high in holes:
+        solid &= ~((u > left) & (u < right) & (v > low) & (v < high))
+    around = np.pad(solid, 1)
+    open_sides = (~around[2:, 1:-1], ~around[:-2, 1:-1], ~around[1:-1, 2:], ~around[1:-1, :-2], np.ones_like(solid))
+    found = []
+    for side, is_open in zip(BOX_SIDES, open_sides, strict=True):
+        i, j = np.nonzero(solid & is_open)
+        spread = np.stack([np.stack([x[i], x[i + 1]], -1), np.stack([y[j], y[j + 1]], -1)], axis=1)
+        depth = np.broadcast_to([[[-thickness, 0.0]]], (len(i), 1, 2))
+        found.append(np.concatenate([spread, depth], axis=1)[:, np.arange(3)[None], side])
+    return quads(np.concatenate(found))
+
+
+def _cut(reach: tuple[float, ...], holes: FloatArray, spacing: float) -> FloatArray:
+    """Return the ends and the edges of holes along an axis, with steps of at most `spacing` between them."""
+    inside = holes[(holes > reach[0]) & (holes < reach[1])]
+    edges = np.unique(np.concatenate([np.array(reach), inside.ravel()]).round(6))
+    steps = [np.linspace(a, b, max(1, math.ceil((b - a) / spacing)), endpoint=False) for a, b in pairwise(edges)]
+    return np.concatenate([*steps, edges[-1:]])
 
 
 def ground(x: tuple[float, float], z: tuple[float, float], unevenness: float, spacing: float = 0.1) -> Shape:

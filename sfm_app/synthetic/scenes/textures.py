@@ -16,7 +16,7 @@ from sfm_app.jit import kernel
 
 FloatArray = NDArray[np.float64]
 Color = tuple[int, int, int]
-Pattern = Literal["stone", "brick", "paving", "ceramic", "wood", "marble", "leaves", "stripes"]
+Pattern = Literal["stone", "brick", "paving", "ceramic", "wood", "marble", "leaves", "stripes", "masonry"]
 PATTERNS: tuple[str, ...] = get_args(Pattern)
 
 
@@ -157,10 +157,11 @@ def tiles(
 ) -> tuple[float, float]:
     """Return border distance and number as `cells` does, for the tile pattern of a kind.
 
-    Bricks on upright walls (1), slabs on the ground (2), leaves along the axis they face most (6).
+    Bricks on upright walls (1), slabs on the ground (2), leaves along the axis they face most (6), and bricks of bodies
+    that may have been turned (8), whose walls run along x or z.
 
     Args:
-        kind: 1, 2 or 6, as above.
+        kind: 1, 2, 6 or 8, as above.
         p: position on the body before it was moved.
         n: unit normal there.
         scale: size of a tile, > 0.
@@ -174,6 +175,8 @@ def tiles(
     if kind == 2:
         return cells(p[0] / scale + wobble, p[2] / scale + wobble, seed)
     along = p[0] if abs(n[2]) >= abs(n[0]) else p[2]
+    if kind == 8:  # the normal turns with the body, and its texture does not
+        along = p[0] + p[2]
     return bricks(along / scale + wobble, p[1] / scale + wobble, seed)
 
 
@@ -225,7 +228,7 @@ def mixture(
     if kind == 0:  # stone: stains and dark pores
         second = _ramp(broad + 0.6 * fine, -0.3, 0.9)
         joint = 0.8 * _ramp(octaves(p, 0.09 * scale, 0.75, footprint, seed + 60), 0.3, 0.55)
-    elif kind <= 2:
+    elif kind <= 2 or kind == 8:
         border, name = tiles(kind, p, n, scale, seed)
         blur = footprint / scale
         joint = 1.0 - _ramp(border, 0.04 - 0.5 * blur, 0.06 + 0.5 * blur)

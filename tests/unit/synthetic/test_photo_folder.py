@@ -9,7 +9,14 @@ from PIL import Image
 from sfm_app.errors import ConfigError, InputError
 from sfm_app.synthetic.cameras import Camera, Views, make_camera
 from sfm_app.synthetic.lenses import Lens
-from sfm_app.synthetic.photo_folder import PhotoOptions, develop, load_truth, save_truth, write_photo_folder
+from sfm_app.synthetic.photo_folder import (
+    PhotoOptions,
+    add_missing_photos,
+    develop,
+    load_truth,
+    save_truth,
+    write_photo_folder,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -51,6 +58,24 @@ def test_the_same_seed_gives_the_same_bytes(photos, still_life, four_views, tmp_
         assert (tmp_path / "again" / path.name).read_bytes() == path.read_bytes()
         assert (tmp_path / "other" / path.name).read_bytes() != path.read_bytes()
     assert progress.seen == [("rendering photos", 4), 1, 1, 1, 1, "done"]
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_missing_photos_are_added_with_the_same_bytes(processes, photos, still_life, four_views, tmp_path):
+    folder, truth = photos
+    (tmp_path / "view_01.jpg").write_bytes(b"left as it is")
+    progress = Counter()
+    found = add_missing_photos(tmp_path, still_life, four_views, PhotoOptions(seed=3), processes, progress)
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(path.name for path in folder.iterdir())
+    for path in folder.iterdir():
+        same = (tmp_path / path.name).read_bytes() == path.read_bytes()
+        assert same == (path.name != "view_01.jpg")
+    assert progress.seen == [("rendering photos", 3), 1, 1, 1, "done"]
+    assert list(found.cam_from_world) == list(truth.cam_from_world)
+    progress.seen.clear()
+    add_missing_photos(tmp_path, still_life, four_views, PhotoOptions(seed=3), processes, progress)
+    assert progress.seen == [], "nothing is missing"
 
 
 def test_truth_survives_the_disk_and_pickling(photos, tmp_path):

@@ -81,3 +81,11 @@ def test_material_colors_are_linear():
     assert row.shape == (13,)
     assert row[:4].tolist() == [PATTERNS.index("wood"), 0.3, 0.5, 7]
     assert row[4:7] == pytest.approx([1.0, 0.0, (128 / 255) ** 2.2])
+
+
+def test_masonry_turns_with_its_body():
+    """The normal is that in the scene, the position that on the body: a turned house keeps its bricks."""
+    row = Material(pattern="masonry", base=(150, 76, 56), second=(188, 116, 84), scale=0.2).row(7)
+    found = np.array([[mixture(row, tuple(p), n, 0.01) for p in POINTS] for n in ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0))])
+    assert np.array_equal(found[0], found[1])
+    assert 0.02 < (found[0][:, 1] > 0.5).mean() < 0.5, "joints between bricks"

@@ -1,0 +1,1 @@
+"""A town of streets and houses, and photos of a walk through it."""
