@@ -7,7 +7,7 @@ lie right, and repeated structure. On real photos that alone halves the error of
 import numpy as np
 from numpy.typing import NDArray
 
-from sfm_app.geometry.damping import DECREASE, INCREASE
+from sfm_app.geometry.damping import DECREASE, INCREASE, DampingRange
 from sfm_app.geometry.pose_manifold import POSE_DOF, retract, write_essential
 from sfm_app.jit import kernel
 
@@ -19,7 +19,7 @@ mismatches that a second structure explains pull the pose to a compromise betwee
 relative poses."""
 STEPS = 12
 """Largest number of steps at each scale. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
-DAMPING_FIRST, DAMPING_LEAST, DAMPING_MOST = 1e-4, 1e-9, 1e6
+DAMPING = DampingRange(first=1e-4, least=1e-9, most=1e6)
 """Damping of the Levenberg-Marquardt steps. Chosen by hand; halved and doubled by `benchmarks.sensitivity`."""
 GAIN = 1e-6
 """Relative decrease of the cost below which they end. Chosen by hand; halved and doubled by
@@ -113,17 +113,17 @@ def _system(lines: FloatArray, pose: FloatArray, sigma: float) -> tuple[FloatArr
 
 @kernel
 def _descend(lines: FloatArray, pose: FloatArray, sigma: float) -> FloatArray:
-    cost, damping = _cost(lines, pose, sigma), DAMPING_FIRST
+    cost, damping = _cost(lines, pose, sigma), DAMPING.first
     for _ in range(STEPS):
         A, b = _system(lines, pose, sigma)
         before, found = cost, False
-        while damping < DAMPING_MOST and not found:
+        while damping < DAMPING.most and not found:
             step = _solve(A, b, damping)
             trial = retract(pose, step)
             lower = _cost(lines, trial, sigma)
             if lower < cost:
                 pose, cost, found = trial, lower, True
-                damping = max(DECREASE * damping, DAMPING_LEAST)
+                damping = max(DECREASE * damping, DAMPING.least)
             else:
                 damping *= INCREASE
         if not found or before - cost < GAIN * before:
