@@ -17,8 +17,13 @@ class Progress(Protocol):
             note: why it is skipped or done again; empty where it is new.
         """
 
-    def finish_stage(self, seconds: float) -> None:
-        """Announce the end of the current stage, with its duration in seconds."""
+    def finish_stage(self, seconds: float, photos: int = 0) -> None:
+        """Announce the end of the current stage.
+
+        Args:
+            seconds: its duration.
+            photos: photos in use; 0 where they do not matter.
+        """
 
     def say(self, text: str) -> None:
         """Show a message."""
@@ -48,8 +53,12 @@ class SilentProgress:
             name, note: not used.
         """
 
-    def finish_stage(self, seconds: float) -> None:
-        """Show nothing."""
+    def finish_stage(self, seconds: float, photos: int = 0) -> None:
+        """Show nothing.
+
+        Args:
+            seconds, photos: not used.
+        """
 
     def say(self, text: str) -> None:
         """Show nothing."""

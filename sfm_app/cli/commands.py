@@ -13,7 +13,6 @@ from sfm_app import __version__
 from sfm_app.api import calibrate_photos, export_model, reconstruct
 from sfm_app.cli.camera_text import intrinsics_lines, intrinsics_summary
 from sfm_app.cli.display import (
-    Terminal,
     file_lines,
     print_json,
     print_lines,
@@ -24,6 +23,7 @@ from sfm_app.cli.display import (
 )
 from sfm_app.cli.doctor import examine
 from sfm_app.cli.options import output_options, settings_from_flags, settings_options
+from sfm_app.cli.terminal import Terminal
 from sfm_app.colmap.backend import has_running_call
 from sfm_app.demo import demo_lines, run_demo
 from sfm_app.errors import ConfigError, SfmError

@@ -1,88 +1,18 @@
-"""What a person sees: progress on stderr, results on stdout."""
+"""What a person sees of a finished run, on stdout."""
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeElapsedColumn
-from rich.progress import Progress as Bars
-
 from sfm_app.api import Run
 from sfm_app.cli.camera_text import contradiction_lines, intrinsics_lines, intrinsics_summary
 from sfm_app.cli.scene_text import scene_lines, scene_summary
 from sfm_app.numerical import json_text
 
-STAGE_TITLES = {
-    "photos": "reading photos",
-    "match_graph": "finding and matching features",
-    "view_graph": "fundamental matrices",
-    "intrinsics": "camera matrix",
-    "scene": "camera poses and points",
-    "depth_maps": "depth maps",
-    "mesh": "surface",
-    "texture": "texture",
-    "files": "files",
-}
-
 MEGABYTE, KILOBYTE = 1e6, 1e3
 NAMES_SHOWN = 5
 """Most files of one kind that are named; the manifest has all."""
-
-
-class Terminal:
-    """Progress on stderr: bars on a terminal, one line per stage otherwise, nothing when quiet."""
-
-    def __init__(self, *, quiet: bool) -> None:
-        self.console = Console(stderr=True, quiet=quiet, highlight=False)
-        self.bars = Bars(
-            TextColumn("  {task.description:18}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn(),
-            console=self.console, transient=True, disable=quiet or not self.console.is_terminal,
-        )  # fmt: skip
-        self.task: TaskID | None = None
-
-    def stage(self, name: str, note: str = "") -> None:
-        """Print the title of a stage.
-
-        Args:
-            name: of the stage.
-            note: why it is skipped or done again; may be empty.
-        """
-        steps = list(STAGE_TITLES)
-        number = f"{steps.index(name) + 1}/{len(steps)} " if name in steps else ""
-        self.console.print(f"{number}{STAGE_TITLES.get(name, name)}{f' [dim]({escape(note)})[/dim]' if note else ''}")
-
-    def finish_stage(self, seconds: float) -> None:
-        """Print how many seconds the stage took."""
-        self.console.print(f"    [dim]{seconds:.1f} s[/dim]")
-
-    def say(self, text: str) -> None:
-        """Print a text as it is."""
-        self.console.print(escape(text))
-
-    def start(self, label: str, total: int) -> None:
-        """Show a bar for work that begins.
-
-        Args:
-            label: what is done.
-            total: steps of the work.
-        """
-        self.task = self.bars.add_task(escape(label), total=total)
-        self.bars.start()
-
-    def advance(self, steps: int = 1) -> None:
-        """Move the bar forward by some steps."""
-        if self.task is not None:
-            self.bars.advance(self.task, steps)
-
-    def finish(self) -> None:
-        """Remove the bar."""
-        if self.task is not None:
-            self.bars.stop()
-            self.bars.remove_task(self.task)
-            self.task = None
 
 
 def print_json(value: Any) -> None:

@@ -1,14 +1,13 @@
 """The loop that runs stages: it skips what is up to date, redoes what is damaged and records everything."""
 
 import logging
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import dropwhile
 
 from sfm_app.colmap.backend import check_written
-from sfm_app.engine.run_log import log_to_file, peak_memory_mb
+from sfm_app.engine.run_log import log_to_file
 from sfm_app.engine.stage import Product, Products, Stage
 from sfm_app.engine.staleness import (
     PHOTOS_CHANGED,
@@ -17,6 +16,7 @@ from sfm_app.engine.staleness import (
     settings_and_versions,
     stage_fingerprint,
 )
+from sfm_app.engine.usage import measure_usage
 from sfm_app.errors import BackendError, ConfigError, DamagedProductError, InputError
 from sfm_app.photos import Source
 from sfm_app.runtime.context import RunContext
@@ -146,18 +146,17 @@ class _Execution:
         run.progress.stage(stage.name, f"again: {again}" if again else "")
         logger.info("%s begins%s", stage.name, f" again: {again}" if again else "")
         run = run.with_fingerprint(self.fingerprints[stage.name])
-        start = time.perf_counter()
-        product = self.make_product(stage, run)
-        seconds = round(time.perf_counter() - start, 2)
-        place = run.workspace
+        with measure_usage() as used:
+            product = self.make_product(stage, run)
+        place, seconds = run.workspace, round(used.seconds, 2)
         record = StageRecord(
-            run.fingerprint, seconds, run.statistics, place.manifest.sizes(stage.files), peak_memory_mb(),
-            settings_and_versions(stage, run), stage.digest(place),
+            run.fingerprint, seconds, run.statistics, place.manifest.sizes(stage.files), used.peak_mb,
+            settings_and_versions(stage, run), stage.digest(place), round(used.cpu_seconds, 2),
         )  # fmt: skip
         place.manifest.finish(stage.name, record, manifest_head(run))
-        logger.info("%s took %.2f s", stage.name, seconds)
-        run.progress.finish_stage(seconds)
+        logger.info("%s took %.2f s, %.2f s of CPU and %d MB", stage.name, seconds, used.cpu_seconds, used.peak_mb)
         self.products.keep(stage, product)
+        run.progress.finish_stage(seconds, len(self.products[self.pipeline.photos].photos))
 
     def make_product(self, stage: Stage[Product], run: RunContext) -> Product:
         """Return the product of a stage, if its photos and the output folder stayed the same meanwhile."""

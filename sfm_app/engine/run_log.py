@@ -1,10 +1,8 @@
-"""The log in the output folder, and the peak memory of the process."""
+"""The log in the output folder."""
 
 import logging
-import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 from sfm_app.runtime.context import RunContext
 
@@ -33,10 +31,3 @@ def log_to_file(run: RunContext) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         handler.close()
-
-
-def peak_memory_mb() -> int | None:
-    """Return the peak memory of this process in MB; None where the system is not Linux."""
-    status = Path("/proc/self/status")
-    found = re.search(r"VmHWM:\s+(\d+) kB", status.read_text(encoding="utf-8")) if status.exists() else None
-    return int(found[1]) // 1024 if found else None

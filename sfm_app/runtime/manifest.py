@@ -30,11 +30,13 @@ class StageRecord:
     files: Mapping[str, int] = field(default_factory=dict)
     """What the stage wrote, with the size in bytes; -1 for folders and the database, whose size readers may change."""
     peak_mb: int | None = None
-    """Most memory that the process had held by the end of the stage, in MB; None where the system does not say."""
+    """Most memory that the program and its processes held during the stage, in MB; None if not measured."""
     made_with: Mapping[str, Any] = field(default_factory=dict)
     """The settings and versions that its result depends on."""
     digest: str = ""
     """Hash of what later runs read of it, so that damage is found before it is read."""
+    cpu_seconds: float | None = None
+    """Of the program and its processes, on all cores; None if not measured."""
 
 
 class Manifest:

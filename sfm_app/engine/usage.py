@@ -1,0 +1,64 @@
+"""Seconds, CPU seconds and memory of a stage, with the processes that it starts."""
+
+import os
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import psutil
+
+EVERY_S = 0.5
+"""Time between two looks at the memory, in seconds. Chosen by hand: a look takes some milliseconds."""
+MEGA = 1e6
+
+
+@dataclass(slots=True)
+class Usage:
+    """What a piece of work has used; complete once it has ended."""
+
+    seconds: float = 0.0
+    cpu_seconds: float = 0.0
+    """Of this process and of those that it has waited for."""
+    peak_mb: int = 0
+    """Most resident memory at any look; pages that processes share count for each of them."""
+
+
+@contextmanager
+def measure_usage() -> Iterator[Usage]:
+    """Measure the work within the block."""
+    used, ended = Usage(), threading.Event()
+    start, cpu_start = time.perf_counter(), _cpu_seconds()
+
+    def watch() -> None:
+        while True:
+            used.peak_mb = max(used.peak_mb, _resident_mb())
+            if ended.wait(EVERY_S):
+                return
+
+    watcher = threading.Thread(target=watch, name="memory", daemon=True)
+    watcher.start()
+    try:
+        yield used
+    finally:
+        ended.set()
+        watcher.join()
+        used.peak_mb = max(used.peak_mb, _resident_mb())
+        used.seconds, used.cpu_seconds = time.perf_counter() - start, _cpu_seconds() - cpu_start
+
+
+def _cpu_seconds() -> float:
+    return sum(os.times()[:4])
+
+
+def _resident_mb() -> int:
+    """Return the memory of this process and of its children in MB."""
+    me = psutil.Process()
+    total = 0
+    for process in (me, *me.children(recursive=True)):
+        try:
+            total += process.memory_info().rss
+        except psutil.Error:  # it has ended meanwhile
+            continue
+    return round(total / MEGA)

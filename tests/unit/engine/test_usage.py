@@ -1,0 +1,39 @@
+import subprocess
+import sys
+import time
+
+import pytest
+
+from sfm_app.engine.usage import measure_usage
+
+HOLD = "held = b'x' * 200_000_000; import time; time.sleep(1.2)"
+
+
+def test_memory_of_other_processes_counts():
+    with measure_usage() as alone:
+        pass
+    with measure_usage() as used:
+        subprocess.run([sys.executable, "-c", HOLD], check=True)
+
+    assert alone.peak_mb > 10
+    assert 200 <= used.peak_mb - alone.peak_mb < 350
+
+
+def test_cpu_seconds_are_those_of_work_and_not_of_waiting():
+    with measure_usage() as idle:
+        time.sleep(0.5)
+    with measure_usage() as busy:
+        end = time.process_time() + 0.5
+        while time.process_time() < end:
+            pass
+
+    assert idle.seconds >= 0.5
+    assert idle.cpu_seconds < 0.3
+    assert 0.45 <= busy.cpu_seconds < 1.0
+
+
+def test_a_failure_is_measured_too():
+    with pytest.raises(ValueError, match="no"), measure_usage() as used:
+        raise ValueError("no")
+
+    assert used.seconds > 0
