@@ -40,6 +40,8 @@ def global_options(seed: int, names: Sequence[str]) -> pycolmap.GlobalPipelineOp
     mapper = options.mapper
     mapper.ba_num_iterations = ADJUSTMENTS
     mapper.bundle_adjustment.ceres.solver_options.function_tolerance = GAIN
+    # on any machine the same bytes; without CUDA, COLMAP warns of it from 50 photos on
+    mapper.global_positioning.use_gpu = mapper.bundle_adjustment.ceres.use_gpu = False
     options.random_seed = mapper.random_seed = mapper.rotation_averaging.random_seed = seed
     mapper.global_positioning.random_seed = mapper.retriangulation.random_seed = seed
     return options
