@@ -6,6 +6,7 @@ another focal, every photo is assigned the camera with which its pairs agree bes
 """
 
 from collections.abc import Sequence
+from heapq import heapify, heappop, heappush
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +86,10 @@ class _PairVotes:
 
     def __init__(self, tables: VoteTables, photos: Sequence[PairId]) -> None:
         self.tables, self.photos = tables, photos
+        self.pairs_of: dict[int, list[int]] = {}
+        for k, pair in enumerate(photos):
+            for photo in pair:
+                self.pairs_of.setdefault(photo, []).append(k)
 
     def find_core(self, theta: FloatArray, everyone: Sequence[int]) -> tuple[float, FloatArray, set[int]]:
         """Find the photos that agree on a camera; return their votes beyond the fair share, the camera, and them."""
@@ -93,16 +98,23 @@ class _PairVotes:
             for k in range(len(self.photos))
         ]
         core = set(everyone)
-        while len(core) > 2:
-            worth = dict.fromkeys(core, 0.0)
-            for (first, second), value in zip(self.photos, beyond, strict=True):
-                if first in core and second in core:
-                    worth[first] += value
-                    worth[second] += value
-            worst = min(core, key=lambda photo: (worth[photo], photo))
-            if worth[worst] >= 0:
+
+        def worth(photo: int) -> float:
+            return sum((beyond[k] for k in self.pairs_of[photo] if core.issuperset(self.photos[k])), 0.0)
+
+        known = {photo: worth(photo) for photo in everyone}
+        waiting = [(value, photo) for photo, value in known.items()]
+        heapify(waiting)
+        while len(core) > 2 and waiting:
+            value, worst = heappop(waiting)
+            if worst not in core or value != known[worst]:  # it has changed since
+                continue
+            if value >= 0:
                 break
             core.remove(worst)
+            for other in {photo for k in self.pairs_of[worst] for photo in self.photos[k]} & core:
+                known[other] = worth(other)
+                heappush(waiting, (known[other], other))
         inside = [value for pair, value in zip(self.photos, beyond, strict=True) if core.issuperset(pair)]
         return float(sum(inside)), theta, core
 
@@ -112,7 +124,8 @@ class _PairVotes:
         trials = np.repeat(theta[None], TRIALS, axis=0)
         trials[:, LOG_FOCAL] += steps
         votes, most = np.zeros(TRIALS), 0.0
-        for k, (first, second) in enumerate(self.photos):
+        for k in self.pairs_of[photo]:
+            first, second = self.photos[k]
             if first == photo and second in core:
                 votes += self.tables.votes(k, trials, theta[None], SIGMA)[:, 0]
             elif second == photo and first in core:
@@ -131,7 +144,8 @@ class _PairVotes:
             before = dict(labels)
             for photo in everyone:
                 votes = np.zeros(len(cameras))
-                for k, (first, second) in enumerate(self.photos):
+                for k in self.pairs_of[photo]:
+                    first, second = self.photos[k]
                     if first == photo and labels[second] >= 0:
                         votes += self.tables.votes(k, cameras, cameras[labels[second]][None], SIGMA)[:, 0]
                     elif second == photo and labels[first] >= 0:

@@ -170,7 +170,7 @@ def _split_group(
     if found.identifiable:
         starts.append(np.append(parameters_from_calibration(found, side)[:4], 0.0))
     tables = VoteTables(ready.F, np.zeros((len(ready), 2), np.int64), ready.weights)
-    photos = [own.photos[k] for k in ready.kept]
+    photos = [own.photos[ready.kept[k]] for k in tables.kept]
     thetas, labels = split_by_focal(tables, photos, starts)
     if cross_validate(tables, photos, starts, labels, seed).is_camera_per_photo:
         return _split_by_photo(camera, number, pairs)

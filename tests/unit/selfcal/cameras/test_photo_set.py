@@ -206,3 +206,20 @@ def test_cameras_that_a_zoom_seems_to_have_are_estimates(shots):
     assert len(found) >= 3
     assert all(camera.found.method == "estimate" for camera in found), [camera.found.reason for camera in found]
     assert all("as those of a zoom do" in camera.found.reason for camera in found)
+
+
+class FewerVotes(photo_set.VoteTables):
+    """Tables without the first pair, as where its F repeats another's once its lens is taken out: copies of photos."""
+
+    def __init__(self, Fs, members, weights):
+        super().__init__(Fs, members, weights)
+        self.kept, self.packed_rows, self.members, self.weights = (
+            values[1:] for values in (self.kept, self.packed_rows, self.members, self.weights)
+        )
+
+
+def test_pairs_that_repeat_others_do_not_keep_two_cameras_together(shots, monkeypatch):
+    monkeypatch.setattr(photo_set, "VoteTables", FewerVotes)
+    made = shots(8, 2, focal=[1000.0] * 4 + [1500.0] * 4)
+    found = cameras_of(made.as_set(["zoom"] * 8))
+    assert sorted(camera.photos for camera in found) == [(0, 1, 2, 3), (4, 5, 6, 7)]
